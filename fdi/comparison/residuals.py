@@ -193,12 +193,9 @@ def examine_residuals(trace: Trace, residual: Columns, repeats: Mapping[str, Flo
     inputs = {"Cor": trace.cor, "Com": trace.com} | ({"load": trace.load} if np.ptp(trace.load) > 0.0 else {})
     colours = {name: fit_whitener(np.diff(u)) for name, u in inputs.items() if np.ptp(u) > 0.0}
     quantities = {"speed": m.v, "position": m.x, "P12": m.p12, "acceleration": m.a}
-    found = {}
-    for name, r in residual.items():
-        foreign = {u: (inputs[u], by) for u, by in colours.items() if (name, u) not in OWN}
-        others = {q: x for q, x in quantities.items() if (name, q) not in OWN}
-        found[name] = _examine_signal(trace, r, repeats.get(name), foreign, others)
-    return found
+    return {name: _examine_signal(
+        trace, r, repeats.get(name), {u: (inputs[u], by) for u, by in colours.items() if (name, u) not in OWN},
+        {q: x for q, x in quantities.items() if (name, q) not in OWN}) for name, r in residual.items()}
 
 
 def fit_whitener(x: Floats) -> Floats:
@@ -238,7 +235,9 @@ def _examine_signal(trace: Trace, residual: Floats, difference: Floats | None,
     follows = tuple(correlate_with_input(name, u, by, r, trace.period) for name, (u, by) in inputs.items())
     found = [bin_residual(name, q, residual) for name, q in quantities.items()]
     depends = sorted((d for d in found if d is not None), key=lambda d: -d.share)
-    memory, noise_memory = (_measure_memory(x) * trace.period for x in (autocorrelate(r), quiet))
+    # the lags at which they first are below 1/e
+    memory, noise_memory = (int(np.argmax(np.append(x, 0.0) < 1 / math.e)) * trace.period
+                            for x in (autocorrelate(r), quiet))
     return ResidualTests(memory, noise_memory, own, band, frequencies, power, departs, allowed, half, follows,
                          tuple(depends))
 
@@ -272,12 +271,6 @@ def _correlate_piece(x: Floats, y: Floats, last: int) -> Floats:
     n = 1 << int(len(x) + last).bit_length()
     whole = np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)
     return whole[:last + 1]
-
-
-def _measure_memory(correlation: Floats) -> int:
-    """The lag at which it first is below 1/e."""
-    below = np.flatnonzero(correlation < 1 / math.e)
-    return int(below[0]) if len(below) else len(correlation)
 
 
 def cumulate_periodogram(x: Floats, period: float) -> tuple[Floats, Floats, float, float]:

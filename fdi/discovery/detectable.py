@@ -167,7 +167,8 @@ class VirtualTest:
         """
         m, k, p = trials.shape
         flat = trials.reshape(-1, p)
-        white = self._whiten(self._predict(flat) - np.repeat(runs, k, 0))
+        predicted = self._predict_values(self.problem, self.names, self.problem.convert_unknowns(self.fit.free, flat))
+        white = self._whiten(predicted - np.repeat(runs, k, 0))
         costs = compute_misfit(white) + flat**2 @ self.prior
         return costs.reshape(m, k), white.reshape(m, k, *white.shape[1:])
 
@@ -211,9 +212,6 @@ class VirtualTest:
                 at[name] = start if entry.parameters[name].unit in WITHOUT_SIZE else moved
             rows.append([at.get(name, values[name]) for name in names])
         return names, np.array(rows)
-
-    def _predict(self, x: Floats) -> Floats:
-        return self._predict_values(self.problem, self.names, self.problem.convert_unknowns(self.fit.free, x))
 
     def _predict_values(self, problem: Problem, names: Sequence[str], rows: Floats, together: int = 64) -> Floats:
         parts = np.array_split(rows, -(-len(rows) // together))

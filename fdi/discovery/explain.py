@@ -38,7 +38,7 @@ import numpy as np
 
 from fdi.discovery.detectable import Blind, find_hidden_effects
 from fdi.discovery.residual_pattern import is_periodic_in_position
-from fdi.discovery.search import FINE, Hypothesis, Search, Sensitivity, WholeRuns, compute_sensitivity
+from fdi.discovery.search import FINE, Hypothesis, Search, Sensitivity, compute_sensitivity
 from fdi.estimation.likelihood import compute_typical_rms
 from fdi.estimation.replay import find_undecided_rows
 from fdi.progress import Progress, Stage, ignore_progress
@@ -94,7 +94,7 @@ class Explanation:
 
 
 def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Trace | None = None,
-            progress: Progress = ignore_progress, whole: WholeRuns | None = None) -> Explanation:
+            progress: Progress = ignore_progress, whole: Sequence[Trace] = ()) -> Explanation:
     """The verdict on a model and a measured run.
 
     Args:
@@ -105,7 +105,7 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
         progress: called with each stage and the share done, 0 to 1.
         whole: the recordings that `est` and `repeats` were cut from, where they were: what is found is judged on them.
     """
-    marks = find_marks(model, [whole.est, *whole.repeats] if whole else [est, *repeats])
+    marks = find_marks(model, whole or [est, *repeats])
     candidates = [e.name for e in list_searched_effects(model.plant)
                   if e.port not in ("command", "reading") and e.starts]
     search = Search(model, est, repeats, candidates, holdout=holdout, whole=whole)

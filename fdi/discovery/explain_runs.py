@@ -16,7 +16,7 @@ from fdi.discovery.laws.terms import write_law_file
 from fdi.discovery.refit import lean_model
 from fdi.discovery.residual_pattern import Pattern, find_pattern, write_effect
 from fdi.discovery.runs import Runs
-from fdi.discovery.search import Hypothesis, WholeRuns, choose_search_excerpt, compute_p_value
+from fdi.discovery.search import Hypothesis, choose_search_excerpt, compute_p_value
 from fdi.discovery.separate import find_separation
 from fdi.estimation.fit import Fit, Value
 from fdi.estimation.likelihood import limit_friction_values
@@ -93,9 +93,9 @@ def explain_recording(runs: Runs, progress: Progress = ignore_progress, rounds: 
         return explain(runs.model, runs.est, runs.repeats, runs.holdout, progress)
     searched = [e.name for e in list_searched_effects(runs.model.plant) if e.port not in UNREPLAYED]
     excerpt = choose_search_excerpt(runs.model, runs.est, searched, progress)
-    whole = WholeRuns(runs.est, runs.repeats)
+    whole = (runs.est, *runs.repeats)
     for _ in range(rounds):
-        est, *repeats = (cut_excerpt(run, excerpt) for run in (runs.est, *runs.repeats))
+        est, *repeats = (cut_excerpt(run, excerpt) for run in whole)
         found = explain(runs.model, est, repeats, runs.holdout, progress, whole=whole)
         said = found.ledger[-1]
         more = None

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdi.discovery.explain import find_marks, measure_gain
-from fdi.discovery.search import Hypothesis, Prospect, Search, WholeRuns, choose_search_excerpt, scan_effects
+from fdi.discovery.search import Hypothesis, Prospect, Search, choose_search_excerpt, scan_effects
 from fdi.estimation.fit import Fit, continue_fit, linearise
 from fdi.estimation.likelihood import limit_friction_values, place_in_healthy_unit
 from fdi.estimation.long_recordings import can_be_cut, cut_excerpt
@@ -94,12 +94,12 @@ def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: 
     marks = _read_marks(original, effects, [est, *repeats])
     replayed = [e for e in effects if CATALOGUE[e].port not in UNREPLAYED]
     first = [e for e in effects[:done] if e in replayed]
-    whole, said = None, ""
+    whole, said = list[Trace](), ""
     if can_be_cut(est, original):
-        whole = WholeRuns(est, tuple(repeats))
+        whole = [est, *repeats]
         excerpt = choose_search_excerpt(original, est, replayed, progress)
-        est, *repeats = (cut_excerpt(run, excerpt) for run in (est, *repeats))
-        said = excerpt.describe(whole.est)
+        said = excerpt.describe(est)
+        est, *repeats = (cut_excerpt(run, excerpt) for run in whole)
     search = Search(original.replace({name: value for name, (value, *_) in marks.items()}), est, repeats, replayed,
                     holdout=holdout, whole=whole)
     model = lean_model(search.model, replayed)

@@ -106,13 +106,6 @@ class Hypothesis:
         return self.fit.cost - self.fit.misfit
 
 
-class WholeRuns(NamedTuple):
-    """The recordings that the runs of a search were cut from."""
-
-    est: Trace
-    repeats: tuple[Trace, ...]
-
-
 def choose_search_excerpt(model: Model, trace: Trace, effects: Iterable[str], progress: Progress = ignore_progress
                           ) -> Excerpt:
     """The part of a long recording that says most about the tolerances and these effects at a usual size."""
@@ -126,13 +119,14 @@ class Search:
     """The state of one search: the problem, its noise, every hypothesis tried."""
 
     def __init__(self, model: Model, trace: Trace, repeats: Sequence[Trace], effects: Iterable[str],
-                 workers: int | None = None, holdout: Trace | None = None, whole: WholeRuns | None = None) -> None:
+                 workers: int | None = None, holdout: Trace | None = None, whole: Sequence[Trace] = ()) -> None:
         self.workers = workers or count_threads()
-        self.holdout, self.whole = holdout, whole  # None: the runs of the search are whole recordings
+        self.holdout, self.whole = holdout, whole  # recordings that the runs of the search were cut from, if they were
         self.sensors = {name: noises.white_noise(model[SIGNALS[name].noise]) for name in OUTPUTS}
         lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
         self.coarse = {"xj": lsb / np.sqrt(12.0)} if lsb else {}  # RMS of rounding, where a signal comes in steps
-        self.noise = tuple(noises.add_rounding(self.sensors[s], self.coarse.get(s, 0.0)) for s in trace.outputs)
+        self.noise = tuple(self.sensors[s]._replace(innovation=float(np.hypot(
+            self.sensors[s].innovation, self.coarse.get(s, 0.0)))) for s in trace.outputs)
         self.model, ready = model, complete_model(model)
         bare = silence_readings(model)
         self.problem = Problem(ready, trace, self.noise, workers=1, bare=bare)
@@ -323,11 +317,11 @@ class Search:
 
         Its ratio is that of all of the recording, or that of the part where it holds on all of the recording.
         """
-        if self.whole is None:
+        if not self.whole:
             return list(hypotheses)
         floor = self.estimate_floor(hypotheses[-1])
         fits = [h.fit for h in hypotheses]
-        runs = [judge_on_all(self.problem, fits, run, steps) for run in (self.whole.est, *self.whole.repeats)]
+        runs = [judge_on_all(self.problem, fits, run, steps) for run in self.whole]
         out = []
         for h, own, *others in zip(hypotheses, *runs, strict=True):
             errors = own.errors

@@ -142,7 +142,10 @@ def remove_effect_and_refit(name: str, runs: Runs | None, model: Model, known: P
 
 
 def _continues_ledger(known: Provenance, runs: Runs) -> bool:
-    return bool(known.ledger) and known.same_data(runs.sources, len(runs.repeats), runs.est.outputs)
+    """Whether the ledger goes on: the same runs, told by their content, and the same signals."""
+    own = [s.sha256 for s in (known.trace, *known.repeats, known.holdout) if s]
+    return (bool(known.ledger) and own == [s.sha256 for s in runs.sources]
+            and len(known.repeats) == len(runs.repeats) and known.signals == tuple(runs.est.outputs))
 
 
 def _make_update(r: Refit, runs: Runs, known: Provenance, effects: Sequence[str], rows: Sequence[Row],
@@ -206,11 +209,6 @@ class Provenance:
     before: Mapping[str, float] | None = None  # parameters that the fits changed, as they were
     ledger: tuple[Row, ...] = ()
     identification: Mapping[str, str | list[str]] | None = None  # of the nominal values, by rig identify
-
-    def same_data(self, sources: Sequence[Source], repeats: int, signals: Sequence[str]) -> bool:
-        """Whether the ledger goes on: the same runs, told by their content, and the same signals."""
-        own = [s.sha256 for s in (self.trace, *self.repeats, self.holdout) if s]
-        return own == [s.sha256 for s in sources] and len(self.repeats) == repeats and self.signals == tuple(signals)
 
 
 def read_provenance(path: Path) -> Provenance:

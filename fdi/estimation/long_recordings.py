@@ -86,15 +86,12 @@ class Excerpt(NamedTuple):
 
     pieces: tuple[tuple[int, int], ...]
 
-    def seconds(self, period: float) -> float:
-        """Length in all."""
-        return sum(stop - first for first, stop in self.pieces) * period
-
     def describe(self, trace: Trace) -> str:
         """In words, for the recording `trace` that it was chosen from."""
         times = [f"{trace.t[first]:.4g} to {trace.t[stop - 1] + trace.period:.4g} s" for first, stop in self.pieces]
+        seconds = sum(stop - first for first, stop in self.pieces) * trace.period
         whole = len(trace) * trace.period
-        return (f"fitted to {self.seconds(trace.period):.3g} s of {whole:.4g} s, the part that says most about the "
+        return (f"fitted to {seconds:.3g} s of {whole:.4g} s, the part that says most about the "
                 f"unknowns ({', '.join(times)}); judged on all of it")
 
 

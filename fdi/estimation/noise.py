@@ -271,11 +271,6 @@ def white_noise(level: float) -> Noise:
     return Noise(level, np.ones(1), level)
 
 
-def add_rounding(noise: Noise, step: float) -> Noise:
-    """White noise and rounding, `step` RMS: for weights; the level stays that of the noise."""
-    return noise._replace(innovation=float(np.hypot(noise.innovation, step)))
-
-
 def measure_level(difference: Floats, block: int = WINDOW) -> float:
     """Standard deviation of noise, (n,), in which now and then something else happens: the median block's."""
     blocks = _cut_windows(difference, block)

@@ -300,8 +300,6 @@ def _keep_still(flat: Floats, k: int) -> Floats:
 class LogFree(Free):
     """A parameter by its logarithm: centre, scale and bounds are those of the logarithm."""
 
-    __slots__ = ()
-
     def value(self, x: float) -> float:
         """The parameter in SI units."""
         return math.exp(super().value(x))
@@ -309,8 +307,6 @@ class LogFree(Free):
 
 class LogFrictionRatio(LogFree):
     """Static friction by the logarithm of its ratio to the dynamic one of the same body, which comes before it."""
-
-    __slots__ = ()
 
     @property
     def dynamic_name(self) -> str:
@@ -320,8 +316,6 @@ class LogFrictionRatio(LogFree):
 
 class LogOpenFilter(Free):
     """Kintas by the logarithm of what the filter lets through, 1 - Kintas: gains go with powers of it."""
-
-    __slots__ = ()
 
     def value(self, x: float) -> float:
         """Kintas."""

@@ -6,13 +6,11 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from fdi.estimation.fit import DAMPINGS, Fit
 from fdi.estimation.likelihood import Free
 from fdi.estimation.unidentifiable import finish_fit, invert_hessian
-
-Floats = NDArray[np.float64]
+from fdi.trace.trace import Floats
 
 
 class CurvedProblem:

@@ -8,7 +8,6 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from noisy_traces import record_plant
-from numpy.typing import NDArray
 
 from fdi.discovery.search import Search
 from fdi.estimation.replay import hold_inputs
@@ -24,9 +23,8 @@ from fdi.estimation.unidentifiable import (
     find_tangents,
 )
 from fdi.estimation.unknowns import list_all_unknowns
+from fdi.trace.trace import Flags, Floats
 from plant import load_model
-
-Floats = NDArray[np.float64]
 
 
 class SteppedResiduals:
@@ -37,7 +35,7 @@ class SteppedResiduals:
         return np.stack([10.0 * (x[:, 0] > 0.005), 1e5 * x[:, 1]], axis=-1)[:, None, :]
 
 
-def confirm(is_tried: NDArray[np.bool_]) -> list[bool]:
+def confirm(is_tried: Flags) -> list[bool]:
     """`confirm_flat` along both unknowns, with a misfit of one allowed."""
     trials = np.array([TRIED * share * np.eye(2) for share in TRIED_SHARES])
     problem = cast(Any, SteppedResiduals())
