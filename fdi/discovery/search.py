@@ -121,7 +121,7 @@ class Search:
     def __init__(self, model: Model, trace: Trace, repeats: Sequence[Trace], effects: Iterable[str],
                  workers: int | None = None, holdout: Trace | None = None, whole: Sequence[Trace] = ()) -> None:
         self.workers = workers or count_threads()
-        self.holdout, self.whole = holdout, whole  # recordings that the runs of the search were cut from, if they were
+        self.holdout, self.whole = holdout, whole  # `whole`: what the runs were cut from, if they were
         self.sensors = {name: noises.white_noise(model[SIGNALS[name].noise]) for name in OUTPUTS}
         lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
         self.coarse = {"xj": lsb / np.sqrt(12.0)} if lsb else {}  # RMS of rounding, where a signal comes in steps
