@@ -13,7 +13,8 @@ from rig.conformance.conformance_case import (
     require_applicable,
 )
 from rig.conformance.data_sheet import Variable
-from rig.conformance.pdo_cases import identify, list_valid, read_mapped, require_emcy, send_short, set_type
+from rig.conformance.error_cases import LIMIT, beat_as, watch
+from rig.conformance.pdo_cases import identify, list_valid, read_mapped, send_short, set_type
 from rig.conformance.sdo_cases import READ_TYPE
 from rig.conformance.target import COMMANDS, OPERATIONAL, PRE_OPERATIONAL, STOPPED, Refusal, Target, name_state
 from rig.network.node_objects import NmtCommand, NmtState
@@ -130,17 +131,12 @@ def check_pdo_by_state(t: Target, state: NmtState) -> str:
 
 def check_emcy_by_state(t: Target) -> str:
     """A supervised heartbeat stops while the node is STOPPED."""
-    require_emcy(t)
-    t.require_writable(0x1016, 1)
-    node = t.find_free_node()
-    t.write(0x1016, 1, node << 16 | 100)
+    node = watch(t)
     t.beat()
     t.enter(STOPPED)
     mark = len(t.frames)
-    for _ in range(3):
-        t.send(0x700 + node, bytes((OPERATIONAL,)))
-        t.wait(0.02)
-    t.wait(0.4)
+    beat_as(t, node, 3)
+    t.wait(2 * LIMIT / 1e3)
     emergencies = [f"EMCY {frame.data.hex(' ')}" for frame in t.heard(mark, t.emcy_id)]
     require(not emergencies, f"{join_labels(emergencies)} in STOPPED")
     beats = len(t.heard(mark, t.heartbeat_id))
