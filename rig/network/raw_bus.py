@@ -349,7 +349,7 @@ def _transmit(port: Port, size: int) -> int:
 
 # ---------------------------------------------------------------------------------------- datagrams of python-can
 
-# A datagram is a msgpack map, always with the same keys in the same order; an example tells which.
+# A datagram is a msgpack map; an example tells how python-can packs it.
 _EXAMPLE = pack_message(can.Message(arbitration_id=0x7FF, is_extended_id=False, data=bytes(range(0xF0, 0xF8))))
 _ID_AT, _LENGTH_AT, _DATA_AT = (_EXAMPLE.index(text) + len(text) for text in (b"\xcd", b"\xa3dlc", b"\xc4\x08"))
 _TAIL = len(_EXAMPLE) - _DATA_AT - 8  # bytes after the payload
@@ -358,7 +358,8 @@ _KEYS = [msgpack.packb(name) for name in _NAMES]
 _KEY_BYTES, _KEY_LENGTHS = np.frombuffer(b"".join(_KEYS), np.uint8), np.array([len(key) for key in _KEYS])
 _ID, _EXTENDED, _REMOTE, _IS_ERROR, _FD, _DLC, _PAYLOAD = (_NAMES.index(name) for name in (
     "arbitration_id", "is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "dlc", "data"))
-_FALSE, _BYTES, _TEXT = 0xC2, 0xC4, 0xD9  # msgpack's first byte of a value; of the last two the length follows
+_OFF = (0x00, 0xC0, 0xC2)  # msgpack's first byte of a value: 0, nothing and false
+_BYTES, _TEXT = 0xC4, 0xD9  # the same of values whose length follows
 _SIZES = np.full(256, -1)  # bytes after the first byte
 _SIZES[:0x80] = _SIZES[[0xC0, 0xC2, 0xC3]] = 0  # a small number, nothing, false, true
 _SIZES[0xA0:0xC0], _SIZES[0xCA:0xD0] = np.arange(32), (4, 8, 1, 2, 4, 8)  # a short text; floats, unsigned numbers
@@ -379,21 +380,21 @@ def encode_datagram(port: Port, cob_id: int, length: int, data: int) -> int:
 def decode_datagram(port: Port, size: int) -> tuple[int, int, int, int]:
     """(kind, COB-ID, length, payload) of `size` bytes in the port's buffer, as python-can's udp_multicast packs them.
 
-    What is laid out otherwise, or contradicts itself, counts as an error frame, as in `UdpBus`.
+    The keys may come in any order, and those that have a default may be missing: other programs pack the map otherwise.
+    What is no such map, or contradicts itself, counts as an error frame, as in `UdpBus`.
     """
-    octets, place, end, at = port.octets, _IN + 1, _IN + size, 0
-    cob_id, dlc, payload, length, flags = -1, -1, 0, -1, 0
-    if octets[_IN] != 0x80 | len(_KEY_LENGTHS):
+    octets, place, end = port.octets, _IN + 1, _IN + size
+    cob_id, dlc, payload, length, flags = -1, -1, 0, 0, 0
+    if octets[_IN] & 0xF0 != 0x80:
         return _ERROR_FRAME, 0, 0, 0
-    for key in range(len(_KEY_LENGTHS)):
-        for _ in range(_KEY_LENGTHS[key]):
-            if octets[place] != _KEY_BYTES[at]:
-                return _ERROR_FRAME, 0, 0, 0
-            place, at = place + 1, at + 1
+    for _ in range(octets[_IN] & 0x0F):
+        key, place = _read_key(octets, place, end)
+        if key < 0 or place >= end:
+            return _ERROR_FRAME, 0, 0, 0
         first = _integer(octets[place])
         place += 1
         count = _integer(_SIZES[first])
-        if first in (_BYTES, _TEXT):
+        if first in (_BYTES, _TEXT) and place < end:
             count = _integer(octets[place])
             place += 1
         if count < 0 or place + count > end:
@@ -404,10 +405,12 @@ def decode_datagram(port: Port, size: int) -> tuple[int, int, int, int]:
             dlc = _read_number(octets, first, place, count)
         elif key == _PAYLOAD:
             payload, length = place, count if first == _BYTES else -1
-        elif key in (_EXTENDED, _REMOTE, _IS_ERROR, _FD) and first != _FALSE:
+        elif key in (_EXTENDED, _REMOTE, _IS_ERROR, _FD) and first not in _OFF:
             flags |= 1 << key
         place += count
-    if place != end or dlc < 0 or length < 0 or flags & 1 << _IS_ERROR:
+    if dlc < 0:
+        dlc = length
+    if place != end or length < 0 or flags & 1 << _IS_ERROR:
         return _ERROR_FRAME, 0, 0, 0
     if flags:
         return _OTHER, 0, 0, 0
@@ -416,6 +419,17 @@ def decode_datagram(port: Port, size: int) -> tuple[int, int, int, int]:
     port.words[_PAYLOAD_WORD] = 0
     _memcpy(octets.ctypes.data + 8 * _PAYLOAD_WORD, octets.ctypes.data + payload, length)
     return _DATA, cob_id, length, _integer(port.words[_PAYLOAD_WORD])
+
+
+def _read_key(octets: NDArray[np.uint8], place: int, end: int) -> tuple[int, int]:
+    """(number in `_NAMES`, place behind the key); -1 for a key that python-can does not know."""
+    at = 0
+    for key in range(len(_KEY_LENGTHS)):
+        length = _integer(_KEY_LENGTHS[key])
+        if place + length <= end and np.array_equal(octets[place:place + length], _KEY_BYTES[at:at + length]):
+            return key, place + length
+        at += length
+    return -1, place
 
 
 def _read_number(octets: NDArray[np.uint8], first: int, place: int, count: int) -> int:
