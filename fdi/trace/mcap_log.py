@@ -9,7 +9,7 @@ import contextlib
 import os
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -23,6 +23,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, ChunkIndex, Schema
+from mcap.stream_reader import lz4  # type: ignore[attr-defined]  # a requirement of mcap, not one of ours
 from mcap.summary import Summary
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
@@ -337,9 +338,9 @@ def unpack_chunk(chunk: Chunk) -> bytes:
     size = chunk.uncompressed_size
     if size > LARGEST_CHUNK:
         raise UnpackingError(f"it declares {size} bytes, more than {LARGEST_CHUNK >> 20} MiB")
-    if chunk.compression not in ("", "zstd"):
+    if chunk.compression not in _UNPACKERS:
         raise UnpackingError(f"compression {chunk.compression[:20]!r} is not known")
-    data = _unpack_zstd(chunk.data, size) if chunk.compression else chunk.data
+    data = _UNPACKERS[chunk.compression](chunk.data, size)
     if len(data) != size:
         raise UnpackingError(f"it declares {size} bytes and has {len(data)} or more")
     if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
@@ -357,3 +358,16 @@ def _unpack_zstd(packed: bytes, size: int) -> bytes:
         return unpacker.decompress(packed, max_output_size=size) if size else b""
     except zstandard.ZstdError as error:
         raise UnpackingError(str(error)) from error
+
+
+def _unpack_lz4(packed: bytes, size: int) -> bytes:
+    """Unpack at most one byte more than `size`. The recorder writes zstd; other programs may write this."""
+    try:
+        data: bytes = lz4.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
+    except RuntimeError as error:
+        raise UnpackingError(str(error)) from error
+    return data
+
+
+_UNPACKERS: dict[str, Callable[[bytes, int], bytes]] = {
+    "": lambda packed, size: packed, "zstd": _unpack_zstd, "lz4": _unpack_lz4}
