@@ -1,1 +1,1 @@
-"""Speed beside C and other libraries, measured in one run."""
+"""Speed of the bench and of the analyses, beside C and the tools of the system, measured in one run."""

@@ -1,1 +1,1 @@
-"""The rerun viewer on a trace."""
+"""The rerun viewer on traces, and the screens that show a run while it runs."""
