@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from plant.compile import compile_function
+from plant.errors import RigError
 from rig.network import codec
 from rig.network.frame import Frame
 from rig.network.link import LinkWire
@@ -168,6 +169,8 @@ class HardLoop(Loop):
         self._words[hc.CANCEL] = self._is_running()
         while self._is_running() and self._words[hc.CANCEL]:
             self.serve()
+        if not self._is_running():  # in lockstep the cycle may have ended with an error before it took its input
+            self._words[hc.TAIL] = self._words[hc.HEAD]
         return self._inputs[self._words[hc.POSITION] % len(self._inputs)].demand if self.k else 0.0
 
     def finish(self) -> None:
@@ -255,8 +258,12 @@ class HardLoop(Loop):
         return self._thread is not None and self._thread.is_alive()
 
     def _require_bus(self) -> None:
-        if self._words[hc.FAILURE] and not self._is_running():
+        if self._is_running():
+            return
+        if self._words[hc.FAILURE]:
             raise self._bus.explain_failure(int(self._words[hc.FAILURE]))
+        if self._thread is not None and not self._words[hc.FINISH]:
+            raise RigError("internal error: the cycle thread ended by itself")
 
     def _warm_up(self) -> None:
         """Play some cycles without sending, then set the cycle's times: code and memory are in place at the start."""
