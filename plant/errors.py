@@ -35,6 +35,18 @@ def escape_control_characters(text: str) -> str:
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
+def show_value(value: object) -> str:
+    """A wrong value as in Python source, for a message: of a long one the beginning.
+
+    >>> show_value(1), show_value("x" * 300)[-9:], show_value(1 << 99999)
+    ('1', 'xxxxxx...', 'a huge value')
+    """
+    try:
+        return f"{text[:200]}..." if len(text := repr(value)) > 200 else text
+    except (ValueError, RecursionError):  # a whole number of thousands of digits, tables of as many levels
+        return "a huge value"
+
+
 def suggest_name(word: str, known: Iterable[str], similarity: float = 0.6) -> str:
     """The end of a message about an unknown name: the nearest of the `known` ones, or "" if none is near.
 

@@ -14,7 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, cast
 
-from plant.errors import InputError, suggest_name
+from plant.errors import InputError, show_value, suggest_name
 from plant.quantity import Quantity, list_quantities
 
 FILTER_LAWS = {"sqrt": 0.5, "linear": 1.0, "pressure": 0.0}
@@ -142,9 +142,9 @@ def parse_value(where: object, name: str, quantity: Quantity, value: object) -> 
         try:
             value = float(value)
         except ValueError:
-            raise InputError(where, name, f"{quantity.expected}, not {value!r}") from None
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(where, name, f"{quantity.expected}, not {value!r}")
+            raise InputError(where, name, f"{quantity.expected}, not {show_value(value)}") from None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or abs(value) > 1e308:
+        raise InputError(where, name, f"{quantity.expected}, not {show_value(value)}")
     if quantity.refuses(float(value)) or (quantity.words and float(value) not in quantity.words.values()):
         raise InputError(where, name, f"{quantity.expected}, not {value:g}")
     return float(value)
@@ -193,8 +193,8 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(where, "", f"TOML ({error})") from None
+    except ValueError as error:  # also of a whole number of thousands of digits, with advice for Python
+        raise InputError(where, "", f"TOML ({str(error).partition('; use sys.')[0]})") from None
     except RecursionError:
         raise InputError(where, "", "TOML with fewer levels of brackets") from None
 

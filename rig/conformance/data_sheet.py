@@ -118,7 +118,11 @@ class Variable(NamedTuple):
         return repr(data.decode("latin-1")) if self.data_type == datatypes.VISIBLE_STRING else data.hex(" ")
 
     def change(self, data: bytes) -> bytes:
-        """Other bytes of the same length, within the limits: by the smallest step where that is possible."""
+        """Other bytes of the same length, within the limits: by the smallest step where that is possible.
+
+        Raises Problem if there are none.
+        """
+        require(data, f"{self.label} has 0 bytes")
         offers = (bytes((data[0] ^ bits,)) + data[1:] for bits in (1, 2, 3))
         return next((offer for offer in offers if len(data) != self.size or self.is_inside(self.decode(offer))), data)
 

@@ -202,8 +202,9 @@ def check_error_behaviour(t: Target, rule: tuple[int, NmtState]) -> str:
         require_abort(code, (0,), f"0x1029:1 = {value}")
     t.enter(OPERATIONAL)
     beat_as(t, node, 15)
-    before = t.heard(0, t.heartbeat_id)[-1].data[0] & 0x7F
-    require(before == OPERATIONAL, f"value {value}: not OPERATIONAL although the heartbeat comes")
+    beats = [frame.data for frame in t.heard(0, t.heartbeat_id) if frame.data]
+    require(beats and beats[-1][0] & 0x7F == OPERATIONAL,
+            f"value {value}: not OPERATIONAL although the heartbeat comes")
     t.wait(1.5 * LIMIT / 1e3 + 0.1)
     t.wait_for(t.heartbeat_id, t.options.timeout, lambda frame: frame.data == bytes((state,)))
     t.require_state(state, f"value {value}")

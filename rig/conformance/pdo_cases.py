@@ -249,7 +249,7 @@ def check_mapping_rules(t: Target, pdo: Pdo) -> str:
     is_free = t.sheet.is_writable(pdo.mapping, 0) and t.sheet.is_writable(pdo.mapping, 1)
     require_applicable(is_free, "the mappings are constant")
     words = read_mapping(t, pdo)
-    copies = 64 // (words[0] & 0xFF) + 1
+    copies = 64 // max(1, words[0] & 0xFF) + 1
     require(t.try_download(pdo.mapping, 0, 0),
             f"{pdo.name}: the number of mapped objects was changed while the PDO is valid")
     with t.restore_afterwards((pdo.parameter, 1)):
@@ -292,7 +292,7 @@ def read_mapping(t: Target, pdo: Pdo) -> list[int]:
 def write_mapping(t: Target, pdo: Pdo, words: Sequence[int]) -> list[int]:
     """Write the mapping of a PDO that is off; the abort codes that came."""
     writes = [(0, 0), *enumerate(words, 1), (0, len(words))]
-    codes = [t.try_download(pdo.mapping, sub, value) for sub, value in writes]
+    codes = [t.try_download(pdo.mapping, sub, value.to_bytes(4 if sub else 1, "little")) for sub, value in writes]
     return [code for code in codes if code]
 
 

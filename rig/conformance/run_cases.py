@@ -96,8 +96,8 @@ def _attempt(target: Target, each: Case) -> tuple[Verdict, str]:
         return Verdict.PASS, each.check(target)
     except CaseEnd as end:
         return end.verdict, str(end)
-    except OverflowError as error:  # the EDS gives an object of CiA 301 a type that is too short
-        return Verdict.FAIL, str(error)
+    except (IndexError, ValueError, ArithmeticError) as error:  # an answer, or a type in the EDS, that is too short
+        return Verdict.FAIL, f"a value that cannot be used ({error})"
 
 
 def _reset(target: Target) -> bool:

@@ -221,7 +221,8 @@ class RunData:
 
     def count_missing(self, name: str, span: slice) -> int:
         """How many samples of a signal were bridged."""
-        column = getattr(self.trace, {"error": "xj", "speed": "xj"}.get(name, name), np.zeros(0))  # or of an event
+        name = {"error": "xj", "speed": "xj"}.get(name, name)
+        column = getattr(self.trace, name) if name in Columns._fields else np.zeros(0)  # an event has none
         return int(np.isnan(np.asarray(column, float)[span]).sum())
 
     def read_step(self, span: slice) -> tuple[Array, Array, float]:

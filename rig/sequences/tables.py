@@ -18,7 +18,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from plant.errors import InputError
+from plant.errors import InputError, show_value
 
 T = TypeVar("T")
 Kinds = Mapping[type, Mapping[str, type]]  # base class -> {kind: class with its keys}
@@ -108,8 +108,10 @@ def parse_table(text: str, file: str) -> tuple[dict[str, Any], Place]:
         found = re.fullmatch(r"(.*) \(at (?:line (\d+), column \d+|end of document)\)", str(error), re.DOTALL)
         message, line = (found[1], found[2] or text.count("\n") + 1) if found else (str(error), 1)
         raise InputError(f"{file}:{line}", "", f"TOML; {message[:1].lower()}{message[1:]}") from error
+    except ValueError as error:  # of tomllib too: Python reads no decimal number that is longer
+        raise InputError(file, "", "TOML with whole numbers of at most 4300 digits") from error
     except RecursionError as error:
-        raise InputError(file, "", "TOML with fewer levels of brackets") from error
+        raise InputError(file, "", "TOML with fewer levels of brackets or parts of a key") from error
 
 
 def build_dataclass(cls: type[T], table: object, place: Place, kinds: Kinds | None = None) -> T:
@@ -147,8 +149,8 @@ def list_choices(word: object, known: Iterable[str]) -> str:
     listed = " or ".join(filter(None, (", ".join(map(repr, names[:-1])), "".join(map(repr, names[-1:])))))
     if word is None:
         return listed
-    close = get_close_matches(str(word), names, 1)
-    return f"{listed}, not {word!r}" + (f" (did you mean {close[0]!r}?)" if close else "")
+    close = get_close_matches(word, names, 1) if isinstance(word, str) else []
+    return f"{listed}, not {show_value(word)}" + (f" (did you mean {close[0]!r}?)" if close else "")
 
 
 def _convert(value: Any, hint: Any, place: Place, kinds: Kinds) -> Any:
@@ -176,7 +178,7 @@ def _convert(value: Any, hint: Any, place: Place, kinds: Kinds) -> Any:
             return dict(_flatten_names(value, args[1], place, kinds))
     else:
         return build_dataclass(bare, value, place, kinds)
-    raise place.refuse(f"{describe_annotation(hint)}, not {value!r}")
+    raise place.refuse(f"{describe_annotation(hint)}, not {show_value(value)}")
 
 
 def _flatten_names(table: dict[str, Any], hint: Any, place: Place, kinds: Kinds,
@@ -218,7 +220,7 @@ def describe_annotation(hint: Any) -> str:
     return _SCALARS.get(hint, "a table")
 
 
-_MOST_PARTS = 100  # of a key that have a line of their own
+_MOST_PARTS = 100  # of a key, with those of the tables that it is in
 _TOKEN = re.compile(
     r"""
     (?P<skip> [ \t\r]+ | \#[^\n]* )
@@ -232,6 +234,8 @@ _TOKEN = re.compile(
 
 def find_lines(text: str) -> dict[str, int]:
     """Line number, from 1, of every key, array element and table header of a text that is TOML.
+
+    Raises RecursionError for keys of too many parts.
 
     >>> find_lines("a.b = [\\n1]\\n[[c]]")
     {'a': 1, 'a.b': 1, 'a.b[0]': 2, 'c': 3, 'c[0]': 3}
@@ -258,7 +262,9 @@ def find_lines(text: str) -> dict[str, int]:
             state = "value" if token == "[" else "key"
         elif token == "=" or (token == "\n" and "header" in state):
             path = above if token == "=" else ""
-            for part in key[:_MOST_PARTS]:
+            if len(key) + path.count(".") > _MOST_PARTS:
+                raise RecursionError
+            for part in key:
                 if path in counts and token == "\n":
                     path = f"{path}[{counts[path] - 1}]"
                 path = _join_keys(path, (part,))

@@ -43,6 +43,8 @@ def refusal(changes: dict[str, object]) -> str:
     ("valve.flow_gain", float("nan"), "not nan"),
     ("valve.flow_gain", float("inf"), "not inf"),
     ("null_bias.current", float("-inf"), "at least -20 A and at most 20 A, not -inf"),
+    pytest.param("valve.flow_gain", 10**400, "not 1000", id="400 digits"),
+    ("valve.flow_gain", [1 << 20000], "not a huge value"),
     ("valve.flow_gain", True, "not True"),
     ("valve.flow_gain", None, "not None"),
     ("valve.flow_gain", [0.3], r"not [0.3]"),
@@ -162,6 +164,7 @@ def test_model_file_round_trip(tmp_path_factory: pytest.TempPathFactory, changes
 
 @pytest.mark.parametrize(("text", "said"), [
     ("[spool\n", "TOML"),
+    pytest.param(f"[spool]\nmass = {'9' * 5000}", "TOML (Exceeds the limit (4300 digits)", id="5000 digits"),
     ("[spool]\nstatic_friction = nan", "spool.static_friction"),
     ("[spool]\nstatic_fricton = 3", "did you mean static_friction?"),
     ("[spol]\nstatic_friction = 3", "did you mean spool?"),

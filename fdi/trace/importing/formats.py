@@ -242,15 +242,15 @@ def open_text_table(path: Path, separator: str | None = None, decimal: str | Non
         encoding = _find_encoding(path)
         with open_text(path, encoding) as stream:
             lines = [line.rstrip("\r\n") for line in itertools.islice(stream, SAMPLE_LINES)]
-    separator, decimal = _find_separators(path, lines, separator, decimal)
-    parse = _make_number_parser(decimal)
-    rows = [[] if _is_comment(line) else _split_line(line, separator) for line in lines]
-    width = _find_width(rows, parse)
-    rows = [row[:width] if _is_padded(row, width) else row for row in rows]
-    first = next((i for i, row in enumerate(rows) if i + 1 != name_line and _is_data(row, width, parse)), None)
-    if first is None:
-        raise InputError(path, "", "a table with rows of numbers in its first 200 lines")
-    names, units, line = _find_names(path, rows, lines, first, width, name_line)
+        separator, decimal = _find_separators(path, lines, separator, decimal)
+        parse = _make_number_parser(decimal)
+        rows = [[] if _is_comment(line) else _split_line(line, separator) for line in lines]
+        width = _find_width(rows, parse)
+        rows = [row[:width] if _is_padded(row, width) else row for row in rows]
+        first = next((i for i, row in enumerate(rows) if i + 1 != name_line and _is_data(row, width, parse)), None)
+        if first is None:
+            raise InputError(path, "", "a table with rows of numbers in its first 200 lines")
+        names, units, line = _find_names(path, rows, lines, first, width, name_line)
     unique = tuple(name + (f" #{names[:i].count(name) + 1}" if name in names[:i] else "")
                    for i, name in enumerate(names))
     return TextTable(path, Layout(encoding, separator, decimal, unique, tuple(units), line, first + 1))

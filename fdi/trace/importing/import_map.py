@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fdi.trace.sensor_dynamics import SensorDynamics
 from fdi.trace.signals import OUTPUTS, SIGNALS
-from plant.errors import InputError, suggest_name
+from plant.errors import InputError, show_value, suggest_name
 from plant.parameters import parse_toml
 
 Floats = NDArray[np.float64]
@@ -97,7 +97,8 @@ def _is_duration(x: float) -> bool:
 
 def _is_span(x: Any) -> bool:
     """Whether it is [from, to] with from before to."""
-    return isinstance(x, list) and len(x) == 2 and all(isinstance(end, int | float) for end in x) and x[0] < x[1]
+    return (isinstance(x, list) and len(x) == 2
+            and all(isinstance(end, float) or (type(end) is int and abs(end) <= 1e308) for end in x) and x[0] < x[1])
 
 
 NUMBER = (int, float)
@@ -149,8 +150,10 @@ def _read_table(where: object, name: str, values: Any, keys: Mapping[str, Key]) 
     for word, key in keys.items():
         if word not in values and key.default is ...:
             raise InputError(where, f"{prefix}{word}", key.expected)
-        if word in values and not (type(values[word]) in key.kinds and key.is_valid(values[word])):
-            raise InputError(where, f"{prefix}{word}", f"{key.expected}, not {values[word]!r}")
+        if word in values and not (type(values[word]) in key.kinds
+                                   and (type(values[word]) is not int or abs(values[word]) <= 1e308)  # a float holds it
+                                   and key.is_valid(values[word])):
+            raise InputError(where, f"{prefix}{word}", f"{key.expected}, not {show_value(values[word])}")
     found = {word: values.get(word, key.default) for word, key in keys.items()}
     return {word: float(value) if type(value) is int and float in keys[word].kinds else value
             for word, value in found.items()}

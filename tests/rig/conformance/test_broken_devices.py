@@ -147,6 +147,9 @@ DEFECTS: list[tuple[str, Break, str]] = [
     ("value too wide", wrap("sdo._upload", lambda device, old, index, sub:
                             old(index, sub).ljust(4, b"\0") if index == 0x1017 else old(index, sub)),
      "2.2 2.4 2.11 2.12 3.2 3.3 3.5 6.11 6.12"),
+    ("value of 0 bytes", wrap("sdo._upload", lambda device, old, index, sub:
+                              b"" if index == 0x1017 else old(index, sub)),
+     "2.2 2.4 2.8 2.12 3.2 3.3 3.5 3.7 3.13 3.14 6.11 6.12"),
     ("a write without effect", wrap("sdo._download", lambda device, old, index, sub, data:
                                     None if index == 0x1017 else old(index, sub, data)),
      "2.12 3.2 3.3 5.7 5.8 6.11 6.12 7.4"),

@@ -105,13 +105,32 @@ def map_freely(*rules: str) -> Break:
     (("off", "object", "mappable"), "more than 64 bits: accepted"),
 ])
 def test_mapping_rules(tmp_path: Path, rules: tuple[str, ...], said: str) -> None:
-    sections = [f"{index}sub{sub}" for index in ("1600", "1A00", "1A01") for sub in range(4)]
-    sheet = change_sheet(tmp_path, *((section, "AccessType=const", "AccessType=rw") for section in sections
-                                     if f"[{section}]" in EDS[3].read_text()))
-    outcome = examine(map_freely(*rules), chapters=("4.17",), sheet=sheet)
+    outcome = examine(map_freely(*rules), chapters=("4.17",), sheet=open_mappings(tmp_path))
     assert said in measured(outcome, "4.17")[1]
     assert outcome.verdict == ("PASS" if len(rules) == 4 else "FAIL")
     assert outcome.notes == []
+
+
+def open_mappings(folder: Path) -> Path:
+    """An EDS whose mappings can be written."""
+    sections = [f"{index}sub{sub}" for index in ("1600", "1A00", "1A01") for sub in range(4)]
+    return change_sheet(folder, *((section, "AccessType=const", "AccessType=rw") for section in sections
+                                  if f"[{section}]" in EDS[3].read_text()))
+
+
+def test_a_mapping_that_the_sheet_lacks_or_of_no_length_is_restored(tmp_path: Path) -> None:
+    sheet = open_mappings(tmp_path)
+    sheet.write_text(sheet.read_text().replace("[1600sub3]", "[1600sub7]"))
+    free = map_freely("off", "object", "mappable", "length")
+    no_length = wrap("sdo._upload", lambda device, old, index, sub: bytes(4) if (index, sub) == (0x1600, 1) else
+                     old(index, sub))
+    def both(device: Any) -> None:
+        free(device)
+        no_length(device)
+
+    for patch in (free, both):
+        outcome = examine(patch, chapters=("4.17",), sheet=sheet)
+        assert measured(outcome, "4.17") == (Verdict.PASS, "RPDO1, TPDO1, TPDO2")
 
 
 @pytest.mark.parametrize(("period", "cases"), [

@@ -226,6 +226,7 @@ def test_what_cannot_be_measured_has_failed_and_says_why(kind: str, fault: str) 
     ("phase_lag", {"window": "step", "frequency": 10.0}, "no 10 Hz"),
     ("response_within", {"after": "fault", "event": "EMCY"}, "no event 'EMCY' after 0.5 s"),
     ("response_within", {"after": 0.1, "signal": "xj", "above": 9.0}, "never passed"),
+    ("response_within", {"after": 0.1, "event": "count"}, "no event 'count' after 0.1 s"),
     ("response_within", {"after": 7.0, "signal": "xj", "above": 9.0}, "empty"),
 ])
 def test_reasons(kind: str, keys: dict[str, Any], reason: str) -> None:

@@ -220,6 +220,9 @@ BAD = [  # text, then what the user reads
      "mine.toml:5: model.overrides.spool.mass: expected a number"),
     (HEAD + '[model]\noverrides = 3\n',
      "model.overrides: expected a table of names, each with a number or a text, not 3"),
+    (HEAD + f'ends = {"9" * 5000}\n', "mine.toml: expected TOML with whole numbers of at most 4300 digits"),
+    (HEAD + f'ends = 0x{"f" * 5000}\n', "mine.toml:3: ends: expected 'completed' or 'safe_state', not a huge value"),
+    (HEAD + f"[model]\noverrides = {{ {'a.' * 3000}b = 1 }}\n", "levels of brackets or parts of a key"),
 ]
 
 

@@ -62,6 +62,8 @@ def test_scale_delay_and_dead_span(keys: str, rows: dict[int, float], tmp_path: 
 
 @pytest.mark.parametrize(("text", "reason"), [
     ('[time]\nsource = "p"\nbits = 8\nrate = 1000\n', r"whole numbers from 0 to 255 \(8 bits\); row 257 has 256"),
+    (f"{P12}offset = 1{'0' * 400}\n", r"offset: expected a finite number, not 1000"),
+    (f"{P12}sensor = {{dead = [[0, 1{'0' * 400}]]}}\n", "dead: expected true, or a list"),
     (f"{P12}sensor = {{dead = true}}\n", "marked dead")])
 def test_too_few_bits_and_a_dead_channel_are_refused(text: str, reason: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=reason):
@@ -260,7 +262,8 @@ def test_bad_rows(row: str, place: str, reason: str, tmp_path: Path) -> None:
     assert place in str(error.value) and reason in str(error.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"no table\n", b"\0\1\2", b"a,b\nc,d\n"])
+@pytest.mark.parametrize("content", [b"", b"no table\n", b"\0\1\2", b"a,b\nc,d\n",
+                                     pytest.param(b'a,b\n1,"' + b"2" * 140000 + b'"\n', id="a long field")])
 def test_what_is_no_table(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_bytes(content)
     with pytest.raises(InputError, match=r"x\.csv"):
