@@ -1,6 +1,7 @@
 """The log of a run as another process reads it while it is written: the run itself is never delayed by its screen."""
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Iterator
 from dataclasses import fields
@@ -24,7 +25,8 @@ _RECORD = struct.Struct("<BQ")  # opcode, length
 def follow_log(path: Path) -> Iterator[list[tuple[int, Record]]]:
     """Give the records of the log that are new, with their log times in ns, again and again; no raw frames.
 
-    The writer closes a chunk at least every 0.2 s; what it has not written yet comes later.
+    The writer closes a chunk at least every 0.2 s; what it has not written yet comes later. The log is opened once, as
+    soon as it is there: it may be moved or deleted. What is given ends if it cannot be read.
     """
     decoders: dict[int, Any] = {}
     for kind, schema in zip(TOPICS.values(), list_channels(), strict=False):  # schemas come first
@@ -32,20 +34,26 @@ def follow_log(path: Path) -> Iterator[list[tuple[int, Record]]]:
             decode = DecoderFactory().decoder_for("protobuf", schema)
             decoders[schema.id] = kind, [field.name for field in fields(kind)], decode
     done = len(MAGIC)  # bytes of the file
-    while True:
-        with path.open("rb") as file:
-            file.seek(done)
-            data = file.read()
-        found, start = [], 0
-        for raw, end in _list_chunks(data):
-            start = end
-            for channel, t_ns, _, message in scan_messages(raw):
-                if channel in decoders:
-                    kind, names, decode = decoders[channel]
-                    record = decode(message)
-                    found.append((t_ns, kind(**{name: getattr(record, name) for name in names})))
-        done += start
-        yield found
+    with contextlib.suppress(OSError):
+        while not path.exists():
+            yield []
+        with path.open("rb", buffering=0) as file:
+            while True:
+                file.seek(done)
+                found, start = list[tuple[int, Record]](), 0
+                for raw, end in _list_chunks(file.read()):
+                    start = end
+                    found += _decode_messages(raw, decoders)
+                done += start
+                yield found
+
+
+def _decode_messages(raw: bytes, decoders: dict[int, Any]) -> Iterator[tuple[int, Record]]:
+    for channel, t_ns, _, message in scan_messages(raw):
+        if channel in decoders:
+            kind, names, decode = decoders[channel]
+            record = decode(message)
+            yield t_ns, kind(**{name: getattr(record, name) for name in names})
 
 
 def _list_chunks(data: bytes) -> Iterator[tuple[bytes, int]]:

@@ -29,12 +29,12 @@ def show_live(plan: LivePlan, log: Path, last_cpu_is_taken: bool, place: ViewerP
 
     Args:
         plan: of the run.
-        log: of the run.
+        log: of the run; the process gets the absolute path, because the plan's Python may change its folder.
         place: of the viewer; None: the screen in the terminal.
         last_cpu_is_taken: the loop runs on the last CPU; the process gets the others, where there are any.
         patience: s to wait for the process; without it the run begins anyway.
     """
-    words = [str(log), *([str(place.port), str(place.file or "")] if place is not None else [])]
+    words = [str(log.absolute()), *([str(place.port), str(place.file or "")] if place is not None else [])]
     with ignore_interrupts():
         process = subprocess.Popen([sys.executable, "-m", "rig.view.live_show", *words], stdin=subprocess.PIPE,
                                    stdout=subprocess.PIPE)
@@ -97,7 +97,7 @@ def find_viewer_place(text: str) -> ViewerPlace:
         raise InputError("--live", "rerun", "the viewer, which is not installed: pip install 'eha-rig[view]'")
     word = text.partition(":")[2]
     if word.endswith(".rrd"):
-        return ViewerPlace(file=Path(require_writable(word, "--live")))
+        return ViewerPlace(file=Path(require_writable(word, "--live")).absolute())
     if word.isdecimal() and 0 < int(word) < 65536:
         if not is_listening(int(word)):
             raise InputError("--live", text, f"a viewer that listens on 127.0.0.1:{word} (rerun --bind 127.0.0.1 "

@@ -1,7 +1,6 @@
 """A run in the rerun viewer while it runs: the plots and lanes of `rig view`, sent piece by piece."""
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -44,7 +43,7 @@ def _list_signals(plan: LivePlan) -> list[str]:
 
 
 class LiveView:
-    """Sends what is new of a run to a recording. Nothing is sent before main begins, where t = 0 is."""
+    """Sends what is new of a run to a recording. Nothing is sent before main begins, where t = 0 is, or it ends."""
 
     def __init__(self, recording: Recording, plan: LivePlan) -> None:
         """Use the recording of the drawing of this plan."""
@@ -56,19 +55,26 @@ class LiveView:
     def update(self, run: LiveRun, new: Sequence[tuple[int, Record]]) -> None:
         """Send the records that have come since the last call, once main has begun."""
         self._waiting += new
-        if math.isnan(run.zero_ns):
-            return
+        if run.zero_ns is not None:
+            self._send_all(run, run.zero_ns)
+
+    def finish(self, run: LiveRun) -> None:
+        """Send what a run that ended before main has left waiting; t = 0 is its last record."""
+        if run.zero_ns is None and self._waiting:
+            self._send_all(run, self._waiting[-1][0])
+
+    def _send_all(self, run: LiveRun, zero_ns: int) -> None:
         for t_ns, record in self._waiting:
-            self._send_record(record, (t_ns - run.zero_ns) * 1e-9)
+            self._send_record(record, (t_ns - zero_ns) / 1e9)
         self._waiting.clear()
         rows = run.read_rows_from(self._rows)
         self._rows += len(rows)
         if len(rows):
-            self._send_rows(rows, run)
+            self._send_rows(rows, run, zero_ns)
 
-    def _send_rows(self, rows: NDArray[np.float64], run: LiveRun) -> None:
+    def _send_rows(self, rows: NDArray[np.float64], run: LiveRun, zero_ns: int) -> None:
         columns = dict(zip(COLUMNS, rows.T, strict=True))
-        columns["error"], t = columns["com"] - columns["xj"], (columns["t_ns"] - run.zero_ns) * 1e-9
+        columns["error"], t = columns["com"] - columns["xj"], (columns["t_ns"] - (zero_ns - run.first_ns)) / 1e9
         for (origin, _), lines in PLOTS.items():
             for line in lines:
                 if line.signal in self._signals:

@@ -25,12 +25,13 @@ _GROWS = ("never_exceeds", "max_error", "event_never")  # kinds whose number onl
 
 
 class Event(NamedTuple):
-    """An event, `t` in s of main."""
+    """An event, `t` in s of main; NaN as long as main has not begun."""
 
     t: float
     level: str
     kind: str
     text: str
+    t_ns: int  # log time
 
 
 class LivePlan(NamedTuple):
@@ -99,7 +100,8 @@ class LiveRun:
         self._table = np.empty((1 << 14, len(COLUMNS)))
         self.cycles = 0  # so far, without those that were missed
         self._main_from = self._main_until = -1  # rows
-        self.zero_ns = nan  # log time at which main began
+        self.first_ns = 0  # log time of the first row, from which `t_ns` counts: a float64 rounds ns since 1970
+        self.zero_ns: int | None = None  # log time at which main began
         self.states = {RIG: "operational", CONTROLLER: "unknown", PLANT: "unknown"}
         self.troubles: dict[int, str] = {}  # nodes that are gone, and how that is known
         self.events: deque[Event] = deque(maxlen=5000)
@@ -120,12 +122,16 @@ class LiveRun:
         elif isinstance(record, recorder.Check):
             self.checks[record.name] = CheckState.read(record)
         else:
-            self.events.append(Event((t_ns - self.zero_ns) * 1e-9, record.level, record.kind, record.text))
+            self.events.append(Event(self._find_time(t_ns), record.level, record.kind, record.text, t_ns))
             node = find_dead_node(record.level, record.kind, record.text)
             if node:
                 self.troubles[node] = record.text.partition(": ")[2] or "is silent"
             elif record.kind == "heartbeat" and record.level == "INFO" and record.text.startswith("node "):
                 self.troubles.pop(int(record.text.split()[1]), None)
+
+    def _find_time(self, t_ns: int) -> float:
+        """Log time in s of main; NaN before main."""
+        return nan if self.zero_ns is None else (t_ns - self.zero_ns) / 1e9
 
     def _add_row(self, t_ns: int, timing: recorder.Timing) -> None:
         row = self._signals
@@ -133,10 +139,13 @@ class LiveRun:
             return
         if self.cycles == len(self._table):
             self._table = np.concatenate((self._table, np.empty_like(self._table)))
-        self._table[self.cycles] = (t_ns, row.phase, row.com, row.xj, row.cor, row.p12, row.xs, row.load,
-                                    timing.lateness, timing.response, timing.overrun)
+        self.first_ns = self.first_ns if self.cycles else t_ns
+        self._table[self.cycles] = (t_ns - self.first_ns, row.phase, row.com, row.xj, row.cor, row.p12, row.xs,
+                                    row.load, timing.lateness, timing.response, timing.overrun)
         if self._main_from < 0 and row.phase >= 1:
-            self._main_from, self.zero_ns = self.cycles, float(t_ns)
+            self._main_from, self.zero_ns = self.cycles, t_ns
+            self.events = deque((event._replace(t=self._find_time(event.t_ns)) for event in self.events),
+                                self.events.maxlen)
         if self._main_until < 0 and row.phase >= 2:
             self._main_until = self.cycles
         self.cycles += 1
@@ -158,7 +167,7 @@ class LiveRun:
     @property
     def t(self) -> float:
         """Time of the last cycle, s of main; NaN before main."""
-        return float(self._table[self.cycles - 1, _COLUMN["t_ns"]] - self.zero_ns) * 1e-9
+        return self._find_time(self.first_ns + int(self.read_last("t_ns", 1)[0])) if self.cycles else nan
 
     @property
     def section(self) -> str:

@@ -68,8 +68,8 @@ def _draw_nodes(run: LiveRun, silence: float) -> list[Text]:
         else:
             line.append(state, style=_NODE_STYLES.get(state, "dim"))
         lines.append(line)
-    if silence >= 0.5 and run.cycles and not run.is_over:
-        lines[0].append(f"   no new cycle for {silence:.1f} s: waiting for a node", style="yellow")
+    if silence >= 1.0 and run.cycles and not run.is_over:
+        lines[0].append(f"   no new cycle in the log for {silence:.1f} s", style="yellow")
     return lines
 
 

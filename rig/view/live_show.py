@@ -117,6 +117,7 @@ def show_in_viewer(log: Path, plan: LivePlan, port: int, file: str) -> None:
             if viewer.poll() is not None if viewer else not is_listening(port):
                 print("rig run: the viewer was closed; the run goes on", file=sys.stderr, flush=True)
                 os._exit(0)  # its library would wait for the viewer
+    view.finish(run)
     stream.flush()
     stream.disconnect()
 

@@ -1,6 +1,8 @@
 """The log of a run as the showing process reads it while it is written, and what it makes of it."""
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from dataclasses import replace
 from math import isnan
 from pathlib import Path
@@ -13,6 +15,7 @@ from fdi.trace.trace import Trace
 from rig.recorder import Check, Event, NmtState, Record, Recorder, Signals, Timing
 from rig.sequences import load_sequence
 from rig.view.live_log import follow_log
+from rig.view.live_process import show_live
 from rig.view.live_run import COLUMNS, LiveRun, find_dead_node, make_live_plan
 from rig.view.live_screen import describe_line, draw_screen
 
@@ -42,6 +45,44 @@ def test_what_is_written_is_there_soon(tmp_path: Path) -> None:
         found = next(batches)
     recorder.close()
     assert found == [(5, NmtState(2, 5, "operational"))]
+
+
+def test_a_log_that_comes_late_and_is_moved_is_read_on(tmp_path: Path) -> None:
+    log = tmp_path / "trace.mcap"
+    batches = follow_log(log)
+    assert next(batches) == []
+    whole = record_run(tmp_path / "whole.mcap", stop=1000).read_bytes()
+    with log.open("wb", buffering=0) as file:
+        file.write(whole[:-50_000])
+        first = next(batches)
+        log.rename(tmp_path / "moved.mcap")
+        file.write(whole[-50_000:])
+        second = next(batches)
+    assert first and second and next(batches) == []
+    assert sum(isinstance(record, Timing) for _, record in first + second) == 1000
+
+
+def test_a_log_that_cannot_be_read_is_the_end(tmp_path: Path) -> None:
+    (tmp_path / "trace.mcap").mkdir()
+    assert list(follow_log(tmp_path / "trace.mcap")) == []
+
+
+class LeavesFolder:
+    """What the Python of a sequence may do where the plan arrives."""
+
+    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
+        return os.chdir, ("/",)
+
+
+def test_log_in_a_relative_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                  capfd: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    record_run(Path("trace.mcap"), stop=1000)
+    plan = make_live_plan(load_sequence("preflight"), "lockstep")
+    with show_live(plan._replace(title=LeavesFolder()), Path("trace.mcap"), last_cpu_is_taken=False) as begin:
+        begin()
+    said = capfd.readouterr().err
+    assert "Traceback" not in said and "live: 0.7 of 13.5 s" in said.splitlines()[-1]
 
 
 Records = list[tuple[int, Record]]
@@ -90,6 +131,36 @@ def test_a_limit_that_is_passed_fails_at_once(preflight: Path) -> None:
     assert run.read_rows_from(0).shape == (4000, len(COLUMNS)) and run.read_last("xj", 2000)[0] == 7e-3
 
 
+EVENTS = """title = "Events"
+setup = [{ kind = "hold", time = 0.02 }]
+main = [{ name = "rest", kind = "hold", time = 0.1 }, { name = "more", kind = "hold", time = 0.1 }]
+checks = [{ name = "begins", kind = "event_occurs", event = "phase main", window = "rest" },
+          { name = "no fault", kind = "event_never", event = "fault early", window = "rest" },
+          { name = "answer", kind = "response_within", event = "fault early", after = 0.0, high = 1, window = "rest" },
+          { name = "first cycle", kind = "event_occurs", event = "guard first", window = "more" }]
+"""
+
+
+@pytest.mark.parametrize("begin_ns", [0, *range(1_800_000_000_000_000_000, 1_800_000_000_000_000_256, 51)])
+def test_events_stand_at_their_cycle(begin_ns: int, tmp_path: Path) -> None:
+    """Those written before the first row of main too, and whatever the log times: a float64 rounds ns since 1970."""
+    (tmp_path / "events.toml").write_text(EVENTS)
+    run = LiveRun(make_live_plan(load_sequence(tmp_path / "events.toml"), "lockstep"))
+    words = {0: ("phase", "set-up"), 20: ("phase", "main"), 120: ("guard", "first")}
+    for cycle in range(220):
+        t_ns = begin_ns + cycle * 1_000_000
+        if cycle in words:
+            run.add(t_ns, Event("INFO", *words[cycle]))
+        if cycle == 20:
+            run.add(t_ns, Event("WARN", "fault", "early"))
+        run.add(t_ns, Signals(cycle, int(cycle >= 20), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 7, 15, 0))
+        run.add(t_ns, Timing(cycle, False, 0.0, 0.0, 0.0))
+    run.judge_checks()
+    assert [event.t for event in run.events] == [-0.02, 0.0, 0.0, 0.1] and run.t == 0.199
+    assert [(state.word, state.value) for state in run.checks.values()] == [
+        ("PASS", 1.0), ("FAIL", 1.0), ("PASS", 0.0), ("PASS", 1.0)]
+
+
 @pytest.mark.parametrize("size", [(80, 24), (60, 20), (200, 60)])
 def test_screen_fits(preflight: Path, size: tuple[int, int]) -> None:
     run, records, _ = make_run(preflight)
@@ -98,11 +169,11 @@ def test_screen_fits(preflight: Path, size: tuple[int, int]) -> None:
     add(run, records[:6000])
     run.add(0, Event("ERROR", "process", "node 3 plant: its process was ended by SIGKILL"))
     run.add(0, Check(name="no emergency", passed=False, value=2.0, unit="1", signal=""))
-    text = draw_screen(run, *size, silence=0.7).plain
+    text = draw_screen(run, *size, silence=1.2).plain
     lines = text.split("\n")
     assert len(lines) <= size[1] and max(map(len, lines)) <= size[0]
     for words in ("node 2 controller operational", "node 3 plant      DEAD: its process was ended by SIGKILL",
-                  "no new cycle for 0.7 s", "FAIL     no emergency 2", "measures", "lockstep: no cycle is late",
+                  "no new cycle in the log", "FAIL     no emergency 2", "measures", "lockstep: no cycle is late",
                   "response p50", "overruns 0"):
         assert words in text, words
     dots = sum(0x2800 < ord(letter) < 0x2900 for letter in text)

@@ -56,6 +56,22 @@ def test_what_arrives_is_what_the_log_holds(tmp_path: Path) -> None:
 
 
 @needs_rerun
+def test_a_run_that_ends_before_main_is_shown(tmp_path: Path) -> None:
+    """Its clock ends with the run."""
+    (tmp_path / "long.toml").write_text('setup = [{ kind = "hold", time = 600 }]\n' + LONG)
+    command = [sys.executable, "-m", "rig.cli.main", "run", str(tmp_path / "long.toml"), "--live",
+               f"rerun:{tmp_path}/live.rrd", "--quiet", "--out", str(tmp_path / "run")]
+    run, log = subprocess.Popen(command), tmp_path / "run" / "trace.mcap"
+    wait_until(lambda: log.exists() and log.stat().st_size > 100_000)  # well into set-up
+    run.send_signal(signal.SIGINT)
+    assert run.wait() == 130
+    rows, trace = read_recording(tmp_path / "live.rrd"), Trace.read(tmp_path / "run", all=True)
+    assert len(rows["/position/ram"]) == len(trace.xj) > 0
+    assert len(rows["/log/events"]) == len(trace.events) and len(rows["/log/checks"]) == len(trace.checks) > 0
+    assert max(t for entity in rows for t, _ in rows[entity] if not math.isnan(t)) == 0.0
+
+
+@needs_rerun
 def test_the_run_goes_on_when_the_viewer_is_closed(tmp_path: Path) -> None:
     (tmp_path / "long.toml").write_text(LONG)
     port = find_free_port()
