@@ -80,10 +80,10 @@ def find_cache_folder() -> Path:
         with tempfile.TemporaryFile(dir=home):
             return home
     except OSError:
-        return _make_private_folder(Path(tempfile.gettempdir()) / f"eha-rig-{os.getuid()}")
+        return make_private_folder(Path(tempfile.gettempdir()) / f"eha-rig-{os.getuid()}")
 
 
-def _make_private_folder(path: Path) -> Path:
+def make_private_folder(path: Path) -> Path:
     """A folder that only this user can write: code is loaded from it. Another one if somebody else has taken `path`."""
     with contextlib.suppress(FileExistsError):
         path.mkdir(mode=0o700)

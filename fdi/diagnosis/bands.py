@@ -251,11 +251,14 @@ def format_design(model: Model) -> str:
 
 def describe_other_model(bands: Bands, model: Model) -> str:
     """Which model bands were made for, if it is another than `model`; else ""."""
-    known = bands.provenance.get("parameters", "")
+    name = bands.provenance.get("model", "eha")
+    known = bands.provenance.get("parameters")
+    if known is None:  # bands of an earlier version say the name alone
+        return f"the model {name}" if name != model.name else ""
     if known == format_design(model):
         return ""
     design = known.strip("{}").replace('"', "").replace(":", " =") or "all parameters nominal"
-    return f"the model {bands.provenance.get('model', 'eha')} with {design}"
+    return f"the model {name} with {design}"
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -559,7 +562,9 @@ def _read_step(step: Mapping[str, Any], period: float, amounts: int, parts: Cont
     healthy = lists.pop("healthy")
     rows = np.arange(len(healthy))
     coarse = rows[::KNOT_CYCLES]
-    if not lists["spread"].shape == lists["shift"].shape == (amounts, len(coarse)) or step["section"] not in parts:
+    shapes = {"spread": (amounts, len(coarse)), "shift": (amounts, len(coarse)), "middle": coarse.shape,
+              "most": coarse.shape}
+    if {name: values.shape for name, values in lists.items()} != shapes or step["section"] not in parts:
         raise ValueError(f"step of section {step['section']}: not a step of the command, or lists of other lengths")
     fine = {name: np.apply_along_axis(lambda knots: np.interp(rows, coarse, knots), -1, values)
             for name, values in lists.items()}

@@ -483,7 +483,7 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
     missing = np.isnan(rows.cor)
     change = np.abs(hold_next(rows.cor) - hold_last(rows.cor))
     unknown |= missing & (change > abrupt * np.nanmax(np.abs(rows.cor)))
-    usable = rows.usable & ~extend_flags(unknown, round(recovery / rows.period))
+    usable = rows.usable & ~extend_flags(unknown, max(round(recovery / rows.period) - 1, 0))
     notes = []
     lost = int(np.isnan(trace.cor).sum())
     if lost:

@@ -1,6 +1,7 @@
 """The trends of both faults of one unit."""
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import json
@@ -203,8 +204,9 @@ def diagnose_once(file: Path, model: Model, again: bool = False) -> dict[str, An
         found = {"started": trace.provenance.get("started", ""),
                  "sizes": {name: list(size) for name, size in d.sizes.items()},
                  "note": "something else is wrong" if d.verdict == "SOMETHING_ELSE" else ""}
-        place.parent.mkdir(parents=True, exist_ok=True)
-        write_text(place, json.dumps(found), "the cache of answers")
+        with contextlib.suppress(OSError, InputError):  # an answer that cannot be kept is found again next time
+            place.parent.mkdir(parents=True, exist_ok=True)
+            write_text(place, json.dumps(found), "the cache of answers")
     return found
 
 

@@ -93,7 +93,7 @@ class Timing(NamedTuple):
     response: Floats  # NaN: no answer
     work: Floats
     overrun: NDArray[np.bool_]
-    feedback_response: Floats  # NaN: none came
+    feedback_response: Floats  # NaN: none came; older logs do not have this column and those behind it
     valve_response: Floats
     execution: Floats
 
@@ -310,7 +310,7 @@ def _from_log(log: Log, everything: bool) -> Trace:
     rest = {name: [(time_ns, message) for _, time_ns, message in log.read_messages(name, most=MOST_MESSAGES)]
             for name in ("/events", "/nmt", "/checks")}
     _require_numbers(log, "/signals", signals, ("cycle", "phase", *REQUIRED[1:], *OPTIONAL))
-    _require_numbers(log, "/timing", timing, ("cycle", *Timing._fields[1:]))
+    _require_numbers(log, "/timing", timing, ("cycle", *Timing._fields[1:5]))
     notes = [f"only the first {MOST_MESSAGES} messages of {name} were read"
              for name, messages in rest.items() if len(messages) == MOST_MESSAGES]
     run = dict(log.metadata.get("run", {}))
@@ -413,7 +413,8 @@ def _select_timing(columns: Mapping[str, NDArray[Any]], cycles: NDArray[np.int64
     if not kept.any():
         return NO_TIMING
     t = (columns["cycle"][kept].astype(int) - zero) * period
-    return Timing(np.round(t, 9), *(columns[name][kept] for name in Timing._fields[1:]))
+    absent = np.full(len(kept), math.nan)
+    return Timing(np.round(t, 9), *(columns.get(name, absent)[kept] for name in Timing._fields[1:]))
 
 
 # Single columns, shape (n,): missing samples are NaN.

@@ -57,10 +57,11 @@ def run_suite(args: argparse.Namespace, base: JobChoice, choose_folder: Callable
     files = [("results", f"{folder}/ suite.html, suite.json, a folder for each case")]
     files += [("JUnit", str(junit))] if junit else []
     report = build_suite_report(suite, results, 1e-9 * clock.now(), processes, folder, files)
+    status = give_answer(report, args, find_status(results, is_interrupted=is_interrupted),
+                         Places(folder / "suite.html", folder / "suite.json"))
     if junit is not None:
         write_text(junit, write_junit(suite.title, results), "--junit")
-    return give_answer(report, args, find_status(results, is_interrupted=is_interrupted),
-                       Places(folder / "suite.html", folder / "suite.json"))
+    return status
 
 
 def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:

@@ -63,9 +63,10 @@ class UdpBus(can.BusABC):
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         while select.select([self._rx], [], [], timeout)[0]:
-            message = self._take_message()
-            if message is not None:
-                return message, False
+            with contextlib.suppress(BlockingIOError):  # another thread was quicker
+                message = self._take_message()
+                if message is not None:
+                    return message, False
             timeout = 0.0  # what is behind our own frame has come already; recv() waits again if nothing has
         return None, False
 

@@ -528,7 +528,7 @@ def _release_until(port: Port, m: Memory, t_ns: int, with_drives: bool) -> bool:
         words[at:end] = words[at + 4:end + 4]
         if what == _DRIVE:
             _keep_drive(m, length, data)
-        else:
+        elif words[TPDOS_AT + 4 * (what - _FEEDBACK) + ID] >= 0:  # it may have been switched off meanwhile
             _send(port, m, words[TPDOS_AT + 4 * (what - _FEEDBACK) + ID], length, data)
             is_fed |= what == _FEEDBACK
         at = _find_next_held(m, t_ns, least)

@@ -158,16 +158,21 @@ def _read_settings(log: Path, said: Mapping[str, str]) -> dict[str, Any]:
 
 def _load_effect_files(codes: list[ForeignCode]) -> tuple[Path, ...]:
     """Write user effects to files and run them. The files outlive this process: nodes in other processes read them."""
-    from plant.compile import find_cache_folder
+    from plant.compile import find_cache_folder, make_private_folder
 
     digest = hashlib.sha256(repr([(code.name, code.content) for code in codes]).encode()).hexdigest()
     files = []
     for code in codes:
-        files.append(find_cache_folder() / f"effects-{digest[:16]}" / code.name.removeprefix(_EFFECT_FOLDER))
-        files[-1].parent.mkdir(exist_ok=True)
-        with write_whole(files[-1]) as part:
-            part.write_bytes(code.content)
-        load_effects(files[-1], code.content)
+        try:
+            folder = make_private_folder(find_cache_folder() / f"effects-{digest}")
+            file = folder / code.name.removeprefix(_EFFECT_FOLDER)
+            if not file.is_file() or file.read_bytes() != code.content:
+                with write_whole(file) as part:
+                    part.write_bytes(code.content)
+        except OSError as error:
+            raise InputError(code.name, "", f"room for its code in the cache folder ({error.strerror})") from error
+        load_effects(file, code.content)
+        files.append(file)
     return tuple(files)
 
 

@@ -244,7 +244,8 @@ def open_text_table(path: Path, separator: str | None = None, decimal: str | Non
             lines = [line.rstrip("\r\n") for line in itertools.islice(stream, SAMPLE_LINES)]
         separator, decimal = _find_separators(path, lines, separator, decimal)
         parse = _make_number_parser(decimal)
-        rows = [[] if _is_comment(line) else _split_line(line, separator) for line in lines]
+        rows = [[] if _is_comment(line) and number != name_line else _split_line(line, separator)
+                for number, line in enumerate(lines, 1)]
         width = _find_width(rows, parse)
         rows = [row[:width] if _is_padded(row, width) else row for row in rows]
         first = next((i for i, row in enumerate(rows) if i + 1 != name_line and _is_data(row, width, parse)), None)

@@ -47,11 +47,12 @@ def run_command(args: argparse.Namespace) -> int:
     with open_wire(args.node, bus) as wire, show_progress(is_silent=args.json or args.quiet) as progress:
         outcome = run_cases(Target(wire, sheet, options), cases, progress)
     subject = Subject(sheet, bus, options.may_write)
-    if junit is not None:
-        write_text(junit, write_junit(outcome, subject), "--junit")
     files = [*places.files, *([("JUnit", str(junit))] if junit else [])]
     status = {"PASS": 0, "FAIL": 1, "INVALID_TIMING": 3}[outcome.verdict]
-    return give_answer(build_conformance_report(outcome, subject, files), args, status, places)
+    status = give_answer(build_conformance_report(outcome, subject, files), args, status, places)
+    if junit is not None:
+        write_text(junit, write_junit(outcome, subject), "--junit")
+    return status
 
 
 def parse_node(text: str) -> int:

@@ -279,6 +279,15 @@ def test_bands_remember_their_model_through_a_file() -> None:
         diagnose(record_plant(com=RAMP_AND_SINE, seed=1), model, load_default_bands())
 
 
+def test_bands_of_an_earlier_version_are_known_by_the_name_of_their_model() -> None:
+    own = load_default_bands()
+    facts = {key: text for key, text in own.provenance.items() if key != "parameters"}
+    old = replace(own, provenance=facts)
+    assert describe_other_model(old, Model()) == ""
+    assert describe_other_model(replace(old, provenance={**facts, "model": "fleet"}), Model()) == "the model fleet"
+
+
+
 def trace(x: np.ndarray, com: np.ndarray | None = None) -> Trace:
     com = command() if com is None else com
     return Trace.from_columns({"com": com, "xj": x, "cor": np.full(len(x), 1e-3)}, 1e-3, {})

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import gzip
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import find_sections
 from fdi.trace.trace import Check, Gap, Trace
 from plant.errors import InputError
-from rig.recorder import Event, NmtState, Recorder, Signals, Timing
+from rig.recorder import U32, Event, NmtState, Recorder, Signals, Timing, schema
 
 KINDS = ["hold", "step", "step", "step", "step", "ramp", "hold", "ramp", "hold", "dynamic", "hold"]  # of preflight
 
@@ -216,3 +217,27 @@ def test_columns_equal_the_parsed_messages_whoever_wrote_them(run: Path, tmp_pat
             np.testing.assert_array_equal(columns[name], [getattr(message, name) for _, message in messages])
             np.testing.assert_array_equal(same[name], columns[name])
     assert len(log.read_columns("/nothing")["time_ns"]) == 0
+
+
+@dataclass(slots=True)
+class OldTiming:
+    """A cycle's timing as logs of version 0.1 have it."""
+
+    cycle: U32 = field(metadata={"unit": "", "doc": ""})
+    overrun: bool = field(metadata={"unit": "", "doc": ""})
+    lateness: float = field(metadata={"unit": "s", "doc": ""})
+    response: float = field(metadata={"unit": "s", "doc": ""})
+    work: float = field(metadata={"unit": "s", "doc": ""})
+
+
+def test_a_log_of_an_earlier_version_has_no_feedback_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(schema.TOPICS, "/timing", OldTiming)
+    monkeypatch.setitem(schema.CHANNELS, OldTiming, schema.CHANNELS[Timing])
+    recorder = Recorder(tmp_path / "trace.mcap", {}, {"period": "0.001"})
+    for k in range(10):
+        old = OldTiming(k, False, 1e-5, 2e-4, 3e-4)
+        recorder.cycle(k * 1_000_000, Signals(k, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0), old)  # type: ignore[arg-type]
+    recorder.close()
+    timing = Trace.read(tmp_path / "trace.mcap").timing
+    assert set(timing.response) == {2e-4} and len(timing.execution) == 10
+    assert np.isnan([timing.feedback_response, timing.valve_response, timing.execution]).all()

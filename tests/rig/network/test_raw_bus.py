@@ -207,6 +207,21 @@ class TestDatagrams:
         random.shuffle(pairs)
         assert read_compiled(data) == read_compiled(msgpack.packb(dict(pairs))) == read_by_python_can(data)
 
+    @pytest.mark.parametrize("change", [{"data": None, "dlc": 0}, {"channel": "x" * 300}, {"dlc": None}, {"dlc": "8"}])
+    def test_other_ways_to_pack_are_those_of_python_can(self, change: dict[str, Any]) -> None:
+        fields = msgpack.unpackb(pack_message(can.Message(arbitration_id=0x80, is_extended_id=False, data=bytes(8))))
+        data = msgpack.packb(fields | change)
+        try:
+            expected = read_by_python_can(data)
+        except (TypeError, ValueError):
+            expected = (1,)
+        assert read_compiled(data) == expected
+
+    def test_a_long_head_of_the_payload_is_read(self) -> None:
+        packed = pack_message(can.Message(arbitration_id=0x80, is_extended_id=False, data=bytes(range(8))))
+        data = packed.replace(b"\xc4\x08", b"\xc5\x00\x08")
+        assert read_compiled(data) == read_by_python_can(data) == read_compiled(packed)
+
     @settings(max_examples=500, deadline=None)
     @given(messages, st.integers(0, 400), st.binary(min_size=1, max_size=9), st.sampled_from(["cut", "bad", "more"]))
     def test_damaged_bytes_never_give_a_frame_that_python_can_does_not_see(
