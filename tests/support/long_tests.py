@@ -77,4 +77,5 @@ LONG_TESTS = (
     "test_answer_schemas.py",
     "test_docs.py",
     "test_docs_site.py",
+    "test_examples.py",
 )
