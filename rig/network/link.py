@@ -6,6 +6,7 @@ import select
 import socket
 import struct
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Sequence
 
 import can
@@ -174,7 +175,7 @@ _STALL = 100 * MS  # twice the longest pause of the cycle in lockstep
 Done = Callable[[], bool]
 
 
-class Wire:
+class Wire(ABC):
     """What the master and the loop need of a bus."""
 
     clock: Clock
@@ -186,22 +187,22 @@ class Wire:
         self.receive: Callable[[Frame], None] = lambda frame: None  # where incoming frames go; set by the master
         self.is_node_gone: Done = lambda: False  # whether a node will not answer any more; set by the session
 
+    @abstractmethod
     def wait(self, done: Done, seconds: float) -> bool:
         """Let frames come in until `done()`; False when it took longer than `seconds`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def wait_for_answers(self, t_ns: int, done: Done) -> None:
         """Lockstep: let the frames of the cycle at `t_ns` come in, until `done()` or nothing more can come."""
-        raise NotImplementedError
 
+    @abstractmethod
     def run_until(self, t_ns: int) -> None:
         """Real time: let frames come in until the clock says `t_ns`."""
-        raise NotImplementedError
 
-    def hear_all(self) -> None:
+    def hear_all(self) -> None:  # noqa: B027 - a bus in memory has no others
         """Let the frames of nodes that are not of the bench in, for the log; during bring-up they stay out."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - nothing to give back
         """Give the bus back."""
 
 
