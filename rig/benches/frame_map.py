@@ -1,0 +1,217 @@
+"""The frames of a bench as data: where each value lies, what a count is worth, who sends the frame, and when.
+
+A bench file (bench_file.py) with its EDS, DCF or DBC becomes a `FrameMap`. Python packs and unpacks with `pack`
+and `unpack`; compiled loops use the tables of packing.py, which hold the same.
+"""
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from fractions import Fraction
+from functools import cached_property
+from math import isnan
+
+EXTENDED = 1 << 31  # in an identifier: it has 29 bits, as in Linux's can_id
+FD = 1 << 30  # in an identifier: a CAN FD frame
+
+
+class Role(IntEnum):
+    """Who takes part in a run, whatever the node numbers are."""
+
+    RIG = 1
+    CONTROLLER = 2
+    PLANT = 3
+
+
+class Kind(IntEnum):
+    """How the bits of a value are read."""
+
+    UNSIGNED = 0
+    SIGNED = 1
+    FLOAT = 2  # IEEE 754, 32 or 64 bits
+
+
+class Guard(IntEnum):
+    """What a protected field holds: the sender computes it and the receiver checks it."""
+
+    NONE = 0
+    COUNTER = 1  # counts the frames, modulo its range
+    CHECKSUM = 2  # see `Field.checksum`
+
+
+@dataclass(frozen=True, kw_only=True)
+class Field:
+    """One value in a frame. In counts it is round((value - offset) / count), limited to the range of its bits."""
+
+    name: str  # signal of the bench, or of the device ("Demand.Enable")
+    lowest: int  # place of the least significant bit: 8 * byte + bit
+    length: int  # bits, 1 to 64
+    is_big_endian: bool = False  # Motorola: above bit 7 of a byte comes bit 0 of the byte before
+    kind: Kind = Kind.UNSIGNED
+    count: Fraction = Fraction(1)  # what a count is worth, SI
+    offset: Fraction = Fraction(0)  # SI
+    fixed: int | None = None  # always these counts: selector of a multiplexed frame, or filling
+    guard: Guard = Guard.NONE
+    checksum: str = ""  # of a checksum: name in checksums.py, or FILE.py:FUNCTION
+    data_id: int = 0  # of AUTOSAR's profiles
+
+    @property
+    def range(self) -> tuple[int, int]:
+        """Smallest and largest counts of an integer."""
+        if self.kind is Kind.SIGNED:
+            return -(1 << self.length - 1), (1 << self.length - 1) - 1
+        return 0, (1 << self.length) - 1
+
+    def encode(self, value: float) -> int:
+        """The bits of a value; out of range it saturates, as the output of a transducer does.
+
+        Raises:
+            ValueError: NaN for an integer: no invented number is sent.
+        """
+        # What count and offset are worth is a fraction, so that 0.005 m at 1e-7 m is 50000 and back 0.005 exactly.
+        counts = (value - float(self.offset)) * self.count.denominator / self.count.numerator
+        if self.kind is Kind.FLOAT:
+            return encode_float(counts, self.length)
+        if isnan(counts):
+            raise ValueError(f"{self.name}: NaN")
+        low, high = self.range
+        if counts >= high:
+            return high
+        if counts <= low:
+            return low & (1 << self.length) - 1
+        return round(counts) & (1 << self.length) - 1
+
+    def decode(self, bits: int) -> float:
+        """The value that these bits stand for, SI."""
+        counts: float = bits
+        if self.kind is Kind.FLOAT:
+            counts = decode_float(bits, self.length)
+        elif self.kind is Kind.SIGNED and bits >> self.length - 1:
+            counts = bits - (1 << self.length)
+        return counts * self.count.numerator / self.count.denominator + float(self.offset)
+
+
+def encode_float(value: float, length: int) -> int:
+    """The bits of an IEEE 754 number of 32 or 64 bits; what 32 bits cannot hold becomes infinite."""
+    if length == 64:
+        return int.from_bytes(struct.pack("<d", value), "little")
+    try:
+        return int.from_bytes(struct.pack("<f", value), "little")
+    except OverflowError:
+        return 0x7F800000 if value > 0 else 0xFF800000
+
+
+def decode_float(bits: int, length: int) -> float:
+    """The number that 32 or 64 bits stand for."""
+    code = "<d" if length == 64 else "<f"
+    value: float = struct.unpack(code, bits.to_bytes(length // 8, "little"))[0]
+    return value
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSpec:
+    """One frame of a bench."""
+
+    name: str  # as people call it: "RPDO1", "Demand"
+    identifier: int  # with EXTENDED and FD
+    length: int  # bytes
+    sender: Role
+    fields: tuple[Field, ...]
+    every: int = 1  # cycles from one to the next
+    is_before_sync: bool = False  # sent before SYNC, with which its values take effect
+    is_answer: bool = True  # of a sender other than the rig: it comes in each `every`-th cycle, so lockstep awaits it
+
+    @cached_property
+    def selector(self) -> Field | None:
+        """The field that tells frames with the same identifier apart."""
+        return next((each for each in self.fields if each.fixed is not None and each.name), None)
+
+    def has(self, *names: str) -> bool:
+        """Whether the frame carries one of these values."""
+        return any(each.name in names for each in self.fields)
+
+
+def locate_bits(each: Field, length: int) -> tuple[str, int]:
+    """Byte order of the integer to which a frame of `length` bytes is taken, and by how much a field is shifted in it.
+    """
+    if not each.is_big_endian:
+        return "little", each.lowest
+    return "big", 8 * (length - 1 - each.lowest // 8) + each.lowest % 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameMap:
+    """All cyclic frames of a bench."""
+
+    frames: tuple[FrameSpec, ...]
+    sync: int | None = None  # identifier of SYNC; None: there is none
+    by_identifier: dict[int, list[FrameSpec]] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        for each in self.frames:
+            self.by_identifier.setdefault(each.identifier, []).append(each)
+
+    def list_from(self, *senders: Role) -> tuple[FrameSpec, ...]:
+        """The frames of these senders."""
+        return tuple(each for each in self.frames if each.sender in senders)
+
+    def find(self, identifier: int, data: bytes) -> FrameSpec | None:
+        """The frame with this identifier and, if it is multiplexed, with the selector of `data`; None: not mapped."""
+        for each in self.by_identifier.get(identifier, ()):
+            chosen = each.selector
+            if chosen is None or (len(data) == each.length and extract_bits(chosen, data) == chosen.fixed):
+                return each
+        return None
+
+
+def extract_bits(each: Field, data: bytes) -> int:
+    """The bits of a field."""
+    order, shift = locate_bits(each, len(data))
+    whole = int.from_bytes(data, order)  # type: ignore[arg-type]  # "little" or "big"
+    return whole >> shift & (1 << each.length) - 1
+
+
+def insert_bits(each: Field, data: bytes, bits: int) -> bytes:
+    """`data` with the bits of a field set."""
+    order, shift = locate_bits(each, len(data))
+    whole = int.from_bytes(data, order)  # type: ignore[arg-type]
+    mask = (1 << each.length) - 1
+    return (whole & ~(mask << shift) | (bits & mask) << shift).to_bytes(len(data), order)  # type: ignore[arg-type]
+
+
+def pack(spec: FrameSpec, values: Mapping[str, float], counter: int = 0) -> bytes:
+    """The payload of a frame. A value that `values` lacks is 0; `counter`: how many of these frames were sent before.
+
+    Raises:
+        ValueError: NaN for an integer.
+    """
+    from rig.benches.checksums import compute_checksum
+
+    data = bytes(spec.length)
+    for each in spec.fields:
+        if each.fixed is not None:
+            bits = each.fixed
+        elif each.guard is Guard.COUNTER:
+            bits = counter % (1 << each.length)
+        elif each.guard is Guard.CHECKSUM:
+            continue
+        else:
+            bits = each.encode(values.get(each.name, 0.0))
+        data = insert_bits(each, data, bits)
+    for each in spec.fields:
+        if each.guard is Guard.CHECKSUM:  # over all else
+            data = insert_bits(each, data, compute_checksum(each, data, counter))
+    return data
+
+
+def unpack(spec: FrameSpec, data: bytes) -> dict[str, float]:
+    """The values of a frame by name, SI.
+
+    Raises:
+        ValueError: a payload of another length.
+    """
+    if len(data) != spec.length:
+        raise ValueError(f"{spec.name}: {spec.length} bytes, not {len(data)}")
+    return {each.name: each.decode(extract_bits(each, data)) for each in spec.fields if each.name}
