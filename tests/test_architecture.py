@@ -33,6 +33,7 @@ SINGLE_MAY_IMPORT = {
                      "fdi.identification", "fdi.diagnosis", "fdi.prognosis", "fdi.report"},
     "rig.interrupts": set(),
     "rig.junit": set(),
+    "rig.tables": set(),
     "rig.doctor": {"rig.network", "rig.run"},
 }
 

@@ -27,8 +27,8 @@ from fdi.prognosis.unit_trend import list_traces
 from plant.errors import InputError
 from plant.model import Model, find_effect
 from plant.parameters import parse_toml, parse_value, read_toml
-from rig.sequences.tables import Place, Range, build_dataclass
 from rig.sequences.timing import PERIOD
+from rig.tables import Place, Range, build_dataclass
 
 OWN_SIMULATOR = "plant"
 HEALTHY = "healthy"

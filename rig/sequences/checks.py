@@ -23,7 +23,7 @@ from rig.sequences import measures
 from rig.sequences.faults import Time
 from rig.sequences.measures import MAIN, NO_DRIVES, UNIT_OF_SIGNAL, DriveFrames, NotMeasurable, RunData, find_scale
 from rig.sequences.python_parts import Argument, UserFunction, describe_value, require_function_name
-from rig.sequences.tables import Range
+from rig.tables import Range
 
 LEFT_OPERATIONAL = "node 2 left OPERATIONAL:"  # words of the event
 Signal = Literal["com", "xj", "error", "speed", "cor", "p12", "xs", "load"]

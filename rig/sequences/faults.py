@@ -21,8 +21,8 @@ from plant.model import Model, find_quantity
 from plant.parameters import check_combinations, parse_value
 from plant.quantity import Quantity
 from plant.segments import RATE, Second
-from rig.sequences import tables
-from rig.sequences.tables import Range
+from rig import tables
+from rig.tables import Range
 
 Table = NDArray[np.int64]
 Sensor = Literal["xj", "p12", "xs"]

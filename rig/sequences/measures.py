@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from plant.errors import InputError
 from plant.run import Columns
 from plant.segments import RATE, Array
-from rig.sequences import tables
+from rig import tables
 
 MEDIAN_SAMPLES = 5  # samples
 SPEED_SPAN = 20  # cycles between the two samples of a speed: 2 um rms of position noise become 0.14 mm/s rms

@@ -18,7 +18,7 @@ from plant.segments import RATE, Array, Second
 from rig.device.emcy import EmcyCode
 from rig.network.codec import Control, Flags, Status
 from rig.sequences.checks import CheckResult
-from rig.sequences.tables import Range
+from rig.tables import Range
 
 Mask = NDArray[np.bool_]
 Whole = NDArray[np.int64]

@@ -22,14 +22,15 @@ from plant.parameters import parse_value
 from plant.profile import Profile, build_profile, list_section_names, parse_columns
 from plant.quantity import Quantity
 from plant.segments import FARTHEST, RATE, STRONGEST, Array, Csv, Segment
-from rig.sequences import checks, faults, tables
+from rig import tables
+from rig.sequences import checks, faults
 from rig.sequences.checks import Check, Guard, PythonCheck
 from rig.sequences.faults import Fault, Parameter, Plan, find_contradiction
 from rig.sequences.measures import MAIN
 from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.python_parts import PythonSegment, Step, load_function, require_function_name, run_file
-from rig.sequences.tables import Place, Range
 from rig.sequences.timing import TimingPolicy
+from rig.tables import Place, Range
 
 PHASES = ("setup", "main", "cleanup", "load")
 Unsigned32 = Annotated[int, Range("1", low=0, high=0xFFFFFFFF)]

@@ -6,7 +6,7 @@ from math import ceil
 from typing import Annotated, Literal
 
 from plant.segments import LONGEST
-from rig.sequences.tables import Range
+from rig.tables import Range
 
 PERIOD = 1e-3  # s, one cycle
 InCycle = Annotated[float, Range("s", above=0.0, high=PERIOD)]

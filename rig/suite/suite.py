@@ -25,7 +25,7 @@ from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import run_job
 from rig.sequences.checks import CheckResult
 from rig.sequences.sequence import load_sequence
-from rig.sequences.tables import Range, build_dataclass, decode_text, parse_table, read_file
+from rig.tables import Range, build_dataclass, decode_text, parse_table, read_file
 
 Value = float | str
 Seed = Annotated[int, Range("1", low=0)]

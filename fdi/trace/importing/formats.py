@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.csv_table import open_text, report_unreadable
-from fdi.trace.importing.import_map import OTHER_UNITS, find_unit
+from fdi.trace.importing.import_map import OTHER_UNITS
 from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace
 from plant.errors import InputError
+from plant.units import find_unit
 
 Floats = NDArray[np.float64]
 

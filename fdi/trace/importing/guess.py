@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION
 from fdi.trace.importing.formats import Channel, Measurement, TextTable, split_unit
-from fdi.trace.importing.import_map import REQUIRED_SIGNALS, SIGNAL_NAMES, UNITS, Unit, find_unit
+from fdi.trace.importing.import_map import REQUIRED_SIGNALS, SIGNAL_NAMES
 from fdi.trace.sensor_dynamics import find_comb
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError
 from plant.parameters import load_nominal_values
+from plant.units import UNITS, Unit, find_unit
 
 Floats = NDArray[np.float64]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ from fdi.trace.sensor_dynamics import SensorDynamics
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError, show_value, suggest_name
 from plant.parameters import parse_toml
+from plant.units import UNITS, Unit, find_unit, require_unit
 
 Floats = NDArray[np.float64]
 
@@ -207,7 +207,7 @@ def _parse_time(path: Path, name: str, values: Any) -> TimeBase | None:
     if source is not None and rate is not None and bits is None:
         raise InputError(path, f"{name}.bits", "the bits of the counter, as source and rate are given")
     has_unit = rate is None and table["unit"] != "iso"
-    return TimeBase(source, require_unit(table["unit"], "s", path, f"{name}.unit") if has_unit else None, rate, bits)
+    return TimeBase(source, _require_unit(table["unit"], "s", path, f"{name}.unit") if has_unit else None, rate, bits)
 
 
 def _parse_signal(path: Path, signal: str, values: Any) -> SignalMap:
@@ -235,56 +235,23 @@ def _parse_signal(path: Path, signal: str, values: Any) -> SignalMap:
 
 
 def _parse_term(path: Path, name: str, table: Mapping[str, Any], si: str) -> SourceTerm:
-    return SourceTerm(**{**table, "unit": require_unit(table["unit"] or si, si, path, f"{name}.unit")})
+    return SourceTerm(**{**table, "unit": _require_unit(table["unit"] or si, si, path, f"{name}.unit")})
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Units
 # ---------------------------------------------------------------------------------------------------------------------
 
-class Unit(NamedTuple):
-    """A unit: its name, the SI unit of its quantity and how many of those it is."""
-
-    name: str
-    si: str
-    factor: Fraction
-
-
-UNITS: Mapping[str, Unit] = {name: Unit(name, si, Fraction(factor)) for si, factors in {
-    "m": {"m": "1", "cm": "1/100", "mm": "1/1000", "um": "1/1000000", "nm": "1/1000000000", "inch": "0.0254",
-          "mil": "0.0000254"},
-    "Pa": {"Pa": "1", "hPa": "100", "kPa": "1000", "MPa": "1000000", "GPa": "1000000000", "mbar": "100",
-           "bar": "100000", "psi": "6894.757293168361"},
-    "A": {"A": "1", "mA": "1/1000", "uA": "1/1000000"},
-    "N": {"N": "1", "kN": "1000", "MN": "1000000", "daN": "10", "lbf": "4.4482216152605"},
-    "s": {"s": "1", "ms": "1/1000", "us": "1/1000000", "ns": "1/1000000000", "min": "60", "h": "3600"},
-}.items() for name, factor in factors.items()}
-SPELLINGS = {"µm": "um", "μm": "um", "µs": "us", "μs": "us", "µA": "uA", "μA": "uA", "in": "inch", "sec": "s",
-             "seconds": "s", "second": "s", "msec": "ms", "usec": "us", "pa": "Pa", "kpa": "kPa", "mpa": "MPa",
-             "Bar": "bar", "BAR": "bar", "MM": "mm", "a": "A", "ma": "mA", "n": "N", "kn": "kN", "S": "s", "MS": "ms",
-             "PSI": "psi", "Volt": "V", "v": "V", "micron": "um", "metre": "m", "meter": "m"}
 OTHER_UNITS = ("V", "mV", "counts", "%")  # what a logger may write that needs scale and offset
 
 
-def find_unit(name: str) -> Unit | None:
-    """The unit of this name or spelling; None if it is not known."""
-    return UNITS.get(SPELLINGS.get(name.strip(), name.strip()))
-
-
-def require_unit(name: str, si: str, where: object, field: str) -> Unit:
-    """The unit `name`, which must measure what `si` measures.
-
-    Raises:
-        InputError: an unknown unit, or one of another quantity.
-    """
-    unit = find_unit(name)
-    fitting = [known for known, u in UNITS.items() if u.si == si]
-    if unit is None and name in OTHER_UNITS:
-        raise InputError(where, field, f"the unit that scale and offset lead to, such as {fitting[0]} ({name} is raw: "
+def _require_unit(name: str, si: str, where: object, field: str) -> Unit:
+    """As of `plant.units`; of a unit that is raw it says what to do."""
+    if find_unit(name) is None and name in OTHER_UNITS:
+        fitting = next(known for known, u in UNITS.items() if u.si == si)
+        raise InputError(where, field, f"the unit that scale and offset lead to, such as {fitting} ({name} is raw: "
                                        f"value = sign * (scale * raw + offset) in `unit`)")
-    if unit is None or unit.si != si:
-        raise InputError(where, field, f"one of {', '.join(fitting)}, not {name!r}{suggest_name(name, fitting)}")
-    return unit
+    return require_unit(name, si, where, field)
 
 
 def convert_to_si(values: Floats, unit: Unit) -> Floats:

@@ -10,7 +10,7 @@ import pytest
 
 from plant import load_model, simulate
 from plant.errors import InputError
-from rig.sequences import tables
+from rig import tables
 from rig.sequences.checks import CheckResult, evaluate_checks
 from rig.sequences.sequence import Sequence, load_sequence, parse_sequence
 

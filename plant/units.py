@@ -1,0 +1,72 @@
+"""Units of other programs and of people: what one of them is worth in SI, exactly."""
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from fractions import Fraction
+from typing import NamedTuple
+
+from plant.errors import InputError, show_value, suggest_name
+
+
+class Unit(NamedTuple):
+    """A unit: its name, the SI unit of its quantity and how many of those it is."""
+
+    name: str
+    si: str
+    factor: Fraction
+
+
+UNITS: Mapping[str, Unit] = {name: Unit(name, si, Fraction(factor)) for si, factors in {
+    "m": {"m": "1", "cm": "1/100", "mm": "1/1000", "um": "1/1000000", "nm": "1/1000000000", "inch": "0.0254",
+          "mil": "0.0000254"},
+    "Pa": {"Pa": "1", "hPa": "100", "kPa": "1000", "MPa": "1000000", "GPa": "1000000000", "mbar": "100",
+           "bar": "100000", "psi": "6894.757293168361"},
+    "A": {"A": "1", "mA": "1/1000", "uA": "1/1000000", "nA": "1/1000000000"},
+    "N": {"N": "1", "kN": "1000", "MN": "1000000", "daN": "10", "lbf": "4.4482216152605"},
+    "s": {"s": "1", "ms": "1/1000", "us": "1/1000000", "ns": "1/1000000000", "min": "60", "h": "3600"},
+}.items() for name, factor in factors.items()}
+SPELLINGS = {"µm": "um", "μm": "um", "µs": "us", "μs": "us", "µA": "uA", "μA": "uA", "in": "inch", "sec": "s",
+             "seconds": "s", "second": "s", "msec": "ms", "usec": "us", "pa": "Pa", "kpa": "kPa", "mpa": "MPa",
+             "Bar": "bar", "BAR": "bar", "MM": "mm", "a": "A", "ma": "mA", "n": "N", "kn": "kN", "S": "s", "MS": "ms",
+             "PSI": "psi", "Volt": "V", "v": "V", "micron": "um", "metre": "m", "meter": "m"}
+_QUANTITY = re.compile(r"\s*([+-]?(?:\d{1,30}\.?\d{0,30}|\.\d{1,30})(?:[eE][+-]?\d{1,2})?)\s*(.*?)\s*")
+
+
+def find_unit(name: str) -> Unit | None:
+    """The unit of this name or spelling; None if it is not known."""
+    return UNITS.get(SPELLINGS.get(name.strip(), name.strip()))
+
+
+def require_unit(name: str, si: str, where: object, field: str) -> Unit:
+    """The unit `name`, which must measure what `si` measures.
+
+    Raises:
+        InputError: an unknown unit, or one of another quantity.
+    """
+    unit = find_unit(name)
+    fitting = [known for known, u in UNITS.items() if u.si == si]
+    if unit is None or unit.si != si:
+        raise InputError(where, field, f"one of {', '.join(fitting)}, not {name!r}{suggest_name(name, fitting)}")
+    return unit
+
+
+def parse_quantity(text: str, si: str, where: object, field: str) -> Fraction:
+    """A number with its unit, such as "20 uA", in `si`, exactly; with `si` "" a number alone.
+
+    >>> parse_quantity("0.1 um", "m", "", ""), parse_quantity("2", "", "", "")
+    (Fraction(1, 10000000), Fraction(2, 1))
+
+    Raises:
+        InputError: no number, no unit, or the unit of another quantity.
+    """
+    found = _QUANTITY.fullmatch(text)
+    if found is None:
+        example = f"a number and a unit, such as '1 {si}'" if si else "a number"
+        raise InputError(where, field, f"{example}, not {show_value(text)}")
+    number, unit = Fraction(found[1]), found[2]
+    if si or unit:
+        if not si:
+            raise InputError(where, field, f"a number without a unit, not {show_value(text)}")
+        number *= require_unit(unit, si, where, field).factor
+    return number
