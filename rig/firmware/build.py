@@ -1,18 +1,27 @@
-"""Compiles the reference firmware; the program is kept under a hash of its sources and of the compiler."""
+"""Compiles the reference firmware, and devices of a user's own on its CANopen stack and ports.
+
+    python -m rig.firmware.build FOLDER
+
+compiles the C files of a folder, with the object table of the EDS in it if there is one, and prints the program's path.
+Programs are kept under a hash of their sources and of the compiler.
+"""
 from __future__ import annotations
 
 import hashlib
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from plant.compile import find_cache_folder
 from plant.errors import InputError, RigError
+from rig.firmware.object_table import write_object_table
 
 FOLDER = Path(__file__).parent
+REFERENCE = ("controller.c", "main.c", "object_table.c")  # the reference firmware; the rest is for any device
 # Without fused multiply-add, so that the control law gives the bits of plant/controller.py.
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic")
 
@@ -27,15 +36,46 @@ def build_controller() -> Path:
     return build_program("controller", sorted(FOLDER.glob("*.c")), FLAGS)
 
 
+def build_device(folder: Path, flags: Sequence[str] = (*FLAGS, "-Werror")) -> Path:
+    """The program of a folder with C files and at most one EDS, on this stack, compiled if necessary.
+
+    Raises:
+        InputError: the folder has no C file, its EDS cannot be read, or no C compiler is installed.
+        RigError: the compiler reports an error.
+    """
+    own = sorted(folder.glob("*.c"))
+    if not own:
+        raise InputError(folder, "", "a folder with the C files of a device")
+    stack = [path for path in sorted(FOLDER.glob("*.c")) if path.name not in REFERENCE]
+    for eds in folder.glob("*.eds"):
+        own.append(_write_generated(write_object_table(eds)) / "object_table.c")
+    return build_program(folder.resolve().name, [*own, *stack], flags)
+
+
+def _write_generated(texts: dict[str, str]) -> Path:
+    """A folder of the cache with these files."""
+    folder = find_cache_folder() / f"generated-{hashlib.sha256(repr(texts).encode()).hexdigest()[:16]}"
+    if not folder.exists():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", dir=folder.parent))
+        for name, text in texts.items():
+            (unfinished / name).write_text(text)
+        try:
+            unfinished.rename(folder)
+        except OSError:  # another build was faster
+            shutil.rmtree(unfinished)
+    return folder
+
+
 def build_program(name: str, sources: Sequence[Path], flags: Sequence[str]) -> Path:
-    """Compile and link C `sources` (headers: this folder and theirs) to a program or library in the cache folder.
+    """Compile and link C `sources` (headers: their folders and this one) to a program or library in the cache folder.
 
     Raises:
         InputError: no C compiler is installed.
         RigError: the compiler reports an error.
     """
     compiler = find_compiler()
-    folders = [FOLDER, *{source.parent for source in sources}]
+    folders = list(dict.fromkeys([*(source.parent for source in sources), FOLDER]))
     files = sorted({*sources, *(path for folder in folders for path in folder.glob("*.h"))})
     digest = hashlib.sha256(repr((compiler, Path(compiler).stat().st_mtime_ns, flags)).encode())
     for path in files:
@@ -68,3 +108,7 @@ def _compile(compiler: str, words: Sequence[str], program: Path) -> None:
         Path(unfinished).replace(program)
     finally:
         Path(unfinished).unlink(missing_ok=True)
+
+
+if __name__ == "__main__":
+    print(build_device(Path(sys.argv[1])))

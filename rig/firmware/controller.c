@@ -173,7 +173,7 @@ static void on_heartbeat_lost(void *context, uint8_t node)
 bool controller_init(struct controller *controller, struct output output)
 {
     memset(controller, 0, sizeof *controller);
-    const struct dictionary od = {OBJECT_TABLE, OBJECT_COUNT, controller->values};
+    const struct dictionary od = {OBJECT_TABLE, OBJECT_COUNT, controller->values, 0};
     const struct hooks hooks = {controller, on_sync, on_rpdo, on_write, on_nmt, on_sync_lost, on_heartbeat_lost};
     bool is_consistent = device_init(&controller->device, CONTROLLER_NODE, od, output, hooks, controller->buffer,
                                      sizeof controller->buffer);

@@ -4,7 +4,9 @@
 
 /* msgpack: first bytes of the values that occur */
 enum { FIXMAP = 0x80, FIXSTR = 0xA0, NIL = 0xC0, FALSE_ = 0xC2, TRUE_ = 0xC3, BIN8 = 0xC4, FLOAT64 = 0xCB,
-       UINT16 = 0xCD };
+       UINT16 = 0xCD, UINT32 = 0xCE };
+
+static const uint32_t STANDARD_LAST = 0x7FF, EXTENDED_LAST = 0x1FFFFFFF; /* identifiers */
 
 static uint8_t *put_key(uint8_t *next, const char *key)
 {
@@ -12,6 +14,14 @@ static uint8_t *put_key(uint8_t *next, const char *key)
     *next++ = (uint8_t)(FIXSTR | length);
     memcpy(next, key, length);
     return next + length;
+}
+
+static uint8_t *put_number(uint8_t *next, uint8_t first, uint32_t number, unsigned size)
+{
+    *next++ = first;
+    while (size-- > 0)
+        *next++ = (uint8_t)(number >> (8 * size)); /* msgpack is big-endian */
+    return next;
 }
 
 static uint8_t *put_flag(uint8_t *next, const char *key, bool value)
@@ -29,10 +39,9 @@ size_t datagram_pack(const struct frame *frame, uint8_t *bytes)
     *next++ = FLOAT64;
     memset(next, 0, 8);
     next = put_key(next + 8, "arbitration_id");
-    *next++ = UINT16;
-    *next++ = (uint8_t)(frame->cob_id >> 8);
-    *next++ = (uint8_t)frame->cob_id;
-    next = put_flag(next, "is_extended_id", false);
+    const uint32_t identifier = frame->cob_id & EXTENDED_LAST;
+    next = identifier > 0xFFFF ? put_number(next, UINT32, identifier, 4) : put_number(next, UINT16, identifier, 2);
+    next = put_flag(next, "is_extended_id", frame->cob_id & ID_EXTENDED);
     next = put_flag(next, "is_remote_frame", false);
     next = put_flag(next, "is_error_frame", false);
     next = put_key(next, "channel");
@@ -67,7 +76,7 @@ static bool take_number(struct reader *reader, size_t size, uint64_t *number)
         return false;
     *number = 0;
     while (size-- > 0)
-        *number = *number << 8 | *reader->next++; /* msgpack is big-endian */
+        *number = *number << 8 | *reader->next++;
     return true;
 }
 
@@ -115,7 +124,7 @@ static bool take_value(struct reader *reader, struct value *value)
         return take_number(reader, 8, &value->number);
     case 0xCC: /* unsigned integers */
     case UINT16:
-    case 0xCE:
+    case UINT32:
     case 0xCF:
         return take_number(reader, (size_t)1 << (first - 0xCC), &value->number);
     case 0xD0: /* signed integers */
@@ -156,9 +165,11 @@ bool datagram_unpack(const uint8_t *bytes, size_t length, struct frame *frame)
         else if (is_key(&key, "data"))
             data = value;
     }
-    if (is_extended || is_special || cob_id > 0x7FF || data.length > 8 || (dlc != UINT64_MAX && dlc != data.length))
+    if (is_special || cob_id > (is_extended ? EXTENDED_LAST : STANDARD_LAST))
         return false;
-    frame->cob_id = (uint16_t)cob_id;
+    if (data.length > 8 || (dlc != UINT64_MAX && dlc != data.length))
+        return false;
+    frame->cob_id = (uint32_t)cob_id | (is_extended ? ID_EXTENDED : 0);
     frame->length = (uint8_t)data.length;
     memset(frame->data, 0, sizeof frame->data);
     if (data.length > 0)

@@ -13,7 +13,7 @@ enum { DATAGRAM_MAX = 256 }; /* bytes that `datagram_pack` needs at most */
 /* Write a frame; returns the number of bytes. */
 size_t datagram_pack(const struct frame *frame, uint8_t *bytes);
 
-/* Read a frame; its time is left as it is. False for what is not a classical data frame with an 11-bit identifier. */
+/* Read a frame; its time is left as it is. False for what is not a classical data frame. */
 bool datagram_unpack(const uint8_t *bytes, size_t length, struct frame *frame);
 
 #endif

@@ -121,7 +121,7 @@ void device_receive(struct device *device, const struct frame *frame)
             return;
         }
     }
-    if (nmt_is_communicating(device->state) && frame->cob_id == 0x600 + device->node_id)
+    if (nmt_is_communicating(device->state) && frame->cob_id == 0x600u + device->node_id)
         sdo_receive(&device->sdo, frame);
     else if (heartbeat_is_watched(&device->consumer, frame->cob_id))
         handle_heartbeat(device, frame);
@@ -257,6 +257,7 @@ bool device_init(struct device *device, uint8_t node_id, struct dictionary od, s
     device->node_id = node_id;
     device->state = NMT_INITIALISING;
     device->od = od;
+    device->od.node_id = node_id;
     device->output = output;
     device->hooks = hooks;
     dictionary_restore(&device->od, 0x1000, 0xFFFF);

@@ -51,7 +51,7 @@ struct device {
     uint8_t number[8]; /* bytes of the last number that was uploaded */
 };
 
-/* Put a device together; its values become the initial ones. It boots at its first tick. `buffer` takes downloads in
+/* Put a device together; its values become the initial ones, those that depend on the node-ID included. It boots at its first tick. `buffer` takes downloads in
  * segments. False if the object dictionary is inconsistent. */
 bool device_init(struct device *device, uint8_t node_id, struct dictionary od, struct output output,
                  struct hooks hooks, uint8_t *buffer, uint32_t capacity);

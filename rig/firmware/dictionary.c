@@ -57,7 +57,7 @@ void dictionary_restore(struct dictionary *od, uint16_t first, uint16_t last)
 {
     for (size_t i = 0; i < od->count; i++)
         if (od->objects[i].index >= first && od->objects[i].index <= last)
-            od->values[i] = od->objects[i].initial;
+            od->values[i] = od->objects[i].initial + (od->objects[i].flags & NODE_RELATIVE ? od->node_id : 0);
 }
 
 uint32_t dictionary_check_range(const struct object *object, uint64_t value)

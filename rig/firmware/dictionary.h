@@ -19,7 +19,8 @@ enum object_flag {
     WRITABLE = 2,
     MAPPABLE = 4,
     HAS_LOW_LIMIT = 8,
-    HAS_HIGH_LIMIT = 16
+    HAS_HIGH_LIMIT = 16,
+    NODE_RELATIVE = 32 /* the node-ID is added to the initial value ("$NODEID+0x180" of an EDS) */
 };
 
 /* One sub-index. The table is sorted by index and sub-index. */
@@ -39,6 +40,7 @@ struct dictionary {
     const struct object *objects;
     size_t count;
     uint64_t *values; /* bits of the numbers, zero-extended, in the order of `objects`; hot: PDOs use it directly */
+    uint8_t node_id;
 };
 
 /* SDO abort codes (CiA 301, table 22), as far as this stack uses them; 0 is success. */

@@ -69,10 +69,10 @@ uint32_t heartbeat_check_entry(uint64_t entry, const uint64_t *others, uint8_t c
     return ABORT_NONE;
 }
 
-bool heartbeat_is_watched(const struct heartbeat_consumer *consumer, uint16_t cob_id)
+bool heartbeat_is_watched(const struct heartbeat_consumer *consumer, uint32_t cob_id)
 {
     for (uint8_t i = 0; i < WATCHED_NODES_MAX; i++)
-        if (consumer->nodes[i].node != 0 && HEARTBEAT_COB_ID + consumer->nodes[i].node == cob_id)
+        if (consumer->nodes[i].node != 0 && cob_id - HEARTBEAT_COB_ID == consumer->nodes[i].node)
             return true;
     return false;
 }

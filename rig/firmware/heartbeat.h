@@ -49,7 +49,7 @@ void heartbeat_watch(struct heartbeat_consumer *consumer, const uint64_t *entrie
 uint32_t heartbeat_check_entry(uint64_t entry, const uint64_t *others, uint8_t count);
 
 /* Whether a frame is a heartbeat of a watched node. */
-bool heartbeat_is_watched(const struct heartbeat_consumer *consumer, uint16_t cob_id);
+bool heartbeat_is_watched(const struct heartbeat_consumer *consumer, uint32_t cob_id);
 
 /* A heartbeat or boot-up of a watched node came. True if the node was not heard before, or was lost. */
 bool heartbeat_receive(struct heartbeat_consumer *consumer, const struct frame *frame);

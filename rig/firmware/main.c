@@ -4,9 +4,9 @@
  */
 #include <stdio.h>
 #include <stdlib.h>
-#include <string.h>
 
 #include "controller.h"
+#include "options.h"
 #include "serve.h"
 
 static void receive(void *context, const struct frame *frame)
@@ -22,8 +22,9 @@ static void tick(void *context, int64_t t_ns)
 int main(int count, char **words)
 {
     static struct controller controller;
-    const bool has_parent = count == 4 && strcmp(words[2], "--parent") == 0;
-    if (count != 2 && !has_parent) {
+    const char *bus, *parent = "0";
+    const struct option options[] = {{"--parent", &parent}, {NULL, NULL}};
+    if (!read_options(count, words, &bus, options)) {
         fprintf(stderr, "usage: controller BUS [--parent PID]; BUS is socketcan:INTERFACE or udp_multicast[:GROUP]\n");
         return 2;
     }
@@ -31,5 +32,5 @@ int main(int count, char **words)
         fprintf(stderr, "controller: the object table is inconsistent\n");
         return 2;
     }
-    return serve_node((struct node){&controller, receive, tick}, words[1], has_parent ? atol(words[3]) : 0);
+    return serve_node((struct node){&controller, receive, tick}, bus, atol(parent));
 }

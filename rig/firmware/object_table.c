@@ -35,7 +35,7 @@ const struct object OBJECT_TABLE[OBJECT_COUNT] = {
     /* Manufacturer software version */
     {0x100A, 0x00, KIND_TEXT, 0, READABLE, 0, 0, 0, "1", 1},
     /* COB-ID EMCY */
-    {0x1014, 0x00, KIND_UNSIGNED, 4, READABLE, 0x82u, 0, 0, NULL, 0},
+    {0x1014, 0x00, KIND_UNSIGNED, 4, READABLE | NODE_RELATIVE, 0x80u, 0, 0, NULL, 0},
     /* Highest sub-index supported */
     {0x1016, 0x00, KIND_UNSIGNED, 1, READABLE, 0x1u, 0, 0, NULL, 0},
     /* Consumer heartbeat time 1 */
@@ -59,9 +59,9 @@ const struct object OBJECT_TABLE[OBJECT_COUNT] = {
     /* Highest sub-index supported */
     {0x1200, 0x00, KIND_UNSIGNED, 1, READABLE, 0x2u, 0, 0, NULL, 0},
     /* COB-ID client to server (rx) */
-    {0x1200, 0x01, KIND_UNSIGNED, 4, READABLE, 0x602u, 0, 0, NULL, 0},
+    {0x1200, 0x01, KIND_UNSIGNED, 4, READABLE | NODE_RELATIVE, 0x600u, 0, 0, NULL, 0},
     /* COB-ID server to client (tx) */
-    {0x1200, 0x02, KIND_UNSIGNED, 4, READABLE, 0x582u, 0, 0, NULL, 0},
+    {0x1200, 0x02, KIND_UNSIGNED, 4, READABLE | NODE_RELATIVE, 0x580u, 0, 0, NULL, 0},
     /* Highest sub-index supported */
     {0x1400, 0x00, KIND_UNSIGNED, 1, READABLE, 0x2u, 0, 0, NULL, 0},
     /* COB-ID used by PDO */
@@ -91,7 +91,7 @@ const struct object OBJECT_TABLE[OBJECT_COUNT] = {
     /* Highest sub-index supported */
     {0x1800, 0x00, KIND_UNSIGNED, 1, READABLE, 0x2u, 0, 0, NULL, 0},
     /* COB-ID used by PDO */
-    {0x1800, 0x01, KIND_UNSIGNED, 4, READABLE | WRITABLE, 0x182u, 0, 0, NULL, 0},
+    {0x1800, 0x01, KIND_UNSIGNED, 4, READABLE | WRITABLE | NODE_RELATIVE, 0x180u, 0, 0, NULL, 0},
     /* Transmission type */
     {0x1800, 0x02, KIND_UNSIGNED, 1, READABLE | WRITABLE, 0xFFu, 0, 0, NULL, 0},
     /* Number of mapped objects */

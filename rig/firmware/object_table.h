@@ -1,4 +1,4 @@
-/* Objects of node 2, generated from dbc/node2.eds by object_table.py: do not edit. */
+/* Objects of a node, generated from node2.eds by object_table.py: do not edit. */
 #ifndef OBJECT_TABLE_H
 #define OBJECT_TABLE_H
 

@@ -114,7 +114,7 @@ void pdos_forget(struct pdos *pdos)
         forget_tpdo(&pdos->tpdos[i]);
 }
 
-struct rpdo *pdos_find_rpdo(struct pdos *pdos, uint16_t cob_id)
+struct rpdo *pdos_find_rpdo(struct pdos *pdos, uint32_t cob_id)
 {
     for (uint8_t i = pdos->rpdo_count; i-- > 0;) /* of two with one COB-ID the last */
         if (pdos->rpdos[i].is_valid && pdos->rpdos[i].cob_id == cob_id)

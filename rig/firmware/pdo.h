@@ -63,7 +63,7 @@ void pdos_configure(struct pdos *pdos);
 void pdos_forget(struct pdos *pdos);
 
 /* The RPDO with that COB-ID, NULL if there is none. */
-struct rpdo *pdos_find_rpdo(struct pdos *pdos, uint16_t cob_id);
+struct rpdo *pdos_find_rpdo(struct pdos *pdos, uint32_t cob_id);
 
 /* A frame for an RPDO came. True if its values are in the dictionary: the RPDO is asynchronous. */
 bool rpdo_receive(struct pdos *pdos, struct rpdo *rpdo, const struct frame *frame);

@@ -12,11 +12,11 @@ enum port_result { PORT_GONE = -1, PORT_NOTHING = 0, PORT_FRAME = 1 };
 struct port {
     /* Connect to a channel: an interface, a group, a pin. False with a message on standard error if that fails. */
     bool (*open)(const char *channel);
-    /* Wait for a frame until `until_ns` by this port's clock. Frames that are not classical data frames with an 11-bit
-     * identifier, and the node's own, are left out. */
+    /* Wait for a frame until `until_ns` by this port's clock. Frames that are not classical data frames, and the node's
+     * own, are left out. */
     enum port_result (*receive)(struct frame *frame, int64_t until_ns);
     /* Put a frame on the bus without waiting; a full transmit queue drops it. False if the bus is gone. */
-    bool (*send)(uint16_t cob_id, const uint8_t *data, uint8_t length);
+    bool (*send)(uint32_t cob_id, const uint8_t *data, uint8_t length);
     /* Time since any fixed moment, ns; never goes back. */
     int64_t (*now)(void);
     void (*close)(void);

@@ -15,7 +15,7 @@ static int can = -1; /* the socket */
 
 static bool report(const char *channel, const char *what)
 {
-    fprintf(stderr, "controller: socketcan:%s: %s: %s\n", channel, what, strerror(errno));
+    fprintf(stderr, "socketcan:%s: %s: %s\n", channel, what, strerror(errno));
     return false;
 }
 
@@ -24,7 +24,7 @@ static bool open_interface(const char *channel)
     can = socket(PF_CAN, SOCK_RAW, CAN_RAW);
     if (can < 0)
         return report(channel, "no CAN socket");
-    const struct can_filter data_frames = {0, CAN_EFF_FLAG | CAN_RTR_FLAG}; /* 11-bit identifier, not remote */
+    const struct can_filter data_frames = {0, CAN_RTR_FLAG}; /* no remote frames */
     setsockopt(can, SOL_CAN_RAW, CAN_RAW_FILTER, &data_frames, sizeof data_frames);
     enlarge_receive_buffer(can);
     struct sockaddr_can address;
@@ -52,13 +52,13 @@ static enum port_result receive(struct frame *frame, int64_t until_ns)
     if (count != (ssize_t)sizeof raw || raw.can_dlc > 8)
         return PORT_NOTHING;
     frame->t_ns = read_clock();
-    frame->cob_id = raw.can_id & CAN_SFF_MASK;
+    frame->cob_id = raw.can_id; /* CAN_EFF_FLAG is ID_EXTENDED */
     frame->length = raw.can_dlc;
     memcpy(frame->data, raw.data, 8);
     return PORT_FRAME;
 }
 
-static bool send_frame(uint16_t cob_id, const uint8_t *data, uint8_t length)
+static bool send_frame(uint32_t cob_id, const uint8_t *data, uint8_t length)
 {
     struct can_frame raw;
     memset(&raw, 0, sizeof raw);

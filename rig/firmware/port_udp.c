@@ -19,7 +19,7 @@ static struct sockaddr_in destination, own;
 
 static bool report(const char *channel, const char *what)
 {
-    fprintf(stderr, "controller: udp_multicast:%s: %s: %s\n", channel, what, strerror(errno));
+    fprintf(stderr, "udp_multicast:%s: %s: %s\n", channel, what, strerror(errno));
     return false;
 }
 
@@ -86,7 +86,7 @@ static enum port_result receive(struct frame *frame, int64_t until_ns)
     }
 }
 
-static bool send_frame(uint16_t cob_id, const uint8_t *data, uint8_t length)
+static bool send_frame(uint32_t cob_id, const uint8_t *data, uint8_t length)
 {
     uint8_t bytes[DATAGRAM_MAX];
     struct frame frame = {0, cob_id, length, {0}};

@@ -23,7 +23,7 @@ static void end(int number)
     is_ended = 1;
 }
 
-static void send_frame(void *context, uint16_t cob_id, const uint8_t *data, uint8_t length)
+static void send_frame(void *context, uint32_t cob_id, const uint8_t *data, uint8_t length)
 {
     (void)context;
     if (!port->send(cob_id, data, length))
@@ -49,7 +49,7 @@ static const char *choose_port(const char *bus)
         if (bus[length] == '\0' && ports[i].channel != NULL)
             return ports[i].channel;
     }
-    fprintf(stderr, "controller: bus: expected socketcan:INTERFACE or udp_multicast[:GROUP], not %s\n", bus);
+    fprintf(stderr, "bus: expected socketcan:INTERFACE or udp_multicast[:GROUP], not %s\n", bus);
     return NULL;
 }
 
@@ -96,6 +96,6 @@ int serve_node(struct node node, const char *bus, long parent)
     run(node, parent);
     port->close();
     if (is_bus_gone)
-        fprintf(stderr, "controller: %s: the bus is gone\n", bus);
+        fprintf(stderr, "%s: the bus is gone\n", bus);
     return is_bus_gone ? 1 : 0;
 }

@@ -26,7 +26,7 @@ from rig.network.node_objects import GAINS, Gains
 SUPPORT = Path(__file__).parent / "firmware"
 STRICT = (*FLAGS, "-Werror")
 UNDEFINED = ("-g", "-fsanitize=undefined", "-fno-sanitize-recover=all")
-NEEDS_A_BUS = ("main.c", "serve.c", "port_socketcan.c", "port_udp.c", "turn.c", "wait.c")
+NEEDS_A_BUS = ("main.c", "options.c", "serve.c", "port_socketcan.c", "port_udp.c", "turn.c", "wait.c")
 DOMAIN_BYTES = 1 << 20
 
 _KINDS = {"f": 2, "d": 2, **dict.fromkeys("bhiq", 1)}
@@ -42,18 +42,18 @@ class _Object(ctypes.Structure):
 
 class _Dictionary(ctypes.Structure):
     _fields_ = [("objects", ctypes.POINTER(_Object)), ("count", ctypes.c_size_t),
-                ("values", ctypes.POINTER(ctypes.c_uint64))]  # fmt: skip
+                ("values", ctypes.POINTER(ctypes.c_uint64)), ("node_id", ctypes.c_uint8)]  # fmt: skip
 
 
 class CFrame(ctypes.Structure):
     """`struct frame`."""
 
-    _fields_ = [("t_ns", ctypes.c_int64), ("cob_id", ctypes.c_uint16), ("length", ctypes.c_uint8),
+    _fields_ = [("t_ns", ctypes.c_int64), ("cob_id", ctypes.c_uint32), ("length", ctypes.c_uint8),
                 ("data", ctypes.c_uint8 * 8)]  # fmt: skip
 
 
 _Bytes = ctypes.POINTER(ctypes.c_uint8)
-_SendFunction = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_uint16, _Bytes, ctypes.c_uint8)
+_SendFunction = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_uint32, _Bytes, ctypes.c_uint8)
 _Plain = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 _Numbered = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_uint16)
 _Write = ctypes.CFUNCTYPE(ctypes.c_uint32, ctypes.c_void_p, ctypes.c_uint16, ctypes.c_uint8, _Bytes, ctypes.c_uint32)
@@ -220,7 +220,7 @@ class CDevice(_View):
             None, self._make_hook(_Plain, "on_sync"), self._make_hook(_Numbered, "on_rpdo"), _Write(self._write_object),
             self._make_hook(_Change, "on_nmt", NmtState), self._make_hook(_Plain, "on_sync_lost"),
             self._make_hook(_Node, "on_heartbeat_lost"))
-        table = _Dictionary(self._kept[0], len(objects), self._kept[1])
+        table = _Dictionary(self._kept[0], len(objects), self._kept[1], 0)
         if not stack.call("device_init", node_id, table, stack.output, self._hooks, self._kept[2], DOMAIN_BYTES):
             Device(node_id, eds_path, send)  # must refuse it too, and says why
             raise AssertionError(f"the Python stack accepts {eds_path}")

@@ -20,7 +20,7 @@ from rig.nodes.firmware import Firmware
 RECORD = struct.Struct("<qHB8s")
 TICK = 0xFFFF
 MS = 1_000_000  # ns
-NEEDS_A_BUS = ("main.c", "serve.c", "port_socketcan.c", "port_udp.c", "turn.c", "wait.c", "datagram.c")
+NEEDS_A_BUS = ("main.c", "options.c", "serve.c", "port_socketcan.c", "port_udp.c", "turn.c", "wait.c", "datagram.c")
 
 
 def make_script(seed: int, length: int) -> list[Frame]:

@@ -70,7 +70,7 @@ static bool spoil_drive(uint8_t *drive)
     return !(has("missed_cycles") && drives % 50 == 0);
 }
 
-static void send_spoiled(void *context, uint16_t cob_id, const uint8_t *data, uint8_t length)
+static void send_spoiled(void *context, uint32_t cob_id, const uint8_t *data, uint8_t length)
 {
     uint8_t spoiled[8] = {0};
     memcpy(spoiled, data, length);

@@ -13,7 +13,7 @@ enum { RECORD = 19, TICK = 0xFFFF };
 
 static uint8_t record[RECORD];
 
-static void write_record(void *context, uint16_t cob_id, const uint8_t *data, uint8_t length)
+static void write_record(void *context, uint32_t cob_id, const uint8_t *data, uint8_t length)
 {
     uint8_t sent[RECORD] = {0};
     (void)context;
