@@ -1,0 +1,90 @@
+"""Control and status words of the profiles, against the tables of the canopen library."""
+from __future__ import annotations
+
+import pytest
+from canopen.profiles.p402 import State402
+
+from rig.benches.profiles import (
+    CIA402,
+    CIA408,
+    PROFILES,
+    TRANSITIONS,
+    State,
+    choose_control,
+    find_state,
+    find_wanted,
+)
+from rig.network.codec import Control, Status
+
+NAMES = {"NOT READY TO SWITCH ON": State.NOT_READY, "SWITCH ON DISABLED": State.OFF,
+         "READY TO SWITCH ON": State.READY, "SWITCHED ON": State.ON, "OPERATION ENABLED": State.ACTIVE,
+         "QUICK STOP ACTIVE": State.QUICK_STOP, "FAULT REACTION ACTIVE": State.FAULT_REACTION, "FAULT": State.FAULT}
+TABLE = {(NAMES[before], NAMES[after]): word for (before, after), word in State402.TRANSITIONTABLE.items()
+         if before != "START"}
+WORDS_402 = {state: next(value for mask, value, row in CIA402.states if row == state) for state in NAMES.values()}
+
+
+def test_the_states_of_cia_402_are_those_of_the_canopen_library() -> None:
+    for word in range(1 << 16):
+        expected = [state for name, state in NAMES.items()
+                    if word & State402.SW_MASK[name][0] == State402.SW_MASK[name][1]]
+        assert find_state(CIA402, word) == (expected[0] if expected else State.UNKNOWN), hex(word)
+
+
+def test_the_control_words_of_cia_402_are_those_of_the_canopen_library() -> None:
+    named = State402.CW_COMMANDS_CODE
+    assert CIA402.ladder == tuple(named[name] for name in ("DISABLE VOLTAGE", "READY TO SWITCH ON", "SWITCHED ON",
+                                                          "OPERATION ENABLED"))
+    assert CIA402.quick_stop == named["QUICK STOP ACTIVE"] and CIA402.reset == named["SWITCH ON DISABLED"]
+    for wanted, word in enumerate(CIA402.ladder):
+        assert find_wanted(CIA402, word) == wanted
+    assert find_wanted(CIA402, CIA402.quick_stop) == State.QUICK_STOP
+
+
+def test_the_transitions_of_cia_402_are_those_of_the_canopen_library() -> None:
+    assert {(before, after) for before, after, _ in TRANSITIONS.values()} == set(TABLE)
+    for before, after, wanted in TRANSITIONS.values():
+        if wanted is State.FAULT:
+            assert TABLE[before, after] == CIA402.reset
+        elif wanted is not None:
+            assert find_wanted(CIA402, TABLE[before, after]) == wanted
+
+
+@pytest.mark.parametrize("start", NAMES.values())
+@pytest.mark.parametrize("wanted", [State.OFF, State.READY, State.ON, State.ACTIVE])
+def test_every_state_is_reached_from_every_other_one(start: State, wanted: State) -> None:
+    state, word = start, 0
+    for _ in range(8):
+        word = choose_control(CIA402, wanted, find_state(CIA402, WORDS_402[state]), word, resets=True)
+        automatic = {(before, after) for before, after, asked in TRANSITIONS.values() if asked is None}
+        state = next((after for (before, after), needed in TABLE.items()
+                      if before == state and (needed == word or (before, after) in automatic)), state)
+    assert state == wanted
+
+
+def test_quick_stop_is_asked_for_directly() -> None:
+    assert choose_control(CIA402, State.QUICK_STOP, State.ACTIVE) == TABLE[State.ACTIVE, State.QUICK_STOP]
+
+
+def test_a_fault_is_acknowledged_by_a_rising_edge_and_only_where_asked_for() -> None:
+    for words in (CIA402, CIA408):
+        first = choose_control(words, State.ACTIVE, State.FAULT, 0, resets=True)
+        second = choose_control(words, State.ACTIVE, State.FAULT, first, resets=True)
+        assert first == words.reset and second & words.reset == 0
+        assert choose_control(words, State.ACTIVE, State.FAULT) == words.ladder[0]
+
+
+def test_the_words_of_cia_408_are_those_of_the_bus_page() -> None:
+    assert CIA408.ladder == (0, Control.DISABLE, Control.DISABLE | Control.HOLD, Control.ACTIVE)
+    assert CIA408.reset == Control.RESET and find_state(CIA408, Status.ACTIVE) == State.ACTIVE
+    status, sent = 0, []
+    for _ in range(6):  # the device confirms each word, and wakes up in fault
+        sent.append(choose_control(CIA408, State.ACTIVE, find_state(CIA408, status), resets=True))
+        status = int(Status.READY) | sent[-1] & 7
+    assert sent == [8, 1, 3, 7, 7, 7]
+
+
+def test_a_device_without_a_control_word_is_always_active() -> None:
+    words = PROFILES["none"]
+    assert find_state(words, 0) == find_wanted(words, 0) == State.ACTIVE
+    assert choose_control(words, State.ACTIVE, State.ACTIVE) == 0
