@@ -6,17 +6,18 @@ import socket
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import can
 
 from plant.errors import InputError, RigError
 from rig.network.can_interface import UdpBus
-from rig.network.frame import Frame, Node, Send
+from rig.network.frame import BIT_RATE_SWITCH, Frame, Node, Send
 from rig.network.udp import GROUP, is_group
 
 BUS_VARIABLE = "EHA_RIG_BUS"  # environment: what `auto` takes
-BITRATE = 1_000_000  # bit/s
+BITRATE, _DATA_BITRATE = 1_000_000, 4_000_000  # bit/s; the second of CAN FD, in advice
+_FD_MTU = 72  # bytes of struct canfd_frame, linux/can.h
 _NETWORK = Path("/sys/class/net")
 _ARPHRD_CAN = "280"
 _SPECS = "auto, embedded, virtual[:NAME], udp_multicast[:GROUP], socketcan:INTERFACE or a python-can INTERFACE:CHANNEL"
@@ -65,7 +66,7 @@ class EmbeddedBus:
         queue, count = self._queue, 0
         while queue:
             others, cob_id, data = queue.popleft()
-            frame = Frame(t_ns, cob_id, data)
+            frame = Frame(t_ns, cob_id & ~BIT_RATE_SWITCH, data)
             for receive in others:
                 receive(frame)
             count += 1
@@ -91,9 +92,12 @@ def choose_bus(spec: str = "auto") -> tuple[str, str]:
     return taken, f"{taken}, as {BUS_VARIABLE} says" if where == BUS_VARIABLE else f"{taken}, as asked"
 
 
-def open_can(spec: str) -> can.BusABC:
+def open_can(spec: str, bitrate: int = BITRATE, fd: bool = False) -> can.BusABC:
     """Open a python-can bus: `virtual[:NAME]`, `udp_multicast[:GROUP]` (this machine only), `socketcan:INTERFACE`, or
-    any other interface python-can knows, at 1 Mbit/s.
+    any other interface python-can knows, at `bitrate` bit/s. A kernel's interface keeps the rates that it was set to.
+
+    `fd`: also for CAN FD frames. The bit timing that some adapters need for it is read from python-can's own
+    configuration file.
 
     Raises InputError for a bad spec, RigError if the bus cannot be opened.
     """
@@ -101,13 +105,14 @@ def open_can(spec: str) -> can.BusABC:
     if kind == "embedded":
         raise InputError("--bus", spec, "a bus between programs, such as udp_multicast or socketcan:vcan0")
     if kind == "socketcan":
-        require_interface(channel)
+        require_interface(channel, fd)
     try:
         if kind == "virtual":
             return can.Bus(interface="virtual", channel=channel)
         if kind == "udp_multicast":
             return UdpBus(channel)
-        return can.Bus(interface=kind, channel=channel, bitrate=BITRATE)
+        options: dict[str, Any] = {"fd": True} if fd else {}  # not every interface knows the option
+        return can.Bus(interface=kind, channel=channel, bitrate=bitrate, **options)
     except (can.CanError, OSError, ImportError, ValueError) as error:
         raise RigError(f"{spec}: {error}".replace("\n", " ")) from error
 
@@ -119,8 +124,8 @@ def list_can_interfaces() -> list[str]:
     return [name for name in names if not explain_socketcan_problem(name)]
 
 
-def explain_socketcan_problem(interface: str) -> str:
-    """Why a kernel CAN interface cannot be used and how to get it, in one line; empty if it can."""
+def explain_socketcan_problem(interface: str, fd: bool = False) -> str:
+    """Why a kernel CAN interface cannot be used and how to get it, in one line; empty if it can. `fd`: for CAN FD."""
     virtual = interface.startswith("vcan")
     up = f"sudo ip link set {interface} up" + ("" if virtual else f" type can bitrate {BITRATE}")
     try:
@@ -135,12 +140,15 @@ def explain_socketcan_problem(interface: str) -> str:
         return f"{interface} is not a CAN interface"
     if not int((folder / "flags").read_text(), 16) & 1:  # IFF_UP
         return f"{interface} is down; {up}"
+    if fd and int((folder / "mtu").read_text()) < _FD_MTU:
+        fast = f"sudo ip link set {interface} mtu {_FD_MTU} up" if virtual else f"{up} dbitrate {_DATA_BITRATE} fd on"
+        return f"{interface} is set to classical CAN, not to CAN FD; sudo ip link set {interface} down && {fast}"
     return ""
 
 
-def require_interface(interface: str) -> None:
-    """Raise RigError unless this kernel CAN interface can be used."""
-    problem = explain_socketcan_problem(interface)
+def require_interface(interface: str, fd: bool = False) -> None:
+    """Raise RigError unless this kernel CAN interface can be used; `fd`: for CAN FD."""
+    problem = explain_socketcan_problem(interface, fd)
     if problem:
         raise RigError(f"socketcan:{interface}: {problem}")
 

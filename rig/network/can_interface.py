@@ -34,18 +34,20 @@ class UdpBus(can.BusABC):
         channel: the multicast group, as in `rig run --bus udp_multicast:GROUP`; default: that of `--bus udp_multicast`.
         port: UDP port.
         can_filters: as in python-can; frames are filtered in this process.
-        options: bit rate and others are accepted and mean nothing here; receive_own_messages and fd must be off.
+        options: bit rate, fd and others are accepted and mean nothing here: the bus carries classical frames and CAN FD
+            frames. receive_own_messages must be off.
 
     Raises:
         can.CanInitializationError: no multicast group, an option that the bus does not have, or no sockets.
     """
 
+    _can_protocol = can.CanProtocol.CAN_FD
+
     def __init__(self, channel: str | None = None, port: int = PORT,
                  can_filters: can.typechecking.CanFilters | None = None, **options: Any) -> None:
         group = channel or GROUP
-        for name in ("receive_own_messages", "fd"):
-            if options.get(name):
-                raise can.CanInitializationError(f"eha_rig_udp: {name} is not possible on this bus")
+        if options.get("receive_own_messages"):
+            raise can.CanInitializationError("eha_rig_udp: receive_own_messages is not possible on this bus")
         if not is_group(group):
             raise can.CanInitializationError(f"eha_rig_udp: channel: {group}: expected an IPv4 multicast group")
         self.channel_info = f"udp_multicast {group}:{port} on the loopback interface"

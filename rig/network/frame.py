@@ -1,19 +1,32 @@
-"""One CAN frame, as nodes see it: bytes and a time, never a socket or a clock."""
+"""One CAN frame, as nodes see it: bytes and a time, never a socket or a clock.
+
+One integer, the COB-ID, says everywhere which frame it is: the identifier, with `EXTENDED` if it has 29 bits and with
+`FD_FRAME` if it is a CAN FD frame. 0x123, 0x123 | EXTENDED and 0x123 | FD_FRAME are three different frames. A plain
+11-bit number is a classical frame.
+"""
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
+EXTENDED = 0x80000000  # in a COB-ID: the identifier has 29 bits, as CAN_EFF_FLAG in Linux's can_id
+FD_FRAME = 0x40000000  # a CAN FD frame, of up to 64 bytes
+# A CAN FD frame whose data go at the higher bit rate. It is set to send such a frame, and stands in logs of others. A
+# bus leaves it out of the frames that it delivers: with it or without it, a frame is the same frame.
+BIT_RATE_SWITCH = 0x20000000
+IDENTIFIER = 0x1FFFFFFF  # the bits of the identifier itself
+FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)  # bytes of the CAN FD frames that are longer than a classical frame
+
 
 class Frame(NamedTuple):
-    """A classical CAN data frame with an 11-bit identifier."""
+    """A CAN data frame: classical or CAN FD, with an identifier of 11 or 29 bits."""
 
     t_ns: int  # ns since the run began; virtual in lockstep
-    cob_id: int
+    cob_id: int  # with EXTENDED and FD_FRAME
     data: bytes
 
 
-Send = Callable[[int, bytes], None]  # (COB-ID, data)
+Send = Callable[[int, bytes], None]  # (COB-ID, data); also with BIT_RATE_SWITCH
 
 
 class Node(Protocol):
@@ -24,3 +37,8 @@ class Node(Protocol):
 
     def tick(self, t_ns: int) -> None:
         """Run what is due at `t_ns`: heartbeats, timeouts, delayed frames."""
+
+
+def has_valid_length(cob_id: int, length: int) -> bool:
+    """Whether a frame of this kind can have `length` bytes: 0 to 8, in CAN FD also those of `FD_LENGTHS`."""
+    return 0 <= length <= 8 or (cob_id & FD_FRAME != 0 and length in FD_LENGTHS)

@@ -5,6 +5,7 @@ import errno
 import select
 import socket
 import struct
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -16,17 +17,19 @@ from plant.errors import RigError
 from rig.network.bus import EmbeddedBus
 from rig.network.can_interface import UdpBus
 from rig.network.clock import Clock, WallClock
-from rig.network.frame import Frame, Node, Send
+from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, IDENTIFIER, Frame, Node, Send, has_valid_length
+from rig.network.message import find_cob_id, make_message
 from rig.network.udp import SO_RXQ_OVFL, SO_TIMESTAMPNS, set_receive_options
 
-_CAN_FRAME = struct.Struct("=IB3x8s")  # linux/can.h
+_CAN_FRAME, _CANFD_FRAME = struct.Struct("=IBxxx8s"), struct.Struct("=IBBxx64s")  # linux/can.h
+_SWITCHED = 1  # CANFD_BRS
 _TIMESPEC = struct.Struct("@qq")
-_EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
+_REMOTE, _ERROR = 0x40000000, 0x20000000  # in the kernel's can_id
 _CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
 _ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(4)
 _FILTER = struct.Struct("=II")  # struct can_filter: identifier, mask
 _SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_JOIN_FILTERS = 101, 1, 6  # linux/can/raw.h
-_INVERTED, _IDENTIFIER = 0x20000000, 0x7FF
+_INVERTED = 0x20000000
 _QUEUE_FULL = (errno.ENOBUFS, errno.EAGAIN)
 
 
@@ -34,7 +37,8 @@ class Link:
     """Frames of one bus, with the times of `clock` (ns since the run began). The link owns the bus.
 
     Counted, to be read at any time: `error_frames` of the controller; `overflows`, frames lost on the way in;
-    `dropped`, frames that are not classical 11-bit data frames; `unsent`, frames the full transmit queue refused.
+    `dropped`, remote frames; `unsent`, frames the full transmit queue refused. On socketcan CAN FD frames come, and can
+    be sent, if the bus was opened with fd=True.
     """
 
     def __init__(self, bus: can.BusABC, clock: Callable[[], int]) -> None:
@@ -54,13 +58,19 @@ class Link:
         return self._in_controller + self._in_kernel + int(getattr(self._bus, "overflows", 0))
 
     def send(self, cob_id: int, data: bytes) -> None:
-        """Put one frame on the bus. Raises RigError when the bus is gone."""
+        """Put one frame on the bus. Raises RigError when the bus is gone, and for a length that such a frame lacks."""
+        if not has_valid_length(cob_id, len(data)):
+            raise RigError(f"frame 0x{cob_id & IDENTIFIER:03X}: {len(data)} bytes; a CAN frame has 0 to 8, a CAN FD "
+                           "frame also 12, 16, 20, 24, 32, 48 or 64")
+        identifier = cob_id & (EXTENDED | IDENTIFIER)
         try:
-            if self._socket is not None:
-                frame = _CAN_FRAME.pack(cob_id, len(data), data)
-                self._socket.send(frame, socket.MSG_DONTWAIT)
+            if self._socket is None:
+                self._bus.send(make_message(cob_id, data))
+            elif cob_id & FD_FRAME:
+                flags = _SWITCHED if cob_id & BIT_RATE_SWITCH else 0
+                self._socket.send(_CANFD_FRAME.pack(identifier, len(data), flags, data), socket.MSG_DONTWAIT)
             else:
-                self._bus.send(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
+                self._socket.send(_CAN_FRAME.pack(identifier, len(data), data), socket.MSG_DONTWAIT)
         except OSError as error:
             if error.errno not in _QUEUE_FULL:
                 raise RigError(f"{self._bus.channel_info}: {error.strerror}") from error
@@ -87,19 +97,19 @@ class Link:
         self._set_filters()
 
     def select_nodes(self, most: int | None) -> None:
-        """Receive only the frames of nodes 0 to `most`, a power of two less one; None: all frames.
+        """Receive only the frames of CANopen nodes 0 to `most`, a power of two less one; None: all frames.
 
         On socketcan the kernel drops the others, so that their number does not matter.
         """
-        self._foreign = 0 if most is None else 0x7F & ~most
+        self._foreign = 0 if most is None else EXTENDED | 0x7F & ~most
         self._set_filters()
 
     def _set_filters(self) -> None:
         if isinstance(self._bus, UdpBus):
             self._bus.leave_out(sorted(self._left_out))
         elif self._socket is not None:
-            exact = _IDENTIFIER | _EXTENDED | _REMOTE
-            filters = [_FILTER.pack(cob_id | _INVERTED, exact) for cob_id in sorted(self._left_out)]
+            exact = IDENTIFIER | EXTENDED | _REMOTE
+            filters = [_FILTER.pack(cob_id & ~FD_FRAME | _INVERTED, exact) for cob_id in sorted(self._left_out)]
             filters += [_FILTER.pack(0, self._foreign)] if self._foreign else []
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, int(bool(filters)))
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"".join(filters) or _FILTER.pack(0, 0))
@@ -113,10 +123,14 @@ class Link:
         for message in self._take_messages(timeout):
             if message.is_error_frame:
                 self.error_frames += 1
-            elif message.is_extended_id or message.is_remote_frame or message.is_fd:
+                continue
+            cob_id = find_cob_id(message) & ~BIT_RATE_SWITCH
+            if message.is_remote_frame:
                 self.dropped += 1
-            elif message.arbitration_id not in self._left_out and not message.arbitration_id & self._foreign:
-                frames.append(Frame(self._clock(), message.arbitration_id, bytes(message.data)))
+            elif not has_valid_length(cob_id, len(message.data)):
+                self.error_frames += 1
+            elif cob_id not in self._left_out and not cob_id & self._foreign:
+                frames.append(Frame(self._clock(), cob_id, bytes(message.data)))
         return frames
 
     def _take_messages(self, timeout: float) -> Iterator[can.Message]:
@@ -135,7 +149,7 @@ class Link:
         epoch = self._find_epoch()  # the kernel stamps with the wall clock
         while True:
             try:
-                data, ancillary, _, _ = raw.recvmsg(_CAN_FRAME.size, _ANCILLARY, socket.MSG_DONTWAIT)
+                data, ancillary, _, _ = raw.recvmsg(_CANFD_FRAME.size, _ANCILLARY, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 return frames
             t_ns = self._clock()
@@ -146,14 +160,15 @@ class Link:
                 elif kind == SO_RXQ_OVFL:
                     self._in_kernel = int.from_bytes(value, "little")
             self._latest = t_ns
-            identifier, length, payload = _CAN_FRAME.unpack(data)
-            if identifier < _ERROR:
-                frames.append(Frame(t_ns, identifier, payload[:length]))
-            elif identifier & _ERROR:
+            identifier, length, payload = int.from_bytes(data[:4], sys.byteorder), data[4], data[8:]
+            if identifier & _ERROR:
                 self.error_frames += 1
                 self._in_controller += bool(identifier & _CONTROLLER and payload[1] & _RX_OVERFLOW)
-            else:
+            elif identifier & _REMOTE:
                 self.dropped += 1
+            else:
+                kind = FD_FRAME if len(data) == _CANFD_FRAME.size else 0
+                frames.append(Frame(t_ns, identifier | kind, payload[:length]))
 
     def _find_epoch(self) -> int:
         """Wall clock minus the link's clock, ns. A thread that is interrupted between the two reads them again."""

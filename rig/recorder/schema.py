@@ -43,10 +43,10 @@ def _describe_field(text: str, unit: str = "", **kw: Any) -> Any:
 
 @dataclass(slots=True)
 class CanFrame:
-    """A raw classical CAN frame; its time is the log time."""
+    """A raw CAN frame; its time is the log time."""
 
-    cob_id: U32 = _describe_field("11-bit identifier")
-    data: bytes = _describe_field("0-8 bytes")
+    cob_id: U32 = _describe_field("identifier; bit 31: extended, 30: FD, 29: BRS")
+    data: bytes = _describe_field("0-64 bytes")
 
 
 @dataclass(slots=True)
@@ -186,7 +186,7 @@ def make_packer(record: type) -> Callable[[int, Any], bytes]:
 
 def _make_frame_packer(pack_head: Callable[..., bytes], args: list[int], size: int) -> Callable[[int, Any], bytes]:
     opcode, _, channel, sequence, _, _, tag, _ = args
-    tails = [bytes([2 << 3 | 2, n]) for n in range(9)]
+    tails = [bytes([2 << 3 | 2, n]) for n in range(65)]
 
     def pack(t_ns: int, frame: Any) -> bytes:
         data: bytes = frame[2]

@@ -45,8 +45,8 @@ def spec(kind: str) -> str:
 
 
 @contextmanager
-def stations(kind: str, number: int = 3) -> Iterator[list[Station]]:
-    """`number` stations on one new bus, all on one clock that starts at 0."""
+def stations(kind: str, number: int = 3, fd: bool = False) -> Iterator[list[Station]]:
+    """`number` stations on one new bus, all on one clock that starts at 0; `fd`: also for CAN FD frames."""
     begin = time.monotonic_ns()
 
     def clock() -> int:
@@ -58,7 +58,7 @@ def stations(kind: str, number: int = 3) -> Iterator[list[Station]]:
         return
     where = spec(kind)
     with ExitStack() as stack:
-        links = [Link(open_can(where), clock) for _ in range(number)]
+        links = [Link(open_can(where, fd=fd), clock) for _ in range(number)]
         for link in links:
             stack.callback(link.close)
         yield list(links)

@@ -120,7 +120,7 @@ modules=${modules%/net/can}
 for module in net/can/can drivers/net/can/dev/can-dev drivers/net/can/vcan net/can/can-raw net/can/can-bcm; do
   [ -e "$modules/$module.ko" ] && insmod "$modules/$module.ko"
 done
-ip link add dev vcan0 type vcan && ip link set vcan0 txqueuelen 1000 up || power_off
+ip link add dev vcan0 type vcan && ip link set vcan0 mtu 72 txqueuelen 1000 up || power_off
 cp /proc/uptime "$JOB/up"
 # Through a pipe, so that the command does not take the console for a terminal; the status travels as a file.
 ( bash "$JOB/command" </dev/null 2>&1; echo $? >"$JOB/status" ) | cat >/dev/tty0

@@ -14,8 +14,9 @@ from plant.errors import RigError
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.can_interface import UdpBus
-from rig.network.frame import Frame
+from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, Frame
 from rig.network.link import Link
+from rig.network.message import find_cob_id
 from rig.network.udp import PORT
 
 only_socketcan = pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
@@ -37,6 +38,19 @@ class TestEveryBus:
         with stations(bus_kind) as (sender, *others):
             for frame in sent:
                 sender.send(*frame)
+            for station in others:
+                assert contents(gather(station, len(sent))) == sent
+            assert sender.poll(0.02) == []
+
+    def test_wide_identifiers_and_fd_frames_reach_everybody(self, bus_kind: str) -> None:
+        identifiers = [cob_id | wide for cob_id in (0, 0x7F, 0x182, 0x7FF) for wide in (0, EXTENDED)]
+        identifiers += [EXTENDED | 0x800, EXTENDED | 0x18FEF1AB, EXTENDED | 0x1FFFFFFF]
+        sent = [(cob_id, bytes(range(0xF0, 0xF0 + length))) for length in (0, 1, 8) for cob_id in identifiers]
+        sent += [(cob_id | FD_FRAME, data) for cob_id, data in sent]
+        sent += [(cob_id | FD_FRAME, bytes(range(length))) for length in FD_LENGTHS for cob_id in identifiers]
+        with stations(bus_kind, fd=True) as (sender, *others):
+            for cob_id, data in sent:
+                sender.send(cob_id | BIT_RATE_SWITCH if cob_id & FD_FRAME else cob_id, data)
             for station in others:
                 assert contents(gather(station, len(sent))) == sent
             assert sender.poll(0.02) == []
@@ -81,10 +95,12 @@ class TestLink:
     @links
     def test_frames_are_left_out_and_taken_again(self, bus_kind: str) -> None:
         """As another socket of the program receives them."""
-        identifiers = (0x000, 0x07F, 0x080, 0x0FF, 0x182, 0x183, 0x202, 0x7FF)
-        with stations(bus_kind, 2) as (sender, receiver):
+        identifiers = (0x000, 0x07F, 0x080, 0x0FF, 0x182, 0x183, 0x202, 0x7FF, EXTENDED | 0x080, EXTENDED | 0x7F,
+                       EXTENDED | 0x18FEF1AB, EXTENDED | 0x18FEF2AB, FD_FRAME | 0x200, FD_FRAME | EXTENDED | 0x12345)
+        with stations(bus_kind, 2, fd=True) as (sender, receiver):
             assert isinstance(receiver, Link)
-            for left_out in ((0x080, 0x182, 0x000), (), (0x7FF, 0x07F), ()):
+            for left_out in ((0x080, 0x182, 0x000), (), (0x7FF, 0x07F), (), (EXTENDED | 0x080, FD_FRAME | 0x200),
+                             (EXTENDED | 0x18FEF1AB, FD_FRAME | EXTENDED | 0x12345, 0x7F)):
                 receiver.leave_out(left_out)
                 for cob_id in (*identifiers, 0x123):
                     sender.send(cob_id, b"1")
@@ -106,13 +122,49 @@ class TestLink:
         where = spec(bus_kind)
         with open_can(where) as bus, open_can(where) as other:
             link = Link(bus, time.monotonic_ns)
-            other.send(can.Message(arbitration_id=0x12345, is_extended_id=True, data=b"1"))
             other.send(can.Message(arbitration_id=0x123, is_extended_id=False, is_remote_frame=True, dlc=2))
+            other.send(can.Message(arbitration_id=0x123, is_extended_id=True, is_remote_frame=True))
             if bus_kind != "socketcan":  # there the controller makes them
                 other.send(can.Message(is_error_frame=True))
             other.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=b"2"))
             assert contents(gather(link, 1)) == [(0x123, b"2")]
             assert (link.dropped, link.error_frames, link.overflows, link.unsent) == (2, bus_kind != "socketcan", 0, 0)
+
+    @links
+    def test_a_bus_of_python_can_hears_and_sends_the_same(self, bus_kind: str) -> None:
+        where = spec(bus_kind)
+        with open_can(where, fd=True) as bus, open_can(where, fd=True) as other:
+            link = Link(bus, time.monotonic_ns)
+            for flags in ({}, {"is_fd": True}, {"is_fd": True, "bitrate_switch": True}):
+                for is_extended in (False, True):
+                    data = bytes(64 if flags else 8)
+                    sent = can.Message(arbitration_id=0x123, is_extended_id=is_extended, data=data, **flags)
+                    other.send(sent)
+                    (frame,) = gather(link, 1)
+                    assert frame.cob_id == find_cob_id(sent) & ~BIT_RATE_SWITCH and frame.data == data
+                    link.send(find_cob_id(sent), data)
+                    heard = other.recv(60)
+                    assert heard is not None
+                    assert heard.equals(sent, timestamp_delta=None, check_channel=False, check_direction=False)
+
+    @links
+    def test_nodes_are_selected_by_classical_frames(self, bus_kind: str) -> None:
+        with stations(bus_kind, 2) as (sender, receiver):
+            assert isinstance(receiver, Link)
+            receiver.select_nodes(3)
+            for cob_id in (0x183, 0x184, EXTENDED | 0x183, 0x080):
+                sender.send(cob_id, b"")
+            assert [frame.cob_id for frame in gather(receiver, 2)] == [0x183, 0x080]
+            receiver.select_nodes(None)
+            sender.send(EXTENDED | 0x183, b"")
+            assert [frame.cob_id for frame in gather(receiver, 1)] == [EXTENDED | 0x183]
+
+    @links
+    def test_a_length_that_no_such_frame_has_is_refused(self, bus_kind: str) -> None:
+        with stations(bus_kind, 1, fd=True) as (station,):
+            for cob_id, length in ((0x80, 9), (EXTENDED, 12), (FD_FRAME | 0x80, 9), (FD_FRAME | 0x80, 65)):
+                with pytest.raises(RigError, match=f"{length} bytes; a CAN frame has 0 to 8"):
+                    station.send(cob_id, bytes(length))
 
     @only_socketcan
     def test_error_frames_are_counted(self, bus_kind: str) -> None:

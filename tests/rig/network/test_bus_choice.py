@@ -77,6 +77,17 @@ def test_what_is_wrong_with_an_interface(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert explain_socketcan_problem("eth0") == "eth0 is not a CAN interface"
     assert explain_socketcan_problem("vcan0") == "vcan0 is down; sudo ip link set vcan0 up"
     assert explain_socketcan_problem("can0") == ""
+    for name, mtu, advice in (("can0", "16", "ip link set can0 up type can bitrate 1000000 dbitrate 4000000 fd on"),
+                              ("vcan0", "16", "ip link set vcan0 mtu 72 up")):
+        (tmp_path / name / "flags").write_text("0xc1")
+        (tmp_path / name / "mtu").write_text(mtu)
+        assert explain_socketcan_problem(name) == ""
+        assert explain_socketcan_problem(name, fd=True) == (
+            f"{name} is set to classical CAN, not to CAN FD; sudo ip link set {name} down && sudo {advice}")
+        (tmp_path / name / "mtu").write_text("72")
+        assert explain_socketcan_problem(name, fd=True) == ""
+        (tmp_path / name / "flags").write_text("0x80")
+    (tmp_path / "can0" / "flags").write_text("0xc1")
     assert bus_module.list_can_interfaces() == ["can0"]
 
 
