@@ -165,14 +165,17 @@ def _convert(value: Any, hint: Any, place: Place, kinds: Kinds) -> Any:
             return value
         raise place.refuse(list_choices(value, args))
     elif origin in (Union, UnionType):
-        for member in (m for m in args if m is not NoneType):
+        members = [member for member in args if member is not NoneType]
+        if len(members) == 1:
+            return _convert(value, members[0], place, kinds)
+        for member in members:
             with suppress(InputError):
                 return _convert(value, member, place, kinds)
     elif origin is tuple:
-        members = args[:1] * len(value) if isinstance(value, list) and args[-1] is Ellipsis else args
-        if isinstance(value, list) and len(value) == len(members):
-            return tuple(_convert(item, member, place.at(i), kinds) for i, (item, member) in
-                         enumerate(zip(value, members, strict=True)))
+        parts = args[:1] * len(value) if isinstance(value, list) and args[-1] is Ellipsis else args
+        if isinstance(value, list) and len(value) == len(parts):
+            return tuple(_convert(item, part, place.at(i), kinds) for i, (item, part) in
+                         enumerate(zip(value, parts, strict=True)))
     elif origin is Mapping:
         if isinstance(value, dict):
             return dict(_flatten_names(value, args[1], place, kinds))

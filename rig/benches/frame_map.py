@@ -54,8 +54,10 @@ class Field:
     offset: Fraction = Fraction(0)  # SI
     fixed: int | None = None  # always these counts: selector of a multiplexed frame, or filling
     guard: Guard = Guard.NONE
+    wrap: int | None = None  # of a counter: how many values it has; None: all that its bits hold
     checksum: str = ""  # of a checksum: name in checksums.py, or FILE.py:FUNCTION
-    data_id: int = 0  # of AUTOSAR's profiles
+    data_id: int = 0  # of AUTOSAR's profile 1
+    data_ids: tuple[int, ...] = ()  # of AUTOSAR's profile 2: by counter
 
     @property
     def range(self) -> tuple[int, int]:
@@ -63,6 +65,11 @@ class Field:
         if self.kind is Kind.SIGNED:
             return -(1 << self.length - 1), (1 << self.length - 1) - 1
         return 0, (1 << self.length) - 1
+
+    @property
+    def modulus(self) -> int:
+        """How many values a counter has: after the last comes 0."""
+        return self.wrap or 1 << self.length
 
     def encode(self, value: float) -> int:
         """The bits of a value; out of range it saturates, as the output of a transducer does.
@@ -122,6 +129,7 @@ class FrameSpec:
     every: int = 1  # cycles from one to the next
     is_before_sync: bool = False  # sent before SYNC, with which its values take effect
     is_answer: bool = True  # of a sender other than the rig: it comes in each `every`-th cycle, so lockstep awaits it
+    roles: tuple[str, ...] = ()  # as sequences name it: "command", "feedback", "valve_state", "drive"
 
     @cached_property
     def selector(self) -> Field | None:
@@ -166,6 +174,18 @@ class FrameMap:
         return None
 
 
+def list_bits(each: Field) -> list[int]:
+    """The places of a field's bits, 8 * byte + bit, from the least significant one on.
+
+    >>> list_bits(Field(name="", lowest=8, length=10, is_big_endian=True))
+    [8, 9, 10, 11, 12, 13, 14, 15, 0, 1]
+    """
+    if not each.is_big_endian:
+        return list(range(each.lowest, each.lowest + each.length))
+    byte, bit = divmod(each.lowest, 8)
+    return [8 * (byte - (bit + i) // 8) + (bit + i) % 8 for i in range(each.length)]
+
+
 def extract_bits(each: Field, data: bytes) -> int:
     """The bits of a field."""
     order, shift = locate_bits(each, len(data))
@@ -194,7 +214,7 @@ def pack(spec: FrameSpec, values: Mapping[str, float], counter: int = 0) -> byte
         if each.fixed is not None:
             bits = each.fixed
         elif each.guard is Guard.COUNTER:
-            bits = counter % (1 << each.length)
+            bits = counter % each.modulus
         elif each.guard is Guard.CHECKSUM:
             continue
         else:

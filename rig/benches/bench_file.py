@@ -1,0 +1,487 @@
+"""Reads bench files: with the EDS, DCF or DBC that they name they become a `Bench`. docs/bench.md has the keys."""
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from dbc import EDS
+from fdi.foreign_code import ForeignCode, require_trust
+from plant.errors import InputError
+from plant.parameters import GROUPS, find_field
+from plant.units import parse_quantity
+from rig.benches import canopen_map
+from rig.benches.bench import INPUTS, MEASURED, OUTPUTS, Bench, CanopenNode, Profile
+from rig.benches.can_map import map_messages, read_database
+from rig.benches.checksums import CHECKSUMS, load_checksum
+from rig.benches.frame_map import EXTENDED, FD, FrameMap, FrameSpec, Guard, Role
+from rig.benches.layout import PHASES, DeviceFrame, Use, build_fields, compute_counts, list_phases
+from rig.tables import Place, Range, build_dataclass, decode_text, list_choices, parse_table, read_file
+
+ReadFile = Callable[[str], bytes]
+Byte = Annotated[int, Range("1", low=0, high=255)]
+NodeId = Annotated[int, Range("1", low=1, high=127)]
+RIG_NODE = 1
+CYCLE_POSITION = 8  # mode of operation of CiA 402: cyclic synchronous position
+_CYCLES = Fraction(1, 10_000), Fraction(1, 10)  # s
+_PROFILE_OBJECTS: dict[str, dict[str, tuple[str, bool]]] = {  # signal -> object and whether the device receives it
+    "cia402": {"control_word": ("0x6040", True), "status_word": ("0x6041", False), "mode": ("0x6060", True),
+               "mode_display": ("0x6061", False)},
+    "cia408": {"control_word": ("0x6040", True), "status_word": ("0x6041", False)},
+    "none": {},
+}
+
+
+@dataclass(frozen=True)
+class NodeKeys:
+    """The keys of [plant_node], and those that [controller] has too."""
+
+    node: NodeId | None = None
+    eds: str | None = None
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    outputs: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ControllerKeys(NodeKeys):
+    """The keys of [controller]."""
+
+    protocol: Literal["canopen", "can"] = "canopen"
+    dbc: str | None = None
+    profile: Profile = "none"
+    mode: Annotated[int, Range("1", low=-128, high=127)] | None = None
+    timeout: str | None = None
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    phases: Mapping[str, float | str] = field(default_factory=dict)
+    ready: Mapping[str, float | str] = field(default_factory=dict)
+    protection: Mapping[str, str | int | tuple[int, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class BenchKeys:
+    """The keys of a bench file."""
+
+    name: str
+    controller: ControllerKeys
+    plant: str = "eha"
+    plant_node: NodeKeys | None = None
+    cycle: str = "1 ms"
+    bitrate: Annotated[int, Range("bit/s", low=10_000, high=1_000_000)] = 1_000_000
+
+
+@dataclass(frozen=True)
+class SignalKeys:
+    """The keys of an input or output."""
+
+    object: str | None = None
+    signal: str | None = None
+    count: str | None = None
+    offset: str | None = None
+
+
+@dataclass(frozen=True)
+class ProtectionKeys:
+    """The keys of a protected signal."""
+
+    kind: str
+    data_id: Annotated[int, Range("1", low=0, high=0xFFFF)] | tuple[Byte, ...] = 0
+
+
+def load_bench(name_or_path: str = "eha", *, is_trusted: bool = False) -> Bench:
+    """Read a bench: a TOML file, or the name of one that comes with the rig.
+
+    Args:
+        name_or_path: e.g. "eha" or "drive_x.toml"; the files that it names lie beside it.
+        is_trusted: whether a Python file that it names for a checksum may run.
+
+    Raises:
+        InputError: no such bench, or the file, line and key that cannot be used and what was expected there.
+    """
+    shipped = list_benches()
+    if name_or_path in shipped:
+        return _load_shipped(name_or_path)
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        raise InputError(name_or_path, "", f"a .toml file, or {list_choices(name_or_path, shipped)}")
+    return _parse_bench(str(path), read_file(path), lambda name: read_file(path.parent / name), path.parent,
+                        is_trusted=is_trusted)
+
+
+def list_benches() -> dict[str, str]:
+    """The benches that come with the rig: name and title."""
+    found = sorted(Path(entry.name).stem for entry in files("rig.benches").iterdir() if entry.name.endswith(".toml"))
+    return {name: _load_shipped(name).name for name in found}
+
+
+@cache
+def _load_shipped(name: str) -> Bench:
+    source, folder = files("rig.benches").joinpath(f"{name}.toml"), EDS[1].parent
+    return _parse_bench(f"{name}.toml", source.read_bytes(), lambda file: read_file(folder / file), folder,
+                        is_trusted=True)
+
+
+def load_bench_from_files(content: Mapping[str, bytes], *, is_trusted: bool = False) -> Bench:
+    """The bench of a log, from `Bench.files`: the first is the bench file, the others are those that it names.
+
+    Raises:
+        InputError: as of `load_bench`; or a file is missing.
+    """
+    bench_file = next(iter(content), "")
+
+    def read(name: str) -> bytes:
+        if name not in content:
+            raise InputError(bench_file or "log", "", f"{name} among the files of the log")
+        return content[name]
+
+    return _parse_bench(bench_file, read(bench_file), read, Path(), is_trusted=is_trusted)
+
+
+class _Reader:
+    """A bench file while it is read: its keys, where they stand, and the files that it names."""
+
+    def __init__(self, name: str, source: bytes, read: ReadFile, *, is_trusted: bool) -> None:
+        table, self.place = parse_table(decode_text(source, name), name)
+        self.keys: BenchKeys = build_dataclass(BenchKeys, table, self.place)
+        self.files = {Path(name).name: source}
+        self._read, self._is_trusted = read, is_trusted
+
+    def read_file(self, name: str, place: Place) -> bytes:
+        """The content of a file that the key at `place` names."""
+        if not name or "\\0" in name:
+            raise place.refuse("the name of a file")
+        with place.locate():
+            self.files[name] = self._read(name)
+        return self.files[name]
+
+    def read_text(self, name: str | None, place: Place, kind: str) -> str:
+        """The text of an EDS, DCF or DBC; those of old tools are not UTF-8."""
+        if name is None:
+            raise place.refuse(f"the name of the device's {kind}")
+        data = self.read_file(name, place)
+        try:
+            return data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            return data.decode("latin-1")
+
+    def find_checksum(self, kind: str, place: Place) -> str:
+        """The name of a checksum for `Field.checksum`; a file of the user's runs, if he trusts it."""
+        file, _, function = kind.rpartition(":")
+        if kind in CHECKSUMS or not file.endswith(".py"):
+            if kind not in CHECKSUMS:
+                raise place.refuse(f"counter, FILE.py:FUNCTION or a checksum: {list_choices(kind, CHECKSUMS)}")
+            return kind
+        source = self.read_file(file, place)
+        require_trust(place.file, [ForeignCode(file, source)], is_trusted=self._is_trusted)
+        return load_checksum(file, source, function)
+
+
+def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, *, is_trusted: bool) -> Bench:
+    """The bench of a file; `read` gives the content of the files that it names, `folder` is where they lie."""
+    reader = _Reader(name, source, read, is_trusted=is_trusted)
+    keys, place = reader.keys, reader.place.at("controller")
+    cycle_ns = _read_time(keys.cycle, reader.place.at("cycle"), *_CYCLES)
+    timeout_ns = None
+    if keys.controller.timeout is not None:
+        timeout_ns = _read_time(keys.controller.timeout, place.at("timeout"), Fraction(cycle_ns, 10**9), Fraction(10))
+    is_canopen = keys.controller.protocol == "canopen"
+    uses = _list_uses(keys.controller, place, INPUTS, OUTPUTS, is_canopen=is_canopen)
+    uses = _add_states(reader, uses, keys.controller, place, is_canopen=is_canopen)
+    _check_signals(uses, ("position_demand", "ram_position"), ("current",), place)
+    nodes: dict[Role, CanopenNode] = {}
+    sync = None
+    if is_canopen:
+        uses, frames, sync, nodes[Role.CONTROLLER] = _map_node(reader, keys.controller, place, uses, folder)
+    else:
+        _refuse_canopen_keys(keys, reader.place)
+        text = reader.read_text(keys.controller.dbc, place.at("dbc"), "DBC")
+        dbc = keys.controller.dbc or ""
+        frames = map_messages(dbc, read_database(dbc, text), uses, cycle_ns)
+    specs = [_build_spec(frame, uses, Role.RIG if frame.is_received else Role.CONTROLLER) for frame in frames]
+    if keys.plant_node is not None:
+        specs, nodes[Role.PLANT] = _join_plant_node(reader, specs, sync, nodes, folder)
+    _check_identifiers(specs, sync, nodes, reader.place)
+    phases, ready = _list_states(frames, uses)
+    return Bench(name=keys.name, frames=FrameMap(frames=tuple(specs), sync=sync), nodes=nodes, plant=keys.plant,
+                 cycle_ns=cycle_ns, bitrate=keys.bitrate, timeout_ns=timeout_ns, phases=phases, ready=ready,
+                 files=reader.files)
+
+
+def _read_time(text: str, place: Place, low: Fraction, high: Fraction) -> int:
+    """A time with its unit, in ns."""
+    with place.locate():
+        time = parse_quantity(text, "s", "", "")
+    if not low <= time <= high or time * 1_000_000 % 1:
+        raise place.refuse(f"whole microseconds from {float(low * 1000):g} to {float(high * 1000):g} ms, not {text!r}")
+    return int(time * 1_000_000_000)
+
+
+def _refuse_canopen_keys(keys: BenchKeys, place: Place) -> None:
+    """Refuse keys of CANopen on plain CAN."""
+    for key in ("node", "eds", "mode", "parameters", "profile"):
+        if getattr(keys.controller, key) not in (None, {}, "none"):
+            raise place.at("controller", key).refuse('protocol = "canopen" together with this key')
+    if keys.plant_node is not None:
+        raise place.at("plant_node").refuse('protocol = "canopen" of the controller')
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What each value of the device is for
+# ---------------------------------------------------------------------------------------------------------------------
+
+def _list_uses(keys: NodeKeys, place: Place, inputs: Mapping[str, str], outputs: Mapping[str, str], *,
+               is_canopen: bool) -> dict[str, Use]:
+    """The signals of [inputs] and [outputs] by the object or MESSAGE.SIGNAL that carries them."""
+    uses: dict[str, Use] = {}
+    for table, known, is_received in (("inputs", inputs, True), ("outputs", outputs, False)):
+        for signal, entry in _group_keys(getattr(keys, table), 0).items():
+            own = place.at(table, signal)
+            if signal not in known:
+                raise own.refuse(f"a signal of the bench: {list_choices(signal, known)}")
+            word = "object" if is_canopen else "signal"
+            said = build_dataclass(SignalKeys, {word if key == "" else key: text for key, text in entry.items()}, own)
+            name = said.object if is_canopen else said.signal
+            if name is None or (said.signal if is_canopen else said.object) is not None:
+                example = '"0x607A"' if is_canopen else '"MESSAGE.SIGNAL"'
+                raise own.refuse(f"a table with {word} = {example}")
+            numbers = {}
+            for key, text in (("count", said.count), ("offset", said.offset)):
+                if text is not None:
+                    with own.at(key).locate():
+                        numbers[key] = parse_quantity(text, known[signal], "", "")
+            if numbers.get("count") == 0:
+                raise own.at("count").refuse("a number other than 0")
+            _add_use(uses, name, Use(place=own, is_received=is_received, signal=signal, unit=known[signal],
+                                     count=numbers.get("count"), offset=numbers.get("offset")), is_canopen=is_canopen)
+    return uses
+
+
+def _group_keys(flat: Mapping[str, Any], dots: int) -> dict[str, dict[str, Any]]:
+    """Dotted keys by their first parts, of which there is one more than `dots`.
+
+    >>> _group_keys({"Demand.Enable.main": 1, "Demand.Crc": "crc8"}, 1)
+    {'Demand.Enable': {'main': 1}, 'Demand.Crc': {'': 'crc8'}}
+    """
+    grouped: dict[str, dict[str, Any]] = {}
+    for full, value in flat.items():
+        parts = full.split(".")
+        grouped.setdefault(".".join(parts[:dots + 1]), {})[".".join(parts[dots + 1:])] = value
+    return grouped
+
+
+def _add_use(uses: dict[str, Use], name: str, use: Use, *, is_canopen: bool) -> None:
+    """Add a use, once for each object or signal."""
+    key = name
+    if is_canopen:
+        found = canopen_map.parse_object(name)
+        if found is None:
+            raise use.place.refuse(f"an object such as 0x2110:1, not {name!r}")
+        key = canopen_map.name_object(*found)
+    if key in uses:
+        raise use.place.refuse(f"each value of the device once; {key} is {uses[key].place.keys} already")
+    uses[key] = use
+
+
+def _add_states(reader: _Reader, uses: dict[str, Use], keys: ControllerKeys, place: Place, *,
+                is_canopen: bool) -> dict[str, Use]:
+    """`uses` with the values of [phases], [ready] and [protection]."""
+    dots = 0 if is_canopen else 1
+    for name, values in _group_keys(keys.phases, dots).items():
+        own = place.at("phases", name)
+        for phase in values:
+            if phase not in PHASES:
+                raise own.refuse(f"values by phase: {list_choices(phase or None, PHASES)}")
+        _add_use(uses, name, Use(place=own, is_received=True, values=values), is_canopen=is_canopen)
+    for name, value in keys.ready.items():
+        use = Use(place=place.at("ready", name), is_received=False, values={"main": value})
+        _add_use(uses, name, use, is_canopen=is_canopen)
+    for name, entry in _group_keys(keys.protection, dots).items():
+        own = place.at("protection", name)
+        said = build_dataclass(ProtectionKeys, {key or "kind": _undo_tuple(value) for key, value in entry.items()}, own)
+        use = Use(place=own, is_received=None, guard=Guard.COUNTER)
+        if said.kind != "counter":
+            use = replace(use, guard=Guard.CHECKSUM, checksum=reader.find_checksum(said.kind, own))
+            use = _set_data_id(use, said.data_id)
+        elif said.data_id:
+            raise own.at("data_id").refuse("a checksum with it")
+        _add_use(uses, name, use, is_canopen=is_canopen)
+    return uses
+
+
+def _undo_tuple(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _set_data_id(use: Use, data_id: int | tuple[int, ...]) -> Use:
+    """The use of a checksum with its data ID."""
+    if use.checksum == "e2e_profile_2":
+        if not isinstance(data_id, tuple) or len(data_id) != 16:
+            raise use.place.refuse("data_id = [16 numbers], one for each value of the counter")
+        return replace(use, data_ids=data_id)
+    if isinstance(data_id, tuple) or (data_id and use.checksum != "e2e_profile_1"):
+        raise use.place.refuse("a data_id of 0 to 65535 with e2e_profile_1, and none with the others")
+    return replace(use, data_id=data_id)
+
+
+def _check_signals(uses: Mapping[str, Use], inputs: tuple[str, ...], outputs: tuple[str, ...], place: Place) -> None:
+    """Refuse a device without the signals that every run needs, and values whose meaning nothing says."""
+    for table, needed, is_received in (("inputs", inputs, True), ("outputs", outputs, False)):
+        known = {use.signal for use in uses.values() if use.is_received is is_received}
+        for signal in needed:
+            if signal not in known:
+                raise place.at(table).refuse(f"also the signal {signal}")
+
+
+def _list_states(frames: list[DeviceFrame], uses: Mapping[str, Use],
+                 ) -> tuple[dict[str, Mapping[str, float]], dict[str, float]]:
+    """Counts by phase of the values that the rig sends, and of those that it waits for."""
+    phases: dict[str, Mapping[str, float]] = {}
+    ready: dict[str, float] = {}
+    for slot in (slot for frame in frames for slot in frame.slots):
+        use = uses.get(slot.name)
+        if use is not None and use.values and use.is_received:
+            phases[slot.name] = list_phases(slot, use)
+        elif use is not None and use.values:
+            ready[slot.name] = compute_counts(slot, use.values["main"], use.place)
+    return phases, ready
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Nodes and frames
+# ---------------------------------------------------------------------------------------------------------------------
+
+def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use], folder: Path,
+              ) -> tuple[dict[str, Use], list[DeviceFrame], int, CanopenNode]:
+    """The uses with the objects of the profile, the PDOs, the identifier of SYNC, and the node."""
+    if keys.node is None:
+        raise place.refuse("also the key 'node', a node-ID from 1 to 127")
+    if keys.node == RIG_NODE:
+        raise place.at("node").refuse(f"a node-ID other than {RIG_NODE}, which the rig has")
+    eds = keys.eds or ""
+    dictionary = canopen_map.read_dictionary(eds, reader.read_text(keys.eds, place.at("eds"), "EDS or DCF"), keys.node)
+    node = CanopenNode(node=keys.node, eds=folder / eds, values=canopen_map.list_values(dictionary))
+    if isinstance(keys, ControllerKeys):
+        uses = _add_profile(uses, dictionary, keys, place)
+        mode = keys.mode
+        if keys.profile != "cia402" and mode is not None:
+            raise place.at("mode").refuse('profile = "cia402" with it')
+        if keys.profile == "cia402" and mode is None:
+            mode = CYCLE_POSITION
+        node = replace(node, profile=keys.profile, mode=mode, settings=tuple(_list_settings(
+            reader.keys.plant, dictionary, keys.parameters, place.at("parameters"))))
+    frames = canopen_map.map_pdos(eds, dictionary, keys.node, uses)
+    return uses, frames, canopen_map.find_sync(dictionary), node
+
+
+def _add_profile(uses: dict[str, Use], dictionary: Any, keys: ControllerKeys, place: Place) -> dict[str, Use]:
+    """`uses` with the objects that the profile gives a meaning; its modes only where a PDO maps them."""
+    named = {(use.signal, use.is_received): use for use in uses.values()}
+    added = dict(uses)
+    for signal, (key, is_received) in _PROFILE_OBJECTS[keys.profile].items():
+        is_optional = signal.startswith("mode") and not canopen_map.is_mapped(dictionary, key, is_received=is_received)
+        if key not in uses and (signal, is_received) not in named and not is_optional:
+            added[key] = Use(place=place.at("profile"), is_received=is_received, signal=signal)
+    if keys.profile == "none":
+        for signal in ("control_word", "mode"):
+            if (signal, True) in named:
+                raise named[signal, True].place.refuse("a profile that gives it a meaning, or values in "
+                                                       "[controller.phases]")
+    return added
+
+
+def _list_settings(plant: str, dictionary: Any, parameters: Mapping[str, str],
+                   place: Place) -> Iterator[tuple[int, int, str]]:
+    """Objects that hold parameters of the model."""
+    for name, parameter in parameters.items():
+        own = place.at(name)
+        index, sub = canopen_map.parse_object(name) or (0, 0)
+        found = canopen_map.find_variable(dictionary, index, sub)
+        if found is None or not found.writable:
+            raise own.refuse("an object of the EDS that can be written, such as 0x2110:1")
+        if plant == "eha":
+            with own.locate():
+                find_field("", parameter, GROUPS)
+        yield index, sub, parameter
+
+
+def _build_spec(frame: DeviceFrame, uses: Mapping[str, Use], sender: Role) -> FrameSpec:
+    """A frame of the controller as one of the bench."""
+    spec = FrameSpec(name=frame.name, identifier=frame.identifier, length=frame.length, sender=sender,
+                     fields=build_fields(frame, uses), every=frame.every, is_before_sync=frame.is_before_sync,
+                     is_answer=frame.is_answer)
+    roles = {"drive": sender is Role.CONTROLLER and spec.has(*OUTPUTS),
+             "command": sender is Role.RIG and spec.has("position_demand", "control_word"),
+             "feedback": sender is Role.RIG and spec.has(*MEASURED)}
+    return replace(spec, roles=tuple(role for role, is_own in roles.items() if is_own))
+
+
+def _join_plant_node(reader: _Reader, specs: list[FrameSpec], sync: int | None, nodes: Mapping[Role, CanopenNode],
+                     folder: Path) -> tuple[list[FrameSpec], CanopenNode]:
+    """The frames with those of [plant_node], and the node; a frame that both know is one."""
+    keys, place = reader.keys.plant_node, reader.place.at("plant_node")
+    assert keys is not None
+    uses = _list_uses(keys, place, OUTPUTS, INPUTS, is_canopen=True)
+    _check_signals(uses, ("current",), ("ram_position",), place)
+    uses, frames, own_sync, node = _map_node(reader, keys, place, uses, folder)
+    if node.node == nodes[Role.CONTROLLER].node:
+        raise place.at("node").refuse(f"a node-ID other than {node.node}, which the controller has")
+    if own_sync != sync:
+        raise place.at("eds").refuse("the controller's identifier of SYNC in 0x1005")
+    joined = {spec.identifier: spec for spec in specs}
+    for frame in frames:
+        own = replace(_build_spec(frame, uses, Role.PLANT), name=f"plant {frame.name}", roles=("valve_state",))
+        other = joined.get(frame.identifier)
+        if other is None and frame.is_received:
+            raise place.at("inputs").refuse(f"a frame of the controller; it has none with the COB-ID of {frame.name}, "
+                                            f"{describe_identifier(frame.identifier)}")
+        if other is not None:
+            own = _join_frame(other, own, frame, place)
+        joined[frame.identifier] = own
+    return list(joined.values()), node
+
+
+def _join_frame(other: FrameSpec, own: FrameSpec, frame: DeviceFrame, place: Place) -> FrameSpec:
+    """The frame that the controller has as `other` and the plant node as `own`."""
+    if not frame.is_received and other.sender is Role.CONTROLLER:
+        raise place.at("outputs").refuse(f"COB-IDs that the controller does not send; {frame.name} has "
+                                         f"{describe_identifier(frame.identifier)} too")
+    places = [[(each.lowest, each.length) for each in spec.fields] for spec in (other, own)]
+    fields = []
+    for theirs, ours in zip(other.fields, own.fields, strict=False):
+        if theirs.name and ours.name and theirs != ours:
+            places.append([])
+        fields.append(theirs if theirs.name else ours)
+    if places[0] != places[-1] or other.length != own.length:
+        raise place.at("eds").refuse(f"the layout and counts of the controller's {other.name} in {frame.name}, "
+                                     f"{describe_identifier(frame.identifier)}")
+    if frame.is_received:
+        return replace(other, fields=tuple(fields))
+    return replace(other, fields=tuple(fields), sender=Role.PLANT, every=own.every, is_answer=own.is_answer,
+                   is_before_sync=False)
+
+
+def describe_identifier(identifier: int) -> str:
+    """An identifier as people write it: 0x182, or 0x18FF0102 with 29 bits.
+
+    >>> describe_identifier(0x182), describe_identifier(0x123 | EXTENDED)
+    ('0x182', '0x00000123')
+    """
+    return f"0x{identifier & 0x1FFF_FFFF:08X}" if identifier & EXTENDED else f"0x{identifier & 0x7FF:03X}"
+
+
+def _check_identifiers(specs: list[FrameSpec], sync: int | None, nodes: Mapping[Role, CanopenNode],
+                       place: Place) -> None:
+    """Refuse an identifier that two frames have, or a frame and a service of a node."""
+    taken = {} if sync is None else {0: "NMT", sync: "SYNC"}
+    for node in [RIG_NODE, *(each.node for each in nodes.values())] if nodes else []:
+        services = {0x80: "EMCY", 0x580: "SDO", 0x600: "SDO", 0x700: "heartbeat"}
+        taken |= {base + node: f"{service} of node {node}" for base, service in services.items()}
+    for spec in specs:
+        identifier = spec.identifier & ~FD
+        message = spec.name.partition("[")[0]  # its pages share the identifier
+        if taken.setdefault(identifier, message) != message:
+            raise place.at("controller").refuse(f"each identifier once; {spec.name} and {taken[identifier]} have "
+                                                f"{describe_identifier(identifier)}")

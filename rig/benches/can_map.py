@@ -1,0 +1,133 @@
+"""A DBC as frames of a device on plain CAN: messages, byte orders, multiplexed pages, CAN FD."""
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from fractions import Fraction
+from typing import Any
+
+import cantools
+from cantools.database.can import Message, Signal
+
+from plant.errors import InputError, suggest_name
+from rig.benches.frame_map import EXTENDED, FD, Field, Kind
+from rig.benches.layout import DeviceFrame, Slot, Use
+from rig.tables import list_choices
+
+_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+
+
+def read_database(name: str, text: str) -> Any:
+    """The messages of a DBC as cantools reads them.
+
+    Raises:
+        InputError: not a DBC.
+    """
+    try:
+        return cantools.database.load_string(text, "dbc", strict=False)
+    except Exception as error:  # whatever cantools stumbles over in a file that is no DBC
+        said = " ".join(str(error).split())[:200]
+        raise InputError(name, "", f"a DBC ({said or type(error).__name__})") from error
+
+
+def map_messages(name: str, database: Any, uses: Mapping[str, Use], cycle_ns: int) -> list[DeviceFrame]:
+    """The messages in which `uses` ("MESSAGE.SIGNAL") lie, each page of a multiplexed one as a frame.
+
+    Raises:
+        InputError: a message or signal that the DBC lacks, or one that cannot be sent as the bench file wants.
+    """
+    messages = {message.name: message for message in database.messages}
+    grouped: dict[str, dict[str, Use]] = {}
+    for full, use in uses.items():
+        message, _, signal = full.partition(".")
+        if message not in messages or not signal:
+            raise use.place.refuse(f"MESSAGE.SIGNAL of {name}, not {full!r}{suggest_name(message, messages)}")
+        known = {each.name for each in messages[message].signals}
+        if signal not in known:
+            raise use.place.refuse(f"a signal of message {message}: {list_choices(signal, known)}")
+        grouped.setdefault(message, {})[full] = use
+    return [frame for message, own in grouped.items() for frame in _map_message(name, messages[message], own, cycle_ns)]
+
+
+def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns: int) -> Iterator[DeviceFrame]:
+    ways = {use.is_received for use in uses.values()} - {None}
+    place = next(iter(uses.values())).place
+    if len(ways) != 1:
+        expected = "in one direction" if ways else "that other tables of this file use"
+        raise place.refuse(f"signals of a message {expected}; {message.name} has {', '.join(uses)}")
+    if message.length not in _FD_LENGTHS:
+        raise InputError(name, message.name, f"a length of a CAN frame, 0 to 8 bytes (CAN FD also 12, 16, 20, 24, 32, "
+                                             f"48, 64), not {message.length}")
+    is_fd = message.is_fd or message.length > 8
+    identifier = message.frame_id | (EXTENDED if message.is_extended_frame else 0) | (FD if is_fd else 0)
+    slots = {signal.name: _read_slot(name, message, signal) for signal in message.signals}
+    pages: list[int | None] = [None]
+    selectors = [signal for signal in message.signals if signal.is_multiplexer]
+    chosen = [signal for signal in message.signals if f"{message.name}.{signal.name}" in uses]
+    if selectors:
+        pages = list(_list_pages(message, chosen, is_received=True in ways))
+    if pages != [None] and (len(selectors) > 1 or selectors[0] in chosen):
+        raise place.refuse(f"one multiplexer, with no other use; {message.name} has "
+                           f"{', '.join(signal.name for signal in selectors)}")
+    for page in pages:
+        on_page = [slots[signal.name] for signal in message.signals
+                   if signal.multiplexer_ids is None or page in signal.multiplexer_ids]
+        if page is not None:
+            selector = slots[selectors[0].name]
+            on_page = [_select(selector, page) if slot is selector else slot for slot in on_page]
+        carries_current = any(slot.name in uses and uses[slot.name].signal == "current" for slot in on_page)
+        yield DeviceFrame(
+            name=message.name if page is None else f"{message.name}[{page}]", identifier=identifier,
+            length=message.length, is_received=True in ways, slots=tuple(on_page),
+            every=_find_period(name, message, cycle_ns),
+            is_answer=True in ways or carries_current or (len(pages) == 1 and bool(message.cycle_time)))
+
+
+def _list_pages(message: Message, chosen: list[Signal], *, is_received: bool) -> Iterator[int | None]:
+    """The values of the selector with a used signal; all that the DBC has, where it stands beside a used one."""
+    numbers = {number for signal in message.signals for number in signal.multiplexer_ids or ()}
+    used = {number for signal in chosen for number in signal.multiplexer_ids or ()}
+    has_common = any(signal.multiplexer_ids is None for signal in chosen)
+    if used:
+        yield from sorted(numbers if has_common and not is_received else used)
+    else:
+        start = next(signal.raw_initial for signal in message.signals if signal.is_multiplexer)
+        yield int(start or 0) if is_received else None
+
+
+def _select(selector: Slot, page: int) -> Slot:
+    """The selector with the value of a page."""
+    return Slot(name=selector.name, bits=selector.bits, start=page, is_selector=True)
+
+
+def _find_period(name: str, message: Message, cycle_ns: int) -> int:
+    period = Fraction(str(message.cycle_time or 0)) * 1_000_000 / cycle_ns
+    if period == 0:
+        return 1
+    if period.denominator != 1 or not 0 < period < 1_000_000:
+        raise InputError(name, message.name, f"a GenMsgCycleTime that is a multiple of the cycle, {cycle_ns / 1e6:g} "
+                                             f"ms, not {message.cycle_time} ms")
+    return int(period)
+
+
+def _read_slot(name: str, message: Message, signal: Signal) -> Slot:
+    conversion = signal.conversion
+    scale, offset, start = conversion.scale, conversion.offset, signal.raw_initial or 0
+    if not all(map(math.isfinite, (scale, offset, start))):
+        raise InputError(name, f"{message.name}.{signal.name}", "finite numbers for factor, offset and start value")
+    lowest = signal.start
+    if signal.byte_order == "big_endian":  # a DBC has the place of the most significant bit
+        last = 8 * (signal.start // 8) + 7 - signal.start % 8 + signal.length - 1
+        lowest = 8 * (last // 8) + 7 - last % 8
+    kind = Kind.SIGNED if signal.is_signed else Kind.UNSIGNED
+    kind = Kind.FLOAT if conversion.is_float else kind
+    exact_scale, exact_offset = Fraction(str(scale)), Fraction(str(offset))
+    wrap = None
+    if signal.maximum and exact_scale and math.isfinite(signal.maximum):
+        last_count = (Fraction(str(signal.maximum)) - exact_offset) / exact_scale
+        wrap = int(last_count) + 1 if 0 < last_count < (1 << signal.length) - 1 else None
+    bits = Field(name="", lowest=lowest, length=signal.length, is_big_endian=signal.byte_order == "big_endian",
+                 kind=kind, wrap=wrap)
+    return Slot(name=f"{message.name}.{signal.name}", bits=bits, scale=exact_scale, offset=exact_offset,
+                unit=signal.unit or "", start=start,
+                choices={str(text): int(number) for number, text in (signal.choices or {}).items()})

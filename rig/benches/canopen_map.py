@@ -1,0 +1,278 @@
+"""An EDS or DCF as frames of a CANopen device: its PDOs, as its mapping parameters say (CiA 301, 7.5.2.35 to 38)."""
+from __future__ import annotations
+
+import io
+import logging
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from canopen.objectdictionary import ODVariable, datatypes
+from canopen.objectdictionary.eds import import_eds
+
+from plant.errors import InputError
+from rig.benches.bench import MEASURED
+from rig.benches.frame_map import EXTENDED, Field, Kind
+from rig.benches.layout import DeviceFrame, Slot, Use
+
+INVALID = 1 << 31  # in a COB-ID: the PDO is switched off
+LONG = 1 << 29  # in a COB-ID: the identifier has 29 bits
+RPDO, TPDO, MAPPING = 0x1400, 0x1800, 0x200
+_LONGEST = 64  # bits of a PDO
+_EVENT = (254, 255)  # transmission types
+AWAITED = ("current", *MEASURED)  # signals without which a cycle cannot go on
+_KINDS = {datatypes.BOOLEAN: Kind.UNSIGNED, datatypes.REAL32: Kind.FLOAT, datatypes.REAL64: Kind.FLOAT,
+          **dict.fromkeys(datatypes.SIGNED_TYPES, Kind.SIGNED),
+          **dict.fromkeys(datatypes.UNSIGNED_TYPES, Kind.UNSIGNED)}
+_OBJECT = re.compile(r"0x([0-9A-Fa-f]{1,4})(?::(0x[0-9A-Fa-f]{1,2}|\d{1,3}))?")
+
+
+class Pdo(NamedTuple):
+    """One PDO of a dictionary."""
+
+    name: str  # RPDO1
+    parameter: int  # index of its communication parameters
+    is_received: bool
+    cob_id: int  # with INVALID and LONG
+    kind: int  # transmission type
+    entries: tuple[tuple[int, int, int], ...]  # index, sub, bits
+
+    @property
+    def length(self) -> int:
+        """Bits."""
+        return sum(bits for _, _, bits in self.entries)
+
+
+def parse_object(text: str) -> tuple[int, int] | None:
+    """Index and sub-index of "0x2110:1" or "0x2100"; None for another text.
+
+    >>> parse_object("0x2110:1"), parse_object("0x6040"), parse_object("2100")
+    ((8464, 1), (24640, 0), None)
+    """
+    found = _OBJECT.fullmatch(text.strip())
+    if found is None:
+        return None
+    sub = found[2] or "0"
+    number = int(sub, 16) if sub.startswith("0x") else int(sub)
+    return (int(found[1], 16), number) if number < 256 else None
+
+
+def name_object(index: int, sub: int) -> str:
+    """The object as bench files and messages name it.
+
+    >>> name_object(0x2110, 1), name_object(0x6040, 0)
+    ('0x2110:1', '0x6040')
+    """
+    return f"0x{index:04X}:{sub}" if sub else f"0x{index:04X}"
+
+
+def read_dictionary(name: str, text: str, node: int) -> Any:
+    """The object dictionary of an EDS or DCF for a node-ID, as canopen reads it.
+
+    Raises:
+        InputError: not an EDS, or a DCF of another node.
+    """
+    log = logging.getLogger("canopen.objectdictionary.eds")
+    was_disabled, log.disabled = log.disabled, True  # what it warns of is no object of a bench
+    try:
+        dictionary: Any = import_eds(io.StringIO(text), node)  # type: ignore[no-untyped-call]
+    except Exception as error:  # whatever canopen stumbles over in a file that is no EDS
+        said = " ".join(str(error).split())[:200]
+        raise InputError(name, "", f"an electronic data sheet (CiA 306): {said or type(error).__name__}") from error
+    finally:
+        log.disabled = was_disabled
+    if not any(index >= 0x1000 for index in dictionary):
+        raise InputError(name, "", "an electronic data sheet (CiA 306) with objects")
+    own = re.search(r"^\[DeviceComm?issioning\][^\[]*^NodeID\s*=\s*(0x[0-9A-Fa-f]{1,2}|[1-9]\d{0,2})\s*$", text,
+                    re.MULTILINE | re.IGNORECASE)
+    if own is not None and int(own[1], 0) != node:
+        raise InputError(name, "NodeID", f"{node}, the node of the bench file, not {int(own[1], 0)}")
+    return dictionary
+
+
+def find_variable(dictionary: Any, index: int, sub: int) -> ODVariable | None:
+    """The variable of a dictionary; None if it has none there."""
+    item = dictionary.get(index)
+    if item is None or isinstance(item, ODVariable):
+        return item if not sub else None
+    if sub not in item.subindices and read_number(dictionary, index, 0) is None:
+        found: ODVariable | None = item.get(sub)  # of a compact array, which lists no elements
+    else:
+        found = item.subindices.get(sub)
+    return found
+
+
+def read_number(dictionary: Any, index: int, sub: int) -> int | None:
+    """The whole number that the device holds after a reset, or that the DCF writes; None if the file gives none."""
+    item = dictionary.get(index)
+    found = item if isinstance(item, ODVariable) else getattr(item, "subindices", {}).get(sub)
+    value = None if found is None else found.default if found.value is None else found.value
+    return value if type(value) is int else None
+
+
+def find_sync(dictionary: Any) -> int:
+    """The identifier of SYNC, 0x80 if the dictionary gives none."""
+    word = read_number(dictionary, 0x1005, 0)
+    return 0x80 if word is None else _read_identifier(word)
+
+
+def _read_identifier(cob_id: int) -> int:
+    return cob_id & 0x1FFF_FFFF | EXTENDED if cob_id & LONG else cob_id & 0x7FF
+
+
+def list_pdos(dictionary: Any, node: int) -> list[Pdo]:
+    """All PDOs of a dictionary, also those that are switched off; an empty mapping entry is left out."""
+    found = []
+    for base, kind, first in ((RPDO, "RPDO", 0x200), (TPDO, "TPDO", 0x180)):
+        for number in (index - base for index in sorted(dictionary) if base <= index < base + MAPPING):
+            predefined = first + 0x100 * number + node if number < 4 else INVALID
+            cob_id = read_number(dictionary, base + number, 1)
+            transmission = read_number(dictionary, base + number, 2)
+            count = read_number(dictionary, base + MAPPING + number, 0) or 0
+            words = [read_number(dictionary, base + MAPPING + number, sub) for sub in range(1, min(count, 64) + 1)]
+            entries = tuple((word >> 16 & 0xFFFF, word >> 8 & 0xFF, word & 0xFF) for word in words if word)
+            found.append(Pdo(f"{kind}{number + 1}", base + number, base == RPDO,
+                             predefined if cob_id is None else cob_id, 255 if transmission is None else transmission,
+                             entries))
+    return found
+
+
+def is_mapped(dictionary: Any, key: str, *, is_received: bool) -> bool:
+    """Whether a PDO that is on carries an object."""
+    return any(name_object(index, sub) == key for pdo in list_pdos(dictionary, 0) for index, sub, _ in pdo.entries
+               if pdo.is_received is is_received and not pdo.cob_id & INVALID)
+
+
+def map_pdos(name: str, dictionary: Any, node: int, uses: Mapping[str, Use]) -> list[DeviceFrame]:
+    """The PDOs in which `uses` (objects, as `name_object` writes them) lie.
+
+    Raises:
+        InputError: an object that the dictionary lacks, that has the wrong type or access, or that no PDO maps; a PDO
+            of more than 8 bytes, or with a transmission type that the rig cannot serve.
+    """
+    pdos = list_pdos(dictionary, node)
+    on = [(pdo, [name_object(index, sub) for index, sub, _ in pdo.entries]) for pdo in pdos if not pdo.cob_id & INVALID]
+    for key, use in uses.items():
+        _check_object(name, dictionary, key, use)
+        if not any(key in keys and use.is_received in (pdo.is_received, None) for pdo, keys in on):
+            raise use.place.refuse(_describe_unmapped(dictionary, pdos, key, use))
+    synchronous = {key for pdo, keys in on for key in keys if not pdo.is_received and 1 <= pdo.kind <= 240}
+    awaited = {key for key, use in uses.items() if use.signal in AWAITED} - synchronous  # only this PDO brings them
+    frames = []
+    for pdo, keys in on:
+        own = {key for key in keys if key in uses and uses[key].is_received in (pdo.is_received, None)}
+        if own:
+            is_answer = 1 <= pdo.kind <= 240 or (pdo.kind in _EVENT and not awaited.isdisjoint(own))
+            frames.append(_map_pdo(name, dictionary, pdo, own, is_answer=is_answer))
+    return frames
+
+
+def _check_object(name: str, dictionary: Any, key: str, use: Use) -> None:
+    """Refuse an object that is absent, no number, or that goes the other way."""
+    index, sub = parse_object(key) or (0, 0)
+    found = find_variable(dictionary, index, sub)
+    if found is None:
+        near = dictionary.get(index)
+        subs = "" if near is None or isinstance(near, ODVariable) else (
+            f"; it has the sub-indices {', '.join(map(str, list(near.subindices)[:12]))}")
+        raise use.place.refuse(f"an object of {name}; it has no {key}{subs}")
+    if found.data_type not in _KINDS:
+        raise use.place.refuse(f"a number; {key} ({found.name}) has the data type 0x{found.data_type or 0:04X}")
+    if use.is_received and not found.writable:
+        raise use.place.refuse(f"an object that can be written; {key} ({found.name}) is {found.access_type}")
+    if use.is_received is False and not found.readable:
+        raise use.place.refuse(f"an object that can be read; {key} ({found.name}) is {found.access_type}")
+
+
+def _describe_unmapped(dictionary: Any, pdos: list[Pdo], key: str, use: Use) -> str:
+    """What to do about an object that is in no PDO that is on."""
+    kind = "TPDO" if use.is_received is False else "RPDO"
+    own = [pdo for pdo in pdos if pdo.name.startswith(kind)]
+    off = next((pdo for pdo in own if any(name_object(index, sub) == key for index, sub, _ in pdo.entries)), None)
+    if off is not None:
+        return (f"an object that a {kind} maps; {off.name} maps {key}, but is switched off (bit 31 of "
+                f"0x{off.parameter:04X}:1)")
+    index, sub = parse_object(key) or (0, 0)
+    found = find_variable(dictionary, index, sub)
+    bits = len(found) if found is not None else 0
+    if found is not None and not found.pdo_mappable:
+        return f"an object that a {kind} maps; {key} cannot be mapped (PDOMapping=0)"
+    room = [pdo.name for pdo in own if pdo.length + bits <= _LONGEST]
+    where = f"{' and '.join(room)} {'has' if len(room) == 1 else 'have'} room" if room else f"no {kind} has room"
+    return f"an object that a {kind} maps; for {key} with {bits} bits {where} (map it in a DCF)"
+
+
+def _map_pdo(name: str, dictionary: Any, pdo: Pdo, own: set[str], *, is_answer: bool) -> DeviceFrame:
+    """The frame of a PDO; only `own` objects keep their names."""
+    where = f"0x{pdo.parameter + MAPPING:04X}"
+    if not 0 < pdo.length <= _LONGEST:
+        raise InputError(name, where, f"at most 8 bytes in {pdo.name}, not {pdo.length} bits")
+    if 241 <= pdo.kind <= 253 or not 0 <= pdo.kind <= 255:
+        raise InputError(name, f"0x{pdo.parameter:04X}:2",
+                         f"a transmission type 0 to 240, 254 or 255 for {pdo.name}, not {pdo.kind}")
+    slots, lowest = [], 0
+    for index, sub, length in pdo.entries:
+        key, found = name_object(index, sub), find_variable(dictionary, index, sub)
+        kind = Kind.UNSIGNED if found is None else _KINDS.get(found.data_type or 0, Kind.UNSIGNED)
+        size = 1 if found is None or found.data_type == datatypes.BOOLEAN else len(found)
+        if key in own and length != size and (size, length) != (1, 8):  # many devices map a BOOLEAN as a byte
+            raise InputError(name, where, f"{key} with {size} bits in {pdo.name}, not {length}")
+        if kind is Kind.FLOAT and length != size:
+            kind = Kind.UNSIGNED
+        start = read_start(found)
+        slots.append(Slot(name=key if key in own else "", start=start,
+                          bits=Field(name="", lowest=lowest, length=length, kind=kind)))
+        lowest += length
+    return DeviceFrame(
+        name=pdo.name, identifier=_read_identifier(pdo.cob_id), length=(lowest + 7) // 8, is_received=pdo.is_received,
+        slots=tuple(slots), every=pdo.kind if not pdo.is_received and 1 <= pdo.kind <= 240 else 1,
+        is_before_sync=pdo.is_received and pdo.kind <= 240, is_answer=is_answer or pdo.is_received)
+
+
+def read_start(found: ODVariable | None) -> float:
+    """The number that an object holds after a reset, 0 if the file gives none."""
+    value = None if found is None else found.default if found.value is None else found.value
+    return value if isinstance(value, int | float) and abs(value) < 1 << 64 else 0
+
+
+def list_values(dictionary: Any) -> tuple[tuple[int, int, bytes], ...]:
+    """The values that a DCF gives to objects that can be written, in the order in which a device takes them.
+
+    A PDO is switched off first, then its mapping is emptied, filled and counted, then its parameters follow, and last
+    its COB-ID (CiA 301, 7.5.2.36).
+    """
+    given: dict[tuple[int, int], bytes] = {}
+    for variable in _list_variables(dictionary):
+        if variable.value is not None and variable.writable and variable.index >= 0x1000:
+            try:
+                given[variable.index, variable.subindex] = variable.encode_raw(variable.value)
+            except (TypeError, ValueError, UnicodeError):
+                continue  # a value that does not fit its type cannot be written either
+    ordered = []
+    for (index, sub), data in given.items():
+        if not RPDO <= index < TPDO + 2 * MAPPING:
+            ordered.append((index, sub, data))
+    for parameter in sorted({index & ~MAPPING for index, _ in given if RPDO <= index < TPDO + 2 * MAPPING}):
+        mapping = {sub: data for (index, sub), data in given.items() if index == parameter + MAPPING}
+        own = {sub: data for (index, sub), data in given.items() if index == parameter and sub}
+        cob_id = own.pop(1, None)
+        if mapping and cob_id is not None:
+            off = int.from_bytes(cob_id, "little") | INVALID
+            ordered.append((parameter, 1, off.to_bytes(4, "little")))
+        count = mapping.pop(0, None)
+        if count is not None and mapping:
+            ordered.append((parameter + MAPPING, 0, b"\0"))
+        ordered += [(parameter + MAPPING, sub, data) for sub, data in mapping.items()]
+        ordered += [(parameter + MAPPING, 0, count)] if count is not None else []
+        ordered += [(parameter, sub, data) for sub, data in own.items()]
+        ordered += [(parameter, 1, cob_id)] if cob_id is not None else []
+    return tuple(ordered)
+
+
+def _list_variables(dictionary: Any) -> Iterator[ODVariable]:
+    for index in sorted(dictionary):
+        item = dictionary[index]
+        if isinstance(item, ODVariable):
+            yield item
+        else:
+            yield from (item.subindices[sub] for sub in sorted(item.subindices))

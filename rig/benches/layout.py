@@ -1,0 +1,162 @@
+"""What an EDS or DBC says of a device's frames, what a bench file says each value is for, and both together as frames.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from typing import Any
+
+from plant.units import find_unit
+from rig.benches.frame_map import Field, Guard, Kind, encode_float, list_bits
+from rig.tables import Place, list_choices
+
+PHASES = ("setup", "main", "cleanup", "safe")
+_PLAIN = {"": Fraction(1), "-": Fraction(1), "1": Fraction(1), "%": Fraction(1, 100)}  # units of a plain number
+_SMALLEST, _LARGEST = 1e-30, 1e30  # what a count may be worth: floats can calculate with it
+
+
+@dataclass(frozen=True, kw_only=True)
+class Use:
+    """What a value of the device is for, as the bench file says."""
+
+    place: Place  # in the bench file
+    is_received: bool | None  # by the device; None: it is protection, in any frame
+    signal: str = ""  # of the bench
+    unit: str = ""  # of the signal, SI
+    count: Fraction | None = None  # what a count is worth, if the file says so
+    offset: Fraction | None = None
+    values: Mapping[str, float | str] = field(default_factory=dict)  # by phase; a state that is awaited: in "main"
+    guard: Guard = Guard.NONE
+    checksum: str = ""
+    data_id: int = 0
+    data_ids: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slot:
+    """A value in a frame of the device: physical value = scale * counts + offset, in `unit`."""
+
+    name: str  # "0x2100", "Demand.Position"
+    bits: Field  # where it lies and how it is read
+    scale: Fraction = Fraction(1)
+    offset: Fraction = Fraction(0)
+    unit: str | None = None  # None: the file cannot say
+    start: float = 0  # counts, while the bench file gives no value
+    choices: Mapping[str, int] = field(default_factory=dict)  # names of counts
+    is_selector: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviceFrame:
+    """A frame of the device as its EDS or DBC describes it."""
+
+    name: str
+    identifier: int
+    length: int
+    is_received: bool
+    slots: tuple[Slot, ...]
+    every: int = 1
+    is_before_sync: bool = False
+    is_answer: bool = True
+
+
+def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ...]:
+    """The fields of a frame; what the bench file does not use is filled with the value that the device starts with.
+
+    Raises:
+        InputError: a used value that lies outside the frame or overlaps another one, has a length that its type cannot
+            have, or whose counts have no known worth.
+    """
+    taken: dict[int, str] = {}
+    fields = []
+    for slot in sorted(frame.slots, key=lambda slot: slot.name not in uses and not slot.is_selector):
+        use, places = uses.get(slot.name), list_bits(slot.bits)
+        other = next((taken[place] for place in places if place in taken), "")
+        is_inside = bool(places) and min(places) >= 0 and max(places) < 8 * frame.length
+        if use is not None:
+            if not is_inside:
+                raise use.place.refuse(f"a signal inside its frame; {slot.name} lies outside the {frame.length} bytes "
+                                       f"of {frame.name}")
+            if other:
+                raise use.place.refuse(f"signals that do not overlap; {slot.name} has bits of {other}")
+            if slot.bits.length > 64 or (slot.bits.kind is Kind.FLOAT and slot.bits.length not in (32, 64)):
+                raise use.place.refuse(f"at most 64 bits, and 32 or 64 for a floating point number; {slot.name} has "
+                                       f"{slot.bits.length}")
+        if is_inside and not other and slot.bits.length <= 64:
+            taken |= dict.fromkeys(places, slot.name)
+            fields.append(_build_field(slot, use))
+    counters = [each for each in fields if each.guard is Guard.COUNTER]
+    if any(each.checksum == "e2e_profile_1" for each in fields):  # its counter never is 15 (AUTOSAR PRS E2E)
+        fields = [replace(each, wrap=min(each.modulus, 15)) if each in counters else each for each in fields]
+    return tuple(sorted(fields, key=lambda each: min(list_bits(each))))
+
+
+def _build_field(slot: Slot, use: Use | None) -> Field:
+    if use is None:
+        start = encode_float(slot.start, slot.bits.length) if slot.bits.kind is Kind.FLOAT else int(slot.start)
+        return replace(slot.bits, name=slot.name if slot.is_selector else "", wrap=None,
+                       fixed=start & (1 << slot.bits.length) - 1)
+    if use.guard is not Guard.NONE:
+        if slot.bits.kind is Kind.FLOAT:
+            raise use.place.refuse(f"a whole number to protect the frame with; {slot.name} is floating point")
+        if use.guard is Guard.COUNTER:
+            return replace(slot.bits, name=slot.name, guard=use.guard)
+        if "#" not in use.checksum and (slot.bits.length != 8 or slot.bits.lowest % 8):
+            raise use.place.refuse(f"a byte for {use.checksum}; {slot.name} has {slot.bits.length} bits from bit "
+                                   f"{slot.bits.lowest} on")
+        return replace(slot.bits, name=slot.name, guard=use.guard, wrap=None, checksum=use.checksum,
+                       data_id=use.data_id, data_ids=use.data_ids)
+    if not use.signal:
+        return replace(slot.bits, name=slot.name, wrap=None)
+    count, offset = _find_worth(slot, use)
+    if not _SMALLEST <= abs(count) <= _LARGEST or abs(offset) > _LARGEST:
+        raise use.place.refuse("counts that are worth something, from 1e-30 to 1e30")
+    return replace(slot.bits, name=use.signal, wrap=None, count=count, offset=offset)
+
+
+def _find_worth(slot: Slot, use: Use) -> tuple[Fraction, Fraction]:
+    """What a count of a signal is worth, and its offset, SI."""
+    if use.count is not None:
+        offset = slot.offset / slot.scale * use.count if slot.scale else Fraction(0)
+        return use.count, offset if use.offset is None else use.offset
+    known = find_unit(slot.unit or "")
+    factor = known.factor if known is not None and known.si == use.unit else None
+    if not use.unit:
+        factor = _PLAIN.get(slot.unit or "")
+    if factor is None:
+        said = "its file gives it no unit" if not slot.unit else f"its unit is {slot.unit!r}"
+        worth = f"such as count = '1 {use.unit}'" if use.unit else "as a number"
+        raise use.place.refuse(f"also what a count of {slot.name} is worth, {worth}; {said}")
+    return slot.scale * factor, slot.offset * factor if use.offset is None else use.offset
+
+
+def compute_counts(slot: Slot, value: float | str, place: Place) -> float:
+    """The counts of a physical value, or of its name.
+
+    Raises:
+        InputError: an unknown name, or a value that the signal cannot hold.
+    """
+    if isinstance(value, str):
+        if value not in slot.choices:
+            raise place.refuse(f"a number{' or ' if slot.choices else ''}{list_choices(None, slot.choices)}"
+                               f", not {value!r}")
+        return slot.choices[value]
+    counts = (Fraction(str(value)) - slot.offset) / slot.scale if slot.scale else Fraction(0)
+    low, high = slot.bits.range
+    if slot.bits.kind is Kind.FLOAT:
+        return float(counts)
+    if counts.denominator != 1 and not math.isclose(counts, round(counts), rel_tol=1e-9):
+        raise place.refuse(f"a multiple of {float(slot.scale):g}, the step of {slot.name}, not {value:g}")
+    if not low <= round(counts) <= high:
+        ends = sorted(float(slot.scale * end + slot.offset) for end in (low, high))
+        raise place.refuse(f"{slot.name} from {ends[0]:g} to {ends[1]:g}, not {value:g}")
+    return round(counts)
+
+
+def list_phases(slot: Slot, use: Use) -> dict[str, Any]:
+    """The counts of a value in each phase; in the safe state as in clean-up, else as the device starts."""
+    given = {phase: compute_counts(slot, value, use.place.at(phase)) for phase, value in use.values.items()}
+    usual = dict.fromkeys(PHASES, slot.start) | {"safe": given.get("cleanup", slot.start)}
+    return usual | given
