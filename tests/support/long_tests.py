@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 LONG_TESTS = (
+    "examples/",
     "newcomer/",
     "studies/",
     "vcan/",

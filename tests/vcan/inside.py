@@ -38,16 +38,19 @@ RIG = Path(sys.executable).with_name("rig")
 def compile_all(out: Path) -> int:
     """Compile what the other parts use: cycles, plant, functions of the raw bus, C programs. Always 0."""
     from c_program import build_faulty
+    from example_devices import DRIVE, ECU
 
     from plant import Actuator, Model
     from plant.compile import compile_function
-    from rig.firmware.build import build_controller
+    from rig.firmware.build import build_controller, build_device
     from rig.network import raw_bus
     from rig.nodes.emulator_service import compile_loop, compile_plant
     from rig.run.hard_loop import compile_cycle
 
     build_controller()
     build_faulty()
+    for folder in (DRIVE, ECU):
+        build_device(folder)
     port = raw_bus.make_closed_port()
     compile_function(raw_bus.receive_frame)(port, 0)
     compile_function(raw_bus.await_frame)(port)

@@ -1,0 +1,165 @@
+"""The ECU of examples/, as cantools sees it: states, current, counters and checksums. Runs on each `bus_kind`."""
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator
+
+import can
+import pytest
+from c_device import skip_without_compiler
+from example_devices import ECU, EcuMaster, compute_crc, run_ecu
+
+from rig.firmware.build import build_device
+
+INIT, SYNCHRONISING, OPERATIONAL, FAULT = 1, 2, 3, 4
+
+
+@pytest.fixture
+def ecu(where: str) -> Iterator[EcuMaster]:
+    """An ECU in state 3."""
+    with run_ecu(where) as master:
+        master.start()
+        yield master
+
+
+def read(answer: dict[str, float]) -> tuple[float, float]:
+    """State and current, mA."""
+    return answer["State"], answer["Current"]
+
+
+def spoil(data: bytes) -> bytes:
+    """A frame with a wrong checksum."""
+    return bytes((data[0] ^ 1, *data[1:]))
+
+
+def test_the_checksum_has_the_published_check_value() -> None:
+    assert compute_crc(b"123456789") == 0x4B
+
+
+def test_without_frames_it_says_that_it_is_there(where: str) -> None:
+    with run_ecu(where) as master:
+        drives = [master.read_drive() for _ in range(20)]
+    assert {read(drive) for drive in drives} == {(INIT, 0.0)}
+    assert [int(drive["Counter"]) for drive in drives] == [(int(drives[0]["Counter"]) + k) % 16 for k in range(20)]
+
+
+def test_five_sound_frames_make_it_operational(where: str) -> None:
+    with run_ecu(where) as master:
+        states = [master.cycle(enable=0)["State"] for _ in range(100)]
+    sound = [state for state in states if state != INIT]  # answers to the first frames may be behind its own Drives
+    assert sound[:5] in ([SYNCHRONISING] * 4 + [OPERATIONAL], [SYNCHRONISING] * 5) and sound[-1] == OPERATIONAL
+
+
+@pytest.mark.parametrize(("target", "position", "current"), [
+    (1.0, 0.5, 1.8), (-1.0, 0.5, -5.4), (5.0, 0.0, 8.0), (-5.0, 0.0, -8.0), (0.0, 0.00123, -0.004),
+    (-8388.608, 1342.17727, -8.0),  # the ends of the ranges
+])
+def test_current_follows_the_error_up_to_its_limit(
+    ecu: EcuMaster, target: float, position: float, current: float
+) -> None:
+    """3.6 A/m; the derivative part is 0 in the first cycle and while nothing changes."""
+    assert read(ecu.cycle(target, position)) == pytest.approx((OPERATIONAL, current))
+    assert read(ecu.cycle(target, position)) == pytest.approx((OPERATIONAL, current))
+
+
+def test_a_change_of_the_error_adds_the_derivative_part(ecu: EcuMaster) -> None:
+    ecu.cycle(1.0, 0.5)
+    assert ecu.cycle(1.1, 0.5)["Current"] == pytest.approx(3.6 * (0.6 + 1.2 / 2 * 0.1))
+
+
+def test_no_current_unless_enabled(ecu: EcuMaster) -> None:
+    assert [read(ecu.cycle(1.0, 0.5, enable)) for enable in (0, 1, 0, 1)] == [(3, 0.0), (3, 1.8), (3, 0.0), (3, 1.8)]
+
+
+def test_its_counter_counts_every_frame(ecu: EcuMaster) -> None:
+    counters = [int(ecu.cycle()["Counter"]) for _ in range(40)]
+    assert counters == [(counters[0] + k) % 16 for k in range(40)]
+
+
+@pytest.mark.parametrize("name", ["Demand", "Feedback"])
+@pytest.mark.parametrize("kind", ["checksum", "counter"])
+def test_wrong_frames_are_not_used_and_three_are_a_fault(ecu: EcuMaster, name: str, kind: str) -> None:
+    ecu.cycle(1.0, 0.5)
+    said = []
+    for _ in range(3):
+        frames = {"Demand": {"Position": 1.0, "Enable": 1}, "Feedback": {"Position": 0.5, "Pressure": 0}}
+        frames[name]["Position"] = -3.0
+        if kind == "counter":
+            ecu.counters[name] -= 1
+        for each, values in frames.items():
+            data = ecu.encode(each, **values)
+            ecu.send(each, spoil(data) if (each, kind) == (name, "checksum") else data)
+        said.append(read(ecu.read_drive()))
+    assert said == [(OPERATIONAL, 1.8), (OPERATIONAL, 1.8), (FAULT, 0.0)]
+
+
+def test_a_fault_lasts_until_enable_is_taken_back(ecu: EcuMaster) -> None:
+    for _ in range(3):
+        ecu.send("Feedback", spoil(ecu.encode("Feedback", Position=0.5, Pressure=0)))
+        ecu.read_drive()
+    assert {read(ecu.cycle(1.0, 0.5)) for _ in range(10)} == {(FAULT, 0.0)}
+    assert read(ecu.cycle(1.0, 0.5, enable=0)) == (OPERATIONAL, 0.0)
+    assert read(ecu.cycle(1.0, 0.5)) == (OPERATIONAL, 1.8)
+
+
+def test_two_lost_frames_are_no_fault(ecu: EcuMaster) -> None:
+    for lost in (1, 2, 1, 2):
+        for name in ecu.counters:
+            ecu.counters[name] += lost
+        assert read(ecu.cycle(1.0, 0.5)) == (OPERATIONAL, 1.8)
+
+
+def test_when_the_frames_stop_the_current_does(where: str) -> None:
+    with run_ecu(where, timeout=200) as master:
+        while read(master.cycle(1.0, 0.5)) != (OPERATIONAL, 1.8):
+            master.cycle(enable=0)
+        master.cycle(1.0, 0.5)
+        while (drive := master.read_drive())["State"] != FAULT:
+            pass
+        assert drive["Current"] == 0.0
+        while master.cycle(enable=0)["State"] != OPERATIONAL:
+            pass
+
+
+def test_when_the_frames_stop_without_current_it_starts_anew(where: str) -> None:
+    with run_ecu(where, timeout=200) as master:
+        while master.cycle(enable=0)["State"] != OPERATIONAL:
+            pass
+        while master.read_drive()["State"] != INIT:
+            pass
+
+
+def test_other_frames_are_not_its_own(ecu: EcuMaster) -> None:
+    """A frame of another length, and the same low bits in an 11-bit identifier, go unanswered."""
+    data = ecu.encode("Feedback", Position=0.5, Pressure=0)
+    ecu.counters["Feedback"] -= 1
+    ecu.send("Feedback", data[:7])
+    identifier = ecu.database.get_message_by_name("Feedback").frame_id & 0x7FF
+    ecu.bus.send(can.Message(arbitration_id=identifier, is_extended_id=False, data=data))
+    before = ecu.cycle()
+    assert int(ecu.cycle()["Counter"]) == (int(before["Counter"]) + 1) % 16
+
+
+@pytest.mark.parametrize(("fault", "off", "on"), [
+    ("none", 0.0, 1.8), ("wrong_sign", 0.0, -1.8), ("wrong_scaling", 0.0, 3.6), ("ignores_enable", 1.8, 1.8),
+])
+def test_a_faulty_ecu(where: str, fault: str, off: float, on: float) -> None:
+    with run_ecu(where, "--fault", fault) as master:
+        master.start()
+        master.cycle(1.0, 0.5, enable=0)
+        assert [read(master.cycle(1.0, 0.5, enable)) for enable in (0, 1, 1)] == (
+            [(OPERATIONAL, off), (OPERATIONAL, on), (OPERATIONAL, on)])
+
+
+def test_a_counter_that_stands_still(where: str) -> None:
+    with run_ecu(where, "--fault", "wrong_counter") as master:
+        master.start()
+        counters = [int(master.cycle()["Counter"]) for _ in range(1100)]
+    assert len(set(counters[:16])) == 16 and set(counters[-50:]) == {0}
+
+
+@pytest.mark.parametrize("words", [[], ["--timeout"], ["B", "--timeout", "0"], ["B", "--fault", "x"]])
+def test_a_wrong_command_line_is_one_line(words: list[str]) -> None:
+    skip_without_compiler()
+    done = subprocess.run([build_device(ECU), *words], capture_output=True, text=True, timeout=20)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1

@@ -1,0 +1,256 @@
+"""The CiA 402 drive of examples/, as canopen sees it: objects, power states, current, faults. On each `bus_kind`."""
+from __future__ import annotations
+
+import struct
+import subprocess
+from collections.abc import Iterator
+
+import canopen
+import pytest
+from bus_stations import spec
+from c_device import skip_without_compiler
+from example_devices import DRIVE, DriveMaster, run_device, run_drive
+from rig_command import rig
+
+from rig.firmware.build import build_device
+
+OFF, SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, RESET, HALT = 0x00, 0x06, 0x07, 0x0F, 0x02, 0x80, 0x10F
+DISABLED, READY, SWITCHED_ON, ENABLED = "SWITCH ON DISABLED", "READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"
+STOPPED, REACTION, FAULT = "QUICK STOP ACTIVE", "FAULT REACTION ACTIVE", "FAULT"
+VALUE_RANGE = 0x06090030  # SDO abort code
+
+
+@pytest.fixture
+def drive(where: str) -> Iterator[DriveMaster]:
+    """A drive that is OPERATIONAL in mode 8, and its master."""
+    with run_drive(where) as master:
+        master.start()
+        yield master
+
+
+def test_objects_after_power_on_are_those_of_the_data_sheet(where: str) -> None:
+    """Those that depend on the node number included."""
+    with run_drive(where, node=9) as master:
+        for item in master.node.object_dictionary.values():
+            leaves = item.values() if hasattr(item, "values") else [item]
+            for leaf in leaves:
+                changes = leaf.index in (0x1003, 0x6041)
+                if leaf.index < 0x1000 or changes:
+                    continue
+                data = master.node.sdo.upload(leaf.index, leaf.subindex)
+                assert leaf.decode_raw(data) == pytest.approx(leaf.default), leaf.name
+        numbers = [master.node.sdo[index][1].raw for index in (0x1400, 0x1401, 0x1800, 0x1801)]
+        assert numbers == [0x209, 0x309, 0x189, 0x289] and master.node.sdo[0x1014].raw == 0x89
+
+
+def test_canopen_takes_it_through_its_states(drive: DriveMaster) -> None:
+    with drive.run_cycles():
+        drive.node.op_mode = "CYCLIC SYNCHRONOUS POSITION"
+        for state in (ENABLED, SWITCHED_ON, READY, ENABLED, DISABLED, READY):
+            drive.node.state = state
+            assert drive.node.state == state
+        assert drive.node.op_mode == "CYCLIC SYNCHRONOUS POSITION"
+        assert not drive.node.is_op_mode_supported("PROFILED POSITION")
+
+
+@pytest.mark.parametrize(("controls", "states"), [
+    ([OFF], [DISABLED]),  # 0, 1
+    ([SWITCH_ON, ENABLE], [DISABLED, DISABLED]),
+    ([SHUTDOWN, SWITCH_ON, ENABLE], [READY, SWITCHED_ON, ENABLED]),  # 2, 3, 4
+    ([SHUTDOWN, ENABLE], [READY, ENABLED]),  # 3 and 4 at once
+    ([SHUTDOWN, ENABLE, SWITCH_ON, SHUTDOWN], [READY, ENABLED, SWITCHED_ON, READY]),  # 5, 6
+    ([SHUTDOWN, OFF], [READY, DISABLED]),  # 7
+    ([SHUTDOWN, QUICK_STOP], [READY, DISABLED]),  # 7
+    ([SHUTDOWN, ENABLE, SHUTDOWN], [READY, ENABLED, READY]),  # 8
+    ([SHUTDOWN, ENABLE, OFF], [READY, ENABLED, DISABLED]),  # 9
+    ([SHUTDOWN, SWITCH_ON, OFF], [READY, SWITCHED_ON, DISABLED]),  # 10
+    ([SHUTDOWN, SWITCH_ON, QUICK_STOP], [READY, SWITCHED_ON, DISABLED]),  # 10
+    ([SHUTDOWN, ENABLE, QUICK_STOP, QUICK_STOP], [READY, ENABLED, STOPPED, DISABLED]),  # 11, 12
+    ([SHUTDOWN, ENABLE, RESET], [READY, ENABLED, ENABLED]),  # no fault to reset
+])
+def test_each_transition(drive: DriveMaster, controls: list[int], states: list[str]) -> None:
+    assert [drive.cycle(control).state for control in controls] == states
+
+
+def test_a_quick_stop_can_stay(drive: DriveMaster) -> None:
+    """Option code 6: until the voltage is disabled (12) or the operation is enabled again (16)."""
+    drive.node.sdo[0x605A].raw = 6
+    drive.enable(target=1000)
+    for control, state in ((QUICK_STOP, STOPPED), (QUICK_STOP, STOPPED), (ENABLE, ENABLED), (QUICK_STOP, STOPPED),
+                           (OFF, DISABLED)):  # fmt: skip
+        answer = drive.cycle(control)
+        assert (answer.state, answer.current != 0) == (state, state == ENABLED)
+
+
+@pytest.mark.parametrize(("target", "position", "current"), [
+    (1000, 0.5, 95),  # 3.8 A/m over 0.5 mm is 1.9 mA, 95 per mille of 20 mA
+    (-1000, 0.5, -285),
+    (0, -0.0101, 2),  # 38 uA: 1.9 counts
+    (100_000, 0.0, 400),
+    (-2_147_483_648, 1e30, -400),
+])
+def test_current_follows_the_error_up_to_its_limit(
+    drive: DriveMaster, target: int, position: float, current: int
+) -> None:
+    answer = drive.enable(target, position)
+    is_limited = bool(answer.status & 0x800)
+    assert (answer.current, is_limited) == (current, abs(current) == 400)
+
+
+def test_current_flows_while_enabled_alone(drive: DriveMaster) -> None:
+    for control in (OFF, SHUTDOWN, SWITCH_ON, ENABLE, SWITCH_ON, ENABLE, SHUTDOWN, ENABLE, QUICK_STOP, OFF, ENABLE):
+        answer = drive.cycle(control, target=1000, position=0.5)
+        assert answer.current == (95 if answer.state == ENABLED else 0)
+
+
+def test_no_current_without_a_mode(where: str) -> None:
+    with run_drive(where) as master:
+        master.start(mode=0)
+        assert master.enable(target=1000)[:2] == (ENABLED, 0)
+        master.node.sdo[0x6060].raw = 8
+        assert master.cycle().current == 190
+
+
+def test_a_halt_holds_the_ram_where_it_was(drive: DriveMaster) -> None:
+    drive.enable(target=1000, position=0.5)
+    halted = drive.cycle(HALT)
+    moved = drive.cycle(HALT, target=5000, position=0.6)
+    again = drive.cycle(ENABLE)
+    assert (halted.state, halted.current, moved.current, again.current) == (ENABLED, 0, -19, 400)
+    follows = [bool(answer.status & 0x1000) for answer in (halted, moved, again)]
+    assert follows == [False, False, True]
+
+
+def test_current_limit_and_gain_are_objects(drive: DriveMaster) -> None:
+    drive.node.sdo[0x6073].raw, drive.node.sdo[0x2002][1].raw = 50, 1.0
+    assert drive.enable(target=500).current == 25
+    assert drive.cycle(target=2000).current == 50
+
+
+@pytest.mark.parametrize(("index", "sub", "value"), [
+    *((0x6060, 0, mode) for mode in (-1, 1, 3, 6, 7, 9)), *((0x605A, 0, code) for code in (3, 5)),
+    (0x2002, 1, float("nan")), (0x2002, 1, -1.0),
+])
+def test_what_it_does_not_know_is_refused(drive: DriveMaster, index: int, sub: int, value: float) -> None:
+    leaf = drive.node.sdo[index] if sub == 0 else drive.node.sdo[index][sub]
+    before = leaf.raw
+    with pytest.raises(canopen.SdoAbortedError) as caught:
+        leaf.raw = value
+    assert caught.value.code == VALUE_RANGE and leaf.raw == before
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_missing_rpdo_is_a_fault(drive: DriveMaster, number: int) -> None:
+    drive.enable(target=1000)
+    answers = [drive.cycle(silent=(number,)) for _ in range(5)]
+    assert [answer.state for answer in answers] == [ENABLED, ENABLED, ENABLED, REACTION, FAULT]
+    assert [answer.current for answer in answers] == [190, 190, 190, 0, 0]
+    assert drive.wait_for_emergency(0x8250)[0] == number and drive.node.sdo[0x603F].raw == 0x8250
+    drive.node.sdo[0x6040].raw = RESET
+    assert drive.cycle(RESET, silent=(number,)).state == FAULT  # the cause is still there
+    assert drive.cycle(RESET).state == FAULT  # no rising edge
+    drive.wait_for_emergency(0)
+    assert [drive.cycle(control).state for control in (ENABLE, RESET, SHUTDOWN, ENABLE)] == (
+        [FAULT, DISABLED, READY, ENABLED])
+    assert drive.node.sdo[0x603F].raw == 0
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_position_that_is_no_number_is_a_fault(drive: DriveMaster, value: float) -> None:
+    drive.enable(target=1000)
+    assert drive.cycle(position=value)[:2] == (REACTION, 0)
+    drive.wait_for_emergency(0x7300)
+    assert drive.cycle(position=0.0)[:2] == (FAULT, 0)
+
+
+def test_it_is_not_enabled_without_a_measured_position(drive: DriveMaster) -> None:
+    answers = [drive.cycle(control, target=1000, silent=(2,)) for control in (SHUTDOWN, SWITCH_ON, ENABLE)]
+    assert [answer.state for answer in answers] == [READY, SWITCHED_ON, SWITCHED_ON]
+    assert drive.cycle()[:2] == (ENABLED, 190)
+
+
+@pytest.mark.parametrize("command", ["PRE-OPERATIONAL", "STOPPED"])
+def test_leaving_operational_with_the_power_on_is_a_fault(drive: DriveMaster, command: str) -> None:
+    drive.enable(target=1000)
+    drive.node.nmt.state = command
+    drive.node.nmt.state = "OPERATIONAL"
+    assert drive.cycle()[:2] == (FAULT, 0)
+    assert [drive.cycle(control).state for control in (OFF, RESET)] == [FAULT, DISABLED]
+    drive.node.nmt.state = command
+    drive.node.nmt.state = "OPERATIONAL"
+    assert drive.cycle(OFF).state == DISABLED  # the power was off
+
+
+def test_lost_sync_is_a_fault(where: str) -> None:
+    with run_drive(where) as master:
+        master.start(sync_us=5_000_000)  # a minute until it is lost
+        master.enable(target=1000)
+        master.node.sdo[0x1006].raw = 1000
+        master.cycle()
+        master.wait_for_emergency(0x8100)
+        assert master.node.sdo[0x6078].raw == 0 and master.node.sdo[0x603F].raw == 0x8100
+        assert master.cycle()[:2] == (FAULT, 0)
+
+
+def test_a_lost_master_is_a_fault(where: str) -> None:
+    with run_drive(where) as master:
+        master.start()
+        master.node.sdo[0x1016][1].raw = 1 << 16 | 50
+        master.enable(target=1000)
+        master.network.send_message(0x701, b"\x05")
+        assert master.wait_for_emergency(0x8130)[0] == 1
+        assert master.node.sdo[0x6078].raw == 0 and master.node.sdo[0x6041].raw & 0x4F == 0x08
+
+
+def test_a_reset_ends_a_fault(drive: DriveMaster) -> None:
+    drive.enable(target=1000)
+    drive.cycle(position=float("nan"))
+    drive.node.nmt.state = "RESET"
+    drive.wait_until_ready()
+    drive.start()
+    assert drive.cycle(OFF, position=0.0).state == DISABLED
+
+
+def test_a_control_word_by_sdo_acts_at_once(drive: DriveMaster) -> None:
+    drive.enable(target=1000)
+    drive.node.sdo[0x6040].raw = OFF
+    assert drive.node.sdo[0x6078].raw == 0 and drive.node.sdo[0x6041].raw & 0x4F == 0x40
+
+
+def test_mode_and_position_are_in_the_second_tpdo(drive: DriveMaster) -> None:
+    drive.network.subscribe(0x285, lambda _, data, time: seen.append(bytes(data)))
+    seen: list[bytes] = []
+    drive.enable(position=-1.2304)
+    drive.node.sdo.upload(0x6041, 0)  # frames come in order: the TPDO was before this
+    assert struct.unpack("<bi", seen[-1]) == (8, -1230)
+
+
+@pytest.mark.parametrize(("fault", "off", "enabled"), [
+    ("none", (DISABLED, 0), (ENABLED, 95)),
+    ("wrong_sign", (DISABLED, 0), (ENABLED, -95)),
+    ("wrong_scaling", (DISABLED, 0), (ENABLED, 190)),
+    ("ignores_enable", (DISABLED, 95), (ENABLED, 95)),
+    ("stuck_status", (ENABLED, 0), (ENABLED, 95)),
+])
+def test_a_faulty_drive(where: str, fault: str, off: tuple[str, int], enabled: tuple[str, int]) -> None:
+    with run_drive(where, "--fault", fault) as master:
+        master.start()
+        master.cycle(OFF, target=1000, position=0.5)
+        assert master.cycle(OFF)[:2] == off
+        assert master.enable(target=1000, position=0.5)[:2] == enabled
+
+
+def test_it_conforms_to_cia_301() -> None:
+    where = spec("udp_multicast")
+    with run_device(DRIVE, where, "--node", "17"):
+        said = rig("conformance", 17, "--eds", DRIVE / "drive.eds", "--bus", where, "--write", "--json")
+    assert [case for case in said.json["tests"] if case["verdict"] == "fail"] == []
+    assert said.status == 0
+
+
+@pytest.mark.parametrize("words", [[], ["--node"], ["B", "--node", "0"], ["B", "--node", "128"], ["B", "--fault", "x"],
+                                   ["B", "--other", "1"]])
+def test_a_wrong_command_line_is_one_line(words: list[str]) -> None:
+    skip_without_compiler()
+    done = subprocess.run([build_device(DRIVE), *words], capture_output=True, text=True, timeout=20)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
