@@ -6,7 +6,7 @@
 #include "bytes.h"
 #include "serve.h"
 
-enum { LAST_SENT = 1000, ENABLE = 0x0F, ENABLED_STATUS = 0x1237, STATE = 0x6F /* bits of the status word */ };
+enum { LAST_SENT = 1000, ENABLE = 0x0F, RESET = 0x80, ENABLED_STATUS = 0x1237, STATE = 0x6F /* bits of the status word */ };
 enum { STATUS = 0, CURRENT = 2, TPDO1_LENGTH = 4, RPDO1_LENGTH = 6 }; /* bytes */
 
 static const char *const NAMES[] = {"none", "wrong_sign", "wrong_scaling", "ignores_enable", "stops_sending",
@@ -33,14 +33,14 @@ void faults_receive(struct drive *drive, const struct frame *frame)
 {
     struct frame heard = *frame;
     if (has("ignores_enable") && frame->cob_id == 0x200u + drive->device.node_id && frame->length == RPDO1_LENGTH) {
-        power_command(&sound, (uint16_t)read_bytes(frame->data, 2), true, true);
-        write_bytes(heard.data, ENABLE, 2);
+        const uint16_t control = (uint16_t)read_bytes(frame->data, 2);
+        power_command(&sound, control, true, true);
+        write_bytes(heard.data, ENABLE | (control & RESET), 2);
         if (drive->power.state < OPERATION_ENABLED && drive->power.state != NOT_READY)
             drive->power.state = OPERATION_ENABLED;
     }
     drive_receive(drive, &heard);
 }
-
 
 static void spoil(uint8_t *data)
 {

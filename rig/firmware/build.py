@@ -1,6 +1,6 @@
 """Compiles the reference firmware, and devices of a user's own on its CANopen stack and ports.
 
-    python -m rig.firmware.build FOLDER
+    python -m rig.firmware.build [FOLDER]
 
 compiles the C files of a folder, with the object table of the EDS in it if there is one, and prints the program's path.
 Programs are kept under a hash of their sources and of the compiler.
@@ -111,4 +111,8 @@ def _compile(compiler: str, words: Sequence[str], program: Path) -> None:
 
 
 if __name__ == "__main__":
-    print(build_device(Path(sys.argv[1])))
+    try:
+        print(build_device(Path(*sys.argv[1:2])))
+    except RigError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
