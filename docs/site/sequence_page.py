@@ -12,8 +12,9 @@ from markdown_text import MADE, escape_markup, make_table, quote_code
 
 from plant import Model
 from plant.segments import Segment
+from rig import tables
 from rig.cli.commands import list as list_command
-from rig.sequences import faults, tables
+from rig.sequences import faults
 from rig.sequences.checks import KEYS, KINDS, Check, Guard
 from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.python_parts import Step
