@@ -1,5 +1,7 @@
 """One CAN frame in, one CAN frame out, as compiled code: SocketCAN and the project's UDP bus, with kernel times.
 
+A COB-ID has the flags of frame.py: EXTENDED for an identifier of 29 bits, FD_FRAME for CAN FD.
+
 A loop that must not be late is a plain function that calls `receive_frame` and `send_frame`, compiled as a whole by
 `plant.compile.compile_function`. It runs without the interpreter lock; it makes no Python object and allocates nothing.
 
@@ -13,12 +15,17 @@ A loop that must not be late is a plain function that calls `receive_frame` and 
         status = send_frame(port, cob_id, 8, data)
 
 `data` is the payload as one signed 64-bit integer, first byte lowest, bytes beyond `length` zero: `join_words` and
-`join_halves` build it, `split_words` and `split_halves` read it. All times are those of CLOCK_MONOTONIC, ns
-(`time.monotonic_ns()`); `receive_frame` gives the time at which the kernel received the frame. A port belongs to one
-thread. `bus.wake()` from another thread makes `receive_frame` return WOKEN once.
+`join_halves` build it, `split_words` and `split_halves` read it. A CAN FD frame has up to 64 bytes, of which `data` is
+the first 8. All bytes of the frame that came last stand at port.octets[PAYLOAD_IN: PAYLOAD_IN + length]; `send_payload`
+sends those at PAYLOAD_OUT, which `send_frame` overwrites.
 
-Filters: the kernel drops frames with other COB-IDs (CAN_RAW_FILTER; on UDP a socket filter, which also drops the bus's
-own frames). What still arrives and is not a classical data frame with an 11-bit identifier is counted and dropped.
+All times are those of CLOCK_MONOTONIC, ns (`time.monotonic_ns()`); `receive_frame` gives the time at which the kernel
+received the frame. A port belongs to one thread. `bus.wake()` from another thread makes `receive_frame` return WOKEN
+once.
+
+Filters: the kernel drops frames with other identifiers (CAN_RAW_FILTER; on UDP a socket filter, which also drops the
+bus's own frames); it does not tell CAN FD from classical frames, which compiled code does. What still arrives and was
+not asked for is dropped; remote frames, frames with 29 bits and CAN FD frames are counted then.
 
 System calls cost most of the time that a loop takes. `await_frame` waits inside the call that receives, which makes one
 call a frame; `receive_frame` needs three where it has to wait, and keeps its deadline to the microsecond.
@@ -45,6 +52,7 @@ from plant.compile import ForeignCall, keep_apart
 from plant.errors import InputError, RigError
 from rig.network import udp
 from rig.network.bus import parse_spec, require_interface
+from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, IDENTIFIER, has_valid_length
 from rig.network.udp import GIVE, SO_RXQ_OVFL, SO_TIMESTAMPNS, TAKE, TURN_LIMIT_NS, Turn, set_receive_options
 
 # status of receive_frame
@@ -63,15 +71,18 @@ _KIND, _RX, _TX, _TURN, _ERROR = range(5)
 _IN_KERNEL, _IN_CONTROLLER, _ERROR_FRAMES, _DROPPED, _UNSENT = range(5, 10)
 _LATEST = 10  # time of the last frame: of two frames in a queue the second is not the earlier one
 _OWN, _COUNTS_LOSSES = 11, 12  # UDP: own port, network order; whether the kernel's count is of losses alone
-_STAMPED, _PAYLOAD_WORD = 13, 14  # whether kernel times are used; a payload on its way in or out
+_STAMPED, _LISTED = 13, 14  # whether kernel times are used; how many COB-IDs beyond the classical ones are received
 # .. then what the kernel reads and writes (asm-generic, 64 bit), as byte offsets
 _MESSAGE, _VECTOR, _POLL, _TIME, _ERRNO, _LIMIT = 256, 320, 336, 352, 368, 384
 _TAKE, _GIVE, _EVENT, _SENDER = 400, 416, 424, 432
-_CONTROL, _ALLOWED, _IN, _OUT = 512, 1024, 2048, 4096
-_CONTROL_SIZE, _IN_SIZE, _OUT_SIZE, _SENDER_SIZE = 256, 2048, 512, 16
-_CAN_SIZE = 16  # struct can_frame
+_CONTROL, _ALLOWED, _FRAME_IN, _FRAME_OUT = 512, 1024, 1280, 1360  # _FRAME: struct can_frame, canfd_frame
+_IN, _OUT, _WIDE_OUT, _LIST = 2048, 4096, 4608, 5120  # datagrams: in; out, with 11 and with 29 bits
+_CONTROL_SIZE, _IN_SIZE, _OUT_SIZE, _SENDER_SIZE, _LIST_SIZE = 256, 2048, 512, 16, 4096
+_CAN_SIZE, _CANFD_SIZE = 16, 72
+PAYLOAD_IN, PAYLOAD_OUT = _FRAME_IN + 8, _FRAME_OUT + 8  # 64 bytes each
 
-_SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_ERR_FILTER = 101, 1, 2
+_SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_ERR_FILTER, _CAN_RAW_FD_FRAMES = 101, 1, 2, 5
+_RTR, _ERR, _CANFD_BRS = 0x40000000, 0x20000000, 1  # linux/can.h: remote and error frames; bit of canfd_frame.flags
 _DONTWAIT, _POLLIN = 0x40, 1
 _EAGAIN, _EINTR, _ENOBUFS = errno.EAGAIN, errno.EINTR, errno.ENOBUFS
 _CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
@@ -193,8 +204,9 @@ def _take_frame(port: Port, flags: int) -> tuple[int, int, int, int, int]:
                 continue
             kind, cob_id, length, data = _decode(port, size)
             if kind == _DATA:
-                if port.octets[_ALLOWED + (cob_id >> 3)] >> (cob_id & 7) & 1:
+                if _is_allowed(port, cob_id):
                     return FRAME, _find_time(port), cob_id, length, data
+                words[_DROPPED] += cob_id > 0x7FF
             elif kind == _ERROR_FRAME:
                 words[_ERROR_FRAMES] += 1
             else:
@@ -206,6 +218,15 @@ def _take_frame(port: Port, flags: int) -> tuple[int, int, int, int, int]:
 
 
 _DATA, _ERROR_FRAME, _OTHER = 0, 1, 2  # what came
+
+
+def _is_allowed(port: Port, cob_id: int) -> bool:
+    if cob_id <= 0x7FF:
+        return bool(port.octets[_ALLOWED + (cob_id >> 3)] >> (cob_id & 7) & 1)
+    for place in range(_LIST // 8, _LIST // 8 + port.words[_LISTED]):  # noqa: SIM110 - compiled
+        if port.words[place] == cob_id:
+            return True
+    return False
 
 
 def _take_datagram(port: Port, flags: int) -> int:
@@ -294,19 +315,20 @@ def _decode(port: Port, size: int) -> tuple[int, int, int, int]:
     """(kind, COB-ID, length, payload) of what came."""
     if port.words[_KIND] == UDP:
         return decode_datagram(port, size)
-    if size != _CAN_SIZE:
-        return _OTHER, 0, 0, 0
-    identifier = _integer(port.halves[_IN // 4]) & 0xFFFFFFFF
-    length = min(_integer(port.octets[_IN + 4]), 8)
-    if identifier & 0x20000000:
-        port.words[_IN_CONTROLLER] += identifier & _CONTROLLER != 0 and port.octets[_IN + 9] & _RX_OVERFLOW != 0
+    cob_id = _integer(port.halves[_FRAME_IN // 4]) & 0xFFFFFFFF
+    if cob_id & _ERR:
+        port.words[_IN_CONTROLLER] += cob_id & _CONTROLLER != 0 and port.octets[PAYLOAD_IN + 1] & _RX_OVERFLOW != 0
         return _ERROR_FRAME, 0, 0, 0
-    if identifier > 0x7FF:
+    if cob_id & _RTR or size not in (_CAN_SIZE, _CANFD_SIZE):
         return _OTHER, 0, 0, 0
-    data = _integer(port.words[(_IN + 8) // 8])
+    most = 8
+    if size == _CANFD_SIZE:
+        cob_id, most = cob_id | FD_FRAME, 64
+    length = min(_integer(port.octets[_FRAME_IN + 4]), most)
+    data = _integer(port.words[PAYLOAD_IN // 8])
     if length < 8:
         data &= (1 << 8 * length) - 1
-    return _DATA, identifier, length, data
+    return _DATA, cob_id, length, data
 
 
 # ---------------------------------------------------------------------------------------- send
@@ -314,30 +336,49 @@ def _decode(port: Port, size: int) -> tuple[int, int, int, int]:
 
 @keep_apart
 def send_frame(port: Port, cob_id: int, length: int, data: int) -> int:
-    """Put a frame on the bus: SENT; QUEUE_FULL, the frame is lost and counted; FAILED or NO_TURN."""
+    """Put a frame of up to 8 bytes on the bus: SENT; QUEUE_FULL, the frame is lost and counted; FAILED or NO_TURN."""
+    port.words[PAYLOAD_OUT // 8] = data
+    return _send_payload(port, cob_id, length)
+
+
+@keep_apart
+def send_payload(port: Port, cob_id: int, length: int) -> int:
+    """Put a frame on the bus whose bytes stand at PAYLOAD_OUT, as `send_frame` does. A length that no frame of this
+    kind has is FAILED; so is CAN FD on a SocketCAN bus that was not opened for it.
+    """
+    return _send_payload(port, cob_id, length)
+
+
+def _send_payload(port: Port, cob_id: int, length: int) -> int:
+    if not has_valid_length(cob_id, length):
+        port.words[_ERROR] = errno.EINVAL
+        return FAILED
     if port.words[_KIND] == UDP:
-        return _send_datagram(port, cob_id, length, data)
-    port.halves[_OUT // 4] = cob_id
-    port.halves[_OUT // 4 + 1] = length
-    port.words[_OUT // 8 + 1] = data
-    return _transmit(port, _CAN_SIZE)
+        return _send_datagram(port, cob_id, length)
+    port.halves[_FRAME_OUT // 4] = cob_id & (EXTENDED | IDENTIFIER)
+    port.halves[_FRAME_OUT // 4 + 1] = length
+    if not cob_id & FD_FRAME:
+        return _transmit(port, _FRAME_OUT, _CAN_SIZE)
+    if cob_id & BIT_RATE_SWITCH:
+        port.octets[_FRAME_OUT + 5] = _CANFD_BRS
+    return _transmit(port, _FRAME_OUT, _CANFD_SIZE)
 
 
-def _send_datagram(port: Port, cob_id: int, length: int, data: int) -> int:
-    size = encode_datagram(port, cob_id, length, data)
+def _send_datagram(port: Port, cob_id: int, length: int) -> int:
+    start, size = encode_datagram(port, cob_id, length)
     base = port.octets.ctypes.data
     while _semtimedop(port.words[_TURN], base + _TAKE, 2, base + _LIMIT) != 0:
         _note_errno(port)
         if port.words[_ERROR] != _EINTR:
             return NO_TURN
-    status = _transmit(port, size)
+    status = _transmit(port, start, size)
     _semtimedop(port.words[_TURN], base + _GIVE, 1, 0)
     return status
 
 
-def _transmit(port: Port, size: int) -> int:
+def _transmit(port: Port, start: int, size: int) -> int:
     words = port.words
-    while _send(words[_TX], port.octets.ctypes.data + _OUT, size, _DONTWAIT) < 0:
+    while _send(words[_TX], port.octets.ctypes.data + start, size, _DONTWAIT) < 0:
         _note_errno(port)
         if words[_ERROR] == _EAGAIN or words[_ERROR] == _ENOBUFS:
             words[_UNSENT] += 1
@@ -349,17 +390,23 @@ def _transmit(port: Port, size: int) -> int:
 
 # ---------------------------------------------------------------------------------------- datagrams of python-can
 
-# A datagram is a msgpack map; an example tells how python-can packs it.
-_EXAMPLE = pack_message(can.Message(arbitration_id=0x7FF, is_extended_id=False, data=bytes(range(0xF0, 0xF8))))
+# A datagram is a msgpack map; an example tells how python-can packs it. With 29 bits the identifier is two bytes longer
+# and the rest is the same.
+_EXAMPLE, _WIDE_EXAMPLE = (
+    pack_message(can.Message(arbitration_id=most, is_extended_id=most > 0x7FF, data=bytes(range(0xF0, 0xF8))))
+    for most in (0x7FF, IDENTIFIER))
 _ID_AT, _LENGTH_AT, _DATA_AT = (_EXAMPLE.index(text) + len(text) for text in (b"\xcd", b"\xa3dlc", b"\xc4\x08"))
 _TAIL = len(_EXAMPLE) - _DATA_AT - 8  # bytes after the payload
+_FD_AT, _SWITCH_AT = (_EXAMPLE[-_TAIL:].index(key) + len(key) for key in (b"is_fd", b"bitrate_switch"))
 _NAMES = list(msgpack.unpackb(_EXAMPLE))
 _KEYS = [msgpack.packb(name) for name in _NAMES]
 _KEY_BYTES, _KEY_LENGTHS = np.frombuffer(b"".join(_KEYS), np.uint8), np.array([len(key) for key in _KEYS])
-_ID, _EXTENDED, _REMOTE, _IS_ERROR, _FD, _DLC, _PAYLOAD = (_NAMES.index(name) for name in (
-    "arbitration_id", "is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "dlc", "data"))
+_ID, _DLC, _PAYLOAD = (_NAMES.index(name) for name in ("arbitration_id", "dlc", "data"))
+_EXTENDED, _REMOTE, _IS_ERROR, _FD, _SWITCH, _PASSIVE = (1 << _NAMES.index(name) for name in (
+    "is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "bitrate_switch", "error_state_indicator"))
+_FLAGS = _EXTENDED | _REMOTE | _IS_ERROR | _FD | _SWITCH | _PASSIVE
 _KEY_STARTS = np.cumsum(_KEY_LENGTHS) - _KEY_LENGTHS
-_NOTHING = 0xC0  # msgpack's first byte of a value
+_NOTHING, _TRUE = 0xC0, 0xC3  # msgpack's first byte of a value
 _OFF = (0x00, _NOTHING, 0xC2)  # 0, nothing and false
 _UNSIGNED, _ABSENT = 0xCC, -2
 _BYTES, _TEXT = 0xC4, 0xD9  # a length of one byte follows; after the next number one of two bytes
@@ -369,26 +416,36 @@ _SIZES[:0x80] = _SIZES[[0xC0, 0xC2, 0xC3]] = 0  # a small number, nothing, false
 _SIZES[0xA0:0xC0], _SIZES[0xCA:0xD0] = np.arange(32), (4, 8, 1, 2, 4, 8)  # a short text; floats, unsigned numbers
 
 
-def encode_datagram(port: Port, cob_id: int, length: int, data: int) -> int:
-    """Write a frame into the port's buffer, as python-can's udp_multicast packs it; its length in bytes."""
-    octets, base, place = port.octets, port.octets.ctypes.data, _OUT + _DATA_AT
-    octets[_OUT + _ID_AT], octets[_OUT + _ID_AT + 1] = cob_id >> 8, cob_id & 0xFF
-    octets[_OUT + _LENGTH_AT] = octets[place - 1] = length
-    port.words[_PAYLOAD_WORD] = data
-    _memcpy(base + place, base + 8 * _PAYLOAD_WORD, length)
-    _memcpy(base + place + length, base + _OUT + _OUT_SIZE - _TAIL, _TAIL)
-    return _integer(_DATA_AT + length + _TAIL)
+def encode_datagram(port: Port, cob_id: int, length: int) -> tuple[int, int]:
+    """Pack the frame whose payload stands at PAYLOAD_OUT as python-can's udp_multicast does; (place in the port, size).
+    """
+    octets, base, start = port.octets, port.octets.ctypes.data, _OUT
+    place = _OUT + _ID_AT
+    if cob_id & EXTENDED:
+        start, place = _WIDE_OUT, _WIDE_OUT + _ID_AT + 2
+        octets[place - 2], octets[place - 1] = cob_id >> 24 & 0x1F, cob_id >> 16 & 0xFF
+    octets[place], octets[place + 1] = cob_id >> 8 & 0xFF, cob_id & 0xFF
+    place += _DATA_AT - _ID_AT
+    octets[place + _LENGTH_AT - _DATA_AT] = octets[place - 1] = length
+    _memcpy(base + place, base + PAYLOAD_OUT, length)
+    place += length
+    _memcpy(base + place, base + _OUT + _OUT_SIZE - _TAIL, _TAIL)
+    if cob_id & FD_FRAME:
+        octets[place + _FD_AT] = _TRUE
+        octets[place + _SWITCH_AT] += cob_id & BIT_RATE_SWITCH != 0
+    return start, _integer(place + _TAIL - start)
 
 
 @keep_apart
 def decode_datagram(port: Port, size: int) -> tuple[int, int, int, int]:
-    """(kind, COB-ID, length, payload) of `size` bytes in the port's buffer, as python-can's udp_multicast packs them.
+    """(kind, COB-ID, length, data) of `size` bytes in the port's buffer, as python-can's udp_multicast packs them; the
+    payload goes to PAYLOAD_IN.
 
     The keys may come in any order, and those that have a default may be missing: other programs pack the map otherwise.
     What is no such map, or contradicts itself, counts as an error frame, as in `UdpBus`.
     """
     octets, place, end = port.octets, _IN + 1, _IN + size
-    cob_id, dlc, payload, length, flags = -1, _ABSENT, 0, 0, 0
+    cob_id, dlc, payload, length, flags = -1, _ABSENT, 0, 0, _EXTENDED
     if octets[_IN] & 0xF0 != 0x80:
         return _ERROR_FRAME, 0, 0, 0
     for guess in range(octets[_IN] & 0x0F):
@@ -410,20 +467,26 @@ def decode_datagram(port: Port, size: int) -> tuple[int, int, int, int]:
             dlc = _read_number(octets, first, place, count)
         elif key == _PAYLOAD:
             payload, length = place, count if first in (_BYTES, _BYTES + 1, _NOTHING) else -1
-        elif key in (_EXTENDED, _REMOTE, _IS_ERROR, _FD) and first not in _OFF:
-            flags |= 1 << key
+        elif _FLAGS >> key & 1:
+            flags = flags | 1 << key if first not in _OFF else flags & ~(1 << key)
         place += count
     if dlc == _ABSENT:
         dlc = length
-    if place != end or length < 0 or flags & 1 << _IS_ERROR:
+    is_valid = place == end and 0 <= cob_id <= (IDENTIFIER if flags & _EXTENDED else 0x7FF) and length >= 0
+    contradiction = _REMOTE if flags & _FD else _SWITCH | _PASSIVE
+    if not is_valid or flags & (_IS_ERROR | contradiction):
         return _ERROR_FRAME, 0, 0, 0
-    if flags:
+    if flags & _REMOTE:
         return _OTHER, 0, 0, 0
-    if cob_id < 0 or cob_id > 0x7FF or length > 8 or dlc != length:
+    if flags & _EXTENDED:
+        cob_id |= EXTENDED
+    if flags & _FD:
+        cob_id |= FD_FRAME
+    if dlc != length or not has_valid_length(cob_id, length):
         return _ERROR_FRAME, 0, 0, 0
-    port.words[_PAYLOAD_WORD] = 0
-    _memcpy(octets.ctypes.data + 8 * _PAYLOAD_WORD, octets.ctypes.data + payload, length)
-    return _DATA, cob_id, length, _integer(port.words[_PAYLOAD_WORD])
+    port.words[PAYLOAD_IN // 8] = 0
+    _memcpy(octets.ctypes.data + PAYLOAD_IN, octets.ctypes.data + payload, length)
+    return _DATA, cob_id, length, _integer(port.words[PAYLOAD_IN // 8])
 
 
 def _read_key(octets: NDArray[np.uint8], place: int, end: int, guess: int) -> tuple[int, int]:
@@ -459,13 +522,14 @@ def _read_number(octets: NDArray[np.uint8], first: int, place: int, count: int) 
 class RawBus:
     """A bus for compiled loops; `port` is what they get. Use it as a context, or close it.
 
-    Counted, to be read at any time: `error_frames`; `overflows`, frames lost on the way in; `dropped`, frames that are
-    not classical 11-bit data frames; `unsent`, frames the full transmit queue refused. On UDP with a filter `overflows`
-    stays as it is: the kernel counts a frame that the filter drops as one that was lost.
+    Counted, to be read at any time: `error_frames`; `overflows`, frames lost on the way in; `dropped`, remote frames,
+    and frames of 29 bits and CAN FD frames that nobody asked for; `unsent`, frames the full transmit queue refused. On
+    UDP with a filter `overflows` stays as it is: the kernel counts a frame that the filter drops as one that was lost.
     """
 
-    def __init__(self, spec: str, cob_ids: Sequence[int] | None = None) -> None:
-        """`cob_ids`: those to be received, all by default.
+    def __init__(self, spec: str, cob_ids: Sequence[int] | None = None, fd: bool = False) -> None:
+        """`cob_ids`: those to be received, by default all classical frames of 11 bits. `fd`: open it for CAN FD; the
+        COB-ID of such a frame does so too.
 
         Raises:
             InputError: a bus of another kind.
@@ -484,7 +548,12 @@ class RawBus:
             with contextlib.ExitStack() as stack:
                 self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
                 stack.callback(os.close, self._wake)
-                self._rx, tx = (_open_socketcan if kind == "socketcan" else self._open_udp)(channel, stack)
+                is_fd = fd or any(cob_id & FD_FRAME for cob_id in cob_ids or ())
+                if kind == "socketcan":
+                    self._rx = tx = _open_socketcan(channel, is_fd, stack)
+                    words[_VECTOR // 8: _VECTOR // 8 + 2] = words.ctypes.data + _FRAME_IN, _CANFD_SIZE
+                else:
+                    self._rx, tx = self._open_udp(channel, stack)
                 words[_RX], words[_TX] = self._rx.fileno(), tx.fileno()
                 self.port.halves[_POLL // 4: _POLL // 4 + 4] = self._rx.fileno(), _POLLIN, self._wake, _POLLIN
                 self._allow(range(0x800))
@@ -550,23 +619,25 @@ class RawBus:
         return rx, tx
 
     def set_filter(self, cob_ids: Sequence[int]) -> None:
-        """Receive these COB-IDs from now on. Another thread may be receiving.
+        """Receive these COB-IDs from now on, CAN FD only if the bus was opened for it. Another thread may be receiving.
 
         Raises:
             RigError: the kernel refuses.
         """
         is_socketcan = bool(self.port.words[_KIND] == SOCKETCAN)
+        self._allow(cob_ids)
         try:
             if is_socketcan:
-                exact = 0x7FF | 0xC0000000  # the identifier, and neither extended nor remote
-                filters = b"".join(struct.pack("=II", cob_id, exact) for cob_id in cob_ids)
-                self._rx.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, filters)
+                filters = []
+                for cob_id in cob_ids:  # the kernel is fast with masks that have just the bits of such an identifier
+                    mask = EXTENDED | _RTR | (IDENTIFIER if cob_id & EXTENDED else 0x7FF)
+                    filters.append(struct.pack("=II", cob_id & (EXTENDED | IDENTIFIER), mask))
+                self._rx.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"".join(filters))
             else:
                 udp.attach_filter(self._rx, socket.ntohs(int(self.port.words[_OWN])), cob_ids)
         except OSError as error:
             raise RigError(f"{self.spec}: {error.strerror}") from error
         self.port.words[_COUNTS_LOSSES] = is_socketcan
-        self._allow(cob_ids)
 
     def use_kernel_times(self, is_wanted: bool) -> None:
         """Whether a frame gets the time at which the kernel received it (the default), or that of the call, which
@@ -575,24 +646,29 @@ class RawBus:
         self.port.words[_STAMPED] = is_wanted
 
     def _allow(self, cob_ids: Sequence[int]) -> None:
-        """One bit a COB-ID, for the frames that the kernel lets through."""
+        """One bit a COB-ID, for the frames that the kernel lets through; those beyond 11 bits are a list."""
+        listed = [cob_id & ~BIT_RATE_SWITCH for cob_id in cob_ids if cob_id > 0x7FF]
+        if len(listed) > _LIST_SIZE // 8:
+            raise RigError(f"{self.spec}: {len(listed)} frames to receive; at most {_LIST_SIZE // 8} are possible")
         allowed = np.zeros(0x800, np.uint8)
-        allowed[list(cob_ids)] = 1
+        allowed[[cob_id for cob_id in cob_ids if cob_id <= 0x7FF]] = 1
         self.port.octets[_ALLOWED: _ALLOWED + 256] = np.packbits(allowed, bitorder="little")
+        self.port.words[_LIST // 8: _LIST // 8 + len(listed)] = listed
+        self.port.words[_LISTED] = len(listed)
 
 
-def _open_socketcan(channel: str, stack: contextlib.ExitStack) -> tuple[socket.socket, socket.socket]:
-    """The socket that receives and sends, twice."""
-    require_interface(channel)
+def _open_socketcan(channel: str, is_fd: bool, stack: contextlib.ExitStack) -> socket.socket:
+    require_interface(channel, is_fd)
     raw = stack.enter_context(socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW))
     set_receive_options(raw)
+    raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, int(is_fd))
     raw.bind((channel,))
-    return raw, raw
+    return raw
 
 
-def open_raw_bus(spec: str, cob_ids: Sequence[int] | None = None) -> RawBus:
+def open_raw_bus(spec: str, cob_ids: Sequence[int] | None = None, fd: bool = False) -> RawBus:
     """Open `socketcan:INTERFACE` or `udp_multicast[:GROUP]` for compiled loops; see `RawBus`."""
-    return RawBus(spec, cob_ids)
+    return RawBus(spec, cob_ids, fd)
 
 
 def can_open(spec: str) -> bool:
@@ -602,7 +678,7 @@ def can_open(spec: str) -> bool:
 
 def _make_port() -> Port:
     """The memory, with the addresses that the kernel's structures hold."""
-    words = np.zeros((_OUT + _OUT_SIZE) // 8, np.int64)
+    words = np.zeros((_LIST + _LIST_SIZE) // 8, np.int64)
     port = Port(words, words.view(np.int32), words.view(np.uint8))
     base = words.ctypes.data
     # struct msghdr: name, its length, vectors, their number, control data, its length, flags
@@ -612,7 +688,8 @@ def _make_port() -> Port:
     for place, operations in ((_TAKE, TAKE), (_GIVE, GIVE)):
         octets = operations.view(np.uint8)
         port.octets[place: place + octets.size] = octets
-    port.octets[_OUT: _OUT + len(_EXAMPLE)] = np.frombuffer(_EXAMPLE, np.uint8)  # for `encode_datagram` to fill in
+    for place, example in ((_OUT, _EXAMPLE), (_WIDE_OUT, _WIDE_EXAMPLE)):  # for `encode_datagram` to fill in
+        port.octets[place: place + len(example)] = np.frombuffer(example, np.uint8)
     port.octets[_OUT + _OUT_SIZE - _TAIL: _OUT + _OUT_SIZE] = np.frombuffer(_EXAMPLE[-_TAIL:], np.uint8)
     return port
 

@@ -112,10 +112,17 @@ class TestLink:
     @only_udp
     def test_the_kernel_drops_them(self, bus_kind: str) -> None:
         """They wake nobody: nothing is there to be read."""
-        with stations(bus_kind, 1) as (sender,), open_can(spec(bus_kind)) as bus:
-            Link(bus, time.monotonic_ns).leave_out([codec.SYNC])
-            sender.send(codec.SYNC, b"")
+        where = spec(bus_kind)
+        with open_can(where) as other, open_can(where) as bus:
+            sender, link = (Link(each, time.monotonic_ns) for each in (other, bus))
+            link.leave_out([codec.SYNC, EXTENDED | 0x7F, EXTENDED | 0x18FEF1AB])
+            for cob_id in (codec.SYNC, EXTENDED | 0x7F, EXTENDED | 0x18FEF1AB):
+                sender.send(cob_id, b"")
             assert select.select([bus], [], [], 0.1)[0] == []
+            others = [EXTENDED | codec.SYNC, 0x7F, EXTENDED | 0x18FEF1AA]
+            for cob_id in others:
+                sender.send(cob_id, b"")
+            assert [frame.cob_id for frame in gather(link, 3)] == others
 
     @links
     def test_foreign_frames_are_counted_and_dropped(self, bus_kind: str) -> None:

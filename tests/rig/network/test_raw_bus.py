@@ -21,11 +21,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plant.compile import compile_function
-from plant.errors import InputError
+from plant.errors import InputError, RigError
 from rig.network import raw_bus
 from rig.network.bus import open_can
+from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, IDENTIFIER, has_valid_length
 from rig.network.link import Link
-from rig.network.raw_bus import FRAME, NEVER, SENT, TIMEOUT, WOKEN, Port, open_raw_bus
+from rig.network.message import find_cob_id, make_message
+from rig.network.raw_bus import (
+    FAILED,
+    FRAME,
+    NEVER,
+    PAYLOAD_IN,
+    PAYLOAD_OUT,
+    SENT,
+    TIMEOUT,
+    WOKEN,
+    Port,
+    open_raw_bus,
+)
 
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
 
@@ -79,6 +92,60 @@ class TestFrames:
                     assert message is not None and not message.is_extended_id
                     assert (message.arbitration_id, bytes(message.data)) == (cob_id, data)
 
+    def test_wide_identifiers_and_fd_frames_go_to_and_fro(self, where: str) -> None:
+        kinds = [EXTENDED, FD_FRAME, EXTENDED | FD_FRAME]
+        kinds += [kind | BIT_RATE_SWITCH for kind in kinds if kind & FD_FRAME]
+        cob_ids = [kind | number for kind in kinds for number in (0, 0x7F, 0x182, 0x7FF)]
+        cob_ids += [kind | number for kind in kinds if kind & EXTENDED for number in (0x800, 0x18FEF1AB, IDENTIFIER)]
+        receive, send = function("receive_frame"), function("send_payload")
+        with open_can(where, fd=True) as other, open_raw_bus(where, cob_ids) as bus:
+            for length in (0, 1, 8, *FD_LENGTHS):
+                data = bytes(range(0xF0 - length, 0xF0))
+                for cob_id in cob_ids if length <= 8 else [each for each in cob_ids if each & FD_FRAME]:
+                    sent = make_message(cob_id, data)
+                    other.send(sent)
+                    status, _, *rest = receive(bus.port, soon())
+                    assert (status, *rest) == (FRAME, cob_id & ~BIT_RATE_SWITCH, length, payload(data[:8]))
+                    assert bytes(bus.port.octets[PAYLOAD_IN: PAYLOAD_IN + length]) == data
+                    bus.port.octets[PAYLOAD_OUT: PAYLOAD_OUT + length] = np.frombuffer(data, np.uint8)
+                    assert send(bus.port, cob_id, length) == SENT
+                    heard = other.recv(60)
+                    assert heard is not None
+                    assert heard.equals(sent, timestamp_delta=None, check_channel=False, check_direction=False)
+
+    def test_the_payload_of_a_classical_frame_stands_there_too(self, where: str, other: can.BusABC) -> None:
+        with open_raw_bus(where) as bus:
+            for length in range(9):
+                data = bytes(range(0xF8, 0xF8 + length))
+                other.send(can.Message(arbitration_id=0x123, data=data, is_extended_id=False))
+                assert function("receive_frame")(bus.port, soon())[0] == FRAME
+                assert bytes(bus.port.octets[PAYLOAD_IN: PAYLOAD_IN + length]) == data
+                bus.port.octets[PAYLOAD_OUT: PAYLOAD_OUT + length] = np.frombuffer(data, np.uint8)
+                assert function("send_payload")(bus.port, 0x124, length) == SENT
+                heard = other.recv(60)
+                assert heard is not None and (heard.arbitration_id, bytes(heard.data)) == (0x124, data)
+
+    def test_only_the_kinds_asked_for_arrive(self, where: str) -> None:
+        """One number is four identifiers: of 11 or 29 bits, classical or CAN FD."""
+        kinds = (0, EXTENDED, FD_FRAME, EXTENDED | FD_FRAME)
+        with open_can(where, fd=True) as other:
+            for wanted in kinds:
+                with open_raw_bus(where, [number | wanted for number in (0x12, 0xFF, 0x183)], fd=True) as bus:
+                    for kind in kinds:
+                        for number in (0x12, 0x13, 0xFF, 0x182, 0x183):
+                            other.send(make_message(number | kind, b"\1"))
+                    assert receive_waiting(bus.port) == [number | wanted for number in (0x12, 0xFF, 0x183)]
+                    bus.set_filter([EXTENDED | 0x12345678, 0x80])
+                    for number in (0x12, EXTENDED | 0x12345678, EXTENDED | 0x12345679, FD_FRAME | 0x80, 0x80):
+                        other.send(make_message(number, b""))
+                    assert receive_waiting(bus.port) == [EXTENDED | 0x12345678, 0x80]
+
+    def test_a_length_that_no_such_frame_has_fails(self, where: str) -> None:
+        with open_raw_bus(where, (), fd=True) as bus:
+            for cob_id, length in ((0x80, 9), (EXTENDED | 0x80, 12), (FD_FRAME | 0x80, 9), (FD_FRAME | 0x80, 65)):
+                status = function("send_payload")(bus.port, cob_id, length)
+                assert status == FAILED and "Invalid argument" in str(bus.explain_failure(status))
+
     def test_only_the_frames_asked_for_arrive_and_none_of_its_own(self, where: str, other: can.BusABC) -> None:
         wanted = [0x000, 0x050, 0x0FF, 0x183, 0x7FF]  # each length of an identifier in msgpack
         with open_raw_bus(where, wanted) as bus, open_raw_bus(where) as python:
@@ -90,6 +157,8 @@ class TestFrames:
                     other.send(can.Message(arbitration_id=cob_id, is_extended_id=False, is_remote_frame=True))
             assert receive_waiting(bus.port) == wanted
             assert (len(receive_waiting(python.port)), python.dropped) == (0x800 + 1, 16)
+            with pytest.raises(RigError, match="513 frames to receive; at most 512 are possible"):
+                bus.set_filter(range(EXTENDED, EXTENDED + 513))
 
     def test_time_is_that_of_reception(self, where: str) -> None:
         receive, send = function("receive_frame"), function("send_frame")
@@ -174,9 +243,12 @@ def read_by_python_can(data: bytes) -> tuple[int, ...]:
     message = unpack_message(data, check=True)
     if message.is_error_frame:
         return (1,)
-    if message.is_extended_id or message.is_remote_frame or message.is_fd:
+    if message.is_remote_frame:
         return (2,)
-    return 0, message.arbitration_id, len(message.data), payload(bytes(message.data))
+    cob_id, data = find_cob_id(message) & ~BIT_RATE_SWITCH, bytes(message.data)
+    if not has_valid_length(cob_id, len(data)):
+        return (1,)
+    return 0, cob_id, len(data), payload(data[:8]), data
 
 
 PORT = raw_bus.make_closed_port()
@@ -185,16 +257,18 @@ PORT = raw_bus.make_closed_port()
 def read_compiled(data: bytes) -> tuple[int, ...]:
     PORT.octets[raw_bus._IN: raw_bus._IN + len(data)] = np.frombuffer(data, np.uint8)
     kind, *rest = function("decode_datagram")(PORT, len(data))
-    return (kind, *rest) if kind == 0 else (kind,)
+    return (kind, *rest, bytes(PORT.octets[PAYLOAD_IN: PAYLOAD_IN + rest[1]])) if kind == 0 else (kind,)
 
 
-messages = st.builds(
-    lambda cob_id, data, flags, t, channel: can.Message(
-        arbitration_id=cob_id, data=b"" if flags == "is_remote_frame" else data, timestamp=t, channel=channel,
-        is_extended_id=flags == "is_extended_id", is_remote_frame=flags == "is_remote_frame",
-        is_error_frame=flags == "is_error_frame", is_fd=flags == "is_fd"),
-    st.one_of(st.integers(0, 0x7FF), st.sampled_from([0, 0x7F, 0x80, 0xFF, 0x100, 0x7FF])), st.binary(max_size=8),
-    st.sampled_from(["", "", "", "is_extended_id", "is_remote_frame", "is_error_frame", "is_fd"]),
+FLAGS = ("is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "bitrate_switch", "error_state_indicator")
+messages = st.builds(  # some contradict themselves
+    lambda number, data, flags, t, channel: can.Message(
+        arbitration_id=number, data=b"" if "is_remote_frame" in flags else data, timestamp=t, channel=channel,
+        **{flag: flag in flags for flag in FLAGS}),
+    st.one_of(st.integers(0, 0x7FF), st.integers(0, 2**29), st.sampled_from([0, 0x7F, 0x80, 0xFF, 0x100, 0x7FF])),
+    st.one_of(st.binary(max_size=8), st.sampled_from(FD_LENGTHS).flatmap(lambda n: st.binary(min_size=n, max_size=n)),
+              st.binary(max_size=66)),
+    st.one_of(st.just(set()), st.sampled_from(FLAGS).map(lambda flag: {flag}), st.sets(st.sampled_from(FLAGS))),
     st.one_of(st.floats(0, 2e9), st.integers(0, 2**40)), st.sampled_from([None, "239.0.0.1", 3, "x" * 40]))
 
 
@@ -205,7 +279,29 @@ class TestDatagrams:
         data = pack_message(message)
         pairs = list(msgpack.unpackb(data).items())
         random.shuffle(pairs)
-        assert read_compiled(data) == read_compiled(msgpack.packb(dict(pairs))) == read_by_python_can(data)
+        try:
+            expected = read_by_python_can(data)
+        except ValueError:  # its flags or its length contradict each other
+            expected = (1,)
+        assert read_compiled(data) == read_compiled(msgpack.packb(dict(pairs))) == expected
+
+    @pytest.mark.parametrize("left_out", [*FLAGS, "dlc", "data", "timestamp"])
+    def test_a_key_that_is_missing_has_the_value_that_python_can_gives_it(self, left_out: str) -> None:
+        for flags in ((), ("is_extended_id",), ("is_fd",)):
+            data = pack_message(can.Message(arbitration_id=0x80, **{flag: flag in flags for flag in FLAGS}))
+            data = msgpack.packb({key: value for key, value in msgpack.unpackb(data).items() if key != left_out})
+            assert read_compiled(data) == read_by_python_can(data)
+
+    @given(st.integers(0, IDENTIFIER), st.binary(max_size=64), st.sets(st.sampled_from(range(3))))
+    def test_packs_as_python_can_does(self, number: int, data: bytes, kinds: set[int]) -> None:
+        flags = sum((EXTENDED, FD_FRAME, BIT_RATE_SWITCH)[kind] for kind in kinds)
+        if not flags & FD_FRAME:
+            flags, data = flags & EXTENDED, data[:8]
+        cob_id = flags | number & (IDENTIFIER if flags & EXTENDED else 0x7FF)
+        PORT.octets[PAYLOAD_OUT: PAYLOAD_OUT + len(data)] = np.frombuffer(data, np.uint8)
+        place, size = function("encode_datagram")(PORT, cob_id, len(data))
+        message = unpack_message(bytes(PORT.octets[place: place + size]), check=True)
+        assert message.equals(make_message(cob_id, data))
 
     @pytest.mark.parametrize("change", [{"data": None, "dlc": 0}, {"channel": "x" * 300}, {"dlc": None}, {"dlc": "8"}])
     def test_other_ways_to_pack_are_those_of_python_can(self, change: dict[str, Any]) -> None:
@@ -231,13 +327,15 @@ class TestDatagrams:
         data = {"cut": data[:place], "bad": data[:place] + bad + data[place + len(bad):], "more": data + bad}[way]
         seen = read_compiled(data)
         assert way == "bad" or seen == (1,)
-        if seen[0] == 0:  # a text that is not UTF-8, or a flag of CAN FD, does not matter to it
-            fields = msgpack.unpackb(data, raw=True)
-            bits = fields.get(b"data") or b""
-            assert seen == (0, fields[b"arbitration_id"], len(bits), payload(bits))
-            assert fields[b"dlc"] == len(bits)
-            kinds = (b"is_extended_id", b"is_remote_frame", b"is_error_frame", b"is_fd")
-            assert not any(fields.get(kind) for kind in kinds)
+        if seen[0] == 0:  # a text that is not UTF-8 does not matter to it
+            fields = {key.decode(errors="replace"): value for key, value in msgpack.unpackb(data, raw=True).items()}
+            bits = fields.get("data") or b""
+            cob_id = fields["arbitration_id"]
+            cob_id |= EXTENDED if fields.get("is_extended_id", True) else 0
+            cob_id |= FD_FRAME if fields.get("is_fd") else 0
+            assert seen == (0, cob_id, len(bits), payload(bits[:8]), bits)
+            assert fields["dlc"] == len(bits)
+            assert not (fields.get("is_remote_frame") or fields.get("is_error_frame"))
 
     @given(st.binary(max_size=300))
     def test_foreign_bytes_are_no_frame(self, data: bytes) -> None:
