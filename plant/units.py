@@ -61,12 +61,7 @@ def parse_quantity(text: str, si: str, where: object, field: str) -> Fraction:
         InputError: no number, no unit, or the unit of another quantity.
     """
     found = _QUANTITY.fullmatch(text)
-    if found is None:
-        example = f"a number and a unit, such as '1 {si}'" if si else "a number"
-        raise InputError(where, field, f"{example}, not {show_value(text)}")
-    number, unit = Fraction(found[1]), found[2]
-    if si or unit:
-        if not si:
-            raise InputError(where, field, f"a number without a unit, not {show_value(text)}")
-        number *= require_unit(unit, si, where, field).factor
-    return number
+    if found is None or bool(found[2]) != bool(si):
+        expected = f"a number and a unit, such as '1 {si}'" if si else "a number without a unit"
+        raise InputError(where, field, f"{expected}, not {show_value(text)}")
+    return Fraction(found[1]) * (require_unit(found[2], si, where, field).factor if si else 1)

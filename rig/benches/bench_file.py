@@ -88,7 +88,7 @@ class ProtectionKeys:
     """The keys of a protected signal."""
 
     kind: str
-    data_id: Annotated[int, Range("1", low=0, high=0xFFFF)] | tuple[Byte, ...] = 0
+    data_id: Annotated[int, Range("1", low=0, high=0xFFFF)] | tuple[Byte, ...] | None = None
 
 
 def load_bench(name_or_path: str = "eha", *, is_trusted: bool = False) -> Bench:
@@ -134,7 +134,7 @@ def load_bench_from_files(content: Mapping[str, bytes], *, is_trusted: bool = Fa
 
     def read(name: str) -> bytes:
         if name not in content:
-            raise InputError(bench_file or "log", "", f"{name} among the files of the log")
+            raise InputError(bench_file or "log", "", "a file of the log")
         return content[name]
 
     return _parse_bench(bench_file, read(bench_file), read, Path(), is_trusted=is_trusted)
@@ -153,8 +153,10 @@ class _Reader:
         """The content of a file that the key at `place` names."""
         if not name or "\\0" in name:
             raise place.refuse("the name of a file")
-        with place.locate():
+        try:
             self.files[name] = self._read(name)
+        except InputError as error:
+            raise place.refuse(f"{error.expected}: {name}") from error
         return self.files[name]
 
     def read_text(self, name: str | None, place: Place, kind: str) -> str:
@@ -191,6 +193,9 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, *, is_t
     uses = _list_uses(keys.controller, place, INPUTS, OUTPUTS, is_canopen=is_canopen)
     uses = _add_states(reader, uses, keys.controller, place, is_canopen=is_canopen)
     _check_signals(uses, ("position_demand", "ram_position"), ("current",), place)
+    for use in uses.values():
+        if use.signal in ("control_word", "mode") and keys.controller.profile == "none":
+            raise use.place.refuse("a profile that gives it a meaning, or values in [controller.phases]")
     nodes: dict[Role, CanopenNode] = {}
     sync = None
     if is_canopen:
@@ -305,7 +310,7 @@ def _add_states(reader: _Reader, uses: dict[str, Use], keys: ControllerKeys, pla
         if said.kind != "counter":
             use = replace(use, guard=Guard.CHECKSUM, checksum=reader.find_checksum(said.kind, own))
             use = _set_data_id(use, said.data_id)
-        elif said.data_id:
+        elif said.data_id is not None:
             raise own.at("data_id").refuse("a checksum with it")
         _add_use(uses, name, use, is_canopen=is_canopen)
     return uses
@@ -315,19 +320,20 @@ def _undo_tuple(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _set_data_id(use: Use, data_id: int | tuple[int, ...]) -> Use:
+def _set_data_id(use: Use, data_id: int | tuple[int, ...] | None) -> Use:
     """The use of a checksum with its data ID."""
-    if use.checksum == "e2e_profile_2":
-        if not isinstance(data_id, tuple) or len(data_id) != 16:
-            raise use.place.refuse("data_id = [16 numbers], one for each value of the counter")
+    if use.checksum == "e2e_profile_2" and isinstance(data_id, tuple) and len(data_id) == 16:
         return replace(use, data_ids=data_id)
-    if isinstance(data_id, tuple) or (data_id and use.checksum != "e2e_profile_1"):
-        raise use.place.refuse("a data_id of 0 to 65535 with e2e_profile_1, and none with the others")
-    return replace(use, data_id=data_id)
+    if use.checksum == "e2e_profile_1" and isinstance(data_id, int):
+        return replace(use, data_id=data_id)
+    if use.checksum.startswith("e2e") or data_id is not None:
+        raise use.place.refuse("a data_id of 0 to 65535 with e2e_profile_1, data_id = [16 numbers], one for each value "
+                               "of the counter, with e2e_profile_2, and none with the others")
+    return use
 
 
 def _check_signals(uses: Mapping[str, Use], inputs: tuple[str, ...], outputs: tuple[str, ...], place: Place) -> None:
-    """Refuse a device without the signals that every run needs, and values whose meaning nothing says."""
+    """Refuse a device without the signals that every run needs."""
     for table, needed, is_received in (("inputs", inputs, True), ("outputs", outputs, False)):
         known = {use.signal for use in uses.values() if use.is_received is is_received}
         for signal in needed:
@@ -384,11 +390,6 @@ def _add_profile(uses: dict[str, Use], dictionary: Any, keys: ControllerKeys, pl
         is_optional = signal.startswith("mode") and not canopen_map.is_mapped(dictionary, key, is_received=is_received)
         if key not in uses and (signal, is_received) not in named and not is_optional:
             added[key] = Use(place=place.at("profile"), is_received=is_received, signal=signal)
-    if keys.profile == "none":
-        for signal in ("control_word", "mode"):
-            if (signal, True) in named:
-                raise named[signal, True].place.refuse("a profile that gives it a meaning, or values in "
-                                                       "[controller.phases]")
     return added
 
 

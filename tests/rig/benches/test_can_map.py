@@ -1,0 +1,157 @@
+"""A DBC as frames: bits and numbers are those of cantools, for any layout."""
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from fractions import Fraction
+from typing import Any
+
+import pytest
+from cantools.database import Database
+from cantools.database.can import Message, Signal
+from cantools.database.conversion import BaseConversion
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.benches.bench_file import load_bench_from_files
+from rig.benches.frame_map import EXTENDED, FD, FrameSpec, Kind, Role, extract_bits, pack, unpack
+
+INPUTS = {"position_demand": ("mm", 1e-3), "ram_position": ("m", 1.0), "load_pressure": ("bar", 1e5),
+          "load_force": ("kN", 1e3), "spool_position": ("um", 1e-6), "flags": ("%", 1e-2)}
+SCALES = (1, 0.1, 0.5, 0.001, 1e-5, 3, 20)
+
+
+@st.composite
+def draw_signals(draw: st.DrawFn, first: int, last: int, pages: tuple[int, ...] = ()) -> list[Signal]:
+    """Signals named S0, S1 .. in the bytes from `first` on, Intel or Motorola, each in bytes of its own."""
+    signals: list[Signal] = []
+    while first < last and len(signals) < len(INPUTS):
+        room = draw(st.integers(1, min(8, last - first)))
+        is_float = room >= 4 and draw(st.booleans())
+        length = (64 if room == 8 else 32) if is_float else draw(st.integers(1, 8 * room))
+        shift = draw(st.integers(0, 8 * room - length))
+        is_intel = draw(st.booleans())
+        place = 8 * first + shift
+        start = place if is_intel else 8 * (place // 8) + 7 - place % 8
+        scale = draw(st.sampled_from(SCALES))
+        conversion = BaseConversion.factory(scale=scale, offset=scale * draw(st.integers(-1000, 1000)),
+                                            is_float=is_float)
+        signals.append(Signal(f"S{len(signals)}", start, length, "little_endian" if is_intel else "big_endian",
+                              is_signed=is_float or draw(st.booleans()), conversion=conversion,
+                              multiplexer_ids=list(pages) or None, multiplexer_signal="Page" if pages else None))
+        first += room
+    return signals
+
+
+@st.composite
+def draw_message(draw: st.DrawFn) -> Message:
+    """What the rig sends, with at least two signals; pages 3 and 9 where it is multiplexed."""
+    length = draw(st.sampled_from((4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)))
+    if draw(st.booleans()):
+        signals = draw(draw_signals(0, length).filter(lambda found: len(found) > 1))
+    else:
+        page = Signal("Page", 0, 8, is_multiplexer=True)
+        signals = draw(draw_signals(1, length, (3,)).filter(lambda found: len(found) > 1))
+        others = draw(draw_signals(1, length, (9,)))
+        for signal in others:
+            signal.name = f"Other{signal.name}"
+        signals = [page, *signals, *others]
+    for signal, (unit, _) in zip([each for each in signals if each.name[0] == "S"], INPUTS.values(), strict=False):
+        signal.unit = unit
+    is_long = draw(st.booleans())
+    return Message(draw(st.integers(1, 0x1FFF_FFFF if is_long else 0x7FE)), "In", length, signals,
+                   is_extended_frame=is_long, is_fd=length > 8, strict=True)
+
+
+def load_frames(message: Message, *lines: str) -> tuple[FrameSpec, ...]:
+    """The frames of a bench whose inputs are the signals S0, S1 .. of a message."""
+    answer = Message(0x7FF, "Out", 2, [Signal("Current", 0, 16, unit="mA")])
+    text = Database([message, answer]).as_dbc_string()
+    count = sum(signal.name[0] == "S" for signal in message.signals)
+    inputs = [f'{name} = "In.S{i}"' for i, name in enumerate(list(INPUTS)[:count])]
+    bench = "\n".join(['name = "x"', "[controller]", 'protocol = "can"', 'dbc = "x.dbc"', "[controller.outputs]",
+                       'current = "Out.Current"', "[controller.inputs]", *inputs, *lines])
+    return load_bench_from_files({"x.toml": bench.encode(), "x.dbc": text.encode("cp1252")}).frames.frames
+
+
+@given(message=draw_message(), data=st.data())
+def test_frames_are_those_of_cantools(message: Message, data: st.DataObject) -> None:
+    spec = load_frames(message)[0]
+    assert spec.identifier == (message.frame_id | (EXTENDED if message.is_extended_frame else 0)
+                               | (FD if message.length > 8 else 0))
+    names = dict(zip(INPUTS, [f"S{i}" for i in range(len(INPUTS))], strict=True))
+    raw: dict[str, Any] = {"Page": 3} if message.is_multiplexed() else {}
+    for each in (field for field in spec.fields if field.name in INPUTS):
+        numbers = st.integers(*each.range) if each.kind is not Kind.FLOAT else st.floats(width=32, allow_nan=False,
+                                                                                         allow_infinity=False)
+        raw[names[each.name]] = data.draw(numbers)
+    encoded = bytes(message.encode(raw, scaling=False, padding=False))
+    for each in (field for field in spec.fields if field.name in INPUTS and field.kind is not Kind.FLOAT):
+        mask = (1 << each.length) - 1
+        assert extract_bits(each, encoded) == raw[names[each.name]] & mask
+    known: Any = message.decode(encoded, decode_choices=False)
+    found = unpack(spec, encoded)
+    for name, signal in names.items():
+        if name in found:
+            assert found[name] == pytest.approx(known[signal] * INPUTS[name][1], rel=1e-12, abs=1e-9 * INPUTS[name][1])
+    exact = {each.name for each in spec.fields if each.length <= 48 and each.kind is not Kind.FLOAT}
+    if all(each.name in exact or each.fixed is not None for each in spec.fields):
+        assert pack(spec, found) == encoded
+
+
+def test_units_and_offsets_become_si_exactly() -> None:
+    message = Message(1, "In", 8, [
+        Signal("S0", 0, 16, unit="mm", conversion=BaseConversion.factory(scale=0.1, offset=5)),
+        Signal("S1", 16, 16, unit="µm", conversion=BaseConversion.factory(scale=0.5, offset=0))])
+    first, second = [each for each in load_frames(message)[0].fields if each.name]
+    assert (first.count, first.offset) == (Fraction(1, 10_000), Fraction(1, 200))
+    assert second.count == Fraction(1, 2_000_000)
+
+
+PAGES = """VERSION ""
+BU_: Rig Ecu
+BO_ 10 Demand: 8 Rig
+ SG_ Position : 0|32@1- (0.001,0) [0|0] "mm" Ecu
+ SG_ Ram : 32|16@1- (0.01,0) [0|0] "mm" Ecu
+ SG_ Left : 48|8@1+ (1,0) [0|0] "" Ecu
+ SG_ Overlap : 50|8@1+ (1,0) [0|0] "" Ecu
+BO_ 11 Drive: 8 Ecu
+ SG_ Page M : 0|8@1+ (1,0) [0|0] "" Rig
+ SG_ State : 8|8@1+ (1,0) [0|0] "" Rig
+ SG_ Current m2 : 16|16@1- (0.02,0) [0|0] "mA" Rig
+ SG_ Heat m3 : 16|16@1- (1,0) [0|0] "" Rig
+BA_DEF_ SG_ "GenSigStartValue" FLOAT 0 255;
+BA_DEF_DEF_ "GenSigStartValue" 0;
+BA_ "GenSigStartValue" SG_ 10 Left 7;
+VAL_ 11 State 3 "run" ;
+"""
+
+
+def load_pages(*lines: str) -> Any:
+    bench = "\n".join(['name = "x"', "[controller]", 'protocol = "can"', 'dbc = "x.dbc"', "[controller.inputs]",
+                       'position_demand = "Demand.Position"', 'ram_position = "Demand.Ram"', "[controller.outputs]",
+                       'current = "Drive.Current"', *lines])
+    return load_bench_from_files({"x.toml": bench.encode(), "x.dbc": PAGES.encode()})
+
+
+def list_pages(bench: Any) -> Iterator[tuple[str, bool, int | None]]:
+    for spec in bench.frames.list_from(Role.CONTROLLER):
+        yield spec.name, spec.is_answer, spec.selector and spec.selector.fixed
+
+
+def test_a_page_is_a_frame_and_what_stands_on_all_pages_is_read_from_each() -> None:
+    assert list(list_pages(load_pages())) == [("Drive[2]", True, 2)]
+    bench = load_pages('[controller.ready]', '"Drive.State" = "run"')
+    assert list(list_pages(bench)) == [("Drive[2]", True, 2), ("Drive[3]", False, 3)]
+    assert bench.ready == {"Drive.State": 3}
+    frame = bytes([3, 3, 0, 0, 0, 0, 0, 0])
+    found = bench.frames.find(11, frame)
+    assert found is not None and unpack(found, frame)["Drive.State"] == 3
+    assert bench.frames.find(11, bytes([9]) + frame[1:]) is None
+
+
+def test_a_signal_that_the_bench_file_does_not_use_has_its_start_value() -> None:
+    spec = load_pages().frames.list_from(Role.RIG)[0]
+    data = pack(spec, {"position_demand": 0.001, "ram_position": -1e-5})
+    assert data == bytes.fromhex("e8030000ffff0700")  # of two that overlap the first is filled
+    assert math.isclose(unpack(spec, data)["ram_position"], -1e-5)
