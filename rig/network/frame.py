@@ -9,8 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-EXTENDED = 0x80000000  # in a COB-ID: the identifier has 29 bits, as CAN_EFF_FLAG in Linux's can_id
-FD_FRAME = 0x40000000  # a CAN FD frame, of up to 64 bytes
+from rig.benches import frame_map
+
+EXTENDED = frame_map.EXTENDED  # in a COB-ID: the identifier has 29 bits, as CAN_EFF_FLAG in Linux's can_id
+FD_FRAME = frame_map.FD  # a CAN FD frame, of up to 64 bytes
 # A CAN FD frame whose data go at the higher bit rate. It is set to send such a frame, and stands in logs of others. A
 # bus leaves it out of the frames that it delivers: with it or without it, a frame is the same frame.
 BIT_RATE_SWITCH = 0x20000000

@@ -20,7 +20,8 @@ from fdi.trace.sensor_dynamics import write_sensors
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from rig.network import codec
-from rig.network.frame import Frame
+from rig.network.frame import FD_FRAME, Frame
+from rig.network.message import find_cob_id, make_message
 from rig.network.node_objects import NmtState as State
 from rig.recorder.schema import Event, NmtState, Record, Signals, collect_provenance
 from rig.recorder.writer import Recorder
@@ -53,11 +54,13 @@ def export_trace(source: Path, out: Path, everything: bool = False) -> int:
     raw = list(read_raw_frames(path))
     if not raw:
         raise InputError(path, "/can", "at least one raw frame")
+    if out.suffix == ".trc" and any(frame.cob_id & FD_FRAME for frame in raw):
+        raise InputError(out, "--out", "a name that ends in .log, .blf or .asc: a .trc would lose the CAN FD frames")
     try:
         with write_whole(require_writable(out, "--out")) as part, can.Logger(part) as writer:
             for frame in raw:
-                writer(can.Message(timestamp=frame.t_ns / 1e9, arbitration_id=frame.cob_id, data=frame.data,
-                                   is_extended_id=False, channel="can0" if out.suffix == ".log" else 0))
+                writer(make_message(frame.cob_id, frame.data, timestamp=frame.t_ns / 1e9,
+                                    channel="can0" if out.suffix == ".log" else 0))
     except OSError as error:
         raise InputError(out, "--out", f"a place that can be written ({error.strerror})") from error
     return len(raw)
@@ -196,10 +199,9 @@ class _CycleBuilder:
 def _read_frames(source: Path) -> Iterator[Frame]:
     first = None
     for message in list_can_messages(source):
-        if not (message.is_extended_id or message.is_fd):
-            first = message.timestamp if first is None else first
-            t_ns = max(0, round((message.timestamp - first) * 1e9))
-            yield Frame(t_ns, message.arbitration_id, bytes(message.data))
+        first = message.timestamp if first is None else first
+        t_ns = max(0, round((message.timestamp - first) * 1e9))
+        yield Frame(t_ns, find_cob_id(message), bytes(message.data))
 
 
 def list_can_messages(source: Path) -> Iterator[can.Message]:
@@ -214,7 +216,8 @@ def list_can_messages(source: Path) -> Iterator[can.Message]:
     try:
         with can.LogReader(source) as reader:
             for message in reader:
-                if not (message.is_error_frame or message.is_remote_frame):
+                is_remote = message.is_remote_frame and not message.is_fd  # of .asc: an empty frame
+                if not (message.is_error_frame or is_remote):
                     yield message
     except OSError as error:
         raise InputError(source, "", f"a readable file ({error.strerror})") from error

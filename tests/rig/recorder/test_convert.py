@@ -12,7 +12,18 @@ from synthetic_run import record_run
 
 import dbc
 from fdi.trace.trace import Trace
-from rig.recorder.convert import RAW_SUFFIXES, export_trace, import_csv, import_frames, read_raw_frames
+from plant.errors import InputError
+from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, Frame
+from rig.network.message import make_message
+from rig.recorder import Recorder
+from rig.recorder.convert import (
+    RAW_SUFFIXES,
+    export_trace,
+    import_csv,
+    import_frames,
+    list_can_messages,
+    read_raw_frames,
+)
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +45,40 @@ def test_raw_frames_there_and_back(log: Path, tmp_path: Path, suffix: str) -> No
         np.testing.assert_allclose(got.column(name), want.column(name), atol=0.51 * resolution)
     assert np.isnan(got.load).all() and not got.gaps
     assert "eha.dbc" in got.attachments and got.provenance["imported"] == out.name
+
+
+@pytest.mark.parametrize("suffix", RAW_SUFFIXES)
+def test_every_kind_of_frame_there_and_back(tmp_path: Path, suffix: str) -> None:
+    """Classical and CAN FD, of 11 and of 29 bits, also with the same number: as python-can reads and writes them."""
+    kinds = [0, EXTENDED] if suffix == ".trc" else [0, EXTENDED, FD_FRAME, EXTENDED | FD_FRAME]
+    kinds += [kind | BIT_RATE_SWITCH for kind in kinds if kind & FD_FRAME]
+    frames = [Frame(0, 0x080, b"")]
+    for kind in kinds:
+        for number in (0, 0x080, 0x7FF, 0x1FFFFFFF if kind & EXTENDED else 0x123):
+            for length in (0, 3, 8, *(FD_LENGTHS if kind & FD_FRAME else ())):
+                frames.append(Frame(len(frames) * 1_000_000, kind | number, bytes(range(0xF0 - length, 0xF0))))
+    recorder = Recorder(tmp_path / "x.mcap", {}, {})
+    for frame in frames:
+        recorder.frame(frame)
+    recorder.close()
+    assert list(read_raw_frames(tmp_path / "x.mcap")) == frames
+    out = tmp_path / f"x{suffix}"
+    assert export_trace(tmp_path / "x.mcap", out) == len(frames)
+    heard = list(list_can_messages(out))
+    for frame, message in zip(frames, heard, strict=True):
+        if not message.is_fd or frame.data:
+            assert message.equals(make_message(*frame[1:]), timestamp_delta=None, check_channel=False)
+    import_frames(out, tmp_path / "back.mcap", dbc.DBC)
+    assert [frame[1:] for frame in read_raw_frames(tmp_path / "back.mcap")] == [frame[1:] for frame in frames]
+
+
+def test_fd_frames_do_not_go_into_a_trc(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "x.mcap", {}, {})
+    recorder.frame(Frame(0, FD_FRAME | 0x80, bytes(64)))
+    recorder.close()
+    with pytest.raises(InputError, match=r"x\.trc: --out: expected a name that ends in \.log, \.blf or \.asc"):
+        export_trace(tmp_path / "x.mcap", tmp_path / "x.trc")
+    assert not (tmp_path / "x.trc").exists()
 
 
 def test_wireshark_decodes_the_export(log: Path, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from rig.recorder.schema import TOPICS, encode_schema, make_packer
 
 VALUES: dict[Any, st.SearchStrategy[Any]] = {
     float: st.floats(), U32: st.integers(0, 2**32 - 1), bool: st.booleans(), str: st.text(max_size=300),
-    bytes: st.binary(max_size=8)}
+    bytes: st.binary(max_size=64)}
 
 
 @pytest.fixture(scope="module")
