@@ -1,21 +1,24 @@
-"""Compiled code: kept on disk, never stale; and the ways to run the plant that must agree bit for bit."""
+"""Compiled code: kept on disk, never stale, prepared when it is worth it; ways to run the plant agree bit for bit."""
 from __future__ import annotations
 
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from effect_files import MEMORY, STIFF, restored_catalogue
+from effect_files import MEMORY, STIFF
 
-from plant import Model, compile, flat, simulate
-from plant.compile import compile_function, compute_fingerprint, find_cache_folder, interpret_function, rebind_names
-from plant.effects import load_effects
-from plant.model import build_initial_state
+from plant import Actuator, Model, compile, machine_code, simulate
+from plant.compile import compute_fingerprint, find_cache_folder
+from plant.effects import CATALOGUE
+from plant.machine_code import StoredCode
+from plant.model import build_kernel
 from plant.run import iterate_noise, sample_noise
+from plant.solve import advance_flat_state
 
 COMMAND = np.r_[np.zeros(5), np.full(95, 1e-3), np.linspace(1e-3, -2e-3, 200)]
 
@@ -40,22 +43,6 @@ def test_seeds() -> None:
     assert (one == same).all() and (one != other).any()
     rows = iterate_noise(5)
     assert (np.array([next(rows) for _ in range(200)]) == sample_noise(5, 200)).all()
-
-
-def test_flat_state_and_back(tmp_path: Path) -> None:
-    with restored_catalogue():
-        (tmp_path / "m.py").write_text(MEMORY)
-        load_effects(tmp_path / "m.py")
-        state = build_initial_state(("constant_load", "sensor_offset", "sensor_lag", "wear"))
-        pack, unpack = flat.make_packers(state)
-        numbers = flat.list_state_values(state)
-        assert len(numbers) == 8 + 4  # two memories of two
-        filled = unpack([float(i) for i in range(12)])
-        assert filled.memory.load[1]._fields == ("travelled", "last")
-        assert type(filled) is type(state)
-        array = np.zeros(12)
-        pack(filled, array)
-        assert (array == np.arange(12)).all()
 
 
 def child(folder: Path, *arguments: Path) -> list[float]:
@@ -111,20 +98,6 @@ def test_fingerprint_sees_what_a_function_depends_on() -> None:
     assert compute_fingerprint(factor(1.0)) != compute_fingerprint(factor(2.0))
 
 
-def test_linking_leaves_the_original_alone() -> None:
-    def twice(x: float) -> float:
-        return inner(x)
-
-    outer = rebind_names(twice, inner=lambda x: 2.0 * x)
-    assert interpret_function(outer, {"inner": lambda x: 5.0 * x})(1.0) == 5.0
-    assert outer(1.0) == 2.0
-    assert compile_function(outer)(1.5) == 3.0
-
-
-def inner(x: float) -> float:
-    return x
-
-
 def test_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / "a"))
     assert find_cache_folder() == tmp_path / "a"
@@ -163,3 +136,62 @@ def test_one_process_compiles_and_the_others_load_it(tmp_path: Path) -> None:
     processes = [subprocess.Popen([sys.executable, str(tmp_path / "count.py")], env=environment, text=True,
                                   stdout=subprocess.PIPE) for _ in range(3)]
     assert sorted(process.communicate()[0].strip() for process in processes) == ["0", "0", "1"]
+
+
+RUN_PLANT = """
+import sys
+import pytest
+
+from plant import Actuator, Model, machine_code
+effects = tuple(sys.argv[1:])
+plant = Actuator(Model(effects=effects), seed=3)
+plant.warm()
+for k in range(400):
+    plant.sample()
+    plant.advance(5e-3 if k < 200 else -4e-3, 1e3)
+print("numba" in sys.modules, plant._flat.tobytes().hex())
+"""
+
+
+def run_process(folder: Path, *effects: str) -> tuple[str, str]:
+    """Whether a new process imported numba, and the state it came to."""
+    done = subprocess.run([sys.executable, "-c", RUN_PLANT, *effects], capture_output=True, text=True, check=True,
+                          env={"EHA_RIG_CACHE": str(folder), "PATH": "/usr/bin:/bin"})
+    imported, state = done.stdout.split()
+    return imported, state
+
+
+def test_the_second_process_runs_without_numba_to_the_same_bits(tmp_path: Path) -> None:
+    assert "spool_friction" in CATALOGUE
+    first, second = run_process(tmp_path, "spool_friction"), run_process(tmp_path, "spool_friction")
+    assert (first[0], second[0]) == ("True", "False")
+    assert first[1] == second[1]
+
+
+def test_a_damaged_file_is_compiled_anew(tmp_path: Path) -> None:
+    _, state = run_process(tmp_path)
+    (stored,) = tmp_path.glob("*/advance.*.o")
+    data = bytearray(stored.read_bytes())
+    data[len(data) // 2] ^= 1
+    stored.write_bytes(data)
+    assert run_process(tmp_path) == ("True", state)
+    stored.write_bytes(b"")
+    assert run_process(tmp_path) == ("True", state)
+    assert run_process(tmp_path) == ("False", state), "a damaged file is replaced"
+
+
+def fail(run: object) -> bytes:
+    """Another release of numba."""
+    raise AttributeError("_get_module_for_linking")
+
+
+@pytest.mark.parametrize(("name", "other"), [
+    ("_link_object", lambda code: (None, lambda *arguments: 0)),  # code that moves nothing
+    ("_emit_object", fail)])
+def test_code_that_gives_other_bits_or_none_is_not_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str,
+                                                          other: Callable[[object], object]) -> None:
+    plant = Actuator(Model())
+    run = build_kernel(advance_flat_state, ())
+    monkeypatch.setattr(machine_code, name, other)
+    StoredCode(tmp_path, lambda: run).warm(plant._flat, plant._record)
+    assert list(tmp_path.iterdir()) == []

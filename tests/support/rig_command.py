@@ -57,6 +57,20 @@ def rig(*words: object) -> Said:
     return Said(status, out.getvalue(), err.getvalue(), words)
 
 
+def refuse(*words: object) -> str:
+    """What the command says about words that it must refuse: one line, exit status 2, nothing on standard output."""
+    said = rig(*words)
+    assert (said.status, said.out, said.err.count("\n")) == (2, "", 1), (words, said)
+    return said.err
+
+
+def answer(*words: object, status: int = 0) -> dict[str, Any]:
+    """The JSON answer of a command that must end with this status, with nothing on standard error."""
+    said = rig(*words, "--json")
+    assert (said.status, said.err) == (status, ""), (words, said)
+    return said.json
+
+
 def started(*words: object, **options: Any) -> subprocess.Popen[str]:
     """The command as a process of its own."""
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options

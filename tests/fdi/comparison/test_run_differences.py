@@ -49,14 +49,12 @@ def test_equal_runs_are_the_same_to_the_last_digit() -> None:
 
 
 def test_noise_of_another_seed_is_the_same_and_a_bump_is_found_with_its_size_sign_and_time() -> None:
-    found, _, signals = compare_two(make_run(1))
-    xj = signals["xj"]
-    assert found.verdict == "SAME" and not xj.is_equal and 0.9 < xj.ratio < 1.1
-    assert xj.rms == pytest.approx(np.sqrt(2) * NOISE, rel=0.05) and xj.noise == pytest.approx((NOISE, NOISE), rel=0.05)
-    assert xj.calm_share == pytest.approx(0.954, abs=0.02)
-    found, _, signals = compare_two(make_run(1, bump=-300e-6))
-    assert found.verdict == "DIFFERENT" and signals["xj"].t == pytest.approx(2.0, abs=0.01)
-    assert signals["xj"].largest == pytest.approx(-300e-6, rel=0.05) and not signals["xj"].is_within_noise
+    (found, _, signals), (other, _, bumped) = compare_two(make_run(1)), compare_two(make_run(1, bump=-300e-6))
+    xj, bump = signals["xj"], bumped["xj"]
+    assert (found.verdict, other.verdict) == ("SAME", "DIFFERENT") and not xj.is_equal and 0.9 < xj.ratio < 1.1
+    assert (xj.rms, *xj.noise) == pytest.approx((np.sqrt(2) * NOISE, NOISE, NOISE), rel=0.05)
+    assert xj.calm_share == pytest.approx(0.954, abs=0.02) and bump.t == pytest.approx(2.0, abs=0.01)
+    assert bump.largest == pytest.approx(-300e-6, rel=0.05) and not bump.is_within_noise
 
 
 @pytest.mark.parametrize("start", [12.345, -3.0])
@@ -67,11 +65,9 @@ def test_runs_with_other_clocks_are_aligned_by_the_command(start: float) -> None
 
 
 def test_a_run_that_was_recorded_later_is_aligned_by_its_steps() -> None:
-    late = make_run(1)
-    rows = {name: getattr(late, name)[700:] for name in PER_ROW}
-    late = replace(late, **rows | {"t": late.t[700:] - late.t[700]})
-    assert find_offset(make_run(0), late) == pytest.approx(0.7)
-    assert compare_two(late)[0].verdict == "SAME"
+    whole = make_run(1)
+    late = replace(whole, **{name: getattr(whole, name)[700:] for name in PER_ROW}, t=whole.t[700:] - whole.t[700])
+    assert find_offset(make_run(0), late) == pytest.approx(0.7) and compare_two(late)[0].verdict == "SAME"
 
 
 @pytest.mark.parametrize("is_first", [True, False])
@@ -86,13 +82,12 @@ def test_of_different_commands_only_equal_parts_are_compared() -> None:
     other = make_run(1)
     far = other.com + np.where(other.t > 2.5, 1e-3, 0.0)
     found, pair, signals = compare_two(replace(other, com=far, xj=other.xj + far - other.com))
-    assert found.verdict == "DIFFERENT" and not pair.has_same_command and pair.common == pytest.approx(2.5, abs=0.01)
-    assert signals["xj"].is_within_noise
+    nothing, _, none = compare_two(replace(other, com=other.com + 1.0))
+    assert (found.verdict, nothing.verdict, none) == ("DIFFERENT", "DIFFERENT", {}) and not pair.has_same_command
+    assert pair.common == pytest.approx(2.5, abs=0.01) and signals["xj"].is_within_noise
     assert "elsewhere they differ" in build_diff_report(found).sentence
-    found, _, signals = compare_two(replace(other, com=other.com + 1.0))
-    assert found.verdict == "DIFFERENT" and not signals
-    assert "no signal could be compared" in build_diff_report(found).sentence
-    assert "<svg" not in render_html(build_diff_report(found))
+    assert "no signal could be compared" in build_diff_report(nothing).sentence
+    assert "<svg" not in render_html(build_diff_report(nothing))
 
 
 def test_missing_samples_signals_and_units_are_left_out() -> None:
@@ -105,15 +100,14 @@ def test_missing_samples_signals_and_units_are_left_out() -> None:
 
 
 def test_checks_are_matched_by_name_and_changes_are_marked() -> None:
-    failed, limits = LIMITED._replace(value=13.0, passed=False), LIMITED._replace(high=12.0)
-    (check,) = match_checks([[LIMITED], [failed]])
-    assert check.is_changed and not check.has_other_limits
-    (check,) = match_checks([[LIMITED], [limits], []])  # a run without any checks changes none
-    assert not check.is_changed and check.has_other_limits and check.results[2] is None
-    new = LIMITED._replace(name="rise time")
-    assert [c.is_changed for c in match_checks([[LIMITED], [LIMITED, new]])] == [False, True]
-    twice = match_checks([[LIMITED, failed], [LIMITED, failed]])
-    assert [c.is_changed for c in twice] == [False, False]
+    failed, limits, new = (LIMITED._replace(**keys) for keys in (
+        {"value": 13.0, "passed": False}, {"high": 12.0}, {"name": "rise time"}))
+    for runs, changed, other_limits in (
+            ([[LIMITED], [failed]], [True], [False]), ([[LIMITED], [LIMITED, new]], [False, True], [False, False]),
+            ([[LIMITED], [limits], []], [False], [True]),  # a run without any checks changes none
+            ([[LIMITED, failed], [LIMITED, failed]], [False, False], [False, False])):
+        found = match_checks(runs)
+        assert [[c.is_changed for c in found], [c.has_other_limits for c in found]] == [changed, other_limits]
 
 
 def test_a_changed_check_makes_runs_different() -> None:
@@ -129,6 +123,5 @@ def test_three_runs_share_one_reference_and_one_page() -> None:
     report = build_diff_report(found)
     page = render_html(report)
     assert [pair.run.label for pair in found.pairs] == ["B", "C"] and page.count("<svg") == 1
-    assert report.data["pairs"][1]["signals"]["xj"]["within_noise"] is False
-    assert report.data["pairs"][0]["signals"]["xj"]["within_noise"] is True
+    assert [pair["signals"]["xj"]["within_noise"] for pair in report.data["pairs"]] == [True, False]
     assert "C - A" in page and "nan" not in format_report(report)

@@ -62,9 +62,8 @@ def sample_states(seed: int = 0, n: int = 6000) -> dict[str, np.ndarray]:
 def test_terms_are_well_formed() -> None:
     names = [field for term in TERMS for field in term.fields]
     assert len(names) == len(set(names)), "each field names one parameter"
-    for term in TERMS:
-        assert set(find_states(term)) <= set(STATES) and term.part in PARTS
-        assert (term.shape is None) == ("{" not in term.factor)
+    assert all(set(find_states(term)) <= set(STATES) and term.part in PARTS
+               and (term.shape is None) == ("{" not in term.factor) for term in TERMS)
 
 
 @pytest.mark.parametrize("name", ["spring_difference", "cogging", "drag_square", "friction_pressure", "contact",
@@ -72,34 +71,24 @@ def test_terms_are_well_formed() -> None:
                                   "dead_band", "gain_drift", "ripple"])
 def test_the_regression_ranks_the_right_term_first(name: str) -> None:
     term, states = BY_NAME[name], sample_states()
-    rng = np.random.default_rng(1)
-    values: dict[str, float] = {name: 1.0}
-    if term.shape is not None:
-        usual = {"position": 2.1e-3, "current": 8e-4, "time": 37.25, "way": 8e-4}
-        values[f"{name}_{term.shape.name}"] = usual[term.shape.state]
-    if term.is_wave:
-        values[f"{name}_phase"] = 0.7
+    usual = {"position": 2.1e-3, "current": 8e-4, "time": 37.25, "way": 8e-4}
+    shape = {f"{name}_{term.shape.name}": usual[term.shape.state]} if term.shape else {}
+    values = {name: 1.0, **shape, **({f"{name}_phase": 0.7} if term.is_wave else {})}
     column = evaluate_columns(term, values, states)[:, 0]
-    missing = column / column.std() + 0.3 * rng.standard_normal(len(column))
+    missing = column / column.std() + 0.3 * np.random.default_rng(1).standard_normal(len(column))
     balance = Balance(term.place, "N", missing, 0.3, 3.0, np.ones(len(missing), bool))
     rows = select_rows(balance, States(**states), {**Model().values, "jack.area": 1e-9})
     best = propose_terms(term.place, rows)[0]
-    assert best.term.name == name
-    assert best.values[name] * column.std() == pytest.approx(1.0, rel=0.15)
-    for field, value in values.items():
-        if field.endswith(("length", "frequency")) and term.is_wave:
-            assert best.values[field] == pytest.approx(value, rel=0.03)
+    assert best.term.name == name and best.values[name] * column.std() == pytest.approx(1.0, rel=0.15)
+    if term.is_wave:
+        assert {field: best.values[field] for field in shape} == pytest.approx(shape, rel=0.03)
 
 
 def test_what_the_residual_follows_is_tested_on_rows_that_the_curve_never_saw() -> None:
-    states, other = sample_states(2), sample_states(3)
-    names = ("position", "speed", "pressure", "spool", "current")
-    rng = np.random.default_rng(5)
-    there = {name: states[name] for name in names}
-    unseen = {name: other[name] for name in names}
-    noise = rng.standard_normal(len(states["time"]))
-    product = there["position"] * there["pressure"] / 1e4
-    held = unseen["position"] * unseen["pressure"] / 1e4
+    there, unseen = ({name: sample_states(seed)[name] for name in ("position", "speed", "pressure", "spool", "current")}
+                     for seed in (2, 3))
+    product, held = (states["position"] * states["pressure"] / 1e4 for states in (there, unseen))
+    noise = np.random.default_rng(5).standard_normal(len(product))
     found = find_dependences(product + 0.3 * product.std() * noise, there, (held, unseen))
     assert found[0].states == ("position", "pressure") and found[0].share > 0.5
     assert found[0].holdout is not None and found[0].holdout > 0.4 and found[0].p_value < 0.02
@@ -126,21 +115,21 @@ def test_a_written_law_is_what_the_library_replayed(place: str, tmp_path: Path) 
         library = Model().with_effects([LIBRARY[place]]).replace(
             {name_parameter(t, f): values[f] for t in terms for f in t.fields})
         own = Model().with_effects(["own_law"])
-        models = [library, own.replace({f"own_law.{f}": v for f, v in values.items()}), own]
         signal = {"force": Drag(0.0, 0.0, 800.0, 500.0), "flow": Line(1e6, 2e9, 2e7, 1e6), "current": 3e-4}[place]
-        outputs: list[list[object]] = []
-        for model in models:
-            record, port = model.build_record()[0], CATALOGUE[model.effects[0]].port
-            law, memory = combine_laws(port, model.effects)
-            outputs.append([])
+
+        def run(model: Model) -> list[object]:
+            record, out = model.build_record()[0], []
+            law, memory = combine_laws(CATALOGUE[model.effects[0]].port, model.effects)
             for k in range(300):
                 s = State(spool_position=states["spool"][k], spool_speed=states["spool_speed"][k],
                           jack_position=states["position"][k], jack_speed=states["speed"][k],
                           pressure=states["pressure"][k])
                 x, memory = law(signal, memory, s, Input(current=states["current"][k], t=1e-3 * k, h=1e-3), record)
-                outputs[-1].append(x)
-    assert outputs[0] == outputs[1] and outputs[1] != outputs[2]
-    assert all(x == signal for x in outputs[2])
+                out.append(x)
+            return out
+
+        written = run(own.replace({f"own_law.{f}": v for f, v in values.items()}))
+        assert run(library) == written != run(own) == [signal] * 300
 
 
 def test_a_law_reads_as_a_formula() -> None:
@@ -215,19 +204,17 @@ def find_hidden(port: str, law: str, size: float, tmp_path: Path) -> LawSearch:
 def test_a_hidden_law_is_found_named_and_written(name: str, tmp_path: Path) -> None:
     outside = OUTSIDE[name]
     found = find_hidden(outside.port, outside.law, outside.size, tmp_path)
+    law = found.law
     print(name, describe_search(found))
-    assert found.law is not None and found.law.holds, found.law
-    assert [term.name for term in found.law.terms] == [outside.term]
-    for signal, error in found.law.holdout.items():
-        assert error < 1.2 * found.floor[signal]
+    assert law is not None and law.holds and [term.name for term in law.terms] == [outside.term], law
+    assert all(error < 1.2 * found.floor[signal] for signal, error in law.holdout.items())
     worst = max(found.floor, key=lambda s: found.base.errors[s] / found.floor[s])
-    assert found.law.hypothesis.errors[worst] < 0.5 * found.base.errors[worst]
-    value = found.law.values[outside.term]
-    assert value.low < outside.size < value.high
+    assert law.hypothesis.errors[worst] < 0.5 * found.base.errors[worst]
+    assert law.values[outside.term].low < outside.size < law.values[outside.term].high
     with restored_catalogue():
-        names = write_law_file(tmp_path / "law.py", found.law.terms, found.law.values, found.law.reason)
-        assert load_effects(tmp_path / "law.py") == list(names.values()) == [f"missing_{found.law.terms[0].place}"]
-        assert CATALOGUE[names[found.law.terms[0].place]].starts
+        names = write_law_file(tmp_path / "law.py", law.terms, law.values, law.reason)
+        assert load_effects(tmp_path / "law.py") == list(names.values()) == [f"missing_{law.terms[0].place}"]
+        assert CATALOGUE[names[law.terms[0].place]].starts
 
 
 def describe_search(found: LawSearch) -> str:
@@ -244,7 +231,4 @@ def describe_search(found: LawSearch) -> str:
 
 def test_a_healthy_run_has_no_law(tmp_path: Path) -> None:
     found = find_hidden("load", "x + size", 0.0, tmp_path)
-    assert found.law is None
-    assert not any(m.visible for m in found.missing)
-
-
+    assert found.law is None and not any(m.visible for m in found.missing)

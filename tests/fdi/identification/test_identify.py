@@ -1,12 +1,13 @@
 """`rig identify`: an actuator of twice the size, what its runs do not show, and inputs that cannot be used."""
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import catch_refusal
+from rig_command import answer, refuse, rig
 
 from fdi.discovery.update_model import read_provenance
 from fdi.estimation.likelihood import scaled_bounds
@@ -27,11 +28,9 @@ from fdi.identification.identify import (
     write_identified_model,
 )
 from fdi.report.identify_report import build_identification_report, describe_identification
-from fdi.report.terminal import format_report, print_report
+from fdi.report.terminal import format_report
 from fdi.trace.trace import Trace
-from plant.errors import InputError
 from plant.model import Model, load_model
-from rig.cli.main import main
 from studies.hidden_effects.truth import SYMBOLS, has_compiler, simulate_truth
 from studies.identification import sample_actuator
 
@@ -83,8 +82,7 @@ def found(runs: tuple[Trace, Trace, Trace]) -> Identification:
 def test_actuator_of_twice_the_size_is_identified(found: Identification) -> None:
     truth = {SYMBOLS[symbol]: value for symbol, value in sample_plant().items()}
     assert found.verdict == "IDENTIFIED", found.reason
-    assert all(e.low <= truth[e.name] <= e.high for e in found.estimates)
-    assert all((e.high - e.low) < 0.1 * e.value for e in found.estimates)
+    assert all(e.low <= truth[e.name] <= e.high < e.low + 0.1 * e.value for e in found.estimates)
     assert max(e.ratio for e in found.holdouts) <= 1.1
     assert max(e.before["p12"] / e.floor["p12"] for e in found.holdouts) > 5.0
     assert found.model["controller.proportional_gain"] == pytest.approx(sample_plant()["GAP"], rel=1e-5)
@@ -107,55 +105,46 @@ def test_no_value_counts_as_identified_where_the_model_fails(found: Identificati
 
 
 def test_range_that_is_too_narrow_gives_no_model_file(runs: tuple[Trace, Trace, Trace], tmp_path: Path,
-                                                      capsys: pytest.CaptureFixture[str],
                                                       monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(global_fit, "SEARCHES", 0)  # no other valley is deeper, and looking for one takes ten seconds
     runs[1].write_csv(tmp_path / "stops.csv")
     (tmp_path / "sheet.toml").write_text("[identify.jack]\narea = 1.3\ntravel = 6\n[identify.valve]\nflow_gain = 6\n"
                                          "[identify.supply]\npressure = 3\n")
-    assert main(["identify", "stops.csv", "--model", "sheet.toml", "--json"]) == 1
-    answer = json.loads(capsys.readouterr().out)
-    area = answer["parameters"]["jack.area"]
-    assert answer["verdict"] == "UNEXPLAINED" and "noise floors" in answer["reason"]
-    assert area["identifiable"] and area["at_bound"]
-    assert area["high"] == area["range"][1] and area["value"] == pytest.approx(area["high"], rel=0.02)
-    assert not any(answer["parameters"][name]["at_bound"] for name in ("jack.travel", "supply.pressure"))
-    assert not (tmp_path / "identified.toml").exists() and (tmp_path / "identified.html").exists()
-    assert main(["identify", "stops.csv", "--model", "sheet.toml", "--out", "mine.toml"]) == 1
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "jack.area: the interval reaches the end of the data sheet's range" in shown
+    told = answer("identify", "stops.csv", "--model", "sheet.toml", status=1)
+    area = told["parameters"]["jack.area"]
+    assert told["verdict"] == "UNEXPLAINED" and "noise floors" in told["reason"]
+    assert area["identifiable"] and area["high"] == area["range"][1] == pytest.approx(area["value"], rel=0.02)
+    assert [told["parameters"][name]["at_bound"] for name in ("jack.area", "jack.travel", "supply.pressure")] == [
+        True, False, False]
+    assert not Path("identified.toml").exists() and Path("identified.html").exists()
+    said = rig("identify", "stops.csv", "--model", "sheet.toml", "--out", "mine.toml")
+    shown = " ".join(said.out.split())
+    assert said.status == 1 and "jack.area: the interval reaches the end of the data sheet's range" in shown
     assert "mine.toml was written because of --out; its parameters do not explain the runs" in shown
     assert "rig compare" not in shown and "rig explain" not in shown
-    written = read_provenance(tmp_path / "mine.toml").identification
+    written = read_provenance(Path("mine.toml")).identification
     assert written is not None and written["verdict"] == "UNEXPLAINED"
 
 
-def test_model_file_is_read_by_every_command(found: Identification, runs: tuple[Trace, Trace, Trace], tmp_path: Path,
-                                             capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "mine.toml"
-    write_identified_model(replace(found, model=replace(found.model, name="mine")), path, "rig identify", "2026-01-01")
-    model = load_model(path)
-    assert model == replace(found.model, name="mine")
-    assert model.nominal["jack.area"] == found.model["jack.area"]
+def test_model_file_is_read_by_every_command(found: Identification, runs: tuple[Trace, Trace, Trace],
+                                             tmp_path: Path) -> None:
+    path, held = tmp_path / "mine.toml", tmp_path / "held.csv"
+    named = replace(found.model, name="mine")
+    write_identified_model(replace(found, model=named), path, "rig identify", "2026-01-01")
+    assert load_model(path) == named and load_model(path).nominal["jack.area"] == named["jack.area"]
     origin = read_provenance(path).identification
-    assert origin is not None and origin["runs"] == ["wave", "stops"] and origin["holdouts"] == ["held"]
+    assert origin is not None and (origin["runs"], origin["holdouts"]) == (["wave", "stops"], ["held"])
     assert "95 %" in path.read_text()
-    runs[2].write_csv(tmp_path / "held.csv")
-    assert main(["compare", str(tmp_path / "held.csv"), "--model", str(path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["verdict"] == "WITHIN_FLOOR"
-    assert main(["fdi", str(tmp_path / "held.csv"), "--model", str(path), "--json"]) in (0, 1)
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["verdict"] == "ACCEPTABLE"
-    assert any("no bands" in note for note in answer["notes"])
+    runs[2].write_csv(held)
+    assert answer("compare", held, "--model", path)["verdict"] == "WITHIN_FLOOR"
+    diagnosed = answer("fdi", held, "--model", path)
+    assert diagnosed["verdict"] == "ACCEPTABLE" and any("no bands" in note for note in diagnosed["notes"])
 
 
-def test_report_shows_every_parameter_and_run(found: Identification, capsys: pytest.CaptureFixture[str]) -> None:
-    from rich.console import Console
-
+def test_report_shows_every_parameter_and_run(found: Identification) -> None:
     report = build_identification_report(found, "eha", "rig identify")
-    print_report(report, Console(width=100))
-    shown = capsys.readouterr().out
+    shown = format_report(report, 100)
     assert all(e.name in shown for e in found.estimates) and "may be wrong" not in shown
     assert set(report.data["parameters"]) == {e.name for e in found.estimates}
     assert [run["held_out"] for run in report.data["runs"]] == [False, False, True]
@@ -181,17 +170,15 @@ def test_long_run_is_fitted_by_parts_and_an_end_stop_that_it_never_met_is_not_at
     assert any("long: fitted to" in note and "of 21 s" in note for note in found.notes)
     assert len(found.residuals[0][1][0]) == len(run)  # judged on all of it
     flow, travel = found.estimates
-    assert flow.is_identifiable and not flow.is_at_bound
-    assert not travel.is_identifiable and not travel.is_at_bound
+    assert [(e.is_identifiable, e.is_at_bound) for e in (flow, travel)] == [(True, False), (False, False)]
     assert travel.low < 0.013 and travel.high == 0.05
 
 
 def test_run_at_rest_identifies_nothing() -> None:
     still = measure(np.zeros(800), np.zeros(800), 4, "still")
     found = identify([still], [])
-    assert found.verdict == "CANNOT_TELL" and "at rest" in found.reason
+    assert (found.verdict, found.model) == ("CANNOT_TELL", load_model()) and "at rest" in found.reason
     assert not any(e.is_identifiable for e in found.estimates)
-    assert found.model == load_model()
     assert {a.parameter for a in found.advice} == {e.name for e in found.estimates}
 
 
@@ -201,12 +188,11 @@ def test_regressions_find_size_and_controller(runs: tuple[Trace, Trace, Trace]) 
     begun, truth = estimate_by_regressions(own.fitted, model), sample_plant()
     for name, symbol in (("jack.area", "AJ"), ("valve.flow_gain", "GQ"), ("jack.travel", "XJM")):
         assert begun[name] == pytest.approx(truth[symbol], rel=0.15), name
-    gains = read_controller(own.fitted)
+    lagged = np.convolve(runs[0].cor, np.full(40, 1.0 / 40.0))[:len(runs[0])]
+    gains, other = read_controller(own.fitted), read_controller([replace(runs[0], cor=lagged)])
     assert gains is not None and gains.is_proportional
     assert gains.limit == pytest.approx(model["controller.current_limit"])
-    lagged = np.convolve(runs[0].cor, np.full(40, 1.0 / 40.0))[:len(runs[0])]
-    other = read_controller([replace(runs[0], cor=lagged)])  # of another law: left alone
-    assert other is not None and not other.is_proportional and not other.values
+    assert other is not None and not other.is_proportional and not other.values  # another law is left alone
 
 
 @pytest.mark.parametrize(("table", "field"), [
@@ -215,9 +201,7 @@ def test_regressions_find_size_and_controller(runs: tuple[Trace, Trace, Trace]) 
     ({"jack": 4}, "identify.jack"), ({"jack": {"aera": 4}}, "jack.aera"), ({}, "identify"), (4, "identify"),
     ({"jack": {"area": [0.0, 1.0]}}, "identify.jack.area"), ({"null_bias": {"current": [-1e-4, 1e-4]}}, "null_bias")])
 def test_ranges_that_cannot_be_are_refused(table: object, field: str) -> None:
-    with pytest.raises(InputError) as caught:
-        parse_free_parameters(table, load_model(), "m.toml")
-    assert field in str(caught.value) and "\n" not in str(caught.value)
+    assert field in catch_refusal(parse_free_parameters, table, load_model(), "m.toml")
 
 
 def test_ranges_of_a_model_file(tmp_path: Path) -> None:
@@ -237,17 +221,15 @@ def test_every_unknown_changes_the_model_wherever_a_fit_may_be() -> None:
     low, high = scaled_bounds(free)
     for seed in range(20):
         x = np.random.default_rng(seed).uniform(np.maximum(low, -2.0), np.minimum(high, 2.0))
-        for k in range(len(free)):
-            moved = x.copy()
-            moved[k] += 0.1 if x[k] + 0.1 < high[k] else -0.1
-            assert (compute_values(free, moved) != compute_values(free, x)).any(), free[k].name
+        for k, (name, *_) in enumerate(free):
+            moved = x + np.where(x + 0.1 < high, 0.1, -0.1) * (np.arange(len(free)) == k)
+            assert (compute_values(free, moved) != compute_values(free, x)).any(), name
 
 
 def test_dynamic_friction_that_no_run_shows_takes_the_static_one_with_it(runs: tuple[Trace, Trace, Trace]) -> None:
     table = {"spool": {"static_friction": [1e-6, 2e-5], "dynamic_friction": [1e-6, 1e-5]}, **FREE}
-    found = identify([runs[1]], [], table)
-    for friction in ("spool.static_friction", "spool.dynamic_friction"):
-        assert not next(e for e in found.estimates if e.name == friction).is_identifiable
+    found = {e.name: e.is_identifiable for e in identify([runs[1]], [], table).estimates}
+    assert not found["spool.static_friction"] and not found["spool.dynamic_friction"]
 
 
 def test_design_survives_the_model_file(tmp_path: Path) -> None:
@@ -258,18 +240,13 @@ def test_design_survives_the_model_file(tmp_path: Path) -> None:
     again = load_model(path)
     assert again.values == changed.values and again.design == sized.design
     path.write_text("design = 3\n")
-    with pytest.raises(InputError, match="design"):
-        load_model(path)
+    assert "design" in catch_refusal(load_model, path)
 
 
-def test_runs_that_cannot_be_used(runs: tuple[Trace, Trace, Trace], tmp_path: Path,
-                                  capsys: pytest.CaptureFixture[str]) -> None:
-    model = load_model()
-    ranges = parse_free_parameters(FREE, model, "test")
+def test_runs_that_cannot_be_used(runs: tuple[Trace, Trace, Trace], tmp_path: Path) -> None:
+    ranges = parse_free_parameters(FREE, load_model(), "test")
     for fitted, held_out, signals, option in (([runs[0]], [runs[0]], None, "--holdout"),
                                               ([runs[0], runs[0]], [], None, "other runs"),
                                               ([runs[0]], [], ["speed"], "--signals")):
-        with pytest.raises(InputError, match=option):
-            collect_identification_runs(model, ranges, fitted, held_out, signals)
-    assert main(["identify", str(tmp_path / "none.csv")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+        assert option in catch_refusal(collect_identification_runs, load_model(), ranges, fitted, held_out, signals)
+    assert "none.csv" in refuse("identify", tmp_path / "none.csv")

@@ -1,23 +1,31 @@
-"""Reports of explanations and of model updates: each verdict in a sentence, each error beside its noise floor."""
+"""Reports of analyses: each verdict in a sentence, each error beside its floor, residuals as measured minus model."""
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
+from noisy_traces import SHORT, record_plant
 
+from fdi.comparison.compare import Comparison, compare
 from fdi.discovery.detectable import Blind
 from fdi.discovery.explain import Marks
 from fdi.discovery.explain_runs import Answer, Candidate, Suspicious
 from fdi.discovery.runs import Source
 from fdi.discovery.update_model import ModelUpdate, Provenance, Row
 from fdi.estimation.fit import Value
+from fdi.estimation.likelihood import Problem
+from fdi.estimation.noise import white_noise
+from fdi.estimation.replay import prepare_trace
+from fdi.report import compare_report, explain_report
+from fdi.report.compare_report import build_comparison_report
 from fdi.report.explain_report import (
     MOODS,
     build_explanation_report,
     build_model_report,
-    describe_blind,
     describe_findings,
     describe_suspicious,
     describe_verdict,
@@ -25,8 +33,9 @@ from fdi.report.explain_report import (
 )
 from fdi.report.html import render_html
 from fdi.report.json import to_plain
-from fdi.report.report import Figure, Report
+from fdi.report.report import Figure, Report, Table
 from fdi.report.terminal import format_report
+from fdi.trace.trace import Trace
 from plant import Model
 
 FLOOR = {"xj": 2e-6, "p12": 2e4}
@@ -67,10 +76,9 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_sentence_has_error_and_noise_floor(case: str) -> None:
-    given, words = CASES[case]
-    sentence = describe_verdict(given)
-    assert words in sentence and sentence.endswith(".")
-    assert "XJ error 45.0 um" in sentence and "noise floor 2.00 um" in sentence
+    sentence, words = describe_verdict(CASES[case][0]), CASES[case][1]
+    assert sentence.endswith(".") and {case.split(" ")[0] for case in CASES} == set(MOODS)
+    assert [each for each in (words, "XJ error 45.0 um", "noise floor 2.00 um") if each not in sentence] == []
 
 
 @pytest.mark.parametrize(("case", "words"), [
@@ -81,13 +89,14 @@ def test_a_size_has_its_interval(case: str, words: str) -> None:
     assert words in describe_verdict(CASES[case][0])
 
 
-def test_another_firmware_is_said_to_be_one() -> None:
-    sentence = describe_verdict(answer("UNEXPLAINED", (), is_at_floor=True))
-    assert sentence.startswith("The output of the controller differs from the model's")
-
-
-def test_all_verdicts_have_a_mood() -> None:
-    assert set(MOODS) == {case.split(" ")[0] for case in CASES}
+def test_another_firmware_and_an_explanation_by_an_unlikely_unit_are_said_to_be_so() -> None:
+    given = answer("PARTLY", ("a",), candidate("a", word="part"))
+    best = SimpleNamespace(effects=("a",), is_at_floor=True, is_far=True)
+    cast(Any, given.explanation).ledger = [given.explanation.base, best]
+    assert describe_verdict(given).startswith(
+        "a explains the residual only with tolerances that fewer than one healthy unit in 1,000 has: current 150 uA")
+    firmware = answer("UNEXPLAINED", (), is_at_floor=True)
+    assert describe_verdict(firmware).startswith("The output of the controller differs from the model's")
 
 
 def test_findings() -> None:
@@ -98,16 +107,8 @@ def test_findings() -> None:
     assert plain["to discriminate"].startswith("no sensor and no command")
     assert plain["not detectable"] == "sensor_gain (up to 0.0200) and sensor_offset (up to 100 um); " \
         "a stop would reveal sensor_gain and sensor_offset"
-    assert lines["to discriminate"] == "measure XS too: in simulation this discriminates between a and b"
-    assert lines["residual"] == "a force"
-
-
-def test_an_explanation_by_an_unlikely_unit_says_so() -> None:
-    given = answer("PARTLY", ("a",), candidate("a", word="part"))
-    best = SimpleNamespace(effects=("a",), is_at_floor=True, is_far=True)
-    cast(Any, given.explanation).ledger = [given.explanation.base, best]
-    assert describe_verdict(given).startswith(
-        "a explains the residual only with tolerances that fewer than one healthy unit in 1,000 has: current 150 uA")
+    assert (lines["to discriminate"], lines["residual"]) == (
+        "measure XS too: in simulation this discriminates between a and b", "a force")
 
 
 @pytest.mark.parametrize("verdict", ["UNEXPLAINED", "EXPLAINED"])
@@ -121,9 +122,6 @@ def test_an_actuator_far_from_the_model_is_to_be_identified(verdict: str) -> Non
 def test_long_lists_name_four_and_count_the_rest() -> None:
     text = describe_suspicious([Suspicious(f"group.field_{i}", 1.0, "N", 4.0 + i) for i in range(6)])
     assert text.startswith("group.field_5 1.00 N (+9.0 tolerances)") and " and 2 more: outside the range" in text
-    unseen = tuple(Blind(f"e{i}", "g.f", 1.0, "N", "a gauge") for i in range(2))
-    two = Answer(cast(Any, None), (), {}, unseen, (), (), ())
-    assert describe_blind(two) == "e0 (up to 1.00 N) and e1 (up to 1.00 N); a gauge would reveal e0 and e1"
 
 
 def render_without_figures(report: Report) -> str:
@@ -165,7 +163,9 @@ def update(helps: bool) -> ModelUpdate:
 
 
 def test_the_report_of_a_model_update_in_all_forms(tmp_path: Any) -> None:
-    report = build_model_report(update(True), tmp_path / "m.toml", tmp_path / "m.toml.bak", tmp_path / "m.html")
+    report, useless = (build_model_report(update(helps), tmp_path / "m.toml", tmp_path / "m.toml.bak",
+                                          tmp_path / "m.html") for helps in (True, False))
+    assert useless.mood == "doubtful" and useless.sentence.endswith("a explains nothing but noise.")
     text, page = format_report(report, 80), render_without_figures(report)
     assert report.sentence == ("a added: XJ error 45.0 um -> 2.00 um, noise floor 2.00 um; held-out run 45.0 um -> "
                                "2.00 um.")
@@ -175,13 +175,62 @@ def test_the_report_of_a_model_update_in_all_forms(tmp_path: Any) -> None:
     assert "held-out" in page and "22.5" in page and "█" not in page and to_plain(report.data)["helps"] is True
 
 
-def test_an_update_that_does_not_help_says_so() -> None:
-    report = build_model_report(update(False))
-    assert report.mood == "doubtful" and report.sentence.endswith("a explains nothing but noise.")
-    assert report.data["model"] is None
-
-
 def test_a_removal_without_a_run_has_nothing_to_show() -> None:
     report = build_model_report(ModelUpdate(Model(), Provenance(), (), "a", None, {}, (), ("the rest stays",)))
     assert (report.verdict, report.sentence, report.data["helps"]) == ("", "a removed.", None)
+    assert report.data["model"] is None
     assert "<svg" not in render_html(report)
+
+
+OFFSETS = {"xj": 0.0, "p12": 3e5, "xs": 8e-6}  # of the sensors; XJ is drawn to the measurement, so it has none
+
+
+@cache
+def record_offset() -> Trace:
+    """A trace whose sensors of P12 and XS show too much, so that measured minus model is positive."""
+    trace = record_plant(com=SHORT, seed=2)
+    return replace(trace, p12=trace.p12 + OFFSETS["p12"], xs=trace.xs + OFFSETS["xs"])
+
+
+@cache
+def compare_offset() -> Comparison:
+    return compare(record_offset(), Model())
+
+
+def read_lines(drawing: str) -> list[list[np.ndarray]]:
+    """The values of the lines over time of each panel of a figure."""
+    return [[np.asarray(line.get_ydata()) for line in ax.lines if len(line.get_ydata()) > 2]
+            for ax in vars(drawing)["figure"].axes]
+
+
+def test_a_comparison_shows_measured_minus_model() -> None:
+    found = compare_offset()
+    panels = read_lines(compare_report.draw_overview(found))
+    scales = {"xj": 1e6, "p12": 1e-5, "xs": 1e6}
+    for number, (name, scale) in enumerate(scales.items()):
+        (measured, model), (residual,) = panels[1 + 2 * number:3 + 2 * number]  # after Com and XJ
+        if name != "xj":  # drawn in mm, its residual in um
+            np.testing.assert_allclose(residual, measured - model, atol=1e-9)
+            assert np.nanmean(residual) == pytest.approx(OFFSETS[name] * scale, rel=0.1)
+    captions = [item.caption for section in build_comparison_report(found).sections for item in section.items
+                if isinstance(item, Figure | Table) and "esidual" in item.caption]
+    assert captions and all("measured minus model" in text for text in captions[:2])
+
+
+def test_a_dependence_has_the_sign_of_measured_minus_model() -> None:
+    on = next(d for d in compare_offset().diagnoses["xs"].depends)
+    assert np.nanmean(on.means) == pytest.approx(OFFSETS["xs"], rel=0.2)
+
+
+def test_explain_and_add_show_measured_minus_model() -> None:
+    trace = prepare_trace(record_offset(), Model())
+    problem = Problem(Model(), trace, tuple(white_noise(1e-6) for _ in trace.outputs))
+    predicted = problem.predict_outputs([], np.empty((1, 0)))
+    fit = SimpleNamespace(residuals=problem.subtract_measurements(predicted)[0])
+    fitted, p12 = cast(Any, SimpleNamespace(fit=fit)), trace.outputs.index("p12")
+    before, after = read_lines(explain_report.draw_change(trace, fitted, fitted, dict.fromkeys(trace.outputs, 1e-6))
+                               )[1 + p12]
+    expected = 1e-5 * (trace.mask_unusable("p12") - predicted[0, p12])
+    np.testing.assert_array_equal(before, after)
+    assert np.nanmean(before) == pytest.approx(np.nanmean(expected), rel=1e-6)
+    assert np.corrcoef(before[1:], expected[1:])[0, 1] > 0.99

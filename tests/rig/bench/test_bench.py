@@ -2,15 +2,49 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from answer_schemas import check_answer
+from bus_stations import gather, spec
 from physics_cases import PREFLIGHT
+from rig_command import answer, refuse, rig
+from vcan_host import kernel_has_vcan0
 
-from rig.bench import plant, stopwatch
+from fdi.report.json import to_json
+from fdi.report.terminal import format_report
+from plant.errors import RigError
+from rig.bench import plant, realtime, stopwatch
+from rig.bench.live import (
+    AGAIN,
+    LIVE,
+    WITHOUT,
+    build_live_runs_report,
+    compare_contenders,
+    describe_ratios,
+    play_run,
+    run_in_terminal,
+    summarise_live_runs,
+)
+from rig.bench.realtime import (
+    COMPILED,
+    CYCLICTEST,
+    IN_C,
+    PYTHON,
+    build_realtime_report,
+    parse_histogram,
+    summarise_contenders,
+)
 from rig.bench.recordings import build_long_recordings_report, make_command, record_unit
-from rig.cli import main
+from rig.bench.responders import run_c_responder, run_emulator
+from rig.network import codec
+from rig.network.bus import open_can
+from rig.network.frame import Frame
+from rig.network.link import Link
+from rig.nodes.emulator import MISSED_LIMIT
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {stopwatch.GET_GCC}")
 
@@ -22,20 +56,16 @@ def test_c_and_python_take_the_same_step() -> None:
     assert cost["difference"] < 1e-9  # m, with another rounding: no more than stick-slip makes of it
 
 
-def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-                                tmp_path: Path) -> None:
+def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """And the JSON answer has what was measured."""
     monkeypatch.setattr(stopwatch.shutil, "which", lambda name: None)
     for name, value in (("bus_run_speed", 10.0), ("run_process_speed", 6.0), ("help_time", 0.1)):
         monkeypatch.setattr(plant, f"measure_{name}", lambda value=value: value)
-    assert main.main(["bench"]) == 0
-    words = " ".join(capsys.readouterr().out.split())
+    words = " ".join(rig("bench").out.split())
     assert "C skipped: gcc is not installed; to get it: apt-get install gcc" in words
-    assert main.main(["bench", "--json", "--out", str(tmp_path / "b.json")]) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer == json.loads((tmp_path / "b.json").read_text())
-    assert answer["times_real_time"] > 0 and answer["cycle"] > 0
-    assert (answer["run_process"], answer["help_process"]) == (6.0, 0.1)
+    told = answer("bench", "--out", tmp_path / "b.json")
+    assert told == json.loads((tmp_path / "b.json").read_text()) and told["times_real_time"] > 0 < told["cycle"]
+    assert (told["run_process"], told["help_process"]) == (6.0, 0.1)
 
 
 def test_whole_processes_are_timed() -> None:
@@ -44,22 +74,19 @@ def test_whole_processes_are_timed() -> None:
 
 
 def test_a_path_that_cannot_be_written_is_told_in_one_line(
-        monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(plant, "run_benchmarks", lambda command, progress: {
         "step": None, "times_real_time": 1.0, "cycle": 1.0, "lockstep": 1.0, "run_process": 1.0, "help_process": 1.0})
-    assert main.main(["bench", "--out", str(tmp_path / "none" / "b.json"), "--quiet"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    line = refuse("bench", "--out", tmp_path / "none" / "b.json", "--quiet")
     assert "--out" in line and "none/b.json: expected a file that can be written (No such file" in line
 
 
-def test_cost_of_recordings(capsys: pytest.CaptureFixture[str]) -> None:
-    """The table names length, CPU time and memory of each command; lengths that nobody can mean are refused."""
+def test_cost_of_recordings() -> None:
+    """The table names length, CPU time and memory of each command."""
     costs = [{"command": "compare", "length": 1800.0, "cpu": 46.7, "memory": 1_350_000_000, "verdict": "WITHIN_FLOOR",
               "interrupted": 0.4}]
     report = build_long_recordings_report({"seed": 0, "cpus": 2, "costs": costs})
     assert report.sentence == "1800 s of recording at 1 kHz take 1.35 GB at most."
-    assert main.main(["bench", "recordings", "--lengths", "60,x"]) == 2
-    assert "--lengths" in capsys.readouterr().err
 
 
 def test_recordings_repeat_by_their_seed() -> None:
@@ -70,3 +97,172 @@ def test_recordings_repeat_by_their_seed() -> None:
     assert once.signals == ("com", "xj", "cor", "p12", "xs", "load")
     assert (once.xs == again.xs).all()
     assert (record_unit(com[:2000], 4).xs != once.xs).any()
+
+
+GROUP = f"udp_multicast:239.75.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
+
+
+def invent_block(rng: np.random.Generator, factor: float) -> dict[str, np.ndarray]:
+    """Times of 1000 cycles, whose blocks scatter by 5 %."""
+    scale = factor * float(np.exp(0.05 * rng.standard_normal()))
+    times = {name: scale * rng.gamma(4.0, 1e-5, 1000) for name in ("lateness", "response", "feedback_response")}
+    return {**times, "overrun": np.zeros(1000, bool)}
+
+
+def test_a_slower_run_is_found_and_noise_is_none() -> None:
+    rng = np.random.default_rng(1)
+    found = {WITHOUT: [invent_block(rng, 1.0) for _ in range(8)], AGAIN: [invent_block(rng, 1.0) for _ in range(8)],
+             LIVE: [invent_block(rng, 1.5) for _ in range(8)]}
+    figures = summarise_live_runs(found)
+    words = {(ratio["contender"], ratio["word"]) for ratio in figures["ratios"]}
+    assert words == {(AGAIN, "no difference found"), (LIVE, "slower")}
+    assert all(ratio["low"] < 1.5 < ratio["high"] for ratio in figures["ratios"] if ratio["contender"] == LIVE)
+    assert "lateness p99 slower with --live (1." in describe_ratios(figures["ratios"])
+    assert figures["cycles"] == {WITHOUT: 8000, AGAIN: 8000, LIVE: 8000}
+    figures |= {"bus": GROUP, "seconds": 8.0, "blocks": 8, "cpus": 2, "priority": 0, "missing": {},
+                "ended_early": {WITHOUT: 0, AGAIN: 0, LIVE: 1}}
+    text = format_report(build_live_runs_report(figures))
+    assert "no real-time priority" in text and "--live: 1" in text and "slower" in text
+    check_answer(["bench", "live"], json.loads(to_json(figures)))
+
+
+def test_few_blocks_and_missing_answers_are_not_known() -> None:
+    block = {"p50": 10.0, "p99": 20.0}
+    ratios = compare_contenders({name: {WITHOUT: [block] * 3, AGAIN: [block] * 3, LIVE: [{}] * 3}
+                                 for name in ("lateness", "response", "feedback_response")})
+    assert {ratio["word"] for ratio in ratios} == {"not known"}
+    assert [ratio["ratio"] for ratio in ratios if ratio["contender"] == AGAIN] == [1.0] * 6
+    assert "--blocks 4 or more" in describe_ratios(ratios)
+
+
+def test_a_run_is_shown_and_measured() -> None:
+    with pytest.raises(RigError, match=r"ended with status 2: rig run: .*--jobs"):
+        play_run(GROUP, 1.0, ("--jobs", "0"))
+    for _ in range(3):  # a busy machine may end a run before an answer came
+        times = play_run(GROUP, 1.0, ("--live",))
+        assert len(times["lateness"]) == len(times["feedback_response"]) == len(times["overrun"])
+        answered = np.isfinite(times["feedback_response"])
+        if answered.any():
+            assert times["feedback_response"][answered].min() > 0.0
+            return
+    pytest.skip("not measured: this machine ended three runs before an answer came")
+
+
+def test_the_terminal_is_one() -> None:
+    status, text = run_in_terminal(["sh", "-c", "stty size; test -t 2 && exit 5"])
+    assert (status, text.split()) == (5, ["40", "120"])
+
+
+raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
+
+HISTOGRAM = """# /dev/cpu_dma_latency set to 0us
+# Histogram
+000000 000000
+000023 000002
+000024 000001
+# Total: 000000003
+# Min Latencies: 00023
+# Avg Latencies: 00023
+# Max Latencies: 00777
+# Histogram Overflows: 00001
+# Histogram Overflow at cycle number:
+# Thread 0: 00002
+"""
+
+
+def test_the_histogram_of_cyclictest() -> None:
+    assert sorted(parse_histogram(HISTOGRAM)) == pytest.approx([23e-6, 23e-6, 24e-6, 777e-6])
+
+
+@needs_gcc
+@raw_kinds
+def test_the_responder_in_c_sends_the_frames_of_the_emulator(bus_kind: str) -> None:
+    where = spec(bus_kind)
+    link = Link(open_can(where), lambda: 0)
+    with run_c_responder(where):
+        for cycle in range(300):
+            link.send(codec.SYNC, b"")
+            feedback, valve = gather(link, 2)
+            assert (feedback.cob_id, len(feedback.data), valve.cob_id) == (codec.FEEDBACK, 8, codec.VALVE_STATE)
+            assert codec.unpack_valve_state(valve.data).cycle == cycle
+    link.close()
+
+
+@pytest.mark.parametrize("is_compiled", [False, True])
+def test_the_emulator_answers_alone(is_compiled: bool) -> None:
+    where = spec("udp_multicast")
+    with run_emulator(where, is_compiled):
+        link = Link(open_can(where), lambda: 0)
+        errors: list[int] = []
+        for cycle in range(5):
+            link.send(codec.SYNC, b"")
+            frames: list[Frame] = []
+            while not {codec.FEEDBACK, codec.VALVE_STATE} <= {frame.cob_id for frame in frames}:
+                frames += (more := gather(link, 1))
+                assert more, f"no answer in cycle {cycle}"
+            valves = [codec.unpack_valve_state(frame.data) for frame in frames if frame.cob_id == codec.VALVE_STATE]
+            assert [valve.cycle for valve in valves] == [cycle]
+            # Nobody answers: one EMCY after three cycles, which may be read with the answers of the cycle after.
+            usual = {codec.FEEDBACK, codec.VALVE_STATE, 0x703}  # the last: it has the default heartbeat of 100 ms
+            errors += [frame.cob_id for frame in frames if frame.cob_id not in usual]
+            assert not errors or cycle >= MISSED_LIMIT
+        assert errors in ([], [0x083])
+        link.close()
+
+
+def test_percentiles_ratios_and_targets() -> None:
+    count = 10_001
+    us = np.linspace(0.0, 100.0, count) * 1e-6
+    answered = {"lateness": us, "feedback_response": 2 * us, "valve_response": 3 * us, "execution": us}
+    times = {CYCLICTEST: {"lateness": us}, COMPILED: answered | {"feedback_response": 2.2 * us},
+             IN_C: answered, PYTHON: answered | {"feedback_response": np.where(us > 90e-6, np.nan, us)}}
+    figures = summarise_contenders(times)
+    assert figures["times_us"]["lateness"][CYCLICTEST] == pytest.approx(
+        {"p50": 50, "p99": 99, "p99_9": 99.9, "max": 100})
+    assert figures["lost"] == {COMPILED: 0, IN_C: 0, PYTHON: 1000}
+    targets = {target["name"]: (target["value"], target["is_met"]) for target in figures["targets"]}
+    assert targets["feedback response p99, compiled / C"] == (pytest.approx(1.1), True)
+    assert targets["lateness p50, compiled / cyclictest"] == (pytest.approx(1.0), True)
+    assert targets["execution p99.9"] == (pytest.approx(99.9), True)
+    slower = summarise_contenders(times | {COMPILED: {name: 1.31 * each for name, each in answered.items()}})
+    assert not any(target["is_met"] for target in slower["targets"])
+
+
+def test_what_is_not_there_is_no_target_met() -> None:
+    us = np.array([1e-6, 2e-6])
+    only = dict.fromkeys(("lateness", "feedback_response", "valve_response", "execution"), us)
+    figures = summarise_contenders({COMPILED: only, PYTHON: only})
+    assert [target["value"] for target in figures["targets"]] == [None] * 6 + [pytest.approx(1.999)]
+    assert sum(target["is_met"] for target in figures["targets"]) == 1
+    text = format_report(build_realtime_report(figures | {
+        "bus": "udp_multicast:239.0.0.1", "seconds": 1.0, "blocks": 1, "cpus": 1, "priority": 0,
+        "missing": ["cyclictest", "gcc"]}))
+    assert "1 of 7 targets" in text and "apt-get install rt-tests" in text and "apt-get install gcc" in text
+    assert "no real-time priority" in text
+
+
+# The guest has a clock of 100 Hz: no real time there.
+@pytest.mark.parametrize("bus_kind", ["udp_multicast"] + ["socketcan"] * ("EHA_RIG_GUEST" not in os.environ
+                                                                          and kernel_has_vcan0()), indirect=True)
+def test_the_command_measures_everybody(bus_kind: str) -> None:
+    """At least the cycles asked for: where Python is late, the last input is repeated until the next one comes."""
+    said = rig("bench", "realtime", "--bus", spec(bus_kind), "--seconds", 0.5, "--blocks", 1, "--json")
+    assert said.status in (0, 1) and said.err == ""
+    figures = said.json
+    there = {COMPILED, PYTHON} | ({IN_C} if shutil.which("gcc") else set())
+    assert figures["times_us"]["feedback_response"].keys() == there
+    for name in there:
+        assert figures["cycles"][name] >= 400 and figures["lost"][name] < figures["cycles"][name]
+    if realtime.find_cyclictest():
+        assert figures["times_us"]["lateness"][CYCLICTEST]["p50"] > 0
+
+
+@pytest.mark.parametrize(("words", "says"), [
+    (("realtime", "--bus", "virtual:x"), "--bus: virtual:x: expected socketcan:INTERFACE"),
+    (("realtime", "--blocks", 0), "--blocks"), (("realtime", "--seconds", 0.1), "--seconds"),
+    (("realtime", "--seconds", "nan"), "--seconds"), (("live", "--bus", "virtual:x"), "--bus"),
+    (("live", "--blocks", 0), "--blocks"), (("live", "--seconds", 1), "--seconds"),
+    (("recordings", "--lengths", "60,x"), "--lengths"),
+])
+def test_bad_input_is_one_line(words: tuple[object, ...], says: str) -> None:
+    assert says in refuse("bench", *words)

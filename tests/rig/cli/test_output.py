@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from rig_command import rig
+from rig_command import refuse, rig
 from synthetic_run import record_run
 
 from fdi.output import write_text, write_whole
@@ -48,11 +48,9 @@ def _refused(words: list[str], sources: dict[str, Path], out: Path) -> str:
     if words[0] == "view" and importlib.util.find_spec("rerun") is None:
         pytest.skip("no rerun")
     before = {path: path.read_bytes() for path in sources.values()}
-    said = rig(*(word.format(out=out, **sources) for word in words))
-    assert said.status == 2 and said.out == "", said
-    assert said.err.count("\n") == 1 and said.err.startswith(f"rig {words[0]}: "), said.err
-    assert {path: path.read_bytes() for path in before} == before
-    return said.err
+    line = refuse(*(word.format(out=out, **sources) for word in words))
+    assert line.startswith(f"rig {words[0]}: ") and {path: path.read_bytes() for path in before} == before
+    return line
 
 
 @pytest.mark.parametrize("place", ["proc", "no folder", "a file as folder", "a folder"])
@@ -98,32 +96,26 @@ def run_limited(*words: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize("name", ["run.csv", "run.mcap", "frames.asc"])
 def test_a_full_disk_leaves_what_was_there_and_no_part(tmp_path: Path, name: str) -> None:
-    record_run(tmp_path / "trace.mcap")
+    record_run(tmp_path / "trace.mcap", stop=3000)
     Trace.read(tmp_path / "trace.mcap").write_csv(tmp_path / "in.csv")
     out = tmp_path / "out"
     out.mkdir()
-    if name == "run.mcap":
-        words = ["import", str(tmp_path / "in.csv"), "--out", str(out / name)]
-    else:
-        words = ["export", str(tmp_path / "trace.mcap"), "--out", str(out / name), "--force"]
-    for before in (None, b"before"):
-        if before is not None:
-            (out / name).write_bytes(before)
+    words = ["import", f"{tmp_path}/in.csv"] if name == "run.mcap" else ["export", f"{tmp_path}/trace.mcap", "--force"]
+    words += ["--out", str(out / name)]
+    for before in ({}, {name: b"before"}):
+        for file, content in before.items():
+            (out / file).write_bytes(content)
         said = run_limited(*words)
-        assert said.returncode == 2 and said.stderr.count("\n") == 1, said
-        assert {path.name: path.read_bytes() for path in out.iterdir()} == ({} if before is None else {name: before})
+        assert (said.returncode, said.stderr.count("\n")) == (2, 1), said
+        assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_simulate_and_export_do_not_replace_a_file_unasked(tmp_path: Path) -> None:
-    command = tmp_path / "c.csv"
-    command.write_text("t,com\n0,0\n0.05,1e-3\n")
+def test_simulate_and_export_do_not_replace_a_file_unasked(sources: dict[str, Path], tmp_path: Path) -> None:
     out = tmp_path / "s.csv"
-    simulate = ["simulate", "--command", str(command), "--steps", "10", "--out", str(out), "--quiet"]
+    simulate = ["simulate", "--command", sources["command"], "--steps", "10", "--out", out, "--quiet"]
     assert rig(*simulate).status == 0
     first = out.read_bytes()
-    refused = rig(*simulate, "--seed", "1")
-    assert refused.status == 2 and "--force" in refused.err and refused.err.count("\n") == 1
-    assert out.read_bytes() == first
+    assert "--force" in refuse(*simulate, "--seed", "1") and out.read_bytes() == first
     assert rig(*simulate, "--seed", "1", "--force").status == 0 and out.read_bytes() != first
     export = ["export", str(out), "--out", str(tmp_path / "e.csv")]
     assert [rig(*words).status for words in (export, export, [*export, "--force"])] == [0, 2, 0]

@@ -1,6 +1,7 @@
-"""Checks against signals whose numbers are known in closed form, and against signals that are not there."""
+"""Checks against signals whose numbers are known in closed form; protocol checks blame no node for a late rig."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import atan2, degrees, exp, isnan, log, pi, sqrt
 from typing import Any
@@ -14,6 +15,14 @@ from plant.segments import Array, Hold, Ramp, Segment, Sine, Step
 from rig.sequences import checks, measures
 from rig.sequences.checks import CheckResult, Guard, GuardWatch, evaluate_checks
 from rig.sequences.measures import NO_DRIVES, DriveFrames
+from rig.sequences.protocol import (
+    Heartbeat,
+    ProtocolLimits,
+    ProtocolRecord,
+    Rows,
+    judge_protocol,
+    measure_frozen,
+)
 
 NOISE = 2e-6  # m rms, as the position transducer has it
 LAG = 0.01  # s, of the first-order follower
@@ -78,11 +87,14 @@ def test_overshoot_of_a_second_order_step(damping: float, size: float) -> None:
 
 def test_no_overshoot_of_a_first_order_step() -> None:
     run, sections = follower(Hold(time=0.1), Step(to=5e-3, time=0.5, name="step"))
-    assert judged(run, sections, "overshoot", window="step").value < 0.2  # 3 sigma of the filtered noise
-    assert judged(run, sections, "overshoot", window=(0.1, 0.6)).value < 0.2
-    assert judged(run, sections, "rise_time", window="step").value == pytest.approx(LAG * log(9), abs=5e-4)
-    settled = judged(run, sections, "settling_time", window="step", band=2.0).value
-    assert settled == pytest.approx(LAG * log(50), abs=2e-3)
+    first, _ = follower(Step(to=5e-3, time=0.5, name="step"))  # in the first cycle: it counts from where the ram is
+    for where, kind, keys, value in (
+            (run, "overshoot", {}, pytest.approx(0.0, abs=0.2)),  # 3 sigma of the filtered noise
+            (run, "overshoot", {"window": (0.1, 0.6)}, pytest.approx(0.0, abs=0.2)),
+            (run, "rise_time", {}, pytest.approx(LAG * log(9), abs=5e-4)),
+            (run, "settling_time", {"band": 2.0}, pytest.approx(LAG * log(50), abs=2e-3)),
+            (first, "rise_time", {"window": (0.0, 0.5)}, pytest.approx(LAG * log(9), abs=5e-4))):
+        assert judged(where, sections, kind, **{"window": "step", **keys}).value == value, kind
 
 
 def test_settling_time_of_a_second_order_step() -> None:
@@ -93,11 +105,6 @@ def test_settling_time_of_a_second_order_step() -> None:
     expected = after[np.flatnonzero(deviation > 0.02)[-1]]
     result = judged(run, sections, "settling_time", window="step", band=2.0, unit="ms")
     assert result.value == pytest.approx(expected * 1000, abs=2.0) and result.unit == "ms"
-
-
-def test_a_step_in_the_first_cycle_counts_from_where_the_ram_is() -> None:
-    run, sections = follower(Step(to=5e-3, time=0.5, name="step"))
-    assert judged(run, sections, "rise_time", window="step").value == pytest.approx(LAG * log(9), abs=5e-4)
 
 
 def test_ramp_error_is_rate_times_lag_in_either_direction() -> None:
@@ -111,21 +118,18 @@ def test_break_away_is_half_the_band_of_a_triangle() -> None:
     command, sections, _ = build_profile([Ramp(to=1e-3, time=2.0, name="ramp")])
     t = np.arange(len(command)) / 1000
     triangle = 20e-6 * (2 * np.abs(2 * (t / 0.16 % 1) - 1) - 1)
-    run = make_run(command, command - 7e-6 - triangle + noise(len(t)))
+    slips, wild = command - 7e-6 - triangle + noise(len(t)), 1e-3 * (np.arange(len(t)) == 500)
     spans = {s.name: slice(s.start, s.stop) for s in sections}
-    assert judged(run, spans, "break_away", window="ramp", unit="um").value == pytest.approx(20.0, abs=1.0)
-    run.xj[500] += 1e-3  # one wild sample
-    assert judged(run, spans, "break_away", window="ramp", unit="um").value == pytest.approx(20.0, abs=1.0)
-    quiet = make_run(command, command + noise(len(t)))
-    assert judged(quiet, spans, "break_away", window="ramp", unit="um").value < 4.0
+    seen, spiked, quiet = (judged(make_run(command, xj), spans, "break_away", window="ramp", unit="um").value
+                           for xj in (slips, slips + wild, command + noise(len(t))))
+    assert (seen, spiked) == pytest.approx((20.0, 20.0), abs=1.0) and quiet < 4.0
 
 
 def test_errors_of_a_known_offset() -> None:
-    command = np.zeros(1000)
-    run = make_run(command, command + 30e-6 + noise(1000))
-    assert judged(run, {}, "steady_error", unit="um").value == pytest.approx(30, abs=0.3)
-    assert judged(run, {}, "rms_error", unit="um").value == pytest.approx(sqrt(900 + 4), abs=0.3)
-    assert judged(run, {}, "max_error", unit="um").value == pytest.approx(30, abs=6)
+    run = make_run(np.zeros(1000), 30e-6 + noise(1000))
+    for kind, value in (("steady_error", pytest.approx(30, abs=0.3)), ("max_error", pytest.approx(30, abs=6)),
+                        ("rms_error", pytest.approx(sqrt(900 + 4), abs=0.3))):
+        assert judged(run, {}, kind, unit="um").value == value
     assert judged(run, {}, "never_exceeds", signal="error", unit="um").value == np.abs(run.xj).max() / MICRON
 
 
@@ -133,8 +137,7 @@ def test_errors_of_a_known_offset() -> None:
 def test_gain_and_phase_of_a_first_order_lag(frequency: float) -> None:
     run, sections = follower(Sine(amplitude=3e-3, frequency=frequency, time=2.0, name="sine"))
     zoh = exp(-1e-3 / LAG)
-    z = np.exp(2j * pi * frequency / 1000)
-    h = (1 - zoh) / (z - zoh)  # of the sampled lag
+    h = (1 - zoh) / (np.exp(2j * pi * frequency / 1000) - zoh)  # of the sampled lag
     keys: dict[str, Any] = {"window": "sine", "frequency": frequency, "skip": 0.5}
     assert judged(run, sections, "amplitude_ratio", **keys).value == pytest.approx(abs(h), abs=1e-3)
     assert judged(run, sections, "phase_lag", **keys).value == pytest.approx(-degrees(atan2(h.imag, h.real)), abs=0.1)
@@ -154,32 +157,29 @@ def test_noise_through_the_median_is_what_its_docstring_says() -> None:
 def test_response_to_a_fault_by_event_and_by_signal() -> None:
     run, sections = follower(Hold(time=0.6), Step(to=1e-3, time=0.4))
     events = (Event(0.1, "EMCY", "node 3: 0x8250"), Event(0.503, "emcy", "0x8250 node 3"))
-    value = judged(run, sections, "response_within", events, after="fault", event="EMCY 0x8250", unit="ms").value
-    assert value == pytest.approx(3.0)
-    value = judged(run, sections, "response_within", after=0.6, signal="xj", above=0.5e-3, unit="ms").value
-    assert value == pytest.approx(1000 * LAG * log(2), abs=1.1)
-    value = judged(run, sections, "response_within", after=0.55, signal="xj", below=1e-3).value
-    assert value == 0.0
+    for keys, value in (({"after": "fault", "event": "EMCY 0x8250"}, pytest.approx(3.0)),
+                        ({"after": 0.6, "signal": "xj", "above": 5e-4}, pytest.approx(1000 * LAG * log(2), abs=1.1)),
+                        ({"after": 0.55, "signal": "xj", "below": 1e-3}, 0.0)):
+        assert judged(run, sections, "response_within", events, unit="ms", **keys).value == value
 
 
 def test_events_are_counted_in_their_window() -> None:
     run, sections = follower(Hold(time=1.0))
     events = (Event(0.2, "EMCY", "0x8250"), Event(0.7, "EMCY", "0x8250"))
-    assert judged(run, sections, "event_occurs", events, event="0x8250").value == 2
-    for keys, passed in (({"kind": "event_occurs", "event": "0x9999"}, False),
-                         ({"kind": "event_never", "event": "emcy", "window": (0.3, 0.6)}, True),
-                         ({"kind": "event_never", "event": "emcy"}, False)):
-        (result,) = evaluate_checks([checks.KEYS[str(keys["kind"])](name="n", **keys)], run, {}, events)
-        assert result.passed is passed
+    for kind, keys, count, passed in (("event_occurs", {"event": "0x8250"}, 2, True),
+                                      ("event_occurs", {"event": "0x9999"}, 0, False),
+                                      ("event_never", {"event": "emcy", "window": (0.3, 0.6)}, 0, True),
+                                      ("event_never", {"event": "emcy"}, 2, False)):
+        (result,) = evaluate_checks([checks.KEYS[kind](kind=kind, name="n", **keys)], run, sections, events)
+        assert (result.value, result.passed) == (count, passed), keys
 
 
 def test_limits_decide() -> None:
     run = make_run(np.zeros(100), np.full(100, 1e-3))
-    cases = ((None, 1.1, True), (None, 0.9, False), (0.9, None, True), (1.1, None, False), (1.0, 1.0, True))
-    for low, high, passed in cases:
+    for low, high, passed in ((None, 1.1, True), (None, 0.9, False), (0.9, None, True), (1.1, None, False),
+                              (1.0, 1.0, True)):
         result = judged(run, {}, "max_error", low=low, high=high, unit="mm")
-        assert result.passed is passed
-        assert (isnan(result.low), isnan(result.high)) == (low is None, high is None)
+        assert (result.passed, isnan(result.low), isnan(result.high)) == (passed, low is None, high is None)
 
 
 def test_few_missing_samples_are_bridged_and_mentioned() -> None:
@@ -289,3 +289,51 @@ def test_a_guard_trips_after_enough_cycles_in_a_row() -> None:
     values = [0.011, 0.011, 0.0, 0.011, float("nan"), 0.011, 0.011]
     assert [watch.find_passed({"xj": x}) for x in values] == [None] * 6 + [guard]
     assert GuardWatch([]).find_passed({"xj": 1e9}) is None
+
+
+ON_TIME = [Heartbeat(0.1 * k) for k in range(10)]
+SLOW = [Heartbeat(0.2 * k) for k in range(5)]
+LATE = [Heartbeat(0.15 * k, 0.06) for k in range(6)]  # the rig stood still before it took them in
+
+
+def judge_heartbeats(beats: Sequence[Heartbeat], seconds: float = 1.0, deaf: float = 0.0) -> CheckResult | None:
+    """The check of the heartbeats of a controller; None if they say nothing."""
+    nothing = np.zeros(5)
+    rows = Rows(*[nothing] * 7, on_time=np.ones(5, bool))
+    record = ProtocolRecord(run=rows, heartbeats={"controller": beats}, heard=(0.0, seconds), deaf=deaf,
+                            current_limit=8e-3)
+    found = [check for check in judge_protocol(record, ProtocolLimits()) if check.signal == "heartbeat"]
+    return found[0] if found else None
+
+
+@pytest.mark.parametrize(("beats", "passed"), [
+    (ON_TIME, True), (SLOW, False), ([], False), (ON_TIME[:1], False), (LATE, None),
+    ([*ON_TIME[:5], Heartbeat(0.62, 0.12), *ON_TIME[7:]], True),  # one stall
+    ([*SLOW, Heartbeat(0.95, 0.3)], False),  # a stall is no excuse for the other heartbeats
+])
+def test_heartbeats_that_waited_for_the_rig_are_not_judged(beats: list[Heartbeat], passed: bool | None) -> None:
+    check = judge_heartbeats(beats)
+    assert (None if check is None else check.passed) == passed
+
+
+def test_a_rig_that_received_nothing_for_most_of_the_run_does_not_miss_heartbeats() -> None:
+    assert judge_heartbeats([], 1.0, deaf=0.8) is None
+    check = judge_heartbeats([], 1.0, deaf=0.5)
+    assert check is not None and not check.passed
+
+
+@pytest.mark.parametrize(("frozen", "limit", "is_found"), [
+    (2e-4, 8e-3, True),  # it is also the largest current of the run
+    (8e-3, 8e-3, False),  # at the limit it says it has
+    (2e-4, None, False),  # a controller that does not say its limit may have this one
+])
+def test_a_current_that_stands_still_below_the_limit_is_found(
+    frozen: float, limit: float | None, is_found: bool
+) -> None:
+    cycles = 100
+    error = np.linspace(0.0, 1e-3, cycles)
+    current = np.where(np.arange(cycles) < 50, 1e-5 * np.sin(np.arange(cycles)), frozen)
+    zero, words = np.zeros(cycles), np.full(cycles, 15.0)
+    rows = Rows(com=error, xj=zero, cor=current, control=words, status=words, flags=zero, response=zero,
+                on_time=np.ones(cycles, bool))
+    assert (measure_frozen(rows, limit) > 4e-4) == is_found

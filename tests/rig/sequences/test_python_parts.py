@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig_command import Said, rig
+from refusals import catch_refusal
+from rig_command import Said, refuse, rig
 
-from plant.errors import InputError
 from rig.sequences import load_sequence
 
 DOCS = Path(__file__).parents[3] / "docs" / "sequences.md"
@@ -58,9 +58,8 @@ def write(folder: Path, sequence: str = SEQUENCE, code: str = CODE) -> Path:
 
 def test_profile_check_and_steps_run_from_a_log_too(tmp_path: Path) -> None:
     said = rig("run", write(tmp_path), "--out", tmp_path / "a", "--json")
-    assert said.status == 0, said.err
     check = said.json["checks"][0]
-    assert check["passed"] and 1.0 < check["value"] < 200.0
+    assert said.status == 0 and check["passed"] and 1.0 < check["value"] < 200.0
     assert (check["unit"], check["requirement"], check["kind"]) == ("um", ["R-1"], "python")
     assert (tmp_path / "a" / "notes.txt").read_text() == "begin ''\nend 'PASS'\n"
     assert said.err == "begin\nend\n"  # what the code prints does not spoil the JSON answer
@@ -68,9 +67,8 @@ def test_profile_check_and_steps_run_from_a_log_too(tmp_path: Path) -> None:
     assert profile.command[150] == pytest.approx(1e-3 * 0.25) and profile.sections[1].name == "own"
 
     (tmp_path / "own.py").unlink()  # the log has it
-    refused = rig("run", "--from", tmp_path / "a", "--out", tmp_path / "b")
-    assert refused.status == 2 and "expected --trust" in refused.err and "sequence/own.py" in refused.err
-    assert not (tmp_path / "b").exists()
+    line = refuse("run", "--from", tmp_path / "a", "--out", tmp_path / "b")
+    assert "expected --trust" in line and "sequence/own.py" in line and not (tmp_path / "b").exists()
     again = rig("run", "--from", tmp_path / "a", "--out", tmp_path / "b", "--trust", "--json")
     assert again.status == 0 and again.json["checks"] == said.json["checks"]
     assert "trusted code: sequence/own.py" in again.err
@@ -82,8 +80,7 @@ def test_the_example_of_the_page_works(tmp_path: Path) -> None:
     (tmp_path / "settle.toml").write_text(toml)
     (tmp_path / "settle.py").write_text("import numpy as np" + code)
     said = rig("run", tmp_path / "settle.toml", "--out", tmp_path / "out", "--json")
-    assert said.status == 0, said.err
-    assert said.json["checks"][0]["name"] == "energy of the error"
+    assert (said.status, said.json["checks"][0]["name"]) == (0, "energy of the error")
     assert (tmp_path / "out" / "note.txt").read_text() == "Own profile, own measure, seed 0"
 
 
@@ -110,9 +107,8 @@ def run_with(folder: Path, old: str, new: str, *, in_code: bool = True) -> Said:
 @pytest.mark.filterwarnings("ignore:.*encountered in")
 def test_an_error_in_the_code_is_one_line(tmp_path: Path, old: str, new: str, line: str) -> None:
     said = run_with(tmp_path, old, new)
-    assert said.status == 2
-    lines = [text for text in said.err.splitlines() if text.startswith("rig run:")]
-    assert len(lines) == 1 and re.search(line, lines[0]), said.err
+    (told,) = [text for text in said.err.splitlines() if text.startswith("rig run:")]
+    assert said.status == 2 and re.search(line, told), said.err
 
 
 @pytest.mark.parametrize(("old", "new", "line"), [
@@ -150,8 +146,5 @@ def test_a_profile_is_computed_once_for_each_start(tmp_path: Path) -> None:
 
 def test_a_file_of_a_bundle_that_is_missing_is_named(tmp_path: Path) -> None:
     sequence = load_sequence(write(tmp_path))
-    bundle = sequence.bundle()
-    assert set(bundle) == {"own.toml", "own.py"}
-    del bundle["own.py"]
-    with pytest.raises(InputError, match=r"own\.py"):
-        type(sequence).from_bundle(bundle)
+    assert set(sequence.bundle()) == {"own.toml", "own.py"}
+    assert "own.py" in catch_refusal(type(sequence).from_bundle, {"own.toml": sequence.bundle()["own.toml"]})

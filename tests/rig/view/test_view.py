@@ -1,37 +1,40 @@
-"""The picture of a real run: no view with an error, every line, lane and text to be seen.
-
-EHA_RIG_REQUIRE_VIEWER=1 forbids skips.
-"""
+"""The viewer: the picture of a run, and recordings of `rig view --compare` and of several runs."""
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
-import subprocess
-import sys
+import signal
+import socket
+import time
+import urllib.request
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
-from recording_rows import read_recording
-from rig_command import rig
+from recording_rows import Rows, read_names, read_recording
+from rig_command import answer, finished, refuse, rig, started
+from short_runs import build_command
 from synthetic_run import record_run
 
+from fdi.comparison.compare import compare
+from fdi.comparison.run_differences import compare_runs
+from fdi.report.numbers import format_ratio
+from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace.trace import Trace
+from plant import Model, simulate
 from rig.view import viewer
 from rig.view.recording import TEXTS, Lane, make_lane_path, write_recording
 from rig.view.rerun_log import LANES, LIMITS, PLOTS, draw_run
 from rig.view.viewer import ViewerError
 
-REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"
-
-
-def _missing() -> str:
-    if importlib.util.find_spec("rerun") is None:
-        return "no rerun: pip install 'eha-rig[view]'"
-    folders = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]
-    if not any(folder.glob("*.json") for folder in folders if folder.is_dir()):
-        return "no Vulkan driver (Debian: apt-get install mesa-vulkan-drivers libvulkan1)"
-    return ""
+REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"  # forbids skips
+pytestmark = pytest.mark.skipif(not REQUIRED and importlib.util.find_spec("rerun") is None,
+                                reason="pip install 'eha-rig[view]'")
+needs_driver = pytest.mark.skipif(
+    not REQUIRED and not any(Path(place).glob("vulkan/icd.d/*.json") for place in ("/usr/share", "/etc")),
+    reason="no Vulkan driver (Debian: apt-get install mesa-vulkan-drivers libvulkan1)")
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +44,6 @@ def trace(preflight: Path) -> Trace:
 
 def _rows(trace: Trace, path: Path) -> dict[str, list[tuple[float, object]]]:
     """What a recording of the trace holds: entity -> time, s (NaN: always), and value of each of its rows."""
-    if importlib.util.find_spec("rerun") is None:
-        pytest.skip("no rerun: pip install 'eha-rig[view]'")
     write_recording(draw_run(trace), path)
     return read_recording(path)
 
@@ -58,8 +59,7 @@ def test_recording_holds_every_line(trace: Trace, rows: dict[str, list[tuple[flo
              "/spool/spool": trace.xs * 1e6, "/timing/response": trace.timing.response * 1e6,
              "/timing/work": trace.timing.work * 1e6}
     for entity, values in drawn.items():
-        np.testing.assert_allclose([value for _, value in rows[entity]], values, rtol=1e-9)
-        np.testing.assert_allclose([t for t, _ in rows[entity]], trace.t, atol=1e-8)
+        np.testing.assert_allclose(rows[entity], np.column_stack([trace.t, values]), rtol=1e-9, atol=1e-8)
 
 
 def test_recording_holds_every_limit(rows: dict[str, list[tuple[float, object]]]) -> None:
@@ -78,10 +78,9 @@ def test_recording_holds_every_lane(trace: Trace, rows: dict[str, list[tuple[flo
     assert lanes.pop("/run/phase") == [(-0.5, "set-up"), (0.0, "main"), (13.5, "clean-up")]
     assert [str(word).split()[0] for _, word in lanes.pop("/run/command")] == [s.kind for s in trace.sections()]
     for node in ("2_controller", "3_plant"):
-        states = lanes.pop(f"/node/{node}")
-        words = [word for _, word in states]  # the probes begin with a reset as well
-        assert words[0] == "boot-up" and words[-1] == "operational" and states[-1][0] < 0
-        assert words.count("boot-up") == words.count("operational") == 3
+        times, words = zip(*lanes.pop(f"/node/{node}"), strict=True)
+        assert (words[0], words[-1]) == ("boot-up", "operational") and times[-1] < 0
+        assert words.count("boot-up") == words.count("operational") == 3  # the probes begin with a reset as well
     assert len(lanes) == len(trace.sequence_checks) == 17
     for check in trace.sequence_checks:
         states = lanes[make_lane_path(f"/check/pass/{check.name}")]
@@ -93,15 +92,14 @@ def test_recording_holds_every_lane(trace: Trace, rows: dict[str, list[tuple[flo
 
 
 def test_recording_holds_faults_and_load(tmp_path: Path) -> None:
-    sequence = tmp_path / "faults.toml"
-    sequence.write_text("""title = "Faults"
+    (tmp_path / "faults.toml").write_text("""title = "Faults"
 setup = [{ kind = "hold", time = 0.1 }]
 main = [{ kind = "hold", time = 0.5 }]
 load = [{ kind = "ramp", to = 500.0, time = 0.2 }]
 faults = [{ name = "offset of XS / small", kind = "offset", signal = "xs", value = 1e-6, start = 0.1, end = 0.3 },
           { kind = "parameter", parameter = "filter.clogging", value = 0.4, start = 0.2 }]
 """)
-    rig("run", sequence, "--out", tmp_path / "run")
+    rig("run", tmp_path / "faults.toml", "--out", tmp_path / "run")
     trace = Trace.read(tmp_path / "run", all=True)
     rows = _rows(trace, tmp_path / "x.rrd")
     assert {entity: [(round(t, 6), word) for t, word in states] for entity, states in rows.items()
@@ -109,19 +107,16 @@ faults = [{ name = "offset of XS / small", kind = "offset", signal = "xs", value
         "/fault/offset_of_XS_small": [(0.1, "active"), (0.3, "")],
         "/fault/parameter_filter.clogging": [(0.2, "active")]}
     np.testing.assert_allclose([value for _, value in rows["/load/load"]], trace.load, atol=1e-9)
-    assert trace.load.max() == 500.0
-    assert "Load on the ram [N]" in {view.title for view in draw_run(trace).shown}
+    assert trace.load.max() == 500.0 and "Load on the ram [N]" in {view.title for view in draw_run(trace).shown}
 
 
 def test_recording_holds_every_event_and_check(trace: Trace, rows: dict[str, list[tuple[float, object]]]) -> None:
-    events = rows["/log/events"]
-    assert len(events) == len(trace.events) > 15
-    assert [t for t, _ in events] == pytest.approx([event.t for event in trace.events])
-    for event, (_, text) in zip(trace.events, events, strict=True):
-        assert f"{event.kind}: {event.text}" in str(text)
-    texts = [str(text) for _, text in rows["/log/checks"]]
-    assert len(texts) == len(trace.checks) == 29 and all(any(f"PASS {c.name}: {c.value:.4g}" in text for text in texts)
-                                    for c in trace.checks)
+    times, texts = zip(*rows["/log/events"], strict=True)
+    assert times == pytest.approx([event.t for event in trace.events]) and len(times) > 15
+    assert all(f"{event.kind}: {event.text}" in str(text) for event, text in zip(trace.events, texts, strict=True))
+    checks = [str(text) for _, text in rows["/log/checks"]]
+    assert len(checks) == len(trace.checks) == 29
+    assert all(any(f"PASS {c.name}: {c.value:.4g}" in text for text in checks) for c in trace.checks)
     assert "- sequence: Preflight" in str(rows["/log/provenance"][0][1])
 
 
@@ -139,73 +134,185 @@ def test_recording_of_an_aborted_run(aborted: Path, tmp_path: Path) -> None:
     assert not any("nan" in str(text) for _, text in rows["/log/checks"])
 
 
+@needs_driver
 def test_headless_screenshot_shows_everything(trace: Trace, tmp_path: Path,
                                               capsys: pytest.CaptureFixture[str]) -> None:
-    missing = _missing()
-    if missing and not REQUIRED:
-        pytest.skip(missing)
-    assert not missing
     write_recording(draw_run(trace), tmp_path / "view.rrd")
     pixels = viewer.take_screenshot(draw_run(trace).shown, tmp_path / "view.rrd", tmp_path / "view.png")
-    plots = {title for origin, title in PLOTS if origin != "load"}
-    assert {*pixels} == {*plots, LANES, TEXTS, LIMITS}
+    assert {*pixels} == {*(title for origin, title in PLOTS if origin != "load"), LANES, TEXTS, LIMITS}
     assert (tmp_path / "view.png").stat().st_size > 50_000
-    assert pixels[LANES] > 20_000 and pixels[TEXTS] > 200
-    assert pixels[LIMITS] > 600  # at least the two lines of the position
+    # of the limits at least the two lines of the position
+    assert pixels[LANES] > 20_000 and pixels[TEXTS] > 200 and pixels[LIMITS] > 600
     with capsys.disabled():
         print("\nviewer:", ", ".join(f"{name} {count} px" for name, count in pixels.items()))
 
 
+@needs_driver
 def test_screenshot_misses_what_is_not_drawn(trace: Trace, tmp_path: Path) -> None:
-    missing = _missing()
-    if missing and not REQUIRED:
-        pytest.skip(missing)
     drawing = draw_run(trace)
     write_recording(drawing._replace(lanes=[Lane("run/x", [], {})], log=[]), tmp_path / "view.rrd")
-    with pytest.raises(ViewerError) as caught:
+    with pytest.raises(ViewerError, match=f"empty views: {LANES}, {TEXTS}$"):
         viewer.take_screenshot(drawing.shown, tmp_path / "view.rrd", tmp_path / "view.png")
-    assert str(caught.value).endswith(f"empty views: {LANES}, {TEXTS}")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def short_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record_run(tmp_path_factory.mktemp("run") / "trace.mcap", stop=1000).parent
 
 
-def test_viewer_that_cannot_draw_says_so(folder: Path, tmp_path: Path) -> None:
-    if importlib.util.find_spec("rerun") is None:
-        pytest.skip("no rerun")
+def test_viewer_that_cannot_draw_says_so(short_run: Path, tmp_path: Path) -> None:
     (tmp_path / "x.rrd").write_bytes(b"")
-    trace = Trace.read(folder)
+    shown = draw_run(Trace.read(short_run)).shown
     with pytest.raises(ViewerError, match="does not draw"):
-        viewer.take_screenshot(draw_run(trace).shown, tmp_path / "x.rrd", tmp_path / "x.png", patience=3)
+        viewer.take_screenshot(shown, tmp_path / "x.rrd", tmp_path / "x.png", patience=3)
 
 
-def test_without_rerun_one_line_says_how_to_get_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ViewerError, match=r"pip install 'eha-rig\[view\]'"):
-        write_recording(draw_run(Trace.read(folder)), folder / "none.rrd")
-
-
-def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    if importlib.util.find_spec("rerun") is None or sys.platform != "linux":
-        pytest.skip("no rerun, or no Linux")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+def test_without_a_display_one_line_says_so_and_the_viewer_listens_on_this_machine_only(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
     with pytest.raises(ViewerError, match="no display"):
         viewer.open_viewer(Path("x.rrd"))
-
-
-def test_it_listens_on_this_machine_only() -> None:
     words = viewer.make_viewer_command(9999)
     assert words[words.index("--bind") + 1] == "127.0.0.1"
 
 
-def test_command(folder: Path, tmp_path: Path) -> None:
-    if importlib.util.find_spec("rerun") is None:
-        pytest.skip("no rerun")
-    words = [sys.executable, "-m", "rig.cli.main", "view", str(folder), "--save", str(tmp_path / "x.rrd")]
-    done = subprocess.run(words, capture_output=True, text=True)
-    assert done.returncode == 0 and done.stdout == f"{tmp_path / 'x.rrd'}\n", done.stderr
-    done = subprocess.run([*words, "--headless"], capture_output=True, text=True)
-    assert done.returncode == 2 and done.stderr == "rig view: --headless: expected --screenshot FILE.png with it\n"
+def test_command(short_run: Path, tmp_path: Path) -> None:
+    said = finished(started("view", short_run, "--save", tmp_path / "x.rrd"))
+    assert said == (0, f"{tmp_path / 'x.rrd'}\n", ""), said
+
+
+BIAS = "null_bias.current=1.5e-4"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """run.csv of a plant with a null bias, healthy.csv, and late.csv: the healthy one 0.25 s later."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name, changes in (("run", {"null_bias.current": 1.5e-4}), ("healthy", {})):
+        columns = simulate(Model().replace(changes), build_command()[:1200], None, 1, 100)
+        Trace.from_columns(columns._asdict(), 1e-3, {}).write_csv(folder / f"{name}.csv")
+    rows = np.loadtxt(folder / "healthy.csv", delimiter=",", comments="#", skiprows=1)
+    head = (folder / "healthy.csv").read_text().splitlines()[0]
+    late = np.vstack([np.tile(rows[:1], (250, 1)), rows])
+    late[:, 0] = np.arange(len(late)) * 1e-3
+    np.savetxt(folder / "late.csv", late, delimiter=",", header=head, comments="", fmt="%.12g")
+    return folder
+
+
+def read_values(rows: Rows, entity: str) -> np.ndarray:
+    return np.array([value for _, value in rows[entity]], float)
+
+
+@pytest.fixture(scope="module")
+def compared(folder: Path) -> tuple[Path, str]:
+    """The recording of `rig view --compare` with an added effect, and the verdict."""
+    told = answer("view", folder / "run.csv", "--compare", "--set", BIAS, "--save", folder / "compare.rrd")
+    return folder / "compare.rrd", told["verdict"]
+
+
+def test_the_comparison_holds_measured_model_residual_and_floor(folder: Path, compared: tuple[Path, str]) -> None:
+    rows = read_recording(compared[0])
+    found = compare(Trace.read(folder / "run.csv"), Model().replace({"null_bias.current": 1.5e-4}))
+    assert compared[1] == found.verdict and found.verdict != "MODEL_INCOMPLETE"
+    for name, scale, shown in (("xj", 1e3, 1e6), ("p12", 1e-5, 1e-5), ("xs", 1e6, 1e6)):
+        np.testing.assert_allclose(read_values(rows, f"/{name}/1_measured"), found.trace.column(name) * scale)
+        np.testing.assert_allclose(read_values(rows, f"/{name}/3_model"), found.replay.model[name] * scale)
+        residual = read_values(rows, f"/residual_{name}/2_model")
+        np.testing.assert_allclose(residual, found.replay.residual[name] * shown)
+        np.testing.assert_allclose(residual * scale / shown, read_values(rows, f"/{name}/1_measured")
+                                   - read_values(rows, f"/{name}/3_model"), atol=1e-6)  # measured minus model
+        floor = NOISE_BAND_RATIO * found.signals[name].floor.value * shown
+        assert read_values(rows, f"/residual_{name}/3_floor_high") == pytest.approx([floor, floor])
+        assert read_values(rows, f"/residual_{name}/3_floor_low") == pytest.approx([-floor, -floor])
+    lane = [word for _, word in rows["/error_over_floor/model"] if word]
+    assert lane == [format_ratio(place.ratio) for place in sorted(found.where, key=lambda place: place.t0)]
+
+
+def test_before_the_change_is_the_model_without_the_added_effect(folder: Path, compared: tuple[Path, str]) -> None:
+    rows, names = read_recording(compared[0]), read_names(compared[0])
+    before, text = compare(Trace.read(folder / "run.csv"), Model()), str(rows["/log/result"][0][1])
+    np.testing.assert_allclose(read_values(rows, "/residual_xj/1_before"), before.replay.residual["xj"] * 1e6)
+    np.testing.assert_allclose(read_values(rows, "/xs/2_before"), before.replay.model["xs"] * 1e6)
+    assert (names["/residual_xj/1_before"], names["/xj/1_measured"]) == ("before the change", "XJ measured")
+    assert "/error_over_floor/before" in rows
+    assert f"### {compared[1]}" in text and "Before the change: MODEL_INCOMPLETE." in text
+
+
+def test_before_a_model_file_is_the_file_without_its_effects(folder: Path, tmp_path: Path) -> None:
+    assert rig("add", "null_bias", folder / "run.csv", "--out", tmp_path / "better.toml").status == 0
+    answer("view", folder / "run.csv", "--compare", "--model", tmp_path / "better.toml", "--signals", "xs,p12",
+           "--save", tmp_path / "x.rrd")
+    rows = read_recording(tmp_path / "x.rrd")
+    before = compare(Trace.read(folder / "run.csv"), Model(), signals=["xs", "p12"])
+    np.testing.assert_allclose(read_values(rows, "/xs/2_before"), before.replay.model["xs"] * 1e6, atol=0.02)
+    left, earlier = (np.abs(read_values(rows, f"/residual_xs/{which}")).mean() for which in ("2_model", "1_before"))
+    assert left < 0.5 * earlier and not any(entity.startswith("/xj/") for entity in rows)
+
+
+def test_without_a_change_there_is_no_before(folder: Path, tmp_path: Path) -> None:
+    assert rig("view", folder / "healthy.csv", "--compare", "--save", tmp_path / "x.rrd").status == 0
+    rows = read_recording(tmp_path / "x.rrd")
+    assert not any("before" in entity for entity in rows) and "/residual_xj/1_model" in rows
+
+
+def test_runs_are_overlaid_and_subtracted_on_the_time_of_the_first(folder: Path, tmp_path: Path) -> None:
+    sources = [str(folder / f"{name}.csv") for name in ("healthy", "run", "late")]
+    assert answer("view", *sources, "--save", tmp_path / "x.rrd")["verdict"] == "DIFFERENT"
+    rows, names = read_recording(tmp_path / "x.rrd"), read_names(tmp_path / "x.rrd")
+    traces = [Trace.read(source) for source in sources]
+    found = compare_runs(sources, traces)
+    assert names["/xj/00_A"] == "A healthy.csv" and names["/difference_xj/01_B"] == "B - A"
+    np.testing.assert_allclose(read_values(rows, "/xj/01_B"), traces[1].xj * 1e3)
+    assert {round(t0 - t1, 6) for (t0, _), t1 in zip(rows["/xj/02_C"], traces[2].t, strict=True)} == {-0.25}
+    for number, pair in enumerate(found.pairs, 1):
+        for name, scale in (("xj", 1e6), ("p12", 1e-5), ("xs", 1e6)):
+            drawn = rows[f"/difference_{name}/{number:02}_{pair.run.label}"]
+            np.testing.assert_allclose(drawn, np.column_stack([pair.t, pair.differences[name] * scale]), atol=1e-8)
+    assert np.abs(read_values(rows, "/difference_xj/02_C")).max() < 1e-6  # um; C is A, later
+    text = str(rows["/log/result"][0][1])
+    assert "### DIFFERENT" in text and "B - A | XJ" in text and "aligned by the command" in text
+
+
+@pytest.mark.parametrize(("words", "message"), [
+    (["--compare", "--headless"], "--headless: expected --screenshot FILE.png with it"),
+    (["other.csv", "--compare"], "--compare: other.csv: expected one trace; rig view A B holds traces against each "
+                                 "other"),
+    (["--model", "eha"], "--model: expected --compare with it"),
+    (["--headless"], "--headless: expected --screenshot FILE.png with it"),
+    (["--theme", "light", "--save", "x.rrd"], "--theme: light: expected no --screenshot, --save or --out with it: they "
+                                              "open no browser"),
+    (["--set", BIAS], "--set: expected --compare with it"),
+    (["--repeat", "other.csv"], "--repeat: expected --compare with it"),
+    (["--signals", "xj"], "--signals: expected --compare with it"),
+    (["--seed", "0"], "--seed: expected --compare with it")])
+def test_options_that_do_not_fit_are_one_line(folder: Path, words: list[str], message: str) -> None:
+    assert refuse("view", folder / "run.csv", *words) == f"rig view: {message}\n"
+
+
+def test_a_theme_is_served_for_a_browser_until_ctrl_c(folder: Path) -> None:
+    """A script that notes the address stands in for a browser, which would open a window."""
+    script, note = folder / "browser", folder / "address.txt"
+    script.write_text(f'#!/bin/sh\nprintf %s "$1" > {note}.part\nmv {note}.part {note}\n')
+    script.chmod(0o755)
+    process = started("view", folder / "run.csv", "--theme", "light", "--json",
+                      env={**os.environ, "BROWSER": f"{script} %s"})
+    try:
+        assert process.stdout is not None
+        place = json.loads(process.stdout.readline())["address"]
+        address = urlsplit(place)
+        assert address.hostname == "127.0.0.1" and parse_qs(address.query)["theme"] == ["light"]
+        with urllib.request.urlopen(place) as page:
+            assert b"rerun" in page.read().lower()
+        while not note.exists():
+            time.sleep(0.05)
+        assert note.read_text() == place
+        data = urlsplit(parse_qs(address.query)["url"][0])
+        with socket.create_connection(("127.0.0.1", data.port or 0)):
+            pass
+    finally:
+        process.send_signal(signal.SIGINT)
+        said = finished(process)
+    assert said.status == 0 and said.err == ""
+    with socket.socket() as probe:  # the server is gone
+        assert probe.connect_ex(("127.0.0.1", address.port or 0)) != 0

@@ -2,16 +2,19 @@
 from __future__ import annotations
 
 import math
+import re
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import catch_refusal
+from scipy.io import savemat
 
 from fdi.trace.importing.conversion import Imported, Samples, import_measurement, place_samples
 from fdi.trace.importing.formats import Channel, ChannelReader, open_measurement, open_text_table
 from fdi.trace.importing.guess import GuessedMap, guess_map
 from fdi.trace.importing.import_map import parse_map
-from plant.errors import InputError
 
 MAP = """
 [signals.com]
@@ -40,11 +43,8 @@ def test_counter_that_wraps_and_a_gap(tmp_path: Path) -> None:
     counts = (65536 - 4 * 490 + 4 * there) % 65536
     text = '[time]\nsource = "n"\nbits = 16\nrate = 4000\n'
     imported = convert(tmp_path, text, n=counts, com=XJ[there], xj=XJ[there], cor=XJ[there])
-    trace = imported.trace
-    assert len(trace) == 1000 and trace.period == 1e-3
-    assert np.flatnonzero(np.isnan(trace.xj)).tolist() == list(range(480, 505))
-    assert np.array_equal(trace.xj[there], XJ[there])
-    assert {s.name: (s.gaps, s.missing) for s in imported.signals}["xj"] == (1, 25)
+    np.testing.assert_array_equal(imported.trace.xj, np.where(np.isin(np.arange(1000), there), XJ, np.nan))
+    assert {s.name: (s.gaps, s.missing) for s in imported.signals}["xj"] == (1, 25) and imported.trace.period == 1e-3
 
 
 P12 = '[time]\nrate = 1000\n[signals.p12]\nsource = "p"\n'
@@ -66,19 +66,16 @@ def test_scale_delay_and_dead_span(keys: str, rows: dict[int, float], tmp_path: 
     (f"{P12}sensor = {{dead = [[0, 1{'0' * 400}]]}}\n", "dead: expected true, or a list"),
     (f"{P12}sensor = {{dead = true}}\n", "marked dead")])
 def test_too_few_bits_and_a_dead_channel_are_refused(text: str, reason: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=reason):
-        convert(tmp_path, text, p=np.arange(1000))
+    assert re.search(reason, catch_refusal(convert, tmp_path, text, p=np.arange(1000)))
 
 
 def test_slow_signal_lies_on_straight_lines_and_its_gap_stays(tmp_path: Path) -> None:
     """100 Hz beside 1 kHz, empty fields between; a second without values is not bridged."""
-    load = np.full(1000, np.nan)
-    load[::10] = 5.0 * np.arange(100)
-    load[400:500] = np.nan
+    k = np.arange(1000)
+    load = np.where((k % 10 == 0) & ((k < 400) | (k >= 500)), 0.5 * k, np.nan)
     imported = convert(tmp_path, '[time]\nrate = 1000\n[signals.load]\nsource = "f"\n', f=load)
-    got = imported.trace.load
-    assert got[:5].tolist() == pytest.approx([0.0, 0.5, 1.0, 1.5, 2.0])
-    assert np.isnan(got[391:500]).all() and not np.isnan(got[:391]).any() and not np.isnan(got[500:991]).any()
+    there = (k < 391) | ((k >= 500) & (k < 991))
+    np.testing.assert_allclose(imported.trace.load[:991], np.where(there, 0.5 * k, np.nan)[:991])
     assert "straight lines between samples 10 ms apart" in imported.signals[0].how
 
 
@@ -87,30 +84,26 @@ def test_what_would_fold_is_filtered_first() -> None:
     t = np.arange(20_000) * 1e-4
     slow, ripple = np.sin(2 * math.pi * 10.0 * t), 0.3 * np.sin(2 * math.pi * 4900.0 * t)
     rows = np.arange(2000) * 1e-3
-    x, how = place_samples(Samples(t, slow + ripple), rows, 1e-3, "auto", None, "")
-    assert how == "low-pass filtered, every 10th sample"
-    assert np.abs(x - slow[::10])[20:-20].max() < 3e-3
-    raw, _ = place_samples(Samples(t, slow + ripple), rows, 1e-3, "auto", False, "")
-    assert np.abs(raw - slow[::10]).max() > 0.1
-    quiet, how = place_samples(Samples(t, slow), rows, 1e-3, "auto", None, "")
-    assert how == "every 10th sample" and np.array_equal(quiet, slow[::10])
+    (filtered, how), (raw, _), (quiet, plain) = (
+        place_samples(Samples(t, x), rows, 1e-3, "auto", is_filtered, "")
+        for x, is_filtered in ((slow + ripple, None), (slow + ripple, False), (slow, None)))
+    assert (how, plain) == ("low-pass filtered, every 10th sample", "every 10th sample")
+    assert np.abs(filtered - slow[::10])[20:-20].max() < 3e-3 and np.abs(raw - slow[::10]).max() > 0.1
+    assert np.array_equal(quiet, slow[::10])
 
 
 def test_held_answers_of_the_controller_keep_their_cycle() -> None:
     """At 4 kHz the current is new in the third sample of a cycle: row k still holds the answer to row k."""
-    t = np.arange(4000) * 2.5e-4
     answer = np.repeat(np.arange(1001.0), 4)[2:4002]  # the first two samples are of the cycle before
-    rows = t[0] + np.arange(1000) * 1e-3
-    x, _ = place_samples(Samples(t, answer), rows, 1e-3, "auto", None, "answer")
+    x, _ = place_samples(Samples(np.arange(4000) * 2.5e-4, answer), T, 1e-3, "auto", None, "answer")
     assert np.array_equal(x[:-1], np.arange(1.0, 1000.0))
 
 
 def test_clock_that_is_not_the_models_keeps_its_samples(tmp_path: Path) -> None:
     """1.0003 ms for 1 ms slips by three rows in 10 s: the trace takes the recording's own period."""
-    n = 10_000
-    x = np.sin(np.arange(n) / 50.0)
-    trace = convert(tmp_path, '[time]\nsource = "t"\n', t=np.arange(n) * 1.0003e-3, com=x, xj=x, cor=x).trace
-    assert trace.period == pytest.approx(1.0003e-3) and len(trace) == n and np.array_equal(trace.xj, x)
+    x = np.sin(np.arange(10_000) / 50.0)
+    trace = convert(tmp_path, '[time]\nsource = "t"\n', t=np.arange(len(x)) * 1.0003e-3, com=x, xj=x, cor=x).trace
+    assert trace.period == pytest.approx(1.0003e-3) and np.array_equal(trace.xj, x)
 
 
 def guess(tmp_path: Path, lines: list[str]) -> GuessedMap:
@@ -149,9 +142,7 @@ def test_guess_scales_counts_and_writes_their_step(tmp_path: Path) -> None:
     A column that does not change is no signal; the map says which one its name means.
     """
     com = np.repeat([0.0, 6.0, -2.0, 12.0, 0.0], 300)
-    xj = np.zeros(1500)
-    for k in range(1, 1500):
-        xj[k] = min(xj[k - 1] + 0.02 * float(np.clip(com[k] - xj[k - 1], -3.0, 3.0)), 7.0)
+    xj = np.array(list(accumulate(com, lambda x, to: min(x + 0.02 * min(max(to - x, -3.0), 3.0), 7.0))))
     cor = np.clip(3.8 * (com - xj), -8.0, 8.0)
     rows = zip(com, np.rint(xj / 0.005) + 1000, cor, strict=True)
     lines = ["t [s];Soll [mm];Ist [counts];i [mA];Kraft [kN]"]
@@ -159,8 +150,7 @@ def test_guess_scales_counts_and_writes_their_step(tmp_path: Path) -> None:
     guessed = guess(tmp_path, lines)
     signals = parse_map(guessed.text, tmp_path / "x.map.toml").signals
     scaling = signals["xj"].term
-    assert scaling.scale == pytest.approx(0.005, rel=0.01) and scaling.offset == pytest.approx(-5.0, rel=0.02)
-    assert signals["xj"].sensor.quantum == pytest.approx(5e-6, rel=0.01)
+    assert (scaling.scale, scaling.offset, signals["xj"].sensor.quantum) == pytest.approx((0.005, -5.0, 5e-6), rel=0.02)
     assert signals["cor"].term.sign == 1.0 and guessed.chosen["xj"] == ("Ist [counts]", "unsure")
     assert guessed.left == {"Kraft [kN]": "always 0; by its name it would be load"}
 
@@ -176,19 +166,13 @@ def test_guess_pairs_two_chambers(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".mat", ".parquet"])
 def test_matlab_and_parquet(suffix: str, tmp_path: Path) -> None:
     columns = {"t": T, "com": XJ, "xj": XJ, "cor": XJ, "p12": 2.0 * XJ}
-    path = tmp_path / f"x{suffix}"
+    path, text = tmp_path / f"x{suffix}", '[time]\nsource = "t"\n' + MAP
     if suffix == ".mat":
-        from scipy.io import savemat
-
         savemat(path, {"run": columns})
-        text = '[time]\nsource = "run.t"\n' + MAP.replace('"c', '"run.c').replace('"x', '"run.x')
+        text = text.replace('source = "', 'source = "run.')
     else:
-        pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'eha-rig[measure]'")
-        import pyarrow as pa
-        from pyarrow import parquet
-
-        parquet.write_table(pa.table(columns), path)
-        text = '[time]\nsource = "t"\n' + MAP
+        parquet = pytest.importorskip("pyarrow.parquet", reason="no pyarrow: pip install 'eha-rig[measure]'")
+        parquet.write_table(pytest.importorskip("pyarrow").table(columns), path)
     imported = import_measurement(open_measurement(path), parse_map(text, tmp_path / "map.toml"), 1e-3)
     assert np.array_equal(imported.trace.xj, XJ)
 
@@ -198,8 +182,7 @@ def test_damaged_files(name: str, word: str, tmp_path: Path) -> None:
     if name != "x.mat":
         pytest.importorskip({"x.parquet": "pyarrow", "x.mf4": "asammdf"}[name], reason="pip install 'eha-rig[measure]'")
     (tmp_path / name).write_bytes(b"not what its name says" * 20)
-    with pytest.raises(InputError, match=rf"{name}: expected an? {word} file"):
-        open_measurement(tmp_path / name)
+    assert re.search(rf"{name}: expected an? {word} file", catch_refusal(open_measurement, tmp_path / name))
 
 
 def test_the_map_in_the_manual_is_valid() -> None:
@@ -257,14 +240,12 @@ def test_missing_fields_and_dates(tmp_path: Path) -> None:
 ])
 def test_bad_rows(row: str, place: str, reason: str, tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_text(f"t,x\n0,1\n1,2\n{row}\n3,4\n")
-    with pytest.raises(InputError) as error:
-        open_text_table(tmp_path / "x.csv").read(["t", "x"])
-    assert place in str(error.value) and reason in str(error.value)
+    line = catch_refusal(open_text_table(tmp_path / "x.csv").read, ["t", "x"])
+    assert place in line and reason in line
 
 
 @pytest.mark.parametrize("content", [b"", b"no table\n", b"\0\1\2", b"a,b\nc,d\n",
                                      pytest.param(b'a,b\n1,"' + b"2" * 140000 + b'"\n', id="a long field")])
 def test_what_is_no_table(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_bytes(content)
-    with pytest.raises(InputError, match=r"x\.csv"):
-        open_text_table(tmp_path / "x.csv")
+    assert "x.csv" in catch_refusal(open_text_table, tmp_path / "x.csv")

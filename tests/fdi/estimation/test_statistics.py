@@ -1,10 +1,14 @@
-"""The floor against noise of known size: white, coloured, with hum, and with errors of the model that do not repeat."""
+"""Statistics against known answers: noise floors, and shares with their exact intervals."""
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 from noisy_traces import LEVELS, sample_noise
+from scipy.stats import binomtest
 
+from fdi.estimation.binomial import clopper_pearson_interval, measure_share
 from fdi.estimation.noise import find_floors, find_hum_lines, floor_from_data, floor_from_repeats, measure_quiet_level
 
 ROWS = 13_500
@@ -22,13 +26,10 @@ def rms(x: np.ndarray) -> float:
 @pytest.mark.parametrize(("colour", "rows", "scatter"), [
     ("white", ROWS, 0.012), ("white", 2000, 0.03), ("hum", ROWS, 0.025), ("hum", 2000, 0.07)])
 def test_a_perfect_model_has_ratio_one(colour: str, rows: int, scatter: float) -> None:
-    ratios = []
-    for seed in range(30):
-        r, repeat = pair(seed, colour, rows)
-        ratios.append(rms(r) / floor_from_repeats(r, [repeat]).value)
+    pairs = [pair(seed, colour, rows) for seed in range(30)]
+    ratios = [rms(r) / floor_from_repeats(r, [repeat]).value for r, repeat in pairs]
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.025)
-    assert np.std(ratios) < scatter
-    assert max(ratios) < 1.02 + 4 * scatter
+    assert np.std(ratios) < scatter and max(ratios) < 1.02 + 4 * scatter
 
 
 @pytest.mark.parametrize("colour", ["white", "hum"])
@@ -46,11 +47,10 @@ def test_stick_slip_that_comes_at_other_times_is_no_noise(part: float, least: fl
         r, repeat = pair(seed, "white")
         rng = np.random.default_rng(seed)
         events = np.repeat(np.where(rng.random(ROWS // 100) < part, rng.exponential(10, ROWS // 100), 0.0), 100)
-        slow = np.cumsum(rng.standard_normal(ROWS)) / 20
-        found.append(floor_from_repeats(r + events * np.tanh(slow), [repeat - events * np.tanh(slow)]))
+        slips = events * np.tanh(np.cumsum(rng.standard_normal(ROWS)) / 20)
+        found.append(floor_from_repeats(r + slips, [repeat - slips]))
     assert np.mean([f.value for f in found]) == pytest.approx(1.0, abs=least)
-    assert found[0].difference > 3.0  # told apart from the noise
-    assert found[0].share < 1.05 - 0.6 * part
+    assert found[0].difference > 3.0 and found[0].share < 1.05 - 0.6 * part  # told apart from the noise
 
 
 def test_hum_of_one_phase_is_found_and_counted() -> None:
@@ -61,27 +61,24 @@ def test_hum_of_one_phase_is_found_and_counted() -> None:
     found = floor_from_repeats(r + hum, [repeat + hum])
     assert found.hum == pytest.approx(0.8 / np.sqrt(2), rel=0.1)
     assert found.value == pytest.approx(np.hypot(1.0, 0.8 / np.sqrt(2)), rel=0.03)
-    assert [f for f, _ in find_hum_lines([r + hum, repeat + hum], 1e-3)] == [50.0]
-    assert find_hum_lines([r, repeat], 1e-3) == []
-    assert 400.0 in [f for f, _ in find_hum_lines([r + 0.3 * np.sin(2 * np.pi * 0.4 * k)] * 2, 1e-3)]
+    fast = r + 0.3 * np.sin(2 * np.pi * 0.4 * k)
+    none, one, more = ([f for f, _ in find_hum_lines(runs, 1e-3)]
+                       for runs in ([r, repeat], [r + hum, repeat + hum], [fast, fast]))
+    assert (none, one) == ([], [50.0]) and 400.0 in more
 
 
 def test_more_repeats_say_the_same_with_less_doubt() -> None:
-    def scatter(count: int) -> float:
-        return float(np.std([floor_from_repeats(sample_noise(10 * s, 2000)[:, 0], [sample_noise(10 * s + i, 2000)[:, 0]
-                                                                      for i in range(1, count + 1)]).value
-                             for s in range(20)]))
-
-    assert scatter(5) < 0.8 * scatter(1)
+    runs = [[sample_noise(10 * s + i, 2000)[:, 0] for i in range(6)] for s in range(20)]
+    few, many = (np.std([floor_from_repeats(r, repeats[:count]).value for r, *repeats in runs]) for count in (1, 5))
+    assert many < 0.8 * few
 
 
 def test_gaps_and_other_lengths() -> None:
     r, repeat = pair(1, "white")
     r[2000:3000], repeat[500:600] = np.nan, np.nan
-    found = find_floors({"xj": r, "p12": r}, [{"xj": repeat[:9000]}])
-    assert set(found) == {"xj"} and found["xj"].source == "repeats" and not found["xj"].lower_bound
-    assert found["xj"].value == pytest.approx(1.0, abs=0.03)
-    assert found["xj"].freedom == pytest.approx(1.0, abs=0.1)
+    ((name, found),) = find_floors({"xj": r, "p12": r}, [{"xj": repeat[:9000]}]).items()
+    assert (name, found.source, found.lower_bound) == ("xj", "repeats", False)
+    assert found.value == pytest.approx(1.0, abs=0.03) and found.freedom == pytest.approx(1.0, abs=0.1)
     assert floor_from_repeats(r[:50], [repeat[:50]]).value == pytest.approx(1.0, abs=0.4)  # too short for windows
     assert measure_quiet_level([np.full(500, np.nan)])[0] == 0.0 and measure_quiet_level([np.zeros(500)])[0] == 0.0
 
@@ -92,3 +89,13 @@ def test_second_differences_are_a_lower_bound() -> None:
     assert floor_from_data(white + slow).value == pytest.approx(1.0, abs=0.05)
     assert floor_from_data(coloured + slow).value < 0.6
     assert floor_from_data(white).lower_bound and floor_from_data(np.array([1.0, 2.0])).value == 0.0
+
+
+@pytest.mark.parametrize("confidence", [0.95, 0.99])
+@pytest.mark.parametrize(("good", "of"), [(0, 10), (10, 10), (7, 33), (198, 200)])
+def test_intervals_are_those_of_clopper_and_pearson(good: int, of: int, confidence: float) -> None:
+    exact = binomtest(good, of).proportion_ci(confidence, method="exact")
+    assert clopper_pearson_interval(good, of, confidence) == pytest.approx((exact.low, exact.high), abs=1e-9)
+    share, nothing = measure_share(good, of), measure_share(0, 0)
+    assert share == (good, of, *clopper_pearson_interval(good, of, 0.95)) and share.value == good / of
+    assert nothing == (0, 0, 0.0, 1.0) and math.isnan(nothing.value)

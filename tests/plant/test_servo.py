@@ -1,10 +1,14 @@
-"""The effects of pump-driven actuators, and the flow under measured pressures, against closed forms."""
+"""Pump-driven actuators: effects and the flow under measured pressures against closed forms, shipped models."""
 from __future__ import annotations
 
 from math import factorial
+from pathlib import Path
 
 import numpy as np
 import pytest
+from physics_cases import PREFLIGHT, SILENT
+from places import SHARED
+from rig_command import rig
 
 from plant import load_model, simulate
 from plant.controller import compute_answers
@@ -18,6 +22,7 @@ from plant.ehs import (
     derive_logger_columns,
     estimate_load_in_motion,
 )
+from plant.forced import compute_flow_balance, compute_force_balance
 from plant.lanes import Lanes
 from plant.model import Model, list_offered_effects, list_searched_effects
 from plant.state import Input, Line, State
@@ -212,3 +217,103 @@ def test_general_effects_suit_every_plant_and_act_and_are_searched_in_this_one(n
     off, on, without = (np.array(simulate(m, command, steps=4, fast=False))
                         for m in (model.with_effects([name]), model.replace(strong), model))
     assert (off == without).all() and np.isfinite(on).all() and (on != without).any()
+
+
+DATA = SHARED / "data" / "electrohydrostatic_rig"
+real = pytest.mark.skipif(not DATA.is_dir(), reason=f"no measurements at {DATA.name}: they belong to others")
+
+
+def speeds(**changed: float) -> tuple[float, float]:
+    """The ram's speed forwards at 1000 units of motor speed, and backwards, m/s."""
+    names = [name.replace("__", ".") for name in changed]
+    lanes = Lanes(load_model("ehs").replace({"quantisation.lsb": 0.0}), names)
+    driven = np.r_[np.full(300, 1000.0), np.full(400, -1000.0)]
+    xj = lanes.replay(np.array([[*changed.values()]]), driven, np.zeros(700))[0, :, 0]
+    return (xj[290] - xj[190]) / 0.1, (xj[690] - xj[590]) / 0.1
+
+
+def test_nominal_is_an_integrator() -> None:
+    """XJ' = D w / AJ, both ways."""
+    model = load_model("ehs")
+    speed = model["pump.displacement"] * 1000.0 / model["jack.area"]
+    assert speeds(pump__area_ratio=1.0) == pytest.approx((speed, -speed), rel=1e-6)
+
+
+def test_unequal_areas_make_it_faster_backwards() -> None:
+    forwards, backwards = speeds(pump__area_ratio=0.68)
+    assert -forwards / backwards == pytest.approx(0.68, rel=1e-6)
+
+
+def test_the_bench_refuses_it() -> None:
+    said = rig("run", "--model", "ehs")
+    assert said.status == 2 and "a model of eha" in said.err and len(said.err.splitlines()) == 1
+
+
+@real
+def test_the_bare_integrator_is_incomplete() -> None:
+    said = rig("compare", DATA / "exp_data_3_4.csv.gz", "--model", "ehs", "--json")
+    assert said.status == 1 and said.json["verdict"] == "MODEL_INCOMPLETE"
+    assert said.json["signals"]["xj"]["ratio"] > 5.0
+
+
+@real
+def test_the_error_falls_on_runs_that_no_fit_saw(tmp_path: Path) -> None:
+    """Fitted to 3_4 alone; the ratio of areas is what 750 against 1100 units for the same speed say, 0.68."""
+    said = rig("add", "one_way_load", "unequal_areas", DATA / "exp_data_3_4.csv.gz", "--model", "ehs", "--holdout",
+               DATA / "exp_data_2_2.csv.gz", "--out", tmp_path / "rig.toml", "--json")
+    assert said.status == 0, said.err
+    first, *_, last = said.json["ledger"]
+    for run in ("error", "holdout"):
+        assert last[run]["p12"] < 0.6 * first[run]["p12"] and last[run]["xj"] <= first[run]["xj"]
+    ratio = said.json["parameters"]["pump.area_ratio"]
+    assert ratio["low"] < ratio["value"] < ratio["high"] and ratio["value"] == pytest.approx(0.68, abs=0.03)
+
+
+P = Model().values
+GQ, GP, AJ = P["valve.flow_gain"], P["valve.pressure_gain"], P["jack.area"]
+
+
+def test_flow_of_a_constant_opening_and_pressure() -> None:
+    """AJ v = GQ (XS - P12/GP) - CLK P12, for as long as it is open."""
+    xs, p12 = np.full(500, 1e-4), np.full(500, 3e6)
+    model = SILENT.replace({"jack.leakage": 2e-11})
+    x, v = compute_flow_balance(model, xs, p12, 1e-3)
+    speed = (GQ * (1e-4 - 3e6 / GP) - 2e-11 * 3e6) / AJ
+    assert v == pytest.approx(np.full(500, speed), rel=1e-9)
+    assert x == pytest.approx(1e-3 + speed * 1e-3 * np.arange(500), rel=1e-9)
+
+
+def test_force_of_a_given_motion() -> None:
+    """MJ a + CJ v + FR, and the friction levels beside it."""
+    t = np.arange(400) * 1e-3
+    x, v, a = 0.5 * 2.0 * t**2, 2.0 * t, 2.0
+    takes, static, dynamic = compute_force_balance(SILENT, x, v, np.zeros(400), np.full(400, 500.0))
+    expected = P["jack.mass"] * a + P["jack.damping"] * v + 500.0
+    assert takes == pytest.approx(expected, rel=1e-9)
+    assert set(static) == {P["jack.static_friction"]} and set(dynamic) == {P["jack.dynamic_friction"]}
+
+
+@pytest.mark.parametrize("changes", [{}, {"spool.static_friction": 45.0}, {"filter.clogging": 0.3},
+                                     {"jack.leakage": 2e-11, "jack.mass": 200.0}])
+def test_both_close_on_a_simulation(changes: dict[str, float]) -> None:
+    """Faults before the spool change nothing in them; faults of the jack are in the model here."""
+    model = SILENT.replace(changes)
+    run = simulate(model, PREFLIGHT, np.full(len(PREFLIGHT), 300.0))
+    x, v = compute_flow_balance(model, run.xs, run.p12, 0.0)
+    assert np.abs(run.xj - x).max() < 20e-6  # m, over 13.5 s: straight lines between the samples
+    takes, _, dynamic = compute_force_balance(model, run.xj, v, run.p12, run.load)
+    steady = np.abs(np.gradient(v, 1e-3)) < 1.0
+    moving = steady & (np.abs(v) > 2e-3)
+    left = run.p12 - (takes + np.sign(v) * dynamic) / AJ
+    assert np.sqrt(np.mean(left[moving] ** 2)) < 1e4  # Pa: half the transducer's noise
+
+
+@pytest.mark.parametrize("changes", [{"orifice_root.share": 1.0, "spool_overlap.overlap": 2e-5},
+                                     {"compressibility.coefficient": 1e-9}])
+def test_the_laws_of_effects_take_part(changes: dict[str, float]) -> None:
+    """An effect that makes P12 a curve of the speed, behind a dead zone: without them the ram is elsewhere."""
+    model = SILENT.replace(changes)
+    run = simulate(model, PREFLIGHT, np.full(len(PREFLIGHT), 2000.0))
+    x, _ = compute_flow_balance(model, run.xs, run.p12, 0.0)
+    plain, _ = compute_flow_balance(SILENT, run.xs, run.p12, 0.0)
+    assert np.sqrt(np.mean((run.xj - x) ** 2)) < 0.05 * np.sqrt(np.mean((run.xj - plain) ** 2))

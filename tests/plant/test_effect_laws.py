@@ -1,4 +1,4 @@
-"""What each effect of ram, transducer and firmware does, against a closed form; and that friction only takes energy."""
+"""What each effect does, from the current to the transducer and the firmware, against a closed form."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
@@ -6,20 +6,229 @@ from typing import Any
 
 import numpy as np
 import pytest
-from effects_cases import EASY, QUIET_SPOOL, WHOLE, H, drive_plant, measure_spool
+from effects_cases import EASY, QUIET_SPOOL, WHOLE, H, drive_plant, measure_speed, measure_spool
+from effects_reference import simulate_jack
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from node_bench import FirmwareDesk
+from physics_cases import SILENT
 
 from plant import Actuator, Model, simulate
-from plant.compile import interpret_function
+from plant.compile import compile_function, interpret_function
 from plant.controller import compute_answers
 from plant.effects import CATALOGUE
+from plant.effects.current import Behind, coil_lag
 from plant.effects.sensors import Lag, Recoil, mount_compliance, sensor_lag
+from plant.effects.supply import Drawn, supply_droop
 from plant.model import build_initial_state, collect_bindings
-from plant.state import Input, State
-from plant.step import compute_coefficients, step_plant
+from plant.state import Input, Ports, State
+from plant.step import compute_coefficients, compute_metering_line, step_plant
+from plant.step import step_jack as ram
 from rig.network.codec import Control
+
+MILLI = 1e-3
+FRICTIONLESS = {"jack.static_friction": 0.0, "jack.dynamic_friction": 0.0}
+ADVANCED = np.random.default_rng(1).uniform(-4e-3, 4e-3, 60)  # A, a new one each cycle
+
+
+def test_null_bias_shifts_position_and_not_pressure() -> None:
+    run = simulate(EASY.replace({"null_bias.current": 2e-4}), np.zeros(600))
+    assert run.xj[-1] == pytest.approx(2e-4 / EASY["controller.proportional_gain"], rel=1e-3)
+    assert run.p12[-1] == pytest.approx(0.0, abs=1.0)
+
+
+def test_hysteresis_is_a_loop_of_its_width_at_any_rate() -> None:
+    """Up against down at no current: the spool is apart by what the width of the loop in current moves it."""
+    for period in (400, 1600):  # cycles
+        current = 2e-3 * np.interp(np.arange(1.75 * period) / period, [0, 0.25, 0.75, 1.25, 1.75], [0, 1, -1, 1, -1])
+        (_, _, xs, _, _), (_, _, plain, _, _) = (
+            drive_plant(EASY.replace({"torque_motor_hysteresis.width": width}), current)[1] for width in (2e-4, 0.0))
+        down, up = period // 2, period
+        assert xs[down] - plain[down] == pytest.approx(0.5 * measure_spool(EASY, 2e-4), rel=0.01)
+        assert xs[down] - xs[up] - (plain[down] - plain[up]) == pytest.approx(measure_spool(EASY, 2e-4), rel=0.01)
+
+
+@pytest.mark.parametrize("tau", [0.3e-3, 3e-3])
+def test_coil_lag_is_3_dB_down_where_it_should(tau: float) -> None:
+    p = EASY.replace({"coil_lag.time": tau}).build_record()[0]
+    w, m = 1.0 / tau, Behind()
+    t = np.arange(round(40 * tau / H)) * H
+    out = np.empty_like(t)
+    for i, x in enumerate(np.sin(w * (t + 0.5 * H))):  # the current is constant over a step: taken at its middle
+        out[i], m = coil_lag(x, m, State(), Input(h=H), p)
+    settled = t > 10 * tau
+    expected = np.sin(w * (t + 0.5 * H) - np.pi / 4) / np.sqrt(2)
+    np.testing.assert_allclose(out[settled], expected[settled], atol=2e-3)
+
+
+@pytest.mark.parametrize("cycles", [1, 2, 5])
+def test_a_delay_of_whole_cycles_is_exactly_that(cycles: int) -> None:
+    late = drive_plant(WHOLE.replace({"transport_delay.cycles": float(cycles)}), ADVANCED)[1]
+    assert (late[:, cycles:] == drive_plant(WHOLE, ADVANCED)[1][:, :-cycles]).all()
+
+
+def test_a_delay_of_a_fraction_changes_within_the_cycle() -> None:
+    """Half a cycle late: the plant of a bus twice as fast that repeats each current, half a cycle ago."""
+    late = drive_plant(EASY.replace({"transport_delay.cycles": 0.5}), ADVANCED)[1]
+    fast = EASY.replace({"controller.period": 0.5e-3})
+    twice = drive_plant(fast, np.r_[0.0, np.repeat(ADVANCED, 2)])[1]  # its steps are half as long
+    np.testing.assert_allclose(late[2], twice[2, :-1:2], atol=2e-8)
+
+
+def test_current_limit_caps_the_speed_and_does_nothing_below() -> None:
+    model = EASY.replace({"current_limit.loss": 0.2})
+    full = drive_plant(model, np.full(60, 8e-3))[1]
+    assert full[4, -1] == pytest.approx(measure_speed(model, measure_spool(model, 0.8 * 8e-3)), rel=2e-3)
+    below = drive_plant(model, np.full(60, 6.3e-3))[1]
+    assert (below == drive_plant(EASY, np.full(60, 6.3e-3))[1]).all()
+
+
+def test_the_nozzles_gain_differs_by_direction() -> None:
+    """The spool settles with the slowest root of flapper and pilot loop, whose gain is Kv (1 + a) or Kv (1 - a)."""
+    model = EASY.replace({"nozzle_asymmetry.asymmetry": 0.2, "flapper.damping": 0.2})
+    v = model.values
+    kv = v["pilot.flow_gain"] * v["feedback_spring.stiffness"] / v["spool.end_area"]
+    for sign in (1.0, -1.0):
+        xs = drive_plant(model, np.full(25, sign * 1e-3))[1][2]
+        rate = np.polyfit(np.arange(6, 14), np.log(1.0 - xs[6:14] / measure_spool(model, sign * 1e-3)), 1)[0] / MILLI
+        roots = np.roots([v["flapper.inertia"], v["flapper.damping"], v["flapper.stiffness"], kv * (1 + 0.2 * sign)])
+        assert rate == pytest.approx(max(roots.real), rel=0.03)
+
+
+def test_the_worn_ball_lets_the_spool_go_half_a_gap_further_and_hunt_at_null() -> None:
+    model = EASY.replace({"feedback_gap.gap": 20e-6})
+    xs = drive_plant(model, np.full(100, 1e-3))[1][2]
+    assert xs[-1] == pytest.approx(measure_spool(model, 1e-3) + 10e-6, rel=1e-4)
+    nudge = np.r_[np.full(20, 1e-4), np.zeros(1500)]
+    hunting, quiet = (np.std(simulate(m, nudge).xs[-500:]) for m in (model, EASY))
+    assert hunting > 2e-6 > 1e-9 > quiet
+
+
+def test_flow_force_is_a_weaker_torque_motor_that_depends_on_the_pressure() -> None:
+    k = 2e-3
+    model = EASY.replace({"flow_force.coefficient": k})
+    for load in (0.0, 15e3):
+        _, p12, xs, _, _ = drive_plant(model, np.full(80, 2e-3), load)[1]
+        lever = model["flapper.stiffness"] / (model["spool.end_area"] * model["pilot.pressure_gain"])
+        spring = model["feedback_spring.stiffness"] + lever * k * (model["supply.pressure"] - abs(p12[-1]))
+        assert xs[-1] == pytest.approx(model["torque_motor.gain"] * 2e-3 / spring, rel=1e-3)
+
+
+def test_overlap_is_flat_around_null_and_underlap_is_twice_as_steep() -> None:
+    """Speed of the unloaded ram over the opening, both ways and within the lap."""
+    for sign in (1.0, -1.0):
+        for xs in (10e-6, 100e-6):
+            current = np.full(80, sign * xs / measure_spool(EASY, 1.0))
+            over, under = (drive_plant(EASY.replace({name: 20e-6}), current)[1][4, -1] for name in (
+                "spool_overlap.overlap", "spool_underlap.underlap"))
+            assert over == pytest.approx(sign * measure_speed(EASY, max(xs - 20e-6, 0.0)), rel=2e-3, abs=1e-9)
+            assert under == pytest.approx(sign * measure_speed(EASY, xs + min(xs, 20e-6)), rel=2e-3)
+
+
+@pytest.mark.parametrize("load", [-20e3, 0.0, 20e3])
+def test_orifice_root_of_the_pressure_left(load: float) -> None:
+    """XS w = P12/GP + QJ/GQ at constant speed, w = sqrt(1 - sign(XS) P12/PSR)."""
+    model = EASY.replace({"orifice_root.share": 1.0, "jack.leakage": 0.0})
+    _, p12, xs, _, v = (row[-1] for row in drive_plant(model, np.full(60, 3e-3), load)[1])
+    w = np.sqrt(1.0 - p12 / model["supply.pressure"])
+    assert v == pytest.approx(measure_speed(model, xs * w - p12 / model["valve.pressure_gain"]), rel=1e-3)
+    assert p12 == pytest.approx((load + model["jack.damping"] * v) / model["jack.area"], rel=1e-3)
+
+
+def test_droop_is_as_large_as_the_flow_and_comes_with_the_lines_lag() -> None:
+    model = EASY.replace({"supply_droop.slope": 2e10})
+    _, _, xs, _, v = (row[-1] for row in drive_plant(model, np.full(80, 6e-3))[1])
+    ratio = 1.0 - 2e10 * model["jack.area"] * v / model["supply.pressure"]
+    assert ratio < 0.8
+    assert v == pytest.approx(measure_speed(model, xs) * np.sqrt(ratio), rel=3e-3)
+    p, m, s = model.build_record()[0], Drawn(), State(jack_speed=0.1)
+    for _ in range(200):  # 2 ms
+        r, m = supply_droop(1.0, m, s, Input(h=H), p)
+    assert 1.0 - r == pytest.approx((1 - np.exp(-1)) * 2e10 * 0.1 * 1.5e-3 / model["supply.pressure"], rel=1e-3)
+
+
+def test_ripple_is_a_line_in_the_speed() -> None:
+    """The flow goes with the root of the supply: a ripple of 4 % is one of 2 % in the speed."""
+    model = EASY.replace({"supply_ripple.amplitude": 0.04, "supply_ripple.frequency": 25.0, "supply_ripple.phase": 0.5})
+    v = drive_plant(model, np.full(320, 2e-3))[1][4, 120:]
+    line = 2.0 * np.fft.rfft(v)[5] / len(v)  # 5 periods in 200 cycles
+    assert abs(line) == pytest.approx(0.02 * v.mean(), rel=0.02)
+    assert np.angle(line * 1j) == pytest.approx(0.5 + 2 * np.pi * 25 * 0.120 - 6 * np.pi, abs=0.05)
+
+
+def test_viscosity_moves_three_parameters_together() -> None:
+    thick = WHOLE.replace({"viscosity_drift.factor": 1.6})
+    by_hand = WHOLE.replace({"jack.damping": 1.6 * WHOLE["jack.damping"], "flapper.damping": 1.6 * 0.45,
+                             "jack.leakage": WHOLE["jack.leakage"] / 1.6})
+    found, expected = (drive_plant(model, ADVANCED)[1] for model in (thick, by_hand))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-15)
+
+
+def _moved(s, spool, load, record, h, out):
+    """Metering edges and ram alone, the spool on a given path; rows XJ, P12."""
+    p = record[0]
+    k = compute_coefficients(p, h)
+    for i in range(len(spool)):
+        u = Input(0.0, load[i], 0.0, i * h, 0.0, h)
+        line, a, b = compute_metering_line(s, u, p, k, spool[i])
+        x, v, p12, c, d = ram(s, u, p, k, line, load[i])
+        m = s.memory
+        s = State(0.0, 0.0, spool[i], 0.0, x, v, p12, x, Ports(
+            m.command, m.current, m.supply, m.viscosity, m.nozzle, m.feedback, m.spool_force, a, b, c, d, m.position,
+            m.reading))
+        out[0, i], out[1, i] = x, p12
+
+
+IMPLICIT = ("compressibility", "orifice_root", "presliding")
+
+
+@pytest.mark.parametrize("changes", [
+    FRICTIONLESS | {"orifice_root.share": 1.0}, FRICTIONLESS | {"orifice_root.share": 0.4},
+    FRICTIONLESS | {"compressibility.coefficient": 1e-9}, FRICTIONLESS | {"compressibility.coefficient": 1e-11},
+    FRICTIONLESS | {"compressibility.coefficient": 1e-9, "orifice_root.share": 1.0},
+    {"presliding.deflection": 5e-6}, {"presliding.deflection": 1e-4},
+    {"presliding.deflection": 2e-5, "compressibility.coefficient": 1e-9, "orifice_root.share": 1.0},
+], ids=lambda c: ", ".join(f"{k} {v:g}" for k, v in c.items() if v))
+@pytest.mark.parametrize(("h", "um", "bar"), [(1e-5, 0.3, 0.05), (5e-5, 1.5, 0.25)])
+def test_implicit_effects_against_an_explicit_integration(changes: dict[str, float], h: float, um: float,
+                                                          bar: float) -> None:
+    """Each alone and all together, at pressures up to 150 of 201 bar; RMS over 0.4 s, speeds to 90 mm/s."""
+    model, fine = SILENT.with_effects(IMPLICIT).replace(changes), 5e-7
+    paths = {}
+    for step in (h, fine):
+        t = np.arange(1, round(0.4 / step) + 1) * step
+        paths[step] = (4e-4 * np.sin(16 * np.pi * t) * (1 - np.exp(-t / 5e-3)) + 1e-4 * np.sin(120 * np.pi * t),
+                       22e3 * np.sin(6 * np.pi * t))
+    every = round(h / fine)
+    ours = np.empty((2, len(paths[h][0])))
+    run = compile_function(_moved, collect_bindings(model.effects))
+    run(build_initial_state(model.effects), *paths[h], model.build_record(), h, ours)
+    error = ours - simulate_jack(model.values, *paths[fine], fine)[:, every - 1::every]
+    assert np.sqrt((error[0] ** 2).mean()) * 1e6 < um
+    assert np.sqrt((error[1] ** 2).mean()) * 1e-5 < bar
+
+
+@pytest.mark.parametrize("h", [1e-5, 5e-5])
+def test_compressibility_resonates_where_it_should_and_the_step_damps_nothing(h: float) -> None:
+    """w = AJ/sqrt(V/4B MJ), 123 Hz; damping from CJ and the edges, within 3 % at 50 us."""
+    model = EASY.replace({"compressibility.coefficient": 1e-9})
+    v, stored = model.values, 0.25 * 1.5e-4 * 1e-9
+    out = np.empty((2, round(0.05 / h)))
+    start = build_initial_state(model.effects)._replace(jack_speed=0.01)
+    run = compile_function(_moved, collect_bindings(model.effects))
+    run(start, *np.zeros((2, out.shape[1])), model.build_record(), h, out)
+    matrix = np.array([[-v["jack.damping"] / v["jack.mass"], v["jack.area"] / v["jack.mass"]],
+                       [-v["jack.area"] / stored, -(v["valve.flow_gain"] / v["valve.pressure_gain"]
+                                                    + v["jack.leakage"]) / stored]])
+    root = np.linalg.eigvals(matrix)[0]
+    t, (_, p12) = np.arange(1, out.shape[1] + 1) * h, out
+    peaks = [i for i in range(1, len(p12) - 1) if abs(p12[i]) >= abs(p12[i - 1]) and abs(p12[i]) > abs(p12[i + 1])]
+    w = np.pi * (len(peaks) - 1) / (t[peaks[-1]] - t[peaks[0]])
+    decay = np.log(abs(p12[peaks[0]] / p12[peaks[-1]])) / (t[peaks[-1]] - t[peaks[0]])
+    assert w / (2 * np.pi) == pytest.approx(123.3, rel=0.01)
+    assert w == pytest.approx(abs(root.imag), rel=0.01)
+    assert decay == pytest.approx(-root.real, rel=0.03)
+
 
 COMMAND = np.r_[np.zeros(10), np.full(150, 2e-3), 2e-3 + 1e-3 * np.sin(np.arange(250) * 0.02)]
 STEADY = np.full(80, 1e-3)  # A

@@ -1,0 +1,166 @@
+"""Fits: last rounds, flat directions, a search by a population, and rows that hang on a level of friction."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from noisy_traces import record_plant
+
+from fdi.discovery.search import Search
+from fdi.estimation.fit import Fit, evolve_population
+from fdi.estimation.likelihood import Problem
+from fdi.estimation.noise import white_noise
+from fdi.estimation.replay import find_undecided_rows, hold_inputs
+from fdi.estimation.unidentifiable import (
+    FLAPPER,
+    JACK_PRESSURE,
+    POSITION_SCALE,
+    SPOOL_WAY,
+    TRIED,
+    TRIED_SHARES,
+    VISCOSITY,
+    confirm_flat,
+    find_tangents,
+    invert_hessian,
+)
+from fdi.estimation.unknowns import list_all_unknowns
+from fdi.trace.trace import Floats, Trace
+from plant import Model, load_model, simulate
+
+
+@pytest.mark.parametrize("steep", [1e6, 1e15, 1e18])
+def test_a_steep_slope_leaves_what_only_a_prior_holds_as_wide_as_the_prior(steep: float) -> None:
+    """Two unknowns that make up for each other, each with a prior of one; a third one with an enormous slope."""
+    slopes = np.array([[1e3, -1e3, 0.0], [0.0, 0.0, np.sqrt(steep)]])
+    covariance = invert_hessian(slopes.T @ slopes + np.diag([1.0, 1.0, 0.0]))
+    assert covariance[0, 0] == pytest.approx(0.5, rel=1e-3)  # both priors count along their common direction
+    assert covariance[2, 2] == pytest.approx(1.0 / steep, rel=1e-3)
+
+
+def test_a_direction_that_nothing_holds_gets_no_width() -> None:
+    assert invert_hessian(np.diag([4.0, 0.0])).tolist() == [[0.25, 0.0], [0.0, 0.0]]
+
+
+class SteppedResiduals:
+    """Residuals (m, 1, 2) that a second unknown moves, and that jump once the first one passes 0.005."""
+
+    def compute_white_residuals(self, free: object, x: Floats) -> Floats:
+        """Whitened residuals of scaled unknowns (m, 2)."""
+        return np.stack([10.0 * (x[:, 0] > 0.005), 1e5 * x[:, 1]], axis=-1)[:, None, :]
+
+
+@pytest.mark.parametrize(("tried", "limits", "expected"), [
+    ([1, 1, 1, 1], [1.0, 1.0], [True, False]),  # a jump in one trial does not hide a flat direction
+    ([0, 0, 0, 0], [1.0, 1.0], [False, False]),  # a bound stopped all of them
+    ([1, 0, 0, 0], [1.0, 1.0], [False, False]),  # the full length forwards, where the jump is
+    ([1, 1, 1, 1], [1.0, 2.1e6], [True, True]), ([1, 1, 1, 1], [2.1e6, 1.0], [True, False])])  # each its own limit
+def test_trials_confirm_a_flat_direction(tried: list[int], limits: list[float], expected: list[bool]) -> None:
+    trials = np.array([TRIED * share * np.eye(2) for share in TRIED_SHARES])
+    is_tried = np.repeat(np.array(tried, bool)[:, None], 2, axis=1)
+    found = confirm_flat(cast(Any, SteppedResiduals()), (), np.zeros(2), trials, is_tried, np.array(limits))
+    assert found.tolist() == expected
+
+
+T = 1e-3 * np.arange(1500)
+GENTLE = 5e-4 * np.sin(2.0 * np.pi * 1.5 * T) * (1.0 - np.exp(-5.0 * T))  # m, neither flapper nor spool stops
+FAST = np.where(T > 0.2, 5e-3, 0.0)  # m, both do
+
+
+def find_flat(changes: dict[str, float], signals: str, com: Floats = GENTLE, load: float = 0.0
+              ) -> list[Mapping[str, float]]:
+    """Directions that a replay of these effects leaves flat; what was measured does not matter, only the current."""
+    model = load_model().replace(changes)
+    trace = hold_inputs(record_plant({}, com, load=load), signals.split(","))
+    problem, free = replace(Search(model, trace, [], [], 1).problem, bare=None), list_all_unknowns(model)
+    directions, tangents = find_tangents(problem, free, np.zeros(len(free)))
+    assert np.linalg.matrix_rank(tangents) == len(directions)
+    return [each.powers for each in directions]
+
+
+EFFECTS = {"spool_overlap.overlap": 2e-5, "compressibility.coefficient": 1e-9, "flow_force.coefficient": 1e-3}
+
+
+@pytest.mark.parametrize(("direction", "signal"), [(SPOOL_WAY, "xs"), (JACK_PRESSURE, "p12")])
+def test_a_scale_that_is_not_measured_is_flat(direction: Mapping[str, float], signal: str) -> None:
+    """Also with effects beside it, which move along."""
+    others = ",".join(s for s in ("xj", "p12", "xs") if s != signal)
+    assert all(direction in find_flat(changes, others) for changes in ({}, EFFECTS))
+    assert direction not in find_flat({}, "xj,p12,xs")
+
+
+def test_a_known_load_does_not_show_the_pressure_but_the_area() -> None:
+    flat = find_flat({}, "xj,xs", load=5e3)
+    assert JACK_PRESSURE in flat and not any("jack.mass" in powers for powers in flat)
+
+
+def test_a_stop_shows_how_far_flapper_and_spool_move() -> None:
+    gentle, fast = find_flat({}, "xj"), find_flat({"torque_motor.gain": 2.5}, "xj", FAST)
+    assert [way in found for found in (gentle, fast) for way in (FLAPPER, SPOOL_WAY)] == [True, True, False, False]
+
+
+def test_leakage_makes_up_for_pressure_gain() -> None:
+    """Whatever is measured."""
+    flat = find_flat({"jack.leakage": 1e-11}, "xj,p12,xs")
+    loss = next(powers for powers in flat if set(powers) == {"valve.pressure_gain", "jack.leakage"})
+    assert loss["jack.leakage"] == pytest.approx(0.05 * loss["valve.pressure_gain"], rel=0.01)
+
+
+@pytest.mark.parametrize(("changes", "direction"), [
+    ({"viscosity_drift.factor": 1.5}, VISCOSITY),
+    ({"sensor_gain.error": 0.02, "aero_stiffness.stiffness": 3e5, "mount_compliance.compliance": 3e-8},
+     POSITION_SCALE)])
+def test_tolerances_make_up_for_viscosity_and_for_the_scale_of_the_position(
+        changes: dict[str, float], direction: Mapping[str, float]) -> None:
+    assert direction in find_flat(changes, "xj,p12,xs")
+
+
+LOWEST = np.array([0.4, -1.2, 2.0, 0.0, -0.7, 1.1])
+TURN = np.linalg.qr(np.random.default_rng(3).standard_normal((6, 6)))[0]
+SCALES = np.array([1.0, 3.0, 10.0, 30.0, 100.0, 300.0])
+
+
+def measure_costs(x: np.ndarray) -> np.ndarray:
+    """A narrow valley across the axes, with ridges 40 high in it: at a far place slopes show the ridges alone."""
+    along = (x - LOWEST) @ TURN * SCALES
+    costs: np.ndarray = (along**2).sum(axis=1) + 20.0 * (1.0 - np.cos(5.0 * along)).sum(axis=1) / 6.0
+    return costs
+
+
+def search(seed: int, low: float = -5.0, high: float = 5.0) -> tuple[np.ndarray, float]:
+    begin = np.zeros(6)
+    found = evolve_population(measure_costs, begin, np.eye(6), np.full(6, low), np.full(6, high), 200, seed)
+    return found.x, found.cost
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_lowest_place_of_a_rough_valley_is_found_and_again_by_the_same_seed(seed: int) -> None:
+    (x, cost), (again, _) = search(seed), search(seed)
+    assert cost < 10.0 < 0.01 * measure_costs(np.zeros((1, 6)))[0] and (x == again).all()
+    assert cost == pytest.approx(measure_costs(x[None])[0])
+    assert np.abs((x - LOWEST) @ TURN * SCALES).max() < 3.0
+
+
+def test_trials_stay_within_the_bounds() -> None:
+    x, _ = search(0, -1.0, 1.0)
+    assert np.abs(x).max() <= 1.0 and (np.abs(x) == 1.0).any()
+
+
+FLOOR = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
+
+
+def _find(changes: dict[str, float], com: np.ndarray) -> np.ndarray:
+    model = Model().with_effects(["compressibility"]).replace(changes)
+    trace = hold_inputs(Trace.from_columns(simulate(model, com, seed=1)._asdict(), 1e-3, {}))
+    problem = Problem(model, trace, tuple(white_noise(FLOOR[s]) for s in trace.outputs), steps=20)
+    return find_undecided_rows(problem, cast(Fit, cast(Any, SimpleNamespace(free=(), values={}))), FLOOR)
+
+
+def test_slips_on_soft_oil_are_undecided_and_a_step_is_not() -> None:
+    ramp = np.concatenate([np.zeros(200), np.linspace(0.0, 1.5e-3, 2500)])  # 0.6 mm/s
+    soft = _find({"compressibility.coefficient": 1.0 / 4e8, "jack.static_friction": 1600.0}, ramp)
+    assert soft.mean() > 0.2 and not soft[:200].any()
+    assert not _find({}, np.repeat([0.0, 3e-3], [200, 800])).any()

@@ -1,0 +1,266 @@
+"""Recordings as fits need them: rows of other lengths, gaps, dead sensors, repeats, part of a long one."""
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+import pytest
+from noisy_traces import record_healthy
+from physics_cases import QUIET
+from refusals import catch_refusal
+
+from fdi.comparison.compare import compare
+from fdi.discovery.runs import collect_runs
+from fdi.estimation.fit import Fit, linearise
+from fdi.estimation.likelihood import Problem
+from fdi.estimation.long_recordings import PIECE, choose_excerpt, cut_excerpt, is_long, judge_on_all, make_excerpt
+from fdi.estimation.noise import white_noise
+from fdi.estimation.replay import (
+    FEWEST_ROWS,
+    PERIODS,
+    align_columns,
+    align_repeat,
+    find_repeat,
+    hold_inputs,
+    match_period,
+    read_cycles,
+)
+from fdi.estimation.unknowns import list_tolerance_unknowns
+from fdi.trace.trace import Trace, bridge_gaps, hold_last, shift_rows
+from plant import Model
+from plant.lanes import Lanes
+from plant.model import find_quantity
+
+MODEL = Model()
+NAMES = ("t", "com", "xj", "cor", "p12", "xs", "load")
+
+
+def columns(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    trace = record_healthy()
+    return {name: trace.column(name).copy() for name in NAMES} | changes
+
+
+def made(period: float = 1e-3, **changes: np.ndarray) -> Trace:
+    return Trace.from_columns(columns(**changes), period, {})
+
+
+def test_a_plain_trace_stays_as_it_is() -> None:
+    trace = record_healthy()
+    (c,), (less,) = read_cycles(trace, MODEL), read_cycles(trace, MODEL, ["xs", "xj"])
+    assert (c.outputs, c.notes, len(c)) == (("xj", "p12", "xs"), (), len(trace)) and c.usable.all()
+    assert not c.filled.any() and (c.cor == trace.cor).all() and (c.mask_unusable("xs") == trace.xs).all()
+    assert less.outputs == ("xj", "xs") and np.isnan(less.p12).all()
+
+
+@pytest.mark.parametrize(("changes", "field", "words"), [
+    ({"xj": 1e3 * record_healthy().xj}, "xj", "values in m; the largest, 5.* is 1.. times jack.travel"),
+    ({"com": 1e3 * record_healthy().com}, "com", "values in m"),
+    ({"cor": 1e3 * record_healthy().cor}, "cor", "values in A"),
+    ({"p12": 1e-5 * record_healthy().p12}, "p12", "values in Pa"),
+    ({"p12": 100 * record_healthy().p12}, "p12", "values in Pa"),
+    ({"xs": 1e6 * record_healthy().xs}, "xs", "values in m"),
+    ({"xs": np.zeros(13_500)}, "xs", r"changes; it is 0 throughout \(--signals xj,p12 leaves it out\)"),
+    ({"xj": np.full(13_500, 1e-3)}, "xj", "changes; it is 0.001 throughout$"),
+    ({"cor": np.full(13_500, np.nan)}, "cor", "a measured column"),
+    ({"period": 1.0, "t": np.arange(13_500.0)}, "t", "times in s, one row a cycle; the rows are 1 s apart"),
+    ({"signals": ["speed"]}, "--signals", "some of xj,p12,xs"),
+    ({"p12": np.full(13_500, np.nan), "signals": ["p12"]}, "p12", "a measured signal; this trace has xj, xs"),
+])
+def test_what_cannot_be_is_refused_in_a_line(changes: dict[str, Any], field: str, words: str) -> None:
+    signals = changes.get("signals")
+    line = catch_refusal(read_cycles, made(**{k: v for k, v in changes.items() if k != "signals"}), MODEL, signals)
+    assert re.search(f"{field}: .*expected .*{words}", line), line
+
+
+@pytest.mark.parametrize("prepare", [partial(read_cycles, model=MODEL), hold_inputs])
+def test_too_few_rows_are_refused(prepare: Callable[[Trace], object]) -> None:
+    assert f"at least {FEWEST_ROWS} rows, not 100" in catch_refusal(prepare, cut(slice(100)))
+
+
+def cut(rows: slice, period: float = 1e-3, **changes: np.ndarray) -> Trace:
+    """Some rows of the healthy trace."""
+    return Trace.from_columns({name: x[rows] for name, x in columns(**changes).items()}, period, {})
+
+
+def spoil(name: str, *rows: int | slice, value: float = np.nan) -> dict[str, np.ndarray]:
+    """That column of the healthy trace with another value in some rows."""
+    x = columns()[name]
+    for each in rows:
+        x[each] = value
+    return {name: x}
+
+
+def test_rows_at_2_khz_are_taken_once_a_cycle() -> None:
+    twice = {name: np.repeat(x, 2) for name, x in columns().items() if name != "t"}
+    (c,) = read_cycles(Trace.from_columns(twice | {"t": np.arange(27_000) * 5e-4}, 5e-4, {}), MODEL)
+    assert c.period == 1e-3 and (c.cor == record_healthy().cor).all() and "one row a cycle" in c.notes[0]
+
+
+def test_rows_at_500_hz_can_be_read_in_two_ways() -> None:
+    half = cut(slice(None, None, 2), 2e-3)
+    slow, sparse = read_cycles(half, MODEL)
+    assert (slow.period, len(slow), sparse.period, len(sparse)) == (2e-3, 6750, 1e-3, 13_499)
+    assert "taken as the trace's, 2 ms" in slow.notes[0] and "one cycle in 2" in sparse.notes[0]
+    assert sparse.filled.sum() == 6749 and np.isnan(sparse.xs[1::2]).all() and (sparse.cor[::2] == half.cor).all()
+    assert not np.isnan(sparse.cor).any() and (sparse.com[1::2] >= sparse.com.min()).all()
+
+
+def test_single_lost_rows_are_filled_and_long_gaps_are_left_out() -> None:
+    (c,) = read_cycles(made(**spoil("cor", 100, 5000, 5002, slice(9000, 9100))), MODEL)
+    assert c.filled.sum() == 103 and c.usable[[100, 5000, 8999, 9400]].all() and not c.usable[9000:9399].any()
+    assert "missing in 103 of 13500 rows; 0.4 s" in c.notes[-1]
+    assert abs(c.cor[5000] - record_healthy().cor[5000]) < 5e-5
+    jump = 500  # the row in which the demand jumps by 5 mm
+    assert not read_cycles(made(**spoil("cor", jump)), MODEL)[0].usable[jump]
+
+
+def test_a_sensor_that_hangs_is_left_out_while_it_does() -> None:
+    (c,) = read_cycles(made(**spoil("p12", slice(9000, 10_000), value=record_healthy().p12[9000])), MODEL)
+    assert not c.usable[9000:10_000].any() and c.usable.sum() == 12_500
+    assert "p12 is frozen for 1.00 s, first at 9.00 s" in c.notes[0]
+    coarse = np.round(record_healthy().xj / 2e-3) * 2e-3  # a converter of a few bits rests for long, and is alive
+    assert read_cycles(made(xj=coarse), MODEL)[0].usable.all()
+    dead = spoil("xs", slice(11_000, None), value=record_healthy().xs[11_000])
+    assert not read_cycles(made(**dead), MODEL)[0].usable[11_000:].any()
+
+
+def test_a_trace_that_starts_in_motion() -> None:
+    (c,) = read_cycles(cut(slice(9700, None)), MODEL)
+    assert not c.usable[:300].any() and c.usable[300] and "already moves" in c.notes[0]
+
+
+def test_times_that_jitter_are_cycles_still() -> None:
+    rng = np.random.default_rng(0)
+    (c,) = read_cycles(made(t=columns()["t"] + rng.uniform(-2e-4, 2e-4, 13_500)), MODEL)
+    assert len(c) == 13_500 and "off an even grid" in c.notes[0]
+
+
+def test_cubics_fill_gaps_and_long_gaps_are_held() -> None:
+    k = np.arange(60.0)
+    curve = 0.01 * (k - 20) ** 3 - k
+    filled, marked = bridge_gaps(np.where(np.isin(k, [0, 1, 10, 30, 31, *range(40, 50)]), np.nan, curve), 5)
+    assert filled[[10, 30, 31]] == pytest.approx(curve[[10, 30, 31]]) and (filled[40:50] == curve[39]).all()
+    assert np.flatnonzero(marked).tolist() == [0, 1, *range(40, 50)]
+    assert hold_last(np.array([np.nan, 1.0, np.nan, 2.0])).tolist() == [0.0, 1.0, 1.0, 2.0]
+    assert [shift_rows(np.arange(4), by).tolist() for by in (1, -1)] == [[0, 0, 1, 2], [1, 2, 3, 3]]
+
+
+def test_a_repeat_is_found_by_its_command() -> None:
+    (c,), (spool,) = read_cycles(record_healthy(), MODEL), read_cycles(record_healthy(), MODEL, ["xs"])
+    repeat = find_repeat(c, cut(slice(100, None)), MODEL, 1)
+    assert (find_repeat(c, record_healthy(1), MODEL, 1).late, repeat.late) == (0, 100)
+    rows = align_columns({"xj": repeat.trace.xj}, repeat.late, len(c))["xj"]
+    assert np.isnan(rows[:100]).all() and (rows[100:] == c.xj[100:]).all()
+    for first, other, words in (
+            (c, made(com=-c.com), "com: expected the command of the trace it repeats"),
+            (spool, made(xs=np.full(13_500, np.nan)), "a signal that the trace has too"),
+            (c, cut(slice(None, None, 3), 2.5e-3), "rows as in the trace")):
+        line = catch_refusal(find_repeat, first, other, MODEL, 1)
+        assert line.startswith("--repeat") and words in line
+
+
+def test_rows_that_the_check_of_the_firmware_leaves_out() -> None:
+    """Rows as recorded: those without Com, XJ or Cor. Rows moved or resampled: those without XJ, or outside the run."""
+    holes = spoil("cor", 5000) | spoil("com", 6000) | spoil("xj", 7000)
+    (c,), (first,) = read_cycles(made(**holes), MODEL), read_cycles(record_healthy(), MODEL)
+    moved = align_repeat(find_repeat(first, cut(slice(20, None), **holes), MODEL, 1), len(first))
+    assert np.flatnonzero(c.incomplete).tolist() == [5000, 6000, 7000]
+    assert np.flatnonzero(moved.incomplete).tolist() == [*range(20), 7000]
+    slow = cut(slice(None, None, 2), 2e-3, **holes)
+    spread = read_cycles(slow, MODEL)[-1]
+    assert len(spread) == 2 * len(slow) - 1 and (spread.incomplete == np.isnan(spread.xj)).all()
+
+
+def test_a_period_that_no_controller_has_is_refused_in_one_line() -> None:
+    quantity = find_quantity("controller.period")
+    assert (quantity.low, quantity.high) == PERIODS
+    assert match_period(Model(), made(50e-3))["controller.period"] == 50e-3
+    for period, text in ((5e-5, "0.05 ms"), (0.2, "200 ms")):
+        line = catch_refusal(match_period, Model(), made(period))
+        assert f"0.1 to 100 ms apart; these rows are {text} apart" in line
+
+
+LEVELS = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
+ACTIVE = slice(20_000, 27_000)  # rows of the recording in which the command moves
+FRICTION = {"spool.static_friction": 12.0, "spool.dynamic_friction": 8.0}
+
+
+@cache
+def record_mostly_at_rest() -> Trace:
+    """40 s, of which 7 s move: steps and a sine."""
+    com, t = np.zeros(40_000), np.arange(7000) * 1e-3
+    com[ACTIVE] = 3e-3 * np.sin(2 * np.pi * 0.7 * t) + 2e-3 * (np.arange(7000) // 900 % 2)
+    rng = np.random.default_rng(0)
+    noise = {name: size * rng.standard_normal(len(com)) for name, size in LEVELS.items()}
+    model = Model().replace(QUIET | FRICTION)
+    xj, cor, p12, xs = Lanes(model, (), 50).closed_loop(np.empty((1, 0)), com - noise["xj"], 0.0 * com)[0].T
+    columns = {"com": com, "cor": cor, "xj": xj + noise["xj"], "p12": p12 + noise["p12"], "xs": xs + noise["xs"]}
+    return Trace.from_columns(columns | {"load": 0.0 * com}, 1e-3, {"source": "long"})
+
+
+@cache
+def prepare_long() -> Trace:
+    return collect_runs(Model(), record_mostly_at_rest()).est
+
+
+def make_problem(trace: Trace) -> Problem:
+    return Problem(Model().replace(QUIET | FRICTION), trace, tuple(white_noise(LEVELS[s]) for s in trace.outputs))
+
+
+def fit_nothing(problem: Problem, trace: Trace) -> Fit:
+    """The model as it is, as a fit."""
+    free = list_tolerance_unknowns(problem.model)[:1]
+    return linearise(replace(problem, trace=trace, _lanes={}), free, np.zeros(1))
+
+
+def test_the_part_that_moves_is_chosen() -> None:
+    """A ram at rest says nothing of masses, areas and gains."""
+    trace = prepare_long()
+    assert is_long(trace)
+    excerpt = choose_excerpt(trace, Model().replace(QUIET), LEVELS)
+    best = [(first, stop) for first, stop in excerpt.pieces if first < ACTIVE.stop and stop > ACTIVE.start]
+    covered = sum(min(stop, ACTIVE.stop) - max(first, ACTIVE.start) for first, stop in best)
+    assert covered > 0.8 * (ACTIVE.stop - ACTIVE.start)
+    assert "of 40 s" in excerpt.describe(trace)
+
+
+def test_a_piece_is_what_the_whole_replay_has_there() -> None:
+    """The lead-in makes a replay forget that it began in the middle; its rows are not compared."""
+    trace = prepare_long()
+    excerpt = make_excerpt([(24_000, 26_000), (22_000, 23_000)])
+    part = cut_excerpt(trace, excerpt)
+    whole = make_problem(trace).predict_outputs((), np.empty((1, 0)))[0]
+    cut = make_problem(part).predict_outputs((), np.empty((1, 0)))[0]
+    rows = np.flatnonzero(part.usable)
+    originals = np.round(part.t[rows] * 1e3).astype(int)
+    assert originals.tolist() == [*range(22_000, 23_000), *range(24_000, 26_000)]
+    floors = np.array(list(LEVELS.values()))[:, None]
+    assert np.abs((cut[:, rows] - whole[:, originals]) / floors).max() < 0.05
+
+
+def test_a_fit_is_judged_on_all_of_the_recording() -> None:
+    """What goes wrong outside the part is found, and where."""
+    trace = prepare_long()
+    part = cut_excerpt(trace, make_excerpt([(20_000, 26_000)]))
+    problem = make_problem(part)
+    fit = fit_nothing(problem, part)
+    rows, k = round(PIECE / trace.period), np.arange(len(trace))
+    slipped = replace(trace, xs=trace.xs + 4e-6 * ((k >= 30_000) & (k < 39_000)))  # after the part
+    good, bad = (judge_on_all(problem, [fit], each, 20)[0] for each in (trace, slipped))
+    assert good.holds(LEVELS) and not bad.holds(LEVELS) and good.find_worst_piece(LEVELS, rows, ()) is None
+    assert good.errors["xj"] == pytest.approx(LEVELS["xj"], rel=0.05)
+    first, stop = bad.find_worst_piece(LEVELS, rows, ()) or (0, 0)
+    assert 30_000 <= first < stop <= 39_000
+
+
+def test_compare_of_a_long_recording() -> None:
+    """The solver is checked on a part, the residual on all rows."""
+    right, wrong = (compare(record_mostly_at_rest(), Model().replace(changes))
+                    for changes in (FRICTION, {"jack.area": 1.2 * Model()["jack.area"]}))
+    assert (right.verdict, wrong.verdict) == ("WITHIN_FLOOR", "MODEL_INCOMPLETE")
+    assert len(right.replay.residual["xj"]) == 40_000
+    assert wrong.scatter is not None and wrong.scatter.ratio["xj"] > 1.15

@@ -1,0 +1,432 @@
+"""`rig run --live`: the log while it is written, the screen in a terminal and without one, and the viewer."""
+from __future__ import annotations
+
+import fcntl
+import importlib.util
+import math
+import os
+import pty
+import re
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Callable
+from dataclasses import replace
+from math import isnan
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recording_rows import read_recording
+from refusals import catch_refusal
+from rig_command import finished, grown, nodes_on, refuse, rig, started
+from synthetic_run import build_cycles, record_run
+
+from fdi.trace.trace import Trace
+from rig.recorder import Check, Event, NmtState, Record, Recorder, Signals, Timing
+from rig.sequences import load_sequence
+from rig.view.live_log import follow_log
+from rig.view.live_process import find_viewer_place, show_live
+from rig.view.live_run import COLUMNS, LiveRun, find_dead_node, make_live_plan
+from rig.view.live_screen import describe_line, draw_screen
+from rig.view.viewer import find_free_port, is_listening
+
+
+def test_every_record_arrives_once_and_in_order_while_the_log_grows(tmp_path: Path) -> None:
+    """Also from a file that ends within a chunk, and nothing more when the log is whole."""
+    whole = record_run(tmp_path / "whole.mcap", stop=1000).read_bytes()
+    log, found = tmp_path / "trace.mcap", []
+    log.write_bytes(whole[:4000])
+    batches = follow_log(log)
+    for cut in range(4000, len(whole) + 30_000, 30_000):
+        log.write_bytes(whole[:cut])
+        found += next(batches)
+    assert next(batches) == []
+    written = [record for _, _, *rows in build_cycles() if rows[0].cycle < 1000 for record in rows]
+    assert list(map(repr, written)) == [repr(record) for _, record in found if isinstance(record, Signals | Timing)]
+    trace = Trace.read(log, all=True)
+    assert [record.text for _, record in found if isinstance(record, Event)] == [event.text for event in trace.events]
+    assert {type(record) for _, record in found} == {Signals, Timing, Event, NmtState, Check}
+
+
+def test_what_is_written_is_there_soon(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "trace.mcap", {}, {})
+    batches, found = follow_log(tmp_path / "trace.mcap"), []
+    recorder.put(5, NmtState(2, 5, "operational"))
+    while not found:  # not only when the log is closed
+        found = next(batches)
+    recorder.close()
+    assert found == [(5, NmtState(2, 5, "operational"))]
+
+
+def test_a_log_that_comes_late_and_is_moved_is_read_on(tmp_path: Path) -> None:
+    log = tmp_path / "trace.mcap"
+    batches = follow_log(log)
+    assert next(batches) == []
+    whole = record_run(tmp_path / "whole.mcap", stop=1000).read_bytes()
+    with log.open("wb", buffering=0) as file:
+        file.write(whole[:-50_000])
+        first = next(batches)
+        log.rename(tmp_path / "moved.mcap")
+        file.write(whole[-50_000:])
+        second = next(batches)
+    assert first and second and next(batches) == []
+    assert sum(isinstance(record, Timing) for _, record in first + second) == 1000
+
+
+def test_a_log_that_cannot_be_read_is_the_end(tmp_path: Path) -> None:
+    (tmp_path / "trace.mcap").mkdir()
+    assert list(follow_log(tmp_path / "trace.mcap")) == []
+
+
+class LeavesFolder:
+    """What the Python of a sequence may do where the plan arrives."""
+
+    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
+        return os.chdir, ("/",)
+
+
+def test_log_in_a_relative_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                  capfd: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    record_run(Path("trace.mcap"), stop=1000)
+    plan = make_live_plan(load_sequence("preflight"), "lockstep")
+    with show_live(plan._replace(title=LeavesFolder()), Path("trace.mcap"), last_cpu_is_taken=False) as begin:
+        begin()
+    said = capfd.readouterr().err
+    assert "Traceback" not in said and "live: 0.7 of 13.5 s" in said.splitlines()[-1]
+
+
+Records = list[tuple[int, Record]]
+
+
+def make_run(preflight: Path) -> tuple[LiveRun, Records, Trace]:
+    """A live run of preflight and all its cycles, from the log of a run that has ended."""
+    records = [(t_ns, record) for t_ns, record in next(follow_log(preflight / "trace.mcap"))
+               if isinstance(record, Signals | Timing)]
+    plan = make_live_plan(load_sequence("preflight"), "lockstep")
+    return LiveRun(plan), records, Trace.read(preflight, all=True)
+
+
+def add(run: LiveRun, records: Records) -> None:
+    for t_ns, record in records:
+        run.add(t_ns, record)
+    run.judge_checks()
+
+
+def test_checks_turn_when_their_window_is_over(preflight: Path) -> None:
+    run, records, trace = make_run(preflight)
+    final = {check.name: check for check in trace.checks}
+    seen: dict[str, list[str]] = {name: [] for name in run.checks}
+    main = int(np.argmax(trace.phase == 1))
+    for first in range(0, len(records) // 2, 250):
+        add(run, records[2 * first:2 * first + 500])
+        for name, state in run.checks.items():
+            if seen[name][-1:] != [state.word]:
+                seen[name].append(state.word)
+            check = final[name]
+            if state.word == "PASS" and not np.isnan(check.t1):
+                assert first + 250 >= main + round(1000 * check.t1) - 250, name
+    assert seen["overshoot, 5 mm"] == seen["position"] == ["waits", "measures", "PASS"]
+    for name, state in run.checks.items():
+        assert state.word == ("PASS" if final[name].passed else "FAIL"), name
+        np.testing.assert_allclose(state.value, final[name].value, rtol=1e-9, err_msg=name)
+
+
+def test_a_limit_that_is_passed_fails_at_once(preflight: Path) -> None:
+    run, records, _ = make_run(preflight)
+    t_ns, signals = records[4000]
+    records[4000] = t_ns, replace(signals, xj=7e-3)  # type: ignore[call-arg]  # the limit is 6 mm for all of main
+    add(run, records[:8000])
+    assert run.checks["position"].word == "FAIL" and run.checks["position"].value == pytest.approx(7.0)
+    assert run.checks["pressure, unloaded"].word == "measures"
+    assert run.read_rows_from(0).shape == (4000, len(COLUMNS)) and run.read_last("xj", 2000)[0] == 7e-3
+
+
+EVENTS = """title = "Events"
+setup = [{ kind = "hold", time = 0.02 }]
+main = [{ name = "rest", kind = "hold", time = 0.1 }, { name = "more", kind = "hold", time = 0.1 }]
+checks = [{ name = "begins", kind = "event_occurs", event = "phase main", window = "rest" },
+          { name = "no fault", kind = "event_never", event = "fault early", window = "rest" },
+          { name = "answer", kind = "response_within", event = "fault early", after = 0.0, high = 1, window = "rest" },
+          { name = "first cycle", kind = "event_occurs", event = "guard first", window = "more" }]
+"""
+
+
+@pytest.mark.parametrize("begin_ns", [0, *range(1_800_000_000_000_000_000, 1_800_000_000_000_000_256, 51)])
+def test_events_stand_at_their_cycle(begin_ns: int, tmp_path: Path) -> None:
+    """Those written before the first row of main too, and whatever the log times: a float64 rounds ns since 1970."""
+    (tmp_path / "events.toml").write_text(EVENTS)
+    run = LiveRun(make_live_plan(load_sequence(tmp_path / "events.toml"), "lockstep"))
+    words = {0: ("phase", "set-up"), 20: ("phase", "main"), 120: ("guard", "first")}
+    for cycle in range(220):
+        t_ns = begin_ns + cycle * 1_000_000
+        if cycle in words:
+            run.add(t_ns, Event("INFO", *words[cycle]))
+        if cycle == 20:
+            run.add(t_ns, Event("WARN", "fault", "early"))
+        run.add(t_ns, Signals(cycle, int(cycle >= 20), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 7, 15, 0))
+        run.add(t_ns, Timing(cycle, False, 0.0, 0.0, 0.0))
+    run.judge_checks()
+    assert [event.t for event in run.events] == [-0.02, 0.0, 0.0, 0.1] and run.t == 0.199
+    assert [(state.word, state.value) for state in run.checks.values()] == [
+        ("PASS", 1.0), ("FAIL", 1.0), ("PASS", 0.0), ("PASS", 1.0)]
+
+
+@pytest.mark.parametrize("size", [(80, 24), (60, 20), (200, 60)])
+def test_screen_fits(preflight: Path, size: tuple[int, int]) -> None:
+    run, records, _ = make_run(preflight)
+    run.add(0, NmtState(2, 5, "operational"))
+    before = draw_screen(run, *size, silence=0.0).plain
+    add(run, records[:6000])
+    run.add(0, Event("ERROR", "process", "node 3 plant: its process was ended by SIGKILL"))
+    run.add(0, Check(name="no emergency", passed=False, value=2.0, unit="1", signal=""))
+    text = draw_screen(run, *size, silence=1.2).plain
+    lines = text.split("\n")
+    assert len(lines) <= size[1] and max(map(len, lines)) <= size[0]
+    for words in ("node 2 controller operational", "node 3 plant      DEAD: its process was ended by SIGKILL",
+                  "no new cycle in the log", "FAIL     no emergency 2", "measures", "lockstep: no cycle is late",
+                  "response p50", "overruns 0"):
+        assert words in text, words
+    dots = sum(0x2800 < ord(letter) < 0x2900 for letter in text)
+    assert dots > size[0] // 2 > sum(0x2800 < ord(letter) < 0x2900 for letter in before)
+    assert "3 plant its process" not in describe_line(run) and "3 its process was ended" in describe_line(run)
+
+
+def test_dead_node() -> None:
+    assert find_dead_node("ERROR", "process", "node 2 controller: its process ended with exit status 1") == 2
+    assert find_dead_node("ERROR", "heartbeat", "node 3 plant is silent") == 3
+    assert find_dead_node("INFO", "heartbeat", "node 3 plant is heard") == 0
+    assert find_dead_node("ERROR", "emcy", "node 3 plant 0x8250") == 0
+    run = LiveRun(make_live_plan(load_sequence("preflight"), "realtime"))
+    for level, text in (("ERROR", "node 3 plant is silent"), ("INFO", "node 3 plant is heard")):
+        run.add(0, Event(level, "heartbeat", text))
+        assert (3 in run.troubles) == (level == "ERROR")
+    assert run.read_last("lateness", 10).tolist() == [] and isnan(run.t)
+    assert "bring-up" in describe_line(run)
+
+
+def test_check_record_ends_the_waiting() -> None:
+    run = LiveRun(make_live_plan(load_sequence("preflight"), "lockstep"))
+    run.add(0, Check(value=1.0, passed=True, name="slip speed", signal="xj", unit="mm/s"))
+    assert run.checks["slip speed"].word == "PASS" and run.checks["slip speed"].is_final
+
+
+COMMAND = [sys.executable, "-m", "rig.cli.main", "run"]
+WATCHED = """
+title = "Watched"
+main = [
+  { name = "step", kind = "step", to = 1e-3, time = 0.2 },
+  { name = "sine", kind = "sine", amplitude = 1e-3, frequency = 1.0, time = 600 },
+]
+checks = [
+  { name = "overshoot", kind = "overshoot", window = "step", high = 100.0 },
+  { name = "position", kind = "never_exceeds", signal = "xj", high = 20, unit = "mm" },
+]
+"""
+LONG = 'title = "Long"\nmain = [{ name = "rest", kind = "hold", time = 600 }]\n'
+
+
+def run_in_terminal(words: list[str], watch: Callable[[str, int], None] = lambda *_: None) -> tuple[str, int]:
+    """Everything that `rig run` writes to a terminal of 80 x 24, and its exit status."""
+    number, fd = pty.fork()
+    if number == 0:  # pragma: no cover
+        os.environ["TERM"] = "xterm-256color"
+        os.execv(sys.executable, [*COMMAND, *words])
+    fcntl.ioctl(fd, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    text = b""
+    while True:
+        if select.select([fd], [], [], 1.0)[0]:
+            try:
+                data = os.read(fd, 65536)
+            except OSError:
+                break
+            text += data
+        watch(text[-200_000:].decode(errors="replace"), number)
+    return text.decode(errors="replace"), os.waitstatus_to_exitcode(os.waitpid(number, 0)[1])
+
+
+def split_frames(text: str) -> list[str]:
+    """The screens that were drawn, without colours."""
+    return [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", frame).replace("\r", "") for frame in text.split("\x1b[H")]
+
+
+def test_screen_of_a_run(tmp_path: Path) -> None:
+    text, status = run_in_terminal(["--live", "--out", str(tmp_path / "run")])
+    frames = split_frames(text)
+    assert status == 0 and "PASS  Every check passed." in frames[-1]
+    assert text.index("\x1b[?1049h") < text.index("\x1b[?1049l") < text.index("Every check passed")
+    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")  # the cursor is shown again
+    assert any("Position [mm]" in frame for frame in frames[1:])
+    assert "lockstep" in frames[-1]
+
+
+def test_screen_follows_the_run(tmp_path: Path) -> None:
+    """A run that lasts until all of it was seen, however slowly the screen is drawn."""
+    sequence = tmp_path / "watched.toml"
+    sequence.write_text(WATCHED)
+    seen: dict[str, set[str]] = {"plot": set(), "nodes": set(), "measures": set(), "passed": set(), "response": set()}
+    stopped: list[int] = []
+
+    def look(text: str, number: int) -> None:
+        for frame in split_frames(text)[1:]:
+            if "Position [mm]" not in frame:
+                continue
+            seen["plot"].add("".join(letter for letter in frame if 0x2800 < ord(letter) < 0x2900))
+            seen["nodes"] |= set(re.findall(r"node 2 controller operational|node 3 plant      operational", frame))
+            seen["measures"] |= set(re.findall(r"measures +([a-z]+)", frame))
+            seen["passed"] |= set(re.findall(r"PASS {2,}([a-z]+)", frame))
+            seen["response"] |= set(re.findall(r"response p50 \d+ p99 \d+ max \d+ us", frame))
+        is_complete = len(seen["plot"]) >= 3 and len(seen["nodes"]) == 2 and all(seen.values())
+        if is_complete and not stopped:
+            stopped.append(number)
+            os.kill(number, signal.SIGINT)
+
+    _, status = run_in_terminal([str(sequence), "--live", "--out", str(tmp_path / "run")], look)
+    assert stopped and status == 130, {name: sorted(each)[:2] for name, each in seen.items()}
+    assert "overshoot" in seen["passed"] and "position" in seen["measures"] and "position" not in seen["passed"]
+
+
+def test_ctrl_c_restores_the_terminal(tmp_path: Path) -> None:
+    sequence = tmp_path / "long.toml"
+    sequence.write_text(LONG)
+    stopped: list[int] = []
+
+    def stop(text: str, number: int) -> None:
+        if not stopped and "rest  " in text:
+            stopped.append(number)
+            os.kill(number, signal.SIGINT)
+
+    text, status = run_in_terminal([str(sequence), "--live", "--out", str(tmp_path / "run")], stop)
+    assert stopped and status == 130
+    assert text.rindex("\x1b[?1049l") > text.rindex("\x1b[?1049h")
+    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
+    assert (tmp_path / "run" / "verdict.json").exists()
+
+
+def test_lines_without_a_terminal(tmp_path: Path) -> None:
+    said = finished(started("run", "--live", "--json", "--out", tmp_path / "run"))
+    lines = said.err.splitlines()
+    assert said.status == 0 and said.out.startswith("{") and "live" not in said.out
+    assert lines[0] == "live: standard error is no terminal: a line every 2 s instead of the screen"
+    assert re.search(r"checks 29 pass, 0 fail of 29; lockstep: no cycle is late; nodes: 2 operational", lines[-1])
+
+
+def test_dead_node_is_announced_before_the_run_ends(tmp_path: Path) -> None:
+    """The plant's process is killed; the line comes while the rig is still at work on its clean-up of 4000 cycles."""
+    sequence = tmp_path / "long.toml"
+    sequence.write_text(LONG + 'cleanup = [{ kind = "hold", time = 4 }]\n')
+    group = f"udp_multicast:239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
+    run = started("run", sequence, "--bus", group, "--out", tmp_path / "run")
+    assert run.stdout is not None and run.stderr is not None
+    run.stdout.readline()  # the nodes are there
+    grown(tmp_path / "run" / "trace.mcap", 300_000)  # well into main
+    plant = next(number for number in nodes_on(group) if b"plant" in Path(f"/proc/{number}/cmdline").read_bytes())
+    os.kill(plant, signal.SIGKILL)
+    assert run.stderr.readline() == "rig run: node 3 plant: its process was ended by SIGKILL\n"
+    assert run.poll() is None  # its report is still to come
+    said = finished(run)
+    assert "ABORTED" in said.out and said.status == 1
+
+
+def test_a_suite_is_not_shown(tmp_path: Path) -> None:
+    line = refuse("run", "preflight", "lost_sync", "--live", "--out", tmp_path / "runs")
+    assert line == "rig run: --live: expected one sequence; runs of a suite run side by side\n"
+
+
+needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="pip install 'eha-rig[view]'")
+SHORT = """title = "Short"
+setup = [{ kind = "hold", time = 0.2 }]
+main = [{ name = "rest", kind = "hold", time = 0.3 }, { name = "out", kind = "step", to = 1e-3, time = 0.5 }]
+load = [{ kind = "ramp", to = 100.0, time = 0.5 }]
+faults = [{ kind = "parameter", parameter = "filter.clogging", value = 0.4, start = 0.2 }]
+checks = [{ name = "position", kind = "never_exceeds", signal = "xj", high = 6, unit = "mm" },
+          { name = "too small", kind = "never_exceeds", signal = "xj", high = 0.1, unit = "mm" }]
+"""
+
+
+@needs_rerun
+def test_what_arrives_is_what_the_log_holds(tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text(SHORT)
+    said = rig("run", tmp_path / "short.toml", "--live", f"rerun:{tmp_path}/live.rrd", "--out", tmp_path / "run")
+    assert said.status == 1 and said.err == "" and "too small" in said.out
+    rows, trace = read_recording(tmp_path / "live.rrd"), Trace.read(tmp_path / "run", all=True)
+    t, ram = zip(*rows["/position/ram"], strict=True)
+    np.testing.assert_allclose(t, trace.t, atol=1e-6)
+    np.testing.assert_allclose(np.array(ram, float), trace.xj * 1e3, atol=1e-9)
+    np.testing.assert_allclose([value for _, value in rows["/spool/spool"]], trace.xs * 1e6, atol=1e-9)
+    assert [state for _, state in rows["/run/phase"]] == ["set-up", "main"]
+    assert rows["/run/phase"][1][0] == pytest.approx(0.0, abs=1e-6)
+    assert str(rows["/check/position"][-1][1]).startswith("PASS")
+    assert str(rows["/check/too_small"][-1][1]).startswith("FAIL")
+    assert [(round(t, 6), state) for t, state in rows["/fault/parameter_filter.clogging"]] == [(0.2, "active")]
+    np.testing.assert_allclose([value for _, value in rows["/load/load"]], trace.load, atol=1e-9)
+    assert trace.load.max() == 100.0
+    assert "operational" in {state for _, state in rows["/node/2_controller"]}
+    assert {entity for entity in rows if entity.startswith("/check/")} == {"/check/position", "/check/too_small"}
+    assert len(rows["/log/checks"]) == len(trace.checks) and len(rows["/log/events"]) == len(trace.events)
+    assert not any(math.isnan(t) for t, _ in rows["/log/events"])
+
+
+@needs_rerun
+def test_a_run_that_ends_before_main_is_shown(tmp_path: Path) -> None:
+    """Its clock ends with the run."""
+    (tmp_path / "long.toml").write_text('setup = [{ kind = "hold", time = 600 }]\n' + LONG)
+    run = started("run", tmp_path / "long.toml", "--live", f"rerun:{tmp_path}/live.rrd", "--quiet", "--out",
+                  tmp_path / "run")
+    grown(tmp_path / "run" / "trace.mcap", 100_000)  # well into set-up
+    run.send_signal(signal.SIGINT)
+    assert finished(run).status == 130
+    rows, trace = read_recording(tmp_path / "live.rrd"), Trace.read(tmp_path / "run", all=True)
+    assert len(rows["/position/ram"]) == len(trace.xj) > 0
+    assert len(rows["/log/events"]) == len(trace.events) and len(rows["/log/checks"]) == len(trace.checks) > 0
+    assert max(t for entity in rows for t, _ in rows[entity] if not math.isnan(t)) == 0.0
+
+
+@needs_rerun
+def test_the_run_goes_on_when_the_viewer_is_closed(tmp_path: Path) -> None:
+    (tmp_path / "long.toml").write_text(LONG)
+    port = find_free_port()
+    server = subprocess.Popen([sys.executable, "-m", "rerun", "--serve-grpc", "--bind", "127.0.0.1", "--port",
+                               str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    log = tmp_path / "run" / "trace.mcap"
+    try:
+        while not is_listening(port):
+            assert server.poll() is None
+        run = started("run", tmp_path / "long.toml", "--live", f"rerun:{port}", "--quiet", "--out", tmp_path / "run")
+        grown(log, 100_000)  # well into main
+    finally:
+        os.killpg(server.pid, signal.SIGKILL)
+        server.wait()
+    assert run.stderr is not None
+    assert run.stderr.readline() == "rig run: the viewer was closed; the run goes on\n"
+    grown(log, log.stat().st_size + 100_000)
+    run.send_signal(signal.SIGINT)
+    assert finished(run).status == 130 and (tmp_path / "run" / "verdict.json").exists()
+
+
+@pytest.mark.parametrize(("status", "words"), [(2, ["run", "--live", "rerun", "--out", "run"]),
+                                               (1, ["view", "trace.mcap", "--save", "x.rrd"])])
+def test_without_the_viewer_one_line_says_how_to_get_it(status: int, words: list[str], tmp_path: Path,
+                                                        monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    record_run(tmp_path / "trace.mcap", stop=400)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    said = rig(*words)
+    assert (said.status, said.err.count("\n")) == (status, 1) and "pip install 'eha-rig[view]'" in said.err
+    assert [path.name for path in tmp_path.iterdir()] == ["trace.mcap"]
+
+
+@needs_rerun
+@pytest.mark.parametrize("word", ["rerun", "rerun:x", "rerun:0", "rerun:/absent/live.rrd", "rerun:{port}"])
+def test_places_that_cannot_be_used(word: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert "--live" in catch_refusal(find_viewer_place, word.format(port=find_free_port()))
+
+
+def test_a_word_after_live_may_be_a_sequence() -> None:
+    assert "absent.toml" in refuse("run", "--live", "absent.toml")
