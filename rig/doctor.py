@@ -15,7 +15,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from rig.benches.bench import Bench
+from rig.benches.bench_file import describe_identifier
 from rig.network import bus
+from rig.network.listening import count_frames, listen
 from rig.run import priority
 
 Status = Literal["ok", "limited", "missing"]
@@ -191,6 +194,35 @@ def examine_storage() -> list[Finding]:
         _grade("storage", "compiled code", not folder.is_relative_to(tempfile.gettempdir()), str(folder),
                "the plant starts in 0.2 s, not 10 s", "a writable home folder, or EHA_RIG_CACHE=FOLDER"),
         _grade("storage", "disk", hours > 1, f"{free / 1e9:.1f} GB free", f"about {hours:.0f} h of logs", "make room")]
+
+
+def listen_to_bench(bench: Bench, spec: str, seconds: float) -> list[Finding]:
+    """Which frames of a bench are on the bus `spec`; nothing is sent.
+
+    Raises:
+        RigError: the bus cannot be opened.
+    """
+    heard, others = count_frames(bench, listen(bench, spec, seconds))
+    found = []
+    for each in heard:
+        load = each.frame
+        is_ours = load.direction.startswith("rig")
+        status: Status = "limited" if each.wrong_lengths or (is_ours and each.received) else "ok"
+        text = f"{each.received} frames in {seconds:g} s" if each.received or not is_ours else "none; the rig sends it"
+        remedy = ""
+        if not each.received and not is_ours:
+            status, remedy = "missing", "power, wiring, bit rate" + (
+                "; PDOs come after NMT start" if bench.nodes and load.content else "")
+        elif is_ours and each.received:
+            remedy = "another rig is on the bus; end it"
+        if each.wrong_lengths:
+            text += f", of {' and '.join(map(str, each.wrong_lengths))} bytes, not {load.length}"
+        found.append(Finding(bench.name, f"{load.name} {describe_identifier(load.identifier)}", status, text,
+                             f"{load.direction}, every {1000 * load.period:g} ms", remedy))
+    if others:
+        shown = ", ".join(f"{name} ({count})" for name, count in sorted(others.items())[:8])
+        found.append(Finding(bench.name, "other frames", "ok", shown, "not of this bench"))
+    return found
 
 
 def _read_text(path: str) -> str:

@@ -59,7 +59,7 @@ def test_a_schema_is_valid_named_in_the_page_and_refers_to_what_is_there(name: s
 
 def test_every_command_that_answers_in_json_has_a_schema() -> None:
     words = [[command] for command in COMMANDS] + [["bench", kind] for kind in KINDS_OF_BENCH]
-    more = {"common.json", "fdi_learn_bands.json", "suite.json"}
+    more = {"common.json", "fdi_learn_bands.json", "suite.json", "check_bench.json"}
     assert {name_schema(each) for each in words} | more == set(SCHEMAS)
     assert name_schema(["bench", "--json"]) == "bench.json"
     assert name_schema(["fdi", "--learn-bands", "a.csv"]) == "fdi_learn_bands.json"
@@ -138,7 +138,7 @@ def test_the_answers_of_small_commands(preflight: Path, tmp_path: Path, monkeypa
     simulated = rig("simulate", "--command", "command.csv", "--out", "run.csv", "--json").json
     samples = {"traces": ["run.csv", "run2.csv", "held.csv"]}
     assert_all_seen("simulate", simulated, samples)
-    kinds = ("parameters", "signals", "sequences", "effects", "checks", "models")
+    kinds = ("parameters", "signals", "sequences", "effects", "checks", "models", "benches")
     assert_all_seen("list", *(rig("list", kind, "--json").json for kind in kinds))
     assert_all_seen("report", rig("report", preflight, "--out", "page.html", "--json").json)
     assert_all_seen("export", rig("export", preflight, "--out", "run.csv", "--force", "--json").json)

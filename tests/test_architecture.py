@@ -34,7 +34,7 @@ SINGLE_MAY_IMPORT = {
     "rig.interrupts": set(),
     "rig.junit": set(),
     "rig.tables": set(),
-    "rig.doctor": {"rig.network", "rig.run"},
+    "rig.doctor": {"rig.benches", "rig.network", "rig.run"},
 }
 
 

@@ -24,7 +24,8 @@ from rig.sequences.sequence import SEGMENT_KINDS
 
 NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
 PAGES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").glob("*.md")}
-MADE = {f"docs/{NOTEBOOK.stem}.md", "ARCHITECTURE.md", "CHANGELOG.md", "examples/README.md", "studies/README.md"}
+MADE = {f"docs/{NOTEBOOK.stem}.md", "ARCHITECTURE.md", "CHANGELOG.md", "studies/README.md",
+        *(path.relative_to(ROOT).as_posix() for path in (ROOT / "examples").rglob("README.md"))}
 
 
 @pytest.fixture(scope="module")

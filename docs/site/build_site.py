@@ -58,8 +58,9 @@ def write_source(source: Path, notebooks: Mapping[Path, Any]) -> None:
     shutil.copytree(ROOT / "docs", source / "docs", ignore=shutil.ignore_patterns("site", "*.py", "__pycache__"))
     for path, cells in notebooks.items():
         write_notebook_page(path, cells, source / "docs" / f"{path.stem}.md")
-    for name in ("ARCHITECTURE.md", "CHANGELOG.md", "examples/README.md", "studies/README.md"):
-        (source / name).parent.mkdir(exist_ok=True)
+    examples = [path.relative_to(ROOT) for path in (ROOT / "examples").rglob("README.md")]
+    for name in ("ARCHITECTURE.md", "CHANGELOG.md", "studies/README.md", *examples):
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, source / name)
     shutil.copy(ROOT / "README.md", source / "index.md")
     write_reference(source / "reference")

@@ -15,6 +15,7 @@ Profile = Literal["cia402", "cia408", "none"]
 INPUTS = {"position_demand": "m", "ram_position": "m", "load_pressure": "Pa", "spool_position": "m", "load_force": "N",
           "control_word": "", "mode": "", "cycle": "", "flags": ""}
 OUTPUTS = {"current": "A", "status_word": "", "mode_display": "", "cycle": ""}
+RIG_NODE = 1  # node-ID of the rig
 MEASURED = ("ram_position", "load_pressure", "spool_position", "load_force")  # by the plant's transducers
 
 

@@ -15,7 +15,7 @@ from plant.errors import InputError
 from plant.parameters import GROUPS, find_field
 from plant.units import parse_quantity
 from rig.benches import canopen_map
-from rig.benches.bench import INPUTS, MEASURED, OUTPUTS, Bench, CanopenNode, Profile
+from rig.benches.bench import INPUTS, MEASURED, OUTPUTS, RIG_NODE, Bench, CanopenNode, Profile
 from rig.benches.can_map import map_messages, read_database
 from rig.benches.checksums import CHECKSUMS, load_checksum
 from rig.benches.frame_map import EXTENDED, FD, FrameMap, FrameSpec, Guard, Role
@@ -25,7 +25,6 @@ from rig.tables import Place, Range, build_dataclass, decode_text, list_choices,
 ReadFile = Callable[[str], bytes]
 Byte = Annotated[int, Range("1", low=0, high=255)]
 NodeId = Annotated[int, Range("1", low=1, high=127)]
-RIG_NODE = 1
 CYCLE_POSITION = 8  # mode of operation of CiA 402: cyclic synchronous position
 _CYCLES = Fraction(1, 10_000), Fraction(1, 10)  # s
 _PROFILE_OBJECTS: dict[str, dict[str, tuple[str, bool]]] = {  # signal -> object and whether the device receives it
@@ -160,14 +159,10 @@ class _Reader:
         return self.files[name]
 
     def read_text(self, name: str | None, place: Place, kind: str) -> str:
-        """The text of an EDS, DCF or DBC; those of old tools are not UTF-8."""
+        """The text of an EDS, DCF or DBC."""
         if name is None:
             raise place.refuse(f"the name of the device's {kind}")
-        data = self.read_file(name, place)
-        try:
-            return data.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            return data.decode("latin-1")
+        return decode_device_text(self.read_file(name, place))
 
     def find_checksum(self, kind: str, place: Place) -> str:
         """The name of a checksum for `Field.checksum`; a file of the user's runs, if he trusts it."""
@@ -179,6 +174,14 @@ class _Reader:
         source = self.read_file(file, place)
         require_trust(place.file, [ForeignCode(file, source)], is_trusted=self._is_trusted)
         return load_checksum(file, source, function)
+
+
+def decode_device_text(data: bytes) -> str:
+    """The text of an EDS, DCF or DBC; those of old tools are not UTF-8."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
 
 
 def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, *, is_trusted: bool) -> Bench:

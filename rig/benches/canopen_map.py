@@ -83,11 +83,17 @@ def read_dictionary(name: str, text: str, node: int) -> Any:
         log.disabled = was_disabled
     if not any(index >= 0x1000 for index in dictionary):
         raise InputError(name, "", "an electronic data sheet (CiA 306) with objects")
-    own = re.search(r"^\[DeviceComm?issioning\][^\[]*^NodeID\s*=\s*(0x[0-9A-Fa-f]{1,2}|[1-9]\d{0,2})\s*$", text,
-                    re.MULTILINE | re.IGNORECASE)
-    if own is not None and int(own[1], 0) != node:
-        raise InputError(name, "NodeID", f"{node}, the node of the bench file, not {int(own[1], 0)}")
+    own = read_node(text)
+    if own not in (None, node):
+        raise InputError(name, "NodeID", f"{node}, the node of the bench file, not {own}")
     return dictionary
+
+
+def read_node(text: str) -> int | None:
+    """The node-ID that a DCF is for; None of an EDS."""
+    found = re.search(r"^\[DeviceComm?issioning\][^\[]*^NodeID\s*=\s*(0x[0-9A-Fa-f]{1,2}|[1-9]\d{0,2})\s*$", text,
+                      re.MULTILINE | re.IGNORECASE)
+    return None if found is None else int(found[1], 0)
 
 
 def find_variable(dictionary: Any, index: int, sub: int) -> ODVariable | None:

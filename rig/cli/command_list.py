@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from rig.cli.options import (
     ANY_TRACE,
+    BENCH,
     FORCE,
     JUNIT,
     MEASURED_TRACE,
@@ -105,10 +106,13 @@ COMMANDS = {
              option("--work", default="fdi", metavar="MODULE:FUNCTION",
                     help="function that judges a case instead of rig fdi"))))),
     "check": Command(
-        "dry run of a sequence: its command against travel, speed and current, checks on the predicted run",
-        "Nothing is opened and nothing moves. Exit status 1 if a limit is violated; --out FILE.html has a picture.",
-        (option("sequence", metavar="SEQUENCE", help="test sequence: a .toml file, or the name of a shipped one"),
-         *MODEL)),
+        "dry run of a sequence: its command against travel, speed and current, checks on the predicted run; the frames "
+        "of a bench",
+        "Nothing is opened and nothing moves. --bench alone lists the frames and their share of the bus. Exit status 1 "
+        "if a limit is violated; --out FILE.html has a picture.",
+        (option("sequence", nargs="?", metavar="SEQUENCE",
+                help="test sequence: a .toml file, or the name of a shipped one"),
+         *MODEL, BENCH)),
     "compare": Command(
         "compare a model with a measured trace: how large the error is, where, when and in which block",
         "Exit status 0 if the residual is noise, 1 otherwise.",
@@ -143,7 +147,11 @@ COMMANDS = {
         "report what this machine can do: CAN, vcan, real-time rights, viewer",
         "Exit status 1 if the embedded bench cannot run here.",
         (option("--seconds", type=float, default=1.0, metavar="S",
-                help="duration of each timer measurement; 0: no measurement (default 1)"),)),
+                help="duration of each timer measurement, and of listening; 0: no measurement (default 1)"),
+         Group("listen for a bench", (
+             BENCH,
+             option("--bus", default="auto", metavar="INTERFACE:CHANNEL",
+                    help="with --bench: where to listen, such as socketcan:can0 or udp_multicast"))))),
     "effects": Command(
         "list the catalogue of physical effects, or show one in detail",
         "An effect of --effects, or any with --test, is also tested: exit status 1 if it fails.",
@@ -202,11 +210,21 @@ COMMANDS = {
          option("--force", action="store_true", help="let --guess replace a map that exists"),
          option("--dbc", metavar="FILE", help="DBC that decodes the raw frames (default: the shipped eha.dbc)"))),
     "list": Command(
-        "list the names that other commands take: parameters, signals, sequences, effects, checks or models",
+        "list the names that other commands take: parameters, signals, sequences, effects, checks, models or benches",
         "Names come with unit, range and default.",
-        (option("kind", choices=("parameters", "signals", "sequences", "effects", "checks", "models"), metavar="KIND",
-                help="one of: parameters, signals, sequences, effects, checks, models"),
+        (option("kind", choices=("parameters", "signals", "sequences", "effects", "checks", "models", "benches"),
+                metavar="KIND", help="one of: parameters, signals, sequences, effects, checks, models, benches"),
          option("word", nargs="?", default="", metavar="WORD", help="only names that contain this word"), *MODEL)),
+    "new": Command(
+        "write a first file of your own, commented: a bench from the EDS, DCF or DBC of your controller",
+        "It goes to --out (default: NAME.toml). Lines that are guesses say so (# unsure).",
+        (option("kind", choices=("bench",), metavar="KIND", help="bench: which device is under test (docs/bench.md)"),
+         option("name", metavar="NAME", help="name of the file, without .toml"),
+         option("--eds", type=Path, metavar="FILE", help="EDS or DCF of a CANopen device"),
+         option("--dbc", type=Path, metavar="FILE", help="DBC of a device on plain CAN"),
+         option("--node", type=parse_count, metavar="N", help="node-ID of the CANopen device (default: the DCF's, or "
+                                                              "2)"),
+         FORCE)),
     "node": Command(
         "run the plant emulator or the reference firmware alone on a CAN bus, opposite a rig or real hardware",
         "It runs until Ctrl-C or SIGTERM ends it, then reports the frames that it lost.",

@@ -79,6 +79,8 @@ REPEAT = option("--repeat", action="append", default=[], metavar="TRACE",
 SIGNALS = option("--signals", metavar="xj,p12,xs", help="signals to use (default: all that the trace has)")
 RUNS = (REPEAT, option("--holdout", metavar="TRACE", help="a run of another command that no fit sees: reveals "
                                                           "overfitting"), SIGNALS)
+BENCH = option("--bench", metavar="FILE|NAME",
+               help="bench file: which controller is under test, and its frames (default: eha, the shipped one)")
 FORCE = option("--force", action="store_true", help="replace the file of --out if there is one")
 JUNIT = option("--junit", metavar="FILE.xml", help="also write the results as JUnit XML, for build servers")
 

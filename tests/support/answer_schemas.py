@@ -30,6 +30,8 @@ def name_schema(words: Sequence[str]) -> str:
     if command == "bench":
         kind = [word for word in words[1:2] if word in KINDS_OF_BENCH]
         return "_".join(["bench", *kind]) + ".json"
+    if command == "check" and "--bench" in words[1:2] and set(words[3:]) <= {"--json"}:
+        return "check_bench.json"  # without a sequence
     for name, option in (("fdi", "--learn-bands"), ("trend", "--score")):
         if command == name and option in words:
             return f"{name}_{option.strip('-').replace('-', '_')}.json"

@@ -10,7 +10,10 @@ from pathlib import Path
 from fdi.report.report import Cell, Column, Mood, Report, Section, Table
 from plant.errors import InputError
 from rig import doctor
+from rig.benches.bench import Bench
+from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, give_answer
+from rig.network.bus import choose_bus
 
 MOODS: dict[doctor.Status, Mood] = {"ok": "good", "limited": "doubtful", "missing": "bad"}
 
@@ -19,22 +22,32 @@ def run_command(args: argparse.Namespace) -> int:
     """Exit status 1 if the embedded bench cannot run here."""
     if not 0 <= args.seconds <= 3600:
         raise InputError("--seconds", "", f"between 0 and 3600 s, not {args.seconds:g}")
-    report = build_doctor_report(doctor.examine_machine(args.seconds))
     places = Places(answer=None if args.out is None else Path(args.out))
+    if args.bench is not None:
+        report = build_listening_report(load_bench(args.bench), choose_bus(args.bus)[0], args.seconds)
+    else:
+        report = build_doctor_report(doctor.examine_machine(args.seconds))
     return give_answer(report, args, int(report.verdict != "PASS"), places)
+
+
+def build_listening_report(bench: Bench, spec: str, seconds: float) -> Report:
+    """Report on the frames of a bench that are heard on a bus."""
+    findings = doctor.listen_to_bench(bench, spec, seconds)
+    theirs = [each for each in findings if each.purpose.startswith("controller")]
+    is_there = any(each.status == "ok" for each in theirs)
+    sentence = (f"The controller is on {spec}." if is_there else
+                f"Nothing of the controller is heard on {spec}.")
+    verdict = "PASS" if is_there else "FAIL"
+    return Report("doctor", bench.name, verdict, "good" if is_there else "bad", sentence,
+                  sections=[Section("", [tabulate_findings(findings)])],
+                  data={"verdict": verdict, "findings": [finding._asdict() for finding in findings]})
 
 
 def build_doctor_report(findings: Sequence[doctor.Finding]) -> Report:
     """Report on the findings: a table with one row each, below the name of its area."""
     blocking = [finding.name for finding in findings if finding.needed and finding.status == "missing"]
-    rows: list[list[Cell | str]] = []
-    for area, found in groupby(findings, lambda finding: finding.area):
-        rows.append([Cell(area, is_strong=True), "", "", "", ""])
-        rows += [[f"  {each.name}", Cell(each.status, MOODS[each.status]), each.found, each.purpose, each.remedy]
-                 for each in found]
-    columns = [Column(title) for title in ("capability", "", "found", "used for", "how to get it")]
     data = {"verdict": "FAIL" if blocking else "PASS", "findings": [finding._asdict() for finding in findings]}
-    section = Section("", [Table(columns, rows)])
+    section = Section("", [tabulate_findings(findings)])
     if blocking:
         return Report("doctor", "this machine", "FAIL", "bad", f"The bench cannot run without: {', '.join(blocking)}.",
                       sections=[section], conclusion="the bench cannot run on this machine", data=data)
@@ -43,3 +56,13 @@ def build_doctor_report(findings: Sequence[doctor.Finding]) -> Report:
                   sections=[section], data=data, conclusion=(
                       f"the embedded bench runs on this machine; {counts['ok']} capabilities ok, {counts['limited']} "
                       f"limited, {counts['missing']} missing (optional)"))
+
+
+def tabulate_findings(findings: Sequence[doctor.Finding]) -> Table:
+    """A row for each finding, below the name of its area."""
+    rows: list[list[Cell | str]] = []
+    for area, found in groupby(findings, lambda finding: finding.area):
+        rows.append([Cell(area, is_strong=True), "", "", "", ""])
+        rows += [[f"  {each.name}", Cell(each.status, MOODS[each.status]), each.found, each.purpose, each.remedy]
+                 for each in found]
+    return Table([Column(title) for title in ("capability", "", "found", "used for", "how to get it")], rows)

@@ -127,6 +127,15 @@ def list_models(model: Model) -> Rows:
              "effects": "\n".join(m.effects) or "-", "default": "yes" if name == "eha" else "no"} for name, m in found]
 
 
+def list_benches(model: Model) -> Rows:
+    """The shipped benches: what --bench takes beside a file."""
+    from rig.benches import bench_file  # here: only this list needs the frames
+
+    found = [(name, bench_file.load_bench(name)) for name in bench_file.list_benches()]
+    return [{"name": name, "title": b.name, "protocol": "canopen" if b.nodes else "can", "plant": b.plant,
+             "cycle, s": b.cycle_ns / 1e9, "frames": len(b.frames.frames)} for name, b in found]
+
+
 KINDS: Mapping[str, tuple[Callable[[Model], Rows], str]] = {  # what lists them, and how to use one
     "parameters": (list_parameters, "Change one with --set NAME=VALUE."),
     "signals": (list_signals, "Choose outputs with --signals xj,p12,xs."),
@@ -135,4 +144,5 @@ KINDS: Mapping[str, tuple[Callable[[Model], Rows], str]] = {  # what lists them,
     "checks": (list_checks, "Use one in a sequence by its kind; every check also takes name, low, high, unit, window, "
                             "skip and requirement."),
     "models": (list_models, "Choose one with --model NAME, or a file."),
+    "benches": (list_benches, "Choose one with --bench NAME, or a file."),
 }

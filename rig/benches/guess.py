@@ -1,0 +1,201 @@
+"""A first bench file from an EDS, DCF or DBC: names, units and access say what is likely; the rest is marked."""
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+from plant.units import find_unit
+from rig.benches.bench import INPUTS, OUTPUTS
+from rig.benches.can_map import read_database
+from rig.benches.canopen_map import (
+    INVALID,
+    find_variable,
+    list_pdos,
+    name_object,
+    read_dictionary,
+    read_node,
+    read_number,
+)
+
+UNSURE = "# unsure: "
+# What a name says of a signal: the quantity, and which of several it is.
+_WORDS: dict[str, tuple[set[str], set[str]]] = {
+    "position_demand": ({"position", "pos", "target", "stroke"},
+                        {"demand", "target", "command", "cmd", "setpoint", "set", "reference", "ref", "desired"}),
+    "ram_position": ({"position", "pos", "ram", "xj", "stroke"},
+                     {"actual", "act", "feedback", "fb", "measured", "sensor", "ram", "xj"}),
+    "load_pressure": ({"pressure", "p12", "press"}, {"load", "differential", "diff", "delta", "p12"}),
+    "spool_position": ({"spool", "xs"}, {"position", "pos", "xs"}),
+    "load_force": ({"force"}, {"load", "external", "cell", "measured"}),
+    "current": ({"current", "cor", "coil"}, {"demand", "actual", "coil", "motor", "cor", "drive", "output"}),
+}
+_WORDS_OF_PROFILES = ("control_word", "status_word", "mode", "mode_display")
+_NEEDED = ("position_demand", "ram_position", "current")
+_USUAL = {"m": "1 um", "Pa": "1 kPa", "N": "1 N", "A": "1 uA"}  # counts, where the file says nothing
+_KNOWN_OBJECTS = {"0x607A": "position_demand", "0x6078": "current"}  # CiA 402
+_RATED_CURRENT = 0x6075  # mA; 0x6078 counts thousandths of it
+_ENABLING = {"enable", "enabled", "active", "activate", "request", "run", "on", "operational", "ready"}
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A value of the device that a signal may be."""
+
+    key: str  # as a bench file writes it
+    name: str  # as people call it
+    unit: str  # "" if the file gives none
+    count: str | None = None  # what a count is worth, where the file gives it apart from the unit
+
+
+def guess_canopen(title: str, file: str, text: str, node: int | None) -> str:
+    """A bench file for a CANopen device; `node` is its node-ID, None for that of the DCF, or 2.
+
+    Raises:
+        InputError: not an EDS.
+    """
+    number = node or read_node(text) or 2
+    dictionary = read_dictionary(file, text, number)
+    device_type = (read_number(dictionary, 0x1000, 0) or 0) & 0xFFFF
+    has_words = all(find_variable(dictionary, index, 0) is not None for index in (0x6040, 0x6041))
+    profile = {402: "cia402", 408: "cia408"}.get(device_type if has_words else 0, "none")
+    doubt = "" if profile != "none" or not has_words else f"  {UNSURE}0x6040 and 0x6041 are there; cia402 or cia408?"
+    lines = [f"name = {json.dumps(title)}", 'plant = "eha"', 'cycle = "1 ms"', "bitrate = 1_000_000", "",
+             "[controller]", 'protocol = "canopen"',
+             f"node = {number}" + ("" if node or read_node(text) else f"  {UNSURE}the EDS does not say"),
+             f"eds = {json.dumps(file)}", f'profile = "{profile}"{doubt}']
+    lines += ['mode = 8                        # cyclic synchronous position'] if profile == "cia402" else []
+    for table, known, kind in (("inputs", INPUTS, "RPDO"), ("outputs", OUTPUTS, "TPDO")):
+        candidates = _list_objects(dictionary, number, is_received=kind == "RPDO")
+        lines += ["", f"[controller.{table}]", *_write_signals(candidates, known, "object", "0x0000")]
+    return "\n".join([_HEAD, *lines, ""])
+
+
+_HEAD = "# Which device is under test, how it talks, and what its numbers mean. docs/bench.md has all keys."
+
+
+def _list_objects(dictionary: Any, node: int, *, is_received: bool) -> list[Candidate]:
+    """The objects that a PDO of this direction maps, without those of the profile."""
+    found = []
+    for pdo in list_pdos(dictionary, node):
+        for index, sub, _ in pdo.entries:
+            variable = find_variable(dictionary, index, sub)
+            if pdo.is_received is not is_received or pdo.cob_id & INVALID or variable is None:
+                continue
+            key, count = name_object(index, sub), None
+            rated = read_number(dictionary, _RATED_CURRENT, 0)
+            if find_unit(variable.unit) is not None:
+                count = f"{variable.factor:g} {variable.unit}"
+            elif key == "0x6078" and rated:
+                count = f"{float(Fraction(rated, 1000)):g} mA"
+            found.append(Candidate(key, variable.qualname, variable.unit if count else "", count))
+    return [each for each in found if each.key not in ("0x6040", "0x6041", "0x6060", "0x6061")]  # the profile's
+
+
+def guess_can(title: str, file: str, text: str) -> str:
+    """A bench file for a device on plain CAN.
+
+    Raises:
+        InputError: not a DBC.
+    """
+    messages = read_database(file, text).messages
+    candidates = {message.name: [Candidate(f"{message.name}.{signal.name}", f"{message.name} {signal.name}",
+                                           signal.unit or "")
+                                 for signal in message.signals if not signal.is_multiplexer] for message in messages}
+    every = [each for own in candidates.values() for each in own]
+    current = _assign(every, ("current",)).get("current")
+    senders = {message.name: set(message.senders) for message in messages}
+    device = senders.get(current[0].key.partition(".")[0], set()) if current else set()
+    sent = [message for message in messages if device and senders[message.name] & device]
+    received = [message for message in messages if message not in sent]
+    inputs = [each for message in received for each in candidates[message.name]]
+    outputs = [each for message in (sent or messages) for each in candidates[message.name]]
+    lines = [f"name = {json.dumps(title)}", 'plant = "eha"', 'cycle = "1 ms"',
+             f"bitrate = 1_000_000  {UNSURE}the DBC does not say", "", "[controller]", 'protocol = "can"',
+             f"dbc = {json.dumps(file)}", f'timeout = "20 ms"  {UNSURE}without a frame for so long the device is gone']
+    used = set()
+    for table, known, own in (("inputs", INPUTS, inputs), ("outputs", OUTPUTS, outputs)):
+        chosen = {signal: unit for signal, unit in known.items() if signal not in _WORDS_OF_PROFILES}
+        names = {found.key.partition(".")[0] for found, _ in _assign(own, [*chosen]).values()}
+        near = [each for each in own if each.key.partition(".")[0] in names] or own
+        lines += ["", f"[controller.{table}]", *_write_signals(near, chosen, "signal", "MESSAGE.SIGNAL")]
+        used |= names
+    lines += _write_states([message for message in messages if message.name in used], sent)
+    return "\n".join([_HEAD, *lines, ""])
+
+
+def _write_states(messages: Sequence[Any], sent: Sequence[Any]) -> list[str]:
+    """The tables of the enabling signals, of protection, and of the state that the rig awaits."""
+    tables: dict[str, list[str]] = {"phases": [], "protection": [], "ready": []}
+    for message in messages:
+        for signal in message.signals:
+            words, key = split_words(signal.name), f'"{message.name}.{signal.name}"'
+            if words & {"crc", "checksum", "chk", "cs"}:
+                tables["protection"].append(f'{key} = "crc8_sae_j1850"  {UNSURE}which checksum it is')
+            elif words & {"counter", "cnt", "alive", "rolling", "sequence"}:
+                tables["protection"].append(f'{key} = "counter"')
+            elif message in sent and words & {"state", "status"}:
+                names = [str(text) for text in (signal.choices or {}).values() if split_words(str(text)) & _ENABLING]
+                if names:
+                    tables["ready"].append(f'{key} = "{names[0]}"  {UNSURE}the state in which main begins')
+            elif message not in sent and words & _ENABLING and signal.length <= 8:
+                tables["phases"].append(f"{key} = {{ setup = 0, main = 1, cleanup = 0 }}  {UNSURE}what enables")
+    return [line for name, lines in tables.items() if lines for line in ("", f"[controller.{name}]", *lines)]
+
+
+def split_words(name: str) -> set[str]:
+    """The words of a name, and the name as one, in small letters.
+
+    >>> sorted(split_words("RamPosition_act"))
+    ['act', 'position', 'ram', 'ramposition_act']
+    """
+    return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+\d*(?![a-z])|[a-z]+\d+", name)} | {name.lower()}
+
+
+def _assign(candidates: Iterable[Candidate], signals: Iterable[str]) -> dict[str, tuple[Candidate, bool]]:
+    """The likeliest candidate of each signal, and whether it is sure; no candidate is two signals."""
+    units = {**INPUTS, **OUTPUTS}
+    scored = []
+    for each in candidates:
+        words = split_words(each.name) | {word for part in each.name.split() for word in split_words(part)}
+        for signal in signals:
+            quantity, which = _WORDS.get(signal, ({signal}, {signal}))
+            unit = find_unit(each.unit)
+            fits = unit is not None and unit.si == units[signal]
+            score = 3 * bool(words & quantity) + 2 * bool(words & which) + fits
+            score += 9 * (_KNOWN_OBJECTS.get(each.key) == signal)
+            if score >= 3 and (unit is None or fits):
+                scored.append((score, signal, each))
+    found: dict[str, tuple[Candidate, bool]] = {}
+    for score, signal, each in sorted(scored, key=lambda entry: -entry[0]):
+        if signal not in found and each not in [other for other, _ in found.values()]:
+            rivals = [other for points, name, other in scored if name == signal and points == score]
+            found[signal] = each, score >= 5 and len(rivals) == 1
+    return found
+
+
+def _write_signals(candidates: Sequence[Candidate], known: Mapping[str, str], word: str, example: str) -> list[str]:
+    """The lines of [inputs] or [outputs]."""
+    found, lines = _assign(candidates, [*known]), []
+    for signal, unit in known.items():
+        if signal in found:
+            each, is_sure = found[signal]
+            doubts = [] if is_sure else [f"is {each.name!r} the {signal}?"]
+            entry = f'{signal} = {{ {word} = "{each.key}" }}' if word == "object" else f'{signal} = "{each.key}"'
+            own = find_unit(each.unit)
+            if unit and each.count is None and (own is None or own.si != unit):
+                doubts.append(f"what one count is worth; the file gives {each.name!r} no unit")
+                entry = f'{signal} = {{ {word} = "{each.key}", count = "{_USUAL[unit]}" }}'
+            elif unit and each.count is not None:
+                entry = f'{signal} = {{ {word} = "{each.key}", count = "{each.count}" }}'
+            lines.append(entry + (f"  {UNSURE}{'; '.join(doubts)}" if doubts else ""))
+        elif signal in _NEEDED:
+            count = f', count = "{_USUAL[unit]}"'
+            lines.append(f'# {signal} = {{ {word} = "{example}"{count} }}  {UNSURE}nothing looks like it')
+    taken = {each.key for each, _ in found.values()}
+    rest = [f"{each.key} ({each.name.rpartition(' ')[2] if word == 'signal' else each.name})" for each in candidates
+            if each.key not in taken]
+    return [*lines, *([f"# not used: {', '.join(rest[:12])}{', ..' if len(rest) > 12 else ''}"] if rest else [])]

@@ -1,0 +1,56 @@
+"""`rig new`: a first file of your own, commented, to be completed."""
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+from fdi.output import require_writable, write_text
+from fdi.report.report import Line, Report, Section
+from plant.errors import InputError
+from rig.benches.bench_file import decode_device_text, load_bench
+from rig.benches.guess import UNSURE, guess_can, guess_canopen
+from rig.cli.answer import give_answer
+from rig.tables import read_file
+
+
+def run_command(args: argparse.Namespace) -> int:
+    """Exit status 0 also where the file is to be completed."""
+    path = Path(args.out or f"{args.name.removesuffix('.toml')}.toml")
+    if path.suffix != ".toml":
+        raise InputError("--out", str(path), "FILE.toml")
+    if path.exists() and not args.force:
+        raise InputError("--out", str(path), "a file that does not exist yet, or --force")
+    require_writable(path, "--out")
+    text = write_bench(path, args)
+    write_text(path, text)
+    try:
+        load_bench(str(path))
+        problem = ""
+    except InputError as error:
+        problem = str(error)
+    return give_answer(build_new_report(path, text, problem), args)
+
+
+def write_bench(path: Path, args: argparse.Namespace) -> str:
+    """The text of a bench file at `path`, from the EDS, DCF or DBC that the options name."""
+    if (args.eds is None) == (args.dbc is None):
+        raise InputError("rig new bench", "", "--eds FILE (EDS or DCF of a CANopen device), or --dbc FILE")
+    if args.node is not None and not (args.eds and 1 < args.node < 128):
+        raise InputError("--node", str(args.node), "2 to 127, together with --eds; node 1 is the rig")
+    source = args.eds or args.dbc
+    text, name = decode_device_text(read_file(source)), Path(os.path.relpath(source, path.parent)).as_posix()
+    return guess_can(path.stem, name, text) if args.dbc else guess_canopen(path.stem, name, text, args.node)
+
+
+def build_new_report(path: Path, text: str, problem: str) -> Report:
+    """Report on a file that was written: what is unsure in it, and what is missing."""
+    marked = [line.strip() for line in text.splitlines() if UNSURE in line]
+    sentence = f"{path} can be used." if not problem else f"{path} is to be completed: {problem}"
+    if marked and not problem:
+        sentence = f"{path} can be used; check what it marks as unsure."
+    return Report("new", str(path), "INCOMPLETE" if problem else "COMPLETE", "doubtful" if problem else "good",
+                  sentence, sections=[Section("Unsure", [Line("unsure", line) for line in marked])],
+                  next_command=f"rig check --bench {path}", files=[("bench", str(path))],
+                  data={"verdict": "INCOMPLETE" if problem else "COMPLETE", "file": str(path), "problem": problem,
+                        "unsure": marked})

@@ -1,0 +1,148 @@
+"""`rig check --bench`, `rig new bench`, `rig doctor --bench` and docs/bench.md."""
+from __future__ import annotations
+
+import re
+import shutil
+import threading
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+from device_files import BENCH, write_bench
+from places import ROOT
+from rig_command import refuse, rig
+
+from rig.benches.bench import INPUTS, OUTPUTS
+from rig.benches.bench_file import ControllerKeys, NodeKeys, load_bench
+from rig.benches.bus_load import list_loads
+from rig.benches.checksums import CHECKSUMS
+from rig.benches.frame_map import EXTENDED, FD, Role, pack
+from rig.benches.guess import UNSURE
+from rig.network.bus import open_can
+from rig.network.clock import WallClock
+from rig.network.frame import Frame
+from rig.network.link import Link
+from rig.network.listening import count_frames
+
+PAGE = (ROOT / "docs" / "bench.md").read_text()
+DRIVE, ECU = ROOT / "examples" / "cia402_drive", ROOT / "examples" / "can_ecu"
+SHEETS = {"drive": DRIVE / "drive.eds", "ecu": ECU / "ecu.dbc", "eha": ROOT / "dbc" / "node2.eds",
+          "eha_on_can": ROOT / "dbc" / "eha.dbc"}
+
+
+def test_the_frames_of_the_shipped_bench_load_the_bus_as_the_page_of_the_bus_says() -> None:
+    answer = rig("check", "--bench", "eha", "--json").json["bench"]
+    cyclic = [each for each in answer["frames"] if not each["name"].startswith("heartbeat")]
+    assert sum(each["share"] for each in cyclic) == pytest.approx((4 * 135 + 55) / 1000)  # docs/bus.md, Load
+    assert answer["nodes"] == {"controller": 2, "plant": 3}
+    assert answer["frames"][0]["signals"] == ["position_demand", "control_word", "cycle"]
+    said = rig("check", "--bench", "eha")
+    assert said.status == 0 and "RPDO1" in said.out and "0x202" in said.out and "WITHIN_LIMITS" in said.out
+
+
+def test_a_bus_that_is_too_slow_is_reported(tmp_path: Path) -> None:
+    slow = write_bench(tmp_path, BENCH.replace("[controller]", "bitrate = 125_000\n[controller]", 1))
+    said = rig("check", "--bench", slow)
+    assert said.status == 1 and "BEYOND_LIMITS" in said.out and "The frames need" in said.out
+
+
+def test_a_sequence_is_checked_together_with_a_bench(tmp_path: Path) -> None:
+    answer = rig("check", "preflight", "--bench", ECU / "bench.toml", "--json").json
+    assert answer["bench"]["protocol"] == "can" and answer["demands"]
+    assert "expected a SEQUENCE, --bench FILE, or both" in refuse("check")
+    assert "a file that can be read" in refuse("check", "--bench", tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize("name", SHEETS)
+def test_a_new_bench_can_be_used_or_says_what_is_missing(name: str, tmp_path: Path,
+                                                         monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    sheet = Path(shutil.copy(SHEETS[name], tmp_path)).name
+    answer = rig("new", "bench", name, "--eds" if sheet.endswith("eds") else "--dbc", sheet, "--json").json
+    assert answer["verdict"] == "COMPLETE" and Path(f"{name}.toml").exists()
+    assert rig("check", "--bench", f"{name}.toml").status == 0
+    bench = load_bench(f"{name}.toml")
+    assert {"position_demand", "ram_position"} <= {each.name for spec in bench.frames.list_from(Role.RIG)
+                                                   for each in spec.fields}
+    assert answer["unsure"] == [line.strip() for line in Path(f"{name}.toml").read_text().splitlines()
+                                if UNSURE in line]
+    assert "a file that does not exist yet" in refuse("new", "bench", name, "--eds", sheet)
+
+
+def test_the_guess_of_an_example_is_the_example(tmp_path: Path) -> None:
+    """For the frames; what the data sheet cannot say is marked."""
+    for name, sheet, words in (("drive", SHEETS["drive"], ("--node", 5)), ("ecu", SHEETS["ecu"], ())):
+        path = tmp_path / f"{name}.toml"
+        option = "--eds" if sheet.suffix == ".eds" else "--dbc"
+        assert rig("new", "bench", name, option, sheet, *words, "--out", path).status == 0
+        guessed, own = load_bench(str(path)), load_bench(str(sheet.parent / "bench.toml"))
+        assert (guessed.frames, guessed.phases, guessed.ready) == (own.frames, own.phases, own.ready)
+
+
+def test_a_sheet_without_the_signals_is_completed_by_the_user(tmp_path: Path) -> None:
+    write_bench(tmp_path)
+    said = rig("new", "bench", "x", "--eds", tmp_path / "x.eds", "--out", tmp_path / "new.toml")
+    assert said.status == 0 and "is to be completed" in said.out and "nothing looks like it" in said.out
+    for words in ((), ("--eds", "a.eds", "--dbc", "b.dbc")):
+        assert "expected --eds FILE" in refuse("new", "bench", "y", *words)
+    for node in ("1", "128"):
+        assert "expected 2 to 127" in refuse("new", "bench", "y", "--eds", tmp_path / "x.eds", "--node", node)
+    assert "a DBC" in refuse("new", "bench", "y", "--dbc", tmp_path / "x.eds", "--out", tmp_path / "y.toml")
+
+
+def test_what_is_heard_is_sorted_by_the_frames_of_the_bench() -> None:
+    bench = load_bench(str(ECU / "bench.toml"))
+    drive = bench.frames.list_from(Role.CONTROLLER)[0]
+    frames = [Frame(0, drive.identifier, pack(drive, {})), Frame(1, drive.identifier, b"12"), Frame(2, 0x123, b"")]
+    heard, others = count_frames(bench, frames)
+    assert [(each.frame.name, each.received, each.wrong_lengths) for each in heard] == [
+        ("Demand", 0, ()), ("Feedback", 0, ()), ("Drive", 1, (2,))]
+    assert others == {"0x123": 1}
+
+
+def test_the_doctor_listens_for_a_bench() -> None:
+    spec, bench = "udp_multicast:239.74.163.93", load_bench(str(ECU / "bench.toml"))
+    drive, stop = bench.frames.list_from(Role.CONTROLLER)[0], threading.Event()
+    link = Link(open_can(spec), WallClock().now)
+
+    def send() -> None:
+        while not stop.wait(0.002):
+            link.send(drive.identifier, pack(drive, {}))
+
+    silent = rig("doctor", "--bench", ECU / "bench.toml", "--bus", spec, "--seconds", "0.2")
+    assert silent.status == 1 and "Nothing of the controller is heard" in silent.out
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        said = rig("doctor", "--bench", ECU / "bench.toml", "--bus", spec, "--seconds", "1", "--json")
+    finally:
+        stop.set()
+        thread.join()
+        link.close()
+    found = {each["name"].split()[0]: each for each in said.json["findings"]}
+    assert said.status == 0 and found["Drive"]["status"] == "ok" and found["Demand"]["found"].startswith("none")
+
+
+def test_the_bits_of_a_frame_grow_with_its_identifier_and_length() -> None:
+    loads = {each.name: each for each in list_loads(load_bench(str(ECU / "bench.toml")))}
+    assert loads["Feedback"].share == pytest.approx(160 / 2000)  # 29 bits, 8 bytes, every 2 ms
+    assert loads["Feedback"].identifier & EXTENDED and not loads["Feedback"].identifier & FD
+
+
+def test_every_key_signal_and_checksum_is_on_the_page() -> None:
+    for each in (*fields(ControllerKeys), *fields(NodeKeys)):
+        assert re.search(rf"\b{each.name}\b", PAGE), each.name
+    for name in (*INPUTS, *OUTPUTS, *CHECKSUMS):
+        assert f"`{name}`" in PAGE, name
+
+
+def test_the_examples_on_the_page_are_valid(tmp_path: Path) -> None:
+    blocks = [re.sub("^    ", "", block, flags=re.MULTILINE) for block in re.findall(r"(?:^(?:    .*)?\n)+", PAGE,
+                                                                                    re.MULTILINE)]
+    canopen = next(block for block in blocks if 'eds = "drive_x.eds"' in block)
+    can = 'name = "x"\n' + next(block for block in blocks if 'dbc = "ecu.dbc"' in block)
+    shutil.copy(DRIVE / "drive.eds", tmp_path / "drive_x.eds")
+    shutil.copy(ECU / "ecu.dbc", tmp_path / "ecu.dbc")
+    for text in (canopen, can):
+        (tmp_path / "b.toml").write_text(text)
+        assert len(load_bench(str(tmp_path / "b.toml")).frames.frames) >= 3
