@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from fdi.foreign_code import load_effects_of_model
 from fdi.output import write_text
-from fdi.report.drawing import Drawing, save_drawing
-from fdi.report.report import Figure, Medium, Report
+from fdi.report.drawing import Drawing, convert_figure, save_drawing
+from fdi.report.report import Figure, Medium, Report, render_html, to_plain
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
@@ -49,8 +49,6 @@ class Plot(Drawing):
         Raises:
             InputError: plotly is not installed.
         """
-        from fdi.report.plotly_figure import convert_figure
-
         return convert_figure(self.figure)
 
     def write(self, path: str | Path) -> None:
@@ -120,14 +118,10 @@ class Result:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON answer as plain values: SI units, None for NaN and infinity."""
-        from fdi.report.json import to_plain
-
         return dict(to_plain(self.report.data))
 
     def to_html(self) -> str:
         """The page as text; it needs no network."""
-        from fdi.report.html import render_html
-
         return render_html(self.report)
 
     def write_html(self, path: str | Path) -> None:
@@ -338,12 +332,12 @@ def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eh
     Raises:
         InputError: runs, a model, a signal or a range that cannot be used.
     """
-    from fdi.identification.free_parameters import (
+    from fdi.identification.identify import (
         collect_identification_runs,
+        identify_model,
         parse_free_parameters,
         read_free_parameters,
     )
-    from fdi.identification.identify import identify_model
     from fdi.report.identify_report import build_identification_report
 
     own_model = _load_model(model, trust)

@@ -5,10 +5,8 @@ import math
 
 import numpy as np
 
-from fdi.diagnosis.bands import judge_position, load_default_bands
+from fdi.diagnosis.bands import UnitKind, format_precursor, judge_position, load_default_bands, simulate_units
 from fdi.diagnosis.faults import FAULTS, Level
-from fdi.diagnosis.learn_bands import UnitKind, simulate_units
-from fdi.diagnosis.precursors import format_precursor
 from fdi.trace.sections import find_sections
 from plant import load_model
 from rig.sequences import load_sequence

@@ -6,8 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from fdi.report.json import to_json
-from fdi.report.report import Report
+from fdi.report.report import Report, to_json
 from plant.errors import RigError
 from rig.campaign.batch import BatchProgress
 from rig.cli.answer import choose_file, show_answer

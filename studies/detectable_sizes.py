@@ -21,8 +21,7 @@ import numpy as np
 from fdi.discovery.detectable import Direction, VirtualTest, list_directions
 from fdi.discovery.runs import read_runs
 from fdi.discovery.search import Search
-from fdi.estimation.fit import Fit
-from fdi.estimation.likelihood import Problem
+from fdi.estimation.fit import Fit, Problem
 from fdi.sources import hash_sources
 from fdi.thresholds import GAIN_DETECTED
 from plant.effects import CATALOGUE

@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.diagnosis.bands import UnitKind, compute_features, simulate_units
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, STATIC_OVER_DYNAMIC, Fault, Level, classify_size
-from fdi.diagnosis.learn_bands import UnitKind, simulate_units
-from fdi.diagnosis.precursors import compute_features
 from fdi.diagnosis.refine import (
     COARSE_STARTS,
     CountedProblem,
@@ -23,11 +22,10 @@ from fdi.diagnosis.refine import (
     make_start,
     refine_sizes,
 )
-from fdi.estimation.likelihood import compute_misfit
+from fdi.estimation.fit import compute_misfit
 from fdi.progress import Progress, ignore_progress
-from fdi.report.json import to_plain
 from fdi.report.numbers import NO_NUMBER, format_digits
-from fdi.report.report import Column, Report, Section, Table
+from fdi.report.report import Column, Report, Section, Table, to_plain
 from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace, hold_last
 from plant.errors import InputError

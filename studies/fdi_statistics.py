@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from fdi.diagnosis.faults import FAULTS
-from rig.campaign.folder import read_campaign_rows, read_matrix_of_folder
-from rig.campaign.report import draw_detection_curves, format_requirement, format_share
-from rig.campaign.summary import name_size, summarise_campaign
+from rig.campaign.judge import read_campaign_rows, read_matrix_of_folder
+from rig.campaign.summary import draw_detection_curves, format_requirement, name_size, show_share, summarise_campaign
 
 FIGURE = Path(__file__).parent.parent / "docs" / "fdi_statistics.svg"
 MET = {None: "", True: "met", False: "**not met**"}
@@ -27,7 +26,7 @@ def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def format_rates(found: Sequence[Mapping[str, Any]]) -> str:
     """The required rates as a table."""
     return format_table(("", "count", "share", "95 % interval", "required", ""),
-                        [(r["name"].strip(), *format_share(r["share"]),
+                        [(r["name"].strip(), *show_share(r["share"]),
                           format_requirement(100 * r["least"], 100 * r["most"]), MET[r["met"]])
                          for r in found if r["share"]["of"]])
 
@@ -41,8 +40,8 @@ def format_tolerance(figures: Mapping[str, Any]) -> str:
         if len(points) > 1:
             out += format_table((name_size(fault), "maintenance or worse", "share", "95 % interval", "non-nominal",
                                  "ruling", "by the bands alone"),
-                                [(f"{p['size']:g}", *format_share(p["detected"]),
-                                  *(format_share(p[key])[1] for key in ("most", "ruling", "bands"))) for p in points])
+                                [(f"{p['size']:g}", *show_share(p["detected"]),
+                                  *(show_share(p[key])[1] for key in ("most", "ruling", "bands"))) for p in points])
     for fault in FAULTS:
         counts = figures["levels"][fault.name]
         said = [word for word in next(iter(counts.values())) if any(row[word] for row in counts.values())]
@@ -54,7 +53,7 @@ def format_tolerance(figures: Mapping[str, Any]) -> str:
     return out + format_table(
         ("plant", "estimate of", "cases", "bias", "RMS error", "95 % within", "truth in its interval", "95 % interval"),
         [(e["label"], name_size(next(f for f in FAULTS if f.name == e["fault"])), str(e["cases"]),
-          *(f"{e[key]:.2g}" for key in ("bias", "rms", "most")), *format_share(e["covered"])[1:])
+          *(f"{e[key]:.2g}" for key in ("bias", "rms", "most")), *show_share(e["covered"])[1:])
          for e in figures["errors"]])
 
 

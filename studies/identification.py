@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.binomial import measure_share
-from fdi.identification.free_parameters import collect_identification_runs, read_free_parameters
-from fdi.identification.identify import identify_model
+from fdi.identification.identify import collect_identification_runs, identify_model, read_free_parameters
 from fdi.trace.trace import Trace
 from plant.model import load_model
-from rig.campaign.units import FLOORS
+from rig.campaign.judge import FLOORS
 from rig.sequences.timing import PERIOD
 from studies.hidden_effects import command
 from studies.hidden_effects.cases import sample_healthy_plant

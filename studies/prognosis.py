@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Fault
 from fdi.prognosis.trend import Trend, fit_trend
 from fdi.progress import Progress
-from fdi.report.json import to_plain
-from fdi.report.report import Column, Line, Report, Section, Table
+from fdi.report.report import Column, Line, Report, Section, Table, to_plain
 from fdi.thresholds import INTERVAL_95_SD, TREND_FEWEST_TRACES
 from plant.errors import RigError
 from rig.campaign.batch import Workers, run_jobs

@@ -20,8 +20,8 @@ from scipy.optimize import least_squares
 
 from fdi.discovery.runs import read_source
 from fdi.discovery.update_model import Provenance, Row, format_model_file
+from fdi.estimation.fit import WITHOUT_NOISE
 from fdi.estimation.replay import compute_residuals, prepare_trace, replay_current, replay_lanes
-from fdi.estimation.unknowns import WITHOUT_NOISE
 from fdi.report.drawing import COMMAND, DRAWN_UNITS, GREEN, shorten_svg, start_figure, to_svg
 from fdi.sources import name_software
 from fdi.trace.signals import OUTPUTS, SIGNALS

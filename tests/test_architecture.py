@@ -85,7 +85,7 @@ ONLY_IN = {
 CLOCK_MODULES = {"time", "datetime", "sched"}
 CLOCK_FILES = (
     "studies/",
-    "rig/bench/responders.py",  # waits for a node to boot
+    "rig/bench/realtime.py",  # waits for a node to boot
     "rig/network/", "rig/run/loop.py", "rig/run/priority.py", "rig/cli/commands/",
     "rig/view/live_",  # a screen has a rate
     "rig/recorder/",  # its thread must close a chunk in time

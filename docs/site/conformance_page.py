@@ -3,8 +3,8 @@ from __future__ import annotations
 
 from markdown_text import MADE, escape_markup, make_table
 
-from rig.conformance.conformance_case import CHAPTERS
 from rig.conformance.run_cases import CASES
+from rig.conformance.target import CHAPTERS
 
 
 def write_conformance_page() -> list[str]:

@@ -11,6 +11,7 @@ from fdi.diagnosis.bands import (
     Bands,
     BandVerdict,
     Event,
+    Precursor,
     describe_other_model,
     is_loaded,
     is_nominal_plant,
@@ -18,14 +19,15 @@ from fdi.diagnosis.bands import (
     list_design,
     load_default_bands,
     matches_command,
+    measure_precursors,
 )
 from fdi.diagnosis.faults import FAULTS, Estimate, Level, find_ruling_fault, judge_size
-from fdi.diagnosis.joint_search import Beside
-from fdi.diagnosis.precursors import Precursor, measure_precursors
 from fdi.diagnosis.refine import (
     COARSE_STARTS,
+    Beside,
     Refinement,
     choose_size_excerpt,
+    find_effects_beside,
     get_positive,
     refine_sizes,
 )
@@ -47,15 +49,13 @@ from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
 
-VERDICTS = ("ACCEPTABLE", "MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE", "CANNOT_TELL")
-
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
     """The answer of `rig fdi` on a trace."""
 
     source: str
-    verdict: str  # one of VERDICTS
+    verdict: str  # ACCEPTABLE, MAINTENANCE, NON_NOMINAL, SOMETHING_ELSE or CANNOT_TELL
     levels: Mapping[str, Level | None]  # by fault; None: cannot be judged
     ruling: str | None  # the fault that is further gone; None if neither is
     sizes: Mapping[str, Estimate]  # by fault, Kintas and N, as the levels are judged by them
@@ -75,11 +75,6 @@ class Diagnosis:
     def events(self) -> tuple[Event, ...]:
         """Stays outside the bands."""
         return self.band_verdict.events if self.band_verdict else ()
-
-    @property
-    def is_acceptable(self) -> bool:
-        """Whether both faults are known to be acceptable."""
-        return self.verdict == "ACCEPTABLE"
 
 
 def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = None,
@@ -139,8 +134,6 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     sizes = _widen_intervals(refinement)
     beside = None
     if with_effects:
-        from fdi.diagnosis.joint_search import find_effects_beside  # here: plain diagnoses need no search
-
         beside = find_effects_beside(model, fitted, refinement, floor, progress, workers, trace)
         refinement = beside.best.refinement
         sizes = dict(beside.sizes) if refinement.is_explained else _widen_intervals(refinement)
@@ -157,15 +150,14 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
 def _find_own_bands(trace: Trace, model: Model, notes: list[str]) -> Bands | None:
     """The bands that come with the software if they fit; a note if they do not."""
     own = load_default_bands()
-    if not is_nominal_plant(model):
-        notes.append("no bands: the software's own are of the nominal unit; rig fdi --learn-bands makes others")
-        return None
-    if is_loaded(trace.load):
-        notes.append("no bands: the ram is loaded, and the software's own are of a free one")
-        return None
-    if not matches_command(own, trace.com, trace.period):
-        notes.append("no bands: the software's own are of the preflight command, this is another")
-        return None
+    for fits, reason in (
+            (is_nominal_plant(model), "the software's own are of the nominal unit; rig fdi --learn-bands makes others"),
+            (not is_loaded(trace.load), "the ram is loaded, and the software's own are of a free one"),
+            (matches_command(own, trace.com, trace.period),
+             "the software's own are of the preflight command, this is another")):
+        if not fits:
+            notes.append(f"no bands: {reason}")
+            return None
     return own
 
 

@@ -11,19 +11,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
 from fdi.estimation.replay import has_known_start, read_cycles
 from fdi.thresholds import ANCHOR_RATE
 from fdi.trace.sections import find_sections
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Flags, Floats, Trace
 from plant.errors import InputError
 from plant.model import Model
 from plant.monitor import Monitor
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 KINTAS_AXIS = np.linspace(0.0, 0.5, 21)
 FSS_AXIS = np.linspace(0.0, 90.0, 21)  # N
@@ -150,8 +146,7 @@ def _compute_maps(trace: Trace, model: Model, values: Floats, drive: str, slidin
 def _join_maps(maps: dict[str, Floats], rows: dict[str, Flags]) -> Floats:
     """RMS over the rows of both kinds, (m,) m."""
     counts = {kind: float(rows[kind].sum()) for kind in maps}
-    joint: Floats = np.sqrt(sum(counts[kind] * maps[kind] ** 2 for kind in maps) / sum(counts.values()))
-    return joint
+    return np.sqrt(sum(counts[kind] * maps[kind] ** 2 for kind in maps) / sum(counts.values()))
 
 
 def _make_map(rms: Floats, kintas: Floats, fss: Floats) -> Map:

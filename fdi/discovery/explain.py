@@ -39,7 +39,7 @@ import numpy as np
 from fdi.discovery.detectable import Blind, find_hidden_effects
 from fdi.discovery.residual_pattern import is_periodic_in_position
 from fdi.discovery.search import FINE, Hypothesis, Search, Sensitivity, compute_sensitivity
-from fdi.estimation.likelihood import compute_typical_rms
+from fdi.estimation.fit import compute_typical_rms
 from fdi.estimation.replay import find_undecided_rows
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (

@@ -9,19 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi.discovery.detectable import Blind
+from fdi.discovery.detectable import Blind, find_separation
 from fdi.discovery.explain import Explanation, Fingerprint, explain, measure_gain
 from fdi.discovery.laws.find_law import LawSearch, find_law_beside
 from fdi.discovery.laws.terms import write_law_file
-from fdi.discovery.refit import lean_model
 from fdi.discovery.residual_pattern import Pattern, find_pattern, write_effect
 from fdi.discovery.runs import Runs
 from fdi.discovery.search import Hypothesis, choose_search_excerpt, compute_p_value
-from fdi.discovery.separate import find_separation
-from fdi.estimation.fit import Fit, Value
-from fdi.estimation.likelihood import limit_friction_values
+from fdi.estimation.fit import UNREPLAYED, Fit, Value, complete_model, limit_friction_values, silence_readings
 from fdi.estimation.long_recordings import PIECE, can_be_cut, cut_excerpt, make_excerpt
-from fdi.estimation.unknowns import UNREPLAYED, complete_model
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     EFFECT_INTERVAL_FACTOR,
@@ -33,7 +29,7 @@ from fdi.thresholds import (
     SUSPICIOUS_TOLERANCES,
 )
 from plant.effects import CATALOGUE
-from plant.lanes import Lanes, compile_kernels
+from plant.lanes import Lanes, compile_kernels, list_kernel_variants
 from plant.model import Model, find_quantity, list_searched_effects
 from plant.run import report_law_errors
 from plant.starts import ensure_starts
@@ -129,6 +125,13 @@ def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: 
     with report_law_errors(model):
         progress("compiling the plant with it, once", 0.0)
         _compile_kernels(model, replayed)
+
+
+def lean_model(model: Model, effects: Sequence[str]) -> Model:
+    """The whole catalogue where its quick kernels have these effects; else a model of its own, worth its compiling."""
+    every, own = complete_model(model), silence_readings(model.with_effects(effects))
+    quick = {e for rung in list_kernel_variants(every)[:-1] for e in rung.model.effects}
+    return every if set(own.effects) <= quick else own
 
 
 def _compile_kernels(model: Model, effects: Sequence[str]) -> None:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.discovery.search import Hypothesis, Search
-from fdi.estimation.likelihood import Problem
+from fdi.estimation.fit import Problem
 from fdi.output import write_text
 from fdi.thresholds import PATTERN_EXPLAINED_SHARE, PATTERN_VISIBLE_RATIO
 from fdi.trace.signals import OUTPUTS

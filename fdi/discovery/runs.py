@@ -68,7 +68,7 @@ def collect_runs(model: Model, trace: Trace, repeats: Sequence[Trace] = (), hold
 def _prepare_runs(model: Model, traces: Sequence[Trace], sources: Sequence[Source], repeats: int,
                   signals: Sequence[str] | None) -> Runs:
     """The runs of a search: the one to explain, so many repeats, and a held-out one if there is one more."""
-    _check_distinct(sources, repeats)
+    require_distinct(sources, "--repeat", "the same command run again", 1 + repeats)
     names = [s.file for s in sources]
     est = _prepare_run(traces[0], model, signals, names[0])
     model = match_period(model, est, SAME_PERIOD)
@@ -99,14 +99,23 @@ def read_source(file: str) -> Source:
         raise InputError(file, "", f"a trace that can be read ({error.strerror})") from error
 
 
-def _check_distinct(sources: Sequence[Source], repeats: int) -> None:
-    """Refuse a run that stands in for itself: it would prove whatever is asked of it."""
+def require_distinct(sources: Sequence[Source], first: str, expected: str, count: int) -> None:
+    """Refuse a run that stands in for itself: it would prove whatever is asked of it.
+
+    Args:
+        sources: of the runs to fit, then of the held-out ones.
+        first: where a run to fit was named, for the message.
+        expected: what it should be.
+        count: of the runs to fit.
+
+    Raises:
+        InputError: a run that is given twice.
+    """
     seen: dict[str, str] = {}
     for number, (file, content) in enumerate(sources):
-        if content in seen and 0 < number <= repeats:
-            raise InputError("--repeat", file, f"the same command run again; this is {seen[content]} itself")
         if content in seen:
-            raise InputError("--holdout", file, f"a run that no fit has seen; this is {seen[content]} itself")
+            place, words = (first, expected) if number < count else ("--holdout", "a run that no fit has seen")
+            raise InputError(place, file, f"{words}; this is {seen[content]} itself")
         seen[content] = file
 
 

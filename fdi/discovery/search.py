@@ -13,29 +13,31 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtrc
 
 from fdi.estimation import noise as noises
-from fdi.estimation.fit import Fit, continue_fit, fit_unknowns, follow_population, linearise
-from fdi.estimation.likelihood import (
+from fdi.estimation.fit import (
+    Fit,
     Free,
     Problem,
+    complete_model,
     compute_misfit,
     compute_weights,
+    continue_fit,
+    fit_unknowns,
+    follow_population,
+    linearise,
+    list_all_unknowns,
+    list_effect_unknowns,
+    name_sine,
     place_in_healthy_unit,
     scale_noise,
     scaled_bounds,
+    silence_readings,
     span_all_rows,
+    turn_amplitudes_positive,
     weigh_priors,
 )
 from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, is_long, judge_on_all
 from fdi.estimation.noise import Noise
 from fdi.estimation.unidentifiable import finish_fit, list_powers, scale_together
-from fdi.estimation.unknowns import (
-    complete_model,
-    list_all_unknowns,
-    list_effect_unknowns,
-    name_sine,
-    silence_readings,
-    turn_amplitudes_positive,
-)
 from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import (
     GAIN_DOUBTFUL,
@@ -68,7 +70,6 @@ class Hypothesis:
     effects: tuple[str, ...]
     fit: Fit
     errors: dict[str, float]  # RMS residual, SI
-    repeated: dict[str, float] = field(default_factory=dict)  # RMS residual on the repeats
     ratio: dict[str, float] = field(default_factory=dict)  # error that repeats, over the floor; 1 = only noise
     repeat_cost: float = 0.0
     others: tuple[Floats, ...] = ()  # residuals (s, n) on the repeats
@@ -290,12 +291,11 @@ class Search:
         others = [p.compute_residuals(found.free, x)[0] for p in self.repeats]
         if not others:
             floor = {s: float(np.hypot(n.level, c)) for s, n, c in zip(signals, self.noise, coarse, strict=True)}
-            return Hypothesis(effects, found, errors, {}, {s: errors[s] / floor[s] for s in signals})
+            return Hypothesis(effects, found, errors, {s: errors[s] / floor[s] for s in signals})
         pairs = zip(self.repeats, others, strict=True)
         cost = float(np.mean([compute_misfit(p.whiten_residuals(r[None]))[0] for p, r in pairs]))
-        repeated = {s: float(np.sqrt(np.mean([_measure_rms(r, signals)[s] ** 2 for r in others]))) for s in signals}
         ratio = dict(zip(signals, measure_repeating(own, others, coarse), strict=True))
-        return Hypothesis(effects, found, errors, repeated, ratio, cost, tuple(others))
+        return Hypothesis(effects, found, errors, ratio, cost, tuple(others))
 
     def make_unseen_problem(self, steps: int | None = None) -> Problem:
         """The held-out run in place of the search's own."""
@@ -325,12 +325,11 @@ class Search:
         out = []
         for h, own, *others in zip(hypotheses, *runs, strict=True):
             errors = own.errors
-            repeated = {s: float(np.sqrt(np.mean([o.errors[s] ** 2 for o in others]))) for s in errors if others}
             ratio = {s: min(x, errors[s] / floor[s]) for s, x in h.ratio.items()}
             if not all(j.holds(floor) for j in (own, *others)):
                 left = [j.typical_ratio(floor) for j in (own, *others)]
                 ratio = {s: max(x, *(each[s] for each in left)) for s, x in h.ratio.items()}
-            out.append(replace(h, errors=errors, repeated=repeated, ratio=ratio, judgement=own))
+            out.append(replace(h, errors=errors, ratio=ratio, judgement=own))
         return out
 
     def learn_noise(self, best: Hypothesis) -> None:

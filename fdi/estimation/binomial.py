@@ -6,8 +6,9 @@ from math import exp, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
+
+from fdi.trace.trace import Floats
 
 
 class Share(NamedTuple):
@@ -43,15 +44,7 @@ def clopper_pearson_interval(good: int, of: int, confidence: float = 0.95) -> tu
     return low, high
 
 
-class Mean(NamedTuple):
-    """A mean and its interval."""
-
-    value: float
-    low: float
-    high: float
-
-
-def estimate_geometric_mean(logs: NDArray[np.float64], risk: float, fewest: int) -> Mean:
+def estimate_geometric_mean(logs: Floats, risk: float, fewest: int) -> tuple[float, float, float]:
     """The geometric mean of independent ratios and its interval by Student's t, NaN of fewer ratios than `fewest`.
 
     Args:
@@ -64,10 +57,10 @@ def estimate_geometric_mean(logs: NDArray[np.float64], risk: float, fewest: int)
     """
     known = logs[np.isfinite(logs)]
     if not len(known):
-        return Mean(nan, nan, nan)
+        return nan, nan, nan
     mean = float(known.mean())
     if len(known) < fewest:
-        return Mean(exp(mean), nan, nan)
+        return exp(mean), nan, nan
     half = float(stdtrit(len(known) - 1, 1.0 - risk / 2) * known.std(ddof=1) / sqrt(len(known)))
     with np.errstate(over="ignore"):  # of ratios that scatter widely nothing is known: up to infinity
-        return Mean(exp(mean), float(np.exp(mean - half)), float(np.exp(mean + half)))
+        return exp(mean), float(np.exp(mean - half)), float(np.exp(mean + half))

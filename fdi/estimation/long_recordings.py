@@ -18,9 +18,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi.estimation.fit import Fit
-from fdi.estimation.likelihood import BLOCK, Problem, limit_dynamic_friction, remove_mains, sum_blocks
-from fdi.estimation.unknowns import list_tolerance_sizes
+from fdi.estimation.fit import (
+    BLOCK,
+    Fit,
+    Problem,
+    limit_dynamic_friction,
+    list_tolerance_sizes,
+    remove_mains,
+    sum_blocks,
+)
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import ANCHOR_RATE, RESIDUAL_HELD_OUT
 from fdi.trace.trace import PER_ROW, Flags, Floats, Trace

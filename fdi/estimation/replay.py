@@ -19,11 +19,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi.estimation.fit import Fit
-from fdi.estimation.likelihood import Problem, limit_dynamic_friction
+from fdi.estimation.fit import WITHOUT_NOISE, Fit, Problem, limit_dynamic_friction, list_tolerance_sizes
 from fdi.estimation.long_recordings import choose_excerpt, cut_excerpt, is_long, replay_in_turns
 from fdi.estimation.noise import WINDOW
-from fdi.estimation.unknowns import WITHOUT_NOISE, list_tolerance_sizes
 from fdi.thresholds import (
     ANCHOR_RATE,
     FRICTION_UNCERTAINTY,

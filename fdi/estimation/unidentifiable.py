@@ -16,14 +16,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.fit import DAMPINGS, Fit, cut_at_bounds, replay_fit, step_within_bounds
-from fdi.estimation.likelihood import (
+from fdi.estimation.fit import (
+    DAMPINGS,
+    Fit,
     Free,
     Problem,
     compute_misfit,
     compute_weights,
+    cut_at_bounds,
+    form_normal_equations,
     limit_dynamic_friction,
+    replay_fit,
     scaled_bounds,
+    step_within_bounds,
     weigh_priors,
 )
 from fdi.progress import NO_STAGE, Stage
@@ -400,14 +405,9 @@ def linearise_along(problem: Problem, now: Fit, slopes: Problem, flat: Floats) -
     steep = np.asarray(np.linalg.pinv(moves), np.float64) @ differences.reshape(len(x), -1)
     jacobian = remove_slope(steep.reshape(len(x), *now.white.shape), flat)
     heavy = (jacobian * compute_weights(now.white)).reshape(len(x), -1)
-    hessian = heavy @ jacobian.reshape(len(x), -1).T + np.diag(weigh_priors(now.free))
-    known = invert_hessian(hessian)
-    return replace(now, cost=_add_prior(now, now.misfit), covariance=known, jacobian=jacobian)
-
-
-def _add_prior(fit: Fit, misfit: float) -> float:
-    """The cost of a fit with this misfit."""
-    return misfit + float(fit.x @ np.diag(weigh_priors(fit.free)) @ fit.x)
+    prior = np.diag(weigh_priors(now.free))
+    known = invert_hessian(heavy @ jacobian.reshape(len(x), -1).T + prior)
+    return replace(now, cost=now.misfit + float(x @ prior @ x), covariance=known, jacobian=jacobian)
 
 
 def _find_principal(covariance: Floats) -> Floats:
@@ -419,14 +419,12 @@ def _find_principal(covariance: Floats) -> Floats:
 
 def take_best_step(problem: Problem, fit: Fit) -> Fit:
     """The best of some damped Gauss-Newton steps; the fit itself if none gains."""
-    prior = np.diag(weigh_priors(fit.free))
-    flat, heavy = (j.reshape(len(fit.x), -1) for j in (fit.jacobian, fit.jacobian * compute_weights(fit.white)))
-    gradient, hessian = heavy @ fit.white.reshape(-1) + prior @ fit.x, heavy @ flat.T + prior
+    gradient, hessian = form_normal_equations(fit)
     trials = np.array([step_within_bounds(fit, hessian, gradient, damping) for damping in DAMPINGS])
     residuals = problem.compute_residuals(fit.free, trials)
     white = problem.whiten_residuals(residuals)
     held = compute_misfit(white)
-    costs = held + np.einsum("ij,jk,ik->i", trials, prior, trials)
+    costs = held + np.einsum("ij,jk,ik->i", trials, np.diag(weigh_priors(fit.free)), trials)
     k = int(np.argmin(costs))
     if costs[k] >= fit.cost:
         return fit

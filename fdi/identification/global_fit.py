@@ -12,10 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fdi.estimation.fit import Fit, evolve_fit, follow_population
-from fdi.estimation.likelihood import Free, compute_misfit, scale_noise, scaled_bounds
+from fdi.estimation.fit import Fit, Free, compute_misfit, evolve_fit, follow_population, scale_noise, scaled_bounds
 from fdi.estimation.unidentifiable import (
     LogFree,
     LogFrictionRatio,
@@ -26,9 +24,8 @@ from fdi.estimation.unidentifiable import (
     start_fit,
 )
 from fdi.progress import Progress, ignore_progress
+from fdi.trace.trace import Floats
 from plant.threads import map_in_threads
-
-Floats = NDArray[np.float64]
 
 # factor on the noise, fits that go on, rounds of each, solver steps a cycle
 FIT_STAGES = ((100.0, 3, 3, 10), (30.0, 2, 4, 10), (6.0, 1, 5, 20), (1.0, 1, 8, 20))

@@ -1,35 +1,58 @@
 """The nominal model of a user's actuator: its parameters from measured runs, and what these runs cannot tell.
 
-The data sheet says where each parameter is about (`free_parameters`). Regressions on the signals give first values
+The data sheet says where each parameter is about. Regressions on the signals give first values
 (`estimate_by_regressions`), a fit that begins far away goes on from there (`global_fit`), and the last rounds have fine
 steps and the noise that is left. A parameter whose interval stays wide is not identifiable from these runs: it keeps
-the data sheet's value, and `experiments` says which run would show it. Held-out runs judge the result.
+the data sheet's value, and simulated candidate runs say which one would show it. Held-out runs judge the result.
 """
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fdi.discovery.runs import Source
+from fdi.discovery.runs import Source, hash_columns, read_source, require_distinct
 from fdi.discovery.update_model import Provenance, format_model_file
 from fdi.estimation import noise as noises
-from fdi.estimation.fit import Fit, Value
-from fdi.estimation.likelihood import Problem, compute_misfit, compute_typical_rms, limit_friction_values
+from fdi.estimation.fit import (
+    Fit,
+    Free,
+    Problem,
+    Value,
+    compute_misfit,
+    compute_typical_rms,
+    limit_friction_values,
+    list_tolerance_unknowns,
+    scaled_bounds,
+    silence_readings,
+)
 from fdi.estimation.long_recordings import can_be_cut, choose_excerpt, cut_excerpt, is_long
 from fdi.estimation.noise import sensor_floors
-from fdi.estimation.replay import differentiate, find_undecided_rows
-from fdi.estimation.unidentifiable import LogFrictionRatio, LogProblem, compute_values, start_fit
-from fdi.estimation.unknowns import silence_readings
-from fdi.identification.experiments import Advice, advise_experiments
-from fdi.identification.free_parameters import Range, get_systematic_sd, list_unknowns
+from fdi.estimation.replay import (
+    SAME_PERIOD,
+    differentiate,
+    find_undecided_rows,
+    hold_inputs,
+    match_period,
+    prepare_trace,
+)
+from fdi.estimation.unidentifiable import (
+    LogFree,
+    LogFrictionRatio,
+    LogProblem,
+    compute_values,
+    remove_slope,
+    start_fit,
+    take_logarithm,
+)
 from fdi.identification.global_fit import (
     descend,
+    find_flat,
     fit_from_afar,
     is_fitted,
     polish_fit,
@@ -45,17 +68,360 @@ from fdi.thresholds import (
     HELD_OUT_UNDECIDED_SHARE,
     IDENTIFIABLE_SHARE,
     IDENTIFIED_INTERVAL_FACTOR,
+    IDENTIFIED_SYSTEMATIC_SD,
     INTERVAL_95_SD,
     MOVING_RAM,
+    PILOT_FLOW_SYSTEMATIC_SD,
     RESIDUAL_HELD_OUT,
     RESIDUAL_WORST,
+    STATIC_FRICTION_SYSTEMATIC_SD,
 )
-from fdi.trace.signals import SIGNALS
-from fdi.trace.trace import Trace, rms, shift_rows
-from plant.model import Model
+from fdi.trace.signals import OUTPUTS, SIGNALS
+from fdi.trace.trace import Floats, Trace, rms, shift_rows
+from plant.errors import InputError
+from plant.lanes import Lanes
+from plant.model import Model, find_quantity, find_shipped_model
+from plant.parameters import read_toml
 from plant.threads import count_threads
 
-Floats = NDArray[np.float64]
+FRICTIONS = (("jack.static_friction", "jack.dynamic_friction"), ("spool.static_friction", "spool.dynamic_friction"))
+SYSTEMATIC_SD = {"jack.static_friction": STATIC_FRICTION_SYSTEMATIC_SD, "pilot.flow_gain": PILOT_FLOW_SYSTEMATIC_SD}
+
+
+class Range(NamedTuple):
+    """How widely a parameter is free: the data sheet's value and the bounds of the fit, SI."""
+
+    name: str
+    centre: float
+    low: float
+    high: float
+    unit: str
+
+    @property
+    def is_relative(self) -> bool:
+        """Whether the fit works on the logarithm: the parameter cannot be zero or negative."""
+        return self.low > 0.0
+
+    @property
+    def half_width(self) -> float:
+        """Half the range: of the logarithm if the range is relative, else SI."""
+        return 0.5 * (math.log(self.high / self.low) if self.is_relative else self.high - self.low)
+
+
+def read_free_parameters(model: Model, source: str | Path | None) -> tuple[Range, ...]:
+    """The free parameters of a model: those of its file, or those of the nominal model where that lists none.
+
+    Args:
+        model: with the values of the data sheet.
+        source: the model's file; None for the nominal model.
+
+    Raises:
+        InputError: a table [identify] with an unknown parameter, or with a factor or range that cannot be; or no such
+            table for a plant that the nominal model is not of.
+    """
+    path = find_shipped_model(str(source)) or Path(str(source))
+    named = read_toml(path).get("identify") if source is not None and path.is_file() else None
+    if named is None and model.plant != "eha":
+        raise InputError(source, "identify", "tables [identify.GROUP] that say what is free (docs/identify.md)")
+    usual = Path(str(files("plant").joinpath("models", "nominal.toml")))
+    return parse_free_parameters(read_toml(usual)["identify"] if named is None else named, model,
+                                 source if named is not None else usual.name)
+
+
+def parse_free_parameters(tables: object, model: Model, where: object) -> tuple[Range, ...]:
+    """The ranges that the tables of [identify] describe, in the model's order.
+
+    Raises:
+        InputError: an unknown parameter, or a factor or range that cannot be.
+    """
+    if not isinstance(tables, Mapping):
+        raise InputError(where, "identify", "a table [identify.GROUP] of factors and ranges")
+    found = {}
+    for group, fields in tables.items():
+        if not isinstance(fields, Mapping):
+            raise InputError(where, f"identify.{group}", "a table of factors and ranges, such as area = 4")
+        for field, width in fields.items():
+            name = f"{group}.{field}"
+            find_quantity(name, where, model.plant)
+            if name not in model.values:
+                raise InputError(where, f"identify.{name}", f"a parameter that the model has; add {group} to its "
+                                                            "effects")
+            found[name] = _parse_range(name, width, model, where)
+    if not found:
+        raise InputError(where, "identify", "at least one free parameter")
+    return tuple(found[name] for name in model.list_names() if name in found)
+
+
+def _parse_range(name: str, width: Any, model: Model, where: object) -> Range:
+    q, value = find_quantity(name, where, model.plant), model[name]
+    possible_low, possible_high = max(q.low, q.above), min(q.high, q.below)
+    field = f"identify.{name}"
+    if _is_number(width):
+        if not width > 1.0 or math.isinf(width):
+            raise InputError(where, field, f"a factor above 1, not {width:g}")
+        if value <= 0.0:
+            raise InputError(where, field, f"a range [low, high]: a factor says nothing of {value:g}")
+        low, high = max(value / width, possible_low), min(value * width, possible_high)
+    elif isinstance(width, list) and len(width) == 2 and all(map(_is_number, width)) and width[0] < width[1]:
+        low, high = map(float, width)
+        if low < possible_low or high > possible_high:
+            raise InputError(where, field, f"a range within {possible_low:g} .. {possible_high:g} {q.unit}")
+    else:
+        raise InputError(where, field, f"a factor above 1, or a range [low, high] in {q.unit}, not {width!r}")
+    middle = math.sqrt(low * high) if low > 0.0 else 0.5 * (low + high)
+    return Range(name, value if low <= value <= high else middle, low, high, q.unit)
+
+
+def _is_number(x: object) -> bool:
+    return isinstance(x, (int, float)) and not isinstance(x, bool)
+
+
+def get_systematic_sd(name: str) -> float:
+    """The relative standard deviation that solver and stick-slip add to a parameter beside that of the fit."""
+    return SYSTEMATIC_SD.get(name, IDENTIFIED_SYSTEMATIC_SD)
+
+
+def list_unknowns(model: Model, ranges: tuple[Range, ...]) -> tuple[Free, ...]:
+    """What the fit may change: the free parameters, and the tolerances of the others."""
+    free = {r.name: _make_free(r) for r in ranges}
+    free |= {f.name: take_logarithm(f) for f in list_tolerance_unknowns(model) if f.name not in free}
+    for static, dynamic in FRICTIONS:
+        if static in free and isinstance(free.get(dynamic), LogFree):
+            del free[static]  # to come after the dynamic one
+            free[static] = _make_friction_ratio(model, static, dynamic, static in {r.name for r in ranges})
+    return tuple(free.values())
+
+
+def _make_friction_ratio(model: Model, static: str, dynamic: str, is_free: bool) -> LogFrictionRatio:
+    """Static over dynamic friction, at least 1.
+
+    As two separate unknowns the dynamic friction could go above the static one, where no signal depends on it any more:
+    a fit that got there would stay.
+    """
+    usual = math.log(max(model[static] / model[dynamic], 1.0))
+    spread, highest = (0.5, math.log(20.0)) if is_free else (0.03, usual + 1.0)
+    return LogFrictionRatio(static, usual, spread, 1.0, 0.0, max(highest, usual), 0.3)
+
+
+def _make_free(r: Range) -> Free:
+    """The parameter, known beforehand to lie within half its range of the data sheet's value."""
+    if r.is_relative:
+        return LogFree(r.name, math.log(r.centre), r.half_width, 1.0, math.log(r.low), math.log(r.high), 0.02)
+    return Free(r.name, r.centre, r.half_width, 1.0, r.low, r.high, 0.02)
+
+
+class IdentificationRuns(NamedTuple):
+    """What an identification works on."""
+
+    model: Model  # at the cycle of the runs
+    fitted: tuple[Trace, ...]  # prepared, with the same outputs
+    held_out: tuple[Trace, ...]
+    sources: tuple[Source, ...]  # of all of them, the held-out ones last
+
+
+def read_identification_runs(model: Model, ranges: Sequence[Range], fitted: Sequence[str], held_out: Sequence[str],
+                             signals: Sequence[str] | None = None) -> IdentificationRuns:
+    """Read and prepare the files of an identification.
+
+    Raises:
+        InputError: a file that cannot be used, or a run given twice.
+    """
+    files = [*fitted, *held_out]
+    sources = [read_source(file) for file in files]
+    return prepare_runs(model, ranges, [Trace.read(file) for file in files], sources, len(fitted), signals)
+
+
+def collect_identification_runs(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace],
+                                held_out: Sequence[Trace], signals: Sequence[str] | None = None) -> IdentificationRuns:
+    """The runs of an identification from traces that have been read or simulated.
+
+    Raises:
+        InputError: a trace that cannot be used, or a run given twice.
+    """
+    traces = [*fitted, *held_out]
+    sources = [Source(t.provenance.get("source", "trace"), hash_columns(t)) for t in traces]
+    return prepare_runs(model, ranges, traces, sources, len(fitted), signals)
+
+
+def prepare_runs(model: Model, ranges: Sequence[Range], traces: Sequence[Trace], sources: Sequence[Source], fitted: int,
+                 signals: Sequence[str] | None) -> IdentificationRuns:
+    """The runs made ready for replay: the first `fitted` to fit, the others held out.
+
+    Raises:
+        InputError: a trace that cannot be used, or a run given twice.
+    """
+    if not fitted:
+        raise InputError("RUN", "", "at least one run to fit")
+    require_distinct(sources, "RUN", "other runs", fitted)
+    for name in signals or ():
+        if name not in OUTPUTS:
+            raise InputError("--signals", name, f"some of {','.join(OUTPUTS)}")
+    shared = [s for s in OUTPUTS if all(s in t.signals for t in traces[:fitted]) and (signals is None or s in signals)]
+    if not shared:
+        raise InputError(sources[0].file, ", ".join(signals or OUTPUTS), "a signal that every run to fit has")
+    limits = ("jack.travel", "spool.travel", "supply.pressure", "controller.current_limit")
+    widest = replace(model, values={**model.values, **{r.name: r.high for r in ranges if r.name in limits}})
+    prepared = [_prepare(t, widest, [s for s in shared if s in t.signals] or shared, source)
+                for t, source in zip(traces, sources, strict=True)]
+    model = match_period(model, prepared[0], SAME_PERIOD)
+    period = model["controller.period"]
+    for trace, source in zip(prepared, sources, strict=True):
+        if abs(trace.period / period - 1.0) > SAME_PERIOD:
+            raise InputError(source.file, "t", f"rows {period:g} s apart, as in {sources[0].file}")
+    return IdentificationRuns(model, tuple(prepared[:fitted]), tuple(prepared[fitted:]), tuple(sources))
+
+
+def _prepare(trace: Trace, model: Model, outputs: Sequence[str], source: Source) -> Trace:
+    if model.plant != "eha":
+        return hold_inputs(trace, outputs, source.file)
+    try:
+        return prepare_trace(trace, model, outputs, source.file)
+    except InputError as error:
+        if "a signal that changes" in error.expected and np.ptp(trace.com) == 0.0:  # at rest: says little, but is a run
+            return hold_inputs(trace, outputs, source.file)
+        raise
+
+
+DIFFERENCE = 0.01  # of a logarithm, or of half a range, for slopes
+STEPS = 20  # solver steps a cycle
+
+
+class Experiment(NamedTuple):
+    """A run that could be made: its name, what to do, its command, (n,) m, by the model, and whether under a load."""
+
+    name: str
+    what: str
+    build: Callable[[Model], Floats]
+    is_loaded: bool = False
+
+
+class Advice(NamedTuple):
+    """How to learn a parameter: the run that narrows its interval most, None where no candidate would do."""
+
+    parameter: str
+    experiment: str | None
+    what: str
+    share: float  # of half the range that the interval would take up with that run beside the present ones
+
+
+def _move(model: Model, levels: Sequence[tuple[float, float]], scale: float, speed: float = math.inf) -> Floats:
+    """A command that goes to each of some (level, seconds), times `scale` m, at `speed` m/s, and holds it."""
+    period, at, parts = model["controller.period"], 0.0, []
+    for level, seconds in levels:
+        to = level * scale
+        if to != at and speed < math.inf:
+            parts.append(np.linspace(at, to, max(2, round(abs(to - at) / speed / period)), endpoint=False))
+        parts.append(np.full(max(1, round(seconds / period)), to))
+        at = to
+    return np.concatenate(parts)
+
+
+def _build_steps(model: Model) -> Floats:
+    levels = (0.0, 0.1, 0.0, 0.6, -0.6, 0.0, -0.1, 0.0)
+    return _move(model, [(level, 0.8 if abs(level) < 0.5 else 1.5) for level in levels], model["jack.travel"])
+
+
+def _build_ramps(model: Model) -> Floats:
+    x = 0.03 * model["jack.travel"]
+    return _move(model, ((0.0, 0.3), (1.0, 0.5), (-1.0, 0.5), (0.0, 0.3)), x, x / 2.0)
+
+
+def _build_sweep(model: Model) -> Floats:
+    t = np.arange(0.0, 5.0, model["controller.period"])
+    com = 0.03 * model["jack.travel"] * np.sin(2.0 * np.pi * (0.5 * t + 1.9 * t**2))  # 0.5 to 19.5 Hz
+    return np.concatenate([_move(model, ((0.0, 0.3),), 0.0), com])
+
+
+def _build_stops(model: Model) -> Floats:
+    speed = 0.2 * model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"]  # with the spool a fifth open
+    return _move(model, ((0.0, 0.3), (1.0, 0.8), (-1.0, 0.8), (0.0, 0.3)), 1.1 * model["jack.travel"], speed)
+
+
+EXPERIMENTS = (
+    Experiment("steps", "steps of a tenth and of six tenths of the stroke", _build_steps),
+    Experiment("ramps", "ramps as slow as 1.5 % of the stroke a second", _build_ramps),
+    Experiment("sweep", "a sine sweep from 0.5 to 20 Hz of 3 % of the stroke", _build_sweep),
+    Experiment("stops", "a command 10 % beyond both end stops, held there for 0.8 s", _build_stops),
+    Experiment("load", "steps under a known force, a third of the largest, pushing and pulling (column load)",
+               _build_steps, is_loaded=True),
+)
+
+
+def advise_experiments(model: Model, free: Sequence[Free], problem: LogProblem, fit: Fit | None, unseen: Sequence[str]
+                       ) -> list[Advice]:
+    """For each parameter that is not identifiable the candidate run that would show it best.
+
+    Args:
+        model: the fitted one.
+        free: all unknowns, those that the present runs do not show as well.
+        problem: the present runs.
+        fit: what they gave; None where they gave nothing.
+        unseen: the parameters to learn.
+    """
+    x = scale_values(free, model.values)
+    present = replace(problem, model=silence_readings(model), steps=STEPS, bare=None, _lanes={})
+    known = np.diag([f.prior**-2 for f in free])
+    if fit is not None:
+        known = known + _measure_information(present, free, x)
+    found = {}
+    for experiment in EXPERIMENTS:
+        com = experiment.build(model)
+        part = np.arange(len(com)) / len(com)
+        force = 0.3 * model["jack.area"] * model["supply.pressure"] * experiment.is_loaded
+        load = force * (((part > 0.2) & (part < 0.45)).astype(float) - ((part >= 0.45) & (part < 0.7)))
+        trace = _simulate(model, com, load, problem.trace.outputs)
+        run = replace(present, trace=trace, also=(), _lanes={})
+        found[experiment.name] = known + _measure_information(run, free, x)
+    what = {e.name: e.what for e in EXPERIMENTS}
+    missing = [s for s in OUTPUTS if s not in problem.trace.outputs]
+    if missing and fit is not None:
+        runs = [_simulate(model, t.com, t.load, OUTPUTS) for t in (problem.trace, *problem.also)]
+        noise = tuple(noises.white_noise(model[SIGNALS[s].noise]) for s in OUTPUTS)
+        sensed = replace(present, trace=runs[0], also=tuple(runs[1:]), noise=noise, _lanes={})
+        found["sensors"] = np.diag([f.prior**-2 for f in free]) + _measure_information(sensed, free, x)
+        what["sensors"] = f"the same runs with {' and '.join(SIGNALS[s].symbol for s in missing)} measured"
+    shares = {name: _compute_shares(free, information) for name, information in found.items()}
+    advice = []
+    for name in unseen:
+        share, best = min((shares[experiment][name], experiment) for experiment in shares)
+        is_enough = share <= IDENTIFIABLE_SHARE
+        advice.append(Advice(name, best if is_enough else None, what[best] if is_enough else "", share))
+    return advice
+
+
+def _simulate(model: Model, com: Floats, load: Floats, outputs: Sequence[str]) -> Trace:
+    """The closed loop on a command, as a recording without noise."""
+    out = Lanes(silence_readings(model), (), STEPS).closed_loop(np.empty((1, 0)), com, load)[0]
+    columns = {"com": com, "xj": out[:, 0], "cor": out[:, 1], "p12": out[:, 2], "xs": out[:, 3], "load": load}
+    return hold_inputs(Trace.from_columns(columns, model["controller.period"], {}), tuple(outputs))
+
+
+def _measure_information(problem: LogProblem, free: Sequence[Free], x: Floats) -> Floats:
+    """What runs tell of scaled unknowns at `x` (p,): the matrix (p, p) of their slopes' products."""
+    low, high = scaled_bounds(free)
+    steps = np.array([DIFFERENCE / f.scale if isinstance(f, LogFree) else DIFFERENCE for f in free])
+    steps = np.where(x + steps > high, -steps, steps)
+    white = problem.compute_white_residuals(free, np.vstack([x, np.clip(x + np.diag(steps), low, high)]))
+    jacobian = remove_slope((white[1:] - white[0]) / steps[:, None, None], find_flat(problem, free, x))
+    rows = jacobian.reshape(len(free), -1)
+    return rows @ rows.T
+
+
+def _compute_shares(free: Sequence[Free], information: Floats) -> dict[str, float]:
+    """Of half its range, the half width of each parameter's interval."""
+    covariance = np.linalg.pinv(information)
+    names = [f.name for f in free]
+    shares = {}
+    for k, f in enumerate(free):
+        slope = np.zeros(len(free))
+        slope[k] = f.scale
+        if isinstance(f, LogFrictionRatio):
+            dynamic = names.index(f.dynamic_name)
+            slope[dynamic] = free[dynamic].scale
+        spread = IDENTIFIED_INTERVAL_FACTOR * float(np.sqrt(slope @ covariance @ slope))
+        shares[f.name] = INTERVAL_95_SD * float(np.hypot(spread, get_systematic_sd(f.name))) / (f.scale * f.prior)
+    return shares
+
 
 LAST_STEPS = 50  # solver steps a cycle, of the last rounds
 OPEN_MISFIT = 4.0  # -2 log likelihood by which a parameter may go to the end of its range and still not be seen
@@ -626,8 +992,7 @@ def _dwells(x: Floats, limit: float, share: float = 2e-3, rows: int = 5 * STALLE
 
 
 def _smooth_speed(trace: Trace) -> Floats:
-    speed: Floats = differentiate(_fill(trace.mask_unusable("xj")), SMOOTHED, 1) / trace.period
-    return speed
+    return differentiate(_fill(trace.mask_unusable("xj")), SMOOTHED, 1) / trace.period
 
 
 def _fill(x: Floats) -> Floats:
@@ -636,8 +1001,7 @@ def _fill(x: Floats) -> Floats:
 
 
 def _average(x: Floats, size: int) -> Floats:
-    mean: Floats = np.convolve(np.pad(_fill(x), size // 2, "edge"), np.full(size, 1.0 / size), "valid")
-    return mean
+    return np.convolve(np.pad(_fill(x), size // 2, "edge"), np.full(size, 1.0 / size), "valid")
 
 
 def _regress(y: Sequence[Floats], columns: Sequence[Sequence[Floats]], largest: float = 1.0, rounds: int = 6
@@ -666,5 +1030,4 @@ def _regress(y: Sequence[Floats], columns: Sequence[Sequence[Floats]], largest: 
         left = np.abs(target - (table / scale) @ found)
         usual = 1.5 * float(np.median(left)) + 1e-300
         weight = np.sqrt(np.minimum(1.0, usual / np.maximum(left, 1e-300)))
-    coefficients: Floats = found / scale
-    return coefficients
+    return found / scale

@@ -12,18 +12,19 @@ from fdi.diagnosis.bands import (
     Bands,
     BandVerdict,
     Event,
+    Precursor,
     RampBand,
     StepBand,
     compute_half_range,
     compute_speed,
     find_lasting_peak,
+    format_precursor,
     read_columns,
     select_ramp_rows,
 )
 from fdi.diagnosis.diagnosis import Diagnosis
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Fault, Level, compute_severity
-from fdi.diagnosis.joint_search import Beside, Explanation
-from fdi.diagnosis.precursors import Precursor, format_precursor
+from fdi.diagnosis.refine import Beside, Explanation
 from fdi.diagnosis.rms_grid import LOWER_CORNER, UPPER_CORNER, Grid, Map
 from fdi.report.drawing import (
     BLUE,

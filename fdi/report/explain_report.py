@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.discovery.explain_runs import Answer, Candidate, Suspicious
-from fdi.discovery.residual_pattern import find_smooth_rows
+from fdi.discovery.laws.find_law import Law, LawCurve, LawSearch, Missing
+from fdi.discovery.laws.terms import describe_formula
+from fdi.discovery.residual_pattern import Pattern, find_smooth_rows
 from fdi.discovery.runs import Source
 from fdi.discovery.search import Hypothesis
 from fdi.discovery.update_model import ModelUpdate, Row
@@ -48,13 +49,8 @@ from fdi.report.numbers import (
     name_parameter,
 )
 from fdi.report.report import Cell, Column, Figure, Line, Listing, Medium, Mood, Report, Section, Table, tabulate
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Floats, Trace
 
-if TYPE_CHECKING:
-    from fdi.discovery.laws.find_law import Law, LawCurve, LawSearch, Missing
-    from fdi.discovery.residual_pattern import Pattern
-
-Floats = NDArray[np.float64]
 BySignal = Mapping[str, float]  # SI
 
 MOODS: dict[str, Mood] = {"NOTHING_MISSING": "good", "EXPLAINED": "good", "PARTLY": "doubtful", "AMBIGUOUS": "doubtful",
@@ -423,8 +419,6 @@ def _describe_law(found: LawSearch) -> str:
 
 
 def _tabulate_terms(law: Law) -> Table:
-    from fdi.discovery.laws.terms import describe_formula
-
     return Table([Column("parameter"), Column("meaning"), Column("value and 95 % interval")], [
         [Cell(name, is_strong=name == term.name),
          term.words if name == term.name else name.removeprefix(f"{term.name}_"),
@@ -470,8 +464,6 @@ def _tabulate_dependences(missing: Sequence[Missing]) -> Table:
 
 def _collect_law_data(found: LawSearch, effects: Sequence[str]) -> dict[str, Any]:
     """The keys of `rig explain --json` about the law; SI units."""
-    from fdi.discovery.laws.terms import describe_formula
-
     law = found.law
     return {
         "missing": [{"place": m.balance.place, "size": m.balance.size, "unit": m.balance.unit,

@@ -1,15 +1,28 @@
-"""The report: what a command answers, as one value that the terminal, HTML and JSON writers render.
+"""The report: what a command answers, as one value that the terminal, HTML and JSON writers render; and the last two.
 
-A command builds a `Report` once. `terminal.print_report` shows it to a person, `html.render_html` writes it as a page,
-and `json.to_json(report.data)` prints it for other programs. The report holds finished text; numbers in it went through
+A command builds a `Report` once. `terminal.print_report` shows it to a person, `render_html` writes it as a page,
+and `to_json(report.data)` prints it for other programs. The report holds finished text; numbers in it went through
 `numbers`. Figures are callables, so that nothing is drawn for a terminal.
 """
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, Literal, TypeVar
+from functools import cache
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import numpy as np
+
+from fdi.output import write_text
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
 
 Mood = Literal["", "good", "doubtful", "bad", "neutral", "muted"]
 T = TypeVar("T")
@@ -207,3 +220,65 @@ class Report:
         """The sections that one medium shows, each with its items there."""
         chosen = ((section, section.select_items(medium)) for section in self.sections)
         return [(section, items) for section, items in chosen if items]
+
+
+def to_json(data: Mapping[str, Any]) -> str:
+    """The JSON text of an answer, in one line.
+
+    >>> to_json({"error": np.float64(1.5), "ratio": float("nan"), "signals": ("xj", "p12")})
+    '{"error": 1.5, "ratio": null, "signals": ["xj", "p12"]}'
+    """
+    return json.dumps(to_plain(data), allow_nan=False)
+
+
+def to_plain(value: Any) -> Any:
+    """A value as JSON can hold it: None for NaN and infinity, lists for tuples and arrays, dicts for mappings.
+
+    A named tuple becomes a list, as `json` itself would write it; give its `_asdict()` where names are wanted.
+
+    Raises:
+        TypeError: a value of another type, which an answer must not hold.
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        return to_plain(value.tolist())
+    if isinstance(value, Enum):
+        return to_plain(value.value)
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [to_plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    raise TypeError(f"{type(value).__name__} in an answer: {value!r}")
+
+
+def render_html(report: Report) -> str:
+    """The page of a report as text. Everything in the report is escaped but the figures, which are SVG."""
+    template = load_templates().get_template("page.html")
+    return template.render(report=report, sections=report.select_sections(Medium.PAGE), page=Medium.PAGE)
+
+
+def write_html(report: Report, path: str | Path, option: str = "--out") -> None:
+    """Write the page of a report.
+
+    Raises:
+        InputError: a path that cannot be written; it names `option`.
+    """
+    write_text(path, render_html(report), option)
+
+
+@cache
+def load_templates() -> Environment:
+    """The page template of this package with its functions; what is put in is escaped."""
+    from jinja2 import Environment, PackageLoader
+
+    templates = Environment(loader=PackageLoader("fdi.report", "."), autoescape=True, trim_blocks=True,
+                            lstrip_blocks=True)
+    templates.globals["group_by_kind"] = lambda items: [  # neighbours of one type share a table
+        (kind.__name__, list(group)) for kind, group in groupby(items, key=type)]
+    templates.globals["figure_script"] = Path(__file__).with_name("figure.js").read_text(encoding="utf-8")
+    return templates

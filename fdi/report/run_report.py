@@ -23,7 +23,6 @@ from fdi.report.drawing import (
     PINK,
     RED,
     TEAL,
-    Floats,
     Mark,
     Panel,
     axes,
@@ -38,10 +37,23 @@ from fdi.report.drawing import (
     shade,
     spans,
 )
-from fdi.report.html import write_html
 from fdi.report.numbers import attach_unit, list_first
-from fdi.report.report import Cell, Column, Figure, Item, Line, Listing, Medium, Mood, Report, Section, Table, tabulate
-from fdi.trace.trace import Check, Event, Trace
+from fdi.report.report import (
+    Cell,
+    Column,
+    Figure,
+    Item,
+    Line,
+    Listing,
+    Medium,
+    Mood,
+    Report,
+    Section,
+    Table,
+    tabulate,
+    write_html,
+)
+from fdi.trace.trace import Check, Event, Floats, Trace
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",
                           "NOT_JUDGED": "doubtful"}
@@ -168,7 +180,7 @@ def _tabulate_checks(checks: Sequence[Check], heading: str, remark: Medium) -> T
         (True, Column(heading), lambda check: check.name),
         (is_windowed, Column("kind", medium=page), lambda check: Cell(_name_measure(check), "muted")),
         (True, Column(""), lambda check: Cell("pass", "good") if check.passed else Cell("FAIL", "bad")),
-        (True, Column("measured", align="right"), lambda check: Cell(_format_value(check), is_strong=True)),
+        (True, Column("measured", align="right"), lambda check: Cell(format_value(check.value), is_strong=True)),
         (True, Column("limits", align="right"), lambda check: format_limits(check.low, check.high)),
         (True, Column("unit"), lambda check: "" if check.unit == "1" else check.unit),
         (is_windowed, Column("window", medium=page), lambda check: Cell(_format_window(check), "muted")),
@@ -183,7 +195,7 @@ def _show_failed_checks(trace: Trace, most: int = 12) -> list[Item]:
     failed = [check for check in trace.sequence_checks if not check.passed and not math.isnan(check.t0)]
     items: list[Item] = []
     for number, check in enumerate(failed[:most]):
-        measured = f"{attach_unit(_format_value(check), check.unit)} measured"
+        measured = f"{attach_unit(format_value(check.value), check.unit)} measured"
         items.append(Figure(f"{check.name}: {_name_measure(check)}, "
                             f"{check.detail if math.isnan(check.value) else measured}, limit "
                             f"{attach_unit(format_limits(check.low, check.high), check.unit)}. Dashed: limits; red: "
@@ -199,8 +211,9 @@ def _name_measure(check: Check) -> str:
     return " of ".join(word for word in (quantity or check.kind.replace("_", " "), check.signal) if word)
 
 
-def _format_value(check: Check) -> str:
-    return "not measurable" if math.isnan(check.value) else f"{check.value:.4g}"
+def format_value(value: float) -> str:
+    """What a check measured."""
+    return "not measurable" if math.isnan(value) else f"{value:.4g}"
 
 
 def format_limits(low: float, high: float) -> str:
@@ -582,16 +595,14 @@ def _name_value(check: Check) -> str:
 
 def _filter_median(signal: Floats) -> Floats:
     """Centred moving median of five samples, the ends repeated, as the checks take it (docs/sequences.md)."""
-    filtered: Floats = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(signal, 2, mode="edge"), 5), axis=1)
-    return filtered
+    return np.median(np.lib.stride_tricks.sliding_window_view(np.pad(signal, 2, mode="edge"), 5), axis=1)
 
 
 def _compute_speed(position: Floats, period: float, span: int = 20) -> Floats:
     """Difference over `span` cycles, one-sided at the ends, m/s, as the checks take it."""
     rows = np.arange(len(position))
     ahead, behind = np.minimum(rows + span // 2, len(rows) - 1), np.maximum(rows - span // 2, 0)
-    speed: Floats = (position[ahead] - position[behind]) / (period * (ahead - behind))
-    return speed
+    return (position[ahead] - position[behind]) / (period * (ahead - behind))
 
 
 STEP_DRAWERS = (_draw_overshoot, _draw_rise_time, _draw_settling_time)

@@ -427,8 +427,7 @@ def hold_last(x: Floats) -> Floats:
     [0.0, 1.0, 1.0, 2.0]
     """
     last = np.maximum.accumulate(np.where(np.isnan(x), 0, np.arange(len(x))))
-    filled: Floats = np.nan_to_num(x[last])
-    return filled
+    return np.nan_to_num(x[last])
 
 
 def hold_next(x: Floats) -> Floats:

@@ -1,41 +1,51 @@
-"""The cycle in real time: its lateness beside cyclictest, its response beside a responder in C, its execution.
+"""The cycle in real time: lateness, response and execution beside cyclictest and C, and with the live screen.
 
 The contenders take turns in short blocks, so that a disturbance of the machine hits all of them.
 """
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import itertools
+import os
+import pty
 import shutil
+import signal
+import struct
 import subprocess
+import sys
 import tempfile
+import termios
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from fcntl import ioctl
+from functools import partial
+from importlib.resources import files
+from importlib.util import find_spec
+from math import isfinite, log, nan
 from pathlib import Path
 from typing import Any
 
+import can
 import numpy as np
+from can.interfaces.udp_multicast.utils import pack_message
 
+from fdi.estimation.binomial import estimate_geometric_mean
 from fdi.progress import Progress, ignore_progress
 from fdi.report.numbers import format_digits
-from fdi.report.report import Cell, Column, Line, Report, Section, Table, tabulate
-from plant.errors import RigError
-from rig.bench.blocks import (
-    Seconds,
-    Times,
-    choose_priority,
-    compute_percentiles,
-    describe_conditions,
-    measure_blocks,
-    pool_times,
-)
-from rig.bench.responders import run_c_responder, run_emulator
-from rig.bench.stopwatch import GET_GCC, find_gcc
+from fdi.report.report import Cell, Column, Line, Mood, Report, Section, Table, tabulate
+from fdi.trace.trace import Floats, Trace
+from plant.errors import InputError, RigError
+from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
-from rig.network.link import Link, LinkWire
+from rig.network.link import Link, LinkWire, serve_node
 from rig.network.master import Master
-from rig.network.raw_bus import open_raw_bus
+from rig.network.node_objects import PLANT
+from rig.network.raw_bus import can_open, open_raw_bus
+from rig.nodes.emulator import Emulator
 from rig.recorder import Recorder, Signals, Timing
-from rig.run.hard_loop import RECEIVED, HardLoop
+from rig.run.hard_loop import RECEIVED, HardLoop, compile_cycle
 from rig.run.loop import CycleInput, CycleLoop, History, Loop
 from rig.run.priority import (
     LOOP_PRIORITY,
@@ -46,6 +56,186 @@ from rig.run.priority import (
     suspend_garbage_collection,
 )
 from rig.sequences.faults import Plan, Schedule
+from rig.view.viewer import find_free_port, is_listening, kill_viewer, make_viewer_command
+
+Work = Callable[[], object]
+
+FLAGS = ("-O3", "-march=native")
+SAME_ROUNDING = (*FLAGS, "-ffp-contract=off")  # no fused multiply-add: the rounding of Python
+GET_GCC = "apt-get install gcc"
+
+
+def measure_durations(works: Mapping[str, Work], rounds: int) -> dict[str, Floats]:
+    """Durations of each work, (rounds,) s, after one warm-up; the rounds alternate between them."""
+    clock = WallClock()
+    taken: dict[str, list[int]] = {name: [] for name in works}
+    for turn in range(rounds + 1):
+        for name, work in works.items():
+            start = clock.now()
+            work()
+            if turn > 0:
+                taken[name].append(clock.now() - start)
+    return {name: np.array(times) * 1e-9 for name, times in taken.items()}
+
+
+def measure_median_duration(work: Work, rounds: int) -> float:
+    """The median duration of one work, s."""
+    return float(np.median(measure_durations({"": work}, rounds)[""]))
+
+
+def find_gcc() -> str:
+    """The path of the C compiler; "" without one."""
+    return shutil.which("gcc") or ""
+
+
+def build_library(source: str, flags: tuple[str, ...], target: Path, package: str = "rig.bench") -> ctypes.CDLL:
+    """A C file of a package as a library; gcc must be installed."""
+    # without -std=c..., which would silently forbid the fused multiply-add
+    compiled = target.with_suffix(".o")
+    places = [f"-I{files('rig.bench')}", "-c", str(files(package) / source), "-o", str(compiled)]
+    subprocess.run([find_gcc(), *flags, "-fPIC", *places], check=True)
+    # a library that is linked with -ffast-math switches the small numbers next to zero off for the whole process
+    harmless = [flag for flag in flags if flag != "-ffast-math"]
+    subprocess.run([find_gcc(), *harmless, "-shared", str(compiled), "-o", str(target), "-lm"], check=True)
+    return ctypes.CDLL(str(target))
+
+
+Times = Mapping[str, Floats]  # by quantity, one value a cycle; NaN: no answer came
+
+
+def measure_blocks(bus: str, seconds: float, blocks: int, contenders: Mapping[str, Callable[[float], Times]],
+                   progress: Progress) -> tuple[dict[str, list[Times]], dict[str, Any]]:
+    """The times of each contender in each block, `seconds` in all for each of them; and the conditions as JSON values.
+
+    Raises:
+        InputError: a bus that compiled code cannot use.
+    """
+    if not can_open(bus):
+        raise InputError("--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP]")
+    compile_cycle(realtime=True)
+    names, found = list(contenders), {name: list[Times]() for name in contenders}
+    for block in range(blocks):
+        turn = block % len(names)  # nobody is always the first
+        for number, name in enumerate(names[turn:] + names[:turn]):
+            progress(f"block {block + 1} of {blocks}: {name}", (block + number / len(names)) / blocks)
+            found[name].append(contenders[name](seconds / blocks))
+    return found, {"bus": bus, "seconds": seconds, "blocks": blocks, "cpus": len(list_cpus()),
+                   "priority": choose_priority()}
+
+
+def choose_priority() -> int:
+    """The loop's real-time priority, or 0 where the machine does not grant it."""
+    with raise_priority():
+        return LOOP_PRIORITY if os.sched_getscheduler(0) == os.SCHED_FIFO else 0
+
+
+def pool_times(blocks: list[Times]) -> dict[str, Floats]:
+    """The times of all blocks, by quantity."""
+    return {quantity: np.concatenate([block[quantity] for block in blocks]) for quantity in blocks[0]}
+
+
+def compute_percentiles(seconds: Floats) -> dict[str, float]:
+    """p50, p99, p99.9 and the largest of the values that are there, us."""
+    known = seconds[~np.isnan(seconds)] * 1e6
+    if not len(known):
+        return {}
+    return dict(zip(("p50", "p99", "p99_9", "max"), np.percentile(known, (50, 99, 99.9, 100)).tolist(), strict=True))
+
+
+def describe_conditions(figures: Mapping[str, Any]) -> Line:
+    """How long was measured, where and with which priority."""
+    priority = f"SCHED_FIFO {figures['priority']}" if figures["priority"] else "no real-time priority"
+    return Line("measured", f"{figures['seconds']:g} s each in {figures['blocks']} alternating blocks on "
+                            f"{figures['bus']}, 1 ms a cycle, {figures['cpus']} CPUs, {priority}")
+
+
+_NMT, _BOOT_UP = 0x000, 0x700 + PLANT
+_START, _RESET = 1, 130  # NMT commands, CiA 301 section 7.2.8.3.1
+
+
+def build_responder(folder: Path) -> Path:
+    """The responder in C, compiled into `folder`."""
+    out = folder / "responder"
+    source = str(files(__package__) / "responder.c")
+    subprocess.run([find_gcc(), "-O2", "-Wall", "-Wextra", "-Werror", "-o", str(out), source], check=True)
+    return out
+
+
+@contextlib.contextmanager
+def run_c_responder(bus: str) -> Iterator[None]:
+    """Run the responder in C on a bus while the context lasts, on the CPU and with the priority of the emulator."""
+    with tempfile.TemporaryDirectory() as folder, open_raw_bus(bus, [codec.SYNC]) as raw:
+        receive, send, turn = raw.descriptors
+        feedback, valve = _pack(bus, codec.FEEDBACK), _pack(bus, codec.VALVE_STATE)
+        cycle_at = valve.index(_PAYLOAD) + 6
+        cpu = list_cpus()[-min(2, len(list_cpus()))]
+        words = [str(build_responder(Path(folder))), *map(str, (receive, send, turn, cpu, LOOP_PRIORITY, cycle_at)),
+                 feedback.hex(), valve.hex()]
+        with _run_process(words, receive, send) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            yield
+
+
+_PAYLOAD = bytes(range(0x11, 0x19))
+
+
+def _pack(bus: str, cob_id: int) -> bytes:
+    """A frame as it goes out on a bus, with `_PAYLOAD`."""
+    if bus.startswith("udp_multicast"):
+        return bytes(pack_message(can.Message(arbitration_id=cob_id, is_extended_id=False, data=_PAYLOAD)))
+    return cob_id.to_bytes(4, sys.byteorder) + bytes([8, 0, 0, 0]) + _PAYLOAD  # struct can_frame
+
+
+@contextlib.contextmanager
+def run_emulator(bus: str, is_compiled: bool) -> Iterator[None]:
+    """Run the plant emulator on a bus while the context lasts, alone and OPERATIONAL.
+
+    Raises:
+        RigError: it does not boot.
+    """
+    module = ["rig.cli.main", "node", "plant", "--quiet", "--bus"] if is_compiled else ["rig.bench.realtime"]
+    with _run_process([sys.executable, "-m", *module, bus]) as process:
+        link = Link(open_can(bus), time.monotonic_ns)
+        try:
+            _wait_for(link, lambda: link.send(_NMT, bytes([_RESET, PLANT])), bytes([0]), process)
+            link.send(_NMT, bytes([_START, PLANT]))
+            time.sleep(0.3)
+        finally:
+            link.close()
+        yield
+
+
+def _wait_for(link: Link, ask: Callable[[], None], answer: bytes, process: subprocess.Popen[bytes],
+              limit: float = 120.0) -> None:
+    """Ask the emulator every second until its NMT error control says `answer`."""
+    end = time.monotonic() + limit
+    while time.monotonic() < end and process.poll() is None:
+        ask()
+        again = time.monotonic() + 1.0
+        while time.monotonic() < again:
+            if any(frame.cob_id == _BOOT_UP and frame.data == answer for frame in link.poll(0.1)):
+                return
+    raise RigError("the plant emulator does not boot")
+
+
+@contextlib.contextmanager
+def _run_process(words: list[str], *descriptors: int) -> Iterator[subprocess.Popen[bytes]]:
+    process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, pass_fds=descriptors)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.communicate()
+
+
+def serve_python_emulator(bus: str) -> None:
+    """Run the plant emulator on a bus until the process is ended."""
+    clock = WallClock()
+    link = Link(open_can(bus), clock.now)
+    with raise_priority():
+        serve_node(Emulator(link.send), link, clock, lambda: False)
+
 
 CYCLICTEST, COMPILED, IN_C, PYTHON = "cyclictest", "compiled", "C", "Python"
 _QUANTITIES = ("lateness", "feedback_response", "valve_response", "execution")
@@ -160,7 +350,7 @@ def find_cyclictest() -> str:
     return shutil.which("cyclictest", path="/usr/bin:/usr/local/bin:/bin:/usr/sbin") or ""
 
 
-def run_cyclictest(seconds: float, priority: int, cpu: int, period_us: int = 1000) -> Seconds:
+def run_cyclictest(seconds: float, priority: int, cpu: int, period_us: int = 1000) -> Floats:
     """Latencies of cyclictest, s, to the microsecond: one thread, absolute due times, memory locked.
 
     `priority` 0 runs it without real-time priority.
@@ -177,7 +367,7 @@ def run_cyclictest(seconds: float, priority: int, cpu: int, period_us: int = 100
     return parse_histogram(done.stdout)
 
 
-def parse_histogram(text: str) -> Seconds:
+def parse_histogram(text: str) -> Floats:
     """The latencies, s, in the histogram that cyclictest prints; those beyond its end count as its maximum."""
     bins, most, overflows = [], 0, 0
     for line in text.splitlines():
@@ -252,3 +442,231 @@ def _tabulate_times(times: Mapping[str, Mapping[str, float]], names: Mapping[str
         (Column("p99.9", "us", "right"), lambda row: f"{row[1]['p99_9']:.1f}"),
         (Column("max", "us", "right"), lambda row: f"{row[1]['max']:.1f}"),
         caption=caption)]
+
+
+WITHOUT, AGAIN, LIVE, VIEWER = "without", "without, again", "--live", "--live rerun"
+QUANTITIES = ("lateness", "response", "feedback_response")
+SHARES = ("p50", "p99")
+_SEQUENCE = """title = "Live"
+setup = [{{ kind = "hold", time = 0.3 }}]
+main = [{{ name = "sine", kind = "sine", amplitude = 3e-3, frequency = 1.0, time = {seconds:g} }}]
+checks = [
+  {{ name = "tracking", kind = "rms_error", high = 1, unit = "mm" }},
+  {{ name = "position", kind = "never_exceeds", signal = "xj", high = 6, unit = "mm" }},
+]
+"""
+
+
+def measure_live_runs(bus: str, seconds: float, blocks: int, progress: Progress = ignore_progress) -> dict[str, Any]:
+    """Measure all contenders on a bus for `seconds` each, in so many blocks.
+
+    Raises:
+        InputError: a bus that compiled code cannot use.
+        RigError: a run that came to no verdict.
+    """
+    missing = {} if find_spec("rerun") else {VIEWER: "not measured: pip install 'eha-rig[view]'"}
+    contenders = {name: partial(play_contender, name, bus) for name in (WITHOUT, AGAIN, LIVE, VIEWER)
+                  if name not in missing}
+    found, conditions = measure_blocks(bus, seconds, blocks, contenders, progress)
+    return summarise_live_runs(found) | conditions | {
+        "missing": missing,
+        "ended_early": {name: sum(len(run["lateness"]) < 900.0 * seconds / blocks for run in runs)
+                        for name, runs in found.items()}}
+
+
+def play_contender(name: str, bus: str, seconds: float) -> Times:
+    """Times of the cycles of a run of one kind, see `play_run`."""
+    if name != VIEWER:
+        return play_run(bus, seconds, ("--live",) if name == LIVE else ())
+    with open_hidden_viewer() as port:
+        return play_run(bus, seconds, ("--live", f"rerun:{port}"))
+
+
+@contextlib.contextmanager
+def open_hidden_viewer(patience: float = 60.0) -> Iterator[int]:
+    """A viewer that draws without a display, by the CPUs that the loop leaves free; give its port on 127.0.0.1.
+
+    Raises:
+        RigError: it does not start, for example without a Vulkan driver.
+    """
+    port = find_free_port()
+    cpus = list_cpus()
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cpus[:-1] or cpus)  # the viewer inherits it
+    try:
+        viewer = subprocess.Popen([*make_viewer_command(port), "--headless", "--window-size", "1280x800"],
+                                  stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                                  start_new_session=True)
+    finally:
+        os.sched_setaffinity(0, before)
+    clock = WallClock()
+    try:
+        while not is_listening(port):
+            if viewer.poll() is not None or clock.now() > patience * 1e9:
+                raise RigError("the viewer does not start without a display; it needs a Vulkan driver (Debian: "
+                               "mesa-vulkan-drivers libvulkan1)")
+            clock.sleep_until(clock.now() + 100_000_000)
+        yield port
+    finally:
+        kill_viewer(viewer)
+
+
+def play_run(bus: str, seconds: float, options: Sequence[str]) -> Times:
+    """Times of the cycles of main of a run with its emulator; NaN where no answer came.
+
+    Raises:
+        RigError: the run came to no verdict.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        sequence, folder = Path(name) / "live.toml", Path(name) / "run"
+        sequence.write_text(_SEQUENCE.format(seconds=seconds))
+        words = [sys.executable, "-m", "rig.cli.main", "run", str(sequence), "--bus", bus, "--pace", "realtime",
+                 "--max-overruns", "1", "--out", str(folder), *options]
+        status, text = run_in_terminal(words)
+        if status not in (0, 1, 3):  # a verdict, whichever
+            lines = [line for line in text.splitlines() if line.strip()] or ["it printed nothing"]
+            raise RigError(f"rig run {' '.join(options)} ended with status {status}: {lines[-1].strip()}")
+        timing = Trace.read(folder, all=True).timing
+    main = timing.t >= 0.0
+    return {name: getattr(timing, name)[main] for name in (*QUANTITIES, "overrun")}
+
+
+def run_in_terminal(words: Sequence[str], size: tuple[int, int] = (40, 120)) -> tuple[int, str]:
+    """Run a program in a terminal of its own, `size` lines and columns; its exit status and what it wrote last."""
+    ours, theirs = pty.openpty()
+    try:
+        ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", *size, 0, 0))
+        process = subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
+                                   env=os.environ | {"TERM": "xterm-256color"})
+        os.close(theirs)
+        text = b""
+        try:
+            while data := _read_some(ours):
+                text = (text + data)[-4096:]
+        finally:
+            process.send_signal(signal.SIGTERM)  # without effect on one that has ended
+            process.wait()
+    finally:
+        os.close(ours)
+    return process.returncode, text.decode(errors="replace")
+
+
+def _read_some(number: int) -> bytes:
+    try:
+        return os.read(number, 65536)
+    except OSError:  # the other end is closed
+        return b""
+
+
+def summarise_live_runs(found: Mapping[str, list[Times]]) -> dict[str, Any]:
+    """Percentiles in us by quantity and contender over all blocks and of each block, ratios, overruns.
+
+    Args:
+        found: contender -> of each block, quantity -> times in s, and which cycles are overruns.
+    """
+    pooled = {name: pool_times(blocks) for name, blocks in found.items()}
+    single = {quantity: {name: [compute_percentiles(block[quantity]) for block in blocks]
+                         for name, blocks in found.items()} for quantity in QUANTITIES}
+    return {"times_us": {quantity: {name: compute_percentiles(times[quantity]) for name, times in pooled.items()}
+                         for quantity in QUANTITIES},
+            "blocks_us": single, "ratios": compare_contenders(single),
+            "overruns": {name: int(times["overrun"].sum()) for name, times in pooled.items()},
+            "cycles": {name: len(times["lateness"]) for name, times in pooled.items()}}
+
+
+def compare_contenders(blocks_us: Mapping[str, Mapping[str, Sequence[Mapping[str, float]]]]) -> list[dict[str, Any]]:
+    """The ratios of all contenders to the runs without a screen: geometric means of the blocks' percentiles.
+
+    low, high: the simultaneous 95 % interval of all ratios; NaN with fewer than four blocks.
+    """
+    found = []
+    others = [name for name in next(iter(blocks_us.values())) if name != WITHOUT]
+    count = len(QUANTITIES) * len(SHARES) * len([name for name in others if name != AGAIN])
+    for quantity, share in itertools.product(QUANTITIES, SHARES):
+        logs = {name: np.array([log(block[share]) if block.get(share, 0.0) > 0.0 else nan for block in blocks])
+                for name, blocks in blocks_us[quantity].items()}
+        for name in others:
+            base = logs[WITHOUT] if name == AGAIN else (logs[WITHOUT] + logs[AGAIN]) / 2
+            ratio, low, high = estimate_geometric_mean(logs[name] - base, 0.05 / count, 4)
+            words = {"not known": not isfinite(low), "slower": low > 1.0, "faster": high < 1.0}
+            found.append({"quantity": quantity, "share": share, "contender": name, "ratio": ratio, "low": low,
+                          "high": high, "word": next((word for word in words if words[word]), "no difference found")})
+    return found
+
+
+_LIVE_TITLES = {
+    "lateness": ("SYNC lateness", "How long after its due time SYNC was sent."),
+    "response": ("SYNC to the controller's answer", "From SYNC until the drive frame of the controller arrived."),
+    "feedback_response": ("SYNC to feedback", "From SYNC until the kernel received the feedback frame of the plant."),
+}
+_MOODS: Mapping[str, Mood] = {"slower": "bad", "faster": "", "no difference found": "good", "not known": "doubtful"}
+
+
+def build_live_runs_report(figures: Mapping[str, Any]) -> Report:
+    """Report on the figures of `rig.bench.realtime.measure_live_runs`, which are its `data`."""
+    overruns = ", ".join(f"{name} {count} of {figures['cycles'][name]}" for name, count in figures["overruns"].items())
+    lines = [describe_conditions(figures), Line("overruns", overruns),
+             *(Line("ended early", f"{name}: {count}") for name, count in figures["ended_early"].items() if count),
+             *(Line(name, reason) for name, reason in figures["missing"].items())]
+    return Report(
+        command="bench", title="live", sentence=describe_ratios(figures["ratios"]),
+        sections=[Section("With and without", _tabulate_ratios(figures["ratios"])),
+                  *(Section(title, _tabulate_live_times(figures["times_us"][quantity], figures["blocks_us"][quantity],
+                                                   caption)) for quantity, (title, caption) in _LIVE_TITLES.items()),
+                  Section("Conditions", lines)],
+        data=dict(figures))
+
+
+def describe_ratios(ratios: Sequence[Mapping[str, Any]]) -> str:
+    """What the ratios say, in one sentence."""
+    names = list(dict.fromkeys(ratio["contender"] for ratio in ratios if not ratio["contender"].startswith(WITHOUT)))
+    shown = " and ".join(names)
+    changed = [f"{ratio['quantity'].replace('_', ' ')} {ratio['share']} {ratio['word']} with {ratio['contender']} "
+               f"({format_digits(ratio['ratio'])} times)" for ratio in ratios
+               if ratio["word"] in ("slower", "faster") and ratio["contender"] in names]
+    if changed:
+        return f"{'; '.join(changed)}."
+    if any(ratio["word"] == "not known" for ratio in ratios):
+        return f"Too few blocks to say whether {shown} changes lateness or response; ask for --blocks 4 or more."
+    return f"Lateness and response with {shown} differ from those without by no more than noise."
+
+
+def _tabulate_ratios(ratios: Sequence[Mapping[str, Any]]) -> list[Table]:
+    def show_interval(ratio: Mapping[str, Any]) -> str:
+        return f"{_format_ratio(ratio['low'])} .. {_format_ratio(ratio['high'])}" if isfinite(ratio["low"]) else ""
+
+    return [tabulate(
+        ratios,
+        (Column("percentile"), lambda ratio: f"{ratio['quantity'].replace('_', ' ')} {ratio['share']}"),
+        (Column("run"), lambda ratio: ratio["contender"]),
+        (Column("ratio", align="right"), lambda ratio: _format_ratio(ratio["ratio"])),
+        (Column("interval", align="right"), show_interval),
+        (Column(""), lambda ratio: Cell(ratio["word"], _MOODS[ratio["word"]])),
+        caption=f'To the runs without the screen: geometric means over the blocks. "{AGAIN}": the same runs once more, '
+                "which is the noise. All intervals together hold with 95 %.")]
+
+
+def _format_ratio(ratio: float) -> str:
+    if not ratio < 100.0:
+        return "> 100" if ratio >= 100.0 else "-"
+    return f"{ratio:.2f}"
+
+
+def _tabulate_live_times(times: Mapping[str, Mapping[str, float]], blocks: Mapping[str, Sequence[Mapping[str, float]]],
+                    caption: str) -> list[Table]:
+    def show_spread(name: str, share: str) -> str:
+        values = [block[share] for block in blocks[name] if block]
+        return f"{min(values):.1f} .. {max(values):.1f}"
+
+    return [tabulate(
+        [name for name, found in times.items() if found],
+        (Column("run"), str),
+        (Column("p50", "us", "right"), lambda name: f"{times[name]['p50']:.1f}"),
+        (Column("p99", "us", "right"), lambda name: f"{times[name]['p99']:.1f}"),
+        (Column("p50 by block", "us", "right"), lambda name: show_spread(name, "p50")),
+        (Column("p99 by block", "us", "right"), lambda name: show_spread(name, "p99")),
+        caption=caption)]
+
+
+if __name__ == "__main__":
+    serve_python_emulator(sys.argv[1])

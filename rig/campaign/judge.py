@@ -1,30 +1,319 @@
-"""A campaign: each case is simulated or read, then judged, on the resumable runner; the answers are flat rows."""
+"""A campaign: a matrix of cases, each simulated or read, then judged; and the folder of the answers, as flat rows.
+
+A simulated unit is a healthy plant with scatter and faults of known size, measured with the bench's noise. The folder:
+
+    campaign.json      the matrix, and a hash of the code; a folder belongs to one campaign
+    finished.jsonl     one row per finished case (see `rig.campaign.batch`)
+    results.parquet    all rows in the matrix's order; replaced as a whole
+"""
 from __future__ import annotations
 
+import hashlib
+import itertools
+import json
+import os
 import platform
 import tomllib
-from collections.abc import Callable, Mapping
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import FAULTS, Level
+from fdi.prognosis.unit_trend import list_traces
 from fdi.sources import hash_sources, import_function
-from fdi.trace.trace import Trace
-from plant import Model
-from plant.errors import RigError
-from plant.model import parse_model
+from fdi.trace.trace import Floats, Trace
+from plant import simulate
+from plant.errors import InputError, RigError
+from plant.model import Model, find_effect, parse_model
+from plant.parameters import load_nominal_values, parse_toml, parse_value, read_toml
+from plant.solve import NOISES
 from plant.threads import count_threads
-from rig.campaign.batch import Batch, BatchProgress, Row, Workers, import_extra, run_batch
-from rig.campaign.folder import open_campaign, select_newest, write_results
-from rig.campaign.matrix import Case, Matrix
-from rig.campaign.units import simulate_case
+from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, import_extra, read_rows, run_batch
 from rig.network.clock import WallClock
+from rig.sequences import load_sequence
+from rig.sequences.timing import PERIOD
+from rig.tables import Place, Range, build_dataclass
 
-Array = NDArray[np.float64]
+OWN_SIMULATOR = "plant"
+HEALTHY = "healthy"
+Tolerance = Annotated[float, Range("1", low=0.0, high=0.2)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """The keys above the first [[case]]; a case may override seeds and tolerance."""
+
+    seeds: Annotated[int, Range("1", low=1)] = 20  # runs of each size
+    first: Annotated[int, Range("1", low=0)] = 0  # seed of the first
+    tolerance: Tolerance | tuple[Tolerance, ...] = (0.015,)
+    simulator: str = OWN_SIMULATOR  # plant.simulate in 10 us steps, or "module:function"
+    colour: Annotated[float, Range("1", low=0.0, high=0.99)] = 0.8  # correlation of xj's noise between cycles
+    hum: Annotated[float, Range("m", low=0.0, high=1e-3)] = 0.7e-6  # of the mains on the position sensor
+    signals: Literal["xj,p12,xs", "xj,p12", "xj"] = "xj,p12,xs"  # measured
+
+    def __post_init__(self) -> None:
+        if self.tolerance == ():
+            raise InputError("matrix", "tolerance", "at least one")
+        if self.simulator != OWN_SIMULATOR and ":" not in self.simulator:
+            raise InputError("matrix", "simulator", f"{OWN_SIMULATOR} or MODULE:FUNCTION, not {self.simulator!r}")
+
+    def list_values(self) -> dict[str, Any]:
+        """JSON values, with a list of tolerances."""
+        given = self.tolerance if isinstance(self.tolerance, tuple) else (self.tolerance,)
+        return {**asdict(self), "tolerance": list(given)}
+
+
+class Case(NamedTuple):
+    """One run to judge; everything random in it follows from its label and seed."""
+
+    number: int  # its place in the matrix
+    label: str  # "healthy", "filter_clogging=0.17 spool_friction=45", or the trace's name in its folder
+    sizes: Mapping[str, float]  # effect to the value of its first parameter, SI
+    tolerance: float
+    seed: int
+    trace: str = ""  # path of a recorded run; if given, nothing is simulated
+
+
+class Matrix(NamedTuple):
+    """The settings and the cases of a campaign, ordered such that the first cases are a fair sample of all."""
+
+    spec: Mapping[str, Any]  # JSON values from which `restore_matrix` makes the same matrix
+    cases: tuple[Case, ...]
+
+
+def list_shipped_matrices() -> list[str]:
+    """The names of the matrices that come with this software."""
+    names = [file.name for file in files("rig.campaign").iterdir()]
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+
+
+def read_matrix(source: str) -> dict[str, Any]:
+    """The tables of a matrix file, or of a shipped one by name. Raises InputError."""
+    if source in list_shipped_matrices():
+        return parse_toml((files("rig.campaign") / f"{source}.toml").read_text(encoding="utf-8"), source)
+    return read_toml(Path(source))
+
+
+def build_matrix(tables: Mapping[str, Any], model: Model, work: str, where: object) -> Matrix:
+    """The campaign that the tables of a matrix file describe.
+
+    Raises:
+        InputError: an unknown key or effect, a value out of range, another plant than `eha`, or no case at all.
+    """
+    place = Place(str(where))
+    given = {key: value for key, value in tables.items() if key != "case"}
+    settings = build_dataclass(Settings, given, place)
+    if model.plant != "eha":
+        raise InputError("--model", model.plant, "eha, whose preflight check this is")
+    if model["controller.period"] != PERIOD:
+        raise InputError("--set", "controller.period", f"{PERIOD:g} s, the cycle of the preflight check")
+    blocks = tables.get("case", [])
+    if not isinstance(blocks, list) or not blocks or not all(isinstance(block, Mapping) for block in blocks):
+        raise InputError(where, "case", "at least one [[case]] (an empty one is a healthy plant)")
+    parsed = [_parse_block(block, given, model, place) for block in blocks]
+    spec = {**settings.list_values(), "model": model.to_toml(), "work": work, "case": parsed}
+    return Matrix(spec, _expand_cases(spec))
+
+
+def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Model, place: Place) -> dict[str, Any]:
+    """A [[case]] table with its defaults filled in. Raises InputError."""
+    own = {key: value for key, value in block.items() if key in ("seeds", "tolerance")}
+    settings = build_dataclass(Settings, {**common, **own}, place).list_values()
+    sizes = {}
+    for name, values in block.items():
+        if name not in own:
+            with place.at(name).locate():
+                effect = find_effect(name, model.plant)
+                if not effect.fitted:
+                    raise InputError("", name, "an effect with a size; this one is noise of the bench")
+                sizes[name] = [parse_value("", name, effect.parameters[effect.fitted[0]], value)
+                               for value in (values if isinstance(values, list) else [values])]
+                if not sizes[name]:
+                    raise InputError("", name, "at least one size")
+    return {"seeds": settings["seeds"], "sizes": sizes, "tolerance": settings["tolerance"]}
+
+
+def _expand_cases(spec: Mapping[str, Any]) -> tuple[Case, ...]:
+    """All cases of all blocks; a case that two blocks have counts once.
+
+    Each block's seeds are spread evenly over the campaign, so that the first cases are of every kind.
+    """
+    cases: dict[tuple[str, float, int], Case] = {}
+    places: dict[tuple[str, float, int], float] = {}  # from 0 to 1
+    for block in spec["case"]:
+        for values in itertools.product(*block["sizes"].values()):
+            sizes = dict(sorted(zip(block["sizes"], values, strict=True)))
+            for tolerance, k in itertools.product(block["tolerance"], range(block["seeds"])):
+                seed = spec["first"] + k
+                key = label_plant(sizes), tolerance, seed
+                cases.setdefault(key, Case(0, label_plant(sizes), sizes, tolerance, seed))
+                places.setdefault(key, (k + 0.5) / block["seeds"])
+    ordered = sorted(cases, key=lambda key: places[key])  # stable: equal places keep the order of the file
+    return tuple(cases[key]._replace(number=number) for number, key in enumerate(ordered))
+
+
+def label_plant(sizes: Mapping[str, float]) -> str:
+    """The label of a plant with faults of these sizes: "filter_clogging=0.17 spool_friction=45", or "healthy"."""
+    return " ".join(f"{name}={size:.9g}" for name, size in sizes.items()) or HEALTHY
+
+
+def build_trace_matrix(folder: str | Path, model: Model, work: str) -> Matrix:
+    """The recorded runs below a folder as cases: the trace.mcap of each run, and every CSV file.
+
+    Raises:
+        InputError: no such folder, or no trace in it.
+    """
+    root = Path(folder).absolute()
+    names = {path.relative_to(root).as_posix(): path for path in list_traces(root)}
+    digests = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in names.items()}
+    spec = {"traces": str(root), "files": digests, "model": model.to_toml(), "work": work}
+    return restore_matrix(spec)
+
+
+def restore_matrix(spec: Mapping[str, Any]) -> Matrix:
+    """The matrix that has these settings: the inverse of `Matrix.spec`."""
+    if "traces" not in spec:
+        return Matrix(spec, _expand_cases(spec))
+    root = Path(spec["traces"])
+    return Matrix(spec, tuple(Case(i, name, {}, 0.0, 0, str(root / name)) for i, name in enumerate(spec["files"])))
+
+
+def parse_faults(words: Sequence[str]) -> list[dict[str, Any]]:
+    """The [[case]] tables of the words of --fault.
+
+    A word is "healthy", "filter_clogging=0.1,0.2" or "filter_clogging=0.17/spool_friction=45".
+
+    Raises:
+        InputError: another word.
+    """
+    blocks: list[dict[str, Any]] = []
+    for word in words:
+        block = {}
+        for part in word.split("/") if word != HEALTHY else []:
+            name, equals, values = part.partition("=")
+            try:
+                block[name.strip()] = [float(value) for value in values.split(",")]
+            except ValueError:
+                raise InputError("--fault", word, "healthy, EFFECT=SIZE,SIZE.., or several of these with / between"
+                                 ) from None
+            if not equals:
+                raise InputError("--fault", word, "EFFECT=SIZE")
+        blocks.append(block)
+    return blocks
+
+
+FLOORS = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
+"""RMS noise of the sensors: m, Pa, m."""
+SCATTERED_PARAMETERS = (
+    "torque_motor.gain", "flapper.inertia", "flapper.damping", "flapper.stiffness", "feedback_spring.stiffness",
+    "pilot.flow_gain", "pilot.pressure_gain", "valve.flow_gain", "valve.pressure_gain", "supply.pressure", "jack.area",
+    "jack.mass", "jack.damping", "jack.static_friction", "jack.dynamic_friction", "jack.leakage")
+"""The parameters with a tolerance, in the order in which they are drawn."""
+
+
+class Unit(NamedTuple):
+    """A unit to simulate, for `plant.simulate` or another simulator."""
+
+    model: Model  # healthy, without scatter
+    scatter: Mapping[str, float]  # parameter "group.field" to the factor on its value
+    sizes: Mapping[str, float]  # effect to the value of its first parameter, SI
+    command: Floats  # (n,) m
+    noise: Floats  # (n, NOISES), in units of the sensors' noise
+
+
+Simulator = Callable[[Unit], Mapping[str, Floats]]
+"""From a unit to its columns com, cor, load, xj, p12, xs, (n,) each, SI."""
+
+
+def simulate_case(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
+    """The preflight check of a plant with the faults, scatter and noise of a case.
+
+    Raises:
+        InputError: values that contradict each other, or a fault or change that the chosen simulator does not have.
+    """
+    command = np.round(load_sequence("preflight").main_profile().command, 12)
+    scatter, noise = sample_random_parts(case, len(command), spec["colour"], spec["hum"])
+    columns = load_simulator(spec["simulator"])(Unit(model, scatter, case.sizes, command, noise))
+    measured = {"com", "cor", "load", *spec["signals"].split(",")}
+    return Trace.from_columns({name: columns[name] for name in columns if name in measured}, model["controller.period"],
+                              {"source": case.label, "seed": str(case.seed)})
+
+
+def load_simulator(name: str) -> Simulator:
+    """`simulate_unit`, or the function "module:function".
+
+    Raises:
+        InputError: there is no such function.
+    """
+    return simulate_unit if name == OWN_SIMULATOR else import_function(name, "--simulator", "a simulator of units")
+
+
+def simulate_unit(unit: Unit) -> dict[str, Floats]:
+    """The columns of a unit by `plant.simulate`."""
+    model = unit.model.replace({name: factor * unit.model[name] for name, factor in unit.scatter.items()})
+    return simulate(add_faults(model, unit.sizes), unit.command, drawn=unit.noise)._asdict()
+
+
+def sample_random_parts(case: Case, cycles: int, colour: float, hum: float) -> tuple[dict[str, float], Floats]:
+    """Scatter and noise of a case, as `Unit` holds them.
+
+    Another label gives other random numbers. Another tolerance gives the same, so that a unit is comparable with
+    itself at another tolerance.
+    """
+    rng = np.random.default_rng([case.seed, 11, zlib.crc32(case.label.encode())])
+    nominal = load_nominal_values()
+    scatter = {name: value / nominal[name] for name, value in sample_healthy_plant(case.tolerance, rng).items()}
+    position = sample_position_noise(cycles, colour, hum, rng)
+    return scatter, np.column_stack([position / FLOORS["xj"], rng.standard_normal((cycles, NOISES - 1))])
+
+
+def sample_healthy_plant(spread: float, rng: np.random.Generator) -> dict[str, float]:
+    """The parameters of a healthy plant; `spread` is their relative standard deviation about nominal."""
+    nominal = load_nominal_values()
+    return {name: nominal[name] * (1 + spread * rng.standard_normal()) for name in SCATTERED_PARAMETERS}
+
+
+def sample_position_noise(n: int, colour: float, hum: float, rng: np.random.Generator) -> Floats:
+    """Noise of the position sensor, (n,) m: first-order noise with the RMS of the noise floor, and hum of 50 Hz.
+
+    Args:
+        n: number of cycles.
+        colour: correlation from one cycle to the next.
+        hum: amplitude of the mains hum, m.
+        rng: source of the random numbers.
+    """
+    from scipy.signal import lfilter  # here, as it takes a second to import
+
+    white = FLOORS["xj"] * rng.standard_normal(n)
+    white[1:] *= np.sqrt(1 - colour**2)
+    noise: Floats = lfilter([1.0], [1.0, -colour], white)
+    return noise + hum * np.sin(2 * np.pi * 50.0 * PERIOD * np.arange(n) + 1.0)
+
+
+def add_faults(model: Model, sizes: Mapping[str, float]) -> Model:
+    """The model with effects of these sizes: values of each effect's first parameter.
+
+    The effect's further parameters follow: of a parameter of the base model in proportion to the first one (dynamic
+    friction to static friction), of an added effect as in the start whose first parameter is nearest to the size.
+    """
+    for name, size in sizes.items():
+        effect = find_effect(name, model.plant)
+        first, *others = effect.fitted
+        if effect.base:
+            changes = {other: model[other] * size / model[first] for other in others}
+        else:
+            starts = sorted(effect.starts, key=lambda start: abs(start[first] - size))
+            changes = {other: starts[0][other] for other in others if starts}
+        model = model.replace(changes | {first: size}, name)
+    return model
+
+
 Judgement = Callable[[Trace, Model], Row]
 """A function that judges a run: from the trace and the healthy model to a flat row of JSON values."""
 
@@ -159,3 +448,105 @@ def plan_batch(matrix: Matrix, sources: str, count: int | None = None, redo_fail
 
 def _has_failed(row: Row) -> bool:
     return bool(row["status"] == FAILED)
+
+
+MATRIX, ROWS, RESULTS = "campaign.json", "finished.jsonl", "results.parquet"
+PART = ".part"
+
+
+def open_campaign(path: str | Path, matrix: Matrix, sources: str) -> RowFile:
+    """Open the rows of a campaign's folder for writing by one process at a time; an empty folder becomes its own.
+
+    Raises:
+        InputError: the folder belongs to another matrix or to something else, the code has changed since the campaign
+            was started, another process is at work in it, or it cannot be written.
+    """
+    folder = Path(path)
+    expected = json.loads(json.dumps({"matrix": matrix.spec, "code": sources}))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if is_campaign_folder(folder):
+            present = _read_campaign(folder)
+            changed = [key for key in {**present["matrix"], **expected["matrix"]}
+                       if present["matrix"].get(key) != expected["matrix"].get(key)]
+            if changed:
+                raise InputError(path, "--out", "a folder of this matrix, or a new one; it differs in "
+                                                f"{', '.join(changed)}")
+            if present["code"] != sources:
+                raise InputError(path, "--out", "a new folder: the code has changed since this campaign was started")
+        elif any(not file.name.endswith(PART) for file in folder.iterdir()):
+            raise InputError(path, "--out", "an empty folder, or one of this campaign")
+        else:
+            replace_file(folder / MATRIX, (json.dumps(expected, indent=1) + "\n").encode())
+    except OSError as error:
+        raise InputError(path, "", f"a folder that can be written ({error.strerror})") from error
+    return RowFile(folder / ROWS)
+
+
+def is_campaign_folder(folder: str | Path) -> bool:
+    """Whether the folder is one of a campaign."""
+    return (Path(folder) / MATRIX).is_file()
+
+
+def read_matrix_of_folder(folder: str | Path) -> Matrix:
+    """The matrix of a campaign's folder. Raises InputError."""
+    return restore_matrix(_read_campaign(Path(folder))["matrix"])
+
+
+def read_campaign_rows(source: str | Path) -> list[Row]:
+    """The rows of a campaign's folder, finished or not, or of a results.parquet, in the matrix's order.
+
+    Raises:
+        InputError: there is no such campaign.
+    """
+    path = Path(source)
+    if path.is_dir() and is_campaign_folder(path):
+        return select_newest(read_rows(path / ROWS))
+    if path.suffix != ".parquet" or not path.is_file():
+        raise InputError(source, "", f"the folder of a campaign, or its {RESULTS}")
+    parquet = import_extra("pyarrow.parquet")
+    try:
+        rows: list[Row] = parquet.read_table(path).to_pylist()
+    except (OSError, ValueError) as error:
+        raise InputError(source, "", f"a Parquet file ({error})") from None
+    return [{key: value for key, value in row.items() if value is not None} for row in rows]
+
+
+def write_results(folder: str | Path, rows: Iterable[Row]) -> None:
+    """Replace results.parquet by one with the newest row of each case; the matrix goes into its schema."""
+    pa, parquet = import_extra("pyarrow"), import_extra("pyarrow.parquet")
+    path, newest = Path(folder) / RESULTS, select_newest(rows)
+    names = list(dict.fromkeys(name for row in newest for name in row))
+    table = pa.table({name: pa.array([row.get(name) for row in newest]) for name in names})
+    table = table.replace_schema_metadata({"campaign": json.dumps(_read_campaign(Path(folder)))})
+    part = path.with_name(path.name + PART)
+    parquet.write_table(table, part)
+    part.replace(path)
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Write a file as a whole: a reader sees the old content or the new one. Raises InputError."""
+    part = path.with_name(path.name + PART)
+    try:
+        with part.open("wb") as out:
+            out.write(data)
+            out.flush()
+            os.fsync(out.fileno())
+        part.replace(path)
+    except PermissionError as error:
+        raise InputError(path, "", f"a place that can be written ({error.strerror})") from None
+
+
+def _read_campaign(folder: Path) -> dict[str, Any]:
+    """The content of campaign.json. Raises InputError."""
+    try:
+        content = json.loads((folder / MATRIX).read_text(encoding="utf-8"))
+        return {"matrix": content["matrix"], "code": content["code"]}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(folder / MATRIX, "", f"the matrix of a campaign ({type(error).__name__})") from None
+
+
+def select_newest(rows: Iterable[Row]) -> list[Row]:
+    """The last row of each case, ordered by its number."""
+    newest = {row["case"]: row for row in rows if "case" in row}
+    return [newest[number] for number in sorted(newest)]

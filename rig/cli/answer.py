@@ -85,11 +85,11 @@ def give_answer(report: Report, args: argparse.Namespace, status: int = 0, place
         InputError: a file that cannot be written.
     """
     if places.answer is not None:
-        from fdi.report.json import to_json
+        from fdi.report.report import to_json
 
         write_text(places.answer, to_json(report.data) + "\n")
     if places.page is not None:
-        from fdi.report.html import write_html
+        from fdi.report.report import write_html
 
         with show_progress(is_silent=args.json or args.quiet) as progress:
             progress("writing", 0.0)
@@ -101,7 +101,7 @@ def give_answer(report: Report, args: argparse.Namespace, status: int = 0, place
 def show_answer(report: Report, args: argparse.Namespace) -> None:
     """Print a report on standard output as --json and --quiet ask; --json comes before --quiet."""
     if args.json:
-        from fdi.report.json import to_json
+        from fdi.report.report import to_json
 
         print(to_json(report.data))
     elif not args.quiet:

@@ -98,7 +98,7 @@ COMMANDS = {
              option("--tolerance", metavar="X,..",
                     help="standard deviation of the base parameters, relative (default 0.015)"),
              option("--simulator", metavar="MODULE:FUNCTION",
-                    help="function that simulates a unit (rig.campaign.units.Unit) instead of the plant model"),
+                    help="function that simulates a unit (rig.campaign.judge.Unit) instead of the plant model"),
              option("--signals", metavar="xj,p12,xs", help="what is measured (default: all three)"),
              option("--model", metavar="FILE|NAME", help="the healthy plant (default eha)"),
              option("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",

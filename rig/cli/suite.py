@@ -19,16 +19,18 @@ from rig.cli.terminal import open_console
 from rig.network.clock import WallClock
 from rig.run.job import JobChoice
 from rig.run.participants import EMBEDDED_NAMES
-from rig.suite.report import MOODS, build_suite_report, write_junit
 from rig.suite.suite import (
+    MOODS,
     CaseResult,
     Suite,
     Variant,
     build_suite,
+    build_suite_report,
     find_status,
     is_suite_file,
     read_suite_file,
     run_cases,
+    write_junit,
 )
 
 

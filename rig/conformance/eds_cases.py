@@ -7,10 +7,22 @@ from itertools import combinations
 from canopen.objectdictionary import datatypes
 from canopen.objectdictionary.datatypes import UNSIGNED8, UNSIGNED16, UNSIGNED32, VISIBLE_STRING
 
-from rig.conformance.conformance_case import Case, CaseFailed, for_each, join_labels, require
-from rig.conformance.data_sheet import HISTORY, PDO_PARAMETERS, SIZES, Pdo, Variable, is_restricted
 from rig.conformance.pdo_cases import describe_mapping, split_entry
-from rig.conformance.target import INVALID, Target
+from rig.conformance.target import (
+    HISTORY,
+    INVALID,
+    PDO_PARAMETERS,
+    SIZES,
+    Case,
+    CaseFailed,
+    Pdo,
+    Target,
+    Variable,
+    for_each,
+    is_restricted,
+    join_labels,
+    require,
+)
 
 SECTIONS = {"FileInfo": (), "MandatoryObjects": (),
             "DeviceInfo": ("VendorName", "VendorNumber", "ProductName", "ProductNumber", "RevisionNumber",

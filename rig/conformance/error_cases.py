@@ -4,8 +4,6 @@ from __future__ import annotations
 from itertools import pairwise
 from statistics import fmean
 
-from rig.conformance.conformance_case import Case, for_each, require, require_applicable
-from rig.conformance.data_sheet import HISTORY, RESTRICTED_ENDS, Pdo
 from rig.conformance.pdo_cases import (
     EXTENDED,
     list_received,
@@ -19,19 +17,26 @@ from rig.conformance.pdo_cases import (
 )
 from rig.conformance.target import (
     COMMANDS,
+    HISTORY,
     INCOMPATIBLE,
     NO_DATA,
     NO_SUB,
     OPERATIONAL,
     PRE_OPERATIONAL,
+    RESTRICTED_ENDS,
     STOPPED,
     TOO_HIGH,
     TOO_LOW,
     VALUE,
+    Case,
+    Pdo,
     Target,
+    for_each,
     name_state,
     read_error_code,
+    require,
     require_abort,
+    require_applicable,
 )
 from rig.network.frame import Frame
 from rig.network.node_objects import NmtState

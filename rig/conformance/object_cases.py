@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 from canopen.objectdictionary.datatypes import DOMAIN
 
-from rig.conformance.conformance_case import Case, CaseFailed, for_each, require, require_applicable
-from rig.conformance.data_sheet import HISTORY, Variable
 from rig.conformance.target import (
+    HISTORY,
     NO_DATA,
     NO_OBJECT,
     NO_SUB,
@@ -20,10 +19,16 @@ from rig.conformance.target import (
     VALUE,
     WRITE_ONLY,
     WRONG_LENGTH,
+    Case,
+    CaseFailed,
     Refusal,
     Target,
+    Variable,
+    for_each,
     format_abort,
+    require,
     require_abort,
+    require_applicable,
 )
 
 Value = tuple[Variable, bytes]  # an object, and what it holds

@@ -5,17 +5,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
-from rig.conformance.conformance_case import (
-    Case,
-    CaseNotApplicable,
-    CaseSkipped,
-    Problem,
-    for_each,
-    join_labels,
-    require,
-    require_applicable,
-)
-from rig.conformance.data_sheet import RESTRICTED_ENDS, Pdo
 from rig.conformance.target import (
     CANNOT_MAP,
     COMMANDS,
@@ -24,12 +13,22 @@ from rig.conformance.target import (
     OPERATIONAL,
     PDO_TOO_LONG,
     PRE_OPERATIONAL,
+    RESTRICTED_ENDS,
     STATE,
     VALUE,
+    Case,
+    CaseNotApplicable,
+    CaseSkipped,
+    Pdo,
+    Problem,
     Target,
+    for_each,
     format_abort,
+    join_labels,
     read_error_code,
+    require,
     require_abort,
+    require_applicable,
 )
 from rig.network.frame import Frame
 

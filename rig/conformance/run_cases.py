@@ -9,15 +9,12 @@ from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell, Column, Line, Medium, Mood, Report, Section, Table
 from plant.errors import RigError
 from rig import junit
-from rig.conformance import eds_cases, error_cases, nmt_cases, object_cases, pdo_cases, sdo_cases, timing_cases
-from rig.conformance.conformance_case import CHAPTERS, Case, CaseEnd, CaseFailed, Verdict
-from rig.conformance.data_sheet import HISTORY, DataSheet, Variable
+from rig.conformance import eds_cases, error_cases, nmt_cases, object_cases, pdo_cases, sdo_cases
 from rig.conformance.object_cases import read_values
-from rig.conformance.target import Target
+from rig.conformance.target import CHAPTERS, HISTORY, Case, CaseEnd, CaseFailed, DataSheet, Target, Variable, Verdict
 
 CASES: list[Case] = [
     *eds_cases.CASES, *object_cases.CASES, *sdo_cases.CASES, *pdo_cases.CASES, *error_cases.CASES, *nmt_cases.CASES,
-    *timing_cases.CASES,
 ]
 
 

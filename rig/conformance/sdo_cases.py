@@ -7,8 +7,6 @@ from functools import partial
 
 from canopen.objectdictionary.datatypes import DOMAIN
 
-from rig.conformance.conformance_case import Case, CaseNotApplicable, for_each, join_labels, require, require_applicable
-from rig.conformance.data_sheet import Variable
 from rig.conformance.object_cases import read_values
 from rig.conformance.target import (
     COMMAND,
@@ -18,10 +16,17 @@ from rig.conformance.target import (
     TOO_LONG,
     TOO_SHORT,
     WRONG_LENGTH,
+    Case,
+    CaseNotApplicable,
     Target,
+    Variable,
+    for_each,
     format_abort,
+    join_labels,
     pack_segment,
+    require,
     require_abort,
+    require_applicable,
 )
 
 Change = tuple[str, Callable[[bytes], bytes]]  # what is done to the data of a download

@@ -5,7 +5,8 @@ import time
 from array import array
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fdi.output import require_writable, write_whole
-from fdi.trace.importing.formats import Channel
-from fdi.trace.importing.import_map import ImportMap
+from fdi.trace.importing.conversion import ImportMap
+from fdi.trace.importing.formats import Channel, Measurement
 from fdi.trace.mcap_log import open_log
 from fdi.trace.sensor_dynamics import write_sensors
 from fdi.trace.trace import Trace
@@ -254,42 +255,35 @@ def _load_own_messages(dbc: Path) -> dict[int, Any]:
     return own
 
 
-@dataclass(frozen=True)
-class CanMeasurement:
-    """A CAN log and the messages of its DBC; channels are named by message and signal, with a dot."""
+def _read_signals(path: Path, messages: Mapping[tuple[int, bool], Any], names: Collection[str],
+                  dates: Collection[str]) -> dict[str, Channel]:
+    """Signals "message.signal" and their times since the first frame of a log. Frames that are too short are left out.
 
-    path: Path
-    format: str
-    units: Mapping[str, str]
-    messages: Mapping[tuple[int, bool], Any]  # (identifier, is extended) to the message of the DBC
-    has_times: bool = True
+    `messages`: (identifier, is extended) to the message of the DBC.
 
-    def read(self, names: Collection[str], dates: Collection[str] = ()) -> dict[str, Channel]:
-        """The signals and their times since the first frame of the log. Frames that are too short are left out.
-
-        Raises:
-            InputError: a log that cannot be read, or without a frame of one of the signals.
-        """
-        wanted = {name.rpartition(".")[0] for name in names}
-        columns = {name: (array("d"), array("d")) for name in names}  # values, times
-        first: float | None = None
-        for frame in list_can_messages(self.path):
-            first = frame.timestamp if first is None else first
-            known = self.messages.get((frame.arbitration_id, frame.is_extended_id))
-            if known is None or known.name not in wanted or len(frame.data) < known.length:
-                continue
-            for signal, value in known.decode(bytes(frame.data), decode_choices=False).items():
-                name = f"{known.name}.{signal}"
-                if name in columns:
-                    columns[name][0].append(float(value))
-                    columns[name][1].append(frame.timestamp - first)
-        for name, (values, _) in columns.items():
-            if not values:
-                raise InputError(self.path, name, "at least one frame of this message")
-        return {name: Channel(*map(np.frombuffer, column)) for name, column in columns.items()}
+    Raises:
+        InputError: a log that cannot be read, or without a frame of one of the signals.
+    """
+    wanted = {name.rpartition(".")[0] for name in names}
+    columns = {name: (array("d"), array("d")) for name in names}  # values, times
+    first: float | None = None
+    for frame in list_can_messages(path):
+        first = frame.timestamp if first is None else first
+        known = messages.get((frame.arbitration_id, frame.is_extended_id))
+        if known is None or known.name not in wanted or len(frame.data) < known.length:
+            continue
+        for signal, value in known.decode(bytes(frame.data), decode_choices=False).items():
+            name = f"{known.name}.{signal}"
+            if name in columns:
+                columns[name][0].append(float(value))
+                columns[name][1].append(frame.timestamp - first)
+    for name, (values, _) in columns.items():
+        if not values:
+            raise InputError(path, name, "at least one frame of this message")
+    return {name: Channel(*map(np.frombuffer, column)) for name, column in columns.items()}
 
 
-def open_can_log(path: Path, dbc: Path) -> CanMeasurement:
+def open_can_log(path: Path, dbc: Path) -> Measurement:
     """A CAN log with the signals of a DBC.
 
     Raises:
@@ -299,4 +293,4 @@ def open_can_log(path: Path, dbc: Path) -> CanMeasurement:
     units = {f"{m.name}.{s.name}": s.unit or "" for m in messages.values() for s in m.signals}
     if not units:
         raise InputError(dbc, "--dbc", "a DBC file with at least one signal")
-    return CanMeasurement(path, f"CAN log, {dbc.name}", units, messages)
+    return Measurement(path, f"CAN log, {dbc.name}", units, partial(_read_signals, path, messages), has_times=True)

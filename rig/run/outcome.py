@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fdi.output import write_text
 from fdi.progress import Progress
-from fdi.report.json import to_plain
+from fdi.report.report import to_plain
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
@@ -316,7 +316,7 @@ def diagnose_servovalve(trace: Trace, progress: Progress, workers: int = 2) -> d
     """
     from fdi.diagnosis.diagnosis import diagnose  # here: loads the compiler, which other runs do not need
     from fdi.report.diagnosis_report import collect_data
-    from fdi.report.json import to_plain
+    from fdi.report.report import to_plain
 
     try:
         diagnosis = diagnose(trace, progress=progress, source=trace.provenance["source"], workers=workers)

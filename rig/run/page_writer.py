@@ -79,7 +79,7 @@ def main() -> None:
     """Load what a page needs and say so, then write the page that a line of standard input names; without one, none."""
     gc.disable()  # this process ends with its page; looking through matplotlib's objects takes a tenth of its time
     from fdi.report.drawing import start_figure, to_svg
-    from fdi.report.html import load_templates
+    from fdi.report.report import load_templates
     from fdi.report.run_report import write_run_page
 
     with start_figure(1.0) as figure:  # loads matplotlib, the fonts and the SVG writer

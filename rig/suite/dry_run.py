@@ -1,18 +1,39 @@
-"""The figures of a sequence before its run: command, load, and the run that a healthy actuator is predicted to make."""
+"""A sequence before its run: command, load, and the run that a healthy actuator is predicted to make, as a report."""
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from fdi.report.drawing import (
+    BLUE,
+    COMMAND,
+    FAULT,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    RED,
+    Mark,
+    axes,
+    call,
+    draw_panels,
+    legend,
+    levels,
+    line,
+    shade,
+)
 from fdi.report.numbers import count_nouns, format_amount, format_signal
+from fdi.report.report import Cell, Column, Figure, Line, Medium, Report, Section, Table, tabulate, to_plain
+from fdi.report.run_report import format_limits
 from plant import Model, simulate
 from plant.model import find_quantity
 from plant.run import Columns
 from plant.segments import RATE, Array
 from rig.nodes.scenario import require_servovalve
-from rig.run.job import Job
+from rig.run.job import Job, find_differences
 from rig.run.outcome import LimitReached, find_limits
 from rig.sequences.checks import CheckResult, Guard, evaluate_checks
 from rig.sequences.faults import (
@@ -278,3 +299,164 @@ def describe_size(fault: Fault, base: Mapping[str, float]) -> str:
         parts += [f"at most {fault.count}"] if fault.count is not None else []
     ramp = getattr(fault, "ramp", 0.0)
     return ", ".join(parts) + (f" within {format_amount(ramp, 's')}" if ramp else "")
+
+
+def build_dry_run_report(dry: DryRun, files: Sequence[tuple[str, str]] = ()) -> Report:
+    """Report on a dry run; `files` are (label, path) of the files written."""
+    sequence = dry.job.sequence
+    problems, data = dry.problems, collect_data(dry)
+    sentence = "; ".join(problems) if problems else "The actuator can follow this sequence."
+    parts = [f"{name} {seconds:g} s" for name, seconds in dry.durations.items() if seconds]
+    duration = f"{sum(dry.durations.values()):g} s: {', '.join(parts)}"
+    facts = [("model", dry.job.model.name), ("differs from nominal", data["differences"]),
+             ("checks", str(len(sequence.checks))), ("guards", str(len(sequence.guards)))]
+    facts += [("steps in Python", ", ".join(f"{step.python} {step.when}" for step in sequence.steps))] if (
+        sequence.steps) else []
+    coloured = " Orange: the faults of the sequence." if dry.faults else ""
+    picture = Figure("Position and speed of the command; position, following error and current of the predicted run of "
+                     "a healthy actuator. Steps have no speed. Red: limits of the actuator. The bars are the windows "
+                     "of the checks, green for a check that passes on the predicted run and red for one that does not."
+                     + coloured, lambda: draw_dry_run(dry))
+    return Report(
+        command="check", title=f"Dry run: {sequence.title}", verdict=data["verdict"],
+        mood="bad" if problems else "good", sentence=sentence, facts=facts, notes=_list_notes(dry),
+        sections=[Section("Command and load", [Line("duration", duration), *_tabulate_demands(dry.demands)]),
+                  Section("Faults", _tabulate_faults(dry.faults)),
+                  Section("Predicted run", [Line(name, text) for name, text in describe_prediction(dry)]),
+                  Section("Checks", _tabulate_checks(dry.checks)),
+                  Section("Picture", [picture])],
+        files=files, data=data)
+
+
+def _list_notes(dry: DryRun) -> list[str]:
+    notes = []
+    if dry.job.sequence.faults:
+        notes.append("the prediction is without the faults of the sequence")
+    length = dry.durations["main"]
+    notes += [f"fault {fault.label!r} ends with main at {length:g} s, not at {fault.end:g} s"
+              for fault in dry.job.sequence.faults if fault.end is not None and fault.end > length + 0.5 / RATE]
+    if dry.not_predicted:
+        notes.append(f"not predicted, because they judge events: {', '.join(dry.not_predicted)}")
+    failing = [check.name for check in dry.checks if not check.passed and check.value == check.value]
+    if failing:
+        notes.append(f"these checks would fail on the predicted run: {', '.join(failing)}")
+    return notes
+
+
+def _tabulate_demands(demands: Sequence[Demand]) -> list[Table]:
+    return [tabulate(
+        [each for each in demands if each.value >= 1e-9],
+        (Column("largest"), lambda each: each.name),
+        (Column("value", align="right"),
+         lambda each: Cell(each.show(each.value), "bad" if each.is_violated else "", True)),
+        (Column("limit", align="right"), lambda each: "" if each.limit is None else each.show(each.limit)),
+        (Column("unit"), lambda each: SHOWN_UNITS[each.unit][0]),
+        (Column("limit from"), lambda each: "" if each.limit is None else each.parameter),
+        (Column("section"), lambda each: each.section), (Column("t", "s", "right"), lambda each: f"{each.t:.3f}"),
+        caption="A jump between two sections is a step and counts neither as speed nor as acceleration.")]
+
+
+def _tabulate_faults(faults: Sequence[PlannedFault]) -> list[Table]:
+    return [tabulate(
+        faults,
+        (Column("fault"), lambda each: each.name), (Column("kind", medium=Medium.PAGE), lambda each: each.kind),
+        (Column("target"), lambda each: each.target),
+        (Column("from", "s", "right"), lambda each: f"{each.t0:.3f}"),
+        (Column("to", "s", "right"), lambda each: f"{each.t1:.3f}"),
+        (Column("duration", "s", "right", Medium.PAGE), lambda each: f"{each.duration:.3f}"),
+        (Column("size"), lambda each: each.size),
+        caption="Times count from the start of main; all faults end with it.")]
+
+
+def describe_prediction(dry: DryRun) -> list[tuple[str, str]]:
+    """The figures of the predicted run: current, following error, limits that it reaches."""
+    run = dry.predicted
+    error = run.com - run.xj
+    limit = dry.job.model.values.get("controller.current_limit")
+    current = f"largest {1e3 * np.abs(run.cor).max():.3g} mA" + (f" of {1e3 * limit:.3g} mA" if limit else "")
+    main = (dry.t >= 0.0) & (dry.t < dry.durations["main"])
+    lines = [("current", current),
+             ("error", f"largest {1e3 * np.abs(error[main]).max():.4g} mm, RMS "
+                       f"{1e3 * math.sqrt(float(np.mean(error[main] ** 2))):.4g} mm in main")]
+    if dry.limits:
+        lines.append(("reaches", "; ".join(each.describe() for each in dry.limits)))
+    return lines
+
+
+def _tabulate_checks(checks: Sequence[CheckResult]) -> list[Table]:
+    def show_value(check: CheckResult) -> Cell:
+        text = "none" if math.isnan(check.value) else f"{check.value:.4g}"
+        return Cell(text, "good" if check.passed else "bad", True)
+
+    return [tabulate(
+        checks,
+        (Column("check"), lambda check: check.name),
+        (Column("window", "s"), lambda check: "-" if math.isnan(check.t0) else f"{check.t0:.3f} .. {check.t1:.3f}"),
+        (Column("predicted", align="right"), show_value),
+        (Column("limits", align="right"), lambda check: format_limits(check.low, check.high)),
+        (Column("unit"), lambda check: "" if check.unit == "1" else check.unit),
+        (Column("remark"), lambda check: check.detail))]
+
+
+def collect_data(dry: DryRun) -> dict[str, Any]:
+    """The JSON answer of a dry run."""
+    run, error = dry.predicted, dry.predicted.com - dry.predicted.xj
+    return {
+        "verdict": "BEYOND_LIMITS" if dry.problems else "WITHIN_LIMITS", "problems": dry.problems,
+        "sequence": dry.job.sequence.title, "model": dry.job.model.name,
+        "differences": find_differences(dry.job).describe(), "durations": dry.durations,
+        "faults": [{**each._asdict(), "duration": each.duration} for each in dry.faults],
+        "demands": [{**each._asdict(), "violated": each.is_violated} for each in dry.demands],
+        "predicted": {"current": float(np.abs(run.cor).max()), "error": float(np.abs(error).max()),
+                      "limits": [each._asdict() for each in dry.limits],
+                      "guards": [trip._asdict() for trip in dry.trips]},
+        "checks": [to_plain(check._asdict()) for check in dry.checks], "not_predicted": dry.not_predicted}
+
+
+def draw_dry_run(dry: DryRun) -> str:
+    """Position, speed, following error, current and load over time, with limits in red; faults, windows of checks."""
+    limits = {each.name: each.limit for each in dry.demands}
+    run, start, end = dry.predicted, float(dry.t[0]), float(dry.t[-1]) + 1.0 / RATE
+    shown: list[tuple[str, list[tuple[Array, str, str | None]], float, float | None]] = [
+        ("position [mm]", [(run.com, COMMAND, "command"), (run.xj, BLUE, "predicted")], 1e3, limits["position"]),
+        ("speed [mm/s]", [(dry.speed, GREY, None)], 1e3, limits["speed"]),
+        ("error [mm]", [(run.com - run.xj, ORANGE, None)], 1e3, None),
+        ("current [mA]", [(run.cor, "#8250df", None)], 1e3, dry.job.model.values.get("controller.current_limit"))]
+    if dry.load.any():
+        shown.append(("load [kN]", [(dry.load, GREY, None)], 1e-3, limits["load"]))
+    faults = [shade(each.t0, each.t1, FAULT, 0.5) for each in dry.faults]
+    panels: list[list[Mark]] = [[
+        *(line(dry.t, values * scale, colour, name, 1.2) for values, colour, name in lines),
+        *_draw_limit(limit, max(float(np.nanmax(np.abs(values))) for values, _, _ in lines), scale), *faults,
+        call("set_ylabel", label, fontsize=8)] for label, lines, scale, limit in shown]
+    panels[0].append(legend(2))
+    groups = {"faults": [(each.name, each.t0, each.t1, FAULT) for each in dry.faults],
+              "checks": [(check.name, check.t0, check.t1, GREEN if check.passed else RED) for check in dry.checks
+                         if check.t0 == check.t0]}
+    bars = {label: group for label, group in groups.items() if group}
+    panels += [[*_draw_bars(group, start, end), call("set_ylabel", label, fontsize=8)] for label, group in bars.items()]
+    panels[-1].append(axes(xlim=(start, end), xlabel="time from the start of the main phase [s]"))
+    heights = [1.6] * len(shown) + [0.15 * len(group) + 0.3 for group in bars.values()]
+    return draw_panels("dry run", [[panel] for panel in panels], sum(heights) + 0.6, sharex=True, height_ratios=heights)
+
+
+def _draw_limit(limit: float | None, largest: float, scale: float) -> list[Mark]:
+    """A limit on both sides of zero; its value above the panel where lines would flatten the curve."""
+    if limit is None:
+        return []
+    if largest > 0.3 * limit:
+        return levels(limit * scale, RED, None, 0.9, "--")
+    return [lambda ax: ax.text(0.0, 1.02, f"limit {limit * scale:.4g}", transform=ax.transAxes, color=RED, fontsize=8)]
+
+
+def _draw_bars(bars: Sequence[tuple[str, float, float, str]], start: float, end: float, least: float = 0.004
+               ) -> Iterator[Mark]:
+    """A bar in a row of its own for each (name, t0, t1, colour); the name stands where there is room.
+
+    `least`: share of the axis that a bar covers, so that a fault of one cycle can be seen.
+    """
+    for row, (name, t0, t1, colour) in enumerate(bars):
+        yield call("barh", -row, max(t1 - t0, least * (end - start)), 0.7, t0, color=colour, alpha=0.75)
+        text, side = (f"{name} ", "right") if t0 > 0.5 * (start + end) else (f" {name}", "left")
+        yield call("text", t0, -row, text, ha=side, va="center", fontsize=6.5, color=INK, clip_on=True)
+    yield axes(yticks=[])

@@ -10,23 +10,367 @@ when it is ready.
 """
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import select
+import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from io import BytesIO
+from math import isnan, nan
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Chunk, Schema
+from mcap_protobuf.decoder import DecoderFactory
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.live import Live
+from rich.text import Text
 
-from rig.recorder import Record
-from rig.view.live_log import follow_log
-from rig.view.live_run import LivePlan, LiveRun
-from rig.view.live_screen import describe_line, draw_screen
+from fdi.trace.mcap_log import scan_messages, unpack_chunk
+from plant.segments import RATE
+from rig.network.node_objects import NAMES
+from rig.recorder import CanFrame, Check, Event, NmtState, Record
+from rig.recorder.schema import TOPICS
+from rig.recorder.writer import MAGIC, list_channels
+from rig.view.live_run import COLUMNS, CheckState, LivePlan, LiveRun
+from rig.view.recording import (
+    ACTIVE,
+    FAIL,
+    LANES,
+    MEASURED,
+    NEUTRAL,
+    NOTHING,
+    PASS,
+    PHASES,
+    PLOTS,
+    SECTIONS,
+    STATES,
+    Drawing,
+    Lane,
+    LogText,
+    Recording,
+    build_blueprint,
+    draw_signals,
+    name_node_lane,
+    read_fault_event,
+)
 from rig.view.viewer import find_free_port, is_listening, make_viewer_command, wait_until
+
+_RECORD = struct.Struct("<BQ")  # opcode, length
+
+
+def follow_log(path: Path) -> Iterator[list[tuple[int, Record]]]:
+    """Give the records of the log that are new, with their log times in ns, again and again; no raw frames.
+
+    The writer closes a chunk at least every 0.2 s; what it has not written yet comes later. The log is opened once, as
+    soon as it is there: it may be moved or deleted. What is given ends if it cannot be read.
+    """
+    decoders: dict[int, Any] = {}
+    for kind, schema in zip(TOPICS.values(), list_channels(), strict=False):  # schemas come first
+        if kind is not CanFrame and isinstance(schema, Schema):
+            decode = DecoderFactory().decoder_for("protobuf", schema)
+            decoders[schema.id] = kind, [field.name for field in fields(kind)], decode
+    done = len(MAGIC)  # bytes of the file
+    with contextlib.suppress(OSError):
+        while not path.exists():
+            yield []
+        with path.open("rb", buffering=0) as file:
+            while True:
+                file.seek(done)
+                found, start = list[tuple[int, Record]](), 0
+                for raw, end in _list_chunks(file.read()):
+                    start = end
+                    found += _decode_messages(raw, decoders)
+                done += start
+                yield found
+
+
+def _decode_messages(raw: bytes, decoders: dict[int, Any]) -> Iterator[tuple[int, Record]]:
+    for channel, t_ns, _, message in scan_messages(raw):
+        if channel in decoders:
+            kind, names, decode = decoders[channel]
+            record = decode(message)
+            yield t_ns, kind(**{name: getattr(record, name) for name in names})
+
+
+def _list_chunks(data: bytes) -> Iterator[tuple[bytes, int]]:
+    """The chunks that are complete, unpacked, and where each ends."""
+    at = 0
+    while at + _RECORD.size <= len(data):
+        opcode, length = _RECORD.unpack_from(data, at)
+        at += _RECORD.size + length
+        if opcode == Opcode.CHUNK and at <= len(data):
+            chunk = Chunk.read(ReadDataStream(BytesIO(data[at - length:at])))
+            yield unpack_chunk(chunk), at
+
+
+_WINDOW = 5 * RATE  # cycles of the plot
+_STYLES = {"PASS": "green", "FAIL": "bold red", "measures": "bold cyan", "waits": "dim", "after the run": "dim"}
+_NODE_STYLES = {"operational": "green", "pre-operational": "yellow", "stopped": "red"}
+_ORDER = ("FAIL", "measures", "PASS", "waits", "after the run")
+
+
+def draw_screen(run: LiveRun, width: int, height: int, silence: float) -> Text:
+    """The whole screen, `height` lines of at most `width` characters. `silence`: s without a new cycle."""
+    lower = max(6, (height - 6) // 2)
+    plot_height = max(height - lower - 7, 3)
+    lines = [_draw_title(run, width), *_draw_nodes(run, silence)]
+    lines.append(Text.assemble(("Position [mm], last 5 s: ", "bold"), ("command", "white"), "  ", ("ram", "bold blue")))
+    lines += draw_plot({"white": run.read_last("com", _WINDOW) * 1e3, "bold blue": run.read_last("xj", _WINDOW) * 1e3},
+                       width, plot_height, 0.2)
+    left, right = _draw_checks(run, lower), [*_draw_timing(run), *_draw_events(run, lower)][:lower]
+    half = width // 2
+    for number in range(lower):
+        line = left[number] if number < len(left) else Text("")
+        line.truncate(half - 1, overflow="ellipsis", pad=True)
+        line.append(" ")
+        line.append_text(right[number] if number < len(right) else Text(""))
+        lines.append(line)
+    lines.append(Text("Ctrl-C ends the run; its log is closed and judged", style="dim"))
+    for line in lines:
+        line.truncate(width, overflow="ellipsis")
+    return Text("\n").join(lines[:height])
+
+
+def describe_line(run: LiveRun) -> str:
+    """The state of the run in one line, for where there is no screen."""
+    words = [state.word for state in run.checks.values()]
+    t = "" if isnan(run.t) else f"{run.t:.1f} of {run.plan.duration:g} s, "
+    nodes = ", ".join(f"{node} {run.troubles.get(node) or state}" for node, state in run.states.items() if node != 1)
+    com, xj = (float(run.read_last(name, 1)[0]) * 1e3 if run.cycles else nan for name in ("com", "xj"))
+    return (f"{t}{run.section}; command {com:.2f} mm, ram {xj:.2f} mm; checks {words.count('PASS')} pass, "
+            f"{words.count('FAIL')} fail of {len(words)}; {_describe_lateness(run)}; nodes: {nodes}")
+
+
+def _draw_title(run: LiveRun, width: int) -> Text:
+    t = 0.0 if isnan(run.t) else min(max(run.t, 0.0), run.plan.duration)
+    share = t / run.plan.duration
+    bar = max(min(width - 70, 20), 6)
+    return Text.assemble((f"{run.plan.title}", "bold"), f"  {run.section}  {t:.1f} of {run.plan.duration:g} s  ",
+                         ("█" * round(share * bar), "green"), ("░" * (bar - round(share * bar)), "dim"),
+                         f"  {run.plan.pace}, {run.cycles} cycles")
+
+
+def _draw_nodes(run: LiveRun, silence: float) -> list[Text]:
+    lines = []
+    for node, name in NAMES.items():
+        line = Text(f"node {node} {name:<11}")
+        state = run.states[node]
+        if node in run.troubles:
+            line.append(f"DEAD: {run.troubles[node]}", style="bold white on red")
+        else:
+            line.append(state, style=_NODE_STYLES.get(state, "dim"))
+        lines.append(line)
+    if silence >= 1.0 and run.cycles and not run.is_over:
+        lines[0].append(f"   no new cycle in the log for {silence:.1f} s", style="yellow")
+    return lines
+
+
+def _draw_checks(run: LiveRun, count: int) -> list[Text]:
+    """The checks: failed ones, those being measured, the last ones that passed, the next ones."""
+    states = list(run.checks.values())
+    words = [state.word for state in states]
+    passed, failed = words.count("PASS"), words.count("FAIL")
+    title = Text.assemble((f"Checks: {passed} pass", "bold"), (f", {failed} fail", "bold red" if failed else "bold"),
+                          (f" of {len(states)}", "bold"))
+    shown = [state for word in _ORDER for state in states if state.word == word]
+    done = [state for state in states if state.word == "PASS"]
+    room = count - 1 - sum(word in ("FAIL", "measures") for word in words)
+    if len(shown) > count - 1:  # the newest of those that passed
+        keep = done[len(done) - max(min(room - 1, len(done)), 0):]
+        shown = [state for state in shown if state.word != "PASS" or state in keep]
+    return [title, *(_draw_check(state) for state in shown[:count - 1])]
+
+
+def _draw_check(state: CheckState) -> Text:
+    return Text.assemble((f"{state.word:<8} ", _STYLES[state.word]), state.name, (state.measured, "bold"))
+
+
+def _draw_timing(run: LiveRun) -> list[Text]:
+    response = run.read_last("response", 2 * RATE)
+    lines = [Text("Timing, last 2 s", style="bold"), Text(_describe_lateness(run)),
+             Text(f"response {_describe_spread(response)}"), Text(f"overruns {run.overruns}")]
+    if run.overruns:
+        lines[3].stylize("yellow")
+    return lines
+
+
+def _describe_lateness(run: LiveRun) -> str:
+    if run.plan.pace == "lockstep":
+        return "lockstep: no cycle is late"
+    return f"lateness {_describe_spread(run.read_last('lateness', 2 * RATE))}"
+
+
+def _describe_spread(values: NDArray[np.float64]) -> str:
+    known = values[~np.isnan(values)] * 1e6
+    if not len(known):
+        return "unknown"
+    p50, p99 = np.percentile(known, (50, 99))
+    return f"p50 {p50:.0f} p99 {p99:.0f} max {known.max():.0f} us"
+
+
+def _draw_events(run: LiveRun, count: int) -> list[Text]:
+    events = [event for event in run.events if event.kind not in ("section", "identity")][-max(count - 5, 1):]
+    styles = {"WARN": "yellow", "ERROR": "bold red"}
+    return [Text("Events", style="bold"),
+            *(Text((f"{event.t:.2f} s " if not isnan(event.t) else "") + f"{event.kind}: {event.text}",
+                   style=styles.get(event.level, "")) for event in events)]
+
+
+_DOTS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])  # row and column of a dot -> its bit
+
+
+def draw_plot(lines: dict[str, NDArray[np.float64]], width: int, height: int, smallest_range: float) -> list[Text]:
+    """Draw columns of values over their number as text, `height` lines of `width` characters.
+
+    Args:
+        lines: colour -> values (n,), the last value at the right edge; a later line covers an earlier one.
+        width: characters, with 8 for the axis.
+        height: lines.
+        smallest_range: of the axis, so that noise does not fill the screen.
+    """
+    columns = max(width - 8, 1)
+    known = [values[~np.isnan(values)] for values in lines.values()]
+    known = [values for values in known if len(values)]
+    low = min((float(values.min()) for values in known), default=0.0)
+    high = max((float(values.max()) for values in known), default=0.0)
+    margin = max(smallest_range - (high - low), 0.1 * (high - low)) / 2
+    low, high = low - margin, high + margin
+    bits = np.zeros((height, columns), int)
+    colours = np.full((height, columns), "", dtype=object)
+    for colour, values in lines.items():
+        for row, column, bit in _list_dots(values, low, high, 2 * columns, 4 * height):
+            bits[row, column] |= bit
+            colours[row, column] = colour
+    labels = {0: high, height // 2: (low + high) / 2, height - 1: low}
+    drawn = []
+    for row in range(height):
+        text = Text(f"{labels[row]:7.2f} " if row in labels else " " * 8, style="dim")
+        for column in range(columns):
+            text.append(chr(0x2800 + bits[row, column]), style=colours[row, column] or None)
+        drawn.append(text)
+    return drawn
+
+
+def _list_dots(values: NDArray[np.float64], low: float, high: float, across: int, down: int
+               ) -> list[tuple[int, int, int]]:
+    """(row, column, bit) of the dots of a line; each column of dots spans what the line passes there."""
+    if not len(values):
+        return []
+    edges = np.linspace(0, len(values), across + 1).astype(int)
+    found = []
+    for x in range(across):
+        part = values[max(edges[x] - 1, 0):max(edges[x + 1], edges[x] + 1)]  # with the one before: steps are joined
+        part = part[~np.isnan(part)]
+        if len(part):
+            y0, y1 = ((high - edge) / (high - low) * (down - 1) for edge in (float(part.max()), float(part.min())))
+            found += [(y // 4, x // 2, int(_DOTS[y % 4, x % 2])) for y in range(round(y0), round(y1) + 1)]
+    return found
+
+
+_WORDS = {"waits": NEUTRAL, "measures": MEASURED, "after the run": NEUTRAL, "PASS": PASS, "FAIL": FAIL}
+
+
+def draw_plan(plan: LivePlan) -> Drawing:
+    """The views of a run that has not begun."""
+    lanes = [Lane("run/phase", [], PHASES),
+             Lane("run/command", [], PHASES | dict.fromkeys(plan.sections, SECTIONS["dynamic"])),
+             *(Lane(name_node_lane(node), [], STATES) for node in NAMES),
+             *(Lane(f"fault/{label}", [], ACTIVE) for label in plan.starts),
+             *(Lane(f"check/{name}", [], {}) for name in plan.check_names)]
+    plots = draw_signals(dict.fromkeys(_list_signals(plan), (NOTHING, NOTHING)))
+    return Drawing(plan.title, plots, LANES, lanes, ("Provenance", f"{plan.title}, {plan.pace}"), log=())
+
+
+def _list_signals(plan: LivePlan) -> list[str]:
+    """The signals that are drawn; in lockstep nothing is ever late."""
+    left_out = {"lateness": plan.pace == "lockstep", "load": not plan.has_load}
+    return [name for name in ("error", *COLUMNS[2:-1]) if not left_out.get(name)]
+
+
+class LiveView:
+    """Sends what is new of a run to a recording. Nothing is sent before main begins, where t = 0 is, or it ends."""
+
+    def __init__(self, recording: Recording, plan: LivePlan) -> None:
+        """Use the recording of the drawing of this plan."""
+        self._recording, self._plan, self._signals = recording, plan, _list_signals(plan)
+        self._rows = 0
+        self._waiting: list[tuple[int, Record]] = []
+        self._shown: dict[str, str] = {}  # lane -> state
+
+    def update(self, run: LiveRun, new: Sequence[tuple[int, Record]]) -> None:
+        """Send the records that have come since the last call, once main has begun."""
+        self._waiting += new
+        if run.zero_ns is not None:
+            self._send_all(run, run.zero_ns)
+
+    def finish(self, run: LiveRun) -> None:
+        """Send what a run that ended before main has left waiting; t = 0 is its last record."""
+        if run.zero_ns is None and self._waiting:
+            self._send_all(run, self._waiting[-1][0])
+
+    def _send_all(self, run: LiveRun, zero_ns: int) -> None:
+        for t_ns, record in self._waiting:
+            self._send_record(record, (t_ns - zero_ns) / 1e9)
+        self._waiting.clear()
+        rows = run.read_rows_from(self._rows)
+        self._rows += len(rows)
+        if len(rows):
+            self._send_rows(rows, run, zero_ns)
+
+    def _send_rows(self, rows: NDArray[np.float64], run: LiveRun, zero_ns: int) -> None:
+        columns = dict(zip(COLUMNS, rows.T, strict=True))
+        columns["error"], t = columns["com"] - columns["xj"], (columns["t_ns"] - (zero_ns - run.first_ns)) / 1e9
+        for (origin, _), lines in PLOTS.items():
+            for line in lines:
+                if line.signal in self._signals:
+                    self._recording.send_values(f"{origin}/{line.path}", t, columns[line.signal] * line.scale)
+        phases = columns["phase"].astype(int)
+        for row in np.flatnonzero(np.diff(phases, prepend=-1)):
+            self._send_state("run/phase", float(t[row]), [*PHASES][min(phases[row], 2)])
+        self._send_state("run/command", float(t[-1]), run.section)
+        for state in run.checks.values():
+            if not state.is_final:
+                self._send_check(state, float(t[-1]))
+
+    def _send_record(self, record: Record, t: float) -> None:
+        if isinstance(record, NmtState):
+            self._send_state(name_node_lane(record.node), t, record.name)
+        elif isinstance(record, Check):
+            state = CheckState.read(record)
+            self._send_check(state, t)
+            self._recording.send_text(LogText(
+                "log/checks", t, f"{state.word} {state.name}:{state.measured} {state.detail}".rstrip(),
+                "INFO" if record.passed else "ERROR"))
+        elif isinstance(record, Event):
+            text = f"{t:8.3f} s  {record.kind}: {record.text}"
+            self._recording.send_text(LogText("log/events", t, text, record.level))
+            fault = read_fault_event(record.text) if record.kind == "fault" else None
+            if fault:
+                self._send_state(f"fault/{fault[0]}", t, fault[1])
+
+    def _send_check(self, state: CheckState, t: float) -> None:
+        if state.name not in self._plan.check_names:
+            return  # the protocol checks are judged after the run: they have no window
+        lane, word = f"check/{state.name}", state.word + state.measured if state.is_judged else state.word
+        if self._shown.get(lane, "waits") != word:
+            self._recording.declare_lane(Lane(lane, [], {**_WORDS, word: _WORDS[state.word]}))
+            self._send_state(lane, t, word)
+
+    def _send_state(self, lane: str, t: float, state: str) -> None:
+        if self._shown.get(lane) != state:
+            self._shown[lane] = state
+            self._recording.send_state(lane, t, state)
+
 
 _EVERY = 0.1  # s between two frames, or pieces
 
@@ -95,8 +439,6 @@ def show_in_viewer(log: Path, plan: LivePlan, port: int, file: str) -> None:
     os.environ["RUST_LOG"] = "off"  # a viewer that is gone is one line of ours, not many of its library
     import rerun as rr
 
-    from rig.view.live_recording import LiveView, draw_plan
-    from rig.view.recording import Recording, build_blueprint
 
     drawing, viewer = draw_plan(plan), None
     blueprint = build_blueprint(drawing, "following")

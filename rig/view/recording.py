@@ -1,19 +1,29 @@
-"""What the viewer shows, as data: plots of curves, lanes of states, texts; and the one writer of its recordings."""
+"""What the viewer shows, as data: plots of curves, lanes of states, texts; of a log, of runs, of a comparison."""
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fdi.comparison.compare import Comparison
+from fdi.comparison.run_differences import Run, RunDifferences
 from fdi.output import require_writable
+from fdi.report.compare_report import describe_verdict
+from fdi.report.diff_report import choose_difference_units, describe_differences
+from fdi.report.drawing import LEVELS, choose_drawn_unit
+from fdi.report.numbers import SIGNAL_NAMES, format_amount, format_ratio, format_signal, join_words
+from fdi.report.run_report import read_verdict
+from fdi.thresholds import NOISE_BAND_RATIO, SIGNAL_ERROR_RATIO
+from fdi.trace.sections import Section
+from fdi.trace.trace import MAIN, Check, Floats, Trace
+from rig.network.node_objects import NAMES
+from rig.sequences.measures import SI_OF_UNIT
 from rig.view.viewer import ShownView, import_rerun
 
-Floats = NDArray[np.float64]
 TIMELINE = "run"
 # on black and on white
 COMMAND, MEASURED, LIMIT, PASS, FAIL, NEUTRAL = 0xA9B2BCFF, 0x3D8FE0FF, 0xE5534BFF, 0x3FA65AFF, 0xE5534BFF, 0x6B7785FF
@@ -216,3 +226,369 @@ def widen_range(low: float, high: float) -> tuple[float, float] | None:
     below, above = math.floor(low / step), math.ceil(high / step)
     is_sparse = 1.3 * step < span and math.floor(high / step) <= math.ceil(low / step)
     return (below * step, above * step) if is_sparse else None
+
+
+VERDICTS = {"PASS": PASS, "FAIL": FAIL, "ABORTED": FAIL, "INVALID_TIMING": 0xD9A441FF}
+STATES = {"operational": PASS, "pre-operational": 0xD9A441FF, "stopped": FAIL, "boot-up": NEUTRAL}
+PHASES = {"set-up": NEUTRAL, "main": MEASURED, "clean-up": NEUTRAL}
+SECTIONS = {"hold": NEUTRAL, "step": MEASURED, "ramp": 0x2A8C82FF, "dynamic": 0x8E5BBFFF}
+ACTIVE = {"active": FAIL}  # state of a fault
+VALUE = 0x2B3138FF  # of the words beside the window of a check
+LEVEL_COLOURS = (0x00DA7EFF, 0xAB0115FF)  # the viewer's colours of INFO and ERROR; WARN's stands in its menu too
+LANES = "Faults, nodes, run"  # title of a view that is no plot
+LIMITS = "limits"  # no view: the lines of the limits in all plots, of which some may lie behind a signal
+LIMITS_OF = {"never_exceeds", "max_error"}  # kinds of check whose limits are limits of the plotted line
+
+
+class RunLine(NamedTuple):
+    """A line of a plot of a run: the signal, its scale from SI, and how it is shown."""
+
+    signal: str
+    scale: float
+    path: str
+    name: str
+    colour: int
+    width: float = 1.5
+
+
+PLOTS = {  # origin, title -> lines
+    ("position", "Position [mm]"): (RunLine("com", 1e3, "command", "Com command [mm]", COMMAND, 4.0),
+                                    RunLine("xj", 1e3, "ram", "XJ ram [mm]", MEASURED)),
+    ("error", "Following error [um]"): (RunLine("error", 1e6, "error", "Com - XJ [um]", 0xE8A33DFF),),
+    ("current", "Current [mA]"): (RunLine("cor", 1e3, "current", "Cor current [mA]", 0xB57EDCFF),),
+    ("pressure", "Differential pressure [bar]"): (
+        RunLine("p12", 1e-5, "pressure", "P12 pressure [bar]", 0x45B8ACFF),),
+    ("spool", "Spool position [um]"): (RunLine("xs", 1e6, "spool", "XS spool [um]", 0xD96BA0FF),),
+    ("load", "Load on the ram [N]"): (RunLine("load", 1.0, "load", "load [N]", 0xD9A441FF),),
+    ("timing", "Cycle timing [us]"): (
+        RunLine("lateness", 1e6, "lateness", "SYNC lateness [us]", 0xF2C94CFF, 1.0),
+        RunLine("response", 1e6, "response", "controller's response [us]", 0x7FD46BFF, 1.0),
+        RunLine("work", 1e6, "work", "bench's own work [us]", 0x8C7AE6FF, 1.0)),
+}
+
+
+def draw_run(trace: Trace) -> Drawing:
+    """Draw a trace; set-up has negative times, main starts at 0."""
+    plots = [plot._replace(curves=[*plot.curves, *_list_limits(plot.origin, trace.checks)])
+             for plot in draw_signals(list_columns(trace))]
+    facts = "\n".join(f"- {key}: {value}" for key, value in trace.provenance.items())
+    log = _list_texts(trace)
+    shown = [ShownView(plot.title, tuple(curve.colour for curve in plot.curves if curve.colour != LIMIT))
+             for plot in plots]
+    lanes = {PASS, *SECTIONS.values(), *STATES.values(), *VERDICTS.values()}
+    shown.append(ShownView(LANES, tuple(lanes), is_lanes=True))
+    shown += [ShownView(TEXTS, LEVEL_COLOURS, 40)] if log else []  # one level in the list of events has some 60
+    shown.append(ShownView(LIMITS, (LIMIT,), 0))
+    name = trace.provenance.get("sequence", trace.provenance.get("source", "trace"))
+    return Drawing(name, plots, LANES, [*_list_lanes(trace)], ("Provenance", facts), shown, log)
+
+
+def list_columns(trace: Trace) -> dict[str, tuple[Floats, Floats]]:
+    """Signal -> times, s, and values in SI; signals without a value are left out, and lateness that is 0 throughout."""
+    timing = trace.timing
+    columns = {name: (trace.t, trace.column(name)) for name in ("com", "xj", "cor", "p12", "xs", "load")}
+    columns["error"] = trace.t, trace.com - trace.xj
+    columns |= {name: (timing.t, getattr(timing, name)) for name in ("lateness", "response", "work")}
+    return {name: (t, values) for name, (t, values) in columns.items() if not np.isnan(values).all()
+            and (name not in ("load", "lateness") or np.nan_to_num(values).any())}  # in lockstep nothing is ever late
+
+
+def draw_signals(columns: Mapping[str, tuple[Floats, Floats]]) -> list[Plot]:
+    """The plots of the signals that there are."""
+    plots = [Plot(origin, title, [
+        Curve(line.path, line.name, line.colour, columns[line.signal][0], columns[line.signal][1] * line.scale,
+              line.width) for line in lines if line.signal in columns]) for (origin, title), lines in PLOTS.items()]
+    return [plot for plot in plots if plot.curves]
+
+
+def _list_limits(origin: str, checks: tuple[Check, ...]) -> Iterator[Curve]:
+    """Limits of a plotted signal as red lines over the check's window."""
+    scales = {line.signal: line.scale for (own, _), lines in PLOTS.items() for line in lines if own == origin}
+    for number, check in enumerate(checks):
+        signal = "error" if check.kind == "max_error" else check.signal
+        if check.kind in LIMITS_OF and signal in scales and not math.isnan(check.t0 + check.high):
+            level = check.high * SI_OF_UNIT.get(check.unit, ("", 1.0))[1] * scales[signal]
+            for name, sign in (("high", 1.0), ("low", -1.0)):  # both kinds judge the size of the signal
+                yield Curve(f"limit_{number}_{name}", f"limit: {check.name}", LIMIT, np.array([check.t0, check.t1]),
+                            np.full(2, sign * level))
+
+
+def _list_lanes(trace: Trace) -> Iterator[Lane]:
+    """Verdict, phase, sections of the command, each node's NMT state, each fault, each check over its window."""
+    yield from list_verdict_lanes(trace, "run", 0.0)
+    turns = np.flatnonzero(np.diff(trace.phase, prepend=-1))
+    yield Lane("run/phase", [(float(trace.t[k]), [*PHASES][trace.phase[k]]) for k in turns], PHASES)
+    yield make_command_lane(trace, "run", 0.0)
+    for node in sorted({state.node for state in trace.nmt}):
+        yield Lane(name_node_lane(node), [(s.t, s.name) for s in trace.nmt if s.node == node], STATES)
+    yield from list_fault_lanes(trace, "fault/", 0.0)
+    for check in trace.sequence_checks:
+        yield _make_check_lane(check, trace)
+
+
+def list_verdict_lanes(trace: Trace, group: str, offset: float) -> list[Lane]:
+    """The verdict of a run, if it has one, `offset` s later than in the trace."""
+    result = read_verdict(trace)
+    return [Lane(f"{group}/verdict", [(float(trace.t[0]) + offset, str(result))], {str(result): VERDICTS[result.word]})
+            ] if result.word in VERDICTS else []
+
+
+def make_command_lane(trace: Trace, group: str, offset: float) -> Lane:
+    """The sections of the command, `offset` s later than in the trace."""
+    sections = [(float(trace.t[s.start]) + offset, s.kind, _describe_section(s)) for s in trace.sections()]
+    return Lane(f"{group}/command", [(t, text) for t, _, text in sections],
+                {text: SECTIONS[kind] for _, kind, text in sections})
+
+
+def list_fault_lanes(trace: Trace, prefix: str, offset: float) -> list[Lane]:
+    """When each fault begins and ends, from the events of the run, `offset` s later than in the trace."""
+    found: dict[str, list[tuple[float, str]]] = {}
+    for event in trace.events:
+        fault = read_fault_event(event.text) if event.kind == "fault" else None
+        if fault:
+            found.setdefault(fault[0], []).append((event.t + offset, fault[1]))
+    return [Lane(f"{prefix}{label}", states, ACTIVE) for label, states in found.items()]
+
+
+def name_node_lane(node: int) -> str:
+    """Path of the lane of a node.
+
+    >>> name_node_lane(2)
+    'node/2 controller'
+    """
+    return f"node/{node} {NAMES.get(node, '')}".strip()
+
+
+def read_fault_event(text: str) -> tuple[str, str] | None:
+    """Label of a fault and its state from now on, from the text of an event of the kind "fault"; None for other texts.
+
+    >>> read_fault_event("leakage begins"), read_fault_event("leakage ends"), read_fault_event("leakage")
+    (('leakage', 'active'), ('leakage', ''), None)
+    """
+    label, _, word = text.rpartition(" ")
+    return (label, "active" if word == "begins" else "") if word in ("begins", "ends") else None
+
+
+def _make_check_lane(check: Check, trace: Trace) -> Lane:
+    """A lane with the window of a check, failed checks first; grey is a window that the run did not reach.
+
+    Verdict and value stand beside the window, on its longer side, because a window may be too short for a number; in
+    the window if it has more room than either side.
+    """
+    unreached = math.isnan(check.t0) and math.isnan(check.value)
+    first, last = float(trace.t[0]), float(trace.t[-1])
+    start, stop = check.t0, check.t1
+    if math.isnan(start):
+        main = trace.t[trace.phase == MAIN]
+        start, stop = (float(main[0]), float(main[-1]) + trace.period) if len(main) else (first, last)
+    word, colour = ("PASS", PASS) if check.passed else ("FAIL", NEUTRAL if unreached else FAIL)
+    text = f"{word} {_describe_measurement(check)}"
+    if math.isnan(check.value) and check.detail:
+        text = f"{word} {describe_value(check.value, check.unit)}: {check.detail}"
+    path = f"check/{'pass' if check.passed else 'FAIL'}/{check.name}"
+    if stop - start > max(start - first, last - stop):
+        return Lane(path, [(start, text), (stop, "")], {text: colour})
+    states = [(first, text), (start, word), (stop, "")] if start - first > last - stop else [(start, word),
+                                                                                             (stop, text)]
+    return Lane(path, states, {text: VALUE, word: colour}, {word: " "})
+
+
+def _describe_section(section: Section) -> str:
+    if section.kind == "ramp":
+        return f"ramp {section.rate * 1e3:.3g} mm/s"
+    return section.kind if section.kind == "dynamic" else f"{section.kind} {section.last * 1e3:.3g} mm"
+
+
+def _describe_measurement(check: Check) -> str:
+    limits = " and ".join(f"{sign} {limit:.4g}" for sign, limit in (("≥", check.low), ("≤", check.high))
+                          if not math.isnan(limit))
+    return describe_value(check.value, check.unit) + (f" (limit {limits})" if limits else "")
+
+
+def describe_value(value: float, unit: str) -> str:
+    """What a check measured.
+
+    >>> describe_value(7.44213, "%"), describe_value(math.nan, "um")
+    ('7.442 %', 'not measured')
+    """
+    if math.isnan(value):
+        return "not measured"
+    return f"{value:.4g}" + ("" if unit in ("", "1") else f" {unit}")
+
+
+def _list_texts(trace: Trace) -> list[LogText]:
+    texts = [LogText("log/events", event.t, f"{event.t:8.3f} s  {event.kind}: {event.text}", event.level)
+             for event in trace.events]
+    for check in trace.checks:
+        t = float(trace.t[-1]) if math.isnan(check.t0) else check.t0
+        word, level = ("PASS", "INFO") if check.passed else ("FAIL", "ERROR")
+        text = f"{t:8.3f} s  {word} {check.name}: {_describe_measurement(check)} {check.detail}".rstrip()
+        texts.append(LogText("log/checks", t, text, level))
+    return texts
+
+
+REFERENCE, NOISE = COMMAND, 0x7FD46BFF
+COLOURS = (0xE8A33DFF, 0xD96BA0FF, 0x45B8ACFF, 0xB57EDCFF, 0x3D8FE0FF)  # of the runs after the first, in rotation
+SIGNALS, RUN_LANES = "signals and differences", "Runs"  # the first is all plots together
+
+
+def draw_runs(found: RunDifferences) -> Drawing:
+    """Draw runs and their differences, on the time of the first run: two plots for each signal, below each other."""
+    plots: list[Plot] = []
+    for name, (size, unit) in choose_difference_units(found).items():
+        shown, scale = LEVELS[name]
+        plots.append(Plot(name, f"{SIGNAL_NAMES[name]} [{shown}]", _draw_signal(found, name, scale)))
+        plots.append(Plot(f"difference_{name}", f"{SIGNAL_NAMES[name]} minus that of A [{unit}]",
+                          _draw_difference(found, name, 1.0 / size)))
+    # a run has one colour in all plots, so they are counted together
+    colours = {curve.colour for plot in plots for curve in plot.curves} - {NOISE, REFERENCE}
+    lanes = {PASS, NEUTRAL, *SECTIONS.values(), *VERDICTS.values()}
+    views = [ShownView(SIGNALS, tuple(colours)), ShownView(RUN_LANES, tuple(lanes), is_lanes=True)]
+    return Drawing(join_words([run.source for run in found.runs]), plots, RUN_LANES, _list_lanes_of_runs(found),
+                   ("Result", describe_result(found)), views, verdict=found.verdict)
+
+
+def _draw_signal(found: RunDifferences, name: str, scale: float) -> list[Curve]:
+    offsets = [0.0, *(pair.offset for pair in found.pairs)]
+    return [Curve(f"{number:02}_{run.label}", f"{run.label} {_shorten_source(run)}", _choose_colour(number),
+                  run.trace.t + offset, run.trace.column(name) * scale, 1.5 if number else 4.0)
+            for number, (run, offset) in enumerate(zip(found.runs, offsets, strict=True)) if name in run.trace.signals]
+
+
+def _draw_difference(found: RunDifferences, name: str, scale: float) -> list[Curve]:
+    known = [(number, pair, signal) for number, pair in enumerate(found.pairs, 1) for signal in pair.signals
+             if signal.name == name]
+    curves = [Curve(f"{number:02}_{pair.run.label}", f"{pair.run.label} - A", _choose_colour(number), pair.t,
+                    pair.differences[name] * scale) for number, pair, _ in known]
+    band = max((NOISE_BAND_RATIO * math.hypot(*signal.noise) * scale for _, _, signal in known), default=0.0)
+    return curves + [Curve(f"noise_{side}", f"noise of both runs, {NOISE_BAND_RATIO:g} SD", NOISE,
+                           found.runs[0].trace.t[[0, -1]], np.full(2, sign * band))
+                     for side, sign in (("high", 1.0), ("low", -1.0))]
+
+
+def _choose_colour(number: int) -> int:
+    return COLOURS[(number - 1) % len(COLOURS)] if number else REFERENCE
+
+
+def _shorten_source(run: Run) -> str:
+    """The last folder or file name of the user's text.
+
+    >>> _shorten_source(Run("B", "runs/clogged/trace.mcap", None)), _shorten_source(Run("B", "before.csv", None))
+    ('clogged', 'before.csv')
+    """
+    path = Path(run.source)
+    return path.parent.name or path.name if path.name == "trace.mcap" else path.name
+
+
+def _list_lanes_of_runs(found: RunDifferences) -> list[Lane]:
+    """Verdict and faults of each run, and the command of each run that has another one than the first."""
+    lanes: list[Lane] = []
+    for run, pair in zip(found.runs, [None, *found.pairs], strict=True):
+        offset = pair.offset if pair else 0.0
+        lanes += list_verdict_lanes(run.trace, run.label, offset)
+        if pair is None or not pair.has_same_command:
+            lanes.append(make_command_lane(run.trace, run.label, offset))
+        lanes += list_fault_lanes(run.trace, f"{run.label}/fault ", offset)
+    return lanes
+
+
+def describe_result(found: RunDifferences) -> str:
+    """Verdict, differences beside the noise, checks that changed, and notes, as Markdown."""
+    runs = [f"- {run.label}: {run.source}" for run in found.runs]
+    lines = [f"### {found.verdict}", "", describe_differences(found), "", *runs, "",
+             "| run | signal | RMS difference | largest | times the noise |", "|---|---|---|---|---|"]
+    lines += [f"| {pair.run.label} - A | {SIGNAL_NAMES[s.name]} | {format_amount(s.rms, s.unit)} | "
+              f"{format_amount(s.largest, s.unit)} at {s.t:.3f} s | {format_ratio(s.ratio)} |"
+              for pair in found.pairs for s in pair.signals]
+    changed = [check for check in found.checks if check.is_changed]
+    if changed:
+        labels = [run.label for run in found.runs]
+        lines += ["", f"| check | {' | '.join(labels)} |", f"|{'---|' * (1 + len(labels))}"]
+        lines += [f"| {check.name} | {' | '.join(_judge(result) for result in check.results)} |" for check in changed]
+    notes = dict.fromkeys(note for pair in found.pairs for note in pair.notes)
+    return "\n".join([*lines, "", *(f"- {note}" for note in notes)])
+
+
+def _judge(result: Any) -> str:
+    return "-" if result is None else "pass" if result.passed else "FAIL"
+
+
+BEFORE, FLOOR = 0xE5534BFF, MEASURED
+# each plot has a colour of its own, so that a picture shows which one is empty
+MODELS = {"xj": 0xE8A33DFF, "p12": 0x45B8ACFF, "xs": 0xD96BA0FF}
+RESIDUALS = {"xj": 0xC2A83EFF, "p12": 0x7FD46BFF, "xs": 0xB57EDCFF}
+COMMAND_AND_ERROR = "Command and error"
+NOT_JUDGED = "not judged"
+
+
+def draw_comparison(c: Comparison, before: Comparison | None) -> Drawing:
+    """Draw a comparison, and that with the model before a change: two plots for each signal, below each other."""
+    models = ([("before", before)] if before else []) + [("model", c)]
+    plots = [draw(name, [(word, found) for word, found in models if name in found.signals])
+             for name in c.signals for draw in (_draw_replay, _draw_residual)]
+    own = {*MODELS.values(), *RESIDUALS.values()}
+    shown = [ShownView(plot.title, tuple({curve.colour for curve in plot.curves} & own)) for plot in plots]
+    shown.append(ShownView(COMMAND_AND_ERROR, (PASS, FAIL, *SECTIONS.values()), is_lanes=True))
+    lanes = [make_command_lane(c.trace, "run", 0.0), *(_make_error_lane(word, found) for word, found in models),
+             *_list_left_out(c)]
+    return Drawing(f"{c.source}, {c.model.name}", plots, COMMAND_AND_ERROR, lanes,
+                   ("Result", describe_comparison(c, before)), shown, verdict=c.verdict)
+
+
+def _draw_replay(name: str, models: Sequence[tuple[str, Comparison]]) -> Plot:
+    """Measured, and what each model makes of the measured current."""
+    (unit, scale), trace = LEVELS[name], models[-1][1].trace
+    curves = [Curve("1_measured", f"{SIGNAL_NAMES[name]} measured", COMMAND, trace.t,
+                    trace.mask_unusable(name) * scale, 4.0)]
+    curves += [Curve(f"{number}_{word}", "before the change" if word == "before" else "model, from the current",
+                     BEFORE if word == "before" else MODELS[name], found.trace.t, found.replay.model[name] * scale)
+               for number, (word, found) in enumerate(models, 2)]
+    return Plot(name, f"{SIGNAL_NAMES[name]} [{unit}]", curves)
+
+
+def _draw_residual(name: str, models: Sequence[tuple[str, Comparison]]) -> Plot:
+    """Measured minus model, and the band of the noise floor."""
+    last = models[-1][1]
+    unit, scale = choose_drawn_unit(name, max(found.signals[name].error for _, found in models))
+    curves = [Curve(f"{number}_{word}", "before the change" if word == "before" else "residual",
+                    BEFORE if word == "before" else RESIDUALS[name], found.trace.t,
+                    found.replay.residual[name] * scale) for number, (word, found) in enumerate(models, 1)]
+    floor = NOISE_BAND_RATIO * last.signals[name].floor.value * scale
+    curves += [Curve(f"3_floor_{side}", f"noise floor, {NOISE_BAND_RATIO:g} SD", FLOOR, last.trace.t[[0, -1]],
+                     np.full(2, sign * floor)) for side, sign in (("high", 1.0), ("low", -1.0))]
+    return Plot(f"residual_{name}", f"Residual of {SIGNAL_NAMES[name]}, measured minus model [{unit}]", curves)
+
+
+def _list_left_out(c: Comparison) -> Iterator[Lane]:
+    """The rows that are not judged."""
+    left_out = c.replay.undecided | ~c.trace.usable
+    if left_out.any():
+        turns = np.flatnonzero(np.diff(left_out.astype(int), prepend=0))
+        states = [(float(c.trace.t[k]), NOT_JUDGED if left_out[k] else "") for k in turns]
+        yield Lane(f"run/{NOT_JUDGED}", states, {NOT_JUDGED: NEUTRAL})
+
+
+def _make_error_lane(word: str, c: Comparison) -> Lane:
+    """The error in each section of the command, over its noise floor."""
+    places = sorted(c.where, key=lambda place: place.t0)
+    colours = {format_ratio(place.ratio): FAIL if place.ratio > SIGNAL_ERROR_RATIO else PASS for place in places}
+    states = []
+    for place, following in zip(places, [*places[1:], None], strict=True):
+        states.append((place.t0, format_ratio(place.ratio)))
+        if following is None or following.t0 > place.t1 + 1e-9:  # no state begins where this one ends
+            states.append((place.t1, ""))
+    return Lane(f"error over floor/{word}", states, colours)
+
+
+def describe_comparison(c: Comparison, before: Comparison | None) -> str:
+    """Verdict, the errors beside the noise floor, and notes, as Markdown."""
+    head = ["signal", *(["error before", "error after"] if before else ["error"]), "noise floor", "ratio"]
+    first = [f"Before the change: {before.verdict}. {describe_verdict(before)}", ""] if before else []
+    lines = [f"### {c.verdict}", "", f"Model {c.model.name}. {describe_verdict(c)}", "", *first,
+             f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
+    for s in c.signals.values():
+        earlier = before.signals.get(s.name) if before else None
+        cells = [SIGNAL_NAMES[s.name], *([format_signal(earlier.error, s.name) if earlier else "-"] if before else []),
+                 format_signal(s.error, s.name), format_signal(s.floor.value, s.name), format_ratio(s.ratio)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join([*lines, "", *(f"- {note}" for note in c.notes)])

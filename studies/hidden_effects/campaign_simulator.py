@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.errors import InputError
-from rig.campaign.units import FLOORS, Unit
+from rig.campaign.judge import FLOORS, Unit
 from studies.hidden_effects.hidden import CATALOGUE
 from studies.hidden_effects.truth import SYMBOLS, nominal_symbols, simulate_truth
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import pytest
 
-from fdi.report.html import render_html
+from fdi.report.report import render_html
 from rig.nodes import firmware
 from rig.sequences.sequence import parse_sequence
 from studies.bus_faults import (

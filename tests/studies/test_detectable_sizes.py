@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from fdi.discovery.detectable import find_hidden_effects
-from fdi.estimation.fit import fit_unknowns
-from fdi.estimation.likelihood import Problem
+from fdi.estimation.fit import Problem, complete_model, fit_unknowns, list_all_unknowns, silence_readings
 from fdi.estimation.noise import white_noise
 from fdi.estimation.replay import hold_inputs
-from fdi.estimation.unknowns import complete_model, list_all_unknowns, silence_readings
 from fdi.trace.trace import Trace
 from plant import Model, simulate
 from plant.effects import CATALOGUE

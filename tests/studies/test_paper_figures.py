@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from fdi import Trace
-from fdi.diagnosis.bands import find_excursions
-from fdi.diagnosis.learn_bands import choose_bands
+from fdi.diagnosis.bands import choose_bands, find_excursions
 from fdi.diagnosis.rms_grid import search_grid
 from fdi.report.diagnosis_report import draw_maps
 from plant import Model, simulate

@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 from physics_cases import PREFLIGHT
 
-from rig.bench import stopwatch
+from rig.bench import realtime
 from studies.peers import __main__ as command
 from studies.peers import grid_runs, many_runs, rivals
 
-needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {stopwatch.GET_GCC}")
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {realtime.GET_GCC}")
 
 
 def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(stopwatch.shutil, "which", lambda name: None)
+    monkeypatch.setattr(realtime.shutil, "which", lambda name: None)
     monkeypatch.setattr(rivals.importlib.util, "find_spec", lambda name: None)
     assert command.main([]) == 0
     words = " ".join(capsys.readouterr().out.split())

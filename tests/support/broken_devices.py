@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from dbc import EDS
-from rig.conformance.conformance_case import Verdict
-from rig.conformance.data_sheet import DataSheet
 from rig.conformance.run_cases import Outcome, choose_cases, run_cases
-from rig.conformance.target import Options, Target
+from rig.conformance.target import DataSheet, Options, Target, Verdict
 from rig.device import Device
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame, Send

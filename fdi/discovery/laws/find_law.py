@@ -20,9 +20,20 @@ from fdi.discovery.explain import Explanation
 from fdi.discovery.laws.terms import LIBRARY, PARTS, TERMS, Term, find_states, name_parameter, registered_library
 from fdi.discovery.residual_pattern import ACCELERATION_WINDOW, CREEP, EDGE, Balance, States, compute_balances
 from fdi.discovery.search import Hypothesis, Search, simulate_starts
-from fdi.estimation.fit import Fit, Value, continue_fit, form_normal_equations, linearise, step_within_bounds
-from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, place_in_healthy_unit
-from fdi.estimation.unknowns import silence_readings
+from fdi.estimation.fit import (
+    Fit,
+    Free,
+    Problem,
+    Value,
+    compute_misfit,
+    compute_typical_rms,
+    continue_fit,
+    form_normal_equations,
+    linearise,
+    place_in_healthy_unit,
+    silence_readings,
+    step_within_bounds,
+)
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     EFFECT_INTERVAL_FACTOR,

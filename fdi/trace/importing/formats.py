@@ -15,20 +15,18 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.csv_table import open_text, report_unreadable
-from fdi.trace.importing.import_map import OTHER_UNITS
 from fdi.trace.signals import SIGNALS
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Floats, Trace
 from plant.errors import InputError
 from plant.units import find_unit
 
-Floats = NDArray[np.float64]
-
+OTHER_UNITS = ("V", "mV", "counts", "%")  # what a logger may write that needs scale and offset
 TEXT_SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".gz")
 
 
@@ -75,8 +73,8 @@ def _as_floats(path: Path, name: str, values: Any) -> Floats:
 def _open_log(path: Path) -> Measurement:
     trace = Trace.read(path)
     units = {name: SIGNALS[name].unit for name in ("t", *trace.signals)}
-    return ChannelReader(path, f"trace of {trace.provenance.get('version.eha-rig', 'this software')}", units,
-                         lambda name: Channel(trace.column(name)))
+    return Measurement(path, f"trace of {trace.provenance.get('version.eha-rig', 'this software')}", units,
+                       read_singly(lambda name: Channel(trace.column(name))))
 
 
 def _open_with(path: Path, kind: str, reader: Callable[[Path], Any]) -> Any:
@@ -113,7 +111,7 @@ def _open_mdf(path: Path) -> Measurement:
     for label, (_, group, index) in sorted(places.items(), key=lambda place: place[1][1:]):
         channel = file.groups[group].channels[index]
         units[label] = getattr(channel, "unit", "") or getattr(channel.conversion, "unit", "") or ""
-    return ChannelReader(path, f"MDF {file.version}", units, read, has_times=True)
+    return Measurement(path, f"MDF {file.version}", units, read_singly(read), has_times=True)
 
 
 def _open_mat(path: Path) -> Measurement:
@@ -124,8 +122,8 @@ def _open_mat(path: Path) -> Measurement:
     columns = dict(_flatten({name: value for name, value in content.items() if not name.startswith("__")}))
     if not columns:
         raise InputError(path, "", "a MAT file with at least one vector of numbers")
-    return ChannelReader(path, "MAT", {name: split_unit(name)[1] for name in columns},
-                         lambda name: Channel(_as_floats(path, name, columns[name])))
+    return Measurement(path, "MAT", {name: split_unit(name)[1] for name in columns},
+                       read_singly(lambda name: Channel(_as_floats(path, name, columns[name]))))
 
 
 def _flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
@@ -155,7 +153,7 @@ def _open_parquet(path: Path) -> Measurement:
     for column in file.schema_arrow:
         said = (column.metadata or {}).get(b"unit", b"").decode(errors="replace")
         units[column.name] = "s" if str(column.type).startswith("timestamp") else said or split_unit(column.name)[1]
-    return ChannelReader(path, "Parquet", units, read)
+    return Measurement(path, "Parquet", units, read_singly(read))
 
 
 READERS: Mapping[str, Callable[[Path], Measurement]] = {".mf4": _open_mdf, ".mdf": _open_mdf, ".mat": _open_mat,
@@ -176,64 +174,47 @@ class Layout(NamedTuple):
     separator: str  # " ": any white space
     decimal: str
     names: tuple[str, ...]
-    units: tuple[str, ...]
     name_line: int  # 0: the file has no names
     first_line: int  # of the numbers
 
 
-@dataclass(frozen=True)
-class TextTable:
-    """A text table whose layout is known; its numbers are read when asked for."""
+def _describe_layout(layout: Layout) -> str:
+    """Separator, decimal sign and line of the names, for people."""
+    separator = {"\t": "tabulator", " ": "white space"}.get(layout.separator, f"'{layout.separator}'")
+    decimal = ", decimal comma" if layout.decimal == "," else ""
+    return f"CSV, separator {separator}{decimal}, " + (f"names in line {layout.name_line}" if layout.name_line else
+                                                       "no names")
 
-    path: Path
-    layout: Layout
-    has_times: bool = False
 
-    @property
-    def format(self) -> str:
-        """Separator, decimal sign and line of the names, for people."""
-        separator = {"\t": "tabulator", " ": "white space"}.get(self.layout.separator, f"'{self.layout.separator}'")
-        decimal = ", decimal comma" if self.layout.decimal == "," else ""
-        names = f"names in line {self.layout.name_line}" if self.layout.name_line else "no names"
-        return f"CSV, separator {separator}{decimal}, {names}"
+def _read_columns(path: Path, layout: Layout, names: Collection[str], dates: Collection[str]) -> dict[str, Channel]:
+    """Columns of a text table, (rows,) each. It is read line by line: memory holds the chosen columns alone.
 
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Column to unit, from a line of units or from brackets behind the name."""
-        return dict(zip(self.layout.names, self.layout.units, strict=True))
-
-    def read(self, names: Collection[str], dates: Collection[str] = ()) -> dict[str, Channel]:
-        """The columns, (rows,) each. The file is read line by line: memory holds the chosen columns alone.
-
-        Raises:
-            InputError: a field that is no number or date, or a row of another length; it names the line.
-        """
-        places = [(self.layout.names.index(name), name) for name in dict.fromkeys(names)]
-        columns = {name: array("d") for _, name in places}
-        parse_number = _make_number_parser(self.layout.decimal)
-        appends = [(i, name, columns[name].append, _parse_date if name in dates else parse_number)
-                   for i, name in places]
-        width = len(self.layout.names)
-        with report_unreadable(self.path, ENCODINGS), open_text(self.path, self.layout.encoding) as stream:
-            for line, text in enumerate(stream, 1):
-                if line < self.layout.first_line or _is_comment(text):
-                    continue
-                fields = _split_line(text.rstrip("\r\n"), self.layout.separator)
-                if len(fields) != width and not _is_padded(fields, width):
-                    raise InputError(f"{self.path}: line {line}", "", f"{width} fields, not {len(fields)}")
-                for i, name, append, parse in appends:
-                    try:
-                        append(parse(fields[i]))
-                    except ValueError:
-                        kind = "a date and time (ISO 8601)" if name in dates else "a finite number or an empty field"
-                        raise InputError(f"{self.path}: line {line}", name, f"{kind}, not {fields[i]!r}") from None
-        if not len(next(iter(columns.values()), array("d"))):
-            raise InputError(self.path, "", "at least one row of numbers")
-        return {name: Channel(np.frombuffer(column)) for name, column in columns.items()}
+    Raises:
+        InputError: a field that is no number or date, or a row of another length; it names the line.
+    """
+    columns = {name: array("d") for name in names}
+    parse_number, width = _make_number_parser(layout.decimal), len(layout.names)
+    parsers = [(layout.names.index(name), name, _parse_date if name in dates else parse_number) for name in columns]
+    with report_unreadable(path, ENCODINGS), open_text(path, layout.encoding) as stream:
+        for line, text in enumerate(stream, 1):
+            if line < layout.first_line or _is_comment(text):
+                continue
+            fields = _split_line(text.rstrip("\r\n"), layout.separator)
+            if len(fields) != width and not _is_padded(fields, width):
+                raise InputError(f"{path}: line {line}", "", f"{width} fields, not {len(fields)}")
+            for i, name, parse in parsers:
+                try:
+                    columns[name].append(parse(fields[i]))
+                except ValueError:
+                    kind = "a date and time (ISO 8601)" if name in dates else "a finite number or an empty field"
+                    raise InputError(f"{path}: line {line}", name, f"{kind}, not {fields[i]!r}") from None
+    if not len(next(iter(columns.values()), array("d"))):
+        raise InputError(path, "", "at least one row of numbers")
+    return {name: Channel(np.frombuffer(column)) for name, column in columns.items()}
 
 
 def open_text_table(path: Path, separator: str | None = None, decimal: str | None = None,
-                    name_line: int | None = None) -> TextTable:
+                    name_line: int | None = None) -> Measurement:
     """A text table; what is not given is found in its first lines.
 
     Raises:
@@ -255,7 +236,9 @@ def open_text_table(path: Path, separator: str | None = None, decimal: str | Non
         names, units, line = _find_names(path, rows, lines, first, width, name_line)
     unique = tuple(name + (f" #{names[:i].count(name) + 1}" if name in names[:i] else "")
                    for i, name in enumerate(names))
-    return TextTable(path, Layout(encoding, separator, decimal, unique, tuple(units), line, first + 1))
+    layout = Layout(encoding, separator, decimal, unique, line, first + 1)
+    return Measurement(path, _describe_layout(layout), dict(zip(unique, units, strict=True)),
+                       partial(_read_columns, path, layout), layout=layout)
 
 
 def split_unit(name: str) -> tuple[str, str]:
@@ -422,44 +405,22 @@ class Channel(NamedTuple):
     t: Floats | None = None
 
 
-class Measurement(Protocol):
-    """An open recording of another logger."""
-
-    @property
-    def path(self) -> Path:
-        """The file."""
-
-    @property
-    def format(self) -> str:
-        """For people: "CSV, separator ';', decimal comma, names in line 3"."""
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Channel to unit as the file has it, "" if it has none; all channels, in the file's order."""
-
-    @property
-    def has_times(self) -> bool:
-        """Whether each channel has times of its own."""
-
-    def read(self, names: Collection[str], dates: Collection[str] = ()) -> dict[str, Channel]:
-        """The channels of these names; `dates` are calendar times and become seconds from the first one on.
-
-        Raises:
-            InputError: a value that is no number, naming its place.
-        """
-
-
 @dataclass(frozen=True)
-class ChannelReader:
-    """A recording of which one channel is read at a time."""
+class Measurement:
+    """An open recording of another logger. `read` gives the channels of some names.
+
+    The second argument of `read` names calendar times, which become seconds from the first one on. It raises InputError
+    for a value that is no number, naming its place.
+    """
 
     path: Path
-    format: str
-    units: Mapping[str, str]
-    read_channel: Callable[[str], Channel]
-    has_times: bool = False
+    format: str  # for people: "CSV, separator ';', decimal comma, names in line 3"
+    units: Mapping[str, str]  # channel to unit as the file has it, "" for none; all channels, in the file's order
+    read: Callable[[Collection[str], Collection[str]], dict[str, Channel]]
+    has_times: bool = False  # whether each channel has times of its own
+    layout: Layout | None = None  # of a text table
 
-    def read(self, names: Collection[str], dates: Collection[str] = ()) -> dict[str, Channel]:
-        """The channels of these names."""
-        return {name: self.read_channel(name) for name in names}
 
+def read_singly(read: Callable[[str], Channel]) -> Callable[[Collection[str], Collection[str]], dict[str, Channel]]:
+    """A `Measurement.read` made of one that reads a single channel."""
+    return lambda names, dates: {name: read(name) for name in names}

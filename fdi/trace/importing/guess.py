@@ -11,18 +11,16 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION
-from fdi.trace.importing.formats import Channel, Measurement, TextTable, split_unit
-from fdi.trace.importing.import_map import REQUIRED_SIGNALS, SIGNAL_NAMES
+from fdi.trace.importing.conversion import REQUIRED_SIGNALS, SIGNAL_NAMES
+from fdi.trace.importing.formats import Channel, Measurement, split_unit
 from fdi.trace.sensor_dynamics import find_comb
 from fdi.trace.signals import OUTPUTS, SIGNALS
+from fdi.trace.trace import Floats
 from plant.errors import InputError
 from plant.parameters import load_nominal_values
 from plant.units import UNITS, Unit, find_unit
-
-Floats = NDArray[np.float64]
 
 # Words of a column's name, in English, German, French, Spanish and Italian, and how much each says for a signal.
 WORDS: Mapping[str, Sequence[tuple[str, float]]] = {
@@ -126,12 +124,12 @@ def guess_map(measurement: Measurement) -> GuessedMap:
 def _read_numbers(measurement: Measurement) -> dict[str, Floats]:
     """The first values of each column of numbers, missing ones held."""
     try:
-        channels: dict[str, Channel] = measurement.read(list(measurement.units))
+        channels: dict[str, Channel] = measurement.read(list(measurement.units), ())
     except InputError:  # some column holds texts
         channels = {}
         for name in measurement.units:
             with suppress(InputError):
-                channels |= measurement.read([name])
+                channels |= measurement.read([name], ())
     out = {}
     for name, channel in channels.items():
         x = channel.values[:SAMPLE]
@@ -417,9 +415,9 @@ def _quote(text: str) -> str:
 
 
 def _list_file_lines(measurement: Measurement) -> list[str]:
-    if not isinstance(measurement, TextTable):
-        return []
     layout = measurement.layout
+    if layout is None:
+        return []
     lines = ["[file]  # how the text is written", f"separator = {_quote(layout.separator)}",
              f"decimal = {_quote(layout.decimal)}"]
     return [*lines, *([f"header = {layout.name_line}"] if layout.name_line else []), ""]

@@ -44,7 +44,7 @@ def measure_cycle(args: argparse.Namespace, progress: Progress) -> Report:
 
 def measure_live(args: argparse.Namespace, progress: Progress) -> Report:
     """Runs with and without the live screen."""
-    from rig.bench.live import build_live_runs_report, measure_live_runs
+    from rig.bench.realtime import build_live_runs_report, measure_live_runs
 
     return build_live_runs_report(measure_live_runs(choose_bus(args, 1.0), args.seconds, args.blocks, progress))
 
@@ -55,7 +55,7 @@ def measure_analyses(args: argparse.Namespace, progress: Progress) -> Report:
     Raises:
         InputError: lengths that are no numbers, or too small.
     """
-    from rig.bench.recordings import build_long_recordings_report, measure_long_recordings
+    from rig.bench.plant import build_long_recordings_report, measure_long_recordings
 
     try:
         lengths = [float(word) for word in args.lengths.split(",")]

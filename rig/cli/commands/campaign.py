@@ -13,12 +13,22 @@ from pathlib import Path
 from typing import Any
 
 from plant import InputError, load_model
-from rig.campaign import matrix
 from rig.campaign.batch import BatchProgress, Row, Workers
-from rig.campaign.folder import is_campaign_folder, read_campaign_rows, read_matrix_of_folder, replace_file
-from rig.campaign.judge import WORKS, run_campaign
-from rig.campaign.report import build_campaign_report, describe_progress, draw_detection_curves
-from rig.campaign.summary import summarise_campaign
+from rig.campaign.judge import (
+    WORKS,
+    Matrix,
+    build_matrix,
+    build_trace_matrix,
+    is_campaign_folder,
+    list_shipped_matrices,
+    parse_faults,
+    read_campaign_rows,
+    read_matrix,
+    read_matrix_of_folder,
+    replace_file,
+    run_campaign,
+)
+from rig.campaign.summary import build_campaign_report, describe_progress, draw_detection_curves, summarise_campaign
 from rig.cli.answer import give_answer
 from rig.cli.inputs import parse_changes
 from rig.cli.progress_bar import show_progress
@@ -63,7 +73,7 @@ def write_statistics(figures: dict[str, Any], folder: Path) -> None:
             replace_file(folder / name, draw_detection_curves(part).encode())
 
 
-def choose_matrix(args: argparse.Namespace) -> tuple[matrix.Matrix, Path]:
+def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
     """The matrix that the options describe, and the folder of its results.
 
     Raises:
@@ -86,16 +96,16 @@ def choose_matrix(args: argparse.Namespace) -> tuple[matrix.Matrix, Path]:
     if args.what and Path(args.what).is_dir():
         if changed or args.fault:
             raise InputError(args.what, "", "no faults or seeds: these are recorded traces")
-        return (matrix.build_trace_matrix(args.what, model, work),
+        return (build_trace_matrix(args.what, model, work),
                 Path(args.out or campaigns / Path(args.what).absolute().name))
-    tables = matrix.read_matrix(args.what) if args.what else {}
-    listed, more = tables.get("case", []), matrix.parse_faults(args.fault)
+    tables = read_matrix(args.what) if args.what else {}
+    listed, more = tables.get("case", []), parse_faults(args.fault)
     tables = {**tables, **changed, "case": [*listed, *more] if isinstance(listed, list) else listed}
     if not tables["case"]:
-        shipped = " or ".join(matrix.list_shipped_matrices())
+        shipped = " or ".join(list_shipped_matrices())
         raise InputError("MATRIX.toml|FOLDER", "", f"a matrix file, the shipped matrix {shipped}, a folder of "
                                                    "traces, or --fault EFFECT=SIZE,..")
-    return (matrix.build_matrix(tables, model, work, args.what or "--fault"),
+    return (build_matrix(tables, model, work, args.what or "--fault"),
             Path(args.out or campaigns / Path(args.what or "options").stem))
 
 

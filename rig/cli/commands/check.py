@@ -14,8 +14,7 @@ from rig.cli.answer import choose_places, give_answer
 from rig.cli.inputs import parse_changes
 from rig.cli.progress_bar import show_progress
 from rig.run.job import JobChoice, build_job
-from rig.suite.dry_run import make_dry_run
-from rig.suite.dry_run_report import build_dry_run_report
+from rig.suite.dry_run import build_dry_run_report, make_dry_run
 
 
 def run_command(args: argparse.Namespace) -> int:

@@ -13,9 +13,8 @@ from fdi.output import write_text
 from plant.errors import InputError, RigError
 from rig.cli.answer import Places, choose_file, give_answer, make_folder
 from rig.cli.progress_bar import show_progress
-from rig.conformance.data_sheet import DataSheet
 from rig.conformance.run_cases import Subject, build_conformance_report, choose_cases, run_cases, write_junit
-from rig.conformance.target import Options, Target
+from rig.conformance.target import DataSheet, Options, Target
 from rig.firmware.build import build_controller
 from rig.network.bus import choose_bus, open_can
 from rig.network.clock import VirtualClock, WallClock

@@ -5,9 +5,8 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from fdi.diagnosis.bands import load_bands
+from fdi.diagnosis.bands import load_bands, make_bands_file
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
-from fdi.diagnosis.learn_bands import make_bands_file
 from fdi.report.diagnosis_report import build_bands_report, build_diagnosis_report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -31,7 +30,7 @@ def run_command(args: argparse.Namespace) -> int:
         bands = None if args.bands is None else load_bands(Path(args.bands))
         found = diagnose(Trace.read(args.trace), model, bands, progress, args.trace, with_effects=args.with_effects)
     report = replace(build_diagnosis_report(found), next_command=suggest_next_command(args, found), files=places.files)
-    return give_answer(report, args, int(not found.is_acceptable), places)
+    return give_answer(report, args, int(found.verdict != "ACCEPTABLE"), places)
 
 
 def learn_bands(args: argparse.Namespace) -> int:

@@ -6,8 +6,12 @@ import shlex
 from dataclasses import replace
 from datetime import date
 
-from fdi.identification.free_parameters import read_free_parameters, read_identification_runs
-from fdi.identification.identify import identify_model, write_identified_model
+from fdi.identification.identify import (
+    identify_model,
+    read_free_parameters,
+    read_identification_runs,
+    write_identified_model,
+)
 from fdi.report.identify_report import build_identification_report
 from rig.cli.answer import Places, choose_file, give_answer
 from rig.cli.discovery_inputs import format_command_line, load_known_model

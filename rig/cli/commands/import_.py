@@ -8,10 +8,9 @@ import dbc
 from fdi.output import require_new, require_writable, write_text
 from fdi.report.import_report import build_guess_report, build_import_report
 from fdi.report.report import Report
-from fdi.trace.importing.conversion import import_measurement
+from fdi.trace.importing.conversion import ImportMap, import_measurement, read_map
 from fdi.trace.importing.formats import Measurement, open_measurement
 from fdi.trace.importing.guess import guess_map
-from fdi.trace.importing.import_map import ImportMap, read_map
 from plant.errors import InputError
 from plant.parameters import load_nominal_values
 from rig.cli.answer import give_answer

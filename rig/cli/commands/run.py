@@ -29,8 +29,7 @@ from rig.run.outcome import Outcome, diagnose_servovalve
 from rig.run.page_writer import PageWriter
 from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import Observe, run_job
-from rig.suite.report import write_junit_of_run
-from rig.suite.suite import is_suite_file
+from rig.suite.suite import is_suite_file, write_junit_of_run
 from rig.view.live_process import ViewerPlace, find_viewer_place, show_live
 from rig.view.live_run import find_dead_node, make_live_plan
 

@@ -24,10 +24,7 @@ from rig.cli.inputs import list_signals
 from rig.cli.interruption import catch_signals
 from rig.cli.progress_bar import show_progress
 from rig.view import viewer
-from rig.view.comparison_log import draw_comparison
-from rig.view.recording import Drawing, write_recording
-from rig.view.rerun_log import draw_run
-from rig.view.runs_log import draw_runs
+from rig.view.recording import Drawing, draw_comparison, draw_run, draw_runs, write_recording
 
 
 def run_command(args: argparse.Namespace) -> int:

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from noisy_traces import SHORT, make_backlash, make_lag, record_healthy, record_plant
 
-from fdi.comparison.blocks import compare_controller, find_lags
-from fdi.comparison.compare import Comparison, compare
+from fdi.comparison.compare import Comparison, compare, compare_controller, find_lags
 from fdi.estimation.replay import read_cycles
 from fdi.report.compare_report import describe_findings, describe_verdict
 from fdi.thresholds import CONTROLLER_ERROR_RATIO

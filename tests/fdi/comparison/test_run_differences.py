@@ -15,7 +15,7 @@ from fdi.comparison.run_differences import (
     match_checks,
 )
 from fdi.report.diff_report import build_diff_report
-from fdi.report.html import render_html
+from fdi.report.report import render_html
 from fdi.report.terminal import format_report
 from fdi.trace.trace import PER_ROW, Check, Trace
 

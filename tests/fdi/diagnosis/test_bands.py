@@ -14,10 +14,12 @@ from noisy_traces import record_plant
 from refusals import catch_refusal
 from rig_command import answer, refuse, rig
 
-from fdi.diagnosis import learn_bands
+from fdi.diagnosis import bands as learn_bands
 from fdi.diagnosis.bands import (
     Bands,
     BandVerdict,
+    UnitKind,
+    choose_bands,
     describe_other_model,
     find_stays,
     format_bands,
@@ -26,19 +28,14 @@ from fdi.diagnosis.bands import (
     list_design,
     load_bands,
     load_default_bands,
+    make_bands_by_simulation,
     matches_command,
     parse_bands,
-    save_bands,
-)
-from fdi.diagnosis.diagnosis import diagnose
-from fdi.diagnosis.faults import Level
-from fdi.diagnosis.learn_bands import (
-    UnitKind,
-    choose_bands,
-    make_bands_by_simulation,
     sample_sensor_noise,
     simulate_units,
 )
+from fdi.diagnosis.diagnosis import diagnose
+from fdi.diagnosis.faults import Level
 from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
@@ -212,7 +209,7 @@ def test_the_file(tmp_path: Path) -> None:
 
     A step of no whole number of mm is read again, too.
     """
-    save_bands(load_default_bands(), tmp_path / "b.toml")
+    (tmp_path / "b.toml").write_text(format_bands(load_default_bands()), encoding="utf-8")
     again = load_bands(tmp_path / "b.toml")
     assert judged(units(0.3)[0], again) == judged(units(0.3)[0])
     assert {"made", "command", "command_hash", "model", "runs", "seed", "software"} <= again.provenance.keys()

@@ -11,18 +11,19 @@ import numpy as np
 import pytest
 from rig_command import rig
 
-from fdi.diagnosis.bands import load_default_bands
-from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
-from fdi.diagnosis.learn_bands import UnitKind, simulate_units
-from fdi.diagnosis.precursors import (
+from fdi.diagnosis.bands import (
     MEANINGS,
     Precursor,
+    UnitKind,
     compute_features,
     find_kind,
     format_precursor,
+    load_default_bands,
     measure_precursors,
+    simulate_units,
     smooth_spikes,
 )
+from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
 from fdi.report.diagnosis_report import draw_precursor_shifts, draw_sizes
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace

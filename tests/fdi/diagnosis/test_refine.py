@@ -23,34 +23,31 @@ from fdi.diagnosis.faults import (
     find_ruling_fault,
     judge_size,
 )
-from fdi.diagnosis.joint_search import (
-    Beside,
-    Explanation,
-    average_explanations,
-    list_other_effects,
-    make_joint_problem,
-    mix_estimates,
-    weigh_costs,
-)
 from fdi.diagnosis.refine import (
     EFFECT_POWERS,
+    Beside,
+    Explanation,
     Refinement,
+    average_explanations,
     find_flat,
+    list_other_effects,
     list_unknowns,
+    make_joint_problem,
     make_problem,
     make_start,
+    mix_estimates,
     refine_sizes,
+    weigh_costs,
 )
+from fdi.estimation.fit import list_effect_unknowns
 from fdi.estimation.replay import hold_inputs
 from fdi.estimation.unidentifiable import find_flat_directions, linearise_across, relax_along
-from fdi.estimation.unknowns import list_effect_unknowns
 from fdi.report.diagnosis_report import build_diagnosis_report
 from fdi.thresholds import GAIN_TIE, RESIDUAL_WORST
 from fdi.trace.trace import Trace
 from plant import load_model
 from plant.effects import CATALOGUE
-from rig.campaign.judge import simulate_case
-from rig.campaign.matrix import build_matrix
+from rig.campaign.judge import build_matrix, simulate_case
 from studies import faults_beside_effects as study
 from studies.hidden_effects import cases, truth
 

@@ -37,11 +37,20 @@ from fdi.discovery.search import (
     measure_repeating,
     scan_effects,
 )
-from fdi.estimation.fit import Fit, Value, linearise
-from fdi.estimation.likelihood import BLOCK, Free, compute_misfit, compute_weights
+from fdi.estimation.fit import (
+    BLOCK,
+    Fit,
+    Free,
+    Value,
+    compute_misfit,
+    compute_weights,
+    linearise,
+    list_all_unknowns,
+    list_effect_unknowns,
+    turn_amplitudes_positive,
+)
 from fdi.estimation.noise import fit_noise, measure_level
 from fdi.estimation.replay import hold_inputs
-from fdi.estimation.unknowns import list_all_unknowns, list_effect_unknowns, turn_amplitudes_positive
 from fdi.thresholds import BLOCK_FITTED_SQUARE
 from fdi.trace.trace import Trace
 from plant import Model, load_model, simulate
@@ -213,7 +222,7 @@ def make_hypothesis(misfit: float, tolerance_cost: float, repeat_cost: float) ->
     """A hypothesis, with a repeat, of which only the costs matter."""
     none = np.zeros((0, 0))
     fit = Fit((), np.zeros(0), misfit + tolerance_cost, misfit, none, none, none, none, True)
-    return Hypothesis((), fit, {}, {}, {}, repeat_cost, (none,))
+    return Hypothesis((), fit, {}, {}, repeat_cost, (none,))
 
 
 def test_tolerances_nearer_to_a_healthy_unit_are_a_gain_and_luck_is_none() -> None:

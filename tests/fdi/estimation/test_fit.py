@@ -11,8 +11,7 @@ import pytest
 from noisy_traces import record_plant
 
 from fdi.discovery.search import Search
-from fdi.estimation.fit import Fit, evolve_population
-from fdi.estimation.likelihood import Problem
+from fdi.estimation.fit import Fit, Problem, evolve_population, list_all_unknowns
 from fdi.estimation.noise import white_noise
 from fdi.estimation.replay import find_undecided_rows, hold_inputs
 from fdi.estimation.unidentifiable import (
@@ -27,7 +26,6 @@ from fdi.estimation.unidentifiable import (
     find_tangents,
     invert_hessian,
 )
-from fdi.estimation.unknowns import list_all_unknowns
 from fdi.trace.trace import Floats, Trace
 from plant import Model, load_model, simulate
 

@@ -15,8 +15,7 @@ from refusals import catch_refusal
 
 from fdi.comparison.compare import compare
 from fdi.discovery.runs import collect_runs
-from fdi.estimation.fit import Fit, linearise
-from fdi.estimation.likelihood import Problem
+from fdi.estimation.fit import Fit, Problem, linearise, list_tolerance_unknowns
 from fdi.estimation.long_recordings import PIECE, choose_excerpt, cut_excerpt, is_long, judge_on_all, make_excerpt
 from fdi.estimation.noise import white_noise
 from fdi.estimation.replay import (
@@ -29,7 +28,6 @@ from fdi.estimation.replay import (
     match_period,
     read_cycles,
 )
-from fdi.estimation.unknowns import list_tolerance_unknowns
 from fdi.trace.trace import Trace, bridge_gaps, hold_last, shift_rows
 from plant import Model
 from plant.lanes import Lanes

@@ -10,21 +10,19 @@ from refusals import catch_refusal
 from rig_command import answer, refuse, rig
 
 from fdi.discovery.update_model import read_provenance
-from fdi.estimation.likelihood import scaled_bounds
+from fdi.estimation.fit import scaled_bounds
 from fdi.estimation.unidentifiable import compute_values
 from fdi.identification import global_fit
-from fdi.identification.free_parameters import (
-    collect_identification_runs,
-    list_unknowns,
-    parse_free_parameters,
-    read_free_parameters,
-)
 from fdi.identification.identify import (
     Identification,
+    collect_identification_runs,
     decide_verdict,
     estimate_by_regressions,
     identify_model,
+    list_unknowns,
+    parse_free_parameters,
     read_controller,
+    read_free_parameters,
     write_identified_model,
 )
 from fdi.report.identify_report import build_identification_report, describe_identification

@@ -17,9 +17,8 @@ from scipy.integrate import quad
 from scipy.stats import halfnorm, multivariate_normal
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
-from fdi.prognosis import regression, remaining_life, unit_trend
-from fdi.prognosis.regression import evaluate_shapes, list_shapes
-from fdi.prognosis.trend import Trend, fit_trend
+from fdi.prognosis import trend, unit_trend
+from fdi.prognosis.trend import Trend, evaluate_shapes, fit_trend, list_shapes
 from fdi.prognosis.unit_trend import Row, find_date_in_name, find_row, format_day, parse_date, read_dates_table
 from fdi.progress import ignore_progress
 from fdi.report.trend_report import explain_level
@@ -75,12 +74,12 @@ def test_a_table_of_dates(tmp_path: Path) -> None:
 
 
 def test_the_evidence_is_that_of_the_model_integrated_by_brute_force() -> None:
-    data = regression.Scaled(np.array([0.0, 0.3, 0.6, 1.0]), np.array([0.02, 0.1, 0.3, 0.5]), np.full(4, 0.03),
+    data = trend.Scaled(np.array([0.0, 0.3, 0.6, 1.0]), np.array([0.02, 0.1, 0.3, 0.5]), np.full(4, 0.03),
                              steps=(2,))
     every, _ = list_shapes()
-    found = regression.fit_growth(data)
+    found = trend.fit_growth(data)
     for part in (found.parts[9], found.parts[25]):
-        cov = regression.compute_covariance(data, part.noise, part.wander)
+        cov = trend.compute_covariance(data, part.noise, part.wander)
         for k in (1, 60, 130):
             column = evaluate_shapes((every[k],), data.u)[:, 0]
 
@@ -89,15 +88,15 @@ def test_the_evidence_is_that_of_the_model_integrated_by_brute_force() -> None:
                 return float(chance * multivariate_normal.pdf(data.y, rise * column, cov))
 
             exact = math.log(quad(likelihood, 0.0, 4.0, epsabs=0.0, limit=200, points=[0.2, 0.5, 1.0])[0])
-            prior = regression.compute_shape_log_priors(part.noise, part.wander)[k]
+            prior = trend.compute_shape_log_priors(part.noise, part.wander)[k]
             ours = part.evidence[k] - prior - 2.0 * math.log(2.0 * math.pi)
             assert ours == pytest.approx(exact, abs=1e-6)
 
 
 def test_reaching_a_limit() -> None:
-    rising = 0.5 + 0.1 * remaining_life.AHEAD
-    paths = remaining_life.Paths(np.array([rising, np.full_like(rising, 0.5), rising + 1.0]), np.zeros(3))
-    assert remaining_life.find_first_passage(paths, 1.0) == pytest.approx([5.0, math.inf, 0.0])
+    rising = 0.5 + 0.1 * trend.AHEAD
+    paths = trend.Paths(np.array([rising, np.full_like(rising, 0.5), rising + 1.0]), np.zeros(3))
+    assert trend.find_first_passage(paths, 1.0) == pytest.approx([5.0, math.inf, 0.0])
 
 
 @pytest.mark.parametrize("law", ["linear", "exponential", "power"])

@@ -16,8 +16,7 @@ from fdi.discovery.explain import Marks
 from fdi.discovery.explain_runs import Answer, Candidate, Suspicious
 from fdi.discovery.runs import Source
 from fdi.discovery.update_model import ModelUpdate, Provenance, Row
-from fdi.estimation.fit import Value
-from fdi.estimation.likelihood import Problem
+from fdi.estimation.fit import Problem, Value
 from fdi.estimation.noise import white_noise
 from fdi.estimation.replay import prepare_trace
 from fdi.report import compare_report, explain_report
@@ -31,9 +30,7 @@ from fdi.report.explain_report import (
     describe_verdict,
     list_sources,
 )
-from fdi.report.html import render_html
-from fdi.report.json import to_plain
-from fdi.report.report import Figure, Report, Table
+from fdi.report.report import Figure, Report, Table, render_html, to_plain
 from fdi.report.terminal import format_report
 from fdi.trace.trace import Trace
 from plant import Model

@@ -9,8 +9,7 @@ import pytest
 from browser import measure_page, needs_browser, print_page, take_picture
 from PIL import Image  # comes with matplotlib
 
-from fdi.report.html import render_html
-from fdi.report.report import Column, Report, Section, Table
+from fdi.report.report import Column, Report, Section, Table, render_html
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Check, Trace
 

@@ -17,7 +17,7 @@ from rig_command import rig
 from synthetic_run import record_run
 
 from fdi.report import drawing, run_report
-from fdi.report.html import render_html
+from fdi.report.report import render_html
 from fdi.report.run_report import build_run_report, read_verdict, write_run_page
 from fdi.trace.trace import Check, Event, Trace
 from rig.recorder import Check as CheckRecord

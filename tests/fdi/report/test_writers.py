@@ -14,9 +14,23 @@ from html_page import HtmlPage
 from refusals import catch_refusal
 from rich.console import Console
 
-from fdi.report.html import render_html, write_html
-from fdi.report.json import to_json, to_plain
-from fdi.report.report import Cell, Column, Figure, Item, Line, Listing, Medium, Paragraph, Report, Section, Table
+from fdi.report.report import (
+    Cell,
+    Column,
+    Figure,
+    Item,
+    Line,
+    Listing,
+    Medium,
+    Paragraph,
+    Report,
+    Section,
+    Table,
+    render_html,
+    to_json,
+    to_plain,
+    write_html,
+)
 from fdi.report.terminal import format_report, print_report
 
 HOSTILE = "<script>alert('x')</script> [bold]a & b[/] [/nothing]"

@@ -14,39 +14,38 @@ from physics_cases import PREFLIGHT
 from rig_command import answer, refuse, rig
 from vcan_host import kernel_has_vcan0
 
-from fdi.report.json import to_json
+from fdi.report.report import to_json
 from fdi.report.terminal import format_report
 from plant.errors import RigError
-from rig.bench import plant, realtime, stopwatch
-from rig.bench.live import (
-    AGAIN,
-    LIVE,
-    WITHOUT,
-    build_live_runs_report,
-    compare_contenders,
-    describe_ratios,
-    play_run,
-    run_in_terminal,
-    summarise_live_runs,
-)
+from rig.bench import plant, realtime
+from rig.bench.plant import build_long_recordings_report, make_command, record_unit
 from rig.bench.realtime import (
+    AGAIN,
     COMPILED,
     CYCLICTEST,
     IN_C,
+    LIVE,
     PYTHON,
+    WITHOUT,
+    build_live_runs_report,
     build_realtime_report,
+    compare_contenders,
+    describe_ratios,
     parse_histogram,
+    play_run,
+    run_c_responder,
+    run_emulator,
+    run_in_terminal,
     summarise_contenders,
+    summarise_live_runs,
 )
-from rig.bench.recordings import build_long_recordings_report, make_command, record_unit
-from rig.bench.responders import run_c_responder, run_emulator
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.frame import Frame
 from rig.network.link import Link
 from rig.nodes.emulator import MISSED_LIMIT
 
-needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {stopwatch.GET_GCC}")
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {realtime.GET_GCC}")
 
 
 @needs_gcc
@@ -58,7 +57,7 @@ def test_c_and_python_take_the_same_step() -> None:
 
 def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """And the JSON answer has what was measured."""
-    monkeypatch.setattr(stopwatch.shutil, "which", lambda name: None)
+    monkeypatch.setattr(realtime.shutil, "which", lambda name: None)
     for name, value in (("bus_run_speed", 10.0), ("run_process_speed", 6.0), ("help_time", 0.1)):
         monkeypatch.setattr(plant, f"measure_{name}", lambda value=value: value)
     words = " ".join(rig("bench").out.split())

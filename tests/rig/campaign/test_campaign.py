@@ -26,12 +26,11 @@ from fdi.report.terminal import print_report
 from fdi.trace.trace import Trace
 from plant import InputError, Model
 from plant.effects import CATALOGUE
-from rig.campaign import batch, folder, matrix, report, units
-from rig.campaign import judge as cases
+from rig.campaign import batch, judge
 from rig.campaign import summary as campaign_summary
 from rig.campaign.batch import BatchProgress, Workers
 from rig.campaign.judge import plan_batch, run_campaign
-from rig.campaign.report import build_campaign_report
+from rig.campaign.summary import build_campaign_report
 from studies.hidden_effects.truth import SYMBOLS, has_compiler
 
 pytest.importorskip("distributed", reason="the extra fleet is not installed")
@@ -42,7 +41,7 @@ TAKES = ("seconds",)  # what may differ between two runs
 
 
 def rows(where: Path) -> list[dict[str, Any]]:
-    return [{key: value for key, value in row.items() if key not in TAKES} for row in folder.read_campaign_rows(where)]
+    return [{key: value for key, value in row.items() if key not in TAKES} for row in judge.read_campaign_rows(where)]
 
 
 def calls(path: Path) -> list[tuple[int, str]]:
@@ -79,7 +78,7 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished campaign of eight cases, by this process."""
     where = tmp_path_factory.mktemp("campaign") / "local"
     model = Model()
-    whole = matrix.build_matrix({"seeds": 2, "case": matrix.parse_faults(MATRIX[1:6:2])}, model, MATRIX[-1], "test")
+    whole = judge.build_matrix({"seeds": 2, "case": judge.parse_faults(MATRIX[1:6:2])}, model, MATRIX[-1], "test")
     run_campaign(whole, where, Workers())
     return where
 
@@ -115,7 +114,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_rows_as_one_process(
     os.kill(victim, signal.SIGKILL)
     gate.unlink()
     assert finished(process).status == 1  # one case fails
-    assert rows(there) == rows(local) == rows(there / folder.RESULTS)
+    assert rows(there) == rows(local) == rows(there / judge.RESULTS)
     did = calls(environment)
     assert Counter(source for _, source in did)[at_work] == 2 and len({pid for pid, _ in did}) >= 2
 
@@ -125,17 +124,17 @@ def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(
     monkeypatch.setenv("CAMPAIGN_FREE", "3")
     there, few = tmp_path / "there", ("--most", 6, "--jobs", 1)
     process = started("campaign", *MATRIX, *few, "--out", there)
-    wait_for(lambda: len(calls(environment)) == 4 and (there / folder.ROWS).read_bytes().count(b"\n") == 3, process)
+    wait_for(lambda: len(calls(environment)) == 4 and (there / judge.ROWS).read_bytes().count(b"\n") == 3, process)
     process.kill()
     process.wait()
     gate.unlink()
     done = rows(there)
     assert len(done) == 3
-    with (there / folder.ROWS).open("a") as out:
+    with (there / judge.ROWS).open("a") as out:
         out.write('{"case": 5, "label": "hea')  # as a kill in the middle of a write leaves it
     said = rig("campaign", there, *few, *MATRIX[-2:], "--json")
     assert (said.status, said.json["cases"]) == (0, 6)
-    assert rows(there) == rows(local)[:6] and rows(there / folder.RESULTS) == rows(there)
+    assert rows(there) == rows(local)[:6] and rows(there / judge.RESULTS) == rows(there)
     again = Counter(source for _, source in calls(environment))
     assert len(again) == 6 and sum(again.values()) <= 7  # the one that the kill interrupted may have begun twice
     for row in done:
@@ -155,15 +154,15 @@ class Dead:
 
 
 def test_processes_give_the_same_rows(environment: Path, local: Path, tmp_path: Path) -> None:
-    whole = folder.read_matrix_of_folder(local)
+    whole = judge.read_matrix_of_folder(local)
     run_campaign(whole, tmp_path / "there", Workers(2, single_threaded=True), count=4)
     assert rows(tmp_path / "there") == rows(local)[:4]
     assert os.getpid() not in {pid for pid, _ in calls(environment)}
 
 
 def test_a_case_that_kills_every_worker_of_a_cluster_has_failed(local: Path) -> None:
-    whole = folder.read_matrix_of_folder(local)
-    plan = plan_batch(whole, cases.hash_campaign_sources())
+    whole = judge.read_matrix_of_folder(local)
+    plan = plan_batch(whole, judge.hash_campaign_sources())
     row = batch.take_result(Dead(), whole.cases[3], plan.describe_failure)
     assert row["reason"] == "KilledWorker: every worker that tried it died" and row["true_fss"] == 30.0
     assert plan.is_failed(row) and plan.is_valid(row)
@@ -172,11 +171,11 @@ def test_a_case_that_kills_every_worker_of_a_cluster_has_failed(local: Path) -> 
 
 def test_progress_counts_the_cases_and_estimates_the_time_left(local: Path, tmp_path: Path) -> None:
     seen: list[BatchProgress] = []
-    found = run_campaign(folder.read_matrix_of_folder(local), tmp_path / "there", Workers(), seen.append, count=8)
+    found = run_campaign(judge.read_matrix_of_folder(local), tmp_path / "there", Workers(), seen.append, count=8)
     assert [(p.done, p.total) for p in seen] == [(i + 1, 8) for i in range(8)]
     assert seen[-1].left == 0.0 < seen[0].left and seen[-1].failed == 1
     assert [row["case"] for row in found] == list(range(8))
-    run_campaign(folder.read_matrix_of_folder(local), tmp_path / "there", Workers(), seen.append)
+    run_campaign(judge.read_matrix_of_folder(local), tmp_path / "there", Workers(), seen.append)
     assert len(seen) == 8  # nothing was left to do
 
 
@@ -186,7 +185,7 @@ def test_a_failed_case_is_kept_with_its_reason_and_judged_again_on_demand(local:
         ("filter_clogging=0.9", 1, "ZeroDivisionError: nothing left to divide")]
     assert "rms" not in failed[0] and "rms" in rows(local)[0]
     copy, seen = shutil.copytree(local, tmp_path / "copy"), list[BatchProgress]()
-    whole = folder.read_matrix_of_folder(copy)
+    whole = judge.read_matrix_of_folder(copy)
     assert len(run_campaign(whole, copy, Workers(), seen.append)) == 8 and seen == []
     again = run_campaign(whole, copy, Workers(), seen.append, redo_failed=True)
     assert [p.row["label"] for p in seen] == ["filter_clogging=0.9"] and seen[0].done == 8
@@ -198,11 +197,11 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
     assert said.status == 2 and "a folder of this matrix, or a new one; it differs in seeds, case" in said.err
     (tmp_path / "notes.txt").write_text("mine")
     assert "an empty folder" in rig("campaign", *MATRIX, "--out", tmp_path).err
-    whole, sources = folder.read_matrix_of_folder(local), cases.hash_campaign_sources()
+    whole, sources = judge.read_matrix_of_folder(local), judge.hash_campaign_sources()
     with pytest.raises(InputError, match="the code has changed"):
-        folder.open_campaign(local, whole, "another")
-    with folder.open_campaign(local, whole, sources), pytest.raises(InputError, match="no other rig process"):
-        folder.open_campaign(local, whole, sources)
+        judge.open_campaign(local, whole, "another")
+    with judge.open_campaign(local, whole, sources), pytest.raises(InputError, match="no other rig process"):
+        judge.open_campaign(local, whole, sources)
 
 
 @pytest.mark.parametrize(("words", "complaint"), [
@@ -239,34 +238,34 @@ def test_a_matrix_file_says_the_same_as_options_and_any_beginning_is_a_fair_samp
         spool_friction = 45.0
         tolerance = [0.0, 0.02]'''
     (tmp_path / "m.toml").write_text(text)
-    found = matrix.build_matrix(matrix.read_matrix(str(tmp_path / "m.toml")), Model(), "fdi", "m")
+    found = judge.build_matrix(judge.read_matrix(str(tmp_path / "m.toml")), Model(), "fdi", "m")
     assert Counter(c.label for c in found.cases) == {
         "healthy": 8, "filter_clogging=0.1 spool_friction=45": 4, "filter_clogging=0.2 spool_friction=45": 4}
     assert [c.number for c in found.cases] == list(range(16)) and len(set(map(str, found.cases))) == 16
     assert {c.tolerance for c in found.cases if c.sizes} == {0.0, 0.02}
     assert Counter(c.label for c in found.cases[:8]).most_common()[-1][1] == 2  # half of all: half of each
-    assert matrix.restore_matrix(json.loads(json.dumps(found.spec))).cases == found.cases
-    shipped = matrix.build_matrix(matrix.read_matrix("statistics"), Model(), "fdi", "statistics")
+    assert judge.restore_matrix(json.loads(json.dumps(found.spec))).cases == found.cases
+    shipped = judge.build_matrix(judge.read_matrix("statistics"), Model(), "fdi", "statistics")
     labels = Counter(c.label for c in shipped.cases)
     assert len(shipped.cases) >= 500 and labels["healthy"] >= 200 and labels[campaign_summary.OFF_GRID] >= 200
 
 
 def test_a_case_depends_on_its_own_seed_alone_and_hides_what_it_says() -> None:
-    spec = matrix.build_matrix({"case": [{}]}, Model(), "", "x").spec
-    case = matrix.Case(5, "spool_friction=45", {"spool_friction": 45.0}, 0.015, 3)
-    first, second = (units.simulate_case(case._replace(number=n), spec, Model()) for n in (5, 99))
-    other = units.simulate_case(case._replace(seed=4), spec, Model())
+    spec = judge.build_matrix({"case": [{}]}, Model(), "", "x").spec
+    case = judge.Case(5, "spool_friction=45", {"spool_friction": 45.0}, 0.015, 3)
+    first, second = (judge.simulate_case(case._replace(number=n), spec, Model()) for n in (5, 99))
+    other = judge.simulate_case(case._replace(seed=4), spec, Model())
     for name in ("xj", "cor", "p12", "xs"):
         assert (first.column(name) == second.column(name)).all() and (first.column(name) != other.column(name)).any()
-    broken = units.add_faults(Model(), {"spool_friction": 45.0, "jack_friction": 1600.0, "stribeck": 0.3})
+    broken = judge.add_faults(Model(), {"spool_friction": 45.0, "jack_friction": 1600.0, "stribeck": 0.3})
     assert broken["spool.dynamic_friction"] == pytest.approx(30.0) and broken["jack.dynamic_friction"] == 1000.0
     assert broken[CATALOGUE["stribeck"].fitted[0]] == 0.3 and broken[CATALOGUE["stribeck"].fitted[1]] > 0
-    chance = [units.sample_random_parts(case._replace(seed=seed), 4000, 0.8, 0.0) for seed in range(60)]
+    chance = [judge.sample_random_parts(case._replace(seed=seed), 4000, 0.8, 0.0) for seed in range(60)]
     assert np.std([scatter[SYMBOLS["GQ"]] for scatter, _ in chance]) == pytest.approx(0.015, rel=0.3)
     noise = chance[0][1]
     assert noise.std(0) == pytest.approx(np.ones(4), rel=0.1)
     assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(0.8, abs=0.05)
-    alone = units.simulate_case(case, {**spec, "signals": "xj"}, Model())
+    alone = judge.simulate_case(case, {**spec, "signals": "xj"}, Model())
     assert set(alone.signals) == {"com", "xj", "cor", "load"}
 
 
@@ -275,15 +274,15 @@ IN_C = "studies.hidden_effects.campaign_simulator:simulate_unit"
 
 @pytest.mark.skipif(not has_compiler(), reason="no gcc: the independent simulator cannot be built")
 def test_the_independent_simulator_makes_the_same_unit() -> None:
-    spec = matrix.build_matrix({"case": [{}]}, Model(), "", "x").spec
-    case = matrix.Case(0, "filter_clogging=0.3", {"filter_clogging": 0.3}, 0.015, 3)
-    simulators = (matrix.OWN_SIMULATOR, IN_C)
-    ours, its = (units.simulate_case(case, {**spec, "simulator": name}, Model()) for name in simulators)
-    healthy = units.simulate_case(case._replace(sizes={}), spec, Model())
+    spec = judge.build_matrix({"case": [{}]}, Model(), "", "x").spec
+    case = judge.Case(0, "filter_clogging=0.3", {"filter_clogging": 0.3}, 0.015, 3)
+    simulators = (judge.OWN_SIMULATOR, IN_C)
+    ours, its = (judge.simulate_case(case, {**spec, "simulator": name}, Model()) for name in simulators)
+    healthy = judge.simulate_case(case._replace(sizes={}), spec, Model())
     apart = [float(np.sqrt(((x.xj - its.xj) ** 2).mean())) for x in (ours, healthy)]
     assert apart[0] < 15e-6 and apart[1] > 2 * apart[0]
     with pytest.raises(InputError, match="an effect with a single size"):
-        units.simulate_case(case._replace(sizes={"moving_mass": 120.0}), {**spec, "simulator": IN_C}, Model())
+        judge.simulate_case(case._replace(sizes={"moving_mass": 120.0}), {**spec, "simulator": IN_C}, Model())
 
 
 def test_a_folder_of_traces_is_judged_and_a_changed_trace_is_another_campaign(tmp_path: Path) -> None:
@@ -304,13 +303,13 @@ def test_a_folder_of_traces_is_judged_and_a_changed_trace_is_another_campaign(tm
 def test_rig_fdi_in_a_campaign_finds_both_faults_and_the_statistics_are_written(tmp_path: Path) -> None:
     said = rig("campaign", "--fault", "filter_clogging=0.17/spool_friction=45", "--seeds", 1, "--tolerance", 0,
                "--out", tmp_path, "--json", "--jobs", 1)
-    row, = folder.read_campaign_rows(tmp_path)
+    row, = judge.read_campaign_rows(tmp_path)
     assert row["status"] == "ok" and said.json["cases"] == 1, row["reason"]
     assert row["kintas"] == pytest.approx(0.17, rel=0.1) and row["fss"] == pytest.approx(45.0, rel=0.05)
     assert row["kintas_low"] < 0.17 < row["kintas_high"] and row["fss_low"] < 45.0 < row["fss_high"]
     assert (row["level_spool_friction"], row["ruling"]) == ("maintenance", "spool_friction")
     assert rig("campaign", tmp_path, "--summary", "--json").json == said.json
-    shown = rig("campaign", tmp_path / folder.RESULTS, "--summary").out
+    shown = rig("campaign", tmp_path / judge.RESULTS, "--summary").out
     assert "off-grid FSS within 2 %" in shown and "1/1" in shown
     assert json.loads((tmp_path / "summary.json").read_text()) == said.json
 
@@ -370,7 +369,7 @@ def test_statistics_count_what_was_said() -> None:
     out = Console(width=100, record=True, quiet=False)
     print_report(build_campaign_report(figures), out)
     assert "3/402" in (text := out.export_text()) and "NOT met" in text and "95.0 %" in text
-    drawn = report.draw_detection_curves(part)
+    drawn = campaign_summary.draw_detection_curves(part)
     assert drawn.startswith("<svg") and "MaxBand" in drawn and "maintenance or worse" in drawn
 
 

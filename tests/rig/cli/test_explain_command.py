@@ -10,7 +10,7 @@ from effect_files import HEAD, restored_catalogue
 from rig_command import Said, answer, refuse, rig
 from short_runs import HIDDEN, build_command, list_trace_arguments, write_measured_runs
 
-from fdi.estimation.unknowns import list_active_effects, list_active_unknowns, list_all_unknowns
+from fdi.estimation.fit import list_active_effects, list_active_unknowns, list_all_unknowns
 from fdi.report import numbers as spoken
 from plant import Model
 from plant.effects import CATALOGUE

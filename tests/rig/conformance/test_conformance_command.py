@@ -12,10 +12,8 @@ from c_device import CFirmware, skip_without_compiler
 from rig_command import gone, rig, started
 
 from dbc import EDS
-from rig.conformance.conformance_case import CHAPTERS, Verdict
-from rig.conformance.data_sheet import DataSheet
 from rig.conformance.run_cases import CASES, Outcome, Result, Subject, choose_cases, run_cases, write_junit
-from rig.conformance.target import Options, Target
+from rig.conformance.target import CHAPTERS, DataSheet, Options, Target, Verdict
 from rig.network.clock import VirtualClock
 from rig.network.link import EmbeddedWire
 

@@ -11,10 +11,8 @@ from changed_sheets import change_sheet, describe_variable
 
 from dbc import EDS
 from plant.errors import InputError, RigError
-from rig.conformance.conformance_case import Verdict
-from rig.conformance.data_sheet import DataSheet
 from rig.conformance.run_cases import Outcome, choose_cases, run_cases
-from rig.conformance.target import Options, Target
+from rig.conformance.target import DataSheet, Options, Target, Verdict
 from rig.device import NmtState, SdoAbort
 from rig.device.dictionary import INVALID
 from rig.network.clock import VirtualClock

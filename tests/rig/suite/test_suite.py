@@ -14,16 +14,18 @@ from short_sequences import SHORT
 
 from rig.run.job import JobChoice
 from rig.sequences.checks import CheckResult
-from rig.suite.report import Evidence, trace_requirements, write_junit
 from rig.suite.suite import (
     Case,
     CaseResult,
+    Evidence,
     PlannedCheck,
     build_suite,
     find_status,
     find_verdict,
     is_suite_file,
     read_suite_file,
+    trace_requirements,
+    write_junit,
 )
 
 ROOT = Path(__file__).parents[3]

@@ -13,8 +13,7 @@ from short_sequences import SHORT
 from fdi.trace.trace import Trace
 from rig.run.job import JobChoice
 from rig.sequences.checks import CheckResult
-from rig.suite.report import write_junit
-from rig.suite.suite import Case, CaseResult, read_suite_file
+from rig.suite.suite import Case, CaseResult, read_suite_file, write_junit
 
 STEPS = """
 title = "Steps and a ramp"

@@ -28,10 +28,9 @@ from synthetic_run import build_cycles, record_run
 from fdi.trace.trace import Trace
 from rig.recorder import Check, Event, NmtState, Record, Recorder, Signals, Timing
 from rig.sequences import load_sequence
-from rig.view.live_log import follow_log
 from rig.view.live_process import find_viewer_place, show_live
 from rig.view.live_run import COLUMNS, LiveRun, find_dead_node, make_live_plan
-from rig.view.live_screen import describe_line, draw_screen
+from rig.view.live_show import describe_line, draw_screen, follow_log
 from rig.view.viewer import find_free_port, is_listening
 
 

@@ -25,8 +25,7 @@ from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace.trace import Trace
 from plant import Model, simulate
 from rig.view import viewer
-from rig.view.recording import TEXTS, Lane, make_lane_path, write_recording
-from rig.view.rerun_log import LANES, LIMITS, PLOTS, draw_run
+from rig.view.recording import LANES, LIMITS, PLOTS, TEXTS, Lane, draw_run, make_lane_path, write_recording
 from rig.view.viewer import ViewerError
 
 REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"  # forbids skips

@@ -11,10 +11,9 @@ import pytest
 from refusals import catch_refusal
 from scipy.io import savemat
 
-from fdi.trace.importing.conversion import Imported, Samples, import_measurement, place_samples
-from fdi.trace.importing.formats import Channel, ChannelReader, open_measurement, open_text_table
+from fdi.trace.importing.conversion import Imported, Samples, import_measurement, parse_map, place_samples
+from fdi.trace.importing.formats import Channel, Measurement, open_measurement, open_text_table, read_singly
 from fdi.trace.importing.guess import GuessedMap, guess_map
-from fdi.trace.importing.import_map import parse_map
 
 MAP = """
 [signals.com]
@@ -33,7 +32,7 @@ def convert(tmp_path: Path, text: str, **columns: np.ndarray) -> Imported:
     (tmp_path / "x.bin").write_bytes(b"x")
     known = {"com": XJ, "xj": XJ, "cor": XJ} | columns
     channels = {name: Channel(np.asarray(values, float)) for name, values in known.items()}
-    measurement = ChannelReader(tmp_path / "x.bin", "arrays", dict.fromkeys(known, ""), channels.__getitem__)
+    measurement = Measurement(tmp_path / "x.bin", "arrays", dict.fromkeys(known, ""), read_singly(channels.__getitem__))
     return import_measurement(measurement, parse_map(text + MAP, tmp_path / "map.toml"), 1e-3)
 
 
@@ -214,7 +213,7 @@ def test_layouts(case: str, tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_bytes(text.encode(encoding))
     table = open_text_table(tmp_path / "x.csv")
     assert list(table.units)[:2] == ["t", "x"]
-    assert [c.values.tolist() for c in table.read(["t", "x"]).values()] == [[0.0, 1.0, 2.0], [1.5, 2.5, -0.03]]
+    assert [c.values.tolist() for c in table.read(["t", "x"], []).values()] == [[0.0, 1.0, 2.0], [1.5, 2.5, -0.03]]
 
 
 @pytest.mark.parametrize(("content", "units"), [
