@@ -293,7 +293,8 @@ def sample_position_noise(n: int, colour: float, hum: float, rng: np.random.Gene
     white = FLOORS["xj"] * rng.standard_normal(n)
     white[1:] *= np.sqrt(1 - colour**2)
     noise: Floats = lfilter([1.0], [1.0, -colour], white)
-    return noise + hum * np.sin(2 * np.pi * 50.0 * PERIOD * np.arange(n) + 1.0)
+    noise += hum * np.sin(2 * np.pi * 50.0 * PERIOD * np.arange(n) + 1.0)
+    return noise
 
 
 def add_faults(model: Model, sizes: Mapping[str, float]) -> Model:

@@ -239,7 +239,7 @@ def test_missing_fields_and_dates(tmp_path: Path) -> None:
 ])
 def test_bad_rows(row: str, place: str, reason: str, tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_text(f"t,x\n0,1\n1,2\n{row}\n3,4\n")
-    line = catch_refusal(open_text_table(tmp_path / "x.csv").read, ["t", "x"])
+    line = catch_refusal(open_text_table(tmp_path / "x.csv").read, ["t", "x"], [])
     assert place in line and reason in line
 
 
