@@ -23,7 +23,6 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, ChunkIndex, Schema
-from mcap.stream_reader import lz4  # type: ignore[attr-defined]  # a requirement of mcap, not one of ours
 from mcap.summary import Summary
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
@@ -339,7 +338,7 @@ def unpack_chunk(chunk: Chunk) -> bytes:
     if size > LARGEST_CHUNK:
         raise UnpackingError(f"it declares {size} bytes, more than {LARGEST_CHUNK >> 20} MiB")
     if chunk.compression not in _UNPACKERS:
-        raise UnpackingError(f"compression {chunk.compression[:20]!r} is not known")
+        raise UnpackingError(f"compression {chunk.compression[:20]!r} is not known, only zstd and none")
     data = _UNPACKERS[chunk.compression](chunk.data, size)
     if len(data) != size:
         raise UnpackingError(f"it declares {size} bytes and has {len(data)} or more")
@@ -360,14 +359,4 @@ def _unpack_zstd(packed: bytes, size: int) -> bytes:
         raise UnpackingError(str(error)) from error
 
 
-def _unpack_lz4(packed: bytes, size: int) -> bytes:
-    """Unpack at most one byte more than `size`. The recorder writes zstd; other programs may write this."""
-    try:
-        data: bytes = lz4.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
-    except RuntimeError as error:
-        raise UnpackingError(str(error)) from error
-    return data
-
-
-_UNPACKERS: dict[str, Callable[[bytes, int], bytes]] = {
-    "": lambda packed, size: packed, "zstd": _unpack_zstd, "lz4": _unpack_lz4}
+_UNPACKERS: dict[str, Callable[[bytes, int], bytes]] = {"": lambda packed, size: packed, "zstd": _unpack_zstd}
