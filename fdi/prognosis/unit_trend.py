@@ -19,6 +19,7 @@ from fdi.output import write_text
 from fdi.prognosis.trend import Trend, fit_trend
 from fdi.progress import Progress
 from fdi.sources import hash_sources
+from fdi.trace.csv_table import report_unreadable
 from fdi.trace.trace import Trace
 from plant.compile import find_cache_folder
 from plant.effects import CATALOGUE
@@ -220,10 +221,8 @@ def _read_answer(place: Path, again: bool) -> dict[str, Any] | None:
 
 def _find_answer_file(file: Path, model: Model) -> Path:
     """File for the answer of a trace: its name is a hash of the trace, the model and the code."""
-    try:
+    with report_unreadable(file, "UTF-8"):
         content = file.read_bytes()
-    except OSError as error:
-        raise InputError(file, "", f"a readable file ({error.strerror})") from error
     theirs = {f for e in model.effects if (f := CATALOGUE[e].file)}
     own = [hashlib.sha256(Path(f).read_bytes()).hexdigest() for f in sorted(theirs)]
     text = json.dumps([sorted(model.values.items()), model.effects, own, model.plant, hash_sources("plant", "fdi")])
