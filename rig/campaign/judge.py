@@ -288,11 +288,11 @@ def sample_position_noise(n: int, colour: float, hum: float, rng: np.random.Gene
         hum: amplitude of the mains hum, m.
         rng: source of the random numbers.
     """
-    from scipy.signal import lfilter  # here, as it takes a second to import
-
     white = FLOORS["xj"] * rng.standard_normal(n)
-    white[1:] *= np.sqrt(1 - colour**2)
-    noise: Floats = lfilter([1.0], [1.0, -colour], white)
+    noise, last = np.empty(n), float(white[0])
+    noise[0] = last
+    for k, innovation in enumerate((np.sqrt(1 - colour**2) * white).tolist()[1:], start=1):
+        noise[k] = last = colour * last + innovation
     noise += hum * np.sin(2 * np.pi * 50.0 * PERIOD * np.arange(n) + 1.0)
     return noise
 

@@ -66,7 +66,8 @@ def test_runs_with_other_clocks_are_aligned_by_the_command(start: float) -> None
 
 def test_a_run_that_was_recorded_later_is_aligned_by_its_steps() -> None:
     whole = make_run(1)
-    late = replace(whole, **{name: getattr(whole, name)[700:] for name in PER_ROW}, t=whole.t[700:] - whole.t[700])
+    shifted = {name: getattr(whole, name)[700:] for name in PER_ROW} | {"t": whole.t[700:] - whole.t[700]}
+    late = replace(whole, **shifted)
     assert find_offset(make_run(0), late) == pytest.approx(0.7) and compare_two(late)[0].verdict == "SAME"
 
 
