@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdi.trace.csv_table import report_unreadable
 from plant.effects import CATALOGUE, load_effects
 from plant.errors import InputError, escape_control_characters
 from plant.parameters import read_toml
@@ -71,10 +70,7 @@ def load_effects_of_model(model: str | Path | None, given: Sequence[Path] = (), 
         InputError: there are such files and the user does not trust them, or one of them cannot be used.
     """
     found = [path for path in find_effect_files(model, given) if not _is_loaded(path)]
-    codes = []
-    for path in found:
-        with report_unreadable(path, "UTF-8"):
-            codes.append(ForeignCode(str(path), path.read_bytes()))
+    codes = [ForeignCode(str(path), _read(path)) for path in found]
     require_trust(model, codes, is_trusted=is_trusted, announce=announce)
     for path, code in zip(found, codes, strict=True):
         load_effects(path, code.content)
@@ -100,6 +96,13 @@ def find_effect_files(model: str | Path | None, given: Sequence[Path] = ()) -> l
 def _is_loaded(path: Path) -> bool:
     """Whether the effects of the catalogue include some of this file, as it is now or was before."""
     return any(effect.file == path.absolute() for effect in CATALOGUE.list_all().values())
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(path, "", f"a readable file ({error.strerror})") from error
 
 
 def require_different_names(files: Sequence[Path]) -> None:
