@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from fdi import Trace
 from fdi.comparison.compare import compare
-from fdi.discovery.explain import explain
+from fdi.discovery import explain
 from fdi.discovery.residual_pattern import find_pattern
 from fdi.discovery.runs import read_runs
 from fdi.discovery.update_model import load_model_file
