@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+import re
 import zlib
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -244,10 +245,12 @@ def _collect_facts(traces: Sequence[Trace]) -> dict[str, Facts]:
     identity: CiA 301, objects 0x1000, 0x1008 to 0x100A, 0x1018.
     """
     fields = ("name", "hardware", "software", "vendor", "product", "revision", "serial")
+    nodes = sorted({int(key[4:key.index(".")]) for trace in traces for key in trace.provenance
+                    if re.match(r"node\d+\.", key)})
     keys = {
         "model": {"sequence": "sequence", "model": "model", "differs from nominal": "differences.text", "seed": "seed"},
         "node": {"controller": "controller",
-                 **{f"node {node}, {field}": f"node{node}.{field}" for node in (2, 3) for field in fields},
+                 **{f"node {node}, {field}": f"node{node}.{field}" for node in nodes for field in fields},
                  "bus": "bus", "pace": "pace", "host": "host", "started": "started", "eha-rig": "version.eha-rig",
                  "commit": "git.commit"},
         "timing": {"kind of timing": "timing.kind"}}

@@ -36,6 +36,7 @@ from fdi.report.numbers import format_digits
 from fdi.report.report import Cell, Column, Line, Mood, Report, Section, Table, tabulate
 from fdi.trace.trace import Floats, Trace
 from plant.errors import InputError, RigError
+from rig.benches.bench_file import load_bench
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
@@ -285,7 +286,7 @@ def play_block(bus: str, seconds: float, is_compiled: bool = True, period_ns: in
         clock = WallClock()
         wire = LinkWire(Link(open_can(bus), clock.now), clock)
         stack.callback(wire.close)
-        master = Master(wire, clock.now, stamped=True)
+        master = Master(wire, clock.now, stamped=True, bench=load_bench())
         master.hooks.on_frame = recorder.frame
         log = _Log(history, recorder)
         loop: Loop = (HardLoop(master, Schedule(Plan(stop=0)), log, open_raw_bus(bus, RECEIVED), period_ns, True)

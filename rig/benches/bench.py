@@ -9,13 +9,13 @@ from typing import Literal
 from rig.benches.frame_map import FrameMap, Role
 
 Profile = Literal["cia402", "cia408", "none"]
+SERVICES = {0x080: "EMCY", 0x580: "SDO", 0x600: "SDO", 0x700: "heartbeat"}  # of a node: CiA 301, table of 7.3.5
 
 # Signals that the rig and its plant give (inputs of the controller) and take (outputs), by the names of bench files,
 # with their units. "" is a number without a unit.
 INPUTS = {"position_demand": "m", "ram_position": "m", "load_pressure": "Pa", "spool_position": "m", "load_force": "N",
           "control_word": "", "mode": "", "cycle": "", "flags": ""}
 OUTPUTS = {"current": "A", "status_word": "", "mode_display": "", "cycle": ""}
-RIG_NODE = 1  # node-ID of the rig
 MEASURED = ("ram_position", "load_pressure", "spool_position", "load_force")  # by the plant's transducers
 
 
@@ -61,9 +61,43 @@ class Bench:
         controller = self.nodes.get(Role.CONTROLLER)
         return "none" if controller is None else controller.profile
 
+    @property
+    def rig_node(self) -> int:
+        """Node-ID of the rig: 1, or the largest that is free if a device has that."""
+        taken = {node.node for node in self.nodes.values()}
+        return 1 if 1 not in taken else next(number for number in range(127, 0, -1) if number not in taken)
+
+    def find_number(self, role: Role) -> int:
+        """The node-ID of a participant; on plain CAN, where nobody has one, the number of its role."""
+        if role in self.nodes:
+            return self.nodes[role].node
+        return self.rig_node if role is Role.RIG and self.nodes else int(role)
+
     def describe_node(self, role: Role) -> str:
         """A participant as messages name it: "node 2 controller" on CANopen, else "controller"."""
-        name = role.name.lower()
-        if role is Role.RIG or role not in self.nodes:
-            return name
-        return f"node {self.nodes[role].node} {name}"
+        has_number = role in self.nodes or (role is Role.RIG and self.nodes)
+        return f"node {self.find_number(role)} {role.name.lower()}" if has_number else role.name.lower()
+
+    def read_data_sheet(self, role: Role) -> tuple[str, str]:
+        """Name and text of a node's EDS or DCF."""
+        path = self.nodes[role].eds
+        name = next((name for name in self.files if path.as_posix().endswith(name)), path.name)
+        return name, decode_device_text(self.files[name] if name in self.files else path.read_bytes())
+
+    def list_services(self) -> dict[int, str]:
+        """Identifiers that carry no values of the bench, and what they are: NMT, SYNC, and the services of the nodes.
+        """
+        found = {} if self.frames.sync is None else {self.frames.sync: "SYNC"}
+        if self.nodes:
+            found[0x000] = "NMT"
+            for number in (self.rig_node, *(node.node for node in self.nodes.values())):
+                found |= {base + number: f"{service} of node {number}" for base, service in SERVICES.items()}
+        return found
+
+
+def decode_device_text(data: bytes) -> str:
+    """The text of an EDS, DCF or DBC; those of old tools are not UTF-8."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")

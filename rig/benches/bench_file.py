@@ -15,10 +15,10 @@ from plant.errors import InputError
 from plant.parameters import GROUPS, find_field
 from plant.units import parse_quantity
 from rig.benches import canopen_map
-from rig.benches.bench import INPUTS, MEASURED, OUTPUTS, RIG_NODE, Bench, CanopenNode, Profile
+from rig.benches.bench import INPUTS, MEASURED, OUTPUTS, Bench, CanopenNode, Profile, decode_device_text
 from rig.benches.can_map import map_messages, read_database
 from rig.benches.checksums import CHECKSUMS, load_checksum
-from rig.benches.frame_map import EXTENDED, FD, FrameMap, FrameSpec, Guard, Role
+from rig.benches.frame_map import FD, FrameMap, FrameSpec, Guard, Role, describe_identifier
 from rig.benches.layout import PHASES, DeviceFrame, Use, build_fields, compute_counts, list_phases
 from rig.tables import Place, Range, build_dataclass, decode_text, list_choices, parse_table, read_file
 
@@ -176,14 +176,6 @@ class _Reader:
         return load_checksum(file, source, function)
 
 
-def decode_device_text(data: bytes) -> str:
-    """The text of an EDS, DCF or DBC; those of old tools are not UTF-8."""
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return data.decode("latin-1")
-
-
 def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, *, is_trusted: bool) -> Bench:
     """The bench of a file; `read` gives the content of the files that it names, `folder` is where they lie."""
     reader = _Reader(name, source, read, is_trusted=is_trusted)
@@ -211,11 +203,12 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, *, is_t
     specs = [_build_spec(frame, uses, Role.RIG if frame.is_received else Role.CONTROLLER) for frame in frames]
     if keys.plant_node is not None:
         specs, nodes[Role.PLANT] = _join_plant_node(reader, specs, sync, nodes, folder)
-    _check_identifiers(specs, sync, nodes, reader.place)
     phases, ready = _list_states(frames, uses)
-    return Bench(name=keys.name, frames=FrameMap(frames=tuple(specs), sync=sync), nodes=nodes, plant=keys.plant,
-                 cycle_ns=cycle_ns, bitrate=keys.bitrate, timeout_ns=timeout_ns, phases=phases, ready=ready,
-                 files=reader.files)
+    bench = Bench(name=keys.name, frames=FrameMap(frames=tuple(specs), sync=sync), nodes=nodes, plant=keys.plant,
+                  cycle_ns=cycle_ns, bitrate=keys.bitrate, timeout_ns=timeout_ns, phases=phases, ready=ready,
+                  files=reader.files)
+    _check_identifiers(bench, reader.place)
+    return bench
 
 
 def _read_time(text: str, place: Place, low: Fraction, high: Fraction) -> int:
@@ -367,8 +360,6 @@ def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use
     """The uses with the objects of the profile, the PDOs, the identifier of SYNC, and the node."""
     if keys.node is None:
         raise place.refuse("also the key 'node', a node-ID from 1 to 127")
-    if keys.node == RIG_NODE:
-        raise place.at("node").refuse(f"a node-ID other than {RIG_NODE}, which the rig has")
     eds = keys.eds or ""
     dictionary = canopen_map.read_dictionary(eds, reader.read_text(keys.eds, place.at("eds"), "EDS or DCF"), keys.node)
     node = CanopenNode(node=keys.node, eds=folder / eds, values=canopen_map.list_values(dictionary))
@@ -467,23 +458,10 @@ def _join_frame(other: FrameSpec, own: FrameSpec, frame: DeviceFrame, place: Pla
                    is_before_sync=False)
 
 
-def describe_identifier(identifier: int) -> str:
-    """An identifier as people write it: 0x182, or 0x18FF0102 with 29 bits.
-
-    >>> describe_identifier(0x182), describe_identifier(0x123 | EXTENDED)
-    ('0x182', '0x00000123')
-    """
-    return f"0x{identifier & 0x1FFF_FFFF:08X}" if identifier & EXTENDED else f"0x{identifier & 0x7FF:03X}"
-
-
-def _check_identifiers(specs: list[FrameSpec], sync: int | None, nodes: Mapping[Role, CanopenNode],
-                       place: Place) -> None:
+def _check_identifiers(bench: Bench, place: Place) -> None:
     """Refuse an identifier that two frames have, or a frame and a service of a node."""
-    taken = {} if sync is None else {0: "NMT", sync: "SYNC"}
-    for node in [RIG_NODE, *(each.node for each in nodes.values())] if nodes else []:
-        services = {0x80: "EMCY", 0x580: "SDO", 0x600: "SDO", 0x700: "heartbeat"}
-        taken |= {base + node: f"{service} of node {node}" for base, service in services.items()}
-    for spec in specs:
+    taken = bench.list_services()
+    for spec in bench.frames.frames:
         identifier = spec.identifier & ~FD
         message = spec.name.partition("[")[0]  # its pages share the identifier
         if taken.setdefault(identifier, message) != message:

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from rig.benches.bench import RIG_NODE, Bench
+from rig.benches.bench import Bench
 from rig.benches.frame_map import EXTENDED, FD, FrameSpec, Guard, Role
 
 HEARTBEAT = 0.1  # s, of each node of the rig
@@ -45,7 +45,7 @@ def list_loads(bench: Bench) -> list[FrameLoad]:
               cycle * spec.every) for spec in bench.frames.frames]
     if bench.frames.sync is not None:
         found.append(("SYNC", bench.frames.sync, "rig > all", 0, (), cycle))
-    nodes = {Role.RIG: RIG_NODE, **{role: each.node for role, each in bench.nodes.items()}} if bench.nodes else {}
+    nodes = {Role.RIG: bench.rig_node, **{role: each.node for role, each in bench.nodes.items()}} if bench.nodes else {}
     for role, node in sorted(nodes.items()):
         found.append((f"heartbeat {node}", 0x700 + node, f"{role.name.lower()} > all", 1, (), HEARTBEAT))
     return [FrameLoad(*each, share=count_bits(each[1], each[3]) / bench.bitrate / each[5]) for each in found]

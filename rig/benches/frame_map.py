@@ -17,6 +17,15 @@ EXTENDED = 1 << 31  # in an identifier: it has 29 bits, as in Linux's can_id
 FD = 1 << 30  # in an identifier: a CAN FD frame
 
 
+def describe_identifier(identifier: int) -> str:
+    """An identifier as people write it: 0x182, or 0x18FF0102 with 29 bits.
+
+    >>> describe_identifier(0x182), describe_identifier(0x123 | EXTENDED)
+    ('0x182', '0x00000123')
+    """
+    return f"0x{identifier & 0x1FFF_FFFF:08X}" if identifier & EXTENDED else f"0x{identifier & 0x7FF:03X}"
+
+
 class Role(IntEnum):
     """Who takes part in a run, whatever the node numbers are."""
 

@@ -1,37 +1,42 @@
-"""Node 1, the rig: NMT master, SYNC producer, SDO client; services by the `canopen` library, cyclic frames by hand.
+"""The rig on the bus: NMT master, SYNC producer, SDO client; services by the `canopen` library, cyclic frames by hand.
 
-The library gets its frames through `Network.notify` and blocks nowhere: its SDO client waits by letting the wire bring
-frames in, so one thread does all and the embedded bus needs no other.
+On plain CAN a bench has no nodes: only cyclic frames pass, and all that is about nodes does nothing. The library gets
+its frames through `Network.notify` and blocks nowhere: its SDO client waits by letting the wire bring frames in, so one
+thread does all and the embedded bus needs no other.
 """
 from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from functools import cache
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import canopen
 from canopen.emcy import EmcyError
+from canopen.sdo.base import SdoVariable
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from dbc import EDS
 from plant.errors import InputError, RigError
-from rig.network import codec
+from rig.benches.bench import Bench
+from rig.benches.canopen_map import (
+    INVALID,
+    MAPPING,
+    find_variable,
+    list_pdos,
+    name_object,
+    read_dictionary,
+    read_number,
+)
+from rig.benches.frame_map import Role
 from rig.network.frame import Frame
 from rig.network.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from rig.network.link import Wire
 from rig.network.node_objects import (
-    CONTROLLER,
     CYCLE_RECORD,
-    GAINS,
-    NAMES,
-    PLANT,
-    RIG,
     SCENARIO,
     CycleRecord,
-    Gains,
     Identity,
     NmtCommand,
     NmtState,
@@ -42,7 +47,8 @@ from rig.network.node_objects import (
 HEARTBEAT, HEARTBEAT_LIMIT = 100, 300  # ms
 PATIENT = 10_000  # ms: the limit where the wall clock says nothing about the run, in lockstep between processes
 BOOT_TIMEOUT = 2.0  # s
-_OURS = (0x000, codec.SYNC, codec.COMMAND, 0x700 + RIG)  # frames that only the rig may send
+NMT, EMCY, SDO_ANSWER, HEARTBEAT_ID = 0x000, 0x080, 0x580, 0x700  # predefined connection set (CiA 301, 7.3.5)
+DEVICE_TYPE, MODE, MODE_DISPLAY = 0x1000, 0x6060, 0x6061  # objects; the modes are those of CiA 402
 R = TypeVar("R")
 _BROKEN_OFF = (0x05030000, 0x05040000, 0x05040001)  # aborts of a server that has lost a transfer, or given it up
 
@@ -68,9 +74,9 @@ class _Node(canopen.RemoteNode):
 
 
 @cache
-def _read_dictionary(node: int) -> canopen.ObjectDictionary:
+def _read_dictionary(name: str, text: str, node: int) -> Any:
     """The library's object dictionary of a node. The library does not change it; to read it takes 20 ms."""
-    return canopen.import_od(str(EDS[node]), node)
+    return read_dictionary(name, text, node)
 
 
 class _Network(canopen.Network):
@@ -89,67 +95,81 @@ class Hooks:
 
     def __init__(self) -> None:
         self.on_frame: Callable[[Frame], None] = lambda frame: None
-        self.on_emcy: Callable[[int, EmcyError], None] = lambda node, error: None
-        self.on_state: Callable[[int, int], None] = lambda node, state: None
-        self.on_lost: Callable[[int], None] = lambda node: None
-        self.on_back: Callable[[int], None] = lambda node: None
-        self.on_heartbeat: Callable[[int, int], None] = lambda node, t_ns: None  # with the time of the wire's clock
+        self.on_emcy: Callable[[Role, EmcyError], None] = lambda node, error: None
+        self.on_state: Callable[[Role, int], None] = lambda node, state: None
+        self.on_lost: Callable[[Role], None] = lambda node: None
+        self.on_back: Callable[[Role], None] = lambda node: None
+        self.on_heartbeat: Callable[[Role, int], None] = lambda node, t_ns: None  # with the time of the wire's clock
         self.on_rival: Callable[[int], None] = lambda cob_id: None
-        self.on_cyclic: dict[int, Callable[[Frame], None]] = {}  # COB-ID to what reads that PDO
+        self.on_cyclic: dict[int, Callable[[Frame], None]] = {}  # identifier to what reads that frame
 
 
 class Master:
-    """Node 1 on the bus; `hooks` are told what it sees.
+    """The rig on the bus of a bench; `hooks` are told what it sees. Nodes are named by their roles.
 
     `stamped`: frames carry their time of reception, and it is kept; otherwise they get the time of `now()`.
     """
 
-    def __init__(self, wire: Wire, now: Callable[[], int], stamped: bool = False) -> None:
-        self.wire, self._now, self._stamped = wire, now, stamped
+    def __init__(self, wire: Wire, now: Callable[[], int], stamped: bool, bench: Bench) -> None:
+        self.wire, self._now, self._stamped, self._bench = wire, now, stamped, bench
         self.hooks = Hooks()
         self.silent = False  # a fault: no heartbeat of ours
         self.is_deaf = False  # a fault: the rig receives nothing
-        self.states = {CONTROLLER: -1, PLANT: -1}
-        self.heard_ns: dict[int, int] = {}  # node: when its last heartbeat came, by the wire's clock
-        self._booted: set[int] = set()
-        self._started_ns: dict[int, int] = {}  # node: when it was told to become OPERATIONAL
-        self._operational: dict[int, StartTime] = {}
-        self._settings: dict[tuple[int, int, int], Any] = {}  # what the run has written: node, index, sub
-        self._before: dict[tuple[int, int, int], bytes] = {}  # objects that the run changes: node, index, sub
-        self._rivals: set[int] = set()  # our own COB-IDs that another node sends
+        self.states = dict.fromkeys(sorted(bench.nodes), -1)
+        self.heard_ns: dict[Role, int] = {}  # when the last heartbeat of a node came, by the wire's clock
+        self._booted: set[Role] = set()
+        self._started_ns: dict[Role, int] = {}  # when a node was told to become OPERATIONAL
+        self._operational: dict[Role, StartTime] = {}
+        self._settings: dict[tuple[Role, int, int], Any] = {}  # what the run has written: node, index, sub
+        self._before: dict[tuple[Role, int, int], bytes] = {}  # objects that the run changes: node, index, sub
+        self._rivals: set[int] = set()  # our own identifiers that another node sends
         self.network = _Network(wire, self.send)
-        self._nodes = {node: self._join(node) for node in (PLANT, CONTROLLER)}
-        self._beat = HeartbeatProducer(RIG, self._send_heartbeat)
+        self._nodes = {role: self._join(role) for role in sorted(bench.nodes, reverse=True)}
+        self._roles = {node.node: role for role, node in bench.nodes.items()}
+        self._beat = HeartbeatProducer(bench.rig_node, self._send_heartbeat)
         self._beat_ns = self._last_pause_ns = 0  # when the rig's own heartbeat was sent; the time between the last two
         self._limit_ns = 0  # after which the nodes miss it
-        self._watch = HeartbeatConsumer(lambda node: self.hooks.on_lost(node), lambda node: self.hooks.on_back(node))
+        self._watch = HeartbeatConsumer(lambda node: self.hooks.on_lost(self._roles[node]),
+                                        lambda node: self.hooks.on_back(self._roles[node]))
         self._state = NmtState.PRE_OPERATIONAL
+        ours = {spec.identifier for spec in bench.frames.list_from(Role.RIG)} | {bench.frames.sync}
+        self._ours = ours | ({NMT, HEARTBEAT_ID + bench.rig_node} if bench.nodes else set())  # only the rig sends them
         # What the library may see, and the only length at which that is what it seems: it unpacks without looking.
-        self._services = {base + node: length for base, length in ((0x080, 8), (0x580, 8), (0x700, 1))
-                          for node in self._nodes}
+        self._services = {base + node: length for base, length in ((EMCY, 8), (SDO_ANSWER, 8), (HEARTBEAT_ID, 1))
+                          for node in self._roles}
         wire.receive = self.receive
 
     def close(self) -> None:
         """Report to nobody any more. Whoever the master reported to is then free, together with what it holds."""
         self._now, self.hooks = self.wire.clock.now, Hooks()
 
-    def _join(self, node: int) -> Any:  # the library's node; its types are too loose to help
-        remote = _Node(node, _read_dictionary(node))
+    @property
+    def watched(self) -> list[Role]:
+        """The nodes that send a heartbeat, or can be told to."""
+        return [role for role in sorted(self._nodes) if self._find_heartbeat(role)]
+
+    def _join(self, role: Role) -> Any:  # the library's node; its types are too loose to help
+        name, text = self._bench.read_data_sheet(role)
+        number = self._bench.nodes[role].node
+        remote = _Node(number, _read_dictionary(name, text, number))
         self.network.add_node(remote)
-        remote.emcy.add_callback(lambda error: self.hooks.on_emcy(node, error))
-        remote.nmt.add_heartbeat_callback(lambda state: self._take_heartbeat(node, state))
+        remote.emcy.add_callback(lambda error: self.hooks.on_emcy(role, error))
+        remote.nmt.add_heartbeat_callback(lambda state: self._take_heartbeat(role, state))
         return remote
 
-    def _take_heartbeat(self, node: int, state: int) -> None:
+    def _take_heartbeat(self, role: Role, state: int) -> None:
         if state == NmtState.INITIALISING:
-            self._booted.add(node)
-            self._nodes[node].emcy.reset()  # its errors ended with the reset, and no EMCY says so
+            self._booted.add(role)
+            self._nodes[role].emcy.reset()  # its errors ended with the reset, and no EMCY says so
         if state == NmtState.OPERATIONAL:
-            seconds = (self.wire.clock.now() - self._started_ns.get(node, 0)) * 1e-9
-            self._operational.setdefault(node, StartTime(seconds, min(seconds, self.wire.blind_ns * 1e-9)))
-        if self.states[node] != state:
-            self.states[node] = state
-            self.hooks.on_state(node, state)
+            seconds = (self.wire.clock.now() - self._started_ns.get(role, 0)) * 1e-9
+            self._operational.setdefault(role, StartTime(seconds, min(seconds, self.wire.blind_ns * 1e-9)))
+        self._note_state(role, state)
+
+    def _note_state(self, role: Role, state: int) -> None:
+        if self.states[role] != state:
+            self.states[role] = state
+            self.hooks.on_state(role, state)
 
     def _send_heartbeat(self, cob_id: int, data: bytes) -> None:
         if self.silent:
@@ -186,16 +206,17 @@ class Master:
         if cyclic is not None:
             cyclic(frame)
             return
-        if frame.cob_id in _OURS and frame.cob_id not in self._rivals:
+        if frame.cob_id in self._ours and frame.cob_id not in self._rivals:
             self._rivals.add(frame.cob_id)
             self.hooks.on_rival(frame.cob_id)
         if self._services.get(frame.cob_id) != len(frame.data):
             return
         if frame.cob_id in self._watch.cob_ids:
-            self.heard_ns[frame.cob_id - 0x700] = now = self.wire.clock.now()
+            role = self._roles[frame.cob_id - HEARTBEAT_ID]
+            self.heard_ns[role] = now = self.wire.clock.now()
             self._watch.receive(Frame(now, frame.cob_id, frame.data))
             if frame.data[0] != NmtState.INITIALISING:  # not a boot-up
-                self.hooks.on_heartbeat(frame.cob_id - 0x700, frame.t_ns if self._stamped else now)
+                self.hooks.on_heartbeat(role, frame.t_ns if self._stamped else now)
         self.network.notify(frame.cob_id, bytearray(frame.data), frame.t_ns * 1e-9)
 
     def tick(self) -> None:
@@ -206,7 +227,8 @@ class Master:
 
     def boot(self) -> None:
         """Send the boot-up message of the rig (CiA 301, 7.2.8.3.3)."""
-        self._beat.send_boot_up()
+        if self._nodes:
+            self._beat.send_boot_up()
 
     def reset(self) -> None:
         """Reset communication of the nodes of the bench and wait for their boot-up.
@@ -216,10 +238,10 @@ class Master:
         """
         self._empty_receive_buffer()
         self._booted.clear()
-        for node in self._nodes:
-            self._command_node(node, NmtCommand.RESET_COMMUNICATION)
-        self.wire.wait(lambda: self._booted >= {CONTROLLER, PLANT}, BOOT_TIMEOUT)
-        silent = [f"node {node} ({NAMES[node]})" for node in (CONTROLLER, PLANT) if node not in self._booted]
+        for role in self._nodes:
+            self._command_node(role, NmtCommand.RESET_COMMUNICATION)
+        self.wire.wait(lambda: self._booted >= self._nodes.keys(), BOOT_TIMEOUT)
+        silent = [self._bench.describe_node(role) for role in sorted(self._nodes) if role not in self._booted]
         if silent:
             raise BusError(f"no boot-up from {' and '.join(silent)} within {BOOT_TIMEOUT:g} s of an NMT reset")
 
@@ -227,72 +249,148 @@ class Master:
         """Take in the frames that wait: a full buffer would have no room for the answers to come."""
         self.wire.run_until(self.wire.clock.now())
 
-    def is_present(self, node: int, seconds: float) -> bool:
+    def is_present(self, role: Role, seconds: float) -> bool:
         """Whether a node answers an NMT reset of its communication."""
         self._empty_receive_buffer()
-        self._booted.discard(node)
-        self._command_node(node, NmtCommand.RESET_COMMUNICATION)
-        return self.wire.wait(lambda: node in self._booted, seconds)
+        self._booted.discard(role)
+        self._command_node(role, NmtCommand.RESET_COMMUNICATION)
+        return self.wire.wait(lambda: role in self._booted, seconds)
 
     def hears_rival(self, seconds: float) -> bool:
         """Whether another rig is active on the bus; only listens, at most `seconds`."""
         return self.wire.wait(lambda: bool(self._rivals), seconds)
 
-    def read_identity(self, node: int) -> Identity:
+    def read_identity(self, role: Role) -> Identity:
         """What a node says about itself; objects that it does not have are None."""
-        return read_identity(lambda index, sub: self._upload(node, index, sub))
+        return read_identity(lambda index, sub: self._upload(role, index, sub))
 
     def read_plant_record(self) -> CycleRecord | None:
         """The plant's own record of its cycles (object 0x2212); None if it has none."""
-        data = self._upload(PLANT, CYCLE_RECORD, 0)
+        data = self._upload(Role.PLANT, CYCLE_RECORD, 0) if Role.PLANT in self._nodes else None
         try:
             record = decode_cycle_record(data or b"")
         except InputError:  # of a foreign plant
             return None
         return record if len(record.cycle) else None
 
-    def configure(self, scenario: bytes, gains: Gains | None, sync_period_us: int,
+    def require_identity(self, role: Role) -> None:
+        """Refuse a device other than that of the data sheet: device type, vendor and product.
+
+        Raises:
+            InputError: the object in which it differs.
+        """
+        self._require_objects(role, list_identity(self._nodes[role].object_dictionary))
+
+    def require_pdos(self, role: Role) -> None:
+        """Refuse a device whose PDOs are not those of the data sheet. Raises InputError."""
+        self._require_objects(role, list_pdo_objects(self._nodes[role].object_dictionary, self._bench.nodes[role].node))
+
+    def _require_objects(self, role: Role, objects: Iterable[ExpectedObject]) -> None:
+        """Compare objects with the data sheet; those that the device lacks are left out. Raises InputError."""
+        if self._upload(role, DEVICE_TYPE, 0) is None:  # every CANopen node has it: this one answers no SDO
+            return
+        for index, sub, value, mask in objects:
+            data = self._upload(role, index, sub)
+            found = value if data is None else int.from_bytes(data[:8], "little")
+            if (found ^ value) & mask:
+                raise InputError(self._bench.read_data_sheet(role)[0], name_object(index, sub),
+                                 f"0x{value:X}, but {self._bench.describe_node(role)} has 0x{found:X}")
+
+    def configure(self, scenario: bytes, parameters: Mapping[str, float] | None, sync_period_us: int,
                   limit_ms: int = HEARTBEAT_LIMIT) -> None:
-        """Load the scenario into the plant and, for our own firmware, its gains; set heartbeats and cycle period.
+        """Load the scenario into the plant, and write values of DCFs, parameters, heartbeats and cycle period.
 
         `sync_period_us` goes to 0x1006; 0 switches the supervision of SYNC off: in lockstep SYNC has no fixed period.
-        `limit_ms` is the heartbeat timeout. A foreign controller (no `gains`) may refuse objects that it does not have.
+        `limit_ms` is the heartbeat timeout. `parameters` of the model are for our own firmware; None: a foreign
+        controller, which has its own, and may refuse 0x1006, 0x1016 and 0x1017.
 
         Raises:
             BusError: a node refused or did not answer.
+            InputError: a value of a DCF, or the mode of operation, that a device refuses.
         """
-        self._download(PLANT, SCENARIO, 0, scenario, seconds=120.0)  # the plant compiles its model in between
+        if Role.PLANT in self._nodes:
+            self._download(Role.PLANT, SCENARIO, 0, scenario, seconds=120.0)  # it compiles its model in between
         self._settings.clear()
-        for sub, value in enumerate(gains or (), 1):
-            self._set(CONTROLLER, GAINS, sub, value)
+        for role in sorted(self._nodes):
+            self._write_values(role)
+        if parameters is not None:
+            for index, sub, name in self._bench.nodes[Role.CONTROLLER].settings:
+                self._set(Role.CONTROLLER, index, sub, parameters[name])
         quick_heartbeat = 10  # ms: until the nodes are OPERATIONAL, so that the time this takes is measured that finely
-        for node in (CONTROLLER, PLANT):
-            foreign = node == CONTROLLER and gains is None
-            settings = ((0x1006, 0, sync_period_us), (0x1016, 1, RIG << 16 | limit_ms), (0x1017, 0, quick_heartbeat))
+        for role in sorted(self._nodes):
+            settings = ((0x1006, 0, sync_period_us), (0x1016, 1, self._bench.rig_node << 16 | limit_ms),
+                        (0x1017, 0, quick_heartbeat))
             for index, sub, value in settings:
-                self._keep(node, index, sub)
+                if not self._is_writable(role, index, sub):
+                    continue
+                self._keep(role, index, sub)
                 try:
-                    self._set(node, index, sub, value)
+                    self._set(role, index, sub, value)
                 except BusError:
-                    if not foreign:
+                    if role is not Role.CONTROLLER or parameters is not None:
                         raise
-        self._watch.configure([node << 16 | limit_ms for node in (CONTROLLER, PLANT)])
-        self._beat.configure(HEARTBEAT, self.wire.clock.now())
+        self._set_mode()
+        self._watch.configure([self._bench.nodes[role].node << 16 | max(limit_ms, 3 * self._find_heartbeat(role))
+                               for role in self.watched])
+        self._beat.configure(HEARTBEAT if self._nodes else 0, self.wire.clock.now())
         self._beat_ns, self._last_pause_ns, self._limit_ns = 0, 0, limit_ms * 1_000_000
+
+    def _is_writable(self, role: Role, index: int, sub: int) -> bool:
+        found = find_variable(self._nodes[role].object_dictionary, index, sub)
+        return found is not None and found.writable
+
+    def _find_heartbeat(self, role: Role) -> int:
+        """Period of a node's heartbeat, ms: ours if it can be set, else that of the data sheet; 0: it has none."""
+        if self._is_writable(role, 0x1017, 0):
+            return HEARTBEAT
+        return read_number(self._nodes[role].object_dictionary, 0x1017, 0) or 0
+
+    def _write_values(self, role: Role) -> None:
+        """Write the values of a DCF. Raises InputError for one that the device refuses."""
+        for index, sub, data in self._bench.nodes[role].values:
+            try:
+                repeat_transfer(lambda index=index, sub=sub, data=data:  # type: ignore[misc]
+                                self._nodes[role].sdo.download(index, sub, data))
+            except (SdoAbortedError, SdoCommunicationError) as error:
+                raise InputError(self._bench.read_data_sheet(role)[0], name_object(index, sub),
+                                 f"a value that {self._bench.describe_node(role)} takes: {error}") from error
+
+    def _set_mode(self) -> None:
+        """Set the mode of operation of a CiA 402 drive, unless a PDO carries it, and wait until it is in force.
+
+        Raises:
+            BusError: the drive refuses it.
+            InputError: it shows another one after a second.
+        """
+        node = self._bench.nodes.get(Role.CONTROLLER)
+        if node is None or node.mode is None or any(spec.has("mode") for spec in self._bench.frames.frames):
+            return
+        self._set(Role.CONTROLLER, MODE, 0, node.mode)
+        shown = None
+        for _ in range(20):
+            data = self._upload(Role.CONTROLLER, MODE_DISPLAY, 0)
+            shown = node.mode if data is None else int.from_bytes(data[:1], "little", signed=True)
+            if shown == node.mode:
+                return
+            self.wire.wait(lambda: False, 0.05)
+        raise InputError(next(iter(self._bench.files), self._bench.name), "controller.mode",
+                         f"a mode of {self._bench.describe_node(Role.CONTROLLER)}, not {node.mode}: "
+                         f"{name_object(MODE_DISPLAY, 0)} shows {shown}")
 
     def configure_again(self) -> list[str]:
         """Write what `configure` wrote once more to the nodes that have booted since they were started.
 
-        A reset sets 0x1006, 0x1016 and 0x1017 to their defaults, and a reset of the node the gains as well. Returns the
-        failures in words.
+        A reset sets 0x1006, 0x1016 and 0x1017 to their defaults, and a reset of the node the other objects as well.
+        Returns the failures in words.
         """
         failures = []
-        for node in sorted(self._booted):
-            written = [(index, sub, value) for (at, index, sub), value in self._settings.items() if at == node]
+        for role in sorted(self._booted):
+            written = [(index, sub, value) for (at, index, sub), value in self._settings.items() if at == role]
             try:
+                self._write_values(role)
                 for index, sub, value in written:
-                    self._write(node, index, sub, value)
-            except (BusError, ConfirmationError) as error:  # it would not answer the others either
+                    self._write(role, index, sub, value)
+            except (RigError, ConfirmationError) as error:  # it would not answer the others either
                 failures.append(f"after its reset {error}")
         return failures
 
@@ -302,20 +400,21 @@ class Master:
         Otherwise a node that stays on the bus would go on watching a rig that has left. Returns the failures in words.
         """
         failures = []
-        for (node, index, sub), data in self._before.items():
-            if node in gone:
+        for (role, index, sub), data in self._before.items():
+            if role in gone:
                 continue
             try:
-                self._nodes[node].sdo.download(index, sub, data)
+                self._nodes[role].sdo.download(index, sub, data)
             except (SdoAbortedError, SdoCommunicationError, ConfirmationError) as error:
-                failures.append(f"node {node} {NAMES[node]}: 0x{index:04X} sub {sub} was not set back ({error})")
+                failures.append(f"{self._bench.describe_node(role)}: {name_object(index, sub)} was not set back "
+                                f"({error})")
         self._before.clear()
         return failures
 
-    def _keep(self, node: int, index: int, sub: int) -> None:
+    def _keep(self, role: Role, index: int, sub: int) -> None:
         """Remember what an object was, for `restore`; 0x1017 may stay, for a heartbeat does no harm."""
-        if index != 0x1017 and (data := self._upload(node, index, sub)) is not None:
-            self._before.setdefault((node, index, sub), data)
+        if index != 0x1017 and (data := self._upload(role, index, sub)) is not None:
+            self._before.setdefault((role, index, sub), data)
 
     def start(self) -> None:
         """Tell the nodes to become OPERATIONAL; the rig is from now on."""
@@ -323,22 +422,26 @@ class Master:
         self._booted.clear()
         self._command(NmtCommand.START, NmtState.OPERATIONAL)
 
-    def wait_for_operational(self, seconds: float) -> dict[int, StartTime]:
+    def wait_for_operational(self, seconds: float) -> dict[Role, StartTime]:
         """Wait until the heartbeat of each node says OPERATIONAL, at most `seconds`, and slow the heartbeats down.
 
-        Returns the time since `start` by node; a node that did not become OPERATIONAL is missing.
+        Returns the time since `start` by node; a node that did not become OPERATIONAL is missing, and one without a
+        heartbeat.
         """
+        watched = set(self.watched)
+
         def are_operational() -> bool:
             self.tick()  # the nodes watch the rig's heartbeat meanwhile
-            return self._operational.keys() >= self._nodes.keys()
+            return self._operational.keys() >= watched
 
         self.wire.wait(are_operational, seconds)
-        for node in self._operational:
-            with contextlib.suppress(BusError):  # of a foreign node whose heartbeat time is fixed
-                self._set(node, 0x1017, 0, HEARTBEAT)
+        for role in self._operational:
+            if self._is_writable(role, 0x1017, 0):
+                with contextlib.suppress(BusError):  # of a foreign node whose heartbeat time is fixed
+                    self._set(role, 0x1017, 0, HEARTBEAT)
         return dict(self._operational)
 
-    def find_silent(self, seconds: float) -> list[int]:
+    def find_silent(self, seconds: float) -> list[Role]:
         """Wait for a heartbeat of each node, at most `seconds`; returns the nodes that sent none."""
         begin = self.wire.clock.now()
 
@@ -346,8 +449,8 @@ class Master:
             self.tick()
             return not find_unheard()
 
-        def find_unheard() -> list[int]:
-            return [node for node in self._nodes if self.heard_ns.get(node, -1) < begin]
+        def find_unheard() -> list[Role]:
+            return [role for role in self.watched if self.heard_ns.get(role, -1) < begin]
 
         self.wire.wait(are_heard, seconds)
         return find_unheard()
@@ -359,63 +462,101 @@ class Master:
     def _command(self, command: NmtCommand, state: NmtState) -> None:
         """Send an NMT command to each node of the bench. Node 0, all nodes, would reach others on the bus as well."""
         self._state = state
-        for node in self._nodes:
-            self._command_node(node, command)
-            self._started_ns[node] = self.wire.clock.now()
+        for role in self._nodes:
+            self._command_node(role, command)
+            self._started_ns[role] = self.wire.clock.now()
+            if not self._find_heartbeat(role):  # it will not say so
+                self._note_state(role, state)
 
-    def _command_node(self, node: int, command: NmtCommand) -> None:
+    def _command_node(self, role: Role, command: NmtCommand) -> None:
         """Send it without the library, which fails after a heartbeat with a state that does not exist."""
-        self.send(0x000, bytes((command, node)))
+        self.send(NMT, bytes((command, self._bench.nodes[role].node)))
 
     def reset_controller(self, reset: str) -> None:
         """Send the controller an NMT reset, "node" or "communication", and do not wait."""
         commands = {"node": NmtCommand.RESET_NODE, "communication": NmtCommand.RESET_COMMUNICATION}
-        self._command_node(CONTROLLER, commands[reset])
+        self._command_node(Role.CONTROLLER, commands[reset])
 
-    def read_gains(self) -> Gains | None:
-        """The gains of the controller (object 0x2110); None if it does not have them."""
-        sdo = self._nodes[CONTROLLER].sdo
-        try:
-            return Gains(*(float(sdo[GAINS][sub].raw) for sub in range(1, len(Gains._fields) + 1)))
-        except (SdoAbortedError, SdoCommunicationError, KeyError):
-            return None
+    def read_parameters(self) -> dict[str, float]:
+        """The parameters of the model that objects of the controller hold; those that it does not have are missing."""
+        node = self._bench.nodes.get(Role.CONTROLLER)
+        found = {}
+        for index, sub, name in () if node is None else node.settings:
+            try:
+                found[name] = float(self._find_entry(Role.CONTROLLER, index, sub).raw)
+            except (SdoAbortedError, SdoCommunicationError):
+                break  # of a firmware without them
+        return found
 
-    def list_errors(self) -> list[int]:
+    def list_errors(self) -> list[Role]:
         """Nodes whose last EMCY has an error register."""
-        return [number for number, node in self._nodes.items() if node.emcy.log and node.emcy.log[-1].register]
+        return [role for role, node in self._nodes.items() if node.emcy.log and node.emcy.log[-1].register]
 
-    def _upload(self, node: int, index: int, sub: int) -> bytes | None:
+    def _upload(self, role: Role, index: int, sub: int) -> bytes | None:
         """An object's bytes; None if the node does not have it or does not answer."""
-        sdo = self._nodes[node].sdo
+        sdo = self._nodes[role].sdo
         try:
             data: bytes = repeat_transfer(lambda: sdo.upload(index, sub))
         except (SdoAbortedError, SdoCommunicationError):
             return None
         return data
 
-    def _set(self, node: int, index: int, sub: int, value: Any) -> None:
+    def _set(self, role: Role, index: int, sub: int, value: Any) -> None:
         """Write an object and remember the value for `configure_again`."""
-        self._write(node, index, sub, value)
-        self._settings[node, index, sub] = value
+        self._write(role, index, sub, value)
+        self._settings[role, index, sub] = value
 
-    def _write(self, node: int, index: int, sub: int, value: Any) -> None:
+    def _write(self, role: Role, index: int, sub: int, value: Any) -> None:
         try:
-            entry = self._nodes[node].sdo[index]
-            variable = entry[sub] if sub else entry
+            variable = self._find_entry(role, index, sub)
             repeat_transfer(lambda: setattr(variable, "raw", value))
         except (SdoAbortedError, SdoCommunicationError, KeyError) as error:
-            raise BusError(f"node {node} ({NAMES[node]}), object 0x{index:04X} sub {sub}: {error}") from error
+            raise BusError(f"{self._bench.describe_node(role)}, object {name_object(index, sub)}: {error}") from error
 
-    def _download(self, node: int, index: int, sub: int, data: bytes, seconds: float) -> None:
-        sdo = self._nodes[node].sdo
+    def _find_entry(self, role: Role, index: int, sub: int) -> Any:
+        entry = self._nodes[role].sdo[index]
+        return entry if isinstance(entry, SdoVariable) else entry[sub]
+
+    def _download(self, role: Role, index: int, sub: int, data: bytes, seconds: float) -> None:
+        sdo = self._nodes[role].sdo
         usual, sdo.RESPONSE_TIMEOUT = sdo.RESPONSE_TIMEOUT, seconds
         try:
             repeat_transfer(lambda: sdo.download(index, sub, data))
         except (SdoAbortedError, SdoCommunicationError) as error:
-            raise BusError(f"node {node} ({NAMES[node]}), object 0x{index:04X}: {error}") from error
+            raise BusError(f"{self._bench.describe_node(role)}, object {name_object(index, sub)}: {error}") from error
         finally:
             sdo.RESPONSE_TIMEOUT = usual
 
+
+class ExpectedObject(NamedTuple):
+    """What a device must hold."""
+
+    index: int  # type: ignore[assignment]  # the word of the standard
+    sub: int
+    value: int
+    mask: int = (1 << 64) - 1  # bits that matter
+
+
+def list_identity(dictionary: Any) -> Iterator[ExpectedObject]:
+    """Device type, vendor-ID and product code of a data sheet; 0 for the last two says nothing."""
+    for index, sub in ((DEVICE_TYPE, 0), (0x1018, 1), (0x1018, 2)):
+        value = read_number(dictionary, index, sub)
+        if value or (value == 0 and not sub):
+            yield ExpectedObject(index, sub, value)
+
+
+def list_pdo_objects(dictionary: Any, node: int) -> Iterator[ExpectedObject]:
+    """COB-ID, transmission type, inhibit time, event timer and mapping of the PDOs that a data sheet switches on."""
+    not_remote = 0xFFFF_FFFF ^ 1 << 30  # whether a PDO may be requested does not matter
+    for pdo in list_pdos(dictionary, node):
+        if pdo.cob_id & INVALID:
+            continue
+        yield ExpectedObject(pdo.parameter, 1, pdo.cob_id, not_remote)
+        for index, subs in ((pdo.parameter, (2, 3, 5)), (pdo.parameter + MAPPING, range(len(pdo.entries) + 1))):
+            for sub in subs:
+                value = read_number(dictionary, index, sub)
+                if value is not None:
+                    yield ExpectedObject(index, sub, value)
 
 def repeat_transfer(transfer: Callable[[], R], attempts: int = 3) -> R:
     """Make an SDO transfer, and repeat it when the server has lost it: one of the two may have stood still meanwhile.

@@ -1,9 +1,9 @@
-"""Numbers and application objects of the three nodes, which the rig writes and the nodes obey."""
+"""Participants of a run, and application objects of our own nodes, which the rig writes and the nodes obey."""
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.errors import InputError
-from plant.model import Model
+from rig.benches.frame_map import Role
 
-RIG, CONTROLLER, PLANT = 1, 2, 3  # node-IDs
-NAMES = {RIG: "rig", CONTROLLER: "controller", PLANT: "plant"}
-GAINS = 0x2110  # of the controller
+RIG, CONTROLLER, PLANT = Role.RIG, Role.CONTROLLER, Role.PLANT  # of the shipped bench they are the node-IDs as well
+NAMES: dict[int, str] = {role: role.name.lower() for role in Role}
+GAINS = 0x2110  # of the reference firmware
 SCENARIO, COUNTERS, CYCLE_RECORD = 0x2210, 0x2211, 0x2212  # of the plant
 
 
@@ -29,9 +29,10 @@ class Gains(NamedTuple):
     period: float
 
 
-def read_gains(model: Model) -> Gains:
-    """What a model's [controller] says."""
-    return Gains(*(model[f"controller.{field}"] for field in Gains._fields))
+def read_gains(values: Mapping[str, float]) -> Gains | None:
+    """The gains among the parameters of a model, or of a controller; None if one is missing."""
+    names = [f"controller.{field}" for field in Gains._fields]
+    return Gains(*(values[name] for name in names)) if all(name in values for name in names) else None
 
 
 class NmtState(IntEnum):

@@ -17,14 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.segments import Array
+from rig.benches.bench import Bench
+from rig.benches.frame_map import Role
 from rig.network.codec import Flags
 from rig.network.master import StartTime
-from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
+from rig.network.node_objects import CONTROLLER, PLANT, RIG
 from rig.sequences.faults import DELAY, BusOff, Offset, Parameter, Plan, Schedule, Silent, Stuck
 from rig.sequences.timing import PERIOD, TimingPolicy
 
 Mask = NDArray[np.bool_]
 
+NO_DRIVE = "drive"  # kind of a trouble: the rig, which moves the plant, gets no drive frames
 _NO_DRIVE = int(Flags.DRIVE_MISSING | Flags.DRIVE_LATE)
 _RPDO_TIMEOUT = 0x8250
 _SETTLING = 100  # cycles: after a lost frame the position loop needs less than this to forget it
@@ -73,8 +76,8 @@ class Trouble(NamedTuple):
     """Something that a node or the rig reported; `node` 0 where no node is meant."""
 
     t_ns: int  # log time
-    node: int
-    kind: str  # kind of the event: emcy, nmt, heartbeat, process, guard, bus, bring_up, operator; late: of the bench
+    node: int  # role
+    kind: str  # of the event: emcy, nmt, heartbeat, process, drive, guard, bus, bring_up, operator; late: of the bench
     code: int  # of an EMCY; NMT state of kind nmt; else 0
     text: str
 
@@ -118,14 +121,15 @@ class Attribution(NamedTuple):
     overruns: NDArray[np.int64]  # (cycles,)
 
 
-def attribute(records: CycleRecords, troubles: Sequence[Trouble], policy: TimingPolicy,
-              gone: Mapping[int, str] | None = None) -> Attribution:
+def attribute(records: CycleRecords, troubles: Sequence[Trouble], policy: TimingPolicy, bench: Bench,
+              gone: Mapping[Role, str] | None = None) -> Attribution:
     """Find the cycles that may be judged, and the first cause of the troubles of a run.
 
     Args:
         records: what was measured in each cycle.
         troubles: everything that was reported, in any order.
         policy: limits of the sequence.
+        bench: names the participants.
         gone: nodes that did not answer any more at the end of the run, and how that is known.
     """
     gone = gone or {}
@@ -133,7 +137,7 @@ def attribute(records: CycleRecords, troubles: Sequence[Trouble], policy: Timing
     disturbances = find_disturbances(records, late)
     judged, invalid = select_judged(records, late, disturbances)
     ordered = sorted(troubles, key=lambda trouble: trouble.t_ns)
-    causes = [find_cause(trouble, records, disturbances, gone) for trouble in ordered]
+    causes = [find_cause(trouble, records, disturbances, gone, bench) for trouble in ordered]
     cause = find_first_cause(causes, disturbances)
     consequences = tuple(trouble for trouble in ordered if cause is None or trouble.text != cause.text)
     return Attribution(judged, invalid, disturbances, cause, consequences, find_affected(records, disturbances),
@@ -193,7 +197,8 @@ def find_plant_stops(records: CycleRecords, troubles: Iterable[Trouble], gone: C
     return [*stops, records.cycles - 1] if PLANT in gone else stops
 
 
-def find_start_problem(times: Mapping[int, StartTime], limit: float) -> tuple[str, str, int] | None:
+def find_start_problem(times: Mapping[Role, StartTime], limit: float, names: Mapping[Role, str],
+                       ) -> tuple[str, str, int] | None:
     """Who is to blame when a node was not OPERATIONAL within `limit` s of NMT start; None if all were.
 
     Returns kind, text and node (0: the bench as a whole) as in `Trouble`. The kind is "late" if the bench was late,
@@ -205,21 +210,22 @@ def find_start_problem(times: Mapping[int, StartTime], limit: float) -> tuple[st
     Args:
         times: of the nodes that became OPERATIONAL, by node.
         limit: s.
+        names: the nodes that say so, with their names.
     """
-    slow = [node for node in (CONTROLLER, PLANT)
+    slow = [node for node in names
             if node not in times or times[node].seconds - times[node].waited > limit]
     said = {node: f"took {times[node].seconds:.2f} s" if node in times else "has not said so" for node in slow}
     rule = f"must be OPERATIONAL within {limit:g} s of NMT start"
     if len(slow) == 2:
-        which = ", ".join(f"node {node} {NAMES[node]} {said[node]}" for node in slow)
+        which = ", ".join(f"{names[node]} {said[node]}" for node in slow)
         return "late", f"the bench was late in bring-up: both nodes {rule}: {which}", 0
     for node in slow:
         kind = "late" if node == PLANT and node in times else "bring_up"  # the plant is a part of the bench
-        return kind, f"node {node} {NAMES[node]} {rule} and {said[node]}", node
+        return kind, f"{names[node]} {rule} and {said[node]}", node
     for node, time in times.items():
         if time.seconds > limit:
-            return "late", (f"the rig stood still for {time.waited:.2f} s and cannot know whether node {node} "
-                            f"{NAMES[node]} was OPERATIONAL within {limit:g} s"), RIG
+            return "late", (f"the rig stood still for {time.waited:.2f} s and cannot know whether {names[node]} "
+                            f"was OPERATIONAL within {limit:g} s"), RIG
     return None
 
 
@@ -306,8 +312,8 @@ def find_affected(records: CycleRecords, disturbances: Iterable[Disturbance]) ->
     return affected
 
 
-def find_cause(trouble: Trouble, records: CycleRecords, disturbances: Iterable[Disturbance],
-               gone: Mapping[int, str]) -> Cause:
+def find_cause(trouble: Trouble, records: CycleRecords, disturbances: Iterable[Disturbance], gone: Mapping[Role, str],
+               bench: Bench) -> Cause:
     """The first cause of one trouble.
 
     What is not about communication is its own cause. Otherwise, in this order: a node that is gone explains the frames
@@ -321,7 +327,8 @@ def find_cause(trouble: Trouble, records: CycleRecords, disturbances: Iterable[D
     silent, origin = _find_silent_node(trouble, records, cycle)
     for node in (silent, trouble.node):
         if node in gone and records.find_stop(node) <= cycle + 1:  # later it still answered
-            return _describe_stop(node, records, min(origin, records.find_stop(node)), cycle, gone[node])
+            role = Role(node)
+            return _describe_stop(role, bench, records, min(origin, records.find_stop(node)), cycle, gone[role])
     window = records.injected.any[max(origin - 1, 0):cycle + 1]
     if window.any() and trouble.kind != "guard":
         return itself._replace(source=0, kind="injected", cycle=max(origin - 1, 0) + int(np.argmax(window)),
@@ -330,7 +337,7 @@ def find_cause(trouble: Trouble, records: CycleRecords, disturbances: Iterable[D
         reach = disturbance.reach + (_SETTLING if trouble.kind == "guard" else 0)
         if any(disturbance.first - 1 <= at <= reach for at in (origin, cycle)):
             return Cause(disturbance.source, "late", disturbance.first, disturbance.text)
-    return _describe_stop(silent, records, origin, cycle, "") if silent else itself
+    return _describe_stop(Role(silent), bench, records, origin, cycle, "") if silent else itself
 
 
 def _is_communication(trouble: Trouble) -> bool:
@@ -343,7 +350,7 @@ def _is_communication(trouble: Trouble) -> bool:
         return 0x8100 <= trouble.code < 0x8300
     if trouble.kind == "nmt":
         return trouble.node == CONTROLLER and trouble.code != 0
-    return trouble.kind in ("heartbeat", "process", "guard")
+    return trouble.kind in ("heartbeat", "process", "guard", NO_DRIVE)
 
 
 def _find_silent_node(trouble: Trouble, records: CycleRecords, cycle: int) -> tuple[int, int]:
@@ -352,10 +359,11 @@ def _find_silent_node(trouble: Trouble, records: CycleRecords, cycle: int) -> tu
         stop = records.find_stop(trouble.node)
         is_answering = trouble.kind == "heartbeat" and stop > cycle  # only the heartbeat is missing
         return (0, cycle) if is_answering else (trouble.node, min(cycle, stop))
-    if trouble.kind != "emcy" or trouble.code != _RPDO_TIMEOUT:
+    is_drive_missing = trouble.kind == NO_DRIVE
+    if not is_drive_missing and (trouble.kind != "emcy" or trouble.code != _RPDO_TIMEOUT):
         return 0, cycle
     no_feedback = records.find_missing(PLANT)
-    if trouble.node != PLANT:
+    if trouble.node != PLANT and not is_drive_missing:
         origin = _find_run_start(no_feedback, cycle)
         return (PLANT, origin) if no_feedback[min(origin, len(no_feedback) - 1):][:1].any() else (0, cycle)
     # The plant's flags of cycle k + 1 speak of the drive frame of cycle k.
@@ -376,15 +384,15 @@ def _find_run_start(missing: Mask, cycle: int, near: int = 4) -> int:
     return int(present[-1]) + 1 if len(present) else 0
 
 
-def _describe_stop(node: int, records: CycleRecords, first: int, cycle: int, how: str) -> Cause:
+def _describe_stop(node: Role, bench: Bench, records: CycleRecords, first: int, cycle: int, how: str) -> Cause:
     """A node that stopped answering in cycle `first`, with the evidence that the bench did its part."""
     missing = np.isnan(records.response if node == CONTROLLER else records.feedback)
-    frames = "drive" if node == CONTROLLER else "feedback"
+    frames, name = "drive" if node == CONTROLLER else "feedback", bench.describe_node(node)
     count = int(np.argmin(missing[first:])) if not missing[first:].all() else 0  # 0: until the end
     if not how and (count or first >= records.cycles):
-        text = f"node {node} {NAMES[node]} did not answer in time: no {frames} frame for {count} cycles from {first}"
+        text = f"{name} did not answer in time: no {frames} frame for {count} cycles from {first}"
     else:
-        text = f"node {node} {NAMES[node]} stopped answering: no {frames} frame since cycle {first}"
+        text = f"{name} stopped answering: no {frames} frame since cycle {first}"
         text += f"; {how}" if how else ""
     evidence = _show_punctuality(records, first, cycle) if node == CONTROLLER else ()
     return Cause(node, "stopped", first, text, evidence, is_gone=bool(how))

@@ -4,10 +4,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from plant.errors import InputError
+from rig.benches.frame_map import Role
 from rig.network.clock import WallClock
 from rig.network.link import EmbeddedWire
 from rig.network.master import HEARTBEAT_LIMIT, PATIENT, Master
-from rig.network.node_objects import CONTROLLER, NAMES, PLANT, Gains, Identity, read_gains
+from rig.network.node_objects import CONTROLLER, Gains, Identity, read_gains
 from rig.nodes.scenario import Scenario
 from rig.run.attribution import Mask, find_start_problem
 from rig.run.hard_loop import open_loop
@@ -38,9 +39,9 @@ class BringUp:
         self._job, self._stage, self._journal, self._safety = job, stage, journal, safety
         self._master, self._stop = master, stop
         self._is_embedded = isinstance(master.wire, EmbeddedWire)
-        self.identities: dict[int, Identity] = {}
-        self.start_times: dict[int, float] = {}  # s from NMT start to OPERATIONAL, by node
-        self.gains: Gains | None = None  # object 0x2110 of the controller, if it has it
+        self.identities: dict[Role, Identity] = {}
+        self.start_times: dict[Role, float] = {}  # s from NMT start to OPERATIONAL
+        self.gains: Gains | None = None  # of the controller, if its objects hold them
         self.probes: list[History] = []  # played before set-up
 
     def start_nodes(self, scenario: Scenario, *, is_run: bool = False) -> None:
@@ -48,15 +49,19 @@ class BringUp:
         job = self._job
         self._master.reset()
         self._stage.is_watching = is_run
-        if not self.identities:
+        is_first = not self.identities
+        if is_first:
             self._identify_nodes()
-        gains = read_gains(job.model) if job.controller != "external" else None
+        parameters = job.model.values if job.controller != "external" else None
         if self.gains is None:
-            self.gains = gains or self._master.read_gains()
+            self.gains = read_gains(self._master.read_parameters() if parameters is None else parameters)
         patient = not job.realtime and isinstance(self._stage.clock, WallClock)
-        self._master.configure(scenario.to_bytes(), gains,
+        self._master.configure(scenario.to_bytes(), parameters,
                                job.sequence.timing.choose_sync_period() if job.realtime or self._is_embedded else 0,
                                PATIENT if patient else HEARTBEAT_LIMIT)
+        if is_first:
+            for role in self.identities:
+                self._master.require_pdos(role)
         self._master.start()
         self._wait_for_operational(job.sequence.timing.operational)
 
@@ -114,19 +119,23 @@ class BringUp:
         return probe
 
     def _identify_nodes(self) -> None:
-        """Read and log what the nodes say about themselves; refuse a firmware that the sequence is not meant for.
+        """Read and log what the nodes say about themselves; refuse another device, and a firmware that the sequence is
+        not meant for.
 
         Raises:
-            InputError: another firmware.
+            InputError: another device or firmware.
         """
-        for node in (CONTROLLER, PLANT):
-            identity = self._master.read_identity(node)
-            self.identities[node] = identity
-            self._journal.log("INFO", "identity", f"node {node} {NAMES[node]}: {identity}")
+        bench, sequence = self._job.bench, self._job.sequence
+        for role in sorted(bench.nodes):
+            identity = self._master.read_identity(role)
+            self.identities[role] = identity
+            self._journal.log("INFO", "identity", f"{bench.describe_node(role)}: {identity}")
             known = {key: str(value) for key, value in identity._asdict().items() if value is not None}
-            self._journal.recorder.metadata(f"node{node}", known)
-        sequence = self._job.sequence
-        key, difference = sequence.firmware.find_difference(self.identities[CONTROLLER]._asdict())
+            self._journal.recorder.metadata(f"node{bench.find_number(role)}", known)
+        for role in self.identities:
+            self._master.require_identity(role)
+        identity = self.identities.get(CONTROLLER, Identity())
+        key, difference = sequence.firmware.find_difference(identity._asdict())
         if difference:
             raise InputError(sequence.name, f"firmware.{key}", difference)
 
@@ -136,11 +145,13 @@ class BringUp:
         A node that is too slow is given three times the limit, so that the time it needs is known.
         """
         times = self._master.wait_for_operational(3 * limit)
-        self.start_times = {node: time.seconds for node, time in times.items()}
-        for node, seconds in sorted(self.start_times.items()):
+        bench = self._job.bench
+        self.start_times = {role: time.seconds for role, time in times.items()}
+        for role, seconds in sorted(self.start_times.items()):
             self._journal.log("INFO", "nmt",
-                              f"node {node} {NAMES[node]} is OPERATIONAL {1e3 * seconds:.0f} ms after NMT start")
-        if problem := find_start_problem(times, limit):
+                              f"{bench.describe_node(role)} is OPERATIONAL {1e3 * seconds:.0f} ms after NMT start")
+        if problem := find_start_problem(times, limit, {role: bench.describe_node(role)
+                                                        for role in self._master.watched}):
             self._safety.handle(*problem)
 
     def find_on_time_of(self, history: History, faults: Schedule | None = None) -> Mask:

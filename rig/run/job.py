@@ -3,12 +3,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import dbc
 from fdi.foreign_code import (
     Announce,
     ForeignCode,
@@ -24,20 +23,26 @@ from plant.effects import load_effects
 from plant.model import find_quantity, parse_model
 from plant.parameters import parse_toml
 from plant.segments import RATE
+from rig.benches.bench import Bench
+from rig.benches.bench_file import load_bench, load_bench_from_files
 from rig.nodes.scenario import Scenario
 from rig.run.choices import CONTROLLERS, PACES, PLANTS
 from rig.sequences import Sequence, load_sequence
 
 _REQUIRED_SETTINGS = {"seed", "bus", "pace", "controller", "plant", "max_overruns"}
-_EFFECT_FOLDER, _SEQUENCE_FOLDER = "effects/", "sequence/"  # folders of the attachments
+_EFFECT_FOLDER, _SEQUENCE_FOLDER, _BENCH_FOLDER = "effects/", "sequence/", "bench/"  # folders of the attachments
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One run. `plant` and `controller`: "builtin", "external", for the plant "auto", for the controller "c"."""
+    """One run. `plant` and `controller`: "builtin", "external", for the plant "auto", for the controller "c".
+
+    Raises InputError for a controller of ours on the bench of another device.
+    """
 
     sequence: Sequence
     model: Model
+    bench: Bench = field(default_factory=load_bench)
     seed: int = 0
     bus: str = "embedded"
     pace: str = "lockstep"
@@ -45,6 +50,11 @@ class Job:
     plant: str = "auto"
     effects: tuple[Path, ...] = ()
     max_overruns: float = 1e-3  # of all cycles, in real time
+
+    def __post_init__(self) -> None:
+        if self.controller != "external" and not speaks_as_shipped(self.bench):
+            raise InputError("--controller", self.controller, "external: our own firmware does not speak as the device "
+                                                              f"of {self.bench.name!r}")
 
     @property
     def realtime(self) -> bool:
@@ -67,12 +77,13 @@ class Job:
         found = {"model.toml": ("application/toml", self.model.to_toml().encode())}
         found |= {_SEQUENCE_FOLDER + name: ("text/plain", data) for name, data in self.sequence.bundle().items()}
         found |= {_EFFECT_FOLDER + path.name: ("text/x-python", path.read_bytes()) for path in self.effects}
-        return found | {path.name: ("text/plain", path.read_bytes()) for path in (dbc.DBC, *dbc.EDS.values())}
+        return found | {_BENCH_FOLDER + name: ("text/plain", data) for name, data in self.bench.files.items()}
 
     def list_settings(self) -> dict[str, object]:
         """The settings of the run, for the log's metadata."""
         return {"seed": self.seed, "bus": self.bus, "pace": self.pace, "controller": self.controller,
-                "plant": self.plant, "model": self.model.name, "sequence": self.sequence.title,
+                "plant": self.plant, "bench": next(iter(self.bench.files), self.bench.name),
+                "model": self.model.name, "sequence": self.sequence.title,
                 "period": self.period_ns / 1e9, "max_overruns": self.max_overruns}
 
 
@@ -123,7 +134,24 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
         raise InputError(path, "attachment model.toml", "text in UTF-8") from error
     model = parse_model(parse_toml(text, where), where)
     require_bench_cycle(model, where)
-    return Job(sequence=Sequence.from_bundle(bundle), model=model, effects=effects, **settings)
+    bench = _read_bench(attachments, said.get("bench", ""), is_trusted=is_trusted)
+    return Job(sequence=Sequence.from_bundle(bundle), model=model, bench=bench, effects=effects, **settings)
+
+
+def _read_bench(attachments: Mapping[str, bytes], name: str, *, is_trusted: bool) -> Bench:
+    """The bench of a log, whose file has this name; a log without one was made on the shipped bench."""
+    files = {key.removeprefix(_BENCH_FOLDER): data for key, data in attachments.items()
+             if key.startswith(_BENCH_FOLDER)}
+    if not files:
+        return load_bench()
+    return load_bench_from_files({name: files.get(name, b""), **files}, is_trusted=is_trusted)
+
+
+def speaks_as_shipped(bench: Bench) -> bool:
+    """Whether our own firmware is a controller of this bench: frames and nodes are those of the shipped one."""
+    shipped = load_bench()
+    numbers = [{role: node.node for role, node in each.nodes.items()} for each in (bench, shipped)]
+    return bench.frames == shipped.frames and numbers[0] == numbers[1]
 
 
 def _require_file_name(log: Path, name: str) -> None:
@@ -184,6 +212,7 @@ class JobChoice(NamedTuple):
     changes: Mapping[str, str | float] = {}  # "GROUP.FIELD" to value, SI
     seed: int = 0
     effects: tuple[Path, ...] = ()  # files of the user's own effects
+    bench: str = "eha"  # a file, or the name of a shipped one
     bus: str = "embedded"
     pace: str | None = None
     controller: str | None = None
@@ -215,12 +244,13 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     model = load_model(name).replace(sequence.model.overrides, sequence.name).replace(choice.changes)
     require_bench_cycle(model, "--set")
     foreign = [name for name in model.list_changes() if name.startswith("controller.")]
-    if choice.controller == "external" and foreign:
+    bench = load_bench(choice.bench, is_trusted=is_trusted)
+    controller = choice.controller or ("builtin" if speaks_as_shipped(bench) else "external")
+    if controller == "external" and foreign:
         raise InputError("--set", foreign[0], "no gains beside --controller external: that firmware has its own")
-    job = Job(sequence=sequence, model=model, seed=choice.seed, effects=(*choice.effects, *brought), bus=choice.bus,
-              max_overruns=sequence.timing.share)
-    return replace_settings(job, pace=choice.pace, controller=choice.controller, plant=choice.plant,
-                            max_overruns=choice.max_overruns)
+    job = Job(sequence=sequence, model=model, bench=bench, seed=choice.seed, effects=(*choice.effects, *brought),
+              bus=choice.bus, controller=controller, max_overruns=sequence.timing.share)
+    return replace_settings(job, pace=choice.pace, plant=choice.plant, max_overruns=choice.max_overruns)
 
 
 class Differences(NamedTuple):

@@ -20,6 +20,7 @@ from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
 from plant.segments import RATE, Array
+from rig.benches.frame_map import Role
 from rig.network.node_objects import NAMES, PLANT, Identity
 from rig.run.attribution import Attribution, Cause, Trouble, count_most_in_a_row
 from rig.run.job import Job, find_differences
@@ -48,8 +49,8 @@ class Outcome:
     speed: float  # multiple of real time, of the cycles alone
     attribution: Attribution
     due_ns: Sequence[int]  # log time of each cycle
-    start_times: dict[int, float]  # s from NMT start to OPERATIONAL, by node
-    identities: dict[int, Identity]
+    start_times: Mapping[Role, float]  # s from NMT start to OPERATIONAL
+    identities: Mapping[Role, Identity]
     limits: Sequence[LimitReached] = ()  # of travel and current, that the run reached
     fdi: dict[str, Any] = field(default_factory=dict)  # diagnosis of `rig fdi`, if it was requested
 
@@ -181,27 +182,38 @@ class Outcome:
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
                 **self._attribution_to_json(), "differences": find_differences(self.job).to_json(),
                 "limits": [limit._asdict() for limit in self.limits],
-                "nodes": {str(node): {
-                    "name": NAMES[node], "identity": self.identities[node]._asdict(),
-                    "operational_ms": round(1e3 * self.start_times[node], 1) if node in self.start_times else None}
-                    for node in sorted(self.identities)},
+                "nodes": {str(self.job.bench.find_number(role)): {
+                    "name": NAMES[role], "identity": self.identities[role]._asdict(),
+                    "operational_ms": round(1e3 * self.start_times[role], 1) if role in self.start_times else None}
+                    for role in sorted(self.identities)},
                 "events": [to_plain(event._asdict()) for event in events], "events_omitted": omitted,
                 "run": self.job.list_settings(), "fdi": self.fdi}
 
     def _attribution_to_json(self) -> dict[str, Any]:
         found = self.attribution
         cause = None if found.cause is None else {
-            "source": name_source(found.cause), "kind": found.cause.kind, "t": self.find_time(found.cause.cycle),
+            "source": self._name_source(found.cause), "kind": found.cause.kind, "t": self.find_time(found.cause.cycle),
             "cycle": found.cause.cycle, "text": found.cause.text, "evidence": list(found.cause.evidence)}
-        consequences = [{"t": self.find_time(self._find_cycle(trouble)), "source": name_node(trouble.node),
+        consequences = [{"t": self.find_time(self._find_cycle(trouble)), "source": self._name_node(trouble.node),
                          "kind": trouble.kind, "text": trouble.text} for trouble in found.consequences]
         cycles = len(found.judged)
         judged = {"cycles": cycles, "judged": int(found.judged.sum()), "invalid": found.invalid,
                   "overruns": int(found.overruns.sum()),
                   "lateness": [{"t": self.find_time(each.first), "cycle": each.first, "last": each.last,
-                                "source": name_node(each.source), "text": each.text}
+                                "source": self._name_node(each.source), "text": each.text}
                                for each in found.disturbances[:100]]}
         return {"cause": cause, "consequences": consequences[:100], "judged": judged}
+
+    def _name_source(self, cause: Cause) -> str:
+        """Who a cause names: a node, "sequence" for a fault of the sequence, "bench", else the kind of the trouble."""
+        if cause.kind == "injected":
+            return "sequence"
+        if cause.is_lateness and cause.source == 0:
+            return "bench"
+        return self._name_node(cause.source) or cause.kind
+
+    def _name_node(self, number: int) -> str:
+        return self.job.bench.describe_node(Role(number)) if number else ""
 
     def describe_attribution(self) -> dict[str, str]:
         """First cause and consequences as they stand in the log; evidence and consequences are JSON."""
@@ -225,20 +237,6 @@ def select_events(events: Sequence[SessionEvent], most: int = 200) -> tuple[list
         if counts[event.kind] <= most:
             selected.append(event)
     return selected, {kind: count - most for kind, count in counts.items() if count > most}
-
-
-def name_source(cause: Cause) -> str:
-    """Who a cause names: a node, "sequence" for a fault of the sequence, "bench", else the kind of the trouble."""
-    if cause.kind == "injected":
-        return "sequence"
-    if cause.is_lateness and cause.source == 0:
-        return "bench"
-    return name_node(cause.source) or cause.kind
-
-
-def name_node(node: int) -> str:
-    """A node in words, such as "node 2 controller"; empty for none."""
-    return f"node {node} {NAMES[node]}" if node in NAMES else ""
 
 
 def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str, reason: str = "") -> dict[str, Any]:

@@ -13,13 +13,14 @@ from typing import NamedTuple
 
 from plant import InputError, Model
 from plant.effects import CATALOGUE
+from rig.benches.frame_map import Role
 from rig.firmware.build import build_controller
 from rig.network.bus import open_can
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Node, Send
 from rig.network.link import EmbeddedWire, Link, LinkWire, Wire
 from rig.network.master import BusError, Master
-from rig.network.node_objects import CONTROLLER, NAMES, PLANT
+from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.run.job import Job
@@ -64,10 +65,12 @@ def open_participants(job: Job) -> Iterator[Participants]:
     clock = WallClock()
     timeout = LOST_FRAME_TIMEOUT if job.sequence.loses_frames else FRAME_TIMEOUT
     link_wire = LinkWire(Link(open_can(job.bus), clock.now), clock, timeout)
-    link_wire.link.select_nodes(3)  # until bring-up is over: boot-ups must not be lost among the frames of others
+    if numbers := [job.bench.find_number(role) for role in (RIG, *job.bench.nodes)] if job.bench.nodes else []:
+        # until bring-up is over: boot-ups must not be lost among the frames of others
+        link_wire.link.select_nodes((1 << max(numbers).bit_length()) - 1)
     processes = NodeProcesses()
     try:
-        _start_missing_nodes(job, Master(link_wire, clock.now), processes)
+        _start_missing_nodes(job, Master(link_wire, clock.now, False, job.bench), processes)
         yield Participants(link_wire, processes)
     finally:
         processes.stop()
@@ -96,20 +99,24 @@ def _start_missing_nodes(job: Job, master: Master, processes: NodeProcesses, riv
     Raises:
         BusError: another rig, or a node that does not answer.
     """
+    bench = job.bench
     if master.hears_rival(rival_time):  # before sending anything: a reset would end the other rig's test
-        raise BusError(f"another rig is active on {job.bus}: received a SYNC or heartbeat of node 1")
+        raise BusError(f"another rig is active on {job.bus}: received a frame of {bench.describe_node(RIG)}")
     for node, wanted in ((PLANT, job.plant), (CONTROLLER, job.controller)):
+        if node not in bench.nodes:
+            continue
+        name, number = bench.describe_node(node), bench.find_number(node)
         limit = external_boot_time if wanted == "external" else boot_time
         there = (wanted != "builtin" or node == CONTROLLER) and master.is_present(node, limit)
         if wanted == "external" and not there:
-            raise BusError(f"node {node} ({NAMES[node]}) does not answer on {job.bus}")
+            raise BusError(f"{name} does not answer on {job.bus}")
         if node == CONTROLLER and wanted != "external" and there:
-            raise BusError(f"a node {node} is on {job.bus} already: say --controller external, or stop it")
+            raise BusError(f"a node {number} is on {job.bus} already: say --controller external, or stop it")
         if not there:
             is_c_firmware = node == CONTROLLER and job.controller == "c"
             processes.start(node, _make_command(job, node), announces=not is_c_firmware)
             if is_replaced(master, node, processes) and wanted != "auto":
-                raise BusError(f"a node {node} ({NAMES[node]}) is on {job.bus} already: stop it, or say "
+                raise BusError(f"a {name} is on {job.bus} already: stop it, or say "
                                f"--{NAMES[node]} external")
 
 
@@ -125,7 +132,7 @@ def find_firmware_parameters(model: Model) -> dict[str, float]:
     return {name: model[name] for effect in acting if effect.is_active(model.values) for name in effect.parameters}
 
 
-def _make_command(job: Job, node: int) -> list[str]:
+def _make_command(job: Job, node: Role) -> list[str]:
     """The command that runs a node of this job as a process of its own, which ends when this one does."""
     parent = ["--parent", str(os.getpid())]
     if node == CONTROLLER and job.controller == "c":
@@ -138,7 +145,7 @@ def _make_command(job: Job, node: int) -> list[str]:
     return words
 
 
-def is_replaced(master: Master, node: int, processes: NodeProcesses, seconds: int = 180) -> bool:
+def is_replaced(master: Master, node: Role, processes: NodeProcesses, seconds: int = 180) -> bool:
     """Wait until a node of our own answers, which may have to compile its loop and the plant; False.
 
     True if somebody else's node came first. Ours has then found it on the bus and ended, see `rig node`. That is why
@@ -158,22 +165,22 @@ def is_replaced(master: Master, node: int, processes: NodeProcesses, seconds: in
             return False
         if is_present:  # another one; ours is about to notice
             processes.wait([node])
-    raise BusError(f"our own node {node} ({NAMES[node]}) did not start")
+    raise BusError(f"our own {NAMES[node]} did not start")
 
 
 Child = subprocess.Popen[bytes]
 
 
 class NodeProcesses:
-    """Processes of this run, by node number. Each has its own session, so that Ctrl-C reaches the rig alone: clean-up
+    """Processes of this run, by role. Each has its own session, so that Ctrl-C reaches the rig alone: clean-up
     needs its plant.
     """
 
     def __init__(self) -> None:
-        self._children: dict[int, Child] = {}
-        self._silent: set[int] = set()  # nodes that are to say when they are on the bus, and have not yet
+        self._children: dict[Role, Child] = {}
+        self._silent: set[Role] = set()  # nodes that are to say when they are on the bus, and have not yet
 
-    def start(self, node: int, command: Sequence[str], *, announces: bool = False) -> None:
+    def start(self, node: Role, command: Sequence[str], *, announces: bool = False) -> None:
         """Start a node as a new process. `announces`: it writes a line as soon as it is on the bus, see `is_ready`."""
         output = subprocess.PIPE if announces else subprocess.DEVNULL
         self._children[node] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output,
@@ -181,7 +188,7 @@ class NodeProcesses:
         if announces:
             self._silent.add(node)
 
-    def is_ready(self, node: int) -> bool:
+    def is_ready(self, node: Role) -> bool:
         """Whether the node has said that it is on the bus, if it is one that says so."""
         if node in self._silent:
             output = self._children[node].stdout
@@ -190,18 +197,18 @@ class NodeProcesses:
                 self._silent.discard(node)
         return node not in self._silent
 
-    def forget(self, node: int) -> None:
+    def forget(self, node: Role) -> None:
         """Leave out a node whose process has ended: another one has taken its place on the bus."""
         child = self._children.pop(node)
         if child.stdout is not None:
             child.stdout.close()
 
-    def find_ended(self) -> dict[int, int]:
+    def find_ended(self) -> dict[Role, int]:
         """Nodes whose process has ended, with its exit status; negative: the signal that ended it."""
         found = {node: child.poll() for node, child in self._children.items()}
         return {node: status for node, status in found.items() if status is not None}
 
-    def wait(self, nodes: Iterable[int], seconds: float = 1.0) -> None:
+    def wait(self, nodes: Iterable[Role], seconds: float = 1.0) -> None:
         """Wait until the processes of these nodes end, for so long each; other nodes are left out.
 
         On a busy machine a process takes some time from the signal that kills it to its end.

@@ -171,7 +171,7 @@ def attribute_run(job: Job, session: Session) -> Attribution:
     records = CycleRecords(np.array(session.log.due_ns, dtype=np.int64), lateness, feedback, valve, response,
                            history.column("flags").astype(np.int64), injected,
                            select_plant_delays(session.plant_record, len(history)))
-    return attribute(records, session.safety.troubles, job.sequence.timing, session.nodes.gone)
+    return attribute(records, session.safety.troubles, job.sequence.timing, job.bench, session.nodes.gone)
 
 
 def select_plant_delays(record: CycleRecord | None, cycles: int) -> Array:

@@ -122,8 +122,8 @@ class Session:
         self.stage = Stage(wire.clock, plan.start)
         self.journal = Journal(self.stage, recorder)
         self.safety = SafeState(self.stage, self.journal, job.sequence.ends == "safe_state")
-        self._master = Master(wire, self.stage.now, job.realtime)
-        self.nodes = NodeWatch(self.stage, self.journal, self.safety, self._master, self._processes,
+        self._master = Master(wire, self.stage.now, job.realtime, job.bench)
+        self.nodes = NodeWatch(self.stage, self.journal, self.safety, self._master, self._processes, job.bench,
                                looks_for_silence=not job.realtime and not self._is_embedded)
         injected = find_injected(plan, self._faults, plan.stop)
         self._overruns = OverrunWatch(job.sequence.timing, job.period_ns * 1e-9,

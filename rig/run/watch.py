@@ -7,9 +7,11 @@ from math import isnan
 
 from canopen.emcy import EmcyError
 
+from rig.benches.bench import Bench
+from rig.benches.frame_map import Role, describe_identifier
 from rig.device.emcy import EmcyCode
 from rig.network.master import HEARTBEAT_LIMIT, Master
-from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG, NmtState
+from rig.network.node_objects import CONTROLLER, PLANT, RIG, NmtState
 from rig.recorder import NmtState as NmtRecord
 from rig.recorder import Signals, Timing
 from rig.run.participants import FRAME_TIMEOUT, NodeProcesses, describe_exit
@@ -22,26 +24,26 @@ class NodeWatch:
     """What the nodes of a run report and whether they still answer. Trouble goes to the safe state."""
 
     def __init__(self, stage: Stage, journal: Journal, safety: SafeState, master: Master, processes: NodeProcesses,
-                 looks_for_silence: bool) -> None:
+                 bench: Bench, looks_for_silence: bool) -> None:
         """`looks_for_silence`: in lockstep between processes, where a cycle waits long for a node that is late."""
         self._stage, self._journal, self._safety, self._processes = stage, journal, safety, processes
-        self._master, self._looks = master, looks_for_silence
-        self.gone: dict[int, str] = {}  # nodes that do not answer any more, and how that is known
+        self._master, self._bench, self._looks = master, bench, looks_for_silence
+        self.gone: dict[Role, str] = {}  # participants that do not answer any more, and how that is known
         self.emergencies: list[Emergency] = []
-        self.heartbeats: dict[int, list[Heartbeat]] = {node: [] for node in (CONTROLLER, PLANT)}
-        self.last_answers = {CONTROLLER: -1, PLANT: -1}  # last cycle with a cyclic frame of the node
-        self._operational: set[int] = set()
+        self.heartbeats: dict[Role, list[Heartbeat]] = {role: [] for role in master.watched}
+        self.last_answers = {CONTROLLER: -1, PLANT: -1}  # last cycle with a cyclic frame of it
+        self._operational: set[Role] = set()
         self._next_look = 0  # when to look again whether the nodes are alive
         self._silence = SilenceWatch(round(FRAME_TIMEOUT * 1e9))
-        self._silent: set[int] = set()  # the nodes among `gone` that are known by their silence in lockstep
+        self._silent: set[Role] = set()  # the nodes among `gone` that are known by their silence in lockstep
         wire = master.wire
         wire.is_node_gone = self.is_node_gone
         master.hooks.on_emcy, master.hooks.on_state = self._note_emergency, self._note_state
         master.hooks.on_lost, master.hooks.on_back = self._handle_silence, self._handle_return
-        master.hooks.on_heartbeat = lambda node, t_ns: self.heartbeats[node].append(
+        master.hooks.on_heartbeat = lambda role, t_ns: self.heartbeats[role].append(
             Heartbeat(t_ns * 1e-9, wire.blind_ns * 1e-9))
-        master.hooks.on_rival = lambda cob_id: safety.handle(
-            "bus", f"another node sends 0x{cob_id:03X}, a frame of node {RIG} {NAMES[RIG]}")
+        master.hooks.on_rival = lambda identifier: safety.handle(
+            "bus", f"another node sends {describe_identifier(identifier)}, a frame of {bench.describe_node(RIG)}")
 
     def begin(self) -> None:
         """Count heartbeats from here on."""
@@ -60,45 +62,45 @@ class NodeWatch:
         if signals.cor == signals.cor:
             self.last_answers[CONTROLLER] = signals.cycle
 
-    def _note_emergency(self, node: int, error: EmcyError) -> None:
+    def _note_emergency(self, node: Role, error: EmcyError) -> None:
         if self._stage.is_playing or self._stage.is_probing:
             is_in_run = self._stage.loop is not None and self._stage.is_playing
             self.emergencies.append(Emergency(self._stage.playing.k if is_in_run else -1, node, error.code))
         if error.code & 0xFF00 == 0:
             left = "an error is gone, others stand" if error.register else "no error any more"
-            self._journal.log("INFO", "recovered", f"node {node} {NAMES[node]}: {left}")
+            self._journal.log("INFO", "recovered", f"{self._bench.describe_node(node)}: {left}")
         elif error.code == EmcyCode.HEARTBEAT_LOST and self._master.is_behind():
-            self._safety.handle("late", f"the rig sent no heartbeat for {self._master.pause:.2f} s, and node {node} "
-                                        f"{NAMES[node]} reports 0x{error.code:04X}", RIG)
+            self._safety.handle("late", f"the rig sent no heartbeat for {self._master.pause:.2f} s, and "
+                                        f"{self._bench.describe_node(node)} reports 0x{error.code:04X}", RIG)
         else:
-            self._safety.handle("emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} {error.get_desc()}".rstrip(),
-                                node, error.code, round(error.timestamp * 1e9))
+            what = f"{self._bench.describe_node(node)} 0x{error.code:04X} {error.get_desc()}".rstrip()
+            self._safety.handle("emcy", what, node, error.code, round(error.timestamp * 1e9))
 
-    def _note_state(self, node: int, state: int) -> None:
+    def _note_state(self, node: Role, state: int) -> None:
         known = {s.value: s.name.lower().replace("_", "-") for s in NmtState}
         name = known.get(state, f"state {state}") if state else "boot-up"
-        self._journal.recorder.put(self._stage.now(), NmtRecord(node, state, name))
+        self._journal.recorder.put(self._stage.now(), NmtRecord(self._bench.find_number(node), state, name))
         if state == NmtState.OPERATIONAL:
             self._operational.add(node)
         elif node in self._operational:
             self._operational.discard(node)
             if self._stage.is_playing:  # a watchdog reset, a power cycle, or an NMT command of another master
-                self._safety.handle("nmt", f"node {node} {NAMES[node]} left OPERATIONAL: {name}", node, state)
+                self._safety.handle("nmt", f"{self._bench.describe_node(node)} left OPERATIONAL: {name}", node, state)
 
-    def _handle_silence(self, node: int) -> None:
+    def _handle_silence(self, node: Role) -> None:
         self.note_ended_processes()
         limit = "" if node not in self._master.heard_ns else (
             f": last heartbeat {1e-9 * (self._stage.clock.now() - self._master.heard_ns[node]):.2f} s ago")
         if not self._is_answering(node):
             self.gone.setdefault(node, f"no heartbeat any more{limit}")
-        self._safety.handle("heartbeat", f"node {node} {NAMES[node]} is silent", node)
+        self._safety.handle("heartbeat", f"{self._bench.describe_node(node)} is silent", node)
 
-    def _handle_return(self, node: int) -> None:
+    def _handle_return(self, node: Role) -> None:
         if node not in self._processes.find_ended():
             self.gone.pop(node, None)
-        self._journal.log("INFO", "heartbeat", f"node {node} {NAMES[node]} is heard")
+        self._journal.log("INFO", "heartbeat", f"{self._bench.describe_node(node)} is heard")
 
-    def _is_answering(self, node: int, recent: int = 20) -> bool:
+    def _is_answering(self, node: Role, recent: int = 20) -> bool:
         """Whether a node sent a cyclic frame in one of the `recent` cycles: its heartbeat alone may be missing."""
         return self._stage.loop is not None and self.last_answers[node] >= self._stage.loop.k - recent
 
@@ -123,7 +125,7 @@ class NodeWatch:
             how = describe_exit(status)
             if self.gone.get(node) != how:
                 is_news, self.gone[node] = True, how
-                self._safety.handle("process", f"node {node} {NAMES[node]}: {how}", node)
+                self._safety.handle("process", f"{self._bench.describe_node(node)}: {how}", node)
         return is_news
 
     def _look_for_silent_nodes(self, now: int) -> None:
@@ -143,7 +145,7 @@ class NodeWatch:
         for node in found.keys() - self.gone.keys():
             self._silent.add(node)
             self.gone[node] = f"no heartbeat for {found[node]:.1f} s either"
-            what = f"node {node} {NAMES[node]} is silent"
+            what = f"{self._bench.describe_node(node)} is silent"
             self._safety.handle("heartbeat", what, node)
             if not self._safety.aborted:  # no sequence can mean that in lockstep
                 self._safety.abort("abort", what)
@@ -198,11 +200,11 @@ class SilenceWatch:
         """`limit_ns`: silence after which a node counts as gone if it does not take part in the cycles either."""
         self._limit, self._step = limit_ns, step_ns
         self._looked_ns = 0
-        self._heard_ns: dict[int, int] = {}
-        self._silent_ns: dict[int, int] = {}
+        self._heard_ns: dict[Role, int] = {}
+        self._silent_ns: dict[Role, int] = {}
 
-    def find_silent(self, now_ns: int, heard_ns: Mapping[int, int], answering: Collection[int] = ()
-                    ) -> dict[int, float]:
+    def find_silent(self, now_ns: int, heard_ns: Mapping[Role, int], answering: Collection[int] = ()
+                    ) -> dict[Role, float]:
         """Nodes that are silent and not `answering`, with the time for which the rig has listened in vain, s.
 
         Args:

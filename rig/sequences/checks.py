@@ -25,7 +25,7 @@ from rig.sequences.measures import MAIN, NO_DRIVES, UNIT_OF_SIGNAL, DriveFrames,
 from rig.sequences.python_parts import Argument, UserFunction, describe_value, require_function_name
 from rig.tables import Range
 
-LEFT_OPERATIONAL = "node 2 left OPERATIONAL:"  # words of the event
+LEFT_OPERATIONAL = "controller left OPERATIONAL:"  # words of the event
 Signal = Literal["com", "xj", "error", "speed", "cor", "p12", "xs", "load"]
 InSI = Annotated[float, "SI units"]
 InUnit = Annotated[float, "the check's unit"]

@@ -102,7 +102,7 @@ class LiveRun:
         self._main_from = self._main_until = -1  # rows
         self.first_ns = 0  # log time of the first row, from which `t_ns` counts: a float64 rounds ns since 1970
         self.zero_ns: int | None = None  # log time at which main began
-        self.states = {RIG: "operational", CONTROLLER: "unknown", PLANT: "unknown"}
+        self.states: dict[int, str] = {RIG: "operational", CONTROLLER: "unknown", PLANT: "unknown"}
         self.troubles: dict[int, str] = {}  # nodes that are gone, and how that is known
         self.events: deque[Event] = deque(maxlen=5000)
         waiting = {check.name for check in plan.checks if check.kind not in _AFTER_RUN}

@@ -11,6 +11,7 @@ from pathlib import Path
 from dbc import EDS
 from fdi.output import write_text
 from plant.errors import InputError, RigError
+from rig.benches.frame_map import Role
 from rig.cli.answer import Places, choose_file, give_answer, make_folder
 from rig.cli.progress_bar import show_progress
 from rig.conformance.run_cases import Subject, build_conformance_report, choose_cases, run_cases, write_junit
@@ -23,7 +24,7 @@ from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.run.participants import EMBEDDED_NAMES, NodeProcesses, require_firmware_bus
 
-OWN_NODES = {"controller": 2, "plant": 3, "c": 2}  # c: the controller in C, rig/firmware
+OWN_NODES = {"controller": Role.CONTROLLER, "plant": Role.PLANT, "c": Role.CONTROLLER}  # c: in C
 
 
 def run_command(args: argparse.Namespace) -> int:

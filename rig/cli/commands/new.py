@@ -8,7 +8,8 @@ from pathlib import Path
 from fdi.output import require_writable, write_text
 from fdi.report.report import Line, Report, Section
 from plant.errors import InputError
-from rig.benches.bench_file import decode_device_text, load_bench
+from rig.benches.bench import decode_device_text
+from rig.benches.bench_file import load_bench
 from rig.benches.guess import UNSURE, guess_can, guess_canopen
 from rig.cli.answer import give_answer
 from rig.tables import read_file

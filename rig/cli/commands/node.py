@@ -99,7 +99,7 @@ def make_node(args: argparse.Namespace, bus: str, link: Link, stack: contextlib.
     scenario = choose_scenario(args)
     if args.node == "plant":
         return Emulator(link.send, scenario)
-    return Firmware(link.send, read_gains(scenario.model), scenario.model)
+    return Firmware(link.send, read_gains(scenario.model.values), scenario.model)
 
 
 def choose_scenario(args: argparse.Namespace) -> Scenario:

@@ -7,6 +7,7 @@ from functools import partial
 import pytest
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from rig.benches.bench_file import load_bench
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame, Send
 from rig.network.link import EmbeddedWire
@@ -43,7 +44,7 @@ def client(*script: str | None) -> tuple[CheckedSdoClient, Server]:
         servers.append(Server(send, script))
         return servers[0]
 
-    master = Master(EmbeddedWire(VirtualClock(), [make]), lambda: 0)
+    master = Master(EmbeddedWire(VirtualClock(), [make]), lambda: 0, False, load_bench())
     sdo = master.network.nodes[PLANT].sdo
     assert isinstance(sdo, CheckedSdoClient)
     return sdo, servers[0]
@@ -162,7 +163,7 @@ def test_a_wrong_confirmation_is_no_object_that_is_not_implemented() -> None:
     def make(send: Send) -> Server:
         return Server(send, ["6011220000000000"])
 
-    master = Master(EmbeddedWire(VirtualClock(), [make]), lambda: 0)
+    master = Master(EmbeddedWire(VirtualClock(), [make]), lambda: 0, False, load_bench())
     line = r"node 3, SDO of object 0x2210 sub 0: confirmation of object 0x2211 sub 0"
     with pytest.raises(ConfirmationError, match=line):
         master.configure(b"12345678", None, 0)
@@ -178,7 +179,7 @@ def test_a_wrong_confirmation_is_no_object_that_is_not_implemented() -> None:
             elif frame.cob_id == 0x603 and frame.data[0] != 0x80:
                 self._send(0x583, b"\x60" + frame.data[1:4] + bytes(4))
 
-    master = Master(EmbeddedWire(VirtualClock(), [lambda send: Controller(send, [])]), lambda: 0)
+    master = Master(EmbeddedWire(VirtualClock(), [lambda send: Controller(send, [])]), lambda: 0, False, load_bench())
     with pytest.raises(ConfirmationError, match="node 2, SDO of object 0x1006 sub 0: confirmation of object 0x1007"):
         master.configure(b"1234", None, 0)
 
@@ -191,8 +192,8 @@ def test_at_the_end_a_wrong_confirmation_is_a_failure_to_set_back() -> None:
         servers.append(Server(send, ["6007100000000000", "6016100100000000"]))
         return servers[0]
 
-    master = Master(EmbeddedWire(VirtualClock(), [make]), lambda: 0)
+    master = Master(EmbeddedWire(VirtualClock(), [make]), lambda: 0, False, load_bench())
     master._before = {(PLANT, 0x1006, 0): bytes(4), (PLANT, 0x1016, 1): bytes(4)}
-    assert master.restore() == ["node 3 plant: 0x1006 sub 0 was not set back (node 3, SDO of object 0x1006 sub 0: "
+    assert master.restore() == ["node 3 plant: 0x1006 was not set back (node 3, SDO of object 0x1006 sub 0: "
                                 "confirmation of object 0x1007 sub 0)"]
     assert [request[:8] for request in servers[0].requests] == ["23061000", "80061000", "23161001"]

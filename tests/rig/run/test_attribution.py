@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rig.benches.bench_file import load_bench
+from rig.benches.frame_map import Role
 from rig.network.codec import Flags
 from rig.network.master import StartTime
 from rig.network.node_objects import CONTROLLER, PLANT, RIG, CycleRecord
@@ -28,6 +30,7 @@ MS = 1_000_000  # ns
 N = 1000
 POLICY = TimingPolicy()
 NAN = float("nan")
+NAMES = {role: load_bench().describe_node(role) for role in (CONTROLLER, PLANT)}
 
 
 class Script:
@@ -69,11 +72,11 @@ class Script:
             getattr(self, name)(*arguments)
         return self
 
-    def attribute(self, gone: Mapping[int, str] | None = None, policy: TimingPolicy = POLICY) -> Attribution:
+    def attribute(self, gone: Mapping[Role, str] | None = None, policy: TimingPolicy = POLICY) -> Attribution:
         due = np.arange(N, dtype=np.int64) * MS
         records = CycleRecords(due, self.lateness, self.feedback, self.valve, self.response, self.flags,
                                Injected(*self.injected), self.delay)
-        return attribute(records, self.troubles, policy, gone)
+        return attribute(records, self.troubles, policy, load_bench(), gone)
 
 
 @pytest.mark.parametrize(("controller", "plant", "blamed"), [
@@ -87,7 +90,7 @@ class Script:
 def test_who_is_to_blame_for_a_slow_start(controller: StartTime | None, plant: StartTime | None,
                                           blamed: tuple[int, str] | None) -> None:
     times = {node: time for node, time in ((CONTROLLER, controller), (PLANT, plant)) if time is not None}
-    found = find_start_problem(times, 1.0)
+    found = find_start_problem(times, 1.0, NAMES)
     assert (None if found is None else (found[2], found[0])) == blamed
     if found is not None and found[0] == "late":
         script = Script()
@@ -216,7 +219,7 @@ def test_a_run_without_cycles() -> None:
     empty, mask = np.zeros(0), np.zeros(0, dtype=bool)
     records = CycleRecords(np.zeros(0, dtype=np.int64), empty, empty, empty, empty, np.zeros(0, dtype=np.int64),
                            Injected(mask, mask, mask), empty)
-    found = attribute(records, [Trouble(0, CONTROLLER, "bring_up", 0, "slow")], POLICY, {PLANT: "gone"})
+    found = attribute(records, [Trouble(0, CONTROLLER, "bring_up", 0, "slow")], POLICY, load_bench(), {PLANT: "gone"})
     assert found.cause is not None and found.cause.source == CONTROLLER and len(found.judged) == 0
 
 

@@ -18,6 +18,7 @@ from bus_stations import spec
 from numba.core.event import install_recorder
 
 from plant.errors import RigError
+from rig.benches.bench_file import load_bench
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
@@ -110,7 +111,7 @@ class Bench:
         self.timings: list[Timing] = []
         self.times: list[int] = []
         self.frames: list[Frame] = []
-        self.master = Master(self.wire, lambda: self.loop.now(), realtime)
+        self.master = Master(self.wire, lambda: self.loop.now(), realtime, load_bench())
         self.master.hooks.on_frame = self.frames.append
         schedule = Schedule(Plan(faults=faults, stop=1000))
         bus = open_raw_bus(where, RECEIVED)

@@ -6,6 +6,7 @@ from math import isnan
 
 import pytest
 
+from rig.benches.bench_file import load_bench
 from rig.network import codec
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame
@@ -81,7 +82,7 @@ class Book:
 def loop(bench: Bench, *faults: Fault, realtime: bool = True) -> tuple[CycleLoop, Book]:
     book = Book()
     schedule = Schedule(Plan(faults=faults, stop=1000))
-    return CycleLoop(Master(bench, bench.clock.now), schedule, book, MS, realtime), book
+    return CycleLoop(Master(bench, bench.clock.now, False, load_bench()), schedule, book, MS, realtime), book
 
 
 def run(one: CycleLoop, cycles: int) -> None:

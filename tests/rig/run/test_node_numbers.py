@@ -11,6 +11,7 @@ from bus_stations import spec
 from rig_command import finished, rig, started
 from standing_nodes import wait_for_node
 
+from rig.benches.bench_file import load_bench
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
 from rig.network.link import Link, LinkWire
@@ -44,7 +45,7 @@ def master(where: str) -> Iterator[Master]:
     """The rig's end of the bus."""
     clock = WallClock()
     wire = LinkWire(Link(open_can(where), clock.now), clock, 2.0)
-    yield Master(wire, clock.now)
+    yield Master(wire, clock.now, False, load_bench())
     wire.close()
 
 
@@ -88,11 +89,11 @@ def test_a_plant_that_came_first_is_used_in_place_of_ours(where: str, master: Ma
 def test_a_run_that_asks_for_its_own_plant_refuses_another_one(where: str, tmp_path: Path) -> None:
     said = rig("run", "--bus", where, "--plant", "builtin", "--out", tmp_path)
     assert said.status == 2
-    assert f"a node 3 (plant) is on {where} already: stop it, or say --plant external" in said.err
+    assert f"a node 3 plant is on {where} already: stop it, or say --plant external" in said.err
 
 
 def test_a_node_of_ours_that_ends_is_no_node(where: str, master: Master) -> None:
     processes = NodeProcesses()
     processes.start(CONTROLLER, [sys.executable, "-c", "raise SystemExit(2)"], announces=True)
-    with pytest.raises(BusError, match=r"our own node 2 \(controller\) did not start"):
+    with pytest.raises(BusError, match=r"our own controller did not start"):
         participants.is_replaced(master, CONTROLLER, processes)

@@ -19,6 +19,7 @@ from fdi.report.run_report import build_run_report, write_run_page
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import CLEANUP, MAIN, SETUP, Trace
 from plant import Actuator, InputError, RigError
+from rig.benches.frame_map import Role
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Frame, Send
 from rig.network.link import EmbeddedWire
@@ -214,9 +215,9 @@ class SlowEnd(NodeProcesses):
         super().__init__()
         self.looks = looks
 
-    def find_ended(self) -> dict[int, int]:
+    def find_ended(self) -> dict[Role, int]:
         self.looks -= 1
-        return {} if self.looks > 0 else {3: -9}
+        return {} if self.looks > 0 else {Role.PLANT: -9}
 
     def wait(self, nodes: Iterable[int], seconds: float = 1.0) -> None:
         assert list(nodes) == [3]
