@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from rig.benches.bench import Bench
-from rig.benches.bench_file import describe_identifier
+from rig.benches.frame_map import describe_identifier
 from rig.network import bus
 from rig.network.listening import count_frames, listen
 from rig.run import priority

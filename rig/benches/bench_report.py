@@ -6,9 +6,8 @@ from typing import Any
 
 from fdi.report.report import Cell, Column, Report, Section, Table, tabulate
 from rig.benches.bench import Bench
-from rig.benches.bench_file import describe_identifier
 from rig.benches.bus_load import FrameLoad, list_loads
-from rig.benches.frame_map import EXTENDED, FD, Role
+from rig.benches.frame_map import EXTENDED, FD, Role, describe_identifier
 
 _IDENTIFIER = 0x1FFF_FFFF
 

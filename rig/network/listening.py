@@ -6,9 +6,8 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from rig.benches.bench import Bench
-from rig.benches.bench_file import describe_identifier
 from rig.benches.bus_load import FrameLoad, list_loads
-from rig.benches.frame_map import FD
+from rig.benches.frame_map import FD, describe_identifier
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
