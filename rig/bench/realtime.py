@@ -18,6 +18,7 @@ import tempfile
 import termios
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from fcntl import ioctl
 from functools import partial
 from importlib.resources import files
@@ -35,6 +36,7 @@ from fdi.progress import Progress, ignore_progress
 from fdi.report.numbers import format_digits
 from fdi.report.report import Cell, Column, Line, Mood, Report, Section, Table, tabulate
 from fdi.trace.trace import Floats, Trace
+from plant import Model
 from plant.errors import InputError, RigError
 from rig.benches.bench_file import load_bench
 from rig.network import codec
@@ -45,9 +47,11 @@ from rig.network.master import Master
 from rig.network.node_objects import PLANT
 from rig.network.raw_bus import can_open, open_raw_bus
 from rig.nodes.emulator import Emulator
+from rig.nodes.scenario import Scenario
 from rig.recorder import Recorder, Signals, Timing
-from rig.run.hard_loop import RECEIVED, HardLoop, compile_cycle
-from rig.run.loop import CycleInput, CycleLoop, History, Loop
+from rig.run.cyclic_values import CycleInput
+from rig.run.hard_loop import compile_cycle, open_loop
+from rig.run.loop import CycleLoop, History, Loop
 from rig.run.priority import (
     LOOP_PRIORITY,
     list_cpus,
@@ -289,8 +293,10 @@ def play_block(bus: str, seconds: float, is_compiled: bool = True, period_ns: in
         master = Master(wire, clock.now, stamped=True, bench=load_bench())
         master.hooks.on_frame = recorder.frame
         log = _Log(history, recorder)
-        loop: Loop = (HardLoop(master, Schedule(Plan(stop=0)), log, open_raw_bus(bus, RECEIVED), period_ns, True)
-                      if is_compiled else CycleLoop(master, Schedule(Plan(stop=0)), log, period_ns, True))
+        bench, plan = replace(load_bench(), cycle_ns=period_ns), Plan(stop=0)
+        scenario, faults = Scenario(Model(), plan), Schedule(plan)
+        loop: Loop = (open_loop(master, bench, scenario, faults, log, bus, True) if is_compiled else
+                      CycleLoop(master, bench, scenario, faults, log, True))
         stack.callback(loop.close)
         stack.enter_context(enter_real_time(is_compiled))
         for _ in range(round(seconds * 1e9 / period_ns)):

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import IntFlag
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +18,14 @@ INPUTS = {"position_demand": "m", "ram_position": "m", "load_pressure": "Pa", "s
           "control_word": "", "mode": "", "cycle": "", "flags": ""}
 OUTPUTS = {"current": "A", "status_word": "", "mode_display": "", "cycle": ""}
 MEASURED = ("ram_position", "load_pressure", "spool_position", "load_force")  # by the plant's transducers
+
+
+class Flags(IntFlag):
+    """State of the input of the plant in a cycle: how the controller answered the cycle before."""
+
+    DRIVE_MISSING = 0x1  # no drive frame came
+    DRIVE_LATE = 0x2  # the frame that came answers an earlier cycle
+    CURRENT_ZEROED = 0x4  # too many in a row: the plant gets no current
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +65,11 @@ class Bench:
         return Role.PLANT in self.nodes
 
     @property
+    def most_missed(self) -> int:
+        """Cycles in a row without a drive frame after which the plant gets no current."""
+        return 3 if self.timeout_ns is None else max(1, -(-self.timeout_ns // self.cycle_ns))
+
+    @property
     def profile(self) -> Profile:
         """Meaning of the controller's control word and status word."""
         controller = self.nodes.get(Role.CONTROLLER)
@@ -72,6 +86,16 @@ class Bench:
         if role in self.nodes:
             return self.nodes[role].node
         return self.rig_node if role is Role.RIG and self.nodes else int(role)
+
+    @property
+    def enables(self) -> tuple[str, ...]:
+        """Fields of `phases` that enable the controller: 0 in set-up or clean-up, and not in main."""
+        return tuple(name for name, values in self.phases.items()
+                     if values.get("main") and 0 in (values.get("setup"), values.get("cleanup"), values.get("safe")))
+
+    def is_enabled(self, phase: str) -> bool:
+        """Whether the fields that enable the controller do so in a phase: "setup", "main" or "cleanup"."""
+        return all(self.phases[name].get(phase, 0) != 0 for name in self.enables)
 
     def describe_node(self, role: Role) -> str:
         """A participant as messages name it: "node 2 controller" on CANopen, else "controller"."""

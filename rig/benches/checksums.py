@@ -9,11 +9,11 @@ import hashlib
 from collections.abc import Callable
 from functools import cache
 from types import ModuleType
+from typing import NamedTuple
 
 from plant.errors import InputError
 from rig.benches.frame_map import Field, Guard, insert_bits
 
-Checksum = Callable[[Field, bytes, int], int]
 UserChecksum = Callable[[bytes, int], int]
 
 
@@ -40,21 +40,27 @@ def compute_crc8(data: bytes, polynomial: int, start: int = 0xFF, inversion: int
     return start ^ inversion
 
 
-def _protect_profile_1(each: Field, data: bytes, counter: int) -> int:
-    """AUTOSAR PRS E2E, profile 1A: both bytes of the data ID, then the data; CRC-8 as of SAE J1850, from 0 to 0."""
-    return compute_crc8(each.data_id.to_bytes(2, "little") + data, 0x1D, 0, 0)
+class Crc(NamedTuple):
+    """A CRC-8 over the bytes of a frame other than its own. Compiled loops calculate it from the same numbers."""
+
+    polynomial: int
+    start: int = 0xFF
+    inversion: int = 0xFF
+    has_data_id: bool = False  # both bytes of the data ID stand before the data
+
+    def list_bytes(self, each: Field, data: bytes, counter: int) -> bytes:
+        """What it is computed over: data ID, data, and the data ID that belongs to this counter."""
+        own = each.lowest // 8
+        before = each.data_id.to_bytes(2, "little") if self.has_data_id else b""
+        behind = bytes([each.data_ids[counter % len(each.data_ids)]]) if each.data_ids else b""
+        return before + data[:own] + data[own + 1:] + behind
 
 
-def _protect_profile_2(each: Field, data: bytes, counter: int) -> int:
-    """AUTOSAR PRS E2E, profile 2: the data, then the data ID of this counter; CRC-8 with polynomial 0x2F."""
-    return compute_crc8(data + bytes([each.data_ids[counter % len(each.data_ids)]]), 0x2F)
-
-
-CHECKSUMS: dict[str, Checksum] = {
-    "crc8_sae_j1850": lambda each, data, counter: compute_crc8(data, 0x1D),
-    "crc8_h2f": lambda each, data, counter: compute_crc8(data, 0x2F),
-    "e2e_profile_1": _protect_profile_1,
-    "e2e_profile_2": _protect_profile_2,
+CHECKSUMS = {
+    "crc8_sae_j1850": Crc(0x1D),
+    "crc8_h2f": Crc(0x2F),
+    "e2e_profile_1": Crc(0x1D, 0, 0, has_data_id=True),  # AUTOSAR PRS E2E, profile 1A
+    "e2e_profile_2": Crc(0x2F),  # AUTOSAR PRS E2E, profile 2, with a data ID for each counter
 }
 _USERS: dict[str, UserChecksum] = {}  # by `Field.checksum`
 
@@ -71,8 +77,8 @@ def compute_checksum(each: Field, data: bytes, counter: int) -> int:
         InputError: a user's function failed or gave no whole number.
     """
     if each.checksum in CHECKSUMS:
-        own = each.lowest // 8
-        return CHECKSUMS[each.checksum](each, data[:own] + data[own + 1:], counter)
+        crc = CHECKSUMS[each.checksum]
+        return compute_crc8(crc.list_bytes(each, data, counter), crc.polynomial, crc.start, crc.inversion)
     try:
         found = _USERS[each.checksum](insert_bits(each, data, 0), counter)
         return int(found) & (1 << each.length) - 1
@@ -80,6 +86,11 @@ def compute_checksum(each: Field, data: bytes, counter: int) -> int:
         name, _, function = each.checksum.partition("#")[0].rpartition(":")
         raise InputError(name, function, f"a whole number from (data, counter), not "
                                          f"{type(error).__name__}: {error}") from error
+
+
+def find_user_checksum(name: str) -> UserChecksum:
+    """The user's function of `Field.checksum`."""
+    return _USERS[name]
 
 
 def load_checksum(name: str, source: bytes, function: str) -> str:

@@ -32,6 +32,7 @@ class ProfileWords(NamedTuple):
     commands: tuple[tuple[int, int, int], ...]  # of a control word; one that matches none asks for OFF
     states: tuple[tuple[int, int, int], ...]  # of a status word
     powered: tuple[int, ...]  # states in which current may flow
+    is_confirmed: bool  # the next step up waits until the status word has confirmed the last one
     delay: float  # s: by then the status word has followed the control word, if the sequence says nothing else
 
 
@@ -48,7 +49,7 @@ CIA402 = ProfileWords(  # IEC 61800-7-201 (CiA 402-2), state machine, tables of 
                        (0x6F, 0x23, State.ON), (0x6F, 0x27, State.ACTIVE), (0x6F, 0x07, State.QUICK_STOP),
                        (0x4F, 0x0F, State.FAULT_REACTION), (0x4F, 0x08, State.FAULT)),
     powered=(int(State.ACTIVE), int(State.QUICK_STOP), int(State.FAULT_REACTION)),
-    delay=0.4,  # the standard has no limit; a drive may have a brake to release
+    is_confirmed=True, delay=0.4,  # the standard has no limit; a drive may have a brake to release
 )
 CIA408 = ProfileWords(  # docs/bus.md
     ladder=(0x0, 0x1, 0x3, 0x7),
@@ -57,10 +58,12 @@ CIA408 = ProfileWords(  # docs/bus.md
     states=_list_pairs((0xF, 0x8, State.OFF), (0xF, 0x9, State.READY), (0xF, 0xB, State.ON), (0xF, 0xF, State.ACTIVE),
                        (0x8, 0x0, State.FAULT)),
     powered=(int(State.ACTIVE),),
-    delay=2e-3,
+    is_confirmed=False, delay=2e-3,
 )
-NO_WORDS = ProfileWords((0, 0, 0, 0), 0, 0, _list_pairs((0, 0, State.ACTIVE)), _list_pairs((0, 0, State.ACTIVE)),
-                        (int(State.ACTIVE),), 0.0)  # no control word: the device is always active
+# No control word: the rig's own word of a cycle says whether the fields that enable the controller do so (bit 0), and
+# whether the values of the phase are sent (bit 1) or those of the safe state.
+NO_WORDS = ProfileWords((0, 2, 2, 3), 0, 0, _list_pairs((0x1, 0x1, State.ACTIVE)), _list_pairs((0, 0, State.ACTIVE)),
+                        (int(State.ACTIVE),), is_confirmed=True, delay=10e-3)
 PROFILES = {"cia402": CIA402, "cia408": CIA408, "none": NO_WORDS}
 
 # Transitions of CiA 402 by number: state before, state after, and the state that the control word asks for. Automatic

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable
-from math import isfinite
 from typing import cast
 
 from dbc import EDS
-from plant import Actuator, Model
+from plant import Model
 from plant.errors import InputError
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
 from rig.network import codec
 from rig.network.codec import Flags
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import COUNTERS, PLANT, SCENARIO
+from rig.nodes.faulty_plant import FaultyPlant
 from rig.nodes.scenario import Scenario
-from rig.sequences.faults import DELAY, DOUBLE, Plan, Schedule, apply_action
+from rig.sequences.faults import DELAY, DOUBLE, Plan, apply_action
 
 MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
 _NAMES = {codec.FEEDBACK: "feedback", codec.VALVE_STATE: "valve_state"}
@@ -62,21 +62,16 @@ class Emulator:
         Raises:
             InputError: a scenario that cannot be run; the previous one stays.
         """
-        plant = Actuator(scenario.model, scenario.seed)
-        plant.warm()
-        self._begin(scenario, plant)
+        self._begin(scenario, FaultyPlant(scenario))
 
-    def _begin(self, scenario: Scenario, plant: Actuator) -> None:
-        self._faults, self._load = Schedule(scenario.plan, scenario.model.values), scenario.load()
-        self._scenario, self._plant = scenario, plant
+    def _begin(self, scenario: Scenario, plant: FaultyPlant) -> None:
+        self._scenario, self._plant, self._faults = scenario, plant, plant.faults
         self._cycle = 0  # of the SYNC to come
-        self._changed = -1  # the last cycle whose parameters are in force
         self._begun = False  # SYNCs are counted from the first start
         self._first = True  # of the cycles after a start: no drive can have answered yet
         self._moved = True
         self._missed = 0  # drive frames missing in a row
         self._synced = -1  # the cycle of the last SYNC
-        self._current = 0.0
         self._held.clear()
         self._late.clear()
         for sub in (1, 2):
@@ -119,9 +114,8 @@ class Emulator:
             self._cycle += 1
             return
         self._miss(1)
-        self._change_parameters(k)
-        self._plant.sample()  # the transducers go on as well
-        self._move()
+        self._plant.pass_unread(k)
+        self._cycle += 1
 
     def _answer_again(self) -> None:
         """Send the PDOs of this SYNC once more; the plant does not move twice."""
@@ -159,7 +153,7 @@ class Emulator:
         if new is NmtState.OPERATIONAL:
             self._begun = self._first = True
         elif new is NmtState.INITIALISING:
-            self._begin(self._scenario, Actuator(self._scenario.model, self._scenario.seed))
+            self._begin(self._scenario, FaultyPlant(self._scenario))
 
     def _on_write(self, index: int, sub: int, data: bytes) -> None:
         if index == SCENARIO:
@@ -170,27 +164,20 @@ class Emulator:
         k, od = self._cycle, self._od
         flags = _NO_FLAGS if self._first else self._judge(k)
         self._first = False
-        self._change_parameters(k)
-        xj, p12, xs = self._plant.sample()
-        if not isfinite(xj + p12 + xs):
+        readings = self._plant.read(k)
+        if readings is None:
             # The simulation diverged (an extreme parameter, a division by zero): stop, send no invented value. Whatever
             # 0x1029 says, the node becomes PRE-OPERATIONAL: no feedback any more.
             self.device.emcy.raise_error(EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")
             self.device.nmt.communication_error(0)
             return
-        faulty = self._faults.change_signal
-        od[0x2200, 0] = codec.raw_position(faulty("xj", xj, k))
-        od[0x2201, 0] = codec.raw_pressure(faulty("p12", p12, k))
-        od[0x2202, 0] = codec.raw_spool(faulty("xs", xs, k))
+        xj, p12, xs = readings
+        od[0x2200, 0] = codec.raw_position(xj)
+        od[0x2201, 0] = codec.raw_pressure(p12)
+        od[0x2202, 0] = codec.raw_spool(xs)
         od[0x2203, 0] = int(flags)
         od[0x2204, 0] = k & 0xFFFF
         self._moved = False
-
-    def _change_parameters(self, k: int) -> None:
-        """Set what faults have made of the plant's parameters since the last cycle."""
-        for name, value in self._faults.parameters_at(k, self._changed).items():
-            self._plant.set(name, value)
-        self._changed = k
 
     def _judge(self, k: int) -> Flags:
         """Whether the latched drive answers the cycle before this one; the current to use until the next SYNC.
@@ -200,7 +187,7 @@ class Emulator:
         """
         fresh = self.device.pdo.rpdos[1].fresh
         if fresh and cast(int, self._od[0x2207, 0]) == (k - 1) & 0xFFFF:
-            self._current = codec.current(cast(int, self._od[0x2205, 0]))
+            self._plant.current = codec.current(cast(int, self._od[0x2205, 0]))
             if self._missed >= MISSED_LIMIT:
                 self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
             self._missed = 0
@@ -213,13 +200,12 @@ class Emulator:
         self._od[COUNTERS, counter] = cast(int, self._od[COUNTERS, counter]) + 1
         if self._missed < MISSED_LIMIT:
             return _NO_FLAGS
-        self._current = 0.0
+        self._plant.current = 0.0
         self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01")
         return Flags.CURRENT_ZEROED
 
     def _move(self) -> None:
-        """Advance the plant by one cycle under the load of this cycle."""
-        k = self._cycle
-        self._plant.advance(self._current, self._load[k] if k < len(self._load) else 0.0)
+        """Advance the plant by one cycle."""
+        self._plant.move(self._cycle)
         self._moved = True
         self._cycle += 1

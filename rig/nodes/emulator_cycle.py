@@ -20,7 +20,6 @@ from plant import Model
 from plant.compile import ForeignCall, keep_apart
 from plant.flat import list_state_values
 from plant.machine_code import ADVANCE_CALL, READ_CALL
-from plant.model import STEPS
 from plant.run import PRESSURE, SENSED, SPOOL
 from plant.segments import RATE
 from plant.solve import NOISES
@@ -40,6 +39,7 @@ from rig.network.raw_bus import (
     sleep_until,
     split_words,
 )
+from rig.nodes.scenario import count_steps
 from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, Schedule, change_frame
 
 MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
@@ -62,14 +62,14 @@ ID, TYPE, COUNT, DATA = range(4)  # COB-ID, -1: none; transmission type; and of 
  RESET_COMMAND, SYNCED) = range(17, 54)
 # .. by nobody: time of a cycle in ns, and where the tables are that depend on the plant and its faults
 (CYCLE_TIME, PARAMETERS, PARAMETERS_AT, SIGNALS, SIGNALS_AT, VALUES_AT, LOAD, LOAD_AT, FLAT, FLAT_AT, LIVE_AT,
- RECORD_SIZE, ADVANCE, READ) = range(64, 78)
+ RECORD_SIZE, ADVANCE, READ, STEPS) = range(64, 79)
 LEVELS_AT, SENSORS_AT = 80, 83  # of the three transducers: where their noise is in the record, their value in the state
 HITS_AT = 86  # of the kinds of frames below: where the rows begin, and behind the last where they end
 _WORDS = 96
 EVENTS_AT, _HELD_AT = _WORDS, _WORDS + EVENT_RING
 TIMES_AT = _HELD_AT + 4 * _HELD_FRAMES
 _TABLES_AT = TIMES_AT + 6 * RING
-_CURRENT, _PERIOD, _READINGS, _FAILURE, NOISE_AT = 0, 1, 4, 8, 16  # in the real numbers
+IN_FORCE, _PERIOD, READINGS, _FAILURE, NOISE_AT = 0, 1, 4, 8, 16  # in the real numbers
 _REAL_TABLES_AT = NOISE_AT + NOISES * NOISE_RING
 
 # what the loop returns
@@ -80,7 +80,7 @@ COMMANDED = 256  # + the NMT command
 
 # What faults act on, late frames in the order of their delivery: drives first, which are for the emulator itself; valve
 # states last, because in lockstep they end the rig's wait. Bus-off is on the whole node.
-_DRIVE, _FEEDBACK, _VALVE, _SYNC, _BUS_OFF = range(5)
+_DRIVE, FEEDBACK_FRAME, _VALVE, _SYNC, _BUS_OFF = range(5)
 _FRAMES = ("drive", "feedback", "valve_state", "sync")
 _SIGNALS = ("xj", "p12", "xs")
 _ADDED, _HOLDS_READING, _HOLDS_VALUE = range(3)  # faults of a sensor
@@ -198,7 +198,7 @@ def _post_event(m: Memory, event: int) -> None:
 def _take_drive(m: Memory, t_ns: int, length: int, data: int) -> None:
     """A drive frame came; a fault may drop, delay or change it. One that comes twice counts once."""
     words = m.words
-    code, argument = _find_action(m, _DRIVE, words[CYCLE] - 1)
+    code, argument = find_action(m, _DRIVE, words[CYCLE] - 1)
     if code == DELAY:
         now = t_ns if words[PERIOD] else words[NOW]
         _hold_frame(m, _DRIVE, now + argument, length, data)
@@ -254,17 +254,18 @@ def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
     if not words[FIRST]:
         flags = _judge_drive(port, m, k, fresh)
     words[FIRST] = 0
-    if not _read_plant(m, k, flags):
+    if not read_plant(m, k):
         _post_event(m, DIVERGED)
         _leave_operational(m, PRE_OPERATIONAL)
         return
+    _fill_frames(m, k, flags)
     end = (k + 1) * words[CYCLE_TIME] - 1  # in lockstep, the last instant of this cycle
     is_crowded = not words[PERIOD] and _is_feedback_due(m, end)
-    is_fed = _send_due(port, m, _FEEDBACK, k, t_ns)
+    is_fed = _send_due(port, m, FEEDBACK_FRAME, k, t_ns)
     if not is_crowded:
         _send_due(port, m, _VALVE, k, t_ns)
     sent_ns = _read_time(port, m, t_ns)
-    _advance_plant(m, k)
+    advance_plant(m, k)
     words[CYCLE] = k + 1
     done_ns = _read_time(port, m, t_ns)
     _record_cycle(m, k, t_ns, begun_ns, sent_ns, done_ns, flags)
@@ -298,9 +299,9 @@ def _is_next_sync(port: Port, m: Memory, t_ns: int) -> bool:
     if _is_bus_off(m, words[CYCLE]):
         _pass_cycle(port, m)
         return False
-    while _find_action(m, _SYNC, words[CYCLE])[0] == DROP:  # time went on for the plant
+    while find_action(m, _SYNC, words[CYCLE])[0] == DROP:  # time went on for the plant
         _pass_cycle(port, m)
-    if words[SYNCED] == words[CYCLE] - 1 and _find_action(m, _SYNC, words[SYNCED])[0] == DOUBLE:
+    if words[SYNCED] == words[CYCLE] - 1 and find_action(m, _SYNC, words[SYNCED])[0] == DOUBLE:
         words[SYNCED] = -1
         if words[STATE] == OPERATIONAL:
             _answer_again(port, m, t_ns)
@@ -319,14 +320,14 @@ def _pass_cycle(port: Port, m: Memory) -> None:
             return
         _miss(port, m, MISSING)
         _set_parameters(m, k)
-        _advance_plant(m, k)
+        advance_plant(m, k)
     words[CYCLE] = k + 1
 
 
 @keep_apart
 def _answer_again(port: Port, m: Memory, t_ns: int) -> None:
     """Send the PDOs of the last SYNC once more; the plant does not move twice."""
-    for what in (_FEEDBACK, _VALVE):
+    for what in (FEEDBACK_FRAME, _VALVE):
         _send_pdo(port, m, what, m.words[CYCLE], t_ns)
 
 
@@ -341,7 +342,7 @@ def _judge_drive(port: Port, m: Memory, k: int, fresh: int) -> int:
     """Flags of this cycle and the current to use until the next SYNC: see `Emulator._judge`."""
     words = m.words
     if fresh and words[ANSWERED] == (k - 1) & 0xFFFF:
-        m.reals[_CURRENT] = words[CURRENT] / 1e8
+        m.reals[IN_FORCE] = words[CURRENT] / 1e8
         words[MISSED] = 0
         _announce_timeout(port, m, 0)
         return 0
@@ -357,7 +358,7 @@ def _miss(port: Port, m: Memory, counter: int) -> int:
     words[counter] += 1
     if words[MISSED] < MISSED_LIMIT:
         return 0
-    m.reals[_CURRENT] = 0.0
+    m.reals[IN_FORCE] = 0.0
     _announce_timeout(port, m, 1)
     return _CURRENT_ZEROED
 
@@ -377,14 +378,15 @@ def _announce_timeout(port: Port, m: Memory, raised: int) -> None:
         _send(port, m, words[EMCY_ID], 8, data)
 
 
-def _read_plant(m: Memory, k: int, flags: int) -> bool:
-    """Change the parameters of this cycle, read the transducers and fill the frames; False if the plant diverged."""
+@keep_apart
+def read_plant(m: Memory, k: int) -> bool:
+    """Change the parameters of this cycle and read the transducers, which faults may disturb; False if it diverged."""
     words, reals = m.words, m.reals
     _set_parameters(m, k)
     noise, flat = NOISE_AT + NOISES * (words[PLANT_CYCLE] % NOISE_RING), words[FLAT_AT]
     if words[READ]:
         base = reals.ctypes.data
-        _call_read(words[READ], base + 8 * _READINGS, base + 8 * _FAILURE,
+        _call_read(words[READ], base + 8 * READINGS, base + 8 * _FAILURE,
                    0, 0, words[FLAT], 8, base + 8 * flat, words[FLAT], 8,
                    0, 0, NOISES, 8, base + 8 * noise, NOISES, 8,
                    words[PLANT_CYCLE] * reals[_PERIOD],
@@ -392,20 +394,27 @@ def _read_plant(m: Memory, k: int, flags: int) -> bool:
     else:  # as in `plant.Actuator.sample`
         for i in range(3):
             level = reals[words[LIVE_AT] + words[LEVELS_AT + i]]
-            reals[_READINGS + i] = reals[flat + words[SENSORS_AT + i]] + level * reals[noise + i]
-    xj, p12, xs = reals[_READINGS], reals[_READINGS + 1], reals[_READINGS + 2]
-    if not np.isfinite(xj + p12 + xs):
+            reals[READINGS + i] = reals[flat + words[SENSORS_AT + i]] + level * reals[noise + i]
+    if not np.isfinite(reals[READINGS] + reals[READINGS + 1] + reals[READINGS + 2]):
         return False
-    words[XJ] = _count(_disturb(m, 0, xj, k) * 1e7)
-    words[P12] = _count(_disturb(m, 1, p12, k) / 10.0)
-    words[XS] = _count(_disturb(m, 2, xs, k) * 1e9)
-    words[FLAGS], words[FRAME_CYCLE] = flags, k & 0xFFFF
-    words[TPDOS_AT + DATA] = join_halves(words[XJ], words[P12])
-    words[TPDOS_AT + 4 + DATA] = join_words(words[XS], words[FLAGS], words[FRAME_CYCLE])
+    for i in range(3):
+        reals[READINGS + i] = _disturb(m, i, reals[READINGS + i], k)
     return True
 
 
-def _advance_plant(m: Memory, k: int) -> None:
+def _fill_frames(m: Memory, k: int, flags: int) -> None:
+    """Put the readings of this cycle into the objects and the frames."""
+    words, reals = m.words, m.reals
+    words[XJ] = _count(reals[READINGS] * 1e7)
+    words[P12] = _count(reals[READINGS + 1] / 10.0)
+    words[XS] = _count(reals[READINGS + 2] * 1e9)
+    words[FLAGS], words[FRAME_CYCLE] = flags, k & 0xFFFF
+    words[TPDOS_AT + DATA] = join_halves(words[XJ], words[P12])
+    words[TPDOS_AT + 4 + DATA] = join_words(words[XS], words[FLAGS], words[FRAME_CYCLE])
+
+
+@keep_apart
+def advance_plant(m: Memory, k: int) -> None:
     """One cycle under the current in force and the load of this cycle."""
     words, reals = m.words, m.reals
     load = 0.0
@@ -413,10 +422,10 @@ def _advance_plant(m: Memory, k: int) -> None:
         load = reals[words[LOAD_AT] + k]
     noise = reals[NOISE_AT + NOISES * (words[PLANT_CYCLE] % NOISE_RING) + NOISES - 1]
     base = reals.ctypes.data
-    _call_advance(words[ADVANCE], base + 8 * _READINGS, base + 8 * _FAILURE,
+    _call_advance(words[ADVANCE], base + 8 * READINGS, base + 8 * _FAILURE,
                   0, 0, words[FLAT], 8, base + 8 * words[FLAT_AT], words[FLAT], 8,
-                  reals[_CURRENT], load, noise, words[PLANT_CYCLE] * reals[_PERIOD],
-                  0, 0, 1, words[RECORD_SIZE], base + 8 * words[LIVE_AT], 1, words[RECORD_SIZE], STEPS)
+                  reals[IN_FORCE], load, noise, words[PLANT_CYCLE] * reals[_PERIOD],
+                  0, 0, 1, words[RECORD_SIZE], base + 8 * words[LIVE_AT], 1, words[RECORD_SIZE], words[STEPS])
     words[PLANT_CYCLE] += 1
 
 
@@ -449,7 +458,7 @@ def _send(port: Port, m: Memory, cob_id: int, length: int, data: int) -> None:
 
 def _send_due(port: Port, m: Memory, what: int, k: int, t_ns: int) -> bool:
     """Send a TPDO where it is due, type n of 1..240 at every n-th SYNC; whether it went out now."""
-    words, at = m.words, TPDOS_AT + 4 * (what - _FEEDBACK)
+    words, at = m.words, TPDOS_AT + 4 * (what - FEEDBACK_FRAME)
     words[at + COUNT] -= 1
     if words[at + COUNT] > 0:
         return False
@@ -459,10 +468,10 @@ def _send_due(port: Port, m: Memory, what: int, k: int, t_ns: int) -> bool:
 
 def _send_pdo(port: Port, m: Memory, what: int, k: int, t_ns: int) -> bool:
     """Send a synchronous TPDO of cycle k as a fault leaves it; whether it went out now."""
-    words, at = m.words, TPDOS_AT + 4 * (what - _FEEDBACK)
+    words, at = m.words, TPDOS_AT + 4 * (what - FEEDBACK_FRAME)
     if words[at + ID] < 0 or not 1 <= words[at + TYPE] <= _LAST_SYNCHRONOUS:
         return False
-    code, argument = _find_action(m, what, k)
+    code, argument = find_action(m, what, k)
     if code == DELAY:
         now = t_ns if words[PERIOD] else words[NOW]
         _hold_frame(m, what, now + argument, 8, words[at + DATA])
@@ -510,8 +519,8 @@ def _find_next_held(m: Memory, t_ns: int, least: int) -> int:
 
 def _is_feedback_due(m: Memory, t_ns: int) -> bool:
     """Whether a feedback frame of an earlier cycle is to be sent until `t_ns`."""
-    at = _find_next_held(m, t_ns, _FEEDBACK)
-    return bool(at >= 0 and m.words[at] == _FEEDBACK)
+    at = _find_next_held(m, t_ns, FEEDBACK_FRAME)
+    return bool(at >= 0 and m.words[at] == FEEDBACK_FRAME)
 
 
 @keep_apart
@@ -519,7 +528,7 @@ def _release_until(port: Port, m: Memory, t_ns: int, with_drives: bool) -> bool:
     """Deliver the late frames that are due at `t_ns`; whether feedback was among them."""
     words = m.words
     is_fed = False
-    least = _DRIVE if with_drives else _FEEDBACK
+    least = _DRIVE if with_drives else FEEDBACK_FRAME
     at = _find_next_held(m, t_ns, least)
     while at >= 0:
         what, length, data = words[at], words[at + 2], words[at + 3]
@@ -528,9 +537,9 @@ def _release_until(port: Port, m: Memory, t_ns: int, with_drives: bool) -> bool:
         words[at:end] = words[at + 4:end + 4]
         if what == _DRIVE:
             _keep_drive(m, length, data)
-        elif words[TPDOS_AT + 4 * (what - _FEEDBACK) + ID] >= 0:  # it may have been switched off meanwhile
-            _send(port, m, words[TPDOS_AT + 4 * (what - _FEEDBACK) + ID], length, data)
-            is_fed |= what == _FEEDBACK
+        elif words[TPDOS_AT + 4 * (what - FEEDBACK_FRAME) + ID] >= 0:  # it may have been switched off meanwhile
+            _send(port, m, words[TPDOS_AT + 4 * (what - FEEDBACK_FRAME) + ID], length, data)
+            is_fed |= what == FEEDBACK_FRAME
         at = _find_next_held(m, t_ns, least)
     return bool(is_fed)
 
@@ -575,7 +584,7 @@ def _await_drive(port: Port, m: Memory) -> None:
 
 
 @keep_apart
-def _find_action(m: Memory, what: int, k: int) -> tuple[int, int]:
+def find_action(m: Memory, what: int, k: int) -> tuple[int, int]:
     """What happens to a frame of cycle k: see `faults.Action`."""
     words = m.words
     low, end = words[HITS_AT + what], words[HITS_AT + what + 1]
@@ -585,8 +594,15 @@ def _find_action(m: Memory, what: int, k: int) -> tuple[int, int]:
     return SENT_NORMALLY, 0
 
 
+def find_drive_action(m: Memory, k: int) -> tuple[int, int]:
+    """What happens to the drive frame that answers cycle k; a plant that is bus-off does not receive it."""
+    if _is_bus_off(m, k):
+        return DROP, 0
+    return find_action(m, _DRIVE, k)
+
+
 def _is_bus_off(m: Memory, k: int) -> bool:
-    return _find_action(m, _BUS_OFF, k)[0] != SENT_NORMALLY
+    return find_action(m, _BUS_OFF, k)[0] != SENT_NORMALLY
 
 
 def _set_parameters(m: Memory, k: int) -> None:
@@ -618,6 +634,20 @@ def _disturb(m: Memory, signal: int, value: float, k: int) -> float:
 
 
 # ------------------------------------------------------------------------------------ made before the start
+
+
+def fill_noise(m: Memory, rng: np.random.Generator, least: int = 1024) -> None:
+    """Fill the ring of noise with the numbers that `plant.Actuator` draws, once `least` rows of it are free."""
+    filled = int(m.words[NOISE_FILLED])
+    free = int(m.words[PLANT_CYCLE]) + NOISE_RING - filled
+    if free < least:
+        return
+    rows = rng.standard_normal((free, NOISES))
+    first = min(free, NOISE_RING - filled % NOISE_RING)  # up to the ring's end, then from its start
+    start = filled % NOISE_RING
+    noise = m.reals[NOISE_AT: NOISE_AT + NOISES * NOISE_RING].reshape(-1, NOISES)
+    noise[start: start + first], noise[: free - first] = rows[:first], rows[first:]
+    m.words[NOISE_FILLED] = filled + free
 
 
 def make_memory(model: Model, load: list[float], schedule: Schedule, advance: int = 0, read: int = 0) -> Memory:
@@ -652,6 +682,7 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
     reals, real_places = _join_tables(_REAL_TABLES_AT, np.float64, values, load, state, record.view(np.float64))
     words[STATE], words[SYNCED] = INITIALISING, -1
     words[CYCLE_TIME] = round(model["controller.period"] * 1e9)
+    words[STEPS] = count_steps(model)
     words[PARAMETERS], words[SIGNALS], words[LOAD], words[FLAT] = len(parameters), len(signals), len(load), len(state)
     words[PARAMETERS_AT], words[SIGNALS_AT] = places[:2]
     words[HITS_AT: HITS_AT + len(hits) + 1] = places[2:]

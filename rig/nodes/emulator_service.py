@@ -92,7 +92,7 @@ class EmulatorService:
             self._scenario, self._memory, self._schedule = scenario, memory, schedule
             self._rng = np.random.default_rng(scenario.seed)
             self._seen = self._last_sync = 0
-            self._sample_noise()
+            ec.fill_noise(self._memory, self._rng)
             self._share_settings()
 
     def receive(self, frame: Frame) -> None:
@@ -116,7 +116,7 @@ class EmulatorService:
             self._last_sync = last
             self.device.sync.notice(t_ns)
         self.device.tick(t_ns)
-        self._sample_noise()
+        ec.fill_noise(self._memory, self._rng)
         self._share_settings()
         self._watch_loop()
 
@@ -226,19 +226,6 @@ class EmulatorService:
         if heard != (shared[ec.SYNC_ID], shared[ec.DRIVE_ID]):
             wanted = 0, int(shared[ec.SYNC_ID]), int(shared[ec.DRIVE_ID])
             self._bus.set_filter([cob_id for cob_id in wanted if cob_id >= 0])
-
-    def _sample_noise(self, least: int = 1024) -> None:
-        """Fill the ring of noise with the numbers that `plant.Actuator` draws, once `least` rows of it are free."""
-        filled = int(self._memory.words[ec.NOISE_FILLED])
-        free = int(self._memory.words[ec.PLANT_CYCLE]) + ec.NOISE_RING - filled
-        if free < least:
-            return
-        rows = self._rng.standard_normal((free, NOISES))
-        first = min(free, ec.NOISE_RING - filled % ec.NOISE_RING)  # up to the ring's end, then from its start
-        start = filled % ec.NOISE_RING
-        noise = self._memory.reals[ec.NOISE_AT: ec.NOISE_AT + NOISES * ec.NOISE_RING].reshape(-1, NOISES)
-        noise[start: start + first], noise[: free - first] = rows[:first], rows[first:]
-        self._memory.words[ec.NOISE_FILLED] = filled + free
 
     def _book_events(self) -> None:
         """Take over what the loop has done or noticed: errors, whose EMCY it sends itself or leaves to the services."""

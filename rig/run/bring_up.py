@@ -99,8 +99,8 @@ class BringUp:
         self.start_nodes(scenario)
         if self._safety.aborted:  # a node did not become OPERATIONAL
             return probe
-        loop = self._stage.loop = open_loop(self._master, Schedule(scenario.plan), probe, self._job.bus,
-                                            self._job.period_ns, self._job.realtime)
+        loop = self._stage.loop = open_loop(self._master, self._job.bench, scenario, Schedule(scenario.plan), probe,
+                                            self._job.bus, self._job.realtime)
         try:
             for step in list_inputs(steps, BEFORE, 0.0):
                 loop.cycle(step)

@@ -1,11 +1,14 @@
-"""The rig's cycle as compiled code: due time, command, SYNC, collecting the answers. No Python object, no allocation.
+"""The rig's cycle as compiled code: due time, frames, SYNC, collecting the answers. No Python object, no allocation.
 
 `play_cycles_in_real_time` runs in a thread of its own without the interpreter lock until the queue is empty and the
-end is asked for; `play_cycle_in_lockstep` plays one cycle a call. Both share their memory, `Buffers`, with Python
-(hard_loop.py): Python writes the inputs of the cycles ahead and reads rows and frames behind.
+end is asked for; `play_cycle_in_lockstep` plays one cycle a call. They share their memory, `Buffers`, with Python
+(hard_loop.py): Python writes the inputs of the cycles ahead and reads rows and frames behind. Which frames there are
+and what lies where in them is data too: `Layout` (rig/benches/packing.py).
 
-The command goes out before the SYNC is due: on a real bus a frame of 8 bytes takes 135 us at 1 Mbit/s and would delay
-the SYNC behind it. Times are those of CLOCK_MONOTONIC, ns.
+A frame whose values take effect with SYNC goes out before SYNC is due: on a real bus a frame of 8 bytes takes 135 us at
+1 Mbit/s and would delay the SYNC behind it. The others follow the SYNC. Where the plant is no node of its own, this
+loop moves it as the emulator does: what the controller answers to cycle k acts from cycle k+1. Times are those of
+CLOCK_MONOTONIC, ns.
 """
 from __future__ import annotations
 
@@ -14,47 +17,88 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.network import codec
+from plant.compile import keep_apart
+from rig.benches.packing import (
+    ACCEPTED,
+    ALL_ROLES,
+    COMMAND,
+    DRIVE,
+    EVERY,
+    FEEDBACK,
+    FRAME_WORDS,
+    FRAMES,
+    FRAMES_AT,
+    IDENTIFIER,
+    IS_ANSWER,
+    IS_BEFORE_SYNC,
+    IS_MINE,
+    IS_NUMBERED,
+    LAST_CYCLE,
+    LENGTH,
+    OTHER_CYCLE,
+    PAYLOAD,
+    ROLES,
+    VALUES_AT,
+    VALVE,
+    Layout,
+    find_frame,
+    pack_frame,
+    unpack_frame,
+)
+from rig.network.frame import FD_FRAME
 from rig.network.raw_bus import (
     FRAME,
+    PAYLOAD_IN,
+    PAYLOAD_OUT,
     Port,
     await_frame,
-    join_words,
     read_clock,
     receive_frame,
     send_frame,
+    send_payload,
     sleep_until,
-    split_halves,
-    split_words,
+)
+from rig.nodes.emulator_cycle import (
+    FEEDBACK_FRAME,
+    IN_FORCE,
+    READINGS,
+    Memory,
+    advance_plant,
+    find_action,
+    find_drive_action,
+    read_plant,
 )
 from rig.sequences.faults import DELAY, DOUBLE, DROP, change_frame
 
 DONE, WAITING = 0, 1  # what `play_cycle_in_lockstep` returns
-FEEDBACK_CAME, VALVE_CAME, DRIVE_CAME = 1, 2, 4  # bits of ANSWERS, in the order of _ANSWERS
-ALL_CAME = FEEDBACK_CAME | VALVE_CAME | DRIVE_CAME
-_ANSWERS = (codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE)
 
 # Words that Python writes; the cycle sets CANCEL back
-(PERIOD, LEAD, SPIN, SPINS_ALWAYS, GRACE, TAIL, CANCEL, OVERRIDE, OVERRIDE_LIMIT, FINISH, DRY, FRAMES_READ, ROWS_READ,
- MAY_IDLE_AT) = range(14)
+(PERIOD, LEAD, SPIN, SPINS_ALWAYS, GRACE, TAIL, CANCEL, OVERRIDE_LIMIT, FINISH, DRY, FRAMES_READ, ROWS_READ,
+ MAY_IDLE_AT, SYNC_ID, MOVES_PLANT, MISSED_LIMIT, SLACK, DRIVEN, SENT_CHANNELS, READINGS_AT, CURRENT_AT,
+ FLAGS_AT) = range(22)
 # Words that the cycle writes; DUE is set by Python before the start. FAILURE is the status of a bus that failed
-(DUE, HEAD, CYCLES, OVERRUNS, UNDERRUNS, ROWS, FRAMES, COMPLETE_UNTIL, FAILURE) = range(16, 25)
-# Words of the cycle alone; from RAW on the input under way, column by column
-(OPEN, SYNC_AT, SEEN, STAGE, ANSWER_LIMIT, MISSED, HELD, FRAMES_WRITTEN, AWAKE_SINCE, WORKED, POSITION, IS_HELD,
- IS_UNDERRUN, RAW, CONTROL, COMMAND_CODE, COMMAND_ARGUMENT, SYNC_CODE, SYNC_ARGUMENT, DEAF, PLANT_FRAMES_LEFT,
- DRIVES_LEFT) = range(32, 54)
-WORDS = 64
-# Columns of an input: raw demand, control word; code and argument of the faults of command and SYNC (change_frame);
-# whether the rig receives nothing, by a fault; in lockstep how many frames of the plant and how many drives are to be
-# awaited (0: until each answer has come)
-INPUT_COLUMNS = DRIVES_LEFT + 1 - RAW
-# Columns of a row; from FEEDBACK_AT and XJ on in the order of _ANSWERS
-(CYCLE, INPUT, INPUT_HELD, WORD, DUE_AT, LATENESS, OVERRUN, ANSWERS, FEEDBACK_AT, VALVE_AT, DRIVE_AT, COMPLETE_AT,
- EXECUTION, XJ, P12, XS, FLAGS, COR, STATUS) = range(19)
-COLUMNS = 19
-# Columns of a frame; its head is COB-ID | length << 12 | sent by the rig << 16
+(DUE, HEAD, CYCLES, OVERRUNS, UNDERRUNS, ROWS, FRAMES_DONE, COMPLETE_UNTIL, FAILURE, DIVERGED) = range(24, 34)
+# Words of the cycle alone; from COUNTED on the input under way, column by column
+(OPEN, SYNC_AT, CAME, AWAITED, STAGE, ANSWER_LIMIT, MISSED, HELD, FRAMES_WRITTEN, AWAKE_SINCE, WORKED, POSITION,
+ IS_HELD, IS_UNDERRUN, ROW_CYCLE, IS_LATE, DRIVES_MISSED, HAS_BEGUN, COUNTED, COMMAND_CODE, COMMAND_ARGUMENT,
+ SYNC_CODE, SYNC_ARGUMENT, DEAF, PLANT_FRAMES_LEFT, DRIVES_LEFT) = range(40, 66)
+WORDS = 72
+# Columns of an input: whether the cycle counts (before the run the controller is enabled in cycles that do not, and
+# the plant stays where it is); code and argument of the faults of command and SYNC (change_frame); whether the rig
+# receives nothing, by a fault; in lockstep how many frames of the plant and how many drives are to be awaited (0:
+# until each answer has come)
+INPUT_COLUMNS = DRIVES_LEFT + 1 - COUNTED
+# Columns of a row
+(CYCLE, INPUT, INPUT_HELD, IS_COUNTED, DUE_AT, LATENESS, OVERRUN, ANSWERS, FEEDBACK_AT, VALVE_AT, DRIVE_AT,
+ COMPLETE_AT, EXECUTION) = range(13)
+COLUMNS = 13
+# Columns of a frame; its head is identifier | length << 32 | sent by the rig << 40. Payload words follow DATA
 TIME, FRAME_HEAD, DATA = range(3)
+# Columns of a frame that waits: when it is due, its place in the layout, its length and 8 words of payload
+_HELD_DUE, _HELD_PLACE, _HELD_LENGTH, _HELD_DATA = range(4)
+HELD_COLUMNS = _HELD_DATA + 8
 
+_DRIVE_MISSING, _DRIVE_LATE, _CURRENT_ZEROED = 1, 2, 4  # flags of a row
 _LONG_WAIT = 20_000_000  # ns: answers that may take this long are awaited to 20 ms, with fewer system calls
 _SECOND_ANSWER_LIMIT = 80_000_000  # ns
 _PATIENCE = 5  # cycles in a row without all answers: a node that is gone must not make clean-up last minutes
@@ -65,18 +109,24 @@ class Buffers(NamedTuple):
 
     words: NDArray[np.int64]
     inputs: NDArray[np.int64]  # (cycles ahead, INPUT_COLUMNS)
+    settings: NDArray[np.float64]  # (cycles ahead + 1, values that Python gives, SI); the last row: of the safe state
     rows: NDArray[np.int64]  # (cycles, COLUMNS)
-    frames: NDArray[np.int64]  # (frames, 3)
-    held: NDArray[np.int64]  # (late commands, 2): time at which to send, payload; the earliest first
+    values: NDArray[np.float64]  # (cycles, channels of the layout), SI
+    frames: NDArray[np.int64]  # (frames, 3, or 10 where a payload may have 64 bytes)
+    held: NDArray[np.int64]  # (late frames, HELD_COLUMNS), the earliest first
 
 
-def make_buffers(ahead: int, rows: int, frames: int, held: int) -> Buffers:
+def make_buffers(ahead: int, rows: int, frames: int, held: int, driven: int, channels: int, is_fd: bool) -> Buffers:
     """Empty buffers for that many entries each, in memory that is already mapped."""
-    shapes = (WORDS, (ahead, INPUT_COLUMNS), (rows, COLUMNS), (frames, 3), (held, 2))
-    return Buffers(*(np.full(shape, 0, np.int64) for shape in shapes))  # unlike zeros it touches every page
+    columns = DATA + 8 if is_fd else DATA + 1
+    # unlike zeros it touches every page
+    return Buffers(np.full(WORDS, 0, np.int64), np.full((ahead, INPUT_COLUMNS), 0, np.int64),
+                   np.full((ahead + 1, driven), np.nan), np.full((rows, COLUMNS), 0, np.int64),
+                   np.full((rows, channels), np.nan), np.full((frames, columns), 0, np.int64),
+                   np.full((held, HELD_COLUMNS), 0, np.int64))
 
 
-def play_cycles_in_real_time(port: Port, buffers: Buffers) -> None:
+def play_cycles_in_real_time(port: Port, buffers: Buffers, m: Layout, plant: Memory) -> None:
     """Play the queue at its due times until FINISH, or until the bus fails (FAILURE).
 
     Due times are a fixed grid. A SYNC that is late by whole periods drops the due times it has missed, and counts them.
@@ -85,21 +135,21 @@ def play_cycles_in_real_time(port: Port, buffers: Buffers) -> None:
     words = buffers.words
     while True:
         # Asleep while the answers come: the kernel notes their times, and nobody waits for the rig to read them.
-        _sleep_until(port, buffers, words[DUE] - words[LEAD])
-        _receive_waiting(port, buffers)
+        _sleep_until(port, buffers, m, words[DUE] - words[LEAD])
+        _receive_waiting(port, buffers, m, plant)
         is_end = not _take_input(buffers)
         if not is_end:
-            _send_command(port, buffers)
-        _wait_until_due(port, buffers)
-        _receive_waiting(port, buffers)
+            _send_frames(port, buffers, m, plant, True)
+        _wait_until_due(port, buffers, m)
+        _receive_waiting(port, buffers, m, plant)
         _end_work(port, words)
-        _close_row(port, buffers)
+        _close_row(port, buffers, m)
         if is_end or words[FAILURE]:
             return
-        _send_sync(port, buffers, read_clock(port) - words[DUE])
+        _begin_cycle(port, buffers, m, plant, read_clock(port) - words[DUE])
 
 
-def play_cycle_in_lockstep(port: Port, buffers: Buffers, until_ns: int) -> int:
+def play_cycle_in_lockstep(port: Port, buffers: Buffers, m: Layout, plant: Memory, until_ns: int) -> int:
     """Play one cycle: DONE when its answers are in, the time for them has passed or the bus has failed (FAILURE);
     WAITING at `until_ns`, to be called again.
     """
@@ -107,35 +157,49 @@ def play_cycle_in_lockstep(port: Port, buffers: Buffers, until_ns: int) -> int:
     if words[STAGE] == DONE:
         _begin_work(port, words)
         _take_input(buffers)
-        _send_command(port, buffers)
-        _send_sync(port, buffers, 0)
+        _send_frames(port, buffers, m, plant, True)
+        _begin_cycle(port, buffers, m, plant, 0)
         grace = words[GRACE] if words[MISSED] < _PATIENCE else words[GRACE] // 10
+        if not words[AWAITED]:  # nothing is sure to come: a cycle takes its time
+            grace = words[PERIOD]
         words[ANSWER_LIMIT] = words[SYNC_AT] + grace
         words[STAGE] = WAITING
         _end_work(port, words)
-    while not words[FAILURE] and (words[SEEN] != ALL_CAME or words[PLANT_FRAMES_LEFT] > 0 or words[DRIVES_LEFT] > 0):
+    while not words[FAILURE] and not _is_answered(words):
         if words[ANSWER_LIMIT] - words[SYNC_AT] >= _LONG_WAIT:
             frame = await_frame(port)
         else:
             frame = receive_frame(port, min(words[ANSWER_LIMIT], until_ns))
-        _accept_frame(buffers, frame)
+        _accept_frame(port, buffers, m, plant, frame)
         if frame[0] != FRAME:
             if read_clock(port) >= _find_answer_limit(words):
                 break
             return WAITING
-    words[MISSED] = 0 if words[SEEN] == ALL_CAME else words[MISSED] + 1
-    _receive_waiting(port, buffers)
-    while words[HELD] > 0 and buffers.held[0, 0] < words[DUE]:
-        _send_first_held(port, buffers)
-    _close_row(port, buffers)
+    words[MISSED] = 0 if _is_complete(words) else words[MISSED] + 1
+    _receive_waiting(port, buffers, m, plant)
+    while words[HELD] > 0 and buffers.held[0, _HELD_DUE] < words[DUE]:
+        _release_first_held(port, buffers, m)
+    _close_row(port, buffers, m)
     words[STAGE] = DONE
     return DONE
+
+
+def _is_complete(words: NDArray[np.int64]) -> bool:
+    """Whether each answer that is sure to come has come."""
+    return bool(words[CAME] & words[AWAITED] == words[AWAITED])
+
+
+def _is_answered(words: NDArray[np.int64]) -> bool:
+    """Lockstep: whether there is nothing left to wait for."""
+    if not words[AWAITED]:
+        return False
+    return _is_complete(words) and words[PLANT_FRAMES_LEFT] <= 0 and words[DRIVES_LEFT] <= 0
 
 
 def _find_answer_limit(words: NDArray[np.int64]) -> int:
     """How long to wait; not long if only a second drive frame is missing: not every controller answers twice."""
     limit = int(words[ANSWER_LIMIT])
-    if words[SEEN] == ALL_CAME and words[PLANT_FRAMES_LEFT] <= 0:
+    if words[AWAITED] and _is_complete(words) and words[PLANT_FRAMES_LEFT] <= 0:
         limit = min(limit, int(words[SYNC_AT]) + _SECOND_ANSWER_LIMIT)
     return limit
 
@@ -150,29 +214,40 @@ def _take_input(buffers: Buffers) -> bool:
     words[IS_HELD] = head == words[TAIL]
     words[IS_UNDERRUN] = words[IS_HELD] and head != words[MAY_IDLE_AT]
     if not words[IS_HELD]:
-        words[RAW: RAW + INPUT_COLUMNS] = buffers.inputs[head % len(buffers.inputs)]
+        for i in range(INPUT_COLUMNS):
+            words[COUNTED + i] = buffers.inputs[head % len(buffers.inputs), i]
         words[POSITION] = head
         words[HEAD] = head + 1
     elif words[FINISH]:
         return False
     else:
-        words[COMMAND_CODE: RAW + INPUT_COLUMNS] = 0  # no fault
+        for i in range(COMMAND_CODE, COUNTED + INPUT_COLUMNS):
+            words[i] = 0  # no fault
         words[UNDERRUNS] += words[IS_UNDERRUN]
-    if words[POSITION] < words[OVERRIDE_LIMIT]:
-        words[CONTROL] = words[OVERRIDE]
     return True
 
 
-def _wait_until_due(port: Port, buffers: Buffers) -> None:
+def _set_values(buffers: Buffers, m: Layout) -> None:
+    """Give the layout the values of the input under way, or of the safe state where that has been asked for."""
+    words, settings = buffers.words, buffers.settings
+    last = len(settings) - 1
+    for i in range(words[DRIVEN]):
+        value = settings[words[POSITION] % last, i]
+        if words[POSITION] < words[OVERRIDE_LIMIT] and not np.isnan(settings[last, i]):
+            value = settings[last, i]
+        m.doubles[m.words[VALUES_AT] + i] = value
+
+
+def _wait_until_due(port: Port, buffers: Buffers, m: Layout) -> None:
     """Sleep until shortly before SYNC is due, then watch the clock: the kernel's wake-up alone is 20 to 60 us late.
 
     On a single CPU the watch is left out unless all answers are in, for a node may need the CPU.
     """
     words = buffers.words
-    _sleep_until(port, buffers, words[DUE] - words[SPIN])
-    is_command_due = words[HELD] > 0 and buffers.held[0, 0] < words[DUE]
-    if is_command_due or not (words[SPINS_ALWAYS] or words[SEEN] == ALL_CAME):
-        _sleep_until(port, buffers, words[DUE])
+    _sleep_until(port, buffers, m, words[DUE] - words[SPIN])
+    is_frame_due = words[HELD] > 0 and buffers.held[0, _HELD_DUE] < words[DUE]
+    if is_frame_due or not (words[SPINS_ALWAYS] or _is_complete(words)):
+        _sleep_until(port, buffers, m, words[DUE])
         return
     _end_work(port, words)
     while read_clock(port) < words[DUE]:
@@ -180,12 +255,13 @@ def _wait_until_due(port: Port, buffers: Buffers) -> None:
     _begin_work(port, words)
 
 
-def _sleep_until(port: Port, buffers: Buffers, t_ns: int) -> None:
-    """Sleep until `t_ns`, and send the late commands that are due before."""
+@keep_apart
+def _sleep_until(port: Port, buffers: Buffers, m: Layout, t_ns: int) -> None:
+    """Sleep until `t_ns`, and send the late frames that are due before."""
     words, held = buffers.words, buffers.held
-    while words[HELD] > 0 and held[0, 0] < t_ns:
-        _pause_until(port, words, held[0, 0])
-        _send_first_held(port, buffers)
+    while words[HELD] > 0 and held[0, _HELD_DUE] < t_ns:
+        _pause_until(port, words, held[0, _HELD_DUE])
+        _release_first_held(port, buffers, m)
     _pause_until(port, words, t_ns)
 
 
@@ -203,135 +279,275 @@ def _end_work(port: Port, words: NDArray[np.int64]) -> None:
     words[WORKED] += read_clock(port) - words[AWAKE_SINCE]
 
 
-def _send_command(port: Port, buffers: Buffers) -> None:
-    """Send the command of the cycle to come as a fault leaves it; one that is to be late is sent later."""
+# ---------------------------------------------------------------------------------------- frames out
+
+
+@keep_apart
+def _send_frames(port: Port, buffers: Buffers, m: Layout, plant: Memory, is_before_sync: bool) -> None:
+    """Send the frames of the cycle to come that go before SYNC, or those that follow it."""
     words = buffers.words
-    code = words[COMMAND_CODE]
-    if code not in (DROP, DELAY):
-        length, data = change_frame(code, words[COMMAND_ARGUMENT], 8, _pack_command(words))
-        _send(port, buffers, codec.COMMAND, length, data, 2 if code == DOUBLE else 1)
+    if is_before_sync:
+        _set_values(buffers, m)
+        if words[MOVES_PLANT]:
+            _read_transducers(buffers, m, plant)
+    for number in range(m.words[FRAMES]):
+        at = FRAMES_AT + FRAME_WORDS * number
+        is_due = words[CYCLES] % m.words[at + EVERY] == 0
+        if m.words[at + IS_MINE] and is_due and m.words[at + IS_BEFORE_SYNC] == is_before_sync:
+            pack_frame(m, at, words[CYCLES])
+            _send_as_fault_leaves_it(port, buffers, m, plant, at)
 
 
-def _pack_command(words: NDArray[np.int64]) -> int:
-    return join_words(words[RAW], words[CONTROL], words[CYCLES])
+def _send_as_fault_leaves_it(port: Port, buffers: Buffers, m: Layout, plant: Memory, at: int) -> None:
+    """Send the frame in the payload; a fault of command or feedback may change, double, delay or drop it."""
+    words = buffers.words
+    code, argument = words[COMMAND_CODE], words[COMMAND_ARGUMENT]
+    if not m.words[at + ROLES] & COMMAND:
+        code, argument = 0, 0
+    if code == 0 and words[MOVES_PLANT] and m.words[at + ROLES] & FEEDBACK:
+        code, argument = find_action(plant, FEEDBACK_FRAME, words[CYCLES])
+    length = m.words[at + LENGTH]
+    if code == DELAY:
+        _hold_frame(buffers, m, at, words[DUE] + argument, length)
+    elif code != DROP:
+        length, m.words[PAYLOAD] = change_frame(code, argument, length, m.words[PAYLOAD])
+        _send(port, buffers, m, m.words[at + IDENTIFIER], length, 2 if code == DOUBLE else 1)
 
 
-def _send_sync(port: Port, buffers: Buffers, late: int) -> None:
-    """Send SYNC, which is `late` by so many ns, and open the row of its cycle; due times that have passed are lost."""
+def _hold_frame(buffers: Buffers, m: Layout, at: int, due: int, length: int) -> None:
+    """Keep the frame in the payload until its time; those that are due at the same time stay in order."""
+    words, held = buffers.words, buffers.held
+    place = words[HELD]
+    if place == len(held):
+        return
+    while place > 0 and held[place - 1, _HELD_DUE] > due:
+        _move_held(buffers, place - 1, place)
+        place -= 1
+    held[place, _HELD_DUE], held[place, _HELD_PLACE], held[place, _HELD_LENGTH] = due, at, length
+    for i in range(8):
+        held[place, _HELD_DATA + i] = m.words[PAYLOAD + i]
+    words[HELD] += 1
+
+
+def _move_held(buffers: Buffers, place: int, to: int) -> None:
+    for i in range(HELD_COLUMNS):
+        buffers.held[to, i] = buffers.held[place, i]
+
+
+@keep_apart
+def _release_first_held(port: Port, buffers: Buffers, m: Layout) -> None:
+    """Send the frame that has waited; one of the controller is received now."""
+    words, held = buffers.words, buffers.held
+    at, length = held[0, _HELD_PLACE], held[0, _HELD_LENGTH]
+    for i in range(8):
+        m.words[PAYLOAD + i] = held[0, _HELD_DATA + i]
+    words[HELD] -= 1
+    for place in range(words[HELD]):
+        _move_held(buffers, place + 1, place)
+    if m.words[at + IS_MINE]:
+        _send(port, buffers, m, m.words[at + IDENTIFIER], length, 1)
+    else:
+        _keep_answer(buffers, m, at, length, read_clock(port) - words[SYNC_AT])
+
+
+@keep_apart
+def _send(port: Port, buffers: Buffers, m: Layout, identifier: int, length: int, count: int) -> None:
+    """Send the payload so many times and record it. A full transmit queue loses it, which the port counts."""
+    words = buffers.words
+    for _ in range(count):
+        if not (words[DRY] or words[FAILURE]):
+            _record_frame(buffers, m, read_clock(port), identifier | length << 32 | 1 << 40)
+            if identifier & FD_FRAME:
+                for i in range(64):
+                    port.octets[PAYLOAD_OUT + i] = m.octets[8 * PAYLOAD + i]
+                words[FAILURE] = min(send_payload(port, identifier, length), 0)
+            else:
+                words[FAILURE] = min(send_frame(port, identifier, length, m.words[PAYLOAD]), 0)
+
+
+# ---------------------------------------------------------------------------------------- the cycle
+
+
+@keep_apart
+def _begin_cycle(port: Port, buffers: Buffers, m: Layout, plant: Memory, late: int) -> None:
+    """Send SYNC, which is `late` by so many ns, open the row of its cycle, send what follows SYNC, move the plant.
+
+    Due times that have passed are lost.
+    """
     words = buffers.words
     lost = late // words[PERIOD]
     words[DUE] += lost * words[PERIOD]
     if words[SYNC_CODE] == DELAY:  # a fault, and no lateness of the bench
         _pause_until(port, words, words[DUE] + words[SYNC_ARGUMENT])
     words[SYNC_AT] = read_clock(port)
-    if words[SYNC_CODE] != DROP:
-        _send(port, buffers, codec.SYNC, 0, 0, 2 if words[SYNC_CODE] == DOUBLE else 1)
-    row = buffers.rows[words[ROWS] % len(buffers.rows)]
-    row[CYCLE], row[INPUT], row[INPUT_HELD] = words[CYCLES], words[POSITION], words[IS_HELD]
-    row[WORD], row[DUE_AT], row[LATENESS] = words[CONTROL], words[DUE], late
-    row[OVERRUN] = 1 if 2 * late > words[PERIOD] or words[IS_UNDERRUN] else 0
-    words[OVERRUNS] += max(lost, row[OVERRUN])
-    words[SEEN], words[OPEN] = 0, 1
-    if words[COMMAND_CODE] == DELAY:
-        _hold_command(buffers)
-    words[CYCLES] += 1
+    if words[SYNC_ID] >= 0 and words[SYNC_CODE] != DROP:
+        m.words[PAYLOAD] = 0
+        _send(port, buffers, m, words[SYNC_ID], 0, 2 if words[SYNC_CODE] == DOUBLE else 1)
+    if words[MOVES_PLANT]:
+        m.doubles[m.words[VALUES_AT] + words[FLAGS_AT]] = _judge_drive(buffers, m, plant)
+    _send_frames(port, buffers, m, plant, False)
+    _open_row(buffers, m, late)
+    words[OVERRUNS] += max(lost, buffers.rows[words[ROWS] % len(buffers.rows), OVERRUN])
+    if words[MOVES_PLANT] and words[COUNTED] and not words[DIVERGED]:
+        advance_plant(plant, words[CYCLES])
+    words[CYCLES] += words[COUNTED]
     words[DUE] += words[PERIOD]
 
 
-def _hold_command(buffers: Buffers) -> None:
-    """Keep a late command until its time; those that are due at the same time stay in order."""
-    words, held = buffers.words, buffers.held
-    place = words[HELD]
-    if place == len(held):
-        return
-    due = words[DUE] + words[COMMAND_ARGUMENT]
-    while place > 0 and held[place - 1, 0] > due:
-        held[place] = held[place - 1]
-        place -= 1
-    held[place, 0], held[place, 1] = due, _pack_command(words)
-    words[HELD] += 1
-
-
-def _send_first_held(port: Port, buffers: Buffers) -> None:
-    words, held = buffers.words, buffers.held
-    _send(port, buffers, codec.COMMAND, 8, held[0, 1], 1)
-    words[HELD] -= 1
-    for place in range(words[HELD]):
-        held[place] = held[place + 1]
-
-
-def _send(port: Port, buffers: Buffers, cob_id: int, length: int, data: int, count: int) -> None:
-    """Send a frame so many times and record it. A full transmit queue loses it, which the port counts."""
+def _open_row(buffers: Buffers, m: Layout, late: int) -> None:
     words = buffers.words
-    for _ in range(count):
-        if not (words[DRY] or words[FAILURE]):
-            _record_frame(buffers, read_clock(port), cob_id | length << 12 | 1 << 16, data)
-            words[FAILURE] = min(send_frame(port, cob_id, length, data), 0)
+    number = words[ROWS] % len(buffers.rows)
+    row = buffers.rows[number]
+    row[CYCLE], row[INPUT], row[INPUT_HELD] = words[CYCLES], words[POSITION], words[IS_HELD]
+    row[IS_COUNTED], row[DUE_AT], row[LATENESS] = words[COUNTED], words[DUE], late
+    row[OVERRUN] = 1 if 2 * late > words[PERIOD] or words[IS_UNDERRUN] else 0
+    row[FEEDBACK_AT], row[VALVE_AT], row[DRIVE_AT], row[COMPLETE_AT] = 0, 0, 0, 0
+    for i in range(words[SENT_CHANNELS]):
+        buffers.values[number, i] = m.doubles[m.words[VALUES_AT] + i]
+    words[OPEN], words[ROW_CYCLE] = 1, words[CYCLES]
+    _expect_answers(buffers, m)
 
 
-def _receive_waiting(port: Port, buffers: Buffers) -> None:
+def _expect_answers(buffers: Buffers, m: Layout) -> None:
+    """Which answers are sure to come in this cycle, and which values of earlier frames still count."""
+    words = buffers.words
+    words[CAME], words[AWAITED], words[IS_LATE] = 0, 0, 0
+    if words[MOVES_PLANT]:
+        words[CAME] = FEEDBACK | VALVE
+    if words[SYNC_CODE] == DROP and words[SYNC_ID] >= 0:
+        return
+    for number in range(m.words[FRAMES]):
+        at = FRAMES_AT + FRAME_WORDS * number
+        if m.words[at + IS_MINE]:
+            continue
+        age = words[HAS_BEGUN] - m.words[at + LAST_CYCLE]
+        slack = words[SLACK] if m.words[at + IS_ANSWER] else words[MISSED_LIMIT]
+        if m.words[at + LAST_CYCLE] >= 0 and age < m.words[at + EVERY] + slack:
+            words[CAME] |= m.words[at + ROLES]
+        elif m.words[at + IS_ANSWER] and age >= m.words[at + EVERY]:
+            words[AWAITED] |= m.words[at + ROLES] & ~ALL_ROLES
+    words[HAS_BEGUN] += 1
+
+
+def _read_transducers(buffers: Buffers, m: Layout, plant: Memory) -> None:
+    """The readings of the cycle to come; a plant that has diverged keeps the last."""
+    words = buffers.words
+    if not read_plant(plant, words[CYCLES]):
+        words[DIVERGED] = 1
+    if not words[DIVERGED]:
+        at = m.words[VALUES_AT] + words[READINGS_AT]
+        for i in range(3):
+            m.doubles[at + i] = plant.reals[READINGS + i]
+
+
+def _judge_drive(buffers: Buffers, m: Layout, plant: Memory) -> int:
+    """Flags of this cycle and the current until the next one: the answer to the last cycle, or none after three."""
+    words = buffers.words
+    if not words[HAS_BEGUN]:
+        return 0
+    if words[CAME] & DRIVE:
+        plant.reals[IN_FORCE] = m.doubles[m.words[VALUES_AT] + words[CURRENT_AT]]
+        words[DRIVES_MISSED] = 0
+        return 0
+    words[DRIVES_MISSED] += 1
+    flags = _DRIVE_LATE if words[IS_LATE] else _DRIVE_MISSING
+    if words[DRIVES_MISSED] >= words[MISSED_LIMIT]:
+        plant.reals[IN_FORCE] = 0.0
+        flags |= _CURRENT_ZEROED
+    return flags
+
+
+# ---------------------------------------------------------------------------------------- frames in
+
+
+@keep_apart
+def _receive_waiting(port: Port, buffers: Buffers, m: Layout, plant: Memory) -> None:
     """Take in the frames that are here, and none that comes meanwhile."""
     now, came = read_clock(port), 0
     while came < now and not buffers.words[FAILURE]:  # the port keeps the reason of the failure
         frame = receive_frame(port, 0)
-        _accept_frame(buffers, frame)
+        _accept_frame(port, buffers, m, plant, frame)
         came = frame[1] if frame[0] == FRAME else now
 
 
-def _accept_frame(buffers: Buffers, frame: tuple[int, int, int, int, int]) -> None:
+@keep_apart
+def _accept_frame(port: Port, buffers: Buffers, m: Layout, plant: Memory,
+                  frame: tuple[int, int, int, int, int]) -> None:
     """Record what `receive_frame` gave, and put the values of an answer into the row of the cycle under way."""
     words = buffers.words
-    status, t_ns, cob_id, length, data = frame
+    status, t_ns, identifier, length, data = frame
     if status < 0:
         words[FAILURE] = status
     if status != FRAME or words[DEAF]:
         return
-    _record_frame(buffers, t_ns, cob_id | length << 12, data)
-    for answer in range(len(_ANSWERS)):
-        if _ANSWERS[answer] == cob_id and words[OPEN]:
-            words[DRIVES_LEFT if cob_id == codec.DRIVE else PLANT_FRAMES_LEFT] -= 1
-            if length == 8:
-                _keep_answer(buffers, answer, t_ns - words[SYNC_AT], data)
+    for i in range(8):
+        m.words[PAYLOAD + i] = 0
+    m.words[PAYLOAD] = data
+    for i in range(8, length):
+        m.octets[8 * PAYLOAD + i] = port.octets[PAYLOAD_IN + i]
+    _record_frame(buffers, m, t_ns, identifier | length << 32)
+    at = find_frame(m, identifier)
+    if at < 0 or m.words[at + IS_MINE] or not words[OPEN]:
+        return
+    is_drive = m.words[at + ROLES] & DRIVE != 0
+    words[DRIVES_LEFT if is_drive else PLANT_FRAMES_LEFT] -= 1
+    if is_drive and words[MOVES_PLANT]:
+        code, argument = find_drive_action(plant, words[ROW_CYCLE])
+        if code == DELAY:
+            _hold_frame(buffers, m, at, t_ns + argument if words[LEAD] else words[DUE] - words[PERIOD] + argument,
+                        length)
+        if code in (DELAY, DROP):
+            return
+        length, m.words[PAYLOAD] = change_frame(code, argument, length, m.words[PAYLOAD])
+    _keep_answer(buffers, m, at, length, t_ns - words[SYNC_AT])
 
 
-def _keep_answer(buffers: Buffers, answer: int, since_sync: int, data: int) -> None:
+@keep_apart
+def _keep_answer(buffers: Buffers, m: Layout, at: int, length: int, since_sync: int) -> None:
+    """Unpack the payload; of frames with the number of their cycle the last counts, of others the first."""
     words = buffers.words
+    roles, came = m.words[at + ROLES], words[CAME]
+    is_first = m.words[at + LAST_CYCLE] != words[HAS_BEGUN] - 1
+    if not (m.words[at + IS_NUMBERED] or is_first or roles & DRIVE):
+        return
+    status = unpack_frame(m, at, length, words[ROW_CYCLE])
+    if status == OTHER_CYCLE and roles & DRIVE:
+        words[IS_LATE] = 1
+    if status != ACCEPTED:
+        return
     row = buffers.rows[words[ROWS] % len(buffers.rows)]
-    seen, came = words[SEEN], 1 << answer
-    is_first = not seen & came
-    if came == FEEDBACK_CAME:  # without the number of its cycle
-        value, state = split_halves(data)
-        is_valid = is_first
-    else:  # of several the last: the plant latches that drive
-        value, state, cycle = split_words(data)
-        is_valid = cycle == row[CYCLE] & 0xFFFF
-    if is_valid:
-        row[XJ + 2 * answer], row[XJ + 2 * answer + 1] = value, state
-        if is_first:
-            row[FEEDBACK_AT + answer] = since_sync
-        words[SEEN] |= came
-        if words[SEEN] == ALL_CAME and seen != ALL_CAME:
-            row[COMPLETE_AT] = since_sync
+    for i in range(3):
+        if is_first and roles & FEEDBACK << i:
+            row[FEEDBACK_AT + i] = since_sync
+    m.words[at + LAST_CYCLE] = words[HAS_BEGUN] - 1
+    words[CAME] |= roles
+    if _is_complete(words) and came & words[AWAITED] != words[AWAITED]:
+        row[COMPLETE_AT] = since_sync
 
 
-def _record_frame(buffers: Buffers, t_ns: int, head: int, data: int) -> None:
+def _record_frame(buffers: Buffers, m: Layout, t_ns: int, head: int) -> None:
     words, frames = buffers.words, buffers.frames
     if words[FRAMES_WRITTEN] - words[FRAMES_READ] < len(frames):
         frame = frames[words[FRAMES_WRITTEN] % len(frames)]
-        frame[TIME], frame[FRAME_HEAD], frame[DATA] = t_ns, head, data
+        frame[TIME], frame[FRAME_HEAD], frame[DATA] = t_ns, head, m.words[PAYLOAD]
+        for i in range(DATA + 1, frames.shape[1]):
+            frame[i] = m.words[PAYLOAD + i - DATA]
         words[FRAMES_WRITTEN] += 1
 
 
-def _close_row(port: Port, buffers: Buffers) -> None:
+def _close_row(port: Port, buffers: Buffers, m: Layout) -> None:
     """Complete the row of the cycle under way and hand it to Python, with the frames up to now."""
     words = buffers.words
-    row = buffers.rows[words[ROWS] % len(buffers.rows)]
-    row[ANSWERS], row[EXECUTION] = words[SEEN], words[WORKED]
+    number = words[ROWS] % len(buffers.rows)
+    row = buffers.rows[number]
+    row[ANSWERS], row[EXECUTION] = words[CAME], words[WORKED]
+    for i in range(words[SENT_CHANNELS], buffers.values.shape[1]):
+        buffers.values[number, i] = m.doubles[m.words[VALUES_AT] + i]
     words[WORKED] = 0
     # The compiler cannot see into a library call: the row is in memory before the counts say that it is there.
     _begin_work(port, words)
     if words[OPEN] and words[ROWS] + 1 - words[ROWS_READ] < len(buffers.rows):
         words[ROWS] += 1
     words[OPEN] = 0
-    words[FRAMES] = words[FRAMES_WRITTEN]
+    words[FRAMES_DONE] = words[FRAMES_WRITTEN]
     words[COMPLETE_UNTIL] = words[DUE]

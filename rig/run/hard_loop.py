@@ -21,42 +21,74 @@ import numpy as np
 
 from plant.compile import compile_function
 from plant.errors import RigError
-from rig.network import codec
+from plant.model import Model
+from rig.benches import packing
+from rig.benches.bench import Bench
+from rig.benches.frame_map import FD, Role
 from rig.network.frame import Frame
 from rig.network.link import LinkWire
 from rig.network.master import Master
-from rig.network.node_objects import PLANT
 from rig.network.raw_bus import RawBus, can_open, make_closed_port, open_raw_bus
+from rig.nodes import emulator_cycle as ec
+from rig.nodes.emulator_service import compile_plant
+from rig.nodes.faulty_plant import DIVERGED
+from rig.nodes.scenario import Scenario
 from rig.recorder import Signals, Timing
 from rig.run import hard_cycle as hc
-from rig.run.loop import CycleInput, CycleLoop, CycleObserver, Loop
+from rig.run.cyclic_values import CycleInput, CyclicValues
+from rig.run.loop import CycleLoop, CycleObserver, Loop
 from rig.run.priority import enter_loop_thread, list_cpus
-from rig.sequences.faults import CUT, DELAY, DOUBLE, DROP, NORMAL, Schedule
+from rig.sequences.faults import CUT, DELAY, DOUBLE, DROP, NORMAL, Plan, Schedule
 
-RECEIVED = (codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE, codec.SYNC, codec.COMMAND)  # the last two: of a second rig
-_PLANT_EMCY = 0x080 + PLANT
 _US = 1000  # ns
 
 
-def open_loop(master: Master, faults: Schedule, log: CycleObserver, bus: str, period_ns: int, realtime: bool) -> Loop:
+def open_loop(master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver, bus: str,
+              realtime: bool) -> Loop:
     """The cycle loop for a bus: the hard one where compiled code can use the bus, else `CycleLoop`.
 
     Raises:
         RigError: the bus cannot be opened.
     """
     if can_open(bus) and isinstance(master.wire, LinkWire):
-        return HardLoop(master, faults, log, open_raw_bus(bus, RECEIVED), period_ns, realtime)
-    return CycleLoop(master, faults, log, period_ns, realtime)
+        return HardLoop(master, bench, scenario, faults, log, open_raw_bus(bus, list_cyclic_frames(bench)), realtime)
+    return CycleLoop(master, bench, scenario, faults, log, realtime)
+
+
+def list_cyclic_frames(bench: Bench) -> list[int]:
+    """Identifiers of the frames that the loop takes in; those that the rig sends itself may come from a second rig."""
+    known = [each.identifier for each in bench.frames.frames]
+    return sorted({*known, *([] if bench.frames.sync is None else [bench.frames.sync])})
 
 
 @cache
 def compile_cycle(realtime: bool) -> Any:
     """Compile the cycle of a pace: some seconds on a new machine, half a second afterwards."""
     play = compile_function(hc.play_cycles_in_real_time if realtime else hc.play_cycle_in_lockstep)
-    buffers = hc.make_buffers(1, 1, 1, 1)
-    buffers.words[hc.PERIOD] = 1
-    play(make_closed_port(), buffers, *() if realtime else (0,))  # fails at once, on a bus that is not there
+    buffers = hc.make_buffers(1, 1, 1, 1, 1, 1, is_fd=False)
+    buffers.words[hc.PERIOD], buffers.words[hc.SYNC_ID] = 1, 0x080
+    plant = ec.make_memory(Model(), [], Schedule(Plan(stop=0)))
+    # fails at once, on a bus that is not there
+    play(make_closed_port(), buffers, packing.make_layout((), (), Role.RIG), plant, *() if realtime else (0,))
     return play
+
+
+class _LoopPlant:
+    """The plant that the compiled cycle moves; where the plant is a node of its own, memory of one that never moves."""
+
+    def __init__(self, bench: Bench, scenario: Scenario) -> None:
+        self._rng = None if bench.has_plant_node else np.random.default_rng(scenario.seed)
+        if self._rng is None:
+            self.memory = ec.make_memory(Model(), [], Schedule(Plan(stop=0)))
+            return
+        schedule = Schedule(scenario.plan, scenario.model.values)
+        self.memory = ec.make_memory(scenario.model, scenario.load(), schedule, *compile_plant(scenario.model))
+        self.draw_noise()
+
+    def draw_noise(self) -> None:
+        """Draw the noise of the cycles to come, a minute ahead."""
+        if self._rng is not None:
+            ec.fill_noise(self.memory, self._rng)
 
 
 class HardLoop(Loop):
@@ -67,18 +99,21 @@ class HardLoop(Loop):
 
     kind = "hard"
 
-    def __init__(self, master: Master, faults: Schedule, log: CycleObserver, bus: RawBus, period_ns: int,
-                 realtime: bool, ahead: int = 1000) -> None:
+    def __init__(self, master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver,
+                 bus: RawBus, realtime: bool, ahead: int = 1000) -> None:
         """`ahead`: cycles that Python queues in real time; a stall of Python up to that length does no harm."""
         wire = master.wire
         assert isinstance(wire, LinkWire)
-        self._master, self._wire, self._bus = master, wire, bus
-        self._faults, self._log, self._period, self._realtime = faults, log, period_ns, realtime
+        self._master, self._wire, self._bus, self._bench = master, wire, bus, bench
+        self._faults, self._log, self._period, self._realtime = faults, log, bench.cycle_ns, realtime
         self._ahead = ahead if realtime else 1
         self._origin = wire.clock.origin_ns
+        self._values = CyclicValues(bench)
+        self._plant = _LoopPlant(bench, scenario)
         bus.use_kernel_times(realtime)
         self._play = compile_cycle(realtime)
-        self._buffers = hc.make_buffers(ahead, 8 * ahead, 64 * ahead, 1100)
+        channels, is_fd = len(self._values.names), any(each.identifier & FD for each in bench.frames.frames)
+        self._buffers = hc.make_buffers(ahead, 8 * ahead, 64 * ahead, 1100, len(self._values.given), channels, is_fd)
         self._words = self._buffers.words
         self._inputs = [CycleInput(0, 0.0, 0.0, 0)] * (9 * ahead)  # of all rows that are not yet logged, and the queue
         self._thread: threading.Thread | None = None
@@ -89,11 +124,14 @@ class HardLoop(Loop):
         self._came_at: int | None = None  # wall time of the service frame under way
         self._last_t_ns = 0
         self._reported = False  # an EMCY of the plant has come in this cycle
+        self._plant_emcy = 0x080 + bench.nodes[Role.PLANT].node if bench.has_plant_node else None
+        self._ours = [bench.frames.sync, *(each.identifier for each in bench.frames.list_from(Role.RIG))]
+        self.outputs = {}
         self._write_frame, master.hooks.on_frame = master.hooks.on_frame, self._keep_frame
         self._receive, wire.receive = wire.receive, self._receive_service
-        wire.link.leave_out(RECEIVED)
+        wire.link.leave_out(list_cyclic_frames(bench))
         self._warm_up()
-        self._t_ns = wire.clock.now() + period_ns  # lockstep: time of the cycle under way or to come
+        self._t_ns = wire.clock.now() + self._period  # lockstep: time of the cycle under way or to come
 
     # ------------------------------------------------------------------------------------ what the session sees
 
@@ -144,13 +182,14 @@ class HardLoop(Loop):
         near = self.waiting <= 2  # the end of the queue: the next input must come within a period
         self._wire.poll(self._period * (0.1e-9 if near else 1e-9))
         self._drain()
+        self._plant.draw_noise()
         self._set_rig_faults(self.k)
         self._master.tick()
         self._require_bus()
 
     def override_control(self, word: int) -> None:
         """See `Loop`."""
-        self._words[hc.OVERRIDE] = word
+        self._buffers.settings[-1] = self._values.list_safe(word)
         self._words[hc.OVERRIDE_LIMIT] = self._words[hc.TAIL]
 
     def wait_until_played(self, stop: Callable[[], bool]) -> bool:
@@ -205,9 +244,9 @@ class HardLoop(Loop):
         position = int(self._words[hc.TAIL])
         self._inputs[position % len(self._inputs)] = step
         queue = self._buffers.inputs
+        self._buffers.settings[position % len(queue)] = self._values.list_given(step)
         queue[position % len(queue)] = (
-            codec.raw_position(step.demand), step.control, *command, *sync,
-            self._faults.is_bus_off("rig", k), *self._count_repeated_frames(k))
+            step.is_counted, *command, *sync, self._faults.is_bus_off("rig", k), *self._count_repeated_frames(k))
         self._words[hc.TAIL] = position + 1
 
     def _count_repeated_frames(self, k: int) -> tuple[int, int]:
@@ -231,7 +270,7 @@ class HardLoop(Loop):
         self._log_pending()
         self._set_rig_faults(self._k)
         self._reported = False
-        while self._play(self._bus.port, self._buffers, self._origin + self._wire.clock.now() + 50_000 * _US):
+        while self._play_until(self._origin + self._wire.clock.now() + 50_000 * _US):
             self._serve_lockstep()
         self._serve_lockstep()
         self._require_bus()
@@ -240,11 +279,16 @@ class HardLoop(Loop):
             self._wire.wait(lambda: self._reported or self._wire.is_node_gone(), self._wire.grace_ns * 1e-9)
         self._drain()
         self._master.tick()
-        self._k += 1
+        self._k = int(self._words[hc.CYCLES])
         self._t_ns += self._period
+
+    def _play_until(self, t_ns: int) -> bool:
+        """Lockstep: play the cycle under way, at most until then; whether it is not over."""
+        return bool(self._play(self._bus.port, self._buffers, self._layout, self._plant.memory, t_ns))
 
     def _serve_lockstep(self) -> None:
         self._wire.poll(0.0)
+        self._plant.draw_noise()
         if self._wire.is_node_gone():  # it will not answer; the others can within a period
             limit = self._origin + self._wire.clock.now() + self._period
             self._words[hc.ANSWER_LIMIT] = min(self._words[hc.ANSWER_LIMIT], limit)
@@ -252,7 +296,7 @@ class HardLoop(Loop):
 
     def _run_thread(self) -> None:
         with enter_loop_thread(from_last=1) as self.scheduler:
-            self._play(self._bus.port, self._buffers)
+            self._play(self._bus.port, self._buffers, self._layout, self._plant.memory)
 
     def _is_running(self) -> bool:
         return self._thread is not None and self._thread.is_alive()
@@ -268,19 +312,35 @@ class HardLoop(Loop):
     def _warm_up(self) -> None:
         """Play some cycles without sending, then set the cycle's times: code and memory are in place at the start."""
         words, period = self._words, self._period
-        words[hc.DRY], words[hc.PERIOD] = 1, period
+        self._prepare_cycle()
+        words[hc.DRY] = 1
         for _ in range(10):
-            self._push(CycleInput(0, 0.0, 0.0, 0))
+            self._push(CycleInput(0, 0.0, 0.0, 0, is_counted=False))
             words[hc.DUE] = self._origin + self._wire.clock.now() + period
             if not self._realtime:
-                self._play(self._bus.port, self._buffers, words[hc.DUE])
+                self._play_until(words[hc.DUE])
         words[hc.FINISH] = 1
         if self._realtime:
-            self._play(self._bus.port, self._buffers)
+            self._play(self._bus.port, self._buffers, self._layout, self._plant.memory)
         words[:] = 0
-        words[hc.PERIOD], words[hc.GRACE], words[hc.MAY_IDLE_AT] = period, self._wire.grace_ns, -1
+        self._prepare_cycle()
+
+    def _prepare_cycle(self) -> None:
+        """The words of a cycle that has not begun, and the tables of its frames."""
+        words, bench, place = self._words, self._bench, self._values.place
+        self._layout = packing.make_layout(bench.frames.list_of(Role.RIG), self._values.names, Role.RIG)
+        words[hc.PERIOD], words[hc.GRACE], words[hc.MAY_IDLE_AT] = self._period, self._wire.grace_ns, -1
         words[hc.SPINS_ALWAYS] = len(list_cpus()) > 1
-        words[hc.LEAD], words[hc.SPIN] = min(200 * _US, period // 4), min(80 * _US, period // 8)
+        if self._realtime:
+            words[hc.LEAD], words[hc.SPIN] = min(200 * _US, self._period // 4), min(80 * _US, self._period // 8)
+        sync = bench.frames.sync
+        words[hc.SYNC_ID] = -1 if sync is None else sync
+        words[hc.MOVES_PLANT], words[hc.MISSED_LIMIT] = not bench.has_plant_node, bench.most_missed
+        # without a SYNC the controller has its own clock: its frame may slip from one cycle of the rig to the next
+        words[hc.SLACK] = sync is None and self._realtime
+        words[hc.DRIVEN], words[hc.SENT_CHANNELS] = len(self._values.given), len(self._values.sent)
+        words[hc.READINGS_AT], words[hc.CURRENT_AT] = place["ram_position"], place["current"]
+        words[hc.FLAGS_AT] = place["flags"]
 
     # ------------------------------------------------------------------------------------ from the cycle
 
@@ -292,28 +352,30 @@ class HardLoop(Loop):
     def _drain(self) -> None:
         """Log the cycles and frames that are complete."""
         words, buffers = self._words, self._buffers
+        self.problem = DIVERGED if words[hc.DIVERGED] else ""
         until = int(words[hc.COMPLETE_UNTIL])  # first: what is added meanwhile waits for the next time
-        first, last = int(words[hc.FRAMES_READ]), int(words[hc.FRAMES])
-        for t_ns, head, data in _read_ring(buffers.frames, first, last):
-            raw = (data & 0xFFFFFFFFFFFFFFFF).to_bytes(8, "little")[:head >> 12 & 15]
-            self._take_frame(t_ns - self._origin, head & 0x7FF, raw, bool(head >> 16))
+        first, last = int(words[hc.FRAMES_READ]), int(words[hc.FRAMES_DONE])
+        for t_ns, head, *data in _read_ring(buffers.frames, first, last):
+            raw = b"".join([(word & 0xFFFFFFFFFFFFFFFF).to_bytes(8, "little") for word in data])
+            self._take_frame(t_ns - self._origin, head & 0xFFFFFFFF, raw[:head >> 32 & 0xFF], bool(head >> 40))
         words[hc.FRAMES_READ] = last
         self._release_frames(until - self._origin if self._realtime else 2**63)
         first, last = int(words[hc.ROWS_READ]), int(words[hc.ROWS])
-        for row in _read_ring(buffers.rows, first, last):
+        values = _read_ring(buffers.values, first, last)
+        for row, said in zip(_read_ring(buffers.rows, first, last), values, strict=True):
             words[hc.ROWS_READ] += 1
-            self._take_row(row)
+            self._take_row(row, dict(zip(self._values.names, said, strict=True)))
 
     def _take_frame(self, t_ns: int, cob_id: int, data: bytes, is_sent: bool) -> None:
         frame = Frame(t_ns, cob_id, data)
-        if cob_id in (codec.SYNC, codec.COMMAND) and not is_sent:
+        if cob_id in self._ours and not is_sent:
             self._receive_service(frame)  # the master reports a second rig
         else:
             self._frames.append((t_ns, frame if self._realtime else Frame(self._t_ns, cob_id, data)))
 
     def _receive_service(self, frame: Frame) -> None:
         self._came_at = frame.t_ns
-        self._reported |= frame.cob_id == _PLANT_EMCY
+        self._reported |= frame.cob_id == self._plant_emcy
         try:
             self._receive(frame)
         finally:
@@ -333,19 +395,22 @@ class HardLoop(Loop):
             self._write_frame(Frame(self._last_t_ns, frame.cob_id, frame.data))
         del self._frames[:count]
 
-    def _take_row(self, row: list[int]) -> None:
+    def _take_row(self, row: list[int], said: dict[str, float]) -> None:
+        self.outputs = said
+        if not row[hc.IS_COUNTED]:
+            return
         step = self._inputs[row[hc.INPUT] % len(self._inputs)]
         phase = self._idle_phase if row[hc.INPUT_HELD] and self._idle_phase else step.phase
         came = row[hc.ANSWERS]
-        has_xj, has_xs, has_cor = came & hc.FEEDBACK_CAME, came & hc.VALVE_CAME, came & hc.DRIVE_CAME
+        has_xj, has_xs, has_cor = came & packing.FEEDBACK, came & packing.VALVE, came & packing.DRIVE
         signals = Signals(
-            row[hc.CYCLE], phase, codec.position(codec.raw_position(step.demand)),
-            codec.position(row[hc.XJ]) if has_xj else nan, codec.current(row[hc.COR]) if has_cor else nan,
-            codec.pressure(row[hc.P12]) if has_xj else nan, codec.spool(row[hc.XS]) if has_xs else nan,
-            step.load, row[hc.WORD], row[hc.STATUS] if has_cor else 0, row[hc.FLAGS] if has_xs else 0)
+            row[hc.CYCLE], phase, said["position_demand"], said["ram_position"] if has_xj else nan,
+            said["current"] if has_cor else nan, said["load_pressure"] if has_xj else nan,
+            said["spool_position"] if has_xs else nan, step.load, int(said["control_word"]),
+            int(said["status_word"]) if has_cor else 0, int(said["flags"]) if has_xs else 0)
         timing = Timing(
             row[hc.CYCLE], bool(row[hc.OVERRUN]), row[hc.LATENESS] * 1e-9 if self._realtime else 0.0,
-            row[hc.DRIVE_AT] * 1e-9 if has_cor else nan, row[hc.COMPLETE_AT] * 1e-9 if came == hc.ALL_CAME else nan,
+            row[hc.DRIVE_AT] * 1e-9 if has_cor else nan, row[hc.COMPLETE_AT] * 1e-9 if row[hc.COMPLETE_AT] else nan,
             row[hc.FEEDBACK_AT] * 1e-9 if has_xj else nan, row[hc.VALVE_AT] * 1e-9 if has_xs else nan,
             row[hc.EXECUTION] * 1e-9)
         if self._realtime:
@@ -360,7 +425,7 @@ class HardLoop(Loop):
             self._log.cycle(*pending)
 
 
-def _read_ring(ring: np.ndarray, first: int, last: int) -> list[list[int]]:
+def _read_ring(ring: np.ndarray, first: int, last: int) -> list[list[Any]]:
     """Entries `first` to `last` - 1 of a ring."""
-    entries: list[list[int]] = ring[np.arange(first, last) % len(ring)].tolist()
+    entries: list[list[Any]] = ring[np.arange(first, last) % len(ring)].tolist()
     return entries

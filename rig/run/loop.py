@@ -12,26 +12,24 @@ import heapq
 from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable
-from math import nan
-from typing import Any, NamedTuple, Protocol
+from math import isnan, nan
+from typing import Protocol
 
 import numpy as np
 
 from plant.segments import Array
-from rig.network import codec
+from rig.benches.bench import Bench, Flags
+from rig.benches.frame_map import FrameSpec, Role, check_guards, make_reader, make_writer
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
 from rig.network.master import Master
+from rig.nodes.faulty_plant import DIVERGED, FaultyPlant
+from rig.nodes.scenario import Scenario
 from rig.recorder import Signals, Timing
-from rig.sequences.faults import DELAY, DROP, Schedule, apply_action
+from rig.run.cyclic_values import CycleInput, CyclicValues
+from rig.sequences.faults import DELAY, DROP, NORMAL, SENT_NORMALLY, Action, Schedule, apply_action
 
-_ANSWERS: dict[int, tuple[int, Callable[[bytes], tuple[Any, ...]], str, str, str, bool]] = {
-    # COB-ID: bit, decoder, two fields of the row, field of the timing, whether it carries the number of its cycle
-    codec.FEEDBACK: (1, codec.unpack_feedback, "xj", "p12", "feedback_response", False),
-    codec.VALVE_STATE: (2, codec.unpack_valve_state, "xs", "flags", "valve_response", True),
-    codec.DRIVE: (4, codec.unpack_drive, "cor", "status", "response", True),
-}
-_ALL = 7  # answers have come
+_RESPONSES = {"feedback": "feedback_response", "valve_state": "valve_response", "drive": "response"}  # of the timing
 
 
 class CycleObserver(Protocol):
@@ -41,20 +39,13 @@ class CycleObserver(Protocol):
         """A cycle is over."""
 
 
-class CycleInput(NamedTuple):
-    """Inputs of one cycle."""
-
-    phase: int  # 0 set-up, 1 main, 2 clean-up
-    demand: float  # m
-    load: float  # N, force on the ram from the scenario
-    control: int  # control word
-
-
 class Loop(ABC):
     """What the session needs of a cycle loop. One that queues its inputs runs behind them and overrides more."""
 
     kind: str  # "soft" or "hard" real time
     scheduler = ""  # how the kernel schedules the thread of the cycle, if it has one of its own
+    problem = ""  # why the plant cannot go on
+    outputs: dict[str, float]  # the last values of the bench that are known; `CyclicValues` has the names
 
     @property
     @abstractmethod
@@ -103,23 +94,55 @@ class Loop(ABC):
         """Give back what the loop holds, whatever happened."""
 
 
+class _Answer:
+    """A frame that comes in: what it says, and the last one of it."""
+
+    def __init__(self, spec: FrameSpec) -> None:
+        self.spec, self.read, self.roles = spec, make_reader(spec), set(spec.roles)
+        if not spec.has("current"):
+            self.roles.discard("drive")
+        self.cycle_mask = max(((1 << each.length) - 1 for each in spec.fields if each.name == "cycle"), default=0)
+        self.is_guarded = any(each.guard for each in spec.fields)
+        self.last = -1  # the cycle in which it came
+        self.counter = -1  # its last alive counter
+
+    def is_sound(self, data: bytes) -> bool:
+        """Whether its alive counter and checksum let it be taken."""
+        if not self.is_guarded:
+            return True
+        problem, self.counter = check_guards(self.spec, data, self.counter)
+        return problem in ("", "jump")
+
+
 class CycleLoop(Loop):
     """Runs cycles one by one and passes each to `log` when it is complete. In real time it is soft: Python is in it."""
 
     kind = "soft"
     k = overruns = underruns = 0
 
-    def __init__(self, master: Master, faults: Schedule, log: CycleObserver, period_ns: int, realtime: bool) -> None:
+    def __init__(self, master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver,
+                 realtime: bool) -> None:
         self._master, self._wire = master, master.wire
-        self._faults, self._log, self._period, self._realtime = faults, log, period_ns, realtime
+        self._faults, self._log, self._period, self._realtime = faults, log, bench.cycle_ns, realtime
+        self._values, self._bench = CyclicValues(bench), bench
+        self._mine = [(each, make_writer(each), make_reader(each)) for each in bench.frames.list_from(Role.RIG)]
+        self._sent = dict.fromkeys((each for each, _, _ in self._mine), 0)
+        self._answers = {each: _Answer(each) for each in bench.frames.frames if each.sender is not Role.RIG}
+        self._plant = None if bench.has_plant_node else FaultyPlant(scenario)
+        self.outputs = dict.fromkeys(self._values.names, 0.0)
         self._open: tuple[int, Signals, Timing] | None = None  # the cycle under way
-        self._seen = 0
+        self._step = CycleInput(0, 0.0, 0.0, 0)  # its inputs
+        self._came: set[str] = set()  # roles of the frames that have come
+        self._awaited: set[FrameSpec] = set()  # frames that are sure to come
+        self._begun = 0  # cycles in which answers were expected, those that do not count among them
+        self._missed = 0  # drive frames in a row
+        self._is_late = False  # a drive frame has come that answers an earlier cycle
         self._wall = WallClock()
-        self._t_ns = self._wire.clock.now() + period_ns  # when the cycle under way, or to come, is due
+        self._t_ns = self._wire.clock.now() + self._period  # when the cycle under way, or to come, is due
         self._sync = 0
-        self._held: list[tuple[int, int, bytes]] = []  # late commands: due, cycle, frame
-        self._demand = 0.0  # m, of the last cycle
-        master.hooks.on_cyclic.update(dict.fromkeys(_ANSWERS, self._take_answer))
+        self._held: list[tuple[int, int, int, bytes]] = []  # late frames: due, order, identifier, payload
+        self._order = 0
+        master.hooks.on_cyclic.update({each.identifier: self._receive_answer for each in self._answers})
 
     def now(self) -> int:
         """See `Loop`."""
@@ -127,30 +150,41 @@ class CycleLoop(Loop):
 
     def hold(self, phase: int) -> float:
         """See `Loop`; the next cycle follows at once."""
-        return self._demand
+        return self._step.demand
 
     def cycle(self, step: CycleInput) -> None:
         """One cycle; the cycle before, which it closes, goes to the log."""
         lateness = self._wait_until_due()
         self._close()
-        self._demand = step.demand
+        self._step = step
         master, k = self._master, self.k
         began = self._wall.now()
-        row = Signals(k, step.phase, codec.position(codec.raw_position(step.demand)), nan, nan, nan, nan,
-                      step.load, step.control, 0, 0)
+        self.outputs.update(zip(self._values.given, self._values.list_given(step), strict=True))
+        if self._plant is not None:
+            self._read_plant(self._plant, k)
         is_overrun = 2 * lateness > self._period  # it leaves the controller too little of the cycle to answer in
         timing = Timing(k, is_overrun, lateness * 1e-9, nan, nan)
-        self._open, self._seen = (self._t_ns, row, timing), 0
         master.silent = not self._faults.is_heartbeat_alive("rig", k)
         master.is_deaf = self._faults.is_bus_off("rig", k)
-        self._command(codec.pack_command(step.demand, step.control, k))
+        self._send_frames(is_before_sync=True)
         delay = self._send_sync()
+        if self._plant is not None:
+            self.outputs["flags"] = self._judge_drive(self._plant)
+        row = Signals(k, step.phase, self.outputs["position_demand"], nan, nan, nan, nan, step.load, step.control, 0, 0)
+        self._open = self._t_ns, row, timing
+        self._expect_answers(delay is not None)
+        self._send_frames(is_before_sync=False)
+        if self._plant is not None:
+            row.xj, row.p12, row.xs, row.flags = self._list_readings()
+            timing.feedback_response = timing.valve_response = 0.0
+            if step.is_counted and not self.problem:
+                self._plant.move(k)
         timing.execution = (self._wall.now() - began) * 1e-9
         if not self._realtime:
             self._wait_for_answers(delay)
-            self._send_held(self._t_ns + self._period)
+            self._release_held(self._t_ns + self._period)
         master.tick()
-        self.k += 1
+        self.k += step.is_counted
         self._t_ns += self._period
 
     def finish(self) -> None:
@@ -165,7 +199,7 @@ class CycleLoop(Loop):
         while self._held and self._held[0][0] < self._t_ns:
             due = self._held[0][0]
             self._wire.run_until(due)
-            self._send_held(due + 1)
+            self._release_held(due + 1)
         self._wire.run_until(self._t_ns)
         late = self._wire.clock.now() - self._t_ns
         lost = late // self._period
@@ -173,64 +207,172 @@ class CycleLoop(Loop):
         self._t_ns += lost * self._period
         return late
 
+    # ------------------------------------------------------------------------------------ the rig's own plant
+
+    def _read_plant(self, plant: FaultyPlant, k: int) -> None:
+        """The readings of the cycle to come; before the run begins the first ones stay."""
+        if self.problem or (not self._step.is_counted and self._begun):
+            return
+        readings = plant.read(k)
+        if readings is None:
+            self.problem = DIVERGED
+            return
+        self.outputs.update(zip(("ram_position", "load_pressure", "spool_position"), readings, strict=True))
+
+    def _judge_drive(self, plant: FaultyPlant) -> int:
+        """Flags of this cycle, and the current until the next one: see hard_cycle.py."""
+        if not self._begun:
+            return 0
+        if "drive" in self._came:
+            plant.current, self._missed = self.outputs["current"], 0
+            return 0
+        self._missed += 1
+        flags = int(Flags.DRIVE_LATE if self._is_late else Flags.DRIVE_MISSING)
+        if self._missed >= self._bench.most_missed:
+            plant.current = 0.0
+            flags |= int(Flags.CURRENT_ZEROED)
+        return flags
+
+    def _list_readings(self) -> tuple[float, float, float, int]:
+        values = self.outputs
+        return values["ram_position"], values["load_pressure"], values["spool_position"], int(values["flags"])
+
+    # ------------------------------------------------------------------------------------ frames out
+
     def _send_sync(self) -> int | None:
         """Send SYNC; returns how late a fault makes it, ns, or None where it is lost."""
-        action = self._faults.find_action("sync", self.k)
+        identifier, action = self._bench.frames.sync, self._faults.find_action("sync", self.k)
         delay = action.argument if action.code == DELAY else 0
         if delay and self._realtime:
             self._wire.run_until(self._t_ns + delay)
         self._sync = self._wire.clock.now() if self._realtime else self._wall.now()
+        if identifier is None:
+            return delay
         for _ in apply_action(action, b""):
-            self._master.send(codec.SYNC, b"")
+            self._master.send(identifier, b"")
         return None if action.code == DROP else delay
 
+    def _send_frames(self, *, is_before_sync: bool) -> None:
+        """Send the frames of this cycle that go before SYNC, or those that follow it."""
+        for spec, write, read in self._mine:
+            if spec.is_before_sync is is_before_sync and self.k % spec.every == 0:
+                data = write(self.outputs, self.k, self._sent[spec])
+                self._sent[spec] += 1
+                self.outputs.update(read(data))  # what the receiver will read
+                action = self._find_fault(spec)
+                if action.code == DELAY:
+                    self._hold(self._t_ns + action.argument, spec.identifier, data)
+                    continue
+                for what in apply_action(action, data):
+                    self._master.send(spec.identifier, what)
+
+    def _find_fault(self, spec: FrameSpec) -> Action:
+        """What a fault does to a frame that the rig sends: to the command, or to the feedback of its own plant."""
+        action = self._faults.find_action("command", self.k) if "command" in spec.roles else NORMAL
+        if action.code == SENT_NORMALLY and self._plant is not None and "feedback" in spec.roles:
+            return self._faults.find_action("feedback", self.k)
+        return action
+
+    def _hold(self, due: int, identifier: int, data: bytes) -> None:
+        self._order += 1
+        heapq.heappush(self._held, (due, self._order, identifier, data))
+
+    def _release_held(self, before_ns: int) -> None:
+        """Late frames whose time has come; those of the controller are taken in now."""
+        while self._held and self._held[0][0] < before_ns:
+            _, _, identifier, data = heapq.heappop(self._held)
+            spec = self._bench.frames.find(identifier, data)
+            if spec in self._answers:
+                self._take_answer(self._answers[spec], data, self._wire.clock.now())
+            else:
+                self._master.send(identifier, data)
+
+    # ------------------------------------------------------------------------------------ frames in
+
+    def _expect_answers(self, is_synced: bool) -> None:
+        """Which answers are sure to come in this cycle, and which values of earlier frames still count."""
+        self._came, self._awaited, self._is_late = set(), set(), False
+        if self._plant is not None:
+            self._came |= {"feedback", "valve_state"}
+        if not is_synced:
+            return
+        # without a SYNC the controller has its own clock: its frame may slip from one cycle of the rig to the next
+        slack = int(self._bench.frames.sync is None and self._realtime)
+        for spec, answer in self._answers.items():
+            age = self._begun - answer.last
+            if answer.last >= 0 and age < spec.every + (slack if spec.is_answer else self._bench.most_missed):
+                self._came |= answer.roles
+            elif spec.is_answer and age >= spec.every:
+                self._awaited.add(spec)
+        self._begun += 1
+
     def _wait_for_answers(self, delay: int | None) -> None:
-        """Lockstep: let the answers come in; without a SYNC there are none, and a cycle's time passes."""
-        if delay is None:
+        """Lockstep: let the answers come in; where none is sure to come, a cycle's time passes."""
+        if delay is None or not self._awaited:
             self._wire.run_until(self._wire.clock.now() + self._period)
         else:
-            self._wire.wait_for_answers(self._t_ns + delay, lambda: self._seen == _ALL)
+            self._wire.wait_for_answers(self._t_ns + delay, lambda: not self._awaited)
 
-    def _command(self, data: bytes) -> None:
-        action = self._faults.find_action("command", self.k)
-        if action.code == DELAY:
-            heapq.heappush(self._held, (self._t_ns + action.argument, self.k, data))
+    def _receive_answer(self, frame: Frame) -> None:
+        """A frame of the controller, or of the plant, has come."""
+        spec = self._bench.frames.find(frame.cob_id, frame.data)
+        if self._open is None or spec not in self._answers:
             return
-        for what in apply_action(action, data):
-            self._master.send(codec.COMMAND, what)
+        answer = self._answers[spec]
+        if self._plant is None or "drive" not in answer.roles:
+            self._take_answer(answer, frame.data, frame.t_ns)
+            return
+        action = self._faults.find_action("drive", self._open[1].cycle)
+        if self._faults.is_bus_off("plant", self._open[1].cycle):
+            return
+        if action.code == DELAY:
+            self._hold((frame.t_ns if self._realtime else self._t_ns) + action.argument, frame.cob_id, frame.data)
+            return
+        for data in apply_action(action, frame.data):
+            self._take_answer(answer, data, frame.t_ns)
 
-    def _send_held(self, before_ns: int) -> None:
-        """Late commands whose time has come."""
-        while self._held and self._held[0][0] < before_ns:
-            self._master.send(codec.COMMAND, heapq.heappop(self._held)[2])
-
-    def _take_answer(self, frame: Frame) -> None:
-        """Put an answer into the row under way: the first feedback, and of the others the last of this cycle."""
-        if self._open is None or len(frame.data) != 8:
+    def _take_answer(self, answer: _Answer, data: bytes, t_ns: int) -> None:
+        """Take the values of an answer: the first feedback, and of the others the last of this cycle."""
+        if self._open is None or len(data) != answer.spec.length:
             return
         _, row, timing = self._open
-        bit, decode, first, second, response, is_numbered = _ANSWERS[frame.cob_id]
-        values, seen = decode(frame.data), self._seen
-        is_first = not seen & bit
-        if values[2] != row.cycle & 0xFFFF if is_numbered else not is_first:
+        is_first = answer.last != self._begun - 1
+        if not (answer.cycle_mask or is_first or "drive" in answer.roles) or not answer.is_sound(data):
             return
-        setattr(row, first, values[0])
-        setattr(row, second, values[1])
-        self._seen = seen | bit
+        values = answer.read(data)
+        if answer.cycle_mask and values["cycle"] != row.cycle & answer.cycle_mask:
+            self._is_late |= "drive" in answer.roles
+            return
+        self.outputs.update(values)
+        answer.last = self._begun - 1
+        self._came |= answer.roles
+        self._awaited.discard(answer.spec)
         if is_first:
-            setattr(timing, response, self._since_sync(frame))
-            if self._seen == _ALL:
-                timing.work = self._since_sync(frame)
+            since = self._since_sync(t_ns)
+            for role in answer.roles & _RESPONSES.keys():
+                setattr(timing, _RESPONSES[role], since)
+            if not self._awaited and isnan(timing.work):
+                timing.work = since
 
-    def _since_sync(self, frame: Frame) -> float:
+    def _since_sync(self, t_ns: int) -> float:
         """Seconds from SYNC to a frame, by its time of reception; in lockstep, where that is virtual, to now."""
-        return ((frame.t_ns if self._realtime else self._wall.now()) - self._sync) * 1e-9
+        return ((t_ns if self._realtime else self._wall.now()) - self._sync) * 1e-9
 
     def _close(self) -> None:
         """The cycle under way is over: the next SYNC is due."""
-        if self._open is not None:
-            complete, self._open = self._open, None
-            self._log.cycle(*complete)
+        if self._open is None:
+            return
+        (t_ns, row, timing), self._open = self._open, None
+        if not self._step.is_counted:
+            return
+        values = self.outputs
+        if self._plant is None and "feedback" in self._came:
+            row.xj, row.p12 = values["ram_position"], values["load_pressure"]
+        if self._plant is None and "valve_state" in self._came:
+            row.xs, row.flags = values["spool_position"], int(values["flags"])
+        if "drive" in self._came:
+            row.cor, row.status = values["current"], int(values["status_word"])
+        self._log.cycle(t_ns, row, timing)
 
 
 _FIELDS = ("phase", "com", "xj", "cor", "p12", "xs", "load", "flags", "lateness", "response",

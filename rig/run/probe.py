@@ -14,7 +14,8 @@ import numpy as np
 
 from plant.segments import RATE
 from rig.network.codec import Control
-from rig.run.loop import CycleInput, History
+from rig.run.cyclic_values import CycleInput
+from rig.run.loop import History
 from rig.sequences.faults import Schedule
 from rig.sequences.protocol import Mask, Rows
 

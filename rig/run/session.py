@@ -17,19 +17,21 @@ import numpy as np
 from fdi.progress import Progress
 from plant.profile import Profile, build_profile
 from plant.segments import RATE, Hold
+from rig.benches.profiles import PROFILES, State
 from rig.network import codec
-from rig.network.codec import Control
 from rig.network.frame import Frame
 from rig.network.link import EmbeddedWire
 from rig.network.master import HEARTBEAT, Master
-from rig.network.node_objects import NAMES, PLANT, CycleRecord, NmtState
+from rig.network.node_objects import CONTROLLER, NAMES, PLANT, CycleRecord, NmtState
 from rig.nodes.scenario import FORCE_RESOLUTION
 from rig.recorder import Recorder, Signals, Timing
 from rig.run.attribution import Mask, find_injected
 from rig.run.bring_up import BringUp
+from rig.run.cyclic_values import CycleInput
+from rig.run.enabling import Enabling
 from rig.run.hard_loop import open_loop
 from rig.run.job import Job
-from rig.run.loop import CycleInput, History
+from rig.run.loop import History
 from rig.run.participants import Participants, find_firmware_parameters
 from rig.run.probe import (
     AFTER,
@@ -49,7 +51,6 @@ from rig.sequences.protocol import ProtocolRecord, Rows
 SETUP, MAIN, CLEANUP = 0, 1, 2
 PHASES = ("setup", "main", "cleanup")
 _SETTLING = 20  # cycles of clean-up that nodes started again have to get rid of their errors
-_ENABLING_STEPS = (Control.DISABLE, Control.DISABLE | Control.HOLD)  # one cycle each on the way to ACTIVE
 _MOST_DRIVES = 2_000_000  # half an hour; a longer run is judged on what was kept
 
 
@@ -139,6 +140,7 @@ class Session:
         self._may_power = True  # it may still use it when errors have gone meanwhile
         self._reset_at = 0  # the cycle of clean-up whose control word resets the faults
         self._demand = 0.0  # m, of the last cycle
+        self._words = PROFILES[job.bench.profile]
 
     def close(self) -> None:
         """Let go of the loop, and of the master and the wire, which report to this session.
@@ -162,8 +164,9 @@ class Session:
         if not self.safety.aborted:
             self.starter.start_nodes(self.scenario, is_run=True)
         self._master.wire.hear_all()
-        self.stage.loop = open_loop(self._master, self._faults, self.log, self.job.bus, self.job.period_ns,
+        self.stage.loop = open_loop(self._master, self.job.bench, self.scenario, self._faults, self.log, self.job.bus,
                                     self.job.realtime)
+        self._enabling = Enabling(self.job.bench, self.stage.loop, self.job.realtime, self._must_end)
         self.nodes.begin()
         self.stage.begun_ns, self.stage.is_playing = self.stage.clock.now(), True
         self._stalled_ns = self._master.wire.stalled_ns
@@ -172,7 +175,7 @@ class Session:
         """Run set-up, main and clean-up. Whatever is raised, clean-up runs and the nodes are stopped."""
         loop = self.stage.playing
         try:
-            if not self.safety.aborted and self._run(SETUP, self._setup) and self._run(MAIN, self._main):
+            if self._enable() and self._run(SETUP, self._setup) and self._await_ready() and self._run(MAIN, self._main):
                 loop.wait_until_played(self._must_end)
         finally:
             try:
@@ -193,6 +196,25 @@ class Session:
                 for failure in self._master.restore(self.nodes.gone):
                     self.journal.log("WARN", "restore", failure)
                 self.journal.log("INFO", "phase", "end")
+
+    def _enable(self) -> bool:
+        """Enable a controller that confirms each step; False when the run is to end."""
+        demand = float(self._setup.command[0]) if len(self._setup.command) else 0.0
+        return self._go_on(self._enabling.enable(demand))
+
+    def _await_ready(self) -> bool:
+        """Between set-up and main: wait until the controller says that it is ready; False when the run is to end."""
+        if not self.job.bench.ready:
+            return True
+        self.stage.playing.wait_until_played(self._must_end)
+        return self._go_on(self._enabling.await_ready(self._demand, self._choose_control_word(MAIN, 0)))
+
+    def _go_on(self, problem: str) -> bool:
+        """End the run because of a problem; whether it goes on."""
+        if problem and not self.safety.aborted:
+            self.safety.note("ready", problem, CONTROLLER)
+            self.safety.abort("ready", problem)
+        return not self.safety.aborted
 
     def _run(self, phase: int, profile: Profile) -> bool:
         """The cycles of one phase; False when it was ended early."""
@@ -218,6 +240,9 @@ class Session:
         """Before each cycle of set-up and main: whether something ends main."""
         self._inject_faults()
         self.nodes.is_node_gone()
+        if self.stage.playing.problem and not self.safety.aborted:
+            self.safety.note("plant", self.stage.playing.problem, PLANT)
+            self.safety.abort("plant", self.stage.playing.problem)
         if self._overruns.problem and not self.safety.aborted:
             self.safety.abort("overrun", self._overruns.problem)
         if self._stop() and not self.safety.aborted:
@@ -253,10 +278,14 @@ class Session:
         """Control word of the phase's cycle `i`."""
         if self.safety.is_safe if phase != CLEANUP else not self._powered:
             return 0
+        words = self._words
         if phase == CLEANUP and self.safety.is_safe and i == self._reset_at:
-            return int(Control.RESET)
-        started = self.stage.playing.queued  # without set-up main is where it is enabled
-        return int(_ENABLING_STEPS[started]) if started < len(_ENABLING_STEPS) else int(Control.ACTIVE)
+            return words.reset
+        if self.job.bench.profile == "none" and not self.job.bench.is_enabled(PHASES[phase]):
+            return words.ladder[State.READY]
+        # without set-up main is where it is enabled; one cycle each on the way to ACTIVE where nothing is confirmed
+        started = State.ACTIVE if words.is_confirmed else self.stage.playing.queued + 1
+        return words.ladder[min(started, State.ACTIVE)]
 
     def _discard_queue(self) -> None:
         """Discard the cycles that are queued, and their events; clean-up begins with the demand of the last one."""

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import groupby, pairwise
 from math import isnan
 
@@ -17,6 +18,7 @@ import pytest
 from bus_stations import spec
 from numba.core.event import install_recorder
 
+from plant import Model
 from plant.errors import RigError
 from rig.benches.bench_file import load_bench
 from rig.network import codec
@@ -27,9 +29,10 @@ from rig.network.link import Link, LinkWire
 from rig.network.master import Master
 from rig.network.raw_bus import open_raw_bus
 from rig.network.udp import PORT, Turn
+from rig.nodes.scenario import Scenario
 from rig.recorder import Signals, Timing
-from rig.run.hard_loop import RECEIVED, HardLoop, compile_cycle
-from rig.run.loop import CycleInput
+from rig.run.cyclic_values import CycleInput
+from rig.run.hard_loop import HardLoop, compile_cycle, list_cyclic_frames
 from rig.sequences.faults import (
     BusOff,
     Corrupted,
@@ -114,8 +117,9 @@ class Bench:
         self.master = Master(self.wire, lambda: self.loop.now(), realtime, load_bench())
         self.master.hooks.on_frame = self.frames.append
         schedule = Schedule(Plan(faults=faults, stop=1000))
-        bus = open_raw_bus(where, RECEIVED)
-        self.loop = HardLoop(self.master, schedule, self, bus, PERIOD, realtime, ahead)
+        bench = replace(load_bench(), cycle_ns=PERIOD)
+        bus = open_raw_bus(where, list_cyclic_frames(bench))
+        self.loop = HardLoop(self.master, bench, Scenario(Model(), Plan(stop=0)), schedule, self, bus, realtime, ahead)
         self._markers = 0
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:

@@ -6,14 +6,17 @@ from math import isnan
 
 import pytest
 
+from plant import Model
 from rig.benches.bench_file import load_bench
 from rig.network import codec
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame
 from rig.network.link import Link, LinkWire
 from rig.network.master import Master
+from rig.nodes.scenario import Scenario
 from rig.recorder import Signals, Timing
-from rig.run.loop import CycleInput, CycleLoop
+from rig.run.cyclic_values import CycleInput
+from rig.run.loop import CycleLoop
 from rig.sequences.faults import Fault, Late, Lost, Plan, Schedule, Silent
 
 MS = 1_000_000  # ns
@@ -82,7 +85,8 @@ class Book:
 def loop(bench: Bench, *faults: Fault, realtime: bool = True) -> tuple[CycleLoop, Book]:
     book = Book()
     schedule = Schedule(Plan(faults=faults, stop=1000))
-    return CycleLoop(Master(bench, bench.clock.now, False, load_bench()), schedule, book, MS, realtime), book
+    master, scenario = Master(bench, bench.clock.now, False, load_bench()), Scenario(Model(), Plan(stop=0))
+    return CycleLoop(master, load_bench(), scenario, schedule, book, realtime), book
 
 
 def run(one: CycleLoop, cycles: int) -> None:

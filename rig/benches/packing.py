@@ -1,0 +1,358 @@
+"""Payloads of mapped frames as compiled code: the tables of a `FrameMap`, and what packs and unpacks with them.
+
+One block of memory, `Layout`, holds the tables, the values and one payload of at most 64 bytes. A loop writes `values`
+(doubles from VALUES on, one a channel), packs a frame into the payload and sends it; a frame that came is put into the
+payload and unpacked into `values`. Nothing is allocated. frame_map.py does the same in Python.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.compile import ForeignCall, compile_function, keep_apart
+from plant.errors import InputError
+from plant.machine_code import find_function_address
+from rig.benches.checksums import CHECKSUMS, find_user_checksum
+from rig.benches.frame_map import Field, FrameSpec, Guard, Kind, Role
+
+# Words of the layout: a scratch word, the payload, then counts and places of the tables
+_SCRATCH, PAYLOAD = 0, 8
+FRAMES, _FIELDS_AT, CHANNELS = 16, 17, 18
+VALUES_AT = 19  # where the values begin
+FRAMES_AT = 24
+# Columns of a frame. Of the loop: how many were sent, or the last alive counter; how many came wrong; the last cycle
+# in which one was taken, -1 before
+(IDENTIFIER, LENGTH, EVERY, IS_MINE, IS_BEFORE_SYNC, IS_ANSWER, IS_NUMBERED, ROLES, _FIRST, _END, _SELECTOR, COUNT,
+ WRONG_COUNTERS, WRONG_CHECKSUMS, LAST_CYCLE) = range(15)
+FRAME_WORDS = 15
+# Roles of a frame, bits of ROLES; above them each frame has a bit of its own
+COMMAND, FEEDBACK, VALVE, DRIVE = 1, 2, 4, 8
+ALL_ROLES = 0xFF
+_FIRST_OWN_BIT = 8
+MOST_FRAMES = 48
+# Columns of a field; the last five are doubles
+(_CHANNEL, _LOWEST, _BITS, _IS_BIG, _KIND, _RULE, _FIXED, _NUMERATOR, _DENOMINATOR, _OFFSET, _LOW, _HIGH) = range(12)
+_FIELD_WORDS = 12
+# A checksum has its numbers in place of count and range; its _FIXED is the address of a user's function, or 0
+_POLYNOMIAL, _START, _INVERSION, _DATA_ID, _DATA_IDS_AT = range(7, 12)
+_VALUE, _CONSTANT, _COUNTER, _CHECKSUM, _CYCLE = range(5)  # rules: what a field holds
+# What `unpack_frame` returns
+ACCEPTED, OTHER_LENGTH, WRONG_CHECKSUM, REPEATED, OTHER_CYCLE = range(5)
+
+_call_checksum = ForeignCall("i" + "qq" + "qqqqqqq" + "q")
+_TWO_63 = 2.0**63
+_SIGNED, _FLOAT = int(Kind.SIGNED), int(Kind.FLOAT)
+
+
+class Layout(NamedTuple):
+    """One block of memory, seen as words, as doubles, as single floats and as bytes."""
+
+    words: NDArray[np.int64]
+    doubles: NDArray[np.float64]
+    singles: NDArray[np.float32]
+    octets: NDArray[np.uint8]
+
+
+@keep_apart
+def find_frame(m: Layout, identifier: int) -> int:
+    """The place of the frame in the payload among the tables; -1 for one that is not mapped."""
+    words = m.words
+    for number in range(words[FRAMES]):
+        at = FRAMES_AT + FRAME_WORDS * number
+        if words[at + IDENTIFIER] == identifier:
+            chosen = words[at + _SELECTOR]
+            if chosen < 0 or _read_bits(m, chosen) == words[chosen + _FIXED]:
+                return at
+    return -1
+
+
+@keep_apart
+def pack_frame(m: Layout, at: int, cycle: int) -> None:
+    """Write the payload of the frame at `at` from the values, which become what the receiver will read."""
+    words = m.words
+    for i in range(8):
+        words[PAYLOAD + i] = 0
+    checksum, number = -1, words[at + COUNT]
+    for field in range(words[at + _FIRST], words[at + _END], _FIELD_WORDS):
+        rule = words[field + _RULE]
+        if rule == _VALUE:
+            place = words[VALUES_AT] + words[field + _CHANNEL]
+            bits = _encode(m, field, m.doubles[place])
+            _write_bits(m, field, bits)
+            m.doubles[place] = _decode(m, field, bits)
+        elif rule == _CONSTANT:
+            _write_bits(m, field, words[field + _FIXED])
+        elif rule == _COUNTER:
+            number = words[at + COUNT] % words[field + _FIXED]
+            _write_bits(m, field, number)
+        elif rule == _CYCLE:
+            _write_bits(m, field, cycle)
+        else:
+            checksum = field
+    if checksum >= 0:
+        _write_bits(m, checksum, _compute_checksum(m, at, checksum, number))
+    words[at + COUNT] += 1
+
+
+@keep_apart
+def unpack_frame(m: Layout, at: int, length: int, cycle: int) -> int:
+    """Take the values of the frame at `at` from the payload: ACCEPTED, or why they are not taken.
+
+    A frame with the number of another cycle, a wrong checksum or the alive counter of the one before is not taken.
+    A counter that jumps is counted: the frames between may be lost on the bus.
+    """
+    words = m.words
+    if length != words[at + LENGTH]:
+        return OTHER_LENGTH
+    counter, checksum = -1, -1
+    for field in range(words[at + _FIRST], words[at + _END], _FIELD_WORDS):
+        rule = words[field + _RULE]
+        if rule == _CYCLE and _read_bits(m, field) != cycle & _find_mask(words[field + _BITS]):
+            return OTHER_CYCLE
+        if rule == _COUNTER:
+            counter = field
+        elif rule == _CHECKSUM:
+            checksum = field
+    number = 0
+    if counter >= 0:
+        number = _read_bits(m, counter)
+    if checksum >= 0:
+        said = _read_bits(m, checksum)
+        _write_bits(m, checksum, 0)
+        if said != _compute_checksum(m, at, checksum, number):
+            words[at + WRONG_CHECKSUMS] += 1
+            return WRONG_CHECKSUM
+    if counter >= 0:
+        last = words[at + COUNT]
+        words[at + COUNT] = number
+        if last >= 0 and number != (last + 1) % words[counter + _FIXED]:
+            words[at + WRONG_COUNTERS] += 1
+            if number == last:
+                return REPEATED
+    for field in range(words[at + _FIRST], words[at + _END], _FIELD_WORDS):
+        if words[field + _RULE] == _VALUE and words[field + _CHANNEL] >= 0:
+            m.doubles[words[VALUES_AT] + words[field + _CHANNEL]] = _decode(m, field, _read_bits(m, field))
+    return ACCEPTED
+
+
+def _find_mask(bits: int) -> int:
+    if bits == 64:
+        return -1
+    return (1 << bits) - 1
+
+
+def _integer(value: Any) -> int:
+    """A word as the integer that compiled code and Python calculate alike with."""
+    return int(np.int64(value))
+
+
+@keep_apart
+def _write_bits(m: Layout, field: int, bits: int) -> None:
+    """Put the lowest bits into the payload, a byte at a time."""
+    octets, place, left = m.octets, m.words[field + _LOWEST], m.words[field + _BITS]
+    while left > 0:
+        octet, shift = 8 * PAYLOAD + place // 8, place % 8
+        count = min(8 - shift, left)
+        mask = (1 << count) - 1
+        octets[octet] = _integer(octets[octet]) & ~(mask << shift) & 0xFF | (bits & mask) << shift
+        bits >>= count
+        left -= count
+        place = _find_next_byte(m, field, place)
+
+
+@keep_apart
+def _read_bits(m: Layout, field: int) -> int:
+    """The bits of a field as a number from 0; of 64 bits with the sign of a signed one."""
+    place, left = m.words[field + _LOWEST], m.words[field + _BITS]
+    bits, done = 0, 0
+    while left > 0:
+        shift = place % 8
+        count = min(8 - shift, left)
+        part = _integer(m.octets[8 * PAYLOAD + place // 8]) >> shift & (1 << count) - 1
+        if done + count == 64 and part >> count - 1:  # the sign, which Python's shift does not set
+            part -= 1 << count
+        bits |= part << done
+        done += count
+        left -= count
+        place = _find_next_byte(m, field, place)
+    return _integer(bits)
+
+
+def _find_next_byte(m: Layout, field: int, place: int) -> int:
+    """Where a field goes on above the byte of `place`: Intel in the byte after it, Motorola in the one before."""
+    if m.words[field + _IS_BIG]:
+        return (place // 8 - 1) * 8
+    return (place // 8 + 1) * 8
+
+
+@keep_apart
+def _encode(m: Layout, field: int, value: float) -> int:
+    """The bits of a value: see `frame_map.Field.encode`."""
+    words, doubles = m.words, m.doubles
+    counts = (value - doubles[field + _OFFSET]) * doubles[field + _DENOMINATOR] / doubles[field + _NUMERATOR]
+    if words[field + _KIND] == _FLOAT:
+        if words[field + _BITS] == 64:
+            doubles[_SCRATCH] = counts
+        else:
+            words[_SCRATCH] = 0
+            m.singles[2 * _SCRATCH] = counts
+        return _integer(words[_SCRATCH])
+    if counts >= doubles[field + _HIGH]:
+        return _find_mask(words[field + _BITS] - (words[field + _KIND] == _SIGNED))
+    counts = np.rint(max(counts, doubles[field + _LOW]))
+    if counts < _TWO_63:
+        return int(counts)
+    return int(counts - _TWO_63) - 0x7FFFFFFFFFFFFFFF - 1
+
+
+@keep_apart
+def _decode(m: Layout, field: int, bits: int) -> float:
+    """The value of bits: see `frame_map.Field.decode`."""
+    words, doubles, length = m.words, m.doubles, m.words[field + _BITS]
+    counts = 0.0
+    if words[field + _KIND] == _FLOAT:
+        words[_SCRATCH] = bits
+        if length == 64:
+            counts = doubles[_SCRATCH]
+        else:
+            counts = float(m.singles[2 * _SCRATCH])
+    elif words[field + _KIND] == _SIGNED:
+        if length < 64 and bits >> length - 1 & 1:
+            bits = (bits & _find_mask(length)) - (1 << length)
+        counts = float(bits)
+    else:
+        counts = float(bits & _find_mask(length))
+        if counts < 0.0:  # of 64 bits
+            counts += 2.0 * _TWO_63
+    value: float = counts * doubles[field + _NUMERATOR] / doubles[field + _DENOMINATOR] + doubles[field + _OFFSET]
+    return value
+
+
+def _compute_checksum(m: Layout, at: int, field: int, counter: int) -> int:
+    """The checksum over the payload, in which its own bits are 0: see checksums.py."""
+    words, base = m.words, m.words.ctypes.data
+    length = words[at + LENGTH]
+    if words[field + _FIXED]:
+        _call_checksum(words[field + _FIXED], base + 8 * _SCRATCH, base + 8 * (_SCRATCH + 1),
+                       0, 0, length, 1, base + 8 * PAYLOAD, length, 1, counter)
+        return _integer(words[_SCRATCH]) & _find_mask(words[field + _BITS])
+    crc, polynomial, own = words[field + _START], words[field + _POLYNOMIAL], words[field + _LOWEST] // 8
+    if words[field + _DATA_ID] >= 0:
+        crc = _add_byte(crc, words[field + _DATA_ID] & 0xFF, polynomial)
+        crc = _add_byte(crc, words[field + _DATA_ID] >> 8, polynomial)
+    for i in range(length):
+        if i != own:
+            crc = _add_byte(crc, _integer(m.octets[8 * PAYLOAD + i]), polynomial)
+    if words[field + _DATA_IDS_AT]:
+        ids = words[field + _DATA_IDS_AT]
+        crc = _add_byte(crc, words[ids + 1 + counter % words[ids]], polynomial)
+    return _integer(crc ^ words[field + _INVERSION])
+
+
+def _add_byte(crc: int, byte: int, polynomial: int) -> int:
+    """The CRC-8 with one more byte, most significant bit first."""
+    crc ^= byte
+    for _ in range(8):
+        crc = (crc << 1 ^ polynomial) & 0xFF if crc & 0x80 else crc << 1
+    return crc
+
+
+# ---------------------------------------------------------------------------------------- made before the start
+
+
+def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], mine: Role) -> Layout:
+    """The tables of these frames for a loop that sends those of `mine` and receives the others.
+
+    Args:
+        frames: in the order in which they are sent.
+        channels: names of the values; what is not among them is skipped in frames that come.
+        mine: who sends.
+    """
+    width = FRAMES_AT + FRAME_WORDS * len(frames)
+    count = sum(len(each.fields) for each in frames)
+    values = width + _FIELD_WORDS * count
+    data_ids = [one for each in frames for one in each.fields if one.data_ids]
+    words = np.zeros(values + len(channels) + sum(1 + len(one.data_ids) for one in data_ids), np.int64)
+    m = Layout(words, words.view(np.float64), words.view(np.float32), words.view(np.uint8))
+    words[FRAMES], words[_FIELDS_AT], words[CHANNELS] = len(frames), width, len(channels)
+    words[VALUES_AT], ids = values, values + len(channels)
+    places = {name: i for i, name in enumerate(channels)}
+    at, field = FRAMES_AT, width
+    for number, each in enumerate(frames):
+        is_mine = each.sender is mine
+        rules = [_find_rule(one) for one in each.fields]
+        words[at: at + FRAME_WORDS] = (
+            each.identifier, each.length, each.every, is_mine, each.is_before_sync, each.is_answer, _CYCLE in rules,
+            _find_roles(each) | 1 << _FIRST_OWN_BIT + number, field, field + _FIELD_WORDS * len(each.fields), -1,
+            0 if is_mine else -1, 0, 0, -1)
+        for one, rule in zip(each.fields, rules, strict=True):
+            if one is each.selector:
+                words[at + _SELECTOR] = field
+            _fill_field(m, field, one, rule, places.get(one.name, -1))
+            if rule == _CHECKSUM and one.data_ids:
+                words[field + _DATA_IDS_AT] = ids
+                words[ids: ids + 1 + len(one.data_ids)] = len(one.data_ids), *one.data_ids
+                ids += 1 + len(one.data_ids)
+            field += _FIELD_WORDS
+        at += FRAME_WORDS
+    return m
+
+
+def list_frame_places(m: Layout) -> range:
+    """Where the frames of a layout stand, in order."""
+    return range(FRAMES_AT, FRAMES_AT + FRAME_WORDS * int(m.words[FRAMES]), FRAME_WORDS)
+
+
+def _find_roles(frame: FrameSpec) -> int:
+    """Bits of the roles that faults and rows know; of the controller's frames the drive is the one with its output."""
+    bits = {"command": COMMAND, "feedback": FEEDBACK, "valve_state": VALVE, "drive": DRIVE}
+    is_drive = frame.has("current")
+    return sum(bits[role] for role in frame.roles if role != "drive" or is_drive)
+
+
+def _find_rule(field: Field) -> int:
+    if field.fixed is not None:
+        return _CONSTANT
+    if field.name == "cycle":
+        return _CYCLE
+    return {Guard.NONE: _VALUE, Guard.COUNTER: _COUNTER, Guard.CHECKSUM: _CHECKSUM}[field.guard]
+
+
+def _fill_field(m: Layout, at: int, field: Field, rule: int, channel: int) -> None:
+    fixed = field.modulus if rule == _COUNTER else field.fixed or 0
+    is_users = rule == _CHECKSUM and field.checksum not in CHECKSUMS
+    if is_users:
+        fixed = _find_address(field)
+    m.words[at: at + _NUMERATOR] = (channel, field.lowest, field.length, field.is_big_endian, field.kind, rule,
+                                    np.array(fixed, np.uint64).astype(np.int64))
+    if rule == _CHECKSUM and not is_users:
+        crc = CHECKSUMS[field.checksum]
+        m.words[at + _POLYNOMIAL: at + _FIELD_WORDS] = (
+            crc.polynomial, crc.start, crc.inversion, field.data_id if crc.has_data_id else -1, 0)
+    else:
+        m.doubles[at + _NUMERATOR: at + _FIELD_WORDS] = (field.count.numerator, field.count.denominator,
+                                                         float(field.offset), *field.range)
+
+
+_COMPILED: dict[str, Any] = {}  # kept: the loops call the code by its address
+
+
+def _find_address(field: Field) -> int:
+    """The compiled function of a user's checksum.
+
+    Raises:
+        InputError: it cannot be compiled.
+    """
+    if field.checksum not in _COMPILED:
+        run = compile_function(find_user_checksum(field.checksum))
+        try:
+            run(np.zeros(8, np.uint8), 0)
+        except Exception as error:  # whatever numba has against it
+            name, _, function = field.checksum.partition("#")[0].rpartition(":")
+            said = str(error).strip().splitlines()[0][:200]
+            raise InputError(name, function, f"a function that can be compiled ({said})") from error
+        _COMPILED[field.checksum] = run
+    return find_function_address(_COMPILED[field.checksum])

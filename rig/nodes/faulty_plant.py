@@ -1,0 +1,53 @@
+"""The plant of a run, cycle by cycle: the actuator with the faults and the load of its scenario. No bus, no clock."""
+from __future__ import annotations
+
+from math import isfinite
+
+from plant import Actuator
+from rig.nodes.scenario import Scenario, count_steps
+from rig.sequences.faults import Schedule
+
+DIVERGED = "the plant has diverged: a signal is not a finite number"
+_SIGNALS = ("xj", "p12", "xs")
+
+
+class FaultyPlant:
+    """What the emulator moves, or the rig itself where the plant is no node of its own."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """A plant at rest. Raises InputError for an effect that cannot be compiled: it is, now."""
+        self.faults = Schedule(scenario.plan, scenario.model.values)
+        self.current = 0.0  # A, in force until the next cycle
+        self._load = scenario.load()
+        self._plant = Actuator(scenario.model, scenario.seed, count_steps(scenario.model))
+        self._plant.warm()
+        self._changed = -1  # the last cycle whose parameters are in force
+
+    def read(self, k: int) -> tuple[float, float, float] | None:
+        """What the transducers say in cycle k: XJ m, P12 Pa, XS m; None when the plant has diverged.
+
+        Call it once a cycle: it draws the noise and puts the faults of this cycle in force.
+        """
+        self._change_parameters(k)
+        readings = self._plant.sample()
+        if not isfinite(sum(readings)):
+            return None
+        xj, p12, xs = (self.faults.change_signal(name, value, k)
+                       for name, value in zip(_SIGNALS, readings, strict=True))
+        return xj, p12, xs
+
+    def move(self, k: int) -> None:
+        """Advance by cycle k under its load and the current in force."""
+        self._plant.advance(self.current, self._load[k] if k < len(self._load) else 0.0)
+
+    def pass_unread(self, k: int) -> None:
+        """A cycle whose readings nobody asks for: the transducers go on as well."""
+        self._change_parameters(k)
+        self._plant.sample()
+        self.move(k)
+
+    def _change_parameters(self, k: int) -> None:
+        """Set what faults have made of the plant's parameters since the last cycle."""
+        for name, value in self.faults.parameters_at(k, self._changed).items():
+            self._plant.set(name, value)
+        self._changed = k

@@ -1,0 +1,72 @@
+"""The controller is made ready in cycles that do not count: CiA 402 is enabled step by step, then its own words say so.
+
+The run stands still meanwhile: neither its profiles nor its faults go on. In real time the last input is repeated until
+the next one, which waits for the answer to it.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isclose
+
+from rig.benches.bench import Bench
+from rig.benches.profiles import PROFILES, State, choose_control, find_state
+from rig.network.clock import WallClock
+from rig.run.cyclic_values import CycleInput
+from rig.run.loop import Loop
+
+LIMIT = 5.0  # s: a controller that is not ready by then ends the run
+
+
+class Enabling:
+    """Gets the controller of a bench ready on a loop. `stop()` is True when the run is to end."""
+
+    def __init__(self, bench: Bench, loop: Loop, realtime: bool, stop: Callable[[], bool]) -> None:
+        self._bench, self._loop, self._realtime, self._stop = bench, loop, realtime, stop
+        self._words = PROFILES[bench.profile]
+
+    def enable(self, demand: float) -> str:
+        """Climb to ACTIVE, with fault reset, holding `demand`, m; why that failed, or ""."""
+        if not self._words.is_confirmed:
+            return ""
+        control = 0
+
+        def step() -> CycleInput:
+            nonlocal control
+            control = choose_control(self._words, State.ACTIVE, self._find_state(), control, resets=True)
+            return CycleInput(0, demand, 0.0, control, is_counted=False)
+
+        if self._play_until(lambda: self._find_state() == State.ACTIVE, step):
+            return ""
+        status = int(self._loop.outputs.get("status_word", 0))
+        return (f"the controller is not enabled after {LIMIT:g} s: status word 0x{status:04X}, "
+                f"{State(self._find_state()).name.lower().replace('_', ' ')}")
+
+    def await_ready(self, demand: float, control: int) -> str:
+        """Send the values of main, with `demand` in m, until the controller is ready; why it is not, or ""."""
+        if self._play_until(self._is_ready, lambda: CycleInput(1, demand, 0.0, control, is_counted=False)):
+            return ""
+        said = ", ".join(f"{name} is {self._loop.outputs.get(name, 0.0):g}, not {value:g}"
+                         for name, value in self._bench.ready.items() if not self._has(name, value))
+        return f"the controller is not ready after {LIMIT:g} s: {said}"
+
+    def _play_until(self, is_done: Callable[[], bool], make_step: Callable[[], CycleInput]) -> bool:
+        """Play cycles until `is_done()`; False if that takes too long, True also when the run is to end."""
+        clock, left = WallClock(), round(LIMIT * 1e9 / self._bench.cycle_ns)
+        while not is_done():
+            left -= 1
+            if left < 0 or (self._realtime and clock.now() > LIMIT * 1e9):
+                return False
+            self._loop.cycle(make_step())
+            self._loop.wait_until_played(self._stop)
+            if self._stop():
+                return True
+        return True
+
+    def _find_state(self) -> int:
+        return find_state(self._words, int(self._loop.outputs.get("status_word", 0)))
+
+    def _is_ready(self) -> bool:
+        return all(self._has(name, value) for name, value in self._bench.ready.items())
+
+    def _has(self, name: str, value: float) -> bool:
+        return isclose(self._loop.outputs.get(name, 0.0), value, rel_tol=1e-9, abs_tol=1e-12)

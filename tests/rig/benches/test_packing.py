@@ -1,0 +1,139 @@
+"""Compiled packing: the same bits as frame_map.py, which the other tests compare with cantools and canopen."""
+from __future__ import annotations
+
+import random
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from plant.compile import compile_function
+from rig.benches.frame_map import Field, FrameSpec, Guard, Kind, Role, check_guards, pack, unpack
+from rig.benches.packing import (
+    ACCEPTED,
+    FRAMES_AT,
+    OTHER_CYCLE,
+    PAYLOAD,
+    REPEATED,
+    VALUES_AT,
+    WRONG_CHECKSUM,
+    Layout,
+    find_frame,
+    make_layout,
+    pack_frame,
+    unpack_frame,
+)
+
+
+def draw_frame(rng: random.Random, sender: Role = Role.RIG) -> FrameSpec:
+    """A frame with values of any kind, place and byte order that do not overlap."""
+    length = rng.choice((1, 3, 8, 12, 64))
+    free, fields = set(range(8 * length)), []
+    for number in range(rng.randrange(1, 9)):
+        bits, is_big = rng.choice((1, 3, 8, 13, 16, 24, 32, 33, 63, 64)), rng.random() < 0.5
+        place = rng.randrange(8 * length)
+        places, at = [], place
+        for _ in range(bits):
+            places.append(at)
+            at = at - 15 if is_big and at % 8 == 7 else at + 1
+        if not free.issuperset(places):
+            continue
+        free -= set(places)
+        kinds = [Kind.UNSIGNED, Kind.SIGNED, *([Kind.FLOAT] if bits in (32, 64) else [])]
+        fields.append(Field(name=f"value{number}", lowest=place, length=bits, is_big_endian=is_big,
+                            kind=rng.choice(kinds), count=Fraction(rng.choice(("1", "1e-7", "10", "0.25"))),
+                            offset=Fraction(rng.choice(("0", "-40", "0.5")))))
+    return FrameSpec(name="frame", identifier=0x123, length=length, sender=sender, fields=tuple(fields))
+
+
+@pytest.fixture(scope="module")
+def compiled() -> tuple[object, object, object]:
+    return tuple(compile_function(one) for one in (pack_frame, unpack_frame, find_frame))
+
+
+def read_payload(layout: Layout, spec: FrameSpec) -> bytes:
+    return layout.octets[8 * PAYLOAD: 8 * PAYLOAD + spec.length].tobytes()
+
+
+def write_payload(layout: Layout, data: bytes) -> None:
+    layout.octets[8 * PAYLOAD: 8 * PAYLOAD + 64] = np.frombuffer(data.ljust(64, b"\0"), np.uint8)
+
+
+@pytest.mark.parametrize("is_compiled", [False, True])
+def test_both_ways_of_packing_give_the_same_bits(is_compiled: bool, compiled: tuple) -> None:
+    """Random frames and values, among them some out of range: bytes, and the values read back, are the same."""
+    write, read, _ = compiled if is_compiled else (pack_frame, unpack_frame, find_frame)
+    rng = random.Random(7)
+    for _ in range(300 if is_compiled else 30):
+        spec = draw_frame(rng)
+        names = [each.name for each in spec.fields]
+        values = {name: rng.choice((0.0, 1.0, -1.5, 1e-3, rng.uniform(-1e3, 1e3), 1e25, -1e25)) for name in names}
+        sent = make_layout([spec], names, Role.RIG)
+        at = int(sent.words[VALUES_AT])
+        sent.doubles[at: at + len(names)] = list(values.values())
+        with np.errstate(over="ignore"):
+            write(sent, FRAMES_AT, 0)
+        data = read_payload(sent, spec)
+        assert data == pack(spec, values), spec
+        received = make_layout([spec], names, Role.CONTROLLER)
+        write_payload(received, data)
+        assert read(received, FRAMES_AT, spec.length, 0) == ACCEPTED
+        expected = list(unpack(spec, data).values())
+        assert received.doubles[at: at + len(names)].tolist() == expected
+        assert sent.doubles[at: at + len(names)].tolist() == expected, "what was sent is what the receiver reads"
+
+
+CHECKSUMS = [("crc8_sae_j1850", 0, ()), ("crc8_h2f", 0, ()), ("e2e_profile_1", 0x123, ()),
+             ("e2e_profile_2", 0, tuple(range(3, 19)))]
+
+
+@pytest.mark.parametrize(("checksum", "data_id", "data_ids"), CHECKSUMS)
+def test_alive_counter_and_checksum(checksum: str, data_id: int, data_ids: tuple[int, ...], compiled: tuple) -> None:
+    """The sender computes both; the receiver takes no frame with a wrong checksum and none twice."""
+    write, read, _ = compiled
+    fields = (Field(name="value", lowest=16, length=16),
+              Field(name="count", lowest=8, length=4, guard=Guard.COUNTER, wrap=15),
+              Field(name="crc", lowest=0, length=8, guard=Guard.CHECKSUM, checksum=checksum, data_id=data_id,
+                    data_ids=data_ids))
+    spec = FrameSpec(name="frame", identifier=1, length=8, sender=Role.RIG, fields=fields)
+    sent, received = make_layout([spec], ["value"], Role.RIG), make_layout([spec], ["value"], Role.CONTROLLER)
+    last = -1
+    for number in range(40):
+        sent.doubles[sent.words[VALUES_AT]] = 7.0 * number
+        write(sent, FRAMES_AT, 0)
+        data = read_payload(sent, spec)
+        assert data == pack(spec, {"value": 7.0 * number}, number)
+        problem, last = check_guards(spec, data, last)
+        assert (problem, last) == ("", number % 15)
+        write_payload(received, data)
+        assert read(received, FRAMES_AT, 8, 0) == ACCEPTED
+        write_payload(received, data)
+        assert read(received, FRAMES_AT, 8, 0) == REPEATED and check_guards(spec, data, last)[0] == "repeated"
+        broken = bytes([*data[:3], data[3] ^ 1, *data[4:]])
+        write_payload(received, broken)
+        assert read(received, FRAMES_AT, 8, 0) == WRONG_CHECKSUM and check_guards(spec, broken, last)[0] == "checksum"
+
+
+def test_a_multiplexed_frame_is_known_by_its_selector(compiled: tuple) -> None:
+    """Frames with one identifier are told apart by the value of the selector; another value is of no frame."""
+    pages = [FrameSpec(name=f"page {page}", identifier=5, length=2, sender=Role.CONTROLLER, fields=(
+        Field(name="selector", lowest=0, length=4, fixed=page), Field(name=f"value{page}", lowest=8, length=8)))
+        for page in (1, 3)]
+    layout = make_layout(pages, ["value1", "value3"], Role.RIG)
+    for page, value in ((1, 10), (3, 30)):
+        write_payload(layout, bytes((page, value)))
+        at = compiled[2](layout, 5)
+        assert compiled[1](layout, at, 2, 0) == ACCEPTED
+    assert layout.doubles[layout.words[VALUES_AT]:].tolist() == [10.0, 30.0]
+    write_payload(layout, bytes((2, 0)))
+    assert compiled[2](layout, 5) == -1
+
+
+def test_an_answer_names_its_cycle(compiled: tuple) -> None:
+    """A frame with a cycle counter is taken in this cycle alone; the counter wraps."""
+    spec = FrameSpec(name="drive", identifier=1, length=3, sender=Role.CONTROLLER, fields=(
+        Field(name="current", lowest=0, length=16), Field(name="cycle", lowest=16, length=8)))
+    layout = make_layout([spec], ["current"], Role.RIG)
+    write_payload(layout, bytes((1, 0, 0x34)))
+    assert compiled[1](layout, FRAMES_AT, 3, 0x1234) == ACCEPTED
+    assert compiled[1](layout, FRAMES_AT, 3, 0x1235) == OTHER_CYCLE
