@@ -19,8 +19,8 @@ class FaultyPlant:
         self.faults = Schedule(scenario.plan, scenario.model.values)
         self.current = 0.0  # A, in force until the next cycle
         self._load = scenario.load()
-        self._plant = Actuator(scenario.model, scenario.seed, count_steps(scenario.model))
-        self._plant.warm()
+        self.actuator = Actuator(scenario.model, scenario.seed, count_steps(scenario.model))
+        self.actuator.warm()
         self._changed = -1  # the last cycle whose parameters are in force
 
     def read(self, k: int) -> tuple[float, float, float] | None:
@@ -29,7 +29,7 @@ class FaultyPlant:
         Call it once a cycle: it draws the noise and puts the faults of this cycle in force.
         """
         self._change_parameters(k)
-        readings = self._plant.sample()
+        readings = self.actuator.sample()
         if not isfinite(sum(readings)):
             return None
         xj, p12, xs = (self.faults.change_signal(name, value, k)
@@ -38,16 +38,16 @@ class FaultyPlant:
 
     def move(self, k: int) -> None:
         """Advance by cycle k under its load and the current in force."""
-        self._plant.advance(self.current, self._load[k] if k < len(self._load) else 0.0)
+        self.actuator.advance(self.current, self._load[k] if k < len(self._load) else 0.0)
 
     def pass_unread(self, k: int) -> None:
         """A cycle whose readings nobody asks for: the transducers go on as well."""
         self._change_parameters(k)
-        self._plant.sample()
+        self.actuator.sample()
         self.move(k)
 
     def _change_parameters(self, k: int) -> None:
         """Set what faults have made of the plant's parameters since the last cycle."""
         for name, value in self.faults.parameters_at(k, self._changed).items():
-            self._plant.set(name, value)
+            self.actuator.set(name, value)
         self._changed = k

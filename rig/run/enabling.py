@@ -41,9 +41,14 @@ class Enabling:
         return (f"the controller is not enabled after {LIMIT:g} s: status word 0x{status:04X}, "
                 f"{State(self._find_state()).name.lower().replace('_', ' ')}")
 
-    def await_ready(self, demand: float, control: int) -> str:
-        """Send the values of main, with `demand` in m, until the controller is ready; why it is not, or ""."""
-        if self._play_until(self._is_ready, lambda: CycleInput(1, demand, 0.0, control, is_counted=False)):
+    def await_ready(self, demand: float, control: int, main_control: int) -> str:
+        """Wait, at a `demand` in m, until the controller is ready; why it is not, or "".
+
+        A controller that is not ready at the end of set-up, with `control`, gets the values of main, with
+        `main_control`: it may say that it is ready as soon as it is enabled.
+        """
+        self._play(CycleInput(0, demand, 0.0, control, is_counted=False))
+        if self._play_until(self._is_ready, lambda: CycleInput(1, demand, 0.0, main_control, is_counted=False)):
             return ""
         said = ", ".join(f"{name} is {self._loop.outputs.get(name, 0.0):g}, not {value:g}"
                          for name, value in self._bench.ready.items() if not self._has(name, value))
@@ -56,11 +61,14 @@ class Enabling:
             left -= 1
             if left < 0 or (self._realtime and clock.now() > LIMIT * 1e9):
                 return False
-            self._loop.cycle(make_step())
-            self._loop.wait_until_played(self._stop)
+            self._play(make_step())
             if self._stop():
                 return True
         return True
+
+    def _play(self, step: CycleInput) -> None:
+        self._loop.cycle(step)
+        self._loop.wait_until_played(self._stop)
 
     def _find_state(self) -> int:
         return find_state(self._words, int(self._loop.outputs.get("status_word", 0)))

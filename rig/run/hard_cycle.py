@@ -82,6 +82,7 @@ DONE, WAITING = 0, 1  # what `play_cycle_in_lockstep` returns
 (OPEN, SYNC_AT, CAME, AWAITED, STAGE, ANSWER_LIMIT, MISSED, HELD, FRAMES_WRITTEN, AWAKE_SINCE, WORKED, POSITION,
  IS_HELD, IS_UNDERRUN, ROW_CYCLE, IS_LATE, DRIVES_MISSED, HAS_BEGUN, COUNTED, COMMAND_CODE, COMMAND_ARGUMENT,
  SYNC_CODE, SYNC_ARGUMENT, DEAF, PLANT_FRAMES_LEFT, DRIVES_LEFT) = range(40, 66)
+PLAYED, IS_UNSURE = 66, 67  # cycles so far; whether a frame may come that is not sure to come
 WORDS = 72
 # Columns of an input: whether the cycle counts (before the run the controller is enabled in cycles that do not, and
 # the plant stays where it is); code and argument of the faults of command and SYNC (change_frame); whether the rig
@@ -160,7 +161,7 @@ def play_cycle_in_lockstep(port: Port, buffers: Buffers, m: Layout, plant: Memor
         _send_frames(port, buffers, m, plant, True)
         _begin_cycle(port, buffers, m, plant, 0)
         grace = words[GRACE] if words[MISSED] < _PATIENCE else words[GRACE] // 10
-        if not words[AWAITED]:  # nothing is sure to come: a cycle takes its time
+        if not words[AWAITED]:  # what may come is given the time of a cycle
             grace = words[PERIOD]
         words[ANSWER_LIMIT] = words[SYNC_AT] + grace
         words[STAGE] = WAITING
@@ -191,7 +192,7 @@ def _is_complete(words: NDArray[np.int64]) -> bool:
 
 def _is_answered(words: NDArray[np.int64]) -> bool:
     """Lockstep: whether there is nothing left to wait for."""
-    if not words[AWAITED]:
+    if not words[AWAITED] and words[IS_UNSURE]:
         return False
     return _is_complete(words) and words[PLANT_FRAMES_LEFT] <= 0 and words[DRIVES_LEFT] <= 0
 
@@ -292,7 +293,7 @@ def _send_frames(port: Port, buffers: Buffers, m: Layout, plant: Memory, is_befo
             _read_transducers(buffers, m, plant)
     for number in range(m.words[FRAMES]):
         at = FRAMES_AT + FRAME_WORDS * number
-        is_due = words[CYCLES] % m.words[at + EVERY] == 0
+        is_due = words[PLAYED] % m.words[at + EVERY] == 0
         if m.words[at + IS_MINE] and is_due and m.words[at + IS_BEFORE_SYNC] == is_before_sync:
             pack_frame(m, at, words[CYCLES])
             _send_as_fault_leaves_it(port, buffers, m, plant, at)
@@ -391,6 +392,7 @@ def _begin_cycle(port: Port, buffers: Buffers, m: Layout, plant: Memory, late: i
     if words[MOVES_PLANT] and words[COUNTED] and not words[DIVERGED]:
         advance_plant(plant, words[CYCLES])
     words[CYCLES] += words[COUNTED]
+    words[PLAYED] += 1
     words[DUE] += words[PERIOD]
 
 
@@ -411,10 +413,11 @@ def _open_row(buffers: Buffers, m: Layout, late: int) -> None:
 def _expect_answers(buffers: Buffers, m: Layout) -> None:
     """Which answers are sure to come in this cycle, and which values of earlier frames still count."""
     words = buffers.words
-    words[CAME], words[AWAITED], words[IS_LATE] = 0, 0, 0
+    words[CAME], words[AWAITED], words[IS_LATE], words[IS_UNSURE] = 0, 0, 0, 0
     if words[MOVES_PLANT]:
         words[CAME] = FEEDBACK | VALVE
     if words[SYNC_CODE] == DROP and words[SYNC_ID] >= 0:
+        words[IS_UNSURE] = 1
         return
     for number in range(m.words[FRAMES]):
         at = FRAMES_AT + FRAME_WORDS * number
@@ -426,6 +429,8 @@ def _expect_answers(buffers: Buffers, m: Layout) -> None:
             words[CAME] |= m.words[at + ROLES]
         elif m.words[at + IS_ANSWER] and age >= m.words[at + EVERY]:
             words[AWAITED] |= m.words[at + ROLES] & ~ALL_ROLES
+        if not m.words[at + IS_ANSWER] or m.words[at + LAST_CYCLE] < 0:
+            words[IS_UNSURE] = 1
     words[HAS_BEGUN] += 1
 
 

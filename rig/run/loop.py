@@ -135,6 +135,7 @@ class CycleLoop(Loop):
         self._came: set[str] = set()  # roles of the frames that have come
         self._awaited: set[FrameSpec] = set()  # frames that are sure to come
         self._begun = 0  # cycles in which answers were expected, those that do not count among them
+        self._played = 0  # cycles
         self._missed = 0  # drive frames in a row
         self._is_late = False  # a drive frame has come that answers an earlier cycle
         self._wall = WallClock()
@@ -185,6 +186,7 @@ class CycleLoop(Loop):
             self._release_held(self._t_ns + self._period)
         master.tick()
         self.k += step.is_counted
+        self._played += 1
         self._t_ns += self._period
 
     def finish(self) -> None:
@@ -255,7 +257,7 @@ class CycleLoop(Loop):
     def _send_frames(self, *, is_before_sync: bool) -> None:
         """Send the frames of this cycle that go before SYNC, or those that follow it."""
         for spec, write, read in self._mine:
-            if spec.is_before_sync is is_before_sync and self.k % spec.every == 0:
+            if spec.is_before_sync is is_before_sync and self._played % spec.every == 0:
                 data = write(self.outputs, self.k, self._sent[spec])
                 self._sent[spec] += 1
                 self.outputs.update(read(data))  # what the receiver will read
@@ -307,10 +309,11 @@ class CycleLoop(Loop):
         self._begun += 1
 
     def _wait_for_answers(self, delay: int | None) -> None:
-        """Lockstep: let the answers come in; where none is sure to come, a cycle's time passes."""
-        if delay is None or not self._awaited:
+        """Lockstep: let the answers come in; what is not sure to come is given the time of a cycle."""
+        is_unsure = any(answer.last < 0 or not spec.is_answer for spec, answer in self._answers.items())
+        if delay is None or (is_unsure and not self._awaited):
             self._wire.run_until(self._wire.clock.now() + self._period)
-        else:
+        elif self._awaited:
             self._wire.wait_for_answers(self._t_ns + delay, lambda: not self._awaited)
 
     def _receive_answer(self, frame: Frame) -> None:

@@ -206,8 +206,8 @@ class Session:
         """Between set-up and main: wait until the controller says that it is ready; False when the run is to end."""
         if not self.job.bench.ready:
             return True
-        self.stage.playing.wait_until_played(self._must_end)
-        return self._go_on(self._enabling.await_ready(self._demand, self._choose_control_word(MAIN, 0)))
+        words = [self._choose_control_word(phase, 0) for phase in (SETUP, MAIN)]
+        return self._go_on(self._enabling.await_ready(self._demand, *words))
 
     def _go_on(self, problem: str) -> bool:
         """End the run because of a problem; whether it goes on."""

@@ -133,17 +133,17 @@ def test_sensor_faults_show_in_the_frames_only() -> None:
     assert [x.pressure - y.pressure for (x, _), (y, _) in zip(a[4:6], b[4:6], strict=True)] == pytest.approx([1e6, 1e6])
     assert [x for x, _ in a[6:]] == [y for y, _ in b[6:]]
     assert np.std([x.spool - y.spool for (_, x), (_, y) in zip(a[6:], b[6:], strict=True)]) > 3e-7
-    assert desk.node._plant.state == sound.node._plant.state
+    assert desk.node._plant.actuator.state == sound.node._plant.actuator.state
 
 
 def test_a_parameter_ramps_cycle_by_cycle_and_returns_when_main_ends() -> None:
     fault = Parameter(parameter="filter.clogging", value=0.4, start=0.01, ramp=0.004)
     desk = PlantDesk(Scenario(QUIET_MODEL, Plan(faults=(fault,), start=5, stop=25)))
-    index = desk.node._plant._index["filter.clogging"]
+    index = desk.node._plant.actuator._index["filter.clogging"]
     seen = []
     for _ in range(30):
         desk.cycle()
-        seen.append(float(desk.node._plant._live[index]))
+        seen.append(float(desk.node._plant.actuator._live[index]))
     assert seen[15:20] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
     assert seen[:15] == [0.0] * 15 and seen[20:25] == [0.4] * 5 and seen[25:] == [0.0] * 5
 
@@ -177,7 +177,7 @@ def test_after_a_pause_the_cycle_is_that_of_the_bus_and_no_fault_was_slept_throu
     desk.nmt(1)
     said = [desk.cycle(1e-3)[1] for _ in range(3)]
     assert [(s.cycle, s.flags) for s in said] == [(15, 0), (16, 0), (17, 0)] and counters(desk) == (0, 0)
-    plant = desk.node._plant
+    plant = desk.node._plant.actuator
     assert [float(plant._live[plant._index[name]]) for name in ("filter.clogging", "spool.dynamic_friction")] == [0, 1]
 
 
@@ -231,7 +231,7 @@ def test_a_plant_without_a_number_says_so_and_stops() -> None:
     """Division by zero far out: EMCY 0x6000, no made-up feedback, and the node lives on."""
     desk = PlantDesk(scenario())
     desk.cycle()
-    desk.node._plant._flat[:] = np.nan
+    desk.node._plant.actuator._flat[:] = np.nan
     before = len(desk.frames(codec.FEEDBACK))
     desk.send(codec.SYNC)
     assert desk.emergencies() == [0x6000] and desk.node.device.state is NmtState.PRE_OPERATIONAL
