@@ -124,12 +124,12 @@ def _load_shipped(name: str) -> Bench:
 
 
 def load_bench_from_files(content: Mapping[str, bytes], *, is_trusted: bool = False) -> Bench:
-    """The bench of a log, from `Bench.files`: the first is the bench file, the others are those that it names.
+    """The bench of a log, from `Bench.files`: the TOML file, and those that it names.
 
     Raises:
         InputError: as of `load_bench`; or a file is missing.
     """
-    bench_file = next(iter(content), "")
+    bench_file = next((name for name in content if name.endswith(".toml")), "")
 
     def read(name: str) -> bytes:
         if name not in content:

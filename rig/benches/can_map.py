@@ -1,7 +1,7 @@
 """A DBC as frames of a device on plain CAN: messages, byte orders, multiplexed pages, CAN FD."""
 from __future__ import annotations
 
-import math
+import re
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from typing import Any
@@ -11,9 +11,11 @@ from cantools.database.can import Message, Signal
 
 from plant.errors import InputError, suggest_name
 from rig.benches.frame_map import EXTENDED, FD, Field, Kind
-from rig.benches.layout import DeviceFrame, Slot, Use
+from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 from rig.tables import list_choices
 
+_HUGE = re.compile(r"^\s*(?:BO_\s[^:\n]*:\s*\d{5}|SG_\s[^:\n]*:[^@\n]*\d{6}|SG_MUL_VAL_\s[^;]*-\s*\d{6})", re.MULTILINE)
+_LARGEST = 1e300
 _FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 
 
@@ -23,8 +25,12 @@ def read_database(name: str, text: str) -> Any:
     Raises:
         InputError: not a DBC.
     """
+    huge = _HUGE.search(text)
+    if huge is not None:  # cantools would work on it for hours
+        raise InputError(name, "", f"a DBC with lengths of CAN frames, not {huge[0].strip()[:100]!r}")
     try:
-        return cantools.database.load_string(text, "dbc", strict=False)
+        with silence_log("cantools"):  # what it warns of are messages that the bench does not use
+            return cantools.database.load_string(text, "dbc", strict=False)
     except Exception as error:  # whatever cantools stumbles over in a file that is no DBC
         said = " ".join(str(error).split())[:200]
         raise InputError(name, "", f"a DBC ({said or type(error).__name__})") from error
@@ -42,6 +48,8 @@ def map_messages(name: str, database: Any, uses: Mapping[str, Use], cycle_ns: in
         message, _, signal = full.partition(".")
         if message not in messages or not signal:
             raise use.place.refuse(f"MESSAGE.SIGNAL of {name}, not {full!r}{suggest_name(message, messages)}")
+        if sum(each.name == message for each in database.messages) > 1:
+            raise use.place.refuse(f"one message {message}; {name} has several")
         known = {each.name for each in messages[message].signals}
         if signal not in known:
             raise use.place.refuse(f"a signal of message {message}: {list_choices(signal, known)}")
@@ -101,33 +109,37 @@ def _select(selector: Slot, page: int) -> Slot:
 
 
 def _find_period(name: str, message: Message, cycle_ns: int) -> int:
-    period = Fraction(str(message.cycle_time or 0)) * 1_000_000 / cycle_ns
-    if period == 0:
-        return 1
-    if period.denominator != 1 or not 0 < period < 1_000_000:
+    given = _read_number(name, f"{message.name} GenMsgCycleTime", message.cycle_time)
+    period = given * 1_000_000 / cycle_ns
+    if period.denominator != 1 or not 0 <= period < 1_000_000:
         raise InputError(name, message.name, f"a GenMsgCycleTime that is a multiple of the cycle, {cycle_ns / 1e6:g} "
-                                             f"ms, not {message.cycle_time} ms")
-    return int(period)
+                                             f"ms, not {float(given):g} ms")
+    return int(period) or 1
+
+
+def _read_number(name: str, field: str, value: int | float | None) -> Fraction:
+    """A number of a DBC as its text stands there; 0 for None."""
+    if value is not None and not abs(value) < _LARGEST:
+        raise InputError(name, field, "a finite number")
+    return Fraction(str(value or 0))
 
 
 def _read_slot(name: str, message: Message, signal: Signal) -> Slot:
-    conversion = signal.conversion
-    scale, offset, start = conversion.scale, conversion.offset, signal.raw_initial or 0
-    if not all(map(math.isfinite, (scale, offset, start))):
-        raise InputError(name, f"{message.name}.{signal.name}", "finite numbers for factor, offset and start value")
+    full, conversion = f"{message.name}.{signal.name}", signal.conversion
+    scale, offset, start, maximum = (_read_number(name, full, value) for value in (
+        conversion.scale, conversion.offset, signal.raw_initial, signal.maximum))
     lowest = signal.start
     if signal.byte_order == "big_endian":  # a DBC has the place of the most significant bit
         last = 8 * (signal.start // 8) + 7 - signal.start % 8 + signal.length - 1
         lowest = 8 * (last // 8) + 7 - last % 8
     kind = Kind.SIGNED if signal.is_signed else Kind.UNSIGNED
     kind = Kind.FLOAT if conversion.is_float else kind
-    exact_scale, exact_offset = Fraction(str(scale)), Fraction(str(offset))
     wrap = None
-    if signal.maximum and exact_scale and math.isfinite(signal.maximum):
-        last_count = (Fraction(str(signal.maximum)) - exact_offset) / exact_scale
+    if maximum and scale and signal.length <= 64:
+        last_count = (maximum - offset) / scale
         wrap = int(last_count) + 1 if 0 < last_count < (1 << signal.length) - 1 else None
     bits = Field(name="", lowest=lowest, length=signal.length, is_big_endian=signal.byte_order == "big_endian",
                  kind=kind, wrap=wrap)
-    return Slot(name=f"{message.name}.{signal.name}", bits=bits, scale=exact_scale, offset=exact_offset,
-                unit=signal.unit or "", start=start,
+    return Slot(name=full, bits=bits, scale=scale, offset=offset, unit=signal.unit or "",
+                start=int(start) if start.denominator == 1 else float(start),
                 choices={str(text): int(number) for number, text in (signal.choices or {}).items()})

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import io
-import logging
 import re
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -13,7 +12,7 @@ from canopen.objectdictionary.eds import import_eds
 from plant.errors import InputError
 from rig.benches.bench import MEASURED
 from rig.benches.frame_map import EXTENDED, Field, Kind
-from rig.benches.layout import DeviceFrame, Slot, Use
+from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 
 INVALID = 1 << 31  # in a COB-ID: the PDO is switched off
 LONG = 1 << 29  # in a COB-ID: the identifier has 29 bits
@@ -72,15 +71,12 @@ def read_dictionary(name: str, text: str, node: int) -> Any:
     Raises:
         InputError: not an EDS, or a DCF of another node.
     """
-    log = logging.getLogger("canopen.objectdictionary.eds")
-    was_disabled, log.disabled = log.disabled, True  # what it warns of is no object of a bench
     try:
-        dictionary: Any = import_eds(io.StringIO(text), node)  # type: ignore[no-untyped-call]
+        with silence_log("canopen"):  # what it warns of is no object of a bench
+            dictionary: Any = import_eds(io.StringIO(text), node)  # type: ignore[no-untyped-call]
     except Exception as error:  # whatever canopen stumbles over in a file that is no EDS
         said = " ".join(str(error).split())[:200]
         raise InputError(name, "", f"an electronic data sheet (CiA 306): {said or type(error).__name__}") from error
-    finally:
-        log.disabled = was_disabled
     if not any(index >= 0x1000 for index in dictionary):
         raise InputError(name, "", "an electronic data sheet (CiA 306) with objects")
     own = read_node(text)

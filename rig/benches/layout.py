@@ -2,8 +2,10 @@
 """
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
@@ -62,6 +64,18 @@ class DeviceFrame:
     is_answer: bool = True
 
 
+@contextmanager
+def silence_log(name: str) -> Iterator[None]:
+    """Keep a library, and its parts, from logging for a while."""
+    log = logging.getLogger(name)
+    level = log.level
+    log.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+
+
 def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ...]:
     """The fields of a frame; what the bench file does not use is filled with the value that the device starts with.
 
@@ -72,19 +86,20 @@ def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ..
     taken: dict[int, str] = {}
     fields = []
     for slot in sorted(frame.slots, key=lambda slot: slot.name not in uses and not slot.is_selector):
-        use, places = uses.get(slot.name), list_bits(slot.bits)
+        use, length = uses.get(slot.name), slot.bits.length
+        places = list_bits(slot.bits) if length <= 64 else []
         other = next((taken[place] for place in places if place in taken), "")
         is_inside = bool(places) and min(places) >= 0 and max(places) < 8 * frame.length
         if use is not None:
+            if length > 64 or (slot.bits.kind is Kind.FLOAT and length not in (32, 64)):
+                raise use.place.refuse(f"at most 64 bits, and 32 or 64 for a floating point number; {slot.name} has "
+                                       f"{length}")
             if not is_inside:
                 raise use.place.refuse(f"a signal inside its frame; {slot.name} lies outside the {frame.length} bytes "
                                        f"of {frame.name}")
             if other:
                 raise use.place.refuse(f"signals that do not overlap; {slot.name} has bits of {other}")
-            if slot.bits.length > 64 or (slot.bits.kind is Kind.FLOAT and slot.bits.length not in (32, 64)):
-                raise use.place.refuse(f"at most 64 bits, and 32 or 64 for a floating point number; {slot.name} has "
-                                       f"{slot.bits.length}")
-        if is_inside and not other and slot.bits.length <= 64:
+        if is_inside and not other:
             taken |= dict.fromkeys(places, slot.name)
             fields.append(_build_field(slot, use))
     counters = [each for each in fields if each.guard is Guard.COUNTER]
