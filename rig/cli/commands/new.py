@@ -37,8 +37,8 @@ def write_bench(path: Path, args: argparse.Namespace) -> str:
     """The text of a bench file at `path`, from the EDS, DCF or DBC that the options name."""
     if (args.eds is None) == (args.dbc is None):
         raise InputError("rig new bench", "", "--eds FILE (EDS or DCF of a CANopen device), or --dbc FILE")
-    if args.node is not None and not (args.eds and 1 < args.node < 128):
-        raise InputError("--node", str(args.node), "2 to 127, together with --eds; node 1 is the rig")
+    if args.node is not None and not (args.eds and args.node < 128):
+        raise InputError("--node", str(args.node), "1 to 127, together with --eds")
     source = args.eds or args.dbc
     text, name = decode_device_text(read_file(source)), Path(os.path.relpath(source, path.parent)).as_posix()
     return guess_can(path.stem, name, text) if args.dbc else guess_canopen(path.stem, name, text, args.node)

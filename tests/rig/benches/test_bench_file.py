@@ -40,8 +40,8 @@ def test_the_shipped_bench_has_the_frames_of_the_codec() -> None:
 def test_the_examples_load_and_their_logs_repeat_them(path: Path) -> None:
     bench = load_bench(str(path))
     again = load_bench_from_files(bench.files)
-    assert (again.frames, again.phases, again.ready, again.files) == (
-        bench.frames, bench.phases, bench.ready, bench.files)
+    assert repr(again.frames) == repr(bench.frames)
+    assert (again.phases, again.ready, again.files) == (bench.phases, bench.ready, bench.files)
 
 
 def test_a_drive_of_cia_402(tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ def test_the_guess_of_an_example_is_the_example(tmp_path: Path) -> None:
         option = "--eds" if sheet.suffix == ".eds" else "--dbc"
         assert rig("new", "bench", name, option, sheet, *words, "--out", path).status == 0
         guessed, own = load_bench(str(path)), load_bench(str(sheet.parent / "bench.toml"))
-        assert (guessed.frames, guessed.phases, guessed.ready) == (own.frames, own.phases, own.ready)
+        assert (repr(guessed.frames), guessed.phases, guessed.ready) == (repr(own.frames), own.phases, own.ready)
 
 
 def test_a_sheet_without_the_signals_is_completed_by_the_user(tmp_path: Path) -> None:
@@ -85,8 +85,7 @@ def test_a_sheet_without_the_signals_is_completed_by_the_user(tmp_path: Path) ->
     assert said.status == 0 and "is to be completed" in said.out and "nothing looks like it" in said.out
     for words in ((), ("--eds", "a.eds", "--dbc", "b.dbc")):
         assert "expected --eds FILE" in refuse("new", "bench", "y", *words)
-    for node in ("1", "128"):
-        assert "expected 2 to 127" in refuse("new", "bench", "y", "--eds", tmp_path / "x.eds", "--node", node)
+    assert "expected 1 to 127" in refuse("new", "bench", "y", "--eds", tmp_path / "x.eds", "--node", "128")
     assert "a DBC" in refuse("new", "bench", "y", "--dbc", tmp_path / "x.eds", "--out", tmp_path / "y.toml")
 
 
