@@ -3,8 +3,8 @@
     python -m studies.bench_mutations [COUNT] [SEED]                # default 100000, 1
 
 Damages the shipped bench and those of examples/ with their EDS and DBC: bytes, lines, numbers, words of other places.
-Each is loaded, its frames are packed and unpacked, their share of the bus is computed, and a first bench file is
-guessed from the damaged sheet.
+Each is loaded, its frames are packed and unpacked, become the tables of the compiled loop and a share of the bus, and a
+first bench file is guessed from the damaged sheet.
 """
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from plant.errors import InputError
-from rig.benches.bench_file import decode_device_text, load_bench, load_bench_from_files
+from rig.benches.bench import decode_device_text
+from rig.benches.bench_file import load_bench, load_bench_from_files
 from rig.benches.bus_load import list_loads
-from rig.benches.frame_map import pack, unpack
+from rig.benches.frame_map import Role, pack, unpack
 from rig.benches.guess import guess_can, guess_canopen
+from rig.benches.packing import make_layout
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 NUMBERS = ("0", "1", "-1", "7", "8", "64", "65", "127", "128", "255", "256", "0xFFFFFFFF", "0x80000000", "0x20000000",
@@ -123,6 +125,7 @@ def _use_bench(files: Mapping[str, bytes]) -> None:
         values = {each.name: 1.0 for each in spec.fields}
         unpack(spec, pack(spec, values, 3))
     list_loads(bench)
+    make_layout(bench.frames.list_of(Role.RIG), ("position_demand", "ram_position", "current"), Role.RIG)
 
 
 def _guess_bench(name: str, data: bytes) -> None:

@@ -117,6 +117,8 @@ def _build_field(slot: Slot, use: Use | None) -> Field:
         if slot.bits.kind is Kind.FLOAT:
             raise use.place.refuse(f"a whole number to protect the frame with; {slot.name} is floating point")
         if use.guard is Guard.COUNTER:
+            if slot.bits.length > 32:
+                raise use.place.refuse(f"a counter of at most 32 bits; {slot.name} has {slot.bits.length}")
             return replace(slot.bits, name=slot.name, guard=use.guard)
         if "#" not in use.checksum and (slot.bits.length != 8 or slot.bits.lowest % 8):
             raise use.place.refuse(f"a byte for {use.checksum}; {slot.name} has {slot.bits.length} bits from bit "
