@@ -260,6 +260,8 @@ def change_frame(code: int, argument: int, length: int, data: int) -> tuple[int,
 
 def apply_action(action: Action, data: bytes) -> tuple[bytes, ...]:
     """What arrives of a frame, at once; a delayed frame is the caller's business and arrives unchanged."""
+    if action.code == SENT_NORMALLY:
+        return (data,)
     length, word = change_frame(*action, len(data), int.from_bytes(data, "little"))
     frame = (word & (1 << 64) - 1).to_bytes(8, "little")[:length]
     return {DROP: (), DOUBLE: (frame, frame)}.get(action.code, (frame,))

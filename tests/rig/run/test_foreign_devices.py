@@ -1,0 +1,179 @@
+"""Controllers that nobody wrote for this rig: other node numbers, types, transmission, byte order, frames.
+
+Each is written with canopen or cantools, and each closes the same position loop, so each must move the ram alike.
+"""
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bus_stations import spec
+from device_files import Entry, Mapped, format_eds
+from python_devices import CanDevice, CanopenDevice, PythonDevice
+
+from fdi.progress import ignore_progress
+from fdi.trace.trace import Trace
+from plant import Model, simulate
+from rig.benches.bench_file import load_bench
+from rig.run import hard_loop
+from rig.run.job import JobChoice, build_job
+from rig.run.runner import run_job
+
+SEQUENCE = """
+title = "Two steps"
+setup = [{ kind = "hold", time = 0.05 }]
+main = [
+  { name = "rest", kind = "hold", time = 0.05 },
+  { name = "step", kind = "step", to = 2e-3, time = 0.25 },
+  { name = "back", kind = "step", to = 0.0, time = 0.25 },
+]
+cleanup = [{ kind = "hold", time = 0.05 }]
+checks = [
+  { name = "rest error", kind = "steady_error", window = "step", high = 100, unit = "um" },
+]
+"""
+IDENTITY = {"1000": Entry(7, "ro", "0x1234"), "1018sub0": Entry(5, "const", "4"), "1018sub1": Entry(7, "ro", "0x77"),
+            "1018sub2": Entry(7, "ro", "0x5"), "1018sub3": Entry(7, "ro"), "1018sub4": Entry(7, "ro")}
+CANOPEN = """
+name = "foreign"
+[controller]
+protocol = "canopen"
+node = {node}
+eds = "device.eds"
+profile = "none"
+[controller.inputs]
+position_demand = {{ object = "0x2000", count = "{position}" }}
+ram_position = {{ object = "0x2001", count = "{position}" }}
+[controller.outputs]
+current = {{ object = "0x2002", count = "{current}" }}
+"""
+CAN = """
+name = "foreign"
+[controller]
+protocol = "can"
+dbc = "device.dbc"
+[controller.inputs]
+position_demand = "{demand}"
+ram_position = "Feedback.Measured"
+[controller.outputs]
+current = "Drive.Current"
+"""
+HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: Rig Ecu\n'
+FD_DBC = HEAD + """
+BO_ 1025 Demand: 12 Rig
+ SG_ Position : 7|32@0- (0.0001,0) [0|0] "mm" Ecu
+
+BO_ 1026 Feedback: 20 Rig
+ SG_ Measured : 96|64@1- (1,0) [0|0] "m" Ecu
+
+BO_ 1027 Drive: 24 Ecu
+ SG_ Current : 151|32@0- (1,0) [0|0] "mA" Rig
+
+BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","StandardCAN_FD";
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 100;
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN_FD";
+BA_DEF_DEF_ "GenMsgCycleTime" 1;
+SIG_VALTYPE_ 1026 Measured : 2;
+SIG_VALTYPE_ 1027 Current : 1;
+"""
+PAGES_DBC = HEAD + """
+BO_ 2565865476 Feedback: 8 Rig
+ SG_ Page M : 0|4@1+ (1,0) [0|0] "" Ecu
+ SG_ Measured m2 : 15|24@0- (0.5,0) [0|0] "um" Ecu
+ SG_ Position m3 : 39|24@0- (0.5,100) [0|0] "um" Ecu
+
+BO_ 2565865477 Drive: 3 Ecu
+ SG_ Current : 5|13@1- (0.002,0) [0|0] "mA" Rig
+
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 100;
+BA_DEF_DEF_ "GenMsgCycleTime" 1;
+"""
+
+
+def start_canopen(folder: Path, where: str, node: int, types: tuple[int, int, int], rpdos: list[Mapped],
+                  tpdos: list[Mapped], position: str, current: str, **device: object) -> PythonDevice:
+    objects = {**IDENTITY, "2000": Entry(types[0]), "2001": Entry(types[1]), "2002": Entry(types[2], "ro"),
+               "2003": Entry(3)}
+    (folder / "device.eds").write_text(format_eds(objects, rpdos, tpdos))
+    (folder / "bench.toml").write_text(CANOPEN.format(node=node, position=position, current=current))
+    return CanopenDevice(where, node, str(folder / "device.eds"), **device)  # type: ignore[arg-type]
+
+
+def start_event_driven(folder: Path, where: str) -> PythonDevice:
+    """REAL32 in mm, both values in one event-driven RPDO; node 100 answers it with a REAL64."""
+    return start_canopen(
+        folder, where, 100, (8, 8, 17), [Mapped((0x2000_0020, 0x2001_0020), "$NODEID+0x400", 255)],
+        [Mapped((0x2002_0040,), "$NODEID+0x380", 255)], "1 mm", "1 mA", on=0x464,
+        inputs={0x464: ("<ff", {"position_demand": 1e-3, "ram_position": 1e-3})}, output=(0x3E4, "<d", 1e-3))
+
+
+def start_synchronous(folder: Path, where: str) -> PythonDevice:
+    """INTEGER16 and INTEGER32 in synchronous RPDOs, beside an object that the bench does not use; node 1."""
+    return start_canopen(
+        folder, where, 1, (3, 4, 3), [Mapped((0x2003_0010, 0x2000_0010), "$NODEID+0x200", 1),
+                                      Mapped((0x2001_0020,), "$NODEID+0x300", 0)],
+        [Mapped((0x2002_0010,), "$NODEID+0x180", 1)], "0.5 um", "1 uA",
+        inputs={0x201: ("<hh", {"unused": 1.0, "position_demand": 0.5e-6}), 0x301: ("<i", {"ram_position": 0.5e-6})},
+        output=(0x181, "<h", 1e-6))
+
+
+def start_every_second(folder: Path, where: str) -> PythonDevice:
+    """The drive comes with every second SYNC (transmission type 2), with COB-IDs outside the predefined set."""
+    return start_canopen(
+        folder, where, 64, (4, 4, 4), [Mapped((0x2000_0020, 0x2001_0020), "0x123", 1)],
+        [Mapped((0x2002_0020,), "0x124", 2)], "0.1 um", "10 nA", every=2,
+        inputs={0x123: ("<ii", {"position_demand": 1e-7, "ram_position": 1e-7})}, output=(0x124, "<i", 1e-8))
+
+
+def start_can_fd(folder: Path, where: str) -> PythonDevice:
+    """CAN FD frames of 12 to 24 bytes, a Motorola integer, an Intel double and a Motorola float."""
+    (folder / "device.dbc").write_text(FD_DBC)
+    (folder / "bench.toml").write_text(CAN.format(demand="Demand.Position"))
+    text = FD_DBC.replace("(0.0001,0)", "(0.0000001,0)")  # in m, as the other
+    return CanDevice(where, text, "Feedback", 1.0, 1e-3, fd=True)
+
+
+def start_multiplexed(folder: Path, where: str) -> PythonDevice:
+    """29-bit identifiers, 24-bit Motorola values on two pages of one frame, a 13-bit Intel current."""
+    (folder / "device.dbc").write_text(PAGES_DBC)
+    (folder / "bench.toml").write_text(CAN.format(demand="Feedback.Position"))
+    return CanDevice(where, PAGES_DBC, "Feedback", 1e-6, 1e-3)
+
+
+DEVICES = [start_event_driven, start_synchronous, start_every_second, start_can_fd, start_multiplexed]
+
+
+@contextlib.contextmanager
+def run_device(device: PythonDevice) -> Iterator[None]:
+    device.start()
+    try:
+        yield
+    finally:
+        device.close()
+
+
+@pytest.mark.parametrize("start", DEVICES, ids=lambda start: start.__name__.removeprefix("start_"))
+@pytest.mark.parametrize("is_compiled", [True, False], ids=["compiled", "python"])
+@pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
+def test_a_foreign_controller_closes_the_loop(start: object, bus_kind: str, is_compiled: bool, tmp_path: Path,
+                                              monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ram moves as a simulation of the same law does, whatever frames carry demand, position and current."""
+    if not is_compiled:  # as on a bus that only python-can knows
+        monkeypatch.setattr(hard_loop, "can_open", lambda spec: False)
+    where = spec(bus_kind)
+    device = start(tmp_path, where)  # type: ignore[operator]
+    (tmp_path / "steps.toml").write_text(SEQUENCE)
+    job = build_job(JobChoice(sequence=str(tmp_path / "steps.toml"), bus=where, controller="external", seed=3))
+    job = replace(job, bench=load_bench(str(tmp_path / "bench.toml")))
+    with run_device(device):
+        outcome = run_job(job, tmp_path / "run", ignore_progress, lambda: False)
+    assert not outcome.aborted, outcome.aborted
+    trace = Trace.read(tmp_path / "run")
+    law = simulate(Model(), trace.com, seed=3)
+    difference = float(np.sqrt(np.nanmean((trace.xj - law.xj) ** 2)))
+    assert difference < 60e-6  # m, of 2 mm: one more cycle of delay, coarser counts
+    assert not np.isnan(trace.cor[5:]).any()
