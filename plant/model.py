@@ -24,7 +24,7 @@ from plant.quantity import Quantity
 from plant.state import Input, Ports, State
 
 SHIPPED_MODELS = ("servo",)  # plant/models/NAME.toml, beside the nominal values of the plants
-STEPS = 100  # steps a cycle: 10 us; its error is measured in the docs
+STEP = 1e-5  # s, of the solver; its error is measured in the docs
 
 
 def find_parameter_groups(effects: Iterable[str] | None = None, plant: str = "eha") -> dict[str, type[Any]]:
@@ -74,6 +74,11 @@ class Model:
     def nominal(self) -> Mapping[str, float]:
         """The nominal values of this design, "group.field" to SI value: the plant's own where it is of usual size."""
         return {**self.kind.nominal, **self.design}
+
+    @property
+    def steps(self) -> int:
+        """Steps of the solver in a cycle of the controller."""
+        return max(1, round(self["controller.period"] / STEP))
 
     @property
     def kind(self) -> Plant:

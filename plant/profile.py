@@ -1,4 +1,4 @@
-"""Turns segments or a CSV file into a position demand: one value per 1 ms cycle, and named sections."""
+"""Turns segments or a CSV file into a position demand: one value per cycle, and named sections."""
 from __future__ import annotations
 
 import csv
@@ -46,17 +46,21 @@ def list_section_names(segments: Sequence[Segment]) -> list[str]:
     return [segment.name or f"{segment.kind}_{number}" for number, segment in enumerate(segments, 1)]
 
 
-def build_profile(segments: Sequence[Segment], start: float = 0.0) -> Profile:
-    """Lay segments end to end from the demand `start` (m). No segments: an empty command that ends where it starts.
+def build_profile(segments: Sequence[Segment], start: float = 0.0, rate: float = RATE) -> Profile:
+    """Lay segments end to end from the demand `start` (m), `rate` values a second.
 
-    Raises InputError when two sections have the same name.
+    No segments: an empty command that ends where it starts.
+
+    Raises:
+        InputError: two sections have the same name, or a segment cannot be sampled at this rate.
     """
     pieces: list[Array] = [np.empty(0)]
     sections: list[Section] = []
     last, begin = start, 0
     for segment, name in zip(segments, list_section_names(segments), strict=True):
-        cycles = round(segment.duration * RATE)
-        demand = segment.demand(np.arange(cycles + 1) / RATE, last)
+        segment.require_rate(rate)
+        cycles = round(segment.duration * rate)
+        demand = segment.demand(np.arange(cycles + 1) / rate, last)
         pieces.append(demand[:-1])
         last = float(demand[-1])
         require(all(name != s.name for s in sections), "name", f"a name used once, not a second {name!r}")
@@ -105,9 +109,9 @@ def parse_columns(data: bytes, where: object, period: float = 1 / RATE) -> dict[
 def resample_on_cycles(t: Array, values: Array, period: float) -> Array:
     """The demand at the start of each cycle, from `values` at the times `t` (s, increasing).
 
-    Rows at that period are taken as they are. Otherwise rows up to 1 ms apart, the bench's own cycle, are samples that
-    hold until the next: a step stays a step. Rows further apart are breakpoints, joined by straight lines. The last
-    row lasts as long as the one before it, if these are samples, or one cycle.
+    Rows at that period are taken as they are. Otherwise rows up to 1 ms apart, the usual cycle, are samples that hold
+    until the next: a step stays a step. Rows further apart are breakpoints, joined by straight lines. The last row
+    lasts as long as the one before it, if these are samples, or one cycle.
     """
     gaps = np.diff(t)
     held = gaps <= (1 + SLACK) / RATE

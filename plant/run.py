@@ -16,7 +16,7 @@ from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.flat import list_state_values, make_packers
 from plant.machine_code import Advance, StoredCode
-from plant.model import STEPS, Model, build_initial_state, build_kernel, collect_bindings
+from plant.model import Model, build_initial_state, build_kernel, collect_bindings
 from plant.solve import NOISES, advance_flat_state, read_flat_sensors, run_closed_loop, step_cycle
 from plant.state import State
 from plant.threads import run_beside
@@ -49,7 +49,7 @@ def iterate_noise(seed: int, block: int = 64) -> Iterator[list[float]]:
         yield from rng.standard_normal((block, NOISES)).tolist()
 
 
-def simulate(model: Model, command: Array, load: Array | None = None, seed: int = 0, steps: int = STEPS,
+def simulate(model: Model, command: Array, load: Array | None = None, seed: int = 0, steps: int | None = None,
              fast: bool = True, drawn: Array | None = None) -> Columns:
     """Run the model with its own controller over a command.
 
@@ -58,7 +58,7 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
         command: (n,) demand in m, one a cycle.
         load: (n,) external force on the ram in N, positive against extension; none by default.
         seed: of the noise.
-        steps: steps a cycle.
+        steps: steps a cycle; default: one every 10 us.
         fast: compiled; False runs the same source in plain Python.
         drawn: (n, NOISES) random numbers in place of those of `seed`: noise that is not white.
 
@@ -75,9 +75,9 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
         run = build_kernel(run_closed_loop, model.effects, fast, model.plant)
         noise = sample_noise(seed, len(com)) if drawn is None else drawn
         if fast:
-            run_beside(partial(run, model.build_state(), com, force, noise, record, steps, out))
+            run_beside(partial(run, model.build_state(), com, force, noise, record, steps or model.steps, out))
         else:
-            run(model.build_state(), com, force, noise, record, steps, out)
+            run(model.build_state(), com, force, noise, record, steps or model.steps, out)
     t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
     xj, cor, p12, xs = (out[:, i].copy() for i in range(4))
     return Columns(t, com, xj, cor, p12, xs, force)
@@ -141,8 +141,8 @@ class Demand:
 class Actuator:
     """One plant that runs cycle by cycle: the core of the emulator. It knows neither clock nor bus."""
 
-    def __init__(self, model: Model, seed: int = 0, steps: int = STEPS, fast: bool = True) -> None:
-        self.model, self.steps = model, steps
+    def __init__(self, model: Model, seed: int = 0, steps: int | None = None, fast: bool = True) -> None:
+        self.model, self.steps = model, steps or model.steps
         self.cycle = 0
         with report_law_errors(model):
             state = model.build_state()

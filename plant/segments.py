@@ -24,7 +24,7 @@ Hertz = Annotated[float, "Hz"]
 Radian = Annotated[float, "rad"]
 PerSecond = Annotated[float, "1/s"]
 
-RATE = 1000  # cycles a second; times are k / RATE because k * 1e-3 is not exact
+RATE = 1000.0  # cycles a second where nothing else is said; times are k / rate because k * 1e-3 is not exact
 FARTHEST, STRONGEST = 1.0, 1e6  # m of demand, N of load, either way: beyond them, somebody wrote mm or kN for SI
 LONGEST = 3600.0  # s, of one segment or file: beyond it, somebody wrote milliseconds
 
@@ -34,6 +34,7 @@ class Segment(ABC):
     """One piece of a command. Checks refer to its section by `name`."""
 
     kind: ClassVar[str]
+    frequencies_in: ClassVar[tuple[str, ...]] = ()  # keys, Hz
     name: str = ""
 
     @property
@@ -46,9 +47,23 @@ class Segment(ABC):
         """The demand at times `t` (s, from the segment's start), after one that ended at `last`."""
 
     def __post_init__(self) -> None:
-        cycles = self.duration * RATE
-        require(0.5 < cycles <= LONGEST * RATE, "time", f"{1 / RATE} to {LONGEST:g} s, not {self.duration:g}")
-        require(abs(cycles - round(cycles)) < 1e-6, "time", f"whole cycles of {1 / RATE} s, not {self.duration:g}")
+        require(0.0 < self.duration <= LONGEST, "time", f"above 0 and at most {LONGEST:g} s, not {self.duration:g}")
+        for key in self.frequencies_in:
+            lowest = float(np.min(getattr(self, key)))
+            require(lowest > 0.0, key, f"a frequency above 0 Hz, not {lowest:g}")
+
+    def require_rate(self, rate: float) -> None:
+        """Refuse a segment that `rate` samples a second cannot show: not whole cycles, or half the rate and above.
+
+        Raises:
+            InputError: the key, and what it must be; whoever read the segment knows its file and line and adds them.
+        """
+        cycles = self.duration * rate
+        require(cycles > 0.5 and abs(cycles - round(cycles)) < 1e-6, "time",
+                f"whole cycles of {1 / rate:g} s, not {self.duration:g}")
+        for key in self.frequencies_in:
+            highest = float(np.max(getattr(self, key)))
+            require(highest < rate / 2, key, f"a frequency below {rate / 2:g} Hz, not {highest:g}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,13 +113,9 @@ class Ramp(Timed):
 class Sine(Timed):
     """A sine about the last demand."""
 
-    kind = "sine"
+    kind, frequencies_in = "sine", ("frequency",)
     amplitude: Level
     frequency: Hertz
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_frequency("frequency", self.frequency)
 
     def demand(self, t: Array, last: float) -> Array:
         return last + self.amplitude * sin_of_turns(self.frequency * t)
@@ -114,7 +125,7 @@ class Sine(Timed):
 class Chirp(Timed):
     """A sine about the last demand whose frequency grows linearly from f0 to f1, faded in by 1 - exp(-fade t)."""
 
-    kind = "chirp"
+    kind, frequencies_in = "chirp", ("f0", "f1")
     amplitude: Level
     f0: Hertz
     f1: Hertz
@@ -122,8 +133,6 @@ class Chirp(Timed):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_frequency("f0", self.f0)
-        require_frequency("f1", self.f1)
         require(self.fade >= 0, "fade", f"0 or more 1/s, not {self.fade:g}")
 
     def demand(self, t: Array, last: float) -> Array:
@@ -139,17 +148,15 @@ class Multisine(Timed):
     A sum of phases does not start at zero, so it is faded in; fade = 0 lets it jump.
     """
 
-    kind = "multisine"
+    kind, frequencies_in = "multisine", ("frequencies",)
     amplitude: Level
     frequencies: tuple[Hertz, ...]
     phases: tuple[Radian, ...] = ()
     fade: PerSecond = 20.0
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         require(bool(self.frequencies), "frequencies", "at least one frequency in Hz")
-        for frequency in self.frequencies:
-            require_frequency("frequencies", frequency)
+        super().__post_init__()
         require(len(self.phases) in (0, len(self.frequencies)), "phases",
                  f"{len(self.frequencies)} phases in rad, one a frequency, not {len(self.phases)}")
         require(self.fade >= 0, "fade", f"0 or more 1/s, not {self.fade:g}")
@@ -190,18 +197,19 @@ class Points(Segment):
 
 @dataclass(frozen=True, kw_only=True)
 class Csv(Segment):
-    """A recorded demand, columns t and com (or value). Whoever reads the file fills in `values`, one a cycle."""
+    """A recorded demand, columns t and com (or value). Whoever reads the file fills in `values`, `rate` a second."""
 
     kind = "csv"
     file: str
     values: tuple[float, ...] = field(default=(0.0,), repr=False, metadata={"key": False})
+    rate: float = field(default=RATE, repr=False, metadata={"key": False})
 
     @property
     def duration(self) -> float:
-        return len(self.values) / RATE
+        return len(self.values) / self.rate
 
     def demand(self, t: Array, last: float) -> Array:
-        return np.array((*self.values, self.values[-1]))
+        return np.array((*self.values, self.values[-1]))[np.rint(t * self.rate).astype(int)]
 
 
 KINDS: dict[str, type[Segment]] = {
@@ -221,8 +229,3 @@ def require(holds: bool, key: str, expected: str) -> None:
     """
     if not holds:
         raise InputError("segment", key, expected)
-
-
-def require_frequency(key: str, frequency: float) -> None:
-    """Refuse a frequency that a signal of one sample a cycle cannot have."""
-    require(0 < frequency < RATE / 2, key, f"a frequency above 0 and below {RATE / 2:g} Hz, not {frequency:g}")

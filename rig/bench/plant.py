@@ -25,7 +25,7 @@ from fdi.report.report import Cell, Column, Item, Line, Report, Section, Table, 
 from fdi.trace.trace import Floats, Trace
 from plant import Actuator, simulate
 from plant.lanes import Lanes
-from plant.model import STEPS, Model, build_kernel
+from plant.model import Model, build_kernel
 from plant.run import sample_noise
 from plant.solve import run_closed_loop
 from rig.bench.realtime import (
@@ -56,7 +56,7 @@ class Accuracy(NamedTuple):
     largest_friction: float
 
 
-def compare_step_with_c(command: Floats, rounds: int = 15, steps: int = STEPS) -> dict[str, Any] | None:
+def compare_step_with_c(command: Floats, rounds: int = 15, steps: int = 100) -> dict[str, Any] | None:
     """A step of the nominal plant over `command` (n,) m in Python and in C (step.c), ns; None without gcc.
 
     c: gcc -O3 -march=native, free to fuse multiply and add; c_same_rounding: without fusing. ratio: Python's time over

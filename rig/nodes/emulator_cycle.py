@@ -39,7 +39,6 @@ from rig.network.raw_bus import (
     sleep_until,
     split_words,
 )
-from rig.nodes.scenario import count_steps
 from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, Schedule, change_frame
 
 MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
@@ -681,8 +680,7 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
     words, places = _join_tables(_TABLES_AT, np.int64, parameters, signals, *hits)
     reals, real_places = _join_tables(_REAL_TABLES_AT, np.float64, values, load, state, record.view(np.float64))
     words[STATE], words[SYNCED] = INITIALISING, -1
-    words[CYCLE_TIME] = round(model["controller.period"] * 1e9)
-    words[STEPS] = count_steps(model)
+    words[CYCLE_TIME], words[STEPS] = round(model["controller.period"] * 1e9), model.steps
     words[PARAMETERS], words[SIGNALS], words[LOAD], words[FLAT] = len(parameters), len(signals), len(load), len(state)
     words[PARAMETERS_AT], words[SIGNALS_AT] = places[:2]
     words[HITS_AT: HITS_AT + len(hits) + 1] = places[2:]

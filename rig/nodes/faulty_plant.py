@@ -4,7 +4,7 @@ from __future__ import annotations
 from math import isfinite
 
 from plant import Actuator
-from rig.nodes.scenario import Scenario, count_steps
+from rig.nodes.scenario import Scenario
 from rig.sequences.faults import Schedule
 
 DIVERGED = "the plant has diverged: a signal is not a finite number"
@@ -19,7 +19,7 @@ class FaultyPlant:
         self.faults = Schedule(scenario.plan, scenario.model.values)
         self.current = 0.0  # A, in force until the next cycle
         self._load = scenario.load()
-        self.actuator = Actuator(scenario.model, scenario.seed, count_steps(scenario.model))
+        self.actuator = Actuator(scenario.model, scenario.seed)
         self.actuator.warm()
         self._changed = -1  # the last cycle whose parameters are in force
 

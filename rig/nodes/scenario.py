@@ -80,11 +80,6 @@ class Scenario(NamedTuple):
             raise InputError(WHERE, "", f"compressed JSON of a scenario ({type(error).__name__}: {error})") from error
 
 
-def count_steps(model: Model) -> int:
-    """Steps of the plant in one cycle, 10 us each."""
-    return max(1, round(model["controller.period"] / 10e-6))
-
-
 def require_servovalve(model: Model) -> None:
     """Refuse a plant other than the servovalve actuator: the bus carries the current of a servovalve."""
     if model.plant != "eha":

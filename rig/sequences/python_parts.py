@@ -34,16 +34,17 @@ class PythonSegment(Timed):
     python: str
     arguments: Mapping[str, Argument] = field(default_factory=dict)
     function: UserFunction | None = field(default=None, repr=False, compare=False, metadata=_OWN)
-    known: dict[float, Array] = field(default_factory=dict, repr=False, compare=False, metadata=_OWN)  # by start
+    # what it returned, by start and number of times: a profile is built several times and must be the same each time
+    known: dict[tuple[float, int], Array] = field(default_factory=dict, repr=False, compare=False, metadata=_OWN)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_function_name(self.python)
 
     def demand(self, t: Array, last: float) -> Array:
-        if last not in self.known:  # a profile is built several times; it must be the same each time
-            self.known[last] = self._compute(t.copy(), last)
-        return self.known[last].copy()
+        if (last, len(t)) not in self.known:
+            self.known[last, len(t)] = self._compute(t.copy(), last)
+        return self.known[last, len(t)].copy()
 
     def _compute(self, t: Array, last: float) -> Array:
         assert self.function is not None

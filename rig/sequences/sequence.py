@@ -261,6 +261,9 @@ def _read_column(file: str, read: Callable[[str, Place, str], bytes], phase: str
 
 def _check_phases(sequence: Sequence, place: Place) -> None:
     for phase in PHASES:
+        for i, segment in enumerate(getattr(sequence, phase)):
+            with place.at(phase, i).locate(has_field=True):
+                segment.require_rate(RATE)
         called = list_section_names(getattr(sequence, phase))
         for i, name in enumerate(called):
             if name in called[:i]:

@@ -113,7 +113,7 @@ def _list_chunks(data: bytes) -> Iterator[tuple[bytes, int]]:
             yield unpack_chunk(chunk), at
 
 
-_WINDOW = 5 * RATE  # cycles of the plot
+_WINDOW = round(5 * RATE)  # cycles of the plot
 _STYLES = {"PASS": "green", "FAIL": "bold red", "measures": "bold cyan", "waits": "dim", "after the run": "dim"}
 _NODE_STYLES = {"operational": "green", "pre-operational": "yellow", "stopped": "red"}
 _ORDER = ("FAIL", "measures", "PASS", "waits", "after the run")
@@ -196,7 +196,7 @@ def _draw_check(state: CheckState) -> Text:
 
 
 def _draw_timing(run: LiveRun) -> list[Text]:
-    response = run.read_last("response", 2 * RATE)
+    response = run.read_last("response", round(2 * RATE))
     lines = [Text("Timing, last 2 s", style="bold"), Text(_describe_lateness(run)),
              Text(f"response {_describe_spread(response)}"), Text(f"overruns {run.overruns}")]
     if run.overruns:
@@ -207,7 +207,7 @@ def _draw_timing(run: LiveRun) -> list[Text]:
 def _describe_lateness(run: LiveRun) -> str:
     if run.plan.pace == "lockstep":
         return "lockstep: no cycle is late"
-    return f"lateness {_describe_spread(run.read_last('lateness', 2 * RATE))}"
+    return f"lateness {_describe_spread(run.read_last('lateness', round(2 * RATE)))}"
 
 
 def _describe_spread(values: NDArray[np.float64]) -> str:

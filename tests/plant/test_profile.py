@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from places import SHARED
 
 from plant.errors import InputError
@@ -54,6 +56,27 @@ def test_every_kind_has_its_length_and_its_section(segment: Segment) -> None:
     assert len(profile.command) == profile.sections[0].stop
     assert np.isfinite(profile.command).all()
     assert {each.kind for each in ONE_OF_EACH} == set(KINDS)
+
+
+@given(cycle_us=st.integers(100, 100_000), cycles=st.lists(st.integers(1, 300), min_size=1, max_size=5))
+def test_a_profile_is_as_long_as_its_segments_at_any_rate(cycle_us: int, cycles: list[int]) -> None:
+    rate = 1e9 / (1000 * cycle_us)
+    segments = [Ramp(to=float(k % 7) / 7, time=n * cycle_us / 1e6) for k, n in enumerate(cycles)]
+    command, sections, end = build_profile(segments, 0.5, rate)
+    assert [section.stop - section.start for section in sections] == cycles
+    assert len(command) == sum(cycles) and sections[-1].stop == len(command)
+    assert command[0] == 0.5 and abs(end - (len(cycles) - 1) % 7 / 7) < 1e-12
+
+
+@pytest.mark.parametrize("rate", [2000.0, 500.0, 200.0, 100.0])
+@pytest.mark.parametrize("segment", ONE_OF_EACH, ids=lambda s: s.kind)
+def test_a_demand_is_the_same_function_of_time_at_any_rate(segment: Segment, rate: float) -> None:
+    if isinstance(segment, Csv):
+        segment = Csv(file="c.csv", values=tuple(np.arange(100) * 1e-5))
+    fine, coarse = (build_profile([segment], 2e-3, most) for most in (max(rate, 1000.0), min(rate, 1000.0)))
+    every = round(max(rate, 1000.0) / min(rate, 1000.0))
+    np.testing.assert_allclose(coarse.command, fine.command[::every], rtol=1e-12, atol=1e-17)
+    assert abs(coarse.end - fine.end) < 1e-15
 
 
 @pytest.mark.parametrize("kind", ["hold", "ramp", "sine", "chirp", "multisine", "points"])
@@ -148,10 +171,14 @@ def test_what_is_no_csv_at_all_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("make", "key", "expected"), [
-    (lambda: Hold(time=0.0), "time", "0.001 to 3600 s"),
-    (lambda: Hold(time=float("nan")), "time", "0.001 to 3600 s"),
-    (lambda: Hold(time=0.0105), "time", "whole cycles"),
-    (lambda: Sine(amplitude=1.0, frequency=500.0, time=1.0), "frequency", "below 500 Hz"),
+    (lambda: Hold(time=0.0), "time", "above 0 and at most 3600 s, not 0"),
+    (lambda: Hold(time=float("nan")), "time", "at most 3600 s, not nan"),
+    (lambda: build_profile([Hold(time=0.0105)]), "time", "whole cycles of 0.001 s, not 0.0105"),
+    (lambda: build_profile([Hold(time=1e-3)], rate=500.0), "time", "whole cycles of 0.002 s, not 0.001"),
+    (lambda: build_profile([Sine(amplitude=1.0, frequency=500.0, time=1.0)]), "frequency", "below 500 Hz"),
+    (lambda: build_profile([Chirp(amplitude=1.0, f0=1.0, f1=60.0, time=1.0)], rate=100.0), "f1", "below 50 Hz, not 60"),
+    (lambda: build_profile([Multisine(amplitude=1.0, frequencies=(1.0, 50.0), time=1.0)], rate=100.0), "frequencies",
+     "below 50 Hz, not 50"),
     (lambda: Chirp(amplitude=1.0, f0=0.0, f1=1.0, time=1.0), "f0", "above 0"),
     (lambda: Chirp(amplitude=1.0, f0=1.0, f1=2.0, time=1.0, fade=-1.0), "fade", "0 or more"),
     (lambda: Multisine(amplitude=1.0, frequencies=(), time=1.0), "frequencies", "at least one"),

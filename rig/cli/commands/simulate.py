@@ -12,7 +12,6 @@ from fdi.report.numbers import format_amount
 from fdi.report.report import Report
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
-from plant.model import STEPS
 from plant.profile import build_profile, read_command, resample_on_cycles
 from plant.segments import RATE, Points
 from rig.cli.answer import give_answer
@@ -37,7 +36,7 @@ def run_command(args: argparse.Namespace) -> int:
     if not out.name.endswith((".csv", ".csv.gz", ".mcap")):
         raise InputError("--out", str(out), "a file .csv, .csv.gz or .mcap")
     require_new(require_writable(out, "--out", source=args.command_file), is_forced=args.force)
-    columns = simulate(model, com, load, args.seed, args.steps or STEPS)
+    columns = simulate(model, com, load, args.seed, args.steps)
     trace = Trace.from_columns(columns._asdict(), period, {"model": model.name, "seed": str(args.seed),
                                                            "command": name})
     if out.suffix == ".mcap":
