@@ -209,7 +209,8 @@ class Csv(Segment):
         return len(self.values) / self.rate
 
     def demand(self, t: Array, last: float) -> Array:
-        return np.array((*self.values, self.values[-1]))[np.rint(t * self.rate).astype(int)]
+        values: Array = np.array((*self.values, self.values[-1]))[np.rint(t * self.rate).astype(int)]
+        return values
 
 
 KINDS: dict[str, type[Segment]] = {
