@@ -126,9 +126,9 @@ def decode_float(bits: int, length: int) -> float:
     return value
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class FrameSpec:
-    """One frame of a bench; each is itself and no other, so that the loops find what they know of it at once."""
+    """One frame of a bench."""
 
     name: str  # as people call it: "RPDO1", "Demand"
     identifier: int  # with EXTENDED and FD
@@ -139,6 +139,8 @@ class FrameSpec:
     is_before_sync: bool = False  # sent before SYNC, with which its values take effect
     is_answer: bool = True  # of a sender other than the rig: it comes in each `every`-th cycle, so lockstep awaits it
     roles: tuple[str, ...] = ()  # as sequences name it: "command", "feedback", "valve_state", "drive"
+
+    __hash__ = object.__hash__  # the loops ask for one and the same frame in each cycle; to hash its values takes 20 us
 
     @cached_property
     def selector(self) -> Field | None:

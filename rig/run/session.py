@@ -17,8 +17,8 @@ import numpy as np
 from fdi.progress import Progress
 from plant.profile import Profile, build_profile
 from plant.segments import RATE, Hold
+from rig.benches.frame_map import Role, make_reader
 from rig.benches.profiles import PROFILES, State
-from rig.network import codec
 from rig.network.frame import Frame
 from rig.network.link import EmbeddedWire
 from rig.network.master import HEARTBEAT, Master
@@ -64,6 +64,7 @@ class CycleLog:
         self.history = History()
         self.after = History()  # the probe after clean-up
         self.due_ns = array("q")  # log time of each cycle
+        self._drive = next(each for each in job.bench.frames.list_from(Role.CONTROLLER) if each.has("current"))
         self._drives: list[Frame] = []
         self._unjudged: list[Signals] = []  # rows that the guards have not seen
 
@@ -85,18 +86,20 @@ class CycleLog:
     def keep_drive(self, frame: Frame) -> None:
         """Record a frame; keep the drive frames for the checks of reactions."""
         self._journal.recorder.frame(frame)
-        if frame.cob_id == codec.DRIVE and len(frame.data) == 8 and len(self._drives) < _MOST_DRIVES:
+        is_drive = frame.cob_id == self._drive.identifier and len(frame.data) == self._drive.length
+        if is_drive and len(self._drives) < _MOST_DRIVES:
             self._drives.append(frame)
 
     def read_drives(self) -> DriveFrames:
         """The drive frames of a run with faults on the bus; times count cycles, as those of events do."""
-        drives = [codec.unpack_drive(frame.data) for frame in self._drives]
+        read = make_reader(self._drive)
+        drives = [read(frame.data) for frame in self._drives]
         came, due = np.array([frame.t_ns for frame in self._drives], np.int64), np.array(self.due_ns, np.int64)
         cycle = np.searchsorted(due, came, "right") - 1
         since = np.clip(came - due[np.maximum(cycle, 0)], 0, self._period_ns - 1) if len(due) else came
         t = np.where(cycle < 0, -np.inf, (cycle - self._start) / RATE + since * 1e-9)
-        return DriveFrames(t, np.array([drive.current for drive in drives]),
-                           np.array([drive.status for drive in drives], np.int64))
+        return DriveFrames(t, np.array([drive["current"] for drive in drives]),
+                           np.array([drive.get("status_word", 0) for drive in drives]).astype(np.int64))
 
     def find_passed_guard(self) -> Guard | None:
         """The first guard that one of the rows since the last call has passed."""
