@@ -86,5 +86,5 @@ def test_the_words_of_cia_408_are_those_of_the_bus_page() -> None:
 
 def test_a_device_without_a_control_word_is_always_active() -> None:
     words = PROFILES["none"]
-    assert find_state(words, 0) == find_wanted(words, 0) == State.ACTIVE
-    assert choose_control(words, State.ACTIVE, State.ACTIVE) == 0
+    control = choose_control(words, State.ACTIVE, State.ACTIVE)
+    assert find_state(words, 0) == find_wanted(words, control) == State.ACTIVE
