@@ -57,6 +57,7 @@ from fdi.trace.trace import Check, Event, Floats, Trace
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",
                           "NOT_JUDGED": "doubtful"}
+_SKIPPED = "not_applicable."  # before the names of checks that do not apply to the bench, in the provenance
 EVENT_MOODS: dict[str, Mood] = {"ERROR": "bad", "WARN": "doubtful"}
 KINDS_OF_TIMING = {"hard real time": "the rig's cycle ran as compiled code",
                    "soft real time": "the rig's cycle ran in Python, on a bus that compiled code cannot use"}
@@ -81,7 +82,8 @@ def build_run_report(trace: Trace) -> Report:
         Section("Checks", [_tabulate_checks(trace.sequence_checks, "check", Medium.BOTH)]),
         Section("Failed checks", _show_failed_checks(trace), medium=page),
         Section("Servovalve", _show_diagnosis(trace), medium=page),
-        Section("Protocol", [_tabulate_checks(trace.protocol_checks, "protocol check", page)]),
+        Section("Protocol", [_tabulate_checks(trace.protocol_checks, "protocol check", page),
+                             _tabulate_skipped(trace)]),
         Section("Signals", [Figure(
             "Command, ram position, following error, current, pressure difference and spool position over time. "
             "Shaded: ramps (blue) and dynamic sections (violet) of the command, injected faults (orange). The bars at "
@@ -95,7 +97,7 @@ def build_run_report(trace: Trace) -> Report:
             medium=page),
         Section("Provenance", [
             tabulate([(name, text) for name, text in sorted(trace.provenance.items())
-                      if not name.startswith(("cause.", "limits.", "fdi.", "differences."))],
+                      if not name.startswith(("cause.", "limits.", "fdi.", "differences.", _SKIPPED))],
                      (Column(""), lambda row: Cell(row[0], "muted")), (Column(""), lambda row: row[1]), is_list=True),
             *(Listing(data.decode("utf-8", "replace"), f"{name} ({len(data)} bytes)")
               for name, data in sorted(trace.attachments.items()))], medium=page)]
@@ -188,6 +190,13 @@ def _tabulate_checks(checks: Sequence[Check], heading: str, remark: Medium) -> T
         (any(check.detail for check in checks), Column("remark", medium=remark),
          lambda check: Cell(check.detail, "muted"))]
     return tabulate(checks, *((column, show) for is_shown, column, show in columns if is_shown))
+
+
+def _tabulate_skipped(trace: Trace) -> Table:
+    """The protocol checks that do not apply to the bench of the run."""
+    return tabulate(
+        [(name.removeprefix(_SKIPPED), why) for name, why in trace.provenance.items() if name.startswith(_SKIPPED)],
+        (Column("not applicable"), lambda row: row[0]), (Column("reason"), lambda row: Cell(row[1], "muted")))
 
 
 def _show_failed_checks(trace: Trace, most: int = 12) -> list[Item]:

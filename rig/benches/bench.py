@@ -38,6 +38,7 @@ class CanopenNode:
     mode: int | None = None  # CiA 402: written to 0x6060
     settings: tuple[tuple[int, int, str], ...] = ()  # objects (index, sub) that hold a parameter of the model
     values: tuple[tuple[int, int, bytes], ...] = ()  # of a DCF: written at bring-up
+    emcy: tuple[int, ...] = ()  # error codes that its manual lists
 
     def find_cob_id(self, service: int) -> int:
         """The COB-ID of a service in the predefined connection set (CiA 301, 7.3.3), such as 0x580."""

@@ -24,6 +24,7 @@ from rig.tables import Place, Range, build_dataclass, decode_text, list_choices,
 
 ReadFile = Callable[[str], bytes]
 Byte = Annotated[int, Range("1", low=0, high=255)]
+EmcyCode = Annotated[int, Range("1", low=0, high=0xFFFF)]
 NodeId = Annotated[int, Range("1", low=1, high=127)]
 CYCLE_POSITION = 8  # mode of operation of CiA 402: cyclic synchronous position
 _CYCLES = Fraction(1, 10_000), Fraction(1, 10)  # s
@@ -41,6 +42,7 @@ class NodeKeys:
 
     node: NodeId | None = None
     eds: str | None = None
+    emcy: tuple[EmcyCode, ...] = ()
     inputs: Mapping[str, str] = field(default_factory=dict)
     outputs: Mapping[str, str] = field(default_factory=dict)
 
@@ -222,8 +224,8 @@ def _read_time(text: str, place: Place, low: Fraction, high: Fraction) -> int:
 
 def _refuse_canopen_keys(keys: BenchKeys, place: Place) -> None:
     """Refuse keys of CANopen on plain CAN."""
-    for key in ("node", "eds", "mode", "parameters", "profile"):
-        if getattr(keys.controller, key) not in (None, {}, "none"):
+    for key in ("node", "eds", "mode", "parameters", "profile", "emcy"):
+        if getattr(keys.controller, key) not in (None, {}, "none", ()):
             raise place.at("controller", key).refuse('protocol = "canopen" together with this key')
     if keys.plant_node is not None:
         raise place.at("plant_node").refuse('protocol = "canopen" of the controller')
@@ -362,7 +364,8 @@ def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use
         raise place.refuse("also the key 'node', a node-ID from 1 to 127")
     eds = keys.eds or ""
     dictionary = canopen_map.read_dictionary(eds, reader.read_text(keys.eds, place.at("eds"), "EDS or DCF"), keys.node)
-    node = CanopenNode(node=keys.node, eds=folder / eds, values=canopen_map.list_values(dictionary))
+    node = CanopenNode(node=keys.node, eds=folder / eds, values=canopen_map.list_values(dictionary),
+                       emcy=keys.emcy)
     if isinstance(keys, ControllerKeys):
         uses = _add_profile(uses, dictionary, keys, place)
         mode = keys.mode

@@ -246,6 +246,11 @@ class FrameMap:
         for each in self.frames:
             self.by_identifier.setdefault(each.identifier, []).append(each)
 
+    @property
+    def is_fd(self) -> bool:
+        """Whether there are CAN FD frames."""
+        return any(each.identifier & FD for each in self.frames)
+
     def list_from(self, *senders: Role) -> tuple[FrameSpec, ...]:
         """The frames of these senders."""
         return tuple(each for each in self.frames if each.sender in senders)

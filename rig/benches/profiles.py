@@ -31,9 +31,11 @@ class ProfileWords(NamedTuple):
     quick_stop: int  # control word that asks for QUICK_STOP; that of OFF where the profile has none
     commands: tuple[tuple[int, int, int], ...]  # of a control word; one that matches none asks for OFF
     states: tuple[tuple[int, int, int], ...]  # of a status word
-    powered: tuple[int, ...]  # states in which current may flow
+    mask: int  # bits of the status word that say the state
+    powered: int  # bit of the status word that says that current may flow
     is_confirmed: bool  # the next step up waits until the status word has confirmed the last one
     delay: float  # s: by then the status word has followed the control word, if the sequence says nothing else
+    active: str  # name of the state ACTIVE
 
 
 def _list_pairs(*rows: tuple[int, int, State]) -> tuple[tuple[int, int, int], ...]:
@@ -48,8 +50,9 @@ CIA402 = ProfileWords(  # IEC 61800-7-201 (CiA 402-2), state machine, tables of 
     states=_list_pairs((0x4F, 0x00, State.NOT_READY), (0x4F, 0x40, State.OFF), (0x6F, 0x21, State.READY),
                        (0x6F, 0x23, State.ON), (0x6F, 0x27, State.ACTIVE), (0x6F, 0x07, State.QUICK_STOP),
                        (0x4F, 0x0F, State.FAULT_REACTION), (0x4F, 0x08, State.FAULT)),
-    powered=(int(State.ACTIVE), int(State.QUICK_STOP), int(State.FAULT_REACTION)),
-    is_confirmed=True, delay=0.4,  # the standard has no limit; a drive may have a brake to release
+    mask=0x6F, powered=0x4, is_confirmed=True,
+    delay=0.4,  # the standard has no limit; a drive may have a brake to release
+    active="Operation enabled",
 )
 CIA408 = ProfileWords(  # docs/bus.md
     ladder=(0x0, 0x1, 0x3, 0x7),
@@ -57,13 +60,14 @@ CIA408 = ProfileWords(  # docs/bus.md
     commands=_list_pairs((0x7, 0x1, State.READY), (0x7, 0x3, State.ON), (0x7, 0x7, State.ACTIVE)),
     states=_list_pairs((0xF, 0x8, State.OFF), (0xF, 0x9, State.READY), (0xF, 0xB, State.ON), (0xF, 0xF, State.ACTIVE),
                        (0x8, 0x0, State.FAULT)),
-    powered=(int(State.ACTIVE),),
-    is_confirmed=False, delay=2e-3,
+    mask=0xF, powered=0x4, is_confirmed=False, delay=2e-3, active="ACTIVE",
 )
 # No control word: the rig's own word of a cycle says whether the fields that enable the controller do so (bit 0), and
 # whether the values of the phase are sent (bit 1) or those of the safe state.
-NO_WORDS = ProfileWords((0, 2, 2, 3), 0, 0, _list_pairs((0x1, 0x1, State.ACTIVE)), _list_pairs((0, 0, State.ACTIVE)),
-                        (int(State.ACTIVE),), is_confirmed=True, delay=10e-3)
+NO_WORDS = ProfileWords(
+    ladder=(0, 2, 2, 3), reset=0, quick_stop=0, commands=_list_pairs((0x1, 0x1, State.ACTIVE)),
+    states=_list_pairs((0, 0, State.ACTIVE)), mask=0, powered=0, is_confirmed=True, delay=10e-3, active="enabled",
+)
 PROFILES = {"cia402": CIA402, "cia408": CIA408, "none": NO_WORDS}
 
 # Transitions of CiA 402 by number: state before, state after, and the state that the control word asks for. Automatic
@@ -135,3 +139,34 @@ def choose_control(words: ProfileWords, wanted: int, state: int, before: int = 0
     if state <= State.ACTIVE:
         return words.ladder[min(wanted, state + 1)]
     return words.ladder[min(wanted, 1)] if state == State.UNKNOWN else words.ladder[0]
+
+
+def list_transitions() -> list[tuple[int, int]]:
+    """State and wanted state of the transitions of CiA 402 that every drive makes when a control word asks for them."""
+    return [(int(before), int(asked)) for number, (before, _, asked) in TRANSITIONS.items()
+            if asked is not None and number not in (15, 16)]
+
+
+def list_reachable(state: int, wanted: frozenset[int], *, resets: bool) -> frozenset[int]:
+    """The states of CiA 402 that a drive may be in next, some transitions after `state`.
+
+    Args:
+        state: before.
+        wanted: what the control words since then have asked for.
+        resets: whether the reset bit rose among them.
+    """
+    asked = set(wanted) | ({int(State.FAULT)} if resets else set())
+    if State.QUICK_STOP in wanted:
+        asked.add(State.OFF)  # 7 and 10 are by Quick stop as well
+    if State.ACTIVE in wanted:
+        asked.add(State.ON)  # Enable operation may mean 3 and 4
+    found, rest = {state}, [state]
+    while rest:
+        before = rest.pop()
+        after = {to for start, to, word in TRANSITIONS.values() if start == before and (word is None or word in asked)}
+        after.add(State.FAULT_REACTION)  # 13
+        if before == State.QUICK_STOP:
+            after.add(State.OFF)  # 12 is automatic with some quick stop option codes
+        rest += after - found
+        found |= after
+    return frozenset(found)

@@ -23,6 +23,7 @@ from rig.cli.options import (
     RUNS,
     SEED_IF_GIVEN,
     SIGNALS,
+    TRUST,
     Group,
     Option,
     offer_page,
@@ -120,14 +121,15 @@ COMMANDS = {
     "conformance": Command(
         "test a CANopen node against CiA 301 and its EDS: numbered tests, JUnit, HTML, JSON",
         "Exit status 1 if a test failed, 3 if none failed and some times could not be measured.",
-        (option("node", metavar="NODE",
+        (option("node", nargs="?", metavar="NODE",
                 help="node-ID of a node on the bus, 1 to 127; or plant, controller or c (the controller in C): our "
-                     "own, started by this command"),
+                     "own, started by this command; with --bench its controller (default) or plant"),
          option("--bus", default="auto", metavar="INTERFACE:CHANNEL",
                 help="for example socketcan:can0 or udp_multicast; our own nodes also run on the embedded bus "
                      "(default)"),
          option("--eds", type=Path, metavar="FILE",
                 help="electronic data sheet of the node (our own nodes have theirs)"),
+         option("--bench", metavar="FILE|NAME", help="bench file: it has node-ID and data sheet"), TRUST,
          option("--chapter", action="append", default=[], metavar="N[.M]",
                 help="only this chapter or test (repeatable)"),
          option("--write", action="store_true",
@@ -234,6 +236,7 @@ COMMANDS = {
          option("--bus", default="auto", metavar="INTERFACE:CHANNEL",
                 help="the bus to join: socketcan:can0 is a CAN interface, udp_multicast works between programs on "
                      "this machine (needed, unless EHA_RIG_BUS names a bus)"),
+         BENCH,
          option("--parent", type=int, default=0, help=argparse.SUPPRESS),  # the node ends when this process ends
          Group("model", MODEL, "The emulator simulates it and the firmware takes its gains from it, until a rig on "
                                "the bus loads another. The bench drives servovalves: ehs and servo are refused."))),
@@ -257,17 +260,18 @@ COMMANDS = {
         (option("sequence", nargs="*", metavar="SEQUENCE",
                 help="test sequence: a .toml file, or the name of a shipped one (default: preflight). Several, or a "
                      "suite file, run on all cores and end in one report (docs/suite.md)"),
-         *PLANT, SEED_IF_GIVEN,
+         *PLANT, SEED_IF_GIVEN, BENCH,
          option("--bus", default="auto", metavar="auto|embedded|INTERFACE:CHANNEL",
                 help="auto: that of EHA_RIG_BUS, else the embedded one (default); embedded: in this process; or "
                      "socketcan:can0, udp_multicast, ..."),
          option("--pace", choices=PACES,
                 help="lockstep: virtual time, bit-reproducible (default); realtime: wall-clock time"),
          option("--controller", choices=CONTROLLERS,
-                help="firmware of node 2: the reference firmware in Python (builtin, default) or in C (c: compiled "
-                     "and started here), or your own on the bus (external)"),
+                help="the reference firmware in Python (builtin, default) or in C (c: compiled and started here), or "
+                     "your own on the bus (external; default for a --bench of your own)"),
          option("--plant", choices=PLANTS,
-                help="plant of node 3: auto uses the emulator that answers on the bus, else starts one (default)"),
+                help="plant of a bench with a plant node: auto uses the emulator that answers on the bus, else starts "
+                     "one (default)"),
          option("--max-overruns", type=float, metavar="FRACTION",
                 help="largest share of overruns in a real-time run; more make its timing invalid (default: that of "
                      "the sequence, 0.001)"),

@@ -62,6 +62,8 @@ OF_EVERY_COMMAND = (
     option("--quiet", action="store_true", help="print nothing but errors"))
 ANY_TRACE = "trace.mcap, the folder of a run, or a CSV"
 MEASURED_TRACE = f"{ANY_TRACE} with t,com,xj,cor[,p12,xs,load]"
+TRUST = option("--trust", action="store_true",
+               help="run the code that a log, model or bench file brings along; it is listed first, with its hash")
 PLANT = (
     option("--model", metavar="FILE|NAME",
            help="model file, or a shipped model: eha (default), ehs (pump-driven servo), servo (the same, a real one)"),
@@ -69,8 +71,7 @@ PLANT = (
            help="change a parameter of the model or of an effect, SI units (repeatable)"),
     option("--effects", action="append", default=[], type=Path, metavar="FILE.py",
            help="your own effects (repeatable)"),
-    option("--trust", action="store_true",
-           help="run the code that a log or a model file brings along; it is listed first, with its hash"))
+    TRUST)
 SEED = option("--seed", type=parse_whole_number, default=0, metavar="N", help="seed of the noise (default 0)")
 SEED_IF_GIVEN = option("--seed", **{**SEED.settings, "default": None})  # so that one that is given is noticed
 MODEL = (*PLANT, SEED)

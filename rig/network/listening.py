@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from rig.benches.bench import Bench
 from rig.benches.bus_load import FrameLoad, list_loads
-from rig.benches.frame_map import FD, describe_identifier
+from rig.benches.frame_map import describe_identifier
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
@@ -29,8 +29,7 @@ def listen(bench: Bench, spec: str, seconds: float) -> list[Frame]:
         RigError: the bus cannot be opened.
     """
     clock = WallClock()
-    is_fd = any(each.identifier & FD for each in bench.frames.frames)
-    link = Link(open_can(spec, bench.bitrate, is_fd), clock.now)
+    link = Link(open_can(spec, bench.bitrate, bench.frames.is_fd), clock.now)
     try:
         frames, end = [], clock.now() + round(seconds * 1e9)
         while (left := end - clock.now()) > 0:

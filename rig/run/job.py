@@ -52,6 +52,9 @@ class Job:
     max_overruns: float = 1e-3  # of all cycles, in real time
 
     def __post_init__(self) -> None:
+        if self.plant == "external" and not self.bench.has_plant_node:
+            raise InputError("--plant", self.plant, f"auto: the rig moves the plant of {self.bench.name!r}, which has "
+                                                    "no plant node")
         if self.controller != "external" and not speaks_as_shipped(self.bench):
             raise InputError("--controller", self.controller, "external: our own firmware does not speak as the device "
                                                               f"of {self.bench.name!r}")
@@ -212,7 +215,7 @@ class JobChoice(NamedTuple):
     changes: Mapping[str, str | float] = {}  # "GROUP.FIELD" to value, SI
     seed: int = 0
     effects: tuple[Path, ...] = ()  # files of the user's own effects
-    bench: str = "eha"  # a file, or the name of a shipped one
+    bench: str | None = None  # a file, or the name of a shipped one
     bus: str = "embedded"
     pace: str | None = None
     controller: str | None = None
@@ -244,7 +247,7 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     model = load_model(name).replace(sequence.model.overrides, sequence.name).replace(choice.changes)
     require_bench_cycle(model, "--set")
     foreign = [name for name in model.list_changes() if name.startswith("controller.")]
-    bench = load_bench(choice.bench, is_trusted=is_trusted)
+    bench = load_bench(choice.bench or "eha", is_trusted=is_trusted)
     controller = choice.controller or ("builtin" if speaks_as_shipped(bench) else "external")
     if controller == "external" and foreign:
         raise InputError("--set", foreign[0], "no gains beside --controller external: that firmware has its own")

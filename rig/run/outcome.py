@@ -26,7 +26,7 @@ from rig.run.attribution import Attribution, Cause, Trouble, count_most_in_a_row
 from rig.run.job import Job, find_differences
 from rig.run.loop import History, Loop
 from rig.run.state import SessionEvent
-from rig.sequences.checks import CheckResult
+from rig.sequences.checks import CheckResult, SkippedCheck
 from rig.sequences.protocol import HEARTBEAT
 
 STATUS_OF_VERDICT = {"PASS": 0, "NOT_JUDGED": 0, "FAIL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
@@ -51,6 +51,7 @@ class Outcome:
     due_ns: Sequence[int]  # log time of each cycle
     start_times: Mapping[Role, float]  # s from NMT start to OPERATIONAL
     identities: Mapping[Role, Identity]
+    skipped: Sequence[SkippedCheck] = ()  # they do not apply to the bench
     limits: Sequence[LimitReached] = ()  # of travel and current, that the run reached
     fdi: dict[str, Any] = field(default_factory=dict)  # diagnosis of `rig fdi`, if it was requested
 
@@ -179,6 +180,7 @@ class Outcome:
         events, omitted = select_events(self.events)
         return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.why,
                 "checks": [to_plain(check._asdict()) for check in self.checks],
+                "not_applicable": [check._asdict() for check in self.skipped],
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
                 **self._attribution_to_json(), "differences": find_differences(self.job).to_json(),
                 "limits": [limit._asdict() for limit in self.limits],

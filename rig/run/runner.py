@@ -35,7 +35,7 @@ from rig.run.priority import (
     suspend_garbage_collection,
 )
 from rig.run.session import MAIN, Session
-from rig.sequences.checks import CheckResult, evaluate_checks
+from rig.sequences.checks import CheckResult, SkippedCheck, evaluate_checks
 from rig.sequences.faults import Schedule
 from rig.sequences.protocol import judge_protocol
 from rig.sequences.python_parts import StepRun
@@ -118,17 +118,19 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     recorder.metadata("timing", {"kind": kind, "reason": reason})
     history = session.log.history
     attribution = attribute_run(job, session)
-    checks = judge_run(job, session, attribution.judged)
+    checks, skipped = judge_run(job, session, attribution.judged)
     for check in checks:
         recorder.put(session.stage.now(), _make_check_record(check))
     diagnosis = diagnose(make_main_trace(job, folder, history)) if diagnose and not session.safety.interrupted else {}
     safety, log, starter = session.safety, session.log, session.starter
     outcome = Outcome(
-        job=job, folder=folder, checks=checks, events=session.journal.events, aborted=safety.aborted,
+        job=job, folder=folder, checks=checks, skipped=skipped, events=session.journal.events, aborted=safety.aborted,
         safe=safety.is_safe, interrupted=safety.interrupted, fdi=diagnosis, attribution=attribution,
         timing=summarise_timing(history, loop, scheduled, kind, reason), counters=_count_lost_frames(history),
         speed=len(history) * job.period_ns * 1e-9 / spent, due_ns=tuple(log.due_ns), start_times=starter.start_times,
         identities=starter.identities, limits=find_limits(history.column, job.model, job.scenario.plan.start))
+    if skipped:
+        recorder.metadata("not_applicable", {check.name: check.reason for check in skipped})
     recorder.metadata("differences", {"text": find_differences(job).describe()})
     if outcome.limits:
         recorder.metadata("limits", {f"{number:02d}": limit.describe() for number, limit in enumerate(outcome.limits)})
@@ -142,14 +144,18 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     return outcome
 
 
-def judge_run(job: Job, session: Session, judged: Mask) -> list[CheckResult]:
-    """Judge the main phase by the checks of the sequence, and the whole run by the protocol checks."""
+def judge_run(job: Job, session: Session, judged: Mask) -> tuple[list[CheckResult], list[SkippedCheck]]:
+    """Judge the main phase by the checks of the sequence, and the whole run by the protocol checks.
+
+    Returns the results, and the protocol checks that do not apply to the bench.
+    """
     main = [session.log.history.column(name, MAIN) for name in Columns._fields[1:]]
     t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
     sequence = job.sequence
     results = evaluate_checks(sequence.checks, Columns(t, *main), sequence.sections(), session.journal.events,
                               sequence.fault_starts(), session.log.read_drives())
-    return [*results, *judge_protocol(session.read_protocol_record(judged), sequence.protocol)]
+    protocol, skipped = judge_protocol(session.read_protocol_record(judged), sequence.protocol)
+    return [*results, *protocol], skipped
 
 
 def make_main_trace(job: Job, folder: Path, history: History) -> Trace:

@@ -346,6 +346,7 @@ class Session:
             heard=(self.stage.begun_ns * 1e-9, self.stage.clock.now() * 1e-9),
             deaf=(self._master.wire.stalled_ns - self._stalled_ns) * 1e-9,
             deaf_cycles=self._faults.list_bus_off_cycles("rig").tolist(), heartbeat_period=HEARTBEAT * 1e-3,
+            bench=job.bench,
             current_limit=model["controller.current_limit"] if start.gains is None else start.gains.current_limit,
             gains=None if find_firmware_parameters(model) else start.gains, realtime=job.realtime,
             is_response_judged=job.realtime and not self._is_embedded)

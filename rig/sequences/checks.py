@@ -51,6 +51,13 @@ class CheckResult(NamedTuple):
     below: float = nan
 
 
+class SkippedCheck(NamedTuple):
+    """A check that does not apply to a bench, and why."""
+
+    name: str
+    reason: str
+
+
 @dataclass(frozen=True, kw_only=True)
 class Check:
     """A measured number and its limits. `window`: a section's name, [t0, t1] in s of main, or "main" for all of it."""

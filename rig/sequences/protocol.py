@@ -5,7 +5,7 @@ bus, no clock. docs/sequences.md lists the checks and their default limits.
 """
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite, nan
 from typing import Annotated, NamedTuple
@@ -15,9 +15,23 @@ from numpy.typing import NDArray
 
 from plant.controller import Loop, compute_current
 from plant.segments import RATE, Array, Second
-from rig.device.emcy import EmcyCode
-from rig.network.codec import Control, Flags, Status
-from rig.sequences.checks import CheckResult
+from rig.benches.bench import Bench
+from rig.benches.bench_file import load_bench
+from rig.benches.canopen_map import name_object
+from rig.benches.frame_map import Role
+from rig.benches.profiles import (
+    CIA402,
+    CIA408,
+    PROFILES,
+    ProfileWords,
+    State,
+    find_state,
+    find_wanted,
+    list_reachable,
+    list_transitions,
+)
+from rig.network.codec import Flags
+from rig.sequences.checks import CheckResult, SkippedCheck
 from rig.tables import Range
 
 Mask = NDArray[np.bool_]
@@ -25,14 +39,7 @@ Whole = NDArray[np.int64]
 KIND = "protocol"  # of the check results
 NO_FRAME = "no drive frame came"
 HEARTBEAT = "heartbeat"  # the signal of those about heartbeats
-CONTROLLER = 2
-DOCUMENTED_EMCY: Mapping[int, frozenset[int]] = {  # by node, as docs/bus.md lists them
-    2: frozenset({EmcyCode.RESET, EmcyCode.COMMUNICATION, EmcyCode.HEARTBEAT_LOST, EmcyCode.PDO_TOO_SHORT,
-                  EmcyCode.PDO_TOO_LONG, EmcyCode.SYNC_LENGTH, EmcyCode.RPDO_TIMEOUT}),
-    3: frozenset({EmcyCode.RESET, EmcyCode.SOFTWARE, EmcyCode.COMMUNICATION, EmcyCode.HEARTBEAT_LOST,
-                  EmcyCode.PDO_TOO_SHORT, EmcyCode.PDO_TOO_LONG, EmcyCode.SYNC_LENGTH, EmcyCode.RPDO_TIMEOUT}),
-}
-_LEVELS, _READY = int(Control.ACTIVE), int(Status.READY)
+_LEVELS, _READY = CIA408.ladder[-1], 0x8  # of control and status word of CiA 408
 LONGEST_STEP_DELAY = 0.1  # s: the probe's step lasts as long
 UpToOneSecond = Annotated[float, Range("s", above=0.0, high=1.0)]
 _BEFORE_EMCY = 20  # cycles: a fault may show in the status word before its EMCY has been read
@@ -42,15 +49,18 @@ _BEFORE_EMCY = 20  # cycles: a fault may show in the status word before its EMCY
 class ProtocolLimits:
     """Limits of the protocol checks: the table `protocol` of a sequence.
 
-    status: time in which status word and zero current follow the control word. missing: share of the cycles whose
+    status: time in which status word and zero current follow the control word (default: 2 ms; 400 ms of CiA 402, 10 ms
+    without a control word). idle_current: largest current that counts as none, such as the noise of a drive that sends
+    what it measures. missing: share of the cycles whose
     drive frame may be missing, late or of another cycle (default: none in lockstep, 0.001 in real time). response_*:
     from SYNC to the drive frame, in real time. heartbeat: tolerance of the median heartbeat period. gain: tolerance of
     the loop's gain, 1. step_delay: from a demand step to the first answer that follows it; above 0 for a controller
-    with a filter in its loop. emcy: codes of node 2 allowed beyond the documented ones. probe: whether to run the
-    probes.
+    with a filter in its loop. emcy: codes of the controller allowed beyond the documented ones. probe: whether to
+    run the probes.
     """
 
-    status: UpToOneSecond = 2e-3
+    status: UpToOneSecond | None = None
+    idle_current: Annotated[float, Range("A", low=0.0)] = 0.0
     missing: Annotated[float, Range("1", low=0.0, high=1.0)] | None = None
     response_p50: UpToOneSecond = 0.5e-3
     response_p99: UpToOneSecond = 0.9e-3
@@ -60,6 +70,10 @@ class ProtocolLimits:
     step_delay: Annotated[float, Range("s", low=0.0, high=LONGEST_STEP_DELAY)] = 0.0
     emcy: tuple[Annotated[int, Range("1", low=1, high=0xFFFF)], ...] = ()
     probe: bool = True
+
+    def find_delay(self, words: ProfileWords) -> float:
+        """The limit `status` for a profile, s."""
+        return words.delay if self.status is None else self.status
 
 
 class Rows(NamedTuple):
@@ -90,7 +104,7 @@ class Emergency(NamedTuple):
     """An EMCY frame; `cycle` is the row of the run, negative before the first."""
 
     cycle: int
-    node: int
+    node: Role
     code: int
 
 
@@ -98,10 +112,10 @@ class Emergency(NamedTuple):
 class ProtocolRecord:
     """All that the protocol checks are judged by.
 
-    `gains`: those of object 0x2110, if the controller has them and follows them. `is_response_judged`: real time, and
-    the controller is not in the rig's own process. `heartbeats`: by the name of the node; `heard`: first and last time
-    at which heartbeats could have been received, s; `deaf`: how long of it the rig received nothing, s; `deaf_cycles`:
-    in which, so that an EMCY of the controller may be missing here.
+    `gains`: those that objects of the controller hold, if it has them and follows them. `is_response_judged`: real
+    time, and the controller is not in the rig's own process. `heartbeats`: of the nodes that send one, by name;
+    `heard`: first and last time at which heartbeats could have been received, s; `deaf`: how long of it the rig
+    received nothing, s; `deaf_cycles`: in which, so that an EMCY of the controller may be missing here.
     """
 
     run: Rows
@@ -113,6 +127,7 @@ class ProtocolRecord:
     deaf: float = 0.0
     deaf_cycles: Sequence[int] = ()
     heartbeat_period: Second = 0.1
+    bench: Bench = field(default_factory=load_bench)
     current_limit: float = nan
     gains: object | None = None
     realtime: bool = False
@@ -124,11 +139,20 @@ class ProtocolRecord:
         return [*self.probes, self.run, *([self.after] if self.after is not None else [])]
 
 
-def judge_protocol(record: ProtocolRecord, limits: ProtocolLimits) -> list[CheckResult]:
-    """The protocol checks of a run, in the order of the table."""
-    return [check for judge in (_judge_current, _judge_status, _judge_drive_frames, _judge_frozen, _judge_probes,
-                                _judge_response, _judge_heartbeats, _judge_emergencies)
-            for check in judge(record, limits)]
+    @property
+    def words(self) -> ProfileWords:
+        """Control word and status word of the controller."""
+        return PROFILES[self.bench.profile]
+
+
+def judge_protocol(record: ProtocolRecord, limits: ProtocolLimits) -> tuple[list[CheckResult], list[SkippedCheck]]:
+    """The protocol checks of a run, in the order of the table, and those that do not apply to its bench."""
+    judges: tuple[Callable[[ProtocolRecord, ProtocolLimits], Iterator[CheckResult | SkippedCheck]], ...] = (
+        _judge_current, _judge_status, _judge_drive_frames, _judge_frozen, _judge_probes, _judge_response,
+        _judge_heartbeats, _judge_emergencies)
+    found = [check for judge in judges for check in judge(record, limits)]
+    return ([check for check in found if isinstance(check, CheckResult)],
+            [check for check in found if isinstance(check, SkippedCheck)])
 
 
 def _make_result(name: str, signal: str, value: float, unit: str, low: float = nan, high: float = nan,
@@ -138,17 +162,21 @@ def _make_result(name: str, signal: str, value: float, unit: str, low: float = n
     return CheckResult(name, KIND, signal, value, unit, low, high, passed, nan, nan, detail)
 
 
-def _judge_current(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
-    """Largest current in cycles whose control word, and those of the grace time before it, are not ACTIVE; and in all.
-    """
-    grace = round(limits.status * RATE)
-    idle = _drop_missing([rows.cor[find_idle(rows.control, grace)] for rows in record.stretches])
+def _judge_current(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
+    """Largest current while it must be zero; and in all cycles."""
+    idle = _drop_missing([rows.cor[find_idle(rows, record.words, limits)] for rows in record.stretches])
     current = _drop_missing([rows.cor for rows in record.stretches])
-    for name, values, limit, detail in (
-            ("no current unless ACTIVE", idle, 0.0, f"{len(idle)} cycles"),
-            ("current within its limit", current, record.current_limit, "")):
-        largest, detail = (float(np.abs(values).max()), detail) if len(values) else (nan, NO_FRAME)
-        yield _make_result(name, "current", largest * 1e3, "mA", high=limit * 1e3, detail=detail)
+    name = f"no current unless {record.words.active}"
+    if record.bench.profile == "none" and not record.bench.enables:
+        yield SkippedCheck(name, "the bench has no control word, and no value of its phases enables the controller")
+    else:
+        yield _judge_largest(name, idle, limits.idle_current, f"{len(idle)} cycles")
+    yield _judge_largest("current within its limit", current, record.current_limit, "")
+
+
+def _judge_largest(name: str, values: Array, limit: float, detail: str) -> CheckResult:
+    largest, detail = (float(np.abs(values).max()), detail) if len(values) else (nan, NO_FRAME)
+    return _make_result(name, "current", largest * 1e3, "mA", high=limit * 1e3, detail=detail)
 
 
 def _drop_missing(parts: Sequence[Array]) -> Array:
@@ -156,22 +184,88 @@ def _drop_missing(parts: Sequence[Array]) -> Array:
     return values[~np.isnan(values)]
 
 
-def find_idle(control: Array, grace: int) -> Mask:
-    """Cycles whose control word is not ACTIVE and was not in the `grace` cycles before; none is before the first."""
-    active = control.astype(int) & _LEVELS == _LEVELS
-    count, k = np.concatenate(([0], np.cumsum(active))), np.arange(len(active))
-    idle: Mask = count[k + 1] == count[np.maximum(k - grace, 0)]
+def map_words(values: Array, find: Callable[[int], int]) -> Whole:
+    """What `find` gives for each of some words, most of which are equal."""
+    known, places = np.unique(values.astype(int), return_inverse=True)
+    found: Whole = np.array([find(word) for word in known.tolist()], np.int64)[places]
+    return found
+
+
+def find_states(rows: Rows, words: ProfileWords) -> Whole:
+    """The `State` of the status word in each cycle."""
+    return map_words(rows.status, lambda word: find_state(words, word))
+
+
+def find_idle(rows: Rows, words: ProfileWords, limits: ProtocolLimits) -> Mask:
+    """Cycles in which there must be no current; none is before the first.
+
+    By the control word: it does not ask for ACTIVE, nor did it in the time `status` before. By the status word of
+    CiA 402: it has said that there is none, for 2 ms.
+    """
+    wanted = map_words(rows.control, lambda word: find_wanted(words, word))
+    idle = _find_over(wanted == State.ACTIVE, limits.find_delay(words))
+    if words is CIA402:
+        idle |= _find_over(np.isnan(rows.cor) | (rows.status.astype(int) & words.powered != 0), CIA408.delay)
     return idle
 
 
-def _judge_status(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
-    """How old the control word is that the status word confirms, at worst."""
-    faulty = _find_faulty(record)
-    ages = np.concatenate([measure_status_ages(rows, faulty if rows is record.run else None)
-                           for rows in record.stretches])
+def _find_over(active: Mask, delay: float) -> Mask:
+    """The cycles that are not active and that follow none that is by `delay` s or less."""
+    count, k = np.concatenate(([0], np.cumsum(active))), np.arange(len(active))
+    over: Mask = count[k + 1] == count[np.maximum(k - round(delay * RATE), 0)]
+    return over
+
+
+def _judge_status(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
+    """How long the status word takes to follow the control word, at worst; of CiA 402 also whether it may do so."""
+    name = "status word follows the control word"
+    if record.bench.profile == "none":
+        yield SkippedCheck(name, "the bench has no control word and no status word")
+        return
+    if record.words is CIA402:
+        wrong = [text for rows in record.stretches for text in list_wrong_changes(rows, limits.find_delay(CIA402))]
+        yield _make_result("status word follows the states of CiA 402", "status word", float(len(wrong)), "1", high=0.0,
+                           detail="; ".join(wrong[:3]))
+        ages = np.concatenate([measure_delays(rows) for rows in record.stretches])
+    else:
+        faulty = _find_faulty(record)
+        ages = np.concatenate([measure_status_ages(rows, faulty if rows is record.run else None)
+                               for rows in record.stretches])
     value, detail = (int(ages.max()) * 1e3 / RATE, "") if len(ages) else (nan, NO_FRAME)
-    yield _make_result("status word follows the control word", "status word", value, "ms", high=limits.status * 1e3,
-                       detail=detail)
+    yield _make_result(name, "status word", value, "ms", high=limits.find_delay(record.words) * 1e3, detail=detail)
+
+
+def list_wrong_changes(rows: Rows, delay: float) -> list[str]:
+    """The changes of state of a CiA 402 drive, in words, that no control word of the last `delay` s explains.
+
+    Before the first cycle it is switched off, or in fault.
+    """
+    states, control = find_states(rows, CIA402), rows.control.astype(int)
+    wanted = map_words(control, lambda word: find_wanted(CIA402, word))
+    rises = np.diff(control & CIA402.reset, prepend=0) > 0
+    answered = np.flatnonzero(~np.isnan(rows.cor))
+    before = np.concatenate(([int(State.NOT_READY)], states[answered]))[:-1]
+    wrong = []
+    for i in np.flatnonzero(states[answered] != before).tolist():
+        k, old = int(answered[i]), State(int(before[i]))
+        near = slice(max(0, int(answered[max(i - 1, 0)]) - round(delay * RATE)), k + 1)
+        new = State(int(states[k]))
+        if new not in list_reachable(old, frozenset(wanted[near].tolist()), resets=bool(rises[near].any())):
+            names = [each.name.lower().replace("_", " ") for each in (new, old)]
+            wrong.append(f"cycle {k}: {names[0]} after {names[1]} with control word 0x{control[k]:02X}")
+    return wrong
+
+
+def measure_delays(rows: Rows) -> Whole:
+    """Of each answered cycle, for how many cycles a CiA 402 drive has kept a state that the control word ends."""
+    states = find_states(rows, CIA402)
+    wanted = map_words(rows.control, lambda word: find_wanted(CIA402, word))
+    pairs = states * len(State) + wanted
+    due = {state * len(State) + word for state, word in list_transitions()}
+    k = np.arange(len(pairs))
+    begin = np.maximum.accumulate(np.where(np.diff(pairs, prepend=-1) != 0, k, 0))  # of the run of this pair
+    found: Whole = np.where(np.isin(pairs, list(due)), k - begin, 0)[~np.isnan(rows.cor)]
+    return found
 
 
 def measure_status_ages(rows: Rows, faulty: Mask | None = None) -> Whole:
@@ -210,9 +304,9 @@ def _find_faulty(record: ProtocolRecord) -> Mask:
     """
     control = record.run.control.astype(int)
     faulty = np.zeros(len(control), bool)
-    resets = np.flatnonzero(control & int(Control.RESET))
+    resets = np.flatnonzero(control & record.words.reset)
     announced = [emergency.cycle for emergency in record.emergencies
-                 if emergency.node == CONTROLLER and emergency.code & 0xFF00]
+                 if emergency.node is Role.CONTROLLER and emergency.code & 0xFF00]
     for cycle in (*announced, *record.deaf_cycles):
         later = resets[resets > cycle]
         end = int(later[0]) + 1 if len(later) else len(control)
@@ -220,7 +314,7 @@ def _find_faulty(record: ProtocolRecord) -> Mask:
     return faulty
 
 
-def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
+def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
     """Share of the cycles without a drive frame before the next SYNC, and with one of another cycle."""
     allowed = (0.001 if record.realtime else 0.0) if limits.missing is None else limits.missing
     wrong = missing = cycles = 0
@@ -232,19 +326,24 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
         wrong += int(is_wrong.sum())
         missing += int(is_missing.sum())
         cycles += int(judged.sum())
-    for name, count in (("drive frames of another cycle", wrong), ("drive frames missing or late", missing)):
+    is_numbered = any(spec.has("cycle") for spec in record.bench.frames.list_from(Role.CONTROLLER))
+    numbered = "drive frames of another cycle"
+    for name, count in ((numbered, wrong), ("drive frames missing or late", missing)):
         value = 100 * count / cycles if cycles else 0.0
+        if name == numbered and not is_numbered:
+            yield SkippedCheck(name, "the controller's frames do not carry the number of the cycle")
+            continue
         yield _make_result(name, "drive", value, "%", high=100 * allowed, detail=f"{count} of {cycles}")
 
 
-def _judge_frozen(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
+def _judge_frozen(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
     """How far the position error moved while the current of the closed loop stood still."""
-    change = measure_frozen(record.run, record.current_limit if record.gains is not None else None)
+    change = measure_frozen(record.run, record.current_limit if record.gains is not None else None, record.words)
     largest = 100.0  # um: fifty times the noise of the position sensor
     yield _make_result("current follows the error", "current", change * 1e6, "um", high=largest)
 
 
-def measure_frozen(rows: Rows, limit: float | None) -> float:
+def measure_frozen(rows: Rows, limit: float | None, words: ProfileWords = CIA408) -> float:
     """Largest change of the sensed position error, m, over cycles with one and the same current.
 
     Only cycles in which control and status word say ACTIVE, and not those within 2 % of the current limit. `limit`:
@@ -252,7 +351,8 @@ def measure_frozen(rows: Rows, limit: float | None) -> float:
     """
     largest = np.nanmax(np.abs(rows.cor), initial=0.0) if limit is None else limit
     is_limited = np.abs(rows.cor) >= 0.98 * largest
-    closed = (rows.control.astype(int) & rows.status.astype(int) & _LEVELS == _LEVELS) & ~is_limited
+    wanted = map_words(rows.control, lambda word: find_wanted(words, word))
+    closed = (wanted == State.ACTIVE) & (find_states(rows, words) == State.ACTIVE) & ~is_limited
     error = rows.com - rows.xj
     stays = closed[1:] & closed[:-1] & (rows.cor[1:] == rows.cor[:-1]) & ~np.isnan(error[1:] + error[:-1])
     edges = np.flatnonzero(np.diff(np.concatenate(([0], stays.astype(int), [0]))))
@@ -260,21 +360,30 @@ def measure_frozen(rows: Rows, limit: float | None) -> float:
     return max(ranges, default=0.0)
 
 
-def _judge_probes(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
+def _judge_probes(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
     """Answer to the demand step of the probe, and whether a reset makes the controller forget."""
+    delay_name, repeat_name = "delay of the answer to a step", "same answers after a reset"
+    node, parameter = record.bench.nodes.get(Role.CONTROLLER), "controller.proportional_gain"
+    objects = {name: name_object(index, sub) for index, sub, name in (node.settings if node is not None else ())}
+    gain_name = f"gain against {objects.get(parameter, 'its object').partition(':')[0]}"
+    if record.words is not CIA408:
+        for name in (delay_name, gain_name, repeat_name):
+            yield SkippedCheck(name, "the probe is made for CANopen and CiA 408")
+        return
     if not record.probes:
         return
     first = record.probes[0]
     delay, detail = measure_step_delay(first)
-    yield _make_result("delay of the answer to a step", "current", delay, "ms", high=limits.step_delay * 1e3,
-                       detail=detail)
+    yield _make_result(delay_name, "current", delay, "ms", high=limits.step_delay * 1e3, detail=detail)
     if record.gains is not None:
         gain, detail = measure_gain(first, record.gains)
         tolerance = 100 * limits.gain
-        yield _make_result("gain against 0x2110", "current", 100 * gain, "%", 100 - tolerance, 100 + tolerance, detail)
+        yield _make_result(gain_name, "current", 100 * gain, "%", 100 - tolerance, 100 + tolerance, detail)
+    else:
+        yield SkippedCheck(gain_name, "the controller has no objects that hold its gains, or does not follow them")
     if len(record.probes) > 1:
         difference, detail = measure_difference(record.probes)
-        yield _make_result("same answers after a reset", "current", difference * 1e3, "mA", high=0.0, detail=detail)
+        yield _make_result(repeat_name, "current", difference * 1e3, "mA", high=0.0, detail=detail)
 
 
 def _find_active(rows: Rows) -> Whole:
@@ -327,7 +436,7 @@ def measure_difference(probes: Sequence[Rows]) -> tuple[float, str]:
     return largest, ""
 
 
-def _judge_response(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
+def _judge_response(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
     """From SYNC to the drive frame, in cycles that the bench delivered on time."""
     if not record.is_response_judged:
         return
@@ -338,12 +447,14 @@ def _judge_response(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[
         yield _make_result(f"response time, {name}", "drive", value, "us", high=limit * 1e6, detail=detail)
 
 
-def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
+def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
     """Median heartbeat period of each node.
 
     A run in which the rig could receive for less than three periods says nothing about it. Nor do heartbeats that may
     have waited for the rig longer than the tolerance.
     """
+    if Role.CONTROLLER.name.lower() not in record.heartbeats:
+        yield SkippedCheck("heartbeat period, controller", "the controller sends no heartbeat")
     begin, end = record.heard
     period, tolerance = record.heartbeat_period, limits.heartbeat
     longest_pause = 3.0 * period  # s: then a node counts as silent
@@ -361,10 +472,14 @@ def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterato
         yield _make_result(f"heartbeat period, {node}", HEARTBEAT, round(value, 6), "ms", low, high, detail)
 
 
-def _judge_emergencies(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
+def _judge_emergencies(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
     """How many EMCY frames carry a code that is not documented for their node."""
-    allowed = {node: codes | (frozenset(limits.emcy) if node == CONTROLLER else frozenset())
-               for node, codes in DOCUMENTED_EMCY.items()}
-    strange = [e for e in record.emergencies if e.code not in allowed.get(e.node, frozenset())]
-    said = ", ".join(dict.fromkeys(f"node {e.node} 0x{e.code:04X}" for e in strange[:5]))
-    yield _make_result("undocumented EMCY codes", "EMCY", float(len(strange)), "1", high=0.0, detail=said)
+    name, allowed = "undocumented EMCY codes", {role: {*node.emcy} for role, node in record.bench.nodes.items()}
+    allowed.setdefault(Role.CONTROLLER, set()).update(limits.emcy)
+    if not allowed[Role.CONTROLLER]:
+        yield SkippedCheck(name, "the bench file lists no EMCY codes of the controller (key emcy)" if record.bench.nodes
+                           else "plain CAN has no EMCY")
+        return
+    strange = [e for e in record.emergencies if e.code not in allowed.get(e.node, ())]
+    said = ", ".join(dict.fromkeys(f"node {record.bench.find_number(e.node)} 0x{e.code:04X}" for e in strange[:5]))
+    yield _make_result(name, "EMCY", float(len(strange)), "1", high=0.0, detail=said)

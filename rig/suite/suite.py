@@ -30,7 +30,7 @@ from rig.run.job import JobChoice, build_job, find_differences
 from rig.run.outcome import INTERRUPTED, Outcome, describe_faults, describe_finding, diagnose_servovalve, has_fault
 from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import run_job
-from rig.sequences.checks import CheckResult
+from rig.sequences.checks import CheckResult, SkippedCheck
 from rig.sequences.sequence import load_sequence
 from rig.tables import Range, build_dataclass, decode_text, parse_table, read_file
 
@@ -46,6 +46,7 @@ class CaseEntry:
     sequence: str | tuple[str, ...]
     name: str = ""
     model: str | tuple[str, ...] = ()
+    bench: str | tuple[str, ...] = ()
     set: Mapping[str, float | str | tuple[float | str, ...]] = field(default_factory=dict)
     seed: Seed | tuple[Seed, ...] = 0
     effects: tuple[str, ...] = ()
@@ -128,18 +129,21 @@ def read_suite_file(path: Path, base: JobChoice) -> tuple[SuiteFile, list[Varian
 
 def _vary(entry: CaseEntry, folder: Path, base: JobChoice) -> Iterator[Variant]:
     """Every combination of the lists of an entry."""
-    sequences, models, seeds = _as_tuple(entry.sequence), _as_tuple(entry.model) or (None,), _as_tuple(entry.seed)
+    sequences, seeds = _as_tuple(entry.sequence), _as_tuple(entry.seed)
+    models, benches = (_as_tuple(names) or (None,) for names in (entry.model, entry.bench))
     values = {name: _as_tuple(value) for name, value in entry.set.items()}
     effects = (*base.effects, *(folder / name for name in entry.effects))
-    for sequence, model, seed, *chosen in itertools.product(sequences, models, seeds, *values.values()):
+    for sequence, model, bench, seed, *chosen in itertools.product(sequences, models, benches, seeds, *values.values()):
         changes: dict[str, Value] = dict(zip(values, chosen, strict=True))
         words = [entry.name or Path(sequence).stem]
         words += [Path(sequence).stem] if entry.name and len(sequences) > 1 else []
-        words += [Path(model).stem] if model is not None and len(models) > 1 else []
+        words += [Path(file).stem for file, files in ((model, models), (bench, benches))
+                  if file is not None and len(files) > 1]
         words += [f"{name}={_show(value)}" for name, value in changes.items() if len(values[name]) > 1]
         words += [f"seed {seed}"] if len(seeds) > 1 else []
         choice = base._replace(sequence=_find_beside(folder, sequence), changes=changes, seed=seed, effects=effects,
                                model=None if model is None else _find_beside(folder, model),
+                               bench=base.bench if bench is None else _find_beside(folder, bench),
                                is_diagnosed=base.is_diagnosed or entry.fdi)
         yield Variant(", ".join(words), choice, entry.timeout, _as_tuple(entry.requirement))
 
@@ -218,6 +222,7 @@ class CaseResult(NamedTuple):
     checks: tuple[CheckResult, ...] = ()
     differences: str = "nothing"  # from the nominal test
     fdi: Mapping[str, Any] = {}  # answer of `rig fdi`, if the case asked for it
+    skipped: tuple[SkippedCheck, ...] = ()  # checks that do not apply to the bench
 
     @property
     def failed(self) -> list[CheckResult]:
@@ -318,7 +323,7 @@ def play_case(case: Case) -> CaseResult:
 def make_result(case: Case, outcome: Outcome, seconds: float) -> CaseResult:
     """The result of a case from the outcome of its run, which took `seconds`."""
     return CaseResult(case, outcome.verdict, outcome.why, seconds, tuple(outcome.checks),
-                      find_differences(outcome.job).describe(), outcome.fdi)
+                      find_differences(outcome.job).describe(), outcome.fdi, tuple(outcome.skipped))
 
 
 @contextlib.contextmanager
@@ -488,9 +493,10 @@ def collect_data(suite: Suite, results: Sequence[CaseResult], requirements: Sequ
         cases.append({
             "name": result.case.name, "verdict": result.verdict, "why": result.why, "seconds": round(result.seconds, 3),
             "folder": str(result.case.folder), "sequence": choice.sequence, "model": choice.model,
-            "set": dict(choice.changes), "seed": choice.seed, "requirement": list(result.case.requirement),
+            "bench": choice.bench, "set": dict(choice.changes), "seed": choice.seed,
+            "requirement": list(result.case.requirement),
             "differences": result.differences, "checks": [to_plain(check._asdict()) for check in result.checks],
-            "fdi": dict(result.fdi)})
+            "not_applicable": [check._asdict() for check in result.skipped], "fdi": dict(result.fdi)})
     return {"verdict": find_verdict(results), "title": suite.title, "cases": cases,
             "counts": dict(Counter(result.verdict for result in results)), "seconds": round(seconds, 3),
             "jobs": processes,
@@ -522,6 +528,8 @@ def _make_suite(title: str, result: CaseResult) -> junit.TestSuite:
     properties += [("requirement", f"{name}: {check.name}") for check in case.checks for name in check.requirement]
     tests = [_make_run_test(result, classname), *(_make_check_test(check, result, classname)
                                                    for check in result.checks)]
+    tests += [junit.TestCase(check.name, classname, problem="skipped", message=f"not applicable: {check.reason}")
+              for check in result.skipped]
     tests += [_make_diagnosis_test(result, classname)] if result.fdi else []
     return junit.TestSuite(case.name, tests, properties, result.seconds)
 

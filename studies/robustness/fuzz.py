@@ -190,7 +190,7 @@ def _play(job: Job, folder: Path, strangers: Sequence[Callable[[Send], Node]] = 
             session = Session(job, participants, recorder, ignore_progress, lambda: False)
             session.bring_up()
             session.run_phases()
-            checks = judge_run(job, session, attribute_run(job, session).judged)
+            checks, _ = judge_run(job, session, attribute_run(job, session).judged)
             failed = [check.name for check in checks if not check.passed]
     except BusError:
         return "" if strangers else "the nodes did not start"  # a stranger may send the very frame that forbids it

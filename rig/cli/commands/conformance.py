@@ -11,6 +11,7 @@ from pathlib import Path
 from dbc import EDS
 from fdi.output import write_text
 from plant.errors import InputError, RigError
+from rig.benches.bench_file import load_bench
 from rig.benches.frame_map import Role
 from rig.cli.answer import Places, choose_file, give_answer, make_folder
 from rig.cli.progress_bar import show_progress
@@ -29,10 +30,13 @@ OWN_NODES = {"controller": Role.CONTROLLER, "plant": Role.PLANT, "c": Role.CONTR
 
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 1 if a test failed, 3 if none failed and some times could not be measured."""
-    node, is_own = parse_node(args.node), args.node in OWN_NODES
-    if args.eds is None and not is_own:
-        raise InputError("--eds", "", f"the electronic data sheet of node {args.node}: --eds FILE")
-    sheet = DataSheet(args.eds or EDS[node], node)
+    name, eds = find_node_of_bench(args) if args.bench else (args.node, args.eds)
+    if name is None:
+        raise InputError("NODE", "", "a node-ID, plant, controller or c; or --bench FILE")
+    node, is_own = parse_node(name), name in OWN_NODES
+    if eds is None and not is_own:
+        raise InputError("--eds", "", f"the electronic data sheet of node {name}: --eds FILE, or --bench FILE")
+    sheet = DataSheet(eds or EDS[node], node)
     cases = choose_cases(args.chapter)
     for word in args.chapter:
         if not choose_cases([word]):
@@ -44,7 +48,7 @@ def run_command(args: argparse.Namespace) -> int:
     junit = choose_file(args.junit, (".xml",), sheet.path, "--junit")  # may be a file in the folder of --out
     bus, _ = choose_bus(args.bus)
     options = Options(may_write=args.write or is_own, timeout=args.timeout, tolerance=1e-3 * args.tolerance)
-    with open_wire(args.node, bus) as wire, show_progress(is_silent=args.json or args.quiet) as progress:
+    with open_wire(name, bus) as wire, show_progress(is_silent=args.json or args.quiet) as progress:
         outcome = run_cases(Target(wire, sheet, options), cases, progress)
     subject = Subject(sheet, bus, options.may_write)
     files = [*places.files, *([("JUnit", str(junit))] if junit else [])]
@@ -53,6 +57,21 @@ def run_command(args: argparse.Namespace) -> int:
     if junit is not None:
         write_text(junit, write_junit(outcome, subject), "--junit")
     return status
+
+
+def find_node_of_bench(args: argparse.Namespace) -> tuple[str, Path]:
+    """Node-ID and data sheet of the controller, or plant, of a bench.
+
+    Raises:
+        InputError: a bench without it.
+    """
+    bench = load_bench(args.bench, is_trusted=args.trust)
+    nodes = {role.name.lower(): node for role, node in bench.nodes.items()}
+    found = nodes.get(args.node or "controller")
+    if found is None or args.eds is not None:
+        raise InputError("--bench", args.bench,
+                         f"one of its CANopen nodes ({', '.join(nodes) or 'it has none'}), and no --eds")
+    return str(found.node), found.eds
 
 
 def parse_node(text: str) -> int:

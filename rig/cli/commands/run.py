@@ -191,8 +191,9 @@ def build_choice(args: argparse.Namespace) -> JobChoice:
         InputError: a --set that is not GROUP.FIELD=VALUE.
     """
     return JobChoice(sequence=[*args.sequence, "preflight"][0], model=args.model, changes=parse_changes(args.set),
-                     seed=args.seed or 0, effects=tuple(args.effects), pace=args.pace, controller=args.controller,
-                     plant=args.plant, max_overruns=args.max_overruns, is_diagnosed=args.fdi)
+                     seed=args.seed or 0, effects=tuple(args.effects), bench=args.bench, pace=args.pace,
+                     controller=args.controller, plant=args.plant, max_overruns=args.max_overruns,
+                     is_diagnosed=args.fdi)
 
 
 def repeat_job(source: Path, args: argparse.Namespace) -> Job:
@@ -204,8 +205,9 @@ def repeat_job(source: Path, args: argparse.Namespace) -> Job:
         InputError: no log of a run, options that would change the job, code in the log that --trust does not allow, or
             a bus in the log that --bus does not name.
     """
-    if args.sequence or args.set or args.model or args.effects or args.seed is not None:
-        raise InputError("--from", str(source), "no SEQUENCE, --model, --set, --seed or --effects: the log has them")
+    if args.sequence or args.set or args.model or args.effects or args.bench or args.seed is not None:
+        raise InputError("--from", str(source), "no SEQUENCE, --model, --set, --seed, --effects or --bench: the log "
+                                                "has them")
     log = source / "trace.mcap" if source.is_dir() else source
     if args.out and (Path(args.out) / "trace.mcap").resolve() == log.resolve():
         raise InputError("--out", args.out, "another folder than that of the log to repeat, which would be overwritten")

@@ -302,7 +302,7 @@ def judge_heartbeats(beats: Sequence[Heartbeat], seconds: float = 1.0, deaf: flo
     rows = Rows(*[nothing] * 7, on_time=np.ones(5, bool))
     record = ProtocolRecord(run=rows, heartbeats={"controller": beats}, heard=(0.0, seconds), deaf=deaf,
                             current_limit=8e-3)
-    found = [check for check in judge_protocol(record, ProtocolLimits()) if check.signal == "heartbeat"]
+    found = [check for check in judge_protocol(record, ProtocolLimits())[0] if check.signal == "heartbeat"]
     return found[0] if found else None
 
 
