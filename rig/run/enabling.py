@@ -8,11 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import isclose
 
+import numpy as np
+
 from rig.benches.bench import Bench
 from rig.benches.profiles import PROFILES, State, choose_control, find_state
 from rig.network.clock import WallClock
 from rig.run.cyclic_values import CycleInput
 from rig.run.loop import Loop
+from rig.sequences.protocol import Rows
 
 LIMIT = 5.0  # s: a controller that is not ready by then ends the run
 
@@ -23,6 +26,14 @@ class Enabling:
     def __init__(self, bench: Bench, loop: Loop, realtime: bool, stop: Callable[[], bool]) -> None:
         self._bench, self._loop, self._realtime, self._stop = bench, loop, realtime, stop
         self._words = PROFILES[bench.profile]
+        self._said: list[tuple[int, float, float]] = []  # control word, status word and current of the cycles
+
+    @property
+    def rows(self) -> Rows:
+        """What was sent and answered, for the protocol checks; the bench need not have been on time."""
+        control, status, current = np.array(self._said, float).reshape(-1, 3).T
+        zero = np.zeros(len(control))
+        return Rows(zero, zero, current, control, status, zero, zero, on_time=zero > 0)
 
     def enable(self, demand: float) -> str:
         """Climb to ACTIVE, with fault reset, holding `demand`, m; why that failed, or ""."""
@@ -69,6 +80,8 @@ class Enabling:
     def _play(self, step: CycleInput) -> None:
         self._loop.cycle(step)
         self._loop.wait_until_played(self._stop)
+        outputs = self._loop.outputs
+        self._said.append((step.control, outputs.get("status_word", 0.0), outputs["current"]))
 
     def _find_state(self) -> int:
         return find_state(self._words, int(self._loop.outputs.get("status_word", 0)))

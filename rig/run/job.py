@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -152,9 +152,9 @@ def _read_bench(attachments: Mapping[str, bytes], name: str, *, is_trusted: bool
 
 def speaks_as_shipped(bench: Bench) -> bool:
     """Whether our own firmware is a controller of this bench: frames and nodes are those of the shipped one."""
-    shipped = load_bench()
-    numbers = [{role: node.node for role, node in each.nodes.items()} for each in (bench, shipped)]
-    return bench.frames == shipped.frames and numbers[0] == numbers[1]
+    own, shipped = (([asdict(frame) for frame in each.frames.frames], each.frames.sync,
+                     {role: node.node for role, node in each.nodes.items()}) for each in (bench, load_bench()))
+    return own == shipped
 
 
 def _require_file_name(log: Path, name: str) -> None:

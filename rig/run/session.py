@@ -339,6 +339,7 @@ class Session:
 
         history, after = self.log.history, self.log.after
         return ProtocolRecord(
+            enabling=self._enabling.rows,
             run=read_rows(history, judged & start.find_on_time_of(history, self._faults)),
             probes=[Rows._make(column[-cycles:] for column in read(probe)) for probe in start.probes if len(probe)],
             after=read(after) if len(after) else None, emergencies=self.nodes.emergencies,

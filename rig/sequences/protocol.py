@@ -112,13 +112,15 @@ class Emergency(NamedTuple):
 class ProtocolRecord:
     """All that the protocol checks are judged by.
 
-    `gains`: those that objects of the controller hold, if it has them and follows them. `is_response_judged`: real
-    time, and the controller is not in the rig's own process. `heartbeats`: of the nodes that send one, by name;
-    `heard`: first and last time at which heartbeats could have been received, s; `deaf`: how long of it the rig
-    received nothing, s; `deaf_cycles`: in which, so that an EMCY of the controller may be missing here.
+    `enabling`: the cycles before the run in which the controller was enabled. `gains`: those that objects of the
+    controller hold, if it has them and follows them. `is_response_judged`: real time, and the controller is not in the
+    rig's own process. `heartbeats`: of the nodes that send one, by name; `heard`: first and last time at which
+    heartbeats could have been received, s; `deaf`: how long of it the rig received nothing, s; `deaf_cycles`: in which,
+    so that an EMCY of the controller may be missing here.
     """
 
     run: Rows
+    enabling: Rows | None = None
     probes: Sequence[Rows] = ()
     after: Rows | None = None
     emergencies: Sequence[Emergency] = ()
@@ -136,7 +138,12 @@ class ProtocolRecord:
     @property
     def stretches(self) -> list[Rows]:
         """All rows, in stretches of consecutive cycles."""
-        return [*self.probes, self.run, *([self.after] if self.after is not None else [])]
+        return [*self.probes, *self.played]
+
+    @property
+    def played(self) -> list[Rows]:
+        """The rows of the run with those before and after it; the probes before set-up are left out."""
+        return [rows for rows in (self.enabling, self.run, self.after) if rows is not None]
 
 
     @property
@@ -223,10 +230,11 @@ def _judge_status(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
         yield SkippedCheck(name, "the bench has no control word and no status word")
         return
     if record.words is CIA402:
-        wrong = [text for rows in record.stretches for text in list_wrong_changes(rows, limits.find_delay(CIA402))]
+        whole = Rows(*map(np.concatenate, zip(*record.played, strict=True)))
+        wrong = list_wrong_changes(whole, limits.find_delay(CIA402))
         yield _make_result("status word follows the states of CiA 402", "status word", float(len(wrong)), "1", high=0.0,
                            detail="; ".join(wrong[:3]))
-        ages = np.concatenate([measure_delays(rows) for rows in record.stretches])
+        ages = measure_delays(whole)
     else:
         faulty = _find_faulty(record)
         ages = np.concatenate([measure_status_ages(rows, faulty if rows is record.run else None)

@@ -84,7 +84,7 @@ def test_the_words_of_cia_408_are_those_of_the_bus_page() -> None:
     assert sent == [8, 1, 3, 7, 7, 7]
 
 
-def test_a_device_without_a_control_word_is_always_active() -> None:
+def test_a_device_without_a_control_word_is_active_where_the_rig_enables_it() -> None:
     words = PROFILES["none"]
     control = choose_control(words, State.ACTIVE, State.ACTIVE)
     assert find_state(words, 0) == find_wanted(words, control) == State.ACTIVE

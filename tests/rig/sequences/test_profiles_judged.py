@@ -20,12 +20,11 @@ ENABLED = [(0x06, 0x0231, 0.0, 3), (0x07, 0x0233, 0.0, 3), (0x0F, 0x1237, 1e-3, 
 SOUND = [*ENABLED, (0x00, 0x0250, 0.0, 20)]
 
 
-def make_rows(parts: list[tuple[int, int, float, int]], phase: list[int] | None = None) -> Rows:
+def make_rows(parts: list[tuple[int, int, float, int]]) -> Rows:
     columns = [np.repeat([part[i] for part in parts], [part[3] for part in parts]).astype(float) for i in range(3)]
     zero = np.zeros(len(columns[0]))
     return Rows(com=zero, xj=zero, cor=columns[2], control=columns[0], status=columns[1], flags=zero, response=zero,
-                on_time=np.ones(len(zero), bool),
-                phase=zero if phase is None else np.repeat(phase, [part[3] for part in parts]).astype(float))
+                on_time=np.ones(len(zero), bool))
 
 
 def judge(rows: Rows, bench: Bench, limits: ProtocolLimits | None = None,
@@ -59,6 +58,15 @@ def test_a_drive_is_held_against_the_state_machine(parts: list[tuple[int, int, f
     assert {name for name in (STATES, FOLLOWS, IDLE) if not found[name].passed} == failed
 
 
+def test_the_cycles_in_which_a_drive_is_enabled_are_judged_with_the_run() -> None:
+    """They come before the run, whose first row finds the drive enabled."""
+    enabled = make_rows([(0x0F, 0x1237, 1e-3, 50)])
+    for before, passed in ((make_rows(ENABLED), True), (make_rows([(0x0F, 0x1237, 0.0, 5)]), False)):
+        record = ProtocolRecord(run=enabled, enabling=before, bench=DRIVE, current_limit=8e-3)
+        found = {check.name: check.passed for check in judge_protocol(record, ProtocolLimits())[0]}
+        assert found[STATES] is passed
+
+
 def test_a_small_current_may_be_allowed_when_idle() -> None:
     noisy = [*ENABLED, (0x00, 0x0250, 1e-5, 600)]
     found, _ = judge(make_rows(noisy), DRIVE, ProtocolLimits(idle_current=2e-5))
@@ -67,13 +75,13 @@ def test_a_small_current_may_be_allowed_when_idle() -> None:
 
 def test_a_controller_that_is_switched_off_by_phase_sends_no_current() -> None:
     def largest(currents: list[float]) -> CheckResult:
-        parts = [(0, 0, current, 100) for current in currents]
-        return judge(make_rows(parts, [0, 1, 2]), ECU)[0]["no current unless switched on"]
+        parts = [(word, 0, current, 100) for word, current in zip((2, 3, 2), currents, strict=True)]
+        return judge(make_rows(parts), ECU)[0]["no current unless enabled"]
 
     assert largest([0.0, 1e-3, 0.0]).passed
     assert not largest([1e-3, 1e-3, 0.0]).passed and not largest([0.0, 1e-3, 1e-3]).passed
     always = judge(make_rows([(0, 0, 1e-3, 100)]), replace(ECU, phases={}))
-    assert "no current unless switched on" in always[1]
+    assert "no current unless enabled" in always[1]
 
 
 def test_what_does_not_apply_is_named_with_its_reason_and_is_no_check() -> None:
