@@ -117,9 +117,9 @@ def _find_period(name: str, message: Message, cycle_ns: int) -> int:
     return int(period) or 1
 
 
-def _read_number(name: str, field: str, value: int | float | None) -> Fraction:
+def _read_number(name: str, field: str, value: object) -> Fraction:
     """A number of a DBC as its text stands there; 0 for None."""
-    if value is not None and not abs(value) < _LARGEST:
+    if value is not None and not (isinstance(value, int | float) and abs(value) < _LARGEST):
         raise InputError(name, field, "a finite number")
     return Fraction(str(value or 0))
 

@@ -82,6 +82,9 @@ def read_dictionary(name: str, text: str, node: int) -> Any:
     own = read_node(text)
     if own not in (None, node):
         raise InputError(name, "NodeID", f"{node}, the node of the bench file, not {own}")
+    if own is None and not name.lower().endswith(".dcf"):
+        for variable in _list_variables(dictionary):
+            variable.value = None  # in an EDS it is a slip of its tool: the device is not to be configured so
     return dictionary
 
 

@@ -140,6 +140,12 @@ def test_values_of_a_dcf_win_and_are_written_in_the_order_in_which_a_device_take
     assert bench.frames.frames[0].identifier == 0x405 and bench.nodes[Role.CONTROLLER].values == values
 
 
+def test_a_value_in_an_eds_is_not_written() -> None:
+    sheet = format_eds({"2000": Entry(5, value="7")})
+    assert list_values(read_dictionary("x.eds", sheet, NODE)) == ()
+    assert len(list_values(read_dictionary("x.DCF", sheet, NODE))) == 1
+
+
 def test_real_numbers_of_a_dcf_are_written_as_such() -> None:
     sheet = format_eds({"2000": Entry(8, value="1.5"), "2001": Entry(5, "ro", value="1")})
     assert list_values(read_dictionary("x.dcf", sheet, NODE)) == ((0x2000, 0, struct.pack("<f", 1.5)),)
