@@ -38,7 +38,10 @@ from fdi.report.report import Cell, Column, Line, Mood, Report, Section, Table, 
 from fdi.trace.trace import Floats, Trace
 from plant import Model
 from plant.errors import InputError, RigError
+from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
+from rig.benches.frame_map import Role
+from rig.firmware.build import build_device
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
@@ -243,6 +246,7 @@ def serve_python_emulator(bus: str) -> None:
 
 
 CYCLICTEST, COMPILED, IN_C, PYTHON = "cyclictest", "compiled", "C", "Python"
+MAPPED = {"CiA 402": "cia402_drive", "plain CAN": "can_ecu"}  # foreign controllers: folders of examples/
 _QUANTITIES = ("lateness", "feedback_response", "valve_response", "execution")
 _SETTLING = 100  # cycles at the beginning of a block that are not counted
 
@@ -276,13 +280,28 @@ def list_contenders(bus: str) -> dict[str, Callable[[float], Times]]:
         with run_emulator(bus, is_compiled=False):
             return play_block(bus, seconds, is_compiled=False)
 
+    def make_mapped(folder: Path) -> Callable[[float], Times]:
+        def measure_mapped(seconds: float) -> Times:
+            with _run_process([str(build_device(folder)), bus]):
+                return play_block(bus, seconds, bench=load_bench(str(folder / "bench.toml")))
+
+        return measure_mapped
+
     rows = ((CYCLICTEST, measure_cyclictest, find_cyclictest()), (COMPILED, measure_compiled, "always"),
             (IN_C, measure_c, find_gcc()), (PYTHON, measure_python, "always"))
-    return {name: measure for name, measure, is_there in rows if is_there}
+    found = {name: measure for name, measure, is_there in rows if is_there}
+    examples = Path(__file__).parents[2] / "examples"  # of a checkout
+    return found | {name: make_mapped(examples / folder) for name, folder in MAPPED.items()
+                    if find_gcc() and (examples / folder).is_dir()}
 
 
-def play_block(bus: str, seconds: float, is_compiled: bool = True, period_ns: int = 1_000_000) -> Times:
-    """Times of the rig's cycle on a bus, with its log, without the first cycles; NaN where no answer came."""
+def play_block(bus: str, seconds: float, is_compiled: bool = True, period_ns: int = 1_000_000,
+               bench: Bench | None = None) -> Times:
+    """Times of the rig's cycle on a bus, with its log, without the first cycles; NaN where no answer came.
+
+    `bench`: that of a foreign controller, which is started.
+    """
+    is_foreign, bench = bench is not None, bench or load_bench()
     history = History()
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         recorder = Recorder(Path(folder) / "trace.mcap", {}, {})
@@ -290,10 +309,13 @@ def play_block(bus: str, seconds: float, is_compiled: bool = True, period_ns: in
         clock = WallClock()
         wire = LinkWire(Link(open_can(bus), clock.now), clock)
         stack.callback(wire.close)
-        master = Master(wire, clock.now, stamped=True, bench=load_bench())
+        master = Master(wire, clock.now, stamped=True, bench=bench)
+        if is_foreign and bench.nodes:
+            master.is_present(Role.CONTROLLER, 5.0)
+            master.start()
         master.hooks.on_frame = recorder.frame
         log = _Log(history, recorder)
-        bench, plan = replace(load_bench(), cycle_ns=period_ns), Plan(stop=0)
+        bench, plan = replace(bench, cycle_ns=period_ns), Plan(stop=0)
         scenario, faults = Scenario(Model(), plan), Schedule(plan)
         loop: Loop = (open_loop(master, bench, scenario, faults, log, bus, True) if is_compiled else
                       CycleLoop(master, bench, scenario, faults, log, True))
@@ -344,7 +366,13 @@ def list_targets(tables: Mapping[str, Mapping[str, Mapping[str, float]]]) -> lis
             own, other = (tables[quantity].get(name, {}).get(share) for name in (COMPILED, rival))
             ratio = own / other if own is not None and other else None
             found.append((f"{quantity.replace('_', ' ')} {share}, compiled / {rival}", ratio, limit, ""))
-    found.append(("execution p99.9", tables["execution"].get(COMPILED, {}).get("p99_9"), 100.0, "us"))
+    for name in MAPPED:
+        for share in ("p50", "p99"):
+            own, other = (tables["lateness"].get(each, {}).get(share) for each in (name, COMPILED))
+            if own is not None:
+                found.append((f"lateness {share}, {name} / compiled", own / other if other else None, 1.2, ""))
+    found += [(f"execution p99.9, {name}", tables["execution"][name].get("p99_9"), 100.0, "us")
+              for name in (COMPILED, *MAPPED) if name in tables["execution"]]
     return [{"name": name, "value": value, "limit": limit, "unit": unit,
              "is_met": value is not None and value <= limit} for name, value, limit, unit in found]
 
@@ -396,6 +424,9 @@ _NAMES = {
                           PYTHON: "plant emulator in Python"},
     "execution": {COMPILED: "rig, compiled cycle", IN_C: "rig, compiled cycle (C answers)"},
 }
+for _name in MAPPED:
+    for _quantity in ("lateness", "execution"):
+        _NAMES[_quantity][_name] = f"rig with its plant ({_name} controller)"
 _NAMES["valve_response"] = _NAMES["feedback_response"]
 _TITLES = {
     "lateness": ("SYNC lateness", "How long after its due time SYNC was sent; for cyclictest, how late it woke up. The "
