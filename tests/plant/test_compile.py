@@ -56,15 +56,12 @@ def test_a_changed_effect_is_never_served_by_old_code(tmp_path: Path) -> None:
     file.write_text(STIFF.format(scale=1.0))
     changed.write_text(STIFF.format(scale=1.0).replace("SCALE * p", "2.0 * SCALE * p"))
     first = child(tmp_path, file, changed)  # compiled after the edit, from the code read before it
-    kept = sorted(path.name for path in (tmp_path / "cache").iterdir())
     second = child(tmp_path, file)  # the edited file
     assert first != second
-    file.write_text(STIFF.format(scale=2.0))  # only a constant differs from the first
-    assert child(tmp_path, file) == second
-    file.write_text(STIFF.format(scale=1.0))
-    assert child(tmp_path, file) == first
-    after = sorted(path.name for path in (tmp_path / "cache").iterdir())
-    assert set(kept) < set(after) and len(after) == 3  # the last run found the first one's code
+    for scale, expected in ((2.0, second), (1.0, first)):  # only a constant differs from the first
+        file.write_text(STIFF.format(scale=scale))
+        assert child(tmp_path, file) == expected
+    assert len(list((tmp_path / "cache").iterdir())) == 3  # the last run found the first one's code
 
 
 def test_a_renamed_file_finds_its_types_again(tmp_path: Path) -> None:
@@ -77,35 +74,27 @@ def test_a_renamed_file_finds_its_types_again(tmp_path: Path) -> None:
 
 
 def test_fingerprint_sees_what_a_function_depends_on() -> None:
-    def made(source: str, **names) -> str:
-        scope = dict(names)
+    def made(source: str, k: object = 1.0) -> str:
+        scope = {"K": k}
         exec(source, scope)
         return compute_fingerprint(scope["f"])
 
-    base = "def f(x):\n    return x * K + g(x)\ndef g(x):\n    return x"
-    assert made(base, K=1.0) == made(base, K=1.0)
-    assert made(base, K=1.0) == made("# a remark\n" + base, K=1.0)
-    assert made(base, K=1.0) != made(base, K=2.0)
-    assert made(base, K=1.0) != made(base.replace("return x\n", "return x\n") + " + 1.0", K=1.0)
-    table, other = np.zeros(5000), np.zeros(5000)
-    other[2500] = 1.0  # where repr shows dots
-    assert made(base, K=table) != made(base, K=other)
-    assert made(base.replace("f(x)", "f(x, y=1.0)"), K=1.0) != made(base.replace("f(x)", "f(x, y=2.0)"), K=1.0)
-
-    def factor(k: float):
-        return lambda x: x * k
-
-    assert compute_fingerprint(factor(1.0)) != compute_fingerprint(factor(2.0))
+    base = "def f(x, y=1.0):\n    return x * K + g(x)\ndef g(x):\n    return x"
+    closure = "def make(k):\n    return lambda x: x * k\nf = make(1.0)"
+    table = np.zeros(5000)
+    assert made(base) == made("# a remark\n" + base)
+    for one, other in (((base,), (base, 2.0)), ((base,), (base + " + 1.0",)), ((base,), (base.replace("1.0", "2.0"),)),
+                       ((base, table), (base, np.where(np.arange(5000) == 2500, 1.0, table))),  # where repr shows dots
+                       ((closure,), (closure.replace("1.0", "2.0"),))):
+        assert made(*one) != made(*other)
 
 
 def test_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / "a"))
-    assert find_cache_folder() == tmp_path / "a"
-    monkeypatch.delenv("EHA_RIG_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "b"))
-    assert find_cache_folder() == tmp_path / "b/eha-rig"
-    monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / "file" / "below"))  # cannot be made: fall back
     (tmp_path / "file").touch()
+    for own, place in (("a", "a"), ("", "b/eha-rig"), ("file/below", None)):  # the last cannot be made: fall back
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "b"))
+        monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / own) if own else "")
+        assert place is None or find_cache_folder() == tmp_path / place
     monkeypatch.setattr(compile.tempfile, "gettempdir", lambda: str(tmp_path))
     taken = tmp_path / f"eha-rig-{os.getuid()}"
     assert find_cache_folder() == taken

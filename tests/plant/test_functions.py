@@ -1,17 +1,23 @@
-"""The elementary functions of the laws: as good as the library's, the same bits in every way to run, wide registers."""
+"""Elementary functions and the firmware's law against the library and numbers worked out by hand."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from math import exp, hypot, sin
+from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
+from effect_files import HEAD, restored_catalogue
 from other_cpus import compiles_for
 
-from plant import functions
+from plant import Actuator, Model, functions
 from plant.compile import INLINE_OPTIONS, _link_calls, compile_function, interpret_function
+from plant.controller import Loop, compute_current
+from plant.effects import load_effects
+from plant.parameters import Controller
+from plant.run import sample_noise
 
 RNG = np.random.default_rng(1)
 NEAR, TINY = RNG.uniform(-1.0, 1.0, 20000), RNG.normal(size=5000) * 1e-5
@@ -94,3 +100,89 @@ def test_they_stand_in_however_a_law_calls_them() -> None:
         assert compile_function(f)(1.3) == interpret_function(f)(1.3) == own
     assert interpret_function(by_name).__globals__["sin"] is not sin is math.sin
     assert interpret_function(by_library).__globals__["math"].sqrt is math.sqrt
+
+
+PID = Controller(proportional_gain=4.0, integral_gain=50.0, derivative_gain=0.002, current_limit=8e-3, period=1e-3)
+PI, PD = PID._replace(derivative_gain=0.0), PID._replace(integral_gain=0.0)
+P = PD._replace(derivative_gain=0.0)
+
+
+@pytest.mark.parametrize(("law", "rows", "expected"), [
+    # 4 A/m on the error, demand minus position; 8 mA at most, either way
+    (P, [(1e-3, 0.0), (1e-3, 0.25e-3), (0.0, 0.5e-3), (5e-3, 0.0), (-5e-3, 0.0), (2e-3, 0.0)],
+     [4e-3, 3e-3, -2e-3, 8e-3, -8e-3, 8e-3]),
+    # errors 1, 0.5, 0.5, 0.75 mm: their rates are none in the first cycle, then -0.5, 0 and +0.25 m/s; times 2 mA
+    (PD, [(1e-3, 0.0), (1e-3, 0.5e-3), (1e-3, 0.5e-3), (1e-3, 0.25e-3)], [4e-3, 2e-3 - 1e-3, 2e-3, 3e-3 + 0.5e-3]),
+    # 50 A/(m s) for 1 ms: 0.05 A per m of error and cycle, so 0.05 mA a cycle at 1 mm; then -0.1 mA at -2 mm
+    (PI, [(1e-3, 0.0), (1e-3, 0.0), (1e-3, 0.0), (0.0, 2e-3)], [4.05e-3, 4.10e-3, 4.15e-3, 0.05e-3 - 8e-3]),
+    # errors 1 and 0.5 mm: 4 + 0.05, then 2 + 0.075 - 1 mA
+    (PID, [(1e-3, 0.0), (1e-3, 0.5e-3)], [4.05e-3, 1.075e-3]),
+    # at 5 mm the output is at its limit and the integral waits; at -1 mm it falls at once, from what it was before
+    (PI, [(1e-3, 0.0), *[(5e-3, 0.0)] * 1000, (1e-3, 0.0), (-1e-3, 0.0)],
+     [4.05e-3, *[8e-3] * 1000, 4.1e-3, -4e-3 + 0.05e-3]),
+], ids=["proportional", "derivative", "integral", "all three", "no wind-up"])
+def test_law(law: Controller, rows: list[tuple[float, float]], expected: list[float]) -> None:
+    """Currents, A, for rows of demand and position, m."""
+    loop, out = Loop(), []
+    for demand, position in rows:
+        current, loop = compute_current(loop, demand, position, law)
+        out.append(current)
+    assert out == pytest.approx(expected, abs=1e-15)
+
+
+def test_the_limit_does_not_stop_an_integral_that_comes_back() -> None:
+    """A full integral (7.95 mA) and a falling error: over the limit by the derivative alone, it still unwinds."""
+    full = Loop(integral=7.95e-3, error=-2e-3, cycles=1.0)  # the error goes from -2 to -1 mm: +1 m/s, +2 mA
+    current, loop = compute_current(full, -1e-3, 0.0, PID._replace(derivative_gain=0.008))  # -4 + 7.9 + 8 mA
+    assert current == 8e-3 and loop.integral == pytest.approx(7.9e-3, abs=1e-15)
+    again = compute_current(full._replace(error=1e-3), 1e-3, 0.0, PID)[1]  # with the error the other way it waits
+    assert again.integral == 7.95e-3
+
+
+@pytest.fixture
+def coil(tmp_path: Path) -> Iterator[None]:
+    """An effect behind `current_noise` that remembers the current in the coil."""
+    with restored_catalogue():
+        (tmp_path / "coil.py").write_text(HEAD + """
+class Gain(NamedTuple):
+    gain: Annotated[float, Quantity("1")] = 1.0
+
+class Seen(NamedTuple):
+    current: float = 0.0
+
+@effect("current", Gain, law="i = g i", memory=Seen)
+def coil(x, m, s, u, p):
+    return p.coil.gain * x, Seen(p.coil.gain * x)
+""")
+        load_effects(tmp_path / "coil.py")
+        yield
+
+
+def in_the_coil(changes: dict[str, float], cycles: int, sent: float = 1e-3, seed: int = 3) -> np.ndarray:
+    """Current in the coil at the last step of each cycle, A, when the firmware sends `sent`."""
+    plant, out = Actuator(Model().replace(changes).with_effects(["coil"]), seed), np.empty(cycles)
+    for k in range(cycles):
+        plant.sample()
+        plant.advance(sent)
+        out[k] = plant.state.memory.current[1].current
+    return out
+
+
+@pytest.mark.parametrize("frequency", [400.0, 50.0])
+def test_hum_is_one_line_of_its_amplitude(frequency: float, coil: None) -> None:
+    """Sampled once a cycle at its last step: 1000 cycles are whole periods, so the line is one bin of the FFT."""
+    seen = in_the_coil({"current_noise.hum": 0.2e-3, "current_noise.frequency": frequency}, 1000)
+    spectrum = np.fft.rfft(seen) / 1000
+    line = 2 * spectrum[round(frequency)]
+    assert spectrum[0] == pytest.approx(1e-3, rel=1e-6)
+    assert line == pytest.approx(-0.2e-3j * np.exp(2j * np.pi * frequency * 0.99e-3), rel=1e-6)  # of sin(2 pi f t)
+    rest = np.delete(np.abs(spectrum), [0, round(frequency)])
+    assert rest.max() < 1e-9
+
+
+def test_white_noise_has_its_rms_and_is_new_every_cycle(coil: None) -> None:
+    seen = in_the_coil({"current_noise.white": 0.1e-3}, 20_000) - 1e-3
+    assert seen.std() == pytest.approx(0.1e-3, rel=0.02) and abs(seen.mean()) < 3e-6
+    assert np.corrcoef(seen[1:], seen[:-1])[0, 1] == pytest.approx(0.0, abs=0.03)
+    fourth = sample_noise(3, 20_000)[:, 3]
+    np.testing.assert_allclose(seen, 0.1e-3 * fourth, atol=1e-15)

@@ -40,7 +40,7 @@ def print_hashes() -> None:
         "interpreted simulate, every effect": np.column_stack(
             simulate(activate_effects(EVERY), SWING[:40], steps=5, fast=False)),
         "interpreted Actuator, effects": run_actuator(some, False),
-        "lanes, closed loop": build_lanes(bare, 40).closed_loop(sample_values(40), SHORT, LOAD),
+        "lanes, closed loop": build_lanes(some, 40).closed_loop(sample_values(40), SHORT, LOAD),
         "lanes, replay, effects": build_lanes(some, 20).replay(sample_values(20), 5.0 * SWING, LOAD, SWING, 2.0),
     }
     hashes = {name: hashlib.sha256(np.ascontiguousarray(x).tobytes()) for name, x in cases.items()}

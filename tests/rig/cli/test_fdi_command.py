@@ -105,8 +105,8 @@ def test_what_it_cannot_use_is_said_in_a_line(folder: Path, monkeypatch: pytest.
 
 def test_a_unit_without_leakage_is_judged_and_not_by_the_bands_of_another(folder: Path) -> None:
     """A parameter that is zero in the model has no logarithm; the shipped bands are those of the nominal unit."""
-    tight, slow = (rig("fdi", folder / "healthy.csv", "--set", change, "--json").json
-                   for change in ("jack.leakage=0", "valve.flow_gain=0.24"))
+    tight, slow = (rig("fdi", folder / name, "--set", change, "--json").json
+                   for name, change in (("short.csv", "jack.leakage=0"), ("healthy.csv", "valve.flow_gain=0.24")))
     assert tight["refined"]["kintas"]["low"] == 0.0 and slow["events"] == []
     assert any("own are of the nominal unit" in note for note in slow["notes"])
 

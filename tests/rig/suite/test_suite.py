@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from junit_schema import read_valid_junit
-from rig_command import Said, finished, rig, started
+from rig_command import Said, finished, refuse, rig, started
 from short_sequences import SHORT
 
 from rig.run.job import JobChoice
@@ -92,23 +92,22 @@ def test_each_case_has_its_verdict_and_the_worst_is_that_of_the_suite(suite: tup
     cases = {case["name"]: case for case in answer["cases"]}
     assert list(cases) == ["short, seed 1", "short, seed 2", "weak, jack.mass=90", "weak, jack.mass=110", "crash",
                            "fail", "hang"]
-    verdicts = [case["verdict"] for case in cases.values()]
-    assert verdicts == ["PASS", "PASS", "FAIL", "FAIL", "ERROR", "ERROR", "ERROR"], said
+    assert [(case["verdict"], case["seed"]) for case in cases.values()] == [
+        ("PASS", 1), ("PASS", 2), ("FAIL", 0), ("FAIL", 0), ("ERROR", 0), ("ERROR", 0), ("ERROR", 0)], said
     assert (said.status, answer["verdict"], answer["jobs"]) == (1, "ERROR", 2)
-    assert cases["crash"]["why"] == "its process was ended by signal 9 (SIGKILL)"
-    assert cases["hang"]["why"] == "it took longer than 1 s"
-    assert re.search(r"own\.py:13: fail: expected .*AttributeError", cases["fail"]["why"])
+    for name, why in (("crash", r"its process was ended by signal 9 \(SIGKILL\)"), ("hang", "it took longer than 1 s"),
+                      ("fail", r".*own\.py:13: fail: expected .*AttributeError.*")):
+        assert re.fullmatch(why, cases[name]["why"])
     assert cases["weak, jack.mass=90"]["set"] == {"filter.clogging": 0.9, "jack.mass": 90.0}
     assert "jack.mass = 110 kg" in cases["weak, jack.mass=110"]["differences"]
-    assert [case["seed"] for case in cases.values()] == [1, 2, 0, 0, 0, 0, 0]
 
 
 def test_a_line_for_each_case_and_a_table(suite: tuple[Path, Said]) -> None:
     lines = suite[1].out.splitlines()
     assert lines[0] == "All kinds: 7 cases, 2 at a time"
-    ended = [line.split() for line in lines[1:8]]
-    assert sorted(words[0] for words in ended) == ["ERROR"] * 3 + ["FAIL"] * 2 + ["PASS"] * 2
-    assert {word for words in ended for word in words if word.endswith("/7")} == {f"{n}/7" for n in range(1, 8)}
+    assert sorted(line.split()[0] for line in lines[1:8]) == ["ERROR"] * 3 + ["FAIL"] * 2 + ["PASS"] * 2
+    assert {word for line in lines[1:8] for word in line.split() if word.endswith("/7")} == {
+        f"{n}/7" for n in range(1, 8)}
     assert lines[8] == "ERROR  5 of 7 cases did not pass: weak, jack.mass=90, weak, jack.mass=110, crash and 2 more."
     assert "Traceback" not in suite[1].err
 
@@ -140,26 +139,23 @@ def test_requirements_are_traced(suite: tuple[Path, Said]) -> None:
 def test_junit_is_valid_and_complete(suite: tuple[Path, Said]) -> None:
     folder, _ = suite
     root = read_valid_junit(folder / "junit.xml")
-    suites = {each.get("name"): each for each in root}
-    assert len(suites) == 7
     assert [each.get("errors") for each in root] == ["0"] * 4 + ["1"] * 3
-    failed = suites["weak, jack.mass=90"].findall("testcase[failure]")
-    assert [case.get("name") for case in failed] == ["overshoot"]
-    assert re.fullmatch(r"measured [\d.]+ %, limits <= 30 %", str(failed[0][0].get("message")))
-    assert "requirement R-1" in str(failed[0].findtext("system-out"))
-    values = [each.get("value") for each in suites["weak, jack.mass=90"].findall("properties/property")]
-    assert "R-1: overshoot" in values and "R-2: whole run" in values
+    weak = root.find("testsuite[@name='weak, jack.mass=90']")
+    assert weak is not None
+    (failed,) = weak.findall("testcase[failure]")
+    assert failed.get("name") == "overshoot" and "requirement R-1" in str(failed.findtext("system-out"))
+    assert re.fullmatch(r"measured [\d.]+ %, limits <= 30 %", str(failed[0].get("message")))
+    assert {"R-1: overshoot", "R-2: whole run"} <= {each.get("value") for each in weak.findall("properties/property")}
 
 
 def test_several_sequences_on_the_command_line_and_junit_of_one(tmp_path: Path) -> None:
     write_sequences(tmp_path)
-    said = rig("run", tmp_path / "short.toml", tmp_path / "short.toml", "--seed", 3, "--json", "--jobs", 1,
-               "--out", tmp_path / "out")
-    assert said.status == 0, said.err
-    assert [(case["name"], Path(case["folder"]).name, case["seed"]) for case in said.json["cases"]] == [
+    short = tmp_path / "short.toml"
+    cases = rig("run", short, short, "--seed", 3, "--json", "--jobs", 1, "--out", tmp_path / "out").json["cases"]
+    assert [(case["name"], Path(case["folder"]).name, case["seed"]) for case in cases] == [
         ("short", "short", 3), ("short (2)", "short-2", 3)]
-    assert said.json["cases"][0]["checks"] == said.json["cases"][1]["checks"]
-    assert rig("run", tmp_path / "short.toml", "--out", tmp_path, "--junit", tmp_path / "j.xml", "--quiet").status == 0
+    assert cases[0]["checks"] == cases[1]["checks"]
+    assert rig("run", short, "--out", tmp_path, "--junit", tmp_path / "j.xml", "--quiet").status == 0
     root = read_valid_junit(tmp_path / "j.xml")
     assert [case.get("name") for case in root[0].findall("testcase")][:3] == ["run", "overshoot", "no emergency"]
     assert "R-1: overshoot" in [each.get("value") for each in root[0].findall("properties/property")]
@@ -180,9 +176,7 @@ def test_bad_input_is_one_line_before_anything_runs(tmp_path: Path, old: str, ne
     write_sequences(tmp_path)
     assert old in SUITE
     (tmp_path / "suite.toml").write_text(SUITE.replace(old, new))
-    said = rig("run", tmp_path / "suite.toml", "--out", tmp_path / "out")
-    assert (said.status, said.out, said.err.count("\n")) == (2, "", 1), said
-    assert re.search(line, said.err), said.err
+    assert re.search(line, refuse("run", tmp_path / "suite.toml", "--out", tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
@@ -193,9 +187,8 @@ def test_bad_input_is_one_line_before_anything_runs(tmp_path: Path, old: str, ne
 def test_options_that_do_not_go_together(tmp_path: Path, words: list[object], line: str) -> None:
     write_sequences(tmp_path)
     (tmp_path / "suite.toml").write_text(SUITE)
-    said = rig("run", *(tmp_path / word if str(word).endswith(".toml") else word for word in words), "--out",
-               tmp_path / "out")
-    assert said.status == 2 and said.err.count("\n") == 1 and line in said.err, said
+    files = (tmp_path / word if str(word).endswith(".toml") else word for word in words)
+    assert line in refuse("run", *files, "--out", tmp_path / "out")
 
 
 def test_ctrl_c_writes_what_is_done(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from junit_schema import read_valid_junit
-from rig_command import Said, rig
+from rig_command import Said, answer, refuse, rig
 from short_sequences import SHORT
 
 from fdi.trace.trace import Trace
@@ -64,12 +64,11 @@ def test_a_fault_fails_its_case_and_no_other(suite: tuple[Path, Said]) -> None:
 
 
 def test_a_case_is_diagnosed_as_a_single_run(suite: tuple[Path, Said], tmp_path: Path) -> None:
-    folder, _ = suite
     (tmp_path / "steps.toml").write_text(STEPS)
-    said = rig("run", tmp_path / "steps.toml", "--fdi", "--set", "filter.clogging=0.6", "--out", tmp_path / "run",
-               "--json")
-    alone, case = said.json["fdi"], json.loads((folder / "suite.json").read_text())["cases"][1]["fdi"]
-    assert said.status == 1 and (alone["verdict"], alone["level"]) == (case["verdict"], case["level"])
+    alone = answer("run", tmp_path / "steps.toml", "--fdi", "--set", "filter.clogging=0.6", "--out", tmp_path / "run",
+                   status=1)["fdi"]
+    case = json.loads((suite[0] / "suite.json").read_text())["cases"][1]["fdi"]
+    assert (alone["verdict"], alone["level"]) == (case["verdict"], case["level"])
     assert alone["refined"]["kintas"] == pytest.approx(case["refined"]["kintas"], rel=1e-9)
     assert Trace.read(tmp_path / "run").provenance["fdi.faults"].startswith("filter clogging non-nominal, Kintas 0.")
 
@@ -127,5 +126,5 @@ def test_the_option_holds_for_all_cases_and_the_key_for_one(tmp_path: Path) -> N
         _, variants = read_suite_file(tmp_path / "suite.toml", JobChoice(is_diagnosed=base))
         assert [variant.choice.is_diagnosed for variant in variants] == expected
     (tmp_path / "suite.toml").write_text(SUITE.replace("fdi = true", "fdi = 1"))
-    said = rig("run", tmp_path / "suite.toml", "--out", tmp_path / "out")
-    assert said.status == 2 and "case[0].fdi: expected true or false, not 1" in said.err and said.err.count("\n") == 1
+    line = refuse("run", tmp_path / "suite.toml", "--out", tmp_path / "out")
+    assert "case[0].fdi: expected true or false, not 1" in line

@@ -196,22 +196,19 @@ def test_screen_fits(preflight: Path, size: tuple[int, int]) -> None:
 
 
 def test_dead_node() -> None:
-    assert find_dead_node("ERROR", "process", "node 2 controller: its process ended with exit status 1") == 2
-    assert find_dead_node("ERROR", "heartbeat", "node 3 plant is silent") == 3
-    assert find_dead_node("INFO", "heartbeat", "node 3 plant is heard") == 0
-    assert find_dead_node("ERROR", "emcy", "node 3 plant 0x8250") == 0
+    for words, node in ((("ERROR", "process", "node 2 controller: its process ended with exit status 1"), 2),
+                        (("ERROR", "heartbeat", "node 3 plant is silent"), 3),
+                        (("INFO", "heartbeat", "node 3 plant is heard"), 0),
+                        (("ERROR", "emcy", "node 3 plant 0x8250"), 0)):
+        assert find_dead_node(*words) == node
     run = LiveRun(make_live_plan(load_sequence("preflight"), "realtime"))
     for level, text in (("ERROR", "node 3 plant is silent"), ("INFO", "node 3 plant is heard")):
         run.add(0, Event(level, "heartbeat", text))
         assert (3 in run.troubles) == (level == "ERROR")
     assert run.read_last("lateness", 10).tolist() == [] and isnan(run.t)
     assert "bring-up" in describe_line(run)
-
-
-def test_check_record_ends_the_waiting() -> None:
-    run = LiveRun(make_live_plan(load_sequence("preflight"), "lockstep"))
-    run.add(0, Check(value=1.0, passed=True, name="slip speed", signal="xj", unit="mm/s"))
-    assert run.checks["slip speed"].word == "PASS" and run.checks["slip speed"].is_final
+    run.add(0, Check(value=1.0, passed=True, name="slip speed", signal="xj", unit="mm/s"))  # ends the waiting
+    assert (run.checks["slip speed"].word, run.checks["slip speed"].is_final) == ("PASS", True)
 
 
 COMMAND = [sys.executable, "-m", "rig.cli.main", "run"]
@@ -253,14 +250,19 @@ def split_frames(text: str) -> list[str]:
     return [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", frame).replace("\r", "") for frame in text.split("\x1b[H")]
 
 
+def require_restored(text: str) -> None:
+    """The terminal is back on its own screen, and its cursor is shown."""
+    assert all(text.rindex(end) > text.rindex(begin) for begin, end in (("\x1b[?1049h", "\x1b[?1049l"),
+                                                                        ("\x1b[?25l", "\x1b[?25h")))
+
+
 def test_screen_of_a_run(tmp_path: Path) -> None:
     text, status = run_in_terminal(["--live", "--out", str(tmp_path / "run")])
     frames = split_frames(text)
-    assert status == 0 and "PASS  Every check passed." in frames[-1]
-    assert text.index("\x1b[?1049h") < text.index("\x1b[?1049l") < text.index("Every check passed")
-    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")  # the cursor is shown again
+    require_restored(text)
+    assert status == 0 and "PASS  Every check passed." in frames[-1] and "lockstep" in frames[-1]
+    assert text.index("\x1b[?1049l") < text.index("Every check passed")
     assert any("Position [mm]" in frame for frame in frames[1:])
-    assert "lockstep" in frames[-1]
 
 
 def test_screen_follows_the_run(tmp_path: Path) -> None:
@@ -300,10 +302,8 @@ def test_ctrl_c_restores_the_terminal(tmp_path: Path) -> None:
             os.kill(number, signal.SIGINT)
 
     text, status = run_in_terminal([str(sequence), "--live", "--out", str(tmp_path / "run")], stop)
-    assert stopped and status == 130
-    assert text.rindex("\x1b[?1049l") > text.rindex("\x1b[?1049h")
-    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
-    assert (tmp_path / "run" / "verdict.json").exists()
+    require_restored(text)
+    assert stopped and status == 130 and (tmp_path / "run" / "verdict.json").exists()
 
 
 def test_lines_without_a_terminal(tmp_path: Path) -> None:
@@ -353,19 +353,15 @@ def test_what_arrives_is_what_the_log_holds(tmp_path: Path) -> None:
     said = rig("run", tmp_path / "short.toml", "--live", f"rerun:{tmp_path}/live.rrd", "--out", tmp_path / "run")
     assert said.status == 1 and said.err == "" and "too small" in said.out
     rows, trace = read_recording(tmp_path / "live.rrd"), Trace.read(tmp_path / "run", all=True)
-    t, ram = zip(*rows["/position/ram"], strict=True)
-    np.testing.assert_allclose(t, trace.t, atol=1e-6)
-    np.testing.assert_allclose(np.array(ram, float), trace.xj * 1e3, atol=1e-9)
-    np.testing.assert_allclose([value for _, value in rows["/spool/spool"]], trace.xs * 1e6, atol=1e-9)
-    assert [state for _, state in rows["/run/phase"]] == ["set-up", "main"]
+    for entity, values in (("/position/ram", trace.xj * 1e3), ("/spool/spool", trace.xs * 1e6),
+                           ("/load/load", trace.load)):
+        np.testing.assert_allclose(rows[entity], np.column_stack([trace.t, values]), atol=1e-6, rtol=1e-9)
+    assert [state for _, state in rows["/run/phase"]] == ["set-up", "main"] and trace.load.max() == 100.0
     assert rows["/run/phase"][1][0] == pytest.approx(0.0, abs=1e-6)
-    assert str(rows["/check/position"][-1][1]).startswith("PASS")
-    assert str(rows["/check/too_small"][-1][1]).startswith("FAIL")
+    assert {entity: str(states[-1][1])[:4] for entity, states in rows.items() if entity.startswith("/check/")} == {
+        "/check/position": "PASS", "/check/too_small": "FAIL"}
     assert [(round(t, 6), state) for t, state in rows["/fault/parameter_filter.clogging"]] == [(0.2, "active")]
-    np.testing.assert_allclose([value for _, value in rows["/load/load"]], trace.load, atol=1e-9)
-    assert trace.load.max() == 100.0
     assert "operational" in {state for _, state in rows["/node/2_controller"]}
-    assert {entity for entity in rows if entity.startswith("/check/")} == {"/check/position", "/check/too_small"}
     assert len(rows["/log/checks"]) == len(trace.checks) and len(rows["/log/events"]) == len(trace.events)
     assert not any(math.isnan(t) for t, _ in rows["/log/events"])
 
