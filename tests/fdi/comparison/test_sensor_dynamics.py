@@ -35,15 +35,13 @@ def run_nominal() -> Trace:
 
 def filter_by_loop(x: np.ndarray, sensor: SensorDynamics) -> np.ndarray:
     """Lag and moving mean sample by sample at 1 kHz: nothing of the tested code."""
+    fine = np.interp((np.arange(50 * len(x)) + 0.5) / 50 - 1.0, np.arange(len(x)), x)  # between the samples
     out, state = [], x[0]
-    fine = 50
-    for k in range(len(x)):
-        for i in range(1, fine + 1):  # Euler steps along the straight line to this sample
-            now = x[max(k - 1, 0)] + (x[k] - x[max(k - 1, 0)]) * (i - 0.5) / fine
-            state = state + (now - state) * 1e-3 / fine / sensor.lag if sensor.lag else x[k]
+    for now in fine:  # Euler steps along the straight line to each sample
+        state = state + (now - state) * 1e-3 / 50 / sensor.lag if sensor.lag else now
         out.append(state)
-    n = round(sensor.moving_mean)
-    return np.array([np.mean([out[max(j, 0)] for j in range(k - n + 1, k + 1)]) for k in range(len(out))])
+    lagged, n = np.array(out[49::50]) if sensor.lag else x, round(sensor.moving_mean)
+    return np.array([np.mean(lagged[np.clip(range(k - n + 1, k + 1), 0, None)]) for k in range(len(x))])
 
 
 def measure(sensors: Mapping[str, SensorDynamics], is_told: bool) -> Comparison:
@@ -60,10 +58,9 @@ def test_filters_of_sensors_are_no_error_of_the_model(sensors: Mapping[str, Sens
     """Told of the filter, compare leaves noise; not told, a multiple of it."""
     told, untold = measure(sensors, True), measure(sensors, False)
     for name in sensors:
-        assert told.signals[name].error < 1.6 * told.signals[name].floor.value
-        assert untold.signals[name].error > 4.0 * told.signals[name].error
+        assert 0.25 * untold.signals[name].error > told.signals[name].error < 1.6 * told.signals[name].floor.value
     assert any("passes the sensor" in note for note in told.notes)
-    assert all(told.blocks[block] is None for block in ("jack", "sensor"))
+    assert (told.blocks["jack"], told.blocks["sensor"]) == (None, None)
 
 
 def test_rounding_is_noise() -> None:
@@ -77,14 +74,11 @@ def test_rounding_is_noise() -> None:
 
 def test_mean_of_the_loggers_samples() -> None:
     """Of 40 samples at 2 kHz: 20 ms, and 9.75 ms late; a centred one is not late."""
-    ramp = np.arange(100.0)
+    ramp, whole = np.arange(100.0), replace(MEAN, lag=3e-3, delay=1e-3)
     late = SensorDynamics(moving_mean=40.0, sample_period=5e-4)
-    assert (ramp - late.apply(ramp, 1e-3))[50:] == pytest.approx(9.75)
-    centred = replace(late, centred=True)
-    assert (ramp - centred.apply(ramp, 1e-3))[30:70] == pytest.approx(0.0, abs=1e-9)
-    assert (ramp - SensorDynamics(delay=3.5e-3).apply(ramp, 1e-3))[10:] == pytest.approx(3.5)
-    assert (ramp - SensorDynamics(lag=2e-3).apply(ramp, 1e-3))[50:] == pytest.approx(2.0)
-    whole = replace(MEAN, lag=3e-3, delay=1e-3)
+    for sensor, rows in ((late, 9.75), (replace(late, centred=True), 0.0), (SensorDynamics(delay=3.5e-3), 3.5),
+                         (SensorDynamics(lag=2e-3), 2.0)):
+        assert (ramp - sensor.apply(ramp, 1e-3))[50:70] == pytest.approx(rows, abs=1e-9)
     assert whole.undo(whole.apply(ramp, 1e-3), 1e-3)[45:80] == pytest.approx(ramp[45:80], abs=1e-3)
 
 
@@ -111,13 +105,11 @@ def test_damaged_dynamics_are_refused(text: str) -> None:
 
 
 def test_resolution_of_a_column() -> None:
-    rng = np.random.default_rng(0)
-    assert measure_resolution(np.round(rng.standard_normal(1000), 3)) == pytest.approx(1e-3, rel=0.01)
-    assert measure_resolution(np.round(rng.standard_normal(1000) * 1e5) * 1e-8) == pytest.approx(1e-8, rel=0.01)
-    six = np.array([float(f"{x:.5e}") for x in rng.uniform(1, 9, 1000)])
-    assert measure_resolution(six) == pytest.approx(1e-5, rel=0.01)
-    assert measure_resolution(rng.standard_normal(1000)) < 1e-10
-    assert measure_resolution(np.tile([5e-3, -5e-3], 500)) == 0.0
+    x = np.random.default_rng(0).standard_normal(1000)
+    six = np.array([float(f"{value:.5e}") for value in 5.0 + np.clip(x, -4.0, 4.0)])
+    for column, resolution in ((np.round(x, 3), 1e-3), (np.round(x * 1e5) * 1e-8, 1e-8), (six, 1e-5)):
+        assert measure_resolution(column) == pytest.approx(resolution, rel=0.01)
+    assert measure_resolution(x) < 1e-10 and measure_resolution(np.tile([5e-3, -5e-3], 500)) == 0.0
 
 
 def test_a_comb_is_found_to_a_part_in_ten_thousand() -> None:
@@ -129,9 +121,7 @@ def test_a_comb_is_found_to_a_part_in_ten_thousand() -> None:
 
 
 def test_rounding_leaves_half_a_step_at_most_and_not_much_less() -> None:
-    rng = np.random.default_rng(2)
-    left = rng.uniform(-0.5, 0.5, 5000)
-    assert is_rounding_left(left, 1.0, 0.01)
-    assert not is_rounding_left(3.0 * left, 1.0, 0.01)  # another firmware
-    assert not is_rounding_left(0.01 * left, 1.0, 0.01)  # the steps themselves went in
-    assert not is_rounding_left(np.full(3, np.nan), 1.0, 0.01)
+    left = np.random.default_rng(2).uniform(-0.5, 0.5, 5000)
+    # in turn: rounding, another firmware, the steps themselves went in, nothing
+    for residual, expected in ((left, True), (3.0 * left, False), (0.01 * left, False), (np.full(3, np.nan), False)):
+        assert is_rounding_left(residual, 1.0, 0.01) == expected
