@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
-from long_tests import LONG_TESTS
+from long_tests import LONG_TESTS, LONGEST
 from plugin_bus_summary import require_bus_kind
 from rig_command import rig
 
@@ -28,7 +28,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the long tests if --quick was given."""
+    """The longest first, so that no worker is left with one of them; leave out the long ones if --quick was given."""
+    items.sort(key=lambda item: not item.nodeid.removeprefix("tests/").startswith(LONGEST))
     if config.getoption("--quick"):
         root = config.rootpath / "tests"
         long = [item for item in items if item.path.relative_to(root).as_posix().startswith(LONG_TESTS)]

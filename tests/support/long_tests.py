@@ -1,6 +1,11 @@
 """Files and folders of tests that `make quick` leaves out: each takes more than some 3 s."""
 from __future__ import annotations
 
+# Those of half a minute and more begin first: none is left to one worker at the end.
+LONGEST = (
+    "vcan/", "rig/view/", "fdi/diagnosis/test_refine.py", "fdi/identification/", "fdi/discovery/test_discovery.py",
+    "fdi/comparison/test_compare.py", "studies/", "rig/campaign/", "rig/run/",
+)
 LONG_TESTS = (
     "examples/",
     "newcomer/",

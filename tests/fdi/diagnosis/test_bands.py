@@ -17,37 +17,33 @@ from rig_command import answer, refuse, rig
 
 from fdi.diagnosis import bands as learn_bands
 from fdi.diagnosis.bands import (
+    MEANINGS,
     Bands,
     BandVerdict,
+    Precursor,
+    UnitKind,
+    choose_bands,
+    compute_features,
     describe_other_model,
+    find_kind,
     find_stays,
     format_bands,
+    format_precursor,
     judge_position,
     judge_trace,
     list_design,
     load_bands,
     load_default_bands,
+    make_bands_by_simulation,
     matches_command,
+    measure_precursors,
     parse_bands,
+    sample_sensor_noise,
+    simulate_units,
+    smooth_spikes,
 )
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.faults import Estimate, Level
-from fdi.diagnosis.bands import (
-    UnitKind,
-    choose_bands,
-    make_bands_by_simulation,
-    sample_sensor_noise,
-    simulate_units,
-)
-from fdi.diagnosis.precursors import (
-    MEANINGS,
-    Precursor,
-    compute_features,
-    find_kind,
-    format_precursor,
-    measure_precursors,
-    smooth_spikes,
-)
 from fdi.report.diagnosis_report import draw_precursor_shifts, draw_sizes
 from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections

@@ -155,10 +155,9 @@ def test_a_model_with_a_known_effect_keeps_it() -> None:
     assert {f.name: f.centre for f in unknowns}["null_bias.current"] == 5e-5
 
 
-@pytest.mark.parametrize("seed", [8, 10])
-def test_a_fit_that_ends_behind_a_ridge_begins_again_from_the_other_side(seed: int) -> None:
-    """Strongly clogged units with scatter, which a first descent leaves at up to 3.5 times the noise."""
-    drawn = build_matrix({"case": [{"filter_clogging": 0.35}], "seeds": 1, "first": seed}, MODEL, "", "test")
+def test_a_fit_that_ends_behind_a_ridge_begins_again_from_the_other_side() -> None:
+    """A strongly clogged unit with scatter, which a first descent leaves at up to 3.5 times the noise."""
+    drawn = build_matrix({"case": [{"filter_clogging": 0.35}], "seeds": 1, "first": 8}, MODEL, "", "test")
     found = diagnose(simulate_case(drawn.cases[0], drawn.spec, MODEL))
     assert found.refinement.is_explained and found.levels[CLOGGING.name] == Level.NON_NOMINAL
     assert found.refinement.kintas.low < 0.35 < found.refinement.kintas.high

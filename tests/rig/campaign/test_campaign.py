@@ -26,9 +26,9 @@ from fdi.report.terminal import format_report
 from fdi.trace.trace import Trace
 from plant import InputError, Model, RigError
 from plant.effects import CATALOGUE
-from rig.campaign.batch import Batch, BatchProgress, RowFile, Workers, read_rows, run_batch, run_in_processes, run_jobs
 from rig.campaign import batch, judge
 from rig.campaign import summary as campaign_summary
+from rig.campaign.batch import Batch, BatchProgress, RowFile, Workers, read_rows, run_batch, run_in_processes, run_jobs
 from rig.campaign.judge import plan_batch, run_campaign
 from rig.campaign.summary import build_campaign_report
 from studies.hidden_effects.truth import SYMBOLS, has_compiler

@@ -15,8 +15,7 @@ from rig_command import Said, answer, refuse, rig
 from short_runs import HIDDEN, build_command, list_trace_arguments, write_measured_runs
 
 from fdi.discovery import update_model
-from fdi.estimation.fit import Value
-from fdi.estimation.fit import list_active_effects, list_active_unknowns, list_all_unknowns
+from fdi.estimation.fit import Value, list_active_effects, list_active_unknowns, list_all_unknowns
 from fdi.report import numbers as spoken
 from plant import Model, load_model
 from plant.effects import CATALOGUE
