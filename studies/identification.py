@@ -19,8 +19,8 @@ from fdi.estimation.binomial import measure_share
 from fdi.identification.identify import collect_identification_runs, identify_model, read_free_parameters
 from fdi.trace.trace import Trace
 from plant.model import load_model
+from plant.segments import RATE
 from rig.campaign.judge import FLOORS
-from rig.sequences.timing import PERIOD
 from studies.hidden_effects import command
 from studies.hidden_effects.cases import sample_healthy_plant
 from studies.hidden_effects.truth import SYMBOLS, nominal_symbols, simulate_truth
@@ -82,7 +82,7 @@ def _measure(plant: dict[str, float], com: Array, force: float, seed: list[int])
     noise = {signal: level * rng.standard_normal(n) for signal, level in FLOORS.items()}
     run = simulate_truth(com, plant, noise["xj"], command.known_load_profile(n, force))
     columns = run._asdict() | {"p12": run.p12 + noise["p12"], "xs": run.xs + noise["xs"]}
-    return Trace.from_columns(columns, PERIOD, {"source": "-".join(map(str, seed))})
+    return Trace.from_columns(columns, 1 / RATE, {"source": "-".join(map(str, seed))})
 
 
 def judge_unit(seed: int, workers: int | None = None) -> dict[str, Any]:

@@ -61,6 +61,11 @@ class Bench:
     files: Mapping[str, bytes] = field(default_factory=dict)  # bench file, EDS, DBC: name -> content, for the log
 
     @property
+    def rate(self) -> float:
+        """Cycles a second."""
+        return 1e9 / self.cycle_ns
+
+    @property
     def has_plant_node(self) -> bool:
         """Whether the plant is a node of its own on the bus."""
         return Role.PLANT in self.nodes

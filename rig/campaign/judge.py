@@ -32,12 +32,12 @@ from plant import simulate
 from plant.errors import InputError, RigError
 from plant.model import Model, find_effect, parse_model
 from plant.parameters import load_nominal_values, parse_toml, parse_value, read_toml
+from plant.segments import RATE
 from plant.solve import NOISES
 from plant.threads import count_threads
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, import_extra, read_rows, run_batch
 from rig.network.clock import WallClock
 from rig.sequences import load_sequence
-from rig.sequences.timing import PERIOD
 from rig.tables import Place, Range, build_dataclass
 
 OWN_SIMULATOR = "plant"
@@ -111,8 +111,8 @@ def build_matrix(tables: Mapping[str, Any], model: Model, work: str, where: obje
     settings = build_dataclass(Settings, given, place)
     if model.plant != "eha":
         raise InputError("--model", model.plant, "eha, whose preflight check this is")
-    if model["controller.period"] != PERIOD:
-        raise InputError("--set", "controller.period", f"{PERIOD:g} s, the cycle of the preflight check")
+    if model["controller.period"] != 1 / RATE:
+        raise InputError("--set", "controller.period", f"{1 / RATE:g} s, the cycle of the preflight check")
     blocks = tables.get("case", [])
     if not isinstance(blocks, list) or not blocks or not all(isinstance(block, Mapping) for block in blocks):
         raise InputError(where, "case", "at least one [[case]] (an empty one is a healthy plant)")
@@ -293,7 +293,7 @@ def sample_position_noise(n: int, colour: float, hum: float, rng: np.random.Gene
     noise[0] = last
     for k, innovation in enumerate((np.sqrt(1 - colour**2) * white).tolist()[1:], start=1):
         noise[k] = last = colour * last + innovation
-    noise += hum * np.sin(2 * np.pi * 50.0 * PERIOD * np.arange(n) + 1.0)
+    noise += hum * np.sin(2 * np.pi * 50.0 * (1 / RATE) * np.arange(n) + 1.0)
     return noise
 
 

@@ -13,6 +13,7 @@ from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell
 from fdi.report.terminal import style_of
 from plant.errors import InputError
+from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, choose_file, give_answer, make_folder
 from rig.cli.interruption import catch_signals
 from rig.cli.terminal import open_console
@@ -74,6 +75,7 @@ def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
     """
     variants: list[Variant] = []
     titles: dict[str, str] = {}  # of each suite file
+    rate = load_bench(base.bench or "eha", is_trusted=args.trust).rate
     requirements: dict[str, str] = {}
     for name in args.sequence:
         if not is_suite_file(name):
@@ -81,7 +83,7 @@ def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
             continue
         if args.model or args.set or args.seed is not None:
             raise InputError("--model, --set, --seed", "", f"in the suite file {name}, as keys of its cases")
-        content, own = read_suite_file(Path(name), base)
+        content, own = read_suite_file(Path(name), base, rate)
         variants += own
         titles[name] = content.title
         listed = content.requirements

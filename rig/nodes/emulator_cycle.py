@@ -21,7 +21,6 @@ from plant.compile import ForeignCall, keep_apart
 from plant.flat import list_state_values
 from plant.machine_code import ADVANCE_CALL, READ_CALL
 from plant.run import PRESSURE, SENSED, SPOOL
-from plant.segments import RATE
 from plant.solve import NOISES
 from rig.network.node_objects import RING
 from rig.network.raw_bus import (
@@ -663,7 +662,7 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
         first, last = min(change.first for change in changes), max(change.last for change in changes)
         course = np.full(last - first + 1, changes[0].base)
         for change in reversed(changes):  # of several in a cycle the first counts
-            t = np.arange(change.last - change.first) / RATE
+            t = np.arange(change.last - change.first) / schedule.rate
             growth = np.divide(t, change.ramp, out=np.ones_like(t), where=t < change.ramp)
             course[change.first - first: change.last - first] = change.base + (change.value - change.base) * growth
         parameters.append((names[changes[0].name], first, len(course), len(values)))

@@ -16,14 +16,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.segments import Array
+from plant.segments import RATE, Array
 from rig.benches.bench import Bench
 from rig.benches.frame_map import Role
 from rig.network.codec import Flags
 from rig.network.master import StartTime
 from rig.network.node_objects import CONTROLLER, PLANT, RIG
 from rig.sequences.faults import DELAY, BusOff, Offset, Parameter, Plan, Schedule, Silent, Stuck
-from rig.sequences.timing import PERIOD, TimingPolicy
+from rig.sequences.timing import TimingPolicy
 
 Mask = NDArray[np.bool_]
 
@@ -52,6 +52,7 @@ class CycleRecords(NamedTuple):
     flags: NDArray[np.int64]  # of the valve state
     injected: Injected
     plant_delay: Array  # the plant's own record: feedback sent after SYNC came; 0 where it has none
+    period: float = 1 / RATE  # s, of a cycle
 
     @property
     def cycles(self) -> int:
@@ -178,16 +179,17 @@ def find_late_cycles(records: CycleRecords, policy: TimingPolicy, stops: Iterabl
         stops: cycles in which the plant was found to have stopped. The frames that were missing then are not late: a
             plant that has stopped is another cause.
     """
-    sync = (records.lateness > policy.sync) & ~records.injected.sync
-    is_in_time = (records.feedback <= policy.feedback) & ~np.isnan(records.valve)
+    latest_sync, latest_feedback = policy.find_limits(records.period)
+    sync = (records.lateness > latest_sync) & ~records.injected.sync
+    is_in_time = (records.feedback <= latest_feedback) & ~np.isnan(records.valve)
     feedback = ~is_in_time & ~records.injected.plant & ~records.injected.sync
     missing = records.find_missing(PLANT)
     for cycle in stops:
-        known_after = 150  # cycles: a change of the NMT state is known with the next heartbeat
+        known_after = round(0.15 / records.period)  # a change of the NMT state is known with the next heartbeat
         first = _find_run_start(missing, min(cycle, records.cycles - 1), near=known_after)
         present = np.flatnonzero(~missing[first:])
         feedback[first:first + int(present[0]) if len(present) else None] = False
-    return LateCycles(sync, feedback, records.plant_delay > policy.feedback)
+    return LateCycles(sync, feedback, records.plant_delay > latest_feedback)
 
 
 def find_plant_stops(records: CycleRecords, troubles: Iterable[Trouble], gone: Container[int]) -> list[int]:
@@ -242,7 +244,7 @@ def find_disturbances(records: CycleRecords, late: LateCycles, joined: int = 2) 
 def _describe_disturbance(records: CycleRecords, late: LateCycles, first: int, last: int) -> Disturbance:
     """A disturbance with its reach: three cycles, and as long again as it lasted."""
     span = slice(first, last + 1)
-    skipped = int(np.floor(np.nan_to_num(records.lateness[span]) / PERIOD).sum())
+    skipped = int(np.floor(np.nan_to_num(records.lateness[span]) / records.period).sum())
     source, text = PLANT, _describe_plant(records, late, span)
     # The rig is named if its SYNC was late first: a stalled rig also takes the plant's frames in late.
     if late.sync[first] or (late.sync[span].any() and not late.stalled[span].any() and late.feedback[span].sum() < 2):
@@ -262,7 +264,7 @@ def _describe_plant(records: CycleRecords, late: LateCycles, span: slice) -> str
 
 def count_overruns(records: CycleRecords, late: LateCycles) -> NDArray[np.int64]:
     """Overruns in each cycle, (cycles,): one for a late cycle, and the whole periods that were skipped if more."""
-    skipped = np.floor(np.nan_to_num(records.lateness) / PERIOD).astype(np.int64)
+    skipped = np.floor(np.nan_to_num(records.lateness) / records.period).astype(np.int64)
     return np.maximum(skipped, late.any.astype(np.int64))
 
 
@@ -409,30 +411,31 @@ def _show_punctuality(records: CycleRecords, first: int, cycle: int) -> tuple[st
             f"{1e3 * float(feedback.max()):.2f} ms",)
 
 
-def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: int = 400,
+def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: float = 0.4,
                   watchdog_limit: int = 4) -> Injected:
     """Find the cycles that the faults of a sequence disturb.
 
     Args:
         plan, schedule: the faults, and in which cycles they act.
         cycles: number of cycles of the run.
-        heartbeat_limit: cycles after which a lost heartbeat has been reported.
+        heartbeat_limit: s after which a lost heartbeat has been reported.
         watchdog_limit: cycles after which missing frames have been reported.
     """
     sync, plant, anything = (np.zeros(cycles, dtype=bool) for _ in range(3))
+    silent, cycle_ns = round(heartbeat_limit * plan.rate), round(1e9 / plan.rate)
     for fault in plan.faults:
         first, last = plan.find_cycles(fault)
         frame = getattr(fault, "frame", "")
         if not frame and not isinstance(fault, Parameter | Offset | Stuck):
-            anything[first:last + heartbeat_limit] = True
+            anything[first:last + silent] = True
             sync[first:last + watchdog_limit] |= not isinstance(fault, Silent)
             plant[first:last + 1] |= isinstance(fault, BusOff)
         for k in range(first, min(last, cycles) if frame else first):
             action = schedule.find_action(frame, k)
             if action.code:
-                last_hit = k - (-action.argument // round(PERIOD * 1e9)) if action.code == DELAY else k
+                last_hit = k - (-action.argument // cycle_ns) if action.code == DELAY else k
                 anything[k:last_hit + watchdog_limit] = True
                 plant[k:last_hit + 1] |= frame in ("feedback", "valve_state", "sync")
                 sync[k:last_hit + 1] |= frame == "sync"
-                anything[k:k + heartbeat_limit] |= frame == "sync"
+                anything[k:k + silent] |= frame == "sync"
     return Injected(sync, plant, anything)

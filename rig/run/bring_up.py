@@ -57,7 +57,8 @@ class BringUp:
             self.gains = read_gains(self._master.read_parameters() if parameters is None else parameters)
         patient = not job.realtime and isinstance(self._stage.clock, WallClock)
         self._master.configure(scenario.to_bytes(), parameters,
-                               job.sequence.timing.choose_sync_period() if job.realtime or self._is_embedded else 0,
+                               job.sequence.timing.choose_sync_period(job.period_ns / 1e9)
+                               if job.realtime or self._is_embedded else 0,
                                PATIENT if patient else HEARTBEAT_LIMIT)
         if is_first:
             for role in self.identities:
@@ -73,7 +74,7 @@ class BringUp:
         Raises:
             BusError: a node does not answer or refuses.
         """
-        steps = list_first_steps(self._job.sequence.protocol.step_delay)
+        steps = list_first_steps(self._job.sequence.protocol.step_delay, self._job.bench.rate)
         cycles = count_cycles(steps)
         steps = (*WARM_UP, *steps) if self._job.realtime else steps
         self._stage.is_probing = True

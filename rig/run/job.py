@@ -22,7 +22,6 @@ from plant import InputError, Model, load_model
 from plant.effects import load_effects
 from plant.model import find_quantity, parse_model
 from plant.parameters import parse_toml
-from plant.segments import RATE
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench, load_bench_from_files
 from rig.nodes.scenario import Scenario
@@ -37,7 +36,10 @@ _EFFECT_FOLDER, _SEQUENCE_FOLDER, _BENCH_FOLDER = "effects/", "sequence/", "benc
 class Job:
     """One run. `plant` and `controller`: "builtin", "external", for the plant "auto", for the controller "c".
 
-    Raises InputError for a controller of ours on the bench of another device.
+    The sequence is sampled at the rate of the bench, whose cycle is the period of the model's controller.
+
+    Raises InputError for a controller of ours on the bench of another device, and for a sequence that cannot be sampled
+    at this rate.
     """
 
     sequence: Sequence
@@ -58,6 +60,8 @@ class Job:
         if self.controller != "external" and not speaks_as_shipped(self.bench):
             raise InputError("--controller", self.controller, "external: our own firmware does not speak as the device "
                                                               f"of {self.bench.name!r}")
+        object.__setattr__(self, "sequence", self.sequence.at_rate(self.bench.rate))
+        object.__setattr__(self, "model", self.model.replace({"controller.period": self.period_ns / 1e9}))
 
     @property
     def realtime(self) -> bool:
@@ -67,7 +71,7 @@ class Job:
     @property
     def period_ns(self) -> int:
         """Length of a cycle, ns."""
-        return round(self.model["controller.period"] * 1e9)
+        return self.bench.cycle_ns
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -96,14 +100,18 @@ def replace_settings(job: Job, **given: object) -> Job:
     return replace(job, **settings)
 
 
-def require_bench_cycle(model: Model, where: object) -> None:
-    """Refuse a model whose controller has another period than the cycle of the bench, 1 ms.
+def require_bench_cycle(model: Model, bench: Bench, where: object) -> None:
+    """Refuse a model that asks for another period of the controller than the cycle of the bench.
+
+    The nominal period asks for none.
 
     Raises:
         InputError: it names `where` the model comes from.
     """
-    if model["controller.period"] != 1.0 / RATE:
-        raise InputError(where, "controller.period", "0.001 s: the bench's cycle is fixed; rig simulate takes others")
+    cycle = bench.cycle_ns / 1e9
+    if model["controller.period"] not in (cycle, model.nominal["controller.period"]):
+        raise InputError(where, "controller.period", f"{cycle:g} s, the cycle of {bench.name!r}: a bench file gives "
+                                                     "another, and rig simulate takes any")
 
 
 def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print_on_standard_error) -> Job:
@@ -136,9 +144,9 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
     except UnicodeDecodeError as error:
         raise InputError(path, "attachment model.toml", "text in UTF-8") from error
     model = parse_model(parse_toml(text, where), where)
-    require_bench_cycle(model, where)
     bench = _read_bench(attachments, said.get("bench", ""), is_trusted=is_trusted)
-    return Job(sequence=Sequence.from_bundle(bundle), model=model, bench=bench, effects=effects, **settings)
+    require_bench_cycle(model, bench, where)
+    return Job(sequence=Sequence.from_bundle(bundle, bench.rate), model=model, bench=bench, effects=effects, **settings)
 
 
 def _read_bench(attachments: Mapping[str, bytes], name: str, *, is_trusted: bool) -> Bench:
@@ -240,14 +248,14 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     require_different_names(choice.effects)
     for file in choice.effects:
         load_effects(file)
-    sequence = load_sequence(choice.sequence) if built is None else built
+    bench = load_bench(choice.bench or "eha", is_trusted=is_trusted)
+    sequence = load_sequence(choice.sequence, bench.rate) if built is None else built
     name = choice.model or sequence.model.name
     brought = load_effects_of_model(name, choice.effects, is_trusted=is_trusted, announce=announce)
     require_different_names((*choice.effects, *brought))
     model = load_model(name).replace(sequence.model.overrides, sequence.name).replace(choice.changes)
-    require_bench_cycle(model, "--set")
-    foreign = [name for name in model.list_changes() if name.startswith("controller.")]
-    bench = load_bench(choice.bench or "eha", is_trusted=is_trusted)
+    require_bench_cycle(model, bench, "--set")
+    foreign = [name for name in model.list_changes() if name.startswith("controller.") and name != "controller.period"]
     controller = choice.controller or ("builtin" if speaks_as_shipped(bench) else "external")
     if controller == "external" and foreign:
         raise InputError("--set", foreign[0], "no gains beside --controller external: that firmware has its own")

@@ -19,7 +19,7 @@ from fdi.report.report import to_plain
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
-from plant.segments import RATE, Array
+from plant.segments import Array
 from rig.benches.frame_map import Role
 from rig.network.node_objects import NAMES, PLANT, Identity
 from rig.run.attribution import Attribution, Cause, Trouble, count_most_in_a_row
@@ -107,7 +107,7 @@ class Outcome:
     def _find_excess(self) -> str:
         """Whether there were more overruns than the sequence accepts, up to the first cause of trouble; in words."""
         policy, overruns = self.job.sequence.timing, self.attribution.overruns.copy()
-        overruns[:round(policy.grace * RATE)] = 0
+        overruns[:round(policy.grace * self.job.bench.rate)] = 0
         if self.attribution.cause is not None and self.aborted:
             overruns = overruns[:self.attribution.cause.cycle]
         total, most, cycles = int(overruns.sum()), policy.most_in_a_row, self.timing["cycles"]
@@ -126,8 +126,8 @@ class Outcome:
         if check.signal == HEARTBEAT:
             return self._is_plant_off
         first, last = (0.0 if isnan(t) else t for t in (check.t0, check.t1))
-        start = self.job.scenario.plan.start
-        rows = slice(start + round(first * RATE), start + round(last * RATE) if last > first else None)
+        start, rate = self.job.scenario.plan.start, self.job.bench.rate
+        rows = slice(start + round(first * rate), start + round(last * rate) if last > first else None)
         return bool(self.attribution.affected[rows].any())
 
     @property
@@ -144,7 +144,7 @@ class Outcome:
 
     def find_time(self, cycle: int) -> float:
         """The time of a cycle, s of main."""
-        return (cycle - self.job.scenario.plan.start) / RATE
+        return (cycle - self.job.scenario.plan.start) / self.job.bench.rate
 
     def describe_cause(self) -> str:
         """The first cause with its time, and what followed from it; empty if there was no trouble."""

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plant.segments import RATE
 from rig.network.codec import Control
 from rig.run.cyclic_values import CycleInput
 from rig.run.loop import History
@@ -38,11 +37,14 @@ WARM_UP = (Step(0, DISTANCE, 30), Step(Control.RESET, DISTANCE, 1))  # real time
 LAST_STEPS = (Step(0, DISTANCE, 8),)
 
 
-def list_first_steps(step_delay: float) -> tuple[Step, ...]:
-    """The steps of a probe before set-up, whose demand step may be answered `step_delay` s late."""
+def list_first_steps(step_delay: float, rate: float) -> tuple[Step, ...]:
+    """The steps of a probe before set-up, whose demand step may be answered `step_delay` s late.
+
+    `rate`: cycles a second.
+    """
     step = 0.5e-3  # m; its current is far below the limit
     return (Step(0, DISTANCE, 4), Step(Control.DISABLE, DISTANCE, 2), Step(Control.DISABLE | Control.HOLD, DISTANCE, 2),
-            Step(Control.ACTIVE, 0.0, 3), Step(Control.ACTIVE, step, 3 + round(step_delay * RATE)),
+            Step(Control.ACTIVE, 0.0, 3), Step(Control.ACTIVE, step, 3 + round(step_delay * rate)),
             Step(0, DISTANCE, 8))
 
 

@@ -153,7 +153,7 @@ def judge_run(job: Job, session: Session, judged: Mask) -> tuple[list[CheckResul
     t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
     sequence = job.sequence
     results = evaluate_checks(sequence.checks, Columns(t, *main), sequence.sections(), session.journal.events,
-                              sequence.fault_starts(), session.log.read_drives())
+                              sequence.fault_starts(), session.log.read_drives(), sequence.rate)
     protocol, skipped = judge_protocol(session.read_protocol_record(judged), sequence.protocol)
     return [*results, *protocol], skipped
 
@@ -176,7 +176,7 @@ def attribute_run(job: Job, session: Session) -> Attribution:
     injected = find_injected(plan, Schedule(plan, job.scenario.model.values), len(history))
     records = CycleRecords(np.array(session.log.due_ns, dtype=np.int64), lateness, feedback, valve, response,
                            history.column("flags").astype(np.int64), injected,
-                           select_plant_delays(session.plant_record, len(history)))
+                           select_plant_delays(session.plant_record, len(history)), job.period_ns / 1e9)
     return attribute(records, session.safety.troubles, job.sequence.timing, job.bench, session.nodes.gone)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from fdi.progress import Progress
 from plant.profile import Profile, build_profile
-from plant.segments import RATE, Hold
+from plant.segments import Hold
 from rig.benches.frame_map import Role, make_reader
 from rig.benches.profiles import PROFILES, State
 from rig.network.frame import Frame
@@ -59,7 +59,8 @@ class CycleLog:
 
     def __init__(self, job: Job, journal: Journal, nodes: NodeWatch, overruns: OverrunWatch) -> None:
         self._journal, self._nodes, self._overruns = journal, nodes, overruns
-        self._is_realtime, self._period_ns, self._start = job.realtime, job.period_ns, job.scenario.plan.start
+        self._is_realtime, self._rate, self._start = job.realtime, job.bench.rate, job.scenario.plan.start
+        self._period_ns = job.period_ns
         self._guards = GuardWatch(job.sequence.guards)
         self.history = History()
         self.after = History()  # the probe after clean-up
@@ -97,7 +98,7 @@ class CycleLog:
         came, due = np.array([frame.t_ns for frame in self._drives], np.int64), np.array(self.due_ns, np.int64)
         cycle = np.searchsorted(due, came, "right") - 1
         since = np.clip(came - due[np.maximum(cycle, 0)], 0, self._period_ns - 1) if len(due) else came
-        t = np.where(cycle < 0, -np.inf, (cycle - self._start) / RATE + since * 1e-9)
+        t = np.where(cycle < 0, -np.inf, (cycle - self._start) / self._rate + since * 1e-9)
         return DriveFrames(t, np.array([drive["current"] for drive in drives]),
                            np.array([drive.get("status_word", 0) for drive in drives]).astype(np.int64))
 
@@ -123,7 +124,7 @@ class Session:
         plan = self.scenario.plan
         self._faults = Schedule(plan, self.scenario.model.values)
         self._is_embedded = isinstance(wire, EmbeddedWire)
-        self.stage = Stage(wire.clock, plan.start)
+        self.stage = Stage(wire.clock, plan.start, plan.rate)
         self.journal = Journal(self.stage, recorder)
         self.safety = SafeState(self.stage, self.journal, job.sequence.ends == "safe_state")
         self._master = Master(wire, self.stage.now, job.realtime, job.bench)
@@ -299,7 +300,8 @@ class Session:
         """The clean-up of the sequence; a tenth of a second without current if a node does not answer or came late."""
         if self.nodes.look_again() or self.safety.is_cut_short:
             self._powered = self._may_power = False
-            return build_profile((Hold(time=0.1),), self._demand)
+            rate = self.job.bench.rate
+            return build_profile((Hold(time=max(1, round(0.1 * rate)) / rate),), self._demand, rate)
         return self.job.sequence.cleanup_profile(self._demand)
 
     def _restore_nodes(self) -> bool:
@@ -329,7 +331,7 @@ class Session:
     def read_protocol_record(self, judged: Mask) -> ProtocolRecord:
         """All that the protocol checks of this run are judged by; `judged`: cycles in which the bench was on time."""
         job, model, start = self.job, self.job.model, self.starter
-        cycles = count_cycles(list_first_steps(job.sequence.protocol.step_delay))
+        cycles = count_cycles(list_first_steps(job.sequence.protocol.step_delay, job.bench.rate))
 
         def read(history: History) -> Rows:
             rows = read_rows(history, start.find_on_time_of(history))

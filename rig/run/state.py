@@ -4,7 +4,6 @@ from __future__ import annotations
 import bisect
 from typing import NamedTuple
 
-from plant.segments import RATE
 from rig.network.clock import Clock
 from rig.recorder import Event, Recorder
 from rig.run.attribution import Trouble
@@ -27,9 +26,9 @@ class SessionEvent(NamedTuple):
 class Stage:
     """Where a run is: the loop that plays, and what is recorded and watched meanwhile."""
 
-    def __init__(self, clock: Clock, start: int) -> None:
-        """`clock` is that of the wire; `start` is the first cycle of main."""
-        self.clock, self._start = clock, start
+    def __init__(self, clock: Clock, start: int, rate: float) -> None:
+        """`clock` is that of the wire; `start` is the first cycle of main; `rate`: cycles a second."""
+        self.clock, self._start, self._rate = clock, start, rate
         self.loop: Loop | None = None
         self.is_probing = False  # before set-up
         self.is_watching = False  # from the reset of the nodes for the run until its last cycle
@@ -49,7 +48,7 @@ class Stage:
     def find_time(self, cycle: int | None = None) -> float:
         """The time of a cycle, by default now, s of main; negative before main."""
         now = self.loop.k if self.loop and not self.is_probing else 0
-        return ((now if cycle is None else cycle) - self._start) / RATE
+        return ((now if cycle is None else cycle) - self._start) / self._rate
 
 
 class Journal:

@@ -172,18 +172,19 @@ class OverrunWatch:
     def __init__(self, policy: TimingPolicy, period: float, injected: Container[int] = ()) -> None:
         """`period` is the length of a cycle in s; `injected`: cycles whose SYNC or plant frames a fault disturbs."""
         self._most = policy.most_in_a_row if policy.overruns == "abort" else None
-        self._policy, self._period, self._injected = policy, period, injected
+        self._grace, self._period, self._injected = policy.grace, period, injected
+        self._latest_sync, self._latest_feedback = policy.find_limits(period)
         self._in_a_row = 0
         self.problem = ""
 
     def add(self, timing: Timing) -> None:
         """Take in a complete cycle."""
-        if self._most is None or self.problem or timing.cycle * self._period < self._policy.grace:
+        if self._most is None or self.problem or timing.cycle * self._period < self._grace:
             return
         if timing.cycle in self._injected:
             return
-        is_fed = timing.feedback_response <= self._policy.feedback and not isnan(timing.valve_response)
-        is_late = timing.lateness > self._policy.sync or not is_fed
+        is_fed = timing.feedback_response <= self._latest_feedback and not isnan(timing.valve_response)
+        is_late = timing.lateness > self._latest_sync or not is_fed
         self._in_a_row = self._in_a_row + max(1, int(timing.lateness / self._period)) if is_late else 0
         if self._in_a_row > self._most:
             self.problem = (f"the bench was late: {self._in_a_row} overruns in a row up to cycle {timing.cycle}, "

@@ -107,7 +107,7 @@ class Check:
         value, t0, t1, detail = nan, nan, nan, ""
         try:
             span = run.find_rows(self.window, self.skip)
-            t0, t1 = span.start / RATE, span.stop / RATE
+            t0, t1 = span.start / run.rate, span.stop / run.rate
             missing = run.count_missing(self.about, span)
             measured = KINDS[self.kind].measure(self, run, span) / self.scale
             if not isfinite(measured):
@@ -124,7 +124,7 @@ class Check:
 
     def _find_reference(self, run: RunData) -> tuple[float, float, float]:
         """What a reaction is measured against: the time from which it counts, s of main, and levels; NaN for none."""
-        after = len(run.trace.t) / RATE if self.kind == "recovers" else getattr(self, "after", nan)
+        after = len(run.trace.t) / run.rate if self.kind == "recovers" else getattr(self, "after", nan)
         after = after if isinstance(after, float) else run.starts.get(after, nan)
         above, below = (getattr(self, key, None) for key in ("above", "below"))
         return after, nan if above is None else above, nan if below is None else below
@@ -154,7 +154,7 @@ class Settling(OfPosition):
 class AtFrequency(OfPosition):
     """At one frequency."""
 
-    frequency: Annotated[float, Range("Hz", above=0.0, below=RATE / 2)]
+    frequency: Annotated[float, Range("Hz", above=0.0)]  # and below half the rate of the run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,7 +240,7 @@ class Window(Columns):
 def _measure_python(check: PythonCheck, run: RunData, span: slice) -> float:
     assert check.function is not None
     columns = [np.array(getattr(run.trace, name)[span], dtype=np.float64) for name in Window._fields[1:]]
-    value = check.function.call(Window(np.arange(span.start, span.stop) / RATE, *columns), **check.arguments)
+    value = check.function.call(Window(np.arange(span.start, span.stop) / run.rate, *columns), **check.arguments)
     if value is None:
         raise NotMeasurable(f"{check.python} returned no value")
     try:
@@ -255,8 +255,8 @@ def _measure_python(check: PythonCheck, run: RunData, span: slice) -> float:
 def _measure_response(check: Response, run: RunData, span: slice) -> float:
     after = run.find_start(check.after)
     if check.signal:
-        rest = run.find_rows((after, span.stop / RATE))
-        return measures.find_crossing(run.read_signal(check.signal, rest), check.above, check.below)
+        rest = run.find_rows((after, span.stop / run.rate))
+        return measures.find_crossing(run.read_signal(check.signal, rest), run.rate, check.above, check.below)
     events = run.find_events(check.event, after)
     if not events:
         raise NotMeasurable(f"no event {check.event!r} after {after:g} s")
@@ -266,13 +266,13 @@ def _measure_response(check: Response, run: RunData, span: slice) -> float:
 def _measure_shut_off(check: ShutOff, run: RunData, span: slice) -> float:
     """Any drive frame counts, also one of another cycle. A controller that leaves OPERATIONAL sends none any more."""
     after = run.find_start(check.after)
-    drives = run.drives.select_between(after, span.stop / RATE)
+    drives = run.drives.select_between(after, span.stop / run.rate)
     is_off = (drives.current == 0.0) & (drives.status & int(Status.MODE) == 0)
     if check.status is not None:
         is_off &= drives.status & 0xF == check.status
     on = np.flatnonzero(~is_off)
     off = drives.t[int(on[-1]) + 1 if len(on) else 0:]
-    left = [event.t for event in run.find_events(LEFT_OPERATIONAL, after, span.stop / RATE)
+    left = [event.t for event in run.find_events(LEFT_OPERATIONAL, after, span.stop / run.rate)
             if not len(on) or event.t >= drives.t[on[-1]]]
     times = [*off[:1].tolist(), *left[:1]]
     if not times:
@@ -281,7 +281,7 @@ def _measure_shut_off(check: ShutOff, run: RunData, span: slice) -> float:
 
 
 def _measure_recovery(check: Check, run: RunData, span: slice) -> float:
-    start = len(run.trace.t) / RATE
+    start = len(run.trace.t) / run.rate
     drives = run.drives.select_between(start, np.inf)
     idle = np.flatnonzero(drives.status & int(Status.ACTIVE) != int(Status.ACTIVE))
     first = int(idle[-1]) + 1 if len(idle) else 0
@@ -291,11 +291,12 @@ def _measure_recovery(check: Check, run: RunData, span: slice) -> float:
 
 
 def _read_response(check: AtFrequency, run: RunData, span: slice) -> complex:
-    return measures.measure_response(run.read_signal("xj", span), run.read_signal("com", span), check.frequency)
+    return measures.measure_response(run.read_signal("xj", span), run.read_signal("com", span), run.rate,
+                                     check.frequency)
 
 
 def _count_events(check: OfEvent, run: RunData, span: slice) -> float:
-    return float(len(run.find_events(check.event, span.start / RATE, span.stop / RATE)))
+    return float(len(run.find_events(check.event, span.start / run.rate, span.stop / run.rate)))
 
 
 class Kind(NamedTuple):
@@ -319,9 +320,9 @@ KINDS: dict[str, Kind] = {
     "ramp_error": Kind("Mean lag behind a ramp, m.", "m", lambda check, run, span: measures.measure_ramp_error(
         run.read_signal("error", span), run.read_signal("com", span))),
     "break_away": Kind("Position error before the spool lets go on a slow ramp, m.", "m",
-                       lambda check, run, span: measures.measure_break_away(run.read_signal("error", span))),
+                       lambda check, run, span: measures.measure_break_away(run.read_signal("error", span), run.rate)),
     "max_error": Kind("Largest position error in either direction, m.", "m", lambda check, run, span: float(
-        np.abs(measures.filter_median(run.read_signal("error", span))).max())),
+        np.abs(measures.filter_median(run.read_signal("error", span), run.rate)).max())),
     "rms_error": Kind("Root mean square of the position error, m.", "m",
                       lambda check, run, span: float(np.sqrt(np.mean(run.read_signal("error", span) ** 2)))),
     "never_exceeds": Kind("Largest size of a signal, every sample counting.", "", lambda check, run, span: float(
@@ -346,7 +347,8 @@ KEYS: dict[str, type[Check]] = {name: kind.keys for name, kind in KINDS.items()}
 
 
 def evaluate_checks(checks: Iterable[Check], trace: Columns, sections: Mapping[str, slice], events: Sequence[Any] = (),
-                    starts: Mapping[str, float] | None = None, drives: DriveFrames = NO_DRIVES) -> list[CheckResult]:
+                    starts: Mapping[str, float] | None = None, drives: DriveFrames = NO_DRIVES,
+                    rate: float = RATE) -> list[CheckResult]:
     """Judge a run.
 
     Args:
@@ -356,8 +358,9 @@ def evaluate_checks(checks: Iterable[Check], trace: Columns, sections: Mapping[s
         events: what happened; each has `t` (s of main), `kind` and `text`.
         starts: when each fault began, s of main, by its label.
         drives: all drive frames, for the checks of a reaction.
+        rate: rows of the trace a second.
     """
-    run = RunData(trace, sections, events, starts or {}, drives)
+    run = RunData(trace, sections, events, starts or {}, drives, rate)
     return [check.judge(run) for check in checks]
 
 

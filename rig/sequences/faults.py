@@ -1,6 +1,6 @@
 """Faults as data, and the schedule of the faults that act in each cycle.
 
-The node that injects a fault asks the `Schedule` every millisecond, so everything random or periodic is computed when
+The node that injects a fault asks the `Schedule` in every cycle, so everything random or periodic is computed when
 it is created; the same seed gives the same faults in the same cycles. Times in a fault are seconds from the start of
 the main phase; a fault ends when main ends, so that clean-up runs on a healthy plant.
 """
@@ -178,7 +178,7 @@ class Jitter(Fault):
     """SYNC comes late by a random time, uniform between 0 and `size` seconds; due times stay where they are."""
 
     kind = "jitter"
-    size: Annotated[float, Range("s", above=0.0, below=1 / RATE)]
+    size: Annotated[float, Range("s", above=0.0, below=0.1)]  # and below a cycle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,22 +277,27 @@ class Edge(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """Faults placed in a run: main is the cycles start <= k < stop, counted from the start of set-up."""
+    """Faults placed in a run: main is the cycles start <= k < stop, counted from the start of set-up.
+
+    `rate`: cycles a second.
+    """
 
     faults: tuple[Fault, ...] = ()
     start: int = 0
     stop: int
     seed: int = 0
+    rate: Annotated[float, Range("1/s", low=1.0, high=1e6)] = RATE
 
     def find_cycles(self, fault: Fault) -> tuple[int, int]:
         """First cycle in which a fault acts and the one in which it no longer does."""
-        last = self.stop if fault.end is None else min(self.stop, self.start + round(fault.end * RATE))
-        return min(last, self.start + round(fault.start * RATE)), last
+        last = self.stop if fault.end is None else min(self.stop, self.start + round(fault.end * self.rate))
+        return min(last, self.start + round(fault.start * self.rate)), last
 
     def to_json(self) -> dict[str, Any]:
         """What `from_json` makes a plan of: plain dicts, lists, numbers and texts."""
         faults = [{"kind": f.kind, **{k: v for k, v in asdict(f).items() if v is not None}} for f in self.faults]
-        return {"faults": faults, "start": self.start, "stop": self.stop, "seed": self.seed}
+        return {"faults": faults, "start": self.start, "stop": self.stop, "seed": self.seed,
+                "rate": self.rate}
 
     @classmethod
     def from_json(cls, data: object) -> Plan:
@@ -342,7 +347,7 @@ class Schedule:
     """
 
     def __init__(self, plan: Plan, base: Mapping[str, float] | None = None) -> None:
-        self._base, self._stop = base or {}, plan.stop
+        self._base, self._stop, self.rate = base or {}, plan.stop, plan.rate
         self.parameters: dict[str, list[ParameterChange]] = {}  # of several faults in a cycle the first counts
         self.signals: dict[str, list[SignalChange]] = {}  # in the order in which they act
         self._frames: dict[str, list[tuple[int, Table]]] = {}  # from which cycle on, and code and argument in each
@@ -368,7 +373,7 @@ class Schedule:
                     fault.parameter, first, last, self._base[fault.parameter], target, fault.ramp))
             case Offset():  # or noise
                 shape = rng.standard_normal(cycles) if isinstance(fault, Noise) else np.ones(cycles)
-                added = [fault.value * _grow(k, fault.ramp) * float(unit) for k, unit in enumerate(shape)]
+                added = [fault.value * _grow(k / self.rate, fault.ramp) * float(unit) for k, unit in enumerate(shape)]
                 self.signals.setdefault(fault.signal, []).append(SignalChange(first, last, added))
             case Stuck():
                 self.signals.setdefault(fault.signal, []).append(SignalChange(first, last, value=fault.value))
@@ -404,7 +409,8 @@ class Schedule:
     def _parameter(self, name: str, cycle: int) -> float:
         for change in self.parameters[name]:
             if change.first <= cycle < change.last:
-                return change.base + (change.value - change.base) * _grow(cycle - change.first, change.ramp)
+                share = _grow((cycle - change.first) / self.rate, change.ramp)
+                return change.base + (change.value - change.base) * share
         return self._base[name]
 
     def list_parameters(self, cycle: int) -> dict[str, float]:
@@ -477,9 +483,8 @@ class Schedule:
 _FRAMES_OF = {"rig": ("command", "sync"), "plant": ("feedback", "valve_state", "drive")}  # none with a node bus-off
 
 
-def _grow(cycles: int, ramp: Second) -> float:
-    """Share of its full size that a fault has so many cycles after its start, 0..1."""
-    t = cycles / RATE
+def _grow(t: Second, ramp: Second) -> float:
+    """Share of its full size that a fault has at a time after its start, 0..1."""
     return 1.0 if t >= ramp else t / ramp
 
 
@@ -518,11 +523,11 @@ def find_contradiction(plan: Plan, model: Model) -> tuple[int, str] | None:
     for i, fault in changing:
         first, last = plan.find_cycles(fault)
         end = max(first, last - 1)
-        for cycle in (first, min(first + ceil(fault.ramp * RATE), end), end, last):
+        for cycle in (first, min(first + ceil(fault.ramp * plan.rate), end), end, last):
             try:
                 check_combinations("faults", schedule.list_parameters(cycle))
             except InputError as error:
-                return i, f"{error.field} {error.expected} at {(cycle - plan.start) / RATE:g} s of main"
+                return i, f"{error.field} {error.expected} at {(cycle - plan.start) / plan.rate:g} s of main"
     return None
 
 

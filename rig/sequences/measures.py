@@ -1,9 +1,10 @@
 """Measures of sampled signals: overshoot, settling time, phase lag and so on, each a single number.
 
-Signals have shape (n,), SI, one sample per cycle. Position carries some 2 um rms of sensor noise; where one sample
-could decide (a peak, the last sample outside a band) a centred moving median of MEDIAN samples goes first. It keeps
-steps and ramps as they are, lowers a peak of angular frequency w by (w * 1 ms)^2 / 2 of its curve (0.7 % at 120 rad/s),
-and leaves 1.1 um rms of the noise.
+Signals have shape (n,), SI, one sample per cycle, `rate` a second. Position carries some 2 um rms of sensor noise;
+where one sample could decide (a peak, the last sample outside a band) a centred moving median of MEDIAN_SPAN goes
+first. At 1000 samples a second it keeps steps and ramps as they are, lowers a peak of angular frequency w by
+(w * 1 ms)^2 / 2 of its curve (0.7 % at 120 rad/s), and leaves 1.1 um rms of the noise. From 200 samples a second down
+there is no room for a median: one sample decides.
 """
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ from plant.run import Columns
 from plant.segments import RATE, Array
 from rig import tables
 
-MEDIAN_SAMPLES = 5  # samples
-SPEED_SPAN = 20  # cycles between the two samples of a speed: 2 um rms of position noise become 0.14 mm/s rms
+MEDIAN_SPAN = 5e-3  # s
+SPEED_SPAN = 20e-3  # s between the two samples of a speed: 2 um rms of position noise become 0.14 mm/s rms
 
 
 class NotMeasurable(Exception):
@@ -42,21 +43,21 @@ def bridge_gaps(signal: Array, name: str, allowed: float) -> Array:
     return np.interp(rows, rows[~missing], signal[~missing])
 
 
-def filter_median(signal: Array) -> Array:
-    """Centred moving median of MEDIAN samples, the ends repeated."""
-    half = MEDIAN_SAMPLES // 2
+def filter_median(signal: Array, rate: float) -> Array:
+    """Centred moving median of the samples in MEDIAN_SPAN, the ends repeated."""
+    half = int(MEDIAN_SPAN * rate / 2 + 1e-9)
     padded = np.pad(signal, half, mode="edge")
-    filtered: Array = np.median(np.lib.stride_tricks.sliding_window_view(padded, MEDIAN_SAMPLES), axis=1)
+    filtered: Array = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1), axis=1)
     return filtered
 
 
-def compute_speed(position: Array) -> Array:
-    """Central difference over SPEED_SPAN cycles, one-sided at the ends, m/s."""
-    rows = np.arange(len(position))
-    ahead, behind = np.minimum(rows + SPEED_SPAN // 2, len(rows) - 1), np.maximum(rows - SPEED_SPAN // 2, 0)
+def compute_speed(position: Array, rate: float) -> Array:
+    """Central difference over SPEED_SPAN, one cycle to each side at least, one-sided at the ends, m/s."""
+    rows, half = np.arange(len(position)), max(1, round(SPEED_SPAN * rate / 2))
+    ahead, behind = np.minimum(rows + half, len(rows) - 1), np.maximum(rows - half, 0)
     if len(rows) < 2:
         raise NotMeasurable("one sample has no speed")
-    difference: Array = (position[ahead] - position[behind]) * RATE / (ahead - behind)
+    difference: Array = (position[ahead] - position[behind]) * rate / (ahead - behind)
     return difference
 
 
@@ -71,27 +72,27 @@ def measure_step_size(com: Array, before: float, smallest: float = 20e-6) -> flo
     return size
 
 
-def measure_overshoot(position: Array, com: Array, before: float) -> float:
+def measure_overshoot(position: Array, com: Array, before: float, rate: float) -> float:
     """How far the highest point is beyond the target, % of the step; 0 if it never gets there."""
     size = measure_step_size(com, before)
-    return max(0.0, 100 * float(((filter_median(position) - com[-1]) / size).max()))
+    return max(0.0, 100 * float(((filter_median(position, rate) - com[-1]) / size).max()))
 
 
-def measure_settling_time(position: Array, com: Array, before: float, band: float) -> float:
+def measure_settling_time(position: Array, com: Array, before: float, rate: float, band: float) -> float:
     """Time until the position stays within +-band % of the step around the target, s."""
     size = measure_step_size(com, before)
-    outside = np.flatnonzero(np.abs(filter_median(position) - com[-1]) > abs(size) * band / 100)
+    outside = np.flatnonzero(np.abs(filter_median(position, rate) - com[-1]) > abs(size) * band / 100)
     if not len(outside):
         return 0.0
     if outside[-1] == len(position) - 1:
         raise NotMeasurable(f"still outside +-{band:g} % at the end of the window")
-    return float(outside[-1] + 1) / RATE
+    return float(outside[-1] + 1) / rate
 
 
-def measure_rise_time(position: Array, com: Array, before: float) -> float:
+def measure_rise_time(position: Array, com: Array, before: float, rate: float) -> float:
     """Time from 10 % to 90 % of the step, s, interpolated between samples."""
     size = measure_step_size(com, before)
-    done = (filter_median(position) - before) / size
+    done = (filter_median(position, rate) - before) / size
 
     def find_time(level: float) -> float:
         beyond = np.flatnonzero(done >= level)
@@ -100,7 +101,7 @@ def measure_rise_time(position: Array, com: Array, before: float) -> float:
         k = int(beyond[0])
         return k - (done[k] - level) / (done[k] - done[k - 1]) if k else 0.0
 
-    return float(find_time(0.9) - find_time(0.1)) / RATE
+    return float(find_time(0.9) - find_time(0.1)) / rate
 
 
 def measure_ramp_error(error: Array, com: Array) -> float:
@@ -110,22 +111,22 @@ def measure_ramp_error(error: Array, com: Array) -> float:
     return float(error.mean() * np.sign(com[-1] - com[0]))
 
 
-def measure_break_away(error: Array) -> float:
+def measure_break_away(error: Array, rate: float) -> float:
     """Position error that builds up before the spool lets go, m: half the band that stick-slip draws on a slow ramp.
 
     docs/physics.md: FSS KF / (GPF1 ASV GM GAP). The band is taken from the 1st to the 99th percentile of the
     filtered error, so that noise and single outliers do not widen it; a triangle loses 2 % by that. The mean (ramp
     error) drops out.
     """
-    low, high = np.percentile(filter_median(error), (1, 99))
+    low, high = np.percentile(filter_median(error, rate), (1, 99))
     return float(high - low) / 2
 
 
-def measure_response(signal: Array, com: Array, frequency: float) -> complex:
+def measure_response(signal: Array, com: Array, rate: float, frequency: float) -> complex:
     """Signal over command as a complex number at `frequency`, Hz: least-squares sine, cosine and mean of both."""
-    if len(com) < RATE / frequency:
+    if len(com) < rate / frequency:
         raise NotMeasurable(f"the window is shorter than one period of {frequency:g} Hz")
-    phase = 2 * np.pi * frequency * np.arange(len(com)) / RATE
+    phase = 2 * np.pi * frequency * np.arange(len(com)) / rate
     basis = np.column_stack((np.sin(phase), np.cos(phase), np.ones(len(com))))
     (sine, cosine, _), *_ = np.linalg.lstsq(basis, np.column_stack((com, signal)), rcond=None)
     asked, given = complex(sine[0], cosine[0]), complex(sine[1], cosine[1])
@@ -134,13 +135,13 @@ def measure_response(signal: Array, com: Array, frequency: float) -> complex:
     return given / asked
 
 
-def find_crossing(signal: Array, above: float | None, below: float | None) -> float:
+def find_crossing(signal: Array, rate: float, above: float | None, below: float | None) -> float:
     """Time of the first of three samples in a row above or below a level, s from the signal's start."""
     beyond = (signal > (inf if above is None else above)) | (signal < (-inf if below is None else below))
     in_a_row = np.flatnonzero(beyond[:-2] & beyond[1:-1] & beyond[2:])
     if not len(in_a_row):
         raise NotMeasurable("the level was never passed")
-    return float(in_a_row[0]) / RATE
+    return float(in_a_row[0]) / rate
 
 
 SI_OF_UNIT: dict[str, tuple[str, float]] = {  # unit: (SI unit, how many of those it is)
@@ -184,13 +185,16 @@ NO_DRIVES = DriveFrames(np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
 
 @dataclass(frozen=True)
 class RunData:
-    """The data of a run that checks use: trace, sections, events, and when each fault started (s of main, by label)."""
+    """The data of a run that checks use: trace, `rate` rows a second, sections, events, and when each fault started
+    (s of main, by label).
+    """
 
     trace: Columns
     sections: Mapping[str, slice] = field(default_factory=dict)
     events: Sequence[Any] = ()  # each has `t` (s of main), `kind` and `text`
     starts: Mapping[str, float] = field(default_factory=dict)
     drives: DriveFrames = NO_DRIVES
+    rate: float = RATE
 
     def find_start(self, after: str | float) -> float:
         """A time, s of main, given as such or as the label of the fault that begins then."""
@@ -200,13 +204,13 @@ class RunData:
         """Rows of a window without its first `skip` seconds; NotMeasurable if the run ended before the window did."""
         rows = len(self.trace.t)
         if isinstance(window, tuple):
-            first, last = round(window[0] * RATE), round(window[1] * RATE)
+            first, last = round(window[0] * self.rate), round(window[1] * self.rate)
         else:
             section = slice(0, rows) if window == MAIN else self.sections[window]
             first, last = section.start, section.stop
         if last > rows:
-            raise NotMeasurable(f"the run ended at {rows / RATE:g} s, the window at {last / RATE:g} s")
-        first += round(skip * RATE)
+            raise NotMeasurable(f"the run ended at {rows / self.rate:g} s, the window at {last / self.rate:g} s")
+        first += round(skip * self.rate)
         if first >= last:
             raise NotMeasurable("the window is empty")
         return slice(first, last)
@@ -216,7 +220,7 @@ class RunData:
         if name == "error":
             return self.read_signal("com", span) - self.read_signal("xj", span)
         if name == "speed":
-            return compute_speed(self.read_signal("xj", span))
+            return compute_speed(self.read_signal("xj", span), self.rate)
         return bridge_gaps(np.asarray(getattr(self.trace, name), float)[span], name, largest_missing_share)
 
     def count_missing(self, name: str, span: slice) -> int:
@@ -225,11 +229,11 @@ class RunData:
         column = getattr(self.trace, name) if name in Columns._fields else np.zeros(0)  # an event has none
         return int(np.isnan(np.asarray(column, float)[span]).sum())
 
-    def read_step(self, span: slice) -> tuple[Array, Array, float]:
-        """Position and demand in a span, and the demand before it (at the very start: where the ram is)."""
+    def read_step(self, span: slice) -> tuple[Array, Array, float, float]:
+        """Position and demand in a span, the demand before it (at the very start: where the ram is), and the rate."""
         position = self.read_signal("xj", span)
         before = float(self.trace.com[span.start - 1] if span.start else position[0])
-        return position, self.read_signal("com", span), before
+        return position, self.read_signal("com", span), before, self.rate
 
     def find_events(self, event: str, t0: float, t1: float = float("inf")) -> list[Any]:
         """Events in t0 <= t < t1 whose kind and text have all words of `event`, whatever their case, by time."""

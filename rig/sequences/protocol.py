@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.controller import Loop, compute_current
-from plant.segments import RATE, Array, Second
+from plant.segments import Array, Second
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.benches.canopen_map import name_object
@@ -50,10 +50,10 @@ class ProtocolLimits:
     """Limits of the protocol checks: the table `protocol` of a sequence.
 
     status: time in which status word and zero current follow the control word (default: 2 ms; 400 ms of CiA 402, 10 ms
-    without a control word). idle_current: largest current that counts as none, such as the noise of a drive that sends
-    what it measures. missing: share of the cycles whose
-    drive frame may be missing, late or of another cycle (default: none in lockstep, 0.001 in real time). response_*:
-    from SYNC to the drive frame, in real time. heartbeat: tolerance of the median heartbeat period. gain: tolerance of
+    without a control word; two cycles at least). idle_current: largest current that counts as none, such as the noise
+    of a drive that sends what it measures. missing: share of the cycles whose drive frame may be missing, late or of
+    another cycle (default: none in lockstep, 0.001 in real time). response_*: from SYNC to the drive frame, in real
+    time (default: 0.5, 0.9 and 1 of the cycle). heartbeat: tolerance of the median heartbeat period. gain: tolerance of
     the loop's gain, 1. step_delay: from a demand step to the first answer that follows it; above 0 for a controller
     with a filter in its loop. emcy: codes of the controller allowed beyond the documented ones. probe: whether to
     run the probes.
@@ -62,18 +62,18 @@ class ProtocolLimits:
     status: UpToOneSecond | None = None
     idle_current: Annotated[float, Range("A", low=0.0)] = 0.0
     missing: Annotated[float, Range("1", low=0.0, high=1.0)] | None = None
-    response_p50: UpToOneSecond = 0.5e-3
-    response_p99: UpToOneSecond = 0.9e-3
-    response_max: UpToOneSecond = 1e-3
+    response_p50: UpToOneSecond | None = None
+    response_p99: UpToOneSecond | None = None
+    response_max: UpToOneSecond | None = None
     heartbeat: UpToOneSecond = 0.01
     gain: Annotated[float, Range("1", above=0.0, below=1.0)] = 0.1
     step_delay: Annotated[float, Range("s", low=0.0, high=LONGEST_STEP_DELAY)] = 0.0
     emcy: tuple[Annotated[int, Range("1", low=1, high=0xFFFF)], ...] = ()
     probe: bool = True
 
-    def find_delay(self, words: ProfileWords) -> float:
-        """The limit `status` for a profile, s."""
-        return words.delay if self.status is None else self.status
+    def find_delay(self, words: ProfileWords, rate: float) -> float:
+        """The limit `status` for a profile, s, at `rate` cycles a second."""
+        return max(words.delay, 2 / rate) if self.status is None else self.status
 
 
 class Rows(NamedTuple):
@@ -171,7 +171,8 @@ def _make_result(name: str, signal: str, value: float, unit: str, low: float = n
 
 def _judge_current(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
     """Largest current while it must be zero; and in all cycles."""
-    idle = _drop_missing([rows.cor[find_idle(rows, record.words, limits)] for rows in record.stretches])
+    rate = record.bench.rate
+    idle = _drop_missing([rows.cor[find_idle(rows, record.words, limits, rate)] for rows in record.stretches])
     current = _drop_missing([rows.cor for rows in record.stretches])
     name = f"no current unless {record.words.active}"
     if record.bench.profile == "none" and not record.bench.enables:
@@ -203,23 +204,24 @@ def find_states(rows: Rows, words: ProfileWords) -> Whole:
     return map_words(rows.status, lambda word: find_state(words, word))
 
 
-def find_idle(rows: Rows, words: ProfileWords, limits: ProtocolLimits) -> Mask:
+def find_idle(rows: Rows, words: ProfileWords, limits: ProtocolLimits, rate: float) -> Mask:
     """Cycles in which there must be no current; none is before the first.
 
     By the control word: it does not ask for ACTIVE, nor did it in the time `status` before. By the status word of
-    CiA 402: it has said that there is none, for 2 ms.
+    CiA 402: it has said that there is none, for 2 ms and two cycles.
     """
     wanted = map_words(rows.control, lambda word: find_wanted(words, word))
-    idle = _find_over(wanted == State.ACTIVE, limits.find_delay(words))
+    idle = _find_over(wanted == State.ACTIVE, round(limits.find_delay(words, rate) * rate))
     if words is CIA402:
-        idle |= _find_over(np.isnan(rows.cor) | (rows.status.astype(int) & words.powered != 0), CIA408.delay)
+        powered = np.isnan(rows.cor) | (rows.status.astype(int) & words.powered != 0)
+        idle |= _find_over(powered, round(ProtocolLimits().find_delay(CIA408, rate) * rate))
     return idle
 
 
-def _find_over(active: Mask, delay: float) -> Mask:
-    """The cycles that are not active and that follow none that is by `delay` s or less."""
+def _find_over(active: Mask, delay: int) -> Mask:
+    """The cycles that are not active and that follow none that is by `delay` cycles or less."""
     count, k = np.concatenate(([0], np.cumsum(active))), np.arange(len(active))
-    over: Mask = count[k + 1] == count[np.maximum(k - round(delay * RATE), 0)]
+    over: Mask = count[k + 1] == count[np.maximum(k - delay, 0)]
     return over
 
 
@@ -229,9 +231,10 @@ def _judge_status(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
     if record.bench.profile == "none":
         yield SkippedCheck(name, "the bench has no control word and no status word")
         return
+    delay = limits.find_delay(record.words, record.bench.rate)
     if record.words is CIA402:
         whole = Rows(*map(np.concatenate, zip(*record.played, strict=True)))
-        wrong = list_wrong_changes(whole, limits.find_delay(CIA402))
+        wrong = list_wrong_changes(whole, round(delay * record.bench.rate))
         yield _make_result("status word follows the states of CiA 402", "status word", float(len(wrong)), "1", high=0.0,
                            detail="; ".join(wrong[:3]))
         ages = measure_delays(whole)
@@ -239,12 +242,12 @@ def _judge_status(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
         faulty = _find_faulty(record)
         ages = np.concatenate([measure_status_ages(rows, faulty if rows is record.run else None)
                                for rows in record.stretches])
-    value, detail = (int(ages.max()) * 1e3 / RATE, "") if len(ages) else (nan, NO_FRAME)
-    yield _make_result(name, "status word", value, "ms", high=limits.find_delay(record.words) * 1e3, detail=detail)
+    value, detail = (int(ages.max()) * 1e3 / record.bench.rate, "") if len(ages) else (nan, NO_FRAME)
+    yield _make_result(name, "status word", value, "ms", high=delay * 1e3, detail=detail)
 
 
-def list_wrong_changes(rows: Rows, delay: float) -> list[str]:
-    """The changes of state of a CiA 402 drive, in words, that no control word of the last `delay` s explains.
+def list_wrong_changes(rows: Rows, delay: int) -> list[str]:
+    """The changes of state of a CiA 402 drive, in words, that no control word of the last `delay` cycles explains.
 
     Before the first cycle it is switched off, or in fault.
     """
@@ -256,7 +259,7 @@ def list_wrong_changes(rows: Rows, delay: float) -> list[str]:
     wrong = []
     for i in np.flatnonzero(states[answered] != before).tolist():
         k, old = int(answered[i]), State(int(before[i]))
-        near = slice(max(0, int(answered[max(i - 1, 0)]) - round(delay * RATE)), k + 1)
+        near = slice(max(0, int(answered[max(i - 1, 0)]) - delay), k + 1)
         new = State(int(states[k]))
         if new not in list_reachable(old, frozenset(wanted[near].tolist()), resets=bool(rises[near].any())):
             names = [each.name.lower().replace("_", " ") for each in (new, old)]
@@ -381,7 +384,7 @@ def _judge_probes(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
     if not record.probes:
         return
     first = record.probes[0]
-    delay, detail = measure_step_delay(first)
+    delay, detail = measure_step_delay(first, record.bench.rate)
     yield _make_result(delay_name, "current", delay, "ms", high=limits.step_delay * 1e3, detail=detail)
     if record.gains is not None:
         gain, detail = measure_gain(first, record.gains)
@@ -399,7 +402,7 @@ def _find_active(rows: Rows) -> Whole:
     return active
 
 
-def measure_step_delay(probe: Rows) -> tuple[float, str]:
+def measure_step_delay(probe: Rows, rate: float) -> tuple[float, str]:
     """Time from the demand step to the first answer that follows it in the same direction, ms, and a remark.
 
     An answer follows when the current has changed by a fifth of the largest change since the step.
@@ -414,7 +417,7 @@ def measure_step_delay(probe: Rows) -> tuple[float, str]:
         return nan, "a drive frame is missing at the step"
     if change.max() <= 0.0:
         return nan, "the current does not follow the demand"
-    return float(np.flatnonzero(change >= 0.2 * change.max())[0]) * 1e3 / RATE, ""
+    return float(np.flatnonzero(change >= 0.2 * change.max())[0]) * 1e3 / rate, ""
 
 
 def measure_gain(probe: Rows, gains: object) -> tuple[float, str]:
@@ -449,10 +452,11 @@ def _judge_response(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[
     if not record.is_response_judged:
         return
     known = _drop_missing([rows.response[rows.on_time] for rows in record.stretches]) * 1e6
-    for name, share, limit in (("p50", 50, limits.response_p50), ("p99", 99, limits.response_p99),
-                               ("max", 100, limits.response_max)):
+    for name, share, limit, usual in (("p50", 50, limits.response_p50, 0.5), ("p99", 99, limits.response_p99, 0.9),
+                                      ("max", 100, limits.response_max, 1.0)):
         value, detail = (float(np.percentile(known, share)), f"{len(known)} cycles") if len(known) else (nan, NO_FRAME)
-        yield _make_result(f"response time, {name}", "drive", value, "us", high=limit * 1e6, detail=detail)
+        high = usual * 1e6 / record.bench.rate if limit is None else limit * 1e6
+        yield _make_result(f"response time, {name}", "drive", value, "us", high=high, detail=detail)
 
 
 def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:

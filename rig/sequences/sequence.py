@@ -1,7 +1,8 @@
 """A test sequence as data: the command of the actuator, the faults during the test, and the checks afterwards.
 
 A sequence is a TOML file (rig/sequences/ has examples): set-up, main and clean-up as lists of segments, the load on the
-ram, faults, checks and guards. Times of loads, faults and checks count from the start of main.
+ram, faults, checks and guards. Times of loads, faults and checks count from the start of main. All times are in s; the
+bench of a run says how many cycles a second has.
 """
 from __future__ import annotations
 
@@ -105,6 +106,7 @@ class Sequence:
     name: str = field(default="", metadata=_OWN)  # the file's, without folders
     source: str = field(default="", metadata=_OWN, repr=False)
     files: Mapping[str, bytes] = field(default_factory=dict, metadata=_OWN, repr=False)  # CSV and Python files, by name
+    rate: float = field(default=RATE, metadata=_OWN)  # cycles a second
 
     @property
     def duration(self) -> float:
@@ -113,15 +115,15 @@ class Sequence:
 
     def setup_profile(self) -> Profile:
         """The command before main, from 0 m."""
-        return build_profile(self.setup)
+        return build_profile(self.setup, rate=self.rate)
 
     def main_profile(self) -> Profile:
         """The command that is judged, from where set-up ended."""
-        return build_profile(self.main, self.setup_profile().end)
+        return build_profile(self.main, self.setup_profile().end, self.rate)
 
     def cleanup_profile(self, start: float) -> Profile:
         """The command after main, or after it was broken off at the demand `start` (m)."""
-        return build_profile(self.cleanup, start)
+        return build_profile(self.cleanup, start, self.rate)
 
     def sections(self) -> dict[str, slice]:
         """Rows of main by section name, as checks see them."""
@@ -129,14 +131,15 @@ class Sequence:
 
     def load_profile(self) -> Array:
         """Force on the ram in N for every cycle of main."""
-        force, _, end = build_profile(self.load)
-        cycles = round(self.duration * RATE)
+        force, _, end = build_profile(self.load, rate=self.rate)
+        cycles = round(self.duration * self.rate)
         return np.concatenate((force, np.full(cycles - len(force), end)))
 
     def plan(self, seed: int) -> Plan:
         """The faults by cycle of the run."""
-        start = round(sum(segment.duration for segment in self.setup) * RATE)
-        return Plan(faults=self.faults, start=start, stop=start + round(self.duration * RATE), seed=seed)
+        start = round(sum(segment.duration for segment in self.setup) * self.rate)
+        stop = start + round(self.duration * self.rate)
+        return Plan(faults=self.faults, start=start, stop=stop, seed=seed, rate=self.rate)
 
     @property
     def loses_frames(self) -> bool:
@@ -157,9 +160,17 @@ class Sequence:
         """The text and the files it uses, by name: all that `from_bundle` needs to make the same sequence."""
         return {self.name: self.source.encode(), **self.files}
 
+    def at_rate(self, rate: float) -> Sequence:
+        """The sequence for a run of so many cycles a second.
+
+        Raises:
+            InputError: the line of what such cycles cannot show.
+        """
+        return self if rate == self.rate else Sequence.from_bundle(self.bundle(), rate)
+
     @classmethod
-    def from_bundle(cls, bundle: Mapping[str, bytes]) -> Sequence:
-        """The sequence of a bundle; Python files in it run.
+    def from_bundle(cls, bundle: Mapping[str, bytes], rate: float = RATE) -> Sequence:
+        """The sequence of a bundle, for `rate` cycles a second; Python files in it run.
 
         Raises:
             InputError: a file is not in it or does not make a sequence.
@@ -173,14 +184,15 @@ class Sequence:
                 raise InputError("bundle", name, "to be part of the bundle")
             return bundle[name]
 
-        return parse_sequence(tables.decode_text(bundle[sources[0]], sources[0]), sources[0], read_file)
+        return parse_sequence(tables.decode_text(bundle[sources[0]], sources[0]), sources[0], read_file, rate)
 
 
-def load_sequence(name_or_path: str | Path) -> Sequence:
+def load_sequence(name_or_path: str | Path, rate: float = RATE) -> Sequence:
     """Read a sequence: a TOML file, or the name of one that comes with the rig.
 
     Args:
         name_or_path: e.g. "preflight" or "tests/mine.toml"; CSV and Python files in it are sought beside it.
+        rate: cycles a second of the bench that is to play it.
 
     Raises:
         InputError: no such sequence, or the file, line and key that cannot be used and what was expected there.
@@ -189,29 +201,34 @@ def load_sequence(name_or_path: str | Path) -> Sequence:
     shipped = {Path(entry.name).stem: entry for entry in found if entry.name.endswith(".toml")}
     if str(name_or_path) in shipped:
         entry = shipped[str(name_or_path)]
-        return parse_sequence(entry.read_text(encoding="utf-8"), entry.name, lambda name: tables.read_file(Path(name)))
+        return parse_sequence(entry.read_text(encoding="utf-8"), entry.name, lambda name: tables.read_file(Path(name)),
+                              rate)
     path = Path(name_or_path)
     if path.suffix != ".toml":
         raise InputError(name_or_path, "", f"a .toml file, or {tables.list_choices(str(name_or_path), shipped)}")
     return parse_sequence(tables.decode_text(tables.read_file(path), path), str(path),
-                          lambda name: tables.read_file(path.parent / name))
+                          lambda name: tables.read_file(path.parent / name), rate)
 
 
-def parse_sequence(text: str, name: str, read_file: ReadFile) -> Sequence:
+def parse_sequence(text: str, name: str, read_file: ReadFile, rate: float = RATE) -> Sequence:
     """The sequence of a TOML text; `read_file` gives the bytes of the CSV and Python files that it names.
 
-    The Python files run.
+    The Python files run. `rate`: cycles a second.
 
     Raises:
         InputError: the file, line and key that cannot be used, or the line of a Python file.
     """
     table, place = tables.parse_table(text, name)
-    sequence = replace(tables.build_dataclass(Sequence, table, place, _KINDS), name=Path(name).name, source=text)
+    sequence = replace(tables.build_dataclass(Sequence, table, place, _KINDS), name=Path(name).name, source=text,
+                       rate=rate)
     sequence = _fill_in_files(sequence, place, read_file)
     _check_phases(sequence, place)
     _check_faults(sequence, place.at("faults"))
     _check_parameters(sequence, place)
     _check_checks(sequence, place.at("checks"))
+    for key in ("sync", "feedback"):
+        if (limit := getattr(sequence.timing, key) or 0.0) * rate > 1.0 + 1e-9:
+            raise place.at("timing", key).refuse(f"at most a cycle, {1 / rate:g} s, not {limit:g}")
     return sequence
 
 
@@ -229,7 +246,8 @@ def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Seq
 
     def fill_in(part: Any, key: str, here: Place) -> Any:
         if isinstance(part, Csv):
-            return replace(part, values=_read_column(part.file, read, key, here.at("file")))
+            values = _read_column(part.file, read, key, here.at("file"), 1 / sequence.rate)
+            return replace(part, values=values, rate=sequence.rate)
         if isinstance(part, PythonSegment | PythonCheck | Step):
             file, name = require_function_name(part.python)
             source = read(file, here.at("python"), "a Python file beside the sequence")
@@ -245,12 +263,13 @@ def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Seq
     return replace(sequence, files=embedded, **filled)
 
 
-def _read_column(file: str, read: Callable[[str, Place, str], bytes], phase: str, here: Place) -> tuple[float, ...]:
-    """The values of a CSV segment, one a cycle."""
+def _read_column(file: str, read: Callable[[str, Place, str], bytes], phase: str, here: Place, period: float,
+                 ) -> tuple[float, ...]:
+    """The values of a CSV segment, one a cycle of `period` s."""
     expected = "a readable command file"
     data = read(file, here, expected)
     try:
-        columns = parse_columns(data, file)
+        columns = parse_columns(data, file, period)
     except InputError as error:
         raise here.refuse(f"{expected}; {error}") from error
     values = columns.get("value" if phase == "load" or "com" not in columns else "com")
@@ -263,7 +282,7 @@ def _check_phases(sequence: Sequence, place: Place) -> None:
     for phase in PHASES:
         for i, segment in enumerate(getattr(sequence, phase)):
             with place.at(phase, i).locate(has_field=True):
-                segment.require_rate(RATE)
+                segment.require_rate(sequence.rate)
         called = list_section_names(getattr(sequence, phase))
         for i, name in enumerate(called):
             if name in called[:i]:
@@ -274,7 +293,7 @@ def _check_phases(sequence: Sequence, place: Place) -> None:
     if not sequence.main:
         raise place.at("main").refuse("at least one segment")
     length = sum(segment.duration for segment in sequence.load)
-    if round(length * RATE) > round(sequence.duration * RATE):
+    if round(length * sequence.rate) > round(sequence.duration * sequence.rate):
         raise place.at("load").refuse(f"at most the {sequence.duration:g} s that main lasts, not {length:g} s")
 
 
@@ -285,7 +304,7 @@ def _check_sizes(sequence: Sequence, place: Place) -> None:
         most, unit, begin = (STRONGEST, "N", 0.0) if phase == "load" else (FARTHEST, "m", start)
         with np.errstate(all="ignore"):  # what overflows is refused below
             try:
-                values, sections, start = build_profile(getattr(sequence, phase), begin)
+                values, sections, start = build_profile(getattr(sequence, phase), begin, sequence.rate)
             except InputError as error:  # a function that computes a segment
                 raise (place.at(phase).refuse(error.expected) if error.where == "segment" else error) from error
         for i, section in enumerate(sections):
@@ -305,7 +324,9 @@ def _check_faults(sequence: Sequence, place: Place) -> None:
         first, last = plan.find_cycles(fault)
         if first == last:
             raise place.at(i, "start" if fault.end is None else "end").refuse(
-                f"a fault that acts in a cycle of {1 / RATE:g} s of main or more")
+                f"a fault that acts in a cycle of {1 / sequence.rate:g} s of main or more")
+        if isinstance(fault, faults.Jitter) and fault.size * sequence.rate >= 1.0:
+            raise place.at(i, "size").refuse(f"a time below a cycle, {1 / sequence.rate:g} s, not {fault.size:g}")
         if isinstance(fault, Parameter):
             others = taken.setdefault(fault.parameter, [])
             if any(first < b and a < last for a, b in others):
@@ -352,7 +373,9 @@ def _check_checks(sequence: Sequence, place: Place) -> None:
             raise place.at(i, "name").refuse(f"a name used once, not {used[check.name]} times {check.name!r}")
         if isinstance(window, str) and window != MAIN and window not in sections:
             raise place.at(i, "window").refuse(f"a section: {tables.list_choices(window, [MAIN, *sections])}")
-        if isinstance(window, tuple) and window[1] > sequence.duration + 0.5 / RATE:
+        if isinstance(window, tuple) and window[1] > sequence.duration + 0.5 / sequence.rate:
             raise place.at(i, "window").refuse(f"an end within main's {sequence.duration:g} s, not {window[1]:g}")
+        if (frequency := getattr(check, "frequency", 0.0)) >= sequence.rate / 2:
+            raise place.at(i, "frequency").refuse(f"below half the rate of {sequence.rate:g} Hz, not {frequency:g}")
         if isinstance(after, str) and labels[after] != 1:
             raise place.at(i, "after").refuse(f"a time or one fault: {tables.list_choices(after, labels)}")

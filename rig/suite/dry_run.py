@@ -31,7 +31,7 @@ from fdi.report.run_report import format_limits
 from plant import Model, simulate
 from plant.model import find_quantity
 from plant.run import Columns
-from plant.segments import RATE, Array
+from plant.segments import Array
 from rig.nodes.scenario import require_servovalve
 from rig.run.job import Job, find_differences
 from rig.run.outcome import LimitReached, find_limits
@@ -134,19 +134,20 @@ def make_dry_run(job: Job) -> DryRun:
     first, last = len(setup.command), len(setup.command) + len(main.command)
     load = np.zeros(len(command))
     load[first:last] = sequence.load_profile()
-    t = (np.arange(len(command)) - first) / RATE
+    rate = sequence.rate
+    t = (np.arange(len(command)) - first) / rate
     predicted = simulate(model, command, load, job.seed)
     sections = name_rows(sequence, (setup.command, main.command, cleanup.command))
-    columns = Columns(np.arange(last - first) / RATE, *(column[first:last] for column in predicted[1:]))
+    columns = Columns(np.arange(last - first) / rate, *(column[first:last] for column in predicted[1:]))
     chosen = [check for check in sequence.checks if check.kind not in OF_EVENTS]
     return DryRun(
-        job=job, durations={"setup": first / RATE, "main": (last - first) / RATE,
-                            "cleanup": (len(command) - last) / RATE},
-        demands=measure_demands(command, load, t, sections, model), t=t,
-        speed=split_jumps(command, [row for row, _ in sections])[0], load=load, faults=faults,
+        job=job, durations={"setup": first / rate, "main": (last - first) / rate,
+                            "cleanup": (len(command) - last) / rate},
+        demands=measure_demands(command, load, t, sections, model, rate), t=t,
+        speed=split_jumps(command, [row for row, _ in sections], rate)[0], load=load, faults=faults,
         predicted=predicted,
         limits=find_limits(lambda name: getattr(predicted, name), model, first),
-        checks=evaluate_checks(chosen, columns, sequence.sections(), (), sequence.fault_starts()),
+        checks=evaluate_checks(chosen, columns, sequence.sections(), (), sequence.fault_starts(), rate=rate),
         not_predicted=[check.name for check in sequence.checks if check.kind in OF_EVENTS],
         trips=[] if sequence.faults else find_trips(sequence.guards, columns))
 
@@ -163,16 +164,16 @@ def name_rows(sequence: TestSequence, commands: Sequence[Array]) -> list[tuple[i
 
 
 def measure_demands(command: Array, load: Array, t: Array, sections: Sequence[tuple[int, str]],
-                    model: Model) -> list[Demand]:
+                    model: Model, rate: float) -> list[Demand]:
     """The largest position, step, speed and acceleration of a command, and the largest load.
 
     A jump at the first row of a section is a step and counts neither as speed nor as acceleration.
     """
     starts = [row for row, _ in sections]
-    speed, jumps = split_jumps(command, starts)
+    speed, jumps = split_jumps(command, starts, rate)
     is_start = np.isin(np.arange(len(command)), starts)
     is_known = ~is_start & ~np.roll(is_start, 1)  # rows whose speed and the one before are of the same section
-    acceleration = np.where(is_known, np.diff(speed, prepend=0.0) * RATE, 0.0)
+    acceleration = np.where(is_known, np.diff(speed, prepend=0.0) * rate, 0.0)
     limits = find_capabilities(model)
 
     def find(name: str, values: Array, unit: str, parameter: str, back: int = 0) -> Demand:
@@ -187,7 +188,7 @@ def measure_demands(command: Array, load: Array, t: Array, sections: Sequence[tu
             find("load", load, "N", "stall force")]
 
 
-def split_jumps(command: Array, starts: Sequence[int]) -> tuple[Array, Array]:
+def split_jumps(command: Array, starts: Sequence[int], rate: float) -> tuple[Array, Array]:
     """Speed of a command in m/s, 0 at its jumps; and its jumps in m, 0 elsewhere. Shape (n,) both.
 
     A jump is a change at the first row of a section, `starts`, that is larger than the changes beside it: else the line
@@ -196,7 +197,7 @@ def split_jumps(command: Array, starts: Sequence[int]) -> tuple[Array, Array]:
     steps = np.diff(command, prepend=command[:1])
     beside = np.maximum(np.abs(np.roll(steps, 1)), np.abs(np.roll(steps, -1)))
     is_jump = np.isin(np.arange(len(command)), starts) & (np.abs(steps) > 2.0 * beside + 1e-9)
-    return np.where(is_jump, 0.0, steps * RATE), np.where(is_jump, steps, 0.0)
+    return np.where(is_jump, 0.0, steps * rate), np.where(is_jump, steps, 0.0)
 
 
 def find_capabilities(model: Model) -> dict[str, float]:
@@ -254,8 +255,8 @@ def plan_faults(job: Job) -> list[PlannedFault]:
     model = job.model.with_effects(changed)
     schedule = Schedule(plan, model.values)
     require_sensible(plan, model)
-    return [PlannedFault(fault.label, fault.kind, name_target(fault), (begin.cycle - plan.start) / RATE,
-                         (end.cycle - plan.start) / RATE, describe_size(fault, model.values))
+    return [PlannedFault(fault.label, fault.kind, name_target(fault), (begin.cycle - plan.start) / plan.rate,
+                         (end.cycle - plan.start) / plan.rate, describe_size(fault, model.values))
             for fault, begin, end in zip(plan.faults, schedule.edges[::2], schedule.edges[1::2], strict=True)]
 
 
@@ -332,9 +333,9 @@ def _list_notes(dry: DryRun) -> list[str]:
     notes = []
     if dry.job.sequence.faults:
         notes.append("the prediction is without the faults of the sequence")
-    length = dry.durations["main"]
+    length, half_a_cycle = dry.durations["main"], 0.5 / dry.job.sequence.rate
     notes += [f"fault {fault.label!r} ends with main at {length:g} s, not at {fault.end:g} s"
-              for fault in dry.job.sequence.faults if fault.end is not None and fault.end > length + 0.5 / RATE]
+              for fault in dry.job.sequence.faults if fault.end is not None and fault.end > length + half_a_cycle]
     if dry.not_predicted:
         notes.append(f"not predicted, because they judge events: {', '.join(dry.not_predicted)}")
     failing = [check.name for check in dry.checks if not check.passed and check.value == check.value]
@@ -416,7 +417,7 @@ def collect_data(dry: DryRun) -> dict[str, Any]:
 def draw_dry_run(dry: DryRun) -> str:
     """Position, speed, following error, current and load over time, with limits in red; faults, windows of checks."""
     limits = {each.name: each.limit for each in dry.demands}
-    run, start, end = dry.predicted, float(dry.t[0]), float(dry.t[-1]) + 1.0 / RATE
+    run, start, end = dry.predicted, float(dry.t[0]), float(dry.t[-1]) + 1.0 / dry.job.sequence.rate
     shown: list[tuple[str, list[tuple[Array, str, str | None]], float, float | None]] = [
         ("position [mm]", [(run.com, COMMAND, "command"), (run.xj, BLUE, "predicted")], 1e3, limits["position"]),
         ("speed [mm/s]", [(dry.speed, GREY, None)], 1e3, limits["speed"]),

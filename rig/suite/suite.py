@@ -102,8 +102,10 @@ def is_suite_file(name: str) -> bool:
         return False
 
 
-def read_suite_file(path: Path, base: JobChoice) -> tuple[SuiteFile, list[Variant]]:
+def read_suite_file(path: Path, base: JobChoice, rate: float) -> tuple[SuiteFile, list[Variant]]:
     """The content of a suite file and its variants; `base` has what the command line chooses for all of them.
+
+    `rate`: cycles a second of the bench.
 
     Raises:
         InputError: the file, line and key that cannot be used.
@@ -116,7 +118,7 @@ def read_suite_file(path: Path, base: JobChoice) -> tuple[SuiteFile, list[Varian
     for i, entry in enumerate(suite.case):
         for variant in _vary(entry, path.parent, base):
             try:
-                load_sequence(variant.choice.sequence)
+                load_sequence(variant.choice.sequence, rate)
             except InputError as error:  # refused with the line of the suite file, if it is not there
                 if error.where == variant.choice.sequence:
                     raise place.at("case", i, "sequence").refuse(f"a sequence; {error}") from error

@@ -19,6 +19,7 @@ from fdi.report.run_report import draw_failed_check, draw_signals, format_limits
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.segments import RATE
+from rig.benches.bench_file import load_bench
 from rig.run.job import JobChoice, build_job
 from rig.run.outcome import Outcome
 from rig.run.runner import run_job
@@ -138,17 +139,18 @@ class Bench:
     def run(self, sequence: str | Path | None = None, *, command: Command | None = None,
             set: Mapping[str, float | str] | None = None, model: str | Path | None = None, seed: int = 0,
             effects: Sequence[str | Path] = (), faults: Sequence[Table] = (), checks: Sequence[Table] = (),
-            load: Sequence[Table] = (), guards: Sequence[Table] = ()) -> BenchRun:
+            load: Sequence[Table] = (), guards: Sequence[Table] = (), bench: str | Path = "eha") -> BenchRun:
         """Run a sequence, or a command built in Python.
 
         Args:
             sequence: a file, or the name of a shipped one (default: preflight).
-            command: in its place, a demand in m for each cycle of 1 ms, or a list of segments as tables.
+            command: in its place, a demand in m for each cycle of the bench, or a list of segments as tables.
             set: parameters of the model or of effects, SI: {"filter.clogging": 0.5}.
             model: a file, or the name of a shipped one; default: that of the bench, else that of the sequence.
             seed: of the noise.
             effects: files of your own effects.
             faults, checks, load, guards: entries as tables, as in a sequence file; added to those of the sequence.
+            bench: a bench file, or the name of a shipped one.
 
         Raises:
             InputError: what cannot be used.
@@ -156,10 +158,11 @@ class Bench:
         __tracebackhide__ = True  # pytest shows the line of the test
         folder = self.folder / f"run-{len(self.runs) + 1}"
         try:
-            built = build_sequence(None if sequence is None else str(sequence), command, faults=faults, checks=checks,
-                                   load=load, guards=guards)
+            built = build_sequence(None if sequence is None else str(sequence), command, load_bench(str(bench)).rate,
+                                   faults=faults, checks=checks, load=load, guards=guards)
             chosen = self.model if model is None else str(model)
-            job = build_job(JobChoice(built.name, chosen, set or {}, seed, tuple(map(Path, effects))), built)
+            job = build_job(JobChoice(built.name, chosen, set or {}, seed, tuple(map(Path, effects)),
+                                      str(bench)), built)
             run = BenchRun(folder, run_job(job, folder, ignore_progress, _never))
         except InputError as error:
             raise InputError(error.where, error.field, error.expected) from None
@@ -177,12 +180,14 @@ Command = NDArray[np.float64] | Sequence[Table]
 _COMMAND_FILE = "command.csv"
 
 
-def build_sequence(sequence: str | None, command: Command | None, **more: Sequence[Table]) -> TestSequence:
+def build_sequence(sequence: str | None, command: Command | None, rate: float = RATE,
+                   **more: Sequence[Table]) -> TestSequence:
     """A sequence from a file or name, or from a command.
 
     Args:
         sequence: a file, or the name of a shipped sequence.
-        command: in its place, a demand in m for each cycle of 1 ms, or a list of segments as tables.
+        command: in its place, a demand in m for each cycle, or a list of segments as tables.
+        rate: cycles a second.
         more: entries as tables that are added to those of the sequence, by key: faults, checks, guards, load.
 
     Raises:
@@ -190,14 +195,14 @@ def build_sequence(sequence: str | None, command: Command | None, **more: Sequen
     """
     added = {key: list(entries) for key, entries in more.items() if len(entries)}
     if command is None:
-        named = load_sequence(sequence or "preflight")
+        named = load_sequence(sequence or "preflight", rate)
         if not added:
             return named
         table, files, name = tomllib.loads(named.source), dict(named.files), named.name
     else:
         if sequence is not None:
             raise InputError("sequence", sequence, "either a sequence or a command")
-        table, files = _make_table(command)
+        table, files = _make_table(command, rate)
         name = "command.toml"
     for key, entries in added.items():
         table[key] = [*table.get(key, []), *entries]
@@ -207,15 +212,15 @@ def build_sequence(sequence: str | None, command: Command | None, **more: Sequen
             raise InputError(file, "", "a file of the sequence")
         return files[file]
 
-    return parse_sequence(write_toml(table), name, read_file)
+    return parse_sequence(write_toml(table), name, read_file, rate)
 
 
-def _make_table(command: Command) -> tuple[dict[str, Any], dict[str, bytes]]:
+def _make_table(command: Command, rate: float) -> tuple[dict[str, Any], dict[str, bytes]]:
     """The table of a sequence that plays a command, and its files."""
     main: Any = list(command)
     files = {}
     if isinstance(command, np.ndarray):
-        rows = "\n".join(f"{k / RATE!r},{float(value)!r}" for k, value in enumerate(np.atleast_1d(command)))
+        rows = "\n".join(f"{k / rate!r},{float(value)!r}" for k, value in enumerate(np.atleast_1d(command)))
         main = [{"name": "command", "kind": "csv", "file": _COMMAND_FILE}]
         files[_COMMAND_FILE] = f"t,com\n{rows}\n".encode()
     return {"title": "Command from Python", "main": main}, files

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import Columns
-from plant.segments import RATE
 from rig import recorder
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
 from rig.sequences import Sequence
@@ -39,6 +38,7 @@ class LivePlan(NamedTuple):
 
     title: str
     duration: float  # s of main
+    rate: float  # cycles a second
     pace: str
     checks: tuple[Check, ...]
     unknown_checks: tuple[str, ...]  # names of checks that only the run itself can judge
@@ -61,8 +61,8 @@ def make_live_plan(sequence: Sequence, pace: str) -> LivePlan:
             known.append(check)
         except (pickle.PicklingError, AttributeError, TypeError):
             unknown.append(check.name)
-    return LivePlan(sequence.title, sequence.duration, pace, tuple(known), tuple(unknown), sequence.sections(),
-                    dict(sequence.fault_starts()), bool(sequence.load))
+    return LivePlan(sequence.title, sequence.duration, sequence.rate, pace, tuple(known), tuple(unknown),
+                    sequence.sections(), dict(sequence.fault_starts()), bool(sequence.load))
 
 
 class CheckState(NamedTuple):
@@ -186,13 +186,13 @@ class LiveRun:
             return
         table = self._table[self._main_from:self._main_from + rows]
         columns = [table[:, _COLUMN[name]] for name in Columns._fields[1:]]
-        data = RunData(Columns(np.arange(rows) / RATE, *columns), self.plan.sections, tuple(self.events),
-                       self.plan.starts)
+        data = RunData(Columns(np.arange(rows) / self.plan.rate, *columns), self.plan.sections, tuple(self.events),
+                       self.plan.starts, rate=self.plan.rate)
         for check in self.plan.checks:
             state = self.checks[check.name]
             if state.is_judged or state.word == "after the run":
                 continue
-            start, stop = _find_window(check, self.plan.sections, self.plan.duration)
+            start, stop = _find_window(check, self.plan)
             if rows > start:
                 state = state._replace(word="measures")
             if rows >= stop or (rows > start and check.window == MAIN and check.kind in _GROWS):
@@ -203,12 +203,12 @@ class LiveRun:
             self.checks[check.name] = state
 
 
-def _find_window(check: Check, sections: dict[str, slice], duration: float) -> tuple[int, int]:
+def _find_window(check: Check, plan: LivePlan) -> tuple[int, int]:
     """First row of a check's window and the one behind its last."""
     if isinstance(check.window, tuple):
-        return round(check.window[0] * RATE), round(check.window[1] * RATE)
-    rows = sections.get(check.window)
-    return (rows.start, rows.stop) if rows else (0, round(duration * RATE))
+        return round(check.window[0] * plan.rate), round(check.window[1] * plan.rate)
+    rows = plan.sections.get(check.window)
+    return (rows.start, rows.stop) if rows else (0, round(plan.duration * plan.rate))
 
 
 def find_dead_node(level: str, kind: str, text: str) -> int:

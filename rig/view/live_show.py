@@ -36,7 +36,6 @@ from rich.live import Live
 from rich.text import Text
 
 from fdi.trace.mcap_log import scan_messages, unpack_chunk
-from plant.segments import RATE
 from rig.network.node_objects import NAMES
 from rig.recorder import CanFrame, Check, Event, NmtState, Record
 from rig.recorder.schema import TOPICS
@@ -113,7 +112,6 @@ def _list_chunks(data: bytes) -> Iterator[tuple[bytes, int]]:
             yield unpack_chunk(chunk), at
 
 
-_WINDOW = round(5 * RATE)  # cycles of the plot
 _STYLES = {"PASS": "green", "FAIL": "bold red", "measures": "bold cyan", "waits": "dim", "after the run": "dim"}
 _NODE_STYLES = {"operational": "green", "pre-operational": "yellow", "stopped": "red"}
 _ORDER = ("FAIL", "measures", "PASS", "waits", "after the run")
@@ -125,8 +123,8 @@ def draw_screen(run: LiveRun, width: int, height: int, silence: float) -> Text:
     plot_height = max(height - lower - 7, 3)
     lines = [_draw_title(run, width), *_draw_nodes(run, silence)]
     lines.append(Text.assemble(("Position [mm], last 5 s: ", "bold"), ("command", "white"), "  ", ("ram", "bold blue")))
-    lines += draw_plot({"white": run.read_last("com", _WINDOW) * 1e3, "bold blue": run.read_last("xj", _WINDOW) * 1e3},
-                       width, plot_height, 0.2)
+    com, xj = (1e3 * run.read_last(name, round(5 * run.plan.rate)) for name in ("com", "xj"))
+    lines += draw_plot({"white": com, "bold blue": xj}, width, plot_height, 0.2)
     left, right = _draw_checks(run, lower), [*_draw_timing(run), *_draw_events(run, lower)][:lower]
     half = width // 2
     for number in range(lower):
@@ -196,7 +194,7 @@ def _draw_check(state: CheckState) -> Text:
 
 
 def _draw_timing(run: LiveRun) -> list[Text]:
-    response = run.read_last("response", round(2 * RATE))
+    response = run.read_last("response", round(2 * run.plan.rate))
     lines = [Text("Timing, last 2 s", style="bold"), Text(_describe_lateness(run)),
              Text(f"response {_describe_spread(response)}"), Text(f"overruns {run.overruns}")]
     if run.overruns:
@@ -207,7 +205,7 @@ def _draw_timing(run: LiveRun) -> list[Text]:
 def _describe_lateness(run: LiveRun) -> str:
     if run.plan.pace == "lockstep":
         return "lockstep: no cycle is late"
-    return f"lateness {_describe_spread(run.read_last('lateness', round(2 * RATE)))}"
+    return f"lateness {_describe_spread(run.read_last('lateness', round(2 * run.plan.rate)))}"
 
 
 def _describe_spread(values: NDArray[np.float64]) -> str:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from plant.errors import InputError
 from plant.parameters import load_nominal_values
-from rig.sequences.timing import PERIOD
+from plant.segments import RATE
 
 Array = NDArray[np.float64]
 
@@ -115,7 +115,7 @@ def simulate_truth(com: Array, changes: Mapping[str, float], noise: Array | None
     out = np.empty((n, 3))
     _load_library().trial_run(
         _point_to(record), ctypes.c_long(n), ctypes.c_long(steps), ctypes.c_int(cor is not None),
-        *map(_point_to, columns), ctypes.c_double(PERIOD), _point_to(answer), _point_to(out))
+        *map(_point_to, columns), ctypes.c_double(1 / RATE), _point_to(answer), _point_to(out))
     xj, p12, xs = np.ascontiguousarray(out.T)
     return Run(columns[0], xj, answer, p12, xs, columns[1])
 

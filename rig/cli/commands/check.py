@@ -22,7 +22,8 @@ def run_command(args: argparse.Namespace) -> int:
     if args.sequence is None:
         return check_bench(args)
     places = choose_places(args, "", args.sequence if Path(args.sequence).is_file() else "")
-    choice = JobChoice(args.sequence, args.model, parse_changes(args.set), args.seed, tuple(args.effects))
+    choice = JobChoice(args.sequence, args.model, parse_changes(args.set), args.seed, tuple(args.effects),
+                       args.bench)
     with show_progress(is_silent=args.json or args.quiet) as progress:
         progress("simulating", 0.0)
         dry = make_dry_run(build_job(choice, is_trusted=args.trust))

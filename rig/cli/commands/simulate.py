@@ -13,7 +13,7 @@ from fdi.report.report import Report
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
 from plant.profile import build_profile, read_command, resample_on_cycles
-from plant.segments import RATE, Points
+from plant.segments import RATE, Array, Points
 from rig.cli.answer import give_answer
 from rig.cli.inputs import load_chosen_model
 
@@ -84,9 +84,22 @@ def load_command(file: str | None, period: float) -> tuple[Any, Any, str]:
     """
     if file is not None:
         return (*read_command(file, period), file)
+    try:
+        return (*sample_preflight(1.0 / period), "preflight")
+    except InputError:  # its segments are not whole cycles of this period
+        columns = sample_preflight(RATE)
+    t = np.arange(len(columns[0])) / RATE
+    command, force = (resample_on_cycles(t, column, period) for column in columns)
+    return command, force, "preflight"
+
+
+def sample_preflight(rate: float) -> tuple[Array, Array]:
+    """Demand, m, and load, N, of the main phase of preflight, `rate` values a second.
+
+    Raises:
+        InputError: its segments are not whole cycles.
+    """
     from rig.sequences import load_sequence
 
-    sequence = load_sequence("preflight")
-    command, force = sequence.main_profile().command, sequence.load_profile()
-    t = np.arange(len(command)) / RATE  # the bench's cycles
-    return resample_on_cycles(t, command, period), resample_on_cycles(t, force, period), "preflight"
+    sequence = load_sequence("preflight", rate)
+    return sequence.main_profile().command, sequence.load_profile()

@@ -36,7 +36,7 @@ class Parts:
     """Stage, journal and safe state of a run whose main begins at cycle 50."""
 
     def __init__(self, k: int = 60, queued: int = 60, tests_safe_state: bool = False) -> None:
-        self.stage, self.recorder, self.loop = Stage(VirtualClock(), 50), Recorder(), Loop(k, queued)
+        self.stage, self.recorder, self.loop = Stage(VirtualClock(), 50, 1000.0), Recorder(), Loop(k, queued)
         self.stage.loop = self.loop  # type: ignore[assignment]
         self.journal = Journal(self.stage, self.recorder)  # type: ignore[arg-type]
         self.safety = SafeState(self.stage, self.journal, tests_safe_state)

@@ -11,7 +11,7 @@ import pytest
 
 from plant.profile import build_profile
 from plant.run import Columns
-from plant.segments import Array, Hold, Ramp, Segment, Sine, Step
+from plant.segments import RATE, Array, Hold, Ramp, Segment, Sine, Step
 from rig.sequences import checks, measures
 from rig.sequences.checks import CheckResult, Guard, GuardWatch, evaluate_checks
 from rig.sequences.measures import NO_DRIVES, DriveFrames
@@ -150,8 +150,8 @@ def test_speed_of_a_ramp() -> None:
 
 
 def test_noise_through_the_median_is_what_its_docstring_says() -> None:
-    assert np.std(measures.filter_median(noise(100_000))) == pytest.approx(1.1e-6, abs=0.05e-6)
-    assert np.std(measures.compute_speed(noise(100_000))) == pytest.approx(0.14e-3, abs=0.01e-3)
+    assert np.std(measures.filter_median(noise(100_000), RATE)) == pytest.approx(1.1e-6, abs=0.05e-6)
+    assert np.std(measures.compute_speed(noise(100_000), RATE)) == pytest.approx(0.14e-3, abs=0.01e-3)
 
 
 def test_response_to_a_fault_by_event_and_by_signal() -> None:

@@ -118,10 +118,10 @@ def test_the_no_load_speed_is_that_of_the_simulated_ram() -> None:
 def test_jumps_are_no_speed() -> None:
     ramp = np.arange(10) * 1e-4
     command = np.concatenate((ramp, np.full(10, 5e-3), 5e-3 + ramp))
-    speed, jumps = split_jumps(command, [0, 10, 20])
+    speed, jumps = split_jumps(command, [0, 10, 20], 1000.0)
     assert np.flatnonzero(jumps).tolist() == [10] and jumps[10] == pytest.approx(5e-3 - 9e-4)
     assert speed.max() == pytest.approx(0.1)
-    speed, jumps = split_jumps(np.arange(30) * 1e-4, [0, 10, 20])  # a line through three sections
+    speed, jumps = split_jumps(np.arange(30) * 1e-4, [0, 10, 20], 1000.0)  # a line through three sections
     assert not jumps.any() and np.abs(speed[1:] - 0.1).max() < 1e-9
 
 

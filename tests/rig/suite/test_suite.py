@@ -249,7 +249,7 @@ def test_the_example_of_the_page(tmp_path: Path) -> None:
     assert block is not None
     (tmp_path / "acceptance.toml").write_text(re.sub(r"(?m)^    ", "", block[0]))
     assert is_suite_file(str(tmp_path / "acceptance.toml"))
-    content, variants = read_suite_file(tmp_path / "acceptance.toml", JobChoice())
+    content, variants = read_suite_file(tmp_path / "acceptance.toml", JobChoice(), 1000.0)
     cases = build_suite(content.title, variants, {}).cases
     assert len(cases) == 7 and "This file makes 3 + 4 cases".lower() in " ".join(text.lower().split())
     for name in ("preflight, seed 2", "reactions, lost_feedback, jack.mass=80"):

@@ -123,7 +123,7 @@ def test_the_option_holds_for_all_cases_and_the_key_for_one(tmp_path: Path) -> N
     (tmp_path / "short.toml").write_text(SHORT)
     (tmp_path / "suite.toml").write_text(SUITE)
     for base, expected in ((False, [True, True, False]), (True, [True] * 3)):
-        _, variants = read_suite_file(tmp_path / "suite.toml", JobChoice(is_diagnosed=base))
+        _, variants = read_suite_file(tmp_path / "suite.toml", JobChoice(is_diagnosed=base), 1000.0)
         assert [variant.choice.is_diagnosed for variant in variants] == expected
     (tmp_path / "suite.toml").write_text(SUITE.replace("fdi = true", "fdi = 1"))
     line = refuse("run", tmp_path / "suite.toml", "--out", tmp_path / "out")
