@@ -63,7 +63,6 @@ LONG_TESTS = (
     "rig/sequences/test_python_parts.py",
     "rig/suite/test_dry_run.py",
     "rig/suite/test_suite.py",
-    "rig/suite/test_suite_diagnosis.py",
     "rig/testing/test_pytest_plugin.py",
     "rig/view/test_view.py",
     "test_answer_schemas.py",

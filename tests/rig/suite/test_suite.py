@@ -1,4 +1,4 @@
-"""Suites: the matrix, one report, requirements, JUnit; a crash or a timeout of one case costs only that one."""
+"""Suites: matrix, report, requirements, JUnit, diagnosis; a crash or a timeout of one case costs only that one."""
 from __future__ import annotations
 
 import json
@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 from junit_schema import read_valid_junit
-from rig_command import Said, finished, refuse, rig, started
+from rig_command import Said, answer, finished, refuse, rig, started
 from short_sequences import SHORT
 
+from fdi.trace.trace import Trace
 from rig.run.job import JobChoice
 from rig.sequences.checks import CheckResult
 from rig.suite.suite import (
@@ -88,13 +89,13 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Said]:
 
 def test_each_case_has_its_verdict_and_the_worst_is_that_of_the_suite(suite: tuple[Path, Said]) -> None:
     folder, said = suite
-    answer = json.loads((folder / "suite.json").read_text())
-    cases = {case["name"]: case for case in answer["cases"]}
+    told = json.loads((folder / "suite.json").read_text())
+    cases = {case["name"]: case for case in told["cases"]}
     assert list(cases) == ["short, seed 1", "short, seed 2", "weak, jack.mass=90", "weak, jack.mass=110", "crash",
                            "fail", "hang"]
     assert [(case["verdict"], case["seed"]) for case in cases.values()] == [
         ("PASS", 1), ("PASS", 2), ("FAIL", 0), ("FAIL", 0), ("ERROR", 0), ("ERROR", 0), ("ERROR", 0)], said
-    assert (said.status, answer["verdict"], answer["jobs"]) == (1, "ERROR", 2)
+    assert (said.status, told["verdict"], told["jobs"]) == (1, "ERROR", 2)
     for name, why in (("crash", r"its process was ended by signal 9 \(SIGKILL\)"), ("hang", "it took longer than 1 s"),
                       ("fail", r".*own\.py:13: fail: expected .*AttributeError.*")):
         assert re.fullmatch(why, cases[name]["why"])
@@ -126,8 +127,8 @@ def test_folders_and_page(suite: tuple[Path, Said]) -> None:
 
 def test_requirements_are_traced(suite: tuple[Path, Said]) -> None:
     folder, said = suite
-    answer = json.loads((folder / "suite.json").read_text())
-    traced = {each["id"]: each for each in answer["requirements"]}
+    told = json.loads((folder / "suite.json").read_text())
+    traced = {each["id"]: each for each in told["requirements"]}
     assert list(traced) == ["R-1", "R-2", "R-9", "R-3"]
     assert [each["verdict"] for each in traced.values()] == ["FAIL", "FAIL", "NOT_COVERED", "OPEN"]
     assert [each["check"] for each in traced["R-2"]["checks"]] == ["whole run"] * 2
@@ -207,19 +208,20 @@ def test_ctrl_c_writes_what_is_done(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     said = finished(process)
     assert said.status == 130, said
-    answer = json.loads((tmp_path / "out" / "suite.json").read_text())
-    assert [case["verdict"] for case in answer["cases"]] == ["PASS", "NOT_RUN", "NOT_RUN"]
+    told = json.loads((tmp_path / "out" / "suite.json").read_text())
+    assert [case["verdict"] for case in told["cases"]] == ["PASS", "NOT_RUN", "NOT_RUN"]
     assert len(read_valid_junit(tmp_path / "j.xml").findall("testsuite/testcase[skipped]")) == 2
     assert "Traceback" not in said.err and "3 at" not in said.out
     assert rig("report", tmp_path / "out" / "hang-seed-1", "--quiet").status == 0  # its log was closed
 
 
-def make_result(verdict: str, *passed: bool) -> CaseResult:
-    """A result of a case with checks "a", "b", .. that verify R-1."""
+def make_result(verdict: str, *passed: bool, fdi: dict[str, str] | None = None) -> CaseResult:
+    """A result of a case with checks "a", "b", .. that verify R-1; diagnosed if `fdi` is given."""
     checks = tuple(CheckResult(name, "max_error", "xj", 1.0, "m", 0.0, 2.0, is_passed, 0.0, 1.0, "", ("R-1",))
                    for name, is_passed in zip("abc", passed, strict=False))
     planned = tuple(PlannedCheck(check.name, ("R-1",)) for check in checks)
-    return CaseResult(Case("case", Path("case"), JobChoice(), 1.0, planned, ("R-2",)), verdict, "because", 1.0, checks)
+    case = Case("case", Path("case"), JobChoice(is_diagnosed=bool(fdi)), 1.0, planned, ("R-2",))
+    return CaseResult(case, verdict, "because", 1.0, checks, fdi=fdi or {})
 
 
 @pytest.mark.parametrize(("verdicts", "status", "worst"), [
@@ -256,3 +258,110 @@ def test_the_example_of_the_page(tmp_path: Path) -> None:
         assert f"`{name}`" in text and name in [case.name for case in cases]
     assert [case.requirement for case in cases] == [("REQ-1",)] * 3 + [("REQ-2",)] * 4
     assert {case.timeout for case in cases[3:]} == {120.0} and cases[0].timeout > 400.0
+
+
+STEPS = """
+title = "Steps and a ramp"
+setup = [{ kind = "hold", time = 0.1 }]
+main = [
+  { name = "step", kind = "step", to = 5e-3, time = 0.4 },
+  { name = "ramp", kind = "ramp", to = 3e-3, time = 0.6 },
+  { name = "back", kind = "step", to = 0.0, time = 0.4 },
+]
+checks = [{ name = "error", kind = "max_error", window = "ramp", unit = "mm", high = 5.0 }]
+"""
+UNITS = """
+title = "Units"
+
+[[case]]
+name = "unit"
+sequence = "steps.toml"
+set = { "filter.clogging" = [0.0, 0.6] }
+fdi = true
+
+[[case]]
+sequence = "short.toml"
+requirement = "R-1"
+"""
+
+
+@pytest.fixture(scope="module")
+def units(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Said]:
+    """The folder of a suite with a healthy and a clogged unit and a run without diagnosis; what the command said."""
+    folder = tmp_path_factory.mktemp("suite")
+    (folder / "steps.toml").write_text(STEPS)
+    (folder / "short.toml").write_text(SHORT)
+    (folder / "suite.toml").write_text(UNITS)
+    return folder / "out", rig("run", folder / "suite.toml", "--out", folder / "out", "--jobs", 2,
+                               "--junit", folder / "out" / "junit.xml")
+
+
+def test_a_fault_fails_its_case_and_no_other(units: tuple[Path, Said]) -> None:
+    folder, said = units
+    told = json.loads((folder / "suite.json").read_text())
+    healthy, clogged, plain = told["cases"]
+    assert [case["verdict"] for case in told["cases"]] == ["PASS", "FAIL", "PASS"] and said.status == 1, said
+    assert (healthy["fdi"]["verdict"], clogged["fdi"]["verdict"], plain["fdi"]) == ("ACCEPTABLE", "NON_NOMINAL", {})
+    assert clogged["fdi"]["level"]["filter_clogging"] == "non_nominal"
+    size = clogged["fdi"]["refined"]["kintas"]
+    assert 0.35 < size["low"] < 0.6 < size["high"]
+    assert all(check["passed"] for check in clogged["checks"])  # the fault alone fails it
+
+
+def test_a_case_is_diagnosed_as_a_single_run(units: tuple[Path, Said], tmp_path: Path) -> None:
+    (tmp_path / "steps.toml").write_text(STEPS)
+    alone = answer("run", tmp_path / "steps.toml", "--fdi", "--set", "filter.clogging=0.6", "--out", tmp_path / "run",
+                   status=1)["fdi"]
+    case = json.loads((units[0] / "suite.json").read_text())["cases"][1]["fdi"]
+    assert (alone["verdict"], alone["level"]) == (case["verdict"], case["level"])
+    assert alone["refined"]["kintas"] == pytest.approx(case["refined"]["kintas"], rel=1e-9)
+    assert Trace.read(tmp_path / "run").provenance["fdi.faults"].startswith("filter clogging non-nominal, Kintas 0.")
+
+
+def test_report_and_page_show_level_and_size(units: tuple[Path, Said]) -> None:
+    folder, said = units
+    table = said.out.split("Servovalve\n")[1].split("A fault beyond acceptable")[0]
+    assert table.count("Kintas 0") == table.count("FSS ") == 2 and table.count("non-nominal") == 1
+    assert "rig fdi: filter clogging non-nominal, Kintas 0." in " ".join(said.out.split())
+    page = (folder / "suite.html").read_text()
+    assert "Filter clogging is non-nominal" in page and "size (95 % interval)" in page
+    assert "Kintas 0." in (folder / "unit-filter.clogging=0.6" / "report.html").read_text()
+
+
+def test_junit_has_the_diagnosis_as_a_test_of_its_own(units: tuple[Path, Said]) -> None:
+    folder, _ = units
+    healthy, clogged, plain = read_valid_junit(folder / "junit.xml")
+    assert [each.get("failures") for each in (healthy, clogged, plain)] == ["0", "1", "0"]
+    (failed,) = clogged.findall("testcase[failure]")
+    assert failed.get("name") == "rig fdi" and "Kintas 0." in str(failed.findtext("failure"))
+    assert "FSS 5" in str(healthy.findtext("testcase[@name='rig fdi']/system-out"))
+    assert plain.find("testcase[@name='rig fdi']") is None
+
+
+@pytest.mark.parametrize(("verdict", "word", "passed", "problems", "reason"), [
+    ("FAIL", "SOMETHING_ELSE", [True], ["", "", "failure"], "rig fdi: SOMETHING_ELSE"),
+    ("FAIL", "SOMETHING_ELSE", [False, False], ["", "failure", "failure", "failure"],
+     "a and 1 more; rig fdi: SOMETHING_ELSE"),
+    ("FAIL", "ACCEPTABLE", [False], ["", "failure", ""], "because"),
+    ("FAIL", "ACCEPTABLE", [True], ["failure", "", ""], "because"),  # it did not end as the sequence says
+    ("PASS", "CANNOT_TELL", [True], ["", "", "skipped"], "rig fdi cannot tell"),
+    ("INVALID_TIMING", "SOMETHING_ELSE", [True], ["error", "", "skipped"], "because")])
+def test_what_the_diagnosis_means_for_the_case(verdict: str, word: str, passed: list[bool], problems: list[str],
+                                               reason: str, tmp_path: Path) -> None:
+    result = make_result(verdict, *passed, fdi={"verdict": word, "sentence": "In words."})
+    (tmp_path / "j.xml").write_text(write_junit("t", [result]))
+    found = [[child.tag for child in case if child.tag != "system-out"]
+             for case in read_valid_junit(tmp_path / "j.xml").iter("testcase")]
+    assert found == [[each] if each else [] for each in problems] and result.reason == reason
+
+
+def test_the_option_holds_for_all_cases_and_the_key_for_one(tmp_path: Path) -> None:
+    (tmp_path / "steps.toml").write_text(STEPS)
+    (tmp_path / "short.toml").write_text(SHORT)
+    (tmp_path / "suite.toml").write_text(UNITS)
+    for base, expected in ((False, [True, True, False]), (True, [True] * 3)):
+        _, variants = read_suite_file(tmp_path / "suite.toml", JobChoice(is_diagnosed=base), 1000.0)
+        assert [variant.choice.is_diagnosed for variant in variants] == expected
+    (tmp_path / "suite.toml").write_text(UNITS.replace("fdi = true", "fdi = 1"))
+    line = refuse("run", tmp_path / "suite.toml", "--out", tmp_path / "out")
+    assert "case[0].fdi: expected true or false, not 1" in line
