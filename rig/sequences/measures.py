@@ -197,8 +197,9 @@ class RunData:
     rate: float = RATE
 
     def find_start(self, after: str | float) -> float:
-        """A time, s of main, given as such or as the label of the fault that begins then."""
-        return after if isinstance(after, float) else self.starts[after]
+        """The start of a cycle, s of main, given as the time nearest to it or as the label of the fault that begins there.
+        """
+        return round(after * self.rate) / self.rate if isinstance(after, float) else self.starts[after]
 
     def find_rows(self, window: str | tuple[float, float], skip: float = 0.0) -> slice:
         """Rows of a window without its first `skip` seconds; NotMeasurable if the run ended before the window did."""

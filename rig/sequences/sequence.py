@@ -153,8 +153,9 @@ class Sequence:
         return any(isinstance(fault, faults.BUS_FAULTS) for fault in self.faults)
 
     def fault_starts(self) -> dict[str, float]:
-        """When each fault begins, s of main, by its label."""
-        return {fault.label: fault.start for fault in self.faults}
+        """When the cycle starts in which each fault begins, s of main, by its label."""
+        plan = self.plan(0)
+        return {fault.label: (plan.find_cycles(fault)[0] - plan.start) / self.rate for fault in self.faults}
 
     def bundle(self) -> dict[str, bytes]:
         """The text and the files it uses, by name: all that `from_bundle` needs to make the same sequence."""

@@ -337,3 +337,36 @@ def test_a_current_that_stands_still_below_the_limit_is_found(
     rows = Rows(com=error, xj=zero, cor=current, control=words, status=words, flags=zero, response=zero,
                 on_time=np.ones(cycles, bool))
     assert (measure_frozen(rows, limit) > 4e-4) == is_found
+
+
+def measure_at(rate: float, kind: str, **keys: Any) -> float:
+    """What a check says of a well-known motion: a step of second order, a ramp, and a sine that lags by 30 deg."""
+    t = np.arange(round(3.0 * rate)) / rate
+    com = np.select([t < 0.2, t < 1.0, t < 2.0], [0.0, 5e-3, 5e-3 - 5e-3 * (t - 1.0)], 1e-3 * np.sin(4 * pi * t))
+    after, wd = np.maximum(t - 0.2, 0.0), 30.0 * sqrt(0.75)
+    step = 5e-3 * (1 - np.exp(-15.0 * after) * (np.cos(wd * after) + 15.0 / wd * np.sin(wd * after)))
+    xj = np.select([t < 1.0, t < 2.0], [step, com + 1e-4], 0.8e-3 * np.sin(4 * pi * t - pi / 6))
+    edges = {name: slice(round(a * rate), round(b * rate))
+             for name, a, b in (("step", 0.2, 1.0), ("ramp", 1.1, 2.0), ("sine", 2.0, 3.0))}
+    nothing = np.full(len(t), np.nan)
+    run = Columns(t, com, xj, nothing, nothing, nothing, nothing)
+    [result] = evaluate_checks([check(kind, **keys)], run, edges, rate=rate)
+    assert result.detail == "" and result.t1 == pytest.approx(edges[keys["window"]].stop / rate)
+    return result.value
+
+
+@pytest.mark.parametrize("rate", [2000.0, 1000.0, 500.0, 200.0, 100.0, 1e9 / 3e6])
+@pytest.mark.parametrize(("kind", "keys", "expected", "cycles"), [
+    ("overshoot", {"window": "step"}, 100 * exp(-pi / sqrt(3)), 0),
+    ("rise_time", {"window": "step"}, 0.0546, 1),
+    ("settling_time", {"window": "step", "band": 5.0}, 0.1764, 1),
+    ("response_within", {"window": "step", "after": 0.2, "signal": "xj", "above": 2.5e-3}, 0.0431, 1),
+    ("ramp_error", {"window": "ramp"}, 1e-4, 0),
+    ("never_exceeds", {"window": "ramp", "signal": "speed"}, 5e-3, 0),
+    ("amplitude_ratio", {"window": "sine", "frequency": 2.0}, 0.8, 0),
+    ("phase_lag", {"window": "sine", "frequency": 2.0}, 30.0, 0)])
+def test_a_check_measures_the_same_at_any_rate(rate: float, kind: str, keys: dict[str, Any], expected: float,
+                                               cycles: int) -> None:
+    """But for what one sample can miss: `cycles` of time, or the curve of a peak."""
+    peak = {"overshoot": 100 * (30.0 / rate) ** 2 / 2 + 0.1}.get(kind, 1e-9)
+    assert measure_at(rate, kind, **keys) == pytest.approx(expected, abs=cycles / rate + peak + 0.002 * expected)
