@@ -197,8 +197,7 @@ class RunData:
     rate: float = RATE
 
     def find_start(self, after: str | float) -> float:
-        """The start of a cycle, s of main, given as the time nearest to it or as the label of the fault that begins there.
-        """
+        """The start of the cycle nearest to a time, s of main, or in which the fault of a label begins."""
         return round(after * self.rate) / self.rate if isinstance(after, float) else self.starts[after]
 
     def find_rows(self, window: str | tuple[float, float], skip: float = 0.0) -> slice:
