@@ -126,7 +126,7 @@ class HardLoop(Loop):
         self._reported = False  # an EMCY of the plant has come in this cycle
         self._plant_emcy = 0x080 + bench.nodes[Role.PLANT].node if bench.has_plant_node else None
         self._ours = [bench.frames.sync, *(each.identifier for each in bench.frames.list_from(Role.RIG))]
-        self.outputs = {}
+        self.outputs = dict.fromkeys(self._values.names, 0.0)
         self._write_frame, master.hooks.on_frame = master.hooks.on_frame, self._keep_frame
         self._receive, wire.receive = wire.receive, self._receive_service
         wire.link.leave_out(list_cyclic_frames(bench))
