@@ -69,11 +69,14 @@ class BringUp:
     def play_probes(self) -> None:
         """Play the probes before set-up, each after a reset of the nodes.
 
-        In real time a probe with a gap is repeated. If the bench itself cannot deliver one, none is judged.
+        They are made for CiA 408. In real time a probe with a gap is repeated. If the bench itself cannot deliver one,
+        none is judged.
 
         Raises:
             BusError: a node does not answer or refuses.
         """
+        if self._job.bench.profile != "cia408":
+            return
         steps = list_first_steps(self._job.sequence.protocol.step_delay, self._job.bench.rate)
         cycles = count_cycles(steps)
         steps = (*WARM_UP, *steps) if self._job.realtime else steps

@@ -6,15 +6,17 @@ the next one, which waits for the answer to it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import isclose
+from math import isclose, nan
 
 import numpy as np
 
 from rig.benches.bench import Bench
 from rig.benches.profiles import PROFILES, State, choose_control, find_state
 from rig.network.clock import WallClock
+from rig.network.codec import Flags
 from rig.run.cyclic_values import CycleInput
 from rig.run.loop import Loop
+from rig.run.watch import PATIENCE, describe_silence
 from rig.sequences.protocol import Rows
 
 LIMIT = 5.0  # s: a controller that is not ready by then ends the run
@@ -27,6 +29,7 @@ class Enabling:
         self._bench, self._loop, self._realtime, self._stop = bench, loop, realtime, stop
         self._words = PROFILES[bench.profile]
         self._said: list[tuple[int, float, float]] = []  # control word, status word and current of the cycles
+        self._silent = 0  # cycles in a row for which the rig's own plant has had no drive frame
 
     @property
     def rows(self) -> Rows:
@@ -49,8 +52,9 @@ class Enabling:
         if self._play_until(lambda: self._find_state() == State.ACTIVE, step):
             return ""
         status = int(self._loop.outputs.get("status_word", 0))
-        return (f"the controller is not enabled after {LIMIT:g} s: status word 0x{status:04X}, "
-                f"{State(self._find_state()).name.lower().replace('_', ' ')}")
+        return self._describe_silence() or (
+            f"the controller is not enabled after {LIMIT:g} s: status word 0x{status:04X}, "
+            f"{State(self._find_state()).name.lower().replace('_', ' ')}")
 
     def await_ready(self, demand: float, control: int, main_control: int) -> str:
         """Wait, at a `demand` in m, until the controller is ready; why it is not, or "".
@@ -63,14 +67,18 @@ class Enabling:
             return ""
         said = ", ".join(f"{name} is {self._loop.outputs.get(name, 0.0):g}, not {value:g}"
                          for name, value in self._bench.ready.items() if not self._has(name, value))
-        return f"the controller is not ready after {LIMIT:g} s: {said}"
+        return self._describe_silence() or f"the controller is not ready after {LIMIT:g} s: {said}"
+
+    def _describe_silence(self) -> str:
+        return describe_silence(self._bench, self._silent) if self._silent else ""
 
     def _play_until(self, is_done: Callable[[], bool], make_step: Callable[[], CycleInput]) -> bool:
         """Play cycles until `is_done()`; False if that takes too long, True also when the run is to end."""
         clock, left = WallClock(), round(LIMIT * 1e9 / self._bench.cycle_ns)
         while not is_done():
             left -= 1
-            if left < 0 or (self._realtime and clock.now() > LIMIT * 1e9):
+            is_over = clock.now() > LIMIT * 1e9 if self._realtime else self._silent >= PATIENCE
+            if left < 0 or is_over:
                 return False
             self._play(make_step())
             if self._stop():
@@ -81,7 +89,9 @@ class Enabling:
         self._loop.cycle(step)
         self._loop.wait_until_played(self._stop)
         outputs = self._loop.outputs
-        self._said.append((step.control, outputs.get("status_word", 0.0), outputs["current"]))
+        self._said.append((step.control, outputs.get("status_word", 0.0), outputs.get("current", nan)))
+        is_silent = int(outputs.get("flags", 0)) & Flags.CURRENT_ZEROED and not self._bench.has_plant_node
+        self._silent = self._silent + 1 if is_silent else 0
 
     def _find_state(self) -> int:
         return find_state(self._words, int(self._loop.outputs.get("status_word", 0)))

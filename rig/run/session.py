@@ -42,7 +42,7 @@ from rig.run.probe import (
     read_rows,
 )
 from rig.run.state import Journal, SafeState, Stage
-from rig.run.watch import NodeWatch, OverrunWatch
+from rig.run.watch import PATIENCE, NodeWatch, OverrunWatch
 from rig.sequences.checks import Guard, GuardWatch
 from rig.sequences.faults import Schedule
 from rig.sequences.measures import DriveFrames
@@ -128,8 +128,9 @@ class Session:
         self.journal = Journal(self.stage, recorder)
         self.safety = SafeState(self.stage, self.journal, job.sequence.ends == "safe_state")
         self._master = Master(wire, self.stage.now, job.realtime, job.bench)
+        patience = round(job.sequence.timing.operational * plan.rate) if job.realtime else PATIENCE
         self.nodes = NodeWatch(self.stage, self.journal, self.safety, self._master, self._processes, job.bench,
-                               looks_for_silence=not job.realtime and not self._is_embedded)
+                               looks_for_silence=not job.realtime and not self._is_embedded, patience=patience)
         injected = find_injected(plan, self._faults, plan.stop)
         self._overruns = OverrunWatch(job.sequence.timing, job.period_ns * 1e-9,
                                       set(np.flatnonzero(injected.sync | injected.plant).tolist()))

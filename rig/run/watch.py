@@ -10,22 +10,29 @@ from canopen.emcy import EmcyError
 from rig.benches.bench import Bench
 from rig.benches.frame_map import Role, describe_identifier
 from rig.device.emcy import EmcyCode
+from rig.network.codec import Flags
 from rig.network.master import HEARTBEAT_LIMIT, Master
 from rig.network.node_objects import CONTROLLER, PLANT, RIG, NmtState
 from rig.recorder import NmtState as NmtRecord
 from rig.recorder import Signals, Timing
+from rig.run.attribution import NO_DRIVE
 from rig.run.participants import FRAME_TIMEOUT, NodeProcesses, describe_exit
 from rig.run.state import Journal, SafeState, Stage
 from rig.sequences.protocol import Emergency, Heartbeat
 from rig.sequences.timing import TimingPolicy
+
+PATIENCE = 5  # cycles in lockstep, of which each may wait long, until the first drive frame must have come
 
 
 class NodeWatch:
     """What the nodes of a run report and whether they still answer. Trouble goes to the safe state."""
 
     def __init__(self, stage: Stage, journal: Journal, safety: SafeState, master: Master, processes: NodeProcesses,
-                 bench: Bench, looks_for_silence: bool) -> None:
-        """`looks_for_silence`: in lockstep between processes, where a cycle waits long for a node that is late."""
+                 bench: Bench, looks_for_silence: bool, patience: int = PATIENCE) -> None:
+        """`looks_for_silence`: in lockstep between processes, where a cycle waits long for a node that is late.
+
+        `patience`: cycles by which the first drive frame must have come, where the rig moves the plant.
+        """
         self._stage, self._journal, self._safety, self._processes = stage, journal, safety, processes
         self._master, self._bench, self._looks = master, bench, looks_for_silence
         self.gone: dict[Role, str] = {}  # participants that do not answer any more, and how that is known
@@ -33,6 +40,7 @@ class NodeWatch:
         self.heartbeats: dict[Role, list[Heartbeat]] = {role: [] for role in master.watched}
         self.last_answers = {CONTROLLER: -1, PLANT: -1}  # last cycle with a cyclic frame of it
         self._operational: set[Role] = set()
+        self._patience, self._missed = patience, 0  # cycles in a row for which the rig's own plant had no drive frame
         self._next_look = 0  # when to look again whether the nodes are alive
         self._silence = SilenceWatch(round(FRAME_TIMEOUT * 1e9))
         self._silent: set[Role] = set()  # the nodes among `gone` that are known by their silence in lockstep
@@ -61,6 +69,28 @@ class NodeWatch:
             self.last_answers[PLANT] = signals.cycle
         if signals.cor == signals.cor:
             self.last_answers[CONTROLLER] = signals.cycle
+        if not self._bench.has_plant_node and not self._master.is_deaf:
+            self._watch_drive(bool(signals.flags & Flags.CURRENT_ZEROED))
+
+    def _watch_drive(self, is_missing: bool) -> None:
+        """No frame of the controller for too long: the end of the run if none ever came, else trouble.
+
+        A controller that sends no heartbeat is gone then. In lockstep, where a cycle waits for it, so is any other,
+        unless the sequence goes on in the safe state.
+        """
+        if not is_missing:
+            if self._missed and self.gone.pop(CONTROLLER, ""):
+                self._journal.log("INFO", "drive", f"{self._bench.describe_node(CONTROLLER)} is heard")
+            self._missed = 0
+            return
+        self._missed += 1
+        is_first = self.last_answers[CONTROLLER] < 0
+        if self._missed != (self._patience if is_first else 1):
+            return
+        what = describe_silence(self._bench, self._missed if is_first else self._bench.most_missed)
+        self._safety.handle("bring_up" if is_first else NO_DRIVE, what, CONTROLLER)
+        if CONTROLLER not in self._master.watched or (self._looks and self._safety.aborted):
+            self.gone.setdefault(CONTROLLER, "it sends no frames")
 
     def _note_emergency(self, node: Role, error: EmcyError) -> None:
         if self._stage.is_playing or self._stage.is_probing:
@@ -159,6 +189,13 @@ class NodeWatch:
             self.note_ended_processes()
             for node in silent:
                 self.gone.setdefault(node, f"no heartbeat within {seconds:g} s at the end of the run")
+
+
+def describe_silence(bench: Bench, cycles: int) -> str:
+    """That no drive frame has come for so many cycles; its name and identifier are those of the bench."""
+    frame = next(each for each in bench.frames.list_from(CONTROLLER) if each.has("current"))
+    return (f"{bench.describe_node(CONTROLLER)}: no frame {frame.name} ({describe_identifier(frame.identifier)}) for "
+            f"{cycles} cycles")
 
 
 class OverrunWatch:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 from bus_stations import spec
@@ -19,6 +20,7 @@ from fdi.progress import ignore_progress
 from fdi.trace.trace import Trace
 from plant import Model, simulate
 from rig.benches.bench_file import load_bench
+from rig.benches.frame_map import Role
 from rig.run import hard_loop
 from rig.run.job import JobChoice, build_job
 from rig.run.runner import run_job
@@ -177,3 +179,33 @@ def test_a_foreign_controller_closes_the_loop(start: object, bus_kind: str, is_c
     difference = float(np.sqrt(np.nanmean((trace.xj - law.xj) ** 2)))
     assert difference < 60e-6  # m, of 2 mm: one more cycle of delay, coarser counts
     assert not np.isnan(trace.cor[5:]).any()
+
+
+class Mute(CanDevice):
+    """It answers so many frames, and no more."""
+
+    def __init__(self, where: str, answers: int) -> None:
+        super().__init__(where, PAGES_DBC, "Feedback", 1e-6, 1e-3)
+        self._left = answers
+
+    def take(self, message: can.Message) -> list[can.Message]:
+        found = super().take(message)
+        self._left -= len(found)
+        return found if self._left >= 0 else []
+
+
+@pytest.mark.parametrize(("answers", "said"), [
+    (0, "controller: no frame Drive (0x18F00005) for 5 cycles"), (60, "controller stopped answering"),
+])
+def test_a_controller_that_sends_no_frames_ends_the_run_with_a_line_that_names_them(answers: int, said: str,
+                                                                                   tmp_path: Path) -> None:
+    where = spec("udp_multicast")
+    (tmp_path / "device.dbc").write_text(PAGES_DBC)
+    (tmp_path / "bench.toml").write_text(CAN.format(demand="Feedback.Position"))
+    (tmp_path / "steps.toml").write_text(SEQUENCE)
+    job = build_job(JobChoice(sequence=str(tmp_path / "steps.toml"), bench=str(tmp_path / "bench.toml"), bus=where))
+    with run_device(Mute(where, answers)):
+        outcome = run_job(job, tmp_path / "run", ignore_progress, lambda: False)
+    assert (outcome.verdict, outcome.status) == ("ABORTED", 1)
+    assert said in outcome.why and "no frame Drive (0x18F00005)" in outcome.aborted
+    assert outcome.attribution.cause is not None and outcome.attribution.cause.source is Role.CONTROLLER
