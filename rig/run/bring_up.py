@@ -160,4 +160,7 @@ class BringUp:
 
     def find_on_time_of(self, history: History, faults: Schedule | None = None) -> Mask:
         """The cycles of a play in which the bench was on time."""
-        return find_on_time(history, faults, self._job.realtime, self._job.period_ns * 1e-9)
+        # a frame that comes every n-th cycle is missing until the next but one
+        slowest = max(frame.every for frame in self._job.bench.frames.frames)
+        reach = 1 if slowest == 1 else 2 * slowest
+        return find_on_time(history, faults, self._job.realtime, self._job.period_ns * 1e-9, reach)

@@ -49,6 +49,8 @@ class Enabling:
             control = choose_control(self._words, State.ACTIVE, self._find_state(), control, resets=True)
             return CycleInput(0, demand, 0.0, control, is_counted=False)
 
+        for _ in range(2):  # the second shows whether the first was answered: a status word from before says nothing
+            self._play(step())
         if self._play_until(lambda: self._find_state() == State.ACTIVE, step):
             return ""
         status = int(self._loop.outputs.get("status_word", 0))
@@ -89,12 +91,18 @@ class Enabling:
         self._loop.cycle(step)
         self._loop.wait_until_played(self._stop)
         outputs = self._loop.outputs
-        self._said.append((step.control, outputs.get("status_word", 0.0), outputs.get("current", nan)))
-        is_silent = int(outputs.get("flags", 0)) & Flags.CURRENT_ZEROED and not self._bench.has_plant_node
+        current = nan if self._has_flag(Flags.DRIVE_MISSING) else outputs.get("current", nan)
+        self._said.append((step.control, outputs.get("status_word", 0.0), current))
+        is_silent = self._has_flag(Flags.CURRENT_ZEROED) and not self._bench.has_plant_node
         self._silent = self._silent + 1 if is_silent else 0
 
     def _find_state(self) -> int:
+        if self._has_flag(Flags.DRIVE_MISSING):
+            return State.UNKNOWN
         return find_state(self._words, int(self._loop.outputs.get("status_word", 0)))
+
+    def _has_flag(self, flag: Flags) -> bool:
+        return bool(int(self._loop.outputs.get("flags", 0)) & flag)
 
     def _is_ready(self) -> bool:
         return all(self._has(name, value) for name, value in self._bench.ready.items())

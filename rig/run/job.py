@@ -27,6 +27,7 @@ from rig.benches.bench_file import load_bench, load_bench_from_files
 from rig.nodes.scenario import Scenario
 from rig.run.choices import CONTROLLERS, PACES, PLANTS
 from rig.sequences import Sequence, load_sequence
+from rig.sequences.faults import require_possible
 
 _REQUIRED_SETTINGS = {"seed", "bus", "pace", "controller", "plant", "max_overruns"}
 _EFFECT_FOLDER, _SEQUENCE_FOLDER, _BENCH_FOLDER = "effects/", "sequence/", "bench/"  # folders of the attachments
@@ -38,8 +39,8 @@ class Job:
 
     The sequence is sampled at the rate of the bench, whose cycle is the period of the model's controller.
 
-    Raises InputError for a controller of ours on the bench of another device, and for a sequence that cannot be sampled
-    at this rate.
+    Raises InputError for a controller of ours on the bench of another device, for a sequence that cannot be sampled at
+    this rate, and for faults that the bench cannot have.
     """
 
     sequence: Sequence
@@ -54,6 +55,7 @@ class Job:
     max_overruns: float = 1e-3  # of all cycles, in real time
 
     def __post_init__(self) -> None:
+        require_possible(self.sequence.faults, self.bench, self.sequence.name)
         if self.plant == "external" and not self.bench.has_plant_node:
             raise InputError("--plant", self.plant, f"auto: the rig moves the plant of {self.bench.name!r}, which has "
                                                     "no plant node")

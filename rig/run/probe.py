@@ -81,14 +81,14 @@ def read_rows(history: History, on_time: Mask) -> Rows:
     return Rows(on_time=on_time, **{name: history.column(name) for name in Rows._fields if name != "on_time"})
 
 
-def find_on_time(history: History, faults: Schedule | None, realtime: bool, period: float) -> Mask:
+def find_on_time(history: History, faults: Schedule | None, realtime: bool, period: float, reach: int = 1) -> Mask:
     """Cycles that the bench delivered: neither this SYNC nor the next was late, feedback came within half a cycle, and
-    no injected fault touched a frame of this cycle or the one before it."""
+    no injected fault touched a frame of this cycle or of the `reach` before it."""
     on_time: Mask = ~np.isnan(history.column("xj"))
     if realtime:
         on_time &= history.column("feedback_response") <= 0.5 * period
         late = history.column("lateness") > 0.1 * period
         on_time &= ~late & ~np.append(late[1:], False)
     if faults is not None:
-        on_time &= ~faults.find_disturbed(len(on_time))
+        on_time &= ~faults.find_disturbed(len(on_time), reach)
     return on_time

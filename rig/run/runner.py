@@ -35,7 +35,7 @@ from rig.run.priority import (
     suspend_garbage_collection,
 )
 from rig.run.session import MAIN, Session
-from rig.sequences.checks import CheckResult, SkippedCheck, evaluate_checks
+from rig.sequences.checks import CheckResult, SkippedCheck, evaluate_checks, find_skipped
 from rig.sequences.faults import Schedule
 from rig.sequences.protocol import judge_protocol
 from rig.sequences.python_parts import StepRun
@@ -147,15 +147,17 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
 def judge_run(job: Job, session: Session, judged: Mask) -> tuple[list[CheckResult], list[SkippedCheck]]:
     """Judge the main phase by the checks of the sequence, and the whole run by the protocol checks.
 
-    Returns the results, and the protocol checks that do not apply to the bench.
+    Returns the results, and the checks that do not apply to the bench.
     """
     main = [session.log.history.column(name, MAIN) for name in Columns._fields[1:]]
     t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
     sequence = job.sequence
-    results = evaluate_checks(sequence.checks, Columns(t, *main), sequence.sections(), session.journal.events,
-                              sequence.fault_starts(), session.log.read_drives(), sequence.rate)
-    protocol, skipped = judge_protocol(session.read_protocol_record(judged), sequence.protocol)
-    return [*results, *protocol], skipped
+    unsaid = {check.name: skipped for check in sequence.checks if (skipped := find_skipped(check, job.bench))}
+    results = evaluate_checks([check for check in sequence.checks if check.name not in unsaid], Columns(t, *main),
+                              sequence.sections(), session.journal.events, sequence.fault_starts(),
+                              session.log.read_drives(), sequence.rate)
+    protocol, inapplicable = judge_protocol(session.read_protocol_record(judged), sequence.protocol)
+    return [*results, *protocol], [*unsaid.values(), *inapplicable]
 
 
 def make_main_trace(job: Job, folder: Path, history: History) -> Trace:

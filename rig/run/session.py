@@ -67,6 +67,7 @@ class CycleLog:
         self.due_ns = array("q")  # log time of each cycle
         self._drive = next(each for each in job.bench.frames.list_from(Role.CONTROLLER) if each.has("current"))
         self._drives: list[Frame] = []
+        self._words = PROFILES[job.bench.profile]
         self._unjudged: list[Signals] = []  # rows that the guards have not seen
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
@@ -100,7 +101,7 @@ class CycleLog:
         since = np.clip(came - due[np.maximum(cycle, 0)], 0, self._period_ns - 1) if len(due) else came
         t = np.where(cycle < 0, -np.inf, (cycle - self._start) / self._rate + since * 1e-9)
         return DriveFrames(t, np.array([drive["current"] for drive in drives]),
-                           np.array([drive.get("status_word", 0) for drive in drives]).astype(np.int64))
+                           np.array([drive.get("status_word", 0) for drive in drives]).astype(np.int64), self._words)
 
     def find_passed_guard(self) -> Guard | None:
         """The first guard that one of the rows since the last call has passed."""
@@ -172,6 +173,7 @@ class Session:
         self.stage.loop = open_loop(self._master, self.job.bench, self.scenario, self._faults, self.log, self.job.bus,
                                     self.job.realtime)
         self._enabling = Enabling(self.job.bench, self.stage.loop, self.job.realtime, self._must_end)
+        self._enablings = [(0, self._enabling)]  # all, with the cycle before which they were played
         self.nodes.begin()
         self.stage.begun_ns, self.stage.is_playing = self.stage.clock.now(), True
         self._stalled_ns = self._master.wire.stalled_ns
@@ -186,6 +188,7 @@ class Session:
             try:
                 self._discard_queue()
                 self._powered = self._restore_nodes()
+                self._enable_again()
                 if not self._run(CLEANUP, self._choose_cleanup()):  # a node has died in it
                     self._discard_queue()
                     self._run(CLEANUP, self._choose_cleanup())
@@ -206,6 +209,16 @@ class Session:
         """Enable a controller that confirms each step; False when the run is to end."""
         demand = float(self._setup.command[0]) if len(self._setup.command) else 0.0
         return self._go_on(self._enabling.enable(demand))
+
+    def _enable_again(self) -> None:
+        """After the safe state: a controller that confirms each step climbs once more, and its fault is reset."""
+        if not (self.safety.is_safe and self._powered and self._words.is_confirmed) or self.nodes.look_again():
+            return
+        again = Enabling(self.job.bench, self.stage.playing, self.job.realtime, self.nodes.note_ended_processes)
+        self._enablings.append((self.stage.playing.k, again))
+        if problem := again.enable(self._demand):
+            self.journal.log("WARN", "restore", problem)
+            self._powered = False
 
     def _await_ready(self) -> bool:
         """Between set-up and main: wait until the controller says that it is ready; False when the run is to end."""
@@ -284,7 +297,7 @@ class Session:
         if self.safety.is_safe if phase != CLEANUP else not self._powered:
             return 0
         words = self._words
-        if phase == CLEANUP and self.safety.is_safe and i == self._reset_at:
+        if phase == CLEANUP and self.safety.is_safe and i == self._reset_at and not words.is_confirmed:
             return words.reset
         if self.job.bench.profile == "none" and not self.job.bench.is_enabled(PHASES[phase]):
             return words.ladder[State.READY]
@@ -320,6 +333,7 @@ class Session:
         self.nodes.note_ended_processes()
         self._powered = self._may_power and not self.nodes.gone and not self._master.list_errors()
         self._reset_at = _SETTLING
+        self._enable_again()
 
     def _play_last_probe(self) -> None:
         """Play the probe after clean-up, if the controller is still in control."""
@@ -342,7 +356,7 @@ class Session:
 
         history, after = self.log.history, self.log.after
         return ProtocolRecord(
-            enabling=self._enabling.rows,
+            enabling=[(cycle, each.rows) for cycle, each in self._enablings],
             run=read_rows(history, judged & start.find_on_time_of(history, self._faults)),
             probes=[Rows._make(column[-cycles:] for column in read(probe)) for probe in start.probes if len(probe)],
             after=read(after) if len(after) else None, emergencies=self.nodes.emergencies,

@@ -87,7 +87,9 @@ class NodeWatch:
         is_first = self.last_answers[CONTROLLER] < 0
         if self._missed != (self._patience if is_first else 1):
             return
-        what = describe_silence(self._bench, self._missed if is_first else self._bench.most_missed)
+        what = describe_silence(self._bench, self._missed)
+        if not is_first:  # in the words of a plant that is a node, which says so by EMCY
+            what = f"plant 0x{EmcyCode.RPDO_TIMEOUT:04X} {describe_missing(self._bench, self._bench.most_missed)}"
         self._safety.handle("bring_up" if is_first else NO_DRIVE, what, CONTROLLER)
         if CONTROLLER not in self._master.watched or (self._looks and self._safety.aborted):
             self.gone.setdefault(CONTROLLER, "it sends no frames")
@@ -192,10 +194,14 @@ class NodeWatch:
 
 
 def describe_silence(bench: Bench, cycles: int) -> str:
+    """That the controller sends no drive frames."""
+    return f"{bench.describe_node(CONTROLLER)}: {describe_missing(bench, cycles)}"
+
+
+def describe_missing(bench: Bench, cycles: int) -> str:
     """That no drive frame has come for so many cycles; its name and identifier are those of the bench."""
     frame = next(each for each in bench.frames.list_from(CONTROLLER) if each.has("current"))
-    return (f"{bench.describe_node(CONTROLLER)}: no frame {frame.name} ({describe_identifier(frame.identifier)}) for "
-            f"{cycles} cycles")
+    return f"no frame {frame.name} ({describe_identifier(frame.identifier)}) for {cycles} cycles"
 
 
 class OverrunWatch:

@@ -18,7 +18,8 @@ import numpy as np
 from plant.errors import InputError
 from plant.run import Columns
 from plant.segments import LONGEST, RATE, Array
-from rig.network.codec import Status
+from rig.benches.bench import Bench
+from rig.benches.profiles import CIA408, State, find_state
 from rig.sequences import measures
 from rig.sequences.faults import Time
 from rig.sequences.measures import MAIN, NO_DRIVES, UNIT_OF_SIGNAL, DriveFrames, NotMeasurable, RunData, find_scale
@@ -130,6 +131,16 @@ class Check:
         return after, nan if above is None else above, nan if below is None else below
 
 
+def find_skipped(check: Check, bench: Bench) -> SkippedCheck | None:
+    """A check of a sequence that a bench cannot answer, with the reason; None for one that it can."""
+    words = check.about.lower().split() if isinstance(getattr(check, "event", None), str) else []
+    if not bench.nodes and "controller" in words and any(word.startswith("0x") for word in words):
+        return SkippedCheck(check.name, "plain CAN has no EMCY")
+    if check.kind == "recovers" and bench.profile == "none":
+        return SkippedCheck(check.name, "the bench has no status word")
+    return None
+
+
 def require_check(holds: bool, key: str, expected: str) -> None:
     """Raise InputError unless `holds`; the caller adds file and line."""
     if not holds:
@@ -184,7 +195,9 @@ class Response(Check):
 
 @dataclass(frozen=True, kw_only=True)
 class ShutOff(Check):
-    """With the instant from which time counts. `status`: four lower bits of the status word; default: without MODE."""
+    """With the instant from which time counts. `status`: four lower bits of the status word of CiA 408, or of another
+    profile the state that they mean; default: any state without current.
+    """
 
     after: str | Time
     status: Annotated[int, Range("1", low=0, high=0xF)] | None = None
@@ -267,9 +280,12 @@ def _measure_shut_off(check: ShutOff, run: RunData, span: slice) -> float:
     """Any drive frame counts, also one of another cycle. A controller that leaves OPERATIONAL sends none any more."""
     after = run.find_start(check.after)
     drives = run.drives.select_between(after, span.stop / run.rate)
-    is_off = (drives.current == 0.0) & (drives.status & int(Status.MODE) == 0)
-    if check.status is not None:
-        is_off &= drives.status & 0xF == check.status
+    words = drives.words
+    is_off = (drives.current == 0.0) & (drives.status & words.powered == 0)
+    if check.status is not None and words is CIA408:
+        is_off &= drives.status & words.mask == check.status
+    elif check.status is not None and words.mask:
+        is_off &= drives.states == find_state(CIA408, check.status)
     on = np.flatnonzero(~is_off)
     off = drives.t[int(on[-1]) + 1 if len(on) else 0:]
     left = [event.t for event in run.find_events(LEFT_OPERATIONAL, after, span.stop / run.rate)
@@ -283,7 +299,7 @@ def _measure_shut_off(check: ShutOff, run: RunData, span: slice) -> float:
 def _measure_recovery(check: Check, run: RunData, span: slice) -> float:
     start = len(run.trace.t) / run.rate
     drives = run.drives.select_between(start, np.inf)
-    idle = np.flatnonzero(drives.status & int(Status.ACTIVE) != int(Status.ACTIVE))
+    idle = np.flatnonzero(drives.states != State.ACTIVE)
     first = int(idle[-1]) + 1 if len(idle) else 0
     if first >= len(drives.t):
         raise NotMeasurable("the controller was not ACTIVE at the end of clean-up")

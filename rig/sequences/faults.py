@@ -7,7 +7,7 @@ the main phase; a fault ends when main ends, so that clean-up runs on a healthy 
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import ceil
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -22,6 +22,8 @@ from plant.parameters import check_combinations, parse_value
 from plant.quantity import Quantity
 from plant.segments import RATE, Second
 from rig import tables
+from rig.benches.bench import Bench
+from rig.benches.frame_map import Role
 from rig.tables import Range
 
 Table = NDArray[np.int64]
@@ -193,12 +195,6 @@ class Foreign(Fault):
     length: Annotated[int, Range("1", low=0, high=8)] = 8
     frames: Annotated[int, Range("1", low=1, high=MOST_FOREIGN)] = 1  # in each of these cycles
     every: Count = 1
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.cob_id == 0x080 or self.cob_id & 0x7F in (1, 2, 3):  # SYNC, or function code and node number
-            raise InputError("fault", "cob_id", "an identifier from 1 to 0x7FF that no node of the bench uses, not "
-                                                f"0x{self.cob_id:X}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -465,18 +461,19 @@ class Schedule:
         """The cycles in which the node (rig or plant) is bus-off, in order."""
         return np.array(sorted({k for cycles in self._nodes.get(("bus_off", node), ()) for k in cycles}), np.int64)
 
-    def find_disturbed(self, cycles: int) -> NDArray[np.bool_]:
-        """Of the first `cycles` those in which a fault acts on a cyclic frame or SYNC, and the one after each.
+    def find_disturbed(self, cycles: int, reach: int = 1) -> NDArray[np.bool_]:
+        """Of the first `cycles` those in which a fault acts on a cyclic frame or SYNC, and the `reach` after each.
 
         After a reset of the controller, all cycles of main.
         """
-        disturbed = np.zeros(max(cycles, self._stop) + 1, bool)
+        disturbed = np.zeros(max(cycles, self._stop) + reach, bool)
         for k, _ in self.resets:  # the rig starts the controller again after main
             disturbed[k:self._stop] = True
         for name in self._frames:
             hits = self.list_frame_hits(name)
             hit = hits[hits[:, 1] == DROP, 0] if name == "sync" else hits[:, 0]
-            disturbed[hit] = disturbed[hit + 1] = True
+            for after in range(reach + 1):
+                disturbed[hit + after] = True
         return disturbed[:cycles]
 
 
@@ -504,6 +501,33 @@ def _choose_hits(fault: Frames, cycles: int, rng: np.random.Generator) -> Table:
             bits = [rng.choice(64, fault.bits, replace=False) for _ in range(is_hit.sum())]
             hits[is_hit, 1] = [np.bitwise_or.reduce(np.int64(1) << chosen) for chosen in bits]
     return hits
+
+
+def require_possible(faults: Sequence[Fault], bench: Bench, where: str) -> None:
+    """Refuse faults that a bench cannot have, such as a lost SYNC on plain CAN.
+
+    Raises:
+        InputError: it names the key of the fault in the sequence `where`.
+    """
+    frames = sorted({role for spec in bench.frames.frames for role in spec.roles})
+    frames += ["sync"] if bench.frames.sync is not None else []
+    taken = bench.list_services() | {spec.identifier: spec.name for spec in bench.frames.frames}
+    for i, fault in enumerate(faults):
+        match fault:
+            case Frames() if fault.frame not in frames:
+                key, expected = "frame", f"a frame of {bench.name!r}: {tables.list_choices(fault.frame, frames)}"
+            case Jitter() if "sync" not in frames:
+                key, expected = "kind", f"a fault without SYNC, which {bench.name!r} does not have, not 'jitter'"
+            case Reset() if Role.CONTROLLER not in bench.nodes:
+                key, expected = "kind", f"a fault without NMT, which {bench.name!r} does not have, not 'reset'"
+            case Silent() if not bench.nodes or (fault.node == "plant" and not bench.has_plant_node):
+                key, expected = "node", f"a node of {bench.name!r} with a heartbeat, not {fault.node!r}"
+            case Foreign() if fault.cob_id in taken:
+                key, expected = "cob_id", (f"an identifier from 1 to 0x7FF that {bench.name!r} does not use; "
+                                           f"0x{fault.cob_id:X} is {taken[fault.cob_id]}")
+            case _:
+                continue
+        raise InputError(where, f"faults[{i}].{key}", expected)
 
 
 def is_noticed_by_time(fault: Fault) -> bool:

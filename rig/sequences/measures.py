@@ -8,7 +8,7 @@ there is no room for a median: one sample decides.
 """
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ from plant.errors import InputError
 from plant.run import Columns
 from plant.segments import RATE, Array
 from rig import tables
+from rig.benches.profiles import CIA408, ProfileWords, find_state
 
 MEDIAN_SPAN = 5e-3  # s
 SPEED_SPAN = 20e-3  # s between the two samples of a speed: 2 um rms of position noise become 0.14 mm/s rms
@@ -167,17 +168,30 @@ def find_scale(unit: str, si: str) -> float:
 MAIN = "main"  # the window that is all of the main phase
 
 
+def map_words(values: NDArray[Any], find: Callable[[int], int]) -> NDArray[np.int64]:
+    """What `find` gives for each of some words, most of which are equal."""
+    known, places = np.unique(values.astype(int), return_inverse=True)
+    found: NDArray[np.int64] = np.array([find(word) for word in known.tolist()], np.int64)[places]
+    return found
+
+
 class DriveFrames(NamedTuple):
     """All drive frames of a run, whatever their cycle number, as columns; only recorded if faults act on the bus."""
 
     t: Array  # s of main
     current: Array  # A
     status: NDArray[np.int64]  # status word
+    words: ProfileWords = CIA408  # what it means
 
     def select_between(self, t0: float, t1: float) -> DriveFrames:
         """Those with t0 <= t < t1."""
         chosen = (self.t >= t0 - 1e-9) & (self.t < t1 - 1e-9)  # times come from ns
-        return DriveFrames(self.t[chosen], self.current[chosen], self.status[chosen])
+        return DriveFrames(self.t[chosen], self.current[chosen], self.status[chosen], self.words)
+
+    @property
+    def states(self) -> NDArray[np.int64]:
+        """What each status word says."""
+        return map_words(self.status, lambda word: find_state(self.words, word))
 
 
 NO_DRIVES = DriveFrames(np.zeros(0), np.zeros(0), np.zeros(0, np.int64))

@@ -32,6 +32,7 @@ from rig.benches.profiles import (
 )
 from rig.network.codec import Flags
 from rig.sequences.checks import CheckResult, SkippedCheck
+from rig.sequences.measures import map_words
 from rig.tables import Range
 
 Mask = NDArray[np.bool_]
@@ -112,15 +113,15 @@ class Emergency(NamedTuple):
 class ProtocolRecord:
     """All that the protocol checks are judged by.
 
-    `enabling`: the cycles before the run in which the controller was enabled. `gains`: those that objects of the
-    controller hold, if it has them and follows them. `is_response_judged`: real time, and the controller is not in the
-    rig's own process. `heartbeats`: of the nodes that send one, by name; `heard`: first and last time at which
-    heartbeats could have been received, s; `deaf`: how long of it the rig received nothing, s; `deaf_cycles`: in which,
-    so that an EMCY of the controller may be missing here.
+    `enabling`: cycles beside the run in which the controller was enabled, and the cycle before which that was. `gains`:
+    those that objects of the controller hold, if it has them and follows them. `is_response_judged`: real time, and the
+    controller is not in the rig's own process. `heartbeats`: of the nodes that send one, by name; `heard`: first and
+    last time at which heartbeats could have been received, s; `deaf`: how long of it the rig received nothing, s;
+    `deaf_cycles`: in which, so that an EMCY of the controller may be missing here.
     """
 
     run: Rows
-    enabling: Rows | None = None
+    enabling: Sequence[tuple[int, Rows]] = ()
     probes: Sequence[Rows] = ()
     after: Rows | None = None
     emergencies: Sequence[Emergency] = ()
@@ -138,12 +139,16 @@ class ProtocolRecord:
     @property
     def stretches(self) -> list[Rows]:
         """All rows, in stretches of consecutive cycles."""
-        return [*self.probes, *self.played]
+        after = [self.after] if self.after is not None else []
+        return [*self.probes, *(rows for _, rows in self.enabling), self.run, *after]
 
-    @property
-    def played(self) -> list[Rows]:
-        """The rows of the run with those before and after it; the probes before set-up are left out."""
-        return [rows for rows in (self.enabling, self.run, self.after) if rows is not None]
+    def join_rows(self) -> Rows:
+        """The rows of the run with those in which the controller was enabled, and those after it, in order."""
+        played = (self.run,) if self.after is None else (self.run, self.after)
+        parts = [np.concatenate(columns) for columns in zip(*played, strict=True)]
+        for cycle, rows in reversed(self.enabling):
+            parts = [np.insert(whole, cycle, part) for whole, part in zip(parts, rows, strict=True)]
+        return Rows(*parts)
 
 
     @property
@@ -192,13 +197,6 @@ def _drop_missing(parts: Sequence[Array]) -> Array:
     return values[~np.isnan(values)]
 
 
-def map_words(values: Array, find: Callable[[int], int]) -> Whole:
-    """What `find` gives for each of some words, most of which are equal."""
-    known, places = np.unique(values.astype(int), return_inverse=True)
-    found: Whole = np.array([find(word) for word in known.tolist()], np.int64)[places]
-    return found
-
-
 def find_states(rows: Rows, words: ProfileWords) -> Whole:
     """The `State` of the status word in each cycle."""
     return map_words(rows.status, lambda word: find_state(words, word))
@@ -233,7 +231,7 @@ def _judge_status(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
         return
     delay = limits.find_delay(record.words, record.bench.rate)
     if record.words is CIA402:
-        whole = Rows(*map(np.concatenate, zip(*record.played, strict=True)))
+        whole = record.join_rows()
         wrong = list_wrong_changes(whole, round(delay * record.bench.rate))
         yield _make_result("status word follows the states of CiA 402", "status word", float(len(wrong)), "1", high=0.0,
                            detail="; ".join(wrong[:3]))

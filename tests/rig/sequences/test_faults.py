@@ -2,12 +2,14 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from refusals import catch_refusal
 
 from plant import load_model
+from rig.benches.bench_file import load_bench
 from rig.nodes.scenario import Scenario
 from rig.sequences import faults
 from rig.sequences.faults import (
@@ -36,6 +38,7 @@ from rig.sequences.faults import (
     Silent,
     Stuck,
     apply_action,
+    require_possible,
 )
 from rig.sequences.sequence import Sequence, parse_sequence
 
@@ -232,3 +235,33 @@ def test_disturbed_cycles() -> None:
     s = schedule(Lost(frame="drive", start=0.01, count=1), Jitter(size=1e-4, start=0.02), Reset(start=0.03), stop=40)
     assert np.flatnonzero(s.find_disturbed(60)).tolist() == [10, 11, *range(30, 40)]
     assert s.resets == [(30, "node")]
+
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+
+
+@pytest.mark.parametrize(("bench", "fault", "said"), [
+    ("", Foreign(start=0.0, cob_id=0x183), "cob_id: expected an identifier from 1 to 0x7FF that 'EHA controller' does "
+                                           "not use; 0x183 is RPDO2"),
+    ("", Foreign(start=0.0, cob_id=0x702), "cob_id: expected an identifier from 1 to 0x7FF that 'EHA controller' does "
+                                           "not use; 0x702 is heartbeat of node 2"),
+    ("", Foreign(start=0.0, cob_id=0x205), ""),  # which node 5 of the other bench has
+    ("cia402_drive", Foreign(start=0.0, cob_id=0x205), "0x205 is RPDO1"),
+    ("cia402_drive", Foreign(start=0.0, cob_id=0x183), ""), ("cia402_drive", Lost(start=0.0, frame="sync"), ""),
+    ("cia402_drive", Lost(start=0.0, frame="valve_state"),
+     "frame: expected a frame of 'Actuator with a CiA 402 drive': 'command', 'drive', 'feedback' or 'sync', not "
+     "'valve_state'"),
+    ("cia402_drive", Silent(start=0.0, node="plant"), "node: expected a node of 'Actuator with a CiA 402 drive' with a "
+                                                      "heartbeat, not 'plant'"),
+    ("can_ecu", Jitter(start=0.0, size=1e-4), "kind: expected a fault without SYNC"),
+    ("can_ecu", Reset(start=0.0), "kind: expected a fault without NMT"),
+    ("can_ecu", Silent(start=0.0, node="rig"), "node: expected a node of 'Actuator with an ECU on plain CAN' with a"),
+    ("can_ecu", Lost(start=0.0, frame="drive"), ""),
+])
+def test_a_fault_is_refused_on_a_bench_that_cannot_have_it(bench: str, fault: Fault, said: str) -> None:
+    at = load_bench(str(EXAMPLES / bench / "bench.toml")) if bench else load_bench()
+    if not said:
+        require_possible([fault], at, "x.toml")
+        return
+    refusal = catch_refusal(require_possible, [fault], at, "x.toml")
+    assert refusal.startswith("x.toml: faults[0].") and said in refusal

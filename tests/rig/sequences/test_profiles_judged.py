@@ -62,7 +62,7 @@ def test_the_cycles_in_which_a_drive_is_enabled_are_judged_with_the_run() -> Non
     """They come before the run, whose first row finds the drive enabled."""
     enabled = make_rows([(0x0F, 0x1237, 1e-3, 50)])
     for before, passed in ((make_rows(ENABLED), True), (make_rows([(0x0F, 0x1237, 0.0, 5)]), False)):
-        record = ProtocolRecord(run=enabled, enabling=before, bench=DRIVE, current_limit=8e-3)
+        record = ProtocolRecord(run=enabled, enabling=[(0, before)], bench=DRIVE, current_limit=8e-3)
         found = {check.name: check.passed for check in judge_protocol(record, ProtocolLimits())[0]}
         assert found[STATES] is passed
 

@@ -168,8 +168,6 @@ BAD = [  # text, then what the user reads
      "'drive'?)"),
     (HEAD + 'faults = [{ kind = "late", frame = "sync", delay = 1e-4, start = 0 }]\n',
      "faults[0].frame: expected 'command', 'drive', 'feedback' or 'valve_state', not 'sync'"),
-    (HEAD + 'faults = [{ kind = "foreign", cob_id = 0x183, start = 0 }]\n',
-     "faults[0].cob_id: expected an identifier from 1 to 0x7FF that no node of the bench uses, not 0x183"),
     (HEAD + 'faults = [{ kind = "short", frame = "drive", length = 8, start = 0 }]\n',
      "faults[0].length: expected a whole number from 0 to 7, not 8"),
     (HEAD + 'faults = [{ kind = "jitter", size = 1e-3, start = 0 }]\n',
