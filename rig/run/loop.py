@@ -12,6 +12,7 @@ import heapq
 from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from math import isnan, nan
 from typing import Protocol
 
@@ -114,6 +115,15 @@ class _Answer:
         return problem in ("", "jump")
 
 
+@dataclass(slots=True)
+class _Seen:
+    """What of the cycle under way has come."""
+
+    came: set[str] = field(default_factory=set)  # roles of the frames
+    awaited: set[FrameSpec] = field(default_factory=set)  # frames that are sure to come, and have not
+    is_late: bool = False  # a drive frame has come that answers an earlier cycle
+
+
 class CycleLoop(Loop):
     """Runs cycles one by one and passes each to `log` when it is complete. In real time it is soft: Python is in it."""
 
@@ -132,12 +142,10 @@ class CycleLoop(Loop):
         self.outputs = dict.fromkeys(self._values.names, 0.0)
         self._open: tuple[int, Signals, Timing] | None = None  # the cycle under way
         self._step = CycleInput(0, 0.0, 0.0, 0)  # its inputs
-        self._came: set[str] = set()  # roles of the frames that have come
-        self._awaited: set[FrameSpec] = set()  # frames that are sure to come
+        self._seen = _Seen()
         self._begun = 0  # cycles in which answers were expected, those that do not count among them
         self._played = 0  # cycles
         self._missed = 0  # drive frames in a row
-        self._is_late = False  # a drive frame has come that answers an earlier cycle
         self._wall = WallClock()
         self._t_ns = self._wire.clock.now() + self._period  # when the cycle under way, or to come, is due
         self._sync = 0
@@ -225,11 +233,11 @@ class CycleLoop(Loop):
         """Flags of this cycle, and the current until the next one: see hard_cycle.py."""
         if not self._begun:
             return 0
-        if "drive" in self._came:
+        if "drive" in self._seen.came:
             plant.current, self._missed = self.outputs["current"], 0
             return 0
         self._missed += 1
-        flags = int(Flags.DRIVE_LATE if self._is_late else Flags.DRIVE_MISSING)
+        flags = int(Flags.DRIVE_LATE if self._seen.is_late else Flags.DRIVE_MISSING)
         if self._missed >= self._bench.most_missed:
             plant.current = 0.0
             flags |= int(Flags.CURRENT_ZEROED)
@@ -293,9 +301,9 @@ class CycleLoop(Loop):
 
     def _expect_answers(self, is_synced: bool) -> None:
         """Which answers are sure to come in this cycle, and which values of earlier frames still count."""
-        self._came, self._awaited, self._is_late = set(), set(), False
+        self._seen = _Seen()
         if self._plant is not None:
-            self._came |= {"feedback", "valve_state"}
+            self._seen.came |= {"feedback", "valve_state"}
         if not is_synced:
             return
         # without a SYNC the controller has its own clock: its frame may slip from one cycle of the rig to the next
@@ -303,18 +311,18 @@ class CycleLoop(Loop):
         for spec, answer in self._answers.items():
             age = self._begun - answer.last
             if answer.last >= 0 and age < spec.every + (slack if spec.is_answer else self._bench.most_missed):
-                self._came |= answer.roles
+                self._seen.came |= answer.roles
             elif spec.is_answer and age >= spec.every:
-                self._awaited.add(spec)
+                self._seen.awaited.add(spec)
         self._begun += 1
 
     def _wait_for_answers(self, delay: int | None) -> None:
         """Lockstep: let the answers come in; what is not sure to come is given the time of a cycle."""
         is_unsure = any(answer.last < 0 or not spec.is_answer for spec, answer in self._answers.items())
-        if delay is None or (is_unsure and not self._awaited):
+        if delay is None or (is_unsure and not self._seen.awaited):
             self._wire.run_until(self._wire.clock.now() + self._period)
-        elif self._awaited:
-            self._wire.wait_for_answers(self._t_ns + delay, lambda: not self._awaited)
+        elif self._seen.awaited:
+            self._wire.wait_for_answers(self._t_ns + delay, lambda: not self._seen.awaited)
 
     def _receive_answer(self, frame: Frame) -> None:
         """A frame of the controller, or of the plant, has come."""
@@ -344,17 +352,17 @@ class CycleLoop(Loop):
             return
         values = answer.read(data)
         if answer.cycle_mask and values["cycle"] != row.cycle & answer.cycle_mask:
-            self._is_late |= "drive" in answer.roles
+            self._seen.is_late |= "drive" in answer.roles
             return
         self.outputs.update(values)
         answer.last = self._begun - 1
-        self._came |= answer.roles
-        self._awaited.discard(answer.spec)
+        self._seen.came |= answer.roles
+        self._seen.awaited.discard(answer.spec)
         if is_first:
             since = self._since_sync(t_ns)
             for role in answer.roles & _RESPONSES.keys():
                 setattr(timing, _RESPONSES[role], since)
-            if not self._awaited and isnan(timing.work):
+            if not self._seen.awaited and isnan(timing.work):
                 timing.work = since
 
     def _since_sync(self, t_ns: int) -> float:
@@ -369,11 +377,11 @@ class CycleLoop(Loop):
         if not self._step.is_counted:
             return
         values = self.outputs
-        if self._plant is None and "feedback" in self._came:
+        if self._plant is None and "feedback" in self._seen.came:
             row.xj, row.p12 = values["ram_position"], values["load_pressure"]
-        if self._plant is None and "valve_state" in self._came:
+        if self._plant is None and "valve_state" in self._seen.came:
             row.xs, row.flags = values["spool_position"], int(values["flags"])
-        if "drive" in self._came:
+        if "drive" in self._seen.came:
             row.cor, row.status = values["current"], int(values["status_word"])
         self._log.cycle(t_ns, row, timing)
 
