@@ -108,6 +108,11 @@ class Bench:
         has_number = role in self.nodes or (role is Role.RIG and self.nodes)
         return f"node {self.find_number(role)} {role.name.lower()}" if has_number else role.name.lower()
 
+    def list_participants(self) -> dict[int, str]:
+        """Who takes part in a run: number, and name with it."""
+        roles = [role for role in Role if role is not Role.PLANT or self.has_plant_node]
+        return {self.find_number(role): self.describe_node(role) for role in roles}
+
     def read_data_sheet(self, role: Role) -> tuple[str, str]:
         """Name and text of a node's EDS or DCF."""
         path = self.nodes[role].eds

@@ -115,6 +115,7 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     kind = f"{loop.kind} real time" if job.realtime else "lockstep"
     why = f"the cycles run in Python, because compiled code cannot use the bus {job.bus}"
     reason = why if kind == "soft real time" else ""
+    recorder.metadata("nodes", {str(number): name for number, name in job.bench.list_participants().items()})
     recorder.metadata("timing", {"kind": kind, "reason": reason})
     history = session.log.history
     attribution = attribute_run(job, session)

@@ -23,6 +23,8 @@ from rig.sequences.timing import TimingPolicy
 
 PATIENCE = 5  # cycles in lockstep, of which each may wait long, until the first drive frame must have come
 
+SILENCE = "silence"  # kind of the events that say that a controller without a heartbeat is gone, or heard again
+
 
 class NodeWatch:
     """What the nodes of a run report and whether they still answer. Trouble goes to the safe state."""
@@ -80,7 +82,7 @@ class NodeWatch:
         """
         if not is_missing:
             if self._missed and self.gone.pop(CONTROLLER, ""):
-                self._journal.log("INFO", "drive", f"{self._bench.describe_node(CONTROLLER)} is heard")
+                self._journal.log("INFO", SILENCE, f"{self._bench.describe_node(CONTROLLER)} is heard")
             self._missed = 0
             return
         self._missed += 1
@@ -93,6 +95,7 @@ class NodeWatch:
         self._safety.handle("bring_up" if is_first else NO_DRIVE, what, CONTROLLER)
         if CONTROLLER not in self._master.watched or (self._looks and self._safety.aborted):
             self.gone.setdefault(CONTROLLER, "it sends no frames")
+            self._journal.log("ERROR", SILENCE, f"{self._bench.describe_node(CONTROLLER)} is silent")
 
     def _note_emergency(self, node: Role, error: EmcyError) -> None:
         if self._stage.is_playing or self._stage.is_probing:

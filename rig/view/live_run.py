@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import pickle
 from collections import deque
+from collections.abc import Mapping
 from math import isnan, nan
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from plant import Columns
 from rig import recorder
-from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
+from rig.benches.bench import Bench
 from rig.sequences import Sequence
 from rig.sequences.checks import Check
 from rig.sequences.measures import MAIN, RunData
@@ -45,6 +46,7 @@ class LivePlan(NamedTuple):
     sections: dict[str, slice]
     starts: dict[str, float]
     has_load: bool
+    nodes: dict[int, str]  # who takes part: number and name
 
     @property
     def check_names(self) -> list[str]:
@@ -52,7 +54,7 @@ class LivePlan(NamedTuple):
         return [*(check.name for check in self.checks), *self.unknown_checks]
 
 
-def make_live_plan(sequence: Sequence, pace: str) -> LivePlan:
+def make_live_plan(sequence: Sequence, pace: str, bench: Bench) -> LivePlan:
     """The plan of a sequence; checks that cannot be sent to another process (Python of a user) keep their names."""
     known, unknown = [], []
     for check in sequence.checks:
@@ -62,7 +64,8 @@ def make_live_plan(sequence: Sequence, pace: str) -> LivePlan:
         except (pickle.PicklingError, AttributeError, TypeError):
             unknown.append(check.name)
     return LivePlan(sequence.title, sequence.duration, sequence.rate, pace, tuple(known), tuple(unknown),
-                    sequence.sections(), dict(sequence.fault_starts()), bool(sequence.load))
+                    sequence.sections(), dict(sequence.fault_starts()), bool(sequence.load),
+                    bench.list_participants())
 
 
 class CheckState(NamedTuple):
@@ -102,7 +105,8 @@ class LiveRun:
         self._main_from = self._main_until = -1  # rows
         self.first_ns = 0  # log time of the first row, from which `t_ns` counts: a float64 rounds ns since 1970
         self.zero_ns: int | None = None  # log time at which main began
-        self.states: dict[int, str] = {RIG: "operational", CONTROLLER: "unknown", PLANT: "unknown"}
+        self.states = {number: "operational" if name.endswith("rig") else "unknown"
+                       for number, name in plan.nodes.items()}
         self.troubles: dict[int, str] = {}  # nodes that are gone, and how that is known
         self.events: deque[Event] = deque(maxlen=5000)
         waiting = {check.name for check in plan.checks if check.kind not in _AFTER_RUN}
@@ -123,11 +127,11 @@ class LiveRun:
             self.checks[record.name] = CheckState.read(record)
         else:
             self.events.append(Event(self._find_time(t_ns), record.level, record.kind, record.text, t_ns))
-            node = find_dead_node(record.level, record.kind, record.text)
-            if node:
+            node = find_named_node(record.kind, record.text, self.plan.nodes)
+            if node and record.level == "ERROR":
                 self.troubles[node] = record.text.partition(": ")[2] or "is silent"
-            elif record.kind == "heartbeat" and record.level == "INFO" and record.text.startswith("node "):
-                self.troubles.pop(int(record.text.split()[1]), None)
+            elif node and record.level == "INFO":
+                self.troubles.pop(node, None)
 
     def _find_time(self, t_ns: int) -> float:
         """Log time in s of main; NaN before main."""
@@ -211,9 +215,10 @@ def _find_window(check: Check, plan: LivePlan) -> tuple[int, int]:
     return (rows.start, rows.stop) if rows else (0, round(plan.duration * plan.rate))
 
 
-def find_dead_node(level: str, kind: str, text: str) -> int:
-    """The node that an event reports as dead: its process ended, or its heartbeat stopped; else 0."""
-    for node, name in NAMES.items():
-        if level == "ERROR" and kind in ("process", "heartbeat") and text.startswith(f"node {node} {name}"):
-            return node
-    return 0
+def find_named_node(kind: str, text: str, nodes: Mapping[int, str]) -> int:
+    """The node that an event reports as dead or alive: its process ended, its frames or its heartbeat stopped; else 0.
+
+    `nodes`: number and name of each.
+    """
+    is_about_life = kind in ("process", "heartbeat", "silence")
+    return next((number for number, name in nodes.items() if is_about_life and text.startswith(name)), 0)

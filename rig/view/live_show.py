@@ -36,7 +36,6 @@ from rich.live import Live
 from rich.text import Text
 
 from fdi.trace.mcap_log import scan_messages, unpack_chunk
-from rig.network.node_objects import NAMES
 from rig.recorder import CanFrame, Check, Event, NmtState, Record
 from rig.recorder.schema import TOPICS
 from rig.recorder.writer import MAGIC, list_channels
@@ -160,8 +159,8 @@ def _draw_title(run: LiveRun, width: int) -> Text:
 
 def _draw_nodes(run: LiveRun, silence: float) -> list[Text]:
     lines = []
-    for node, name in NAMES.items():
-        line = Text(f"node {node} {name:<11}")
+    for node, name in run.plan.nodes.items():
+        line = Text(f"{name:<18}")
         state = run.states[node]
         if node in run.troubles:
             line.append(f"DEAD: {run.troubles[node]}", style="bold white on red")
@@ -282,7 +281,7 @@ def draw_plan(plan: LivePlan) -> Drawing:
     """The views of a run that has not begun."""
     lanes = [Lane("run/phase", [], PHASES),
              Lane("run/command", [], PHASES | dict.fromkeys(plan.sections, SECTIONS["dynamic"])),
-             *(Lane(name_node_lane(node), [], STATES) for node in NAMES),
+             *(Lane(name_node_lane(node, name), [], STATES) for node, name in plan.nodes.items()),
              *(Lane(f"fault/{label}", [], ACTIVE) for label in plan.starts),
              *(Lane(f"check/{name}", [], {}) for name in plan.check_names)]
     plots = draw_signals(dict.fromkeys(_list_signals(plan), (NOTHING, NOTHING)))
@@ -342,7 +341,7 @@ class LiveView:
 
     def _send_record(self, record: Record, t: float) -> None:
         if isinstance(record, NmtState):
-            self._send_state(name_node_lane(record.node), t, record.name)
+            self._send_state(name_node_lane(record.node, self._plan.nodes.get(record.node)), t, record.name)
         elif isinstance(record, Check):
             state = CheckState.read(record)
             self._send_check(state, t)

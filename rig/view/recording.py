@@ -320,7 +320,8 @@ def _list_lanes(trace: Trace) -> Iterator[Lane]:
     yield Lane("run/phase", [(float(trace.t[k]), [*PHASES][trace.phase[k]]) for k in turns], PHASES)
     yield make_command_lane(trace, "run", 0.0)
     for node in sorted({state.node for state in trace.nmt}):
-        yield Lane(name_node_lane(node), [(s.t, s.name) for s in trace.nmt if s.node == node], STATES)
+        name = trace.provenance.get(f"nodes.{node}")
+        yield Lane(name_node_lane(node, name), [(s.t, s.name) for s in trace.nmt if s.node == node], STATES)
     yield from list_fault_lanes(trace, "fault/", 0.0)
     for check in trace.sequence_checks:
         yield _make_check_lane(check, trace)
@@ -350,13 +351,14 @@ def list_fault_lanes(trace: Trace, prefix: str, offset: float) -> list[Lane]:
     return [Lane(f"{prefix}{label}", states, ACTIVE) for label, states in found.items()]
 
 
-def name_node_lane(node: int) -> str:
-    """Path of the lane of a node.
+def name_node_lane(node: int, name: str | None = None) -> str:
+    """Path of the lane of a node; the name of a log that has none is that of the shipped bench.
 
-    >>> name_node_lane(2)
-    'node/2 controller'
+    >>> name_node_lane(2), name_node_lane(5, "node 5 controller")
+    ('node/2 controller', 'node/5 controller')
     """
-    return f"node/{node} {NAMES.get(node, '')}".strip()
+    word = NAMES.get(node, "") if name is None else name.split()[-1]
+    return f"node/{node} {word}".strip()
 
 
 def read_fault_event(text: str) -> tuple[str, str] | None:

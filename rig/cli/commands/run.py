@@ -4,7 +4,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -31,7 +31,7 @@ from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import Observe, run_job
 from rig.suite.suite import is_suite_file, write_junit_of_run
 from rig.view.live_process import ViewerPlace, find_viewer_place, show_live
-from rig.view.live_run import find_dead_node, make_live_plan
+from rig.view.live_run import find_named_node, make_live_plan
 
 
 def run_command(args: argparse.Namespace) -> int:
@@ -104,25 +104,25 @@ def choose_bus_of_run(args: argparse.Namespace, wanted: str, controller: str | N
 def choose_observer(job: Job, log: Path, place: ViewerPlace | None, *, is_live: bool) -> Iterator[Observe]:
     """What looks at the records of a run: the screen or the viewer of --live, and the lines about dead nodes."""
     if not is_live:
-        yield announce_dead_node
+        yield partial(announce_dead_node, job.bench.list_participants())
         return
     kept: list[Record] = []  # while a screen covers the terminal
-    with show_live(make_live_plan(job.sequence, job.pace), log, job.realtime, place) as begin:
+    with show_live(make_live_plan(job.sequence, job.pace, job.bench), log, job.realtime, place) as begin:
         def observe(t_ns: int, record: Record) -> None:
             begin()  # now the log is there
             if place is not None:
-                announce_dead_node(t_ns, record)
+                announce_dead_node(job.bench.list_participants(), t_ns, record)
             elif isinstance(record, Event):
                 kept.append(record)
 
         yield observe
     for record in kept:
-        announce_dead_node(0, record)
+        announce_dead_node(job.bench.list_participants(), 0, record)
 
 
-def announce_dead_node(t_ns: int, record: Record) -> None:
-    """Print a line on standard error, at once, when a node has died."""
-    if isinstance(record, Event) and find_dead_node(record.level, record.kind, record.text):
+def announce_dead_node(nodes: Mapping[int, str], t_ns: int, record: Record) -> None:
+    """Print a line on standard error, at once, when one of the nodes has died."""
+    if isinstance(record, Event) and record.level == "ERROR" and find_named_node(record.kind, record.text, nodes):
         clear = "\r\033[K" if sys.stderr.isatty() else ""
         print(f"{clear}rig run: {record.text}", file=sys.stderr, flush=True)
 

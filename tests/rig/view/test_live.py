@@ -26,10 +26,11 @@ from rig_command import finished, grown, nodes_on, refuse, rig, started
 from synthetic_run import build_cycles, record_run
 
 from fdi.trace.trace import Trace
+from rig.benches.bench_file import load_bench
 from rig.recorder import Check, Event, NmtState, Record, Recorder, Signals, Timing
 from rig.sequences import load_sequence
 from rig.view.live_process import find_viewer_place, show_live
-from rig.view.live_run import COLUMNS, LiveRun, find_dead_node, make_live_plan
+from rig.view.live_run import COLUMNS, LiveRun, find_named_node, make_live_plan
 from rig.view.live_show import describe_line, draw_screen, follow_log
 from rig.view.viewer import find_free_port, is_listening
 
@@ -92,7 +93,7 @@ def test_log_in_a_relative_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
                                   capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
     record_run(Path("trace.mcap"), stop=1000)
-    plan = make_live_plan(load_sequence("preflight"), "lockstep")
+    plan = make_live_plan(load_sequence("preflight"), "lockstep", load_bench())
     with show_live(plan._replace(title=LeavesFolder()), Path("trace.mcap"), last_cpu_is_taken=False) as begin:
         begin()
     said = capfd.readouterr().err
@@ -106,7 +107,7 @@ def make_run(preflight: Path) -> tuple[LiveRun, Records, Trace]:
     """A live run of preflight and all its cycles, from the log of a run that has ended."""
     records = [(t_ns, record) for t_ns, record in next(follow_log(preflight / "trace.mcap"))
                if isinstance(record, Signals | Timing)]
-    plan = make_live_plan(load_sequence("preflight"), "lockstep")
+    plan = make_live_plan(load_sequence("preflight"), "lockstep", load_bench())
     return LiveRun(plan), records, Trace.read(preflight, all=True)
 
 
@@ -159,7 +160,7 @@ checks = [{ name = "begins", kind = "event_occurs", event = "phase main", window
 def test_events_stand_at_their_cycle(begin_ns: int, tmp_path: Path) -> None:
     """Those written before the first row of main too, and whatever the log times: a float64 rounds ns since 1970."""
     (tmp_path / "events.toml").write_text(EVENTS)
-    run = LiveRun(make_live_plan(load_sequence(tmp_path / "events.toml"), "lockstep"))
+    run = LiveRun(make_live_plan(load_sequence(tmp_path / "events.toml"), "lockstep", load_bench()))
     words = {0: ("phase", "set-up"), 20: ("phase", "main"), 120: ("guard", "first")}
     for cycle in range(220):
         t_ns = begin_ns + cycle * 1_000_000
@@ -196,12 +197,14 @@ def test_screen_fits(preflight: Path, size: tuple[int, int]) -> None:
 
 
 def test_dead_node() -> None:
-    for words, node in ((("ERROR", "process", "node 2 controller: its process ended with exit status 1"), 2),
-                        (("ERROR", "heartbeat", "node 3 plant is silent"), 3),
-                        (("INFO", "heartbeat", "node 3 plant is heard"), 0),
-                        (("ERROR", "emcy", "node 3 plant 0x8250"), 0)):
-        assert find_dead_node(*words) == node
-    run = LiveRun(make_live_plan(load_sequence("preflight"), "realtime"))
+    ecu, nodes = {1: "rig", 2: "controller"}, load_bench().list_participants()
+    for names, kind, text, node in ((nodes, "process", "node 2 controller: its process ended with exit status 1", 2),
+                                    (nodes, "heartbeat", "node 3 plant is silent", 3),
+                                    (nodes, "heartbeat", "node 3 plant is heard", 3),
+                                    (nodes, "emcy", "node 3 plant 0x8250", 0),
+                                    (ecu, "silence", "controller is heard", 2)):
+        assert find_named_node(kind, text, names) == node
+    run = LiveRun(make_live_plan(load_sequence("preflight"), "realtime", load_bench()))
     for level, text in (("ERROR", "node 3 plant is silent"), ("INFO", "node 3 plant is heard")):
         run.add(0, Event(level, "heartbeat", text))
         assert (3 in run.troubles) == (level == "ERROR")
