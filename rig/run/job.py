@@ -59,6 +59,9 @@ class Job:
         if self.plant == "external" and not self.bench.has_plant_node:
             raise InputError("--plant", self.plant, f"auto: the rig moves the plant of {self.bench.name!r}, which has "
                                                     "no plant node")
+        if self.plant != "external" and self.bench.has_plant_node and not speaks_as_shipped(self.bench):
+            raise InputError("--plant", self.plant, "external: our own plant emulator does not speak as that of "
+                                                    f"{self.bench.name!r}")
         if self.controller != "external" and not speaks_as_shipped(self.bench):
             raise InputError("--controller", self.controller, "external: our own firmware does not speak as the device "
                                                               f"of {self.bench.name!r}")
@@ -258,12 +261,14 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     model = load_model(name).replace(sequence.model.overrides, sequence.name).replace(choice.changes)
     require_bench_cycle(model, bench, "--set")
     foreign = [name for name in model.list_changes() if name.startswith("controller.") and name != "controller.period"]
-    controller = choice.controller or ("builtin" if speaks_as_shipped(bench) else "external")
+    is_ours = speaks_as_shipped(bench)
+    controller = choice.controller or ("builtin" if is_ours else "external")
+    plant = choice.plant or ("auto" if is_ours or not bench.has_plant_node else "external")
     if controller == "external" and foreign:
         raise InputError("--set", foreign[0], "no gains beside --controller external: that firmware has its own")
     job = Job(sequence=sequence, model=model, bench=bench, seed=choice.seed, effects=(*choice.effects, *brought),
-              bus=choice.bus, controller=controller, max_overruns=sequence.timing.share)
-    return replace_settings(job, pace=choice.pace, plant=choice.plant, max_overruns=choice.max_overruns)
+              bus=choice.bus, controller=controller, plant=plant, max_overruns=sequence.timing.share)
+    return replace_settings(job, pace=choice.pace, max_overruns=choice.max_overruns)
 
 
 class Differences(NamedTuple):

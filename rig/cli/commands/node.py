@@ -10,6 +10,7 @@ import time
 from fdi.output import require_writable
 from fdi.report.report import Report
 from plant.errors import InputError, RigError
+from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, give_answer
 from rig.cli.inputs import load_chosen_model
 from rig.network import heartbeat
@@ -23,6 +24,7 @@ from rig.nodes.emulator import Emulator
 from rig.nodes.emulator_service import LEFT_OUT, EmulatorService
 from rig.nodes.firmware import Firmware
 from rig.nodes.scenario import Scenario, require_servovalve
+from rig.run.job import speaks_as_shipped
 from rig.run.participants import EMBEDDED_NAMES
 from rig.run.priority import LOOP_PRIORITY, enter_loop_thread, lock_memory, raise_priority
 from rig.sequences.faults import Plan
@@ -38,6 +40,9 @@ def run_command(args: argparse.Namespace) -> int:
         RigError: the bus cannot be opened, or a node with this number is on it.
     """
     bus, _ = choose_bus(args.bus)
+    bench = load_bench(args.bench or "eha", is_trusted=args.trust)
+    if not speaks_as_shipped(bench):
+        raise InputError("--bench", args.bench, "a bench with the frames of the shipped one: our nodes have no others")
     if bus.partition(":")[0] in EMBEDDED_NAMES:
         given = "" if args.bus == "auto" else args.bus
         raise InputError("--bus", given, "a bus between programs, such as udp_multicast or socketcan:vcan0")
@@ -46,7 +51,7 @@ def run_command(args: argparse.Namespace) -> int:
     clock = WallClock()
     ended: list[int] = []
     with contextlib.ExitStack() as stack:
-        link = Link(open_can(bus), clock.now)
+        link = Link(open_can(bus, bench.bitrate), clock.now)
         opened_ns = clock.now()
         stack.callback(link.close)
         node = make_node(args, bus, link, stack, is_compiled)
