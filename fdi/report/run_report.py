@@ -418,7 +418,7 @@ class _View(NamedTuple):
         return self.trace.t[self.rows]
 
     def read(self, name: str) -> Floats:
-        """A signal over the window; `error` is Com - XJ, `speed` that of the ram over 20 cycles. SI."""
+        """A signal over the window; `error` is Com - XJ, `speed` that of the ram over 20 ms. SI."""
         trace = self.trace
         if name == "speed":
             return _compute_speed(trace.xj, trace.period)[self.rows]
@@ -433,7 +433,7 @@ class _View(NamedTuple):
     def compute_share(self) -> Floats:
         """How much of the step XJ has done, %; filtered as the checks do it."""
         before, size = self.step
-        return 100.0 * (_filter_median(self.read("xj")) - before) / size
+        return 100.0 * (_filter_median(self.read("xj"), self.trace.period) - before) / size
 
 
 def draw_failed_check(trace: Trace, check: Check, salt: str = "check") -> str:
@@ -499,7 +499,7 @@ def _draw_size(view: _View) -> Panel:
     check, is_error = view.check, view.check.kind != "never_exceeds"
     name = "error" if is_error else check.signal
     values = view.read(name) / UNIT_SIZES[check.unit]
-    filtered = _filter_median(values) if is_error else values
+    filtered = _filter_median(values, view.trace.period) if is_error else values
     middle = 0.0
     sides: tuple[float, ...] = BOTH
     if check.kind == "break_away":
@@ -602,15 +602,17 @@ def _name_value(check: Check) -> str:
     return attach_unit(f"measured {check.value:.4g}", check.unit)
 
 
-def _filter_median(signal: Floats) -> Floats:
-    """Centred moving median of five samples, the ends repeated, as the checks take it (docs/sequences.md)."""
-    return np.median(np.lib.stride_tricks.sliding_window_view(np.pad(signal, 2, mode="edge"), 5), axis=1)
+def _filter_median(signal: Floats, period: float, span: float = 5e-3) -> Floats:
+    """Centred moving median over `span` s, the ends repeated, as the checks take it (docs/sequences.md)."""
+    half = int(span / period / 2 + 1e-9)
+    padded = np.pad(signal, half, mode="edge")
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1), axis=1)
 
 
-def _compute_speed(position: Floats, period: float, span: int = 20) -> Floats:
-    """Difference over `span` cycles, one-sided at the ends, m/s, as the checks take it."""
-    rows = np.arange(len(position))
-    ahead, behind = np.minimum(rows + span // 2, len(rows) - 1), np.maximum(rows - span // 2, 0)
+def _compute_speed(position: Floats, period: float, span: float = 20e-3) -> Floats:
+    """Difference over `span` s, one-sided at the ends, m/s, as the checks take it."""
+    rows, half = np.arange(len(position)), max(1, round(span / period / 2))
+    ahead, behind = np.minimum(rows + half, len(rows) - 1), np.maximum(rows - half, 0)
     return (position[ahead] - position[behind]) / (period * (ahead - behind))
 
 

@@ -1,0 +1,81 @@
+"""The rig tests the controllers of examples/ by their bench files: the sound ones pass, and none of the faulty ones."""
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from bus_stations import spec
+from example_devices import DRIVE, ECU, run_device
+from rig_command import Said, rig
+from short_sequences import SHORT, SLOW_START
+
+PATIENT = {DRIVE: (), ECU: ("--timeout", "60000")}  # in lockstep the rig may stop for as long as the machine likes
+IN_TIME = """
+[protocol]
+missing = 0.1
+response_p50 = 1.0
+response_p99 = 1.0
+response_max = 1.0
+"""  # in real time: on a busy machine an answer comes late
+TRIES = 3  # in real time, on a machine that may be busy
+examples = pytest.mark.parametrize("folder", [DRIVE, ECU], ids=lambda folder: folder.name)
+
+
+def run_bench(folder: Path, where: str, out: Path, *words: object, options: tuple[str, ...] = ()) -> Said:
+    """Run a sequence, preflight unless `words` begin with another one, against an example on a bus."""
+    with run_device(folder, where, *options):
+        return rig("run", *words, "--bench", folder / "bench.toml", "--bus", where, "--json", "--out", out)
+
+
+def list_failed(said: Said) -> list[str]:
+    """Names of the checks that failed."""
+    return [check["name"] for check in said.json["checks"] if not check["passed"]]
+
+
+@examples
+def test_preflight_passes_in_lockstep(tmp_path: Path, folder: Path) -> None:
+    said = run_bench(folder, spec("udp_multicast"), tmp_path, options=PATIENT[folder])
+    assert (said.status, said.json["verdict"], list_failed(said)) == (0, "PASS", [])
+
+
+@examples
+def test_a_short_run_passes_in_real_time(tmp_path: Path, folder: Path) -> None:
+    (tmp_path / "short.toml").write_text(SHORT + SLOW_START + IN_TIME)
+    for k in range(TRIES):
+        words = (tmp_path / "short.toml", "--pace", "realtime")
+        said = run_bench(folder, spec("udp_multicast"), tmp_path / str(k), *words)
+        if said.json["verdict"] not in ("ABORTED", "INVALID_TIMING"):
+            assert (said.status, said.json["verdict"], list_failed(said)) == (0, "PASS", [])
+            return
+    pytest.skip(f"the machine was too busy for {TRIES} runs in real time: {said.json['verdict']}")
+
+
+@examples
+def test_a_short_run_passes_on_each_bus(tmp_path: Path, folder: Path, where: str, bus_kind: str) -> None:
+    (tmp_path / "short.toml").write_text(SHORT + SLOW_START)
+    said = run_bench(folder, where, tmp_path / "run", tmp_path / "short.toml", options=PATIENT[folder])
+    assert (said.status, said.json["verdict"], list_failed(said)) == (0, "PASS", [])
+
+
+@pytest.mark.parametrize(("folder", "fault", "found_by"), [
+    *((folder, "wrong_sign", "guard 'ram far out'") for folder in (DRIVE, ECU)),
+    *((folder, "wrong_scaling", "current within its limit") for folder in (DRIVE, ECU)),
+    (DRIVE, "ignores_enable", "no current unless"), (ECU, "ignores_enable", "no current unless"),
+    *((folder, "stops_sending", "no drive frame") for folder in (DRIVE, ECU)),
+    (DRIVE, "stuck_status", "status word follows"), (ECU, "wrong_counter", "no drive frame"),
+])
+def test_a_faulty_controller_does_not_pass(tmp_path: Path, folder: Path, fault: str, found_by: str) -> None:
+    said = run_bench(folder, spec("udp_multicast"), tmp_path, options=("--fault", fault, *PATIENT[folder]))
+    cause = (said.json.get("cause") or {}).get("text", "")
+    assert said.status == 1 and said.json["verdict"] in ("FAIL", "ABORTED")
+    assert any(re.search(found_by, text) for text in [*list_failed(said), cause]), (list_failed(said), cause)
+
+
+def test_the_page_names_each_fault() -> None:
+    """What the page of an example lists is what its program takes."""
+    for folder in (DRIVE, ECU):
+        names = re.search(r"NAMES\[\] = \{(.*?)\}", (folder / "faults.c").read_text(), re.DOTALL)
+        assert names is not None
+        page = (folder / "README.md").read_text()
+        assert [name for name in re.findall(r'"(\w+)"', names[1])[1:] if f"`{name}`" not in page] == []
