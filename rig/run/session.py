@@ -146,6 +146,7 @@ class Session:
         self._may_power = True  # it may still use it when errors have gone meanwhile
         self._reset_at = 0  # the cycle of clean-up whose control word resets the faults
         self._demand = 0.0  # m, of the last cycle
+        self._enablings: list[tuple[int, Enabling]] = []  # all, with the cycle before which they were played
         self._words = PROFILES[job.bench.profile]
 
     def close(self) -> None:
@@ -155,6 +156,7 @@ class Session:
         """
         self._master.close()
         self._master.wire.is_node_gone = lambda: False
+        self._enablings.clear()
         self.stage.loop = None
 
     def bring_up(self) -> None:
@@ -172,8 +174,8 @@ class Session:
         self._master.wire.hear_all()
         self.stage.loop = open_loop(self._master, self.job.bench, self.scenario, self._faults, self.log, self.job.bus,
                                     self.job.realtime)
-        self._enabling = Enabling(self.job.bench, self.stage.loop, self.job.realtime, self._must_end)
-        self._enablings = [(0, self._enabling)]  # all, with the cycle before which they were played
+        first = Enabling(self.job.bench, self.stage.loop, self.job.realtime, self._must_end)
+        self._enablings.append((0, first))
         self.nodes.begin()
         self.stage.begun_ns, self.stage.is_playing = self.stage.clock.now(), True
         self._stalled_ns = self._master.wire.stalled_ns
@@ -208,7 +210,7 @@ class Session:
     def _enable(self) -> bool:
         """Enable a controller that confirms each step; False when the run is to end."""
         demand = float(self._setup.command[0]) if len(self._setup.command) else 0.0
-        return self._go_on(self._enabling.enable(demand))
+        return self._go_on(self._enablings[0][1].enable(demand))
 
     def _enable_again(self) -> None:
         """After the safe state: a controller that confirms each step climbs once more, and its fault is reset."""
@@ -225,7 +227,7 @@ class Session:
         if not self.job.bench.ready:
             return True
         words = [self._choose_control_word(phase, 0) for phase in (SETUP, MAIN)]
-        return self._go_on(self._enabling.await_ready(self._demand, *words))
+        return self._go_on(self._enablings[0][1].await_ready(self._demand, *words))
 
     def _go_on(self, problem: str) -> bool:
         """End the run because of a problem; whether it goes on."""
