@@ -324,7 +324,8 @@ def play_block(bus: str, seconds: float, is_compiled: bool = True, period_ns: in
         for _ in range(round(seconds * 1e9 / period_ns)):
             loop.cycle(CycleInput(1, 0.0, 0.0, 0))
         loop.finish()
-    return {name: history.column(name)[_SETTLING:].copy() for name in _QUANTITIES}
+    named = ("lateness", "execution") if is_foreign else _QUANTITIES  # its plant has no frames
+    return {name: history.column(name)[_SETTLING:].copy() for name in named}
 
 
 class _Log:
@@ -352,7 +353,8 @@ def summarise_contenders(times: Mapping[str, Times]) -> dict[str, Any]:
         quantity: {name: compute_percentiles(found[quantity]) for name, found in times.items() if quantity in found}
         for quantity in _QUANTITIES}
     tables["execution"].pop(PYTHON, None)  # it is another quantity there: up to SYNC
-    lost = {name: int(np.isnan(found["feedback_response"]).sum()) for name, found in times.items() if len(found) > 1}
+    lost = {name: int(np.isnan(found["feedback_response"]).sum()) for name, found in times.items()
+            if "feedback_response" in found}
     return {"times_us": tables, "lost": lost, "cycles": {name: len(found["lateness"]) for name, found in times.items()},
             "targets": list_targets(tables)}
 

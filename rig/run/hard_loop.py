@@ -313,7 +313,7 @@ class HardLoop(Loop):
         """Play some cycles without sending, then set the cycle's times: code and memory are in place at the start."""
         words, period = self._words, self._period
         self._prepare_cycle()
-        words[hc.DRY] = 1
+        words[hc.DRY], words[hc.GRACE] = 1, 0
         for _ in range(10):
             self._push(CycleInput(0, 0.0, 0.0, 0, is_counted=False))
             words[hc.DUE] = self._origin + self._wire.clock.now() + period

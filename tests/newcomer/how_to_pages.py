@@ -25,7 +25,9 @@ DATED = """mkdir unit7
 for month in 1 2 3 4; do
   rig simulate --set filter.clogging=0.0$((2 * month)) --seed $month --out unit7/2026-0$month-01.csv --quiet
 done"""
+EXAMPLES = f"cp '{ROOT}/examples/cia402_drive/drive.eds' drive_x.eds; cp '{ROOT}/examples/can_ecu/ecu.dbc' ecu.dbc"
 PARTS = (
+    Part("docs/bench.md", "From a data sheet", EXAMPLES),
     Part("docs/commands.md", "Run a test", f"{SEQUENCE}\nrig run --out sent --quiet && cp sent/trace.mcap sent.mcap"),
     Part("docs/commands.md", "Look at a run",
          f"{SAMPLES}\nmv run.csv before.csv; mv run2.csv after.csv; cp before.csv bench.csv\n"
