@@ -54,7 +54,12 @@ def write_parameter_page() -> list[str]:
 
 def make_plain_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """A table of `rig list`; the names are code."""
-    shown = [[quote_code(value) if key in ("name", "effects") else
-              "" if value is None else f"{value:g}" if isinstance(value, float) else escape_markup(str(value))
-              for key, value in row.items()] for row in rows]
+    shown = [[quote_code(value) if key in ("name", "effects") else _format_value(value) for key, value in row.items()]
+             for row in rows]
     return make_table(list(rows[0]), shown)
+
+
+def _format_value(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:g}" if isinstance(value, float) else escape_markup(str(value))

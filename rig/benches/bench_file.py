@@ -18,7 +18,7 @@ from rig.benches import canopen_map
 from rig.benches.bench import INPUTS, MEASURED, OUTPUTS, Bench, CanopenNode, Profile, decode_device_text
 from rig.benches.can_map import map_messages, read_database
 from rig.benches.checksums import CHECKSUMS, load_checksum
-from rig.benches.frame_map import FD, FrameMap, FrameSpec, Guard, Role, describe_identifier
+from rig.benches.frame_map import FD, MOST_FRAMES, FrameMap, FrameSpec, Guard, Role, describe_identifier
 from rig.benches.layout import PHASES, DeviceFrame, Use, build_fields, compute_counts, list_phases
 from rig.tables import Place, Range, build_dataclass, decode_text, list_choices, parse_table, read_file
 
@@ -205,6 +205,8 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, *, is_t
     specs = [_build_spec(frame, uses, Role.RIG if frame.is_received else Role.CONTROLLER) for frame in frames]
     if keys.plant_node is not None:
         specs, nodes[Role.PLANT] = _join_plant_node(reader, specs, sync, nodes, folder)
+    if len(specs) > MOST_FRAMES:
+        raise reader.place.refuse(f"at most {MOST_FRAMES} frames or pages of multiplexed ones, not {len(specs)}")
     phases, ready = _list_states(frames, uses)
     bench = Bench(name=keys.name, frames=FrameMap(frames=tuple(specs), sync=sync), nodes=nodes, plant=keys.plant,
                   cycle_ns=cycle_ns, bitrate=keys.bitrate, timeout_ns=timeout_ns, phases=phases, ready=ready,

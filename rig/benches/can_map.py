@@ -4,15 +4,15 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
-from typing import Any
-
-import cantools
-from cantools.database.can import Message, Signal
+from typing import TYPE_CHECKING, Any
 
 from plant.errors import InputError, suggest_name
 from rig.benches.frame_map import EXTENDED, FD, Field, Kind
 from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 from rig.tables import list_choices
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message, Signal
 
 _HUGE = re.compile(r"^\s*(?:BO_\s[^:\n]*:\s*\d{5}|SG_\s[^:\n]*:[^@\n]*\d{6}|SG_MUL_VAL_\s[^;]*-\s*\d{6})", re.MULTILINE)
 _LARGEST = 1e300
@@ -28,6 +28,8 @@ def read_database(name: str, text: str) -> Any:
     huge = _HUGE.search(text)
     if huge is not None:  # cantools would work on it for hours
         raise InputError(name, "", f"a DBC with lengths of CAN frames, not {huge[0].strip()[:100]!r}")
+    import cantools  # here: a CANopen bench has no DBC, and to load it takes 20 ms
+
     try:
         with silence_log("cantools"):  # what it warns of are messages that the bench does not use
             return cantools.database.load_string(text, "dbc", strict=False)

@@ -20,8 +20,7 @@ from rig.benches.frame_map import Field, FrameSpec, Guard, Kind, Role
 
 # Words of the layout: a scratch word, the payload, then counts and places of the tables
 _SCRATCH, PAYLOAD = 0, 8
-FRAMES, _FIELDS_AT, CHANNELS = 16, 17, 18
-VALUES_AT = 19  # where the values begin
+FRAMES, VALUES_AT = 16, 17  # how many frames, and where the values begin
 FRAMES_AT = 24
 # Columns of a frame. Of the loop: how many were sent, or the last alive counter; how many came wrong; the last cycle
 # in which one was taken, -1 before
@@ -32,7 +31,6 @@ FRAME_WORDS = 15
 COMMAND, FEEDBACK, VALVE, DRIVE = 1, 2, 4, 8
 ALL_ROLES = 0xFF
 _FIRST_OWN_BIT = 8
-MOST_FRAMES = 48
 # Columns of a field; the last five are doubles
 (_CHANNEL, _LOWEST, _BITS, _IS_BIG, _KIND, _RULE, _FIXED, _NUMERATOR, _DENOMINATOR, _OFFSET, _LOW, _HIGH) = range(12)
 _FIELD_WORDS = 12
@@ -277,8 +275,7 @@ def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], mine: Role
     data_ids = [one for each in frames for one in each.fields if one.data_ids]
     words = np.zeros(values + len(channels) + sum(1 + len(one.data_ids) for one in data_ids), np.int64)
     m = Layout(words, words.view(np.float64), words.view(np.float32), words.view(np.uint8))
-    words[FRAMES], words[_FIELDS_AT], words[CHANNELS] = len(frames), width, len(channels)
-    words[VALUES_AT], ids = values, values + len(channels)
+    words[FRAMES], words[VALUES_AT], ids = len(frames), values, values + len(channels)
     places = {name: i for i, name in enumerate(channels)}
     at, field = FRAMES_AT, width
     for number, each in enumerate(frames):

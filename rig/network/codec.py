@@ -68,14 +68,6 @@ class Status(IntFlag):
     ACTIVE = DISABLE | HOLD | MODE | READY
 
 
-class Flags(IntFlag):
-    """Object 0x2203: state of the plant emulator's input in this cycle."""
-
-    DRIVE_MISSING = 0x1  # no drive frame came for this cycle
-    DRIVE_LATE = 0x2  # the frame that came answers an earlier cycle
-    CURRENT_ZEROED = 0x4  # three in a row: the emulator applies no current (EMCY 0x8250)
-
-
 class Command(NamedTuple):
     """Position demand and control word from the rig, frame 0x202."""
 

@@ -108,7 +108,7 @@ Times = NDArray[np.int64]
 class CycleRecord(NamedTuple):
     """One entry a cycle, in order, each (n,). Times in ns of CLOCK_MONOTONIC, kept to a microsecond.
 
-    `flags` are those of the valve state frame (`codec.Flags`). In a cycle without the frames `sent` is when they would
+    `flags` are those of the valve state frame (`bench.Flags`). In a cycle without the frames `sent` is when they would
     have been sent.
     """
 

@@ -13,9 +13,9 @@ from typing import cast
 from dbc import EDS
 from plant import Model
 from plant.errors import InputError
+from rig.benches.bench import Flags
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
 from rig.network import codec
-from rig.network.codec import Flags
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import COUNTERS, PLANT, SCENARIO
 from rig.nodes.faulty_plant import FaultyPlant

@@ -22,6 +22,7 @@ from plant.flat import list_state_values
 from plant.machine_code import ADVANCE_CALL, READ_CALL
 from plant.run import PRESSURE, SENSED, SPOOL
 from plant.solve import NOISES
+from rig.benches.bench import Flags
 from rig.network.node_objects import RING
 from rig.network.raw_bus import (
     FRAME,
@@ -83,7 +84,7 @@ _FRAMES = ("drive", "feedback", "valve_state", "sync")
 _SIGNALS = ("xj", "p12", "xs")
 _ADDED, _HOLDS_READING, _HOLDS_VALUE = range(3)  # faults of a sensor
 
-_DRIVE_MISSING, _DRIVE_LATE, _CURRENT_ZEROED = 1, 2, 4  # codec.Flags
+DRIVE_MISSING, DRIVE_LATE, CURRENT_ZEROED = map(int, Flags)
 _LAST_SYNCHRONOUS = 240  # transmission types of PDOs (CiA 301, table 70)
 _TIMEOUT_CODE, _TIMEOUT_REGISTER = 0x8250, 0x11
 _MAXIMUM, _MINIMUM = 2.0**31 - 1.0, -(2.0**31)
@@ -345,8 +346,8 @@ def _judge_drive(port: Port, m: Memory, k: int, fresh: int) -> int:
         _announce_timeout(port, m, 0)
         return 0
     if fresh:
-        return _DRIVE_LATE | _miss(port, m, LATE)
-    return _DRIVE_MISSING | _miss(port, m, MISSING)
+        return DRIVE_LATE | _miss(port, m, LATE)
+    return DRIVE_MISSING | _miss(port, m, MISSING)
 
 
 def _miss(port: Port, m: Memory, counter: int) -> int:
@@ -358,7 +359,7 @@ def _miss(port: Port, m: Memory, counter: int) -> int:
         return 0
     m.reals[IN_FORCE] = 0.0
     _announce_timeout(port, m, 1)
-    return _CURRENT_ZEROED
+    return CURRENT_ZEROED
 
 
 def _announce_timeout(port: Port, m: Memory, raised: int) -> None:

@@ -22,12 +22,18 @@ class FaultyPlant:
         self.actuator = Actuator(scenario.model, scenario.seed)
         self.actuator.warm()
         self._changed = -1  # the last cycle whose parameters are in force
+        self._last: tuple[int, tuple[float, float, float] | None] = -1, None  # cycle and what the transducers said
 
     def read(self, k: int) -> tuple[float, float, float] | None:
         """What the transducers say in cycle k: XJ m, P12 Pa, XS m; None when the plant has diverged.
 
-        Call it once a cycle: it draws the noise and puts the faults of this cycle in force.
+        The first call in a cycle draws the noise and puts the faults of this cycle in force; another one says the same.
         """
+        if k != self._last[0]:
+            self._last = k, self._draw_readings(k)
+        return self._last[1]
+
+    def _draw_readings(self, k: int) -> tuple[float, float, float] | None:
         self._change_parameters(k)
         readings = self.actuator.sample()
         if not isfinite(sum(readings)):

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.segments import RATE, Array
-from rig.benches.bench import Bench
+from rig.benches.bench import Bench, Flags
 from rig.benches.frame_map import Role
-from rig.network.codec import Flags
 from rig.network.master import StartTime
 from rig.network.node_objects import CONTROLLER, PLANT, RIG
 from rig.sequences.faults import DELAY, BusOff, Offset, Parameter, Plan, Schedule, Silent, Stuck

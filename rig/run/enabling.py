@@ -10,10 +10,9 @@ from math import isclose, nan
 
 import numpy as np
 
-from rig.benches.bench import Bench
+from rig.benches.bench import Bench, Flags
 from rig.benches.profiles import PROFILES, State, choose_control, find_state
 from rig.network.clock import WallClock
-from rig.network.codec import Flags
 from rig.run.cyclic_values import CycleInput
 from rig.run.loop import Loop
 from rig.run.watch import PATIENCE, describe_silence

@@ -59,6 +59,9 @@ from rig.network.raw_bus import (
     sleep_until,
 )
 from rig.nodes.emulator_cycle import (
+    CURRENT_ZEROED,
+    DRIVE_LATE,
+    DRIVE_MISSING,
     FEEDBACK_FRAME,
     IN_FORCE,
     READINGS,
@@ -99,7 +102,6 @@ TIME, FRAME_HEAD, DATA = range(3)
 _HELD_DUE, _HELD_PLACE, _HELD_LENGTH, _HELD_DATA = range(4)
 HELD_COLUMNS = _HELD_DATA + 8
 
-_DRIVE_MISSING, _DRIVE_LATE, _CURRENT_ZEROED = 1, 2, 4  # flags of a row
 _LONG_WAIT = 20_000_000  # ns: answers that may take this long are awaited to 20 ms, with fewer system calls
 _SECOND_ANSWER_LIMIT = 80_000_000  # ns
 _PATIENCE = 5  # cycles in a row without all answers: a node that is gone must not make clean-up last minutes
@@ -455,10 +457,10 @@ def _judge_drive(buffers: Buffers, m: Layout, plant: Memory) -> int:
         words[DRIVES_MISSED] = 0
         return 0
     words[DRIVES_MISSED] += 1
-    flags = _DRIVE_LATE if words[IS_LATE] else _DRIVE_MISSING
+    flags = DRIVE_LATE if words[IS_LATE] else DRIVE_MISSING
     if words[DRIVES_MISSED] >= words[MISSED_LIMIT]:
         plant.reals[IN_FORCE] = 0.0
-        flags |= _CURRENT_ZEROED
+        flags |= CURRENT_ZEROED
     return flags
 
 

@@ -220,8 +220,8 @@ class CycleLoop(Loop):
     # ------------------------------------------------------------------------------------ the rig's own plant
 
     def _read_plant(self, plant: FaultyPlant, k: int) -> None:
-        """The readings of the cycle to come; before the run begins the first ones stay."""
-        if self.problem or (not self._step.is_counted and self._begun):
+        """The readings of the cycle to come."""
+        if self.problem:
             return
         readings = plant.read(k)
         if readings is None:

@@ -14,8 +14,8 @@ from fdi.progress import Progress
 from fdi.trace.trace import Trace
 from plant import Actuator, Columns, InputError
 from plant.segments import Array
+from rig.benches.bench import Flags
 from rig.network.clock import WallClock
-from rig.network.codec import Flags
 from rig.network.node_objects import CycleRecord
 from rig.network.raw_bus import can_open
 from rig.recorder import Check, Record, Recorder

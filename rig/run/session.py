@@ -17,7 +17,7 @@ import numpy as np
 from fdi.progress import Progress
 from plant.profile import Profile, build_profile
 from plant.segments import Hold
-from rig.benches.frame_map import Role, make_reader
+from rig.benches.frame_map import make_reader
 from rig.benches.profiles import PROFILES, State
 from rig.network.frame import Frame
 from rig.network.link import EmbeddedWire
@@ -65,7 +65,7 @@ class CycleLog:
         self.history = History()
         self.after = History()  # the probe after clean-up
         self.due_ns = array("q")  # log time of each cycle
-        self._drive = next(each for each in job.bench.frames.list_from(Role.CONTROLLER) if each.has("current"))
+        self._drive = job.bench.frames.drive
         self._drives: list[Frame] = []
         self._words = PROFILES[job.bench.profile]
         self._unjudged: list[Signals] = []  # rows that the guards have not seen

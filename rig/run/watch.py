@@ -7,10 +7,9 @@ from math import isnan
 
 from canopen.emcy import EmcyError
 
-from rig.benches.bench import Bench
+from rig.benches.bench import Bench, Flags
 from rig.benches.frame_map import Role, describe_identifier
 from rig.device.emcy import EmcyCode
-from rig.network.codec import Flags
 from rig.network.master import HEARTBEAT_LIMIT, Master
 from rig.network.node_objects import CONTROLLER, PLANT, RIG, NmtState
 from rig.recorder import NmtState as NmtRecord
@@ -203,7 +202,7 @@ def describe_silence(bench: Bench, cycles: int) -> str:
 
 def describe_missing(bench: Bench, cycles: int) -> str:
     """That no drive frame has come for so many cycles; its name and identifier are those of the bench."""
-    frame = next(each for each in bench.frames.list_from(CONTROLLER) if each.has("current"))
+    frame = bench.frames.drive
     return f"no frame {frame.name} ({describe_identifier(frame.identifier)}) for {cycles} cycles"
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from plant.controller import Loop, compute_current
 from plant.segments import Array, Second
-from rig.benches.bench import Bench
+from rig.benches.bench import Bench, Flags
 from rig.benches.bench_file import load_bench
 from rig.benches.canopen_map import name_object
 from rig.benches.frame_map import Role
@@ -30,7 +30,6 @@ from rig.benches.profiles import (
     list_reachable,
     list_transitions,
 )
-from rig.network.codec import Flags
 from rig.sequences.checks import CheckResult, SkippedCheck
 from rig.sequences.measures import map_words
 from rig.tables import Range

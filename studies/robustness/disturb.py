@@ -28,10 +28,10 @@ import numpy as np
 
 from fdi.trace.trace import Trace
 from plant.errors import RigError
+from rig.benches.bench import Flags
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
-from rig.network.codec import Flags
 from rig.network.frame import Frame
 from rig.network.link import Link
 from rig.network.udp import PORT, find_key

@@ -262,6 +262,20 @@ def test_a_mistake_in_a_dbc_is_one_line(old: str, new: str, error: str, tmp_path
     assert error in read_mistake(write_bench(tmp_path, CAN_BENCH, ecu_dbc=DBC.replace(old, new)))
 
 
+def test_more_frames_than_the_compiled_loops_tell_apart_are_one_line(tmp_path: Path) -> None:
+    """A value beside the selector makes each page a frame."""
+    pages = "".join(f' SG_ Value{n} m{n} : 32|8@1+ (1,0) [0|0] "" Rig\n' for n in range(60))
+    dbc = ('VERSION ""\nNS_ :\nBS_:\nBU_: Rig Ecu\n\nBO_ 1 Demand: 8 Rig\n'
+           ' SG_ Position : 0|32@1- (1,0) [0|0] "um" Ecu\n SG_ Ram : 32|32@1- (1,0) [0|0] "um" Ecu\n\n'
+           'BO_ 2 Drive: 8 Ecu\n SG_ Page M : 0|8@1+ (1,0) [0|0] "" Rig\n SG_ Current : 8|16@1- (1,0) [0|0] "uA" Rig\n'
+           f'{pages}')
+    bench = ('name = "x"\n[controller]\nprotocol = "can"\ndbc = "ecu.dbc"\n[controller.inputs]\n'
+             'position_demand = "Demand.Position"\nram_position = "Demand.Ram"\n[controller.outputs]\n'
+             'current = "Drive.Current"\n[controller.ready]\n"Drive.Value0" = 1\n')
+    assert "at most 48 frames or pages of multiplexed ones, not 61" in read_mistake(
+        write_bench(tmp_path, bench, ecu_dbc=dbc))
+
+
 @pytest.mark.parametrize("name, error", [
     ("nope", "nope: expected a .toml file, or 'eha', not 'nope'"), ("nope.toml", "nope.toml: expected a file that ca"),
 ])

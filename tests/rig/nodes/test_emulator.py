@@ -10,9 +10,9 @@ import pytest
 from node_bench import MS, PlantDesk
 
 from plant import Actuator, Model
+from rig.benches.bench import Flags
 from rig.device import Abort, NmtState
 from rig.network import codec
-from rig.network.codec import Flags
 from rig.network.node_objects import COUNTERS
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import (
