@@ -9,6 +9,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from plant import signals
 from plant.effects import register_base
 from plant.effects.sensors import Quantisation
 from plant.effects.valve import Compressibility
@@ -17,6 +18,7 @@ from plant.parameters import GROUPS, convert_group_unit, read_shipped_model
 from plant.plants import Array, MeasuredPressures, Plant, Table, Term
 from plant.ports import at_current, at_position, at_valve
 from plant.quantity import Quantity
+from plant.signals import Signals
 from plant.state import Input, Line, Ports, State
 from plant.step import step_jack
 
@@ -188,7 +190,8 @@ LOGGER_SOURCES = ("time", "ADC1_Channel_2", "ADC1_Channel_3", "ADC1_Channel_6", 
 
 PLANT = Plant(
     name="ehs",
-    unit="raw",
+    signals=Signals(*(s._replace(unit="raw", quantity="speed of the motor") if s.role == "drive" else s
+                      for s in signals.EHA[1:])),
     step=step_servo,
     coefficients=compute_servo_coefficients,
     groups=PARAMETER_GROUPS,

@@ -14,12 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from plant import signals
 from plant import step as reference
 from plant.compile import Function, list_called_names
 from plant.effects import Effect
 from plant.errors import InputError
 from plant.parameters import GROUPS, load_nominal_values
 from plant.quantity import Quantity
+from plant.signals import Signals
 
 Array = NDArray[np.float64]
 MODULES = {"ehs": "plant.ehs"}  # plants beside the reference model; read when first named
@@ -68,7 +70,7 @@ class Plant:
     """One kind of actuator."""
 
     name: str
-    unit: str  # of what drives it, the columns `cor`
+    signals: Signals  # what commands it, drives it and is measured of it
     step: Function  # (state, input, parameters, coefficients) -> state
     coefficients: Function  # (parameters, step length) -> a NamedTuple of floats
     groups: Mapping[str, type[Any]]  # its parameters
@@ -100,6 +102,11 @@ class Plant:
             calls = calls | list_called_names(reference.apply_changing_oil)
         return frozenset({"command", "reading"} | {name[3:] for name in calls if name.startswith("at_")})
 
+    @property
+    def unit(self) -> str:
+        """Unit of what drives it."""
+        return self.signals.drive.unit
+
     def offers(self, e: Effect) -> bool:
         """Whether the plant has the port, the parameters and the unit of current that an effect needs."""
         if e.plant not in ("", self.name) or e.name in self.lacks:
@@ -130,4 +137,5 @@ def list_plants() -> tuple[str, ...]:
 
 @cache
 def _build_reference_plant() -> Plant:
-    return Plant("eha", "A", reference.step_plant, reference.compute_coefficients, GROUPS, load_nominal_values())
+    return Plant("eha", signals.EHA, reference.step_plant, reference.compute_coefficients, GROUPS,
+                 load_nominal_values())

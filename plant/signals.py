@@ -1,0 +1,81 @@
+"""The signals of a plant, as it declares them: what commands it, what drives it, what of it is measured."""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+ROLES = ("time", "command", "drive", "load", "output")
+
+
+class Signal(NamedTuple):
+    """A commanded or measured quantity of an actuator."""
+
+    name: str  # of its column in a recording
+    symbol: str  # as figures and tables have it
+    unit: str  # SI, or a unit of the plant's own such as raw
+    quantity: str  # what it is, for people
+    role: str = "output"  # one of ROLES; the first output is the one that the controller controls
+    noise: str = ""  # "group.field" of the parameter that holds its sensor's noise
+
+    def __repr__(self) -> str:
+        return f"<Signal {self.name}: {self.quantity}, {self.unit}>"
+
+
+class Signals(tuple[Signal, ...]):
+    """The signals of one plant in the order of its columns, `t` first."""
+
+    def __new__(cls, *declared: Signal) -> Signals:
+        """The signals with time in front.
+
+        Raises:
+            ValueError: two of one name, an unknown role, or not exactly one command, one drive and at least one output.
+        """
+        made = super().__new__(cls, (Signal("t", "t", "s", "time", "time"), *declared))
+        for role, most in (("time", 1), ("command", 1), ("drive", 1), ("load", 1), ("output", 99)):
+            found = [s.name for s in made if s.role == role]
+            if len(found) > most or (not found and role != "load"):
+                raise ValueError(f"expected {'one signal' if most == 1 else 'signals'} of role {role}, not {found}")
+        if len({s.name for s in made}) < len(made) or not {s.role for s in made} <= set(ROLES):
+            raise ValueError(f"expected different names, and roles of {', '.join(ROLES)}: {', '.join(map(repr, made))}")
+        return made
+
+    def find(self, name: str) -> Signal:
+        """The signal of that name. Raises KeyError."""
+        for signal in self:
+            if signal.name == name:
+                return signal
+        raise KeyError(name)
+
+    @property
+    def command(self) -> Signal:
+        """What the controller is asked for."""
+        return next(s for s in self if s.role == "command")
+
+    @property
+    def drive(self) -> Signal:
+        """What the controller answers, and what drives the plant."""
+        return next(s for s in self if s.role == "drive")
+
+    @property
+    def load(self) -> Signal | None:
+        """The external load, None if the plant has none."""
+        return next((s for s in self if s.role == "load"), None)
+
+    @property
+    def outputs(self) -> tuple[Signal, ...]:
+        """What is measured of the plant, and what a replay predicts; the controlled one first."""
+        return tuple(s for s in self if s.role == "output")
+
+    @property
+    def controlled(self) -> Signal:
+        """The signal that the controller controls."""
+        return self.outputs[0]
+
+
+EHA = Signals(
+    Signal("com", "Com", "m", "position demand", "command"),
+    Signal("xj", "XJ", "m", "sensed ram position", noise="sensors.position_noise"),
+    Signal("cor", "Cor", "A", "current command of the servovalve", "drive"),
+    Signal("p12", "P12", "Pa", "pressure difference across the jack", noise="sensors.pressure_noise"),
+    Signal("xs", "XS", "m", "spool position", noise="sensors.spool_noise"),
+    Signal("load", "load", "N", "external force on the ram", "load"),
+)
