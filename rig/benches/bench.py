@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntFlag
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
-from rig.benches.frame_map import FrameMap, Role
+from rig.benches.frame_map import Field, FrameMap, Role
 
 Profile = Literal["cia402", "cia408", "none"]
 SERVICES = {0x080: "EMCY", 0x580: "SDO", 0x600: "SDO", 0x700: "heartbeat"}  # of a node: CiA 301, table of 7.3.5
@@ -28,6 +28,13 @@ class Flags(IntFlag):
     CURRENT_ZEROED = 0x4  # too many in a row: the plant gets no current
 
 
+class SignalObject(NamedTuple):
+    """The object of a device that holds a signal, and how."""
+
+    key: tuple[int, int]  # index, sub-index
+    field: Field
+
+
 @dataclass(frozen=True, kw_only=True)
 class CanopenNode:
     """A CANopen node of a bench."""
@@ -39,6 +46,8 @@ class CanopenNode:
     settings: tuple[tuple[int, int, str], ...] = ()  # objects (index, sub) that hold a parameter of the model
     values: tuple[tuple[int, int, bytes], ...] = ()  # of a DCF: written at bring-up
     emcy: tuple[int, ...] = ()  # error codes that its manual lists
+    inputs: Mapping[str, SignalObject] = field(default_factory=dict)  # signals that it receives
+    outputs: Mapping[str, SignalObject] = field(default_factory=dict)  # signals that it sends
 
     def find_cob_id(self, service: int) -> int:
         """The COB-ID of a service in the predefined connection set (CiA 301, 7.3.3), such as 0x580."""

@@ -15,7 +15,16 @@ from plant.errors import InputError
 from plant.parameters import GROUPS, find_field
 from plant.units import parse_quantity
 from rig.benches import canopen_map
-from rig.benches.bench import INPUTS, MEASURED, OUTPUTS, Bench, CanopenNode, Profile, decode_device_text
+from rig.benches.bench import (
+    INPUTS,
+    MEASURED,
+    OUTPUTS,
+    Bench,
+    CanopenNode,
+    Profile,
+    SignalObject,
+    decode_device_text,
+)
 from rig.benches.can_map import map_messages, read_database
 from rig.benches.checksums import CHECKSUMS, load_checksum
 from rig.benches.frame_map import FD, MOST_FRAMES, FrameMap, FrameSpec, Guard, Role, describe_identifier
@@ -378,7 +387,21 @@ def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use
         node = replace(node, profile=keys.profile, mode=mode, settings=tuple(_list_settings(
             reader.keys.plant, dictionary, keys.parameters, place.at("parameters"))))
     frames = canopen_map.map_pdos(eds, dictionary, keys.node, uses)
+    node = replace(node, inputs=_list_objects(frames, uses, is_received=True),
+                   outputs=_list_objects(frames, uses, is_received=False))
     return uses, frames, canopen_map.find_sync(dictionary), node
+
+
+def _list_objects(frames: list[DeviceFrame], uses: Mapping[str, Use], *, is_received: bool) -> dict[str, SignalObject]:
+    """The objects of a node by the signal that they hold."""
+    found = {}
+    for frame in (each for each in frames if each.is_received is is_received):
+        fields = {each.lowest: each for each in build_fields(frame, uses)}
+        for slot in frame.slots:
+            use, key = uses.get(slot.name), canopen_map.parse_object(slot.name)
+            if use is not None and use.signal and key is not None:
+                found[use.signal] = SignalObject(key, fields[slot.bits.lowest])
+    return found
 
 
 def _add_profile(uses: dict[str, Use], dictionary: Any, keys: ControllerKeys, place: Place) -> dict[str, Use]:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from fractions import Fraction
 from functools import cached_property
-from math import isnan
 
 EXTENDED = 1 << 31  # in an identifier: it has 29 bits, as in Linux's can_id
 FD = 1 << 30  # in an identifier: a CAN FD frame
@@ -69,7 +68,7 @@ class Field:
     data_id: int = 0  # of AUTOSAR's profile 1
     data_ids: tuple[int, ...] = ()  # of AUTOSAR's profile 2: by counter
 
-    @property
+    @cached_property
     def range(self) -> tuple[int, int]:
         """Smallest and largest counts of an integer."""
         if self.kind is Kind.SIGNED:
@@ -87,18 +86,39 @@ class Field:
         Raises:
             ValueError: NaN for an integer: no invented number is sent.
         """
-        # What count and offset are worth is a fraction, so that 0.005 m at 1e-7 m is 50000 and back 0.005 exactly.
-        counts = (value - float(self.offset)) * self.count.denominator / self.count.numerator
         if self.kind is Kind.FLOAT:
-            return encode_float(counts, self.length)
-        if isnan(counts):
-            raise ValueError(f"{self.name}: NaN")
+            return encode_float(self.compute_counts(value), self.length)
+        return int(self.compute_counts(value)) & (1 << self.length) - 1
+
+    def compute_counts(self, value: float) -> float:
+        """What the device's object holds for a value: limited and rounded to a whole number unless it is a float.
+
+        Raises:
+            ValueError: as of `encode`.
+        """
+        numerator, denominator, offset = self._worth
+        counts = (value - offset) * denominator / numerator
+        if self.kind is Kind.FLOAT:
+            return counts
         low, high = self.range
         if counts >= high:
             return high
         if counts <= low:
-            return low & (1 << self.length) - 1
-        return round(counts) & (1 << self.length) - 1
+            return low
+        return round(counts)  # of NaN: ValueError
+
+    def compute_value(self, counts: float) -> float:
+        """The value that these counts stand for, SI."""
+        numerator, denominator, offset = self._worth
+        return counts * numerator / denominator + offset
+
+    @cached_property
+    def _worth(self) -> tuple[int, int, float]:
+        """What a count is worth as two whole numbers, and the offset.
+
+        0.005 m at 1e-7 m is 50000 and back 0.005 exactly, for 10^7 is a floating point number and 10^-7 is none.
+        """
+        return self.count.numerator, self.count.denominator, float(self.offset)
 
     def decode(self, bits: int) -> float:
         """The value that these bits stand for, SI."""
@@ -107,7 +127,7 @@ class Field:
             counts = decode_float(bits, self.length)
         elif self.kind is Kind.SIGNED and bits >> self.length - 1:
             counts = bits - (1 << self.length)
-        return counts * self.count.numerator / self.count.denominator + float(self.offset)
+        return self.compute_value(counts)
 
 
 def encode_float(value: float, length: int) -> int:
@@ -250,6 +270,16 @@ class FrameMap:
     def is_fd(self) -> bool:
         """Whether there are CAN FD frames."""
         return any(each.identifier & FD for each in self.frames)
+
+    def find_role(self, role: str) -> FrameSpec:
+        """The frame that a sequence calls so: "command", "feedback", "valve_state" or "drive".
+
+        Raises:
+            StopIteration: there is none.
+        """
+        if role == "drive":
+            return self.drive
+        return next(each for each in self.frames if role in each.roles)
 
     @cached_property
     def drive(self) -> FrameSpec:

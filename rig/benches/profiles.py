@@ -5,7 +5,7 @@ before; a step down may skip others. The functions take plain numbers, so that c
 """
 from __future__ import annotations
 
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
 
@@ -21,6 +21,26 @@ class State(IntEnum):
     FAULT_REACTION = 6  # Fault reaction active
     FAULT = 7
     UNKNOWN = 8  # a status word that the profile does not have, or none yet
+
+
+class Control(IntFlag):
+    """Control word 0x6040 of CiA 408: all three level bits set = device mode active."""
+
+    DISABLE = 0x1  # D: 1 = not disabled
+    HOLD = 0x2  # H: 1 = hold released
+    MODE = 0x4  # M: 1 = device mode active, the loop is closed
+    RESET = 0x8  # R: a rising edge acknowledges a fault
+    ACTIVE = DISABLE | HOLD | MODE
+
+
+class Status(IntFlag):
+    """Status word 0x6041 of CiA 408: the level bits echo what is in force."""
+
+    DISABLE = 0x1
+    HOLD = 0x2
+    MODE = 0x4
+    READY = 0x8  # R: no fault
+    ACTIVE = DISABLE | HOLD | MODE | READY
 
 
 class ProfileWords(NamedTuple):

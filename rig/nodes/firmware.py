@@ -1,4 +1,4 @@
-"""Node 2, the reference firmware: a position loop in a CANopen device. With it the bench needs no external controller.
+"""The reference firmware: a position loop in a CANopen device. With it the bench needs no external controller.
 
 It answers each feedback frame with a drive frame. The control word (CiA 408) lets current flow only in device mode
 ACTIVE without a fault; any fault is latched until it has gone and the control word's reset bit rises.
@@ -9,13 +9,13 @@ import struct
 from math import isfinite
 from typing import cast
 
-from dbc import EDS
 from plant.controller import Loop, compute_current
 from plant.model import Model
 from plant.run import Demand
+from rig.benches.bench import SignalObject
+from rig.benches.bench_file import load_bench
+from rig.benches.profiles import Control, Status
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
-from rig.network import codec
-from rig.network.codec import Control, Status
 from rig.network.frame import Send
 from rig.network.node_objects import CONTROLLER, GAINS, Gains
 
@@ -35,7 +35,8 @@ class Firmware:
 
     def __init__(self, send: Send, gains: Gains | None = None, model: Model | None = None) -> None:
         self._taken = Demand(model or Model())
-        self.device = Device(CONTROLLER, EDS[CONTROLLER], send)
+        own = load_bench().nodes[CONTROLLER]
+        self.device = Device(own.node, own.eds, send)
         self.device.on_sync = self._on_sync
         self.device.on_rpdo = self._on_rpdo
         self.device.on_nmt = self._on_nmt
@@ -43,6 +44,10 @@ class Firmware:
         self.device.on_sync_lost = self._on_sync_lost
         self.device.on_write = self._on_write
         self._od = self.device.od.values
+        self._demand, self._position = own.inputs["position_demand"], own.inputs["ram_position"]
+        self._current = own.outputs["current"]
+        self._control, self._status_word = own.inputs["control_word"].key, own.outputs["status_word"].key
+        self._cycle, self._answered = own.inputs["cycle"].key, own.outputs["cycle"].key
         self._od.update({(GAINS, sub): value for sub, value in enumerate(gains or (), 1)})
         self._lost: set[int] = set()  # RPDOs whose loss was announced by EMCY; a restart does not take that back
         self._restart()
@@ -112,17 +117,19 @@ class Firmware:
         self._hear(_FEEDBACK)
         status = self._status()
         if status & _LOOP_CLOSED:
-            demand = codec.position(cast(int, self._od[0x2100, 0]))
-            position = codec.position(cast(int, self._od[0x2102, 0]))
+            demand, position = self._read(self._demand), self._read(self._position)
             current, self._loop = compute_current(self._loop, self._taken(demand, position), position, self._gains)
         else:
             current, self._loop = 0.0, Loop()
             self._taken.restart()
         self._drive(current, status)
 
+    def _read(self, place: SignalObject) -> float:
+        return place.field.compute_value(cast(float, self._od[place.key]))
+
     def _status(self) -> int:
         """Status word: the level bits of the control word, unless a fault is latched."""
-        control = cast(int, self._od[0x6040, 0])
+        control = cast(int, self._od[self._control])
         reset = bool(control & _RESET)
         if self._fault and reset and not self._acknowledged and not self.device.emcy.active:
             self._fault = False
@@ -134,8 +141,8 @@ class Firmware:
 
     def _drive(self, current: float, status: int) -> None:
         od = self._od
-        od[0x2104, 0] = codec.raw_current(current)
-        od[0x6041, 0] = status
-        od[0x2105, 0] = od[0x2101, 0]
+        od[self._current.key] = self._current.field.compute_counts(current)
+        od[self._status_word] = status
+        od[self._answered] = od[self._cycle]
         self.device.transmit(1)
 

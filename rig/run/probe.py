@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rig.network.codec import Control
+from rig.benches.profiles import Control
 from rig.run.cyclic_values import CycleInput
 from rig.run.loop import History
 from rig.sequences.faults import Schedule

@@ -24,7 +24,7 @@ from plant.model import build_initial_state, collect_bindings
 from plant.state import Input, Ports, State
 from plant.step import compute_coefficients, compute_metering_line, step_plant
 from plant.step import step_jack as ram
-from rig.network.codec import Control
+from rig.benches.profiles import Control
 
 MILLI = 1e-3
 FRICTIONLESS = {"jack.static_friction": 0.0, "jack.dynamic_friction": 0.0}
