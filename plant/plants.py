@@ -78,7 +78,8 @@ class Plant:
     has: tuple[str, ...] = ()  # effects of the nominal model
     lacks: tuple[str, ...] = ()  # effects that cannot be
     scatter: Mapping[str, float] | None = None  # tolerances, a fraction, of parameters; None: as their groups say
-    controller: bool = True  # the controller is known, so that Cor can be held against com and XJ
+    controller: bool = True  # the controller is known, so that the drive can be held against command and output
+    balances: bool = False  # `plant.forced` balances flow and force of its jack, as measured signals have them
     tables: tuple[Table, ...] = field(default=(), repr=False)  # of the files that its rig writes
     measured_pressures: MeasuredPressures | None = None  # how they drive the plant; None: they cannot
 
@@ -138,4 +139,4 @@ def list_plants() -> tuple[str, ...]:
 @cache
 def _build_reference_plant() -> Plant:
     return Plant("eha", signals.EHA, reference.step_plant, reference.compute_coefficients, GROUPS,
-                 load_nominal_values())
+                 load_nominal_values(), balances=True)

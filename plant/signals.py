@@ -15,6 +15,10 @@ class Signal(NamedTuple):
     quantity: str  # what it is, for people
     role: str = "output"  # one of ROLES; the first output is the one that the controller controls
     noise: str = ""  # "group.field" of the parameter that holds its sensor's noise
+    limit: str = ""  # "group.field" of the parameter that bounds its size, where one does
+    finest: float = 0.0  # RMS noise, SI, that no transducer of it is below
+    slight: float = 0.0  # change, SI, that a friction level off by a thousandth makes without any change of a stop
+    faint: float = 0.0  # range, SI; a signal that moves by less is in another unit
 
     def __repr__(self) -> str:
         return f"<Signal {self.name}: {self.quantity}, {self.unit}>"
@@ -46,6 +50,17 @@ class Signals(tuple[Signal, ...]):
         raise KeyError(name)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all but the time."""
+        return tuple(s.name for s in self[1:])
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """Names of those without which nothing can be replayed: command, controlled signal, drive; in their order."""
+        needed = {self.command.name, self.controlled.name, self.drive.name}
+        return tuple(name for name in self.names if name in needed)
+
+    @property
     def command(self) -> Signal:
         """What the controller is asked for."""
         return next(s for s in self if s.role == "command")
@@ -72,10 +87,13 @@ class Signals(tuple[Signal, ...]):
 
 
 EHA = Signals(
-    Signal("com", "Com", "m", "position demand", "command"),
-    Signal("xj", "XJ", "m", "sensed ram position", noise="sensors.position_noise"),
-    Signal("cor", "Cor", "A", "current command of the servovalve", "drive"),
-    Signal("p12", "P12", "Pa", "pressure difference across the jack", noise="sensors.pressure_noise"),
-    Signal("xs", "XS", "m", "spool position", noise="sensors.spool_noise"),
+    Signal("com", "Com", "m", "position demand", "command", limit="jack.travel"),
+    Signal("xj", "XJ", "m", "sensed ram position", noise="sensors.position_noise", limit="jack.travel", finest=5e-8,
+           slight=1e-6),
+    Signal("cor", "Cor", "A", "current command of the servovalve", "drive", limit="controller.current_limit"),
+    Signal("p12", "P12", "Pa", "pressure difference across the jack", noise="sensors.pressure_noise",
+           limit="supply.pressure", finest=2e3, slight=5e3, faint=1e3),
+    Signal("xs", "XS", "m", "spool position", noise="sensors.spool_noise", limit="spool.travel", finest=5e-8,
+           slight=5e-7, faint=1e-9),
     Signal("load", "load", "N", "external force on the ram", "load"),
 )
