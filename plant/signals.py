@@ -1,6 +1,7 @@
 """The signals of a plant, as it declares them: what commands it, what drives it, what of it is measured."""
 from __future__ import annotations
 
+from math import inf
 from typing import NamedTuple
 
 ROLES = ("time", "command", "drive", "load", "output")
@@ -15,10 +16,17 @@ class Signal(NamedTuple):
     quantity: str  # what it is, for people
     role: str = "output"  # one of ROLES; the first output is the one that the controller controls
     noise: str = ""  # "group.field" of the parameter that holds its sensor's noise
+    largest: float = inf  # a command or load beyond it, either way, is a mistake of units
     limit: str = ""  # "group.field" of the parameter that bounds its size, where one does
     finest: float = 0.0  # RMS noise, SI, that no transducer of it is below
     slight: float = 0.0  # change, SI, that a friction level off by a thousandth makes without any change of a stop
     faint: float = 0.0  # range, SI; a signal that moves by less is in another unit
+    noun: str = ""  # what people call that of which it is: ram, spool, current; default: its symbol
+
+    @property
+    def called(self) -> str:
+        """What it is of, in a word."""
+        return self.noun or self.symbol
 
     def __repr__(self) -> str:
         return f"<Signal {self.name}: {self.quantity}, {self.unit}>"
@@ -87,13 +95,14 @@ class Signals(tuple[Signal, ...]):
 
 
 EHA = Signals(
-    Signal("com", "Com", "m", "position demand", "command", limit="jack.travel"),
+    Signal("com", "Com", "m", "position demand", "command", largest=1.0, limit="jack.travel"),
     Signal("xj", "XJ", "m", "sensed ram position", noise="sensors.position_noise", limit="jack.travel", finest=5e-8,
-           slight=1e-6),
-    Signal("cor", "Cor", "A", "current command of the servovalve", "drive", limit="controller.current_limit"),
+           slight=1e-6, noun="ram"),
+    Signal("cor", "Cor", "A", "current command of the servovalve", "drive", limit="controller.current_limit",
+           noun="current"),
     Signal("p12", "P12", "Pa", "pressure difference across the jack", noise="sensors.pressure_noise",
            limit="supply.pressure", finest=2e3, slight=5e3, faint=1e3),
     Signal("xs", "XS", "m", "spool position", noise="sensors.spool_noise", limit="spool.travel", finest=5e-8,
-           slight=5e-7, faint=1e-9),
-    Signal("load", "load", "N", "external force on the ram", "load"),
+           slight=5e-7, faint=1e-9, noun="spool"),
+    Signal("load", "load", "N", "external force on the ram", "load", largest=1e6),
 )
