@@ -20,7 +20,7 @@ from plant.ports import at_current, at_position, at_valve
 from plant.quantity import Quantity
 from plant.signals import Signals
 from plant.state import Input, Line, Ports, State
-from plant.step import step_jack
+from plant.step import measure, step_jack
 
 ROD_SIDE = 0.686  # area of the rod side over that of the piston side; a 50 mm piston usually has a 28 mm rod
 COUNT = 2.5e-5  # m a count of the position sensor and of the demand
@@ -192,13 +192,15 @@ PLANT = Plant(
     name="ehs",
     signals=Signals(*(s._replace(unit="raw", quantity="speed of the motor") if s.role == "drive" else s
                       for s in signals.EHA[1:])),
+    parameters=PARAMETER_GROUPS,
+    state=State,
     step=step_servo,
+    measure=measure,
+    moves=("jack_position",),
     coefficients=compute_servo_coefficients,
-    groups=PARAMETER_GROUPS,
-    given=NOMINAL,
+    values=NOMINAL,
     has=("quantisation",),
     lacks=("constant_load", "aero_stiffness", "sensor_gain", "sensor_lag", "sensor_offset"),
-    controller=False,
     scatter={"pump.displacement": 0.1},
     tables=(Table(skip=60, separator=";", load=estimate_load, columns=PROCESSED_COLUMNS),
             Table(skip=60, separator=";", load=estimate_load_in_motion, columns=LOGGER_COLUMNS,

@@ -52,3 +52,18 @@ def solve_velocity(v0: float, impulse: float, push: float, line: float, slope: f
     low, high = 0.0 if v0 > 0.0 else -inf, 0.0 if v0 < 0.0 else inf
     v = v if v > low else low
     return v if v < high else high
+
+
+def solve_sliding(v0: float, impulse: float, dry: float, free: float) -> float:
+    """Velocity after the step of  m v' = F - c v - dry(v), implicit in v; it stops at zero before it turns round.
+
+    Args:
+        v0: velocity before, m/s or rad/s.
+        impulse: m v0 + h F, N s or N m s.
+        dry: h times the level of dry friction.
+        free: 1/(m + h c), one over the effective mass or inertia.
+    """
+    v = soften(impulse, dry) * free
+    low, high = 0.0 if v0 > 0.0 else -inf, 0.0 if v0 < 0.0 else inf
+    v = v if v > low else low
+    return v if v < high else high

@@ -18,6 +18,20 @@ def pass_signal(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Mem
     return x, m
 
 
+def port(unit: str, meaning: str) -> Function:
+    """A place in a plant's step where effects act; it is bound to a name at_NAME of the plant's file.
+
+    `signal, m = at_NAME(signal, m, s, u, p)` gives the signal as the effects change it, and their memories.
+
+    Args:
+        unit: of the signal.
+        meaning: of the signal, for people.
+    """
+    made = rebind_names(pass_signal)
+    made.port = (unit, meaning)
+    return made
+
+
 at_command = at_current = at_nozzle = at_feedback = at_spool_force = at_metering = pass_signal
 at_valve = at_load = at_jack_drag = at_position = at_reading = at_supply = at_viscosity = pass_signal
 

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from math import inf
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 ROLES = ("time", "command", "drive", "load", "output")
 
@@ -15,7 +15,7 @@ class Signal(NamedTuple):
     unit: str  # SI, or a unit of the plant's own such as raw
     quantity: str  # what it is, for people
     role: str = "output"  # one of ROLES; the first output is the one that the controller controls
-    noise: str = ""  # "group.field" of the parameter that holds its sensor's noise
+    noise: Any = ""  # of its sensor, RMS of one sample a cycle: "group.field" of a parameter, or a number
     largest: float = inf  # a command or load beyond it, either way, is a mistake of units
     limit: str = ""  # "group.field" of the parameter that bounds its size, where one does
     finest: float = 0.0  # RMS noise, SI, that no transducer of it is below
@@ -104,5 +104,10 @@ EHA = Signals(
            limit="supply.pressure", finest=2e3, slight=5e3, faint=1e3),
     Signal("xs", "XS", "m", "spool position", noise="sensors.spool_noise", limit="spool.travel", finest=5e-8,
            slight=5e-7, faint=1e-9, noun="spool"),
+    Signal("com", "Com", "m", "position demand", "command", largest=1.0),
+    Signal("xj", "XJ", "m", "sensed ram position", noise="sensors.position_noise"),
+    Signal("cor", "Cor", "A", "current command of the servovalve", "drive"),
+    Signal("p12", "P12", "Pa", "pressure difference across the jack", noise="sensors.pressure_noise"),
+    Signal("xs", "XS", "m", "spool position", noise="sensors.spool_noise"),
     Signal("load", "load", "N", "external force on the ram", "load", largest=1e6),
 )

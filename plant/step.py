@@ -220,3 +220,8 @@ def step_plant(s: State, u: Input, p: Any, k: Coefficients) -> State:
     return State(xf, vf, xs, vs, xj, vj, p12, sensed, Ports(
         m.command, m_current, m_supply, m_viscosity, m_nozzle, m_feedback, m_force, m_metering, m_valve, m_load,
         m_drag, m_position, m.reading))
+
+
+def measure(s: State, p: Any) -> tuple[float, float, float]:
+    """What the transducers show: XJ m, P12 Pa, XS m."""
+    return s.sensed, s.pressure, s.spool_position

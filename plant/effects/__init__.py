@@ -125,39 +125,56 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
     """
     if port not in Ports._fields:
         raise ValueError(f"no port {port!r}; there are {', '.join(Ports._fields)}")
-    free = group._fields if fitted is None else tuple(fitted)
-    if disturbance:
-        free = ()
-    if not set(free) <= set(group._fields):
-        raise ValueError(f"fitted are fields of {group.__name__} ({', '.join(group._fields)}), not {', '.join(free)}")
 
     def register(function: Law) -> Law:
         function = getattr(function, "py_func", function)  # an @njit function is welcome too
         known = CATALOGUE.list_all().get(name := function.__name__)
         if name in GROUPS or (known and known.file != Path(function.__code__.co_filename)):
             raise ValueError(f"{name}: the name is taken")
-        if set(group._fields) - set(group._field_defaults):
-            raise ValueError(f"{name}: every parameter needs a default, its off value")
-        meaning = {f"{name}.{field}": q for field, q in list_quantities(group).items()}
-        off = {f"{name}.{field}": float(x) for field, x in group._field_defaults.items()}
-        names = tuple(f"{name}.{field}" for field in free)
-        CATALOGUE.add_effect(Effect(name, port, law, symptoms, meaning, off, group, function, memory, disturbance,
-                                    names, _name_starts(names, starts), **more))
+        CATALOGUE.add_effect(build_effect(function, port, group, law=law, symptoms=symptoms, memory=memory,
+                                          disturbance=disturbance, fitted=fitted, starts=starts, **more))
         return function
 
     return register
+
+
+def build_effect(function: Law, port: str, group: type[Any], *, law: str, symptoms: str = "",
+                 memory: type[Any] | None = None, disturbance: bool = False, fitted: Sequence[str] | None = None,
+                 starts: Sequence[Start] = (), **more: Any) -> Effect:
+    """The effect of a law, with the arguments of `effect`.
+
+    Raises:
+        ValueError: an unknown field, or a parameter without default.
+    """
+    name = function.__name__
+    free = group._fields if fitted is None else tuple(fitted)
+    if disturbance:
+        free = ()
+    if not set(free) <= set(group._fields):
+        raise ValueError(f"fitted are fields of {group.__name__} ({', '.join(group._fields)}), not {', '.join(free)}")
+    if set(group._fields) - set(group._field_defaults):
+        raise ValueError(f"{name}: every parameter needs a default, its off value")
+    meaning = {f"{name}.{field}": q for field, q in list_quantities(group).items()}
+    off = {f"{name}.{field}": float(x) for field, x in group._field_defaults.items()}
+    names = tuple(f"{name}.{field}" for field in free)
+    return Effect(name, port, law, symptoms, meaning, off, group, function, memory, disturbance, names,
+                  _name_starts(names, starts), **more)
 
 
 def _name_starts(names: tuple[str, ...], values: Sequence[Start]) -> tuple[Mapping[str, float], ...]:
     return tuple(dict(zip(names, start if isinstance(start, tuple) else (start,), strict=True)) for start in values)
 
 
-def register_base(name: str, *fields: str, law: str, symptoms: str, starts: Sequence[Start],
-         groups: Mapping[str, type[Any]] = GROUPS, **more: Any) -> None:
-    """Register an effect that a plant has already, by the parameters of `groups` that carry it; a fit frees all."""
+def register_base(name: str, *fields: str, **more: Any) -> None:
+    """Register an effect that a plant has already: see `build_base_effect`."""
+    CATALOGUE.add_effect(build_base_effect(name, *fields, **more))
+
+
+def build_base_effect(name: str, *fields: str, law: str, symptoms: str = "", starts: Sequence[Start] = (),
+                      groups: Mapping[str, type[Any]] = GROUPS, **more: Any) -> Effect:
+    """An effect that a plant has already, by the parameters of `groups` that carry it; a fit frees all."""
     meaning = {field: list_quantities(groups[field.partition(".")[0]])[field.partition(".")[2]] for field in fields}
-    CATALOGUE.add_effect(Effect(name, "", law, symptoms, meaning, {}, fitted=fields,
-                                starts=_name_starts(fields, starts), **more))
+    return Effect(name, "", law, symptoms, meaning, {}, fitted=fields, starts=_name_starts(fields, starts), **more)
 
 
 def load_effects(path: Path, source: bytes | None = None) -> list[str]:
