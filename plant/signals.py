@@ -104,10 +104,5 @@ EHA = Signals(
            limit="supply.pressure", finest=2e3, slight=5e3, faint=1e3),
     Signal("xs", "XS", "m", "spool position", noise="sensors.spool_noise", limit="spool.travel", finest=5e-8,
            slight=5e-7, faint=1e-9, noun="spool"),
-    Signal("com", "Com", "m", "position demand", "command", largest=1.0),
-    Signal("xj", "XJ", "m", "sensed ram position", noise="sensors.position_noise"),
-    Signal("cor", "Cor", "A", "current command of the servovalve", "drive"),
-    Signal("p12", "P12", "Pa", "pressure difference across the jack", noise="sensors.pressure_noise"),
-    Signal("xs", "XS", "m", "spool position", noise="sensors.spool_noise"),
     Signal("load", "load", "N", "external force on the ram", "load", largest=1e6),
 )
