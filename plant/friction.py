@@ -55,7 +55,7 @@ def solve_velocity(v0: float, impulse: float, push: float, line: float, slope: f
 
 
 def solve_sliding(v0: float, impulse: float, dry: float, free: float) -> float:
-    """Velocity after the step of  m v' = F - c v - dry(v), implicit in v; it stops at zero before it turns round.
+    """Velocity after the step of  m v' = F - c v - dry(v), implicit in v; friction stops it where it would turn round.
 
     Args:
         v0: velocity before, m/s or rad/s.
@@ -64,6 +64,6 @@ def solve_sliding(v0: float, impulse: float, dry: float, free: float) -> float:
         free: 1/(m + h c), one over the effective mass or inertia.
     """
     v = soften(impulse, dry) * free
-    low, high = 0.0 if v0 > 0.0 else -inf, 0.0 if v0 < 0.0 else inf
+    low, high = 0.0 if v0 > 0.0 and dry > 0.0 else -inf, 0.0 if v0 < 0.0 and dry > 0.0 else inf
     v = v if v > low else low
     return v if v < high else high
