@@ -30,10 +30,10 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.link import Link
 from studies.robustness.nodes import start_nodes
+from studies.shipped_frames import COMMAND, DRIVE, FEEDBACK, SYNC, VALVE_STATE, unpack_frame
 
 SEQUENCE = """
 title = "A process of the bench stalls"
@@ -107,7 +107,7 @@ def wait_for_cycle(link: Link, cycle: int, run: subprocess.Popen[str]) -> bool:
     end = time.monotonic() + RUN_LIMIT
     while run.poll() is None and time.monotonic() < end:
         for frame in link.poll(0.02):
-            if frame.cob_id == codec.COMMAND and codec.unpack_command(frame.data).cycle >= cycle:
+            if frame.cob_id == COMMAND and unpack_frame(COMMAND, frame.data)["cycle"] >= cycle:
                 return True
     return False
 
@@ -139,7 +139,7 @@ def run_trial(case: Case, number: int, sequence: Path, folder: Path, group: str,
                case.pace, "--json", "--plant", "external" if standing else "builtin", "--out", str(out)]
     command += ["--controller", "external"] if standing else []
     link = Link(open_can(f"udp_multicast:{group}"), time.monotonic_ns)
-    link.leave_out((codec.SYNC, codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE))  # this program may be slow
+    link.leave_out((SYNC, FEEDBACK, VALVE_STATE, DRIVE))  # this program may be slow
     run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     is_reached = wait_for_cycle(link, 1, run)
     victim = run.pid if case.process == "rig" else (standing or find_children(run.pid)).get(case.process, 0)

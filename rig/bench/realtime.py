@@ -42,7 +42,7 @@ from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.benches.frame_map import Role
 from rig.firmware.build import build_device
-from rig.network import codec
+from rig.network import heartbeat
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
 from rig.network.link import Link, LinkWire, serve_node
@@ -157,7 +157,7 @@ def describe_conditions(figures: Mapping[str, Any]) -> Line:
                             f"{figures['bus']}, 1 ms a cycle, {figures['cpus']} CPUs, {priority}")
 
 
-_NMT, _BOOT_UP = 0x000, 0x700 + PLANT
+_NMT = 0x000
 _START, _RESET = 1, 130  # NMT commands, CiA 301 section 7.2.8.3.1
 
 
@@ -172,10 +172,12 @@ def build_responder(folder: Path) -> Path:
 @contextlib.contextmanager
 def run_c_responder(bus: str) -> Iterator[None]:
     """Run the responder in C on a bus while the context lasts, on the CPU and with the priority of the emulator."""
-    with tempfile.TemporaryDirectory() as folder, open_raw_bus(bus, [codec.SYNC]) as raw:
+    frames = load_bench().frames
+    with tempfile.TemporaryDirectory() as folder, open_raw_bus(bus, [frames.sync or 0]) as raw:
         receive, send, turn = raw.descriptors
-        feedback, valve = _pack(bus, codec.FEEDBACK), _pack(bus, codec.VALVE_STATE)
-        cycle_at = valve.index(_PAYLOAD) + 6
+        feedback, valve = (_pack(bus, frames.find_role(role).identifier) for role in ("feedback", "valve_state"))
+        number = next(each for each in frames.find_role("valve_state").fields if each.name == "cycle")
+        cycle_at = valve.index(_PAYLOAD) + number.lowest // 8
         cpu = list_cpus()[-min(2, len(list_cpus()))]
         words = [str(build_responder(Path(folder))), *map(str, (receive, send, turn, cpu, LOOP_PRIORITY, cycle_at)),
                  feedback.hex(), valve.hex()]
@@ -203,26 +205,28 @@ def run_emulator(bus: str, is_compiled: bool) -> Iterator[None]:
         RigError: it does not boot.
     """
     module = ["rig.cli.main", "node", "plant", "--quiet", "--bus"] if is_compiled else ["rig.bench.realtime"]
+    plant = load_bench().nodes[PLANT]
     with _run_process([sys.executable, "-m", *module, bus]) as process:
         link = Link(open_can(bus), time.monotonic_ns)
         try:
-            _wait_for(link, lambda: link.send(_NMT, bytes([_RESET, PLANT])), bytes([0]), process)
-            link.send(_NMT, bytes([_START, PLANT]))
+            _wait_for(link, lambda: link.send(_NMT, bytes([_RESET, plant.node])),
+                      plant.find_cob_id(heartbeat.COB_ID), process)
+            link.send(_NMT, bytes([_START, plant.node]))
             time.sleep(0.3)
         finally:
             link.close()
         yield
 
 
-def _wait_for(link: Link, ask: Callable[[], None], answer: bytes, process: subprocess.Popen[bytes],
+def _wait_for(link: Link, ask: Callable[[], None], boot_up: int, process: subprocess.Popen[bytes],
               limit: float = 120.0) -> None:
-    """Ask the emulator every second until its NMT error control says `answer`."""
+    """Ask the emulator every second until its boot-up comes."""
     end = time.monotonic() + limit
     while time.monotonic() < end and process.poll() is None:
         ask()
         again = time.monotonic() + 1.0
         while time.monotonic() < again:
-            if any(frame.cob_id == _BOOT_UP and frame.data == answer for frame in link.poll(0.1)):
+            if any(frame.cob_id == boot_up and frame.data == b"\0" for frame in link.poll(0.1)):
                 return
     raise RigError("the plant emulator does not boot")
 

@@ -107,6 +107,10 @@ class Field:
             return low
         return round(counts)  # of NaN: ValueError
 
+    def wrap_number(self, number: int) -> int:
+        """The number of a cycle as the field holds it."""
+        return number & (1 << self.length) - 1
+
     def compute_value(self, counts: float) -> float:
         """The value that these counts stand for, SI."""
         numerator, denominator, offset = self._worth
@@ -196,7 +200,7 @@ def _choose_bits(each: Field, values: Mapping[str, float], cycle: int) -> int:
     if each.fixed is not None:
         return each.fixed
     if each.name == "cycle":
-        return cycle & (1 << each.length) - 1
+        return each.wrap_number(cycle)
     return each.encode(values.get(each.name, 0.0))
 
 
@@ -265,6 +269,11 @@ class FrameMap:
     def __post_init__(self) -> None:
         for each in self.frames:
             self.by_identifier.setdefault(each.identifier, []).append(each)
+
+    @property
+    def identifiers(self) -> list[int]:
+        """Those of the frames, and of SYNC."""
+        return sorted({*self.by_identifier, *([] if self.sync is None else [self.sync])})
 
     @property
     def is_fd(self) -> bool:

@@ -96,6 +96,15 @@ def pack_frame(m: Layout, at: int, cycle: int) -> None:
 
 
 @keep_apart
+def read_cycle_number(m: Layout, at: int) -> int:
+    """The number of the cycle in the payload, which is that of the frame at `at`; -1 if it carries none."""
+    for field in range(m.words[at + _FIRST], m.words[at + _END], _FIELD_WORDS):
+        if m.words[field + _RULE] == _CYCLE:
+            return _read_bits(m, field)
+    return -1
+
+
+@keep_apart
 def unpack_frame(m: Layout, at: int, length: int, cycle: int) -> int:
     """Take the values of the frame at `at` from the payload: ACCEPTED, or why they are not taken.
 

@@ -205,12 +205,14 @@ COMMANDS = {
                 help="a recording: .csv or other text, .mf4, .mat, .parquet, .mcap, or a CAN log: .log (candump), "
                      ".blf, .asc, .trc"),
          option("--map", metavar="MAP.toml",
-                help="which column is which signal, in which unit (default: a CSV has our own columns, a CAN log our "
-                     "own frames)"),
+                help="which column is which signal, in which unit (default: a CSV has our own columns, a CAN log the "
+                     "frames of --bench)"),
          option("--guess", action="store_true",
                 help="write a first map (FILE.map.toml, or --out), with its reasons"),
          option("--force", action="store_true", help="let --guess replace a map that exists"),
-         option("--dbc", metavar="FILE", help="DBC that decodes the raw frames (default: the shipped eha.dbc)"))),
+         option("--dbc", metavar="FILE", help="DBC that decodes the raw frames (default: the bench; with --map "
+                                                     "the shipped eha.dbc)"),
+         BENCH, TRUST)),
     "list": Command(
         "list the names that other commands take: parameters, signals, sequences, effects, checks, models or benches",
         "Names come with unit, range and default.",
@@ -231,8 +233,7 @@ COMMANDS = {
         "run the plant emulator or the reference firmware alone on a CAN bus, opposite a rig or real hardware",
         "It runs until Ctrl-C or SIGTERM ends it, then reports the frames that it lost.",
         (option("node", choices=("plant", "controller"),
-                help="plant: the plant emulator, CANopen node 3; controller: the reference firmware of the "
-                     "controller, CANopen node 2"),
+                help="plant: the plant emulator; controller: the reference firmware of the controller"),
          option("--bus", default="auto", metavar="INTERFACE:CHANNEL",
                 help="the bus to join: socketcan:can0 is a CAN interface, udp_multicast works between programs on "
                      "this machine (needed, unless EHA_RIG_BUS names a bus)"),

@@ -1,1 +1,1 @@
-"""Reference firmware of node 2 in C99: sources, the generator of their object table, and how `rig` builds them."""
+"""Reference firmware in C99: sources, the generator of their object table, and how `rig` builds them."""

@@ -1,1 +1,1 @@
-"""Buses, links, wire, clock, codec and the CANopen master."""
+"""Buses, links, wire, clock and the CANopen master."""

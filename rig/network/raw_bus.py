@@ -14,10 +14,9 @@ A loop that must not be late is a plain function that calls `receive_frame` and 
         if status == FRAME: ...
         status = send_frame(port, cob_id, 8, data)
 
-`data` is the payload as one signed 64-bit integer, first byte lowest, bytes beyond `length` zero: `join_words` and
-`join_halves` build it, `split_words` and `split_halves` read it. A CAN FD frame has up to 64 bytes, of which `data` is
-the first 8. All bytes of the frame that came last stand at port.octets[PAYLOAD_IN: PAYLOAD_IN + length]; `send_payload`
-sends those at PAYLOAD_OUT, which `send_frame` overwrites.
+`data` is the payload as one signed 64-bit integer, first byte lowest, bytes beyond `length` zero. A CAN FD frame has up
+to 64 bytes, of which `data` is the first 8. All bytes of the frame that came last stand at port.octets[PAYLOAD_IN:
+PAYLOAD_IN + length]; `send_payload` sends those at PAYLOAD_OUT, which `send_frame` overwrites.
 
 All times are those of CLOCK_MONOTONIC, ns (`time.monotonic_ns()`); `receive_frame` gives the time at which the kernel
 received the frame. A port belongs to one thread. `bus.wake()` from another thread makes `receive_frame` return WOKEN
@@ -110,39 +109,6 @@ class Port(NamedTuple):
 def _integer(value: Any) -> int:
     """A number of an array as the integer that compiled code and Python calculate alike with: 64 bits, signed."""
     return int(np.int64(value))
-
-
-# ---------------------------------------------------------------------------------------- payloads
-
-
-def join_words(low: int, middle: int, high: int) -> int:
-    """Payload of INT32, UNSIGNED16, UNSIGNED16: command, valve state and drive (`codec.SIGNALS`)."""
-    return (low & 0xFFFFFFFF) | (middle & 0xFFFF) << 32 | _sign_word(high & 0xFFFF) << 48
-
-
-def join_halves(low: int, high: int) -> int:
-    """Payload of two INT32: feedback."""
-    return (low & 0xFFFFFFFF) | _sign_half(high) << 32
-
-
-def split_words(data: int) -> tuple[int, int, int]:
-    """INT32, UNSIGNED16, UNSIGNED16 of a payload."""
-    return _sign_half(data), data >> 32 & 0xFFFF, data >> 48 & 0xFFFF
-
-
-def split_halves(data: int) -> tuple[int, int]:
-    """The two INT32 of a payload."""
-    return _sign_half(data), data >> 32
-
-
-def _sign_half(value: int) -> int:
-    """The lower 32 bits as a signed number."""
-    return ((value & 0xFFFFFFFF) ^ 0x80000000) - 0x80000000
-
-
-def _sign_word(value: int) -> int:
-    """The lower 16 bits as a signed number: as the top bits of a payload they decide its sign."""
-    return ((value & 0xFFFF) ^ 0x8000) - 0x8000
 
 
 # ---------------------------------------------------------------------------------------- time

@@ -1,4 +1,4 @@
-"""Node 3, the plant emulator: the actuator behind a CANopen interface.
+"""The plant emulator: the actuator behind a CANopen interface.
 
 At each SYNC it reads its transducers and sends them, then moves the plant one cycle with the current that was latched:
 the answer to cycle k acts from cycle k+1. All faults are loaded before the start (object 0x2210), so a fault takes no
@@ -8,23 +8,22 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable
-from typing import cast
+from typing import NamedTuple, cast
 
-from dbc import EDS
 from plant import Model
 from plant.errors import InputError
-from rig.benches.bench import Flags
+from rig.benches.bench import Bench, CanopenNode, Flags
+from rig.benches.bench_file import load_bench
+from rig.benches.frame_map import FrameSpec
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
-from rig.network import codec
+from rig.network import heartbeat
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import COUNTERS, PLANT, SCENARIO
 from rig.nodes.faulty_plant import FaultyPlant
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import DELAY, DOUBLE, Plan, apply_action
 
-MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
-_NAMES = {codec.FEEDBACK: "feedback", codec.VALVE_STATE: "valve_state"}
-_HEARTBEAT = 0x700 + PLANT
+READINGS = ("ram_position", "load_pressure", "spool_position")  # signals of the transducers, in the plant's order
 _NO_FLAGS = Flags(0)  # made once: an operation on an IntFlag takes a microsecond
 
 
@@ -42,16 +41,58 @@ def accept_scenario(device: Device, data: bytes, load: Callable[[Scenario], None
         raise SdoAbort(Abort.VALUE) from error
 
 
+class PlantPlace(NamedTuple):
+    """The plant node of a bench: its objects, the frames that it sends and the one that it awaits."""
+
+    node: CanopenNode
+    sync: int
+    feedback: FrameSpec
+    valve_state: FrameSpec
+    drive: FrameSpec
+    most_missed: int  # drive frames in a row until the current is zeroed
+
+    @property
+    def frames(self) -> tuple[FrameSpec, FrameSpec, FrameSpec]:
+        """In the order of the compiled loop."""
+        return self.drive, self.feedback, self.valve_state
+
+    @classmethod
+    def find(cls, bench: Bench) -> PlantPlace:
+        """That of a bench.
+
+        Raises:
+            InputError: the bench has none, or one with other signals than those of the shipped bench.
+        """
+        try:
+            node = bench.nodes[PLANT]
+            found = cls(node, bench.frames.sync or 0, bench.frames.find_role("feedback"),
+                        bench.frames.find_role("valve_state"), bench.frames.drive, bench.most_missed)
+            for signals, known in (((*READINGS, "flags", "cycle"), node.outputs), (("current", "cycle"), node.inputs)):
+                for signal in signals:
+                    known[signal]
+        except (KeyError, StopIteration) as error:
+            raise InputError(bench.name, "plant_node", "frames of feedback and of valve state with the signals of the "
+                             f"shipped bench ({error})") from error
+        return found
+
+
 class Emulator:
     """The plant node. Its interface is `receive` and `tick`; `scenario` is used until the rig loads another."""
 
-    def __init__(self, send: Send, scenario: Scenario | None = None) -> None:
+    def __init__(self, send: Send, scenario: Scenario | None = None, bench: Bench | None = None) -> None:
         self._send = send
-        self.device = Device(PLANT, EDS[PLANT], self._transmit)
+        self._place = place = PlantPlace.find(bench or load_bench())
+        self._heartbeat = place.node.find_cob_id(heartbeat.COB_ID)
+        self._names = {place.feedback.identifier: "feedback", place.valve_state.identifier: "valve_state"}
+        self._written = [place.node.outputs[signal] for signal in READINGS]
+        self._flags, self._number = (place.node.outputs[signal] for signal in ("flags", "cycle"))
+        self._current, self._answered = (place.node.inputs[signal] for signal in ("current", "cycle"))
+        self.device = Device(place.node.node, place.node.eds, self._transmit)
         self.device.on_sync = self._on_sync
         self.device.on_write = self._on_write
         self.device.on_nmt = self._on_nmt
         self._od = self.device.od.values
+        self._drive = next(pdo for pdo in self.device.pdo.rpdos.values() if pdo.cob_id == place.drive.identifier)
         self._held: list[tuple[int, int, int, bytes]] = []  # late frames: due, order, COB-ID, data
         self._late: list[tuple[int, int, Frame]] = []
         self.load_scenario(scenario or Scenario(Model(), Plan(stop=0)))
@@ -79,7 +120,7 @@ class Emulator:
 
     def receive(self, frame: Frame) -> None:
         """A frame of another node arrived: a fault may delay or drop it."""
-        if frame.cob_id == codec.DRIVE:
+        if frame.cob_id == self._place.drive.identifier:
             action = self._faults.find_action("drive", self._cycle - 1)
             if action.code == DELAY:
                 heapq.heappush(self._late, (frame.t_ns + action.argument, len(self._late), frame))
@@ -87,8 +128,9 @@ class Emulator:
             for data in apply_action(action, frame.data):
                 self.device.receive(frame._replace(data=data))
             return
-        is_cycle = frame.cob_id == codec.SYNC and self._begun
-        if self._faults.is_bus_off("plant", self._cycle if frame.cob_id == codec.SYNC else self._cycle - 1):
+        is_sync = frame.cob_id == self._place.sync
+        is_cycle = is_sync and self._begun
+        if self._faults.is_bus_off("plant", self._cycle if is_sync else self._cycle - 1):
             if is_cycle:  # it receives nothing, but its plant goes on
                 self._pass_cycle()
             return
@@ -134,7 +176,7 @@ class Emulator:
 
     def _transmit(self, cob_id: int, data: bytes) -> None:
         """Send a frame unless a fault drops or delays it."""
-        name = _NAMES.get(cob_id)
+        name = self._names.get(cob_id)
         if name is not None:
             action = self._faults.find_action(name, self._cycle)
             if action.code == DELAY:
@@ -143,7 +185,7 @@ class Emulator:
             for what in apply_action(action, data):
                 self._send(cob_id, what)
             return
-        if cob_id == _HEARTBEAT and not self._first and not self._faults.is_heartbeat_alive("plant", self._cycle):
+        if cob_id == self._heartbeat and not self._first and not self._faults.is_heartbeat_alive("plant", self._cycle):
             return  # before the first SYNC there is no cycle: bring-up needs the heartbeat
         if not self._faults.is_bus_off("plant", self._cycle - 1):
             self._send(cob_id, data)
@@ -171,12 +213,9 @@ class Emulator:
             self.device.emcy.raise_error(EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")
             self.device.nmt.communication_error(0)
             return
-        xj, p12, xs = readings
-        od[0x2200, 0] = codec.raw_position(xj)
-        od[0x2201, 0] = codec.raw_pressure(p12)
-        od[0x2202, 0] = codec.raw_spool(xs)
-        od[0x2203, 0] = int(flags)
-        od[0x2204, 0] = k & 0xFFFF
+        for place, reading in zip(self._written, readings, strict=True):
+            od[place.key] = place.field.compute_counts(reading)
+        od[self._flags.key], od[self._number.key] = int(flags), self._number.field.wrap_number(k)
         self._moved = False
 
     def _judge(self, k: int) -> Flags:
@@ -185,10 +224,10 @@ class Emulator:
         A missing or late answer leaves the current as it was; after three in a row there is none (EMCY 0x8250) until
         answers come again.
         """
-        fresh = self.device.pdo.rpdos[1].fresh
-        if fresh and cast(int, self._od[0x2207, 0]) == (k - 1) & 0xFFFF:
-            self._plant.current = codec.current(cast(int, self._od[0x2205, 0]))
-            if self._missed >= MISSED_LIMIT:
+        fresh = self._drive.fresh
+        if fresh and self._od[self._answered.key] == self._answered.field.wrap_number(k - 1):
+            self._plant.current = self._current.field.compute_value(cast(float, self._od[self._current.key]))
+            if self._missed >= self._place.most_missed:
                 self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
             self._missed = 0
             return _NO_FLAGS
@@ -198,10 +237,10 @@ class Emulator:
         """No answer to the last cycle; the flag if it was one too many: then there is no current."""
         self._missed += 1
         self._od[COUNTERS, counter] = cast(int, self._od[COUNTERS, counter]) + 1
-        if self._missed < MISSED_LIMIT:
+        if self._missed < self._place.most_missed:
             return _NO_FLAGS
         self._plant.current = 0.0
-        self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01")
+        self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, bytes((self._drive.n,)))
         return Flags.CURRENT_ZEROED
 
     def _move(self) -> None:

@@ -11,6 +11,7 @@ after the answer to that cycle has come.
 """
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +24,19 @@ from plant.machine_code import ADVANCE_CALL, READ_CALL
 from plant.run import PRESSURE, SENSED, SPOOL
 from plant.solve import NOISES
 from rig.benches.bench import Flags
+from rig.benches.frame_map import FrameSpec, Role
+from rig.benches.packing import (
+    FRAME_WORDS,
+    FRAMES_AT,
+    LENGTH,
+    PAYLOAD,
+    VALUES_AT,
+    Layout,
+    make_layout,
+    pack_frame,
+    read_cycle_number,
+    unpack_frame,
+)
 from rig.network.node_objects import RING
 from rig.network.raw_bus import (
     FRAME,
@@ -31,17 +45,13 @@ from rig.network.raw_bus import (
     WOKEN,
     Port,
     await_frame,
-    join_halves,
-    join_words,
     read_clock,
     receive_frame,
     send_frame,
     sleep_until,
-    split_words,
 )
 from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, Schedule, change_frame
 
-MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
 NOISE_RING = 1 << 16  # cycles of noise drawn ahead
 EVENT_RING = 256
 _HELD_FRAMES = 4096  # late frames that can wait: two a cycle for the longest delay, and as many drives
@@ -54,14 +64,17 @@ INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 STOP, DEMOTED, PERIOD, SYNC_ID, DRIVE_ID, DRIVE_TYPE, EMCY_ID, OTHER_REGISTER, NOISE_FILLED = range(9)
 TPDOS_AT = 9  # rows of feedback and valve state, with the columns
 ID, TYPE, COUNT, DATA = range(4)  # COB-ID, -1: none; transmission type; and of the loop: SYNCs to go, payload
-# .. by the loop; from XJ on the objects from 0x2200 on:
-(XJ, P12, XS, FLAGS, FRAME_CYCLE, CURRENT, STATUS_WORD, ANSWERED, STATE, BEGUN, FIRST, CYCLE, MISSED, WAITING,
+# .. by the loop:
+(FRAME_CYCLE, ANSWERED, STATE, BEGUN, FIRST, CYCLE, MISSED, WAITING,
  WAITING_DATA, MISSING, LATE, ZEROED, PLANT_CYCLE, HELD, NOW, EVENTS, RECORDED, LAST_SYNC, LONGEST_WAKE,
  LONGEST_RESPONSE, LONGEST_CYCLE, PUSHED, PUSHED_TIME, PUSHED_ID, PUSHED_LENGTH, PUSHED_DATA, SHORT, UNSENT, FAILURE,
- RESET_COMMAND, SYNCED) = range(17, 54)
+ RESET_COMMAND, SYNCED) = range(17, 48)
 # .. by nobody: time of a cycle in ns, and where the tables are that depend on the plant and its faults
-(CYCLE_TIME, PARAMETERS, PARAMETERS_AT, SIGNALS, SIGNALS_AT, VALUES_AT, LOAD, LOAD_AT, FLAT, FLAT_AT, LIVE_AT,
- RECORD_SIZE, ADVANCE, READ, STEPS) = range(64, 79)
+(CYCLE_TIME, PARAMETERS, PARAMETERS_AT, SIGNALS, SIGNALS_AT, FAULT_VALUES_AT, LOAD, LOAD_AT, FLAT, FLAT_AT,
+ LIVE_AT, RECORD_SIZE, ADVANCE, READ, STEPS) = range(64, 79)
+# .. of the node: its node-ID, RPDO of the drive, mask of the cycle's number in it, and how many drives may be missing
+# in a row before the current is zeroed
+NODE, DRIVE_NUMBER, NUMBER_MASK, MISSED_LIMIT = range(48, 52)
 LEVELS_AT, SENSORS_AT = 80, 83  # of the three transducers: where their noise is in the record, their value in the state
 HITS_AT = 86  # of the kinds of frames below: where the rows begin, and behind the last where they end
 _WORDS = 96
@@ -82,12 +95,14 @@ COMMANDED = 256  # + the NMT command
 _DRIVE, FEEDBACK_FRAME, _VALVE, _SYNC, _BUS_OFF = range(5)
 _FRAMES = ("drive", "feedback", "valve_state", "sync")
 _SIGNALS = ("xj", "p12", "xs")
+# Values of the frames
+CHANNELS = ("ram_position", "load_pressure", "spool_position", "flags", "current", "status_word")
+_FLAGS, _CURRENT = CHANNELS.index("flags"), CHANNELS.index("current")
 _ADDED, _HOLDS_READING, _HOLDS_VALUE = range(3)  # faults of a sensor
 
 DRIVE_MISSING, DRIVE_LATE, CURRENT_ZEROED = map(int, Flags)
 _LAST_SYNCHRONOUS = 240  # transmission types of PDOs (CiA 301, table 70)
 _TIMEOUT_CODE, _TIMEOUT_REGISTER = 0x8250, 0x11
-_MAXIMUM, _MINIMUM = 2.0**31 - 1.0, -(2.0**31)
 
 _call_advance, _call_read = ForeignCall(ADVANCE_CALL), ForeignCall(READ_CALL)
 
@@ -108,10 +123,13 @@ class Memory(NamedTuple):
 
     reals: current in force, A; period, s; readings of the transducers; a ring of noise, NOISES a cycle;
     values of the faults; load, N a cycle; state and parameters of the plant.
+
+    frames: drive, feedback and valve state as the bench has them, with their values.
     """
 
     words: Words
     reals: Reals
+    frames: Layout
 
 
 def run_emulator(port: Port, m: Memory) -> int:
@@ -160,7 +178,7 @@ def _take_command(m: Memory, data: int) -> bool:
     """An NMT command to this node; True for a reset, which the services carry out. They hear of all from here."""
     words = m.words
     command, node = data & 0xFF, data >> 8 & 0xFF  # before its boot-up the node hears nothing
-    if words[STATE] == INITIALISING or (node != 0 and node != 3):
+    if words[STATE] == INITIALISING or (node != 0 and node != words[NODE]):
         return False
     if command == 129 or command == 130:
         words[RESET_COMMAND] = command
@@ -211,7 +229,7 @@ def _keep_drive(m: Memory, length: int, data: int) -> None:
     words = m.words
     if words[STATE] != OPERATIONAL:
         return
-    if length < 8:
+    if length < m.frames.words[FRAMES_AT + LENGTH]:
         if not words[SHORT]:
             _post_event(m, DRIVE_SHORT)
         words[SHORT] = 1
@@ -222,7 +240,21 @@ def _keep_drive(m: Memory, length: int, data: int) -> None:
     if words[DRIVE_TYPE] <= _LAST_SYNCHRONOUS:
         words[WAITING], words[WAITING_DATA] = 1, data
     else:
-        words[CURRENT], words[STATUS_WORD], words[ANSWERED] = split_words(data)
+        _read_drive(m, data)
+
+
+def _find_place(what: int) -> int:
+    """Where a frame stands in the layout."""
+    return FRAMES_AT + FRAME_WORDS * what
+
+
+@keep_apart
+def _read_drive(m: Memory, data: int) -> None:
+    """Put the values of a drive frame into the objects, whatever cycle it answers."""
+    frames = m.frames
+    frames.words[PAYLOAD] = data
+    m.words[ANSWERED] = read_cycle_number(frames, FRAMES_AT)
+    unpack_frame(frames, FRAMES_AT, frames.words[FRAMES_AT + LENGTH], m.words[ANSWERED])
 
 
 # ------------------------------------------------------------------------------------ cycle
@@ -247,7 +279,7 @@ def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
     fresh = words[WAITING]
     if fresh:
         words[WAITING] = 0
-        words[CURRENT], words[STATUS_WORD], words[ANSWERED] = split_words(words[WAITING_DATA])
+        _read_drive(m, words[WAITING_DATA])
     k = words[CYCLE]
     flags = 0
     if not words[FIRST]:
@@ -340,8 +372,8 @@ def _read_time(port: Port, m: Memory, t_ns: int) -> int:
 def _judge_drive(port: Port, m: Memory, k: int, fresh: int) -> int:
     """Flags of this cycle and the current to use until the next SYNC: see `Emulator._judge`."""
     words = m.words
-    if fresh and words[ANSWERED] == (k - 1) & 0xFFFF:
-        m.reals[IN_FORCE] = words[CURRENT] / 1e8
+    if fresh and words[ANSWERED] == (k - 1) & words[NUMBER_MASK]:
+        m.reals[IN_FORCE] = m.frames.doubles[m.frames.words[VALUES_AT] + _CURRENT]
         words[MISSED] = 0
         _announce_timeout(port, m, 0)
         return 0
@@ -355,7 +387,7 @@ def _miss(port: Port, m: Memory, counter: int) -> int:
     words = m.words
     words[MISSED] += 1
     words[counter] += 1
-    if words[MISSED] < MISSED_LIMIT:
+    if words[MISSED] < words[MISSED_LIMIT]:
         return 0
     m.reals[IN_FORCE] = 0.0
     _announce_timeout(port, m, 1)
@@ -372,7 +404,7 @@ def _announce_timeout(port: Port, m: Memory, raised: int) -> None:
     register = words[OTHER_REGISTER]
     data = register << 16
     if raised:
-        data = _TIMEOUT_CODE | (register | _TIMEOUT_REGISTER) << 16 | 1 << 24
+        data = _TIMEOUT_CODE | (register | _TIMEOUT_REGISTER) << 16 | words[DRIVE_NUMBER] << 24
     if words[EMCY_ID] >= 0 and not _is_bus_off(m, words[CYCLE] - 1):
         _send(port, m, words[EMCY_ID], 8, data)
 
@@ -403,13 +435,14 @@ def read_plant(m: Memory, k: int) -> bool:
 
 def _fill_frames(m: Memory, k: int, flags: int) -> None:
     """Put the readings of this cycle into the objects and the frames."""
-    words, reals = m.words, m.reals
-    words[XJ] = _count(reals[READINGS] * 1e7)
-    words[P12] = _count(reals[READINGS + 1] / 10.0)
-    words[XS] = _count(reals[READINGS + 2] * 1e9)
-    words[FLAGS], words[FRAME_CYCLE] = flags, k & 0xFFFF
-    words[TPDOS_AT + DATA] = join_halves(words[XJ], words[P12])
-    words[TPDOS_AT + 4 + DATA] = join_words(words[XS], words[FLAGS], words[FRAME_CYCLE])
+    frames, values = m.frames, m.frames.words[VALUES_AT]
+    for i in range(3):
+        frames.doubles[values + i] = m.reals[READINGS + i]
+    frames.doubles[values + _FLAGS] = flags
+    m.words[FRAME_CYCLE] = k
+    for what in (FEEDBACK_FRAME, _VALVE):
+        pack_frame(frames, _find_place(what), k)
+        m.words[TPDOS_AT + 4 * (what - FEEDBACK_FRAME) + DATA] = frames.words[PAYLOAD]
 
 
 @keep_apart
@@ -426,11 +459,6 @@ def advance_plant(m: Memory, k: int) -> None:
                   reals[IN_FORCE], load, noise, words[PLANT_CYCLE] * reals[_PERIOD],
                   0, 0, 1, words[RECORD_SIZE], base + 8 * words[LIVE_AT], 1, words[RECORD_SIZE], words[STEPS])
     words[PLANT_CYCLE] += 1
-
-
-def _count(value: float) -> int:
-    """The nearest INT32, half counts to the even one: see `codec`."""
-    return int(np.rint(min(max(value, _MINIMUM), _MAXIMUM)))
 
 
 def _record_cycle(m: Memory, k: int, t_ns: int, begun_ns: int, sent_ns: int, done_ns: int, flags: int) -> None:
@@ -473,10 +501,10 @@ def _send_pdo(port: Port, m: Memory, what: int, k: int, t_ns: int) -> bool:
     code, argument = find_action(m, what, k)
     if code == DELAY:
         now = t_ns if words[PERIOD] else words[NOW]
-        _hold_frame(m, what, now + argument, 8, words[at + DATA])
+        _hold_frame(m, what, now + argument, m.frames.words[_find_place(what) + LENGTH], words[at + DATA])
     if code in (DELAY, DROP):
         return False
-    length, data = change_frame(code, argument, 8, words[at + DATA])
+    length, data = change_frame(code, argument, m.frames.words[_find_place(what) + LENGTH], words[at + DATA])
     _send(port, m, words[at + ID], length, data)
     if code == DOUBLE:
         _send(port, m, words[at + ID], length, data)
@@ -611,7 +639,7 @@ def _set_parameters(m: Memory, k: int) -> None:
         at = words[PARAMETERS_AT] + 4 * i
         since = min(k - words[at + 1], words[at + 2] - 1)
         if since >= 0:
-            reals[words[LIVE_AT] + words[at]] = reals[words[VALUES_AT] + words[at + 3] + since]
+            reals[words[LIVE_AT] + words[at]] = reals[words[FAULT_VALUES_AT] + words[at + 3] + since]
 
 
 def _disturb(m: Memory, signal: int, value: float, k: int) -> float:
@@ -619,7 +647,7 @@ def _disturb(m: Memory, signal: int, value: float, k: int) -> float:
     words, reals = m.words, m.reals
     for i in range(words[SIGNALS]):
         at = words[SIGNALS_AT] + 5 * i
-        kind, first, place = words[at + 1], words[at + 2], words[VALUES_AT] + words[at + 4]
+        kind, first, place = words[at + 1], words[at + 2], words[FAULT_VALUES_AT] + words[at + 4]
         if words[at] != signal:
             continue
         if not first <= k < words[at + 3]:
@@ -649,11 +677,12 @@ def fill_noise(m: Memory, rng: np.random.Generator, least: int = 1024) -> None:
     m.words[NOISE_FILLED] = filled + free
 
 
-def make_memory(model: Model, load: list[float], schedule: Schedule, advance: int = 0, read: int = 0) -> Memory:
+def make_memory(model: Model, load: list[float], schedule: Schedule, advance: int = 0, read: int = 0,
+                frames: Sequence[FrameSpec] = ()) -> Memory:
     """Memory of the loop for a plant at rest, its load (N a cycle) and its faults; no noise is drawn yet.
 
     `advance`, `read`: addresses of the compiled `plant.solve.advance_flat_state` and, for a model with effects on its
-    readings, `read_flat_sensors`.
+    readings, `read_flat_sensors`. `frames`: drive, feedback and valve state, for a plant that is a node of its own.
     """
     names = {name: i for i, name in enumerate(model.list_names())}
     parameters: list[tuple[int, ...]] = []
@@ -684,12 +713,12 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
     words[PARAMETERS], words[SIGNALS], words[LOAD], words[FLAT] = len(parameters), len(signals), len(load), len(state)
     words[PARAMETERS_AT], words[SIGNALS_AT] = places[:2]
     words[HITS_AT: HITS_AT + len(hits) + 1] = places[2:]
-    words[VALUES_AT], words[LOAD_AT], words[FLAT_AT], words[LIVE_AT], _ = real_places
+    words[FAULT_VALUES_AT], words[LOAD_AT], words[FLAT_AT], words[LIVE_AT], _ = real_places
     words[RECORD_SIZE], words[ADVANCE], words[READ] = record.dtype.itemsize, advance, read
     words[LEVELS_AT: LEVELS_AT + 3] = [names[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
     words[SENSORS_AT: SENSORS_AT + 3] = SENSED, PRESSURE, SPOOL
     reals[_PERIOD] = model["controller.period"]
-    return Memory(words, reals)
+    return Memory(words, reals, make_layout(frames, CHANNELS, Role.PLANT))
 
 
 def _join_tables(start: int, kind: Any, *tables: Any) -> tuple[NDArray[Any], list[int]]:

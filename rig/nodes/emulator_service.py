@@ -1,4 +1,4 @@
-"""Node 3 on SocketCAN and UDP: the compiled cycle in a thread of its own, and beside it the CANopen services in Python.
+"""The plant node on SocketCAN and UDP: the compiled cycle in a thread of its own, and the CANopen services in Python.
 
 The loop hears the NMT commands and obeys them in the order of the bus, between two SYNCs; it passes them on to the
 services, which keep the state that heartbeat, SDO and EMCY need. All that they share are arrays (emulator_cycle.py).
@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from dbc import EDS
 from plant import Model
 from plant.compile import compile_function
 from plant.effects import CATALOGUE
@@ -26,25 +25,25 @@ from plant.machine_code import find_function_address
 from plant.model import build_kernel
 from plant.run import load_stored_advance, report_law_errors
 from plant.solve import NOISES, read_flat_sensors
+from rig.benches.bench import Bench
+from rig.benches.bench_file import load_bench
+from rig.benches.packing import VALUES_AT
 from rig.device import Device, EmcyCode, ErrorRegister, NmtState
-from rig.network import codec
+from rig.device.pdo import RPDO, TPDO
 from rig.network.frame import Frame, Send
-from rig.network.node_objects import COUNTERS, CYCLE_RECORD, PLANT, RING, SCENARIO, CycleRecord, encode_cycle_record
+from rig.network.node_objects import COUNTERS, CYCLE_RECORD, RING, SCENARIO, CycleRecord, encode_cycle_record
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
-from rig.nodes.emulator import accept_scenario
+from rig.nodes.emulator import PlantPlace, accept_scenario
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import Plan, Schedule
 
-# what the services need not hear: the PDOs, and what the loop hears
-LEFT_OUT = (0x000, codec.SYNC, codec.DRIVE, codec.COMMAND, codec.FEEDBACK, codec.VALVE_STATE)
-_HEARTBEAT, _EMCY, _SDO, _REPLY = 0x700 + PLANT, 0x080 + PLANT, 0x600 + PLANT, 0x580 + PLANT
 _COMPILED, _FIFO, _LOCKED, _PINNED = 1, 2, 4, 8  # 0x2211 sub 9
 _RAISED = {  # events of the loop: the errors that they raise
-    ec.TIMEOUT_RAISED: (EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01"),
-    ec.DRIVE_SHORT: (EmcyCode.PDO_TOO_SHORT, ErrorRegister.COMMUNICATION, b"\x01"),
-    ec.DIVERGED: (EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")}
-_CLEARED = {ec.TIMEOUT_CLEARED: (EmcyCode.RPDO_TIMEOUT, b""), ec.DRIVE_WHOLE: (EmcyCode.PDO_TOO_SHORT, b"\x01")}
+    ec.TIMEOUT_RAISED: (EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION),
+    ec.DRIVE_SHORT: (EmcyCode.PDO_TOO_SHORT, ErrorRegister.COMMUNICATION),
+    ec.DIVERGED: (EmcyCode.SOFTWARE, ErrorRegister.GENERIC)}
+_CLEARED = {ec.TIMEOUT_CLEARED: EmcyCode.RPDO_TIMEOUT, ec.DRIVE_WHOLE: EmcyCode.PDO_TOO_SHORT}
 _STOP_LIMIT = 5.0  # s: the longest that the loop waits inside a cycle is 1 s, for its turn to send
 
 
@@ -58,7 +57,7 @@ class EmulatorService:
     _memory: ec.Memory  # what the loop works on
 
     def __init__(self, send: Send, bus: RawBus, enter_thread: Callable[[], AbstractContextManager[str]],
-                 scenario: Scenario | None = None, is_locked: bool = False) -> None:
+                 scenario: Scenario | None = None, is_locked: bool = False, bench: Bench | None = None) -> None:
         self._send, self._bus, self._enter_thread, self._is_locked = send, bus, enter_thread, is_locked
         self._thread: threading.Thread | None = None
         self._kind = _COMPILED
@@ -67,7 +66,14 @@ class EmulatorService:
         self._booking = False  # an error whose EMCY the loop has sent
         self._scenario: Scenario | None = None
         self._seen = self._last_sync = 0
-        self.device = Device(PLANT, EDS[PLANT], self._transmit)
+        self._place = place = PlantPlace.find(bench or load_bench())
+        self._emcy, self._sdo, self._reply, self._heartbeat = map(place.node.find_cob_id, (0x080, 0x600, 0x580, 0x700))
+        self._unheard = list_unheard(bench or load_bench())
+        self.device = Device(place.node.node, place.node.eds, self._transmit)
+        pdo = self.device.pdo
+        self._drive = next(each for each in pdo.rpdos.values() if each.cob_id == place.drive.identifier)
+        self._tpdos = [next(each for each in pdo.tpdos.values() if each.cob_id == spec.identifier)
+                       for spec in (place.feedback, place.valve_state)]
         self.device.on_write = self._on_write
         self.device.on_nmt = self._on_nmt
         self._od = self.device.od.values
@@ -84,7 +90,12 @@ class EmulatorService:
     def _begin(self, scenario: Scenario, state: int | None) -> None:
         """Make new memory for the loop, whose next SYNC is the first; `state`: None for the one it is in."""
         schedule = Schedule(scenario.plan, scenario.model.values)
-        memory = ec.make_memory(scenario.model, scenario.load(), schedule, *compile_plant(scenario.model))
+        place = self._place
+        memory = ec.make_memory(scenario.model, scenario.load(), schedule, *compile_plant(scenario.model),
+                                place.frames)
+        answered = place.node.inputs["cycle"].field
+        memory.words[ec.NODE: ec.MISSED_LIMIT + 1] = (place.node.node, self._drive.n, answered.wrap_number(-1),
+                                                      place.most_missed)
         with self._stop_loop():
             words = memory.words
             words[ec.STATE] = self._memory.words[ec.STATE] if state is None else state
@@ -97,10 +108,10 @@ class EmulatorService:
 
     def receive(self, frame: Frame) -> None:
         """A frame for the services arrived."""
-        if frame.cob_id in LEFT_OUT or self._is_bus_off():
+        if frame.cob_id in self._unheard or self._is_bus_off():
             return
         self._book_events()
-        if frame.cob_id == _SDO:
+        if frame.cob_id == self._sdo:
             self._show_values(frame.data)
         self.device.receive(frame)
 
@@ -167,7 +178,7 @@ class EmulatorService:
         """Do what the loop has done at an NMT command, or left to the services."""
         self._obeying = True
         try:
-            self.device.receive(Frame(self.device.t_ns, 0, bytes((command, PLANT))))
+            self.device.receive(Frame(self.device.t_ns, 0, bytes((command, self.device.node_id))))
         finally:
             self._obeying = False
 
@@ -175,15 +186,16 @@ class EmulatorService:
 
     def _transmit(self, cob_id: int, data: bytes) -> None:
         """Send a frame of the services unless a fault or the loop has dealt with it."""
-        if cob_id == _EMCY and self._booking:
+        if cob_id == self._emcy and self._booking:
             return
-        if cob_id == _REPLY:
+        if cob_id == self._reply:
             self._share_settings()  # what SDO has written is in force when it is confirmed
-        if cob_id == _HEARTBEAT and data == bytes(1) and not self._memory.words[ec.STATE]:  # the first boot-up
+        if cob_id == self._heartbeat and data == bytes(1) and not self._memory.words[ec.STATE]:  # the first boot-up
             self._memory.words[ec.STATE] = ec.PRE_OPERATIONAL
         words = self._memory.words
         is_begun = words[ec.BEGUN] and not words[ec.FIRST]  # before the first SYNC there is no cycle
-        if cob_id == _HEARTBEAT and is_begun and not self._schedule.is_heartbeat_alive("plant", int(words[ec.CYCLE])):
+        if cob_id == self._heartbeat and is_begun and not self._schedule.is_heartbeat_alive("plant",
+                                                                                          int(words[ec.CYCLE])):
             return
         if not self._is_bus_off():
             self._send(cob_id, data)
@@ -206,7 +218,7 @@ class EmulatorService:
 
     def _share_settings(self) -> None:
         """What SDO may change, and the error register without the loop's own error."""
-        shared, od, pdo = self._memory.words, self.device.od, self.device.pdo
+        shared, od = self._memory.words, self.device.od
         shared[ec.PERIOD] = od.read_number(0x1006, 0)
         self._bus.use_kernel_times(bool(shared[ec.PERIOD]))
         emcy = od.read_number(0x1014, 0, 1 << 31)
@@ -214,22 +226,22 @@ class EmulatorService:
         others = [code for code in self.device.emcy.active if code != EmcyCode.RPDO_TIMEOUT]
         communication = any(code != EmcyCode.SOFTWARE for code in others)
         shared[ec.OTHER_REGISTER] = ErrorRegister.GENERIC * bool(others) | ErrorRegister.COMMUNICATION * communication
-        for row, number in enumerate((1, 2)):
-            at, kind = ec.TPDOS_AT + 4 * row, od.read_number(0x1800 + row, 2)
-            shared[at + ec.ID] = _encode_cob_id(pdo.tpdos[number].cob_id)
+        for row, tpdo in enumerate(self._tpdos):
+            at, kind = ec.TPDOS_AT + 4 * row, od.read_number(TPDO + tpdo.n - 1, 2)
+            shared[at + ec.ID] = _encode_cob_id(tpdo.cob_id)
             if shared[at + ec.TYPE] != kind:
                 shared[at + ec.TYPE] = shared[at + ec.COUNT] = kind
-        shared[ec.DRIVE_TYPE] = od.read_number(0x1400, 2)
+        shared[ec.DRIVE_TYPE] = od.read_number(RPDO + self._drive.n - 1, 2)
         heard = shared[ec.SYNC_ID], shared[ec.DRIVE_ID]
         shared[ec.SYNC_ID] = od.read_number(0x1005, 0, 0x80) & 0x7FF
-        shared[ec.DRIVE_ID] = _encode_cob_id(pdo.rpdos[1].cob_id)
+        shared[ec.DRIVE_ID] = _encode_cob_id(self._drive.cob_id)
         if heard != (shared[ec.SYNC_ID], shared[ec.DRIVE_ID]):
             wanted = 0, int(shared[ec.SYNC_ID]), int(shared[ec.DRIVE_ID])
             self._bus.set_filter([cob_id for cob_id in wanted if cob_id >= 0])
 
     def _book_events(self) -> None:
         """Take over what the loop has done or noticed: errors, whose EMCY it sends itself or leaves to the services."""
-        emcy, t_ns = self.device.emcy, self.device.t_ns
+        emcy, t_ns, number = self.device.emcy, self.device.t_ns, bytes((self._drive.n,))
         while self._seen < self._memory.words[ec.EVENTS]:
             event = self._memory.words[ec.EVENTS_AT + self._seen % ec.EVENT_RING]
             self._seen += 1
@@ -237,11 +249,11 @@ class EmulatorService:
             if event >= ec.COMMANDED:
                 self._obey(int(event) - ec.COMMANDED)
             elif event == ec.SYNC_MALFORMED:
-                self.device.sync.receive(Frame(t_ns, codec.SYNC, b"\0"))
+                self.device.sync.receive(Frame(t_ns, self._place.sync, b"\0"))
             elif event in _RAISED:
-                emcy.raise_error(*_RAISED[event])
+                emcy.raise_error(*_RAISED[event], b"\x03" if event == ec.DIVERGED else number)
             else:
-                emcy.clear(*_CLEARED[event])
+                emcy.clear(_CLEARED[event], number if event == ec.DRIVE_WHOLE else b"")
             if event == ec.DIVERGED:
                 self._obeying = True  # the loop has left OPERATIONAL
                 self.device.nmt.communication_error(0)
@@ -251,8 +263,14 @@ class EmulatorService:
     def _show_values(self, request: bytes) -> None:
         """Put the loop's values into the dictionary, which an SDO request is about to read."""
         shared, od = self._memory.words, self._od
-        for index in range(0x2200, 0x2208):
-            od[index, 0] = int(shared[ec.XJ + index - 0x2200])
+        node, frames = self._place.node, self._memory.frames
+        values = dict(zip(ec.CHANNELS, frames.doubles[frames.words[VALUES_AT]:], strict=False))
+        for places, cycle in ((node.outputs, ec.FRAME_CYCLE), (node.inputs, ec.ANSWERED)):
+            for signal, (key, field) in places.items():
+                if signal == "cycle":
+                    od[key] = field.wrap_number(int(shared[cycle]))
+                else:
+                    od[key] = field.compute_counts(values.get(signal, 0.0))
         longest = (shared[word] // 1000 for word in (ec.LONGEST_WAKE, ec.LONGEST_RESPONSE, ec.LONGEST_CYCLE))
         counts = (shared[ec.MISSING], shared[ec.LATE], shared[ec.RECORDED], shared[ec.UNSENT], self._bus.overflows,
                   *longest, self._kind)
@@ -267,6 +285,11 @@ class EmulatorService:
         times = self._memory.words[ec.TIMES_AT: ec.TIMES_AT + 6 * RING].reshape(-1, 6)
         rows = times[np.arange(max(0, recorded - RING), recorded) % RING]
         return CycleRecord(*rows.T)
+
+
+def list_unheard(bench: Bench) -> tuple[int, ...]:
+    """What the services need not hear: the frames of the bench, and what the loop hears."""
+    return 0x000, *bench.frames.identifiers
 
 
 def _encode_cob_id(cob_id: int | None) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 import time
 from array import array
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from math import nan
@@ -20,8 +20,9 @@ from fdi.trace.mcap_log import open_log
 from fdi.trace.sensor_dynamics import write_sensors
 from fdi.trace.trace import Trace
 from plant.errors import InputError
-from rig.network import codec
-from rig.network.frame import FD_FRAME, Frame
+from rig.benches.bench import Bench
+from rig.benches.frame_map import EXTENDED, FrameSpec, Role, describe_identifier, make_reader
+from rig.network.frame import BIT_RATE_SWITCH, FD_FRAME, Frame
 from rig.network.message import find_cob_id, make_message
 from rig.network.node_objects import NmtState as State
 from rig.recorder.schema import Event, NmtState, Record, Signals, collect_provenance
@@ -123,52 +124,70 @@ def _write_log(out: Path, attachments: Mapping[str, tuple[str, bytes]], metadata
         recorder.close()
 
 
-def import_frames(source: Path, out: Path, dbc: Path) -> int:
-    """Make a log from raw frames, decoded by `dbc` and cut into cycles at each SYNC; -> cycles.
+def import_frames(source: Path, out: Path, bench: Bench, dbc: Path | None = None) -> int:
+    """Make a log from the raw frames of a bench, cut into cycles at each SYNC or demand; -> cycles.
 
-    Row k holds the demand sent before SYNC k, what the plant sensed at it and the drive frame that echoes its number.
-    Raises InputError for a file or DBC that cannot be read, and when there is no SYNC in it.
+    Row k holds the demand of cycle k, what the plant sensed in it and the drive frame that answers it. `dbc` decodes
+    the frames in place of the bench.
+    Raises InputError for a file or DBC that cannot be read, and when there is no cycle in it.
     """
-    cycles = _CycleBuilder(_load_own_messages(dbc))
+    cycles = _CycleBuilder(bench, _find_readers(bench, dbc))
     items: list[Frame | tuple[int, Record]] = []
     for frame in _read_frames(source):
         items += [frame, *((frame.t_ns, record) for record in cycles.feed(frame))]
     starts = [t_ns for t_ns, _ in cycles.rows]
     if not starts:
-        raise InputError(source, "", f"at least one SYNC frame (0x{codec.SYNC:03X})")
+        sync = bench.frames.sync
+        begin = f"{bench.frames.find_role('command').name} frame" if sync is None else f"SYNC frame (0x{sync:03X})"
+        raise InputError(source, "", f"at least one {begin}")
     spans = np.sort(np.diff(starts))
-    period = round(float(spans[len(spans) // 2]) / 1e9, 4) if len(spans) else 1e-3
+    period = bench.cycle_ns / 1e9
+    if len(spans) and not 0.9 < spans[len(spans) // 2] / bench.cycle_ns < 1.1:  # it ran at another speed
+        period = round(float(spans[len(spans) // 2]) / 1e9, 4)
     items = sorted([*items, *cycles.rows], key=lambda item: item[0])
-    _write_log(out, {dbc.name: ("text/plain", dbc.read_bytes())},
+    decoding = {} if dbc is None else {dbc.name: dbc.read_bytes()}
+    _write_log(out, {name: ("text/plain", data) for name, data in {**bench.files, **decoding}.items()},
                collect_provenance(imported=source.name, period=period, pace="imported"), items)
     return len(starts)
 
 
-class _CycleBuilder:
-    """Frames in, one Signals a SYNC out; heartbeats and emergencies become records on the way."""
+_COLUMNS = {"position_demand": "com", "ram_position": "xj", "load_pressure": "p12", "spool_position": "xs",
+            "load_force": "load", "current": "cor", "control_word": "control", "status_word": "status",
+            "flags": "flags"}
+_WORDS = ("control", "status", "flags")
+_LASTING = ("position_demand", "control_word")  # in force until the next one comes
+Readers = Mapping[FrameSpec, Callable[[bytes], Mapping[str, float]]]
 
-    def __init__(self, messages: Mapping[int, Any]) -> None:
+
+class _CycleBuilder:
+    """Frames in, one Signals a cycle out; heartbeats and emergencies become records on the way."""
+
+    def __init__(self, bench: Bench, readers: Readers) -> None:
         self.rows: list[tuple[int, Signals]] = []
-        self._messages = messages
-        self._demand, self._control = nan, 0
+        self._frames, self._is_canopen, self._readers = bench.frames, bool(bench.nodes), readers
+        self._begin = bench.frames.find_role("command")  # a cycle begins with it where there is no SYNC
+        self._waiting: dict[str, float] = {}  # values for the next cycle
         self._sent: int | None = None  # cycle of the command since the last SYNC
         self._recent: deque[tuple[int, Signals]] = deque(maxlen=8)  # an answer is late by a few cycles at most
         self._nmt: dict[int, int] = {}
 
     def feed(self, frame: Frame) -> Iterable[Record]:
         """Take a frame; -> what is to be recorded besides rows."""
-        cob_id, node = frame.cob_id, frame.cob_id & 0x7F
-        if cob_id == codec.SYNC:
+        cob_id, node = frame.cob_id & ~BIT_RATE_SWITCH, frame.cob_id & 0x7F
+        spec = self._frames.find(cob_id, frame.data)
+        if cob_id == self._frames.sync:
             self._open(frame.t_ns)
-        elif cob_id in self._messages:
-            message = self._messages[cob_id]
-            if len(frame.data) < message.length:
-                return [Event("WARN", "frame", f"0x{cob_id:03X}: {len(frame.data)} bytes instead of {message.length}")]
-            self._take(cob_id, message.decode(frame.data, decode_choices=False))
+        elif spec is not None:
+            if len(frame.data) < spec.length:
+                where = describe_identifier(cob_id)
+                return [Event("WARN", "frame", f"{where}: {len(frame.data)} bytes instead of {spec.length}")]
+            self._take(frame.t_ns, spec, self._readers[spec](frame.data[:spec.length]))
+        elif not self._is_canopen:
+            pass
         elif 0x700 < cob_id < 0x780 and len(frame.data) == 1 and self._nmt.get(node) != frame.data[0]:
             state = self._nmt[node] = frame.data[0]
             return [NmtState(node, state, _STATES.get(state, f"state {state}"))]
-        elif codec.SYNC < cob_id < 0x100 and len(frame.data) == 8:
+        elif 0x080 < cob_id < 0x100 and len(frame.data) == 8:
             code = int.from_bytes(frame.data[:2], "little")
             return [Event("ERROR" if code else "INFO", "emcy", f"node {node}: 0x{code:04X}")]
         return []
@@ -178,23 +197,35 @@ class _CycleBuilder:
         sent = expected if self._sent is None else self._sent
         skipped = (sent - expected) & 0xFFFF if self.rows else 0
         cycle += skipped if skipped < 1000 else 0  # the counter of a bench started anew is no gap
-        row = Signals(cycle, 1, self._demand, nan, nan, nan, nan, nan, self._control, 0, 0)
+        row = Signals(cycle, 1, nan, nan, nan, nan, nan, nan, 0, 0, 0)
+        _fill(row, self._waiting)
         self.rows.append((t_ns, row))
         self._recent.append((sent & 0xFFFF, row))
+        self._waiting = {name: value for name, value in self._waiting.items() if name in _LASTING}
         self._sent = None
 
-    def _take(self, cob_id: int, values: Mapping[str, Any]) -> None:
-        if cob_id == codec.COMMAND:
-            self._demand, self._control = values["position_demand"], values["control_word"]
-            self._sent = values["cycle"]
-        elif cob_id == codec.FEEDBACK and self.rows:
-            self.rows[-1][1].xj, self.rows[-1][1].p12 = values["ram_position"], values["load_pressure"]
-        elif cob_id == codec.VALVE_STATE and self.rows:
-            self.rows[-1][1].xs, self.rows[-1][1].flags = values["spool_position"], values["flags"]
-        elif cob_id == codec.DRIVE:
-            for sent, row in self._recent:
-                if sent == values["cycle"]:
-                    row.cor, row.status = values["current"], values["status_word"]
+    def _take(self, t_ns: int, spec: FrameSpec, values: Mapping[str, float]) -> None:
+        if spec.sender is Role.CONTROLLER:
+            for sent, row in list(self._recent)[-1 if "cycle" not in values else 0:]:
+                if sent == values.get("cycle", sent):
+                    _fill(row, values)
+        elif spec.is_before_sync or (self._frames.sync is None and spec is self._begin):
+            self._waiting |= values
+            self._sent = int(values["cycle"]) if "cycle" in values else self._sent
+            if not spec.is_before_sync:
+                self._open(t_ns)
+        else:
+            self._waiting |= {name: value for name, value in values.items() if name in _LASTING}
+            if self.rows:
+                _fill(self.rows[-1][1], values)
+
+
+def _fill(row: Signals, values: Mapping[str, float]) -> None:
+    """Put the values of a frame into a row."""
+    for name, value in values.items():
+        column = _COLUMNS.get(name)
+        if column is not None:
+            setattr(row, column, round(value) if column in _WORDS else value)
 
 
 def _read_frames(source: Path) -> Iterator[Frame]:
@@ -244,14 +275,19 @@ def _load_messages(dbc: Path) -> dict[tuple[int, bool], Any]:
     return {(m.frame_id, m.is_extended_frame): m for m in getattr(base, "messages", ())}
 
 
-def _load_own_messages(dbc: Path) -> dict[int, Any]:
-    """The messages of our own frames, which have all our signals."""
+def _find_readers(bench: Bench, dbc: Path | None) -> Readers:
+    """What decodes each frame of a bench: the bench itself, or a DBC that must have all its signals."""
+    if dbc is None:
+        return {spec: make_reader(spec) for spec in bench.frames.frames}
     found = _load_messages(dbc)
-    own: dict[int, Any] = {}
-    for signal in codec.SIGNALS:
-        own[signal.cob_id] = message = found.get((signal.cob_id, False))
-        if message is None or signal.name not in [each.name for each in message.signals]:
-            raise InputError(dbc, f"frame 0x{signal.cob_id:03X}", f"the signal {signal.name}")
+    own: dict[FrameSpec, Callable[[bytes], Mapping[str, float]]] = {}
+    for spec in bench.frames.frames:
+        message = found.get((spec.identifier & 0x1FFF_FFFF, bool(spec.identifier & EXTENDED)))
+        known = () if message is None else [each.name for each in message.signals]
+        missing = [each.name for each in spec.fields if each.name and each.name not in known]
+        if message is None or missing:
+            raise InputError(dbc, f"frame {describe_identifier(spec.identifier)}", f"the signal {', '.join(missing)}")
+        own[spec] = partial(message.decode, decode_choices=False)
     return own
 
 

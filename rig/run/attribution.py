@@ -88,7 +88,7 @@ class Disturbance(NamedTuple):
     first: int
     last: int
     reach: int
-    source: int  # node 1 rig or node 3 plant
+    source: int  # role: rig or plant
     text: str
 
 

@@ -57,8 +57,7 @@ def open_loop(master: Master, bench: Bench, scenario: Scenario, faults: Schedule
 
 def list_cyclic_frames(bench: Bench) -> list[int]:
     """Identifiers of the frames that the loop takes in; those that the rig sends itself may come from a second rig."""
-    known = [each.identifier for each in bench.frames.frames]
-    return sorted({*known, *([] if bench.frames.sync is None else [bench.frames.sync])})
+    return bench.frames.identifiers
 
 
 @cache

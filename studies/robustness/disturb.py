@@ -29,13 +29,13 @@ import numpy as np
 from fdi.trace.trace import Trace
 from plant.errors import RigError
 from rig.benches.bench import Flags
-from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
 from rig.network.link import Link
 from rig.network.udp import PORT, find_key
 from rig.recorder.recover import recover_log
+from studies.shipped_frames import COMMAND, DRIVE, FEEDBACK, SYNC, VALVE_STATE, unpack_frame
 
 PROCESSES = ("rig", "controller", "plant")
 ACTIONS = ("kill", "stop", "remove folder", "fill disk", "full tmpfs")
@@ -76,7 +76,7 @@ class _Watcher:
 
     def __init__(self, bus: str, clock: WallClock) -> None:
         self._link = Link(open_can(bus), clock.now)
-        self._link.leave_out((codec.COMMAND, codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE))
+        self._link.leave_out((COMMAND, FEEDBACK, VALVE_STATE, DRIVE))
         self._is_idle = False  # no frame was waiting
         self._frames = {"plant": 0, "controller": 0}  # cyclic frames heard
         self._stop = threading.Event()
@@ -98,7 +98,7 @@ class _Watcher:
         """Listen to the nodes as well, and wait for a frame of one of them."""
         self._heard = dict.fromkeys(self._heard, self.syncs)
         before = self._frames[node]
-        self._link.leave_out((codec.COMMAND,))
+        self._link.leave_out((COMMAND,))
         wait_until(lambda: self._frames[node] > before, seconds, step=0.001)
 
     def finish(self, seconds: float = 60.0) -> None:
@@ -107,17 +107,17 @@ class _Watcher:
         wait_until(lambda: self._is_idle, seconds)
 
     def _note(self, frame: Frame) -> None:
-        if frame.cob_id == codec.SYNC:
+        if frame.cob_id == SYNC:
             self.first_sync = self.first_sync or frame.t_ns
             self.syncs += 1
-        elif frame.cob_id == codec.FEEDBACK:
+        elif frame.cob_id == FEEDBACK:
             self._hear("plant")
-        elif frame.cob_id == codec.DRIVE and len(frame.data) == 8:
-            if codec.unpack_drive(frame.data).current == 0.0:
+        elif frame.cob_id == DRIVE and len(frame.data) == 8:
+            if unpack_frame(DRIVE, frame.data)["current"] == 0.0:
                 self._note_zero("plant")
             self._hear("controller")
-        elif (frame.cob_id == codec.VALVE_STATE and len(frame.data) == 8
-              and codec.unpack_valve_state(frame.data).flags & Flags.CURRENT_ZEROED):
+        elif (frame.cob_id == VALVE_STATE and len(frame.data) == 8
+              and int(unpack_frame(VALVE_STATE, frame.data)["flags"]) & Flags.CURRENT_ZEROED):
             self._note_zero("controller")
 
     def _hear(self, node: str) -> None:

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rig.network import codec
 from rig.network.frame import Frame
+from studies.shipped_frames import COMMAND, DRIVE, FEEDBACK, SYNC, VALVE_STATE, pack_frame
 
 NODES = (1, 2, 3)
 _OBJECTS = (0x1000, 0x1001, 0x1003, 0x1005, 0x1006, 0x1008, 0x1014, 0x1016, 0x1017, 0x1018, 0x1029, 0x1200, 0x1400,
@@ -27,7 +27,7 @@ def invent_frames(count: int, seed: int) -> Iterator[Frame]:
         kind = rng.random()
         if kind < 1.0 / 8.0:
             t_ns, cycle = t_ns + 1_000_000, cycle + 1
-            yield Frame(t_ns, codec.SYNC, b"")
+            yield Frame(t_ns, SYNC, b"")
             continue
         cob_id, data = _make_valid_frame(rng, cycle)
         if kind > 0.55:
@@ -37,6 +37,10 @@ def invent_frames(count: int, seed: int) -> Iterator[Frame]:
         yield Frame(t_ns, cob_id, data)
 
 
+def _pack(cob_id: int, cycle: int, **values: float) -> tuple[int, bytes]:
+    return cob_id, pack_frame(cob_id, {**values, "cycle": cycle})
+
+
 def _make_valid_frame(rng: np.random.Generator, cycle: int) -> tuple[int, bytes]:
     """A frame that a node of the bench may send in this cycle."""
     node = int(rng.choice(NODES))
@@ -44,13 +48,14 @@ def _make_valid_frame(rng: np.random.Generator, cycle: int) -> tuple[int, bytes]
         case 0:
             return 0x000, bytes((int(rng.choice(_NMT)), int(rng.integers(4))))
         case 1 | 2:
-            return codec.COMMAND, codec.pack_command(rng.normal(0.0, 5e-3), int(rng.choice((0, 1, 3, 7, 15))), cycle)
+            return _pack(COMMAND, cycle, position_demand=rng.normal(0.0, 5e-3),
+                         control_word=int(rng.choice((0, 1, 3, 7, 15))))
         case 3:
-            return codec.FEEDBACK, codec.pack_feedback(rng.normal(0.0, 5e-3), rng.normal(0.0, 1e6))
+            return _pack(FEEDBACK, cycle, ram_position=rng.normal(0.0, 5e-3), load_pressure=rng.normal(0.0, 1e6))
         case 4:
-            return codec.VALVE_STATE, codec.pack_valve_state(rng.normal(0.0, 1e-4), int(rng.integers(8)), cycle)
+            return _pack(VALVE_STATE, cycle, spool_position=rng.normal(0.0, 1e-4), flags=int(rng.integers(8)))
         case 5 | 6:
-            return codec.DRIVE, codec.pack_drive(rng.normal(0.0, 5e-3), int(rng.integers(16)), cycle)
+            return _pack(DRIVE, cycle, current=rng.normal(0.0, 5e-3), status_word=int(rng.integers(16)))
         case 7:
             return 0x700 + node, bytes((int(rng.choice((0, 4, 5, 127))),))
         case 8:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from fdi.progress import Progress, ignore_progress
 from plant.model import load_model
-from rig.network import codec
+from rig.benches.profiles import Control, Status
 from rig.network.bus import EmbeddedBus
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame, Node, Send
@@ -25,6 +25,7 @@ from rig.run.runner import attribute_run, judge_run, open_recorder
 from rig.run.session import Session
 from rig.sequences.sequence import parse_sequence
 from studies.robustness.frames import invent_frames
+from studies.shipped_frames import COMMAND, DRIVE, FEEDBACK, SYNC, VALVE_STATE, pack_frame, unpack_frame
 
 PAGE = resource.getpagesize()
 
@@ -102,14 +103,14 @@ def _is_answering(target: str, node: Node, bus: EmbeddedBus, t_ns: int) -> bool:
     boots = (0x700 + number, b"\0") in ask(0x000, bytes((129, number)))
     identity = [data[:4] for cob_id, data in ask(0x600 + number, b"\x40\x00\x10\0\0\0\0\0") if cob_id == 0x580 + number]
     ask(0x000, bytes((1, number)))
-    ask(codec.COMMAND, codec.pack_command(1e-3, int(codec.Control.ACTIVE), 7))
-    at_sync = [cob_id for cob_id, _ in ask(codec.SYNC, b"")]
+    ask(COMMAND, pack_frame(COMMAND, {"position_demand": 1e-3, "control_word": Control.ACTIVE, "cycle": 7}))
+    at_sync = [cob_id for cob_id, _ in ask(SYNC, b"")]
     if target == "plant":
-        return boots and identity == [b"\x43\x00\x10\0"] and at_sync[:2] == [codec.FEEDBACK, codec.VALVE_STATE]
-    answers = [data for cob_id, data in ask(codec.FEEDBACK, codec.pack_feedback(0.0, 0.0)) if cob_id == codec.DRIVE]
-    drive = codec.unpack_drive(answers[0]) if len(answers) == 1 and len(answers[0]) == 8 else None
+        return boots and identity == [b"\x43\x00\x10\0"] and at_sync[:2] == [FEEDBACK, VALVE_STATE]
+    answers = [data for cob_id, data in ask(FEEDBACK, pack_frame(FEEDBACK, {})) if cob_id == DRIVE]
+    drive = unpack_frame(DRIVE, answers[0]) if len(answers) == 1 and len(answers[0]) == 8 else None
     return (boots and identity == [b"\x43\x00\x10\0"] and drive is not None
-            and (drive.cycle, drive.status) == (7, int(codec.Status.ACTIVE)) and 0.0 < drive.current < 0.02)
+            and (drive["cycle"], drive["status_word"]) == (7, Status.ACTIVE) and 0.0 < drive["current"] < 0.02)
 
 
 class _Stranger:
@@ -122,10 +123,10 @@ class _Stranger:
 
     def receive(self, frame: Frame) -> None:
         """Send some when a SYNC comes."""
-        if frame.cob_id == codec.SYNC and not frame.data:
+        if frame.cob_id == SYNC and not frame.data:
             for _, (_, cob_id, data) in zip(range(self._each), self._frames, strict=False):
                 self.sent += 1
-                if cob_id != codec.SYNC or data:  # its own SYNC would start cycles within a cycle without end
+                if cob_id != SYNC or data:  # its own SYNC would start cycles within a cycle without end
                     self._send(cob_id, data)
 
     def tick(self, t_ns: int) -> None:

@@ -6,9 +6,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import codec
+from codec import Command, Drive, Feedback
+
 from plant import Model
-from rig.network import codec
-from rig.network.codec import Command, Drive, Feedback
 from rig.network.frame import Frame, Send
 from rig.nodes.firmware import Firmware
 

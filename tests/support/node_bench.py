@@ -3,12 +3,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import codec
 from c_device import CFirmware
+from codec import Drive, Feedback, ValveState
 
 from plant import Model
-from rig.network import codec
 from rig.network.bus import EmbeddedBus
-from rig.network.codec import Drive, Feedback, ValveState
 from rig.network.frame import Send
 from rig.network.node_objects import SCENARIO
 from rig.nodes.emulator import Emulator

@@ -5,10 +5,10 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
+import codec
 import numpy as np
 
 from plant import load_model, simulate
-from rig.network import codec
 from rig.network.frame import Frame
 from rig.recorder import Check, Event, NmtState, Recorder, Signals, Timing
 

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from dbc import EDS
 from fdi.output import write_text
 from plant.errors import InputError, RigError
 from rig.benches.bench_file import load_bench
@@ -36,7 +35,7 @@ def run_command(args: argparse.Namespace) -> int:
     node, is_own = parse_node(name), name in OWN_NODES
     if eds is None and not is_own:
         raise InputError("--eds", "", f"the electronic data sheet of node {name}: --eds FILE, or --bench FILE")
-    sheet = DataSheet(eds or EDS[node], node)
+    sheet = DataSheet(eds or load_bench().nodes[OWN_NODES[name]].eds, node)
     cases = choose_cases(args.chapter)
     for word in args.chapter:
         if not choose_cases([word]):
@@ -81,7 +80,7 @@ def parse_node(text: str) -> int:
         InputError: neither a node-ID nor one of our nodes.
     """
     if text in OWN_NODES:
-        return OWN_NODES[text]
+        return load_bench().nodes[OWN_NODES[text]].node
     if text.isdigit() and 1 <= int(text) <= 127:
         return int(text)
     raise InputError("NODE", text, "a node-ID from 1 to 127, controller, plant or c")

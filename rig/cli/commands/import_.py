@@ -13,6 +13,7 @@ from fdi.trace.importing.formats import Measurement, open_measurement
 from fdi.trace.importing.guess import guess_map
 from plant.errors import InputError
 from plant.parameters import load_nominal_values
+from rig.benches.bench_file import load_bench
 from rig.cli.answer import give_answer
 from rig.recorder.convert import RAW_SUFFIXES, import_csv, import_frames, open_can_log, write_imported
 
@@ -26,6 +27,8 @@ def run_command(args: argparse.Namespace) -> int:
         raise InputError("--guess", args.map, "--guess or --map, not both")
     if args.force and not args.guess:
         raise InputError("--force", "", "--guess, whose map it lets replace another")
+    if args.bench and (args.map or args.guess or source.suffix not in RAW_SUFFIXES):
+        raise InputError("--bench", args.bench, "a CAN log without --map or --guess")
     if args.dbc and source.suffix not in RAW_SUFFIXES:
         raise InputError("--dbc", args.dbc, "a CAN log to decode; a CSV of signals has no frames")
     suffix = ".map.toml" if args.guess else ".mcap"
@@ -45,7 +48,8 @@ def import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
         InputError: another format, or other columns.
     """
     if source.suffix in RAW_SUFFIXES:
-        cycles = import_frames(source, out, choose_dbc(args))
+        bench = load_bench(args.bench or "eha", is_trusted=args.trust)
+        cycles = import_frames(source, out, bench, Path(args.dbc) if args.dbc else None)
     elif source.name.endswith((".csv", ".csv.gz")):
         try:
             cycles = import_csv(source, out)

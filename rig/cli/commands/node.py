@@ -10,6 +10,7 @@ import time
 from fdi.output import require_writable
 from fdi.report.report import Report
 from plant.errors import InputError, RigError
+from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, give_answer
 from rig.cli.inputs import load_chosen_model
@@ -21,7 +22,7 @@ from rig.network.link import Link, serve_node
 from rig.network.node_objects import CONTROLLER, PLANT, read_gains
 from rig.network.raw_bus import can_open, open_raw_bus
 from rig.nodes.emulator import Emulator
-from rig.nodes.emulator_service import LEFT_OUT, EmulatorService
+from rig.nodes.emulator_service import EmulatorService, list_unheard
 from rig.nodes.firmware import Firmware
 from rig.nodes.scenario import Scenario, require_servovalve
 from rig.run.job import speaks_as_shipped
@@ -54,10 +55,12 @@ def run_command(args: argparse.Namespace) -> int:
         link = Link(open_can(bus, bench.bitrate), clock.now)
         opened_ns = clock.now()
         stack.callback(link.close)
-        node = make_node(args, bus, link, stack, is_compiled)
+        node = make_node(args, bench, link, stack, is_compiled)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda got, frame: ended.append(got))
-        require_free_number(args.node, link, bus, LISTENING_TIME - (clock.now() - opened_ns) * 1e-9)
+        role = PLANT if args.node == "plant" else CONTROLLER
+        require_free_number(bench.find_number(role), args.node, link, bus,
+                            LISTENING_TIME - (clock.now() - opened_ns) * 1e-9)
         if args.parent or not (args.quiet or args.json):  # the rig that has started it waits for this line
             kind = "compiled loop" if is_compiled else "Python loop, soft real time"
             print(f"{args.node} on {bus}, {kind}; Ctrl-C ends it", flush=True)
@@ -69,26 +72,26 @@ def run_command(args: argparse.Namespace) -> int:
     return give_answer(Report("node", args.node, sentence=sentence, data=counts), args, places=places)
 
 
-def require_free_number(name: str, link: Link, bus: str, seconds: float) -> None:
+def require_free_number(number: int, name: str, link: Link, bus: str, seconds: float) -> None:
     """Refuse to join a bus on which a node with our number has been heard since `link` was opened.
 
     Two nodes with one number would both answer, and the bench would see a node that leaves OPERATIONAL at random.
 
     Args:
-        name: of our node, plant or controller.
+        number, name: of our node, which is plant or controller.
         link, bus: what it is about to join.
         seconds: how long to listen still; most nodes need more time than enough to load.
 
     Raises:
         RigError: such a node.
     """
-    number = PLANT if name == "plant" else CONTROLLER
     time.sleep(max(0.0, seconds))
     if any(frame.cob_id == heartbeat.COB_ID + number for frame in link.poll()):
         raise RigError(f"{bus}: a node {number} ({name}) is on this bus already; stop it before you start another one")
 
 
-def make_node(args: argparse.Namespace, bus: str, link: Link, stack: contextlib.ExitStack, is_compiled: bool) -> Node:
+def make_node(args: argparse.Namespace, bench: Bench, link: Link, stack: contextlib.ExitStack,
+              is_compiled: bool) -> Node:
     """The node that the options describe. The compiled loop has a socket of its own; `link` is for its services.
 
     Raises:
@@ -96,14 +99,14 @@ def make_node(args: argparse.Namespace, bus: str, link: Link, stack: contextlib.
     """
     if is_compiled:
         is_locked = stack.enter_context(lock_memory())
-        raw = stack.enter_context(open_raw_bus(bus))
-        link.leave_out(LEFT_OUT)
-        service = EmulatorService(link.send, raw, enter_loop_thread, choose_scenario(args), is_locked)
+        raw = stack.enter_context(open_raw_bus(choose_bus(args.bus)[0]))
+        link.leave_out(list_unheard(bench))
+        service = EmulatorService(link.send, raw, enter_loop_thread, choose_scenario(args), is_locked, bench)
         stack.callback(service.close)
         return service
     scenario = choose_scenario(args)
     if args.node == "plant":
-        return Emulator(link.send, scenario)
+        return Emulator(link.send, scenario, bench)
     return Firmware(link.send, read_gains(scenario.model.values), scenario.model)
 
 

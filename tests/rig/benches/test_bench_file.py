@@ -5,6 +5,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import pytest
+from codec import SIGNALS, SYNC, Signal
 from device_files import BENCH, OBJECTS, RPDOS, TPDOS, Entry, Mapped, format_eds, write_bench
 from places import ROOT
 
@@ -12,7 +13,6 @@ from dbc import EDS
 from plant.errors import InputError
 from rig.benches.bench_file import list_benches, load_bench, load_bench_from_files
 from rig.benches.frame_map import Guard, Kind, Role, pack
-from rig.network.codec import SIGNALS, SYNC, Signal
 
 EXAMPLES = sorted(ROOT.glob("examples/*/bench.toml"))
 

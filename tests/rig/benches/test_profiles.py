@@ -9,12 +9,13 @@ from rig.benches.profiles import (
     CIA408,
     PROFILES,
     TRANSITIONS,
+    Control,
     State,
+    Status,
     choose_control,
     find_state,
     find_wanted,
 )
-from rig.network.codec import Control, Status
 
 NAMES = {"NOT READY TO SWITCH ON": State.NOT_READY, "SWITCH ON DISABLED": State.OFF,
          "READY TO SWITCH ON": State.READY, "SWITCHED ON": State.ON, "OPERATION ENABLED": State.ACTIVE,

@@ -4,6 +4,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+import codec
 import pytest
 from changed_sheets import change_sheet
 from device_bench import Rack
@@ -11,7 +12,6 @@ from device_bench import Rack
 from dbc import EDS
 from plant.errors import InputError
 from rig.device import Device, NmtCommand
-from rig.network import codec
 
 DRIVE = bytes.fromhex("0100000002000300")  # current 1, status 2, cycle 3
 # Scripts that begin in OPERATIONAL. 182: drive frame, with the current (2205) in its first word; 083: EMCY.

@@ -7,11 +7,11 @@ import struct
 import time
 
 import can
+import codec
 import pytest
 from bus_stations import gather, spec, stations
 
 from plant.errors import RigError
-from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.can_interface import UdpBus
 from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, Frame

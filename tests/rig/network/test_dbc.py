@@ -11,13 +11,13 @@ from typing import NamedTuple, cast
 
 import canopen
 import cantools
+import codec
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes
 from cantools.database.can import Database
+from codec import SIGNALS, Signal
 
 from dbc import DBC, EDS
-from rig.network import codec
-from rig.network.codec import SIGNALS, Signal
 
 FRAMES = (codec.COMMAND, codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE)
 NODES = {1: "Rig", 2: "Controller", 3: "Plant"}

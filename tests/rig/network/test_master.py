@@ -5,12 +5,12 @@ import contextlib
 import threading
 from collections.abc import Iterator
 
+import codec
 import pytest
 from bus_stations import spec
 
 from plant import Model
 from rig.benches.bench_file import load_bench
-from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Frame

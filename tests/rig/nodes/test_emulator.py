@@ -5,6 +5,7 @@ import json
 import zlib
 from typing import Any
 
+import codec
 import numpy as np
 import pytest
 from node_bench import MS, PlantDesk
@@ -12,7 +13,6 @@ from node_bench import MS, PlantDesk
 from plant import Actuator, Model
 from rig.benches.bench import Flags
 from rig.device import Abort, NmtState
-from rig.network import codec
 from rig.network.node_objects import COUNTERS
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import (

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 
+import codec
 import numpy as np
 import pytest
 from bus_stations import spec
@@ -15,8 +16,8 @@ from node_bench import MS
 
 from plant import Model
 from plant.compile import compile_function
+from rig.benches.bench_file import load_bench
 from rig.device import NmtState
-from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
@@ -24,8 +25,8 @@ from rig.network.link import Link, serve_node
 from rig.network.node_objects import decode_cycle_record
 from rig.network.raw_bus import make_closed_port, open_raw_bus
 from rig.nodes import emulator_cycle as ec
-from rig.nodes.emulator import MISSED_LIMIT, Emulator
-from rig.nodes.emulator_service import LEFT_OUT, EmulatorService, compile_loop
+from rig.nodes.emulator import Emulator, PlantPlace
+from rig.nodes.emulator_service import EmulatorService, compile_loop, list_unheard
 from rig.nodes.scenario import Scenario
 from rig.run.priority import enter_loop_thread
 from rig.sequences.faults import DOUBLE, DROP, BusOff, Corrupted, Duplicated, Fault, Lost, Plan, Schedule, Short
@@ -50,7 +51,7 @@ class BusDesk:
             clock = WallClock()
             with open_raw_bus(self.where) as raw:
                 link = Link(open_can(self.where), clock.now)
-                link.leave_out(LEFT_OUT)
+                link.leave_out(list_unheard(load_bench()))
                 self.node = EmulatorService(link.send, raw, enter_loop_thread, self.scenario)
                 ready.set()
                 serve_node(self.node, link, clock, ended.is_set)
@@ -179,7 +180,7 @@ class TestServices:
 
     def test_three_missing_drives_are_an_error_of_the_services_too(self, desk: BusDesk) -> None:
         run_cycle(desk, 1e-3)
-        assert [run_cycle(desk, None).flags for _ in range(MISSED_LIMIT + 1)] == [0, 1, 1, 5]
+        assert [run_cycle(desk, None).flags for _ in range(4)] == [0, 1, 1, 5]
         while desk.upload(0x1001) != b"\x11":  # the services take it over within a tick
             time.sleep(0.001)
         assert desk.upload(0x1003, 1)[:2] == b"\x50\x82"
@@ -274,12 +275,13 @@ class TestServices:
 def test_a_wake_up_does_not_end_the_wait_for_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     """The services wake the loop to stop it for a new scenario; the loop seldom takes that wake-up before its run."""
     monkeypatch.setattr(ec, "_ANSWER_LIMIT", 10_000_000_000)
-    memory = ec.make_memory(Model(), [], Schedule(Plan(stop=0)))
+    place = PlantPlace.find(load_bench())
+    memory = ec.make_memory(Model(), [], Schedule(Plan(stop=0)), frames=place.frames)
     words = memory.words
     words[ec.STATE], words[ec.DRIVE_ID], words[ec.DRIVE_TYPE] = ec.OPERATIONAL, codec.DRIVE, 1
     where = spec("udp_multicast")
     await_drive = compile_function(ec._await_drive)
-    await_drive(make_closed_port(), ec.make_memory(Model(), [], Schedule(Plan(stop=0))))  # compiles it
+    await_drive(make_closed_port(), ec.make_memory(Model(), [], Schedule(Plan(stop=0)), frames=place.frames))
     with open_raw_bus(where, [codec.DRIVE]) as raw:
         link = Link(open_can(where), lambda: 0)
         raw.wake()

@@ -5,15 +5,15 @@ from __future__ import annotations
 
 import struct
 
+import codec
 import node_bench
 import pytest
 from c_device import skip_without_compiler
 from node_bench import FirmwareDesk
 
 from plant.controller import Loop, compute_current
+from rig.benches.profiles import Control, Status
 from rig.device import Abort, NmtState
-from rig.network import codec
-from rig.network.codec import Control, Status
 from rig.network.node_objects import GAINS, Gains
 from rig.nodes.firmware import LOST_AFTER
 

@@ -13,6 +13,7 @@ from synthetic_run import record_run
 import dbc
 from fdi.trace.trace import Trace
 from plant.errors import InputError
+from rig.benches.bench_file import load_bench
 from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, Frame
 from rig.network.message import make_message
 from rig.recorder import Recorder
@@ -35,7 +36,8 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_raw_frames_there_and_back(log: Path, tmp_path: Path, suffix: str) -> None:
     out = tmp_path / f"x{suffix}"
     assert export_trace(log, out) == 6500
-    assert import_frames(out, tmp_path / "back.mcap", dbc.DBC) == 1300
+    bench, decoding = load_bench(), dbc.DBC if suffix == ".blf" else None
+    assert import_frames(out, tmp_path / "back.mcap", bench, decoding) == 1300
     before, after = list(read_raw_frames(log)), list(read_raw_frames(tmp_path / "back.mcap"))
     assert [f[1:] for f in before] == [f[1:] for f in after]
     worst = max(abs(a.t_ns - b.t_ns) for a, b in zip(before, after, strict=True))
@@ -44,7 +46,8 @@ def test_raw_frames_there_and_back(log: Path, tmp_path: Path, suffix: str) -> No
     for name, resolution in {"com": 1e-7, "xj": 1e-7, "cor": 1e-8, "p12": 10.0, "xs": 1e-9}.items():
         np.testing.assert_allclose(got.column(name), want.column(name), atol=0.51 * resolution)
     assert np.isnan(got.load).all() and not got.gaps
-    assert "eha.dbc" in got.attachments and got.provenance["imported"] == out.name
+    assert {*bench.files, *(["eha.dbc"] if decoding else [])} <= got.attachments.keys()
+    assert got.provenance["imported"] == out.name
 
 
 @pytest.mark.parametrize("suffix", RAW_SUFFIXES)
@@ -68,7 +71,7 @@ def test_every_kind_of_frame_there_and_back(tmp_path: Path, suffix: str) -> None
     for frame, message in zip(frames, heard, strict=True):
         if not message.is_fd or frame.data:
             assert message.equals(make_message(*frame[1:]), timestamp_delta=None, check_channel=False)
-    import_frames(out, tmp_path / "back.mcap", dbc.DBC)
+    import_frames(out, tmp_path / "back.mcap", load_bench())
     assert [frame[1:] for frame in read_raw_frames(tmp_path / "back.mcap")] == [frame[1:] for frame in frames]
 
 
@@ -107,7 +110,7 @@ def test_lost_and_late_frames_of_a_candump(tmp_path: Path) -> None:
     lines = [*at(0, 0), *at(1, 1), *at(2, None), *at(3, 2), *at(6, 6), "(1700000000.010000) can0 702#7F",
              "(1700000000.011000) can0 083#5082010000000000", "(1700000000.012000) can0 202#1027"]
     (tmp_path / "x.log").write_text("\n".join(lines) + "\n")
-    assert import_frames(tmp_path / "x.log", tmp_path / "x.mcap", dbc.DBC) == 5
+    assert import_frames(tmp_path / "x.log", tmp_path / "x.mcap", load_bench()) == 5
     trace = Trace.read(tmp_path / "x.mcap")
     assert len(trace) == 7 and [g.cycles for g in trace.gaps] == [2]
     np.testing.assert_allclose(trace.cor, [1e-5, 1e-5, 1e-5, np.nan, np.nan, np.nan, 1e-5])

@@ -14,6 +14,7 @@ from dataclasses import replace
 from itertools import groupby, pairwise
 from math import isnan
 
+import codec
 import pytest
 from bus_stations import spec
 from numba.core.event import install_recorder
@@ -21,7 +22,6 @@ from numba.core.event import install_recorder
 from plant import Model
 from plant.errors import RigError
 from rig.benches.bench_file import load_bench
-from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
 from rig.network.frame import Frame

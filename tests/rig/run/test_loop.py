@@ -4,11 +4,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import isnan
 
+import codec
 import pytest
 
 from plant import Model
 from rig.benches.bench_file import load_bench
-from rig.network import codec
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame
 from rig.network.link import Link, LinkWire

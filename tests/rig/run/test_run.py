@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
+import codec
 import numpy as np
 import pytest
 from bus_stations import spec
@@ -25,7 +26,6 @@ from fdi.report.run_report import build_run_report
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import CLEANUP, Trace
 from plant import simulate
-from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.frame import Frame
 from rig.network.link import Link
