@@ -77,5 +77,5 @@ $(VENV)/.run: pyproject.toml $(MADE)
 
 $(VENV)/.test: pyproject.toml $(MADE)
 	@echo "== installing what the tests and the viewer need into $(VENV) (once, about two minutes)"
-	@$(PIP) -e '.[dev,docs,view,plots,fleet,learn,measure,shell]'
+	@$(PIP) -e '.[dev,docs,view,plots,fleet,learn,measure,fmu,shell]'
 	@touch $@ $(VENV)/.run

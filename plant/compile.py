@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -69,6 +69,24 @@ class ForeignCall:
         made: dict[str, Any] = {"type_call": type_call}
         exec(f"def call_{self.signature}(context, address, {names}):\n    return type_call((address, {names}))", made)
         return numba.extending.intrinsic(made[f"call_{self.signature}"])
+
+
+class NormalTables(NamedTuple):
+    """numpy's tables of the ziggurat of the normal distribution: 256 layers, and where the tail begins."""
+
+    k: list[int]
+    w: list[float]
+    f: list[float]
+    r: float
+    inverse_r: float
+
+
+def read_normal_tables() -> NormalTables:
+    """The tables with which `numpy.random.Generator.standard_normal` draws, which numba has a copy of."""
+    import numba.np.random._constants as numbers
+
+    return NormalTables(numbers.ki_double.tolist(), numbers.wi_double.tolist(), numbers.fi_double.tolist(),
+                        float(numbers.ziggurat_nor_r), float(numbers.ziggurat_nor_inv_r))
 
 
 def find_cache_folder() -> Path:

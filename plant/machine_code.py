@@ -11,6 +11,7 @@ import contextlib
 import ctypes
 import hashlib
 import os
+import re
 import tempfile
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -64,7 +65,7 @@ class StoredCode:
             run = self._compile()
             run(flat, 0.0, 0.0, 0.0, 0.0, record, 0)
             with contextlib.suppress(Exception):  # another release of numba may name its inner parts otherwise
-                code = _emit_object(run)
+                code = emit_object(run)
                 if code is not None and _gives_same_bits(code, run, flat, record):
                     _write_object(self._path, code)
 
@@ -152,8 +153,14 @@ def _write_object(path: Path, code: bytes) -> None:
         raise
 
 
-def _emit_object(run: Any) -> bytes | None:
-    """The compiled function of a dispatcher alone, without its way in from Python; None if it needs numba to run."""
+def emit_object(run: Any, symbol: str = _SYMBOL, triple: str = "") -> bytes | None:
+    """The compiled function of a dispatcher alone, without its way in from Python; None if it needs numba to run.
+
+    Args:
+        run: numba's dispatcher of a function that was compiled for one signature.
+        symbol: its name in the object code.
+        triple: the machines to emit code for, as LLVM calls them, every CPU of the kind; "" for this CPU alone.
+    """
     import llvmlite.binding as llvm
 
     overloads = list(getattr(run, "overloads", {}).values())
@@ -161,19 +168,29 @@ def _emit_object(run: Any) -> bytes | None:
         return None
     library = overloads[0].library
     module = llvm.parse_bitcode(library._get_module_for_linking().as_bitcode())
+    machine = library.codegen._tm
+    if triple:
+        # nobody owns the arrays that the code gets: counting who uses them, which needs numba, does nothing
+        module = llvm.parse_assembly(re.sub(r"(?m)^ *(tail )?call void @NRT_(inc|dec)ref\(.*$", "", str(module)))
+        llvm.initialize_all_targets()
+        llvm.initialize_all_asmprinters()
+        machine = llvm.Target.from_triple(triple).create_target_machine(opt=3, reloc="pic", codemodel="default")
+        module.triple, module.data_layout = triple, str(machine.target_data)
     target = module.get_function(overloads[0].fndesc.llvm_func_name)
     for value in (*module.functions, *module.global_variables):
         if not value.is_declaration:
             value.linkage = "internal"
     target.linkage = "external"
-    target.name = _SYMBOL
+    target.name = symbol
+    if triple:
+        target.visibility = "hidden"  # a library of the process may have a function of the same name
     manager = llvm.create_new_module_pass_manager()
     manager.add_global_dead_code_eliminate_pass()
-    manager.run(module, llvm.create_pass_builder(library.codegen._tm, llvm.create_pipeline_tuning_options()))
+    manager.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
     foreign = {value.name for value in (*module.functions, *module.global_variables) if value.is_declaration}
     if any(name not in _KNOWN and not name.startswith("llvm.") for name in foreign):
         return None
-    return bytes(library.codegen._tm.emit_object(module))
+    return bytes(machine.emit_object(module))
 
 
 def _link_object(code: bytes) -> tuple[Any, Any]:

@@ -141,7 +141,8 @@ def test_the_answers_of_small_commands(preflight: Path, tmp_path: Path, monkeypa
     kinds = ("parameters", "signals", "sequences", "effects", "checks", "models", "benches")
     assert_all_seen("list", *(rig("list", kind, "--json").json for kind in kinds))
     assert_all_seen("report", rig("report", preflight, "--out", "page.html", "--json").json)
-    assert_all_seen("export", rig("export", preflight, "--out", "run.csv", "--force", "--json").json)
+    assert_all_seen("export", rig("export", preflight, "--out", "run.csv", "--force", "--json").json,
+                    rig("export", "--fmu", "eha.fmu", "--json").json)
     assert_all_seen("recover", rig("recover", preflight / "trace.mcap", "--out", "again.mcap", "--json").json)
     imported = rig("import", "run.csv", "--out", "run.mcap", "--json").json
     check_answer(["import"], imported)

@@ -172,10 +172,17 @@ COMMANDS = {
                      "--out FILE.html a law that holds is written beside it, as FILE_law.py)"),
          offer_page("explain.html"))),
     "export": Command(
-        "write a trace in another format: .csv, .csv.gz (signals), .log, .blf, .asc, .trc (raw frames)",
-        "The suffix of --out chooses the format.",
-        (option("trace", metavar="TRACE", help=ANY_TRACE),
-         option("--all", action="store_true", help="also export the signals of set-up and clean-up"), FORCE)),
+        "write a trace in another format, .csv, .csv.gz (signals), .log, .blf, .asc, .trc (raw frames), or a model as "
+        "an FMU",
+        "The suffix of --out chooses the format of a trace.",
+        (option("trace", metavar="TRACE", nargs="?", help=ANY_TRACE),
+         option("--all", action="store_true", help="also export the signals of set-up and clean-up"), FORCE,
+         Group("a model", (
+             option("--fmu", type=Path, metavar="OUT.fmu",
+                    help="write the model with its effects as a unit for co-simulation: compiled code that needs "
+                         "neither Python nor this program"),
+             option("--fmi", choices=("2", "3"), default="2", help="version of FMI, 2.0 (default) or 3.0"),
+             *MODEL)))),
     "fdi": Command(
         "judge filter clogging and spool friction from a trace: levels, sizes with intervals, other deviations",
         "Exit status 0 if both faults are acceptable, 1 otherwise. --learn-bands makes bands instead.",

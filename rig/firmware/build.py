@@ -87,12 +87,12 @@ def build_program(name: str, sources: Sequence[Path], flags: Sequence[str]) -> P
     return program
 
 
-def find_compiler() -> str:
-    """The path of the C compiler. Raises InputError if there is none."""
+def find_compiler(where: str = "--controller", use: str = "to build the firmware with") -> str:
+    """The path of the C compiler. Raises InputError, with what it is for, if there is none."""
     for name in ("gcc", "cc", "clang"):
         if found := shutil.which(name):
             return found
-    raise InputError("--controller", "c", "a C compiler to build the firmware with: apt-get install gcc libc6-dev")
+    raise InputError(where, "", f"a C compiler {use}: apt-get install gcc libc6-dev")
 
 
 def _compile(compiler: str, words: Sequence[str], program: Path) -> None:

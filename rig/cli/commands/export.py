@@ -1,4 +1,4 @@
-"""`rig export`: signals as CSV, raw frames as CAN logs."""
+"""`rig export`: signals as CSV, raw frames as CAN logs, a model as a functional mock-up unit."""
 from __future__ import annotations
 
 import argparse
@@ -8,14 +8,37 @@ from fdi.output import require_new, require_writable
 from fdi.report.report import Report
 from plant.errors import InputError
 from rig.cli.answer import give_answer
+from rig.cli.inputs import load_chosen_model
 from rig.recorder.convert import export_trace
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """The suffix of --out chooses the format."""
+    """The suffix of --out chooses the format of a trace; --fmu writes a model."""
+    if args.fmu is not None:
+        return write_fmu(args)
+    if args.trace is None:
+        raise InputError("TRACE", "", "a trace to export, or --fmu OUT.fmu for a model")
+    if args.model or args.set or args.effects:
+        raise InputError("--fmu", "", "OUT.fmu beside --model, --set and --effects: they do not change a trace")
     if args.out is None:
         raise InputError("--out", "", "the file to write, such as run.csv or frames.blf")
     out = require_new(require_writable(args.out, "--out", source=args.trace), is_forced=args.force)
     count = export_trace(Path(args.trace), out, args.all)
     sentence = f"{out}: {count} {'rows' if '.csv' in out.suffixes else 'frames'}"
     return give_answer(Report("export", args.trace, sentence=sentence, data={"path": str(out), "count": count}), args)
+
+
+def write_fmu(args: argparse.Namespace) -> int:
+    """Write the model of --model, --set and --effects as a functional mock-up unit; exit status 0."""
+    if args.trace or args.out or args.all:
+        raise InputError("--fmu", str(args.fmu), "no TRACE, --out and --all beside it: it exports a model")
+    if args.fmu.suffix != ".fmu":
+        raise InputError("--fmu", str(args.fmu), "a file .fmu")
+    out = require_new(require_writable(args.fmu, "--fmu", source=args.model), is_forced=args.force)
+    from rig.fmi.export import export_fmu  # here: it loads numba
+
+    model = load_chosen_model(args)
+    platforms = export_fmu(model, out, args.fmi, args.seed)
+    sentence = f"{out}: {model.name} as FMI {args.fmi}.0 co-simulation for {', '.join(platforms)}"
+    data = {"path": str(out), "count": 1, "fmi": args.fmi, "platforms": platforms}
+    return give_answer(Report("export", str(out), sentence=sentence, data=data), args)

@@ -1,0 +1,341 @@
+"""Writes a model as a functional mock-up unit: a library of machine code, and the XML that describes its variables.
+
+The equations are the machine code that numba compiled, linked with the interface in C of this folder. The code is
+emitted for every CPU of an architecture, not for this one alone; without fused multiply-add its bits are the same.
+"""
+from __future__ import annotations
+
+import hashlib
+import math
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any, NamedTuple
+from uuid import UUID
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from fdi.output import write_whole
+from plant.compile import read_normal_tables
+from plant.errors import InputError, RigError
+from plant.flat import list_state_values
+from plant.machine_code import emit_object
+from plant.model import STEP, Model, build_kernel, find_quantity
+from plant.run import report_law_errors
+from plant.solve import NOISES
+from rig.firmware.build import find_compiler
+from rig.fmi.unit_cycle import INPUTS, LOOP, advance_unit
+
+FOLDER = Path(__file__).parent
+VERSIONS = ("2", "3")
+_FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-s", "-w")
+_LARGEST = sys.float_info.max
+
+
+class Platform(NamedTuple):
+    """A kind of machine: its names in FMI 3 and FMI 2, in LLVM, and programs that compile C for it."""
+
+    name: str
+    old_name: str
+    triple: str
+    suffix: str
+    compilers: tuple[str, ...]
+    flags: tuple[str, ...] = ("-fPIC",)
+
+
+PLATFORMS = (
+    Platform("x86_64-linux", "linux64", "x86_64-unknown-linux-gnu", ".so", ("x86_64-linux-gnu-gcc",)),
+    Platform("aarch64-linux", "aarch64-linux", "aarch64-unknown-linux-gnu", ".so", ("aarch64-linux-gnu-gcc",)),
+    Platform("x86_64-windows", "win64", "x86_64-w64-windows-gnu", ".dll", ("x86_64-w64-mingw32-gcc",),
+             ("-static-libgcc",)),
+)
+
+
+class Variable(NamedTuple):
+    """A real variable of the unit; its value reference is its place in the list."""
+
+    name: str
+    role: str  # TIME, INPUT, OUTPUT, FIXED or TUNABLE, as in unit.h
+    unit: str
+    description: str
+    start: float = 0.0
+    low: float = -_LARGEST
+    high: float = _LARGEST
+
+
+def export_fmu(model: Model, out: Path, version: str = "2", seed: int = 0) -> list[str]:
+    """Write `model` to the file `out`; returns the platforms that it runs on.
+
+    Args:
+        model: the plant with its effects; their values are the start values of the unit's parameters.
+        out: file to write; the same model gives the same bytes.
+        version: of FMI, "2" or "3".
+        seed: start value of the unit's parameter `seed`, of the noise.
+
+    Raises:
+        InputError: no C compiler, or an effect that cannot be compiled or needs more than arithmetic.
+        RigError: the compiler reports an error.
+    """
+    variables = list_variables(model)
+    run = _compile_cycle(model)
+    identifier = re.sub(r"[^A-Za-z0-9_]", "_", model.name)
+    identifier = identifier if identifier[0].isalpha() else f"m{identifier}"
+    tables = write_tables(model, variables, seed)
+    sources = [FOLDER / "unit.c", FOLDER / f"fmi{version}.c"]
+    digest = hashlib.sha256((version + tables + model.to_toml()).encode())
+    for path in (FOLDER / "unit.h", *sources):
+        digest.update(path.read_bytes())
+    token = f"{{{UUID(bytes=digest.digest()[:16])}}}"
+    tables += f'#define TOKEN "{token}"\n#define MODEL_HASH UINT64_C(0x{digest.hexdigest()[:16]})\n'
+    files = {f"binaries/{machine.name if version == '3' else machine.old_name}/{identifier}{machine.suffix}": library
+             for machine, library in _build_libraries(model, run, tables, sources).items()}
+    platforms = [name.split("/")[1] for name in files]
+    describe = {"2": _describe_fmi2, "3": _describe_fmi3}[version]
+    files["modelDescription.xml"] = describe(model, variables, identifier, token, seed).encode()
+    files["documentation/index.html"] = _write_page(model, variables).encode()
+    files["resources/model.toml"] = model.to_toml().encode()
+    with write_whole(out) as unfinished, zipfile.ZipFile(unfinished, "w") as archive:
+        for name in sorted(files):
+            entry = zipfile.ZipInfo(name)  # without a time: the same model gives the same file
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, files[name], zipfile.ZIP_DEFLATED)
+    return platforms
+
+
+def _build_libraries(model: Model, run: Any, tables: str, sources: Sequence[Path]) -> dict[Platform, bytes]:
+    """The library for each platform that can be compiled for here."""
+    made = {}
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "unit_tables.h").write_text(tables)
+        code, library = Path(folder, "plant.o"), Path(folder, "library")
+        for machine, compiler in find_platforms():
+            emitted = emit_object(run, "advance_unit", machine.triple)
+            if emitted is None:
+                raise InputError("effects", ", ".join(model.effects), "laws that need nothing but arithmetic")
+            code.write_bytes(emitted)
+            words = [compiler, *_FLAGS, *machine.flags, f"-I{folder}", f"-I{FOLDER}", *map(str, sources), str(code)]
+            done = subprocess.run([*words, "-o", str(library), "-lm"], capture_output=True, text=True, check=False)
+            if done.returncode == 0:
+                made[machine] = library.read_bytes()
+            elif not made:  # this machine; a compiler for another one may lack its C library
+                lines = [line for line in done.stderr.splitlines() if "error" in line or "undefined" in line]
+                raise RigError(f"{compiler}: {(lines or ['no message'])[0]}")
+    return made
+
+
+def find_platforms() -> list[tuple[Platform, str]]:
+    """The platforms that this machine can compile for, itself first, with the compiler.
+
+    Raises:
+        InputError: no C compiler for this machine, or a machine that is not in the table.
+    """
+    own = f"{platform.machine()}-{platform.system().lower()}"
+    here = [machine for machine in PLATFORMS if machine.name == own]
+    if not here:
+        raise InputError("--fmu", own, f"a machine that is one of {', '.join(m.name for m in PLATFORMS)}")
+    found = [(here[0], find_compiler("--fmu", "to link the FMU with"))]
+    for machine in PLATFORMS:
+        compilers = [path for path in map(shutil.which, machine.compilers) if path]
+        if machine.name != own and compilers:
+            found.append((machine, compilers[0]))
+    return found
+
+
+def _compile_cycle(model: Model) -> Any:
+    """numba's dispatcher of the unit's cycle, compiled."""
+    flat = np.array(list_state_values(model.build_state()))
+    with report_law_errors(model):
+        run = build_kernel(advance_unit, model.effects, True, model.plant)
+        loop = np.array([0.0] * (LOOP - 1) + [-1.0])
+        run(flat, loop, np.zeros(INPUTS), np.zeros(NOISES), model.build_record(), model.steps,
+            np.zeros(len(model.kind.signals.outputs) + 1))
+    return run
+
+
+def list_variables(model: Model) -> list[Variable]:
+    """Time, inputs, outputs and parameters of the unit, by value reference."""
+    signals = model.kind.signals
+    load = signals.load
+    found = [
+        Variable("time", "TIME", "s", "time"),
+        Variable(signals.command.name, "INPUT", signals.command.unit,
+                 f"{signals.command.quantity}; used where closed_loop is true"),
+        Variable(signals.drive.name, "INPUT", signals.drive.unit,
+                 f"{signals.drive.quantity}, held for the step; used where closed_loop is false"),
+        Variable("load" if load is None else load.name, "INPUT", "N" if load is None else load.unit,
+                 "external load" if load is None else f"{load.quantity}, held for the step"),
+        *(Variable(s.name, "OUTPUT", s.unit, s.quantity) for s in signals.outputs),
+        Variable("answer", "OUTPUT", signals.drive.unit,
+                 f"answer of the controller in the last cycle; it drives the plant in the next one if closed_loop is "
+                 f"true: {signals.drive.quantity}"),
+    ]
+    for name in model.list_names():
+        q = find_quantity(name, plant=model.plant)
+        group, _, field = name.partition(".")
+        words = "".join(f"; {value:g}: {word}" for word, value in q.words.items())
+        symbol = f" ({q.symbol})" if q.symbol else ""
+        text = f"{field.replace('_', ' ')} of {group.replace('_', ' ')}{symbol}{words}"
+        low: float = max(q.low, math.nextafter(q.above, math.inf), -_LARGEST)
+        high = min(q.high, math.nextafter(q.below, -math.inf), _LARGEST)
+        if q.words:
+            low, high = min(q.words.values()), max(q.words.values())
+        found.append(Variable(name, "FIXED" if name == "controller.period" else "TUNABLE", q.unit, text, model[name],
+                              low, high))
+    return found
+
+
+# -------------------------------------------------------------------------------------------- tables for the C code
+
+
+def write_tables(model: Model, variables: Sequence[Variable], seed: int) -> str:
+    """The header with the numbers of the model, and numpy's tables of the normal distribution."""
+    normal = read_normal_tables()
+    outputs = [i for i, v in enumerate(variables) if v.role == "OUTPUT"]
+    parameters = [i for i, v in enumerate(variables) if v.role in ("FIXED", "TUNABLE")]
+    period = next(i for i in parameters if variables[i].name == "controller.period")
+    flat = list_state_values(model.build_state())
+    counts = {"REALS": len(variables), "STATES": len(flat), "NOISES": NOISES, "TIME_AT": 0, "INPUTS": 1,
+              "OUTPUTS": outputs[0], "OUTPUT_COUNT": len(outputs), "PARAMETERS": parameters[0],
+              "PARAMETER_COUNT": len(parameters), "PERIOD": period, "SEED_AT": len(variables),
+              "CLOSED_AT": len(variables) + 1, "SEED": seed, "SOLVER_STEP": STEP.hex(),
+              "ZIGGURAT_R": normal.r.hex(), "ZIGGURAT_INVERSE_R": normal.inverse_r.hex()}
+    tables = {
+        "VARIABLE_TABLE": [f'{{"{v.name}", {v.role}, '
+                           f'{", ".join(float(number).hex() for number in (v.start, v.low, v.high))}}}'
+                           for v in variables],
+        "FLAT_TABLE": [value.hex() for value in flat],
+        "ZIGGURAT_K": [f"UINT64_C({k})" for k in normal.k],
+        "ZIGGURAT_W": [w.hex() for w in normal.w],
+        "ZIGGURAT_F": [f.hex() for f in normal.f],
+    }
+    lines = [f"#define {name} {value}" for name, value in counts.items()]
+    lines += [f"#define {name} {{{', '.join(values)}}}" for name, values in tables.items()]
+    return "\n".join(lines) + "\n"
+
+
+# -------------------------------------------------------------------------------------------- modelDescription.xml
+
+_BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+_DERIVED = {"N": {"kg": 1, "m": 1, "s": -2}, "Pa": {"kg": 1, "m": -1, "s": -2}, "J": {"kg": 1, "m": 2, "s": -2},
+            "W": {"kg": 1, "m": 2, "s": -3}, "V": {"kg": 1, "m": 2, "s": -3, "A": -1},
+            "Ohm": {"kg": 1, "m": 2, "s": -3, "A": -2}, "H": {"kg": 1, "m": 2, "s": -2, "A": -2}, "Hz": {"s": -1}}
+
+
+def find_exponents(unit: str) -> dict[str, int] | None:
+    """Exponents of the SI units in `unit`, such as "N m s2/m"; None where it has a part that is not SI.
+
+    >>> find_exponents("A/(m s)"), find_exponents("raw/m")
+    ({'m': -1, 's': -1, 'A': 1}, None)
+    """
+    total = dict.fromkeys(_BASE_UNITS, 0)
+    above, *below = unit.replace("rms", "").replace("(", "").replace(")", "").split("/")
+    for sign, words in ((1, above), *((-1, words) for words in below)):
+        for word in words.split():
+            name = word.rstrip("0123456789")
+            parts = {name: 1} if name in _BASE_UNITS else _DERIVED.get(name)
+            if parts is None and word != "1":
+                return None
+            for base, exponent in (parts or {}).items():
+                total[base] += sign * exponent * int(word[len(name):] or 1)
+    return {base: exponent for base, exponent in total.items() if exponent}
+
+
+def _tag(name: str, attributes: dict[str, object], inner: Iterable[str] = ()) -> str:
+    words = "".join(f" {key}={quoteattr(str(value))}" for key, value in attributes.items())
+    content = list(inner)
+    return f"<{name}{words}>\n{''.join(content)}</{name}>\n" if content else f"<{name}{words}/>\n"
+
+
+def _write_units(variables: Sequence[Variable]) -> str:
+    units = {v.unit: find_exponents(v.unit) for v in variables}
+    return _tag("UnitDefinitions", {}, (
+        _tag("Unit", {"name": name}, [] if base is None else [_tag("BaseUnit", dict(base))])
+        for name, base in units.items()))
+
+
+_OTHERS = (("seed", "seed of the sensors' noise"),
+           ("closed_loop", "true: the controller of the model closes the loop; false: the input drives the plant"))
+_CAUSALITY = {"TIME": ("independent", "continuous"), "INPUT": ("input", "continuous"),
+              "OUTPUT": ("output", "discrete"), "FIXED": ("parameter", "fixed"), "TUNABLE": ("parameter", "tunable")}
+
+
+def _list_attributes(v: Variable) -> tuple[dict[str, object], dict[str, object]]:
+    """What both versions say of a variable: of itself, and of its number."""
+    causality, variability = _CAUSALITY[v.role]
+    itself: dict[str, object] = {"description": v.description, "causality": causality, "variability": variability}
+    number: dict[str, object] = {"unit": v.unit}
+    if v.low > -_LARGEST:
+        number["min"] = repr(float(v.low))
+    if v.high < _LARGEST:
+        number["max"] = repr(float(v.high))
+    if v.role in ("INPUT", "FIXED", "TUNABLE"):
+        number["start"] = repr(v.start)
+    return itself, number
+
+
+def _describe(version: str, model: Model, token: dict[str, object], parts: Iterable[str]) -> str:
+    about = {"fmiVersion": version, "modelName": model.name, **token,
+             "description": f"{model!r}"[1:-1], "generationTool": "eha-rig", "variableNamingConvention": "structured"}
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + _tag("fmiModelDescription", about, parts)
+
+
+def _list_common(model: Model, variables: Sequence[Variable]) -> list[str]:
+    period = model["controller.period"]
+    return [_write_units(variables), _tag("LogCategories", {}, [_tag("Category", {"name": "logStatusError"})]),
+            _tag("DefaultExperiment", {"startTime": 0.0, "stopTime": 1000 * period, "stepSize": period})]
+
+
+def _describe_fmi2(model: Model, variables: Sequence[Variable], identifier: str, token: str, seed: int) -> str:
+    scalars = []
+    for i, v in enumerate(variables):
+        itself, number = _list_attributes(v)
+        scalars.append(_tag("ScalarVariable", {"name": v.name, "valueReference": i, **itself}, [_tag("Real", number)]))
+    for i, ((name, text), kind, start) in enumerate(zip(_OTHERS, ("Integer", "Boolean"), (seed, "false"), strict=True)):
+        attributes = {"name": name, "valueReference": len(variables) + i, "description": text,
+                      "causality": "parameter", "variability": "fixed"}
+        scalars.append(_tag("ScalarVariable", attributes, [_tag(kind, {"start": start})]))
+    unknowns = [_tag("Unknown", {"index": i}) for i, v in enumerate(variables, 1) if v.role == "OUTPUT"]
+    return _describe("2.0", model, {"guid": token}, [
+        _tag("CoSimulation", {"modelIdentifier": identifier, "canHandleVariableCommunicationStepSize": "false",
+                              "canNotUseMemoryManagementFunctions": "true", "canGetAndSetFMUstate": "true",
+                              "canSerializeFMUstate": "true"}),
+        *_list_common(model, variables), _tag("ModelVariables", {}, scalars),
+        _tag("ModelStructure", {}, [_tag("Outputs", {}, unknowns), _tag("InitialUnknowns", {}, unknowns)])])
+
+
+def _describe_fmi3(model: Model, variables: Sequence[Variable], identifier: str, token: str, seed: int) -> str:
+    scalars = []
+    for i, v in enumerate(variables):
+        itself, number = _list_attributes(v)
+        scalars.append(_tag("Float64", {"name": v.name, "valueReference": i, **itself, **number}))
+    for i, ((name, text), kind, start) in enumerate(zip(_OTHERS, ("Int32", "Boolean"), (seed, "false"), strict=True)):
+        scalars.append(_tag(kind, {"name": name, "valueReference": len(variables) + i, "description": text,
+                                   "causality": "parameter", "variability": "fixed", "start": start}))
+    outputs = [i for i, v in enumerate(variables) if v.role == "OUTPUT"]
+    return _describe("3.0", model, {"instantiationToken": token}, [
+        _tag("CoSimulation", {"modelIdentifier": identifier, "canHandleVariableCommunicationStepSize": "true",
+                              "fixedInternalStepSize": model["controller.period"], "canGetAndSetFMUState": "true",
+                              "canSerializeFMUState": "true"}),
+        *_list_common(model, variables), _tag("ModelVariables", {}, scalars),
+        _tag("ModelStructure", {}, [_tag(name, {"valueReference": i})
+                                    for name in ("Output", "InitialUnknown") for i in outputs])])
+
+
+def _write_page(model: Model, variables: Sequence[Variable]) -> str:
+    """The documentation in the file: what the variables are."""
+    rows = "".join(f"<tr><td>{escape(v.name)}<td>{_CAUSALITY[v.role][0]}<td>{escape(v.unit)}<td>{v.start:g}"
+                   f"<td>{escape(v.description)}" for v in variables)
+    return (f"<!DOCTYPE html><meta charset='utf-8'><title>{escape(model.name)}</title><h1>{escape(model.name)}</h1>"
+            f"<p>{escape(repr(model)[1:-1])}</p><p>A step is a whole number of cycles of the controller. Step k starts "
+            "with the outputs of row k of <code>rig simulate</code>: with closed_loop true and com[k] as demand the "
+            "unit gives its rows bit for bit; with closed_loop false it is driven by cor[k - 1], 0 in the first step. "
+            "The noise is that of <code>--seed</code>; set the parameters sensors.* to 0 to be without.</p>"
+            f"<table><tr><th>variable<th>causality<th>unit<th>start<th>description{rows}</table>\n")
