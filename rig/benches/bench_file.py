@@ -215,7 +215,7 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, *, is_t
     if keys.plant_node is not None:
         specs, nodes[Role.PLANT] = _join_plant_node(reader, specs, sync, nodes, folder)
     if len(specs) > MOST_FRAMES:
-        raise reader.place.refuse(f"at most {MOST_FRAMES} frames or pages of multiplexed ones, not {len(specs)}")
+        raise reader.place.refuse(f"at most {MOST_FRAMES} frames or pages of multiplexed ones")
     phases, ready = _list_states(frames, uses)
     bench = Bench(name=keys.name, frames=FrameMap(frames=tuple(specs), sync=sync), nodes=nodes, plant=keys.plant,
                   cycle_ns=cycle_ns, bitrate=keys.bitrate, timeout_ns=timeout_ns, phases=phases, ready=ready,
@@ -434,7 +434,7 @@ def _build_spec(frame: DeviceFrame, uses: Mapping[str, Use], sender: Role) -> Fr
     """A frame of the controller as one of the bench."""
     spec = FrameSpec(name=frame.name, identifier=frame.identifier, length=frame.length, sender=sender,
                      fields=build_fields(frame, uses), every=frame.every, is_before_sync=frame.is_before_sync,
-                     is_answer=frame.is_answer)
+                     is_answer=frame.is_answer, is_switched=frame.is_switched)
     roles = {"drive": sender is Role.CONTROLLER and spec.has(*OUTPUTS),
              "command": sender is Role.RIG and spec.has("position_demand", "control_word"),
              "feedback": sender is Role.RIG and spec.has(*MEASURED)}

@@ -7,7 +7,7 @@ from typing import Any
 from fdi.report.report import Cell, Column, Report, Section, Table, tabulate
 from rig.benches.bench import Bench
 from rig.benches.bus_load import FrameLoad, list_loads
-from rig.benches.frame_map import EXTENDED, FD, Role, describe_identifier
+from rig.benches.frame_map import EXTENDED, FD, SWITCHED, Role, describe_identifier
 
 _IDENTIFIER = 0x1FFF_FFFF
 
@@ -24,9 +24,8 @@ def build_bench_report(bench: Bench, files: Sequence[tuple[str, str]] = ()) -> R
     facts = [("protocol", "CANopen" if bench.nodes else "CAN"), *([("nodes", ", ".join(nodes))] if nodes else []),
              ("profile", bench.profile), ("plant", bench.plant), ("cycle", f"{bench.cycle_ns / 1e6:g} ms")]
     notes = []
-    if any(each.identifier & FD for each in loads):
-        notes.append("CAN FD frames are counted at this bit rate throughout; with a higher one for the data they take "
-                     "less")
+    if any(each.identifier & SWITCHED for each in loads):
+        notes.append("BRS: the data go at the higher bit rate of the bus; the frames are counted at this one")
     verdict = "WITHIN_LIMITS" if is_possible else "BEYOND_LIMITS"
     return Report(command="check", title=f"Bench: {bench.name}", verdict=verdict, mood="good" if is_possible else "bad",
                   sentence=sentence, facts=facts, notes=notes, sections=[Section("Frames", [tabulate_frames(loads)])],
@@ -40,7 +39,8 @@ def tabulate_frames(loads: Sequence[FrameLoad]) -> Table:
         [*loads, total],
         (Column("frame"), lambda each: Cell(each.name, is_strong=each is not total)),
         (Column("identifier"), lambda each: "" if each is total else (
-            describe_identifier(each.identifier) + (" FD" if each.identifier & FD else ""))),
+            describe_identifier(each.identifier) + " FD" * bool(each.identifier & FD)
+            + ", BRS" * bool(each.identifier & SWITCHED))),
         (Column("from > to"), lambda each: each.direction),
         (Column("bytes", align="right"), lambda each: "" if each is total else str(each.length)),
         (Column("signals"), lambda each: ", ".join(each.content)),
@@ -53,6 +53,7 @@ def collect_data(bench: Bench, loads: Sequence[FrameLoad]) -> dict[str, Any]:
     """The bench as the JSON answer has it."""
     frames = [{"name": each.name, "identifier": each.identifier & _IDENTIFIER,
                "extended": bool(each.identifier & EXTENDED), "fd": bool(each.identifier & FD),
+               "brs": bool(each.identifier & SWITCHED),
                "direction": each.direction, "bytes": each.length, "signals": list(each.content),
                "period": each.period, "share": each.share} for each in loads]
     return {"name": bench.name, "plant": bench.plant, "protocol": "canopen" if bench.nodes else "can",

@@ -13,7 +13,7 @@ class FrameLoad(NamedTuple):
     """A frame of a bench, and its share of the bus."""
 
     name: str
-    identifier: int  # with EXTENDED and FD
+    identifier: int  # with EXTENDED, FD and SWITCHED
     direction: str  # "rig > controller"
     length: int  # bytes
     content: tuple[str, ...]  # signals, and what protects them
@@ -41,7 +41,7 @@ def count_bits(identifier: int, length: int) -> int:
 def list_loads(bench: Bench) -> list[FrameLoad]:
     """The cyclic frames of a bench, then SYNC and the heartbeats."""
     cycle = bench.cycle_ns / 1e9
-    found = [(spec.name, spec.identifier, _describe_direction(bench, spec), spec.length, list_content(spec),
+    found = [(spec.name, spec.sent_as, _describe_direction(bench, spec), spec.length, list_content(spec),
               cycle * spec.every) for spec in bench.frames.frames]
     if bench.frames.sync is not None:
         found.append(("SYNC", bench.frames.sync, "rig > all", 0, (), cycle))

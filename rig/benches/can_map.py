@@ -3,11 +3,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from fractions import Fraction
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from plant.errors import InputError, suggest_name
-from rig.benches.frame_map import EXTENDED, FD, Field, Kind
+from rig.benches.frame_map import EXTENDED, FD, MOST_FRAMES, Field, Kind
 from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 from rig.tables import list_choices
 
@@ -56,7 +58,25 @@ def map_messages(name: str, database: Any, uses: Mapping[str, Use], cycle_ns: in
         if signal not in known:
             raise use.place.refuse(f"a signal of message {message}: {list_choices(signal, known)}")
         grouped.setdefault(message, {})[full] = use
-    return [frame for message, own in grouped.items() for frame in _map_message(name, messages[message], own, cycle_ns)]
+    switched = _find_switched(database)
+    return [replace(frame, is_switched=bool(frame.identifier & FD) and message in switched)
+            for message, own in grouped.items() for frame in _map_message(name, messages[message], own, cycle_ns)]
+
+
+def _find_switched(database: Any) -> set[str]:
+    """The messages whose data go at the higher bit rate of CAN FD: the attribute CANFD_BRS says so."""
+    specifics = database.dbc
+    definition = None if specifics is None else specifics.attribute_definitions.get("CANFD_BRS")
+    if definition is None:
+        return set()
+    names, found = [str(each) for each in definition.choices or ()], set()
+    for message in database.messages:
+        given = message.dbc.attributes.get("CANFD_BRS") if message.dbc is not None else None
+        value = definition.default_value if given is None else given.value
+        is_place = given is not None and isinstance(value, int) and 0 <= value < len(names)
+        if (names[int(value)] if is_place else str(value)) == "1":
+            found.add(message.name)
+    return found
 
 
 def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns: int) -> Iterator[DeviceFrame]:
@@ -71,43 +91,73 @@ def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns:
     is_fd = message.is_fd or message.length > 8
     identifier = message.frame_id | (EXTENDED if message.is_extended_frame else 0) | (FD if is_fd else 0)
     slots = {signal.name: _read_slot(name, message, signal) for signal in message.signals}
-    pages: list[int | None] = [None]
-    selectors = [signal for signal in message.signals if signal.is_multiplexer]
+    signals = {signal.name: signal for signal in message.signals}
     chosen = [signal for signal in message.signals if f"{message.name}.{signal.name}" in uses]
-    if selectors:
-        pages = list(_list_pages(message, chosen, is_received=True in ways))
-    if pages != [None] and (len(selectors) > 1 or selectors[0] in chosen):
-        raise place.refuse(f"one multiplexer, with no other use; {message.name} has "
-                           f"{', '.join(signal.name for signal in selectors)}")
+    pages = list(islice(_list_pages(message, chosen, is_received=True in ways), MOST_FRAMES + 1))
+    for selector in sorted({selector for page in pages for selector in page}):
+        own = f"{message.name}.{selector}"
+        if own in uses:
+            raise uses[own].place.refuse(f"signals with no other use; {own} is the multiplexer of used ones")
     for page in pages:
-        on_page = [slots[signal.name] for signal in message.signals
-                   if signal.multiplexer_ids is None or page in signal.multiplexer_ids]
-        if page is not None:
-            selector = slots[selectors[0].name]
-            on_page = [_select(selector, page) if slot is selector else slot for slot in on_page]
+        on_page = [replace(slots[signal.name], start=page[signal.name], is_selector=True) if signal.name in page else
+                   slots[signal.name] for signal in message.signals if _is_on_page(signals, signal.name, page)]
         carries_current = any(slot.name in uses and uses[slot.name].signal == "current" for slot in on_page)
         yield DeviceFrame(
-            name=message.name if page is None else f"{message.name}[{page}]", identifier=identifier,
-            length=message.length, is_received=True in ways, slots=tuple(on_page),
+            name=f"{message.name}[{'.'.join(map(str, page.values()))}]" if page else message.name,
+            identifier=identifier, length=message.length, is_received=True in ways, slots=tuple(on_page),
             every=_find_period(name, message, cycle_ns),
             is_answer=True in ways or carries_current or (len(pages) == 1 and bool(message.cycle_time)))
 
 
-def _list_pages(message: Message, chosen: list[Signal], *, is_received: bool) -> Iterator[int | None]:
-    """The values of the selector with a used signal; all that the DBC has, where it stands beside a used one."""
-    numbers = {number for signal in message.signals for number in signal.multiplexer_ids or ()}
-    used = {number for signal in chosen for number in signal.multiplexer_ids or ()}
-    has_common = any(signal.multiplexer_ids is None for signal in chosen)
-    if used:
-        yield from sorted(numbers if has_common and not is_received else used)
-    else:
-        start = next(signal.raw_initial for signal in message.signals if signal.is_multiplexer)
-        yield int(start or 0) if is_received else None
+Page = Mapping[str, int]  # values of selectors
 
 
-def _select(selector: Slot, page: int) -> Slot:
-    """The selector with the value of a page."""
-    return Slot(name=selector.name, bits=selector.bits, start=page, is_selector=True)
+def _list_pages(message: Message, chosen: list[Signal], *, is_received: bool) -> Iterator[Page]:
+    """The pages with a used signal; of those that the device sends also the others on which it stands.
+
+    Selectors that tell no used signals apart are signals as others are.
+    """
+    signals = {signal.name: signal for signal in message.signals}
+    ancestors = {signal.name: _list_ancestors(signals, signal.name) for signal in message.signals}
+    telling = {name for signal in chosen for name in ancestors[signal.name]}
+    near = [*chosen, *(signals[name] for name in telling)]
+
+    def extend(page: Page, rest: list[str]) -> Iterator[Page]:
+        if not rest:
+            own = {signal.multiplexer_signal for signal in chosen if _is_on_page(signals, signal.name, page)}
+            ends = {name for name in page if not any(signals[other].multiplexer_signal == name for other in page)}
+            if own and (not is_received or own >= ends):
+                yield page
+            return
+        name, later = rest[0], rest[1:]
+        if not _is_on_page(signals, name, page):
+            yield from extend(page, later)
+            return
+        stands_beside = not is_received and any(
+            name not in ancestors[signal.name] and _is_on_page(signals, signal.name, page) for signal in chosen)
+        for number in sorted({number for each in (message.signals if stands_beside else near)
+                              if each.multiplexer_signal == name for number in each.multiplexer_ids or ()}):
+            yield from extend({**page, name: number}, later)
+
+    return extend({}, sorted(telling, key=lambda name: (len(ancestors[name]), name)))
+
+
+def _list_ancestors(signals: Mapping[str, Signal], name: str) -> list[str]:
+    """The selectors on which a signal depends."""
+    found: list[str] = []
+    while (parent := signals[name].multiplexer_signal) in signals and parent not in found:
+        found.append(name := str(parent))
+    return found
+
+
+def _is_on_page(signals: Mapping[str, Signal], name: str, page: Page) -> bool:
+    """Whether a page has a signal; a selector that the page leaves open has its start value."""
+    for each in (signals[one] for one in (name, *_list_ancestors(signals, name))):
+        parent = str(each.multiplexer_signal)
+        if parent in signals and page.get(parent, int(signals[parent].raw_initial or 0)) not in (
+                each.multiplexer_ids or ()):
+            return False
+    return True
 
 
 def _find_period(name: str, message: Message, cycle_ns: int) -> int:

@@ -14,6 +14,7 @@ from functools import cached_property
 
 EXTENDED = 1 << 31  # in an identifier: it has 29 bits, as in Linux's can_id
 FD = 1 << 30  # in an identifier: a CAN FD frame
+SWITCHED = 1 << 29  # beside FD, to send a frame: its data go at the higher bit rate
 MOST_FRAMES = 48  # of a bench: the compiled loops keep a bit of a word for each
 
 
@@ -162,15 +163,21 @@ class FrameSpec:
     fields: tuple[Field, ...]
     every: int = 1  # cycles from one to the next
     is_before_sync: bool = False  # sent before SYNC, with which its values take effect
+    is_switched: bool = False  # CAN FD: the data go at the higher bit rate
     is_answer: bool = True  # of a sender other than the rig: it comes in each `every`-th cycle, so lockstep awaits it
     roles: tuple[str, ...] = ()  # as sequences name it: "command", "feedback", "valve_state", "drive"
 
     __hash__ = object.__hash__  # the loops ask for one and the same frame in each cycle; to hash its values takes 20 us
 
+    @property
+    def sent_as(self) -> int:
+        """The identifier to send the frame with."""
+        return self.identifier | SWITCHED * self.is_switched
+
     @cached_property
-    def selector(self) -> Field | None:
-        """The field that tells frames with the same identifier apart."""
-        return next((each for each in self.fields if each.fixed is not None and each.name), None)
+    def selectors(self) -> tuple[Field, ...]:
+        """The fields that tell frames with the same identifier apart; several where multiplexers are nested."""
+        return tuple(each for each in self.fields if each.fixed is not None and each.name)
 
     def has(self, *names: str) -> bool:
         """Whether the frame carries one of these values."""
@@ -305,10 +312,10 @@ class FrameMap:
         return self.list_from(role) + others
 
     def find(self, identifier: int, data: bytes) -> FrameSpec | None:
-        """The frame with this identifier and, if it is multiplexed, with the selector of `data`; None: not mapped."""
+        """The frame with this identifier and, if it is multiplexed, with the selectors of `data`; None: not mapped."""
         for each in self.by_identifier.get(identifier, ()):
-            chosen = each.selector
-            if chosen is None or (len(data) == each.length and extract_bits(chosen, data) == chosen.fixed):
+            if not each.selectors or (len(data) == each.length and all(
+                    extract_bits(chosen, data) == chosen.fixed for chosen in each.selectors)):
                 return each
         return None
 

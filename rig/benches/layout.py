@@ -62,6 +62,7 @@ class DeviceFrame:
     every: int = 1
     is_before_sync: bool = False
     is_answer: bool = True
+    is_switched: bool = False
 
 
 @contextmanager

@@ -25,8 +25,8 @@ FRAMES_AT = 24
 # Columns of a frame. Of the loop: how many were sent, or the last alive counter; how many came wrong; the last cycle
 # in which one was taken, -1 before
 (IDENTIFIER, LENGTH, EVERY, IS_MINE, IS_BEFORE_SYNC, IS_ANSWER, IS_NUMBERED, ROLES, _FIRST, _END, _SELECTOR, COUNT,
- WRONG_COUNTERS, WRONG_CHECKSUMS, LAST_CYCLE) = range(15)
-FRAME_WORDS = 15
+ WRONG_COUNTERS, WRONG_CHECKSUMS, LAST_CYCLE, SENT_AS) = range(16)
+FRAME_WORDS = 16
 # Roles of a frame, bits of ROLES; above them each frame has a bit of its own
 COMMAND, FEEDBACK, VALVE, DRIVE = 1, 2, 4, 8
 ALL_ROLES = 0xFF
@@ -34,6 +34,7 @@ _FIRST_OWN_BIT = 8
 # Columns of a field; the last five are doubles
 (_CHANNEL, _LOWEST, _BITS, _IS_BIG, _KIND, _RULE, _FIXED, _NUMERATOR, _DENOMINATOR, _OFFSET, _LOW, _HIGH) = range(12)
 _FIELD_WORDS = 12
+_NEXT = _CHANNEL  # of a selector: the next one of its frame, or -1
 # A checksum has its numbers in place of count and range; its _FIXED is the address of a user's function, or 0
 _POLYNOMIAL, _START, _INVERSION, _DATA_ID, _DATA_IDS_AT = range(7, 12)
 _VALUE, _CONSTANT, _COUNTER, _CHECKSUM, _CYCLE = range(5)  # rules: what a field holds
@@ -62,7 +63,9 @@ def find_frame(m: Layout, identifier: int) -> int:
         at = FRAMES_AT + FRAME_WORDS * number
         if words[at + IDENTIFIER] == identifier:
             chosen = words[at + _SELECTOR]
-            if chosen < 0 or _read_bits(m, chosen) == words[chosen + _FIXED]:
+            while chosen >= 0 and _read_bits(m, chosen) == words[chosen + _FIXED]:
+                chosen = words[chosen + _NEXT]
+            if chosen < 0:
                 return at
     return -1
 
@@ -293,11 +296,12 @@ def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], mine: Role
         words[at: at + FRAME_WORDS] = (
             each.identifier, each.length, each.every, is_mine, each.is_before_sync, each.is_answer, _CYCLE in rules,
             _find_roles(each) | 1 << _FIRST_OWN_BIT + number, field, field + _FIELD_WORDS * len(each.fields), -1,
-            0 if is_mine else -1, 0, 0, -1)
+            0 if is_mine else -1, 0, 0, -1, each.sent_as)
         for one, rule in zip(each.fields, rules, strict=True):
-            if one is each.selector:
-                words[at + _SELECTOR] = field
             _fill_field(m, field, one, rule, places.get(one.name, -1))
+            if one in each.selectors:
+                words[field + _NEXT] = words[at + _SELECTOR]
+                words[at + _SELECTOR] = field
             if rule == _CHECKSUM and one.data_ids:
                 words[field + _DATA_IDS_AT] = ids
                 words[ids: ids + 1 + len(one.data_ids)] = len(one.data_ids), *one.data_ids

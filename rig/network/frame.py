@@ -15,7 +15,7 @@ EXTENDED = frame_map.EXTENDED  # in a COB-ID: the identifier has 29 bits, as CAN
 FD_FRAME = frame_map.FD  # a CAN FD frame, of up to 64 bytes
 # A CAN FD frame whose data go at the higher bit rate. It is set to send such a frame, and stands in logs of others. A
 # bus leaves it out of the frames that it delivers: with it or without it, a frame is the same frame.
-BIT_RATE_SWITCH = 0x20000000
+BIT_RATE_SWITCH = frame_map.SWITCHED
 IDENTIFIER = 0x1FFFFFFF  # the bits of the identifier itself
 FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)  # bytes of the CAN FD frames that are longer than a classical frame
 

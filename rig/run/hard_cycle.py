@@ -28,7 +28,6 @@ from rig.benches.packing import (
     FRAME_WORDS,
     FRAMES,
     FRAMES_AT,
-    IDENTIFIER,
     IS_ANSWER,
     IS_BEFORE_SYNC,
     IS_MINE,
@@ -38,6 +37,7 @@ from rig.benches.packing import (
     OTHER_CYCLE,
     PAYLOAD,
     ROLES,
+    SENT_AS,
     VALUES_AT,
     VALVE,
     Layout,
@@ -314,7 +314,7 @@ def _send_as_fault_leaves_it(port: Port, buffers: Buffers, m: Layout, plant: Mem
         _hold_frame(buffers, m, at, words[DUE] + argument, length)
     elif code != DROP:
         length, m.words[PAYLOAD] = change_frame(code, argument, length, m.words[PAYLOAD])
-        _send(port, buffers, m, m.words[at + IDENTIFIER], length, 2 if code == DOUBLE else 1)
+        _send(port, buffers, m, m.words[at + SENT_AS], length, 2 if code == DOUBLE else 1)
 
 
 def _hold_frame(buffers: Buffers, m: Layout, at: int, due: int, length: int) -> None:
@@ -348,7 +348,7 @@ def _release_first_held(port: Port, buffers: Buffers, m: Layout) -> None:
     for place in range(words[HELD]):
         _move_held(buffers, place + 1, place)
     if m.words[at + IS_MINE]:
-        _send(port, buffers, m, m.words[at + IDENTIFIER], length, 1)
+        _send(port, buffers, m, m.words[at + SENT_AS], length, 1)
     else:
         _keep_answer(buffers, m, at, length, read_clock(port) - words[SYNC_AT])
 

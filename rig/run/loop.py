@@ -22,7 +22,7 @@ from plant.segments import Array
 from rig.benches.bench import Bench, Flags
 from rig.benches.frame_map import FrameSpec, Role, check_guards, make_reader, make_writer
 from rig.network.clock import WallClock
-from rig.network.frame import Frame
+from rig.network.frame import BIT_RATE_SWITCH, Frame
 from rig.network.master import Master
 from rig.nodes.faulty_plant import DIVERGED, FaultyPlant
 from rig.nodes.scenario import Scenario
@@ -271,10 +271,10 @@ class CycleLoop(Loop):
                 self.outputs.update(read(data))  # what the receiver will read
                 action = self._find_fault(spec)
                 if action.code == DELAY:
-                    self._hold(self._t_ns + action.argument, spec.identifier, data)
+                    self._hold(self._t_ns + action.argument, spec.sent_as, data)
                     continue
                 for what in apply_action(action, data):
-                    self._master.send(spec.identifier, what)
+                    self._master.send(spec.sent_as, what)
 
     def _find_fault(self, spec: FrameSpec) -> Action:
         """What a fault does to a frame that the rig sends: to the command, or to the feedback of its own plant."""
@@ -291,7 +291,7 @@ class CycleLoop(Loop):
         """Late frames whose time has come; those of the controller are taken in now."""
         while self._held and self._held[0][0] < before_ns:
             _, _, identifier, data = heapq.heappop(self._held)
-            spec = self._bench.frames.find(identifier, data)
+            spec = self._bench.frames.find(identifier & ~BIT_RATE_SWITCH, data)
             if spec in self._answers:
                 self._take_answer(self._answers[spec], data, self._wire.clock.now())
             else:

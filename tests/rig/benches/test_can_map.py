@@ -4,17 +4,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from fractions import Fraction
-from typing import Any
+from typing import Any, cast
 
 import pytest
-from cantools.database import Database
+from cantools.database import Database, load_string
 from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from hypothesis import given
 from hypothesis import strategies as st
 
+from plant.errors import InputError
 from rig.benches.bench_file import load_bench_from_files
-from rig.benches.frame_map import EXTENDED, FD, FrameSpec, Kind, Role, extract_bits, pack, unpack
+from rig.benches.frame_map import EXTENDED, FD, SWITCHED, FrameSpec, Kind, Role, extract_bits, pack, unpack
+from rig.benches.packing import PAYLOAD, find_frame, list_frame_places, make_layout
 
 INPUTS = {"position_demand": ("mm", 1e-3), "ram_position": ("m", 1.0), "load_pressure": ("bar", 1e5),
           "load_force": ("kN", 1e3), "spool_position": ("um", 1e-6), "flags": ("%", 1e-2)}
@@ -136,7 +138,7 @@ def load_pages(*lines: str) -> Any:
 
 def list_pages(bench: Any) -> Iterator[tuple[str, bool, int | None]]:
     for spec in bench.frames.list_from(Role.CONTROLLER):
-        yield spec.name, spec.is_answer, spec.selector and spec.selector.fixed
+        yield spec.name, spec.is_answer, spec.selectors[0].fixed if spec.selectors else None
 
 
 def test_a_page_is_a_frame_and_what_stands_on_all_pages_is_read_from_each() -> None:
@@ -155,3 +157,64 @@ def test_a_signal_that_the_bench_file_does_not_use_has_its_start_value() -> None
     data = pack(spec, {"position_demand": 0.001, "ram_position": -1e-5})
     assert data == bytes.fromhex("e8030000ffff0700")  # of two that overlap the first is filled
     assert math.isclose(unpack(spec, data)["ram_position"], -1e-5)
+
+
+NESTED = """VERSION ""
+BU_: Rig Ecu
+BO_ 10 Demand: 16 Rig
+ SG_ Kind M : 7|8@0+ (1,0) [0|0] "" Ecu
+ SG_ Part m0M : 8|4@1+ (1,0) [0|0] "" Ecu
+ SG_ Position m2 : 16|16@1- (0.001,0.5) [0|0] "mm" Ecu
+ SG_ Ram m4 : 16|16@1- (0.01,0) [0|0] "mm" Ecu
+BO_ 11 Drive: 8 Ecu
+ SG_ Kind M : 0|8@1+ (1,0) [0|0] "" Rig
+ SG_ Part m0M : 8|4@1+ (1,0) [0|0] "" Rig
+ SG_ Current m5 : 31|16@0- (0.02,0) [0|0] "mA" Rig
+ SG_ State m3 : 16|8@1+ (1,0) [0|0] "" Rig
+ SG_ Side m0 : 48|8@1+ (1,0) [0|0] "" Rig
+ SG_ Heat m1 : 16|16@1- (1,0) [0|0] "" Rig
+BA_DEF_ BO_ "CANFD_BRS" ENUM "0","1";
+BA_DEF_DEF_ "CANFD_BRS" "1";
+SG_MUL_VAL_ 10 Part Kind 0-0;
+SG_MUL_VAL_ 10 Position Part 2-3;
+SG_MUL_VAL_ 10 Ram Kind 4-4;
+SG_MUL_VAL_ 11 Part Kind 0-0;
+SG_MUL_VAL_ 11 Current Part 5-5;
+SG_MUL_VAL_ 11 State Part 3-3;
+SG_MUL_VAL_ 11 Side Kind 0-0;
+SG_MUL_VAL_ 11 Heat Kind 1-1;
+"""
+
+
+@pytest.mark.parametrize("state, pages", [
+    ("State", ["Demand[0.2]", "Demand[0.3]", "Demand[4]", "Drive[0.3]", "Drive[0.5]"]),
+    ("Side", ["Demand[0.2]", "Demand[0.3]", "Demand[4]", "Drive[0.3]", "Drive[0.5]"]),
+    ("Heat", ["Demand[0.2]", "Demand[0.3]", "Demand[4]", "Drive[0.5]", "Drive[1]"])])
+def test_pages_of_nested_multiplexers_are_those_of_cantools(state: str, pages: list[str]) -> None:
+    """Each page is known by all its selectors, also in the compiled tables; CANFD_BRS counts for CAN FD."""
+    text = "\n".join(['name = "x"', "[controller]", 'protocol = "can"', 'dbc = "x.dbc"', "[controller.inputs]",
+                      'position_demand = "Demand.Position"', 'ram_position = "Demand.Ram"', "[controller.outputs]",
+                      'current = "Drive.Current"', "[controller.ready]", f'"Drive.{state}" = 3'])
+    frames = load_bench_from_files({"x.toml": text.encode(), "x.dbc": NESTED.encode()}).frames
+    database = cast(Database, load_string(NESTED, "dbc"))
+    assert sorted(spec.name for spec in frames.frames) == pages
+    layout = make_layout(frames.frames, [], Role.RIG)
+    for place, spec in zip(list_frame_places(layout), frames.frames, strict=True):
+        message = database.get_message_by_name(spec.name.partition("[")[0])
+        data = pack(spec, {"position_demand": 1e-3, "ram_position": -2e-4, "current": 4e-3})
+        known: Any = message.decode(data)
+        selectors = ".".join(str(known[name]) for name in ("Kind", "Part") if name in known)
+        assert spec.name == f"{message.name}[{selectors}]" and bytes(message.encode(known)) == data
+        scales = {"Position": (1e-3, "position_demand"), "Ram": (1e-3, "ram_position"), "Current": (1e-3, "current")}
+        for name, (scale, signal) in scales.items():
+            if name in known:
+                assert unpack(spec, data)[signal] == pytest.approx(scale * known[name])
+        layout.octets[8 * PAYLOAD: 8 * PAYLOAD + len(data)] = list(data)
+        assert frames.find(spec.identifier, data) is spec and find_frame(layout, spec.identifier) == place
+        is_fd = message.length > 8
+        assert spec.sent_as == message.frame_id | (FD | SWITCHED if is_fd else 0)
+
+
+def test_a_selector_has_no_other_use() -> None:
+    with pytest.raises(InputError, match=r"Drive\.Page is the multiplexer of used ones"):
+        load_pages("[controller.ready]", '"Drive.Page" = 2')
