@@ -1,6 +1,6 @@
-"""The machine code of one cycle of the plant, stored on disk so that it runs without numba.
+"""Machine code stored on disk so that it runs without numba: one cycle of the plant, and cycles of a whole bench.
 
-Importing numba and loading its cache takes 0.6 s, a third of a test run of 13.5 s. numba still compiles the code; what
+Importing numba and loading its cache takes 0.6 s, half of a test run of 13.5 s. numba still compiles the code; what
 it has compiled is stored as an object file, and the next process links that with LLVM alone, in 0.05 s. Where this is
 not possible (code that calls something besides `sqrt`, a file that is damaged or of other versions), numba runs as
 before: the bits of the results are the same, because the code is.
@@ -13,7 +13,7 @@ import hashlib
 import os
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -25,69 +25,61 @@ Array = NDArray[Any]
 # numba's calling convention: address of the result, of the failure, then the arguments, an array as 7 of them
 ADVANCE_CALL = "i" + "qq" + "qqqqqqq" + "dddd" + "qqqqqqq" + "q"
 READ_CALL = "i" + "qq" + "qqqqqqq" + "qqqqqqq" + "d" + "qqqqqqq"
-Advance = Callable[[float, float, float, float], object]  # current A, load N, noise, t s: moves the state one cycle
+Call = Callable[..., object]
 
-_SYMBOL = "advance"
+_SYMBOL = "entry"  # of the code in a file
 _DIGEST = 32  # bytes of the SHA-256 in front of the object code
 _KNOWN = {"sqrt", "memset", "memcpy", "memmove"}  # what the code may call outside itself; LLVM finds these anywhere
-# numba passes an array as owner, parent, number of items, bytes an item, data, length, stride.
-_ARRAY: list[Any] = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p,
-                     ctypes.c_int64, ctypes.c_int64]
-# The interpreter lock is kept: the call takes 2 us, and another thread that gets the lock may keep it for longer.
-_ENTRY = ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *_ARRAY, *[ctypes.c_double] * 4, *_ARRAY,
-                           ctypes.c_int64)
 
 
 class StoredCode:
-    """Machine code of `plant.solve.advance_flat_state` for one kind of plant.
+    """Machine code of one function of numbers and arrays, such as `plant.solve.advance_flat_state` of a kind of plant.
 
     It comes from a file in `folder`; without one, numba compiles it and the result is stored there.
     """
 
-    def __init__(self, folder: Path, compile_code: Callable[[], Any]) -> None:
-        """`compile_code` returns numba's dispatcher of `advance_flat_state`; `folder` is for this source code alone."""
-        self._path = folder / f"{_SYMBOL}.{_name_environment()}.o"
+    def __init__(self, folder: Path, compile_code: Callable[[], Any], name: str = "advance") -> None:
+        """`compile_code` returns numba's dispatcher; `folder` is for this source code alone."""
+        self._path = folder / f"{name}.{_name_environment()}.o"
         self._compile = compile_code
         self._engine: Any = None  # owns the code
-        self._entry: Any = None
         code = _read_object(self._path)
         if code is not None and not os.environ.get("NUMBA_DISABLE_JIT"):
             with contextlib.suppress(Exception):  # whatever LLVM has against the file, numba can compile it again
-                self._engine, self._entry = _link_object(code)
+                self._engine = _link_object(code)
 
-    def warm(self, flat: Array, record: Array) -> None:
+    def warm(self, make_arguments: Callable[[], Sequence[Any]]) -> None:
         """Compile with numba and store the machine code for the next process, unless it was stored already.
 
-        `flat` is a state of the plant, one number a field, and `record` its parameters as `Model.build_record` gives
-        them.
+        `make_arguments` gives arguments for a trial: each time new arrays with the same content.
         """
-        if self._entry is None:
+        if self._engine is None:
             run = self._compile()
-            run(flat, 0.0, 0.0, 0.0, 0.0, record, 0)
+            run(*make_arguments())
             with contextlib.suppress(Exception):  # another release of numba may name its inner parts otherwise
                 code = emit_object(run)
-                if code is not None and _gives_same_bits(code, run, flat, record):
+                if code is not None and _gives_same_bits(code, run, make_arguments):
                     _write_object(self._path, code)
 
     def find_address(self) -> int:
-        """Address of the machine code, for a `plant.compile.ForeignCall` of ADVANCE_CALL; call `warm` before."""
-        if self._entry is not None:
+        """Address of the machine code, for a `plant.compile.ForeignCall`; call `warm` before."""
+        if self._engine is not None:
             return int(self._engine.get_function_address(_SYMBOL))
         return find_function_address(self._compile())
 
-    def bind(self, flat: Array, record: Array, steps: int) -> Advance:
-        """The function that advances the state `flat` of a plant with the parameters `record` by one cycle."""
-        if self._entry is None:
+    def bind(self, head: Sequence[Any], count: int = 0, tail: Sequence[Any] = ()) -> Call:
+        """The function of `count` floats, which stand between the arguments `head` and `tail`. Arrays are shared."""
+        if self._engine is None:
             run = self._compile()
-            return lambda current, load, noise, t: run(flat, current, load, noise, t, record, steps)
-        entry = self._entry
-        head, tail = _list_arguments(flat, record, steps)
+            return lambda *numbers: run(*head, *numbers, *tail)
+        entry = _make_entry(self._engine, (*head, *[0.0] * count, *tail))
+        first, last = _list_places(head), [value for _, value in _flatten(tail)]
 
-        def advance(current: float, load: float, noise: float, t: float) -> None:
-            if entry(*head, current, load, noise, t, *tail) != 0:  # an exception; numba knows how to raise it
-                self._compile()(flat, current, load, noise, t, record, steps)
+        def call(*numbers: float) -> None:
+            if entry(*first, *numbers, *last) != 0:  # an exception; numba knows how to raise it
+                self._compile()(*head, *numbers, *tail)
 
-        return advance
+        return call
 
 
 def find_function_address(run: Any) -> int:
@@ -96,27 +88,49 @@ def find_function_address(run: Any) -> int:
     return int(overload.library.get_pointer_to_function(overload.fndesc.llvm_func_name))
 
 
-def _gives_same_bits(code: bytes, run: Any, flat: Array, record: Array) -> bool:
-    """Whether the object code moves a copy of the state as numba's function does; else it is not to be stored."""
-    _engine, entry = _link_object(code)
-    expected, state = flat.copy(), flat.copy()
-    head, tail = _list_arguments(state, record, 10)
-    for current in (1e-3, -2e-3, 5e-3):
-        run(expected, current, 100.0, 0.0, 0.0, record, 10)
-        if entry(*head, current, 100.0, 0.0, 0.0, *tail) != 0:
-            return False
-    return state.tobytes() == expected.tobytes()
+def _gives_same_bits(code: bytes, run: Any, make_arguments: Callable[[], Sequence[Any]]) -> bool:
+    """Whether the object code changes arrays as numba's function does; else it is not to be stored."""
+    engine, expected, found = _link_object(code), make_arguments(), make_arguments()
+    run(*expected)
+    status = _make_entry(engine, found)(*_list_places(found))
+    same = [one.tobytes() == other.tobytes() for one, other in zip(_list_arrays(expected), _list_arrays(found),
+                                                                   strict=True)]
+    return status == 0 and all(same)
 
 
-def _list_arguments(flat: Array, record: Array, steps: int) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """The arguments of the machine code before and behind the four numbers of a cycle."""
-    result, failure = ctypes.c_void_p(), ctypes.c_void_p()
-    return ((ctypes.byref(result), ctypes.byref(failure), *_describe_array(flat)), (*_describe_array(record), steps))
+# The interpreter lock is kept: the call is short, and another thread that gets the lock may keep it for longer.
+def _make_entry(engine: Any, arguments: Sequence[Any]) -> Call:
+    """The code in the engine as a function of what `_list_places` gives; it returns 0, or not 0 for an exception."""
+    kinds = [kind for kind, _ in _flatten(arguments)]
+    make = ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *kinds)
+    return make(engine.get_function_address(_SYMBOL))
 
 
-def _describe_array(array: Array) -> tuple[int | None, ...]:
-    size = array.dtype.itemsize
-    return None, None, len(array), size, array.ctypes.data, len(array), size
+def _list_places(arguments: Sequence[Any]) -> list[Any]:
+    """Room for a result and for a failure, then the arguments as the machine code takes them."""
+    room = (ctypes.c_int64(), ctypes.c_int64())
+    return [*map(ctypes.byref, room), *(value for _, value in _flatten(arguments))]
+
+
+def _flatten(arguments: Sequence[Any]) -> list[tuple[Any, Any]]:
+    """Type and value of each word: of an array owner, parent, items, bytes an item, data, lengths, strides."""
+    words: list[tuple[Any, Any]] = []
+    for one in arguments:
+        if isinstance(one, np.ndarray):
+            sizes = (one.size, one.dtype.itemsize), (*one.shape, *one.strides)
+            words += [(ctypes.c_void_p, None)] * 2
+            words += [*((ctypes.c_int64, n) for n in sizes[0]), (ctypes.c_void_p, one.ctypes.data),
+                      *((ctypes.c_int64, n) for n in sizes[1])]
+        elif isinstance(one, tuple):
+            words += _flatten(one)
+        else:
+            words.append((ctypes.c_double if isinstance(one, float) else ctypes.c_int64, one))
+    return words
+
+
+def _list_arrays(arguments: Sequence[Any]) -> list[Array]:
+    return [each for one in arguments for each in (_list_arrays(one) if isinstance(one, tuple) else [one])
+            if isinstance(each, np.ndarray)]
 
 
 def _name_environment() -> str:
@@ -176,6 +190,8 @@ def emit_object(run: Any, symbol: str = _SYMBOL, triple: str = "") -> bytes | No
         llvm.initialize_all_asmprinters()
         machine = llvm.Target.from_triple(triple).create_target_machine(opt=3, reloc="pic", codemodel="default")
         module.triple, module.data_layout = triple, str(machine.target_data)
+    # numba counts who uses an array and calls this for the last one; the arrays that this code gets have no owner
+    module.link_in(llvm.parse_assembly("define void @NRT_MemInfo_call_dtor(ptr %owner) { ret void }"))
     target = module.get_function(overloads[0].fndesc.llvm_func_name)
     for value in (*module.functions, *module.global_variables):
         if not value.is_declaration:
@@ -193,8 +209,8 @@ def emit_object(run: Any, symbol: str = _SYMBOL, triple: str = "") -> bytes | No
     return bytes(machine.emit_object(module))
 
 
-def _link_object(code: bytes) -> tuple[Any, Any]:
-    """LLVM's engine with the object code in it, and the function."""
+def _link_object(code: bytes) -> Any:
+    """LLVM's engine with the object code in it."""
     import llvmlite.binding as llvm
 
     llvm.initialize_native_target()
@@ -203,4 +219,4 @@ def _link_object(code: bytes) -> tuple[Any, Any]:
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
-    return engine, _ENTRY(engine.get_function_address(_SYMBOL))
+    return engine

@@ -15,7 +15,7 @@ from plant.controller import apply_command_effects
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.flat import list_state_values, make_packers
-from plant.machine_code import Advance, StoredCode
+from plant.machine_code import Call, StoredCode
 from plant.model import Model, build_initial_state, build_kernel, collect_bindings
 from plant.solve import NOISES, advance_flat_state, read_flat_sensors, run_closed_loop, step_cycle
 from plant.state import State
@@ -42,11 +42,29 @@ def sample_noise(seed: int, cycles: int) -> Array:
     return np.random.default_rng(seed).standard_normal((cycles, NOISES))
 
 
-def iterate_noise(seed: int, block: int = 64) -> Iterator[list[float]]:
-    """The rows of `sample_noise` without end; drawn `block` at a time, which costs a tenth of drawing single rows."""
-    rng = np.random.default_rng(seed)
-    while True:
-        yield from rng.standard_normal((block, NOISES)).tolist()
+class NoiseStream:
+    """The rows of `sample_noise` without end; drawn in blocks, which costs a tenth of drawing single rows."""
+
+    def __init__(self, seed: int, block: int = 64) -> None:
+        self._rng, self._block = np.random.default_rng(seed), block
+        self._drawn, self._at = np.empty((0, NOISES)), 0
+
+    def take(self) -> list[float]:
+        """The next row."""
+        row: list[float] = self.look_ahead(1)[0].tolist()
+        self._at += 1
+        return row
+
+    def look_ahead(self, rows: int) -> Array:
+        """The next rows, (rows, NOISES), which stay the next ones; see `skip`."""
+        if self._at + rows > len(self._drawn):
+            more = self._rng.standard_normal((max(rows, self._block), NOISES))
+            self._drawn, self._at = np.concatenate((self._drawn[self._at:], more)), 0
+        return self._drawn[self._at: self._at + rows]
+
+    def skip(self, rows: int) -> None:
+        """Leave out rows that `look_ahead` has given."""
+        self._at += rows
 
 
 def simulate(model: Model, command: Array, load: Array | None = None, seed: int = 0, steps: int | None = None,
@@ -118,8 +136,8 @@ class Demand:
     """The demand after the effects at the port `command`, cycle by cycle: what the firmware closes its loop on."""
 
     def __init__(self, model: Model) -> None:
-        is_changed = any(CATALOGUE[effect].port == "command" for effect in model.effects)
-        self._law = build_kernel(apply_command_effects, model.effects, fast=False) if is_changed else None
+        self.is_changed = any(CATALOGUE[effect].port == "command" for effect in model.effects)
+        self._law = build_kernel(apply_command_effects, model.effects, fast=False) if self.is_changed else None
         self._first = build_initial_state(model.effects).memory.command
         self._record = model.build_record()[0]
         self._period = model["controller.period"]
@@ -138,6 +156,15 @@ class Demand:
         return float(taken)
 
 
+class LentPlant(NamedTuple):
+    """State and parameters of a plant, places of the noise of its three transducers, address of its machine code."""
+
+    flat: Array
+    live: Array
+    levels: list[int]
+    advance: int
+
+
 class Actuator:
     """One plant that runs cycle by cycle: the core of the emulator. It knows neither clock nor bus."""
 
@@ -152,7 +179,7 @@ class Actuator:
         self._live = self._record.view(np.float64)  # the same numbers, in the order of their names
         self._index = {name: i for i, name in enumerate(model.list_names())}
         self._levels = [self._index[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
-        self._draws = iterate_noise(seed)
+        self.noise = NoiseStream(seed)
         self._noise = [0.0] * NOISES
         self._code = load_stored_advance(model.effects, model.plant) if fast else None
         self._advance = self._bind_advance()
@@ -174,13 +201,13 @@ class Actuator:
         """
         with report_law_errors(self.model):
             if self._code is not None:
-                self._code.warm(self._flat, self._record)
+                self._code.warm(lambda: (self._flat.copy(), 5e-3, 100.0, 0.0, 0.0, self._record, 10))
             if self._read:
                 self._read(self._flat.copy(), np.array(self._noise), 0.0, self._record)
 
     def sample(self) -> tuple[float, float, float]:
         """The readings of the transducers: XJ m, P12 Pa, XS m. Call it once per cycle: it draws the cycle's noise."""
-        n = self._noise = next(self._draws)
+        n = self._noise = self.noise.take()
         if self._read:
             return cast("tuple[float, float, float]", self._read(
                 self._flat, np.array(n), self.cycle * self._period, self._record))
@@ -195,9 +222,15 @@ class Actuator:
         self._advance(current, load, self._noise[3], t)
         self.cycle += 1
 
-    def _bind_advance(self) -> Advance:
+    def lend(self) -> LentPlant | None:
+        """What compiled code needs to run cycles of this plant itself; None where that takes more than `advance`."""
+        if self._code is None or self._read is not None:
+            return None
+        return LentPlant(self._flat, self._live, self._levels, self._code.find_address())
+
+    def _bind_advance(self) -> Call:
         if self._code is not None:
-            return self._code.bind(self._flat, self._record, self.steps)
+            return self._code.bind((self._flat,), 4, (self._record, self.steps))
         run = build_kernel(advance_flat_state, self.model.effects, fast=False, plant=self.model.plant)
         return lambda current, load, noise, t: run(self._flat, current, load, noise, t, self._record, self.steps)
 

@@ -51,7 +51,7 @@ from rig.network.node_objects import PLANT
 from rig.network.raw_bus import can_open, open_raw_bus
 from rig.nodes.emulator import Emulator
 from rig.nodes.scenario import Scenario
-from rig.recorder import Recorder, Signals, Timing
+from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.cyclic_values import CycleInput
 from rig.run.hard_loop import compile_cycle, open_loop
 from rig.run.loop import CycleLoop, History, Loop
@@ -341,6 +341,10 @@ class _Log:
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
         self._history.cycle(t_ns, signals, timing)
         self._recorder.cycle(t_ns, signals, timing)
+
+    def cycles(self, block: CycleBlock) -> None:
+        self._history.cycles(block)
+        self._recorder.cycles(block)
 
 
 @contextlib.contextmanager

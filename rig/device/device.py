@@ -79,6 +79,10 @@ class Device:
         self.sync.tick(t_ns)
         self.sdo.tick(t_ns)
 
+    def find_due(self) -> int:
+        """When the next timer runs out, ns; `tick` has nothing to do before, as long as SYNC comes."""
+        return 0 if self.sdo.is_busy else min(self.heartbeat.due, self.consumer.find_due())
+
     def read(self, index: int, sub: int = 0) -> Value:
         """An object's raw value. Raises KeyError if there is none."""
         return self.od.values[index, sub]

@@ -90,6 +90,15 @@ class Rpdo(Pdo):
             self._od.values.update(zip(self._keys, self._unpack(data), strict=True))
             self._arrived(self.n)
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a frame waits for the next SYNC."""
+        return self._waiting is not None
+
+    def put(self, data: bytes) -> None:
+        """Let a frame of the right length wait for the next SYNC."""
+        self._waiting = data
+
     def latch(self) -> None:
         """SYNC: what came last becomes valid."""
         data = self._waiting

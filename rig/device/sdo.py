@@ -69,6 +69,11 @@ class SdoServer:
         self._last_ns = 0
         self.reset()
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether a transfer is open."""
+        return self._open is not None
+
     def reset(self) -> None:
         """Forget an open transfer."""
         self._open: int | None = None  # command specifier of the segments expected

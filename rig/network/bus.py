@@ -37,6 +37,11 @@ class EmbeddedBus:
         self._others: list[list[Receive]] = []  # for each node, everybody else
         self._queue: deque[tuple[list[Receive], int, bytes]] = deque()
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no frame waits."""
+        return not self._queue
+
     def attach(self, receive: Receive) -> Send:
         """Connect a node: `receive` gets every frame of the other nodes; the returned function sends."""
         others = list(self._receivers)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from rig.network.frame import Frame, Send
 
 COB_ID = 0x700  # + node
+NEVER = 2**63 - 1  # ns
 _MS = 1_000_000  # ns
 
 
@@ -20,6 +21,11 @@ class HeartbeatProducer:
         """A new producer time takes effect at once, the first heartbeat is one period away; 0 stops it."""
         self._period = period_ms * _MS
         self._due = t_ns + self._period
+
+    @property
+    def due(self) -> int:
+        """When the next heartbeat is due, ns."""
+        return self._due if self._period else NEVER
 
     def send_boot_up(self) -> None:
         self._send(self._cob_id, b"\0")
@@ -62,6 +68,10 @@ class HeartbeatConsumer:
         if node not in self._deadlines:
             self._back(node)
         self._deadlines[node] = frame.t_ns + self._limits[node]
+
+    def find_due(self) -> int:
+        """When the first of the nodes would be lost, ns."""
+        return min(self._deadlines.values(), default=NEVER - 1) + 1
 
     def tick(self, t_ns: int) -> None:
         for deadline in self._deadlines.values():

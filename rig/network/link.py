@@ -229,7 +229,12 @@ class EmbeddedWire(Wire):
         self.clock, self._period = clock, period_ns
         self._bus = EmbeddedBus()
         self.send = self._bus.attach(lambda frame: self.receive(frame))
-        self._nodes = [self._bus.add(make) for make in makers]
+        self.nodes = [self._bus.add(make) for make in makers]
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether no frame waits to be delivered."""
+        return self._bus.is_empty
 
     def wait(self, done: Done, seconds: float) -> bool:
         """See `Wire`; the time waited is the clock's."""
@@ -258,7 +263,7 @@ class EmbeddedWire(Wire):
     def _deliver(self, t_ns: int) -> None:
         """Deliver what is there, run the nodes' timers, deliver what came of them."""
         self._bus.deliver(t_ns)
-        for node in self._nodes:
+        for node in self.nodes:
             node.tick(t_ns)
         self._bus.deliver(t_ns)
 

@@ -225,6 +225,10 @@ class Master:
         self._beat.tick(now, self._state)
         self._watch.tick(now)
 
+    def find_due(self) -> int:
+        """When `tick` has something to do, ns."""
+        return min(self._beat.due, self._watch.find_due())
+
     def boot(self) -> None:
         """Send the boot-up message of the rig (CiA 301, 7.2.8.3.3)."""
         if self._nodes:

@@ -106,7 +106,7 @@ class Emulator:
         self._begin(scenario, FaultyPlant(scenario))
 
     def _begin(self, scenario: Scenario, plant: FaultyPlant) -> None:
-        self._scenario, self._plant, self._faults = scenario, plant, plant.faults
+        self._scenario, self.plant, self._faults = scenario, plant, plant.faults
         self._cycle = 0  # of the SYNC to come
         self._begun = False  # SYNCs are counted from the first start
         self._first = True  # of the cycles after a start: no drive can have answered yet
@@ -156,7 +156,7 @@ class Emulator:
             self._cycle += 1
             return
         self._miss(1)
-        self._plant.pass_unread(k)
+        self.plant.pass_unread(k)
         self._cycle += 1
 
     def _answer_again(self) -> None:
@@ -164,6 +164,19 @@ class Emulator:
         if self.device.state is NmtState.OPERATIONAL:
             for tpdo in self.device.pdo.cyclic:
                 tpdo.send()
+
+    def is_quiet(self, k: int) -> bool:
+        """Whether the SYNC to come is that of cycle k, and nothing else is under way: no frame is late or missing."""
+        is_steady = self._moved and not self._first and not self._missed and self._synced == self._cycle - 1
+        return (is_steady and self._cycle == k and self.device.state is NmtState.OPERATIONAL
+                and not self._held and not self._late and self._drive.is_waiting)
+
+    def pass_quiet(self, cycles: int, drive: bytes) -> None:
+        """So many cycles were simulated elsewhere, on the state of `plant`; the last was answered by `drive`."""
+        self._cycle += cycles
+        self._synced = self._cycle - 1
+        self.plant.pass_quiet(cycles)
+        self._drive.put(drive)
 
     def tick(self, t_ns: int) -> None:
         """Deliver the delayed frames that are due at `t_ns`."""
@@ -206,7 +219,7 @@ class Emulator:
         k, od = self._cycle, self._od
         flags = _NO_FLAGS if self._first else self._judge(k)
         self._first = False
-        readings = self._plant.read(k)
+        readings = self.plant.read(k)
         if readings is None:
             # The simulation diverged (an extreme parameter, a division by zero): stop, send no invented value. Whatever
             # 0x1029 says, the node becomes PRE-OPERATIONAL: no feedback any more.
@@ -226,7 +239,7 @@ class Emulator:
         """
         fresh = self._drive.fresh
         if fresh and self._od[self._answered.key] == self._answered.field.wrap_number(k - 1):
-            self._plant.current = self._current.field.compute_value(cast(float, self._od[self._current.key]))
+            self.plant.current = self._current.field.compute_value(cast(float, self._od[self._current.key]))
             if self._missed >= self._place.most_missed:
                 self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
             self._missed = 0
@@ -239,12 +252,12 @@ class Emulator:
         self._od[COUNTERS, counter] = cast(int, self._od[COUNTERS, counter]) + 1
         if self._missed < self._place.most_missed:
             return _NO_FLAGS
-        self._plant.current = 0.0
+        self.plant.current = 0.0
         self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, bytes((self._drive.n,)))
         return Flags.CURRENT_ZEROED
 
     def _move(self) -> None:
         """Advance the plant by one cycle."""
-        self._plant.move(self._cycle)
+        self.plant.move(self._cycle)
         self._moved = True
         self._cycle += 1

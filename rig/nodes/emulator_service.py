@@ -305,7 +305,7 @@ def compile_plant(model: Model) -> tuple[int, int]:
     with report_law_errors(model):
         flat, record = np.array(list_state_values(model.build_state())), model.build_record()
         code = load_stored_advance(model.effects, model.plant)
-        code.warm(flat, record)
+        code.warm(lambda: (flat.copy(), 5e-3, 100.0, 0.0, 0.0, record, 10))
         read = 0
         if any(CATALOGUE[name].port == "reading" for name in model.effects):
             run = build_kernel(read_flat_sensors, model.effects)

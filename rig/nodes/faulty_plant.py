@@ -52,6 +52,15 @@ class FaultyPlant:
         self.actuator.sample()
         self.move(k)
 
+    def list_loads(self, k: int, cycles: int) -> list[float]:
+        """The load in the cycles from k on, N; those behind its end have none and are left out."""
+        return self._load[k:k + cycles]
+
+    def pass_quiet(self, cycles: int) -> None:
+        """So many cycles were simulated elsewhere, on the state of the actuator; no fault changed in them."""
+        self.actuator.noise.skip(cycles)
+        self.actuator.cycle += cycles
+
     def _change_parameters(self, k: int) -> None:
         """Set what faults have made of the plant's parameters since the last cycle."""
         for name, value in self.faults.parameters_at(k, self._changed).items():

@@ -53,10 +53,17 @@ class Firmware:
         self._restart()
         self.receive, self.tick = self.device.receive, self.device.tick
 
+    def is_quiet(self, control: int) -> bool:
+        """Whether the loop is closed under this control word, and nothing else is under way: no fault, no effect."""
+        is_heard = self.device.pdo.rpdos[_COMMAND].fresh and not any(self._missed.values())
+        return (is_heard and self._od[self._control] == control and not self._fault and not self._taken.is_changed
+                and bool(cast(int, self._od[self._status_word]) & _LOOP_CLOSED)
+                and self.device.state is NmtState.OPERATIONAL)
+
     def _restart(self) -> None:
-        self._loop = Loop()
+        self.loop = Loop()
         self._taken.restart()
-        self._gains = Gains(*(cast(float, self._od[GAINS, sub]) for sub in range(1, len(Gains._fields) + 1)))
+        self.gains = Gains(*(cast(float, self._od[GAINS, sub]) for sub in range(1, len(Gains._fields) + 1)))
         self._missed = {_COMMAND: 0, _FEEDBACK: 0}  # SYNCs since the last frame
         self._fault = False
         self._acknowledged = True
@@ -118,9 +125,9 @@ class Firmware:
         status = self._status()
         if status & _LOOP_CLOSED:
             demand, position = self._read(self._demand), self._read(self._position)
-            current, self._loop = compute_current(self._loop, self._taken(demand, position), position, self._gains)
+            current, self.loop = compute_current(self.loop, self._taken(demand, position), position, self.gains)
         else:
-            current, self._loop = 0.0, Loop()
+            current, self.loop = 0.0, Loop()
             self._taken.restart()
         self._drive(current, status)
 

@@ -1,5 +1,7 @@
 """The log: MCAP with protobuf channels, written off the loop's thread, salvaged after a crash."""
+from rig.recorder.block import CycleBlock
 from rig.recorder.schema import U32, CanFrame, Check, Event, NmtState, Record, Signals, Timing
-from rig.recorder.writer import Recorder, RecorderError
+from rig.recorder.writer import Observer, Recorder, RecorderError
 
-__all__ = ["U32", "CanFrame", "Check", "Event", "NmtState", "Record", "Recorder", "RecorderError", "Signals", "Timing"]
+__all__ = ["U32", "CanFrame", "Check", "CycleBlock", "Event", "NmtState", "Observer", "Record", "Recorder",
+           "RecorderError", "Signals", "Timing"]

@@ -151,6 +151,16 @@ def describe_channel(record: type) -> dict[str, str]:
     return out
 
 
+def list_row_fields(record: type) -> list[tuple[str, str]]:
+    """Name and numpy code of what `make_packer` packs in one go: header, then tag and value of each number."""
+    head = [("opcode", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("time", "<u8"),
+            ("published", "<u8")]
+    hints = get_type_hints(record, include_extras=True)
+    codes = {"d": "<f8", "I": "<u4", "?": "?"}
+    numbers = [(item.name, codes[code]) for item in fields(record) if (code := _WIRE[hints[item.name]][2])]
+    return [*head, *(each for name, code in numbers for each in ((f"tag.{name}", "u1"), (name, code)))]
+
+
 def make_packer(record: type) -> Callable[[int, Any], bytes]:
     """-> pack(t_ns, values or record): a whole MCAP message record, header included.
 

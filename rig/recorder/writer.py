@@ -16,8 +16,9 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
+import numpy as np
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -40,6 +41,7 @@ from mcap.records import (
 
 from plant.errors import RigError
 from rig.network.frame import Frame
+from rig.recorder.block import CycleBlock, pack_block
 from rig.recorder.schema import (
     CHANNELS,
     TOPICS,
@@ -58,6 +60,13 @@ CHUNK_WALL = 0.2  # s
 DRAIN_EVERY = 0.01  # s
 QUEUE_LIMIT = 2_000_000  # items; a disk that hangs must not eat the memory
 LIBRARY = "eha-rig"
+
+
+class Observer(NamedTuple):
+    """Who looks at the records of a run but raw frames, in the writing thread, 10 ms behind the run."""
+
+    see: Callable[[int, Record], None]  # time, ns, and record
+    sees_rows: bool = True  # False: only events, states and checks
 
 
 class RecorderError(RigError):
@@ -79,8 +88,7 @@ class Recorder:
 
     attachments: name -> (media type, bytes); metadata: name -> text. Times are ns since the run's start. In the file
     they are counted from `epoch_ns`, ns since 1970, which the metadata record `clock` holds: other programs then show
-    dates, and two runs with the same seed still differ in this one number only. `observe` is called by the writing
-    thread with each time and record but raw frames.
+    dates, and two runs with the same seed still differ in this one number only.
     Raises RecorderError when the file cannot be made; later, once, from `cycle` or `put` when it cannot be written, or
     from `close` if neither was called since. After that everything is accepted and dropped, so that the loop
     can still bring the run to rest.
@@ -89,9 +97,9 @@ class Recorder:
     frame: Callable[[Frame], None]  # record a raw frame; the queue's own append, so it costs 30 ns
 
     def __init__(self, path: Path, attachments: Mapping[str, tuple[str, bytes]], metadata: Mapping[str, str],
-                 epoch_ns: int = 0, observe: Callable[[int, Record], None] | None = None) -> None:
+                 epoch_ns: int = 0, observer: Observer | None = None) -> None:
         self.path = path
-        self._epoch_ns, self._observe = epoch_ns, observe
+        self._epoch_ns, self._observer = epoch_ns, observer
         self._failure: RecorderError | None = None  # that the loop has not heard of
         self._queue: deque[Any] = deque()
         self.frame = self._queue.append
@@ -124,7 +132,11 @@ class Recorder:
         if self._failure is not None:
             self._tell()
 
-    def put(self, t_ns: int, record: Record) -> None:
+    def cycles(self, block: CycleBlock) -> None:
+        """Record cycles that were played together; raises RecorderError once when the log is lost."""
+        self.put(int(block.t_ns[0]), block)
+
+    def put(self, t_ns: int, record: Record | CycleBlock) -> None:
         """Record anything but a raw frame; raises RecorderError once when the log is lost."""
         self._queue.append((t_ns, record))
         if self._failure is not None:
@@ -171,7 +183,7 @@ class Recorder:
             self._queue.clear()
 
     def _drain(self) -> None:
-        queue, packers, epoch_ns, observe = self._queue, self._packers, self._epoch_ns, self._observe
+        queue, packers, epoch_ns = self._queue, self._packers, self._epoch_ns
         waiting = len(queue)
         if waiting > QUEUE_LIMIT:
             raise OSError(0, f"the disk is too slow: {waiting} records waiting")
@@ -184,25 +196,46 @@ class Recorder:
                 continue
             t_ns, record = item
             pack = packers.get(type(record))
-            if pack is None:
+            if isinstance(record, CycleBlock):
+                self._add_block(record)
+            elif pack is None:
                 self._file.write_metadata(*record)
             else:
                 self._add(t_ns + epoch_ns, CHANNELS[type(record)], pack(t_ns + epoch_ns, record))
-                if observe is not None:
-                    observe(t_ns, record)
+                self._show(t_ns, record)
+
+    def _show(self, t_ns: int, record: Record) -> None:
+        if self._observer is not None and (self._observer.sees_rows or type(record) not in (Signals, Timing)):
+            self._observer.see(t_ns, record)
 
     def _add(self, t_ns: int, channel: int, raw: bytes) -> None:
-        if not self._parts:
-            self._first_ns = t_ns
-        elif self._size >= CHUNK_BYTES or t_ns - self._first_ns >= CHUNK_NS:
-            self._close_chunk()
-            self._first_ns = t_ns
+        self._make_room(t_ns, t_ns)
         try:
             self._index[channel].extend((t_ns, self._size))
         except KeyError:
             self._index[channel] = array("Q", (t_ns, self._size))
         self._parts.append(raw)
         self._size += len(raw)
+
+    def _add_block(self, block: CycleBlock) -> None:
+        self._make_room(int(block.t_ns[0]) + self._epoch_ns, int(block.t_ns[-1]) + self._epoch_ns)
+        raw, index = pack_block(block, self._epoch_ns)
+        for channel, pairs in index.items():
+            if len(pairs):
+                pairs[1::2] += np.uint64(self._size)
+                self._index.setdefault(channel, array("Q")).frombytes(pairs.tobytes())
+        self._parts.append(raw)
+        self._size += len(raw)
+        if self._observer is not None and self._observer.sees_rows:
+            for t_ns, record in block.list_rows():
+                self._show(t_ns, record)
+
+    def _make_room(self, first_ns: int, last_ns: int) -> None:
+        """Close the chunk if it is full, or too old for records of these times."""
+        if self._parts and (self._size >= CHUNK_BYTES or last_ns - self._first_ns >= CHUNK_NS):
+            self._close_chunk()
+        if not self._parts:
+            self._first_ns = first_ns
 
     def _close_chunk(self) -> None:
         self._closed_at = time.monotonic()

@@ -26,7 +26,7 @@ from rig.network.frame import BIT_RATE_SWITCH, Frame
 from rig.network.master import Master
 from rig.nodes.faulty_plant import DIVERGED, FaultyPlant
 from rig.nodes.scenario import Scenario
-from rig.recorder import Signals, Timing
+from rig.recorder import CycleBlock, Signals, Timing
 from rig.run.cyclic_values import CycleInput, CyclicValues
 from rig.sequences.faults import DELAY, DROP, NORMAL, SENT_NORMALLY, Action, Schedule, apply_action
 
@@ -39,6 +39,9 @@ class CycleObserver(Protocol):
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
         """A cycle is over."""
 
+    def cycles(self, block: CycleBlock) -> None:
+        """Several are over, and the last of the block is under way."""
+
 
 class Loop(ABC):
     """What the session needs of a cycle loop. One that queues its inputs runs behind them and overrides more."""
@@ -46,6 +49,7 @@ class Loop(ABC):
     kind: str  # "soft" or "hard" real time
     scheduler = ""  # how the kernel schedules the thread of the cycle, if it has one of its own
     problem = ""  # why the plant cannot go on
+    plays_many = False  # whether `play_many` is worth a call
     outputs: dict[str, float]  # the last values of the bench that are known; `CyclicValues` has the names
 
     @property
@@ -75,6 +79,13 @@ class Loop(ABC):
     @abstractmethod
     def cycle(self, step: CycleInput) -> None:
         """Run one cycle, or queue it; cycles that are complete go to the log."""
+
+    def play_many(self, phase: int, demands: Array, loads: Array, control: int) -> int:
+        """Run several cycles under one control word, as many of these as are possible at once; returns how many.
+
+        `demands` in m, `loads` in N. The rows of all but the last go to the log.
+        """
+        return 0
 
     @abstractmethod
     def finish(self) -> None:
@@ -116,7 +127,7 @@ class _Answer:
 
 
 @dataclass(slots=True)
-class _Seen:
+class Seen:
     """What of the cycle under way has come."""
 
     came: set[str] = field(default_factory=set)  # roles of the frames
@@ -142,7 +153,7 @@ class CycleLoop(Loop):
         self.outputs = dict.fromkeys(self._values.names, 0.0)
         self._open: tuple[int, Signals, Timing] | None = None  # the cycle under way
         self._step = CycleInput(0, 0.0, 0.0, 0)  # its inputs
-        self._seen = _Seen()
+        self._seen = Seen()
         self._begun = 0  # cycles in which answers were expected, those that do not count among them
         self._played = 0  # cycles
         self._missed = 0  # drive frames in a row
@@ -301,7 +312,7 @@ class CycleLoop(Loop):
 
     def _expect_answers(self, is_synced: bool) -> None:
         """Which answers are sure to come in this cycle, and which values of earlier frames still count."""
-        self._seen = _Seen()
+        self._seen = Seen()
         if self._plant is not None:
             self._seen.came |= {"feedback", "valve_state"}
         if not is_synced:
@@ -404,6 +415,10 @@ class History:
         self._numbers.extend((row.phase, row.com, row.xj, row.cor, row.p12, row.xs, row.load, row.flags,
                               timing.lateness, timing.response, timing.feedback_response, timing.valve_response,
                               timing.execution, row.control, row.status))
+
+    def cycles(self, block: CycleBlock) -> None:
+        """Append several cycles (called by a loop)."""
+        self._numbers.frombytes(np.column_stack([block.columns[name][:-1] for name in _FIELDS]).astype(float).tobytes())
 
     def column(self, name: str, phase: int | None = None) -> Array:
         """All cycles, or those of one phase. Raises ValueError for a name that is no field."""

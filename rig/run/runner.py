@@ -18,7 +18,7 @@ from rig.benches.bench import Flags
 from rig.network.clock import WallClock
 from rig.network.node_objects import CycleRecord
 from rig.network.raw_bus import can_open
-from rig.recorder import Check, Record, Recorder
+from rig.recorder import Check, Observer, Recorder
 from rig.recorder.schema import collect_provenance, read_epoch_ns
 from rig.run.attribution import Attribution, CycleRecords, Mask, attribute, find_injected
 from rig.run.hard_loop import compile_cycle
@@ -41,12 +41,11 @@ from rig.sequences.protocol import judge_protocol
 from rig.sequences.python_parts import StepRun
 
 Diagnose = Callable[[Trace], dict[str, Any]]
-Observe = Callable[[int, Record], None]
 
 
 def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool],
             prepare: Callable[[], object] = lambda: None, diagnose: Diagnose | None = None,
-            observe: Observe | None = None) -> Outcome:
+            observer: Observer | None = None) -> Outcome:
     """Run a job; its log and verdict are written to `folder`, before the nodes that it started are stopped.
 
     Args:
@@ -57,8 +56,7 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
         prepare: called when the nodes are there and nothing has moved: it may compute or wait, the run will not.
         diagnose: gives the answer of `rig fdi --json` on the main phase, called when the run has ended; None: not asked
             for.
-        observe: called with the time, ns, and each record of the log but raw frames, by the thread that writes the log,
-            10 ms behind the run.
+        observer: who looks at the records of the log.
 
     Raises:
         RigError: bad input, an error in the user's Python code, a missing bus or node, or a log that cannot be
@@ -74,7 +72,7 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
             with open_participants(job) as participants:
                 prepare()
                 epoch_ns = read_epoch_ns() - participants.wire.clock.now()
-                with (open_recorder(job, folder, epoch_ns, observe) as recorder,
+                with (open_recorder(job, folder, epoch_ns, observer) as recorder,
                       contextlib.closing(Session(job, participants, recorder, progress, stop)) as session):
                     outcome = play_job(job, folder, session, recorder, progress, diagnose)
                 outcome.save()
@@ -214,15 +212,15 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def open_recorder(job: Job, folder: Path, epoch_ns: int = 0, observe: Observe | None = None) -> Iterator[Recorder]:
+def open_recorder(job: Job, folder: Path, epoch_ns: int = 0, observer: Observer | None = None) -> Iterator[Recorder]:
     """Replace the results of an earlier run by the log of this one; it is closed whatever happens.
 
-    epoch_ns: the date at which the times of the log begin, ns since 1970. observe: see `Recorder`.
+    epoch_ns: the date at which the times of the log begin, ns since 1970. observer: see `Recorder`.
     """
     for name in ("verdict.json", "report.html"):  # of the run before
         (folder / name).unlink(missing_ok=True)
     recorder = Recorder(folder / "trace.mcap", job.build_attachments(), collect_provenance(**job.list_settings()),
-                        epoch_ns, observe)
+                        epoch_ns, observer)
     try:
         yield recorder
     finally:

@@ -16,7 +16,7 @@ import numpy as np
 
 from fdi.progress import Progress
 from plant.profile import Profile, build_profile
-from plant.segments import Hold
+from plant.segments import Array, Hold
 from rig.benches.frame_map import make_reader
 from rig.benches.profiles import PROFILES, State
 from rig.network.frame import Frame
@@ -24,10 +24,11 @@ from rig.network.link import EmbeddedWire
 from rig.network.master import HEARTBEAT, Master
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, CycleRecord, NmtState
 from rig.nodes.scenario import FORCE_RESOLUTION
-from rig.recorder import Recorder, Signals, Timing
+from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.attribution import Mask, find_injected
 from rig.run.bring_up import BringUp
 from rig.run.cyclic_values import CycleInput
+from rig.run.embedded_cycle import MOST
 from rig.run.enabling import Enabling
 from rig.run.hard_loop import open_loop
 from rig.run.job import Job
@@ -62,11 +63,13 @@ class CycleLog:
         self._is_realtime, self._rate, self._start = job.realtime, job.bench.rate, job.scenario.plan.start
         self._period_ns = job.period_ns
         self._guards = GuardWatch(job.sequence.guards)
+        self.guarded = self._guards.list_limits()
         self.history = History()
         self.after = History()  # the probe after clean-up
         self.due_ns = array("q")  # log time of each cycle
         self._drive = job.bench.frames.drive
         self._drives: list[Frame] = []
+        self._keeps_drives = job.sequence.disturbs_bus
         self._words = PROFILES[job.bench.profile]
         self._unjudged: list[Signals] = []  # rows that the guards have not seen
 
@@ -84,6 +87,19 @@ class CycleLog:
         if self._guards and signals.phase != CLEANUP:
             self._unjudged.append(signals)
         self._journal.recorder.cycle(t_ns, signals, timing)
+
+    def cycles(self, block: CycleBlock) -> None:
+        """Record complete cycles that were played together, all within the guards (called by the loop)."""
+        self.history.cycles(block)
+        self.due_ns.frombytes(block.t_ns[:-1].tobytes())
+        if self._keeps_drives:
+            self._drives += block.list_frames(self._drive.identifier)[:_MOST_DRIVES - len(self._drives)]
+        if len(block.t_ns) > 1:
+            signals, _ = block.make_row(-2)
+            self._nodes.add(signals)
+            if self._guards and signals.phase != CLEANUP:
+                self._unjudged.append(signals)
+        self._journal.recorder.cycles(block)
 
     def keep_drive(self, frame: Frame) -> None:
         """Record a frame; keep the drive frames for the checks of reactions."""
@@ -123,6 +139,7 @@ class Session:
         self._setup, self._main = job.sequence.setup_profile(), job.sequence.main_profile()  # now, not between cycles
         self.scenario = job.scenario
         plan = self.scenario.plan
+        self._loads = np.array(self.scenario.force, float) * FORCE_RESOLUTION
         self._faults = Schedule(plan, self.scenario.model.values)
         self._is_embedded = isinstance(wire, EmbeddedWire)
         self.stage = Stage(wire.clock, plan.start, plan.rate)
@@ -173,7 +190,7 @@ class Session:
             self.starter.start_nodes(self.scenario, is_run=True)
         self._master.wire.hear_all()
         self.stage.loop = open_loop(self._master, self.job.bench, self.scenario, self._faults, self.log, self.job.bus,
-                                    self.job.realtime)
+                                    self.job.realtime, self.log.guarded)
         first = Enabling(self.job.bench, self.stage.loop, self.job.realtime, self._must_end)
         self._enablings.append((0, first))
         self.nodes.begin()
@@ -243,18 +260,33 @@ class Session:
         for section in profile.sections:
             self.journal.announce("INFO", "section", f"{PHASES[phase]}: {section.name}")
             shown = section.name if phase == MAIN else PHASES[phase]
-            for i in range(section.start, section.stop):
+            i = section.start
+            while i < section.stop:
                 self._announce_faults()
                 if phase == CLEANUP and i == _SETTLING and not self._powered:
                     self._try_again()
-                self._demand = float(profile.command[i])
-                load = self._find_load(loop.queued) if phase == MAIN else 0.0
-                loop.cycle(CycleInput(phase, self._demand, load, self._choose_control_word(phase, i)))
-                if loop.queued % 50 == 0:
+                control, before = self._choose_control_word(phase, i), loop.queued
+                i += self._play_many(phase, profile.command[i:section.stop], control) if loop.plays_many else 0
+                if loop.queued == before:
+                    load = self._find_load(loop.queued) if phase == MAIN else 0.0
+                    loop.cycle(CycleInput(phase, float(profile.command[i]), load, control))
+                    i += 1
+                self._demand = float(profile.command[i - 1])
+                if loop.queued // 50 > before // 50:
                     self._progress(shown, loop.k / max(self.scenario.plan.stop, loop.k))
                 if self.nodes.note_ended_processes() if phase == CLEANUP else self._must_end():
                     return False
         return True
+
+    def _play_many(self, phase: int, demands: Array, control: int) -> int:
+        """Play several cycles at once, if the loop can and nothing is to be decided between them; returns how many."""
+        if self.safety.is_safe or not self._powered:
+            return 0
+        demands, k = demands[:MOST], self.stage.playing.queued
+        loads, known = np.zeros(len(demands)), self._loads[k:k + len(demands)]
+        if phase == MAIN:
+            loads[:len(known)] = known
+        return self.stage.playing.play_many(phase, demands, loads, control)
 
     def _must_end(self) -> bool:
         """Before each cycle of set-up and main: whether something ends main."""
@@ -292,7 +324,7 @@ class Session:
 
     def _find_load(self, cycle: int) -> float:
         """Force on the ram from the scenario in a cycle, N."""
-        return float(self.scenario.force[cycle] * FORCE_RESOLUTION) if cycle < len(self.scenario.force) else 0.0
+        return float(self._loads[cycle]) if cycle < len(self._loads) else 0.0
 
     def _choose_control_word(self, phase: int, i: int) -> int:
         """Control word of the phase's cycle `i`."""

@@ -413,6 +413,14 @@ class GuardWatch:
     def __bool__(self) -> bool:
         return bool(self._watched)
 
+    def list_limits(self) -> dict[str, tuple[float, float]]:
+        """The limits of each signal, SI, within which no guard of it is passed."""
+        limits: dict[str, tuple[float, float]] = {}
+        for guard, low, high in self._watched:
+            lowest, highest = limits.get(guard.signal, (-inf, inf))
+            limits[guard.signal] = max(low, lowest), min(high, highest)
+        return limits
+
     def find_passed(self, values: Mapping[str, float]) -> Guard | None:
         """The first guard whose limit this cycle's `values` (SI, by signal) exceed for its number of cycles.
 

@@ -17,7 +17,7 @@ from plant.compile import compute_fingerprint, find_cache_folder
 from plant.effects import CATALOGUE
 from plant.machine_code import StoredCode
 from plant.model import build_kernel
-from plant.run import iterate_noise, sample_noise
+from plant.run import NoiseStream, sample_noise
 from plant.solve import advance_flat_state
 
 COMMAND = np.r_[np.zeros(5), np.full(95, 1e-3), np.linspace(1e-3, -2e-3, 200)]
@@ -41,8 +41,12 @@ print(json.dumps(run.xj.tolist()))
 def test_seeds() -> None:
     one, same, other = (simulate(Model(), COMMAND, seed=seed).xj for seed in (1, 1, 2))
     assert (one == same).all() and (one != other).any()
-    rows = iterate_noise(5)
-    assert (np.array([next(rows) for _ in range(200)]) == sample_noise(5, 200)).all()
+    rows = NoiseStream(5)
+    taken = [rows.take() for _ in range(30)]
+    assert (rows.look_ahead(100) == sample_noise(5, 130)[30:]).all()
+    rows.skip(70)
+    assert (np.array([*taken, *[rows.take() for _ in range(100)]]) == np.delete(sample_noise(5, 200), slice(30, 100), 0)
+            ).all()
 
 
 def child(folder: Path, *arguments: Path) -> list[float]:
@@ -175,12 +179,12 @@ def fail(run: object) -> bytes:
 
 
 @pytest.mark.parametrize(("name", "other"), [
-    ("_link_object", lambda code: (None, lambda *arguments: 0)),  # code that moves nothing
-    ("_emit_object", fail)])
+    ("_make_entry", lambda engine, arguments: lambda *words: 0),  # code that moves nothing
+    ("emit_object", fail)])
 def test_code_that_gives_other_bits_or_none_is_not_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str,
                                                           other: Callable[[object], object]) -> None:
     plant = Actuator(Model())
     run = build_kernel(advance_flat_state, ())
     monkeypatch.setattr(machine_code, name, other)
-    StoredCode(tmp_path, lambda: run).warm(plant._flat, plant._record)
+    StoredCode(tmp_path, lambda: run).warm(lambda: (plant._flat.copy(), 5e-3, 0.0, 0.0, 0.0, plant._record, 10))
     assert list(tmp_path.iterdir()) == []

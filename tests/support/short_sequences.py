@@ -54,10 +54,10 @@ def play(one: Job, folder: Path, stop: Callable[[], bool] = never) -> Outcome:
         return run_job(one, folder, ignore_progress, stop)
 
 
-def stop_after(cycles: int) -> Callable[[], bool]:
-    """An operator who presses Ctrl-C in that cycle of the run."""
+def stop_after(questions: int) -> Callable[[], bool]:
+    """An operator who presses Ctrl-C after the run has asked for it so often, each time cycles are over."""
     asked = iter(range(10**9))
-    return lambda: next(asked) >= cycles
+    return lambda: next(asked) >= questions
 
 
 def kinds(outcome: Outcome) -> list[tuple[str, str]]:

@@ -23,12 +23,12 @@ from rig.cli.interruption import catch_signals
 from rig.cli.progress_bar import show_progress
 from rig.network.bus import choose_bus
 from rig.network.clock import WallClock
-from rig.recorder import Event, Record
+from rig.recorder import Event, Observer, Record
 from rig.run.job import Job, JobChoice, build_job, find_differences, read_job, replace_settings
 from rig.run.outcome import Outcome, diagnose_servovalve
 from rig.run.page_writer import PageWriter
 from rig.run.participants import EMBEDDED_NAMES
-from rig.run.runner import Observe, run_job
+from rig.run.runner import run_job
 from rig.suite.suite import is_suite_file, write_junit_of_run
 from rig.view.live_process import ViewerPlace, find_viewer_place, show_live
 from rig.view.live_run import find_named_node, make_live_plan
@@ -54,10 +54,10 @@ def run_command(args: argparse.Namespace) -> int:
     clock = WallClock()
     with PageWriter() as pages, catch_signals() as is_to_stop:
         with (announce_run(job, why, is_silent=is_silent or is_on_screen) as progress,
-              choose_observer(job, folder / "trace.mcap", place, is_live=args.live is not None) as observe):
+              choose_observer(job, folder / "trace.mcap", place, is_live=args.live is not None) as observer):
             prepare = pages.wait_until_loaded if job.realtime else lambda: None
             diagnose = partial(diagnose_servovalve, progress=progress) if args.fdi else None
-            outcome = run_job(job, folder, progress, is_to_stop, prepare, diagnose, observe)
+            outcome = run_job(job, folder, progress, is_to_stop, prepare, diagnose, observer)
             progress("report", 0.0)
             pages.start_page(folder / "trace.mcap", folder / "report.html")
             report = build_run_report(Trace.read(folder / "trace.mcap", all=True))  # meanwhile
@@ -101,10 +101,10 @@ def choose_bus_of_run(args: argparse.Namespace, wanted: str, controller: str | N
 
 
 @contextlib.contextmanager
-def choose_observer(job: Job, log: Path, place: ViewerPlace | None, *, is_live: bool) -> Iterator[Observe]:
+def choose_observer(job: Job, log: Path, place: ViewerPlace | None, *, is_live: bool) -> Iterator[Observer]:
     """What looks at the records of a run: the screen or the viewer of --live, and the lines about dead nodes."""
     if not is_live:
-        yield partial(announce_dead_node, job.bench.list_participants())
+        yield Observer(partial(announce_dead_node, job.bench.list_participants()), sees_rows=False)
         return
     kept: list[Record] = []  # while a screen covers the terminal
     with show_live(make_live_plan(job.sequence, job.pace, job.bench), log, job.realtime, place) as begin:
@@ -115,7 +115,7 @@ def choose_observer(job: Job, log: Path, place: ViewerPlace | None, *, is_live: 
             elif isinstance(record, Event):
                 kept.append(record)
 
-        yield observe
+        yield Observer(observe)
     for record in kept:
         announce_dead_node(job.bench.list_participants(), 0, record)
 

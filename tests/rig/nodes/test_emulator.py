@@ -73,7 +73,7 @@ def test_missing_and_late_drives(drives: str, flags: list[int], counted: tuple[i
     desk = PlantDesk(scenario())
     assert [desk.cycle(None if drive == "-" else 2e-3, answers=60_000 if drive == "<" else None)[1].flags
             for drive in drives] == flags
-    assert (counters(desk), desk.emergencies(), desk.node._plant.current) == (counted, emergencies, current)
+    assert (counters(desk), desk.emergencies(), desk.node.plant.current) == (counted, emergencies, current)
 
 
 def test_the_cycle_number_wraps_without_a_miss() -> None:
@@ -133,17 +133,17 @@ def test_sensor_faults_show_in_the_frames_only() -> None:
     assert [x.pressure - y.pressure for (x, _), (y, _) in zip(a[4:6], b[4:6], strict=True)] == pytest.approx([1e6, 1e6])
     assert [x for x, _ in a[6:]] == [y for y, _ in b[6:]]
     assert np.std([x.spool - y.spool for (_, x), (_, y) in zip(a[6:], b[6:], strict=True)]) > 3e-7
-    assert desk.node._plant.actuator.state == sound.node._plant.actuator.state
+    assert desk.node.plant.actuator.state == sound.node.plant.actuator.state
 
 
 def test_a_parameter_ramps_cycle_by_cycle_and_returns_when_main_ends() -> None:
     fault = Parameter(parameter="filter.clogging", value=0.4, start=0.01, ramp=0.004)
     desk = PlantDesk(Scenario(QUIET_MODEL, Plan(faults=(fault,), start=5, stop=25)))
-    index = desk.node._plant.actuator._index["filter.clogging"]
+    index = desk.node.plant.actuator._index["filter.clogging"]
     seen = []
     for _ in range(30):
         desk.cycle()
-        seen.append(float(desk.node._plant.actuator._live[index]))
+        seen.append(float(desk.node.plant.actuator._live[index]))
     assert seen[15:20] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
     assert seen[:15] == [0.0] * 15 and seen[20:25] == [0.4] * 5 and seen[25:] == [0.0] * 5
 
@@ -177,7 +177,7 @@ def test_after_a_pause_the_cycle_is_that_of_the_bus_and_no_fault_was_slept_throu
     desk.nmt(1)
     said = [desk.cycle(1e-3)[1] for _ in range(3)]
     assert [(s.cycle, s.flags) for s in said] == [(15, 0), (16, 0), (17, 0)] and counters(desk) == (0, 0)
-    plant = desk.node._plant.actuator
+    plant = desk.node.plant.actuator
     assert [float(plant._live[plant._index[name]]) for name in ("filter.clogging", "spool.dynamic_friction")] == [0, 1]
 
 
@@ -231,7 +231,7 @@ def test_a_plant_without_a_number_says_so_and_stops() -> None:
     """Division by zero far out: EMCY 0x6000, no made-up feedback, and the node lives on."""
     desk = PlantDesk(scenario())
     desk.cycle()
-    desk.node._plant.actuator._flat[:] = np.nan
+    desk.node.plant.actuator._flat[:] = np.nan
     before = len(desk.frames(codec.FEEDBACK))
     desk.send(codec.SYNC)
     assert desk.emergencies() == [0x6000] and desk.node.device.state is NmtState.PRE_OPERATIONAL
@@ -289,7 +289,7 @@ def test_a_plant_that_is_bus_off_moves_without_current_and_comes_back() -> None:
         desk.wait(MS)
     cycles = [codec.unpack_valve_state(data).cycle for data in desk.frames(codec.VALVE_STATE)]
     assert cycles == [*range(10), *range(30, 40)]
-    assert desk.node._plant.current == 5e-3 and desk.node._od[COUNTERS, 1] >= 20
+    assert desk.node.plant.current == 5e-3 and desk.node._od[COUNTERS, 1] >= 20
     assert not [t_ns for t_ns, _, _ in desk.heard if 10 * MS <= t_ns < 30 * MS]
 
 

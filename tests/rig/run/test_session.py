@@ -81,12 +81,13 @@ def test_a_guard_ends_main_and_clean_up_runs(tmp_path: Path) -> None:
     assert trace.com[trace.phase == CLEANUP][0] == trace.com[trace.phase == MAIN][-1]  # from where it was
 
 
-@pytest.mark.parametrize("cycle", [0, 20, 100, 399])
-def test_the_operator_ends_it(tmp_path: Path, cycle: int) -> None:
-    outcome = play(job(), tmp_path, stop_after(cycle))
+@pytest.mark.parametrize("questions", [0, 2, 8])
+def test_the_operator_ends_it(tmp_path: Path, questions: int) -> None:
+    """Cycles that are played together are too few for the operator to wait: they end at the next heartbeat."""
+    outcome = play(job(), tmp_path, stop_after(questions))
     assert (outcome.verdict, outcome.status, outcome.interrupted) == ("ABORTED", 130, True)
     setup, main, cleanup = phases(tmp_path)
-    assert setup + main == cycle + 1 and cleanup == 50
+    assert questions < setup + main <= 100 * questions + 1 and cleanup == 50
     assert ("operator", "stopped by the operator") in kinds(outcome)
 
 
@@ -278,14 +279,15 @@ def test_whatever_is_raised_clean_up_runs_and_the_log_is_whole(tmp_path: Path, e
     calls = iter(range(10**6))
 
     def stop() -> bool:
-        if next(calls) == 200:
+        if next(calls) == 5:
             raise error
         return False
 
     threads = threading.active_count()
     with pytest.raises(type(error)):
         play(job(), tmp_path, stop)
-    assert phases(tmp_path) == [50, 151, 50]
+    setup, main, cleanup = phases(tmp_path)
+    assert (setup, cleanup) == (50, 50) and 1 < main < 250
     assert Trace.read(tmp_path, all=True).events[-1].text == "end"
     assert threading.active_count() == threads and not (tmp_path / "verdict.json").exists()
 
@@ -295,7 +297,7 @@ def test_a_log_that_cannot_be_written_is_told_after_clean_up(tmp_path: Path) -> 
     calls = iter(range(10**6))
 
     def stop() -> bool:
-        if next(calls) == 150:
+        if next(calls) == 5:
             (tmp_path / "trace.mcap").unlink()
         return False
 

@@ -1,0 +1,201 @@
+"""Quiet cycles of the embedded bus as compiled code: rig, plant and reference firmware in one loop, without a bus.
+
+A cycle is quiet when nothing happens in it but its frames: all nodes are OPERATIONAL, the loop of the controller is
+closed, and no timer runs out. embedded_loop.py finds such cycles and plays all others in Python. Frames are packed from
+the tables of the bench (rig/benches/packing.py), and each value is what its receiver reads from its frame: rows and
+payloads are those of the nodes in Python (rig/nodes) to the last bit.
+"""
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.compile import ForeignCall, compile_function, compute_fingerprint, find_cache_folder, interpret_function
+from plant.controller import Loop, compute_current
+from plant.machine_code import ADVANCE_CALL, StoredCode
+from plant.model import Model
+from plant.run import PRESSURE, SENSED, SPOOL, Actuator, LentPlant, sample_noise
+from plant.solve import NOISES
+from rig.benches.bench import Bench
+from rig.benches.bench_file import load_bench
+from rig.benches.frame_map import FrameSpec, Role
+from rig.benches.packing import PAYLOAD, VALUES_AT, Layout, list_frame_places, make_layout, pack_frame
+from rig.network.node_objects import Gains, read_gains
+from rig.run.cyclic_values import CyclicValues
+
+# Words: cycles to play and played, the number of the first; of the plant its cycle, the address of its code, steps and
+# size of its parameters; address of the C library's clock (0: no times) and its answer; places of the frames
+ASKED, DONE, FIRST, PLANT_CYCLE, ADVANCE, STEPS, RECORD_SIZE, CLOCK, TIME, FRAMES_AT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 10
+LEVELS_AT = 14  # places of the noise of the three transducers among the parameters
+DEMAND, LOAD, READINGS, CURRENT = range(17, 21)  # places among the values; readings are three
+_WORDS = 24
+COMMAND, FEEDBACK, VALVE, DRIVE = range(4)  # frames, columns of the payloads
+# Reals: the controller's loop and gains, period, the limits of the guards, their signals, scratch
+LOOP, GAINS, PERIOD, LOW, HIGH, _GUARDED, _SCRATCH = 0, 3, 8, 9, 16, 23, 30
+_REALS = 32
+GUARDED = ("xj", "p12", "xs", "com", "cor", "load", "error")
+SYNC_AT, PLANT_AT, DRIVE_AT, END_AT, BEGUN_AT = range(5)  # columns of the times
+
+_KNOWN = {"position_demand", "control_word", "cycle", "ram_position", "load_pressure", "spool_position", "flags",
+          "current", "status_word"}  # what our own nodes put into frames
+MOST = 500  # cycles a call
+_call_advance, _call_clock = ForeignCall(ADVANCE_CALL), ForeignCall("iiq")
+_MONOTONIC = 1
+
+
+class Buffers(NamedTuple):
+    """What Python and the compiled loop share; of a call row i is its cycle i."""
+
+    words: NDArray[np.int64]
+    reals: NDArray[np.float64]
+    layout: Layout
+    inputs: NDArray[np.float64]  # (MOST, 3): demand m, load for the rig N, load on the plant N
+    noise: NDArray[np.float64]  # (MOST, NOISES)
+    values: NDArray[np.float64]  # (MOST, values of the bench), SI
+    payloads: NDArray[np.int64]  # (MOST, 4)
+    times: NDArray[np.int64]  # (MOST, 5), ns
+
+
+def play_quiet_cycles(b: Buffers, flat: NDArray[np.float64], live: NDArray[np.float64]) -> None:
+    """Play the cycles asked for, but none after one whose values are outside a guard, nor one of a plant that diverges.
+
+    `flat`: state of the plant; `live`: its parameters.
+    """
+    words, reals, m = b.words, b.reals, b.layout
+    at = m.words[VALUES_AT]
+    loop = Loop(reals[LOOP], reals[LOOP + 1], reals[LOOP + 2])
+    gains = Gains(reals[GAINS], reals[GAINS + 1], reals[GAINS + 2], reals[GAINS + 3], reals[GAINS + 4])
+    words[DONE] = 0
+    for i in range(words[ASKED]):
+        _note_time(b, i, BEGUN_AT)
+        xj = flat[SENSED] + live[words[LEVELS_AT]] * b.noise[i, 0]
+        p12 = flat[PRESSURE] + live[words[LEVELS_AT + 1]] * b.noise[i, 1]
+        xs = flat[SPOOL] + live[words[LEVELS_AT + 2]] * b.noise[i, 2]
+        if _is_outside(b) or not np.isfinite(xj + p12 + xs):
+            break
+        in_force = m.doubles[at + words[CURRENT]]  # what the controller answered to the cycle before
+        m.doubles[at + words[DEMAND]], m.doubles[at + words[LOAD]] = b.inputs[i, 0], b.inputs[i, 1]
+        _pack(b, i, COMMAND)
+        _note_time(b, i, SYNC_AT)
+        readings = at + words[READINGS]
+        m.doubles[readings], m.doubles[readings + 1], m.doubles[readings + 2] = xj, p12, xs
+        _pack(b, i, FEEDBACK)
+        _pack(b, i, VALVE)
+        _note_time(b, i, PLANT_AT)
+        m.doubles[at + words[CURRENT]], loop = compute_current(
+            loop, m.doubles[at + words[DEMAND]], m.doubles[readings], gains)
+        _pack(b, i, DRIVE)
+        _note_time(b, i, DRIVE_AT)
+        _call_advance(words[ADVANCE], reals.ctypes.data + 8 * _SCRATCH, reals.ctypes.data + 8 * (_SCRATCH + 1),
+                      0, 0, len(flat), 8, flat.ctypes.data, len(flat), 8,
+                      in_force, b.inputs[i, 2], b.noise[i, NOISES - 1], (words[PLANT_CYCLE] + i) * reals[PERIOD],
+                      0, 0, 1, words[RECORD_SIZE], live.ctypes.data, 1, words[RECORD_SIZE], words[STEPS])
+        _note_time(b, i, END_AT)
+        for channel in range(b.values.shape[1]):
+            b.values[i, channel] = m.doubles[at + channel]
+        words[DONE] += 1
+    reals[LOOP], reals[LOOP + 1], reals[LOOP + 2] = loop.integral, loop.error, loop.cycles
+
+
+def _is_outside(b: Buffers) -> bool:
+    """Whether a value of the cycle before is outside the limits of the guards."""
+    words, reals, at = b.words, b.reals, b.layout.words[VALUES_AT]
+    for i in range(3):
+        reals[_GUARDED + i] = b.layout.doubles[at + words[READINGS] + i]
+    reals[_GUARDED + 3] = b.layout.doubles[at + words[DEMAND]]
+    reals[_GUARDED + 4] = b.layout.doubles[at + words[CURRENT]]
+    reals[_GUARDED + 5] = b.layout.doubles[at + words[LOAD]]
+    reals[_GUARDED + 6] = reals[_GUARDED + 3] - reals[_GUARDED]
+    for i in range(7):  # noqa: SIM110 - compiled
+        if not reals[LOW + i] <= reals[_GUARDED + i] <= reals[HIGH + i]:
+            return True
+    return False
+
+
+def _pack(b: Buffers, i: int, what: int) -> None:
+    """Pack a frame of cycle i; its values become what the receiver reads."""
+    pack_frame(b.layout, b.words[FRAMES_AT + what], b.words[FIRST] + i)
+    b.payloads[i, what] = b.layout.words[PAYLOAD]
+
+
+def _note_time(b: Buffers, i: int, column: int) -> None:
+    words = b.words
+    if words[CLOCK]:
+        _call_clock(words[CLOCK], _MONOTONIC, words.ctypes.data + 8 * TIME)
+        b.times[i, column] = words[TIME] * 1_000_000_000 + words[TIME + 1]
+
+
+# ---------------------------------------------------------------------------------------- made before the start
+
+
+def make_buffers(bench: Bench, names: Sequence[str], guards: Mapping[str, tuple[float, float]]) -> Buffers:
+    """Buffers for a bench whose values have these names. `guards`: limits by signal, SI."""
+    m = make_layout(bench.frames.list_of(Role.RIG), names, Role.RIG)
+    b = Buffers(np.zeros(_WORDS, np.int64), np.zeros(_REALS), m, np.zeros((MOST, 3)), np.zeros((MOST, NOISES)),
+                np.zeros((MOST, len(names))), np.zeros((MOST, 4), np.int64), np.zeros((MOST, 5), np.int64))
+    places = dict(zip((each.identifier for each in bench.frames.list_of(Role.RIG)), list_frame_places(m), strict=True))
+    b.words[FRAMES_AT:FRAMES_AT + 4] = [places[each.identifier] for each in list_frames(bench)]
+    b.words[DEMAND:CURRENT + 1] = [names.index(name) for name in ("position_demand", "load_force", "ram_position",
+                                                                  "current")]
+    limits = [guards.get(signal, (-np.inf, np.inf)) for signal in GUARDED]
+    b.reals[LOW:LOW + len(GUARDED)], b.reals[HIGH:HIGH + len(GUARDED)] = zip(*limits, strict=True)
+    return b
+
+
+def list_frames(bench: Bench) -> list[FrameSpec]:
+    """The frames of a cycle in the order of the payloads; empty unless there is one of each kind, in each cycle."""
+    found = [each for role in ("command", "feedback", "valve_state", "drive")
+             for each in bench.frames.frames if role in each.roles]
+    is_plain = all(each.every == 1 and each.length == 8 and {one.name for one in each.fields} <= _KNOWN
+                   for each in found)
+    return found if is_plain and len(bench.frames.frames) == len(set(found)) == len(found) == 4 else []
+
+
+def set_values(b: Buffers, values: Sequence[float]) -> None:
+    """The values of the cycle before, SI."""
+    at = b.layout.words[VALUES_AT]
+    b.layout.doubles[at:at + len(values)] = values
+
+
+def bind_code(b: Buffers, plant: LentPlant, actuator: Actuator) -> Callable[[], object]:
+    """The compiled cycles on a plant; note where its code and parameters are."""
+    _lend_plant(b, plant, actuator)
+    return load_code().bind((b, plant.flat, plant.live))
+
+
+def _lend_plant(b: Buffers, plant: LentPlant, actuator: Actuator) -> None:
+    b.words[ADVANCE], b.words[STEPS], b.words[RECORD_SIZE] = plant.advance, actuator.steps, 8 * len(plant.live)
+    b.words[LEVELS_AT:LEVELS_AT + 3] = plant.levels
+    b.reals[PERIOD] = actuator.model["controller.period"]
+
+
+def is_compiled() -> bool:
+    """Whether code is compiled in this process: not where a debugger wants plain Python."""
+    return not os.environ.get("NUMBA_DISABLE_JIT")
+
+
+def make_trial() -> tuple[Buffers, Any, Any]:
+    """Arguments of some cycles of the shipped bench, without times."""
+    bench, actuator = load_bench(), Actuator(Model())
+    actuator.warm()
+    plant = actuator.lend()
+    assert plant is not None
+    b = make_buffers(bench, CyclicValues(bench).names, {})
+    _lend_plant(b, plant, actuator)
+    b.words[ASKED], b.inputs[:, 0], b.noise[:20] = 20, 1e-3, sample_noise(0, 20)
+    b.reals[GAINS:GAINS + len(Gains._fields)] = read_gains(actuator.model.values)
+    return b, plant.flat, plant.live
+
+
+@cache
+def load_code() -> StoredCode:
+    """The compiled cycles, for any plant: some seconds on a new machine."""
+    source = compute_fingerprint(interpret_function(play_quiet_cycles))
+    code = StoredCode(find_cache_folder() / source, partial(compile_function, play_quiet_cycles), "cycles")
+    code.warm(make_trial)
+    return code

@@ -1,0 +1,102 @@
+"""Cycles that are played together as compiled code leave the same log as cycles that the nodes in Python play alone."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from short_sequences import SHORT, job, play
+
+from fdi.trace.mcap_log import open_log
+from plant.run import NoiseStream
+from plant.segments import Array
+from rig.run import hard_loop
+from rig.run.embedded_loop import EmbeddedLoop, find_busy_cycles
+from rig.run.outcome import Outcome
+from rig.sequences.faults import Late, Noise, Parameter, Plan
+
+LOADED = SHORT.replace("main = [", 'load = [{ kind = "ramp", to = 1500, time = 0.3 }]\nmain = [')
+GUARDED = SHORT + 'guards = [{ name = "g", signal = "error", low = -0.5, high = 0.1, unit = "mm", cycles = %d }]'
+
+
+def with_fault(text: str) -> str:
+    return f"faults = [{{ {text} }}]\n" + SHORT
+
+
+def read_log(folder: Path) -> list[tuple[int, int, bytes]]:
+    """The messages in the order of the file, without what the wall clock says of a cycle."""
+    log = open_log(folder / "trace.mcap")
+    topics = {number: channel.topic for number, channel in log.channels.items()}
+    return [(number, t_ns, data[:5] if topics[number] == "/timing" else data)
+            for number, t_ns, data in log.list_raw_messages()]
+
+
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many cycles were played together, call by call."""
+    counts: list[int] = []
+    original = EmbeddedLoop.play_many
+
+    def play_many(self: EmbeddedLoop, phase: int, demands: Array, loads: Array, control: int) -> int:
+        counts.append(original(self, phase, demands, loads, control))
+        return counts[-1]
+
+    monkeypatch.setattr(EmbeddedLoop, "play_many", play_many)
+    return counts
+
+
+def play_both(monkeypatch: pytest.MonkeyPatch, folder: Path, *given: Any, **settings: Any) -> Outcome:
+    """Play a job as it is and with every cycle in Python; the logs and verdicts must be the same."""
+    together = play(job(*given, **settings), folder / "together")
+    monkeypatch.setattr(hard_loop, "can_play_many", lambda master, bench: False)
+    alone = play(job(*given, **settings), folder / "alone")
+    assert read_log(folder / "together") == read_log(folder / "alone")
+    assert (together.verdict, together.aborted, together.checks) == (alone.verdict, alone.aborted, alone.checks)
+    assert together.events == alone.events
+    return together
+
+
+@pytest.mark.parametrize(("text", "set_", "least"), [
+    (SHORT, {}, 400),
+    (LOADED, {"filter.clogging": 0.3, "controller.integral_gain": 0.4}, 400),
+    (SHORT, {"controller.current_limit": 1e-3, "controller.derivative_gain": 1e-4}, 400),
+    (SHORT, {"command_rate_limit.rate": 0.05}, 0),  # an effect in the firmware, which is Python
+    (with_fault('kind = "parameter", parameter = "filter.clogging", value = 0.5, start = 0.1'), {}, 350),
+    (with_fault('kind = "parameter", parameter = "filter.clogging", value = 0.5, start = 0.1, end = 0.3, ramp = 0.1'),
+     {}, 200),
+    (with_fault('kind = "noise", signal = "p12", value = 1e4, start = 0.1, end = 0.2'), {}, 200),
+    (with_fault('kind = "stuck", signal = "xj", start = 0.1, end = 0.12'), {}, 300),
+    (with_fault('kind = "late", frame = "drive", delay = 2.5e-3, start = 0.1, end = 0.15'), {}, 100),
+    (with_fault('kind = "lost", frame = "feedback", start = 0.2, end = 0.22'), {}, 100),
+    (with_fault('kind = "heartbeat", node = "rig", start = 0.05, end = 0.32'), {}, 50),
+    (with_fault('kind = "foreign", start = 0.1, end = 0.2, every = 3'), {}, 200),
+    (with_fault('kind = "reset", start = 0.15'), {}, 100),
+    (with_fault('kind = "lost", frame = "drive", start = 0.2, count = 1'), {}, 100),
+    (GUARDED % 3, {}, 20), (GUARDED % 1, {}, 20), (GUARDED % 40, {}, 20)])
+def test_the_log_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, played: list[int], text: str,
+                             set_: dict[str, float], least: int) -> None:
+    play_both(monkeypatch, tmp_path, text, seed=3, set_=set_)
+    assert sum(played) >= least and (least or not sum(played))
+
+
+def test_a_plant_that_diverges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, played: list[int]) -> None:
+    """No number is made up: the cycle in which it has diverged is played by the nodes."""
+    original = NoiseStream.__init__
+
+    def begin(self: NoiseStream, seed: int) -> None:
+        original(self, seed)
+        self._drawn = self.look_ahead(300)
+        self._drawn[200, 1] = np.nan
+
+    monkeypatch.setattr(NoiseStream, "__init__", begin)
+    outcome = play_both(monkeypatch, tmp_path)
+    assert outcome.safe and sum(played) > 150
+
+
+def test_python_plays_the_cycles_in_which_a_fault_begins_acts_or_ends() -> None:
+    """A parameter needs Python where it changes, any other fault all the time."""
+    ramped = Parameter(parameter="filter.clogging", value=0.4, start=0.1, end=0.2, ramp=0.01)
+    busy = find_busy_cycles(Plan(faults=(ramped, Late(frame="drive", delay=1e-3, start=0.3, end=0.302),
+                                         Noise(signal="xj", value=1e-6, start=0.4, end=0.401)), start=50, stop=500))
+    assert busy.tolist() == [*range(149, 162), *range(249, 252), *range(349, 354), *range(449, 453)]
