@@ -182,8 +182,10 @@ class _Reader:
             if kind not in CHECKSUMS:
                 raise place.refuse(f"counter, FILE.py:FUNCTION or a checksum: {list_choices(kind, CHECKSUMS)}")
             return kind
+        is_announced = file in self.files
         source = self.read_file(file, place)
-        require_trust(place.file, [ForeignCode(file, source)], is_trusted=self._is_trusted)
+        if not is_announced:
+            require_trust(place.file, [ForeignCode(file, source)], is_trusted=self._is_trusted)
         return load_checksum(file, source, function)
 
 

@@ -106,6 +106,9 @@ def load_checksum(name: str, source: bytes, function: str) -> str:
             exec(compile(source, name, "exec", dont_inherit=True), module.__dict__)
         except Exception as error:
             raise InputError(name, "", f"a file that Python can run ({type(error).__name__}: {error})") from error
+        for place, value in vars(module).items():  # tables: compiled code takes constants alone
+            if isinstance(value, list | bytearray):
+                vars(module)[place] = bytes(value) if isinstance(value, bytearray) else tuple(value)
         if not callable(getattr(module, function, None)):
             raise InputError(name, function, "a function (data: bytes, counter: int) -> int")
         _USERS[known] = getattr(module, function)

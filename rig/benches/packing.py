@@ -347,6 +347,18 @@ def _fill_field(m: Layout, at: int, field: Field, rule: int, channel: int) -> No
                                                          float(field.offset), *field.range)
 
 
+def users_checksum(data: NDArray[np.uint8], counter: int) -> int:
+    """The place of a user's function in `call_users_checksum`."""
+    raise NotImplementedError
+
+
+def call_users_checksum(data: NDArray[np.uint8], counter: int) -> int:
+    """What is compiled for a user's function: the compiler looks for the file of the function that it is given, and the
+    one in a log has none.
+    """
+    return users_checksum(data, counter)
+
+
 _COMPILED: dict[str, Any] = {}  # kept: the loops call the code by its address
 
 
@@ -357,12 +369,13 @@ def _find_address(field: Field) -> int:
         InputError: it cannot be compiled.
     """
     if field.checksum not in _COMPILED:
-        run = compile_function(find_user_checksum(field.checksum))
+        run = compile_function(call_users_checksum, {"users_checksum": find_user_checksum(field.checksum)})
         try:
             run(np.zeros(8, np.uint8), 0)
         except Exception as error:  # whatever numba has against it
             name, _, function = field.checksum.partition("#")[0].rpartition(":")
-            said = str(error).strip().splitlines()[0][:200]
-            raise InputError(name, function, f"a function that can be compiled ({said})") from error
+            lines = [line.strip() for line in str(error).splitlines() if line.strip() and "pipeline" not in line]
+            raise InputError(name, function, "a function of whole numbers that numba can compile "
+                                             f"({' '.join(lines[:2])[:200]})") from error
         _COMPILED[field.checksum] = run
     return find_function_address(_COMPILED[field.checksum])

@@ -39,6 +39,33 @@ def test_preflight_passes_in_lockstep(tmp_path: Path, folder: Path) -> None:
     assert (said.status, said.json["verdict"], list_failed(said)) == (0, "PASS", [])
 
 
+OWN_CHECKSUM = '''
+def add_up(data, counter):
+    crc = 0xFF
+    for byte in data[1:]:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x1D) & 0xFF if crc & 0x80 else crc << 1
+    return crc ^ INVERSION
+'''
+
+
+def test_a_checksum_of_the_users_own_protects_a_whole_run(tmp_path: Path) -> None:
+    """Sent and checked in compiled cycles; without --trust one line; with another result the ECU hears nothing."""
+    bench = (ECU / "bench.toml").read_text().replace('"crc8_sae_j1850"', '"own.py:add_up"')
+    where, words = spec("udp_multicast"), ("--bench", tmp_path / "bench.toml", "--out", tmp_path / "run", "--json")
+    (tmp_path / "bench.toml").write_text(bench)
+    (tmp_path / "ecu.dbc").write_bytes((ECU / "ecu.dbc").read_bytes())
+    (tmp_path / "short.toml").write_text(SHORT + SLOW_START)
+    for inversion, trust, status in ((0xFF, (), 2), (0xFF, ("--trust",), 0), (0xFE, ("--trust",), 1)):
+        (tmp_path / "own.py").write_text(OWN_CHECKSUM.replace("INVERSION", str(inversion)))
+        with run_device(ECU, where, *PATIENT[ECU]):
+            said = rig("run", tmp_path / "short.toml", *words, "--bus", where, *trust)
+        assert said.status == status, said.err
+        assert said.err.count("own.py") == 1 and said.err.count("\n") == 1 + (status == 1)  # refused, or announced
+    assert said.json["verdict"] == "ABORTED"
+
+
 @examples
 def test_a_short_run_passes_in_real_time(tmp_path: Path, folder: Path) -> None:
     (tmp_path / "short.toml").write_text(SHORT + SLOW_START + IN_TIME)
