@@ -4,7 +4,7 @@ Motor and screw are seen from the nut, in metres: z = r theta with r = lead/(2 p
 
     L i' = V - R i - Ke theta'          V = L wc (i_ref - i) + R wc int(i_ref - i) + Ke theta', |V| <= Vdc
     J/r^2 z'' = Kt i/r - B/r^2 z' - F   F = k (d - clip(d, b/2) + tau d'), d = z - x; none within the backlash b
-    M x'' = F - C x' - dry(FS, FD, x') - load        |x| <= travel
+    M x'' = F - C x' - dry(FS, FD, x') - load        |x| <= travel, FS = FD (1 + stiction)
 
 The current controller cancels the pole of the winding, so the current follows as a first-order lag of 1/wc (Krishnan,
 Permanent Magnet Synchronous and Brushless DC Motor Drives, 2010). Backlash as a dead zone with a spring behind it
@@ -66,8 +66,8 @@ class Surface(NamedTuple):
 
     mass: Annotated[float, Quantity("kg", "M", low=1e-2, high=1e6, tolerance=0.02)] = 200.0
     damping: Annotated[float, Quantity("N s/m", "C", low=0, high=1e7, tolerance=0.05)] = 2e3
-    static_friction: Annotated[float, Quantity("N", "FS", low=0, high=1e6, tolerance=0.05)] = 150.0
-    dynamic_friction: Annotated[float, Quantity("N", "FD", low=0, high=1e6, tolerance=0.05)] = 100.0
+    friction: Annotated[float, Quantity("N", "FD", low=0, high=1e6, tolerance=0.05)] = 100.0
+    stiction: Annotated[float, Quantity("1", "FS/FD - 1", low=0, high=10)] = 0.5
     travel: Annotated[float, Quantity("m", low=1e-3, high=10)] = 0.06
 
 
@@ -183,7 +183,8 @@ def step(s: State, m: Any, u: Any, p: Any, k: Any) -> tuple[State, Any]:
     mean, current, integral = step_current(s, clip(wanted, p.drive.current_limit), p, k)
     torque, m = at_torque(p.motor.torque_constant * mean, m, s, u, p)
     load, m = at_load(u.load, m, s, u, p)
-    friction, m = at_friction(Friction(0.0, p.surface.static_friction, p.surface.dynamic_friction), m, s, u, p)
+    level = p.surface.friction
+    friction, m = at_friction(Friction(0.0, level * (1.0 + p.surface.stiction), level), m, s, u, p)
     v0, w0 = s.speed, s.motor_speed
     impulse = p.surface.mass * v0 - h * (load + friction.force)
     dry = h * (friction.static if v0 == 0.0 else friction.dynamic)
@@ -261,9 +262,10 @@ _FRICTION = "Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30, 1994"
 base_effect("backlash", Screw, "backlash", law="F = 0 while |z - x| < b/2", starts=(2e-5, 6e-5, 2e-4),
             symptoms="at each reversal the motor turns and the surface waits",
             source="Nordin and Gutman 2002; " + _FAULTS)
-base_effect("dry_friction", Surface, "static_friction", "dynamic_friction", law="dry(FS, FD, x')",
-            symptoms="the current steps with the sign of the speed; stick-slip at low speed",
-            starts=((15.0, 12.0), (60.0, 50.0), (300.0, 200.0), (900.0, 600.0)), source="Karnopp 1985; " + _FAULTS)
+base_effect("dry_friction", Surface, "friction", law="dry(FS, FD, x')", starts=(15.0, 50.0, 200.0, 500.0),
+            symptoms="the current steps with the sign of the speed", source="Karnopp 1985; " + _FAULTS)
+base_effect("stiction", Surface, "stiction", law="FS = FD (1 + stiction)", starts=(0.2, 1.0, 2.0),
+            symptoms="stick-slip at low speed: the surface waits and then jumps", source="Karnopp 1985")
 base_effect("viscous_friction", Surface, "damping", law="C x'", symptoms="the current grows with speed",
             starts=(500.0, 4e3, 1e4), source="grease of the screw, at low temperature above all")
 base_effect("moving_mass", Surface, "mass", law="M x''", symptoms="the current grows with acceleration",
@@ -380,7 +382,7 @@ PLANT = Plant(
     state=State, step=step, coefficients=compute_coefficients, measure=measure, moves=follow, sense=sense,
     control=control, control_memory=Loops,
     faults=(
-        Fault("dry_friction", "dry friction of screw and bearings", "surface.dynamic_friction", (100.0, 400.0), 150.0,
+        Fault("dry_friction", "dry friction of screw and bearings", "surface.friction", (100.0, 400.0), 150.0,
               250.0, "limits are ours: 1.5 and 2.5 times nominal; law and range (to 3 times): " + _FAULTS),
         Fault("backlash", "backlash of the screw", "screw.backlash", (0.0, 4e-4), 5e-5, 1.5e-4,
               "limits are ours, by the lost motion of a primary flight control; law: " + _FAULTS),

@@ -5,11 +5,12 @@
 
 #include "bytes.h"
 
-enum { GAIN = 0x2002, CONTROL_WORD = 0x6040, QUICK_STOP_OPTION = 0x605A, MODE = 0x6060 };
+enum { GAINS = 0x2002, CONTROL_WORD = 0x6040, QUICK_STOP_OPTION = 0x605A, MODE = 0x6060 };
 enum { HALT = 0x100, VOLTAGE = 0x10, REMOTE = 0x200, LIMITED = 0x800, FOLLOWS = 0x1000 }; /* control, then status word */
 enum { NO_MODE = 0, CYCLIC_SYNCHRONOUS_POSITION = 8, STAY_IN_QUICK_STOP = 6 };
 enum { EMCY_SENSOR = 0x7300, ERROR_PROFILE = 0x20 }; /* a position that is no number */
 enum { LOST_AFTER = 3 };                             /* SYNCs in a row without an RPDO */
+static const double DEFAULT_PERIOD = 1e-3;           /* s, of SYNC */
 
 static double real_from_bits(uint64_t bits)
 {
@@ -115,10 +116,12 @@ static void watch_sensor(struct drive *drive)
 static double run_loop(struct drive *drive)
 {
     const double rated = (double)drive->values[OBJECT_6075_00] * 1e-3; /* A */
+    const uint64_t period = drive->values[OBJECT_1006_00]; /* of SYNC, us; 0: not told */
     const struct gains gains = {
         .proportional_gain = real_from_bits(drive->values[OBJECT_2002_01]),
         .current_limit = (double)drive->values[OBJECT_6073_00] * 1e-3 * rated,
-        .period = 1.0, /* integral and derivative part are off */
+        .derivative_gain = real_from_bits(drive->values[OBJECT_2002_02]),
+        .period = period ? (double)period * 1e-6 : DEFAULT_PERIOD,
     };
     const double position = read_position(drive);
     const bool is_halted = drive->values[OBJECT_6040_00] & HALT;
@@ -164,7 +167,7 @@ static uint32_t on_write(void *context, uint16_t index, uint8_t sub, const uint8
         return ABORT_VALUE;
     else if (index == QUICK_STOP_OPTION && value != 2 && value != STAY_IN_QUICK_STOP)
         return ABORT_VALUE;
-    else if (index == GAIN && !(isfinite(real_from_bits(value)) && real_from_bits(value) >= 0.0))
+    else if (index == GAINS && !(isfinite(real_from_bits(value)) && real_from_bits(value) >= 0.0))
         return ABORT_VALUE;
     return ABORT_NONE;
 }

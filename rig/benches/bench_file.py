@@ -66,6 +66,7 @@ class ControllerKeys(NodeKeys):
     mode: Annotated[int, Range("1", low=-128, high=127)] | None = None
     timeout: str | None = None
     parameters: Mapping[str, str] = field(default_factory=dict)
+    values: Mapping[str, float] = field(default_factory=dict)
     phases: Mapping[str, float | str] = field(default_factory=dict)
     ready: Mapping[str, float | str] = field(default_factory=dict)
     protection: Mapping[str, str | int | tuple[int, ...]] = field(default_factory=dict)
@@ -237,7 +238,7 @@ def _read_time(text: str, place: Place, low: Fraction, high: Fraction) -> int:
 
 def _refuse_canopen_keys(keys: BenchKeys, place: Place) -> None:
     """Refuse keys of CANopen on plain CAN."""
-    for key in ("node", "eds", "mode", "parameters", "profile", "emcy"):
+    for key in ("node", "eds", "mode", "parameters", "values", "profile", "emcy"):
         if getattr(keys.controller, key) not in (None, {}, "none", ()):
             raise place.at("controller", key).refuse('protocol = "canopen" together with this key')
     if keys.plant_node is not None:
@@ -387,7 +388,8 @@ def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use
         if keys.profile == "cia402" and mode is None:
             mode = CYCLE_POSITION
         node = replace(node, profile=keys.profile, mode=mode, settings=tuple(_list_settings(
-            reader.keys.plant, dictionary, keys.parameters, place.at("parameters"))))
+            reader.keys.plant, dictionary, keys.parameters, place.at("parameters"))),
+            values=(*node.values, *_list_values(dictionary, keys.values, place.at("values"))))
     frames = canopen_map.map_pdos(eds, dictionary, keys.node, uses)
     node = replace(node, inputs=_list_objects(frames, uses, is_received=True),
                    outputs=_list_objects(frames, uses, is_received=False))
@@ -417,19 +419,35 @@ def _add_profile(uses: dict[str, Use], dictionary: Any, keys: ControllerKeys, pl
     return added
 
 
+def _find_writable(dictionary: Any, key: str, place: Place) -> Any:
+    """The object of the EDS that a key such as 0x2110:1 names, which can be written."""
+    index, sub = canopen_map.parse_object(key) or (0, 0)
+    found = canopen_map.find_variable(dictionary, index, sub)
+    if found is None or not found.writable:
+        raise place.refuse("an object of the EDS that can be written, such as 0x2110:1")
+    return found
+
+
+def _list_values(dictionary: Any, values: Mapping[str, float], place: Place) -> Iterator[tuple[int, int, bytes]]:
+    """Objects that are written at bring-up, after those of a DCF."""
+    for key, value in values.items():
+        found = _find_writable(dictionary, key, place.at(key))
+        data = canopen_map.encode_value(found, value)
+        if data is None:
+            raise place.at(key).refuse(f"a number that {found.name} can hold, not {value:g}")
+        yield found.index, found.subindex, data
+
+
 def _list_settings(plant: str, dictionary: Any, parameters: Mapping[str, str],
                    place: Place) -> Iterator[tuple[int, int, str]]:
     """Objects that hold parameters of the model."""
     for name, parameter in parameters.items():
         own = place.at(name)
-        index, sub = canopen_map.parse_object(name) or (0, 0)
-        found = canopen_map.find_variable(dictionary, index, sub)
-        if found is None or not found.writable:
-            raise own.refuse("an object of the EDS that can be written, such as 0x2110:1")
+        found = _find_writable(dictionary, name, own)
         if plant == "eha":
             with own.locate():
                 find_field("", parameter, GROUPS)
-        yield index, sub, parameter
+        yield found.index, found.subindex, parameter
 
 
 def _build_spec(frame: DeviceFrame, uses: Mapping[str, Use], sender: Role) -> FrameSpec:

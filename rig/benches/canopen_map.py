@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import io
 import re
+import struct
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -238,6 +239,18 @@ def read_start(found: ODVariable | None) -> float:
     """The number that an object holds after a reset, 0 if the file gives none."""
     value = None if found is None else found.default if found.value is None else found.value
     return value if isinstance(value, int | float) and abs(value) < 1 << 64 else 0
+
+
+def encode_value(variable: ODVariable, value: float) -> bytes | None:
+    """The bytes of a number in an object, None if it cannot hold it."""
+    whole = variable.data_type not in datatypes.FLOAT_TYPES
+    too_low = variable.min is not None and value < variable.min
+    if (whole and value % 1) or too_low or (variable.max is not None and value > variable.max):
+        return None
+    try:
+        return bytes(variable.encode_raw(int(value) if whole else float(value)))
+    except (TypeError, ValueError, OverflowError, struct.error):
+        return None
 
 
 def list_values(dictionary: Any) -> tuple[tuple[int, int, bytes], ...]:

@@ -24,9 +24,9 @@ USUAL = Parameters(*(cls() for cls in GROUPS.values()))
 RADIUS = USUAL.screw.lead / (2.0 * pi * USUAL.screw.ratio)  # m a radian of the motor
 MOTOR = USUAL.motor.inertia / RADIUS**2  # kg, as the nut feels it
 MASS, STIFF = USUAL.surface.mass, 1.0 / USUAL.screw.compliance
-NO_FRICTION = {"surface.damping": 0.0, "surface.static_friction": 0.0, "surface.dynamic_friction": 0.0,
+NO_FRICTION = {"surface.damping": 0.0, "surface.friction": 0.0,
                "motor.damping": 0.0, "screw.relaxation": 0.0}
-NO_DRY = {"surface.static_friction": 0.0, "surface.dynamic_friction": 0.0}
+NO_DRY = {"surface.friction": 0.0}
 
 
 def change_parameters(**changes: float) -> Any:
@@ -93,14 +93,14 @@ def test_stiction_breaks_at_its_level_and_sliding_needs_the_dynamic_one() -> Non
     rising = np.linspace(0.0, 0.3, 400_000)
     p = change_parameters(**{"motor.damping": 0.0, "surface.travel": 10.0})
     moving = int(np.argmax(run(p, rising)[:, 4] != 0.0))
-    assert rising[moving] * thrust == pytest.approx(p.surface.static_friction, rel=1e-3)
+    assert rising[moving] * thrust == pytest.approx(p.surface.friction * (1.0 + p.surface.stiction), rel=1e-3)
     v = run(p, hold(1.0, 20.0, 1e-4), 1e-4)[-1, 4]  # (Kt i/r - FD)/C, from m v' = 0
-    assert v == pytest.approx((thrust - p.surface.dynamic_friction) / p.surface.damping, rel=1e-3)
+    assert v == pytest.approx((thrust - p.surface.friction) / p.surface.damping, rel=1e-3)
 
 
 @pytest.mark.parametrize("width", [5e-5, 2e-4])
 def test_the_surface_waits_for_the_motor_by_the_backlash_and_the_wind_up_of_friction(width: float) -> None:
-    p = change_parameters(**{"screw.backlash": width, "surface.static_friction": 100.0})
+    p = change_parameters(**{"screw.backlash": width, "surface.stiction": 0.0})
     s = run(p, np.sin(2.0 * pi * 0.25 * 2e-5 * np.arange(200_000)), 2e-5)
     lost, slides = np.abs(s[:, 1] - s[:, 3]), s[:, 4] != 0.0
     force = 100.0 + p.surface.damping * np.median(np.abs(s[slides, 4]))
@@ -145,7 +145,7 @@ def test_the_smooth_model_agrees_with_an_independent_solver() -> None:
 
 
 def test_power_in_is_power_stored_and_lost() -> None:
-    p = change_parameters(**{"surface.static_friction": 100.0})
+    p = change_parameters(**{"surface.stiction": 0.0})
     t = 1e-5 * np.arange(100_000)
     s = run(p, 3.0 * np.sin(2.0 * pi * 2.0 * t), load=500.0)
     mid = 0.5 * (s[1:] + s[:-1])

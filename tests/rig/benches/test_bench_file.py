@@ -182,6 +182,10 @@ MISTAKES = [
      "controller.phases.0x2003: expected values by phase: 'cleanup', 'main', 'safe' or 'setup'"),
     ("[controller.outputs]", '[controller.parameters]\n"0x2003" = "controller.gain"\n[controller.outputs]',
      "controller.parameters.0x2003: expected a field of controller"),
+    *(("[controller.outputs]", f'[controller.values]\n"{key}" = {value}\n[controller.outputs]',
+       f"controller.values.{key}: expected {said}") for key, value, said in (
+        ("0x2003", 300, "a number that Object 2003 can hold, not 300"), ("0x2003", 0.5, "a number that"),
+        ("0x2002", 1, "an object of the EDS that can be written"))),
     ("[controller.outputs]", 'mode = { object = "0x2003" }\n[controller.outputs]', "for 0x2003 with 8 bits RPDO1"),
     ("cia402", 'none"\ninputs.control_word.object = "0x2003#', "expected TOML; "),
 ]
