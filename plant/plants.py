@@ -24,6 +24,7 @@ from plant import step as reference
 from plant.compile import Function, list_called_names
 from plant.effects import Effect, build_base_effect, build_effect
 from plant.errors import InputError
+from plant.faults import Fault
 from plant.parameters import GROUPS, load_nominal_values
 from plant.ports import port
 from plant.quantity import Quantity
@@ -75,18 +76,6 @@ class MeasuredPressures(NamedTuple):
     compute_force: Callable[[Mapping[str, float], Array, Array, float], Array]
     used: frozenset[str]  # parameters that it needs
     given: Mapping[str, float]  # parameters with which the step takes the load for this force
-
-
-class Fault(NamedTuple):
-    """A fault that `rig fdi` measures: a parameter, and the sizes at which it needs maintenance."""
-
-    name: str
-    title: str  # what it is, for people
-    parameter: str  # "group.field" of the plant or of an effect
-    range: tuple[float, float]  # SI, of its sizes; the first is the healthy unit
-    acceptable: float  # SI; up to here acceptable
-    maintenance: float  # SI; up to here maintenance, beyond it non-nominal
-    source: str = ""  # where the limits come from
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.bands import UnitKind, compute_features, simulate_units
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
-from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, STATIC_OVER_DYNAMIC, Fault, Level, classify_size
+from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Fault, Level, classify_size
 from fdi.diagnosis.refine import (
-    COARSE_STARTS,
     CountedProblem,
+    list_coarse_starts,
     list_unknowns,
     make_problem,
     make_start,
@@ -135,7 +135,7 @@ class Objective:
     def __init__(self, problem: CountedProblem, model: Model, start: tuple[float, float], around: float = 0.2,
                  factor: float = 2.0, sliding: tuple[float, float] = (0.05, 1.0)) -> None:
         self.problem, self.free = problem, list_unknowns(model)
-        self.start = np.array([start[0], math.log(max(start[1], 1.0)), 1.0 / STATIC_OVER_DYNAMIC])
+        self.start = np.array([start[0], math.log(max(start[1], 1.0)), FRICTION.follow["spool.dynamic_friction"]])
         k, f = self.start[:2]
         self.box = [(max(0.0, k - around), min(0.9, k + around)), (f - math.log(factor), f + math.log(factor)), sliding]
         self.start = np.clip(self.start, *np.transpose(self.box))
@@ -154,7 +154,7 @@ class Objective:
         return Attempt(method, float(point[0]), math.exp(float(point[1])), left, spent, False)
 
     def _compute_white_residuals(self, points: Floats) -> Floats:
-        x = np.array([make_start(self.free, k, math.exp(f)) for k, f, _ in points])
+        x = np.array([make_start(self.free, FAULTS, (k, math.exp(f))) for k, f, _ in points])
         sliding = self.free[self._sliding]
         x[:, self._sliding] = (points[:, 1] + np.log(points[:, 2]) - sliding.centre) / sliding.scale
         return self.problem.compute_white_residuals(self.free, x)
@@ -163,9 +163,10 @@ class Objective:
 def search_by_least_squares(model: Model, trace: Trace, start: tuple[float, float], floor: Mapping[str, float],
                             seed: int) -> Attempt:
     """The default: every tolerance and suspect free, Gauss-Newton steps."""
-    r = refine_sizes(model, trace, (start, *COARSE_STARTS), floor)
+    r = refine_sizes(model, trace, (start, *list_coarse_starts(FAULTS)), floor)
     left = float(np.sqrt(np.mean(np.square([*r.ratio.values()]))))
-    return Attempt("least squares", r.kintas.value, r.fss.value, left, r.simulations, True)
+    kintas, fss = (r.sizes[fault.name].value for fault in FAULTS)
+    return Attempt("least squares", kintas, fss, left, r.simulations, True)
 
 
 def search_by_differential_evolution(model: Model, trace: Trace, start: tuple[float, float],

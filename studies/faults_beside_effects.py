@@ -106,8 +106,8 @@ def judge_job(job: Job, signals: Sequence[str], sources: str) -> Row:
                 "ratio": max(found.refinement.ratio.values())}
     for fault in FAULTS:
         size, level = found.sizes[fault.name], found.levels[fault.name]
-        row[fault.symbol] = [size.value, size.low, size.high]
-        row[f"level_{fault.symbol}"] = "cannot_tell" if level is None else level.word
+        row[fault.key] = [size.value, size.low, size.high]
+        row[f"level_{fault.key}"] = "cannot_tell" if level is None else level.word
     return row
 
 
@@ -122,12 +122,12 @@ class Score(NamedTuple):
 def score_row(row: Mapping[str, Any]) -> Score:
     """A row against the truth."""
     true = {f.name: row["valve"].get(f.name, f.healthy) for f in FAULTS}
-    levels = {f.name: row[f"level_{f.symbol}"] for f in FAULTS}
+    levels = {f.name: row[f"level_{f.key}"] for f in FAULTS}
     wanted = {f.name: classify_size(f, true[f.name]).word for f in FAULTS}
     judged = list(row["valve"]) or [f.name for f in FAULTS]
     healthy = [f.name for f in FAULTS if f.name not in row["valve"]]
     blamed = any(levels[name] not in (Level.ACCEPTABLE.word, "cannot_tell") for name in healthy)
-    inside = tuple(row[f.symbol][1] <= true[f.name] <= row[f.symbol][2] for f in FAULTS)
+    inside = tuple(row[f.key][1] <= true[f.name] <= row[f.key][2] for f in FAULTS)
     return Score(all(levels[name] == wanted[name] for name in judged), blamed, (inside[0], inside[1]))
 
 

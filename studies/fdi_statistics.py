@@ -11,7 +11,7 @@ from typing import Any
 
 from fdi.diagnosis.faults import FAULTS
 from rig.campaign.judge import read_campaign_rows, read_matrix_of_folder
-from rig.campaign.summary import draw_detection_curves, format_requirement, name_size, show_share, summarise_campaign
+from rig.campaign.summary import draw_detection_curves, format_requirement, show_share, summarise_campaign
 
 FIGURE = Path(__file__).parent.parent / "docs" / "fdi_statistics.svg"
 MET = {None: "", True: "met", False: "**not met**"}
@@ -38,21 +38,21 @@ def format_tolerance(figures: Mapping[str, Any]) -> str:
     for fault in FAULTS:
         points = figures["curves"][fault.name]
         if len(points) > 1:
-            out += format_table((name_size(fault), "maintenance or worse", "share", "95 % interval", "non-nominal",
+            out += format_table((fault.symbol, "maintenance or worse", "share", "95 % interval", "non-nominal",
                                  "ruling", "by the bands alone"),
                                 [(f"{p['size']:g}", *show_share(p["detected"]),
                                   *(show_share(p[key])[1] for key in ("most", "ruling", "bands"))) for p in points])
     for fault in FAULTS:
         counts = figures["levels"][fault.name]
         said = [word for word in next(iter(counts.values())) if any(row[word] for row in counts.values())]
-        out += format_table((f"{name_size(fault)}: true level, reported", *said),
+        out += format_table((f"{fault.symbol}: true level, reported", *said),
                      [(name, *(str(row[word]) for word in said)) for name, row in counts.items() if any(row.values())])
     said = sorted({word for row in figures["ruling"].values() for word in row})
     out += format_table(("ruling fault: truth, reported", *said),
                  [(name, *(str(row.get(word, 0)) for word in said)) for name, row in figures["ruling"].items()])
     return out + format_table(
         ("plant", "estimate of", "cases", "bias", "RMS error", "95 % within", "truth in its interval", "95 % interval"),
-        [(e["label"], name_size(next(f for f in FAULTS if f.name == e["fault"])), str(e["cases"]),
+        [(e["label"](next(f for f in FAULTS if f.name == e["fault"])), str(e["cases"]),
           *(f"{e[key]:.2g}" for key in ("bias", "rms", "most")), *show_share(e["covered"])[1:])
          for e in figures["errors"]])
 

@@ -118,7 +118,7 @@ def simulate_unit(law: str, seed: int) -> Unit:
     x = np.linspace(0.0, 1.0, 4000)
     course_t = np.concatenate([[0.0], onset + life * x])
     shape = np.concatenate([[0.0], LAWS[law](x, rng)])
-    course = fault.healthy + (fault.most - fault.healthy) * shape
+    course = fault.healthy + (fault.maintenance - fault.healthy) * shape
     t = np.arange(0.0, onset + life, INTERVAL)
     t = np.sort(np.maximum(t + rng.uniform(-2.0, 2.0, len(t)), 0.0))
     return Unit(law, fault, onset, course_t, course, t, measure_sizes(fault, np.interp(t, course_t, course), rng))
@@ -186,7 +186,7 @@ def score_unit(unit: Unit, predict: Predict = predict_unit, every: int = 2) -> S
 
     End of life is the time at which the fault reaches MaxBand.
     """
-    end, middle = unit.time_of_size(unit.fault.most), unit.time_of_size(unit.fault.middle)
+    end, middle = unit.time_of_size(unit.fault.maintenance), unit.time_of_size(unit.fault.acceptable)
     counts = [n for n in range(TREND_FEWEST_TRACES, len(unit.t) + 1, every) if unit.t[n - 1] < end]
     predictions = {n: predict(unit, n) for n in counts}
     with_trend = [n for n in counts if predictions[n].has_trend]

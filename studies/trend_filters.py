@@ -22,7 +22,7 @@ START, SPREAD = np.log(0.2), 1.5  # of the logarithm of a, and of c
 
 def scale_sizes(u: Unit, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times in 100 days; sizes, 0 healthy and 1 at MaxBand; their standard deviations."""
-    span = u.fault.most - u.fault.healthy
+    span = u.fault.maintenance - u.fault.healthy
     value, low, high = np.array(u.sizes[:n]).T
     return u.t[:n] / 100, (value - u.fault.healthy) / span, np.maximum(high - value, value - low) / 1.96 / span
 
@@ -110,7 +110,7 @@ def format_score(name: str, method: Callable[[Unit, int], np.ndarray],
     """The scores of a method as a row of the table."""
     rows = []
     for u in units:
-        end = u.time_of_size(u.fault.most)
+        end = u.time_of_size(u.fault.maintenance)
         for part in PARTS:
             n = int(np.searchsorted(u.t, u.onset + part * (end - u.onset)))
             if n < 3:

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.diagnosis.faults import CLOGGING, DYNAMIC, FAULTS, FRICTION, STATIC_OVER_DYNAMIC, Level
+from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Level
 from fdi.estimation.fit import limit_dynamic_friction, list_tolerance_sizes
 from fdi.output import require_writable, write_text
 from fdi.progress import Progress, ignore_progress
@@ -63,6 +63,8 @@ from plant.model import Model, load_model
 from plant.parameters import parse_toml
 from plant.threads import count_threads
 
+DYNAMIC = "spool.dynamic_friction"  # FDS, which follows FSS
+STATIC_OVER_DYNAMIC = 1.0 / FRICTION.follow[DYNAMIC]
 STEP_JUDGED_FROM = 0.004  # s; the command has to come through a cycle of the bus and the pilot stage
 STEP_JUDGED_UNTIL = 0.1  # s after a step; later there is only stick-slip, which the ramps show better
 LEVELS = {"middle": Level.MAINTENANCE, "most": Level.NON_NOMINAL}  # of a signal that has left this band
@@ -694,21 +696,23 @@ def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: fl
         raise InputError("trace", "t", f"one row per {1e3 * model['controller.period']:g} ms, the model's cycle, for "
                                        f"bands by simulation, not per {1e3 * period:g} ms")
     sound = float(model[FRICTION.parameter])
-    amounts = [sound, *(size for size in sorted({*frictions, FRICTION.middle, FRICTION.most}) if size > 1.2 * sound)]
+    known = sorted({*frictions, FRICTION.acceptable, FRICTION.maintenance})
+    amounts = [sound, *(size for size in known if size > 1.2 * sound)]
 
     def draw(kind: UnitKind, number: int = faulty) -> Floats:
         return simulate_units(model, com, load, kind, number, seed, steps, progress)
 
     healthy = draw(UnitKind("healthy"), count)
     rubbing = [healthy, *(draw(UnitKind(f"{size:g} N", friction=size)) for size in amounts[1:])]
-    clogged = [draw(UnitKind(f"Kintas {size:g}", clogging=size)) for size in (CLOGGING.middle, CLOGGING.most)]
-    easy = draw(UnitKind("low dynamic friction", friction=FRICTION.middle, sliding=low_sliding))
+    clogged = [draw(UnitKind(f"Kintas {size:g}", clogging=size))
+               for size in (CLOGGING.acceptable, CLOGGING.maintenance)]
+    easy = draw(UnitKind("low dynamic friction", friction=FRICTION.acceptable, sliding=low_sliding))
     stepped = tuple(_make_step_band(i, s, period, rubbing, clogged) for i, s in enumerate(parts) if s.kind == "step")
     ramped = tuple(_make_ramp_band(i, s, com, period, [*rubbing, easy], amounts)
                    for i, s in enumerate(parts) if is_slow_ramp(s, period))
     text = ";".join(f"{s.kind},{(s.stop - s.start) * period:.2f},{1e6 * s.first:.0f},{1e6 * s.last:.0f}" for s in parts)
     tables = {"healthy": healthy[:faulty], CLOGGING.name: clogged[0],
-              FRICTION.name: rubbing[amounts.index(FRICTION.middle)]}
+              FRICTION.name: rubbing[amounts.index(FRICTION.acceptable)]}
     facts = {"made": "by simulation", "command": name, "model": model.name, "parameters": format_design(model),
              "runs": str(count), "faulty": str(faulty), "seed": str(seed),
              "command_hash": hashlib.sha256(text.encode()).hexdigest()[:16], "software": name_software()}
@@ -755,7 +759,7 @@ def _make_ramp_band(number: int, s: Section, com: Floats, period: float, rubbing
                     amounts: Sequence[float]) -> RampBand:
     """The band of a ramp from units with rising friction; the last ones have Table 2's lesser FSS and a low FDS."""
     errors, speeds = zip(*(_measure_ramp(x, com, s, period) for x in rubbing), strict=True)
-    lesser, greater = (list(amounts).index(size) for size in (FRICTION.middle, FRICTION.most))
+    lesser, greater = (list(amounts).index(size) for size in (FRICTION.acceptable, FRICTION.maintenance))
     position, velocity = (_make_width(x[0], x[lesser], x[greater]) for x in (errors, speeds))
     half = np.array([np.median(compute_half_range(e)) for e in errors])
     slip, easier = (float(np.median(find_lasting_peak(speeds[i]) / compute_half_range(errors[i])))

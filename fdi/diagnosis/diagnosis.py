@@ -2,11 +2,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from fdi.diagnosis.ambiguity import Group, cut_intervals, find_groups
 from fdi.diagnosis.bands import (
     Bands,
     BandVerdict,
@@ -21,14 +22,15 @@ from fdi.diagnosis.bands import (
     matches_command,
     measure_precursors,
 )
-from fdi.diagnosis.faults import FAULTS, Estimate, Level, find_ruling_fault, judge_size
+from fdi.diagnosis.faults import FAULTS, Estimate, Fault, Level, choose_faults, find_ruling_fault, judge_size
 from fdi.diagnosis.refine import (
-    COARSE_STARTS,
     Beside,
     Refinement,
+    Sizes,
     choose_size_excerpt,
     find_effects_beside,
     get_positive,
+    list_coarse_starts,
     refine_sizes,
 )
 from fdi.diagnosis.rms_grid import Grid, search_grid
@@ -55,10 +57,12 @@ class Diagnosis:
     """The answer of `rig fdi` on a trace."""
 
     source: str
-    verdict: str  # ACCEPTABLE, MAINTENANCE, NON_NOMINAL, SOMETHING_ELSE or CANNOT_TELL
+    faults: tuple[Fault, ...]
+    verdict: str  # ACCEPTABLE, MAINTENANCE, NON_NOMINAL, AMBIGUOUS, SOMETHING_ELSE or CANNOT_TELL
     levels: Mapping[str, Level | None]  # by fault; None: cannot be judged
-    ruling: str | None  # the fault that is further gone; None if neither is
-    sizes: Mapping[str, Estimate]  # by fault, Kintas and N, as the levels are judged by them
+    ruling: str | None  # the fault that is furthest gone; None if none is
+    sizes: Mapping[str, Estimate]  # by fault, SI, as the levels are judged by them
+    groups: tuple[Group, ...]  # faults of which at least one is not acceptable, without telling which
     refinement: Refinement
     grid: Grid | None  # None: the command has neither steps nor ramps
     precursors: Mapping[str, Precursor]
@@ -79,33 +83,38 @@ class Diagnosis:
 
 def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = None,
              progress: Progress = ignore_progress, source: str = "trace", workers: int = 2,
-             with_effects: bool = False) -> Diagnosis:
-    """Judge the two faults from a trace of any command.
+             with_effects: bool = False, faults: Sequence[Fault] | None = None) -> Diagnosis:
+    """Judge faults from a trace of any command.
 
     Args:
-        trace: needs Com, XJ and Cor; P12, XS and a known load narrow the intervals.
+        trace: needs command, controlled signal and drive; further outputs and a known load narrow the intervals.
         model: the unit as it left the works; default the nominal one.
         bands: default: those that come with the software, if they are of this command.
         progress: called with each stage and the share done, 0 to 1.
         source: the trace's name in refusals.
         workers: threads.
-        with_effects: search the catalogue for what else is wrong, and size both faults beside it.
+        with_effects: search the catalogue for what else is wrong, and size the faults beside it.
+        faults: default those that the plant brings, or else the paper's.
 
     Raises:
         InputError: a trace that cannot be judged at all, or bands of another model.
     """
     model = model or load_model()
-    if model.plant != "eha":
-        raise InputError("--model", model.plant, "eha: the two faults are the paper's servovalve's")
+    faults = choose_faults(None, model.kind) if faults is None else tuple(faults)
     progress("reading", 0.0)
     trace = prepare_trace(trace, model, None, source)
     model = match_period(model, trace, SAME_PERIOD)
     if float(np.ptp(trace.com)) < MOVING_RAM and float(np.nanmax(trace.xj) - np.nanmin(trace.xj)) < MOVING_RAM:
         raise InputError(source, "com",
-                         f"a ram that moves {1e3 * MOVING_RAM:g} mm or more: at rest it shows neither fault")
+                         f"a ram that moves {1e3 * MOVING_RAM:g} mm or more: at rest it shows no fault")
     notes = list(trace.notes)
     progress("bands", 0.03)
-    if bands is None:
+    if not set(FAULTS) <= set(faults):
+        if bands is not None:
+            names = " and ".join(fault.name for fault in FAULTS)
+            raise InputError("--bands", "", f"none: bands judge {names}, which are not both among these faults")
+        notes.append("no bands: the software's own are of the paper's faults")
+    elif bands is None:
         bands = _find_own_bands(trace, model, notes)
     elif other := describe_other_model(bands, model):
         design = ", ".join(f"{name} = {value:g}" for name, value in list_design(model).items())
@@ -120,17 +129,18 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     floor = {name: f.value for name, f in sensor_floors(trace, model).items()}
     fitted = trace
     if is_long(trace):
-        excerpt = choose_size_excerpt(model, trace, floor, progress)
+        excerpt = choose_size_excerpt(model, trace, floor, progress, faults)
         fitted = cut_excerpt(trace, excerpt)
         notes.append(excerpt.describe(trace))
-    grid = _search_grid(fitted, model, notes)
+    grid = _search_grid(fitted, model, notes) if set(FAULTS) <= set(faults) else None
     if with_effects:
         progress("refinement", 0.07)
     maps = (grid.joint, grid.step, grid.ramp) if grid else ()
-    starts = [grid.merged[:2]] if grid else []
-    starts += [m.minimum[:2] for m in maps if m is not None]
-    refinement = refine_sizes(model, fitted, (*starts, *COARSE_STARTS), floor, workers, trace,
-                              ignore_progress if with_effects else progress)
+    pairs = [grid.merged[:2]] if grid else []
+    pairs += [m.minimum[:2] for m in maps if m is not None]
+    starts = [_complete_sizes(faults, pair) for pair in pairs]
+    refinement = refine_sizes(model, fitted, (*starts, *list_coarse_starts(faults)), floor, workers, trace,
+                              ignore_progress if with_effects else progress, faults)
     sizes = _widen_intervals(refinement)
     beside = None
     if with_effects:
@@ -138,13 +148,26 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         refinement = beside.best.refinement
         sizes = dict(beside.sizes) if refinement.is_explained else _widen_intervals(refinement)
     levels = _judge_sizes(sizes, refinement)
+    groups: tuple[Group, ...] = ()
+    if refinement.is_explained and None in levels.values():
+        undecided = [name for name, level in levels.items() if level is None]
+        sizes |= cut_intervals(refinement, undecided, sizes)
+        levels = _judge_sizes(sizes, refinement)
+        groups = find_groups(refinement, [name for name, level in levels.items() if level is None])
     if beside is not None:
         levels |= dict.fromkeys(beside.disputed)
     progress("done", 1.0)
-    return Diagnosis(source=source, verdict=_decide_verdict(levels, refinement.is_explained), levels=levels,
-                     ruling=find_ruling_fault(sizes, levels), sizes=sizes, refinement=refinement, grid=grid,
+    return Diagnosis(source=source, faults=faults, levels=levels, groups=groups,
+                     verdict=_decide_verdict(levels, groups, refinement.is_explained),
+                     ruling=find_ruling_fault(faults, sizes, levels), sizes=sizes, refinement=refinement, grid=grid,
                      precursors=precursors, band_verdict=band_verdict, others=_find_unhealthy(refinement, model),
                      trace=trace, model=model, floor=floor, bands=bands, notes=tuple(notes), beside=beside)
+
+
+def _complete_sizes(faults: Sequence[Fault], pair: Sizes) -> Sizes:
+    """One size for each fault from the pair of the grid; the others as in a healthy unit."""
+    known = dict(zip((fault.name for fault in FAULTS), pair, strict=True))
+    return tuple(known.get(fault.name, fault.healthy) for fault in faults)
 
 
 def _find_own_bands(trace: Trace, model: Model, notes: list[str]) -> Bands | None:
@@ -175,7 +198,7 @@ def _search_grid(trace: Trace, model: Model, notes: list[str]) -> Grid | None:
 
 def _judge_sizes(sizes: Mapping[str, Estimate], refinement: Refinement) -> dict[str, Level | None]:
     """Level of each fault; where physics is missing in the fit, a fault is acceptable at most, or cannot be judged."""
-    levels = {f.name: judge_size(f, sizes[f.name]) for f in FAULTS}
+    levels = {f.name: judge_size(f, sizes[f.name]) for f in refinement.faults}
     if refinement.is_explained:
         return levels
     is_known = max(refinement.ratio.values()) <= RESIDUAL_JUDGES_NOTHING
@@ -190,20 +213,22 @@ def _find_unhealthy(refinement: Refinement, model: Model) -> dict[str, Estimate]
 
 
 def _widen_intervals(found: Refinement) -> dict[str, Estimate]:
-    """The sizes of both faults; where more than noise is left, their intervals are wider by as much."""
+    """The sizes of the faults; where more than noise is left, their intervals are wider by as much."""
     wider = 1.0 if found.is_explained else max(found.ratio.values())
-    return {f.name: Estimate(e.value, max(e.value - wider * (e.value - e.low), 0.0),
-                             min(e.value + wider * (e.high - e.value), f.largest))
-            for f in FAULTS for e in (found.sizes[f.name],)}
+    return {f.name: Estimate(e.value, max(e.value - wider * (e.value - e.low), f.range[0]),
+                             min(e.value + wider * (e.high - e.value), f.range[1]))
+            for f in found.faults for e in (found.sizes[f.name],)}
 
 
-def _decide_verdict(levels: Mapping[str, Level | None], is_explained: bool) -> str:
+def _decide_verdict(levels: Mapping[str, Level | None], groups: Sequence[Group], is_explained: bool) -> str:
     if not is_explained:
         return "SOMETHING_ELSE"
     known = [found for found in levels.values() if found is not None]
     worst = max(known, default=Level.ACCEPTABLE)
     if worst > Level.ACCEPTABLE:
         return worst.name
+    if groups:
+        return "AMBIGUOUS"
     return "ACCEPTABLE" if len(known) == len(levels) else "CANNOT_TELL"
 
 

@@ -1,21 +1,29 @@
-"""The two progressive faults of the servovalve, and the rules from a size with its interval to one of three levels.
+"""Lists of faults by name or file, and the rules from a size with its interval to one of three levels.
 
-A limit of Table 2 counts as reached when it lies inside the 95 % interval or below it, while the limit before it (the
-healthy size, for MidBand) is excluded. A fault is acceptable only if MidBand lies clear of the interval
+A limit counts as reached when it lies inside the 95 % interval or below it, while the limit before it (the healthy
+size, for MidBand) is excluded. A fault is acceptable only if MidBand lies clear of the interval
 (`ACCEPTABLE_INTERVAL_FACTOR`): a missed fault costs more than an early look. So a fault exactly at MidBand is found in
 98 % of all tests, as long as the interval excludes a healthy unit. An interval that holds both the healthy size and
 MidBand cannot be judged.
 """
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
 from typing import NamedTuple
 
 from fdi.thresholds import ACCEPTABLE_INTERVAL_FACTOR
+from plant.errors import InputError
+from plant.faults import Fault, place_faults, read_faults
+from plant.plants import Plant, find_plant
 
-DYNAMIC = "spool.dynamic_friction"  # FDS, which goes with FSS
-STATIC_OVER_DYNAMIC = 1.5  # FSS over FDS of the nominal spool (plant/models/nominal.toml)
+__all__ = ["CLOGGING", "FAULTS", "FRICTION", "Estimate", "Fault", "Level", "choose_faults", "classify_size",
+           "compute_severity", "find_ruling_fault", "judge_size", "list_fault_files", "load_faults"]
+
+SHIPPED = "faults_{}.toml"  # beside this file
 
 
 class Level(IntEnum):
@@ -31,24 +39,6 @@ class Level(IntEnum):
         return self.name.lower()
 
 
-class Fault(NamedTuple):
-    """A progressive fault: its parameter, healthy size, and the sizes that end two classes (Table 2 of the paper)."""
-
-    name: str  # of its effect
-    symbol: str  # of its size: kintas, fss
-    parameter: str  # "group.field"
-    unit: str
-    healthy: float
-    middle: float  # MidBand
-    most: float  # MaxBand
-    largest: float  # that a fit may find
-
-
-CLOGGING = Fault("filter_clogging", "kintas", "filter.clogging", "1", 0.0, 0.25, 0.35, 0.95)
-FRICTION = Fault("spool_friction", "fss", "spool.static_friction", "N", 5.0, 35.0, 70.0, 1000.0)
-FAULTS = CLOGGING, FRICTION
-
-
 class Estimate(NamedTuple):
     """A number with its 95 % interval, SI units."""
 
@@ -57,34 +47,89 @@ class Estimate(NamedTuple):
     high: float
 
 
+def list_fault_files() -> list[str]:
+    """Names of the lists of faults that come with the software."""
+    start, end = SHIPPED.split("{}")
+    found = [entry.name for entry in files("fdi.diagnosis").iterdir()]
+    return sorted(name[len(start):-len(end)] for name in found if name.startswith(start) and name.endswith(end))
+
+
+def load_faults(source: str | Path = "paper", kind: Plant | None = None) -> tuple[Fault, ...]:
+    """The faults of a shipped list by name, or of a file, for a plant (default: the EHA).
+
+    Raises:
+        InputError: no such list, or faults that the plant cannot have.
+    """
+    kind = kind or find_plant("eha")
+    if str(source) in list_fault_files():
+        return _load_shipped_faults(str(source), kind)
+    if not Path(source).is_file():
+        raise InputError("--faults", str(source), f"a fault file, or one of {', '.join(list_fault_files())}")
+    return read_faults(Path(source), kind)
+
+
+@cache
+def _load_shipped_faults(name: str, kind: Plant) -> tuple[Fault, ...]:
+    return read_faults(Path(str(files("fdi.diagnosis") / SHIPPED.format(name))), kind)
+
+
+def choose_faults(source: str | Path | None, kind: Plant) -> tuple[Fault, ...]:
+    """The faults that an option names; without it those that the plant brings, or else the paper's.
+
+    Raises:
+        InputError: no such list, or faults that the plant cannot have.
+    """
+    if source is None and kind.faults:
+        return place_faults(kind.faults, kind, kind.name)
+    if source is None and kind.name != "eha":
+        raise InputError("--faults", "", f"a fault file: the plant {kind.name} brings no faults of its own")
+    return load_faults(source or "paper", kind)
+
+
+FAULTS = CLOGGING, FRICTION = load_faults()  # the paper's
+
+
 def judge_size(fault: Fault, size: Estimate) -> Level | None:
     """The level of a fault of that size; None if the interval holds both a healthy unit and MidBand.
 
     >>> judge_size(CLOGGING, Estimate(0.02, 0.0, 0.07)).word, judge_size(CLOGGING, Estimate(0.23, 0.18, 0.28)).word
     ('acceptable', 'maintenance')
     """
-    if size.value + ACCEPTABLE_INTERVAL_FACTOR * (size.high - size.value) < fault.middle:
+    value, low, high = measure_departures(fault, size)
+    healthy, middle, most = fault.limits
+    if value + ACCEPTABLE_INTERVAL_FACTOR * (high - value) < middle:
         return Level.ACCEPTABLE
-    if size.low <= fault.healthy:
+    if low <= healthy:
         return None
-    if size.high >= fault.most and size.low > fault.middle:
+    if high >= most and low > middle:
         return Level.NON_NOMINAL
     return Level.MAINTENANCE
 
 
+def measure_departures(fault: Fault, size: Estimate) -> Estimate:
+    """An estimate as departures, larger is worse; the least one is 0 where the interval of both ways is on both sides.
+    """
+    ends = sorted(fault.measure_departure(x) for x in size[1:])
+    inside = fault.both_ways and size.low < fault.healthy < size.high
+    return Estimate(fault.measure_departure(size.value), 0.0 if inside else ends[0], ends[1])
+
+
 def classify_size(fault: Fault, value: float) -> Level:
-    """The class of a size without an interval, by Table 2 of the paper; a size at a limit is beyond it."""
-    return Level(int(value >= fault.middle) + int(value >= fault.most))
+    """The class of a size without an interval, as by Table 2 of the paper; a size at a limit is beyond it."""
+    size, (_, middle, most) = fault.measure_departure(value), fault.limits
+    return Level(int(size >= middle) + int(size >= most))
 
 
 def compute_severity(fault: Fault, value: float) -> float:
     """How far a fault has gone: 0 healthy, 1 at MidBand, 2 at MaxBand, straight lines between and beyond."""
-    if value <= fault.middle:
-        return (value - fault.healthy) / (fault.middle - fault.healthy)
-    return 1.0 + (value - fault.middle) / (fault.most - fault.middle)
+    size, (healthy, middle, most) = fault.measure_departure(value), fault.limits
+    if size <= middle:
+        return (size - healthy) / (middle - healthy)
+    return 1.0 + (size - middle) / (most - middle)
 
 
-def find_ruling_fault(sizes: Mapping[str, Estimate], levels: Mapping[str, Level | None]) -> str | None:
-    """Name of the more severe of the faults that are not acceptable; None if there is none."""
-    gone = [f for f in FAULTS if levels.get(f.name) not in (None, Level.ACCEPTABLE)]
+def find_ruling_fault(faults: Sequence[Fault], sizes: Mapping[str, Estimate], levels: Mapping[str, Level | None]
+                      ) -> str | None:
+    """Name of the most severe of the faults that are not acceptable; None if there is none."""
+    gone = [f for f in faults if levels.get(f.name) not in (None, Level.ACCEPTABLE)]
     return max(gone, key=lambda f: compute_severity(f, sizes[f.name].value)).name if gone else None

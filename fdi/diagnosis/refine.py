@@ -1,14 +1,14 @@
-"""The sizes of the two faults from a replay of the measured current, with all that differs between healthy units.
+"""The sizes of the faults from a replay of the measured drive, with all that differs between healthy units.
 
-Free are the faults (Kintas, FSS and, as a nuisance, FDS), the base parameters with their tolerances as priors, and
-suspects: what else ages or is set up wrongly, such as jack friction, leakage, a null bias, or a load that nobody
-measured. The effect of a suspect is then not blamed on the servovalve. A loss of pilot flow gain within its tolerance
-looks like a clogged filter, so the tolerances decide how wide the intervals are.
+Free are the faults (of the paper's: Kintas, FSS and, as a nuisance, FDS, which follows FSS), the base parameters with
+their tolerances as priors, and suspects: what else ages or is set up wrongly, such as jack friction, leakage, a null
+bias, or a load that nobody measured. The effect of a suspect is then not blamed on a fault. A loss of pilot flow gain
+within its tolerance looks like a clogged filter, so the tolerances decide how wide the intervals are.
 
 All unknowns but the suspects that may be negative are logarithms: the plant's gains, forces and frictions scale, and
 what may be scaled together without changing a signal is a straight line in logarithms.
 
-What else is wrong is searched for with each effect of the catalogue beside both faults: a fault that was found first
+What else is wrong is searched for with each effect of the catalogue beside the faults: a fault that was found first
 would take up what belongs to the effect, and the other way round. Scan, fits and charges are those of `rig explain`.
 """
 from __future__ import annotations
@@ -22,17 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.diagnosis.faults import (
-    CLOGGING,
-    DYNAMIC,
-    FAULTS,
-    FRICTION,
-    STATIC_OVER_DYNAMIC,
-    Estimate,
-    Fault,
-    Level,
-    judge_size,
-)
+from fdi.diagnosis.faults import FAULTS, Estimate, Fault, Level, compute_severity, judge_size
 from fdi.discovery.explain import find_marks
 from fdi.discovery.explain_runs import list_fitted_parameters
 from fdi.discovery.search import Prospect, scan_effects
@@ -55,6 +45,7 @@ from fdi.estimation.fit import (
 from fdi.estimation.long_recordings import Excerpt, choose_excerpt, judge_on_all
 from fdi.estimation.unidentifiable import (
     FLAPPER,
+    ORIGINS,
     LogFree,
     LogFrictionRatio,
     LogOpenFilter,
@@ -70,7 +61,6 @@ from fdi.progress import NO_STAGE, Progress, Stage, ignore_progress
 from fdi.thresholds import (
     FAULT_BLAMED_SHARE,
     FITTED_RUN_WORST,
-    FSS_INTERVAL_FACTOR,
     FURTHER_EFFECT_SHARE,
     GAIN_CONVINCES,
     GAIN_TIE,
@@ -87,13 +77,13 @@ from fdi.thresholds import (
 from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Floats, Trace
 from plant.effects import CATALOGUE
-from plant.model import Model, list_searched_effects
+from plant.model import Model, find_quantity, list_searched_effects
 from plant.threads import R, T, map_in_threads
 
-SMALLEST_FSS = 0.05  # N, bound of a fit
-FAULT_PARAMETERS = (CLOGGING.parameter, FRICTION.parameter, DYNAMIC)
-# (Kintas, FSS in N) from which fits begin, beside the grid's answers
-COARSE_STARTS = tuple(product((0.0, 0.12, 0.24, 0.36, 0.48), 5.0 * 1.4 ** np.arange(-1.0, 10.0)))
+SMALLEST_SHARE = 0.01  # of the healthy size, bound of a fit by logarithms
+LINEAR_FAULT_SPREAD = 10.0  # prior standard deviation of a linear size, in MidBands: it may be any
+Sizes = tuple[float, ...]
+"""One size for each fault, SI."""
 # (factor on the noise, rounds): small stops of the ram count only once the fit is near
 NOISE_SCHEDULE = ((30.0, 4), (6.0, 4), (1.0, 8))
 FINE_STEPS = 20  # solver steps a cycle of the last fit
@@ -136,23 +126,55 @@ def get_positive(model: Model, name: str) -> float:
     return max(model[name], 1e-3 * model.nominal[name])
 
 
-def list_unknowns(model: Model, fault_spread: float = 150.0) -> tuple[Free, ...]:
+def list_unknowns(model: Model, faults: Sequence[Fault] = FAULTS, fault_spread: float = 150.0) -> tuple[Free, ...]:
     """What a fit may change: the faults first, then the suspects, then the tolerances.
 
     `fault_spread` is the prior standard deviation of the faults in tolerances: they may be of any size, and where no
     signal shows them, this is what is known.
     """
-    clogging = LogOpenFilter(CLOGGING.parameter, 0.0, UNIT_TOLERANCE, fault_spread, math.log(1.0 - CLOGGING.largest),
-                             0.0, 1.0)
-    friction = [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, fault_spread,
-                        math.log(SMALLEST_FSS), math.log(FRICTION.largest), 1.0)
-                for name in ("spool.static_friction", DYNAMIC)]
-    suspects = [_make_suspect(s, model) for s in SUSPECTS]
-    usual = math.log(get_positive(model, "jack.static_friction") / get_positive(model, "jack.dynamic_friction"))
-    ratio = LogFrictionRatio("jack.static_friction", usual, 0.03, 1.0, 0.0, usual + 1.0, 0.3)
-    taken = {f.name for f in (clogging, *friction, *suspects, ratio)}
+    own = [u for fault in faults for u in _make_fault_unknowns(fault, model, fault_spread)]
+    suspects = [_make_suspect(s, model) for s in list_suspects(model, faults)]
+    taken = {f.name for f in (*own, *suspects)}
+    ratio: list[Free] = []
+    if "jack.dynamic_friction" in taken and "jack.static_friction" not in taken:
+        usual = math.log(get_positive(model, "jack.static_friction") / get_positive(model, "jack.dynamic_friction"))
+        ratio = [LogFrictionRatio("jack.static_friction", usual, 0.03, 1.0, 0.0, usual + 1.0, 0.3)]
+        taken.add("jack.static_friction")
     tolerances = (take_logarithm(f) for f in list_all_unknowns(model) if f.name not in taken)
-    return (clogging, *friction, *suspects, ratio, *tolerances)
+    return (*own, *suspects, *ratio, *tolerances)
+
+
+def _make_fault_unknowns(fault: Fault, model: Model, spread: float) -> list[Free]:
+    """A fault's size and what follows it as unknowns.
+
+    What is lost from a whole goes by the logarithm of what is left, a size of which a healthy unit has some by its own
+    logarithm, and any other is linear, in units of MidBand.
+    """
+    low, high = fault.range
+    if ORIGINS.get(fault.parameter) == 1.0:
+        return [LogOpenFilter(fault.parameter, math.log(1.0 - fault.healthy), UNIT_TOLERANCE, spread,
+                              math.log(1.0 - high), math.log(1.0 - low), 1.0)]
+    if low < 0.0 or fault.healthy <= 0.0:
+        healthy, middle, _ = fault.limits
+        factors = {fault.parameter: 1.0, **fault.follow}
+        return [Free(name, by * fault.healthy, abs(by) * (middle - healthy), LINEAR_FAULT_SPREAD,
+                     min(by * low, by * high), max(by * low, by * high), 0.02) for name, by in factors.items()]
+    least = max(low, SMALLEST_SHARE * fault.healthy)
+    same = find_quantity(fault.parameter, plant=model.plant).unit
+
+    def take_bounds(name: str) -> tuple[float, float]:  # of what follows, too, where it is of the same kind
+        by = 1.0 if find_quantity(name, plant=model.plant).unit == same else fault.follow[name]
+        return math.log(by * least), math.log(by * high)
+
+    return [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, spread, *take_bounds(name), 1.0)
+            for name in fault.parameters]
+
+
+def list_suspects(model: Model, faults: Sequence[Fault]) -> list[Suspect]:
+    """The suspects that this plant can have and that are not among the faults."""
+    own = {name for fault in faults for name in fault.parameters}
+    return [s for s in SUSPECTS if s.parameter not in own and (s.parameter in model.values or
+                                                               model.kind.offers(CATALOGUE[s.effect]))]
 
 
 def _make_suspect(s: Suspect, model: Model) -> Free:
@@ -165,17 +187,69 @@ def _make_suspect(s: Suspect, model: Model) -> Free:
     return own._replace(centre=usual, scale=s.spread, prior=1.0, step=0.02)
 
 
-def make_start(free: Sequence[Free], kintas: float, fss: float, offsets: Mapping[str, float] | None = None,
-               sliding: float = math.inf) -> Floats:
-    """Scaled unknowns, (p,), of a plant that has the two faults and `offsets`, and is nominal otherwise.
+def make_start(free: Sequence[Free], faults: Sequence[Fault], sizes: Sequence[float],
+               offsets: Mapping[str, float] | None = None, stays: Mapping[str, float] | None = None) -> Floats:
+    """Scaled unknowns, (p,), of a plant that has faults of these sizes and `offsets`, and is nominal otherwise.
 
-    FDS goes with FSS, but not beyond `sliding` N.
+    What follows a fault goes with it, but not beyond its value in `stays`.
     """
-    logs = {CLOGGING.parameter: math.log(1.0 - min(max(kintas, 0.0), CLOGGING.largest)),
-            FRICTION.parameter: math.log(max(fss, SMALLEST_FSS)),
-            DYNAMIC: math.log(min(max(fss, SMALLEST_FSS) / STATIC_OVER_DYNAMIC, sliding)),
-            **(offsets or {})}
-    return np.array([(logs.get(f.name, f.centre) - f.centre) / f.scale for f in free])
+    known = {f.name: f for f in free}
+    values: dict[str, float] = dict(offsets or {})
+    for fault, size in zip(faults, sizes, strict=True):
+        own = known[fault.parameter]
+        size = fault.range[0] if isinstance(own, LogOpenFilter) and size < fault.range[0] else size
+        values[own.name] = place_value(own, size)
+        for name, by in fault.follow.items():
+            value = max(size, math.exp(own.low)) / (1.0 / by) if isinstance(own, LogFree) else by * size
+            values[name] = place_value(known[name], min(value, (stays or {}).get(name, math.inf)))
+    return np.array([(values.get(f.name, f.centre) - f.centre) / f.scale for f in free])
+
+
+def place_value(f: Free, value: float) -> float:
+    """The number of which the unknown `f` makes a parameter's value, within its bounds below."""
+    if isinstance(f, LogOpenFilter):
+        return max(math.log(1.0 - min(value, 1.0 - 1e-12)), f.low)
+    return math.log(max(value, math.exp(f.low))) if isinstance(f, LogFree) else value
+
+
+def list_coarse_starts(faults: Sequence[Fault]) -> list[Sizes]:
+    """Sizes from which fits begin: all pairs of faults in coarse steps, the other faults as in a healthy unit.
+
+    Of two faults every size is paired with every one of the other; of more, two of each.
+    """
+    ladders = [_list_ladder(fault) for fault in faults]
+    if len(faults) <= 2:
+        return list(product(*ladders))
+    healthy = tuple(fault.healthy for fault in faults)
+    found = [healthy]
+    for i, ladder in enumerate(ladders):
+        found += [(*healthy[:i], size, *healthy[i + 1:]) for size in ladder]
+    for i, j in combinations(range(len(faults)), 2):
+        for a, b in product(_pick_two(ladders[i]), _pick_two(ladders[j])):
+            found.append((*healthy[:i], a, *healthy[i + 1:j], b, *healthy[j + 1:]))
+    return found
+
+
+def _list_ladder(fault: Fault) -> list[float]:
+    """Sizes of a fault in coarse steps: by a factor where a healthy unit has some, else by parts of MidBand."""
+    if _is_scaled(fault):
+        return [x for x in fault.healthy * 1.4 ** np.arange(-1.0, 10.0) if x <= fault.range[1]]
+    healthy, middle, _ = fault.limits
+    ways = (-1.0, 1.0) if fault.both_ways else (1.0,)
+    way = -1.0 if fault.falls else 1.0
+    sizes = [fault.healthy + way * side * part * (middle - healthy) for side in ways
+             for part in (0.0, 0.48, 0.96, 1.44, 1.92)]
+    return [x for x in dict.fromkeys(sizes) if fault.range[0] <= x <= fault.range[1]]
+
+
+def _is_scaled(fault: Fault) -> bool:
+    """Whether a size grows by factors: a healthy unit has some of it, and it is no share of a whole."""
+    return (fault.healthy > 0.0 and fault.range[0] >= 0.0 and not fault.falls
+            and ORIGINS.get(fault.parameter) != 1.0)
+
+
+def _pick_two(ladder: Sequence[float]) -> list[float]:
+    return [ladder[(len(ladder) + 1) // 2], ladder[-1]]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -186,9 +260,9 @@ def make_start(free: Sequence[Free], kintas: float, fss: float, offsets: Mapping
 class Refinement:
     """What the refinement found."""
 
-    kintas: Estimate
-    fss: Estimate  # N
-    correlation: float  # of the two
+    faults: tuple[Fault, ...]
+    sizes: Mapping[str, Estimate]  # by fault
+    correlations: Floats  # (f, f) of the faults
     others: Mapping[str, Estimate]  # the suspects by parameter, SI
     fit: Fit
     errors: Mapping[str, float]  # RMS residual by signal, SI
@@ -199,9 +273,10 @@ class Refinement:
     worst: float = RESIDUAL_WORST  # error over noise that a few stops of the ram may leave
 
     @property
-    def sizes(self) -> dict[str, Estimate]:
-        """Both faults, by name."""
-        return {fault.name: getattr(self, fault.symbol) for fault in FAULTS}
+    def correlation(self) -> float:
+        """The strongest correlation of two sizes; 0 for a single fault."""
+        pairs = self.correlations[np.triu_indices(len(self.faults), 1)]
+        return float(pairs[np.argmax(np.abs(pairs))]) if len(pairs) else 0.0
 
     @property
     def ratio(self) -> dict[str, float]:
@@ -219,68 +294,76 @@ class Refinement:
 
 @dataclass
 class CountedProblem(LogProblem):
-    """A problem that counts the runs it makes, and knows static friction by its ratio."""
+    """A problem that counts the runs it makes, knows static friction by its ratio, and which faults are looked for."""
 
+    faults: tuple[Fault, ...] = FAULTS
     counts: list[int] = field(default_factory=list)  # shared by the problem's copies and threads
     stage: Stage = NO_STAGE  # takes a step with each round of a fit
+
+    @property
+    def fault_parameters(self) -> set[str]:
+        """The parameters of the faults, and those that follow."""
+        return {name for fault in self.faults for name in fault.parameters}
 
     def predict_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
         self.counts.append(len(values))
         return super().predict_signals(names, values, trace)
 
 
-def make_problem(model: Model, trace: Trace, floor: Mapping[str, float] | None = None, workers: int = 2
-                 ) -> CountedProblem:
-    """The model with the suspects ready in it, and the run to compare it with; `floor` RMS noise by signal, SI."""
+def make_problem(model: Model, trace: Trace, floor: Mapping[str, float] | None = None, workers: int = 2,
+                 faults: Sequence[Fault] = FAULTS) -> CountedProblem:
+    """The model with faults and suspects ready in it, and the run to compare it with; `floor` RMS noise by signal, SI.
+    """
     level = {name: floor[name] if floor else model[SIGNALS[name].noise] for name in trace.outputs}
-    ready = silence_readings(model).with_effects(s.effect for s in SUSPECTS if not CATALOGUE[s.effect].base)
+    own = [s.effect for s in list_suspects(model, faults) if not CATALOGUE[s.effect].base]
+    own += [name.partition(".")[0] for fault in faults for name in fault.parameters]
+    ready = silence_readings(model).with_effects(own)
     noise = tuple(noises.white_noise(level[name]) for name in trace.outputs)
-    return CountedProblem(ready, trace, noise, workers=workers)
+    return CountedProblem(ready, trace, noise, workers=workers, faults=tuple(faults))
 
 
-def choose_size_excerpt(model: Model, trace: Trace, floor: Mapping[str, float], progress: Progress = ignore_progress
-                        ) -> Excerpt:
+def choose_size_excerpt(model: Model, trace: Trace, floor: Mapping[str, float], progress: Progress = ignore_progress,
+                        faults: Sequence[Fault] = FAULTS) -> Excerpt:
     """The part of a long recording that says most about the faults, the suspects and the tolerances."""
-    problem = make_problem(model, trace, floor)
-    sliding = FRICTION.middle / STATIC_OVER_DYNAMIC
-    changes = [{CLOGGING.parameter: CLOGGING.middle},
-               {FRICTION.parameter: FRICTION.middle, DYNAMIC: sliding},
-               *({f.name: f.value(1.0)} for f in (_make_suspect(s, model) for s in SUSPECTS))]
+    problem = make_problem(model, trace, floor, faults=faults)
+    changes = [*(fault.list_changes(fault.place_size(fault.limits[1])) for fault in faults),
+               *({f.name: f.value(1.0)} for f in (_make_suspect(s, model) for s in list_suspects(model, faults)))]
     return choose_excerpt(trace, problem.model, floor, changes, progress)
 
 
-def refine_sizes(model: Model, trace: Trace, starts: Sequence[tuple[float, float]] = COARSE_STARTS,
+def refine_sizes(model: Model, trace: Trace, starts: Sequence[Sizes] | None = None,
                  floor: Mapping[str, float] | None = None, workers: int = 2, whole: Trace | None = None,
-                 progress: Progress = ignore_progress) -> Refinement:
+                 progress: Progress = ignore_progress, faults: Sequence[Fault] = FAULTS) -> Refinement:
     """Fault sizes by least squares from the best of some starts.
 
     Args:
         model: the plant as it left the works.
         trace: the run, prepared for replay.
-        starts: (Kintas, FSS in N) each.
+        starts: one size for each fault, SI, in each; default a coarse grid.
         floor: RMS noise by signal, SI; default the model's sensors.
         workers: threads.
         whole: the recording that `trace` was cut from: the fit is judged on it.
         progress: called with the stage and the share of a diagnosis that is done.
+        faults: what to estimate.
     """
     usual_rounds = 44  # from two starts; a fit that is restarted takes twice as many
     stage = Stage(progress, "refinement", 0.3, 0.97, usual_rounds)
-    problem = replace(make_problem(model, trace, floor, workers), stage=stage)
-    free = list_unknowns(model)
-    first = _fit_coarsely(problem, free, starts)
+    problem = replace(make_problem(model, trace, floor, workers, faults), stage=stage)
+    free = list_unknowns(problem.model, faults)
+    first = _fit_coarsely(problem, free, starts or list_coarse_starts(faults))
     problem = learn_left_noise(problem, first)
     return report_fit(_fit_finely(problem, first), problem, whole)
 
 
-def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Fit:
+def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequence[Sizes]) -> Fit:
     """A fit from the best start and, if that blames a fault, one from a healthy unit: whichever leaves less."""
     alone = replace(problem, workers=1, _lanes={})
     begin = [choose_start(problem, free, starts)]
-    healthy = make_start(free, CLOGGING.healthy, FRICTION.healthy, estimate_offsets(problem))
-    if _blames_a_fault(free, begin[0]):
+    healthy = make_healthy_start(problem, free)
+    if _blames_a_fault(problem, free, begin[0]):
         begin.append(healthy)
     fits = map_in_threads(lambda x: descend(alone, start_fit(free, x), NOISE_SCHEDULE), begin, problem.workers)
-    if len(fits) == 1 and (not is_noise_left(problem, fits[0]) or _blames_a_fault(free, fits[0].x)):
+    if len(fits) == 1 and (not is_noise_left(problem, fits[0]) or _blames_a_fault(problem, free, fits[0].x)):
         fits.append(descend(problem, start_fit(free, healthy), NOISE_SCHEDULE))
     best = min(fits, key=lambda f: f.cost)
     return best if is_noise_left(problem, best) else descend(problem, best, ((3.0, 4), (1.0, 8)))
@@ -310,9 +393,9 @@ def _restart_fit(problem: CountedProblem, found: Fit, parts: Sequence[float], ro
     lie behind one of them are found from the other side, or never.
     """
     free = found.free
-    home = make_start(free, 0.0, FRICTION.healthy, estimate_offsets(problem))
-    faults = [f.name in FAULT_PARAMETERS for f in free]
-    home[faults] = found.x[faults]
+    home = make_healthy_start(problem, free)
+    kept = [f.name in problem.fault_parameters for f in free]
+    home[kept] = found.x[kept]
     alone = replace(problem, workers=1, _lanes={})
 
     def fit_from(part: float) -> Fit:
@@ -350,11 +433,16 @@ def find_flat(problem: CountedProblem, free: Sequence[Free], x: Floats) -> Float
     return find_flat_directions(problem, free, x, (FLAPPER,), EFFECT_POWERS, PRIORS_KNOW_MORE_MISFIT)
 
 
-def _blames_a_fault(free: Sequence[Free], x: Floats) -> bool:
+def _blames_a_fault(problem: CountedProblem, free: Sequence[Free], x: Floats) -> bool:
     """Whether scaled unknowns, (p,), hold one of the faults for far gone."""
     known = {f.name: f.value(float(v)) for f, v in zip(free, x, strict=True)}
-    kintas, fss = known[CLOGGING.parameter], known[FRICTION.parameter]
-    return kintas > FAULT_BLAMED_SHARE * CLOGGING.middle or fss > FAULT_BLAMED_SHARE * FRICTION.middle
+    return any(fault.measure_departure(known[fault.parameter]) > FAULT_BLAMED_SHARE * fault.limits[1]
+               for fault in problem.faults)
+
+
+def make_healthy_start(problem: CountedProblem, free: Sequence[Free]) -> Floats:
+    """Scaled unknowns, (p,), of a unit without faults, with the bias and the load that the means show."""
+    return make_start(free, problem.faults, [fault.healthy for fault in problem.faults], estimate_offsets(problem))
 
 
 def is_noise_left(problem: Problem, found: Fit) -> bool:
@@ -367,28 +455,42 @@ def measure_ratios(problem: Problem, found: Fit) -> list[float]:
     return [float(np.sqrt(np.nanmean(r**2))) / n.level for r, n in zip(found.residuals, problem.noise, strict=True)]
 
 
-def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Floats:
+def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence[Sizes]) -> Floats:
     """The start, (p,) scaled, with the smallest misfit, searched on ever finer grids around the best one."""
     loud = scale_noise(replace(problem, workers=1, _lanes={}), NOISE_SCHEDULE[0][0])
-    offsets = estimate_offsets(problem)
-    usual = problem.model[DYNAMIC]
+    offsets, faults = estimate_offsets(problem), problem.faults
+    usual = {name: problem.model[name] for fault in faults for name in fault.follow}
 
-    def try_starts(tried: Sequence[tuple[float, float]], sliding: float) -> tuple[float, tuple[float, float], Floats]:
-        x = np.array([make_start(free, *s, offsets, sliding) for s in tried])
+    def try_starts(tried: Sequence[Sizes], stays: Mapping[str, float]) -> tuple[float, Sizes, Floats]:
+        x = np.array([make_start(free, faults, s, offsets, stays) for s in tried])
         costs = compute_misfit(loud.compute_white_residuals(free, x))
         k = int(np.argmin(costs))
         return float(costs[k]), tried[k], x[k]
 
-    def search(sliding: float) -> tuple[float, Floats]:
-        cost, best, x = try_starts(starts, sliding)
-        for step, factor in ((0.05, 1.2), (0.02, 1.08), (0.01, 1.03)):  # of Kintas, of FSS
-            around = [(min(max(best[0] + i * step, 0.0), CLOGGING.largest), best[1] * factor**j)
-                      for i, j in product(range(-2, 3), repeat=2)]
-            cost, best, x = try_starts(around, sliding)
+    def search(stays: Mapping[str, float]) -> tuple[float, Floats]:
+        cost, best, x = try_starts(starts, stays)
+        # of the two faults that are furthest gone
+        moved = sorted(sorted(range(len(faults)), key=lambda i: -compute_severity(faults[i], best[i]))[:2])
+        for part, factor in ((0.2, 1.2), (0.08, 1.08), (0.04, 1.03)):  # of MidBand, and of sizes by their logarithm
+            around = []
+            for steps in product(range(-2, 3), repeat=len(moved)):
+                sizes = list(best)
+                for i, step in zip(moved, steps, strict=True):
+                    sizes[i] = _step_size(faults[i], best[i], step, part, factor)
+                around.append(tuple(sizes))
+            cost, best, x = try_starts(around, stays)
         return cost, x
 
     # dynamic friction goes with the static one, or has stayed what it was
-    return min(map_in_threads(search, (math.inf, usual), problem.workers), key=lambda each: each[0])[1]
+    ways = ({}, usual) if usual else ({},)
+    return min(map_in_threads(search, ways, problem.workers), key=lambda each: each[0])[1]
+
+
+def _step_size(fault: Fault, size: float, steps: int, part: float, factor: float) -> float:
+    if _is_scaled(fault):
+        return size * factor**steps
+    healthy, middle, _ = fault.limits
+    return min(max(size + steps * (part * (middle - healthy)), fault.range[0]), fault.range[1])
 
 
 def estimate_offsets(problem: Problem) -> dict[str, float]:
@@ -427,12 +529,13 @@ def report_fit(last: Fit, problem: CountedProblem, whole: Trace | None = None) -
     errors = {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(outputs, last.residuals, strict=True)}
     floor = {s: n.level for s, n in zip(outputs, problem.noise, strict=True)}
     names = [f.name for f in last.free]
-    i, j = names.index(CLOGGING.parameter), names.index(FRICTION.parameter)
-    spread = np.sqrt(np.diag(last.covariance))
-    correlation = float(last.covariance[i, j] / (spread[i] * spread[j]))
-    found = Refinement(estimate_parameter(last, CLOGGING.parameter),
-                       estimate_parameter(last, FRICTION.parameter, FSS_INTERVAL_FACTOR), correlation,
-                       {s.parameter: estimate_parameter(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
+    places = [names.index(fault.parameter) for fault in problem.faults]
+    spread = np.sqrt(np.diag(last.covariance))[places]
+    correlations = last.covariance[np.ix_(places, places)] / np.outer(spread, spread)
+    sizes = {fault.name: estimate_parameter(last, fault.parameter, fault.interval_factor) for fault in problem.faults}
+    suspects = list_suspects(problem.model, problem.faults)
+    found = Refinement(problem.faults, sizes, correlations,
+                       {s.parameter: estimate_parameter(last, s.parameter) for s in suspects}, last, errors, floor,
                        sum(problem.counts))
     if whole is None or whole is problem.trace:
         return found
@@ -450,7 +553,7 @@ def estimate_parameter(found: Fit, name: str, factor: float = 1.0) -> Estimate:
 
 def find_effects_beside(model: Model, trace: Trace, alone: Refinement, floor: Mapping[str, float],
                         progress: Progress = ignore_progress, workers: int = 2, whole: Trace | None = None) -> Beside:
-    """The valve faults beside the other effects that a recording shows.
+    """The faults beside the other effects that a recording shows.
 
     Args:
         model: the unit as delivered.
@@ -462,23 +565,26 @@ def find_effects_beside(model: Model, trace: Trace, alone: Refinement, floor: Ma
         whole: the recording that `trace` was cut from: fits are judged on it.
     """
     marks, floor = _read_marks(model, whole or trace, floor)
-    problem = make_joint_problem(model, trace, floor, workers)
-    search = JointSearch(problem, list_other_effects(model), model, progress)
+    faults = alone.faults
+    problem = make_joint_problem(model, trace, floor, workers, faults)
+    search = JointSearch(problem, list_other_effects(model, faults), progress)
     fits = search.find_explanations(alone.fit)
     explanations = [_explain(effects, fit, search.problem, whole) for effects, fit in fits]
     return average_explanations(explanations, marks)
 
 
-def list_other_effects(model: Model) -> list[str]:
+def list_other_effects(model: Model, faults: Sequence[Fault] = FAULTS) -> list[str]:
     """The effects that are searched: all that a replay shows, but for those that every fit of the faults has."""
-    always = {CLOGGING.name, FRICTION.name, *(s.effect for s in SUSPECTS), *model.effects}
+    own = {name for fault in faults for name in fault.parameters}
+    always = {*(s.effect for s in SUSPECTS), *model.effects}
     return [e.name for e in list_searched_effects(model.plant)
-            if e.name not in always and e.port not in UNREPLAYED and e.starts]
+            if e.name not in always and e.port not in UNREPLAYED and e.starts and not own & set(e.fitted)]
 
 
-def make_joint_problem(model: Model, trace: Trace, floor: Mapping[str, float], workers: int = 2) -> CountedProblem:
+def make_joint_problem(model: Model, trace: Trace, floor: Mapping[str, float], workers: int = 2,
+                       faults: Sequence[Fault] = FAULTS) -> CountedProblem:
     """The run, and the model with the whole catalogue ready in it."""
-    problem = make_problem(model, trace, floor, workers)
+    problem = make_problem(model, trace, floor, workers, faults)
     return replace(problem, bare=problem.model, model=complete_model(problem.model), _lanes={})
 
 
@@ -507,8 +613,8 @@ Named = tuple[tuple[str, ...], Fit]
 class JointSearch:
     """The state of one search: the problem with its noise, and the effects to try."""
 
-    def __init__(self, problem: CountedProblem, effects: Sequence[str], model: Model, progress: Progress) -> None:
-        self.problem, self.effects, self.model, self.progress = problem, list(effects), model, progress
+    def __init__(self, problem: CountedProblem, effects: Sequence[str], progress: Progress) -> None:
+        self.problem, self.effects, self.progress = problem, list(effects), progress
 
     def find_explanations(self, alone: Fit, most_effects: int = 2) -> list[Named]:
         """Fits with 0, 1 .. other effects that may be the answer, taken to the end with one noise.
@@ -516,7 +622,7 @@ class JointSearch:
         Fits are compared only when they have gone equally far: one that has just begun has the cost of the stops that
         it still misses, and a rival that has been fitted to the end beats it although it is wrong.
         """
-        free = list_unknowns(self.model)
+        free = self.list_unknowns()
         begun = self.descend(replace(alone, free=free), ((1.0, 2),))
         parents: list[Named] = [((), begun)]
         found = self.deepen(parents)
@@ -538,6 +644,10 @@ class JointSearch:
             parents = self.map_alone(lambda each: (each[0], self.descend(each[1], ((1.0, 2),))), deep[:2])
         return self.finish(found)
 
+    def list_unknowns(self) -> tuple[Free, ...]:
+        """What the fits of the faults alone change."""
+        return list_unknowns((self.problem.bare or self.problem.model), self.problem.faults)
+
     def deepen(self, found: Sequence[Named], rounds: int = 8) -> list[Named]:
         """The fits taken further with finer steps; while the best leaves more than noise, they also begin elsewhere."""
         fine = self._refine_steps()
@@ -553,7 +663,7 @@ class JointSearch:
 
     def _refine_steps(self) -> JointSearch:
         problem = replace(self.problem, steps=FINE_STEPS, _lanes={})
-        return JointSearch(problem, self.effects, self.model, self.progress)
+        return JointSearch(problem, self.effects, self.progress)
 
     def add_effects(self, parent: Named, count: int, is_enough: bool) -> list[Named]:
         """The parent with one more effect each: the promising ones fitted; `is_enough`: the faults leave noise only."""
@@ -594,13 +704,13 @@ class JointSearch:
         Priors then hold the tolerances, and stops of the ram that are made or missed hardly count: what is left is the
         course of the signals, in which an effect shows although no fit without it comes near them.
         """
-        loud = JointSearch(scale_noise(self.problem, factor), effects, self.model, self.progress)
+        loud = JointSearch(scale_noise(self.problem, factor), effects, self.progress)
         return loud.scan(loud.descend(fit, ((1.0, rounds),)), effects, np.inf)
 
     def start_afresh(self) -> Fit:
-        """A unit with the best pair of faults and no other deviation: an effect may lead fits into a local minimum."""
-        free = list_unknowns(self.model)
-        x = choose_start(self.problem, free, COARSE_STARTS)
+        """A unit with the best sizes of the faults and no other deviation: an effect may lead fits astray."""
+        free = self.list_unknowns()
+        x = choose_start(self.problem, free, list_coarse_starts(self.problem.faults))
         return linearise_across(self.problem, free, x, guess_first_covariance(free), find_flat(self.alone, free, x))
 
     def finish(self, found: Sequence[Named]) -> list[Named]:
@@ -690,8 +800,8 @@ class JointSearch:
 
     def _place_home(self, fit: Fit) -> Floats:
         """Scaled unknowns, (p,), of a unit with a fit's faults and effects and no other deviation."""
-        home = make_start(fit.free, 0.0, FRICTION.healthy, estimate_offsets(self.problem))
-        kept = [f.name in FAULT_PARAMETERS or not np.isfinite(f.prior) for f in fit.free]
+        home = make_healthy_start(self.problem, fit.free)
+        kept = [f.name in self.problem.fault_parameters or not np.isfinite(f.prior) for f in fit.free]
         home[kept] = fit.x[kept]
         return home
 
@@ -737,7 +847,7 @@ def _takes_fair_share(before: Fit, after: Fit) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """The two faults fitted beside some other effects."""
+    """The faults fitted beside some other effects."""
 
     effects: tuple[str, ...]  # () for the faults alone
     parameters: Mapping[str, Estimate]  # of these effects, by name, SI
@@ -746,13 +856,13 @@ class Explanation:
 
     @property
     def sizes(self) -> dict[str, Estimate]:
-        """Both faults, by name."""
-        return self.refinement.sizes
+        """The faults, by name."""
+        return dict(self.refinement.sizes)
 
     @property
     def levels(self) -> dict[str, Level | None]:
         """Levels that this explanation alone would give, by fault."""
-        return {fault.name: judge_size(fault, self.sizes[fault.name]) for fault in FAULTS}
+        return {fault.name: judge_size(fault, self.sizes[fault.name]) for fault in self.refinement.faults}
 
 
 @dataclass(frozen=True, eq=False)
@@ -760,7 +870,7 @@ class Beside:
     """Explanations of a recording by the faults and other effects, with sizes averaged over them."""
 
     explanations: tuple[Explanation, ...]  # best first; those that are not much less likely than the best
-    sizes: Mapping[str, Estimate]  # of both faults, by name, averaged
+    sizes: Mapping[str, Estimate]  # of the faults, by name, averaged
     marks: Mapping[str, Mapping[str, Estimate]]  # effects that leave a mark without noise, with their parameters
     disputed: tuple[str, ...]  # faults whose level depends on which explanation is right
 
@@ -797,8 +907,9 @@ def average_explanations(found: Sequence[Explanation], marks: Mapping[str, Mappi
                      key=lambda pair: -pair[0])
     total = sum(weight for weight, _ in counted)
     kept = tuple(Explanation(e.effects, e.parameters, e.refinement, weight / total) for weight, e in counted)
-    sizes = {f.name: mix_estimates([e.sizes[f.name] for e in kept], [e.weight for e in kept]) for f in FAULTS}
-    return Beside(kept, sizes, marks or {}, tuple(f.name for f in FAULTS if _is_disputed(f, kept)))
+    faults = kept[0].refinement.faults
+    sizes = {f.name: mix_estimates([e.sizes[f.name] for e in kept], [e.weight for e in kept]) for f in faults}
+    return Beside(kept, sizes, marks or {}, tuple(f.name for f in faults if _is_disputed(f, kept)))
 
 
 def weigh_costs(costs: Sequence[float]) -> list[float]:

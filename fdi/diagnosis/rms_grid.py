@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
+from fdi.diagnosis.faults import CLOGGING, FRICTION
 from fdi.estimation.replay import has_known_start, read_cycles
 from fdi.thresholds import ANCHOR_RATE
 from fdi.trace.sections import find_sections
@@ -23,11 +23,11 @@ from plant.monitor import Monitor
 
 KINTAS_AXIS = np.linspace(0.0, 0.5, 21)
 FSS_AXIS = np.linspace(0.0, 90.0, 21)  # N
-SLIDING_RATIOS = (1.0 / STATIC_OVER_DYNAMIC, 1.0, 1.0 / 3.0, 1.0 / 15.0)  # FDS/FSS, the nominal plant's first
+SLIDING_RATIOS = (*FRICTION.follow.values(), 1.0, 1.0 / 3.0, 1.0 / 15.0)  # FDS/FSS, the nominal plant's first
 DRIVES = ("current", "command")
 # corners of the unit square (Kintas, FSS N): MidBand in its middle, MaxBand at its right and upper edge
-LOWER_CORNER = 2.0 * CLOGGING.middle - CLOGGING.most, 2.0 * FRICTION.middle - FRICTION.most
-UPPER_CORNER = CLOGGING.most, FRICTION.most
+LOWER_CORNER = tuple(2.0 * fault.acceptable - fault.maintenance for fault in (CLOGGING, FRICTION))
+UPPER_CORNER = CLOGGING.maintenance, FRICTION.maintenance
 
 
 class Point(NamedTuple):

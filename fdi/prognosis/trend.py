@@ -408,13 +408,13 @@ def fit_trend(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate
     posterior = fit_growth(found.data)
     paths, laws = _sample_paths(found, posterior, _fit_unit_error(data, used)), posterior.compute_law_probabilities()
     remaining = {}
-    for reached, limit in (("maintenance", fault.middle), ("non_nominal", fault.most)):
+    for reached, limit in (("maintenance", fault.acceptable), ("non_nominal", fault.maintenance)):
         draws = find_first_passage(paths, (limit - fault.healthy) / unit) * span
         remaining[reached] = Remaining(limit, *_summarise_draws(draws), draws)
     middle = np.linspace(0.0, 1.0, 60)
     level = fault.healthy + unit * estimate_level(found.data, posterior, middle)
     past = Curve(t[found.first] + span * middle, *level)
-    now = np.maximum(fault.healthy + unit * paths.sizes[:, 0], 0.0)  # neither fault can be less
+    now = np.maximum(fault.healthy + unit * paths.sizes[:, 0], fault.range[0])
     return Trend(fault, "TREND" if laws["none"] < NO_GROWTH_PROBABILITY else "NO_TREND", t, sizes, used, breaks, laws,
                  _summarise_draws(now), _summarise_draws(paths.rate * unit / span), remaining, past,
                  _make_forecast(fault, unit, paths, float(t[-1]), span))
@@ -422,7 +422,7 @@ def fit_trend(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate
 
 def _scale_series(fault: Fault, t: Floats, sizes: Sequence[Estimate]) -> tuple[Scaled, float]:
     """The series in the regression's units, and the size that is 1 there."""
-    unit = fault.most - fault.healthy
+    unit = fault.maintenance - fault.healthy
     value, low, high = np.array(sizes).T
     sigma = np.maximum(high - value, value - low) / INTERVAL_95_SD / unit  # one side may end at the parameter's bound
     span = float(t[-1] - t[0]) or 1.0

@@ -1,4 +1,4 @@
-"""The trends of both faults of one unit."""
+"""The trends of the faults of one unit."""
 from __future__ import annotations
 
 import contextlib
@@ -7,14 +7,14 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi.diagnosis.faults import FAULTS, Estimate, Level
+from fdi.diagnosis.faults import FAULTS, Estimate, Fault, Level, measure_departures
 from fdi.output import write_text
 from fdi.prognosis.trend import Trend, fit_trend
 from fdi.progress import Progress
@@ -31,14 +31,14 @@ LIMIT_NAMES = {"maintenance": "MidBand", "non_nominal": "MaxBand"}
 
 @dataclass(frozen=True, eq=False)
 class UnitTrend:
-    """The trends of both faults through the traces of one unit."""
+    """The trends of the faults through the traces of one unit."""
 
     gathered: Gathered
     trends: tuple[Trend, ...]
 
     @property
     def level(self) -> Level:
-        """The worse of the two levels at the last trace."""
+        """The worst level at the last trace."""
         return max(trend.level for trend in self.trends)
 
     @property
@@ -48,22 +48,25 @@ class UnitTrend:
 
 
 def follow_unit(gathered: Gathered) -> UnitTrend:
-    """Follow both faults through the traces."""
+    """Follow the faults through the traces; one that falls, or goes both ways, by its distance from a healthy unit."""
     t = [point.t for point in gathered.points]
-    trends = (fit_trend(fault, t, [point.sizes[fault.name] for point in gathered.points]) for fault in FAULTS)
+    trends = (fit_trend(fault.turn_up(), t, [measure_departures(fault, point.sizes[fault.name])
+                                             for point in gathered.points]) for fault in gathered.faults)
     return UnitTrend(gathered, tuple(trends))
 
 
-def read_points(path: Path) -> Gathered:
-    """Read the points of an earlier answer of `rig trend` from its JSON file.
+def read_points(path: Path, faults: Sequence[Fault] | None = None) -> Gathered:
+    """Read the points of an earlier answer of `rig trend` from its JSON file; `faults`: default those of the answer.
 
     Raises:
         InputError: another kind of file.
     """
     try:
         answer = json.loads(path.read_text(encoding="utf-8"))
+        own = tuple(Fault(**{**table, "range": tuple(table["range"])}) for table in answer.get("faults", ()))
+        faults = tuple(faults or own or FAULTS)
         points = tuple(Point(str(p["trace"]), float(p["t"]), {
-            f.name: Estimate(*(float(p[f.symbol][name]) for name in Estimate._fields)) for f in FAULTS},
+            f.name: Estimate(*(float(p[f.key][name]) for name in Estimate._fields)) for f in faults},
             str(p.get("note", ""))) for p in answer["points"])
         axis = str(answer["axis"])
         if not all(math.isfinite(p.t) and all(e.low <= e.value <= e.high for e in p.sizes.values()) for p in points):
@@ -72,7 +75,7 @@ def read_points(path: Path) -> Gathered:
         raise InputError(path, "", f"an answer of rig trend ({type(error).__name__}: {error})") from error
     if axis not in AXES or not points:
         raise InputError(path, "axis", f"one of {', '.join(AXES)} and at least one point")
-    return Gathered(str(path), axis, tuple(sorted(points, key=lambda p: p.t)), ())
+    return Gathered(str(path), axis, tuple(sorted(points, key=lambda p: p.t)), (), faults)
 
 
 ENDINGS = (".mcap", ".csv", ".csv.gz")
@@ -94,10 +97,11 @@ class Gathered(NamedTuple):
     axis: str  # "date" | "hours" | "flights"
     points: tuple[Point, ...]
     notes: tuple[str, ...]
+    faults: tuple[Fault, ...] = FAULTS
 
 
 def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | None = None, table: Path | None = None,
-                 again: bool = False) -> Gathered:
+                 again: bool = False, faults: Sequence[Fault] = FAULTS) -> Gathered:
     """Diagnose all traces of a folder and below.
 
     Args:
@@ -107,6 +111,7 @@ def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | Non
         axis: of time; default the first on which all traces have a place.
         table: of dates; default dates.csv in the folder, if there is one.
         again: diagnose again what has been diagnosed before.
+        faults: what to follow.
 
     Raises:
         InputError: no folder, no traces, no axis on which all of them have a place, or none that can be judged.
@@ -118,7 +123,7 @@ def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | Non
     names = {file: file.relative_to(folder).as_posix() for file in list_traces(folder)}
     for file, name in names.items():
         try:
-            rows[file] = _date_trace(folder, name, read_start_time(file, model, again), find_row(dates, name))
+            rows[file] = _date_trace(folder, name, read_start_time(file, model, again, faults), find_row(dates, name))
         except InputError as error:
             notes.append(f"{name} left out: {str(error).removeprefix(f'{file}: ')}")
     axis = _choose_axis(folder, rows, axis)  # before the work: a trace without a date is refused at once
@@ -129,16 +134,16 @@ def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | Non
     for i, (file, row) in enumerate(rows.items()):
         progress(f"trace {i + 1} of {len(rows)}", i / len(rows))
         try:
-            answer = diagnose_once(file, model, again)
+            answer = diagnose_once(file, model, again, faults)
         except InputError as error:
             notes.append(f"{names[file]} left out: {str(error).removeprefix(f'{file}: ')}")
             continue
-        sizes = {f.name: Estimate(*answer["sizes"][f.name]) for f in FAULTS}
+        sizes = {f.name: Estimate(*answer["sizes"][f.name]) for f in faults}
         points.append(Point(names[file], row[list(AXES).index(axis)], sizes, answer["note"]))
     progress("trend", 1.0)
     if not points:
         raise InputError(folder, "", f"traces that can be judged; {notes[0]}" + (" ..." if notes[1:] else ""))
-    return Gathered(str(folder), axis, tuple(sorted(points, key=lambda p: (p.t, p.trace))), tuple(notes))
+    return Gathered(str(folder), axis, tuple(sorted(points, key=lambda p: (p.t, p.trace))), tuple(notes), tuple(faults))
 
 
 def list_traces(folder: Path) -> list[Path]:
@@ -179,29 +184,29 @@ def _choose_axis(folder: Path, rows: Mapping[Path, Row], wanted: str | None) -> 
     raise InputError(without[missing][0], missing, expected)
 
 
-def read_start_time(file: Path, model: Model, again: bool = False) -> str:
+def read_start_time(file: Path, model: Model, again: bool = False, faults: Sequence[Fault] = FAULTS) -> str:
     """Start time in the log; "" if there is none.
 
     Raises:
         InputError: a file that is not a trace.
     """
-    found = _read_answer(_find_answer_file(file, model), again)
+    found = _read_answer(_find_answer_file(file, model, faults), again)
     return str(found["started"]) if found else Trace.read(file).provenance.get("started", "")
 
 
-def diagnose_once(file: Path, model: Model, again: bool = False) -> dict[str, Any]:
+def diagnose_once(file: Path, model: Model, again: bool = False, faults: Sequence[Fault] = FAULTS) -> dict[str, Any]:
     """Start time and sizes of a trace, by `diagnose` or from the answer stored by an earlier call.
 
     Raises:
         InputError: a trace that cannot be judged; this answer is not stored.
     """
-    place = _find_answer_file(file, model)
+    place = _find_answer_file(file, model, faults)
     found = _read_answer(place, again)
     if found is None:
         from fdi.diagnosis.diagnosis import diagnose
 
         trace = Trace.read(file)
-        d = diagnose(trace, model, source=str(file))
+        d = diagnose(trace, model, source=str(file), faults=faults)
         found = {"started": trace.provenance.get("started", ""),
                  "sizes": {name: list(size) for name, size in d.sizes.items()},
                  "note": "something else is wrong" if d.verdict == "SOMETHING_ELSE" else ""}
@@ -219,13 +224,14 @@ def _read_answer(place: Path, again: bool) -> dict[str, Any] | None:
     return found
 
 
-def _find_answer_file(file: Path, model: Model) -> Path:
-    """File for the answer of a trace: its name is a hash of the trace, the model and the code."""
+def _find_answer_file(file: Path, model: Model, faults: Sequence[Fault]) -> Path:
+    """File for the answer of a trace: its name is a hash of the trace, the model, the faults and the code."""
     with report_unreadable(file, "UTF-8"):
         content = file.read_bytes()
     theirs = {f for e in model.effects if (f := CATALOGUE[e].file)}
     own = [hashlib.sha256(Path(f).read_bytes()).hexdigest() for f in sorted(theirs)]
-    text = json.dumps([sorted(model.values.items()), model.effects, own, model.plant, hash_sources("plant", "fdi")])
+    text = json.dumps([sorted(model.values.items()), model.effects, own, model.plant, hash_sources("plant", "fdi"),
+                       [asdict(fault) for fault in faults]])
     return find_cache_folder() / "trend" / f"{hashlib.sha256(content + text.encode()).hexdigest()[:32]}.json"
 
 

@@ -1,13 +1,15 @@
-"""The report of a diagnosis: verdict, both faults, response in its bands, RMS maps, precursors, provenance."""
+"""The report of a diagnosis: verdict, faults, response in its bands, RMS maps, precursors, provenance."""
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from fdi.diagnosis.ambiguity import Group
 from fdi.diagnosis.bands import (
     Bands,
     BandVerdict,
@@ -77,10 +79,8 @@ from fdi.thresholds import BAND_NEAREST_LIMIT_SD
 from fdi.trace.sections import Section as CommandSection
 from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace
-from plant.model import find_quantity
+from plant.model import find_quantity, list_offered_effects
 
-FAULT_NAMES = {CLOGGING.name: "filter clogging", FRICTION.name: "spool friction"}
-SIZE_SYMBOLS = {CLOGGING.name: "Kintas", FRICTION.name: "FSS"}
 LEVEL_NAMES = {Level.ACCEPTABLE: "acceptable", Level.MAINTENANCE: "maintenance", Level.NON_NOMINAL: "non-nominal",
                None: "cannot be judged"}
 LEVEL_MOODS: dict[Level | None, Mood] = {Level.ACCEPTABLE: "good", Level.MAINTENANCE: "doubtful",
@@ -104,9 +104,9 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
     provenance = {} if d.bands is None else d.bands.provenance
     sections = [
         Section("Faults", [_tabulate_faults(d), Figure(
-            "Each estimate of the two sizes over the three levels: green acceptable, amber maintenance, red "
+            "Each estimate of the sizes over the three levels: green acceptable, amber maintenance, red "
             "non-nominal. Circle: fit with its 95 % interval; diamonds: the other methods.",
-            partial(draw_sizes, d.sizes, d.grid, d.band_verdict))]),
+            partial(draw_sizes, d.faults, d.sizes, d.grid, d.band_verdict))]),
         Section("Other effects", _show_effects(d)),
         Section("Response in its bands", _show_bands(d)),
         Section("Events", _tabulate_events(d)),
@@ -114,8 +114,8 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
         Section("Precursors", _show_precursors(d)),
         Section("Fit", [
             Line("residual", describe_residual(d)),
-            Line("fit", f"{d.refinement.method}, {d.refinement.simulations} simulations; correlation of the two sizes "
-                        f"{d.refinement.correlation:+.2f}"),
+            Line("fit", f"{d.refinement.method}, {d.refinement.simulations} simulations; "
+                        f"{describe_correlation(d)}"),
             *(Line("deviation", describe_deviation(name, size)) for name, size in d.others.items())]),
         Section("Provenance of the bands", [tabulate(
             sorted(provenance.items()), (Column(""), lambda row: Cell(row[0], "muted")),
@@ -126,7 +126,7 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
 
 def build_bands_report(made: Mapping[str, Any]) -> Report:
     """Report on bands that `rig fdi --learn-bands` wrote."""
-    judged = join_words(FAULT_NAMES[name] for name in made["judges"])
+    judged = join_words(fault.title for fault in FAULTS if fault.name in made["judges"])
     return Report(
         command="fdi", title=str(made["bands"]), files=[("bands", str(made["bands"]))],
         sentence=f"The bands judge {judged}." if judged else
@@ -137,33 +137,78 @@ def build_bands_report(made: Mapping[str, Any]) -> Report:
 
 def describe_verdict(d: Diagnosis) -> str:
     """The verdict in a sentence or two."""
+    whole, each = ("neither fault", "the two faults") if len(d.faults) == 2 else ("no fault", "the faults")
     if d.verdict == "SOMETHING_ELSE" and d.beside is not None:
-        return (f"Neither the two faults nor they and other effects of the catalogue explain this trace: the residual "
+        return (f"Neither {each} nor they and other effects of the catalogue explain this trace: the residual "
                 f"of the best fit is {describe_residual(d)}. No fault is reported until the cause is known.")
     if d.verdict == "SOMETHING_ELSE":
-        return (f"Neither fault explains this trace: the residual of the best fit is {describe_residual(d)}. Something "
-                "else is wrong; no fault is reported until the cause is known. rig fdi --with-effects searches for the "
-                "cause and sizes both faults beside it.")
-    names = join_words(FAULT_NAMES[name] for name, level in d.levels.items() if level is None)
+        return (f"{whole.capitalize()} explains this trace: the residual of the best fit is {describe_residual(d)}. "
+                "Something else is wrong; no fault is reported until the cause is known. rig fdi --with-effects "
+                f"searches for the cause and sizes {'both' if len(d.faults) == 2 else 'the'} faults beside it.")
+    titles = {fault.name: fault.title for fault in d.faults}
+    grouped = {name for group in d.groups for name in group.names}
+    names = join_words(titles[name] for name, level in d.levels.items() if level is None and name not in grouped)
     is_disputed = d.beside is not None and d.beside.disputed
+    groups = " ".join(describe_group(d, group) for group in d.groups)
     if d.verdict == "CANNOT_TELL" and not is_disputed:
         return f"This trace does not determine {names}: a healthy unit and MidBand are both within the 95 % interval."
+    if d.verdict == "AMBIGUOUS":
+        return groups + (f" This trace does not determine {names} either." if names else "")
     if d.verdict == "CANNOT_TELL" and d.beside is not None:
         sentence = (f"The level of {names} depends on what else is wrong, and this trace does not tell "
                     f"{_join_alternatives(d.beside)} apart.")
     elif d.verdict == "ACCEPTABLE":
-        sentence = "Both faults are acceptable."
+        many = {1: f"{d.faults[0].title.capitalize()} is acceptable.", 2: "Both faults are acceptable."}
+        sentence = many.get(len(d.faults), f"All {len(d.faults)} faults are acceptable.")
     else:
-        worst = next(fault for fault in FAULTS if fault.name == d.ruling)
+        worst = next(fault for fault in d.faults if fault.name == d.ruling)
         need = "requires maintenance" if d.levels[worst.name] == Level.MAINTENANCE else "is non-nominal"
-        rest = "; ".join(f"{FAULT_NAMES[name]} {'' if level is None else 'is '}{LEVEL_NAMES[level]}"
-                         for name, level in d.levels.items() if name != worst.name)
+        rest = _describe_rest(d, worst)
         middle, most = format_limits_of_fault(worst)
-        sentence = (f"{FAULT_NAMES[worst.name].capitalize()} {need}: {SIZE_SYMBOLS[worst.name]} "
-                    f"{format_size(worst, d.sizes[worst.name])}, MidBand {middle}, MaxBand {most}; {rest}.")
+        sentence = (f"{worst.title.capitalize()} {need}: {worst.symbol} "
+                    f"{format_size(worst, d.sizes[worst.name])}, MidBand {middle}, MaxBand {most}"
+                    + (f"; {rest}." if rest else ".") + (f" {groups}" if groups else ""))
     if d.beside is not None and d.beside.is_explained and d.beside.effects:
         sentence += f" Beside the faults: {_join_alternatives(d.beside)}."
     return sentence + (f" Other deviations: {_list_others(d)}." if d.others else "")
+
+
+def _describe_rest(d: Diagnosis, worst: Fault) -> str:
+    """The levels of the faults that do not rule; of many, those that are not acceptable, and how many are."""
+    rest = {fault: d.levels[fault.name] for fault in d.faults if fault != worst}
+    many = [fault for fault, level in rest.items() if level == Level.ACCEPTABLE]
+    said = [f"{fault.title} {'' if level is None else 'is '}{LEVEL_NAMES[level]}" for fault, level in rest.items()
+            if len(rest) == 1 or fault not in many]
+    if len(rest) > 1 and many:
+        said.append(f"{len(many)} other faults are acceptable" if len(many) > 1 else f"{many[0].title} is acceptable")
+    return "; ".join(said)
+
+
+def describe_group(d: Diagnosis, group: Group) -> str:
+    """Faults that a trace does not tell apart, and what would."""
+    titles = join_words((f.title for f in d.faults if f.name in group.names), "or")
+    return (f"At least one of these is not acceptable: {titles}. This trace does not tell which; "
+            f"{describe_separation(d, group)}.")
+
+
+def describe_separation(d: Diagnosis, group: Group) -> str:
+    """What would tell the faults of a group apart: signals that were not measured, or another test."""
+    unmeasured = [s.symbol for s in d.model.kind.signals.outputs if s.name not in d.trace.outputs]
+    owners = [e for e in list_offered_effects(d.model.plant) for f in d.faults
+              if f.name in group.names and f.parameter in e.fitted and e.revealed_by]
+    ways = [f"a recording with {join_words(unmeasured)}"] if unmeasured else []
+    ways += [f"{e.name}: {e.revealed_by}" for e in owners]
+    return f"to find out, try {'; '.join(ways)}" if ways else "another test, or an inspection, has to"
+
+
+def describe_correlation(d: Diagnosis) -> str:
+    """The strongest correlation of two sizes, and of which ones where there are more than two."""
+    if len(d.faults) < 2:
+        return "one fault"
+    table = np.abs(np.triu(d.refinement.correlations, 1))
+    i, j = np.unravel_index(int(table.argmax()), table.shape)
+    which = "the two sizes" if len(d.faults) == 2 else f"{d.faults[i].symbol} and {d.faults[j].symbol}"
+    return f"{'' if len(d.faults) == 2 else 'largest '}correlation of {which} {d.refinement.correlation:+.2f}"
 
 
 def format_size(fault: Fault, size: Estimate) -> str:
@@ -184,16 +229,16 @@ class FoundFault(NamedTuple):
 
 
 def list_found_faults(answer: Mapping[str, Any]) -> list[FoundFault]:
-    """Both faults of an answer of `rig fdi --json`; none if it has no levels, because the trace cannot be judged."""
+    """The faults of an answer of `rig fdi --json`; none if it has no levels, because the trace cannot be judged."""
     if not answer.get("level"):
         return []
     words = {level.word: name for level, name in LEVEL_NAMES.items() if level is not None}
     found = []
-    for fault in FAULTS:
-        size = Estimate(**{key: math.nan if x is None else x for key, x in answer["refined"][fault.symbol].items()})
-        level = words.get(answer["level"][fault.name], LEVEL_NAMES[None])
-        found.append(FoundFault(FAULT_NAMES[fault.name], level,
-                                f"{SIZE_SYMBOLS[fault.name]} {format_size(fault, size)}"))
+    for name, fault in (answer.get("faults") or _collect_faults(FAULTS)).items():
+        size = Estimate(**{key: math.nan if x is None else x for key, x in answer["refined"][fault["key"]].items()})
+        level = words.get(answer["level"][name], LEVEL_NAMES[None])
+        shown = format_interval(size.value, size.low, size.high, fault["unit"])
+        found.append(FoundFault(fault["title"], level, f"{fault['symbol']} {shown}"))
     return found
 
 
@@ -203,7 +248,7 @@ def format_limits_of_fault(fault: Fault) -> tuple[str, str]:
     >>> format_limits_of_fault(FRICTION)
     ('35 N', '70 N')
     """
-    return attach_unit(f"{fault.middle:g}", fault.unit), attach_unit(f"{fault.most:g}", fault.unit)
+    return attach_unit(f"{fault.acceptable:g}", fault.unit), attach_unit(f"{fault.maintenance:g}", fault.unit)
 
 
 def describe_residual(d: Diagnosis) -> str:
@@ -215,12 +260,12 @@ def describe_residual(d: Diagnosis) -> str:
 def describe_overruled_bands(d: Diagnosis) -> list[str]:
     """A sentence for each fault that the fit judges better than the bands do: which result to trust, and why."""
     sentences = []
-    for fault in FAULTS:
+    for fault in d.faults:
         by_bands = d.band_verdict.levels.get(fault.name) if d.band_verdict else None
         level = d.levels[fault.name]
         if by_bands is not None and level is not None and by_bands > level:
             cause = f", with {_list_others(d)}" if d.others else ""
-            sentences.append(f"The bands call {FAULT_NAMES[fault.name]} {LEVEL_NAMES[by_bands]}; the fit, which models "
+            sentences.append(f"The bands call {fault.title} {LEVEL_NAMES[by_bands]}; the fit, which models "
                              f"the whole plant, finds it {LEVEL_NAMES[level]}{cause}. Trust the fit.")
     return sentences
 
@@ -235,13 +280,13 @@ def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
     if g is None:
         return sentences
     for fault, axis in zip(FAULTS, (g.kintas, g.fss), strict=True):
-        size, found = d.sizes[fault.name], float(getattr(g.merged, fault.symbol))
+        size, found = d.sizes[fault.name], float(getattr(g.merged, fault.key))
         outside = max(size.low - found, found - size.high)
         if outside <= far * float(axis[1] - axis[0]):
             continue
-        parts = [f"{words} {format_digits(float(getattr(part.minimum, fault.symbol)))}"
+        parts = [f"{words} {format_digits(float(getattr(part.minimum, fault.key)))}"
                  for words, part in (("steps", g.step), ("ramps", g.ramp)) if part is not None]
-        at = f"{SIZE_SYMBOLS[fault.name]} {attach_unit(format_digits(found), fault.unit)}"
+        at = f"{fault.symbol} {attach_unit(format_digits(found), fault.unit)}"
         sentence = (f"The grid gives {at} (minima: {', '.join(parts)}), the fit {format_size(fault, size)}: the grid "
                     "matches the position alone with a plant that has only these two faults")
         if d.others:
@@ -284,17 +329,17 @@ def _tabulate_faults(d: Diagnosis) -> Table:
     by_bands = d.band_verdict.levels if d.band_verdict else {}
 
     def show_grid(fault: Fault) -> str:
-        if d.grid is None:
+        if d.grid is None or fault not in FAULTS:
             return NO_NUMBER
-        return attach_unit(format_digits(float(getattr(d.grid.merged, fault.symbol))), fault.unit)
+        return attach_unit(format_digits(float(getattr(d.grid.merged, fault.key))), fault.unit)
 
     def show_bands(fault: Fault) -> Cell:
         level = by_bands.get(fault.name)
         return Cell("not judged" if level is None else LEVEL_NAMES[level], LEVEL_MOODS[level])
 
-    limits = "; ".join(f"{SIZE_SYMBOLS[f.name]} {' and '.join(format_limits_of_fault(f))}" for f in FAULTS)
+    limits = "; ".join(f"{f.symbol} {' and '.join(format_limits_of_fault(f))}" for f in d.faults)
     return tabulate(
-        FAULTS, (Column("fault"), lambda f: FAULT_NAMES[f.name] + (" *" if d.ruling == f.name else "")),
+        d.faults, (Column("fault"), lambda f: f.title + (" *" if d.ruling == f.name else "")),
         (Column("level"), lambda f: Cell(LEVEL_NAMES[d.levels[f.name]], LEVEL_MOODS[d.levels[f.name]])),
         (Column("size (95 % interval)", align="right"),
          lambda f: Cell(format_size(f, d.sizes[f.name]), is_strong=True)),
@@ -307,20 +352,20 @@ def _tabulate_faults(d: Diagnosis) -> Table:
 
 
 def _show_effects(d: Diagnosis) -> list[Item]:
-    """One row for each explanation that may be right: its effects with sizes, and what it makes of both faults."""
+    """One row for each explanation that may be right: its effects with sizes, and what it makes of the faults."""
     b = d.beside
     if b is None:
         return []
     columns = [Column("beside the faults"), Column("probability", "%", "right"), Column("size (95 % interval)"),
-               *(column for fault in FAULTS for column in (Column(SIZE_SYMBOLS[fault.name], align="right"),
+               *(column for fault in d.faults for column in (Column(fault.symbol, align="right"),
                                                            Column("level"))),
                Column("residual / noise", align="right", medium=Medium.PAGE)]
     rows: list[list[Cell | str]] = []
     for e in b.explanations:
-        levels = {f: e.levels[f.name] if d.refinement.is_explained else None for f in FAULTS}
+        levels = [(f, e.levels[f.name] if d.refinement.is_explained else None) for f in d.faults]
         rows.append([
             name_explanation(e), f"{100 * e.weight:.0f}", _format_parameters(e.parameters) or NO_NUMBER,
-            *(cell for f, level in levels.items() for cell in (
+            *(cell for f, level in levels for cell in (
                 format_size(f, e.sizes[f.name]), Cell(LEVEL_NAMES[level], LEVEL_MOODS[level]))),
             format_ratio(max(e.refinement.ratio.values()))])
     caption = ("Explanations that fit the trace about equally well; the sizes above are averaged over them." if
@@ -329,8 +374,8 @@ def _show_effects(d: Diagnosis) -> list[Item]:
         caption = "The best that the search found; it leaves more than noise, so no level follows from it."
     return [Table(columns, rows, caption),
             *(Line(effect, f"{_format_parameters(own)}, read off without noise") for effect, own in b.marks.items()),
-            *(Paragraph(f"The level of {FAULT_NAMES[name]} depends on which of these is right: cannot be judged.")
-              for name in b.disputed)]
+            *(Paragraph(f"The level of {fault.title} depends on which of these is right: cannot be judged.")
+              for fault in d.faults if fault.name in b.disputed)]
 
 
 def _format_parameters(sizes: Mapping[str, Any]) -> str:
@@ -426,9 +471,9 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
         (number("healthy s.d."), lambda name: format_precursor(found[name].noise, name)),
         (Column("deviation", "s.d.", "right"), lambda name: Cell(
             show_deviation(found[name].departure), "bad" if 4.0 < abs(found[name].departure) < math.inf else "")),
-        (number(f"Kintas {CLOGGING.middle:g} adds"), lambda name: format_precursor(found[name].clogging, name)),
+        (number(f"Kintas {CLOGGING.acceptable:g} adds"), lambda name: format_precursor(found[name].clogging, name)),
         (number("in s.d."), lambda name: show_deviation(found[name].clogging_ratio)),
-        (number(f"FSS {FRICTION.middle:g} N adds"), lambda name: format_precursor(found[name].friction, name)),
+        (number(f"FSS {FRICTION.acceptable:g} N adds"), lambda name: format_precursor(found[name].friction, name)),
         (number("in s.d."), lambda name: show_deviation(found[name].friction_ratio)),
         caption="Deviation: measured minus healthy mean, in standard deviations of healthy units; red beyond 4."),
         Figure("How far a fault at MidBand moves each precursor, in standard deviations of healthy units: longer bars "
@@ -443,7 +488,9 @@ def collect_data(d: Diagnosis) -> dict[str, Any]:
         "verdict": d.verdict, "sentence": describe_verdict(d),
         "level": {name: level.word if level is not None else None for name, level in d.levels.items()},
         "ruling": d.ruling,
-        "severity": {f.name: compute_severity(f, d.sizes[f.name].value) for f in FAULTS},
+        "severity": {f.name: compute_severity(f, d.sizes[f.name].value) for f in d.faults},
+        "faults": _collect_faults(d.faults),
+        "groups": [list(group.names) for group in d.groups],
         "events": [e._asdict() for e in d.events],
         "bands": {"level": {name: level.word for name, level in d.band_verdict.levels.items()},
                   "ruling": d.band_verdict.ruling} if d.band_verdict else None,
@@ -452,18 +499,26 @@ def collect_data(d: Diagnosis) -> dict[str, Any]:
             **{name: None if found is None else found.minimum._asdict()
                for name, found in (("step", g.step), ("ramp", g.ramp), ("joint", g.joint))},
             "merged": g.merged._asdict(), "simulations": g.simulations},
-        "refined": {"kintas": d.sizes[CLOGGING.name]._asdict(), "fss": d.sizes[FRICTION.name]._asdict(),
+        "refined": {**{f.key: d.sizes[f.name]._asdict() for f in d.faults},
                     "correlation": r.correlation, "method": r.method, "simulations": r.simulations,
                     "reached": r.is_explained},
         "signals": {s: {"error": r.errors[s], "floor": r.floor[s], "ratio": r.ratio[s]} for s in r.errors},
         "others": {name: {**e._asdict(), "unhealthy": name in d.others} for name, e in r.others.items()},
         "notes": list(d.notes),
-        **({"with_effects": _collect_beside(d.beside)} if d.beside is not None else {}),
+        **({"with_effects": _collect_beside(d)} if d.beside is not None else {}),
     }
 
 
-def _collect_beside(b: Beside) -> dict[str, Any]:
+def _collect_faults(faults: Sequence[Fault]) -> dict[str, dict[str, Any]]:
+    keys = ("title", "symbol", "key", "parameter", "unit", "healthy", "acceptable", "maintenance")
+    return {fault.name: {key: getattr(fault, key) for key in keys} for fault in faults}
+
+
+def _collect_beside(d: Diagnosis) -> dict[str, Any]:
     """What was searched and found beside the faults; SI units."""
+    b = d.beside
+    if b is None:
+        return {}
     return {
         "effects": list(b.effects), "explained": b.is_explained, "ambiguous": b.is_ambiguous,
         "disputed": list(b.disputed),
@@ -472,7 +527,7 @@ def _collect_beside(b: Beside) -> dict[str, Any]:
             {"effects": list(e.effects), "probability": e.weight,
              "parameters": {name: {**v._asdict(), "unit": find_quantity(name).unit}
                             for name, v in e.parameters.items()},
-             **{f.symbol: e.sizes[f.name]._asdict() for f in FAULTS},
+             **{f.key: e.sizes[f.name]._asdict() for f in d.faults},
              "level": {name: level.word if level is not None and e.refinement.is_explained else None
                        for name, level in e.levels.items()},
              "ratio": dict(e.refinement.ratio)} for e in b.explanations],
@@ -482,7 +537,6 @@ def _collect_beside(b: Beside) -> dict[str, Any]:
 SHADES = {"middle": ORANGE, "most": RED}
 MAP_CONTOURS = 7
 UM, MM, MS = 1e6, 1e3, 1e3
-ENDS = {CLOGGING.name: 0.5, FRICTION.name: 100.0}  # of the axes, at least
 
 
 def draw_overview(trace: Trace, judged: BandVerdict) -> str:
@@ -568,29 +622,43 @@ def _shade_events(events: Sequence[Event], limits: tuple[float, float], signal: 
                   alpha=0.18, lw=0, zorder=-1) for shown, colour in SHADES.items()]
 
 
-def draw_sizes(sizes: Mapping[str, Estimate], grid: Grid | None, judged: BandVerdict | None) -> str:
-    """Both faults' sizes: refined with its interval, grid, and what the ramps show, over the three levels."""
+def draw_sizes(faults: Sequence[Fault], sizes: Mapping[str, Estimate], grid: Grid | None,
+               judged: BandVerdict | None) -> str:
+    """The faults' sizes: refined with its interval, grid, and what the ramps show, over the three levels."""
     points = () if grid is None else (
         ("grid, merged", grid.merged), ("grid, steps", grid.step and grid.step.minimum),
         ("grid, ramps", grid.ramp and grid.ramp.minimum))
     panels = []
-    for fault in FAULTS:
-        found = [(label, float(getattr(point, fault.symbol))) for label, point in points if point]
+    for fault in faults:
+        found = [(label, float(getattr(point, fault.key))) for label, point in points if point and fault in FAULTS]
         if judged is not None and fault == FRICTION:
             found.append(("bands, ramps", judged.friction))
         panels.append(_draw_sizes_of_fault(fault, sizes[fault.name], found))
-    return draw_panels("estimates", [panels], 1.9)
+    panels += [[]] * (-len(panels) % 2)
+    return draw_panels("estimates", [panels[i:i + 2] for i in range(0, len(panels), 2)], 1.9 * ((len(panels) + 1) // 2))
 
 
 def _draw_sizes_of_fault(fault: Fault, fit: Estimate, found: Sequence[tuple[str, float]]) -> Panel:
-    end = max(ENDS[fault.name], 1.05 * fit.high, *(1.05 * size for _, size in found))
+    _, middle, most = fault.limits
+    reach = [fit.low, fit.high, *(size for _, size in found)]
+    end = max(most / 0.7, *(1.05 * fault.measure_departure(size) for size in reach))
     interval = [[max(fit.value - fit.low, 0.0)], [max(fit.high - fit.value, 0.0)]]
-    return [*(shade(low, high, colour, 0.13) for low, high, colour in (
-                (0.0, fault.middle, GREEN), (fault.middle, fault.most, ORANGE), (fault.most, end, RED))),
-            call("errorbar", fit.value, 0, xerr=interval, color=INK, capsize=3, marker="o", ms=6),
+    ways = (-1.0, 1.0) if fault.both_ways else (1.0,)
+    zones = ((0.0 if fault.healthy >= 0.0 and not fault.falls else fault.limits[0], middle, GREEN),
+             (middle, most, ORANGE), (most, end, RED))
+    shades = []
+    for (low, high, colour), way in product(zones, ways):
+        left, right = sorted(_place_size(fault, x, way) for x in (low, high))
+        shades.append(shade(left, right, colour, 0.13))
+    limits = sorted(_place_size(fault, x, way) for x in (zones[0][0], end) for way in ways)
+    return [*shades, call("errorbar", fit.value, 0, xerr=interval, color=INK, capsize=3, marker="o", ms=6),
             *(dot(size, row, INK, marker="D", ms=4) for row, (_, size) in enumerate(found, 1)),
             *name_rows(["refined", *(label for label, _ in found)]),
-            axes(xlim=(0.0, end), xlabel="Kintas" if fault == CLOGGING else "FSS [N]")]
+            axes(xlim=(limits[0], limits[-1]), xlabel=fault.symbol + (f" [{fault.unit}]" if fault.unit != "1" else ""))]
+
+
+def _place_size(fault: Fault, departure: float, way: float) -> float:
+    return 2.0 * fault.healthy - fault.place_size(departure) if way < 0.0 else fault.place_size(departure)
 
 
 def draw_precursor_shifts(found: Mapping[str, Precursor]) -> str:
@@ -601,9 +669,9 @@ def draw_precursor_shifts(found: Mapping[str, Precursor]) -> str:
     rows = np.arange(len(known))
     return draw_panels("telling", [[[
         call("barh", rows - 0.2, [abs(p.clogging_ratio) for p in known], height=0.38, color=BLUE,
-             label=f"Kintas {CLOGGING.middle:g}"),
+             label=f"Kintas {CLOGGING.acceptable:g}"),
         call("barh", rows + 0.2, [abs(p.friction_ratio) for p in known], height=0.38, color=ORANGE,
-             label=f"FSS {FRICTION.middle:g} N"),
+             label=f"FSS {FRICTION.acceptable:g} N"),
         instant(3.0, INK, width=0.8, style=":"), *name_rows([p.words for p in known]), call("set_xscale", "log"),
         call("set_xlim", left=0.1), legend(2),
         axes(xlabel="shift / healthy standard deviation [1] (dotted: 3, below it one test does not show the fault)")]]],

@@ -2,12 +2,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from fdi.diagnosis.faults import FAULTS, Estimate, Level, judge_size
+from fdi.diagnosis.faults import Estimate, Level, judge_size
 from fdi.prognosis.trend import Break, Remaining, Trend
 from fdi.prognosis.unit_trend import LIMIT_NAMES, Point, UnitTrend, format_day
 from fdi.report.drawing import (
@@ -38,11 +39,12 @@ MOODS: dict[Level, Mood] = {Level.ACCEPTABLE: "good", Level.MAINTENANCE: "doubtf
 
 def build_trend_report(unit: UnitTrend) -> Report:
     """Report on the trends of a unit; its `data` is the answer of `rig trend --json`."""
-    points = unit.gathered.points
+    g = unit.gathered
+    points = g.points
     ends = dict.fromkeys(_format_place(point.t, unit) for point in (points[0], points[-1]))
     worst = max(unit.trends, key=lambda trend: trend.level)
-    sizes = ((Column("FSS" if fault.unit == "N" else "Kintas"),
-              lambda point, fault=fault: _format_size(point.sizes[fault.name], fault.unit)) for fault in FAULTS)
+    sizes = ((Column(fault.symbol),
+              lambda point, fault=fault: _format_size(point.sizes[fault.name], fault.unit)) for fault in g.faults)
     sections = [
         *(_build_fault_section(trend, unit) for trend in unit.trends),
         Section("Sizes over time", [Figure(
@@ -62,15 +64,16 @@ def build_trend_report(unit: UnitTrend) -> Report:
 def explain_level(trend: Trend) -> str:
     """Why a fault has its level: its size now, beside the limits that decide."""
     fault, level = trend.fault, trend.level
-    healthy, middle, most = (attach_unit(f"{x:g}", fault.unit) for x in (fault.healthy, fault.middle, fault.most))
-    name = fault.name.replace("_", " ").capitalize()
+    healthy, middle, most = (attach_unit(f"{x:g}", fault.unit)
+                             for x in (fault.healthy, fault.acceptable, fault.maintenance))
+    name = fault.title.capitalize()
     words = f"{name} is {level.word.replace('_', '-')}: {_format_size(trend.now, fault.unit)} now"
     reasons = (
         (judge_size(fault, trend.now) is None,
          f"; the interval holds both a healthy unit ({healthy}) and MidBand ({middle}), so the value alone decides"),
         (level == Level.ACCEPTABLE, f", below MidBand ({middle})"),
         (level == Level.NON_NOMINAL, f", above MidBand ({middle}) and up to MaxBand ({most}) or more"),
-        (trend.now.value >= fault.middle, f", above MidBand ({middle}), not surely at MaxBand ({most})"),
+        (trend.now.value >= fault.acceptable, f", above MidBand ({middle}), not surely at MaxBand ({most})"),
         (True, f"; its interval comes too near MidBand ({middle}) to be acceptable"))
     return words + next(reason for holds, reason in reasons if holds)
 
@@ -100,7 +103,7 @@ def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
             caption="Probability: that the limit is reached within a time as long as the traces cover.",
             medium=Medium.PAGE),
         *([Listing(chart, medium=Medium.TERMINAL)] if chart else [])]
-    return Section(fault.name.replace("_", " "), items,
+    return Section(fault.title, items,
                    badge=Cell(trend.verdict.replace("_", " "), MOODS[trend.level]), title_medium=Medium.BOTH)
 
 
@@ -127,8 +130,7 @@ def _describe_trend(trend: Trend, unit: UnitTrend) -> list[str]:
 
 
 def _describe_growth(trend: Trend, unit: UnitTrend) -> str:
-    symbol = "Kintas" if trend.fault.symbol == "kintas" else trend.fault.symbol.upper()
-    state = f"{symbol} {_format_size(trend.now, trend.fault.unit)} now"
+    state = f"{trend.fault.symbol} {_format_size(trend.now, trend.fault.unit)} now"
     if trend.verdict == "TOO_FEW":
         return f"{state}; no trend: {_explain_too_few(int(trend.used.sum()))}"
     if trend.verdict == "NO_TREND" or trend.rate is None:
@@ -194,9 +196,10 @@ def _collect_data(unit: UnitTrend) -> dict[str, Any]:
     """
     g = unit.gathered
     return {"level": {trend.fault.name: trend.level.word for trend in unit.trends}, "axis": g.axis, "unit": unit.unit,
+            "faults": [asdict(fault) for fault in g.faults],
             "source": g.source, "last": _collect_place(g.points[-1].t, unit), "notes": g.notes,
             "points": [{"trace": p.trace, g.axis: _collect_place(p.t, unit), "t": p.t, "note": p.note,
-                        **{f.symbol: p.sizes[f.name]._asdict() for f in FAULTS}} for p in g.points],
+                        **{f.key: p.sizes[f.name]._asdict() for f in g.faults}} for p in g.points],
             "trends": {trend.fault.name: _collect_trend(trend, unit) for trend in unit.trends}}
 
 
@@ -207,7 +210,7 @@ def _collect_trend(trend: Trend, unit: UnitTrend) -> dict[str, Any]:
         **{f"{name}_at": _collect_place(end + t, unit) if math.isfinite(t) else None
            for name, t in (("value", left.value), ("low", left.low), ("high", left.high))},
         "ever": left.compute_probability_within(1e300)} for level, left in trend.remaining.items()}
-    return {"verdict": trend.verdict, "size": trend.fault.symbol, "unit": trend.fault.unit,
+    return {"verdict": trend.verdict, "size": trend.fault.key, "unit": trend.fault.unit,
             "now": trend.now._asdict(), "rate": None if trend.rate is None else trend.rate._asdict(),
             "laws": {law: round(p, 4) for law, p in trend.laws.items()},
             "breaks": [{"kind": b.kind, "trace": points[b.row].trace, "t": points[b.row].t, "size": b.size}
@@ -236,7 +239,7 @@ def _draw_chart(trend: Trend, unit: UnitTrend, future_share: float = 0.35) -> st
     until = end + future_share / (1.0 - future_share) * (end - start)
     if trend.future is not None:
         until = min(max(until, float(trend.future.t[-1])), end + 1.5 * (end - start))
-    top = 1.15 * max(trend.fault.most, *(size.value for size in trend.sizes))
+    top = 1.15 * max(trend.fault.maintenance, *(size.value for size in trend.sizes))
 
     def find_column(t: Any) -> Any:
         return np.rint((np.asarray(t) - start) / (until - start) * (WIDTH - 1)).astype(int)
@@ -245,7 +248,7 @@ def _draw_chart(trend: Trend, unit: UnitTrend, future_share: float = 0.35) -> st
         return HEIGHT - 1 - min(max(round(size / top * (HEIGHT - 1)), 0), HEIGHT - 1)
 
     cells = np.full((HEIGHT, WIDTH), " ")
-    names = {find_row(trend.fault.middle): "MidBand", find_row(trend.fault.most): "MaxBand"}
+    names = {find_row(trend.fault.acceptable): "MidBand", find_row(trend.fault.maintenance): "MaxBand"}
     cells[list(names)] = "-"
     for curve, shaded_from in ((trend.past, WIDTH), (trend.future, find_column(end) + 1)):
         if curve is None:
@@ -267,21 +270,21 @@ def _draw_chart(trend: Trend, unit: UnitTrend, future_share: float = 0.35) -> st
     return "\n".join([*lines, f"{'':7}{first.ljust(at)}{last}".ljust(7 + WIDTH - len(final)) + final])
 
 
-LABELS = {"kintas": "filter clogging, Kintas", "fss": "spool friction, FSS"}
-
-
 def draw_trends(unit: UnitTrend) -> Drawing:
-    """Both faults, one above the other."""
-    above, below = (_draw_fault(trend, unit) for trend in unit.trends)
+    """The faults, one above the other."""
     xlabel = "" if unit.gathered.axis == "date" else f"{unit.gathered.axis} [{unit.unit}]"
-    return draw_panels("trend", [[[*above, legend(5)]], [[*below, axes(xlabel=xlabel)]]], 7.2, sharex=True)
+    panels = [[*_draw_fault(trend, unit)] for trend in unit.trends]
+    panels[0].append(legend(5))
+    panels[-1].append(axes(xlabel=xlabel))
+    return draw_panels("trend", [[panel] for panel in panels], 3.6 * len(panels), sharex=True)
 
 
 def _draw_fault(trend: Trend, unit: UnitTrend) -> Panel:
     t = _convert_times(trend.t, unit)
     value, low, high = np.array(trend.sizes).T
-    panel = [axes(ylim=(min(0.0, float(low.min())), 1.25 * max(trend.fault.most, float(value.max()))),
-                  ylabel=LABELS[trend.fault.symbol] + ("" if trend.fault.unit == "1" else f" [{trend.fault.unit}]"))]
+    unit_shown = "" if trend.fault.unit == "1" else f" [{trend.fault.unit}]"
+    panel = [axes(ylim=(min(0.0, float(low.min())), 1.25 * max(trend.fault.maintenance, float(value.max()))),
+                  ylabel=f"{trend.fault.title}, {trend.fault.symbol}{unit_shown}")]
     if trend.past is not None and trend.future is not None:
         for curve, colour, name, style in ((trend.past, BLUE, "fitted course", "-"),
                                            (trend.future, ORANGE, "forecast, 95 %", "--")):
@@ -292,7 +295,8 @@ def _draw_fault(trend: Trend, unit: UnitTrend) -> Panel:
                    color=colour, label=name)
               for used, colour, name in ((trend.used, INK, "traces"), (~trend.used, COMMAND, "traces left out"))
               if used.any()]
-    for name, limit, colour in (("maintenance", trend.fault.middle, AMBER), ("non_nominal", trend.fault.most, RED)):
+    for name, limit, colour in (("maintenance", trend.fault.acceptable, AMBER),
+                                ("non_nominal", trend.fault.maintenance, RED)):
         panel += [level(limit, colour, style=":"),
                   call("text", t[0], limit, f"{LIMIT_NAMES[name]} ", color=colour, va="bottom", fontsize=8),
                   *_mark_arrival(trend, name, limit, colour, unit)]

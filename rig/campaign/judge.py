@@ -24,14 +24,15 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
-from fdi.diagnosis.faults import FAULTS, Level
+from fdi.diagnosis.faults import FAULTS, Fault, Level
 from fdi.prognosis.unit_trend import list_traces
 from fdi.sources import hash_sources, import_function
 from fdi.trace.trace import Floats, Trace
 from plant import simulate
 from plant.errors import InputError, RigError
-from plant.model import Model, find_effect, parse_model
+from plant.model import Model, find_effect, find_quantity, parse_model
 from plant.parameters import load_nominal_values, parse_toml, parse_value, read_toml
+from plant.quantity import Quantity
 from plant.segments import RATE
 from plant.solve import NOISES
 from plant.threads import count_threads
@@ -100,7 +101,8 @@ def read_matrix(source: str) -> dict[str, Any]:
     return read_toml(Path(source))
 
 
-def build_matrix(tables: Mapping[str, Any], model: Model, work: str, where: object) -> Matrix:
+def build_matrix(tables: Mapping[str, Any], model: Model, work: str, where: object,
+                 faults: Sequence[Fault] = FAULTS) -> Matrix:
     """The campaign that the tables of a matrix file describe.
 
     Raises:
@@ -116,12 +118,13 @@ def build_matrix(tables: Mapping[str, Any], model: Model, work: str, where: obje
     blocks = tables.get("case", [])
     if not isinstance(blocks, list) or not blocks or not all(isinstance(block, Mapping) for block in blocks):
         raise InputError(where, "case", "at least one [[case]] (an empty one is a healthy plant)")
-    parsed = [_parse_block(block, given, model, place) for block in blocks]
-    spec = {**settings.list_values(), "model": model.to_toml(), "work": work, "case": parsed}
+    parsed = [_parse_block(block, given, model, place, faults) for block in blocks]
+    spec = {**settings.list_values(), "model": model.to_toml(), "work": work, **list_own_faults(faults), "case": parsed}
     return Matrix(spec, _expand_cases(spec))
 
 
-def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Model, place: Place) -> dict[str, Any]:
+def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Model, place: Place,
+                 faults: Sequence[Fault]) -> dict[str, Any]:
     """A [[case]] table with its defaults filled in. Raises InputError."""
     own = {key: value for key, value in block.items() if key in ("seeds", "tolerance")}
     settings = build_dataclass(Settings, {**common, **own}, place).list_values()
@@ -129,14 +132,33 @@ def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Mod
     for name, values in block.items():
         if name not in own:
             with place.at(name).locate():
-                effect = find_effect(name, model.plant)
-                if not effect.fitted:
-                    raise InputError("", name, "an effect with a size; this one is noise of the bench")
-                sizes[name] = [parse_value("", name, effect.parameters[effect.fitted[0]], value)
+                quantity = _find_size(name, model, faults)
+                sizes[name] = [parse_value("", name, quantity, value)
                                for value in (values if isinstance(values, list) else [values])]
                 if not sizes[name]:
                     raise InputError("", name, "at least one size")
     return {"seeds": settings["seeds"], "sizes": sizes, "tolerance": settings["tolerance"]}
+
+
+def _find_size(name: str, model: Model, faults: Sequence[Fault]) -> Quantity:
+    """What the size of a fault, or of an effect by its first parameter, is. Raises InputError."""
+    own = next((fault for fault in faults if fault.name == name), None)
+    if own is not None:
+        return find_quantity(own.parameter, plant=model.plant)
+    effect = find_effect(name, model.plant)
+    if not effect.fitted:
+        raise InputError("", name, "an effect with a size; this one is noise of the bench")
+    return effect.parameters[effect.fitted[0]]
+
+
+def list_own_faults(faults: Sequence[Fault]) -> dict[str, Any]:
+    """The faults as JSON values of a campaign; nothing for the paper's, which all folders without them have."""
+    return {} if tuple(faults) == FAULTS else {"faults": [asdict(fault) for fault in faults]}
+
+
+def restore_faults(spec: Mapping[str, Any]) -> tuple[Fault, ...]:
+    """The faults of a campaign."""
+    return tuple(Fault(**{**table, "range": tuple(table["range"])}) for table in spec.get("faults", ())) or FAULTS
 
 
 def _expand_cases(spec: Mapping[str, Any]) -> tuple[Case, ...]:
@@ -163,7 +185,7 @@ def label_plant(sizes: Mapping[str, float]) -> str:
     return " ".join(f"{name}={size:.9g}" for name, size in sizes.items()) or HEALTHY
 
 
-def build_trace_matrix(folder: str | Path, model: Model, work: str) -> Matrix:
+def build_trace_matrix(folder: str | Path, model: Model, work: str, faults: Sequence[Fault] = FAULTS) -> Matrix:
     """The recorded runs below a folder as cases: the trace.mcap of each run, and every CSV file.
 
     Raises:
@@ -172,7 +194,8 @@ def build_trace_matrix(folder: str | Path, model: Model, work: str) -> Matrix:
     root = Path(folder).absolute()
     names = {path.relative_to(root).as_posix(): path for path in list_traces(root)}
     digests = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in names.items()}
-    spec = {"traces": str(root), "files": digests, "model": model.to_toml(), "work": work}
+    spec = {"traces": str(root), "files": digests, "model": model.to_toml(), "work": work,
+            **list_own_faults(faults)}
     return restore_matrix(spec)
 
 
@@ -222,9 +245,10 @@ class Unit(NamedTuple):
 
     model: Model  # healthy, without scatter
     scatter: Mapping[str, float]  # parameter "group.field" to the factor on its value
-    sizes: Mapping[str, float]  # effect to the value of its first parameter, SI
+    sizes: Mapping[str, float]  # fault, or effect by its first parameter, to its size, SI
     command: Floats  # (n,) m
     noise: Floats  # (n, NOISES), in units of the sensors' noise
+    faults: tuple[Fault, ...] = FAULTS
 
 
 Simulator = Callable[[Unit], Mapping[str, Floats]]
@@ -239,7 +263,8 @@ def simulate_case(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
     """
     command = np.round(load_sequence("preflight").main_profile().command, 12)
     scatter, noise = sample_random_parts(case, len(command), spec["colour"], spec["hum"])
-    columns = load_simulator(spec["simulator"])(Unit(model, scatter, case.sizes, command, noise))
+    columns = load_simulator(spec["simulator"])(
+        Unit(model, scatter, case.sizes, command, noise, restore_faults(spec)))
     measured = {"com", "cor", "load", *spec["signals"].split(",")}
     return Trace.from_columns({name: columns[name] for name in columns if name in measured}, model["controller.period"],
                               {"source": case.label, "seed": str(case.seed)})
@@ -257,7 +282,7 @@ def load_simulator(name: str) -> Simulator:
 def simulate_unit(unit: Unit) -> dict[str, Floats]:
     """The columns of a unit by `plant.simulate`."""
     model = unit.model.replace({name: factor * unit.model[name] for name, factor in unit.scatter.items()})
-    return simulate(add_faults(model, unit.sizes), unit.command, drawn=unit.noise)._asdict()
+    return simulate(add_faults(model, unit.sizes, unit.faults), unit.command, drawn=unit.noise)._asdict()
 
 
 def sample_random_parts(case: Case, cycles: int, colour: float, hum: float) -> tuple[dict[str, float], Floats]:
@@ -297,13 +322,17 @@ def sample_position_noise(n: int, colour: float, hum: float, rng: np.random.Gene
     return noise
 
 
-def add_faults(model: Model, sizes: Mapping[str, float]) -> Model:
-    """The model with effects of these sizes: values of each effect's first parameter.
+def add_faults(model: Model, sizes: Mapping[str, float], faults: Sequence[Fault] = ()) -> Model:
+    """The model with faults of the list, or effects, of these sizes: values of each effect's first parameter.
 
     The effect's further parameters follow: of a parameter of the base model in proportion to the first one (dynamic
     friction to static friction), of an added effect as in the start whose first parameter is nearest to the size.
     """
+    known = {fault.name: fault for fault in faults if tuple(faults) != FAULTS}
     for name, size in sizes.items():
+        if name in known:
+            model = model.replace(known[name].list_changes(size), name)
+            continue
         effect = find_effect(name, model.plant)
         first, *others = effect.fitted
         if effect.base:
@@ -333,7 +362,7 @@ def judge_case(case: Case, spec: Mapping[str, Any], expected_sources: str) -> Ro
     try:
         trace = Trace.read(case.trace) if case.trace else simulate_case(case, spec, model)
         start = clock.now()
-        row |= {"status": OK, **_load_judgement(spec)(trace, model), "seconds": (clock.now() - start) * 1e-9}
+        row |= {"status": OK, **_judge_trace(spec, trace, model), "seconds": (clock.now() - start) * 1e-9}
     except RigError as error:
         row |= {"status": REFUSED, "reason": " ".join(str(error).split())}
     except Exception as error:
@@ -347,9 +376,14 @@ def describe_case(case: Case, spec: Mapping[str, Any]) -> Row:
            "seed": case.seed, "status": FAILED, "reason": ""}
     if case.trace:
         return row
-    model = _parse_healthy_model(spec)
-    return row | {"true_kintas": case.sizes.get("filter_clogging", model["filter.clogging"]),
-                  "true_fss": case.sizes.get("spool_friction", model["spool.static_friction"])}
+    values = _parse_healthy_model(spec).values
+    return row | {f"true_{fault.key}": case.sizes.get(fault.name, values.get(fault.parameter, fault.healthy))
+                  for fault in restore_faults(spec)}
+
+
+def _judge_trace(spec: Mapping[str, Any], trace: Trace, model: Model) -> Row:
+    judge = _load_judgement(spec)
+    return judge_by_fdi(trace, model, restore_faults(spec)) if judge is judge_by_fdi else judge(trace, model)
 
 
 def _load_judgement(spec: Mapping[str, Any]) -> Judgement:
@@ -370,7 +404,7 @@ WORKS: Mapping[str, str] = {"fdi": "rig.campaign.judge:judge_by_fdi"}
 CANNOT_TELL = "cannot_tell"
 
 
-def judge_by_fdi(trace: Trace, model: Model) -> dict[str, Any]:
+def judge_by_fdi(trace: Trace, model: Model, faults: Sequence[Fault] = FAULTS) -> dict[str, Any]:
     """The diagnosis of `rig fdi`: levels, ruling fault, sizes with intervals, events, precursors, other effects.
 
     Raises:
@@ -378,18 +412,20 @@ def judge_by_fdi(trace: Trace, model: Model) -> dict[str, Any]:
     """
     from fdi.diagnosis.diagnosis import diagnose
 
-    found = diagnose(trace, model, workers=count_threads())
+    found = diagnose(trace, model, workers=count_threads(), faults=faults)
     row: dict[str, Any] = {"verdict": found.verdict, "ruling": found.ruling or ""}
-    for fault in FAULTS:
+    for fault in faults:
         size = found.sizes[fault.name]
         row[f"level_{fault.name}"] = _format_level(found.levels[fault.name])
-        row |= {fault.symbol: size.value, f"{fault.symbol}_low": size.low, f"{fault.symbol}_high": size.high}
+        row |= {fault.key: size.value, f"{fault.key}_low": size.low, f"{fault.key}_high": size.high}
     if found.band_verdict is not None:
         levels, by = found.band_verdict.levels, found.band_verdict.severity
-        row |= {f"band_{fault.name}": _format_level(levels.get(fault.name)) for fault in FAULTS}
-        row |= {f"severity_{fault.name}": by[fault.name] for fault in FAULTS if fault.name in by}
+        row |= {f"band_{fault.name}": _format_level(levels.get(fault.name)) for fault in faults}
+        row |= {f"severity_{fault.name}": by[fault.name] for fault in faults if fault.name in by}
     if found.grid is not None:
         row |= {"grid_kintas": found.grid.merged.kintas, "grid_fss": found.grid.merged.fss}
+    if found.groups:
+        row["groups"] = [list(group.names) for group in found.groups]
     return row | {
         "events": [event._asdict() for event in found.events], "event_count": len(found.events),
         "correlation": found.refinement.correlation, "left_over": max(found.refinement.ratio.values()),

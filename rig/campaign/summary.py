@@ -4,6 +4,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -26,14 +27,13 @@ from fdi.report.report import (
     Table,
 )
 from rig.campaign.batch import BatchProgress, Row
-from rig.campaign.judge import CANNOT_TELL, FAILED, HEALTHY, OK, REFUSED, label_plant
+from rig.campaign.judge import CANNOT_TELL, FAILED, HEALTHY, OK, REFUSED, label_plant, restore_faults
 
 Figures = dict[str, Any]  # JSON values
 # The paper's second worked case, which no cell of a 21 x 21 grid hits.
 OFF_GRID = label_plant({"filter_clogging": 0.17, "spool_friction": 45.0})
 CLOSE = {CLOGGING.name: 0.05, FRICTION.name: 0.02}  # largest relative error of an estimate of the off-grid case
 LEVELS = [level.word for level in Level]
-FAULT_NAMES = {fault.name: fault for fault in FAULTS}
 
 
 def judge_rate(name: str, share: Share, least: float = 0.0, most: float = 1.0) -> Figures:
@@ -56,72 +56,72 @@ def format_share(share: Share) -> Figures:
     return {**share._asdict(), "share": share.value if share.of else None}
 
 
-def summarise_campaign(rows: Sequence[Row]) -> Figures:
+def summarise_campaign(rows: Sequence[Row], faults: Sequence[Fault] = FAULTS) -> Figures:
     """All figures as JSON values: simulated plants by tolerance, recorded traces one by one.
 
     A refused or failed case detects nothing. It counts among the cases, but never as a false alarm. Rows of a judgement
     without fault levels enter the status counts and times alone.
     """
-    levelled = [row for row in rows if row["status"] != OK or f"level_{CLOGGING.name}" in row]
-    simulated = [row for row in levelled if "true_fss" in row]
+    levelled = [row for row in rows if row["status"] != OK or f"level_{faults[0].name}" in row]
+    truth = f"true_{faults[0].key}"
+    simulated = [row for row in levelled if truth in row]
     tolerances = sorted({row["tolerance"] for row in simulated})
-    shown = ("label", "status", "ruling", *(f"level_{fault.name}" for fault in FAULTS), "kintas", "fss", "trust")
+    shown = ("label", "status", "ruling", *(f"level_{fault.name}" for fault in faults),
+             *(fault.key for fault in faults), "trust")
     return {"cases": len(rows), "status": dict(Counter(row["status"] for row in rows)),
             "seconds": summarise_times(rows),
-            "tolerances": [_summarise_tolerance(tolerance, [row for row in simulated if row["tolerance"] == tolerance])
-                           for tolerance in tolerances],
-            "traces": [{name: row.get(name) for name in shown} for row in levelled if "true_fss" not in row],
+            "faults": [asdict(fault) for fault in faults],
+            "tolerances": [_summarise_tolerance(tolerance, [row for row in simulated if row["tolerance"] == tolerance],
+                                                faults) for tolerance in tolerances],
+            "traces": [{name: row.get(name) for name in shown} for row in levelled if truth not in row],
             "reasons": [{"case": row["label"], "seed": row["seed"], "status": row["status"], "reason": row["reason"]}
                         for row in rows if row["status"] != OK]}
 
 
-def _summarise_tolerance(tolerance: float, rows: Sequence[Row]) -> Figures:
+def _summarise_tolerance(tolerance: float, rows: Sequence[Row], faults: Sequence[Fault]) -> Figures:
     """The figures of the simulated plants of one tolerance."""
-    false_alarms = [row for row in rows if row["label"] == HEALTHY and is_alarm(row)]
-    shown = ("seed", "verdict", *(f"level_{fault.name}" for fault in FAULTS))
-    return {"tolerance": tolerance, "cases": len(rows), "rates": count_rates(rows),
-            "curves": {fault.name: count_detections(rows, fault) for fault in FAULTS},
-            "levels": {fault.name: count_levels(rows, fault) for fault in FAULTS},
-            "ruling": count_ruling_faults(rows), "errors": measure_errors(rows),
+    false_alarms = [row for row in rows if row["label"] == HEALTHY and is_alarm(row, faults)]
+    shown = ("seed", "verdict", *(f"level_{fault.name}" for fault in faults))
+    return {"tolerance": tolerance, "cases": len(rows), "rates": count_rates(rows, faults),
+            "curves": {fault.name: count_detections(rows, fault) for fault in faults},
+            "levels": {fault.name: count_levels(rows, fault, faults) for fault in faults},
+            "ruling": count_ruling_faults(rows, faults), "errors": measure_errors(rows, faults),
             "false_alarms": [{key: row.get(key) for key in shown} for row in false_alarms]}
 
 
-def count_rates(rows: Sequence[Row]) -> list[Figures]:
+def count_rates(rows: Sequence[Row], faults: Sequence[Fault] = FAULTS) -> list[Figures]:
     """The rates of one tolerance, required ones and those for information, with counts."""
     healthy = [row for row in rows if row["label"] == HEALTHY and row["status"] == OK]
-    rates = [judge_rate("healthy: false alarm", count_share(healthy, is_alarm), most=0.005),
+    rates = [judge_rate("healthy: false alarm", count_share(healthy, partial(is_alarm, faults=faults)), most=0.005),
              judge_rate("  event outside a band", count_share(healthy, lambda row: bool(row.get("event_count")))),
              judge_rate("  judged acceptable", count_share(healthy, lambda row: row.get("verdict") == "ACCEPTABLE"))]
-    for fault in FAULTS:
-        for band, least, size in (("MidBand", 0.95, fault.middle), ("MaxBand", 0.995, fault.most)):
+    for fault in faults:
+        for band, least, size in (("MidBand", 0.95, fault.acceptable), ("MaxBand", 0.995, fault.maintenance)):
             group = [row for row in select_single_fault(rows, fault) if true_size(row, fault) == size]
-            rates.append(judge_rate(f"{name_size(fault)} at {band} detected",
+            rates.append(judge_rate(f"{fault.symbol} at {band} detected",
                                     count_share(group, partial(is_detected, fault=fault)), least))
-    beyond = [row.get("ruling") == fault.name for fault in FAULTS for row in select_single_fault(rows, fault)
-              if true_size(row, fault) >= fault.middle]
+    beyond = [row.get("ruling") == fault.name for fault in faults for row in select_single_fault(rows, fault)
+              if classify_size(fault, true_size(row, fault)) > Level.ACCEPTABLE]
     rates.append(judge_rate("ruling fault, MidBand on", measure_share(sum(beyond), len(beyond)), 0.97))
     # The coverage over all plants that scatter, without those at a bound, where an interval starts at the truth.
-    errors = measure_errors([row for row in rows if row["tolerance"] > 0.0])
-    for fault in FAULTS:
-        covered = [error["covered"] for error in errors if error["fault"] == fault.name and error["truth"] > 0.0]
+    errors = measure_errors([row for row in rows if row["tolerance"] > 0.0], faults)
+    for fault in faults:
+        covered = [error["covered"] for error in errors
+                   if error["fault"] == fault.name and error["truth"] != fault.range[0]]
         share = measure_share(sum(each["good"] for each in covered), sum(each["of"] for each in covered))
-        rates.append(judge_rate(f"{name_size(fault)} covered, all", share))
-    return [*rates, *_count_off_grid_rates([row for row in rows if row["label"] == OFF_GRID])]
+        rates.append(judge_rate(f"{fault.symbol} covered, all", share))
+    worked = [row for row in rows if row["label"] == OFF_GRID] if tuple(faults) == FAULTS else []
+    return [*rates, *_count_off_grid_rates(worked)]
 
 
 def _count_off_grid_rates(rows: Sequence[Row]) -> Iterator[Figures]:
     """Without scatter the estimates have to be close; with scatter their intervals have to be right."""
-    for error in measure_errors(rows):
-        name, is_exact = name_size(FAULT_NAMES[error["fault"]]), rows[0]["tolerance"] == 0.0
+    for error in measure_errors(rows, FAULTS):
+        name, is_exact = error["symbol"], rows[0]["tolerance"] == 0.0
         close, covered = (measure_share(error[key]["good"], error[key]["of"]) for key in ("close", "covered"))
         yield judge_rate(f"off-grid {name} within {100 * CLOSE[error['fault']]:g} %", close,
                          least=0.95 if is_exact else 0.0)
         yield judge_rate(f"off-grid {name} covered", covered, *((0.0, 1.0) if is_exact else (0.93, 0.97)))
-
-
-def name_size(fault: Fault) -> str:
-    """The symbol of a fault's size as the paper writes it: Kintas, FSS."""
-    return {"kintas": "Kintas"}.get(fault.symbol, fault.symbol.upper())
 
 
 def count_share(rows: Iterable[Row], is_good: Callable[[Row], bool]) -> Share:
@@ -130,9 +130,10 @@ def count_share(rows: Iterable[Row], is_good: Callable[[Row], bool]) -> Share:
     return measure_share(sum(judged), len(judged))
 
 
-def is_alarm(row: Row) -> bool:
-    """Whether the judgement reports a fault beyond acceptable, or something other than the two faults."""
-    return any(is_detected(row, fault) for fault in FAULTS) or row.get("verdict") == "SOMETHING_ELSE"
+def is_alarm(row: Row, faults: Sequence[Fault] = FAULTS) -> bool:
+    """Whether the judgement reports a fault beyond acceptable, or something other than the faults."""
+    return (any(is_detected(row, fault) for fault in faults)
+            or row.get("verdict") in ("AMBIGUOUS", "SOMETHING_ELSE"))
 
 
 def is_detected(row: Row, fault: Fault, level: Level = Level.MAINTENANCE, judged_by: str = "level") -> bool:
@@ -150,7 +151,7 @@ def select_single_fault(rows: Iterable[Row], fault: Fault) -> list[Row]:
 
 def true_size(row: Row, fault: Fault) -> float:
     """The true size of a fault, SI."""
-    return float(row[f"true_{fault.symbol}"])
+    return float(row[f"true_{fault.key}"])
 
 
 def count_detections(rows: Sequence[Row], fault: Fault) -> list[Figures]:
@@ -172,12 +173,12 @@ def count_detections(rows: Sequence[Row], fault: Fault) -> list[Figures]:
                               counted.items()}} for size in sorted(groups)]
 
 
-def count_levels(rows: Iterable[Row], fault: Fault) -> dict[str, dict[str, int]]:
+def count_levels(rows: Iterable[Row], fault: Fault, faults: Sequence[Fault] = FAULTS) -> dict[str, dict[str, int]]:
     """True level to reported level to number of plants; plants with further faults do not count."""
     answers = [*LEVELS, CANNOT_TELL, REFUSED, FAILED]
     table = {level: dict.fromkeys(answers, 0) for level in LEVELS}
     for row in rows:
-        if not has_other_fault(row):
+        if not has_other_fault(row, faults):
             answer = row[f"level_{fault.name}"] if row["status"] == OK else row["status"]
             table[classify_size(fault, true_size(row, fault)).word][answer] += 1
     return table
@@ -188,36 +189,37 @@ def _list_faults(row: Row) -> list[str]:
     return [] if row["label"] == HEALTHY else [part.partition("=")[0] for part in row["label"].split()]
 
 
-def has_other_fault(row: Row) -> bool:
-    """Whether a plant has another fault than clogging and friction."""
-    return not FAULT_NAMES.keys() >= set(_list_faults(row))
+def has_other_fault(row: Row, faults: Sequence[Fault] = FAULTS) -> bool:
+    """Whether a plant has another fault than those that were looked for."""
+    return not {fault.name for fault in faults} >= set(_list_faults(row))
 
 
-def count_ruling_faults(rows: Iterable[Row]) -> dict[str, dict[str, int]]:
+def count_ruling_faults(rows: Iterable[Row], faults: Sequence[Fault] = FAULTS) -> dict[str, dict[str, int]]:
     """What a plant has (a fault and its true level, or several faults) to the reported ruling fault, counts."""
     table: dict[str, Counter[str]] = {}
     for row in rows:
         answer = row.get("ruling") or "none" if row["status"] == OK else row["status"]
-        table.setdefault(_describe_faults(row), Counter())[answer] += 1
+        table.setdefault(_describe_faults(row, faults), Counter())[answer] += 1
     return {name: dict(table[name]) for name in sorted(table)}
 
 
-def _describe_faults(row: Row) -> str:
+def _describe_faults(row: Row, faults: Sequence[Fault]) -> str:
     names = _list_faults(row)
-    if len(names) == 1 and names[0] in FAULT_NAMES:
-        fault = FAULT_NAMES[names[0]]
+    for fault in (fault for fault in faults if names == [fault.name]):
         return f"{names[0]}, {classify_size(fault, true_size(row, fault)).word}"
     return " and ".join(names) or HEALTHY
 
 
-def measure_errors(rows: Sequence[Row]) -> list[Figures]:
+def measure_errors(rows: Sequence[Row], faults: Sequence[Fault] = FAULTS) -> list[Figures]:
     """Errors of the estimates by label and fault: healthy plants, single faults, both faults, each by size."""
-    order = {row["label"]: (row["faults"], row["true_kintas"] == 0.0, row["true_kintas"], row["true_fss"], row["label"])
-             for row in rows}
+    first, *others = faults
+    order = {row["label"]: (row["faults"], true_size(row, first) == first.healthy,
+                            *(true_size(row, fault) for fault in (first, *others)), row["label"]) for row in rows}
     errors = []
     for label in sorted(order, key=lambda label: order[label]):
-        group = [row for row in rows if row["label"] == label and row["status"] == OK and not has_other_fault(row)]
-        for fault in FAULTS:
+        group = [row for row in rows
+                 if row["label"] == label and row["status"] == OK and not has_other_fault(row, faults)]
+        for fault in faults:
             estimated = [row for row in group if math.isfinite(_measure_width(row, fault))]
             if estimated:
                 errors.append(_measure_error(label, estimated, fault))
@@ -226,8 +228,8 @@ def measure_errors(rows: Sequence[Row]) -> list[Figures]:
 
 def _measure_width(row: Row, fault: Fault) -> float:
     """Width of the interval of an estimate; NaN without one."""
-    low = row.get(f"{fault.symbol}_low")
-    return math.nan if low is None else float(row[f"{fault.symbol}_high"] - low)
+    low = row.get(f"{fault.key}_low")
+    return math.nan if low is None else float(row[f"{fault.key}_high"] - low)
 
 
 def _measure_error(label: str, rows: Sequence[Row], fault: Fault) -> Figures:
@@ -237,12 +239,13 @@ def _measure_error(label: str, rows: Sequence[Row], fault: Fault) -> Figures:
     plant; covered: the 95 % interval contains the truth.
     """
     size = true_size(rows[0], fault)
-    error = np.array([row[fault.symbol] for row in rows]) - size
-    close = measure_share(int((abs(error) <= CLOSE[fault.name] * size).sum()), len(error))
-    covered = count_share(rows, lambda row: row[f"{fault.symbol}_low"] <= size <= row[f"{fault.symbol}_high"])
-    return {"label": label, "fault": fault.name, "truth": size, "cases": len(error), "bias": float(error.mean()),
+    error = np.array([row[fault.key] for row in rows]) - size
+    close = measure_share(int((abs(error) <= CLOSE.get(fault.name, 0.05) * abs(size)).sum()), len(error))
+    covered = count_share(rows, lambda row: row[f"{fault.key}_low"] <= size <= row[f"{fault.key}_high"])
+    return {"label": label, "fault": fault.name, "symbol": fault.symbol, "truth": size,
+            "cases": len(error), "bias": float(error.mean()),
             "rms": float(np.sqrt((error**2).mean())), "most": float(np.quantile(abs(error), 0.95)),
-            "close": format_share(close) if size > fault.healthy else None, "covered": format_share(covered)}
+            "close": format_share(close) if size != fault.healthy else None, "covered": format_share(covered)}
 
 
 def summarise_times(rows: Iterable[Row]) -> dict[str, float]:
@@ -261,27 +264,28 @@ def describe_progress(progress: BatchProgress) -> str:
 
 def build_campaign_report(figures: Mapping[str, Any], title: str = "campaign") -> Report:
     """Report on the figures of `rig.campaign.summary.summarise_campaign`, which are its `data`."""
+    faults = restore_faults(figures)
     status = ", ".join(f"{count} {word}" for word, count in figures["status"].items())
     took = figures["seconds"]
     time = [Line("time a case", f"{took['median']:.2f} s (median), {took['p95']:.2f} s (95th percentile), "
                                 f"{took['most']:.2f} s (longest)")] if took else []
     return Report(
         command="campaign", title=title, sentence=f"{figures['cases']} cases: {status or 'none finished'}.",
-        sections=[Section("Time", time), *(_build_tolerance_section(part) for part in figures["tolerances"]),
-                  Section("Traces", _tabulate_traces(figures["traces"])),
+        sections=[Section("Time", time), *(_build_tolerance_section(part, faults) for part in figures["tolerances"]),
+                  Section("Traces", _tabulate_traces(figures["traces"], faults)),
                   Section("Cases without a result", _list_reasons(figures["reasons"]))],
         data=figures)
 
 
-def _build_tolerance_section(part: Mapping[str, Any]) -> Section:
+def _build_tolerance_section(part: Mapping[str, Any], faults: Sequence[Fault]) -> Section:
     tables = [_tabulate_rates(part["rates"]),
-              *(_tabulate_detections(fault, part["curves"][fault.name]) for fault in FAULTS),
+              *(_tabulate_detections(fault, part["curves"][fault.name]) for fault in faults),
               *(_tabulate_counts(f"true {fault.name}", part["levels"][fault.name],
                                  f"Cases by true level of {fault.name} (row) and level reported (column).")
-                for fault in FAULTS),
+                for fault in faults),
               _tabulate_counts("true faults", part["ruling"], "Cases by true faults (row) and ruling fault reported "
                                                               "(column)."),
-              _tabulate_errors(part["errors"])]
+              _tabulate_errors(part["errors"], faults)]
     title = f"Plants with {100 * part['tolerance']:g} % scatter: {part['cases']} cases"
     return Section(title, [table for table in tables if table.rows], title_medium=Medium.BOTH)
 
@@ -347,28 +351,28 @@ def _tabulate_counts(title: str, counts: Mapping[str, Mapping[str, int]], captio
     return Table(_number_columns(title, *answers), rows, caption)
 
 
-def _tabulate_errors(errors: Sequence[Mapping[str, Any]]) -> Table:
+def _tabulate_errors(errors: Sequence[Mapping[str, Any]], faults: Sequence[Fault]) -> Table:
     rows = []
     for error in errors:
         plant = error["label"]
-        for other in FAULTS:
-            plant = plant.replace(f"{other.name}=", f"{name_size(other)} ")
-        rows.append([plant, name_size(FAULT_NAMES[error["fault"]]), str(error["cases"]),
+        for other in faults:
+            plant = plant.replace(f"{other.name}=", f"{other.symbol} ")
+        rows.append([plant, error["symbol"], str(error["cases"]),
                      *(f"{error[key]:.2g}" for key in ("bias", "rms", "most")), *show_share(error["covered"])[1:]])
     columns = _number_columns("plant", "estimate", "cases", "bias", "RMS", "p95", "covered", "95 % interval")
-    return Table(columns, rows, "Errors of the estimated sizes (FSS in N); covered: share of 95 % intervals that "
+    return Table(columns, rows, "Errors of the estimated sizes (SI units); covered: share of 95 % intervals that "
                                 "contain the true size.")
 
 
-def _tabulate_traces(traces: Sequence[Mapping[str, Any]]) -> list[Item]:
+def _tabulate_traces(traces: Sequence[Mapping[str, Any]], faults: Sequence[Fault]) -> list[Item]:
     if not traces:
         return []
-    columns = [Column("trace"), *(Column(fault.name) for fault in FAULTS), Column("ruling"),
-               *(Column(name_size(fault), align="right") for fault in FAULTS)]
+    columns = [Column("trace"), *(Column(fault.name) for fault in faults), Column("ruling"),
+               *(Column(fault.symbol, align="right") for fault in faults)]
     rows = []
     for trace in traces:
-        levels = [trace[f"level_{fault.name}"] or trace["status"] for fault in FAULTS]
-        sizes = [trace[fault.symbol] for fault in FAULTS]
+        levels = [trace[f"level_{fault.name}"] or trace["status"] for fault in faults]
+        sizes = [trace[fault.key] for fault in faults]
         rows.append([trace["label"], *levels, trace["ruling"] or NO_NUMBER,
                      *(format_digits(math.nan if size is None else size) for size in sizes)])
     return [Table(columns, rows, "Levels, ruling fault and fault sizes of each recorded trace.")]
@@ -387,18 +391,23 @@ LINES = (("detected", "maintenance or worse", BLUE), ("most", "non-nominal", RED
          ("bands", "maintenance or worse, by the bands alone", COMMAND))
 
 
-def draw_detection_curves(part: Mapping[str, Any]) -> str:
+def draw_detection_curves(part: Mapping[str, Any], faults: Sequence[Fault] = FAULTS) -> str:
     """Draw the share of plants that are detected, by size of a single fault, with 95 % intervals, as SVG.
 
     `part` is the element of `summarise_campaign(...)["tolerances"]` for one tolerance.
     """
-    panels = [_draw_fault(fault, part["curves"][fault.name]) for fault in FAULTS]
-    panels[0].append(axes(ylabel="share of plants [%]", ylim=(-3, 103)))
-    return draw_panels("detection", [panels], 3.6, 10.0, common_legend=True, sharey=True)
+    panels = [_draw_fault(fault, part["curves"][fault.name]) for fault in faults]
+    across = 2 if len(panels) > 1 else 1
+    panels += [[]] * (-len(panels) % across)
+    rows = [panels[i:i + across] for i in range(0, len(panels), across)]
+    for row in rows:
+        row[0].append(axes(ylabel="share of plants [%]", ylim=(-3, 103)))
+    return draw_panels("detection", rows, 3.6 * len(rows), 10.0, common_legend=True, sharey=True)
 
 
 def _draw_fault(fault: Fault, points: Sequence[Mapping[str, Any]]) -> list[Mark]:
-    span = max([fault.most, *(point["size"] for point in points)]) - fault.healthy
+    limits = [fault.place_size(departure) for departure in fault.limits[1:]]
+    span = max(abs(size - fault.healthy) for size in [*limits, *(point["size"] for point in points)])
     panel: list[Mark] = []
     for i, (key, label, colour) in enumerate(LINES):
         known = [point for point in points if point[key]["of"]]
@@ -407,8 +416,8 @@ def _draw_fault(fault: Fault, points: Sequence[Mapping[str, Any]]) -> list[Mark]
         ends = [[100 * abs(point[key]["share"] - point[key][end]) for point in known] for end in ("low", "high")]
         panel.append(call("errorbar", x, y, ends, color=colour, lw=1.4, marker="o", ms=3.5, elinewidth=0.9, capsize=2,
                           label=label))
-    for size, word in ((fault.middle, "MidBand"), (fault.most, "MaxBand")):
+    for size, word in zip(limits, ("MidBand", "MaxBand"), strict=True):
         panel += [instant(size, COMMAND, None, 0.9, "--"),
                   call("text", size, 50, f" {word}", color=INK, fontsize=8, rotation=90, va="center", ha="right")]
     unit = f" [{fault.unit}]" if fault.unit != "1" else ""
-    return [*panel, axes(xlabel=f"{fault.name}, {name_size(fault)}{unit}")]
+    return [*panel, axes(xlabel=f"{fault.name}, {fault.symbol}{unit}")]

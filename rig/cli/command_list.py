@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from rig.cli.options import (
     ANY_TRACE,
     BENCH,
+    FAULTS,
     FORCE,
     JUNIT,
     MEASURED_TRACE,
@@ -104,6 +105,7 @@ COMMANDS = {
              option("--model", metavar="FILE|NAME", help="the healthy plant (default eha)"),
              option("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
                     help="change a parameter of this plant (repeatable)"),
+             FAULTS,
              option("--work", default="fdi", metavar="MODULE:FUNCTION",
                     help="function that judges a case instead of rig fdi"))))),
     "check": Command(
@@ -184,13 +186,13 @@ COMMANDS = {
              option("--fmi", choices=("2", "3"), default="2", help="version of FMI, 2.0 (default) or 3.0"),
              *MODEL)))),
     "fdi": Command(
-        "judge filter clogging and spool friction from a trace: levels, sizes with intervals, other deviations",
-        "Exit status 0 if both faults are acceptable, 1 otherwise. --learn-bands makes bands instead.",
-        (option("trace", metavar="TRACE", nargs="?", help=MEASURED_TRACE), *MODEL,
+        "judge faults from a trace (default: clogging, spool friction): levels, sizes with intervals, other deviations",
+        "Exit status 0 if all faults are acceptable, 1 otherwise. --learn-bands makes bands instead.",
+        (option("trace", metavar="TRACE", nargs="?", help=MEASURED_TRACE), *MODEL, FAULTS,
          option("--bands", metavar="FILE",
                 help="bands to judge by (default: the shipped ones, for the preflight command)"),
          option("--with-effects", action="store_true",
-                help="search the catalogue for what else is wrong, and size both faults beside it (half a minute of "
+                help="search the catalogue for what else is wrong, and size the faults beside it (half a minute of "
                      "computing more, two minutes where the search is hard)"),
          option("--learn-bands", nargs="*", metavar="TRACE",
                 help="make bands from healthy traces of a fleet and write them to --out FILE.toml; without traces, "
@@ -221,11 +223,13 @@ COMMANDS = {
                                                      "the shipped eha.dbc)"),
          BENCH, TRUST)),
     "list": Command(
-        "list the names that other commands take: parameters, signals, sequences, effects, checks, models or benches",
+        "list names that other commands take: parameters, signals, sequences, effects, checks, models, benches, faults",
         "Names come with unit, range and default.",
-        (option("kind", choices=("parameters", "signals", "sequences", "effects", "checks", "models", "benches"),
-                metavar="KIND", help="one of: parameters, signals, sequences, effects, checks, models, benches"),
-         option("word", nargs="?", default="", metavar="WORD", help="only names that contain this word"), *MODEL)),
+        (option("kind", metavar="KIND",
+                choices=("parameters", "signals", "sequences", "effects", "checks", "models", "benches", "faults"),
+                help="one of: parameters, signals, sequences, effects, checks, models, benches, faults"),
+         option("word", nargs="?", default="", metavar="WORD", help="only names that contain this word"), *MODEL,
+         FAULTS)),
     "new": Command(
         "write a first file of your own, commented: a bench from the EDS, DCF or DBC of your controller",
         "It goes to --out (default: NAME.toml). Lines that are guesses say so (# unsure).",
@@ -311,11 +315,11 @@ COMMANDS = {
                 help="steps of the plant per cycle (default: one every 10 us)"))),
     "trend": Command(
         "follow the fault sizes of one unit through its dated traces: growth, and time left to the limits",
-        "Exit status 0 if both faults are within MidBand at the last trace, 1 otherwise.",
+        "Exit status 0 if all faults are within MidBand at the last trace, 1 otherwise.",
         (option("folder", nargs="?", metavar="FOLDER",
                 help="traces of one unit, dated by their logs, names or dates.csv; or the JSON file of an earlier "
                      "answer"),
-         *MODEL,
+         *MODEL, FAULTS,
          option("--axis", choices=("date", "hours", "flights"),
                 help="time axis of the trend (default: the first of these that all traces have)"),
          option("--dates", metavar="FILE.csv",

@@ -68,7 +68,7 @@ def list_signals(args: argparse.Namespace) -> list[str] | None:
 def format_arguments(args: argparse.Namespace) -> str:
     """The runs and the model of a command, as arguments of the command to type next."""
     words = [args.trace]
-    for name in ("repeat", "holdout", "model", "set", "effects", "signals"):
+    for name in ("repeat", "holdout", "model", "set", "effects", "signals", "faults"):
         values = getattr(args, name, None) or []
         words += [word for value in (values if isinstance(values, list) else [values])
                   for word in (f"--{name}", str(value))]

@@ -80,6 +80,9 @@ REPEAT = option("--repeat", action="append", default=[], metavar="TRACE",
 SIGNALS = option("--signals", metavar="xj,p12,xs", help="signals to use (default: all that the trace has)")
 RUNS = (REPEAT, option("--holdout", metavar="TRACE", help="a run of another command that no fit sees: reveals "
                                                           "overfitting"), SIGNALS)
+FAULTS = option("--faults", metavar="FILE|NAME",
+                help="faults to measure: a fault file, or a shipped list by name (default: those of the plant file, or "
+                     "paper)")
 BENCH = option("--bench", metavar="FILE|NAME",
                help="bench file: which controller is under test, and its frames (default: eha, the shipped one)")
 FORCE = option("--force", action="store_true", help="replace the file of --out if there is one")

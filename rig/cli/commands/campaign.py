@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from fdi.diagnosis.faults import choose_faults, load_faults
 from plant import InputError, load_model
 from rig.campaign.batch import BatchProgress, Row, Workers
 from rig.campaign.judge import (
@@ -26,6 +27,7 @@ from rig.campaign.judge import (
     read_matrix,
     read_matrix_of_folder,
     replace_file,
+    restore_faults,
     run_campaign,
 )
 from rig.campaign.summary import build_campaign_report, describe_progress, draw_detection_curves, summarise_campaign
@@ -49,7 +51,9 @@ def run_command(args: argparse.Namespace) -> int:
 
 def give_summary(rows: Sequence[Row], folder: Path, args: argparse.Namespace) -> int:
     """Write and show the statistics of finished cases; return the exit status."""
-    figures = summarise_campaign(rows)
+    faults = (restore_faults(read_matrix_of_folder(folder).spec) if is_campaign_folder(folder)
+              else load_faults(args.faults or "paper"))
+    figures = summarise_campaign(rows, faults)
     report = build_campaign_report(figures, str(folder))
     if folder.is_dir():
         write_statistics(figures, folder)
@@ -70,7 +74,7 @@ def write_statistics(figures: dict[str, Any], folder: Path) -> None:
         if any(len(points) > 1 for points in part["curves"].values()):
             alone = len(figures["tolerances"]) == 1
             name = "detection.svg" if alone else f"detection-{100 * part['tolerance']:g}.svg"
-            replace_file(folder / name, draw_detection_curves(part).encode())
+            replace_file(folder / name, draw_detection_curves(part, restore_faults(figures)).encode())
 
 
 def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
@@ -84,7 +88,7 @@ def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
     changed = {key: value for key, value in wanted.items() if value is not None}
     work = WORKS.get(args.work, args.work)
     if args.what and is_campaign_folder(args.what):
-        if changed or args.fault or args.model or args.set or args.out:
+        if changed or args.fault or args.faults or args.model or args.set or args.out:
             raise InputError(args.what, "", "no other option about the matrix: this folder has its own")
         found = read_matrix_of_folder(args.what)
         if found.spec["work"] not in (*WORKS.values(), work):  # a folder is data
@@ -92,11 +96,11 @@ def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
                                                 "function")
         return found, Path(args.what)
     model = load_model(args.model or "eha").replace(parse_changes(args.set))
-    campaigns = Path("campaigns")
+    faults, campaigns = choose_faults(args.faults, model.kind), Path("campaigns")
     if args.what and Path(args.what).is_dir():
         if changed or args.fault:
             raise InputError(args.what, "", "no faults or seeds: these are recorded traces")
-        return (build_trace_matrix(args.what, model, work),
+        return (build_trace_matrix(args.what, model, work, faults),
                 Path(args.out or campaigns / Path(args.what).absolute().name))
     tables = read_matrix(args.what) if args.what else {}
     listed, more = tables.get("case", []), parse_faults(args.fault)
@@ -105,7 +109,7 @@ def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
         shipped = " or ".join(list_shipped_matrices())
         raise InputError("MATRIX.toml|FOLDER", "", f"a matrix file, the shipped matrix {shipped}, a folder of "
                                                    "traces, or --fault EFFECT=SIZE,..")
-    return (build_matrix(tables, model, work, args.what or "--fault"),
+    return (build_matrix(tables, model, work, args.what or "--fault", faults),
             Path(args.out or campaigns / Path(args.what or "options").stem))
 
 

@@ -1,4 +1,4 @@
-"""`rig fdi`: how far filter clogging and spool friction have gone, from one captured test."""
+"""`rig fdi`: how far faults have gone, from one captured test."""
 from __future__ import annotations
 
 import argparse
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from fdi.diagnosis.bands import load_bands, make_bands_file
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
+from fdi.diagnosis.faults import choose_faults
 from fdi.report.diagnosis_report import build_bands_report, build_diagnosis_report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -17,7 +18,7 @@ from rig.cli.progress_bar import show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Exit status 0 if both faults are acceptable, 1 otherwise. --learn-bands makes bands instead."""
+    """Exit status 0 if all faults are acceptable, 1 otherwise. --learn-bands makes bands instead."""
     if args.learn_bands is not None:
         return learn_bands(args)
     if args.command_file is not None:
@@ -28,7 +29,9 @@ def run_command(args: argparse.Namespace) -> int:
     model = load_chosen_model(args)
     with show_progress(is_silent=args.json or args.quiet) as progress:
         bands = None if args.bands is None else load_bands(Path(args.bands))
-        found = diagnose(Trace.read(args.trace), model, bands, progress, args.trace, with_effects=args.with_effects)
+        faults = choose_faults(args.faults, model.kind)
+        found = diagnose(Trace.read(args.trace), model, bands, progress, args.trace, with_effects=args.with_effects,
+                         faults=faults)
     report = replace(build_diagnosis_report(found), next_command=suggest_next_command(args, found), files=places.files)
     return give_answer(report, args, int(found.verdict != "ACCEPTABLE"), places)
 
@@ -47,7 +50,7 @@ def learn_bands(args: argparse.Namespace) -> int:
 
 
 def suggest_next_command(args: argparse.Namespace, found: Diagnosis) -> str:
-    """What to type next where neither fault explains the trace: the search for other effects, or after it
+    """What to type next where no fault explains the trace: the search for other effects, or after it
     `rig explain`; else "".
     """
     if found.verdict != "SOMETHING_ELSE":

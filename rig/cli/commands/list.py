@@ -9,6 +9,7 @@ from typing import Any
 
 from fdi.report.report import Cell, Column, Report, Section, Table
 from fdi.trace.signals import OUTPUTS, SIGNALS
+from plant.errors import InputError
 from plant.model import (
     SHIPPED_MODELS,
     Model,
@@ -28,7 +29,11 @@ Rows = list[dict[str, Any]]
 def run_command(args: argparse.Namespace) -> int:
     """Names come with unit, range and default."""
     find, use = KINDS[args.kind]
-    rows = [row for row in find(load_chosen_model(args)) if args.word.lower() in row["name"].lower()]
+    if args.faults is not None and args.kind != "faults":
+        raise InputError("--faults", args.faults, f"rig list faults, not {args.kind}")
+    model = load_chosen_model(args)
+    listed = list_faults(model, args.faults) if args.kind == "faults" else find(model)
+    rows = [row for row in listed if args.word.lower() in row["name"].lower()]
     return give_answer(build_list_report(args.kind, use, rows), args)
 
 
@@ -136,6 +141,19 @@ def list_benches(model: Model) -> Rows:
              "cycle, s": b.cycle_ns / 1e9, "frames": len(b.frames.frames)} for name, b in found]
 
 
+def list_faults(model: Model, source: str | None = None) -> Rows:
+    """The faults of a file, of the plant, or of all shipped lists that the plant can have."""
+    from fdi.diagnosis.faults import choose_faults, list_fault_files, load_faults  # here: only this list needs them
+
+    if source is not None or model.kind.faults:
+        found = {source or model.plant: choose_faults(source, model.kind)}
+    else:
+        found = {name: load_faults(name, model.kind) for name in list_fault_files()} if model.plant == "eha" else {}
+    return [{"name": f.name, "list": name, "title": f.title, "parameter": f.parameter, "unit": f.unit,
+             "healthy": f.healthy, "acceptable": f.acceptable, "maintenance": f.maintenance,
+             "range": f"{f.range[0]:g} .. {f.range[1]:g}"} for name, faults in found.items() for f in faults]
+
+
 KINDS: Mapping[str, tuple[Callable[[Model], Rows], str]] = {  # what lists them, and how to use one
     "parameters": (list_parameters, "Change one with --set NAME=VALUE."),
     "signals": (list_signals, "Choose outputs with --signals xj,p12,xs."),
@@ -145,4 +163,5 @@ KINDS: Mapping[str, tuple[Callable[[Model], Rows], str]] = {  # what lists them,
                             "skip and requirement."),
     "models": (list_models, "Choose one with --model NAME, or a file."),
     "benches": (list_benches, "Choose one with --bench NAME, or a file."),
+    "faults": (list_faults, "Measure those of a list with rig fdi TRACE --faults LIST, or a file; SI units."),
 }

@@ -5,6 +5,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+from fdi.diagnosis.faults import choose_faults, load_faults
 from fdi.prognosis.unit_trend import UnitTrend, follow_unit, gather_sizes, read_points
 from fdi.report.drawing import save_drawing
 from fdi.report.trend_report import build_trend_report, draw_trends
@@ -15,7 +16,7 @@ from rig.cli.progress_bar import show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Exit status 0 if both faults are within MidBand at the last trace, 1 otherwise."""
+    """Exit status 0 if all faults are within MidBand at the last trace, 1 otherwise."""
     if args.folder is None:
         raise InputError("FOLDER", "", "a folder of dated traces")
     out = choose_file(args.out or None, (".html", ".png", ".svg", ".json"), args.folder)
@@ -35,6 +36,7 @@ def follow_traces(args: argparse.Namespace) -> UnitTrend:
     model, source = load_chosen_model(args), Path(args.folder)
     with show_progress(is_silent=args.json or args.quiet) as progress:
         if source.suffix == ".json" and not source.is_dir():
-            return follow_unit(read_points(source))
+            return follow_unit(read_points(source, load_faults(args.faults, model.kind) if args.faults else None))
         table = None if args.dates is None else Path(args.dates)
-        return follow_unit(gather_sizes(source, model, progress, args.axis, table, args.again))
+        return follow_unit(gather_sizes(source, model, progress, args.axis, table, args.again,
+                                        choose_faults(args.faults, model.kind)))

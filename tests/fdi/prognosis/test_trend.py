@@ -178,7 +178,7 @@ def test_estimates_at_their_bound_only_say_not_more_than() -> None:
 
 def test_the_metrics_on_predictors_that_are_known() -> None:
     unit = simulate_unit("linear", 4)
-    end, middle = unit.time_of_size(unit.fault.most), unit.time_of_size(unit.fault.middle)
+    end, middle = unit.time_of_size(unit.fault.maintenance), unit.time_of_size(unit.fault.acceptable)
 
     def by(factor: float) -> Any:
         def predict(u: Unit, n: int) -> Prediction:
@@ -200,7 +200,7 @@ def test_intervals_hold_the_truth() -> None:
     for i, law in enumerate(LAWS):
         for k in range(2):
             u = simulate_unit(law, 100 * i + k)
-            end = u.time_of_size(u.fault.most)
+            end = u.time_of_size(u.fault.maintenance)
             n = int(np.searchsorted(u.t, (u.onset + end) / 2))
             left = fit_trend(u.fault, list(u.t[:n]), u.sizes[:n]).remaining["non_nominal"]
             held.append(left.low <= end - u.t[n - 1] <= left.high)

@@ -1,0 +1,122 @@
+"""Faults that a recording does not tell apart: what their common posterior still says of each, and of all together.
+
+Sizes are estimated together, with a common Gaussian posterior (the covariance of the fit, all other unknowns left
+free). Two faults that change the signals alike have wide intervals each, although their sum is well known. Then the
+bounds of the one cut what the other may be: no size is below that of a new unit. So an interval that cannot be judged
+is replaced by that of the profile likelihood within the bounds of all faults. What still cannot be judged is tested
+together: if no point with all of these faults acceptable is within the 95 % region, at least one of them is not, and
+they form a group.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from fdi.diagnosis.faults import Estimate, Fault
+from fdi.diagnosis.refine import Refinement, place_value
+from fdi.estimation.fit import scaled_bounds
+from fdi.thresholds import INTERVAL_95_SD
+from fdi.trace.trace import Floats
+
+ALIKE = 0.5  # correlation of two sizes from which they may be one group
+
+
+class Group(NamedTuple):
+    """Faults of which at least one is not acceptable."""
+
+    names: tuple[str, ...]
+    excluded: float  # distance from the nearest unit in which all of them are acceptable, standard deviations
+
+
+class _Region:
+    """The posterior of the scaled sizes of the faults, (f,), and their bounds."""
+
+    def __init__(self, found: Refinement) -> None:
+        names = [f.name for f in found.fit.free]
+        self.faults = found.faults
+        self.places = [names.index(fault.parameter) for fault in found.faults]
+        self.free = [found.fit.free[k] for k in self.places]
+        self.x = found.fit.x[self.places]
+        covariance = found.fit.covariance[np.ix_(self.places, self.places)]
+        values, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
+        self.root = (axes / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T  # |root (x - x0)|: distance, s.d.
+        self.spread = np.sqrt(np.diag(covariance))
+        self.low, self.high = scaled_bounds(self.free)
+
+    def measure_distance(self, low: Floats, high: Floats) -> float:
+        """Distance, standard deviations, of the nearest point between the limits, (f,) each."""
+        wide = np.maximum(high, low + 1e-9 * self.spread)
+        return float(np.linalg.norm(self.root @ (lsq_linear(self.root, self.root @ self.x, (low, wide)).x - self.x)))
+
+    def find_ends(self, i: int, factor: float) -> Estimate:
+        """The profile's interval of fault `i`, SI, `factor` times 1.96 standard deviations."""
+        ends = []
+        for bound in (self.low[i], self.high[i]):
+            inside, outside = float(self.x[i]), float(bound)
+            far = float(self.x[i]) + np.sign(outside - inside) * 3.0 * factor * INTERVAL_95_SD * self.spread[i]
+            outside = min(outside, far) if outside > inside else max(outside, far)
+            if self._reach(i, outside) > factor * INTERVAL_95_SD:
+                for _ in range(30):
+                    middle = 0.5 * (inside + outside)
+                    is_in = self._reach(i, middle) <= factor * INTERVAL_95_SD
+                    inside, outside = (middle, outside) if is_in else (inside, middle)
+            else:
+                inside = outside
+            ends.append(self.free[i].value(inside))
+        return Estimate(self.free[i].value(float(self.x[i])), *sorted(ends))
+
+    def _reach(self, i: int, value: float) -> float:
+        low, high = self.low.copy(), self.high.copy()
+        low[i] = high[i] = value
+        return self.measure_distance(low, high)
+
+    def limit_to_acceptable(self, low: Floats, high: Floats, i: int) -> None:
+        """Narrow the limits, (f,), to acceptable sizes of fault `i`."""
+        fault = self.faults[i]
+        sizes = _list_acceptable(fault)
+        ends = sorted(min(max(place_value(self.free[i], size), self.low[i]), self.high[i]) for size in sizes)
+        low[i], high[i] = ends
+
+    def group_alike(self, members: Sequence[int]) -> list[list[int]]:
+        """The members in groups of those whose sizes correlate."""
+        covariance = np.linalg.pinv(self.root.T @ self.root)
+        alike = np.abs(covariance / np.outer(self.spread, self.spread)) > ALIKE
+        groups: list[list[int]] = []
+        for i in members:
+            near = [g for g in groups if any(alike[i, j] for j in g)]
+            groups = [g for g in groups if g not in near] + [[*(j for g in near for j in g), i]]
+        return groups
+
+
+def _list_acceptable(fault: Fault) -> tuple[float, float]:
+    if fault.both_ways:
+        return fault.healthy - fault.acceptable, fault.healthy + fault.acceptable
+    return (fault.acceptable, fault.range[1]) if fault.falls else (fault.range[0], fault.acceptable)
+
+
+def cut_intervals(found: Refinement, names: Sequence[str], sizes: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """The intervals of these faults within the bounds of all faults; those that this makes no narrower stay."""
+    region = _Region(found)
+    cut = {}
+    for i, fault in enumerate(found.faults):
+        if fault.name in names and len(found.faults) > 1:
+            ends, known = region.find_ends(i, fault.interval_factor), sizes[fault.name]
+            cut[fault.name] = Estimate(known.value, max(known.low, ends.low), min(known.high, ends.high))
+    return cut
+
+
+def find_groups(found: Refinement, names: Sequence[str]) -> tuple[Group, ...]:
+    """Groups among faults that cannot be judged one by one: at least one of each group is not acceptable."""
+    region = _Region(found)
+    groups = []
+    for group in region.group_alike([i for i, fault in enumerate(found.faults) if fault.name in names]):
+        low, high = region.low.copy(), region.high.copy()
+        for i in group:
+            region.limit_to_acceptable(low, high, i)
+        distance = region.measure_distance(low, high)
+        if len(group) > 1 and distance > INTERVAL_95_SD:
+            groups.append(Group(tuple(found.faults[i].name for i in sorted(group)), distance))
+    return tuple(groups)

@@ -1,0 +1,259 @@
+"""Faults as data: the parameter that a fault changes, the sizes that it can have, and the two limits of its levels.
+
+A fault file is TOML (docs/fdi.md, "Your own faults"); a plant file declares its own faults as values of `Fault`. What a
+fault leaves out comes from the plant: the unit and the symbol from the parameter, the healthy size from its nominal
+value.
+
+    [faults.spool_friction]
+    title = "friction of the spool"
+    parameter = "spool.static_friction"     # of the plant or of an effect
+    range = [0, 1000]                       # SI, sizes that are possible
+    acceptable = 35                         # MidBand
+    maintenance = 70                        # MaxBand
+    follow = ["spool.dynamic_friction"]     # grows in proportion
+    source = "Table 2 of the paper"
+"""
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from plant.errors import InputError, show_value, suggest_name
+from plant.parameters import read_toml
+
+SHOWN_BY = ("", "steps", "ramps")
+WORD = re.compile(r"[a-z][a-z0-9_]*")  # of a fault: a key of JSON and a column of a campaign
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault that `rig fdi` measures: a parameter, and the sizes at which it needs maintenance. All sizes are SI."""
+
+    name: str
+    title: str  # what it is, for people
+    parameter: str  # "group.field" of the plant or of an effect
+    range: tuple[float, float]  # sizes that are possible
+    acceptable: float  # MidBand: up to here acceptable
+    maintenance: float  # MaxBand: up to here maintenance, beyond it non-nominal
+    source: str = ""  # where the limits come from
+    symbol: str = ""  # of the size; default that of the parameter
+    unit: str = ""  # of the size; default, and only choice, that of the parameter
+    healthy: float = math.nan  # size of a healthy unit; default the nominal value of the parameter
+    follow: Mapping[str, float] = field(default_factory=dict, hash=False)  # factors on the size; NaN: as nominal
+    both_ways: bool = False  # the limits are distances from the healthy size, above and below it
+    shown_by: str = ""  # sections of a command on which bands judge it: steps, ramps or, by default, none
+    interval_factor: float = 1.0  # on the 95 % interval of a fit, where simulations show that it is too narrow
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.follow, Mapping):  # names alone
+            object.__setattr__(self, "follow", dict.fromkeys(self.follow, math.nan))
+
+    @property
+    def key(self) -> str:
+        """The symbol as a key of JSON: kintas, fss."""
+        return re.sub(r"\W+", "_", self.symbol or self.name).strip("_").lower()
+
+    @property
+    def falls(self) -> bool:
+        """Whether the size of the fault is smaller than that of a healthy unit."""
+        return self.acceptable > self.maintenance
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Its parameter and those that follow it."""
+        return self.parameter, *self.follow
+
+    def list_changes(self, size: float) -> dict[str, float]:
+        """The parameters of a unit with a fault of that size, SI."""
+        return {self.parameter: size, **{name: size * factor for name, factor in self.follow.items()}}
+
+    def measure_departure(self, size: float) -> float:
+        """The size so that larger is worse: distance from a healthy unit of a fault that falls or goes both ways."""
+        if self.both_ways:
+            return abs(size - self.healthy)
+        return self.healthy - size if self.falls else size
+
+    def place_size(self, departure: float) -> float:
+        """The size that departs so far, on the side above where both are possible."""
+        if self.both_ways:
+            return self.healthy + departure
+        return self.healthy - departure if self.falls else departure
+
+    def turn_up(self) -> Fault:
+        """The fault by its departure, which rises from a healthy unit on; itself where its size does."""
+        if not (self.falls or self.both_ways):
+            return self
+        healthy, middle, most = self.limits
+        most_possible = max(self.measure_departure(end) for end in self.range)
+        return replace(self, symbol=f"change of {self.symbol}", range=(0.0, most_possible), healthy=healthy,
+                       acceptable=middle, maintenance=most, both_ways=False, follow={})
+
+    @property
+    def limits(self) -> tuple[float, float, float]:
+        """Departures of a healthy unit, of MidBand and of MaxBand, rising."""
+        if self.both_ways:
+            return 0.0, self.acceptable, self.maintenance
+        healthy, middle, most = (self.measure_departure(x) for x in (self.healthy, self.acceptable, self.maintenance))
+        return healthy, middle, most
+
+
+KEYS = {f.name: f for f in fields(Fault) if f.name != "name"}
+REQUIRED = ("title", "parameter", "range", "acceptable", "maintenance")
+NUMBERS = ("acceptable", "maintenance", "healthy", "interval_factor")
+
+
+def read_faults(path: Path, kind: Any) -> tuple[Fault, ...]:
+    """The faults of a file, for a plant (`plant.plants.Plant`).
+
+    Raises:
+        InputError: unreadable, not a fault file, or a fault that the plant cannot have; with file and key.
+    """
+    tables = read_toml(path)
+    for key in tables:
+        if key != "faults":
+            raise InputError(path, key, "only tables [faults.NAME]")
+    found = tables.get("faults")
+    if not isinstance(found, dict) or not found:
+        raise InputError(path, "", "at least one table [faults.NAME]")
+    return place_faults((_read_fault(path, name, table) for name, table in found.items()), kind, path)
+
+
+def _read_fault(path: Path, name: str, table: object) -> Fault:
+    where = f"faults.{name}"
+    if not isinstance(table, dict):
+        raise InputError(path, where, "a table")
+    for key in table:
+        if key not in KEYS:
+            raise InputError(path, f"{where}.{key}", f"one of {', '.join(KEYS)}{suggest_name(key, KEYS)}")
+    for key in REQUIRED:
+        if key not in table:
+            raise InputError(path, where, f"also the key {key}")
+    values = dict(table)
+    for key, value in values.items():
+        is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if key == "range":
+            ends = value if isinstance(value, list) else []
+            if len(ends) != 2 or not all(type(x) in (int, float) and math.isfinite(x) for x in ends):
+                raise InputError(path, f"{where}.range", f"[least, largest] in SI units, not {show_value(value)}")
+            values["range"] = float(ends[0]), float(ends[1])
+        elif key in NUMBERS:
+            if not is_number:
+                raise InputError(path, f"{where}.{key}", f"a number, not {show_value(value)}")
+            values[key] = float(value)
+        elif key == "both_ways":
+            if not isinstance(value, bool):
+                raise InputError(path, f"{where}.{key}", f"true or false, not {show_value(value)}")
+        elif key == "follow":
+            values[key] = _read_follow(path, f"{where}.{key}", value)
+        elif not isinstance(value, str):
+            raise InputError(path, f"{where}.{key}", f"a text, not {show_value(value)}")
+    return Fault(name, **values)
+
+
+def _read_follow(path: Path, where: str, value: object) -> dict[str, float]:
+    """Names of parameters, or a table of factors; TOML reads a name with a dot as a table in a table."""
+    if isinstance(value, list) and all(isinstance(name, str) for name in value):
+        return dict.fromkeys(value, math.nan)
+    if isinstance(value, dict):
+        flat = {f"{group}.{name}" if isinstance(part, dict) else group: factor for group, part in value.items()
+                for name, factor in (part.items() if isinstance(part, dict) else [("", part)])}
+        if all(type(factor) in (int, float) and math.isfinite(factor) for factor in flat.values()):
+            return {name: float(factor) for name, factor in flat.items()}
+    raise InputError(path, where, f'["group.field", ..] or {{ "group.field" = factor on the size }}, not '
+                                  f"{show_value(value)}")
+
+
+def place_faults(faults: Any, kind: Any, where: object = "faults") -> tuple[Fault, ...]:
+    """Faults with what they leave out taken from the plant, checked one by one and together.
+
+    Raises:
+        InputError: see `place_fault`; or two faults of one parameter or symbol.
+    """
+    placed: list[Fault] = []
+    owners: dict[str, str] = {}
+    for fault in faults:
+        mine = place_fault(fault, kind, where)
+        if any(other.key == mine.key for other in placed):
+            mine = replace(mine, symbol=mine.name) if not fault.symbol else mine
+        for what in (*mine.parameters, mine.key):
+            if what in owners:
+                raise InputError(where, f"faults.{mine.name}", f"a parameter and a symbol of its own; {what} is that "
+                                                               f"of {owners[what]}")
+            owners[what] = mine.name
+        placed.append(mine)
+    return tuple(placed)
+
+
+def place_fault(fault: Fault, kind: Any, where: object = "faults") -> Fault:
+    """A fault with unit, symbol and healthy size from its parameter in the plant `kind`.
+
+    Parameters that follow without a factor on the size keep their nominal ratio to the fault's own.
+
+    Raises:
+        InputError: a parameter that the plant lacks, another unit, or limits that contradict each other or the range.
+    """
+    from plant.model import find_quantity  # models know plants, and plants know faults
+
+    def refuse(key: str, expected: str) -> InputError:
+        return InputError(where, f"faults.{fault.name}.{key}".rstrip("."), expected)
+
+    def look_up(key: str, name: object) -> Any:
+        try:
+            return find_quantity(str(name), where, kind.name)
+        except InputError as error:
+            raise refuse(key, f"a parameter of the plant {kind.name} or of an effect, not {name} "
+                              f"(there expected {error.expected})") from error
+
+    if not WORD.fullmatch(fault.name):
+        raise refuse("", "a name of small letters, digits and _")
+    q = look_up("parameter", fault.parameter)
+    if not q.unit:
+        raise refuse("parameter", f"a parameter with a unit; {fault.parameter} is declared without one")
+    if fault.unit not in ("", q.unit):
+        raise refuse("unit", f"{q.unit}, that of {fault.parameter}, not {fault.unit}")
+    usual = {name: _find_usual(name, kind) for name in fault.parameters}
+    if usual[fault.parameter] == 0.0 and any(map(math.isnan, fault.follow.values())):
+        raise refuse("follow", f"a table of factors: {fault.parameter} is 0 in a healthy unit")
+    for name in fault.follow:
+        look_up("follow", name)
+    follow = {name: usual[name] / usual[fault.parameter] if math.isnan(factor) else factor
+              for name, factor in fault.follow.items()}
+    placed = replace(fault, unit=q.unit, symbol=fault.symbol or q.symbol or fault.name, follow=follow,
+                     healthy=usual[fault.parameter] if math.isnan(fault.healthy) else fault.healthy)
+    _check_limits(placed, q, refuse)
+    return placed
+
+
+def _find_usual(name: str, kind: Any) -> float:
+    """The nominal value of a parameter: the plant's own, or the off value of the effect that has it."""
+    from plant.model import list_offered_effects
+
+    off = {key: value for e in list_offered_effects(kind.name) for key, value in e.off.items()}
+    return float({**off, **kind.nominal}.get(name, 0.0))
+
+
+def _check_limits(f: Fault, q: Any, refuse: Any) -> None:
+    """Raises InputError for sizes that contradict each other."""
+    low, high = f.range
+    if low >= high:
+        raise refuse("range", f"[least, largest], not [{low:g}, {high:g}]")
+    if q.refuses(low) or q.refuses(high):
+        raise refuse("range", f"values of {f.parameter}, {q.expected}, not [{low:g}, {high:g}]")
+    if not low <= f.healthy <= high:
+        raise refuse("range", f"a range that holds the healthy size, {f.healthy:g} {f.unit}, not [{low:g}, {high:g}]")
+    shift = f.healthy if f.both_ways else 0.0
+    for key, size in (("acceptable", f.acceptable), ("maintenance", f.maintenance)):
+        if not low <= shift + size <= high:
+            raise refuse(key, f"a size within the range {low:g} .. {high:g} {f.unit}, not {size:g}")
+    healthy = 0.0 if f.both_ways else f.healthy
+    if not (healthy < f.acceptable < f.maintenance or (healthy > f.acceptable > f.maintenance and not f.both_ways)):
+        raise refuse("acceptable", f"a size between that of a healthy unit, {healthy:g}, and maintenance, "
+                                   f"{f.maintenance:g} {f.unit}, not {f.acceptable:g}")
+    if f.shown_by not in SHOWN_BY:
+        raise refuse("shown_by", f"steps or ramps, not {f.shown_by}")
+    if not 0.1 <= f.interval_factor <= 10.0:
+        raise refuse("interval_factor", f"a factor from 0.1 to 10, not {f.interval_factor:g}")
