@@ -286,12 +286,6 @@ FLEET_PRIOR_TRACES = 8.0
 # Standard deviation, relative, by which the parameters of healthy units differ (plant/parameters.py).
 UNIT_TOLERANCE = 0.015
 
-# Factor on the interval of FSS that the covariance gives: stick-slip and the solver's step add to it.
-#
-# Over 320 simulated cases the error was 1.14 standard deviations; with the factor 95.3 % of the intervals hold the true
-# value, without it 91.3 % (docs/statistics.md).
-FSS_INTERVAL_FACTOR = 1.1
-
 # RMS residual over noise, over all blocks, that a few stops of the ram at the wrong moment may leave.
 #
 # The typical block (`RESIDUAL_IS_NOISE`) decides; this limit catches a misfit in the 15 % of blocks it leaves out. A
@@ -305,6 +299,12 @@ RESIDUAL_HOPELESS = {"xj": 7.0, "p12": 7.0, "xs": 2.0}
 
 # RMS residual over noise above which a fit says nothing of any size: neither a level nor a suspect is reported.
 RESIDUAL_JUDGES_NOTHING = 1.5
+
+# Correlation of two estimated sizes from which the faults may be one group that a trace does not tell apart.
+GROUP_CORRELATION = 0.5
+
+# Prior standard deviation of a size that is fitted without a logarithm, in MidBands: it may be any.
+LINEAR_FAULT_SPREAD = 10.0
 
 # Share of MidBand; a fit that ends above it is compared with one that starts from a healthy unit.
 FAULT_BLAMED_SHARE = 0.5

@@ -40,7 +40,6 @@ PROMISED_BELOW = {
     ("add", "ledger"): "effect error holdout",
     ("fdi", "events"): "band signal t_in t_out",
     ("fdi", "grid"): "step ramp merged",
-    ("fdi", "refined"): "kintas fss method simulations",
 }
 
 
@@ -138,7 +137,7 @@ def test_the_answers_of_small_commands(preflight: Path, tmp_path: Path, monkeypa
     simulated = rig("simulate", "--command", "command.csv", "--out", "run.csv", "--json").json
     samples = {"traces": ["run.csv", "run2.csv", "held.csv"]}
     assert_all_seen("simulate", simulated, samples)
-    kinds = ("parameters", "signals", "sequences", "effects", "checks", "models", "benches")
+    kinds = ("parameters", "signals", "sequences", "effects", "checks", "models", "benches", "faults")
     assert_all_seen("list", *(rig("list", kind, "--json").json for kind in kinds))
     assert_all_seen("report", rig("report", preflight, "--out", "page.html", "--json").json)
     assert_all_seen("export", rig("export", preflight, "--out", "run.csv", "--force", "--json").json,

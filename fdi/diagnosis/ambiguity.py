@@ -18,10 +18,8 @@ from scipy.optimize import lsq_linear
 from fdi.diagnosis.faults import Estimate, Fault
 from fdi.diagnosis.refine import Refinement, place_value
 from fdi.estimation.fit import scaled_bounds
-from fdi.thresholds import INTERVAL_95_SD
+from fdi.thresholds import GROUP_CORRELATION, INTERVAL_95_SD
 from fdi.trace.trace import Floats
-
-ALIKE = 0.5  # correlation of two sizes from which they may be one group
 
 
 class Group(NamedTuple):
@@ -83,7 +81,7 @@ class _Region:
     def group_alike(self, members: Sequence[int]) -> list[list[int]]:
         """The members in groups of those whose sizes correlate."""
         covariance = np.linalg.pinv(self.root.T @ self.root)
-        alike = np.abs(covariance / np.outer(self.spread, self.spread)) > ALIKE
+        alike = np.abs(covariance / np.outer(self.spread, self.spread)) > GROUP_CORRELATION
         groups: list[list[int]] = []
         for i in members:
             near = [g for g in groups if any(alike[i, j] for j in g)]

@@ -66,6 +66,7 @@ from fdi.thresholds import (
     GAIN_TIE,
     GAIN_WORTH_A_FIT,
     INTERVAL_95_SD,
+    LINEAR_FAULT_SPREAD,
     PRIORS_KNOW_MORE_MISFIT,
     RESIDUAL_HELD_OUT,
     RESIDUAL_HOPELESS,
@@ -81,7 +82,6 @@ from plant.model import Model, find_quantity, list_searched_effects
 from plant.threads import R, T, map_in_threads
 
 SMALLEST_SHARE = 0.01  # of the healthy size, bound of a fit by logarithms
-LINEAR_FAULT_SPREAD = 10.0  # prior standard deviation of a linear size, in MidBands: it may be any
 Sizes = tuple[float, ...]
 """One size for each fault, SI."""
 # (factor on the noise, rounds): small stops of the ram count only once the fit is near

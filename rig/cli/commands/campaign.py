@@ -96,11 +96,11 @@ def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
                                                 "function")
         return found, Path(args.what)
     model = load_model(args.model or "eha").replace(parse_changes(args.set))
-    faults, campaigns = choose_faults(args.faults, model.kind), Path("campaigns")
+    campaigns = Path("campaigns")
     if args.what and Path(args.what).is_dir():
         if changed or args.fault:
             raise InputError(args.what, "", "no faults or seeds: these are recorded traces")
-        return (build_trace_matrix(args.what, model, work, faults),
+        return (build_trace_matrix(args.what, model, work, choose_faults(args.faults, model.kind)),
                 Path(args.out or campaigns / Path(args.what).absolute().name))
     tables = read_matrix(args.what) if args.what else {}
     listed, more = tables.get("case", []), parse_faults(args.fault)
@@ -109,6 +109,7 @@ def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
         shipped = " or ".join(list_shipped_matrices())
         raise InputError("MATRIX.toml|FOLDER", "", f"a matrix file, the shipped matrix {shipped}, a folder of "
                                                    "traces, or --fault EFFECT=SIZE,..")
+    faults = choose_faults(args.faults, model.kind) if args.faults or model.plant == "eha" else ()
     return (build_matrix(tables, model, work, args.what or "--fault", faults),
             Path(args.out or campaigns / Path(args.what or "options").stem))
 

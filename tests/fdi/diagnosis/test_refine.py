@@ -251,7 +251,8 @@ def average(worn: Diagnosis, second: Estimate, more: float = 0.0) -> Beside:
     """Over a lag without a fault, and another one whose fit costs so much more, with this size of clogging."""
     found = worn.refinement
     return average_explanations([
-        Explanation((effect,), {}, replace(found, kintas=kintas, fit=replace(found.fit, cost=cost)))
+        Explanation((effect,), {}, replace(
+            found, sizes={**found.sizes, CLOGGING.name: kintas}, fit=replace(found.fit, cost=cost)))
         for effect, kintas, cost in (("sensor_lag", Estimate(0.05, 0.0, 0.1), 100.0),
                                      ("coil_lag", second, 100.0 + more))])
 

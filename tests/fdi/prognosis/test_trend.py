@@ -241,7 +241,7 @@ def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
         refuse("trend", *words)
 
 
-def answered(file: Path, model: Any, again: bool = False) -> dict[str, Any]:
+def answered(file: Path, model: Any, again: bool = False, faults: Any = ()) -> dict[str, Any]:
     """In place of the diagnosis, and of a look into the log."""
     if file.name == "broken.csv":
         raise InputError(file, "xj", "a position")
