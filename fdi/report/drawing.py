@@ -22,7 +22,6 @@ import numpy as np
 from fdi.output import write_text, write_whole
 from fdi.report.numbers import SIGNAL_NAMES, SIGNAL_UNITS, choose_unit
 from fdi.thresholds import NOISE_BAND_RATIO
-from fdi.trace.sections import find_sections
 from fdi.trace.trace import Floats, Trace, rms
 from plant.errors import InputError
 
@@ -132,7 +131,7 @@ def shade_sections(trace: Trace) -> list[Mark]:
     """The ramps (blue) and the dynamic sections (violet) of the command."""
     colours = {"ramp": "#f1f3f8", "dynamic": "#f7f1fa"}
     return [shade(float(trace.t[section.start]), float(trace.t[section.stop - 1]), colours[section.kind])
-            for section in find_sections(trace.com, trace.period) if section.kind in colours]
+            for section in trace.sections() if section.kind in colours]
 
 
 def draw_panels(salt: str, rows: Sequence[Sequence[Panel]], height: float, width: float = 11.0,
@@ -338,8 +337,8 @@ def _find_limits(axis: Axis, limits: tuple[float, float]) -> tuple[str, list[flo
 
 def shorten_svg(drawing: str, decimals: int = 1) -> str:
     """The same drawing with so many decimals of a point in its lines; one is enough for a file that is kept."""
-    digits = re.compile(rf"(\.\d{{{decimals}}})\d+")
-    return re.sub(r'(?<= d=")[^"]*', lambda line: digits.sub(r"\1", line[0]), drawing)
+    digits = re.compile(rf"(?<=\.\d{{{decimals}}})\d+")
+    return re.sub(r'(?<= d=")[^"]*', lambda line: digits.sub("", line[0]), drawing)
 
 
 MARKERS = {"|": "line-ns-open", "_": "line-ew-open", "s": "square", "D": "diamond", "x": "x-thin-open",

@@ -342,7 +342,7 @@ def draw_timing(trace: Trace) -> str:
         if (values > 0).any():
             known = np.maximum(values[~np.isnan(values)] * 1e6, shortest_time)
             bins = np.logspace(math.log10(known.min()), math.log10(max(float(known.max()), 1.0)) + 0.02, 60)
-            panels.append([call("hist", known, bins=bins.tolist(), color=colour, log=True),
+            panels.append([call("hist", known, bins=bins.tolist(), color=colour, log=True, histtype="stepfilled"),
                            instant(float(np.percentile(known, 99)), INK, width=0.8, style=":"),
                            axes(xscale="log", xlabel=f"{name} [us]",
                                 ylabel="" if panels else "cycles (dotted: p99)")])
@@ -364,9 +364,8 @@ def _bridge_short_gaps(values: Floats) -> Floats:
 
 def _mark_missing(trace: Trace, values: Floats, columns: int = 1400) -> Mark:
     """A red mark at the foot of the panel in each of so many columns in which samples are missing."""
-    pieces = np.array_split(np.isnan(values), min(columns, len(values)))
-    lost = np.array([piece.any() for piece in pieces])
-    starts = np.cumsum([0, *map(len, pieces)])
+    starts = np.linspace(0, len(values), min(columns, len(values)) + 1).astype(int)
+    lost = np.logical_or.reduceat(np.isnan(values), starts[:-1])
     edges = np.flatnonzero(np.diff(lost, prepend=False, append=False)).reshape(-1, 2)
     ends = [(float(trace.t[starts[a]]), float(trace.t[starts[b] - 1]) + trace.period) for a, b in edges]
     return spans(ends, RED, 0.04, lw=0.5, zorder=3)
@@ -384,19 +383,21 @@ def _draw_checks(trace: Trace) -> Panel:
     first, last = float(trace.t[0]), float(trace.t[-1])
     room, far = 0.005 * (last - first), 0.25 * (last - first)
     panel = [axes(ylim=(len(trace.sequence_checks) - 0.4, -0.6), yticks=[], ylabel="checks")]
+    bars: list[tuple[float, float, float, str]] = []
     for row, check in enumerate(trace.sequence_checks):
         t0, t1 = (first, last) if math.isnan(check.t0) else (check.t0, check.t1)
         name, x, side, colour = check.name, t0 + room, "left", "white"
         if math.isnan(check.t0) and math.isnan(check.value):
             name, colour = f"{check.name}: not measured", RED
         else:
-            panel.append(call("barh", row, t1 - t0, left=t0, height=0.7, color=GREEN if check.passed else RED))
+            bars.append((row, t1 - t0, t0, GREEN if check.passed else RED))
             if last - t1 > far:
                 x, colour = t1 + room, INK
             elif t0 - first > far:
                 x, side, colour = t0 - room, "right", INK
         panel.append(call("text", x, row, name, va="center", ha=side, color=colour, fontsize=7, clip_on=True))
-    return panel
+    rows, widths, lefts, colours = zip(*bars, strict=True) if bars else ((),) * 4
+    return [*panel, call("barh", rows, widths, left=lefts, height=0.7, color=colours)]
 
 
 UNIT_SIZES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "m/s": 1.0, "mm/s": 1e-3, "Pa": 1.0, "bar": 1e5, "MPa": 1e6, "N": 1.0,

@@ -9,7 +9,7 @@ import contextlib
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -71,10 +71,14 @@ class Log:
             out = []
             with self.path.open("rb") as stream:
                 for index in self._chunks:
-                    if not index.message_index_offsets or decode.keys() & index.message_index_offsets.keys():
-                        for channel, time_ns, _, data in scan_messages(_read_chunk(self.path, stream, index)):
-                            if channel in decode:
-                                out.append((time_ns - self.epoch_ns, channel, data))
+                    there = index.message_index_offsets
+                    if there and not decode.keys() & there.keys():
+                        continue
+                    places = [_message_offsets(stream, index, number) for number in decode if number in there]
+                    starts = np.sort(np.concatenate(places)).astype(np.uint64).tolist() if places else None
+                    for channel, time_ns, _, data in scan_messages(_read_chunk(self.path, stream, index), starts):
+                        if channel in decode:
+                            out.append((time_ns - self.epoch_ns, channel, data))
             out.sort(key=lambda item: item[0])
             for time_ns, channel, data in out[:most]:
                 topic, parse = decode[channel]
@@ -264,18 +268,24 @@ def _decode_rows(raw: bytes, offsets: NDArray[np.int64], dtype: np.dtype[Any]) -
     return rows
 
 
-def scan_messages(raw: bytes) -> Iterator[tuple[int, int, int, bytes]]:
+def scan_messages(raw: bytes, starts: Iterable[int] | None = None) -> Iterator[tuple[int, int, int, bytes]]:
     """(channel, log time in ns, offset of the record, data) of each message in an unpacked chunk, in its order.
 
-    Raises struct.error for a chunk that ends within a record.
+    `starts`: offsets of the messages that are wanted; None: all. Raises struct.error for a chunk that ends within a
+    record.
     """
-    at, end = 0, len(raw)
-    while at < end:
+    for at in _list_records(raw) if starts is None else starts:
         opcode, length = _RECORD.unpack_from(raw, at)
         if opcode == Opcode.MESSAGE:
             channel, _, time_ns, _ = _MESSAGE.unpack_from(raw, at + 9)
             yield channel, time_ns, at, raw[at + 31:at + 9 + length]
-        at += 9 + length
+
+
+def _list_records(raw: bytes) -> Iterator[int]:
+    at = 0
+    while at < len(raw):
+        yield at
+        at += 9 + int(_RECORD.unpack_from(raw, at)[1])
 
 
 def read_declarations(raw: bytes) -> list[Schema | Channel]:

@@ -43,18 +43,19 @@ from rig.benches.bench_file import load_bench
 from rig.benches.frame_map import Role
 from rig.firmware.build import build_device
 from rig.network import heartbeat
-from rig.network.bus import open_can
+from rig.network.bus import can_open, open_can
 from rig.network.clock import WallClock
 from rig.network.link import Link, LinkWire, serve_node
 from rig.network.master import Master
 from rig.network.node_objects import PLANT
-from rig.network.raw_bus import can_open, open_raw_bus
+from rig.network.raw_bus import open_raw_bus
 from rig.nodes.emulator import Emulator
 from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.cyclic_values import CycleInput
-from rig.run.hard_loop import compile_cycle, open_loop
+from rig.run.hard_loop import compile_cycle
 from rig.run.loop import CycleLoop, History, Loop
+from rig.run.loops import open_loop
 from rig.run.priority import (
     LOOP_PRIORITY,
     list_cpus,

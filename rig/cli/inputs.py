@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import tomllib
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -79,3 +80,14 @@ def format_arguments(args: argparse.Namespace) -> str:
 def list_shipped_sequences() -> list[str]:
     """Names of the sequences that come with the rig."""
     return sorted(Path(entry.name).stem for entry in files("rig.sequences").iterdir() if entry.name.endswith(".toml"))
+
+
+def is_suite_file(name: str) -> bool:
+    """Whether a file is a suite and no sequence: it has the key `case`. False for what cannot be read."""
+    path = Path(name)
+    if path.suffix != ".toml" or not path.is_file():
+        return False
+    try:
+        return "case" in tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):  # whoever reads it as a sequence says what is wrong
+        return False

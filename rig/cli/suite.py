@@ -15,6 +15,7 @@ from fdi.report.terminal import style_of
 from plant.errors import InputError
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, choose_file, give_answer, make_folder
+from rig.cli.inputs import is_suite_file
 from rig.cli.interruption import catch_signals
 from rig.cli.terminal import open_console
 from rig.network.clock import WallClock
@@ -28,7 +29,6 @@ from rig.suite.suite import (
     build_suite,
     build_suite_report,
     find_status,
-    is_suite_file,
     read_suite_file,
     run_cases,
     write_junit,

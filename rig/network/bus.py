@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -120,6 +121,12 @@ def open_can(spec: str, bitrate: int = BITRATE, fd: bool = False) -> can.BusABC:
         return can.Bus(interface=kind, channel=channel, bitrate=bitrate, **options)
     except (can.CanError, OSError, ImportError, ValueError) as error:
         raise RigError(f"{spec}: {error}".replace("\n", " ")) from error
+
+
+def can_open(spec: str) -> bool:
+    """Whether compiled loops can use this bus (raw_bus.py); the others are for python-can, in soft real time."""
+    is_known = spec.partition(":")[0] in ("socketcan", "udp_multicast")
+    return is_known and sys.byteorder == "little" and sys.platform == "linux"
 
 
 def list_can_interfaces() -> list[str]:

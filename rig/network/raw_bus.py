@@ -36,7 +36,6 @@ import errno
 import os
 import socket
 import struct
-import sys
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -50,7 +49,7 @@ from numpy.typing import NDArray
 from plant.compile import ForeignCall, keep_apart
 from plant.errors import InputError, RigError
 from rig.network import udp
-from rig.network.bus import parse_spec, require_interface
+from rig.network.bus import can_open, parse_spec, require_interface
 from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, IDENTIFIER, has_valid_length
 from rig.network.udp import GIVE, SO_RXQ_OVFL, SO_TIMESTAMPNS, TAKE, TURN_LIMIT_NS, Turn, set_receive_options
 
@@ -635,11 +634,6 @@ def _open_socketcan(channel: str, is_fd: bool, stack: contextlib.ExitStack) -> s
 def open_raw_bus(spec: str, cob_ids: Sequence[int] | None = None, fd: bool = False) -> RawBus:
     """Open `socketcan:INTERFACE` or `udp_multicast[:GROUP]` for compiled loops; see `RawBus`."""
     return RawBus(spec, cob_ids, fd)
-
-
-def can_open(spec: str) -> bool:
-    """Whether compiled loops can use this bus; the others are for python-can, in soft real time."""
-    return spec.partition(":")[0] in KINDS and sys.byteorder == "little" and sys.platform == "linux"
 
 
 def _make_port() -> Port:

@@ -11,9 +11,9 @@ from rig.network.master import HEARTBEAT_LIMIT, PATIENT, Master
 from rig.network.node_objects import CONTROLLER, Gains, Identity, read_gains
 from rig.nodes.scenario import Scenario
 from rig.run.attribution import Mask, find_start_problem
-from rig.run.hard_loop import open_loop
 from rig.run.job import Job
 from rig.run.loop import History
+from rig.run.loops import open_loop
 from rig.run.probe import (
     ATTEMPTS,
     BEFORE,

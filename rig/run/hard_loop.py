@@ -28,7 +28,7 @@ from rig.benches.frame_map import FD, Role
 from rig.network.frame import Frame
 from rig.network.link import LinkWire
 from rig.network.master import Master
-from rig.network.raw_bus import RawBus, can_open, make_closed_port, open_raw_bus
+from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator_service import compile_plant
 from rig.nodes.faulty_plant import DIVERGED
@@ -36,28 +36,11 @@ from rig.nodes.scenario import Scenario
 from rig.recorder import Signals, Timing
 from rig.run import hard_cycle as hc
 from rig.run.cyclic_values import CycleInput, CyclicValues
-from rig.run.embedded_loop import EmbeddedLoop, Limits, can_play_many
-from rig.run.loop import CycleLoop, CycleObserver, Loop
+from rig.run.loop import CycleObserver, Loop
 from rig.run.priority import enter_loop_thread, list_cpus
 from rig.sequences.faults import CUT, DELAY, DOUBLE, DROP, NORMAL, Plan, Schedule
 
 _US = 1000  # ns
-
-
-def open_loop(master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver, bus: str,
-              realtime: bool, guards: Limits | None = None) -> Loop:
-    """The cycle loop for a bus: the hard one where compiled code can use the bus, else one in Python.
-
-    With `guards`, limits of signals, cycles of a run may be played together.
-
-    Raises:
-        RigError: the bus cannot be opened.
-    """
-    if can_open(bus) and isinstance(master.wire, LinkWire):
-        return HardLoop(master, bench, scenario, faults, log, open_raw_bus(bus, list_cyclic_frames(bench)), realtime)
-    if guards is not None and not realtime and can_play_many(master, bench):
-        return EmbeddedLoop(master, bench, scenario, faults, log, guards)
-    return CycleLoop(master, bench, scenario, faults, log, realtime)
 
 
 def list_cyclic_frames(bench: Bench) -> list[int]:

@@ -32,6 +32,10 @@ class PageWriter:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the second process."""
         if self._process is not None:
             self._process.kill()
             self._process.communicate()

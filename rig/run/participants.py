@@ -14,7 +14,6 @@ from typing import NamedTuple
 from plant import InputError, Model
 from plant.effects import CATALOGUE
 from rig.benches.frame_map import Role
-from rig.firmware.build import build_controller
 from rig.network.bus import open_can
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Node, Send
@@ -61,6 +60,8 @@ def open_participants(job: Job) -> Iterator[Participants]:
         return
     if job.controller == "c":
         require_firmware_bus(job.bus)
+        from rig.firmware.build import build_controller  # here and below: other runs need no compiler
+
         build_controller()  # now, where an error is still reported before anything is on the bus
     clock = WallClock()
     timeout = LOST_FRAME_TIMEOUT if job.sequence.loses_frames else FRAME_TIMEOUT
@@ -136,6 +137,8 @@ def _make_command(job: Job, node: Role) -> list[str]:
     """The command that runs a node of this job as a process of its own, which ends when this one does."""
     parent = ["--parent", str(os.getpid())]
     if node == CONTROLLER and job.controller == "c":
+        from rig.firmware.build import build_controller
+
         return [str(build_controller()), job.bus, *parent]
     words = [sys.executable, "-m", "rig.cli.main", "node", NAMES[node], "--bus", job.bus, "--quiet", *parent]
     words += [word for path in job.effects for word in ("--effects", str(path))]

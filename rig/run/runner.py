@@ -17,13 +17,12 @@ from plant.segments import Array
 from rig.benches.bench import Flags
 from rig.network.clock import WallClock
 from rig.network.node_objects import CycleRecord
-from rig.network.raw_bus import can_open
 from rig.recorder import Check, Observer, Recorder
 from rig.recorder.schema import collect_provenance, read_epoch_ns
 from rig.run.attribution import Attribution, CycleRecords, Mask, attribute, find_injected
-from rig.run.hard_loop import compile_cycle
 from rig.run.job import Job, find_differences
 from rig.run.loop import History
+from rig.run.loops import compile_loop
 from rig.run.outcome import Outcome, describe_faults, find_limits, summarise_timing
 from rig.run.participants import open_participants
 from rig.run.priority import (
@@ -64,8 +63,7 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
     """
     if job.plant != "external":  # here, where an effect that cannot be compiled is still reported as bad input
         Actuator(job.scenario.model).warm()
-    if can_open(job.bus):  # before any node is started: on a new machine this takes seconds
-        compile_cycle(job.realtime)
+    compile_loop(job)
     with lock_folder(folder):
         try:
             _play_steps(job, folder, "before", "")

@@ -30,9 +30,9 @@ from rig.run.bring_up import BringUp
 from rig.run.cyclic_values import CycleInput
 from rig.run.embedded_cycle import MOST
 from rig.run.enabling import Enabling
-from rig.run.hard_loop import open_loop
 from rig.run.job import Job
 from rig.run.loop import History
+from rig.run.loops import open_loop
 from rig.run.participants import Participants, find_firmware_parameters
 from rig.run.probe import (
     AFTER,

@@ -6,7 +6,6 @@ import itertools
 import os
 import re
 import signal
-import tomllib
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -89,17 +88,6 @@ class Variant(NamedTuple):
     choice: JobChoice
     timeout: float | None = None
     requirement: tuple[str, ...] = ()
-
-
-def is_suite_file(name: str) -> bool:
-    """Whether a file is a suite and no sequence: it has the key `case`. False for what cannot be read."""
-    path = Path(name)
-    if path.suffix != ".toml" or not path.is_file():
-        return False
-    try:
-        return "case" in tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):  # whoever reads it as a sequence says what is wrong
-        return False
 
 
 def read_suite_file(path: Path, base: JobChoice, rate: float) -> tuple[SuiteFile, list[Variant]]:

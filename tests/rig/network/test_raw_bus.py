@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from plant.compile import compile_function
 from plant.errors import InputError, RigError
 from rig.network import raw_bus
-from rig.network.bus import open_can
+from rig.network.bus import can_open, open_can
 from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, IDENTIFIER, has_valid_length
 from rig.network.link import Link
 from rig.network.message import find_cob_id, make_message
@@ -353,7 +353,7 @@ def test_everybody_hears_all_frames_in_one_order(where: str) -> None:
 
 def test_other_buses_are_refused() -> None:
     for where in ("embedded", "virtual:x", "slcan:x"):
-        assert not raw_bus.can_open(where)
+        assert not can_open(where)
         with pytest.raises(InputError):
             open_raw_bus(where)
-    assert raw_bus.can_open("udp_multicast") and raw_bus.can_open("socketcan:vcan0")
+    assert can_open("udp_multicast") and can_open("socketcan:vcan0")

@@ -11,7 +11,7 @@ from short_sequences import SHORT, job, play
 from fdi.trace.mcap_log import open_log
 from plant.run import NoiseStream
 from plant.segments import Array
-from rig.run import hard_loop
+from rig.run import loops
 from rig.run.embedded_loop import EmbeddedLoop, find_busy_cycles
 from rig.run.outcome import Outcome
 from rig.sequences.faults import Late, Noise, Parameter, Plan
@@ -49,7 +49,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def play_both(monkeypatch: pytest.MonkeyPatch, folder: Path, *given: Any, **settings: Any) -> Outcome:
     """Play a job as it is and with every cycle in Python; the logs and verdicts must be the same."""
     together = play(job(*given, **settings), folder / "together")
-    monkeypatch.setattr(hard_loop, "can_play_many", lambda master, bench: False)
+    monkeypatch.setattr(loops, "can_play_many", lambda master, bench: False)
     alone = play(job(*given, **settings), folder / "alone")
     assert read_log(folder / "together") == read_log(folder / "alone")
     assert (together.verdict, together.aborted, together.checks) == (alone.verdict, alone.aborted, alone.checks)

@@ -21,7 +21,7 @@ from fdi.trace.trace import Trace
 from plant import Model, simulate
 from rig.benches.bench_file import load_bench
 from rig.benches.frame_map import Role
-from rig.run import hard_loop
+from rig.run import loops
 from rig.run.job import JobChoice, build_job
 from rig.run.runner import run_job
 
@@ -165,7 +165,7 @@ def test_a_foreign_controller_closes_the_loop(start: object, bus_kind: str, is_c
                                               monkeypatch: pytest.MonkeyPatch) -> None:
     """The ram moves as a simulation of the same law does, whatever frames carry demand, position and current."""
     if not is_compiled:  # as on a bus that only python-can knows
-        monkeypatch.setattr(hard_loop, "can_open", lambda spec: False)
+        monkeypatch.setattr(loops, "can_open", lambda spec: False)
     where = spec(bus_kind)
     device = start(tmp_path, where)  # type: ignore[operator]
     (tmp_path / "steps.toml").write_text(SEQUENCE)

@@ -13,6 +13,7 @@ from rig_command import Said, answer, finished, refuse, rig, started
 from short_sequences import SHORT
 
 from fdi.trace.trace import Trace
+from rig.cli.inputs import is_suite_file
 from rig.run.job import JobChoice
 from rig.sequences.checks import CheckResult
 from rig.suite.suite import (
@@ -23,7 +24,6 @@ from rig.suite.suite import (
     build_suite,
     find_status,
     find_verdict,
-    is_suite_file,
     read_suite_file,
     trace_requirements,
     write_junit,

@@ -1,0 +1,239 @@
+"""`rig run` with one sequence: its job, the run, its answer."""
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import count
+from pathlib import Path
+
+from fdi.output import write_text
+from fdi.progress import Progress
+from fdi.report.report import Line, Medium, Report, Section
+from fdi.report.run_report import build_run_report
+from fdi.trace.trace import Trace
+from plant.errors import InputError
+from rig.cli.answer import choose_file, give_answer
+from rig.cli.command_list import LIVE_ON_TERMINAL
+from rig.cli.inputs import is_suite_file, parse_changes
+from rig.cli.interruption import catch_signals
+from rig.cli.progress_bar import show_progress
+from rig.network.bus import choose_bus
+from rig.network.clock import WallClock
+from rig.recorder import Event, Observer, Record
+from rig.run.job import Job, JobChoice, build_job, find_differences, read_job, replace_settings
+from rig.run.outcome import Outcome, diagnose_servovalve
+from rig.run.page_writer import PageWriter
+from rig.run.participants import EMBEDDED_NAMES
+from rig.run.runner import run_job
+from rig.view.live_process import ViewerPlace, find_viewer_place, show_live
+from rig.view.live_run import find_named_node, make_live_plan
+
+
+def run_sequence(args: argparse.Namespace, pages: PageWriter) -> int:
+    """Run what the command line says, several sequences too; return the exit status. Raises RigError."""
+    if args.live not in (None, LIVE_ON_TERMINAL) and args.live.partition(":")[0] != "rerun":
+        args.live, args.sequence = LIVE_ON_TERMINAL, [args.live, *args.sequence]  # the word behind --live is a sequence
+    if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
+        raise InputError("--max-overruns", "", f"a fraction from 0 to 1, not {args.max_overruns:g}")
+    if not args.source and (len(args.sequence) > 1 or any(map(is_suite_file, args.sequence))):
+        if args.live:
+            raise InputError("--live", "", "one sequence; runs of a suite run side by side")
+        pages.close()  # each case of a suite writes its own
+        return start_suite(args)
+    is_silent, is_on_screen = args.json or args.quiet, args.live == LIVE_ON_TERMINAL
+    place = find_viewer_place(args.live) if args.live and not is_on_screen else None
+    job = repeat_job(args.source, args) if args.source else build_job(build_choice(args), is_trusted=args.trust)
+    bus, why = choose_bus_of_run(args, job.bus if args.source else args.bus, job.controller)
+    job = replace_settings(job, bus=bus)
+    folder = Path(args.out) if args.out else make_new_folder(Path("runs"), Path(job.sequence.name).stem)
+    junit = choose_file(args.junit, (".xml",), None, "--junit")
+    clock = WallClock()
+    with catch_signals() as is_to_stop:
+        with (announce_run(job, why, is_silent=is_silent or is_on_screen) as progress,
+              choose_observer(job, folder / "trace.mcap", place, is_live=args.live is not None) as observer):
+            prepare = pages.wait_until_loaded if job.realtime else lambda: None
+            diagnose = partial(diagnose_servovalve, progress=progress) if args.fdi else None
+            outcome = run_job(job, folder, progress, is_to_stop, prepare, diagnose, observer)
+            progress("report", 0.0)
+            pages.start_page(folder / "trace.mcap", folder / "report.html")
+            report = build_run_report(Trace.read(folder / "trace.mcap", all=True))  # meanwhile
+        if is_on_screen and not is_silent:
+            print_settings(job, why)
+        with contextlib.suppress(BrokenPipeError):  # whether somebody reads the output does not change the verdict
+            give_answer(add_outcome(report, outcome), args)  # the page may take longer than the operator wants to wait
+        pages.finish_page()
+    if junit is not None:
+        from rig.suite.suite import write_junit_of_run
+
+        write_text(junit, write_junit_of_run(outcome, 1e-9 * clock.now()), "--junit")
+    return outcome.status
+
+
+def start_suite(args: argparse.Namespace) -> int:
+    """Run several sequences or suite files; return the exit status.
+
+    Raises:
+        RigError: bad input; nothing has run then.
+    """
+    from rig.cli.suite import run_suite  # here: it loads rich, which a run with --json does not need
+
+    bus, _ = choose_bus_of_run(args, args.bus, args.controller)
+    name = Path(args.sequence[0]).stem if len(args.sequence) == 1 else "suite"
+
+    def choose_folder() -> Path:  # not before everything has been tried: an error leaves no folder behind
+        return Path(args.out) if args.out else make_new_folder(Path("runs"), name)
+
+    return run_suite(args, build_choice(args)._replace(bus=bus), choose_folder)
+
+
+def choose_bus_of_run(args: argparse.Namespace, wanted: str, controller: str | None) -> tuple[str, str]:
+    """The bus of a run and why it is that one.
+
+    Raises:
+        RigError: a bus that is not there.
+    """
+    bus, why = choose_bus(wanted)
+    if controller == "c" and bus == "embedded" and args.bus == "auto":
+        return "udp_multicast", "udp_multicast: --controller c is a program and needs a bus between programs"
+    return bus, why
+
+
+@contextlib.contextmanager
+def choose_observer(job: Job, log: Path, place: ViewerPlace | None, *, is_live: bool) -> Iterator[Observer]:
+    """What looks at the records of a run: the screen or the viewer of --live, and the lines about dead nodes."""
+    if not is_live:
+        yield Observer(partial(announce_dead_node, job.bench.list_participants()), sees_rows=False)
+        return
+    kept: list[Record] = []  # while a screen covers the terminal
+    with show_live(make_live_plan(job.sequence, job.pace, job.bench), log, job.realtime, place) as begin:
+        def observe(t_ns: int, record: Record) -> None:
+            begin()  # now the log is there
+            if place is not None:
+                announce_dead_node(job.bench.list_participants(), t_ns, record)
+            elif isinstance(record, Event):
+                kept.append(record)
+
+        yield Observer(observe)
+    for record in kept:
+        announce_dead_node(job.bench.list_participants(), 0, record)
+
+
+def announce_dead_node(nodes: Mapping[int, str], t_ns: int, record: Record) -> None:
+    """Print a line on standard error, at once, when one of the nodes has died."""
+    if isinstance(record, Event) and record.level == "ERROR" and find_named_node(record.kind, record.text, nodes):
+        clear = "\r\033[K" if sys.stderr.isatty() else ""
+        print(f"{clear}rig run: {record.text}", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def announce_run(job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
+    """Show the progress bar of a run, and say on standard output what runs on which bus and `why` on that."""
+    is_announced = is_silent
+    with show_progress(is_silent=is_silent, is_realtime=job.realtime) as update:
+        def announce(stage: str, share: float) -> None:
+            nonlocal is_announced
+            if not is_announced:  # not before there is a bus and a place for the results: an error is one line
+                is_announced = True
+                print_settings(job, why)
+            update(stage, share)
+
+        yield announce
+
+
+def print_settings(job: Job, why: str) -> None:
+    """Say on standard output what runs on which bus and `why` on that."""
+    from rig.cli.terminal import open_console
+
+    text = f"{job.sequence.title}, {job.sequence.duration:g} s, {job.pace}, seed {job.seed}, {why}"
+    open_console().print(text, markup=False, soft_wrap=True)
+
+
+def add_outcome(report: Report, outcome: Outcome) -> Report:
+    """The report of a run's trace with what only the run knows: its speed, lost frames, where the results are.
+
+    Its last line repeats a verdict other than a plain PASS: the headline may have scrolled out of sight.
+    """
+    timing, judged, fdi = outcome.timing, outcome.attribution.judged, outcome.fdi
+    late = timing["lateness_us"]
+    pace = (f"{timing['cycles']} cycles, {timing['overruns']} overruns; lateness p50 {late['p50']:g}, "
+            f"p99 {late['p99']:g}, max {late['max']:g} us ({timing['kind']}, {timing['scheduler']})"
+            if outcome.job.realtime else f"{timing['cycles']} cycles in lockstep, {outcome.speed:.1f} times real time")
+    differences = find_differences(outcome.job).describe()
+    texts = {
+        "timing": pace,
+        "real time": timing["reason"],
+        "judged": "" if judged.all() else (f"{int(judged.sum())} of {len(judged)} cycles; the bench was late: "
+                                           f"{_list_counts(outcome.attribution.invalid)}"),
+        "first cause": outcome.describe_cause() if outcome.attribution.cause is not None else "",
+        "missing": _list_counts(outcome.counters),
+        "not nominal": differences if differences != "nothing" else "",
+        "servovalve": f"{fdi['verdict']}: {fdi['sentence']}" if fdi else ""}
+    reason = outcome.why or "every check passed"
+    if fdi.get("verdict") == "CANNOT_TELL":
+        reason += "; rig fdi cannot tell"
+    lines = [Line(label, text) for label, text in texts.items() if text]
+    return replace(report, sections=[*report.sections, Section("Run", lines, medium=Medium.TERMINAL)],
+                   files=[("results", f"{outcome.folder}/ trace.mcap, verdict.json, report.html")],
+                   conclusion="" if outcome.verdict == "PASS" and not fdi else f"{outcome.verdict}: {reason}",
+                   data=outcome.to_json())
+
+
+def _list_counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.items() if count)
+
+
+def build_choice(args: argparse.Namespace) -> JobChoice:
+    """What the command line chooses for the run of its first sequence; the bus is chosen later.
+
+    Raises:
+        InputError: a --set that is not GROUP.FIELD=VALUE.
+    """
+    return JobChoice(sequence=[*args.sequence, "preflight"][0], model=args.model, changes=parse_changes(args.set),
+                     seed=args.seed or 0, effects=tuple(args.effects), bench=args.bench, pace=args.pace,
+                     controller=args.controller, plant=args.plant, max_overruns=args.max_overruns,
+                     is_diagnosed=args.fdi)
+
+
+def repeat_job(source: Path, args: argparse.Namespace) -> Job:
+    """The job recorded in a log, to repeat it; bus, pace, controller and plant may be given anew.
+
+    A bus other than the embedded one must be named on the command line: a log does not decide what hardware moves.
+
+    Raises:
+        InputError: no log of a run, options that would change the job, code in the log that --trust does not allow, or
+            a bus in the log that --bus does not name.
+    """
+    if args.sequence or args.set or args.model or args.effects or args.bench or args.seed is not None:
+        raise InputError("--from", str(source), "no SEQUENCE, --model, --set, --seed, --effects or --bench: the log "
+                                                "has them")
+    log = source / "trace.mcap" if source.is_dir() else source
+    if args.out and (Path(args.out) / "trace.mcap").resolve() == log.resolve():
+        raise InputError("--out", args.out, "another folder than that of the log to repeat, which would be overwritten")
+    job = read_job(source, is_trusted=args.trust)
+    if args.bus == "auto" and job.bus.partition(":")[0] not in EMBEDDED_NAMES:
+        raise InputError(log, f"bus {job.bus}", f"--bus {job.bus} to use it again, or --bus embedded: the bus of a log "
+                                                "is opened only if the command line names it")
+    return replace_settings(job, bus=None if args.bus == "auto" else args.bus, pace=args.pace,
+                            controller=args.controller, plant=args.plant, max_overruns=args.max_overruns)
+
+
+def make_new_folder(parent: Path, name: str) -> Path:
+    """Make a new folder: parent/name, else name-2, name-3, ... Made at once, so that no two runs take it.
+
+    Raises:
+        InputError: the place cannot be written.
+    """
+    for number in count(1):
+        folder = parent / (name if number == 1 else f"{name}-{number}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise InputError("--out", str(folder), f"a place that can be written ({error.strerror})") from error
+        return folder
+    raise AssertionError

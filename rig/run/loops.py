@@ -1,0 +1,42 @@
+"""Which cycle loop plays a run: the bus, the pace and the nodes decide."""
+from __future__ import annotations
+
+from rig.benches.bench import Bench
+from rig.network.bus import can_open
+from rig.network.link import LinkWire
+from rig.network.master import Master
+from rig.nodes.scenario import Scenario
+from rig.run import embedded_cycle
+from rig.run.embedded_loop import EmbeddedLoop, Limits, can_play_many
+from rig.run.job import Job
+from rig.run.loop import CycleLoop, CycleObserver, Loop
+from rig.sequences.faults import Schedule
+
+
+def compile_loop(job: Job) -> None:
+    """Compile the cycle of a job, before any node is started: some seconds on a new machine."""
+    if can_open(job.bus):
+        from rig.run.hard_loop import compile_cycle  # here: on the embedded bus a run needs none of it
+
+        compile_cycle(job.realtime)
+    elif job.controller == "builtin" and not job.realtime and embedded_cycle.is_compiled():
+        embedded_cycle.load_code()
+
+
+def open_loop(master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver, bus: str,
+              realtime: bool, guards: Limits | None = None) -> Loop:
+    """The cycle loop for a bus: the hard one where compiled code can use the bus, else one in Python.
+
+    With `guards`, limits of signals, cycles of a run may be played together.
+
+    Raises:
+        RigError: the bus cannot be opened.
+    """
+    if can_open(bus) and isinstance(master.wire, LinkWire):
+        from rig.network.raw_bus import open_raw_bus  # here: on the embedded bus a run needs none of it
+        from rig.run.hard_loop import HardLoop, list_cyclic_frames
+
+        return HardLoop(master, bench, scenario, faults, log, open_raw_bus(bus, list_cyclic_frames(bench)), realtime)
+    if guards is not None and not realtime and can_play_many(master, bench):
+        return EmbeddedLoop(master, bench, scenario, faults, log, guards)
+    return CycleLoop(master, bench, scenario, faults, log, realtime)
