@@ -63,7 +63,7 @@ def main(folder: str) -> None:
                                        ("second", "cog.csv", "cog2.csv", "cogged.toml")):
         model, known = load_model_file(Path(file))
         (HERE / f"{example}_left.svg").write_text(shorten_svg(draw_residuals(run, repeat, model)), encoding="utf-8")
-        drawn = explain_report.draw_ledger(known.ledger, known.floor or {})
+        drawn = explain_report.draw_ledger(known.ledger, known.floor or {}, model.kind.signals)
         (HERE / f"{example}_ledger.svg").write_text(shorten_svg(drawn), encoding="utf-8")
 
 

@@ -108,9 +108,6 @@ RESIDUAL_IS_SCATTER = 1.15
 # No simulator, no oil and no seal is known better than that.
 FRICTION_UNCERTAINTY = 1e-3
 
-# Changes, m and Pa, that `FRICTION_UNCERTAINTY` makes without any change of a stop; larger ones are undecided.
-UNDECIDED_SMALLEST = {"xj": 1e-6, "p12": 5e3, "xs": 5e-7}
-
 # ---------------------------------------------------------------------------------------------------------------------
 # Effects: when missing physics is found. Gains are in -2 log likelihood.
 # ---------------------------------------------------------------------------------------------------------------------

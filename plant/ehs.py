@@ -190,7 +190,7 @@ LOGGER_SOURCES = ("time", "ADC1_Channel_2", "ADC1_Channel_3", "ADC1_Channel_6", 
 
 PLANT = Plant(
     name="ehs",
-    signals=Signals(*(s._replace(unit="raw", quantity="speed of the motor") if s.role == "drive" else s
+    signals=Signals(*(s._replace(unit="raw", quantity="speed of the motor", noun="motor") if s.role == "drive" else s
                       for s in signals.EHA[1:])),
     parameters=PARAMETER_GROUPS,
     state=State,

@@ -4,6 +4,8 @@ from __future__ import annotations
 from math import inf
 from typing import Any, NamedTuple
 
+from plant.units import UNITS
+
 ROLES = ("time", "command", "drive", "load", "output")
 
 
@@ -21,7 +23,21 @@ class Signal(NamedTuple):
     finest: float = 0.0  # RMS noise, SI, that no transducer of it is below
     slight: float = 0.0  # change, SI, that a friction level off by a thousandth makes without any change of a stop
     faint: float = 0.0  # range, SI; a signal that moves by less is in another unit
+    shown: str = ""  # unit of its axes; default: its own
     noun: str = ""  # what people call that of which it is: ram, spool, current; default: its symbol
+
+    @property
+    def shown_unit(self) -> str:
+        """The unit of its axes."""
+        return self.shown if self._has_shown() else self.unit
+
+    @property
+    def shown_scale(self) -> float:
+        """By which a value is multiplied for its axes."""
+        return float(1 / UNITS[self.shown].factor) if self._has_shown() else 1.0
+
+    def _has_shown(self) -> bool:
+        return self.shown in UNITS and UNITS[self.shown].si == self.unit
 
     @property
     def called(self) -> str:
@@ -50,6 +66,10 @@ class Signals(tuple[Signal, ...]):
             raise ValueError(f"expected different names, and roles of {', '.join(ROLES)}: {', '.join(map(repr, made))}")
         return made
 
+    def __getnewargs__(self) -> tuple[Signal, ...]:
+        """As a worker process hands it on."""
+        return tuple(self[1:])
+
     def find(self, name: str) -> Signal:
         """The signal of that name. Raises KeyError."""
         for signal in self:
@@ -67,6 +87,12 @@ class Signals(tuple[Signal, ...]):
         """Names of those without which nothing can be replayed: command, controlled signal, drive; in their order."""
         needed = {self.command.name, self.controlled.name, self.drive.name}
         return tuple(name for name in self.names if name in needed)
+
+    @property
+    def loop(self) -> tuple[str, ...]:
+        """Names of the columns of a closed loop: controlled signal, drive, the other outputs."""
+        controlled, *others = (s.name for s in self.outputs)
+        return (controlled, self.drive.name, *others)
 
     @property
     def command(self) -> Signal:
@@ -95,14 +121,15 @@ class Signals(tuple[Signal, ...]):
 
 
 EHA = Signals(
-    Signal("com", "Com", "m", "position demand", "command", largest=1.0, limit="jack.travel"),
+    Signal("com", "Com", "m", "position demand", "command", largest=1.0, limit="jack.travel",
+           shown="mm"),
     Signal("xj", "XJ", "m", "sensed ram position", noise="sensors.position_noise", limit="jack.travel", finest=5e-8,
-           slight=1e-6, noun="ram"),
+           slight=1e-6, shown="mm", noun="ram"),
     Signal("cor", "Cor", "A", "current command of the servovalve", "drive", limit="controller.current_limit",
-           noun="current"),
+           shown="mA", noun="current"),
     Signal("p12", "P12", "Pa", "pressure difference across the jack", noise="sensors.pressure_noise",
-           limit="supply.pressure", finest=2e3, slight=5e3, faint=1e3),
+           limit="supply.pressure", finest=2e3, slight=5e3, faint=1e3, shown="bar", noun="pressure"),
     Signal("xs", "XS", "m", "spool position", noise="sensors.spool_noise", limit="spool.travel", finest=5e-8,
-           slight=5e-7, faint=1e-9, noun="spool"),
-    Signal("load", "load", "N", "external force on the ram", "load", largest=1e6),
+           slight=5e-7, faint=1e-9, shown="um", noun="spool"),
+    Signal("load", "load", "N", "external force on the ram", "load", largest=1e6, shown="kN", noun="load"),
 )

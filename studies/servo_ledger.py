@@ -20,11 +20,10 @@ from scipy.optimize import least_squares
 
 from fdi.discovery.runs import read_source
 from fdi.discovery.update_model import Provenance, Row, format_model_file
-from fdi.estimation.fit import WITHOUT_NOISE
+from fdi.estimation.fit import silence_sensors
 from fdi.estimation.replay import compute_residuals, prepare_trace, replay_current, replay_lanes
-from fdi.report.drawing import COMMAND, DRAWN_UNITS, GREEN, shorten_svg, start_figure, to_svg
+from fdi.report.drawing import COMMAND, GREEN, choose_drawn_unit, shorten_svg, start_figure, to_svg
 from fdi.sources import name_software
-from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Trace, rms
 from plant.lanes import Lanes
 from plant.model import Model, load_model
@@ -131,8 +130,8 @@ def fit_values(model: Model, trace: Trace, free: Mapping[str, Bounds], signal: s
     names = list(tie_values(dict.fromkeys(free, 0.0)))
     scale = np.array([abs(bounds.first) for bounds in free.values()])
     low, high = (np.array([bounds[i] for bounds in free.values()]) / scale for i in (1, 2))
-    lanes = Lanes(model.replace(WITHOUT_NOISE), names, CYCLE_STEPS)
-    measured, column = trace.mask_unusable(signal), OUTPUTS.index(signal)
+    lanes = Lanes(silence_sensors(model), names, CYCLE_STEPS)
+    measured, column = trace.mask_unusable(signal), trace.output_names.index(signal)
 
     def compute_rows(x: Floats) -> Floats:
         given = [tie_values(dict(zip(free, row * scale, strict=True))) for row in x]
@@ -257,7 +256,7 @@ def draw_steps(rows: Sequence[LedgerRow], trace: Trace, folder: Path) -> None:
     for number, (before, after) in enumerate(pairwise(rows), 1):
         assert after.step is not None
         signal = after.step.signal
-        unit, factor = DRAWN_UNITS[signal]
+        unit, factor = choose_drawn_unit(trace.declared.find(signal), 0.0)
         with start_figure(2.2, 8.0) as figure:
             axes = figure.subplots()
             for row, colour, label in ((before, COMMAND, "before"), (after, GREEN, "after")):
@@ -265,7 +264,8 @@ def draw_steps(rows: Sequence[LedgerRow], trace: Trace, folder: Path) -> None:
                 whole = len(left) // BLOCK * BLOCK
                 blocks = np.sqrt(np.mean(left[:whole].reshape(-1, BLOCK) ** 2, axis=1))
                 axes.plot(trace.t[:whole:BLOCK], factor * blocks, color=colour, lw=1.2, label=label)
-            axes.set(title=f"{number}. {after.step.title}", ylabel=f"{SIGNALS[signal].symbol} [{unit}]", xlabel="t [s]")
+            axes.set(title=f"{number}. {after.step.title}", xlabel="t [s]",
+                     ylabel=f"{trace.declared.find(signal).symbol} [{unit}]")
             axes.legend(frameon=False)
             svg = shorten_svg(to_svg(figure, after.step.effect))
         (folder / f"{number}_{after.step.effect}.svg").write_text(svg, encoding="utf-8")

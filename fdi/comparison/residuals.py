@@ -20,21 +20,21 @@ from scipy.special import kolmogi, ndtri
 
 from fdi.estimation.replay import Columns, differentiate
 from fdi.thresholds import CONDITION_DENSITY, CONDITION_EXCESS_LEAST, CONDITION_SHARE, RESIDUAL_TEST_CONFIDENCE
-from fdi.trace.sections import describe_section, find_sections
+from fdi.trace.sections import describe_section
 from fdi.trace.trace import Flags, Floats, Trace, hold_last
+from plant.signals import Signal, Signals
 
 SMOOTH = 0.021  # s of measured position that a speed is taken from
 REVERSES = 5e-4  # m/s in the other direction make a reversal; a ram at rest trembles by less
 SPEEDS = (0.001, 0.003, 0.01, 0.02, 0.05, 0.1)  # m/s
 RATES = (0.3, 1.0, 3.0)  # m/s2
 PLACES = (0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3)  # m
-PRESSURES = (5e5, 1e6, 2e6, 5e6, 1e7)  # Pa
-OPENINGS = (5e-6, 20e-6, 50e-6, 2e-4)  # m
+LEVELS = {"Pa": (5e5, 1e6, 2e6, 5e6, 1e7), "m": (5e-6, 20e-6, 50e-6, 2e-4)}  # of the other outputs, by unit
+SHARES = (0.05, 0.1, 0.2, 0.5)  # of the largest value, for outputs in other units
 DELAYS = (0.005, 0.02, 0.05, 0.1)  # s after a reversal
 REACH = 100  # lags, of the autocorrelation
 AFTER, BEFORE = 60, 20  # lags, of the residual after and before the input
 BINS = 15
-OWN = {("xj", "Cor"), ("p12", "P12")}  # a signal's own noise or error is in these; that they go together says nothing
 WILD = 5.0  # standard deviations; what is larger is an event and has no say in a colour
 WHITE = np.ones(1)  # the filter of what is white already
 SHAPES = ("proportional to", "steps with the sign of", "even in")
@@ -52,30 +52,32 @@ class Place(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What the ram does, (n,) each."""
+    """What the plant does, (n,) each."""
 
-    x: Floats  # m
-    v: Floats  # m/s
-    a: Floats  # m/s2
-    p12: Floats  # Pa
-    xs: Floats  # m
-    cor: Floats  # A
-    reversed_for: Floats  # s since the ram last reversed; inf before
+    x: Floats  # the controlled signal
+    v: Floats  # its speed
+    a: Floats  # its acceleration
+    others: Mapping[str, Floats]  # the other outputs, by name
+    drive: Floats
+    reversed_for: Floats  # s since the motion last reversed; inf before
+    signals: Signals
+    scale: float  # as of `Trace.scale`
 
 
 def describe_motion(trace: Trace, model: Columns) -> Motion:
     """What the replay of the `model` does, whose noise is not in the residuals, and how long ago it last reversed."""
-    x = model["xj"]
+    controlled, *others = trace.declared.outputs
+    x, reverses = model[controlled.name], REVERSES * trace.scale
     size = max(5, round(SMOOTH / trace.period) | 1)
     v = differentiate(x, size, 1) / trace.period
     a = differentiate(x, 2 * size + 1, 2) / trace.period**2
-    sign = hold_last(np.where(np.abs(v) > REVERSES, np.sign(v), np.nan))
+    sign = hold_last(np.where(np.abs(v) > reverses, np.sign(v), np.nan))
     turns = np.flatnonzero((np.diff(sign) != 0.0) & (sign[:-1] != 0.0)) + 1
     last = np.full(len(x), -(10**9))
     last[turns] = turns
     rows = np.arange(len(x)) - np.maximum.accumulate(last)
     since = np.where(rows > 10**8, math.inf, rows * trace.period)
-    return Motion(x, v, a, model["p12"], model["xs"], trace.cor, since)
+    return Motion(x, v, a, {s.name: model[s.name] for s in others}, trace.drive, since, trace.declared, trace.scale)
 
 
 def combine_residuals(residual: Columns, floor: Mapping[str, float]) -> Floats:
@@ -88,11 +90,11 @@ def combine_residuals(residual: Columns, floor: Mapping[str, float]) -> Floats:
 
 
 def locate_error(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Place]:
-    """The sections of the command with their shares of `z2` (n,), the largest first; `limit` A of the current."""
+    """The sections of the command with their shares of `z2` (n,), the largest first; `limit` of the drive."""
     total = float(np.nansum(z2))
     out = []
     shortest = 0.05  # s; a section with fewer samples is not judged by itself
-    for section in find_sections(trace.com, trace.period):
+    for section in trace.sections():
         rows = slice(section.start, section.stop)
         inside = z2[rows]
         there = ~np.isnan(inside)
@@ -102,7 +104,7 @@ def locate_error(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Plac
         chosen[rows] = True
         share = float(np.nansum(inside)) / total
         said = find_condition(np.where(chosen, z2, np.nan), m, limit) if share > 0.03 else ""
-        words = describe_section(section, float(np.abs(trace.com[rows]).max()))
+        words = describe_section(section, float(np.abs(trace.command[rows]).max()), trace.declared.command.unit)
         t0, t1 = float(trace.t[section.start]), float(trace.t[section.stop - 1] + trace.period)
         out.append(Place(words, t0, t1, share, math.sqrt(float(np.nanmean(inside))), said))
     return sorted(out, key=lambda place: -place.share)
@@ -127,25 +129,38 @@ def find_condition(z2: Floats, m: Motion, limit: float) -> str:
 
 
 def _list_conditions(m: Motion, limit: float) -> Sequence[tuple[str, Flags]]:
-    speed, far, hard = np.abs(m.v), np.abs(m.x), np.abs(m.a)
+    speed, far, hard, by = np.abs(m.v), np.abs(m.x), np.abs(m.a), m.scale
+    unit, ram, symbol = m.signals.controlled.unit, m.signals.controlled.called, m.signals.controlled.symbol
     return [
-        *((f"ram faster than {_format_speed(s)}", speed > s) for s in SPEEDS),
-        *((f"ram slower than {_format_speed(s)}", speed < s) for s in SPEEDS[:4]),
-        *((f"ram further than {1e3 * x:g} mm from the middle", far > x) for x in PLACES),
-        *((f"within {1e3 * x:g} mm of the middle", far < x) for x in PLACES[:3]),
-        *((f"ram accelerates by more than {a:g} m/s2", hard > a) for a in RATES),
+        *((f"{ram} faster than {_format_speed(s * by, unit)}", speed > s * by) for s in SPEEDS),
+        *((f"{ram} slower than {_format_speed(s * by, unit)}", speed < s * by) for s in SPEEDS[:4]),
+        *((f"{ram} further than {_format_place(x * by, unit)} from the middle", far > x * by) for x in PLACES),
+        *((f"within {_format_place(x * by, unit)} of the middle", far < x * by) for x in PLACES[:3]),
+        *((f"{ram} accelerates by more than {a * by:g} {unit}/s2", hard > a * by) for a in RATES),
         *((f"within {1e3 * d:g} ms after a reversal", m.reversed_for < d) for d in DELAYS),
-        ("ram extends", m.v > REVERSES), ("ram retracts", m.v < -REVERSES),
-        ("XJ positive", m.x > PLACES[0]), ("XJ negative", m.x < -PLACES[0]),
-        ("current at its limit", np.abs(m.cor) > 0.99 * limit),
-        *((f"|P12| above {1e-5 * p:g} bar", np.abs(m.p12) > p) for p in PRESSURES),
-        ("P12 positive", m.p12 > PRESSURES[0]), ("P12 negative", m.p12 < -PRESSURES[0]),
-        *((f"spool within {1e6 * x:g} um of its null", np.abs(m.xs) < x) for x in OPENINGS),
-        *((f"spool more than {1e6 * x:g} um from its null", np.abs(m.xs) > x) for x in OPENINGS)]
+        (f"{ram} extends", m.v > REVERSES * by), (f"{ram} retracts", m.v < -REVERSES * by),
+        (f"{symbol} positive", m.x > PLACES[0] * by), (f"{symbol} negative", m.x < -PLACES[0] * by),
+        (f"{m.signals.drive.called} at its limit", np.abs(m.drive) > 0.99 * limit),
+        *(each for name, x in m.others.items() for each in _list_levels(m.signals.find(name), x))]
 
 
-def _format_speed(s: float) -> str:
-    return f"{s:g} m/s" if s >= 0.1 else f"{1e3 * s:g} mm/s"
+def _list_levels(signal: Signal, x: Floats) -> Sequence[tuple[str, Flags]]:
+    """Conditions on an output other than the controlled one; a length is the way of a part from its null."""
+    size, levels = np.abs(x), LEVELS.get(signal.unit) or [float(np.abs(x).max()) * share for share in SHARES]
+    factor, unit = {"Pa": (1e-5, "bar"), "m": (1e6, "um")}.get(signal.unit, (1.0, signal.unit))
+    if signal.unit == "m":
+        return [*((f"{signal.called} within {factor * y:g} {unit} of its null", size < y) for y in levels),
+                *((f"{signal.called} more than {factor * y:g} {unit} from its null", size > y) for y in levels)]
+    return [*((f"|{signal.symbol}| above {factor * y:.3g} {unit}", size > y) for y in levels),
+            (f"{signal.symbol} positive", x > levels[0]), (f"{signal.symbol} negative", x < -levels[0])]
+
+
+def _format_place(x: float, unit: str) -> str:
+    return f"{1e3 * x:g} mm" if unit == "m" else f"{x:g} {unit}"
+
+
+def _format_speed(s: float, unit: str) -> str:
+    return f"{1e3 * s:g} mm/s" if unit == "m" and s < 0.1 else f"{s:g} {unit}/s"
 
 
 class Follows(NamedTuple):
@@ -162,7 +177,7 @@ class Follows(NamedTuple):
 class Depends(NamedTuple):
     """Means of the residual over bins of one quantity."""
 
-    on: str  # "speed", "position", "P12", "acceleration"
+    on: str  # "speed", "position", "acceleration", or the symbol of an output
     share: float  # of the residual's mean square, that the means hold
     shape: str  # one of SHAPES, or ""
     size: float  # largest mean, residual's unit
@@ -190,12 +205,17 @@ class ResidualTests(NamedTuple):
 def examine_residuals(trace: Trace, residual: Columns, repeats: Mapping[str, Floats], m: Motion
                       ) -> dict[str, ResidualTests]:
     """Each signal's residual (n,); `repeats`: the difference to a repeat's residual over sqrt 2, where there is one."""
-    inputs = {"Cor": trace.cor, "Com": trace.com} | ({"load": trace.load} if np.ptp(trace.load) > 0.0 else {})
+    d = trace.declared
+    inputs = {d.drive.symbol: trace.drive, d.command.symbol: trace.command}
+    inputs |= {d.load.symbol: trace.load} if d.load and np.ptp(trace.load) > 0.0 else {}
     colours = {name: fit_whitener(np.diff(u)) for name, u in inputs.items() if np.ptp(u) > 0.0}
-    quantities = {"speed": m.v, "position": m.x, "P12": m.p12, "acceleration": m.a}
+    levels = {s.symbol: m.others[s.name] for s in d.outputs[1:] if s.unit != d.controlled.unit}  # such as pressures
+    quantities = {"speed": m.v, "position": m.x, **levels, "acceleration": m.a}
+    # a signal's own noise or error is in these; that they go together says nothing
+    own = {(s.name, s.symbol) for s in d.outputs} | {(d.controlled.name, d.drive.symbol)}
     return {name: _examine_signal(
-        trace, r, repeats.get(name), {u: (inputs[u], by) for u, by in colours.items() if (name, u) not in OWN},
-        {q: x for q, x in quantities.items() if (name, q) not in OWN}) for name, r in residual.items()}
+        trace, r, repeats.get(name), {u: (inputs[u], by) for u, by in colours.items() if (name, u) not in own},
+        {q: x for q, x in quantities.items() if (name, q) not in own}) for name, r in residual.items()}
 
 
 def fit_whitener(x: Floats) -> Floats:
@@ -368,13 +388,14 @@ def map_deviation(trace: Trace, residual: Mapping[str, Floats], floor: Mapping[s
         floor: noise floor of each signal, > 0, in the unit of its residual.
         fewest: rows that a cell needs.
     """
-    known = np.flatnonzero(~np.isnan(trace.xj))
-    position = np.interp(np.arange(len(trace)), known, trace.xj[known])
+    known = np.flatnonzero(~np.isnan(trace.controlled))
+    position = np.interp(np.arange(len(trace)), known, trace.controlled[known])
+    speeds, amplitudes = (np.array(edges) * trace.scale for edges in (CELL_SPEEDS, AMPLITUDES))
     speed = np.abs(position[np.minimum(np.arange(len(position)) + 10, len(position) - 1)]
                    - position[np.maximum(np.arange(len(position)) - 10, 0)]) / (20 * trace.period)
     width = 2 * round(0.25 / trace.period) + 1
     amplitude = 0.5 * (maximum_filter1d(position, width) - minimum_filter1d(position, width))
-    cells = (np.digitize(amplitude, AMPLITUDES) - 1) * (len(CELL_SPEEDS) - 1) + np.digitize(speed, CELL_SPEEDS) - 1
+    cells = (np.digitize(amplitude, amplitudes) - 1) * (len(CELL_SPEEDS) - 1) + np.digitize(speed, speeds) - 1
     shape, size = (len(AMPLITUDES) - 1, len(CELL_SPEEDS) - 1), (len(AMPLITUDES) - 1) * (len(CELL_SPEEDS) - 1)
     judged = ~np.all([np.isnan(r) for r in residual.values()], axis=0)
     rows = np.bincount(cells[judged], minlength=size).reshape(shape)
@@ -389,6 +410,5 @@ def map_deviation(trace: Trace, residual: Mapping[str, Floats], floor: Mapping[s
         ratio[name] = np.where(enough & (count > 0), np.sqrt(square / np.maximum(count, 1)) / floor[name], np.nan)
     down, across = (slice(np.flatnonzero(enough.any(axis))[0], np.flatnonzero(enough.any(axis))[-1] + 1)
                     for axis in (1, 0))
-    return DeviationMap(np.array(CELL_SPEEDS[across.start:across.stop + 1]),
-                        np.array(AMPLITUDES[down.start:down.stop + 1]),
+    return DeviationMap(speeds[across.start:across.stop + 1], amplitudes[down.start:down.stop + 1],
                         {name: r[down, across] for name, r in ratio.items()}, rows[down, across])

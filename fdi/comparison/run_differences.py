@@ -13,13 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.estimation.noise import FINEST, floor_from_data
+from fdi.estimation.noise import floor_from_data
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
-from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Check, Flags, Floats, Trace, rms
+from plant.errors import InputError
+from plant.signals import Signal
 
-COMPARED = ("xj", "p12", "xs", "cor", "load")
-SAME_COMMAND = 1.5e-7  # m; the bus carries steps of 1e-7 m
+SAME_COMMAND = 1.5e-7  # m, times `Trace.scale`; the bus carries steps of 1e-7 m
 
 
 class Run(NamedTuple):
@@ -37,8 +37,7 @@ class SignalDifference:
     `noise` is the noise floor of the reference and of the other run.
     """
 
-    name: str
-    unit: str
+    signal: Signal
     rms: float
     largest: float  # with its sign: other run minus reference
     t: float  # s, time of the reference at which the difference is largest
@@ -46,6 +45,16 @@ class SignalDifference:
     samples: int
     calm_share: float  # of the samples, those within two noise floors of both runs
     is_equal: bool  # to the last digit
+
+    @property
+    def name(self) -> str:
+        """Of its column."""
+        return self.signal.name
+
+    @property
+    def unit(self) -> str:
+        """Of the difference."""
+        return self.signal.unit
 
     @property
     def ratio(self) -> float:
@@ -102,7 +111,14 @@ def compare_runs(sources: Sequence[str], traces: Sequence[Trace]) -> RunDifferen
     Args:
         sources: name of each trace, for people.
         traces: two or more, with all phases or only their main phase.
+
+    Raises:
+        InputError: runs of plants with other signals.
     """
+    names = traces[0].declared.names
+    for source, trace in zip(sources, traces, strict=True):
+        if trace.declared.names != names:
+            raise InputError(source, "", f"a run with the signals of {sources[0]}: {', '.join(names)}")
     runs = tuple(Run(_make_label(i), source, trace)
                  for i, (source, trace) in enumerate(zip(sources, traces, strict=True)))
     pairs = tuple(_subtract(runs[0], other) for other in runs[1:])
@@ -152,7 +168,8 @@ def _subtract(reference: Run, other: Run) -> RunPair:
     overlap, common = len(rows.t) * period, float(agrees.sum()) * period
     is_same = len(rows.t) > 0 and bool(agrees.mean() > 0.995)  # missing rows and edges of interpolated steps aside
     differences, found, left_out = {}, [], {}
-    for name in COMPARED:
+    d = a.declared
+    for name in (*a.output_names, d.drive.name, *([d.load.name] if d.load else [])):
         reason = _find_obstacle(name, reference, other)
         if reason:
             left_out[name] = reason
@@ -167,7 +184,8 @@ def _subtract(reference: Run, other: Run) -> RunPair:
             left_out[name] = "no row with equal commands in which both runs have it"
             continue
         differences[name] = difference
-        found.append(_measure_difference(name, a.units[name], rows.t, difference, (first, second)))
+        signal = d.find(name)._replace(unit=a.units[name])
+        found.append(_measure_difference(signal, rows.t, difference, (first, second)))
     return RunPair(other, tuple(found), is_same, common, overlap, offset, rows.t, differences, left_out,
                    tuple(_list_notes(reference, other, offset, rows, agrees, is_same)))
 
@@ -177,18 +195,18 @@ def _find_obstacle(name: str, reference: Run, other: Run) -> str:
     has = [run for run in (reference, other) if name in run.trace.signals]
     if len(has) == 1:
         return f"only {has[0].label} has it"
-    a, b = (run.trace.units.get(name, SIGNALS[name].unit) for run in (reference, other))
+    a, b = (run.trace.units.get(name, "") for run in (reference, other))
     return f"in {a} in {reference.label}, in {b} in {other.label}" if has and a != b else ""
 
 
-def _measure_difference(name: str, unit: str, t: Floats, difference: Floats,
+def _measure_difference(signal: Signal, t: Floats, difference: Floats,
                         columns: tuple[Floats, Floats]) -> SignalDifference:
     known = np.flatnonzero(~np.isnan(difference))
     row = int(known[np.argmax(np.abs(difference[known]))])
     is_equal = not difference[known].any()
-    noise = [max(float(floor_from_data(column).value), FINEST.get(name, 0.0)) for column in columns]
+    noise = [max(float(floor_from_data(column).value), signal.finest) for column in columns]
     calm = np.abs(difference[known]) <= NOISE_BAND_RATIO * math.hypot(*noise)
-    return SignalDifference(name, unit, rms(difference), float(difference[row]), float(t[row]), (noise[0], noise[1]),
+    return SignalDifference(signal, rms(difference), float(difference[row]), float(t[row]), (noise[0], noise[1]),
                             len(known), float(calm.mean()), is_equal)
 
 
@@ -220,7 +238,7 @@ def _propose_offsets(a: Trace, b: Trace) -> Iterator[float]:
 def _sample_rates(trace: Trace, period: float) -> Floats:
     """Changes of the command from row to row, one row per `period`."""
     t = np.arange(trace.t[0], trace.t[-1] + 0.5 * trace.period, period)
-    return np.nan_to_num(np.diff(sample_column(trace, "com", t), prepend=np.nan))
+    return np.nan_to_num(np.diff(sample_column(trace, trace.declared.command.name, t), prepend=np.nan))
 
 
 def _correlate(first: Floats, second: Floats) -> int:
@@ -242,9 +260,9 @@ def _share_rows(a: Trace, b: Trace, offset: float) -> _Rows:
 
 def _find_common_rows(rows: _Rows) -> Flags:
     """The rows in which both commands are known and equal."""
-    first, second = rows.sample("com")
+    first, second = rows.sample(rows.reference.declared.command.name)
     with np.errstate(invalid="ignore"):
-        agrees: Flags = np.abs(first - second) <= SAME_COMMAND
+        agrees: Flags = np.abs(first - second) <= SAME_COMMAND * rows.reference.scale
     return agrees
 
 

@@ -75,7 +75,6 @@ from fdi.thresholds import (
     UNIT_TOLERANCE,
     WEIGHT_COUNTS,
 )
-from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Floats, Trace
 from plant.effects import CATALOGUE
 from plant.model import Model, find_quantity, list_searched_effects
@@ -314,7 +313,7 @@ def make_problem(model: Model, trace: Trace, floor: Mapping[str, float] | None =
                  faults: Sequence[Fault] = FAULTS) -> CountedProblem:
     """The model with faults and suspects ready in it, and the run to compare it with; `floor` RMS noise by signal, SI.
     """
-    level = {name: floor[name] if floor else model[SIGNALS[name].noise] for name in trace.outputs}
+    level = {name: floor[name] if floor else model[trace.declared.find(name).noise] for name in trace.outputs}
     own = [s.effect for s in list_suspects(model, faults) if not CATALOGUE[s.effect].base]
     own += [name.partition(".")[0] for fault in faults for name in fault.parameters]
     ready = silence_readings(model).with_effects(own)

@@ -9,6 +9,7 @@ Where two explanations fit equally well: which sensor or which command would tel
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,7 +24,6 @@ from fdi.estimation.fit import Fit, Problem, compute_misfit, compute_weights, fi
 from fdi.estimation.replay import hold_inputs
 from fdi.estimation.unidentifiable import VISCOSITY, list_powers, scale_together
 from fdi.thresholds import GAIN_DETECTED, MISFIT_DISCRIMINATES
-from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Floats, Trace
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes
@@ -252,21 +252,30 @@ def find_separation(search: Search, equal: Sequence[Hypothesis]) -> Separation |
         return None
     names = tuple(dict.fromkeys(e for h in equal for e in h.effects))
     own = search.problem.trace
-    missing = tuple(s for s in OUTPUTS if s not in own.outputs)
+    missing = tuple(s for s in own.output_names if s not in own.outputs)
     for more in dict.fromkeys([*((s,) for s in missing), missing] if missing else []):
         left = min(_measure_misfit(search, a, b, _same_command(search, a, (*own.outputs, *more))) for a, b in pairs)
         if left > MISFIT_DISCRIMINATES:
             return Separation(names, f"measure {' and '.join(more)} too, on the same command", {}, left)
     best = None
-    for words, command, play in list_commands():
+    for words, command, play in list_commands(own):
         left = min(_measure_misfit(search, a, b, _simulate_command(search, a, play, own.outputs)) for a, b in pairs)
         if left > MISFIT_DISCRIMINATES and (best is None or left > best.misfit):
             best = Separation(names, words, command, left)
     return best
 
 
-def list_commands() -> list[tuple[str, dict[str, Any], Callable[[Floats], tuple[Floats, Floats]]]]:
-    """Commands to try, in words, as segments of a sequence, and as functions of time giving demand m and load N."""
+def list_commands(trace: Trace) -> list[tuple[str, dict[str, Any], Callable[[Floats], tuple[Floats, Floats]]]]:
+    """Commands to try, in words, as segments of a sequence, and as functions of time giving demand and load.
+
+    They are those of a ram, in m and N, as large as the trace's plant has its motions and loads.
+    """
+    signal, load_signal = trace.declared.command, trace.declared.load
+    push = 5e-3 * (load_signal.largest if load_signal and math.isfinite(load_signal.largest) else 0.0)
+
+    def name(amplitude: float) -> str:
+        return f"{1e3 * amplitude:g} mm" if signal.unit == "m" else f"{amplitude:.3g} {signal.unit}"
+
     def sine(amplitude: float, hertz: float, load: float = 0.0) -> Callable[[Floats], tuple[Floats, Floats]]:
         return lambda t: (amplitude * np.sin(2.0 * np.pi * hertz * t), np.full_like(t, load))
 
@@ -283,12 +292,18 @@ def list_commands() -> list[tuple[str, dict[str, Any], Callable[[Floats], tuple[
         return segments({"kind": "hold", "time": 0.3}, {"kind": "step", "to": to, "time": 1.5},
                         {"kind": "step", "to": 0.0, "time": 1.2})
 
-    return [("a sine of 3 mm at 1 Hz against a load of 5 kN", sines(3e-3, 1.0, 5e3), sine(3e-3, 1.0, 5e3)),
-            ("a sine of 2 mm at 10 Hz", sines(2e-3, 10.0), sine(2e-3, 10.0)),
-            ("a sine of 0.2 mm at 20 Hz", sines(2e-4, 20.0), sine(2e-4, 20.0)),
-            ("a sine of 20 mm at 1 Hz", sines(20e-3, 1.0), sine(20e-3, 1.0)),
-            ("a step of 20 mm and back", steps(20e-3), step(20e-3)),
-            ("a step into the end stop, 45 mm, and back", steps(45e-3), step(45e-3))]
+    small, middle, wide, far, beyond = (size * trace.scale for size in (2e-4, 2e-3, 3e-3, 20e-3, 45e-3))
+    pushed = f"a sine of {name(wide)} at 1 Hz against a load of "
+    pushed += f"{1e-3 * push:g} kN" if load_signal and load_signal.unit == "N" else f"{push:g}"
+    found = [(f"a sine of {name(middle)} at 10 Hz", sines(middle, 10.0), sine(middle, 10.0)),
+             (f"a sine of {name(small)} at 20 Hz", sines(small, 20.0), sine(small, 20.0)),
+             (f"a sine of {name(far)} at 1 Hz", sines(far, 1.0), sine(far, 1.0)),
+             (f"a step of {name(far)} and back", steps(far), step(far))]
+    if push:
+        found.insert(0, (pushed, sines(wide, 1.0, push), sine(wide, 1.0, push)))
+    if signal.limit:
+        found.append((f"a step into the end stop, {name(beyond)}, and back", steps(beyond), step(beyond)))
+    return found
 
 
 def _same_command(search: Search, h: Hypothesis, signals: tuple[str, ...]) -> Trace:
@@ -296,8 +311,8 @@ def _same_command(search: Search, h: Hypothesis, signals: tuple[str, ...]) -> Tr
     names = [f.name for f in h.fit.free]
     predicted = search.problem.predict_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
     own = search.problem.trace
-    return replace(own, outputs=tuple(s for s in OUTPUTS if s in signals), usable=np.ones(len(own), bool),
-                   **dict(zip(OUTPUTS, predicted, strict=True)))
+    return own.with_columns(dict(zip(own.output_names, predicted, strict=True)), usable=np.ones(len(own), bool),
+                            outputs=tuple(s for s in own.output_names if s in signals))
 
 
 def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tuple[Floats, Floats]],
@@ -309,8 +324,9 @@ def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tu
     names = [f.name for f in h.fit.free]
     lanes = Lanes(problem.model, names, problem.steps, 1)
     out = lanes.closed_loop(np.array([[h.fit.values[n] for n in names]]), com, load)[0]
-    columns = dict(zip(("xj", "cor", "p12", "xs"), out.T, strict=True))
-    return hold_inputs(Trace.from_columns({"com": com, "load": load, **columns}, period, {}), signals)
+    d = problem.trace.declared
+    columns = {d.command.name: com, **dict(zip(d.loop, out.T, strict=True))} | ({d.load.name: load} if d.load else {})
+    return hold_inputs(Trace.from_columns(columns, period, {}, d), signals)
 
 
 def _measure_misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Trace) -> float:

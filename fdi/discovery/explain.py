@@ -40,7 +40,7 @@ from fdi.discovery.detectable import Blind, find_hidden_effects
 from fdi.discovery.residual_pattern import is_periodic_in_position
 from fdi.discovery.search import FINE, Hypothesis, Search, Sensitivity, compute_sensitivity
 from fdi.estimation.fit import compute_typical_rms
-from fdi.estimation.replay import find_undecided_rows
+from fdi.estimation.replay import find_controller_gain, find_undecided_rows
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (
     ERROR_PARTLY_EXPLAINED,
@@ -110,7 +110,7 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
                   if e.port not in ("command", "reading") and e.starts]
     search = Search(model, est, repeats, candidates, holdout=holdout, whole=whole)
     if marks.step:
-        search.coarse = {"xj": marks.rounding}
+        search.coarse = {est.declared.controlled.name: marks.rounding}
     progress("fitting the tolerances", 0.03)
     base = search.fit_base()
     if base.is_at_floor:
@@ -419,11 +419,11 @@ def find_marks(model: Model, traces: Sequence[Trace]) -> Marks:
     A transducer with few bits is read by the controller as well, so Cor follows from the steps. Where Cor differs by
     what rounding leaves, the recorder has rounded what the controller knows better, and that is no effect of the bench.
     """
-    comb = find_comb(traces[0].position, FINEST_COMB)
+    comb = find_comb(traces[0].anchor, FINEST_COMB)
     step, prints = comb.step if comb else 0.0, list[Fingerprint]()
     resolution, is_recorder = measure_firmware_resolution(model, traces[0]), False
     if comb and model.kind.controller:
-        left = model["controller.proportional_gain"] * step
+        left = find_controller_gain(model, traces[0].period)[0] * step
         is_recorder = is_rounding_left(compute_firmware_residual(model, traces[0]), left, resolution)
         resolution = float(np.hypot(resolution, left / np.sqrt(12.0))) if is_recorder else resolution
     if comb and not is_recorder and "quantisation" not in model.effects:
@@ -443,16 +443,17 @@ def measure_firmware_resolution(model: Model, trace: Trace) -> float:
 
     Where the file holds Com or Cor with fewer digits, these.
     """
-    gain = model["controller.proportional_gain"]
-    steps = np.array([max(BUS_CURRENT, measure_resolution(trace.cor)), gain * BUS_POSITION,
-                      gain * max(BUS_POSITION, measure_resolution(trace.com))])
+    gain = find_controller_gain(model, trace.period)[0]
+    steps = np.array([max(BUS_CURRENT, measure_resolution(trace.drive)), gain * BUS_POSITION * trace.scale,
+                      gain * max(BUS_POSITION * trace.scale, measure_resolution(trace.command))])
     return float(np.sqrt((steps**2).sum() / 12.0))
 
 
 def compute_firmware_residual(model: Model, trace: Trace) -> Floats:
     """Cor of the model's controller on the measured com and XJ, minus the measured Cor: (n,) A, NaN where missing."""
     own = replace(model, effects=tuple(e for e in model.effects if CATALOGUE[e].firmware))
-    return compute_answers(own, trace.com, hold_last(trace.position)) - np.where(trace.incomplete, np.nan, trace.cor)
+    answers = compute_answers(own, trace.command, hold_last(trace.anchor))
+    return answers - np.where(trace.incomplete, np.nan, trace.drive)
 
 
 def _measure_rms(model: Model, traces: Sequence[Trace]) -> float:

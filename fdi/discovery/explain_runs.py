@@ -13,7 +13,7 @@ from fdi.discovery.detectable import Blind, find_separation
 from fdi.discovery.explain import Explanation, Fingerprint, explain, measure_gain
 from fdi.discovery.laws.find_law import LawSearch, find_law_beside
 from fdi.discovery.laws.terms import write_law_file
-from fdi.discovery.residual_pattern import Pattern, find_pattern, write_effect
+from fdi.discovery.residual_pattern import UNBALANCED, Pattern, can_balance, find_pattern, write_effect
 from fdi.discovery.runs import Runs
 from fdi.discovery.search import Hypothesis, choose_search_excerpt, compute_p_value
 from fdi.estimation.fit import UNREPLAYED, Fit, Value, complete_model, limit_friction_values, silence_readings
@@ -29,6 +29,7 @@ from fdi.thresholds import (
     SUSPICIOUS_TOLERANCES,
 )
 from plant.effects import CATALOGUE
+from plant.errors import InputError
 from plant.lanes import Lanes, compile_kernels, list_kernel_variants
 from plant.model import Model, find_quantity, list_searched_effects
 from plant.run import report_law_errors
@@ -55,18 +56,20 @@ def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = Non
     Raises:
         InputError: a user's effect that cannot be compiled and run, or a file that cannot be written.
     """
+    if effect_file and not can_balance(runs.model):
+        raise InputError("--write-effect", str(effect_file), f"a plant with known balances; {UNBALANCED}")
     prepare_effects(runs, progress=progress)
     e = explain_recording(runs, progress)
     is_left, law = e.verdict in PATTERN_VERDICTS, None
-    # the terms of laws have been tried on the reference model's balances only
-    if is_left and not e.base.is_at_floor and runs.model.plant == "eha":
+    # the terms of laws are those of the reference model's balances
+    if is_left and not e.base.is_at_floor and runs.model.kind.balances:
         law = find_law_beside(e, progress)
     progress("writing the answer", 0.97)
     found = law.law if law is not None and law.law is not None and law.law.holds else None
     file = effect_file or law_file
     names = write_law_file(file, found.terms, found.values, found.reason) if found is not None and file else {}
     shape = None
-    if is_left or (effect_file and found is None):
+    if can_balance(runs.model) and (is_left or (effect_file and found is None)):
         shape = find_pattern(e.search, e.ledger[-1])
         if effect_file and found is None:
             write_effect(shape, effect_file)
@@ -75,8 +78,9 @@ def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = Non
         equal = [h for h in e.ranked if h.is_at_floor and set(h.effects) <= set(e.effects)]
         separation = find_separation(e.search, equal)
     answer = assess_explanation(e, seed)
-    return replace(answer, pattern=str(shape) if is_left else "", separate=separation._asdict() if separation else {},
-                   law=law, law_effects=tuple(names.values())), shape
+    told = replace(answer, pattern=str(shape or UNBALANCED) if is_left else "",
+                   separate=separation._asdict() if separation else {}, law=law, law_effects=tuple(names.values()))
+    return told, shape
 
 
 def explain_recording(runs: Runs, progress: Progress = ignore_progress, rounds: int = 2) -> Explanation:
@@ -114,7 +118,7 @@ def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: 
     for name in [e.name for e in list_searched_effects(runs.model.plant)] if effects is None else effects:
         if not CATALOGUE[name].starts and CATALOGUE[name].fitted:
             progress(f"looking for sizes of {name}", 0.0)
-            ensure_starts(name, runs.est.com, runs.est.load)
+            ensure_starts(name, runs.est.command, runs.est.load)
     if effects is None:
         whole_model = complete_model(runs.model)
         with report_law_errors(whole_model):
@@ -215,7 +219,8 @@ def assess_explanation(e: Explanation, seed: int) -> Answer:
     baseline = {"error": dict(e.base.errors), "holdout": dict(e.holdout.get((), {})), "floor": dict(e.floor)}
     if hand:
         unit = e.marks.resolution
-        baseline["error"]["cor"], baseline["floor"]["cor"] = e.marks.controller * unit, unit
+        drive = e.search.problem.trace.declared.drive.name
+        baseline["error"][drive], baseline["floor"][drive] = e.marks.controller * unit, unit
     best = e.ledger[-1].fit if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base.fit
     model = e.search.problem.model
     noiseless = tuple(c.name for c in list_searched_effects(model.plant) if c.port in UNREPLAYED and c.fitted)
@@ -291,8 +296,9 @@ def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:
     values = {name: Value(*of, CATALOGUE[p.effect].parameters[name].unit) for name, of in p.parameters.items()}
     error, ratios = dict(e.base.errors), dict(e.base.ratio)
     if CATALOGUE[p.effect].firmware:
-        error["cor"] = p.after * e.marks.resolution
-        ratios = {"cor": p.after}
+        drive = e.search.problem.trace.declared.drive.name
+        error[drive] = p.after * e.marks.resolution
+        ratios = {drive: p.after}
     n = len(e.search.problem.trace)
     won = n * math.log(max(p.before, 1.0) / max(p.after, 1.0))
     evidence = won - 0.5 * len(values) * math.log(n) - math.log(len(CATALOGUE))
@@ -303,12 +309,12 @@ def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:
 
 def _list_ledger(e: Explanation, hand: Sequence[Fingerprint]
             ) -> list[tuple[str | None, Mapping[str, float], Mapping[str, float]]]:
-    unit = e.marks.resolution
-    cor = {"cor": e.marks.controller * unit} if hand else {}
+    unit, name = e.marks.resolution, e.search.problem.trace.declared.drive.name
+    drive = {name: e.marks.controller * unit} if hand else {}
     rows: list[tuple[str | None, Mapping[str, float], Mapping[str, float]]] = [
-        (None, e.base.errors | cor, e.holdout.get((), {}))]
+        (None, e.base.errors | drive, e.holdout.get((), {}))]
     for p in e.marks.prints:
         if p.effect in e.effects:
-            cor = {"cor": p.after * unit} if p in hand else cor
-            rows.append((p.effect, e.base.errors | cor, e.holdout.get((), {})))
-    return rows + [(h.effects[-1], h.errors | cor, e.holdout.get(h.effects, {})) for h in e.ledger[1:]]
+            drive = {name: p.after * unit} if p in hand else drive
+            rows.append((p.effect, e.base.errors | drive, e.holdout.get((), {})))
+    return rows + [(h.effects[-1], h.errors | drive, e.holdout.get(h.effects, {})) for h in e.ledger[1:]]

@@ -12,8 +12,8 @@ from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.fit import Problem
 from fdi.output import write_text
 from fdi.thresholds import PATTERN_EXPLAINED_SHARE, PATTERN_VISIBLE_RATIO
-from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Flags, Floats, Trace
+from plant.model import Model
 
 KNOTS = 15  # of a curve
 SPATIAL_TURNS = 3.0  # over the range of the position: a slower wave is a trend, for example a spring
@@ -29,6 +29,17 @@ STATES = {"position": ("m", "s.jack_position"), "speed": ("m/s", "s.jack_speed")
 PORTS = {"force": ("load", "x + {0}"), "flow": ("metering", "x - ({0}) / p.valve.flow_gain"),
          "current": ("current", "x - ({0})")}
 PUMPED = ("current", "x - ({0}) / p.pump.displacement")  # a flow, where a pump delivers it
+
+
+# Parameters of the equations that are balanced: of the ram, and of the valve or the pump that feeds it.
+RAM = frozenset({"jack.area", "jack.damping", "jack.mass", "jack.dynamic_friction", "jack.leakage"})
+FEEDS = (frozenset({"pump.displacement", "pump.area_ratio"}), frozenset({"valve.flow_gain", "pilot.flow_gain"}))
+UNBALANCED = "the equations of this plant are not known as balances: what is left is not traced to a force or a flow"
+
+
+def can_balance(model: Model) -> bool:
+    """Whether the plant has the equations that are balanced here."""
+    return any(RAM | feed <= model.values.keys() for feed in FEEDS)
 
 
 class Pattern(NamedTuple):
@@ -92,6 +103,8 @@ def is_periodic_in_position(search: Search, base: Hypothesis, found: Hypothesis)
     Teeth, magnets and a bent rod make such a force. A friction law that fits its mean at each speed helps a little, on
     every run, and is then named for it.
     """
+    if not can_balance(search.problem.model):
+        return False
     balances, states = compute_balances(search.problem, base, search.estimate_floor(base))
     force = next((b for b in balances if b.place == "force"), None)
     if force is None or force.ratio < PATTERN_VISIBLE_RATIO:
@@ -242,11 +255,11 @@ def compute_balances(problem: Problem, h: Hypothesis, floor: Mapping[str, float]
     measured = replay.copy()
     columns = trace.output_columns
     measured[columns] = np.where(np.isnan(trace.measurements), replay[columns], trace.measurements)
-    before = np.concatenate([[0.0], trace.cor[:-1]])
+    before = np.concatenate([[0.0], trace.drive[:-1]])
     period = problem.model.values["controller.period"]
     compute = partial(_compute_terms, current=before, load=trace.load, p=values, period=period)
     own, seen = compute(replay), compute(measured)
-    level = [floor.get(s, 0.0) for s in OUTPUTS]
+    level = [floor.get(s, 0.0) for s in trace.output_names]
     rng = np.random.default_rng(0)
     draws = 4  # simulated runs without anything missing
     kept = find_smooth_rows(trace)
@@ -260,7 +273,7 @@ def compute_balances(problem: Problem, h: Hypothesis, floor: Mapping[str, float]
         found.append(Balance(place, UNITS[place], missing, noise, rms / noise if noise else 0.0, smooth[kept]))
     position, speed = _smooth(measured[0], SPEED_WINDOW), _measure_speed(measured[0], period)
     states = (position, speed, measured[1], measured[2], before, trace.t, _measure_speed(measured[2], period),
-              trace.com, np.clip(speed / CREEP, -1.0, 1.0), measure_way(position, speed),
+              trace.command, np.clip(speed / CREEP, -1.0, 1.0), measure_way(position, speed),
               _smooth(measured[0], ACCELERATION_WINDOW, deriv=2, delta=period))
     return sorted(found, key=lambda b: -b.ratio), States(*(x[kept] for x in states))
 

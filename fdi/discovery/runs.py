@@ -17,7 +17,6 @@ from fdi.estimation.replay import (
     prepare_trace,
     replay_current,
 )
-from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
@@ -50,7 +49,8 @@ def read_runs(model: Model, trace: str, repeats: Sequence[str] = (), holdout: st
     """
     files = [trace, *repeats, *([holdout] if holdout else [])]
     sources = [read_source(file) for file in files]
-    return _prepare_runs(model, [Trace.read(file) for file in files], sources, len(repeats), signals)
+    traces = [Trace.read(file, signals=model.kind.signals) for file in files]
+    return _prepare_runs(model, traces, sources, len(repeats), signals)
 
 
 def collect_runs(model: Model, trace: Trace, repeats: Sequence[Trace] = (), holdout: Trace | None = None,
@@ -75,17 +75,19 @@ def _prepare_runs(model: Model, traces: Sequence[Trace], sources: Sequence[Sourc
     others = tuple(_prepare_repeat(est, traces[n], model, names[n], n) for n in range(1, 1 + repeats))
     unseen = _prepare_holdout(est, traces[-1], model, names[0], names[-1]) if len(traces) > 1 + repeats else None
     doubt = ""
-    if others and model.plant == "eha":  # an error of the model is the same in all of them, so it does not matter here
+    if others and model.kind.controller:  # an error of the model is the same in all of them and does not matter here
         first, *left = (compute_residuals(run, replay_current(run, model)) for run in (est, *others))
-        doubt = describe_doubtful_repeats(find_floors(first, left, est.period), sensor_floors(est, model))
+        doubt = describe_doubtful_repeats(find_floors(first, left, est.period), sensor_floors(est, model),
+                                          est.declared)
     return Runs(model, est, others, unseen, tuple(sources), (*est.notes, *([doubt] if doubt else [])))
 
 
 def hash_columns(trace: Trace) -> str:
     """SHA-256 of the columns of a trace, which tells it from any other."""
     content = hashlib.sha256()
-    for name in ("com", *OUTPUTS, "cor", "load"):
-        content.update(trace.column(name).tobytes())
+    d = trace.declared
+    for signal in (d.command, *d.outputs, d.drive, *([d.load] if d.load else [])):
+        content.update(trace.column(signal.name).tobytes())
     return content.hexdigest()
 
 
@@ -120,8 +122,8 @@ def require_distinct(sources: Sequence[Source], first: str, expected: str, count
 
 
 def _prepare_run(trace: Trace, model: Model, outputs: Sequence[str] | None, source: str) -> Trace:
-    """A run as fits use it; the checks of ranges and rates are those of the reference model alone."""
-    if model.plant != "eha":
+    """A run as fits use it: on the cycles of its controller, where that is known; else row by row as it is."""
+    if not model.kind.controller:
         return hold_inputs(trace, outputs, source)
     return prepare_trace(trace, model, outputs, source)
 
@@ -131,7 +133,7 @@ def _prepare_repeat(est: Trace, trace: Trace, model: Model, source: str, number:
     missing = [s for s in est.outputs if s not in trace.signals]
     if missing:
         raise InputError(source, missing[0], f"the signals of the run it repeats ({', '.join(est.outputs)})")
-    if model.plant != "eha":
+    if not model.kind.controller:
         return hold_inputs(trace, est.outputs, source)
     repeat = find_repeat(est, trace, model, number)
     if repeat.late == 0 and len(repeat.trace) == len(trace):

@@ -48,11 +48,11 @@ from fdi.thresholds import (
     TOLERANCE_SQUARE_FAR,
     WHITE_SQUARE_POOR,
 )
-from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Floats, Trace
 from plant.effects import CATALOGUE
 from plant.lanes import Part
 from plant.model import Model
+from plant.signals import Signal
 from plant.threads import R, T, count_threads, map_in_threads
 
 FITTED = 8  # effects of a scan that get a full fit
@@ -116,6 +116,13 @@ def choose_search_excerpt(model: Model, trace: Trace, effects: Iterable[str], pr
     return choose_excerpt(trace, complete_model(model), floor, changes, progress)
 
 
+def _find_level(trace: Trace, signal: Signal, model: Model) -> float:
+    """RMS of a sensor's white noise: the model's, or that of the data where the plant declares none."""
+    if signal.noise:
+        return model[signal.noise]
+    return max(noises.floor_from_data(trace.mask_unusable(signal.name)).value, signal.finest) or 1.0
+
+
 class Search:
     """The state of one search: the problem, its noise, every hypothesis tried."""
 
@@ -123,9 +130,11 @@ class Search:
                  workers: int | None = None, holdout: Trace | None = None, whole: Sequence[Trace] = ()) -> None:
         self.workers = workers or count_threads()
         self.holdout, self.whole = holdout, whole  # `whole`: what the runs were cut from, if they were
-        self.sensors = {name: noises.white_noise(model[SIGNALS[name].noise]) for name in OUTPUTS}
+        self.sensors = {signal.name: noises.white_noise(_find_level(trace, signal, model))
+                        for signal in trace.declared.outputs}
         lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
-        self.coarse = {"xj": lsb / np.sqrt(12.0)} if lsb else {}  # RMS of rounding, where a signal comes in steps
+        # RMS of rounding, where a signal comes in steps
+        self.coarse = {trace.declared.controlled.name: lsb / np.sqrt(12.0)} if lsb else {}
         self.noise = tuple(self.sensors[s]._replace(innovation=float(np.hypot(
             self.sensors[s].innovation, self.coarse.get(s, 0.0)))) for s in trace.outputs)
         self.model, ready = model, complete_model(model)

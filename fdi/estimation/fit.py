@@ -102,13 +102,13 @@ class Problem:
         return np.concatenate(runs, axis=-1) if self.also else runs[0]
 
     def predict_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
-        """XJ, P12 and XS of one run (default: the first), as its sensors show them, measured or not: (m, 3, n)."""
+        """All outputs of one run (default: the first), as its sensors show them, measured or not: (m, outputs, n)."""
         key = tuple(names)
         if key not in self._lanes:
             bare = self.bare is not None and set(key) <= set(self.bare.values)
             self._lanes[key] = Lanes(self.bare if bare and self.bare else self.model, key, self.steps, self.workers)
         trace = self.trace if trace is None else trace
-        out = self._lanes[key].replay(values, trace.cor, trace.load, trace.position, self.anchor, trace.parts,
+        out = self._lanes[key].replay(values, trace.drive, trace.load, trace.anchor, self.anchor, trace.parts,
                                       trace.chambers)
         return trace.pass_sensors(out).transpose(0, 2, 1)
 
@@ -223,7 +223,6 @@ def compute_typical_rms(residuals: Floats, share: float = 0.85) -> Floats:
 
 
 UNREPLAYED = ("command", "reading")  # ports that a replay from the measured current does not pass
-WITHOUT_NOISE = {f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")}
 
 
 def list_relative_tolerances(model: Model, names: Iterable[str]) -> dict[str, float]:
@@ -319,6 +318,11 @@ def _is_off_nominal(e: Effect, model: Model) -> bool:
                for name, q in e.parameters.items())
 
 
+def silence_sensors(model: Model) -> Model:
+    """The model without the noise of its sensors."""
+    return model.replace({signal.noise: 0.0 for signal in model.kind.signals if signal.noise})
+
+
 def complete_model(model: Model) -> Model:
     """The model without sensor noise and with all effects that are searched in its plant, at their off values."""
     return silence_readings(model.with_effects(e.name for e in list_searched_effects(model.plant) if not e.disturbance))
@@ -327,7 +331,7 @@ def complete_model(model: Model) -> Model:
 def silence_readings(model: Model) -> Model:
     """The model without sensor noise and rounding: these are what fits allow for."""
     readings = [CATALOGUE[name] for name in model.effects if CATALOGUE[name].port == "reading"]
-    return model.replace(WITHOUT_NOISE | {name: value for e in readings for name, value in e.off.items()})
+    return silence_sensors(model).replace({name: value for e in readings for name, value in e.off.items()})
 
 
 DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)

@@ -13,8 +13,8 @@ act there alone.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from fdi.estimation.fit import (
 )
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import ANCHOR_RATE, RESIDUAL_HELD_OUT
-from fdi.trace.trace import PER_ROW, Flags, Floats, Trace
+from fdi.trace.trace import Flags, Floats, Trace
 from plant.lanes import TURN, Lanes, Part
 from plant.model import Model
 
@@ -60,7 +60,7 @@ def _is_driven_by_pressures(trace: Trace, model: Model) -> bool:
 
 def replay_in_turns(lanes: Lanes, values: Floats, trace: Trace, position: Floats | None, anchor: float,
                     rows: int = TURN) -> Iterator[tuple[int, Floats]]:
-    """XJ m, P12 Pa and XS m as the sensors of the trace show them, so many `rows` at a time: the first row, (m, k, 3).
+    """The outputs as the sensors of the trace show them, so many `rows` at a time: the first row, (m, k, outputs).
 
     Memory does not grow with the recording, unless the position is predicted from measured pressures.
 
@@ -73,12 +73,12 @@ def replay_in_turns(lanes: Lanes, values: Floats, trace: Trace, position: Floats
         rows: of a turn.
     """
     if _is_driven_by_pressures(trace, lanes.model):
-        out = lanes.replay(values, trace.cor, trace.load, position, anchor, trace.parts, trace.chambers)
+        out = lanes.replay(values, trace.drive, trace.load, position, anchor, trace.parts, trace.chambers)
         whole = trace.pass_sensors(out)
         yield from ((first, whole[:, first:first + rows]) for first in range(0, len(trace), rows))
         return
-    before = np.empty((len(values), 0, 3))  # what a filtering sensor remembers
-    for first, out in lanes.replay_in_turns(values, trace.cor, trace.load, position, anchor, rows):
+    before = np.empty((len(values), 0, len(trace.output_names)))  # what a filtering sensor remembers
+    for first, out in lanes.replay_in_turns(values, trace.drive, trace.load, position, anchor, rows):
         if not trace.sensors:
             yield first, out
             continue
@@ -152,7 +152,7 @@ def _measure_information(trace: Trace, model: Model, floor: Mapping[str, float],
     scale = 1.0 / np.array([floor[name] for name in trace.outputs])
     information, misfit = np.zeros((count, len(moved), len(moved))), np.zeros(count)
     measured = np.zeros(count)
-    turns = replay_in_turns(lanes, limit_dynamic_friction(names, table), trace, trace.position, ANCHOR_RATE, rows)
+    turns = replay_in_turns(lanes, limit_dynamic_friction(names, table), trace, trace.anchor, ANCHOR_RATE, rows)
     for k, (first, out) in enumerate(turns):
         if k >= count:
             break
@@ -191,7 +191,7 @@ def cut_excerpt(trace: Trace, excerpt: Excerpt) -> Trace:
     ranges, parts, rows = list[tuple[int, int, int]](), [], 0
     for first, stop in excerpt.pieces:
         begin, stop = max(_find_lead_in(trace, first), ranges[-1][2] if ranges else 0), min(stop, len(trace))
-        known = np.flatnonzero(~np.isnan(trace.xj[begin:stop]))
+        known = np.flatnonzero(~np.isnan(trace.controlled[begin:stop]))
         if not len(known):
             continue
         begin += int(known[0])  # a replay starts where the ram was seen
@@ -201,10 +201,8 @@ def cut_excerpt(trace: Trace, excerpt: Excerpt) -> Trace:
     kept = np.concatenate([np.arange(begin, stop) for begin, _, stop in ranges])
     leading = np.concatenate([np.arange(begin, stop) < first if begin else np.zeros(stop, bool)
                               for begin, first, stop in ranges])
-    columns: dict[str, Any] = {name: getattr(trace, name)[kept] for name in PER_ROW}
-    columns["usable"], columns["incomplete"] = columns["usable"] & ~leading, columns["incomplete"] | leading
-    chambers = None if trace.chambers is None else trace.chambers[kept]
-    return replace(trace, **columns, chambers=chambers, parts=tuple(parts))
+    return trace.take_rows(kept, usable=trace.usable[kept] & ~leading, incomplete=trace.incomplete[kept] | leading,
+                           parts=tuple(parts))
 
 
 def _find_lead_in(trace: Trace, first: int, wide: float = 0.5, longest: float = 20.0) -> int:
@@ -213,12 +211,12 @@ def _find_lead_in(trace: Trace, first: int, wide: float = 0.5, longest: float = 
     A spool that friction holds remembers where it came to rest until the next wide movement. The current must have
     gone through the `wide` part of its usual range, within the `longest` time, s.
     """
-    usual = float(np.subtract(*np.percentile(trace.cor[::10], (99.0, 1.0))))
+    usual = float(np.subtract(*np.percentile(trace.drive[::10], (99.0, 1.0))))
     step = round(LEAD_IN / trace.period)
     begin = first
     while begin > 0 and (first - begin) * trace.period < longest:
         begin = max(begin - step, 0)
-        if float(np.ptp(trace.cor[begin:first])) >= wide * usual:
+        if float(np.ptp(trace.drive[begin:first])) >= wide * usual:
             return max(begin - step, 0) if first - begin < 2 * step else begin
     return begin
 
@@ -275,7 +273,7 @@ def judge_on_all(problem: Problem, fits: Sequence[Fit], trace: Trace, steps: int
     lanes = Lanes(problem.model, names, steps)
     period, outputs = trace.period, trace.output_columns
     squares, counts = [], []
-    turns = replay_in_turns(lanes, limit_dynamic_friction(names, values), trace, trace.position, problem.anchor)
+    turns = replay_in_turns(lanes, limit_dynamic_friction(names, values), trace, trace.anchor, problem.anchor)
     for first, out in turns:
         seen = trace.measurements[:, first:first + out.shape[1]]
         left = out.transpose(0, 2, 1)[:, outputs] - seen

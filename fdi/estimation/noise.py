@@ -27,10 +27,10 @@ from fdi.thresholds import (
     NOISIER_THAN_MODEL,
     REPEAT_FLOOR_RATIO,
 )
-from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Flags, Floats, Trace, rms
 from plant.effects import CATALOGUE, combine_laws
 from plant.model import Model
+from plant.signals import Signals
 from plant.state import Input
 
 WINDOW = 100  # samples; shorter than stick-slip events are apart, longer than two periods of hum
@@ -38,7 +38,6 @@ QUIET = 0.2  # the part of all windows that the first guess rests on
 LAGS = 40  # samples, of the noise's autocorrelation
 MAINS = (50.0, 60.0, 400.0)  # Hz, and what is an odd or even multiple of them below half the sampling rate
 NEIGHBOURS = (-7.0, -5.0, -3.0, 3.0, 5.0, 7.0)  # Hz beside a line: how large it would look without hum
-FINEST = {"xj": 5e-8, "p12": 2e3, "xs": 5e-8}  # no transducer is better, and a simulation without noise needs a floor
 SWEEP = 4000  # positions
 
 
@@ -97,28 +96,29 @@ def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
     """The floors without repeats: the model's sensor noise, or the data's own where that is more or none is given."""
     out = {}
     for name in trace.outputs:
-        given, seen = model[SIGNALS[name].noise], floor_from_data(trace.mask_unusable(name))
-        given = simulate_reading_noise(model, trace.xj) if name == "xj" else given
+        signal, seen = trace.declared.find(name), floor_from_data(trace.mask_unusable(name))
+        given = model.values.get(signal.noise, 0.0)
+        given = simulate_reading_noise(model, trace.controlled) if signal == trace.declared.controlled else given
         share = 1.0
         if name in trace.sensors:
             given = trace.sensors[name].measure_noise(given)
             share = trace.sensors[name].count_independent(trace.period)
         found = Floor(given, "model") if given > 0.0 and seen.value < NOISIER_THAN_MODEL * given else seen
-        out[name] = found._replace(value=max(found.value, FINEST[name]), freedom=share)
+        out[name] = found._replace(value=max(found.value, signal.finest), freedom=share)
     return out
 
 
-def simulate_reading_noise(model: Model, xj: Floats) -> float:
-    """RMS, m, of what noise and the effects on a reading (rounding, say) make of a position within xj's range.
+def simulate_reading_noise(model: Model, controlled: Floats) -> float:
+    """RMS of what noise and the effects on a reading (rounding, say) make of a signal within the range of `controlled`.
 
     A sweep through it, as neither is in a replay.
     """
-    level = model["sensors.position_noise"]
+    level = model.values.get(model.kind.signals.controlled.noise, 0.0)
     law, memory = combine_laws("reading", model.effects)
     if not any(CATALOGUE[name].port == "reading" for name in model.effects):
         return level
     noise = level * np.random.default_rng(0).standard_normal(SWEEP)
-    true = np.linspace(float(np.nanmin(xj)), float(np.nanmax(xj)), SWEEP)
+    true = np.linspace(float(np.nanmin(controlled)), float(np.nanmax(controlled)), SWEEP)
     s, p, out = model.build_state(), model.build_record()[0], np.empty(SWEEP)
     for k, x in enumerate((true + noise).tolist()):
         u = Input(0.0, 0.0, 0.0, k * model["controller.period"], 0.0, model["controller.period"])
@@ -126,12 +126,12 @@ def simulate_reading_noise(model: Model, xj: Floats) -> float:
     return rms(out - true)
 
 
-def describe_doubtful_repeats(floor: Mapping[str, Floor], noise: Mapping[str, Floor]) -> str:
+def describe_doubtful_repeats(floor: Mapping[str, Floor], noise: Mapping[str, Floor], signals: Signals) -> str:
     """What makes a noise floor from repeats larger than the sensors' own noise explains; empty if nothing does."""
     def limit(name: str) -> float:  # the data's own noise is a lower bound: coloured noise has less of it
         return REPEAT_FLOOR_RATIO * (LOWER_BOUND_ERROR_RATIO if noise[name].lower_bound else 1.0)
 
-    above = [f"{SIGNALS[name].symbol} by {f.value / noise[name].value:.2g}" for name, f in floor.items()
+    above = [f"{signals.find(name).symbol} by {f.value / noise[name].value:.2g}" for name, f in floor.items()
              if f.source == "repeats" and f.value > limit(name) * noise[name].value]
     if not above:
         return ""

@@ -15,11 +15,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from fdi.estimation.fit import WITHOUT_NOISE, Fit, Problem, limit_dynamic_friction, list_tolerance_sizes
+from fdi.estimation.fit import Fit, Problem, limit_dynamic_friction, list_tolerance_sizes, silence_sensors
 from fdi.estimation.long_recordings import choose_excerpt, cut_excerpt, is_long, replay_in_turns
 from fdi.estimation.noise import WINDOW
 from fdi.thresholds import (
@@ -30,10 +30,9 @@ from fdi.thresholds import (
     SCATTER_LARGE_RESIDUAL,
     SCATTER_TOLERANCES,
     SOLVER_ERROR_SHARE,
-    UNDECIDED_SMALLEST,
 )
-from fdi.trace.signals import OUTPUTS, SIGNALS
-from fdi.trace.trace import PER_ROW, Flags, Floats, Trace, bridge_gaps, hold_last, hold_next, rms
+from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, hold_last, hold_next, rms
+from plant.controller import compute_answers
 from plant.errors import InputError
 from plant.lanes import Lanes
 from plant.model import Model
@@ -50,33 +49,33 @@ ALIKE = 20  # neighbouring samples that say the same thing
 class Replay(NamedTuple):
     """A model's replay of one trace; columns (n,) by signal."""
 
-    model: Columns  # XJ anchored, P12, XS
+    model: Columns  # the plant's outputs, the controlled one anchored
     residual: Columns  # measured less model, NaN where not measured
     steps: int  # a cycle
     solver_error: Mapping[str, float]  # RMS, by halving the step
     undecided: Flags  # rows that hang on a knife's edge
-    blind: Mapping[str, float]  # RMS, elsewhere, by which the current that was not recorded may move a replay
+    blind: Mapping[str, float]  # RMS, elsewhere, by which the drive that was not recorded may move a replay
 
 
 def replay_lanes(lanes: Lanes, values: Floats, trace: Trace, current: Floats | None = None,
                  anchor: float = ANCHOR_RATE) -> Floats:
-    """XJ, P12 and XS, (m, n, 3), of the plant driven by a current (default: the measured one), for each row of values.
+    """The outputs, (m, n, outputs), of the plant driven by a current (default: the measured one), for each of values.
 
     They are what the sensors of the trace show of the plant.
 
     The replay starts at the first measured position, or in the middle where that is not known.
     """
-    position = trace.unlagged_position if has_known_start(trace) else None
-    driven = trace.cor if current is None else current
+    position = trace.unlagged if has_known_start(trace) else None
+    driven = trace.drive if current is None else current
     out = lanes.replay(values, driven, trace.load, position, anchor, trace.parts, trace.chambers)
     return trace.pass_sensors(out)
 
 
 def replay_current(trace: Trace, model: Model, steps: int = REPLAY_STEPS, anchor: float = ANCHOR_RATE) -> Columns:
-    """XJ, P12 and XS, (n,) each, of the plant driven by the measured current, without noise."""
-    lanes = Lanes(model.replace(WITHOUT_NOISE), (), steps)
+    """The outputs, (n,) each, of the plant driven by the measured current, without noise."""
+    lanes = Lanes(silence_sensors(model), (), steps)
     out = replay_lanes(lanes, np.empty((1, 0)), trace, anchor=anchor)
-    return {name: out[0, :, i] for i, name in enumerate(OUTPUTS)}
+    return {name: out[0, :, i] for i, name in enumerate(trace.output_names)}
 
 
 def measure_misfit(trace: Trace, model: Model) -> float:
@@ -87,7 +86,7 @@ def measure_misfit(trace: Trace, model: Model) -> float:
 
 def has_known_start(trace: Trace) -> bool:
     """Whether the first position is known; else the replay starts in the middle."""
-    return not np.isnan(trace.xj[0])
+    return not np.isnan(trace.controlled[0])
 
 
 def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, float]) -> Replay:
@@ -95,7 +94,7 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
     coarse, undecided, blind = _replay_with_other_frictions(trace, model, floor)
     checked = trace
     if is_long(trace):
-        checked = cut_excerpt(trace, choose_excerpt(trace, model.replace(WITHOUT_NOISE), floor))
+        checked = cut_excerpt(trace, choose_excerpt(trace, silence_sensors(model), floor))
     steps, error = _choose_steps(checked, model, floor, undecided if checked is trace else ~checked.usable)
     if checked is trace or steps > 2 * REPLAY_STEPS:  # else the replay that is there will do
         coarse = replay_current(trace, model, steps)
@@ -109,27 +108,28 @@ def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str,
     """The replay, the rows that hang on a knife's edge, and by how much a guessed current moves it elsewhere, RMS."""
     names = [name for name in FRICTIONS if name in model.values]
     values = vary_frictions(names, model.values)
-    lanes = Lanes(model.replace(WITHOUT_NOISE), names, REPLAY_STEPS)
-    position = trace.unlagged_position if has_known_start(trace) else None
+    lanes = Lanes(silence_sensors(model), names, REPLAY_STEPS)
+    position = trace.unlagged if has_known_start(trace) else None
     turns = [replay_in_turns(lanes, values, trace, position, ANCHOR_RATE)]
-    turns += [replay_in_turns(lanes, values[:1], replace(trace, cor=current), position, ANCHOR_RATE)
+    turns += [replay_in_turns(lanes, values[:1], trace.with_inputs(drive=current), position, ANCHOR_RATE)
               for current in guess_current(trace)]
-    found = np.empty((len(OUTPUTS), len(trace)))
+    outputs = trace.declared.outputs
+    found = np.empty((len(outputs), len(trace)))
     undecided = np.zeros(len(trace), bool)
-    power, count = np.zeros(len(OUTPUTS)), 0
+    power, count = np.zeros(len(outputs)), 0
     for (first, own), *others in zip(*turns, strict=True):
         runs = np.concatenate([own, *(other for _, other in others)])
         rows = slice(first, first + runs.shape[1])
         found[:, rows] = runs[0].T
-        for i, name in enumerate(OUTPUTS):
-            if name in floor:
+        for i, signal in enumerate(outputs):
+            if signal.name in floor:
                 moved = np.abs(runs[1:, :, i] - runs[:1, :, i])
-                large = find_large_windows(moved, max(floor[name], UNDECIDED_SMALLEST[name]))
-                undecided[rows] |= large & ~np.isnan(trace.mask_unusable(name)[rows])
+                large = find_large_windows(moved, max(floor[signal.name], signal.slight))
+                undecided[rows] |= large & ~np.isnan(trace.mask_unusable(signal.name)[rows])
         guessed = (runs[len(values):] - runs[:1])[:, ~undecided[rows]]
         power, count = power + (guessed**2).sum(axis=(0, 1)), count + guessed.shape[0] * guessed.shape[1]
-    blind = {name: math.sqrt(float(power[i]) / count) if count else 0.0 for i, name in enumerate(OUTPUTS)}
-    return {name: found[i] for i, name in enumerate(OUTPUTS)}, undecided, blind
+    blind = {name: math.sqrt(float(power[i]) / count) if count else 0.0 for i, name in enumerate(trace.output_names)}
+    return {name: found[i] for i, name in enumerate(trace.output_names)}, undecided, blind
 
 
 def _choose_steps(trace: Trace, model: Model, floor: Mapping[str, float], undecided: Flags
@@ -139,7 +139,7 @@ def _choose_steps(trace: Trace, model: Model, floor: Mapping[str, float], undeci
     judged = ~undecided
     while True:
         fine, steps = replay_current(trace, model, 2 * steps), 2 * steps
-        error = {name: rms((fine[name] - coarse[name])[judged]) for name in OUTPUTS if name in floor}
+        error = {name: rms((fine[name] - coarse[name])[judged]) for name in trace.output_names if name in floor}
         if all(error[name] <= SOLVER_ERROR_SHARE * floor[name] for name in error) or steps >= FINEST_REPLAY_STEPS:
             return steps, error
         coarse = fine
@@ -154,13 +154,13 @@ def guess_current(trace: Trace) -> list[Floats]:
         return []
     there = np.flatnonzero(~trace.filled)
     odd = there[1::2]
-    thinned = trace.cor.copy()
+    thinned = trace.drive.copy()
     thinned[trace.filled], thinned[odd] = np.nan, np.nan
     again, lost = bridge_gaps(thinned, len(trace))
-    error = np.where(lost, 0.0, trace.cor - again)
+    error = np.where(lost, 0.0, trace.drive - again)
     near = odd[np.clip(np.searchsorted(odd, np.arange(len(trace))), 0, len(odd) - 1)]
     signs = np.random.default_rng(0).choice([-1.0, 1.0], len(trace))
-    return [trace.cor + np.where(trace.filled, sign * signs * error[near], 0.0) for sign in (1.0, -1.0)]
+    return [trace.drive + np.where(trace.filled, sign * signs * error[near], 0.0) for sign in (1.0, -1.0)]
 
 
 def compute_residuals(trace: Trace, model: Columns) -> Columns:
@@ -202,31 +202,55 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
     changes = np.abs(runs[1:] - runs[0])
     undecided = np.zeros(runs.shape[2], bool)
     for i, signal in enumerate(problem.trace.outputs):
-        large = find_large_windows(changes[:, i], max(floor[signal], UNDECIDED_SMALLEST[signal]))
+        slight = problem.trace.declared.find(signal).slight
+        large = find_large_windows(changes[:, i], max(floor[signal], slight))
         undecided |= large & ~np.isnan(problem.trace.measurements[i])
     return undecided
 
 
 def measure_drift(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> tuple[float, float]:
-    """Of a replay without anchor: RMS of the residual of XJ, m, and the speed at which it departs, m/s."""
-    free = trace.mask_unusable("xj") - replay_current(trace, model, steps, 0.0)["xj"]
+    """Of a replay without anchor: RMS of the residual of the controlled signal, SI, and its rate of departure, SI/s."""
+    name = trace.declared.controlled.name
+    free = trace.mask_unusable(name) - replay_current(trace, model, steps, 0.0)[name]
     there = ~np.isnan(free)
     t = trace.t[there] - trace.t[there].mean()
     return rms(free), float(np.sum(t * free[there]) / np.sum(t**2))
 
 
 def replay_command(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> Columns:
-    """Residuals, measured less model, of the chosen signals and `cor` in a run from the command alone, no noise."""
+    """Residuals, measured less model, of the chosen signals and the drive in a run from the command alone, no noise."""
     rest_time = 1.0  # s at the first demand, before a closed-loop replay begins
     before = round(rest_time / trace.period)
-    com = np.concatenate([np.full(before, trace.com[0]), trace.com])
+    command = np.concatenate([np.full(before, trace.command[0]), trace.command])
     load = np.concatenate([np.full(before, trace.load[0]), trace.load])
-    lanes = Lanes(model.replace(WITHOUT_NOISE), (), steps)
-    out = lanes.closed_loop(np.empty((1, 0)), com, load)[0]
-    shown = trace.pass_sensors(out[:, [0, 2, 3]])[before:]
-    whole = {"cor": out[before:, 1]} | {name: shown[:, i] for i, name in enumerate(OUTPUTS)}
-    left = {name: trace.mask_unusable(name) - whole[name] for name in trace.outputs}
-    return left | {"cor": trace.mask_unusable("cor") - whole["cor"]}
+    lanes = Lanes(silence_sensors(model), (), steps)
+    out = lanes.closed_loop(np.empty((1, 0)), command, load)[0]
+    drive = trace.declared.drive.name
+    place = trace.declared.loop.index(drive)
+    shown = trace.pass_sensors(np.delete(out, place, axis=-1))[before:]
+    whole = {name: shown[:, i] for i, name in enumerate(trace.output_names)} | {drive: out[before:, place]}
+    return {name: trace.mask_unusable(name) - whole[name] for name in (*trace.outputs, drive)}
+
+
+def find_controller_gain(model: Model, period: float) -> tuple[float, float]:
+    """Drive for each unit of the controlled signal, and for each unit by which it changes within a cycle; no sign.
+
+    Those of the PID law are parameters; another law is asked for its answer to a small change.
+    """
+    if "controller.proportional_gain" in model.values:
+        return abs(model["controller.proportional_gain"]), abs(model["controller.derivative_gain"]) / period
+    size = 1e-6 * (model.kind.signals.command.largest if math.isfinite(model.kind.signals.command.largest) else 1.0)
+    sensed = np.zeros(50)
+    sensed[20:] = size
+    answers = compute_answers(model, np.zeros(50), sensed)
+    steady = abs(float(answers[21] - answers[19])) / size
+    return steady, max(abs(float(answers[20] - answers[19])) / size - steady, 0.0)
+
+
+def has_controller_memory(model: Model) -> bool:
+    """Whether the controller's answer may hang on readings of long ago: by an integral, or in a way not known."""
+    unknown = getattr(model.kind, "control_memory", None) is not None
+    return model.values.get("controller.integral_gain", float(unknown)) != 0.0
 
 
 def differentiate(x: Floats, size: int, order: int) -> Floats:
@@ -251,7 +275,7 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
     base = np.array([model[name] for name in known])
     size = np.array(list(known.values()))
     scatter_steps = 20  # a cycle; coarse, because only the size of the residual matters here
-    lanes = Lanes(model.replace(WITHOUT_NOISE), list(known), scatter_steps)
+    lanes = Lanes(silence_sensors(model), list(known), scatter_steps)
     scale = np.array([floor[name] for name in trace.outputs])[:, None]
 
     def compute_scaled_residuals(x: Floats) -> Floats:
@@ -263,7 +287,7 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
 
     whole = trace
     if is_long(whole):
-        trace = cut_excerpt(whole, choose_excerpt(whole, model.replace(WITHOUT_NOISE), floor))
+        trace = cut_excerpt(whole, choose_excerpt(whole, silence_sensors(model), floor))
     x = np.zeros(len(base))
     now = compute_scaled_residuals(x[None])[0]
     for _ in range(2):
@@ -293,9 +317,7 @@ PERIODS = (1e-4, 0.1)  # s, shortest and longest of a controller: the bounds of 
 SAME_PERIOD = 0.01  # of a period: two periods that differ by less are the same
 BRIDGED_ROWS = 5  # of missing current that are interpolated; longer gaps are left out
 STILL = 5e-5  # m; a ram that moves further than that moves every sensor
-LIMITS = (("xj", 3.0, "jack.travel"), ("com", 5.0, "jack.travel"), ("xs", 3.0, "spool.travel"),
-          ("p12", 3.0, "supply.pressure"), ("cor", 20.0, "controller.current_limit"))  # signal, times, parameter
-FAINT = {"p12": 1e3, "xs": 1e-9}  # a signal whose range is smaller is in another unit
+LIMIT_TIMES = {"command": 5.0, "output": 3.0, "drive": 20.0}  # by role: more times its limit is another unit
 
 
 def prepare_trace(trace: Trace, model: Model, outputs: Sequence[str] | None = None, source: object = "trace") -> Trace:
@@ -304,9 +326,9 @@ def prepare_trace(trace: Trace, model: Model, outputs: Sequence[str] | None = No
     Where the rows can be read in more than one way, the way that a replay of the model fits best is taken.
 
     Args:
-        trace: the recording; needs Com, XJ and Cor.
+        trace: the recording; needs command, controlled signal and drive.
         model: its plant says what a signal can be, its controller how long a cycle is.
-        outputs: signals that replays are compared with; default: all of xj, p12, xs that were measured.
+        outputs: signals that replays are compared with; default: all of the plant's outputs that were measured.
         source: the recording's name in error messages.
 
     Raises:
@@ -324,10 +346,10 @@ def hold_inputs(trace: Trace, outputs: Sequence[str] | None = None, source: obje
     For recordings of other plants, whose ranges are not known, and for simulated ones.
 
     Raises:
-        InputError: too few rows, no Com, XJ or Cor, or a chosen signal that was not measured.
+        InputError: too few rows, no command, controlled signal or drive, or a chosen signal that was not measured.
     """
-    return replace(trace, cor=hold_last(trace.cor), load=hold_last(trace.load), com=hold_last(trace.com),
-                   incomplete=_find_incomplete(trace), outputs=_choose_outputs(trace, outputs, source))
+    return trace.with_inputs(hold_last(trace.command), hold_last(trace.drive), hold_last(trace.load),
+                             incomplete=_find_incomplete(trace), outputs=_choose_outputs(trace, outputs, source))
 
 
 def match_period(model: Model, trace: Trace, tolerance: float = 0.0) -> Model:
@@ -364,7 +386,7 @@ def read_cycles(trace: Trace, model: Model, outputs: Sequence[str] | None = None
     if abs(ratio - 1) < SAME_PERIOD:
         return [_fill_inputs(rows, trace, source)]
     if rows_in_cycle > 1 and abs(1 / ratio / rows_in_cycle - 1) < SAME_PERIOD:
-        phase = _find_new_current(rows.cor, rows_in_cycle)
+        phase = _find_new_current(rows.drive, rows_in_cycle)
         if phase is not None:
             note = f"rows every {ms:g} ms, current new every {rows_in_cycle}: one row a cycle is used"
             return [_fill_inputs(_thin_rows(rows, rows_in_cycle, phase).with_notes(note), trace, source)]
@@ -377,15 +399,17 @@ def read_cycles(trace: Trace, model: Model, outputs: Sequence[str] | None = None
 
 
 def _choose_outputs(trace: Trace, outputs: Sequence[str] | None, source: object) -> tuple[str, ...]:
-    for name in ("cor", "com", "xj"):
+    declared = trace.declared
+    for name in declared.required:
         if name not in trace.signals:
-            raise InputError(source, name, "a measured column: a replay starts from the current, Com and XJ")
+            words = f"{declared.drive.symbol}, {declared.command.symbol} and {declared.controlled.symbol}"
+            raise InputError(source, name, f"a measured column: a replay starts from {words}")
     if len(trace) < FEWEST_ROWS:
         raise InputError(source, "t", f"at least {FEWEST_ROWS} rows, not {len(trace)}")
-    measured = [name for name in OUTPUTS if name in trace.signals]
+    measured = [name for name in trace.output_names if name in trace.signals]
     for name in outputs or ():
-        if name not in OUTPUTS:
-            raise InputError("--signals", name, f"some of {','.join(OUTPUTS)}")
+        if name not in trace.output_names:
+            raise InputError("--signals", name, f"some of {','.join(trace.output_names)}")
         if name not in measured:
             raise InputError(source, name, f"a measured signal; this trace has {', '.join(measured)}")
     return tuple(name for name in measured if not outputs or name in outputs)
@@ -393,51 +417,52 @@ def _choose_outputs(trace: Trace, outputs: Sequence[str] | None, source: object)
 
 def _check_signals(trace: Trace, model: Model, chosen: Sequence[str], source: object) -> None:
     """Refuse another plant's recordings, other units and dead sensors."""
+    declared = trace.declared
     recorded = trace.provenance.get("plant", "")
-    if recorded in MODULES and recorded != model.plant:
-        raise InputError(source, "--model", f"{recorded}, whose rig recorded this, not {model.plant}")
+    if (recorded in MODULES and recorded != model.plant) or declared.names != model.kind.signals.names:
+        raise InputError(source, "--model", f"{recorded or 'the plant'}, whose rig recorded this, not {model.plant}")
     if trace.period > 50 * model["controller.period"]:
         raise InputError(source, "t", f"times in s, one row a cycle; the rows are {trace.period:g} s apart")
-    for name, factor, limit in LIMITS:
-        largest = float(np.nanmax(np.abs(trace.column(name)))) if name in trace.signals else 0.0
-        if largest > factor * model.values.get(limit, math.inf):
-            times = largest / model[limit]
-            raise InputError(source, name, f"values in {SIGNALS[name].unit}; the largest, {largest:g}, is "
-                                           f"{times:.0f} times {limit}")
-    moves = float(np.nanmax(trace.com) - np.nanmin(trace.com)) > STILL
+    for signal in declared[1:]:
+        largest = float(np.nanmax(np.abs(trace.column(signal.name)))) if signal.name in trace.signals else 0.0
+        if largest > LIMIT_TIMES.get(signal.role, math.inf) * model.values.get(signal.limit, math.inf):
+            times = largest / model[signal.limit]
+            raise InputError(source, signal.name, f"values in {signal.unit}; the largest, {largest:g}, is "
+                                                  f"{times:.0f} times {signal.limit}")
+    moves = float(np.nanmax(trace.command) - np.nanmin(trace.command)) > STILL * trace.scale
     for name in chosen:
-        values = trace.column(name)
+        values, signal, controlled = trace.column(name), declared.find(name), declared.controlled.name
         lowest, highest = float(np.nanmin(values)), float(np.nanmax(values))
-        if lowest == highest and (moves or name == "xj"):
-            without = ",".join(other for other in chosen if other != name) or "xj"
-            hint = "" if name == "xj" else f" (--signals {without} leaves it out)"
+        if lowest == highest and (moves or name == controlled):
+            without = ",".join(other for other in chosen if other != name) or controlled
+            hint = "" if name == controlled else f" (--signals {without} leaves it out)"
             raise InputError(source, name, f"a signal that changes; it is {lowest:g} throughout{hint}")
-        if moves and highest - lowest < FAINT.get(name, 0.0):
-            raise InputError(source, name, f"values in {SIGNALS[name].unit}; the largest is {highest:g}")
+        if moves and highest - lowest < signal.faint:
+            raise InputError(source, name, f"values in {signal.unit}; the largest is {highest:g}")
 
 
 def _take_rows(trace: Trace, chosen: Sequence[str]) -> Trace:
-    """The recording row by row, nothing filled yet; of the outputs only those that were chosen, and XJ."""
+    """The recording row by row, nothing filled yet; of the outputs only those chosen, and the controlled one."""
     notes = []
     grid = trace.t[0] + trace.period * np.arange(len(trace))
     jitter = float(np.abs(trace.t - grid).max())
     if jitter > 0.1 * trace.period:
         notes.append(f"times are up to {1e3 * jitter:.2g} ms off an even grid; each row is taken as one cycle")
     nothing = np.full(len(trace), np.nan)
-    # the controller's block and the anchor of a replay need XJ, chosen or not
-    left_out = {name: nothing for name in OUTPUTS if name not in chosen and name != "xj"}
-    return replace(trace, **left_out, usable=np.ones(len(trace), bool),  # type: ignore[arg-type]
-                   filled=np.zeros(len(trace), bool), incomplete=_find_incomplete(trace), outputs=tuple(chosen),
-                   notes=(*trace.notes, *notes))
+    # the controller's block and the anchor of a replay need the controlled signal, chosen or not
+    left_out = {name: nothing for name in trace.output_names[1:] if name not in chosen}
+    return trace.with_columns(left_out, usable=np.ones(len(trace), bool), filled=np.zeros(len(trace), bool),
+                              incomplete=_find_incomplete(trace), outputs=tuple(chosen),
+                              notes=(*trace.notes, *notes))
 
 
 def _find_incomplete(trace: Trace) -> Flags:
-    """Rows in which Com, XJ or Cor was not recorded.
+    """Rows in which command, controlled signal or drive was not recorded.
 
-    Where rows are resampled or moved onto those of another run, only the rows without XJ count as incomplete: Com and
-    Cor are then those that were filled in.
+    Where rows are resampled or moved onto those of another run, only the rows without the controlled signal count as
+    incomplete: command and drive are then those that were filled in.
     """
-    return np.isnan(trace.com) | np.isnan(trace.xj) | np.isnan(trace.cor)
+    return np.isnan(trace.command) | np.isnan(trace.controlled) | np.isnan(trace.drive)
 
 
 def _find_new_current(cor: Floats, rows: int) -> int | None:
@@ -449,26 +474,24 @@ def _find_new_current(cor: Floats, rows: int) -> int | None:
 
 def _thin_rows(trace: Trace, rows: int, phase: int) -> Trace:
     """Every so many rows, from row `phase` on."""
-    columns: dict[str, Any] = {name: getattr(trace, name)[phase::rows] for name in PER_ROW}
-    columns["incomplete"] = np.isnan(columns["xj"])
-    return replace(trace, **columns, period=trace.period * rows)
+    kept = slice(phase, None, rows)
+    return trace.take_rows(kept, incomplete=np.isnan(trace.controlled[kept]), period=trace.period * rows)
 
 
 def _spread_rows(trace: Trace, cycles: int) -> Trace:
     """Each row as one of so many cycles, nothing recorded in the others."""
     n = (len(trace) - 1) * cycles + 1
     period = trace.period / cycles
-    columns: dict[str, Any] = {}  # Any, as `replace` cannot tell them from other fields
-    for name in ("com", "cor", "load", *OUTPUTS):
-        columns[name] = np.full(n, np.nan)
-        columns[name][::cycles] = getattr(trace, name)
-    return replace(trace, **columns, t=np.round(trace.t[0] + period * np.arange(n), 9), period=period,
+    columns = {name: np.full(n, np.nan) for name in trace.columns}
+    for name, column in columns.items():
+        column[::cycles] = trace.columns[name]
+    return replace(trace, columns=columns, t=np.round(trace.t[0] + period * np.arange(n), 9), period=period,
                    phase=np.repeat(trace.phase, cycles)[:n], usable=np.ones(n, bool), filled=np.zeros(n, bool),
-                   incomplete=np.isnan(columns["xj"]))
+                   incomplete=np.isnan(columns[trace.declared.controlled.name]))
 
 
 def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.3, abrupt: float = 0.1) -> Trace:
-    """Com, Cor and load without gaps; rows flagged that no replay can be compared with.
+    """Command, drive and load without gaps; rows flagged that no replay can be compared with.
 
     Args:
         rows: the recording on the controller's cycles.
@@ -477,18 +500,19 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
         recovery: s after a gap, until an anchored replay is back on the recording.
         abrupt: share of the largest current; a gap across which the current changes by more cannot be filled.
     """
-    cor, unknown = bridge_gaps(rows.cor, max(BRIDGED_ROWS, round(trace.period / rows.period)))
-    missing = np.isnan(rows.cor)
-    change = np.abs(hold_next(rows.cor) - hold_last(rows.cor))
-    unknown |= missing & (change > abrupt * np.nanmax(np.abs(rows.cor)))
+    drive, unknown = bridge_gaps(rows.drive, max(BRIDGED_ROWS, round(trace.period / rows.period)))
+    missing = np.isnan(rows.drive)
+    change = np.abs(hold_next(rows.drive) - hold_last(rows.drive))
+    unknown |= missing & (change > abrupt * np.nanmax(np.abs(rows.drive)))
     usable = rows.usable & ~extend_flags(unknown, max(round(recovery / rows.period) - 1, 0))
     notes = []
-    lost = int(np.isnan(trace.cor).sum())
+    lost = int(np.isnan(trace.drive).sum())
     if lost:
         notes.append(f"the current is missing in {lost} of {len(trace)} rows; "
                      f"{(~usable).sum() * rows.period:.2g} s of the trace could not be replayed")
     for name in rows.outputs:
-        frozen = _find_frozen(getattr(rows, name), rows.com if name == "xj" else rows.xj)
+        mover = rows.command if name == rows.declared.controlled.name else rows.controlled
+        frozen = _find_frozen(rows.column(name), mover, rows.scale)
         if frozen.any():
             first = float(rows.t[int(np.argmax(frozen))])
             seconds = float(frozen.sum()) * rows.period
@@ -499,13 +523,14 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
         notes.append(f"the ram already moves in the first row: the first {start * rows.period:g} s are not judged")
         usable[:start] = False
     if usable.sum() < FEWEST_ROWS:
-        raise InputError(source, "cor", f"at least {FEWEST_ROWS} rows that can be replayed, not {int(usable.sum())}")
-    return replace(rows, cor=cor, com=_fill_demand(rows.com), load=hold_last(rows.load), usable=usable, filled=missing,
-                   notes=(*rows.notes, *notes))
+        raise InputError(source, rows.declared.drive.name,
+                         f"at least {FEWEST_ROWS} rows that can be replayed, not {int(usable.sum())}")
+    return rows.with_inputs(_fill_demand(rows.command, 2e-4 * rows.scale), drive, hold_last(rows.load),
+                            usable=usable, filled=missing, notes=(*rows.notes, *notes))
 
 
-def _fill_demand(com: Floats, step: float = 2e-4) -> Floats:
-    """Com where it is missing: on straight lines, but held before a change by more than `step` m: a step."""
+def _fill_demand(com: Floats, step: float) -> Floats:
+    """Com where it is missing: on straight lines, but held before a change by more than `step`: a step."""
     rows, missing = np.arange(len(com)), np.isnan(com)
     before, behind = hold_last(com), hold_next(com)
     line = np.interp(rows, rows[~missing], com[~missing])
@@ -518,16 +543,18 @@ def extend_flags(flagged: Flags, rows: int) -> Flags:
     return total[rows + 1:] > total[:-rows - 1]
 
 
-def _find_frozen(x: Floats, mover: Floats, longest: int = 200, moved: float = 1e-3, jump: float = 5.0) -> Flags:
+def _find_frozen(x: Floats, mover: Floats, scale: float, longest: int = 200, moved: float = 1e-3, jump: float = 5.0
+                 ) -> Flags:
     """Rows in which `x` repeats one value while `mover` goes on, and then jumps, or never changes again.
 
     A ram at rest under a coarse converter also repeats its value, but goes on by the converter's steps.
 
     Args:
         x: the signal.
-        mover: m; moves it if it is alive.
+        mover: moves it if it is alive.
+        scale: of the mover, as of `Trace.scale`.
         longest: equal rows that a live signal may have.
-        moved: m that the mover goes on, for a signal that never changes again.
+        moved: how far the mover goes on, times the scale, for a signal that never changes again.
         jump: steps, in usual ones, that a signal makes when it comes back.
     """
     out = np.zeros(len(x), bool)
@@ -539,23 +566,23 @@ def _find_frozen(x: Floats, mover: Floats, longest: int = 200, moved: float = 1e
             continue
         way = float(np.nanmax(mover[first:stop]) - np.nanmin(mover[first:stop]))
         if stop == len(x):
-            out[first:stop] = way > moved
+            out[first:stop] = way > moved * scale
         else:
-            out[first:stop] = way > STILL and steps[stop - 1] > jump * usual
+            out[first:stop] = way > STILL * scale and steps[stop - 1] > jump * usual
     return out
 
 
 def _starts_in_motion(trace: Trace, rows: int = 16, fast: float = 2e-3) -> bool:
-    """Whether the ram moves faster than `fast` m/s in the first row: replays start at rest.
+    """Whether the plant moves faster than `fast` m/s, times the scale, in the first row: replays start at rest.
 
     The speed is that of a parabola through the first `rows` positions.
     """
-    first = trace.xj[:rows]
+    first = trace.controlled[:rows]
     if np.isnan(first).any():
         return False
     k = np.arange(rows)
     parabola = np.linalg.pinv(np.vander(k.astype(float), 3, increasing=True))
-    return abs(float(parabola[1] @ first) / trace.period) > fast
+    return abs(float(parabola[1] @ first) / trace.period) > fast * trace.scale
 
 
 class Repeat(NamedTuple):
@@ -586,22 +613,28 @@ def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_shar
     if not ways:
         raise InputError(source, "t", f"rows as in the trace it repeats; they are {1e3 * trace.period:g} ms apart")
     repeat = ways[0]
-    for late in (0, _find_first_move(first.com) - _find_first_move(repeat.com)):
-        if _measure_agreement(first.com, repeat.com, late) >= same_share:
+    for late in (0, _find_first_move(first) - _find_first_move(repeat)):
+        if _measure_agreement(first, repeat, late) >= same_share:
             return Repeat(repeat, late)
-    raise InputError(source, "com", "the command of the trace it repeats; another command is no repeat")
+    raise InputError(source, first.declared.command.name,
+                     "the command of the trace it repeats; another command is no repeat")
 
 
-def _find_first_move(com: Floats) -> int:
-    return int(np.argmax(np.abs(com - com[0]) > SAME_COMMAND_POSITION))
+def _find_first_move(trace: Trace) -> int:
+    return int(np.argmax(np.abs(trace.command - trace.command[0]) > SAME_COMMAND_POSITION * trace.scale))
 
 
-def _measure_agreement(a: Floats, b: Floats, late: int, overlap: float = 0.5) -> float:
-    """The share of the common rows in which b, `late` rows later, is a; 0 if these are less than `overlap` of a."""
+def _measure_agreement(one: Trace, other: Trace, late: int, overlap: float = 0.5) -> float:
+    """The share of the common rows in which the other's command, `late` rows later, is that of the one.
+
+    0 if these are less than `overlap` of the one.
+    """
+    a, b = one.command, other.command
     first, last = max(0, late), min(len(a), len(b) + late)
     if last - first < overlap * len(a):
         return 0.0
-    return float(np.mean(np.abs(a[first:last] - b[first - late:last - late]) <= SAME_COMMAND_POSITION))
+    same = np.abs(a[first:last] - b[first - late:last - late]) <= SAME_COMMAND_POSITION * one.scale
+    return float(np.mean(same))
 
 
 def align_columns(columns: Mapping[str, Floats], late: int, rows: int) -> dict[str, Floats]:
@@ -619,6 +652,5 @@ def align_repeat(repeat: Repeat, rows: int) -> Trace:
     trace = repeat.trace
     wanted = np.arange(rows) - repeat.late
     place = np.clip(wanted, 0, len(trace) - 1)
-    columns: dict[str, Any] = {name: getattr(trace, name)[place] for name in PER_ROW}
     usable = (wanted == place) & trace.usable[place]
-    return replace(trace, **columns | {"usable": usable, "incomplete": np.isnan(columns["xj"]) | ~usable})
+    return trace.take_rows(place, usable=usable, incomplete=np.isnan(trace.controlled[place]) | ~usable)

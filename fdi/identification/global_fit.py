@@ -15,6 +15,7 @@ import numpy as np
 
 from fdi.estimation.fit import Fit, Free, compute_misfit, evolve_fit, follow_population, scale_noise, scaled_bounds
 from fdi.estimation.unidentifiable import (
+    BALANCED,
     LogFree,
     LogFrictionRatio,
     LogProblem,
@@ -184,7 +185,7 @@ def scan_unknowns(problem: LogProblem, fit: Fit, rounds: int = 2) -> Fit:
 def find_flat(problem: LogProblem, free: Sequence[Free], x: Floats) -> Floats:
     """Directions (p, k) of scaled unknowns at `x` (p,) along which no signal changes."""
     v = {**problem.model.values, **problem.list_values(free, x)}
-    if problem.model.plant != "eha":
+    if not v.keys() >= BALANCED:
         return np.empty((len(free), 0))
     leaking = {"valve.pressure_gain": 1.0}
     if v["jack.leakage"] > 0.0:  # only 1/GP + CLK/GQ counts

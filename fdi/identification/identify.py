@@ -27,6 +27,7 @@ from fdi.estimation.fit import (
     compute_misfit,
     compute_typical_rms,
     limit_friction_values,
+    list_relative_tolerances,
     list_tolerance_unknowns,
     scaled_bounds,
     silence_readings,
@@ -76,7 +77,6 @@ from fdi.thresholds import (
     RESIDUAL_WORST,
     STATIC_FRICTION_SYSTEMATIC_SD,
 )
-from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Floats, Trace, rms, shift_rows
 from plant.errors import InputError
 from plant.lanes import Lanes
@@ -108,24 +108,34 @@ class Range(NamedTuple):
         return 0.5 * (math.log(self.high / self.low) if self.is_relative else self.high - self.low)
 
 
+USUAL_FACTOR = 4  # within which a parameter may be wrong where nothing says so
+
+
 def read_free_parameters(model: Model, source: str | Path | None) -> tuple[Range, ...]:
     """The free parameters of a model: those of its file, or those of the nominal model where that lists none.
 
     Args:
         model: with the values of the data sheet.
-        source: the model's file; None for the nominal model.
+        source: the model's file; None for the nominal model. Without a list, the parameters that differ from unit to
+            unit are free.
 
     Raises:
         InputError: a table [identify] with an unknown parameter, or with a factor or range that cannot be; or no such
-            table for a plant that the nominal model is not of.
+            table, and no parameter with a tolerance.
     """
     path = find_shipped_model(str(source)) or Path(str(source))
     named = read_toml(path).get("identify") if source is not None and path.is_file() else None
-    if named is None and model.plant != "eha":
-        raise InputError(source, "identify", "tables [identify.GROUP] that say what is free (docs/identify.md)")
+    if named is not None:
+        return parse_free_parameters(named, model, source)
     usual = Path(str(files("plant").joinpath("models", "nominal.toml")))
-    return parse_free_parameters(read_toml(usual)["identify"] if named is None else named, model,
-                                 source if named is not None else usual.name)
+    tables = read_toml(usual)["identify"]
+    if {f"{group}.{field}" for group, fields in tables.items() for field in fields} <= model.values.keys():
+        return parse_free_parameters(tables, model, usual.name)
+    scattering = {name: _parse_range(name, USUAL_FACTOR, model, model.name)
+                  for name in list_relative_tolerances(model, model.list_names()) if model[name] > 0.0}
+    if not scattering:
+        raise InputError(source, "identify", "tables [identify.GROUP] that say what is free (docs/identify.md)")
+    return tuple(scattering.values())
 
 
 def parse_free_parameters(tables: object, model: Model, where: object) -> tuple[Range, ...]:
@@ -228,7 +238,8 @@ def read_identification_runs(model: Model, ranges: Sequence[Range], fitted: Sequ
     """
     files = [*fitted, *held_out]
     sources = [read_source(file) for file in files]
-    return prepare_runs(model, ranges, [Trace.read(file) for file in files], sources, len(fitted), signals)
+    traces = [Trace.read(file, signals=model.kind.signals) for file in files]
+    return prepare_runs(model, ranges, traces, sources, len(fitted), signals)
 
 
 def collect_identification_runs(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace],
@@ -253,13 +264,14 @@ def prepare_runs(model: Model, ranges: Sequence[Range], traces: Sequence[Trace],
     if not fitted:
         raise InputError("RUN", "", "at least one run to fit")
     require_distinct(sources, "RUN", "other runs", fitted)
+    outputs = tuple(s.name for s in model.kind.signals.outputs)
     for name in signals or ():
-        if name not in OUTPUTS:
-            raise InputError("--signals", name, f"some of {','.join(OUTPUTS)}")
-    shared = [s for s in OUTPUTS if all(s in t.signals for t in traces[:fitted]) and (signals is None or s in signals)]
+        if name not in outputs:
+            raise InputError("--signals", name, f"some of {','.join(outputs)}")
+    shared = [s for s in outputs if all(s in t.signals for t in traces[:fitted]) and (signals is None or s in signals)]
     if not shared:
-        raise InputError(sources[0].file, ", ".join(signals or OUTPUTS), "a signal that every run to fit has")
-    limits = ("jack.travel", "spool.travel", "supply.pressure", "controller.current_limit")
+        raise InputError(sources[0].file, ", ".join(signals or outputs), "a signal that every run to fit has")
+    limits = {s.limit for s in model.kind.signals if s.limit}
     widest = replace(model, values={**model.values, **{r.name: r.high for r in ranges if r.name in limits}})
     prepared = [_prepare(t, widest, [s for s in shared if s in t.signals] or shared, source)
                 for t, source in zip(traces, sources, strict=True)]
@@ -272,12 +284,12 @@ def prepare_runs(model: Model, ranges: Sequence[Range], traces: Sequence[Trace],
 
 
 def _prepare(trace: Trace, model: Model, outputs: Sequence[str], source: Source) -> Trace:
-    if model.plant != "eha":
+    if not model.kind.controller:
         return hold_inputs(trace, outputs, source.file)
     try:
         return prepare_trace(trace, model, outputs, source.file)
     except InputError as error:
-        if "a signal that changes" in error.expected and np.ptp(trace.com) == 0.0:  # at rest: says little, but is a run
+        if "a signal that changes" in error.expected and np.ptp(trace.command) == 0.0:  # at rest: says little
             return hold_inputs(trace, outputs, source.file)
         raise
 
@@ -305,7 +317,7 @@ class Advice(NamedTuple):
 
 
 def _move(model: Model, levels: Sequence[tuple[float, float]], scale: float, speed: float = math.inf) -> Floats:
-    """A command that goes to each of some (level, seconds), times `scale` m, at `speed` m/s, and holds it."""
+    """A command that goes to each of some (level, seconds), times `scale`, at `speed` a second, and holds it."""
     period, at, parts = model["controller.period"], 0.0, []
     for level, seconds in levels:
         to = level * scale
@@ -316,25 +328,49 @@ def _move(model: Model, levels: Sequence[tuple[float, float]], scale: float, spe
     return np.concatenate(parts)
 
 
+def _measure_stroke(model: Model) -> float:
+    """How far the plant goes either way: its declared limit, else what the largest command has to a ram's stroke."""
+    command = model.kind.signals.command
+    usual = 0.04 * (command.largest if math.isfinite(command.largest) else 1.0)
+    return model.values.get(command.limit, usual)
+
+
 def _build_steps(model: Model) -> Floats:
     levels = (0.0, 0.1, 0.0, 0.6, -0.6, 0.0, -0.1, 0.0)
-    return _move(model, [(level, 0.8 if abs(level) < 0.5 else 1.5) for level in levels], model["jack.travel"])
+    return _move(model, [(level, 0.8 if abs(level) < 0.5 else 1.5) for level in levels], _measure_stroke(model))
 
 
 def _build_ramps(model: Model) -> Floats:
-    x = 0.03 * model["jack.travel"]
+    x = 0.03 * _measure_stroke(model)
     return _move(model, ((0.0, 0.3), (1.0, 0.5), (-1.0, 0.5), (0.0, 0.3)), x, x / 2.0)
 
 
 def _build_sweep(model: Model) -> Floats:
     t = np.arange(0.0, 5.0, model["controller.period"])
-    com = 0.03 * model["jack.travel"] * np.sin(2.0 * np.pi * (0.5 * t + 1.9 * t**2))  # 0.5 to 19.5 Hz
+    com = 0.03 * _measure_stroke(model) * np.sin(2.0 * np.pi * (0.5 * t + 1.9 * t**2))  # 0.5 to 19.5 Hz
     return np.concatenate([_move(model, ((0.0, 0.3),), 0.0), com])
 
 
 def _build_stops(model: Model) -> Floats:
-    speed = 0.2 * model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"]  # with the spool a fifth open
-    return _move(model, ((0.0, 0.3), (1.0, 0.8), (-1.0, 0.8), (0.0, 0.3)), 1.1 * model["jack.travel"], speed)
+    stroke = _measure_stroke(model)
+    speed = 5.0 * stroke
+    if {"valve.flow_gain", "spool.travel", "jack.area"} <= model.values.keys():  # with the spool a fifth open
+        speed = 0.2 * model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"]
+    return _move(model, ((0.0, 0.3), (1.0, 0.8), (-1.0, 0.8), (0.0, 0.3)), 1.1 * stroke, speed)
+
+
+def _measure_push(model: Model) -> float:
+    """A third of the largest load that the plant can bear; 0 where it has none."""
+    load = model.kind.signals.load
+    if load is None or {"jack.area", "supply.pressure"} <= model.values.keys():
+        return 0.3 * model["jack.area"] * model["supply.pressure"] if load else 0.0
+    return 5e-3 * load.largest if math.isfinite(load.largest) else 0.0
+
+
+def list_experiments(model: Model) -> tuple[Experiment, ...]:
+    """Those that the plant can make: it may have no end stop, and no load."""
+    return tuple(e for e in EXPERIMENTS if (not e.is_loaded or _measure_push(model))
+                 and (e.build is not _build_stops or model.kind.signals.command.limit))
 
 
 EXPERIMENTS = (
@@ -364,22 +400,23 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: LogProblem, 
     if fit is not None:
         known = known + _measure_information(present, free, x)
     found = {}
-    for experiment in EXPERIMENTS:
+    for experiment in list_experiments(model):
         com = experiment.build(model)
         part = np.arange(len(com)) / len(com)
-        force = 0.3 * model["jack.area"] * model["supply.pressure"] * experiment.is_loaded
+        force = _measure_push(model) * experiment.is_loaded
         load = force * (((part > 0.2) & (part < 0.45)).astype(float) - ((part >= 0.45) & (part < 0.7)))
         trace = _simulate(model, com, load, problem.trace.outputs)
         run = replace(present, trace=trace, also=(), _lanes={})
         found[experiment.name] = known + _measure_information(run, free, x)
     what = {e.name: e.what for e in EXPERIMENTS}
-    missing = [s for s in OUTPUTS if s not in problem.trace.outputs]
-    if missing and fit is not None:
-        runs = [_simulate(model, t.com, t.load, OUTPUTS) for t in (problem.trace, *problem.also)]
-        noise = tuple(noises.white_noise(model[SIGNALS[s].noise]) for s in OUTPUTS)
+    outputs = model.kind.signals.outputs
+    missing = [s for s in outputs if s.name not in problem.trace.outputs]
+    if missing and fit is not None and all(s.noise for s in outputs):
+        runs = [_simulate(model, t.command, t.load, problem.trace.output_names) for t in (problem.trace, *problem.also)]
+        noise = tuple(noises.white_noise(model[s.noise]) for s in outputs)
         sensed = replace(present, trace=runs[0], also=tuple(runs[1:]), noise=noise, _lanes={})
         found["sensors"] = np.diag([f.prior**-2 for f in free]) + _measure_information(sensed, free, x)
-        what["sensors"] = f"the same runs with {' and '.join(SIGNALS[s].symbol for s in missing)} measured"
+        what["sensors"] = f"the same runs with {' and '.join(s.symbol for s in missing)} measured"
     shares = {name: _compute_shares(free, information) for name, information in found.items()}
     advice = []
     for name in unseen:
@@ -392,8 +429,9 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: LogProblem, 
 def _simulate(model: Model, com: Floats, load: Floats, outputs: Sequence[str]) -> Trace:
     """The closed loop on a command, as a recording without noise."""
     out = Lanes(silence_readings(model), (), STEPS).closed_loop(np.empty((1, 0)), com, load)[0]
-    columns = {"com": com, "xj": out[:, 0], "cor": out[:, 1], "p12": out[:, 2], "xs": out[:, 3], "load": load}
-    return hold_inputs(Trace.from_columns(columns, model["controller.period"], {}), tuple(outputs))
+    d = model.kind.signals
+    columns = {d.command.name: com, **dict(zip(d.loop, out.T, strict=True))} | ({d.load.name: load} if d.load else {})
+    return hold_inputs(Trace.from_columns(columns, model["controller.period"], {}, d), tuple(outputs))
 
 
 def _measure_information(problem: LogProblem, free: Sequence[Free], x: Floats) -> Floats:
@@ -526,7 +564,9 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
     floor = {s: float(np.median([f[s].value for f in (sensor_floors(t, model) for t in fitted)]))
              for s in fitted[0].outputs}
     if not any(_moves(t) for t in fitted):
-        reason = f"no run to fit moves the ram by {1e3 * MOVING_RAM:g} mm: at rest nothing can be identified"
+        controlled, least = model.kind.signals.controlled, MOVING_RAM * fitted[0].scale
+        reason = (f"no run to fit moves the {controlled.called} by {least * controlled.shown_scale:g} "
+                  f"{controlled.shown_unit}: at rest nothing can be identified")
         return _tell_nothing(model, ranges, runs, sources, len(fitted), floor, reason, notes)
     gains = read_controller(fitted) if model.kind.controller else None
     free = list_unknowns(model, tuple(ranges))
@@ -676,7 +716,8 @@ def build_model(model: Model, problem: LogProblem, fit: Fit, gains: ControllerGa
     values = problem.list_values(fit.free, fit.x)
     held = {n: v for n, v in problem.model.values.items() if v != model.values.get(n) and not n.startswith("sensors.")
             and n not in values}
-    noise = {SIGNALS[s].noise: n.level for s, n in zip(problem.trace.outputs, problem.noise, strict=True)}
+    noise = {problem.trace.declared.find(s).noise: n.level
+             for s, n in zip(problem.trace.outputs, problem.noise, strict=True)}
     read = {} if gains is None else gains.values
     found = {n: float(f"{v:.6g}") for n, v in {**held, **values, **read, **noise}.items() if n in model.values}
     complete = limit_friction_values({**model.values, **found})
@@ -775,7 +816,7 @@ def decide_verdict(estimates: Sequence[Estimate], errors: Sequence[RunError]) ->
 
 
 def _moves(trace: Trace) -> bool:
-    return float(np.nanmax(trace.xj) - np.nanmin(trace.xj)) >= MOVING_RAM
+    return float(np.nanmax(trace.controlled) - np.nanmin(trace.controlled)) >= MOVING_RAM * trace.scale
 
 
 def _tell_nothing(model: Model, ranges: Sequence[Range], runs: Sequence[Trace], sources: Sequence[Source], fitted: int,
@@ -840,8 +881,8 @@ def _mark_unseen(text: str, unseen: Mapping[str, str]) -> str:
 class ControllerGains(NamedTuple):
     """The proportional law, answer = gain * error up to a limit, and how well it holds."""
 
-    gain: float  # A/m
-    limit: float | None  # A; None where the answer never stayed at its largest value
+    gain: float  # drive for each unit of the error
+    limit: float | None  # of the drive; None where the answer never stayed at its largest value
     exact: float  # share of the rows in which it holds
 
     @property
@@ -860,12 +901,12 @@ def read_controller(runs: Sequence[Trace], tolerance: float = 1e-3, fewest_rows:
     """The law of the controller that was at work in some runs; None where its error or its answer is always zero.
 
     Args:
-        runs: with Com, XJ and Cor.
+        runs: with command, controlled signal and drive.
         tolerance: of an answer, as a share of the largest one, up to which the law holds.
         fewest_rows: at the largest answer, from which on that is the limit.
     """
-    error = np.concatenate([t.com - t.xj for t in runs])
-    answer = np.concatenate([t.cor for t in runs])
+    error = np.concatenate([t.command - t.controlled for t in runs])
+    answer = np.concatenate([t.drive for t in runs])
     known = np.isfinite(error) & np.isfinite(answer)
     error, answer = error[known], answer[known]
     largest = float(np.abs(answer).max(initial=0.0))
@@ -884,6 +925,8 @@ def read_controller(runs: Sequence[Trace], tolerance: float = 1e-3, fewest_rows:
 SMOOTHED = 25  # rows of the parabola that gives speed and acceleration
 MOVING = 1e-3  # m/s, above which the ram's friction is the dynamic one
 STALLED_ROWS = 20  # at a limit, in a row or not, that show it
+P12, XS = "p12", "xs"  # signals of the electrohydraulic actuator, whose equations the regressions are
+REGRESSED = {"jack.travel", "jack.area", "supply.pressure", "valve.flow_gain", "torque_motor.gain", "spool.travel"}
 
 
 def estimate_by_regressions(runs: Sequence[Trace], model: Model, known: frozenset[str] = frozenset()
@@ -896,22 +939,25 @@ def estimate_by_regressions(runs: Sequence[Trace], model: Model, known: frozense
         known: parameters that are not free, so that others make up for them.
     """
     found: dict[str, float] = {}
-    stroke = _find_limit(np.concatenate([t.xj for t in runs]))  # half of it, m, as far as the ram went
-    if stroke > 0.98 * model["jack.travel"] or _dwells(np.concatenate([t.xj for t in runs]), stroke):
+    if not model.values.keys() >= REGRESSED:
+        return found
+    position = np.concatenate([t.controlled for t in runs])
+    stroke = _find_limit(position)  # half of it, m, as far as the ram went
+    if stroke > 0.98 * model["jack.travel"] or _dwells(position, stroke):
         found["jack.travel"] = stroke
-    if all("p12" in t.outputs for t in runs):
-        pressure = np.concatenate([t.mask_unusable("p12") for t in runs])
+    if all(P12 in t.outputs for t in runs):
+        pressure = np.concatenate([t.mask_unusable(P12) for t in runs])
         highest = _find_limit(pressure)
         if highest > model["supply.pressure"] or _dwells(pressure, highest):
             found["supply.pressure"] = highest
-    if all("xs" in t.outputs for t in runs):
+    if all(XS in t.outputs for t in runs):
         found |= _estimate_spool(runs, model)
     p = {**model.values, **found}
-    if all({"xs", "p12"} <= set(t.outputs) for t in runs):
+    if all({XS, P12} <= set(t.outputs) for t in runs):
         found |= _estimate_jack(runs, p, "jack.area" not in known)
     else:
-        has_spool = all("xs" in t.outputs for t in runs)
-        drive = [t.mask_unusable("xs") if has_spool else shift_rows(t.cor, 4) for t in runs]
+        has_spool = all(XS in t.outputs for t in runs)
+        drive = [t.mask_unusable(XS) if has_spool else shift_rows(t.drive, 4) for t in runs]
         opening = 1.0 if has_spool else p["torque_motor.gain"] / p["feedback_spring.stiffness"]
         gain = _regress([_smooth_speed(t) for t in runs], [[d] for d in drive], 1.0 if has_spool else 0.5)
         if gain is not None and gain[0] > 0.0:
@@ -926,12 +972,12 @@ def _estimate_spool(runs: Sequence[Trace], model: Model) -> dict[str, float]:
     """
     found: dict[str, float] = {}
     size = 61
-    spool = [t.mask_unusable("xs") for t in runs]
+    spool = [t.mask_unusable(XS) for t in runs]
     every = np.concatenate(spool)
     limit = _find_limit(every)
-    level = [np.where(_average((np.abs(t.xs) > 0.6 * limit).astype(float), size) > 0.0, np.nan, _average(x, size))
-             for t, x in zip(runs, spool, strict=True)]
-    gain = _regress(level, [[_average(t.cor, size)] for t in runs])
+    level = [np.where(_average((np.abs(t.column(XS)) > 0.6 * limit).astype(float), size) > 0.0, np.nan,
+                      _average(x, size)) for t, x in zip(runs, spool, strict=True)]
+    gain = _regress(level, [[_average(t.drive, size)] for t in runs])
     if gain is None or gain[0] <= 0.0:
         return found
     ratio = model["feedback_spring.stiffness"] / model["torque_motor.gain"] * gain[0]  # KSF/GM of the model over own
@@ -949,10 +995,11 @@ def _estimate_jack(runs: Sequence[Trace], p: Mapping[str, float], is_area_free: 
     """Flow gain, leakage, area, mass, damping and friction from spool, pressure, position and load."""
     found: dict[str, float] = {}
     speed = [_smooth_speed(t) for t in runs]
-    acceleration = [differentiate(_fill(t.mask_unusable("xj")), SMOOTHED, 2) / t.period**2 for t in runs]
-    spool = [_average(t.mask_unusable("xs"), 9) for t in runs]
-    pressure = [_average(t.mask_unusable("p12"), 9) for t in runs]
-    away = [np.where((np.abs(t.xj) < 0.97 * p["jack.travel"]) & (np.abs(q) < 0.8 * p["supply.pressure"]), 1.0, np.nan)
+    acceleration = [differentiate(_fill_position(t), SMOOTHED, 2) / t.period**2 for t in runs]
+    spool = [_average(t.mask_unusable(XS), 9) for t in runs]
+    pressure = [_average(t.mask_unusable(P12), 9) for t in runs]
+    away = [np.where((np.abs(t.controlled) < 0.97 * p["jack.travel"]) & (np.abs(q) < 0.8 * p["supply.pressure"]),
+                     1.0, np.nan)
             for t, q in zip(runs, pressure, strict=True)]
     flow = _regress([v * w for v, w in zip(speed, away, strict=True)],
                     [[x, -q] for x, q in zip(spool, pressure, strict=True)])
@@ -992,7 +1039,11 @@ def _dwells(x: Floats, limit: float, share: float = 2e-3, rows: int = 5 * STALLE
 
 
 def _smooth_speed(trace: Trace) -> Floats:
-    return differentiate(_fill(trace.mask_unusable("xj")), SMOOTHED, 1) / trace.period
+    return differentiate(_fill_position(trace), SMOOTHED, 1) / trace.period
+
+
+def _fill_position(trace: Trace) -> Floats:
+    return _fill(trace.mask_unusable(trace.declared.controlled.name))
 
 
 def _fill(x: Floats) -> Floats:

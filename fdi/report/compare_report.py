@@ -8,34 +8,34 @@ from typing import Any
 
 import numpy as np
 
-from fdi.comparison.compare import BALANCED, Comparison, SignalError
+from fdi.comparison.compare import Comparison, SignalError
 from fdi.comparison.residuals import Depends, ResidualTests, map_deviation
+from fdi.estimation.replay import find_controller_gain
 from fdi.report.drawing import (
     BLUE,
     COMMAND,
     GREEN,
     INK,
-    LEVELS,
     ORANGE,
     RED,
-    SIGNAL_COLOURS,
     Mark,
     Panel,
     area,
     axes,
     band,
     call,
+    choose_colour,
     choose_drawn_unit,
     draw_over_time,
     draw_panels,
     instant,
+    label_signal,
     legend,
     line,
     name_rows,
     shade,
 )
 from fdi.report.numbers import (
-    SIGNAL_NAMES,
     count_nouns,
     format_amount,
     format_digits,
@@ -47,15 +47,16 @@ from fdi.report.numbers import (
 )
 from fdi.report.report import Cell, Column, Figure, Line, Medium, Mood, Report, Section, Table, tabulate
 from fdi.thresholds import BLOCK_ERROR_RATIO, CONTROLLER_ERROR_RATIO, DEPENDENCE_SHARE, FLOW_GAIN_FAR, NOISE_BAND_RATIO
+from plant.signals import Signal
 
 MOODS: dict[str, Mood] = {"WITHIN_FLOOR": "good", "MODEL_INCOMPLETE": "bad", "CANNOT_TELL": "doubtful"}
 INPUTS_OF_BLOCKS = {
-    "controller": "Com and XJ to Cor",
     "servovalve": "Cor to XS",
     "jack": "XS and P12 to the ram",
     "sensor": "flow of the ram to XJ",
 }
 OTHER_ACTUATOR = "If the model describes another actuator than the measured one, `rig identify` fits it"
+MOTIONS = {"speed": "/s", "position": "", "acceleration": "/s2"}  # and what follows the unit of length
 SHAPE_WORDS = {  # how a residual depends on a quantity
     "": "", "proportional to": " (proportional)", "steps with the sign of": " (a step where it changes sign)",
     "even in": " (an even function)",
@@ -66,7 +67,7 @@ def build_comparison_report(c: Comparison, next_command: str = "", files: Sequen
     """The report of a comparison; `files` are those that were written."""
     t, changes = c.trace, sorted(c.model.list_changes().items())
     facts = [("model", c.model.name), ("trace", f"{len(t) * t.period:.3f} s, {len(t)} cycles of {1e3 * t.period:g} ms"),
-             ("repeats", str(c.repeats)), ("signals", ", ".join(SIGNAL_NAMES[name] for name in t.outputs))]
+             ("repeats", str(c.repeats)), ("signals", ", ".join(s.signal.symbol for s in c.signals.values()))]
     sections = [
         Section("Signals", [_tabulate_signals(c)]),
         Section("Blocks", [_tabulate_blocks(c)]),
@@ -112,20 +113,20 @@ def describe_verdict(c: Comparison) -> str:
     worst = max(c.signals.values(), key=lambda s: s.ratio)
     if c.named == ("controller",) and worst.ratio <= worst.limit:
         return "The plant fits, but the output of the controller differs from the model's."
-    blocks = f"; {_describe_blocks(c)}" if c.model.plant == BALANCED else ""
+    blocks = f"; {_describe_blocks(c)}" if c.model.kind.balances else ""
     return f"The model does not explain this trace: {_error_and_floor(worst)}{blocks}."
 
 
 def _error_and_floor(s: SignalError) -> str:
     bound = "at least " if s.floor.lower_bound else ""
-    return (f"{SIGNAL_NAMES[s.name]} error {format_signal(s.error, s.name)}, "
-            f"noise floor {bound}{format_signal(s.floor.value, s.name)}")
+    return (f"{s.signal.symbol} error {format_signal(s.error, s.signal)}, "
+            f"noise floor {bound}{format_signal(s.floor.value, s.signal)}")
 
 
 def _describe_blocks(c: Comparison) -> str:
     """Which blocks disagree with the measurement, the worst first, and which fit."""
     if not c.named:
-        is_short = set(c.signals) == {"xj"}
+        is_short = len(c.signals) == 1
         return "P12 or XS would show in which block" if is_short else "no single block stands out"
     names = list(c.named)
     if c.blocks["jack"] is not None and c.blocks["jack"] == c.blocks["sensor"] and "jack" in names:
@@ -141,15 +142,15 @@ def _tabulate_signals(c: Comparison) -> Table:
     page = Medium.PAGE
     return tabulate(
         c.signals.values(),
-        (Column("signal"), lambda s: SIGNAL_NAMES[s.name]),
-        (Column("error", align="right"), lambda s: Cell(format_signal(s.error, s.name), is_strong=True)),
+        (Column("signal"), lambda s: s.signal.symbol),
+        (Column("error", align="right"), lambda s: Cell(format_signal(s.error, s.signal), is_strong=True)),
         (Column("noise floor", align="right"),
-         lambda s: (">= " if s.floor.lower_bound else "") + format_signal(s.floor.value, s.name)),
+         lambda s: (">= " if s.floor.lower_bound else "") + format_signal(s.floor.value, s.signal)),
         (Column("ratio", align="right"), lambda s: Cell(format_ratio(s.ratio), "bad" if s.ratio > s.limit else "good")),
         (Column("floor from", medium=page), lambda s: Cell(s.floor.source, "muted")),
-        (Column("error from the command alone", align="right"), lambda s: format_signal(s.closed_loop_error, s.name)),
+        (Column("error from the command alone", align="right"), lambda s: format_signal(s.closed_loop_error, s.signal)),
         (Column("solver error", align="right", medium=page),
-         lambda s: Cell(format_signal(s.solver_error, s.name), "muted")),
+         lambda s: Cell(format_signal(s.solver_error, s.signal), "muted")),
         caption="Error: RMS of the residual (measured minus model) with the measured current as input. Noise floor: "
                 "RMS that noise alone leaves. A perfect model has ratio 1.")
 
@@ -186,8 +187,10 @@ def describe_block(c: Comparison, name: str) -> str:
     """What the ratio of a block was computed from, or what is missing for it."""
     if name == "controller":
         return _describe_controller(c)
+    if not c.model.kind.balances:
+        return "the signal with the largest ratio" if name == "plant" else "cannot be told from the plant"
     path = INPUTS_OF_BLOCKS[name]
-    measured = [SIGNAL_NAMES[s] for s in ("xs", "p12") if s in c.signals]
+    measured = [s.signal.symbol for s in reversed([*c.signals.values()]) if s.signal != c.trace.declared.controlled]
     if c.blocks[name] is None:
         needs = {(): "needs XS or P12", ("P12",): "needs XS", ("XS",): "needs P12"}
         return f"{path}: {needs.get(tuple(measured), 'too little data')}"
@@ -202,19 +205,21 @@ def describe_block(c: Comparison, name: str) -> str:
 
 
 def _describe_controller(c: Comparison) -> str:
-    path, a = INPUTS_OF_BLOCKS["controller"], c.answer
+    d, a = c.trace.declared, c.answer
+    path = f"{d.command.symbol} and {d.controlled.symbol} to {d.drive.symbol}"
     if c.blocks["controller"] is None:
         return f"{path}: the firmware is not known"
-    lags = [f"{name} {count_nouns(lag, 'cycle')} earlier" for name, lag in (("Com", a.com_lag), ("XJ", a.xj_lag))
-            if lag > 0]
+    late = ((d.command.symbol, a.com_lag), (d.controlled.symbol, a.xj_lag))
+    lags = [f"{symbol} {count_nouns(lag, 'cycle')} earlier" for symbol, lag in late if lag > 0]
     if lags:
         path += f" (from {' and '.join(lags)})"
     if a.ratio <= CONTROLLER_ERROR_RATIO:
         return f"{path}: equal to the last digit"
-    found = f"{path}: error {1e6 * a.error:.3g} uA RMS, floor {1e6 * a.floor:.3g} uA"
-    gain = c.model["controller.proportional_gain"]
+    factor, shown = (1e6, "uA") if d.drive.unit == "A" else (1.0, d.drive.unit)
+    found = f"{path}: error {factor * a.error:.3g} {shown} RMS, floor {factor * a.floor:.3g} {shown}"
+    gain, unit = find_controller_gain(c.model, c.trace.period)[0], f"{d.drive.unit}/{d.controlled.unit}"
     if math.isfinite(a.gain) and abs(a.gain / gain - 1) > 0.002:
-        found += f"; its gain is {a.gain:.4g} A/m, the model's {gain:.4g} A/m"
+        found += f"; its gain is {a.gain:.4g} {unit}, the model's {gain:.4g} {unit}"
     return found
 
 
@@ -225,7 +230,7 @@ def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6
     """
     is_wrong = c.verdict != "WITHIN_FLOOR"
     changes = [f"{name} = {value:g}" for name, value in sorted(c.model.list_changes().items())]
-    errors = ", ".join(f"{SIGNAL_NAMES[s.name]} by {format_signal(s.solver_error, s.name)}" for s in c.signals.values())
+    errors = ", ".join(f"{s.signal.symbol} by {format_signal(s.solver_error, s.signal)}" for s in c.signals.values())
     lines = [
         Line("floor", _describe_floor(c)),
         Line("solver", f"halving the step to {1e6 * c.trace.period / c.replay.steps:g} us changes {errors}"),
@@ -235,7 +240,7 @@ def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6
         Line("when", c.condition if is_wrong else ""),
         Line("flow", _describe_flow(c)),
         Line("drift", _describe_drift(c)),
-        *(Line("residual", _describe_residual(name, d)) for name, d in c.diagnoses.items()
+        *(Line("residual", _describe_residual(c.signals[name].signal, d)) for name, d in c.diagnoses.items()
           if c.signals[name].ratio > c.signals[name].limit),
         Line("scatter", _describe_scatter(c)),
         Line("not nominal", list_first(changes, most_changes), medium=Medium.TERMINAL)]
@@ -262,11 +267,13 @@ def _describe_flow(c: Comparison, notable_share: float = 0.005) -> str:
 
 
 def _describe_drift(c: Comparison, notable: float = 1e-6) -> str:
-    """A free replay that drifts by 1 um/s."""
-    if "xj" not in c.signals or abs(c.drift) <= notable or c.trace.filled.any():
+    """A free replay that drifts by 1 um/s, of a ram."""
+    controlled = c.trace.declared.controlled
+    if controlled.name not in c.signals or abs(c.drift) <= notable * c.trace.scale or c.trace.filled.any():
         return ""
-    return ("a replay that is not corrected towards the measured position drifts by "
-            f"{format_amount(c.drift, 'm/s')}")
+    what = "position" if controlled.unit == "m" else controlled.symbol
+    return (f"a replay that is not corrected towards the measured {what} drifts by "
+            f"{format_amount(c.drift, f'{controlled.unit}/s')}")
 
 
 def _describe_scatter(c: Comparison) -> str:
@@ -278,12 +285,13 @@ def _describe_scatter(c: Comparison) -> str:
         which = f" (in tolerances: {', '.join(changed)})" if changed else ""
         return f"tolerances of the parameters could explain all of the error{which}"
     worst = max(s.ratio, key=lambda name: s.ratio[name])
+    signal = c.signals[worst].signal
     return (f"scatter between units does not explain it: with all parameters refitted within their tolerances the "
-            f"{SIGNAL_NAMES[worst]} error is still {format_signal(s.error[worst], worst)}, "
+            f"{signal.symbol} error is still {format_signal(s.error[worst], signal)}, "
             f"{format_ratio(s.ratio[worst])} times the floor")
 
 
-def _describe_residual(name: str, d: ResidualTests, strong: float = 0.15, long_memory: float = 3.0) -> str:
+def _describe_residual(signal: Signal, d: ResidualTests, strong: float = 0.15, long_memory: float = 3.0) -> str:
     """What distinguishes a residual from noise: memory, input it follows, quantity it depends on; "" for nothing.
 
     A correlation below `strong` explains 2 % of the power or less; `long_memory` is in memories of the noise.
@@ -299,12 +307,13 @@ def _describe_residual(name: str, d: ResidualTests, strong: float = 0.15, long_m
     if d.depends and d.depends[0].share > DEPENDENCE_SHARE:
         first = d.depends[0]
         found.append(f"{format_percent(first.share)} of its power depends on {first.on}{SHAPE_WORDS[first.shape]}, "
-                     f"up to {format_signal(abs(first.size), name)}")
-    return f"{SIGNAL_NAMES[name]}: {'; '.join(found)}" if found else ""
+                     f"up to {format_signal(abs(first.size), signal)}")
+    return f"{signal.symbol}: {'; '.join(found)}" if found else ""
 
 
 def collect_data(c: Comparison) -> dict[str, Any]:
     """The answer of `rig compare --json`; SI units."""
+    controlled = c.signals.get(c.trace.declared.controlled.name)
     return {
         "verdict": c.verdict, "reason": c.reason or describe_verdict(c), "trace": c.source, "model": c.model.name,
         "signals": {name: {
@@ -312,7 +321,7 @@ def collect_data(c: Comparison) -> dict[str, Any]:
             "closed_loop_error": s.closed_loop_error, "solver_error": s.solver_error, "limit": s.limit,
             "floor_source": s.floor.source, "sensor_noise": s.sensor_noise, "lower_bound": s.floor.lower_bound,
             "hum": s.floor.hum, "difference": s.floor.difference} for name, s in c.signals.items()},
-        "solver_error": c.signals["xj"].solver_error if "xj" in c.signals else None,
+        "solver_error": controlled.solver_error if controlled else None,
         "steps": c.replay.steps,
         "where": [{"section": p.section, "t0": p.t0, "t1": p.t1, "share": p.share, "ratio": p.ratio,
                    "condition": p.condition} for p in c.where],
@@ -332,8 +341,15 @@ def collect_data(c: Comparison) -> dict[str, Any]:
         "repeats": c.repeats, "notes": list(c.notes)}
 
 
-QUANTITIES = {"speed": ("speed [mm/s]", 1e3), "position": ("position [mm]", 1e3), "P12": ("P12 [bar]", 1e-5),
-              "acceleration": ("acceleration [m/s2]", 1.0)}
+def find_quantity_axis(c: Comparison, kind: str) -> tuple[str, float]:
+    """Label and scale of the axis of a quantity that a residual is drawn over."""
+    controlled = c.trace.declared.controlled
+    if kind in MOTIONS and kind != "acceleration":
+        return f"{kind} [{controlled.shown_unit}{MOTIONS[kind]}]", controlled.shown_scale
+    if kind in MOTIONS:
+        return f"{kind} [{controlled.unit}{MOTIONS[kind]}]", 1.0
+    signal = next(s for s in c.trace.declared.outputs if s.symbol == kind)
+    return label_signal(signal), signal.shown_scale
 
 
 def draw_overview(c: Comparison) -> str:
@@ -341,17 +357,21 @@ def draw_overview(c: Comparison) -> str:
     t = c.trace.t
     ends = np.flatnonzero(np.diff((c.replay.undecided | ~c.trace.usable).astype(int), prepend=0, append=0))
     left_out = [shade(float(t[a]), float(t[b - 1]), RED, 0.12) for a, b in ends.reshape(-1, 2)]
-    panels: list[Panel] = [[line(t, c.trace.com * 1e3, COMMAND, "Com, command", 2.2),
-                            line(t, c.trace.xj * 1e3, BLUE, "XJ, ram"), axes(ylabel="position [mm]"), legend(2),
-                            *left_out]]
+    d = c.trace.declared
+    command, controlled = d.command, d.controlled
+    what = "position" if controlled.unit == "m" else controlled.symbol
+    panels: list[Panel] = [[line(t, c.trace.command * command.shown_scale, COMMAND, f"{command.symbol}, command", 2.2),
+                            line(t, c.trace.controlled * controlled.shown_scale, BLUE,
+                                 f"{controlled.symbol}, {controlled.called}"),
+                            axes(ylabel=f"{what} [{controlled.shown_unit}]"), legend(2), *left_out]]
     for name, s in c.signals.items():
-        (unit, scale), (fine, small) = LEVELS[name], choose_drawn_unit(name, s.error)
+        scale, (fine, small) = s.signal.shown_scale, choose_drawn_unit(s.signal, s.error)
         floor = NOISE_BAND_RATIO * s.floor.value * small
-        panels += [[line(t, c.trace.mask_unusable(name) * scale, SIGNAL_COLOURS[name], "measured", 1.2),
-                    line(t, c.replay.model[name] * scale, ORANGE, "model, from the current", 0.8),
-                    axes(ylabel=f"{SIGNAL_NAMES[name]} [{unit}]"), legend(2), *left_out],
+        panels += [[line(t, c.trace.mask_unusable(name) * scale, choose_colour(d, name), "measured", 1.2),
+                    line(t, c.replay.model[name] * scale, ORANGE, f"model, from the {d.drive.called}", 0.8),
+                    axes(ylabel=label_signal(s.signal)), legend(2), *left_out],
                    [band(-floor, floor, GREEN), line(t, c.replay.residual[name] * small, INK, width=0.7),
-                    axes(ylabel=f"residual of\n{SIGNAL_NAMES[name]} [{fine}]"), *left_out]]
+                    axes(ylabel=f"residual of\n{s.signal.symbol} [{fine}]"), *left_out]]
     return draw_over_time("overview", c.trace, panels, [1.5] + [1.3, 1.3] * len(c.signals))
 
 
@@ -375,8 +395,10 @@ def draw_deviation_map(c: Comparison) -> str:
     found = map_deviation(c.trace, {name: c.replay.residual[name] for name in floor}, floor) if floor else None
     if found is None:
         return ""
+    controlled = c.trace.declared.controlled
+    unit = controlled.shown_unit
     norm = LogNorm(1.0, max(10.0, *(float(np.nanmax(ratio)) for ratio in found.ratio.values())))
-    speeds, amplitudes = ([["" if np.isinf(edge) else f"{1e3 * edge:g}" for edge in edges]
+    speeds, amplitudes = ([["" if np.isinf(edge) else f"{controlled.shown_scale * edge:g}" for edge in edges]
                            for edges in (found.speeds, found.amplitudes)])
     return draw_panels("map", [[[
         call("pcolormesh", np.ma.masked_invalid(ratio), cmap="YlOrRd", norm=norm, edgecolors="white", linewidth=1.0),
@@ -384,20 +406,22 @@ def draw_deviation_map(c: Comparison) -> str:
                color="white" if norm(value) > 0.6 else INK)
           for (row, column), value in np.ndenumerate(ratio) if np.isfinite(value)),
         call("set_xticks", range(len(speeds)), speeds), call("set_yticks", range(len(amplitudes)), amplitudes),
-        axes(title=SIGNAL_NAMES[name], xlabel="speed [mm/s]", ylabel="" if number else "amplitude [mm]"),
+        axes(title=c.signals[name].signal.symbol, xlabel=f"speed [{unit}/s]",
+             ylabel="" if number else f"amplitude [{unit}]"),
         call("grid", False)] for number, (name, ratio) in enumerate(found.ratio.items())]],
         1.2 + 0.42 * len(found.amplitudes), sharey=True)
 
 
 def draw_whiteness(c: Comparison) -> str:
     """One row per signal: autocorrelation, cumulative periodogram, cross-correlation with the current."""
-    return draw_panels("whiteness", [_draw_tests(d, c.trace.period, SIGNAL_NAMES[name])
+    drive = c.trace.declared.drive.symbol
+    return draw_panels("whiteness", [_draw_tests(d, c.trace.period, c.signals[name].signal.symbol, drive)
                                      for name, d in c.diagnoses.items()], 2.4 * len(c.diagnoses))
 
 
-def _draw_tests(d: ResidualTests, period: float, label: str) -> list[Panel]:
+def _draw_tests(d: ResidualTests, period: float, label: str, drive: str) -> list[Panel]:
     rise = np.linspace(0.0, 1.0, len(d.frequencies))
-    chosen = next((f for f in d.follows if f.input == "Cor"), d.follows[0] if d.follows else None)
+    chosen = next((f for f in d.follows if f.input == drive), d.follows[0] if d.follows else None)
     return [
         [*_draw_correlation(np.arange(1, len(d.correlation)) * period, d.correlation[1:], d.band),
          axes(ylabel=f"{label}\nautocorrelation", xlabel="lag [ms]")],
@@ -413,20 +437,22 @@ def _draw_correlation(lags: Any, values: Any, bound: float) -> list[Mark]:
 
 
 def draw_dependence(c: Comparison) -> str:
-    """One row per signal: mean residual over speed, position, P12 and acceleration, with 95 % intervals."""
+    """One row per signal: mean residual over motion and other outputs, with 95 % intervals."""
     by = {name: {x.on: x for x in d.depends} for name, d in c.diagnoses.items()}
-    kinds = [kind for kind in QUANTITIES if any(kind in own for own in by.values())]
+    possible = ("speed", "position", *(s.symbol for s in c.trace.declared.outputs), "acceleration")
+    kinds = [kind for kind in possible if any(kind in own for own in by.values())]
     if not kinds:
         return ""
     return draw_panels("dependence", [_draw_means(c, name, kinds, own) for name, own in by.items()], 2.3 * len(by))
 
 
 def _draw_means(c: Comparison, name: str, kinds: Sequence[str], by: dict[str, Depends]) -> list[Panel]:
-    unit, scale = choose_drawn_unit(name, max((d.size for d in by.values()), key=abs, default=0.0))
+    signal, places = c.signals[name].signal, {kind: find_quantity_axis(c, kind) for kind in kinds}
+    unit, scale = choose_drawn_unit(signal, max((d.size for d in by.values()), key=abs, default=0.0))
     floor = NOISE_BAND_RATIO * c.signals[name].floor.value * scale
     return [[band(-floor, floor, GREEN, alpha=0.15),
-             call("errorbar", by[kind].centres * QUANTITIES[kind][1], by[kind].means * scale, by[kind].half * scale,
-                  color=SIGNAL_COLOURS[name], lw=1.0, marker="o", ms=3),
-             axes(xlabel=QUANTITIES[kind][0], title=f"{100 * by[kind].share:.0f} % of the power",
-                  ylabel=f"mean residual\nof {SIGNAL_NAMES[name]} [{unit}]" if kind == kinds[0] else "")]
+             call("errorbar", by[kind].centres * places[kind][1], by[kind].means * scale, by[kind].half * scale,
+                  color=choose_colour(c.trace.declared, name), lw=1.0, marker="o", ms=3),
+             axes(xlabel=places[kind][0], title=f"{100 * by[kind].share:.0f} % of the power",
+                  ylabel=f"mean residual\nof {signal.symbol} [{unit}]" if kind == kinds[0] else "")]
             if kind in by else [] for kind in kinds]

@@ -53,7 +53,6 @@ from fdi.report.drawing import (
 )
 from fdi.report.numbers import (
     NO_NUMBER,
-    SIGNAL_NAMES,
     attach_unit,
     format_digits,
     format_interval,
@@ -99,7 +98,7 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
     t, page = d.trace, Medium.PAGE
     changes = [f"{name}={value:g}" for name, value in sorted(d.model.list_changes().items())]
     facts = [("trace", f"{len(t) * t.period:.3f} s, {len(t)} cycles of {1e3 * t.period:g} ms"),
-             ("signals", ", ".join(SIGNAL_NAMES[name] for name in t.outputs)),
+             ("signals", ", ".join(t.declared.find(name).symbol for name in t.outputs)),
              ("model", " ".join([d.model.name, *changes])), ("software", name_software())]
     provenance = {} if d.bands is None else d.bands.provenance
     sections = [
@@ -253,7 +252,8 @@ def format_limits_of_fault(fault: Fault) -> tuple[str, str]:
 
 def describe_residual(d: Diagnosis) -> str:
     """The residual of the best fit: "XJ 1.00, P12 1.02 times the noise floor"."""
-    ratios = ", ".join(f"{SIGNAL_NAMES[s]} {format_ratio(ratio)}" for s, ratio in d.refinement.ratio.items())
+    ratios = ", ".join(f"{d.trace.declared.find(s).symbol} {format_ratio(ratio)}"
+                       for s, ratio in d.refinement.ratio.items())
     return f"{ratios} times the noise floor"
 
 
@@ -291,9 +291,10 @@ def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
                     "matches the position alone with a plant that has only these two faults")
         if d.others:
             sentence += f", here with {_list_others(d)}"
-        if "xj" in d.refinement.errors:
+        left = d.refinement.errors.get(d.trace.declared.controlled.name)
+        if left is not None:
             sentence += (f"; its best cell leaves {1e6 * g.joint.minimum.rms:.3g} um of the position, the fit "
-                         f"{1e6 * d.refinement.errors['xj']:.3g} um")
+                         f"{1e6 * left:.3g} um")
         trust = "Trust the fit" if d.refinement.is_explained else "The fit does not explain the trace either"
         sentences.append(f"{sentence}. {trust}.")
     return sentences
@@ -543,8 +544,9 @@ def draw_overview(trace: Trace, judged: BandVerdict) -> str:
     """Command and position of the whole trace, times outside the bands shaded."""
     limits = (float(trace.t[0]), float(trace.t[-1]) + trace.period)
     return draw_panels("overview", [[[
-        line(trace.t, trace.com * MM, COMMAND, "Com, command", 2.2),
-        line(trace.t, trace.mask_unusable("xj") * MM, BLUE, "XJ, ram"), *_shade_events(judged.events, limits),
+        line(trace.t, trace.command * MM, COMMAND, "Com, command", 2.2),
+        line(trace.t, trace.mask_unusable(trace.declared.controlled.name) * MM, BLUE, "XJ, ram"),
+        *_shade_events(judged.events, limits),
         axes(xlim=limits, ylabel="position [mm]", xlabel="time [s]"), legend(2)]]], 2.4)
 
 
@@ -569,7 +571,7 @@ def _draw_step(trace: Trace, bands: Bands, step: StepBand, s: CommandSection, ju
     return [area(t, -healthy, healthy, GREEN, "healthy", 0.15),
             *(line(t, np.where(there, side * limit, np.nan) * UM, colour, label, 1.6)
               for limit, colour, label in ((middle, ORANGE, "MidBand"), (most, RED, "MaxBand"))),
-            line(t, (trace.mask_unusable("xj")[rows] - centre) * UM, INK, "measured"),
+            line(t, (trace.mask_unusable(trace.declared.controlled.name)[rows] - centre) * UM, INK, "measured"),
             *_shade_events(judged.events, (0.0, float(t[-1])), "position", MS, begin),
             axes(xlim=(0.0, float(t[-1])), title=f"step of {(s.last - s.first) * MM:+.3g} mm at {begin:.4g} s",
                  xlabel="time from the step [ms]", ylabel="off the healthy\nresponse [um]")]
@@ -586,9 +588,10 @@ def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
 
 
 def _draw_ramp(trace: Trace, ramp: RampBand, s: CommandSection, judged: BandVerdict, is_first: bool) -> list[Panel]:
-    rows, way, xj = select_ramp_rows(s, trace.period), np.sign(s.rate), trace.mask_unusable("xj")
-    error = way * (trace.com[rows] - xj[rows])
-    fast = way * compute_speed(xj, trace.period)[rows] - abs(s.rate)
+    rows, way = select_ramp_rows(s, trace.period), np.sign(s.rate)
+    x = trace.mask_unusable(trace.declared.controlled.name)
+    error = way * (trace.command[rows] - x[rows])
+    fast = way * compute_speed(x, trace.period)[rows] - abs(s.rate)
     scale = ramp.compute_scale(float(compute_half_range(error)), float(find_lasting_peak(fast)))
     limits = (float(trace.t[rows.start]), float(trace.t[rows.stop - 1]))
     above = axes(title=f"ramp at {s.rate * MM:+.3g} mm/s, judged from {limits[0]:.4g} s",

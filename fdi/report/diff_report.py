@@ -16,20 +16,20 @@ from fdi.report.drawing import (
     COMMAND,
     GREEN,
     GREY,
-    LEVELS,
     ORANGE,
     PINK,
     TEAL,
+    VIOLET,
     Panel,
     axes,
     band,
     dot,
     draw_over_time,
+    label_signal,
     legend,
     line,
 )
 from fdi.report.numbers import (
-    SIGNAL_NAMES,
     choose_unit,
     count_nouns,
     format_digits,
@@ -71,7 +71,7 @@ def describe_differences(found: RunDifferences) -> str:
         if not pair.signals:
             words = "no signal could be compared"
         elif beyond:
-            ratios = join_words(f"{SIGNAL_NAMES[s.name]} by {format_ratio(s.ratio)}" for s in beyond)
+            ratios = join_words(f"{s.signal.symbol} by {format_ratio(s.ratio)}" for s in beyond)
             words = f"{ratios} times the noise"
         elif all(s.is_equal for s in pair.signals):
             words = "every sample is equal"
@@ -108,7 +108,7 @@ def _show_signals(found: RunDifferences) -> list[Item]:
     for pair in found.pairs:
         for s in pair.signals:
             scale, unit = units[s.name]
-            rows.append([f"{pair.run.label} - A", SIGNAL_NAMES[s.name], unit,
+            rows.append([f"{pair.run.label} - A", s.signal.symbol, unit,
                          Cell(format_digits(s.rms / scale), is_strong=True),
                          *(("-", "-") if s.is_equal else (format_digits(s.largest / scale), f"{s.t:.3f}")),
                          *(format_digits(noise / scale) for noise in s.noise),
@@ -120,7 +120,8 @@ def _show_signals(found: RunDifferences) -> list[Item]:
     figure = Figure("Each signal of all runs, and below it the difference from A. Green: two noise floors of both runs "
                     "on either side of zero. The circle marks the largest difference. Shaded: ramps (blue) and dynamic "
                     "sections (violet) of the command.", partial(draw_differences, found))
-    return [Table(columns, rows, caption), *(Line("left out", f"{SIGNAL_NAMES[name]} of {pair.run.label}: {reason}")
+    symbols = {s.name: s.symbol for s in found.runs[0].trace.declared}
+    return [Table(columns, rows, caption), *(Line("left out", f"{symbols[name]} of {pair.run.label}: {reason}")
                                              for pair in found.pairs for name, reason in pair.not_compared.items()),
             *([figure] if rows else [])]
 
@@ -202,7 +203,7 @@ def _collect_data(found: RunDifferences, facts: Mapping[str, Facts]) -> dict[str
         "models": facts["model"], "nodes": facts["node"], "timing": facts["timing"]}
 
 
-COLOURS = (BLUE, ORANGE, PINK, TEAL, "#8250df", GREY)  # of the runs, the reference first
+COLOURS = (BLUE, ORANGE, PINK, TEAL, VIOLET, GREY)  # of the runs, the reference first
 
 
 def choose_difference_units(found: RunDifferences) -> dict[str, tuple[float, str]]:
@@ -217,20 +218,23 @@ def draw_differences(found: RunDifferences) -> str:
     reference = found.runs[0].trace
     offsets = [0.0, *(pair.offset for pair in found.pairs)]
     runs = list(zip(found.runs, offsets, COLOURS * len(offsets), strict=False))
+    command = reference.declared.command
     panels: list[Panel] = [[
-        line(reference.t, reference.com * 1e3, COMMAND, "Com A", 1.6), axes(ylabel="Com [mm]"),
-        *(line(run.trace.t + offset, run.trace.com * 1e3, colour, f"Com {run.label}", 0.9)
+        line(reference.t, reference.command * command.shown_scale, COMMAND, f"{command.symbol} A", 1.6),
+        axes(ylabel=label_signal(command)),
+        *(line(run.trace.t + offset, run.trace.command * command.shown_scale, colour, f"{command.symbol} {run.label}",
+               0.9)
           for (run, offset, colour), pair in zip(runs[1:], found.pairs, strict=True) if not pair.has_same_command)]]
     for number, (name, (size, word)) in enumerate(choose_difference_units(found).items()):
-        unit, scale = LEVELS[name]
+        signal = reference.declared.find(name)
         compared = [(pair, colour, s) for pair, (_, _, colour) in zip(found.pairs, runs[1:], strict=True)
                     for s in pair.signals if s.name == name]
         half = max(NOISE_BAND_RATIO * math.hypot(*s.noise) / size for _, _, s in compared)
         panels += [
-            [*(line(run.trace.t + offset, run.trace.column(name) * scale, colour, run.label,
+            [*(line(run.trace.t + offset, run.trace.column(name) * signal.shown_scale, colour, run.label,
                     1.3 if run is found.runs[0] else 0.8) for run, offset, colour in runs if name in run.trace.signals),
-             axes(ylabel=f"{SIGNAL_NAMES[name]} [{unit}]"), *([] if number else [legend(len(runs))])],
-            [band(-half, half, GREEN), axes(ylabel=f"difference\n{SIGNAL_NAMES[name]} [{word}]"),
+             axes(ylabel=label_signal(signal)), *([] if number else [legend(len(runs))])],
+            [band(-half, half, GREEN), axes(ylabel=f"difference\n{signal.symbol} [{word}]"),
              *(line(pair.t, pair.differences[name] / size, colour, f"{pair.run.label} - A", 0.7)
                for pair, colour, _ in compared),
              *(dot(s.t, s.largest / size, colour, ms=4, mfc="none") for _, colour, s in compared)]]

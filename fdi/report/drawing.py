@@ -20,10 +20,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fdi.output import write_text, write_whole
-from fdi.report.numbers import SIGNAL_NAMES, SIGNAL_UNITS, choose_unit
+from fdi.report.numbers import choose_unit
 from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace.trace import Floats, Trace, rms
 from plant.errors import InputError
+from plant.signals import Signal, Signals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,27 +38,36 @@ INK, COMMAND, RED, GREEN = "#24292f", "#8b949e", "#c93c37", "#2b8a3e"
 BLUE, ORANGE, AMBER, GREY, TEAL, PINK = "#1f6feb", "#d9730d", "#b7791f", "#57606a", "#0f8b8d", "#bf3989"
 BEFORE, AFTER = "#9aa4b1", BLUE  # the model as it was, and as it is found
 FAULT = "#ffd8a8"  # an injected fault
-SIGNAL_COLOURS = {"xj": BLUE, "p12": TEAL, "xs": PINK}
+VIOLET = "#8250df"
+OUTPUT_COLOURS = (BLUE, TEAL, PINK, VIOLET, GREY)  # of the outputs of a plant, in their order
 STYLE: Any = {  # matplotlib's types want each key as a literal
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9, "axes.edgecolor": "#b6bcc4",
     "axes.grid": True, "axes.spines.top": False, "axes.spines.right": False, "grid.color": "#e4e7eb", "text.color": INK,
     "text.parse_math": False,  # a name in a log may have a dollar sign
     "path.simplify_threshold": 0.06,  # points; what may be lost shows when a figure is zoomed 20 times
     "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.axisbelow": True, "axes.titlesize": 9}
-DRAWN_UNITS = {"xj": ("um", 1e6), "p12": ("bar", 1e-5), "xs": ("um", 1e6)}  # of small differences: unit, scale of SI
-LEVELS = {"xj": ("mm", 1e3), "cor": ("mA", 1e3), "load": ("kN", 1e-3), "p12": ("bar", 1e-5), "xs": ("um", 1e6)}
-"""Unit and scale of a signal itself."""
 LINE_COLUMNS = 7300  # a line is drawn by its extremes in this many columns: each sample of a run of 14 s, for zooming
 
 
-def choose_drawn_unit(name: str, size: float) -> tuple[str, float]:
+def choose_drawn_unit(signal: Signal, size: float) -> tuple[str, float]:
     """Unit and scale of an axis for errors of this size of a signal: the unit in which a table prints that size.
 
-    >>> choose_drawn_unit("xj", 2e-3), choose_drawn_unit("p12", 1e4)
-    (('mm', 1000.0), ('bar', 1e-05))
+    >>> choose_drawn_unit(Signal("x", "X", "m", "position"), 2e-3)
+    ('mm', 1000.0)
     """
-    scale, unit = choose_unit(SIGNAL_UNITS[name], size)
+    scale, unit = choose_unit(signal.unit, size)
     return unit, 1.0 / scale
+
+
+def choose_colour(signals: Signals, name: str) -> str:
+    """The colour of an output by its place; that of anything else is violet."""
+    names = [s.name for s in signals.outputs]
+    return OUTPUT_COLOURS[names.index(name) % len(OUTPUT_COLOURS)] if name in names else VIOLET
+
+
+def label_signal(signal: Signal) -> str:
+    """The label of an axis: symbol and unit."""
+    return f"{signal.symbol} [{signal.shown_unit}]"
 
 
 call = methodcaller  # of matplotlib's `Axes`
@@ -196,13 +206,16 @@ def draw_residuals(salt: str, trace: Trace, models: Sequence[tuple[str, str, Flo
         floor: RMS of the noise of each signal, SI; dotted lines at twice of it.
         is_cut: whether the last model's residual sets the height of a panel.
     """
-    panels: list[Panel] = [[line(trace.t, trace.com * 1e3, COMMAND, width=1.6), axes(ylabel="Com [mm]")]]
+    command = trace.declared.command
+    panels: list[Panel] = [[line(trace.t, trace.command * command.shown_scale, COMMAND, width=1.6),
+                            axes(ylabel=label_signal(command))]]
     for i, name in enumerate(trace.outputs):
-        unit, scale = choose_drawn_unit(name, rms(models[0][2][i]))
+        signal = trace.declared.find(name)
+        unit, scale = choose_drawn_unit(signal, rms(models[0][2][i]))
         half = scale * max(8.0 * floor[name], 1.2 * float(np.nanmax(np.abs(models[-1][2][i]))))
         panels.append([*(line(trace.t, -misfit[i] * scale, colour, label, 0.9) for label, colour, misfit in models),
                        *levels(NOISE_BAND_RATIO * floor[name] * scale, GREEN, "two noise floors", 0.8, ":"),
-                       axes(ylabel=f"{SIGNAL_NAMES[name]} [{unit}]", **{"ylim": (-half, half)} if is_cut else {}),
+                       axes(ylabel=f"{signal.symbol} [{unit}]", **{"ylim": (-half, half)} if is_cut else {}),
                        *([legend(3)] if i == 0 else [])])
     return draw_over_time(salt, trace, panels, [0.8] + [1.3] * len(trace.outputs),
                           xlabel="time [s]; what is beyond an axis is cut off" if is_cut else "time [s]")

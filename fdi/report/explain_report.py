@@ -38,7 +38,6 @@ from fdi.report.drawing import (
 )
 from fdi.report.numbers import (
     NO_NUMBER,
-    SIGNAL_NAMES,
     format_amount,
     format_interval,
     format_p_value,
@@ -50,6 +49,7 @@ from fdi.report.numbers import (
 )
 from fdi.report.report import Cell, Column, Figure, Line, Listing, Medium, Mood, Report, Section, Table, tabulate
 from fdi.trace.trace import Floats, Trace
+from plant.signals import Signals
 
 BySignal = Mapping[str, float]  # SI
 
@@ -79,7 +79,9 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
     after = None if a.best is e.base else a.best
     notes = [*notes, *([e.excerpt] if e.excerpt else [])]
     if marks.is_recorder:
-        notes.append(f"XJ is recorded in steps of {format_amount(marks.step, 'm')}, but Cor shows that the controller "
+        d = trace.declared
+        notes.append(f"{d.controlled.symbol} is recorded in steps of {format_amount(marks.step, d.controlled.unit)}, "
+                     f"but {d.drive.symbol} shows that the controller "
                      "reads it finer: the rounding is noise of the recording and no effect")
     sections = [
         Section("Candidates", [_tabulate_candidates(a)] if a.candidates else []),
@@ -100,7 +102,8 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
         Section("Error after each effect", [Figure(
             "Error over noise floor after each effect, on the fitted and on the held-out run. An effect that lowers "
             "only the blue bar is overfitting.",
-            partial(draw_ledger, [Row(*row) for row in a.ledger], a.baseline["floor"]))] if len(a.ledger) > 2 else []),
+            partial(draw_ledger, [Row(*row) for row in a.ledger], a.baseline["floor"], trace.declared))]
+            if len(a.ledger) > 2 else []),
         Section("Ranking", [Figure(
             "Error over noise floor of the worst signal, for the best candidates. The right effect reaches the green "
             "line on both runs.", partial(draw_ranking, a.explanations, e.floor))] if a.candidates else []),
@@ -118,12 +121,18 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
                   next_command, files, collect_data(a, notes))
 
 
+def find_signals(a: Answer) -> Signals:
+    """The signals of the plant that an answer is about."""
+    return a.explanation.search.problem.trace.declared
+
+
 def describe_verdict(a: Answer) -> str:
     """The verdict in a sentence or two: the effect, its size, and the error before and after beside the noise floor."""
     named = _named_candidates(a)
     words, verb = join_words(c.effect for c in named), "explain" if len(named) > 1 else "explains"
-    error, floor = a.baseline["error"], a.baseline["floor"]
-    floors = "; ".join(f"{SIGNAL_NAMES[s]} error {_format(error, s)}, noise floor {_format(floor, s)}" for s in error)
+    error, floor, signals = a.baseline["error"], a.baseline["floor"], find_signals(a)
+    floors = "; ".join(f"{signals.find(s).symbol} error {_format(error, s, signals)}, noise floor "
+                       f"{_format(floor, s, signals)}" for s in error)
     if a.verdict == "NOTHING_MISSING":
         return f"Nothing is missing: the residual is noise ({floors})."
     if a.verdict == "NOT_RESOLVABLE":
@@ -148,11 +157,12 @@ def _describe_unexplained(a: Answer) -> str:
     if a.explanation.base.is_at_floor and not a.explanation.effects:
         return ("The output of the controller differs from the model's, and no effect of the catalogue explains the "
                 "difference.")
-    worst = _find_worst_signal(a)
+    worst, signals = _find_worst_signal(a), find_signals(a)
     best = min(a.candidates, key=lambda c: c.ratio, default=None)
-    return (f"No effect of the catalogue explains the residual: {SIGNAL_NAMES[worst]} error "
-            f"{_format(a.baseline['error'], worst)}, noise floor {_format(a.baseline['floor'], worst)}"
-            + (f"; the best, {best.effect}, leaves {_format(best.error, worst)}." if best else "."))
+    return (f"No effect of the catalogue explains the residual: {signals.find(worst).symbol} error "
+            f"{_format(a.baseline['error'], worst, signals)}, noise floor "
+            f"{_format(a.baseline['floor'], worst, signals)}"
+            + (f"; the best, {best.effect}, leaves {_format(best.error, worst, signals)}." if best else "."))
 
 
 def _named_candidates(a: Answer) -> list[Candidate]:
@@ -177,13 +187,13 @@ def _find_worst_signal(a: Answer) -> str:
 
 def _describe_change(a: Answer, c: Candidate) -> str:
     """Error before and after, noise floor, held-out run."""
-    s = _find_worst_signal(a)
-    sentence = _describe_step(s, a.baseline["error"], c.error, a.baseline["floor"])
-    return sentence + (f"; held-out run {_format(c.holdout, s)}" if s in c.holdout else "")
+    s, signals = _find_worst_signal(a), find_signals(a)
+    sentence = _describe_step(s, a.baseline["error"], c.error, a.baseline["floor"], signals)
+    return sentence + (f"; held-out run {_format(c.holdout, s, signals)}" if s in c.holdout else "")
 
 
-def _format(by_signal: BySignal, signal: str) -> str:
-    return format_signal(by_signal.get(signal, math.nan), signal)
+def _format(by_signal: BySignal, name: str, signals: Signals) -> str:
+    return format_signal(by_signal.get(name, math.nan), signals.find(name))
 
 
 def describe_findings(a: Answer) -> list[Line]:
@@ -232,10 +242,11 @@ def describe_blind(a: Answer) -> str:
 def _tabulate_candidates(a: Answer, most: int = 8) -> Table:
     """The candidates, best first, below the model without any further effect."""
     floor, has_holdout = a.explanation.floor, any(c.holdout for c in a.candidates)
-    columns = [Column("effect"), Column("result"), *(Column(SIGNAL_NAMES[s], align="right") for s in floor)]
+    symbols = [find_signals(a).find(s).symbol for s in floor]
+    columns = [Column("effect"), Column("result"), *(Column(symbol, align="right") for symbol in symbols)]
     if has_holdout:
         columns += [Column("held-out run", align="right", medium=Medium.TERMINAL),
-                    *(Column(f"{SIGNAL_NAMES[s]}, held-out run", align="right", medium=Medium.PAGE) for s in floor)]
+                    *(Column(f"{symbol}, held-out run", align="right", medium=Medium.PAGE) for symbol in symbols)]
     columns += [Column("evidence", align="right"), Column("p", align="right"), Column("size", medium=Medium.PAGE)]
 
     def show_ratios(ratios: BySignal, holdout: BySignal) -> list[str]:
@@ -304,7 +315,8 @@ def collect_data(a: Answer, notes: Sequence[str] = ()) -> dict[str, Any]:
                       "usual": b.usual, "revealed_by": b.revealed_by} for b in a.blind],
         "seen_without_noise": a.noiseless, "suspicious": [s._asdict() for s in a.suspicious],
         "separate": a.separate, "pattern": a.pattern,
-        "controller": {"error": e.marks.controller, "unit": "counts"}, "signals": {s: SIGNAL_NAMES[s] for s in e.floor},
+        "controller": {"error": e.marks.controller, "unit": "counts"},
+        "signals": {s: find_signals(a).find(s).symbol for s in e.floor},
         "notes": notes, **{key: value for key, value in sometimes.items() if value is not None}}
 
 
@@ -335,7 +347,7 @@ def draw_ranking(candidates: Sequence[Candidate], floor: BySignal, most: int = 1
              xlabel="error of the worst signal over its noise floor"), legend(3)]]], 0.9 + 0.34 * len(shown))
 
 
-def draw_ledger(rows: Sequence[Row], floor: BySignal) -> str:
+def draw_ledger(rows: Sequence[Row], floor: BySignal, declared: Signals) -> str:
     """Error over noise floor of each signal after each effect, on the fitted run and on the held-out one."""
     x, signals = np.arange(len(rows)), [s for s in floor if s in rows[0].error]
 
@@ -346,7 +358,8 @@ def draw_ledger(rows: Sequence[Row], floor: BySignal) -> str:
                 call("bar", x + 0.19, held, width=0.36, color=ORANGE, label="held-out run"),
                 level(1.0, GREEN, width=1.2),
                 call("set_xticks", x, [name_step(row) for row in rows], rotation=20, ha="right"),
-                axes(yscale="log", title=SIGNAL_NAMES[s], ylabel="error over noise floor" if s == signals[0] else "")]
+                axes(yscale="log", title=declared.find(s).symbol,
+                     ylabel="error over noise floor" if s == signals[0] else "")]
 
     return draw_panels("ledger", [list(map(draw_signal, signals))], 2.9, common_legend=True, sharey=True)
 
@@ -428,12 +441,13 @@ def _tabulate_terms(law: Law) -> Table:
 
 
 def _tabulate_law_errors(found: LawSearch, law: Law) -> Table:
-    columns = [Column(f"{SIGNAL_NAMES[s]}{words}", align="right")
+    signals = found.signals
+    columns = [Column(f"{signals.find(s).symbol}{words}", align="right")
                for words in ("", ", held-out")[:2 if law.holdout else 1] for s in found.floor]
     rows: list[list[Cell | str]] = []
     for name, *sides in _list_errors(found, law):
         is_law = name == "with the law"
-        shown = [_format(errors, s) for errors in sides for s in found.floor]
+        shown = [_format(errors, s, signals) for errors in sides for s in found.floor]
         rows.append([Cell(name, "good" if is_law else "", is_law), *shown[:len(columns)]])
     return Table([Column("model"), *columns], rows, (
         "Errors, RMS; of the held-out run those of the typical block (the worst 15 % are left out). The law explains "
@@ -493,7 +507,7 @@ def build_model_report(update: ModelUpdate, path: Path | None = None, backup: Pa
         backup: where the file that was there before is now.
         page: the page to be written.
     """
-    p, r, floor = update.provenance, update.refit, update.floor
+    p, r, floor, signals = update.provenance, update.refit, update.floor, update.model.kind.signals
     parameters = _list_parameters(update.parameters)
     lines = [Line(str(name), str(value), medium=Medium.TERMINAL) for name, value in parameters.rows]
     if update.suspicious:
@@ -504,9 +518,9 @@ def build_model_report(update: ModelUpdate, path: Path | None = None, backup: Pa
         after = last if last is not first else None
         sections = [
             Section("Error after each step", [
-                _tabulate_errors(p.ledger, floor), _draw_bars(p.ledger, floor), Figure(
+                _tabulate_errors(p.ledger, floor, signals), _draw_bars(p.ledger, floor), Figure(
                     "Error over noise floor after each step, on the fitted and on the held-out run. An effect that "
-                    "lowers only the blue bar is overfitting.", partial(draw_ledger, p.ledger, floor))]),
+                    "lowers only the blue bar is overfitting.", partial(draw_ledger, p.ledger, floor, signals))]),
             *sections,
             Section("Residual", [Figure(
                 "Residual (measured minus model) of each signal, before and after. Where the model is complete, the "
@@ -533,23 +547,24 @@ def build_model_report(update: ModelUpdate, path: Path | None = None, backup: Pa
 
 def describe_update(update: ModelUpdate) -> str:
     """What the update did to the error of the worst signal, on the fitted and on the held-out run."""
-    floor = update.floor
+    floor, signals = update.floor, update.model.kind.signals
     if update.refit is None:
         return f"{update.removed} removed."
     if update.removed:
         earlier, later = update.provenance.ledger[-2:]
         s = max(later.error, key=lambda name: later.error[name] / floor[name])
-        return f"{update.removed} removed: {_describe_step(s, earlier.error, later.error, floor)}."
+        return f"{update.removed} removed: {_describe_step(s, earlier.error, later.error, floor, signals)}."
     before, after = update.refit.steps[-1 - len(update.added)], update.refit.last
     s = max(before.error, key=lambda name: before.error[name] / floor[name])
-    sentence = f"{join_words(update.added)} added: {_describe_step(s, before.error, after.error, floor)}"
+    sentence = f"{join_words(update.added)} added: {_describe_step(s, before.error, after.error, floor, signals)}"
     if s in after.holdout:
-        sentence += f"; held-out run {_format(before.holdout, s)} -> {_format(after.holdout, s)}"
+        sentence += f"; held-out run {_format(before.holdout, s, signals)} -> {_format(after.holdout, s, signals)}"
     return f"{sentence}." if update.helps else f"{sentence}. {update.added[-1]} explains nothing but noise."
 
 
-def _describe_step(s: str, before: BySignal, after: BySignal, floor: BySignal) -> str:
-    return (f"{SIGNAL_NAMES[s]} error {_format(before, s)} -> {_format(after, s)}, noise floor {_format(floor, s)}")
+def _describe_step(s: str, before: BySignal, after: BySignal, floor: BySignal, signals: Signals) -> str:
+    was, now, noise = (_format(values, s, signals) for values in (before, after, floor))
+    return f"{signals.find(s).symbol} error {was} -> {now}, noise floor {noise}"
 
 
 def _list_runs(rows: Sequence[Row]) -> list[tuple[str, Cell, BySignal]]:
@@ -558,15 +573,15 @@ def _list_runs(rows: Sequence[Row]) -> list[tuple[str, Cell, BySignal]]:
         (name_step(row), Cell("fitted"), row.error), ("", Cell("held-out", "muted"), row.holdout)) if run[2]]
 
 
-def _tabulate_errors(rows: Sequence[Row], floor: BySignal) -> Table:
+def _tabulate_errors(rows: Sequence[Row], floor: BySignal, signals: Signals) -> Table:
     """RMS error of each signal after each step, on the fitted run and on the held-out one."""
     columns = [column for s in floor for column in (
-        Column(SIGNAL_NAMES[s], align="right"), Column("over floor", align="right", medium=Medium.PAGE))]
+        Column(signals.find(s).symbol, align="right"), Column("over floor", align="right", medium=Medium.PAGE))]
     cells: list[list[Cell | str]] = [[step, role, *(
         cell for s in floor for ratio in [errors.get(s, math.nan) / floor[s]]
-        for cell in (Cell(_format(errors, s), _choose_mood(ratio)), Cell(format_ratio(ratio), "muted")))]
+        for cell in (Cell(_format(errors, s, signals), _choose_mood(ratio)), Cell(format_ratio(ratio), "muted")))]
         for step, role, errors in _list_runs(rows)]
-    floors = [Cell(text, "muted") for s in floor for text in (_format(floor, s), "1")]
+    floors = [Cell(text, "muted") for s in floor for text in (_format(floor, s, signals), "1")]
     return Table([Column("step"), Column("run"), *columns], [*cells, [Cell("noise floor", "muted"), "", *floors]],
                  f"RMS error of each signal. Green: at most {GOOD_RATIO:g} times the noise floor.")
 

@@ -20,7 +20,6 @@ from fdi.report.drawing import (
     name_rows,
 )
 from fdi.report.numbers import (
-    SIGNAL_NAMES,
     format_amount,
     format_interval,
     format_percent,
@@ -30,6 +29,7 @@ from fdi.report.numbers import (
 )
 from fdi.report.report import Cell, Column, Figure, Line, Listing, Medium, Mood, Report, Section, Table, tabulate
 from fdi.thresholds import HELD_OUT_UNDECIDED_SHARE, RESIDUAL_HELD_OUT
+from plant.signals import Signals
 
 MOODS: dict[str, Mood] = {"IDENTIFIED": "good", "PARTLY": "doubtful", "CANNOT_TELL": "doubtful", "UNEXPLAINED": "bad"}
 
@@ -54,7 +54,7 @@ def build_identification_report(found: Identification, title: str, command: str 
             "Each free parameter over its data sheet value: grey the range of the data sheet, blue the 95 % interval "
             "that the runs leave, orange where the runs do not show the parameter.",
             partial(draw_estimates, found.estimates))]),
-        Section("Error of each run", [_tabulate_errors(found.errors)]),
+        Section("Error of each run", [_tabulate_errors(found.errors, found.model.kind.signals)]),
         Section("Findings", _describe_findings(found)),
         Section("Residual", [Figure(
             f"Residual of each signal of the {'held-out' if shown.is_held_out else 'fitted'} run {shown.source.file}, "
@@ -77,14 +77,15 @@ def describe_identification(found: Identification) -> str:
         return (f"No parameters within the ranges explain the runs: {found.reason}. Something is missing in the model, "
                 "or a range is too narrow.")
     chosen = (found.holdouts or found.errors)[0]  # the error of its worst signal
-    s = max(chosen.before, key=lambda name: chosen.before[name] / chosen.floor[name])
+    name = max(chosen.before, key=lambda name: chosen.before[name] / chosen.floor[name])
+    s = found.model.kind.signals.find(name)
     count = f"{len(seen)} of {len(found.estimates)} free parameters are identified"
     if found.verdict == "IDENTIFIED":
         count = f"All {len(seen)} free parameters are identified"
     but = f" But {found.reason}." if found.verdict == "PARTLY" and len(seen) == len(found.estimates) else ""
-    return (f"{count}: {'held-out run, ' if chosen.is_held_out else ''}{SIGNAL_NAMES[s]} error "
-            f"{format_signal(chosen.before[s], s)} -> {format_signal(chosen.after[s], s)}, noise floor "
-            f"{format_signal(chosen.floor[s], s)}.{but}")
+    return (f"{count}: {'held-out run, ' if chosen.is_held_out else ''}{s.symbol} error "
+            f"{format_signal(chosen.before[name], s)} -> {format_signal(chosen.after[name], s)}, noise floor "
+            f"{format_signal(chosen.floor[name], s)}.{but}")
 
 
 def _tabulate_parameters(found: Identification) -> Table:
@@ -115,19 +116,19 @@ def _judge_estimate(e: Estimate, verdict: str) -> tuple[str, Mood]:
     return ("not to be trusted", "doubtful") if verdict == "UNEXPLAINED" else ("identified", "good")
 
 
-def _tabulate_errors(errors: Sequence[RunError]) -> Table:
+def _tabulate_errors(errors: Sequence[RunError], signals: Signals) -> Table:
     columns = [Column("run"), Column(""), Column("signal"), Column("before", align="right"),
                Column("after", align="right"), Column("noise floor", align="right"),
                Column("over floor", align="right")]
     rows: list[list[Cell | str]] = []
     for e in errors:
         kind = "held-out" if e.is_held_out else "fitted"
-        for number, s in enumerate(e.after):
-            ratio = e.after[s] / e.floor[s]
+        for number, name in enumerate(e.after):
+            ratio, s = e.after[name] / e.floor[name], signals.find(name)
             file, role = (e.source.file, kind) if number == 0 else ("", "")  # once for the rows of a run
-            rows.append([file, Cell(role, "muted"), SIGNAL_NAMES[s],
-                         Cell(format_signal(e.before[s], s), "muted"), format_signal(e.after[s], s),
-                         Cell(format_signal(e.floor[s], s), "muted"),
+            rows.append([file, Cell(role, "muted"), s.symbol,
+                         Cell(format_signal(e.before[name], s), "muted"), format_signal(e.after[name], s),
+                         Cell(format_signal(e.floor[name], s), "muted"),
                          Cell(format_ratio(ratio), "good" if ratio <= RESIDUAL_HELD_OUT else "bad")])
     return Table(columns, rows, "RMS error of each signal with the data sheet's values (before) and with those found.")
 
@@ -140,10 +141,11 @@ def _describe_findings(found: Identification) -> list[Line]:
     pairs = join_words(f"{c.first} with {c.second} ({c.value:+.3f})" for c in found.correlations[:4])
     gains = found.controller
     law = "" if gains is None else "no proportional law with a limit: the model keeps its gains"
+    drive, controlled = found.model.kind.signals.drive.unit, found.model.kind.signals.controlled.unit
     if gains is not None and gains.is_proportional:
-        limit = "" if gains.limit is None else f", limit {format_amount(gains.limit, 'A')}"
-        law = (f"gain {format_amount(gains.gain, 'A/m', 4)}{limit}; exact in {format_percent(gains.exact, 3)} of the "
-               "rows")
+        limit = "" if gains.limit is None else f", limit {format_amount(gains.limit, drive)}"
+        gain = format_amount(gains.gain, f"{drive}/{controlled}", 4)
+        law = f"gain {gain}{limit}; exact in {format_percent(gains.exact, 3)} of the rows"
     lines = [
         *(Line("to identify", f"{join_words(names)}: {text}") for text, names in advised.items()),
         Line("at a bound", f"{at_bound}: the interval reaches the end of the data sheet's range; give a wider one"

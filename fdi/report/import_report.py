@@ -4,31 +4,28 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
-from fdi.report.numbers import SIGNAL_NAMES, choose_unit, count_nouns, format_digits, list_first
+from fdi.report.numbers import choose_unit, count_nouns, format_digits, list_first
 from fdi.report.report import Cell, Column, Line, Mood, Report, Section, tabulate
 from fdi.trace.importing.conversion import Imported, ImportedSignal
 from fdi.trace.importing.formats import Measurement
 from fdi.trace.importing.guess import GuessedMap
-from fdi.trace.signals import SIGNALS
 
-MISSING = {"p12": "the forces on the ram are not judged by themselves",
-           "xs": "the servovalve is not judged by itself",
-           "load": "it is taken as 0; a load that did act is then a force that the model lacks"}
-"""Signals that a trace may lack, and what this means for the answers."""
 MOST = 12  # channels that a note names; a recording may have hundreds
 
 
 def build_import_report(imported: Imported, measurement: Measurement, out: Path) -> Report:
     """Rows and period of the trace; a table of its signals."""
     trace = imported.trace
+    signals = trace.declared
     table = tabulate(
-        imported.signals, (Column("signal"), lambda s: SIGNAL_NAMES[s.name]), (Column("source"), lambda s: s.source),
+        imported.signals, (Column("signal"), lambda s: signals.find(s.name).symbol),
+        (Column("source"), lambda s: s.source),
         (Column("unit"), lambda s: s.unit), (Column("rate", "Hz", "right"), lambda s: f"{s.rate:.6g}"),
-        (Column("range", align="right"), _format_range),
+        (Column("range", align="right"), lambda s: _format_range(s, signals.find(s.name).unit)),
         (Column("gaps", align="right"), lambda s: str(s.gaps or "none")),
         (Column("missing", "rows", "right"), lambda s: str(s.missing or "none")),
         caption="Rate and gaps: in the source. Range and missing: in the trace.")
-    lines = [Line(SIGNAL_NAMES[s.name], s.how) for s in imported.signals]
+    lines = [Line(signals.find(s.name).symbol, s.how) for s in imported.signals]
     sentence = (f"{out}: {count_nouns(len(trace), 'row')} of {1e3 * trace.period:.6g} ms from {measurement.path.name} "
                 f"({measurement.format})")
     notes = _list_notes(imported, measurement)
@@ -43,12 +40,13 @@ def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path)
     """Which column is taken for which signal."""
     moods: dict[str, Mood] = {"sure": "good", "likely": "doubtful", "unsure": "bad"}
     chosen = guessed.chosen
-    missing = [SIGNAL_NAMES[name] for name in ("com", "xj", "cor") if name not in guessed.chosen]
+    signals = guessed.signals
+    missing = [signals.find(name).symbol for name in signals.required if name not in chosen]
     notes = [f"no column was found for {', '.join(missing)}: complete the map by hand"] if missing else []
     if guessed.left:
         notes.append(f"columns left out: {list_first([f'{name} ({why})' for name, why in guessed.left.items()], MOST)}")
     table = tabulate(
-        chosen, (Column("signal"), lambda name: SIGNAL_NAMES.get(name, name)),
+        chosen, (Column("signal"), lambda name: name if name == "time" else signals.find(name).symbol),
         (Column("source"), lambda name: chosen[name][0]),
         (Column("confidence"), lambda name: Cell(chosen[name][1], moods[chosen[name][1]])),
         caption="The map says why in comments. Check what is not sure.")
@@ -61,15 +59,18 @@ def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path)
 
 def _list_notes(imported: Imported, measurement: Measurement) -> list[str]:
     """Signals that the trace does not have, and columns of the recording that no signal uses."""
-    missing = [name for name in MISSING if name not in {s.name for s in imported.signals}]
-    notes = [f"no {SIGNAL_NAMES[name]}: {MISSING[name]}" for name in missing]
+    signals, known = imported.trace.declared, {s.name for s in imported.signals}
+    notes = [f"no {s.symbol}: {s.quantity} is not judged by itself" for s in signals.outputs if s.name not in known]
+    if signals.load and signals.load.name not in known:
+        notes.append(f"no {signals.load.symbol}: it is taken as 0; a load that did act is then a force that the model "
+                     "lacks")
     unused = [name for name in measurement.units if name not in imported.used]
     if unused:
         notes.append(f"not in the map, not imported: {list_first(unused, MOST)}")
     return notes
 
 
-def _format_range(s: ImportedSignal) -> str:
-    scale, unit = choose_unit(SIGNALS[s.name].unit, max(abs(s.low), abs(s.high)))
+def _format_range(s: ImportedSignal, si: str) -> str:
+    scale, unit = choose_unit(si, max(abs(s.low), abs(s.high)))
     size = max(abs(s.low), abs(s.high)) / scale
     return f"{format_digits(s.low / scale, 4, size)} .. {format_digits(s.high / scale, 4, size)} {unit}"

@@ -20,24 +20,25 @@ from fdi.report.drawing import (
     GREY,
     INK,
     ORANGE,
-    PINK,
     RED,
-    TEAL,
+    VIOLET,
     Mark,
     Panel,
     axes,
     call,
+    choose_colour,
     dot,
     draw_over_time,
     draw_panels,
     instant,
+    label_signal,
     legend,
     level,
     line,
     shade,
     spans,
 )
-from fdi.report.numbers import attach_unit, list_first
+from fdi.report.numbers import attach_unit, choose_unit, list_first
 from fdi.report.report import (
     Cell,
     Column,
@@ -161,7 +162,8 @@ def _list_notes(trace: Trace, most: int = 5) -> list[str]:
     if rest:
         notes.append(f"and {sum(gap.cycles for gap in rest)} cycles in {len(rest)} more gaps")
     names_of_count: dict[int, list[str]] = {}
-    for name in (name for name in trace.signals if name != "load"):  # which is known or not, never sampled
+    load = trace.declared.load  # which is known or not, never sampled
+    for name in (name for name in trace.signals if load is None or name != load.name):
         names_of_count.setdefault(int(np.isnan(trace.column(name)).sum()), []).append(name)
     parts = [f"{count} of {', '.join(names)}" for count, names in names_of_count.items() if count]
     if parts:
@@ -294,23 +296,26 @@ def read_verdict(trace: Trace) -> Verdict:
 
 
 BRIDGED = 5  # cycles
-PANELS = (("xj", "position [mm]", 1e3, BLUE), ("error", "error [um]", 1e6, ORANGE),
-          ("close", "error, close up [um]", 1e6, ORANGE), ("cor", "current [mA]", 1e3, "#8250df"),
-          ("p12", "P12 [bar]", 1e-5, TEAL), ("xs", "XS [um]", 1e6, PINK), ("load", "load [kN]", 1e-3, GREY))
-
-
 def draw_signals(trace: Trace) -> str:
-    """Command and position, error, current, pressure and spool over one time axis, with sections and checks."""
-    t, error, half = trace.t, trace.com - trace.xj, _choose_close_up(trace)
-    values = {"xj": trace.xj, "error": error, "close": error if half else np.full_like(error, math.nan),
-              "cor": trace.cor, "p12": trace.p12, "xs": trace.xs,
-              "load": np.where(np.nan_to_num(trace.load).any(), trace.load, math.nan)}
+    """Command and controlled signal, error, drive, other outputs and load over one time axis, with sections and checks.
+    """
+    d, t, error, half = trace.declared, trace.t, trace.command - trace.controlled, _choose_close_up(trace)
+    what = "position" if d.controlled.unit == "m" else d.controlled.symbol
+    size, fine = choose_unit(d.controlled.unit, 0.0)
+    shown = [(trace.controlled, f"{what} [{d.controlled.shown_unit}]", d.controlled.shown_scale, BLUE),
+             (error, f"error [{fine}]", 1.0 / size, ORANGE),
+             (error if half else np.full_like(error, math.nan), f"error, close up [{fine}]", 1.0 / size, ORANGE),
+             (trace.drive, f"{d.drive.called} [{d.drive.shown_unit}]", d.drive.shown_scale, VIOLET),
+             *((trace.column(s.name), label_signal(s), s.shown_scale, choose_colour(d, s.name)) for s in d.outputs[1:])]
+    if d.load and np.nan_to_num(trace.load).any():
+        shown.append((trace.load, label_signal(d.load), d.load.shown_scale, GREY))
     faults = list_faults(trace)
-    panels = [[line(t, _bridge_short_gaps(values[name]) * scale, colour, "XJ, ram" if name == "xj" else None),
-               _mark_missing(trace, values[name]), *(shade(t0, t1, FAULT, 0.5) for _, t0, t1 in faults),
-               axes(ylabel=label, **{"ylim": (-half * scale, half * scale)} if name == "close" else {})]
-              for name, label, scale, colour in PANELS if not np.isnan(values[name]).all()]
-    panels[0] = [line(t, trace.com * 1e3, COMMAND, "Com, command", 2.4), *panels[0], legend(2),
+    legends = f"{d.controlled.symbol}, {d.controlled.called}", f"{d.command.symbol}, command"
+    panels = [[line(t, _bridge_short_gaps(values) * scale, colour, None if number else legends[0]),
+               _mark_missing(trace, values), *(shade(t0, t1, FAULT, 0.5) for _, t0, t1 in faults),
+               axes(ylabel=label, **{"ylim": (-half * scale, half * scale)} if number == 2 else {})]
+              for number, (values, label, scale, colour) in enumerate(shown) if not np.isnan(values).all()]
+    panels[0] = [line(t, trace.command * d.command.shown_scale, COMMAND, legends[1], 2.4), *panels[0], legend(2),
                  *(call("annotate", f" {fault}", (t0, 0.07), xycoords=("data", "axes fraction"), fontsize=7)
                    for fault, t0, _ in faults)]
     checks = trace.sequence_checks
@@ -372,8 +377,8 @@ def _mark_missing(trace: Trace, values: Floats, columns: int = 1400) -> Mark:
 
 
 def _choose_close_up(trace: Trace) -> float:
-    """Half the height, in m, that shows the error on the ramps well; 0 without ramps. Steps dwarf it."""
-    ramps = [np.abs(trace.com - trace.xj)[s.start:s.stop] for s in trace.sections() if s.kind == "ramp"]
+    """Half the height, SI, that shows the error on the ramps well; 0 without ramps. Steps dwarf it."""
+    ramps = [np.abs(trace.command - trace.controlled)[s.start:s.stop] for s in trace.sections() if s.kind == "ramp"]
     error = np.concatenate([np.empty(0), *ramps])
     return 0.0 if np.isnan(error).all() else 2.0 * float(np.nanpercentile(error, 99))
 
@@ -402,8 +407,6 @@ def _draw_checks(trace: Trace) -> Panel:
 
 UNIT_SIZES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "m/s": 1.0, "mm/s": 1e-3, "Pa": 1.0, "bar": 1e5, "MPa": 1e6, "N": 1.0,
               "kN": 1e3, "A": 1.0, "mA": 1e-3, "s": 1.0, "ms": 1e-3}
-SHOWN_UNITS = {"com": "mm", "xj": "mm", "error": "um", "speed": "mm/s", "cor": "mA", "p12": "bar", "xs": "um",
-               "load": "kN"}
 BOTH = (1.0, -1.0)  # sides of zero
 
 
@@ -419,22 +422,50 @@ class _View(NamedTuple):
         return self.trace.t[self.rows]
 
     def read(self, name: str) -> Floats:
-        """A signal over the window; `error` is Com - XJ, `speed` that of the ram over 20 ms. SI."""
+        """A signal over the window; `error` is command less controlled signal, `speed` that of the latter over 20 ms.
+        """
         trace = self.trace
+        if name in trace.columns:
+            return trace.column(name)[self.rows]
         if name == "speed":
-            return _compute_speed(trace.xj, trace.period)[self.rows]
-        return (trace.com - trace.xj if name == "error" else trace.column(name))[self.rows]
+            return _compute_speed(trace.controlled, trace.period)[self.rows]
+        return (trace.command - trace.controlled)[self.rows]
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        return (*self.trace.declared.names, "error", "speed")
+
+    @property
+    def symbol(self) -> str:
+        return self.trace.declared.controlled.symbol
+
+    @property
+    def command(self) -> Floats:
+        return self.trace.command[self.rows]
+
+    @property
+    def controlled(self) -> Floats:
+        return self.trace.controlled[self.rows]
+
+    def find_unit(self, name: str) -> str:
+        """The unit in which a signal, `error` or `speed` is shown."""
+        d = self.trace.declared
+        if name in self.trace.columns:
+            return d.find(name).shown_unit
+        fine = choose_unit(d.controlled.unit, 0.0)[1]
+        return {"error": fine, "speed": f"{d.controlled.shown_unit}/s"}[name]
 
     @property
     def step(self) -> tuple[float, float]:
-        """Demand before the window, and what the step adds to it, m."""
-        before = float(self.trace.com[self.rows.start - 1] if self.rows.start else self.trace.xj[0])
-        return before, float(self.trace.com[self.rows.stop - 1]) - before
+        """Demand before the window, and what the step adds to it."""
+        command = self.trace.command
+        before = float(command[self.rows.start - 1] if self.rows.start else self.trace.controlled[0])
+        return before, float(command[self.rows.stop - 1]) - before
 
     def compute_share(self) -> Floats:
-        """How much of the step XJ has done, %; filtered as the checks do it."""
+        """How much of the step the plant has done, %; filtered as the checks do it."""
         before, size = self.step
-        return 100.0 * (_filter_median(self.read("xj"), self.trace.period) - before) / size
+        return 100.0 * (_filter_median(self.controlled, self.trace.period) - before) / size
 
 
 def draw_failed_check(trace: Trace, check: Check, salt: str = "check") -> str:
@@ -450,9 +481,10 @@ def draw_failed_check(trace: Trace, check: Check, salt: str = "check") -> str:
     if stop - first < 2:
         return ""
     if draw is not _draw_reaction and check.signal and (
-            check.signal not in SHOWN_UNITS or np.isnan(view.read(check.signal)).all()):
+            check.signal not in view.known or np.isnan(view.read(check.signal)).all()):
         return ""
-    if draw in STEP_DRAWERS and (abs(view.step[1]) <= 1e-6 or (draw is _draw_overshoot and math.isnan(check.value))):
+    is_still = abs(view.step[1]) <= 1e-6 * trace.scale
+    if draw in STEP_DRAWERS and (is_still or (draw is _draw_overshoot and math.isnan(check.value))):
         draw = _draw_response
     return draw_panels(salt, [[[axes(xlim=(check.t0, check.t1), xlabel="time [s]"), *draw(view), legend(6)]]], 2.3)
 
@@ -462,7 +494,7 @@ def _draw_overshoot(view: _View) -> Panel:
     check, t, beyond = view.check, view.t, view.compute_share() - 100.0
     peak = t[int(np.nanargmax(beyond))]
     high = 1.5 * max(check.value, np.nan_to_num(check.high))
-    return [line(t, beyond, BLUE, "XJ beyond the target", 1.2), *_draw_limits(check),
+    return [line(t, beyond, BLUE, f"{view.symbol} beyond the target", 1.2), *_draw_limits(check),
             dot(peak, check.value, RED, _name_value(check)),
             axes(ylim=(-high, high), xlim=(t[0], min(t[-1], t[0] + max(0.06, 4.0 * (peak - t[0])))),
                  ylabel="beyond the\ntarget [%]")]
@@ -472,7 +504,7 @@ def _draw_rise_time(view: _View) -> Panel:
     """Share of the step that is done, with the times of 10 % and 90 %."""
     done = view.compute_share()
     start = next(iter(view.t[done >= 10.0]), math.nan)
-    return [line(view.t, done, BLUE, "XJ, share of the step", 1.2),
+    return [line(view.t, done, BLUE, f"{view.symbol}, share of the step", 1.2),
             *(level(share, COMMAND, width=0.8, style=":") for share in (10.0, 90.0)),
             *([] if math.isnan(start) else [instant(start, COMMAND, width=0.8, style=":"), *_draw_times(view, start)]),
             axes(ylim=(-10.0, 125.0), ylabel="done [%]")]
@@ -482,7 +514,7 @@ def _draw_settling_time(view: _View) -> Panel:
     """Distance from the target; the position has to stay near it after the time limit."""
     check = view.check
     beyond = math.copysign(1.0, view.step[1]) * (view.compute_share() - 100.0)
-    panel = [line(view.t, beyond, BLUE, "XJ less the target", 1.2), *_draw_times(view, float(view.t[0]))]
+    panel = [line(view.t, beyond, BLUE, f"{view.symbol} less the target", 1.2), *_draw_times(view, float(view.t[0]))]
     size = 110.0
     if check.value > 0.0:
         last_outside = round(_to_seconds(check, check.value) / view.trace.period) - 1
@@ -499,16 +531,18 @@ def _draw_size(view: _View) -> Panel:
     """
     check, is_error = view.check, view.check.kind != "never_exceeds"
     name = "error" if is_error else check.signal
-    values = view.read(name) / UNIT_SIZES[check.unit]
+    values = view.read(name) / UNIT_SIZES.get(check.unit, 1.0)
     filtered = _filter_median(values, view.trace.period) if is_error else values
     middle = 0.0
     sides: tuple[float, ...] = BOTH
     if check.kind == "break_away":
         values, middle = filtered, 0.5 * float(np.nanpercentile(filtered, (1, 99)).sum())
     elif check.kind in ("steady_error", "ramp_error"):
-        com = view.read("com")
+        com = view.command
         sides = (float(np.sign(com[-1] - com[0] if check.kind == "ramp_error" else np.nanmean(values))),)
-    panel = [line(view.t, values, BLUE, "error, Com - XJ" if is_error else name, 0.9),
+    d = view.trace.declared
+    words = f"error, {d.command.symbol} - {d.controlled.symbol}" if is_error else name
+    panel = [line(view.t, values, BLUE, words, 0.9),
              axes(ylabel=f"{name} [{check.unit}]"), *_draw_limits(check, sides, middle)]
     if check.kind in ("max_error", "never_exceeds"):
         row = int(np.nanargmax(np.abs(filtered)))
@@ -518,13 +552,17 @@ def _draw_size(view: _View) -> Panel:
 
 def _draw_response(view: _View) -> Panel:
     """Demand and position; for a gain also the amplitudes that the limits allow."""
-    com, check = 1e3 * view.read("com"), view.check
+    d = view.trace.declared
+    scale, command, unit = d.controlled.shown_scale, d.command.symbol, d.controlled.shown_unit
+    com, check = scale * view.command, view.check
     middle, amplitude = 0.5 * (np.nanmax(com) + np.nanmin(com)), 0.5 * (np.nanmax(com) - np.nanmin(com))
     limits = (check.low, check.high) if check.kind == "amplitude_ratio" else ()
-    return [line(view.t, com, COMMAND, "Com", 1.6), line(view.t, 1e3 * view.read("xj"), BLUE, "XJ"),
+    return [line(view.t, com, COMMAND, command, 1.6),
+            line(view.t, scale * view.controlled, BLUE, d.controlled.symbol),
             *(mark for limit in limits
-              for mark in _draw_sides(limit * amplitude, AMBER, f"{limit:g} of Com", BOTH, middle, "--")),
-            _write_in_legend(_name_value(check)), axes(ylabel="position [mm]")]
+              for mark in _draw_sides(limit * amplitude, AMBER, f"{limit:g} of {command}", BOTH, middle, "--")),
+            _write_in_legend(_name_value(check)),
+            axes(ylabel=f"{'position' if d.controlled.unit == 'm' else d.controlled.symbol} [{unit}]")]
 
 
 def _draw_reaction(view: _View) -> Panel:
@@ -534,16 +572,17 @@ def _draw_reaction(view: _View) -> Panel:
     the instant, which earlier versions wrote, the window is drawn.
     """
     check = view.check
-    name = check.signal if check.signal in SHOWN_UNITS else "cor"
-    unit = SHOWN_UNITS[name]
+    name = check.signal if check.signal in view.known else view.trace.declared.drive.name
+    unit = view.find_unit(name)
+    size = UNIT_SIZES.get(unit, 1.0)
     if not math.isnan(check.after):
         view = view._replace(rows=_find_reaction_rows(view))
-    panel = [line(view.t, view.read(name) / UNIT_SIZES[unit], BLUE, name, 1.2), axes(ylabel=f"{name} [{unit}]")]
+    panel = [line(view.t, view.read(name) / size, BLUE, name, 1.2), axes(ylabel=f"{name} [{unit}]")]
     if math.isnan(check.after):
         return [*panel, _write_in_legend(f"{_name_value(check)}; limits in the table")]
     unmeasured = [_write_in_legend(_name_value(check))] if math.isnan(check.value) else []
     begin = "clean-up begins" if check.kind == "recovers" else f"from {check.after:g} s"
-    bounds = ((x / UNIT_SIZES[unit], word) for x, word in ((check.above, "above"), (check.below, "below")))
+    bounds = ((x / size, word) for x, word in ((check.above, "above"), (check.below, "below")))
     return [*panel, instant(check.after, COMMAND, begin, 1.2, ":"),
             *(level(x, COMMAND, f"{word} {x:g} {unit}", 1.2, "--") for x, word in bounds if not math.isnan(x)),
             *_draw_times(view, check.after), *unmeasured, axes(xlim=(view.t[0], view.t[-1]))]

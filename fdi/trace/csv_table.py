@@ -7,7 +7,7 @@ import gzip
 import io
 import math
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from fdi.output import write_whole
 from plant.errors import InputError
 from plant.plants import Plant, Table, Term, find_plant, list_plants
+from plant.signals import Signals
 from plant.unpacking import UnpackingError, limit_unpacked_size
 
 Floats = NDArray[np.float64]
@@ -31,8 +32,8 @@ class CsvColumns(NamedTuple):
     plant: Plant | None  # whose rig wrote the file in its own columns; None for a trace of this software
 
 
-def read_csv(path: Path, required: Iterable[str], optional: Iterable[str]) -> CsvColumns:
-    """Read a CSV of the columns `required` and `optional`, or of a plant's own rig, told by the names in its header.
+def read_csv(path: Path, signals: Signals) -> CsvColumns:
+    """Read a CSV of t and these signals, or of a plant's own rig, told by the names in its header.
 
     Raises InputError naming the line for anything but numbers, and for t that does not grow.
     """
@@ -46,7 +47,9 @@ def read_csv(path: Path, required: Iterable[str], optional: Iterable[str]) -> Cs
                     sources, notes = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
                     return CsvColumns(_combine_columns(sources, table), notes, plant)
         rows = csv.reader(chain([header], stream))
-        return CsvColumns(*_parse_rows(path, rows, tuple(required), tuple(optional)), None)
+        required = ("t", *signals.required)
+        optional = tuple(name for name in signals.names if name not in required)
+        return CsvColumns(*_parse_rows(path, rows, required, optional), None)
 
 
 @contextlib.contextmanager

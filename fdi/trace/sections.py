@@ -17,32 +17,33 @@ class Section(NamedTuple):
     kind: str  # "hold", "step" (the jump and the rest after it), "ramp", "dynamic"
     start: int
     stop: int
-    first: float  # m, demand before the section
-    last: float  # m, demand at its end
-    rate: float  # m/s, of a ramp; 0 otherwise
+    first: float  # demand before the section, in the command's unit
+    last: float  # demand at its end
+    rate: float  # a second, of a ramp; 0 otherwise
 
 
-def describe_section(section: Section, furthest: float = 0.0) -> str:
-    """A section in words; `furthest` m, how far its demand goes.
+def describe_section(section: Section, furthest: float = 0.0, unit: str = "m") -> str:
+    """A section in words; `furthest`, how far its demand goes, in the `unit` of the command.
 
     >>> describe_section(Section("step", 500, 1500, 0.0, 5e-3, 0.0))
     'step to 5 mm'
     """
-    level = f"{1e3 * section.last:.4g} mm"
+    factor, shown = (1e3, "mm") if unit == "m" else (1.0, unit)
+    level = f"{factor * section.last:.4g} {shown}"
     if section.kind == "ramp":
-        return f"ramp at {1e3 * section.rate:.3g} mm/s"
+        return f"ramp at {factor * section.rate:.3g} {shown}/s"
     if section.kind == "dynamic":
-        return f"motion within {1e3 * furthest:.4g} mm"
+        return f"motion within {factor * furthest:.4g} {shown}"
     return f"{section.kind} {'to' if section.kind == 'step' else 'at'} {level}"
 
 
-def find_sections(command: Floats, period: float = 1e-3) -> list[Section]:
-    """Cut a command, shape (n,) in m, one row per `period` s, into sections that cover it without overlap.
+def find_sections(command: Floats, period: float = 1e-3, scale: float = 1.0) -> list[Section]:
+    """Cut a command, shape (n,), one row per `period` s, into sections that cover it without overlap.
 
     Straight lines are found greedily within the resolution of the bus; what is not straight for 0.15 s is dynamic.
-    Missing rows (NaN) continue the last demand.
+    Missing rows (NaN) continue the last demand. `scale` is that of `Trace.scale`: 1 for a ram's command in m.
     """
-    com = np.asarray(command, float)
+    com = np.asarray(command, float) / scale
     com = np.nan_to_num(com[np.maximum.accumulate(np.where(np.isnan(com), 0, np.arange(len(com))))])
     shortest_time = 0.15  # s; a sine of 0.05 Hz and 1 mm leaves its tangent by RESOLUTION within this time
     shortest = max(3, round(shortest_time / period))
@@ -59,7 +60,8 @@ def find_sections(command: Floats, period: float = 1e-3) -> list[Section]:
             out[-1] = out[-1]._replace(stop=stop, last=float(com[stop - 1]))
         else:
             out.append(Section(kind, start, stop, float(before), float(com[stop - 1]), rate))
-    return _merge_short_parts(out, shortest)
+    merged = _merge_short_parts(out, shortest)
+    return [s._replace(first=s.first * scale, last=s.last * scale, rate=s.rate * scale) for s in merged]
 
 
 def _find_lines(com: Floats) -> list[tuple[int, int, float]]:

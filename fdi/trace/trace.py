@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.csv_table import read_csv, write_csv
+from fdi.trace.declaration import DECLARATION, read_declaration
 from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.sensor_dynamics import SensorDynamics, read_sensors
-from fdi.trace.signals import OUTPUTS, SIGNALS
+from plant import signals as plant_signals
 from plant.errors import InputError, escape_control_characters
+from plant.signals import Signals
 
 if TYPE_CHECKING:
     from plant.lanes import Part  # a bench that reads its own log does not load the compiler
@@ -26,10 +28,7 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Messages = list[tuple[int, Any]]  # (time ns, protobuf message)
 
-REQUIRED = ("t", "com", "xj", "cor")
-OPTIONAL = ("p12", "xs", "load")
-PER_ROW = ("t", "com", "cor", "load", *OUTPUTS, "phase", "usable", "filled", "incomplete")  # columns of a trace
-UNITS = {name: signal.unit for name, signal in SIGNALS.items()}
+PER_ROW = ("t", "phase", "usable", "filled", "incomplete")  # columns of a trace beside its signals
 SETUP, MAIN, CLEANUP = 0, 1, 2
 MOST_MESSAGES = 100_000  # events of a log that are read: a node can send a thousand emergencies a second
 
@@ -105,29 +104,28 @@ NO_TIMING = Timing(_NONE, _NONE, _NONE, _NONE, np.empty(0, bool), _NONE, _NONE, 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """One row per cycle, also for cycles that are missing: their samples are NaN. Row k holds Com_k, XJ_k, Cor_k.
+    """One row per cycle, also for cycles that are missing: their samples are NaN.
 
-    Columns have shape (n,) and SI units; a signal that was not measured is NaN throughout. t = 0 is where
-    the main phase starts.
+    Row k holds the sensed outputs at the start of cycle k, the command that the controller gets then, and the drive
+    that it answers. Columns have shape (n,) and the units of `units`, SI as a rule; a signal that was not measured is
+    NaN throughout. t = 0 is where the main phase starts. A column is an attribute by the name of its signal too
+    (`trace.xj`), unless a trace has an attribute of that name itself.
 
-    A trace that was prepared for replay (fdi.estimation.replay) has Com, Cor and load without gaps, names the
+    A trace that was prepared for replay (fdi.estimation.replay) has command, drive and load without gaps, names the
     `outputs` that replays are compared with, and flags the rows for which that cannot be done.
     """
 
     t: Floats
-    com: Floats
-    xj: Floats
-    cor: Floats
-    p12: Floats
-    xs: Floats
-    load: Floats
+    declared: Signals  # of the plant that was recorded
+    columns: Mapping[str, Floats]  # of all declared signals, by name, without the time
     period: float  # s
     phase: NDArray[np.int64]  # 0 set-up, 1 main, 2 clean-up
     usable: Flags  # rows that a replay can be compared with; all rows of a trace that was not prepared
-    filled: Flags  # rows whose current is interpolated
-    incomplete: Flags  # rows in which Com, XJ or Cor was not recorded, though preparation has filled them
+    filled: Flags  # rows whose drive is interpolated
+    incomplete: Flags  # rows in which command, controlled signal or drive was not recorded, though they were filled
+    units: Mapping[str, str]  # by signal
     chambers: Floats | None = None  # (n, 2) Pa, pressures of both chambers, where they were measured one by one
-    outputs: tuple[str, ...] = ()  # of OUTPUTS, measured and chosen; none in a trace that was not prepared
+    outputs: tuple[str, ...] = ()  # measured and chosen ones; none in a trace that was not prepared
     gaps: tuple[Gap, ...] = ()
     provenance: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # what reading had to leave out
@@ -136,7 +134,6 @@ class Trace:
     nmt: tuple[Nmt, ...] = ()
     timing: Timing = NO_TIMING
     attachments: Mapping[str, bytes] = field(default_factory=dict)  # enough to repeat the run
-    units: Mapping[str, str] = field(default_factory=lambda: dict(UNITS))
     sensors: Mapping[str, SensorDynamics] = field(default_factory=dict)  # by signal, of those that are not ideal
     parts: tuple[Part, ...] = ()  # pieces of a longer recording that the rows are; none: one piece
 
@@ -153,11 +150,18 @@ class Trace:
         """The checks that every run makes of the controller's behaviour on the bus."""
         return tuple(check for check in self.checks if check.is_protocol)
 
+    def __getattr__(self, name: str) -> Floats:
+        """The column of a signal of that name."""
+        if name.startswith("_") or name == "columns" or name not in self.columns:  # the second while it is unpickled
+            raise AttributeError(f"a trace without signal {name!r}" if name != "columns" else name)
+        return self.columns[name]
+
     @classmethod
-    def read(cls, path: str | Path, *, all: bool = False) -> Trace:
+    def read(cls, path: str | Path, *, all: bool = False, signals: Signals = plant_signals.EHA) -> Trace:
         """Read trace.mcap (its main phase, or every phase with `all`), a run's folder, .csv or .csv.gz.
 
-        Raises InputError, naming file, line or field, for what cannot be a trace.
+        `signals` are those of the plant whose columns a CSV file has; a log that says which it holds does not need
+        them. Raises InputError, naming file, line or field, for what cannot be a trace.
         """
         path = Path(path)
         if not path.exists():
@@ -167,28 +171,81 @@ class Trace:
             if not path.is_file():
                 raise InputError(path.parent, "", "the folder of a run; it has no trace.mcap")
         if path.suffix == ".mcap":
-            return _from_log(open_log(path), all)
+            return _from_log(open_log(path), all, signals)
         if path.name.endswith((".csv", ".csv.gz")):
-            return _from_csv(path)
+            return _from_csv(path, signals)
         raise InputError(path, "", "a trace: .mcap, .csv, .csv.gz or the folder of a run")
 
     @classmethod
-    def from_columns(cls, columns: Mapping[str, Floats], period: float, provenance: Mapping[str, str]) -> Trace:
-        """A trace from columns com, xj, cor and, where known, t, p12, xs, load, shape (n,) each."""
-        grid = {"t": np.round(np.arange(len(columns["com"])) * period, 9), **columns}
-        return _make_trace(grid, period, np.arange(len(grid["com"])), provenance=dict(provenance))
+    def from_columns(cls, columns: Mapping[str, Floats], period: float, provenance: Mapping[str, str],
+                     signals: Signals = plant_signals.EHA) -> Trace:
+        """A trace from columns of shape (n,): at least command, controlled signal and drive of the `signals`; and t."""
+        rows = len(columns[signals.command.name])
+        grid = {"t": np.round(np.arange(rows) * period, 9), **columns}
+        return _make_trace(grid, signals, period, np.arange(rows), provenance=dict(provenance))
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Names of the columns that hold at least one sample, t aside."""
-        return tuple(name for name in (*REQUIRED[1:], *OPTIONAL) if not np.isnan(getattr(self, name)).all())
+        """Names of the signals that have at least one sample."""
+        return tuple(name for name in self.declared.names if not np.isnan(self.columns[name]).all())
 
     def column(self, name: str) -> Floats:
-        """A column by name. Raises KeyError."""
-        if name not in UNITS:
-            raise KeyError(name)
-        values: Floats = getattr(self, name)
-        return values
+        """A column by the name of its signal, or t. Raises KeyError."""
+        return self.t if name == "t" else self.columns[name]
+
+    @property
+    def command(self) -> Floats:
+        """What the controller is asked for."""
+        return self.columns[self.declared.command.name]
+
+    @property
+    def controlled(self) -> Floats:
+        """What of the plant the controller controls, as sensed."""
+        return self.columns[self.declared.controlled.name]
+
+    @property
+    def drive(self) -> Floats:
+        """What the controller answers, and what drives the plant."""
+        return self.columns[self.declared.drive.name]
+
+    @property
+    def load(self) -> Floats:
+        """The external load; zero for a plant that declares none."""
+        signal = self.declared.load
+        return np.zeros(len(self)) if signal is None else self.columns[signal.name]
+
+    def take_rows(self, rows: NDArray[np.int64] | slice, **fields: Any) -> Trace:
+        """The same trace with these of its rows, and other `fields`."""
+        kept: dict[str, Any] = {name: getattr(self, name)[rows] for name in PER_ROW}
+        chambers = None if self.chambers is None else self.chambers[rows]
+        columns = {name: column[rows] for name, column in self.columns.items()}
+        return replace(self, **{**kept, "columns": columns, "chambers": chambers, **fields})
+
+    def with_columns(self, columns: Mapping[str, Floats], **fields: Any) -> Trace:
+        """The same trace with other columns for these signals, and other `fields`. Raises KeyError."""
+        if unknown := columns.keys() - self.columns.keys():
+            raise KeyError(unknown.pop())
+        return replace(self, columns={**self.columns, **columns}, **fields)
+
+    def with_inputs(self, command: Floats | None = None, drive: Floats | None = None, load: Floats | None = None,
+                    **fields: Any) -> Trace:
+        """The same trace with other inputs, (n,) each, and other `fields`."""
+        d = self.declared
+        given = ((d.command, command), (d.drive, drive), (d.load, load))
+        return self.with_columns({s.name: column for s, column in given if s is not None and column is not None},
+                                 **fields)
+
+    @cached_property
+    def scale(self) -> float:
+        """The size of the motion: lengths that are right for a ram, whose command is at most 1 m, are multiplied by it.
+
+        It is the largest command that the plant declares, else a hundred times the range of this one.
+        """
+        largest = self.declared.command.largest
+        if math.isfinite(largest):
+            return largest
+        span = float(np.nanmax(self.command) - np.nanmin(self.command)) if not np.isnan(self.command).all() else 0.0
+        return 100.0 * span or 1.0
 
     def mask_unusable(self, name: str) -> Floats:
         """A column, NaN where it is missing or its row cannot be used."""
@@ -199,17 +256,22 @@ class Trace:
         """The outputs as rows (s, n), NaN where they are missing or cannot be used."""
         return np.array([self.mask_unusable(name) for name in self.outputs])
 
+    @cached_property
+    def output_names(self) -> tuple[str, ...]:
+        """Names of all outputs that the plant declares, in the order of the columns of a replay."""
+        return tuple(s.name for s in self.declared.outputs)
+
     @property
     def output_columns(self) -> list[int]:
         """Where the outputs stand among the columns of a replay."""
-        return [OUTPUTS.index(name) for name in self.outputs]
+        return [self.output_names.index(name) for name in self.outputs]
 
     def pass_sensors(self, outputs: Floats) -> Floats:
-        """A model's XJ, P12 and XS, (.., n, 3), as the sensors of this trace show them."""
+        """A model's outputs, (.., n, outputs), as the sensors of this trace show them."""
         if not self.sensors:
             return outputs
         shown = outputs.copy()
-        for i, name in enumerate(OUTPUTS):
+        for i, name in enumerate(self.output_names):
             if name in self.sensors:
                 shown[..., i] = self.sensors[name].apply(outputs[..., i], self.period)
         return shown
@@ -217,24 +279,23 @@ class Trace:
     @property
     def filtered(self) -> tuple[str, ...]:
         """The outputs whose sensors filter or delay."""
-        return tuple(name for name in OUTPUTS if name in self.sensors and self.sensors[name].filters)
+        return tuple(name for name in self.output_names if name in self.sensors and self.sensors[name].filters)
 
     @cached_property
-    def position(self) -> Floats:
-        """XJ as a replay is drawn to it: as measured, and known in the first row, where the replay starts."""
-        position = self.unlagged_position
-        if not np.isnan(position[0]):
-            return position
-        position = position.copy()
-        position[0] = position[~np.isnan(position)][0]
-        return position
+    def anchor(self) -> Floats:
+        """What a replay is drawn to: the controlled signal as measured, and known in the first row, where it starts."""
+        anchor = self.unlagged
+        if not np.isnan(anchor[0]):
+            return anchor
+        anchor = anchor.copy()
+        anchor[0] = anchor[~np.isnan(anchor)][0]
+        return anchor
 
     @cached_property
-    def unlagged_position(self) -> Floats:
-        """XJ without the lag of its sensor: a replay drawn to it as measured would lag behind."""
-        if "xj" not in self.filtered:
-            return self.xj
-        return self.sensors["xj"].undo(self.xj, self.period)
+    def unlagged(self) -> Floats:
+        """The controlled signal without the lag of its sensor: a replay drawn to it as measured would lag behind."""
+        name = self.declared.controlled.name
+        return self.sensors[name].undo(self.controlled, self.period) if name in self.filtered else self.controlled
 
     def with_notes(self, *notes: str) -> Trace:
         """The same trace with more notes."""
@@ -242,13 +303,13 @@ class Trace:
 
     def __repr__(self) -> str:
         source = self.provenance.get("source", "")
-        measured = ", ".join(name for name in OUTPUTS if name in self.signals)
+        measured = ", ".join(name for name in self.output_names if name in self.signals)
         of = f" of {source}" if source else ""
         return f"<Trace{of}: {len(self)} cycles of {1e3 * self.period:g} ms, {len(self) * self.period:g} s, {measured}>"
 
-    def with_delays(self, com: int = 0, cor: int = 0) -> Trace:
-        """The same trace with Com and Cor delayed by so many cycles (negative: advanced)."""
-        return replace(self, com=shift_rows(self.com, com), cor=shift_rows(self.cor, cor))
+    def with_delays(self, command: int = 0, drive: int = 0) -> Trace:
+        """The same trace with command and drive delayed by so many cycles (negative: advanced)."""
+        return self.with_inputs(shift_rows(self.command, command), shift_rows(self.drive, drive))
 
     def sections(self) -> list[Section]:
         """Hold, step, ramp and dynamic sections of the command in this trace."""
@@ -256,17 +317,25 @@ class Trace:
 
     @cached_property
     def _sections(self) -> tuple[Section, ...]:
-        return tuple(find_sections(self.com, self.period))  # once: every panel of a figure shades them
+        # once: every panel of a figure shades them
+        return tuple(find_sections(self.command, self.period, self.scale))
 
     def write_csv(self, path: str | Path) -> None:
         """Write t and the measured signals; missing cycles become gaps in t. Raises InputError."""
-        names = ("t", *REQUIRED[1:], *(name for name in OPTIONAL if name in self.signals))
+        measured = {*self.declared.required, *self.signals}
+        names = ("t", *(name for name in self.declared.names if name in measured))
         there = ~np.all([np.isnan(self.column(name)) for name in names[1:]], axis=0)
         write_csv(Path(path), {name: self.column(name)[there] for name in names})
 
 
-def _from_csv(path: Path) -> Trace:
-    columns, notes, plant = read_csv(path, REQUIRED, OPTIONAL)
+def list_units(signals: Signals) -> dict[str, str]:
+    """The unit of each signal by its name."""
+    return {s.name: s.unit for s in signals}
+
+
+def _from_csv(path: Path, signals: Signals) -> Trace:
+    columns, notes, plant = read_csv(path, signals)
+    signals = plant.signals if plant else signals
     t = columns.pop("t")
     if len(t) < 2:
         raise InputError(path, "t", "at least two rows")
@@ -278,7 +347,7 @@ def _from_csv(path: Path) -> Trace:
     period = round(float(t[-1] - t[0]) / float(rows[-1]), 9)
     grid = _spread_rows(path, rows, {**columns, "t": t})
     grid["t"] = np.where(np.isnan(grid["t"]), np.round(t[0] + period * np.arange(len(grid["t"])), 9), grid["t"])
-    return _make_trace(grid, period, rows, notes=notes, units=UNITS | ({"cor": plant.unit} if plant else {}),
+    return _make_trace(grid, signals, period, rows, notes=notes,
                        provenance={"source": path.name} | ({"plant": plant.name} if plant else {}))
 
 
@@ -293,30 +362,32 @@ def _spread_rows(path: Path, rows: NDArray[np.int64], columns: Mapping[str, Floa
     return out
 
 
-def _make_trace(grid: Mapping[str, Floats], period: float, rows: NDArray[np.int64], **more: object) -> Trace:
+def _make_trace(grid: Mapping[str, Floats], signals: Signals, period: float, rows: NDArray[np.int64], **more: Any
+                ) -> Trace:
     """The trace of columns in which cycles without one of the `rows` are NaN."""
     t = grid["t"]
-    columns = {name: grid.get(name, np.full(len(t), math.nan)) for name in (*REQUIRED, *OPTIONAL)}
+    columns = {name: grid.get(name, np.full(len(t), math.nan)) for name in signals.names}
     if "pa" in grid and "pb" in grid:
         more["chambers"] = np.column_stack([grid["pa"], grid["pb"]])
-    more.setdefault("phase", np.full(len(t), MAIN))
-    more.update(usable=np.ones(len(t), bool), filled=np.zeros(len(t), bool), incomplete=np.zeros(len(t), bool))
+    fields = {"phase": np.full(len(t), MAIN), "units": list_units(signals), **more}
+    fields |= {"usable": np.ones(len(t), bool), "filled": np.zeros(len(t), bool), "incomplete": np.zeros(len(t), bool)}
     gaps = tuple(Gap(float(t[a]), float(t[b]), int(b - a - 1)) for a, b in pairwise(rows) if b - a > 1)
-    return Trace(**columns, period=period, gaps=gaps, **more)  # type: ignore[arg-type]
+    return Trace(t=t, declared=signals, columns=columns, period=period, gaps=gaps, **fields)
 
 
-def _from_log(log: Log, everything: bool) -> Trace:
+def _from_log(log: Log, everything: bool, declared: Signals) -> Trace:
+    declared = read_declaration(log.path, log.metadata.get(DECLARATION, {})) or declared
     signals, timing = log.read_columns("/signals"), log.read_columns("/timing")
     rest = {name: [(time_ns, message) for _, time_ns, message in log.read_messages(name, most=MOST_MESSAGES)]
             for name in ("/events", "/nmt", "/checks")}
-    _require_numbers(log, "/signals", signals, ("cycle", "phase", *REQUIRED[1:], *OPTIONAL))
+    names = declared.names
+    _require_numbers(log, "/signals", signals, ("cycle", "phase", *names))
     _require_numbers(log, "/timing", timing, ("cycle", *Timing._fields[1:5]))
     notes = [f"only the first {MOST_MESSAGES} messages of {name} were read"
              for name, messages in rest.items() if len(messages) == MOST_MESSAGES]
     run = dict(log.metadata.get("run", {}))
     if not len(signals["time_ns"]):
         raise InputError(log.path, "/signals", "at least one cycle")
-    names = ("com", "xj", "cor", "p12", "xs", "load")
     table = np.column_stack([signals[name].astype(float) for name in ("time_ns", "cycle", "phase", *names)])
     table = table[np.argsort(table[:, 1], kind="stable")]
     cycle, phase = table[:, 1].astype(int), table[:, 2].astype(int)
@@ -332,14 +403,15 @@ def _from_log(log: Log, everything: bool) -> Trace:
     rows = cycle[kept] - cycle[kept][0]
     grid = _spread_rows(log.path, rows, {name: table[kept, 3 + i] for i, name in enumerate(names)}
                         | {"phase": phase[kept].astype(float)})
-    grid["t"] = np.round((np.arange(len(grid["xj"])) + (cycle[kept][0] - cycle[first])) * period, 9)
     filled = hold_last(grid.pop("phase"))
-    more = {f"{name}.{key}": value for name, record in log.metadata.items() if name != "run"
+    grid["t"] = np.round((np.arange(len(filled)) + (cycle[kept][0] - cycle[first])) * period, 9)
+    more = {f"{name}.{key}": value for name, record in log.metadata.items() if name not in ("run", DECLARATION)
             for key, value in record.items()}  # as `verdict.status`
     said = {escape_control_characters(key): escape_control_characters(text) for key, text in {**run, **more}.items()}
-    return _make_trace(grid, period, rows, phase=filled.astype(int), provenance={"source": log.path.name, **said},
-                       units=dict(UNITS) | log.read_units("/signals"), attachments=log.attachments, notes=tuple(notes),
-                       sensors=read_sensors(log.path, run),
+    return _make_trace(grid, declared, period, rows, phase=filled.astype(int),
+                       provenance={"source": log.path.name, **said},
+                       units=list_units(declared) | log.read_units("/signals"), attachments=log.attachments,
+                       notes=tuple(notes), sensors=read_sensors(log.path, run),
                        timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
                        events=tuple(_list_records(log, "/events", Event, rest, seconds)),
                        nmt=tuple(_list_records(log, "/nmt", Nmt, rest, seconds)),

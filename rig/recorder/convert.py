@@ -19,13 +19,14 @@ from fdi.trace.importing.formats import Channel, Measurement
 from fdi.trace.mcap_log import open_log
 from fdi.trace.sensor_dynamics import write_sensors
 from fdi.trace.trace import Trace
+from plant import signals as plant_signals
 from plant.errors import InputError
 from rig.benches.bench import Bench
 from rig.benches.frame_map import EXTENDED, FrameSpec, Role, describe_identifier, make_reader
 from rig.network.frame import BIT_RATE_SWITCH, FD_FRAME, Frame
 from rig.network.message import find_cob_id, make_message
 from rig.network.node_objects import NmtState as State
-from rig.recorder.schema import Event, NmtState, Record, Signals, collect_provenance
+from rig.recorder.schema import Event, NmtState, Record, Signals, collect_provenance, make_row_record
 from rig.recorder.writer import Recorder
 
 if TYPE_CHECKING:
@@ -95,25 +96,27 @@ def write_mcap(trace: Trace, out: Path, metadata: Mapping[str, str] | None = Non
     """
     given = {"period": repr(trace.period), **trace.provenance} if metadata is None else metadata
     attachments = {name: ("application/octet-stream", data) for name, data in trace.attachments.items()}
-    _write_log(out, attachments, {**given, **write_sensors(trace.sensors)}, _list_rows(trace))
+    _write_log(out, attachments, {**given, **write_sensors(trace.sensors)}, _list_rows(trace),
+               trace.declared)
 
 
 def _list_rows(trace: Trace, block: int = 10_000) -> Iterator[tuple[int, Signals]]:
     """The rows of a trace that have a value, made in blocks: those of a long recording would fill the memory."""
-    signals = np.column_stack((trace.com, trace.xj, trace.cor, trace.p12, trace.xs, trace.load))
+    signals = np.column_stack([trace.columns[name] for name in trace.declared.names])
+    make: Callable[..., Signals] = make_row_record(trace.declared)
     known = np.flatnonzero(~np.isnan(signals).all(axis=1))
     for first in range(0, len(known), block):
         rows = known[first:first + block]
-        for k, phase, (com, xj, cor, p12, xs, load) in zip(
-                rows.tolist(), trace.phase[rows].tolist(), signals[rows].tolist(), strict=True):
-            yield round(k * trace.period * 1e9), Signals(k, phase, com, xj, cor, p12, xs, load, 0, 0, 0)
+        for k, phase, values in zip(rows.tolist(), trace.phase[rows].tolist(), signals[rows].tolist(), strict=True):
+            yield round(k * trace.period * 1e9), make(k, phase, *values, 0, 0, 0)
 
 
 def _write_log(out: Path, attachments: Mapping[str, tuple[str, bytes]], metadata: Mapping[str, str],
-               items: Iterable[Frame | tuple[int, Record]]) -> None:
+               items: Iterable[Frame | tuple[int, Record]],
+               declared: plant_signals.Signals = plant_signals.EHA) -> None:
     """Write raw frames, and records with their times, as fast as the writer can: here nothing paces the loop."""
     with write_whole(out) as part:
-        recorder = Recorder(part, attachments, metadata)
+        recorder = Recorder(part, attachments, metadata, declared=declared)
         for k, item in enumerate(items):
             if isinstance(item, Frame):
                 recorder.frame(item)

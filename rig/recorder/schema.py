@@ -14,15 +14,18 @@ import struct
 import subprocess
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, make_dataclass
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, cast, get_type_hints
 
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Fd
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+from plant import signals as plant_signals
 
 U32 = Annotated[int, "fixed32"]
 
@@ -122,6 +125,26 @@ class Check:
     unit: str = _describe_field("of value, low and high")
     detail: str = _describe_field("why, in words", default="")
     requirement: str = _describe_field("ids of the requirements that it verifies, with commas between them", default="")
+
+
+@cache
+def make_row_record(declared: plant_signals.Signals) -> type[Signals]:
+    """The record of one cycle of a plant with these signals; `Signals` itself for those of the EHA."""
+    if declared.names == plant_signals.EHA.names:
+        return Signals
+    kept = {item.name: item for item in fields(Signals)}
+    first, last = (("cycle", "phase"), ("control", "status", "flags"))
+    hints = get_type_hints(Signals, include_extras=True)
+
+    def keep(names: tuple[str, ...]) -> list[tuple[str, Any, Any]]:
+        return [(name, hints[name], field(metadata=dict(kept[name].metadata))) for name in names]
+
+    own = [(s.name, float, _describe_field(s.quantity, s.unit)) for s in declared[1:]]
+    made: Any = make_dataclass("Signals", [*keep(first), *own, *keep(last)], slots=True, namespace={"__doc__":
+                               "One cycle, decoded: row k holds the command, the sensed outputs and the drive, the "
+                               "answer to sample k. NaN: no sample."})
+    CHANNELS[made] = CHANNELS[Signals]
+    return cast("type[Signals]", made)
 
 
 Record = Signals | Timing | Event | NmtState | Check

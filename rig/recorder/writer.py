@@ -39,6 +39,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from fdi.trace.declaration import DECLARATION, write_declaration
+from plant import signals as plant_signals
 from plant.errors import RigError
 from rig.network.frame import Frame
 from rig.recorder.block import CycleBlock, pack_block
@@ -52,6 +54,7 @@ from rig.recorder.schema import (
     describe_channel,
     encode_schema,
     make_packer,
+    make_row_record,
 )
 
 CHUNK_BYTES = 64 * 1024
@@ -73,13 +76,19 @@ class RecorderError(RigError):
     """The log cannot be written any more (disk full, folder gone, disk too slow). Raised once, to the loop."""
 
 
-def list_channels() -> list[McapRecord]:
-    """Schemas and channels of a log of this rig; both have the number of the channel."""
+def list_topics(declared: plant_signals.Signals = plant_signals.EHA) -> dict[str, type]:
+    """The record of each topic, for a plant with these signals."""
+    return {**TOPICS, "/signals": make_row_record(declared)}
+
+
+def list_channels(declared: plant_signals.Signals = plant_signals.EHA) -> list[McapRecord]:
+    """Schemas and channels of a log of a plant with these signals; both have the number of the channel."""
+    topics = list_topics(declared)
     schemas = [Schema(id=CHANNELS[record], data=encode_schema(record), encoding="protobuf",
-                      name=f"eha.{record.__name__}") for record in TOPICS.values()]
+                      name=f"eha.{record.__name__}") for record in topics.values()]
     channels = [Channel(id=CHANNELS[record], topic=topic, message_encoding="protobuf",
                         metadata=describe_channel(record), schema_id=CHANNELS[record])
-                for topic, record in TOPICS.items()]
+                for topic, record in topics.items()]
     return [*schemas, *channels]
 
 
@@ -97,7 +106,8 @@ class Recorder:
     frame: Callable[[Frame], None]  # record a raw frame; the queue's own append, so it costs 30 ns
 
     def __init__(self, path: Path, attachments: Mapping[str, tuple[str, bytes]], metadata: Mapping[str, str],
-                 epoch_ns: int = 0, observer: Observer | None = None) -> None:
+                 epoch_ns: int = 0, observer: Observer | None = None,
+                 declared: plant_signals.Signals = plant_signals.EHA) -> None:
         self.path = path
         self._epoch_ns, self._observer = epoch_ns, observer
         self._failure: RecorderError | None = None  # that the loop has not heard of
@@ -106,16 +116,18 @@ class Recorder:
         self._stop = threading.Event()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = McapFile(path, LIBRARY, list_channels())
+            self._file = McapFile(path, LIBRARY, list_channels(declared))
             for name, (media_type, data) in attachments.items():
                 self._file.write_attachment(name, media_type, data, time.time_ns())
             self._file.write_metadata("run", metadata)
+            if declared != plant_signals.EHA:  # which a log without declaration has
+                self._file.write_metadata(DECLARATION, write_declaration(declared))
             if epoch_ns:
                 start = datetime.fromtimestamp(epoch_ns // 10**9, UTC).isoformat()
                 self._file.write_metadata("clock", {"epoch_ns": str(epoch_ns), "start": start})
         except OSError as error:
             raise _describe_failure(path, error) from error
-        self._packers = {record: make_packer(record) for record in TOPICS.values()}
+        self._packers = {record: make_packer(record) for record in list_topics(declared).values()}
         self._parts: list[bytes] = []
         self._size = 0
         self._first_ns = 0

@@ -25,7 +25,7 @@ from fdi.report.drawing import (
     line,
     shade,
 )
-from fdi.report.numbers import count_nouns, format_amount, format_signal
+from fdi.report.numbers import count_nouns, format_amount
 from fdi.report.report import Cell, Column, Figure, Line, Medium, Report, Section, Table, tabulate, to_plain
 from fdi.report.run_report import format_limits
 from plant import Model, simulate
@@ -52,6 +52,7 @@ from rig.sequences.faults import (
     Stuck,
     require_sensible,
 )
+from rig.sequences.measures import UNIT_OF_SIGNAL
 from rig.sequences.sequence import Sequence as TestSequence
 
 OF_EVENTS = ("response_within", "shut_off", "recovers", "event_occurs", "event_never")  # without a bus no events
@@ -280,7 +281,8 @@ def describe_size(fault: Fault, base: Mapping[str, float]) -> str:
             parts = [" to ".join(words.get(value) or format_amount(value, quantity.unit) for value in values)]
         case Offset() | Stuck():
             of_noise = " RMS" if isinstance(fault, Noise) else ""
-            parts = ["its last reading" if fault.value is None else format_signal(fault.value, fault.signal) + of_noise]
+            unit = UNIT_OF_SIGNAL[fault.signal]
+            parts = ["its last reading" if fault.value is None else format_amount(fault.value, unit) + of_noise]
         case Late():
             parts = [format_amount(fault.delay, "s")]
         case Corrupted():

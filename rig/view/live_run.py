@@ -5,12 +5,14 @@ import pickle
 from collections import deque
 from collections.abc import Mapping
 from math import isnan, nan
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plant import Columns
+from plant.signals import EHA, Signals
 from rig import recorder
 from rig.benches.bench import Bench
 from rig.sequences import Sequence
@@ -18,8 +20,6 @@ from rig.sequences.checks import Check
 from rig.sequences.measures import MAIN, RunData
 
 PHASES = ("set-up", "main", "clean-up")
-COLUMNS = ("t_ns", "phase", "com", "xj", "cor", "p12", "xs", "load", "lateness", "response", "overrun")
-_COLUMN = {name: number for number, name in enumerate(COLUMNS)}
 _AFTER_RUN = ("shut_off", "recovers")  # kinds that need all drive frames
 _GROWS = ("never_exceeds", "max_error", "event_never")  # kinds whose number only grows: a limit passed stays passed
 
@@ -47,6 +47,12 @@ class LivePlan(NamedTuple):
     starts: dict[str, float]
     has_load: bool
     nodes: dict[int, str]  # who takes part: number and name
+    signals: Signals = EHA  # of the plant
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Of the table of cycles."""
+        return ("t_ns", "phase", *self.signals.names, "lateness", "response", "overrun")
 
     @property
     def check_names(self) -> list[str]:
@@ -100,7 +106,9 @@ class LiveRun:
 
     def __init__(self, plan: LivePlan) -> None:
         self.plan = plan
-        self._table = np.empty((1 << 14, len(COLUMNS)))
+        self._column = {name: number for number, name in enumerate(plan.columns)}
+        self._get_values = attrgetter(*plan.signals.names)
+        self._table = np.empty((1 << 14, len(plan.columns)))
         self.cycles = 0  # so far, without those that were missed
         self._main_from = self._main_until = -1  # rows
         self.first_ns = 0  # log time of the first row, from which `t_ns` counts: a float64 rounds ns since 1970
@@ -144,8 +152,8 @@ class LiveRun:
         if self.cycles == len(self._table):
             self._table = np.concatenate((self._table, np.empty_like(self._table)))
         self.first_ns = self.first_ns if self.cycles else t_ns
-        self._table[self.cycles] = (t_ns - self.first_ns, row.phase, row.com, row.xj, row.cor, row.p12, row.xs,
-                                    row.load, timing.lateness, timing.response, timing.overrun)
+        self._table[self.cycles] = (t_ns - self.first_ns, row.phase, *self._get_values(row), timing.lateness,
+                                    timing.response, timing.overrun)
         if self._main_from < 0 and row.phase >= 1:
             self._main_from, self.zero_ns = self.cycles, t_ns
             self.events = deque((event._replace(t=self._find_time(event.t_ns)) for event in self.events),
@@ -161,7 +169,7 @@ class LiveRun:
 
     def read_last(self, name: str, cycles: int) -> NDArray[np.float64]:
         """The last values of a column, at most so many."""
-        return self._table[max(self.cycles - cycles, 0):self.cycles, _COLUMN[name]]
+        return self._table[max(self.cycles - cycles, 0):self.cycles, self._column[name]]
 
     @property
     def is_over(self) -> bool:
@@ -189,7 +197,7 @@ class LiveRun:
         if self._main_from < 0 or rows < 1:
             return
         table = self._table[self._main_from:self._main_from + rows]
-        columns = [table[:, _COLUMN[name]] for name in Columns._fields[1:]]
+        columns = [table[:, self._column[name]] for name in Columns._fields[1:]]
         data = RunData(Columns(np.arange(rows) / self.plan.rate, *columns), self.plan.sections, tuple(self.events),
                        self.plan.starts, rate=self.plan.rate)
         for check in self.plan.checks:

@@ -36,10 +36,10 @@ from rich.live import Live
 from rich.text import Text
 
 from fdi.trace.mcap_log import scan_messages, unpack_chunk
+from plant.signals import EHA, Signals
 from rig.recorder import CanFrame, Check, Event, NmtState, Record
-from rig.recorder.schema import TOPICS
-from rig.recorder.writer import MAGIC, list_channels
-from rig.view.live_run import COLUMNS, CheckState, LivePlan, LiveRun
+from rig.recorder.writer import MAGIC, list_channels, list_topics
+from rig.view.live_run import CheckState, LivePlan, LiveRun
 from rig.view.recording import (
     ACTIVE,
     FAIL,
@@ -49,7 +49,6 @@ from rig.view.recording import (
     NOTHING,
     PASS,
     PHASES,
-    PLOTS,
     SECTIONS,
     STATES,
     Drawing,
@@ -58,6 +57,7 @@ from rig.view.recording import (
     Recording,
     build_blueprint,
     draw_signals,
+    list_plots,
     name_node_lane,
     read_fault_event,
 )
@@ -66,14 +66,14 @@ from rig.view.viewer import find_free_port, is_listening, make_viewer_command, w
 _RECORD = struct.Struct("<BQ")  # opcode, length
 
 
-def follow_log(path: Path) -> Iterator[list[tuple[int, Record]]]:
+def follow_log(path: Path, signals: Signals = EHA) -> Iterator[list[tuple[int, Record]]]:
     """Give the records of the log that are new, with their log times in ns, again and again; no raw frames.
 
     The writer closes a chunk at least every 0.2 s; what it has not written yet comes later. The log is opened once, as
     soon as it is there: it may be moved or deleted. What is given ends if it cannot be read.
     """
     decoders: dict[int, Any] = {}
-    for kind, schema in zip(TOPICS.values(), list_channels(), strict=False):  # schemas come first
+    for kind, schema in zip(list_topics(signals).values(), list_channels(signals), strict=False):  # schemas come first
         if kind is not CanFrame and isinstance(schema, Schema):
             decode = DecoderFactory().decoder_for("protobuf", schema)
             decoders[schema.id] = kind, [field.name for field in fields(kind)], decode
@@ -121,8 +121,12 @@ def draw_screen(run: LiveRun, width: int, height: int, silence: float) -> Text:
     lower = max(6, (height - 6) // 2)
     plot_height = max(height - lower - 7, 3)
     lines = [_draw_title(run, width), *_draw_nodes(run, silence)]
-    lines.append(Text.assemble(("Position [mm], last 5 s: ", "bold"), ("command", "white"), "  ", ("ram", "bold blue")))
-    com, xj = (1e3 * run.read_last(name, round(5 * run.plan.rate)) for name in ("com", "xj"))
+    signals = run.plan.signals
+    command, controlled = signals.command, signals.controlled
+    title = next(title for (origin, title) in list_plots(signals) if origin == "position")
+    lines.append(Text.assemble((f"{title}, last 5 s: ", "bold"), ("command", "white"), "  ",
+                               (controlled.called, "bold blue")))
+    com, xj = (s.shown_scale * run.read_last(s.name, round(5 * run.plan.rate)) for s in (command, controlled))
     lines += draw_plot({"white": com, "bold blue": xj}, width, plot_height, 0.2)
     left, right = _draw_checks(run, lower), [*_draw_timing(run), *_draw_events(run, lower)][:lower]
     half = width // 2
@@ -143,8 +147,11 @@ def describe_line(run: LiveRun) -> str:
     words = [state.word for state in run.checks.values()]
     t = "" if isnan(run.t) else f"{run.t:.1f} of {run.plan.duration:g} s, "
     nodes = ", ".join(f"{node} {run.troubles.get(node) or state}" for node, state in run.states.items() if node != 1)
-    com, xj = (float(run.read_last(name, 1)[0]) * 1e3 if run.cycles else nan for name in ("com", "xj"))
-    return (f"{t}{run.section}; command {com:.2f} mm, ram {xj:.2f} mm; checks {words.count('PASS')} pass, "
+    signals = run.plan.signals
+    unit, ram = signals.controlled.shown_unit, signals.controlled.called
+    com, xj = (float(run.read_last(s.name, 1)[0]) * s.shown_scale if run.cycles else nan
+               for s in (signals.command, signals.controlled))
+    return (f"{t}{run.section}; command {com:.2f} {unit}, {ram} {xj:.2f} {unit}; checks {words.count('PASS')} pass, "
             f"{words.count('FAIL')} fail of {len(words)}; {_describe_lateness(run)}; nodes: {nodes}")
 
 
@@ -284,14 +291,16 @@ def draw_plan(plan: LivePlan) -> Drawing:
              *(Lane(name_node_lane(node, name), [], STATES) for node, name in plan.nodes.items()),
              *(Lane(f"fault/{label}", [], ACTIVE) for label in plan.starts),
              *(Lane(f"check/{name}", [], {}) for name in plan.check_names)]
-    plots = draw_signals(dict.fromkeys(_list_signals(plan), (NOTHING, NOTHING)))
+    plots = draw_signals(dict.fromkeys(_list_signals(plan), (NOTHING, NOTHING)), list_plots(plan.signals))
     return Drawing(plan.title, plots, LANES, lanes, ("Provenance", f"{plan.title}, {plan.pace}"), log=())
 
 
 def _list_signals(plan: LivePlan) -> list[str]:
     """The signals that are drawn; in lockstep nothing is ever late."""
-    left_out = {"lateness": plan.pace == "lockstep", "load": not plan.has_load}
-    return [name for name in ("error", *COLUMNS[2:-1]) if not left_out.get(name)]
+    left_out = {"lateness": plan.pace == "lockstep"}
+    if plan.signals.load:
+        left_out[plan.signals.load.name] = not plan.has_load
+    return [name for name in ("error", *plan.columns[2:-1]) if not left_out.get(name)]
 
 
 class LiveView:
@@ -325,9 +334,11 @@ class LiveView:
             self._send_rows(rows, run, zero_ns)
 
     def _send_rows(self, rows: NDArray[np.float64], run: LiveRun, zero_ns: int) -> None:
-        columns = dict(zip(COLUMNS, rows.T, strict=True))
-        columns["error"], t = columns["com"] - columns["xj"], (columns["t_ns"] - (zero_ns - run.first_ns)) / 1e9
-        for (origin, _), lines in PLOTS.items():
+        signals = run.plan.signals
+        columns = dict(zip(run.plan.columns, rows.T, strict=True))
+        columns["error"] = columns[signals.command.name] - columns[signals.controlled.name]
+        t = (columns["t_ns"] - (zero_ns - run.first_ns)) / 1e9
+        for (origin, _), lines in list_plots(signals).items():
             for line in lines:
                 if line.signal in self._signals:
                     self._recording.send_values(f"{origin}/{line.path}", t, columns[line.signal] * line.scale)
@@ -384,7 +395,7 @@ def follow_run(log: Path, run: LiveRun) -> Batches:
         began = time.monotonic()
         if select.select([0], [], [], 0)[0]:
             is_there = bool(os.read(0, 1))
-            records = follow_log(log) if is_there else records
+            records = follow_log(log, run.plan.signals) if is_there else records
         new = next(records, [])
         for t_ns, record in new:
             run.add(t_ns, record)

@@ -4,6 +4,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -14,12 +15,13 @@ from fdi.comparison.run_differences import Run, RunDifferences
 from fdi.output import require_writable
 from fdi.report.compare_report import describe_verdict
 from fdi.report.diff_report import choose_difference_units, describe_differences
-from fdi.report.drawing import LEVELS, choose_drawn_unit
-from fdi.report.numbers import SIGNAL_NAMES, format_amount, format_ratio, format_signal, join_words
+from fdi.report.drawing import choose_drawn_unit, label_signal
+from fdi.report.numbers import choose_unit, format_amount, format_ratio, format_signal, join_words
 from fdi.report.run_report import read_verdict
 from fdi.thresholds import NOISE_BAND_RATIO, SIGNAL_ERROR_RATIO
 from fdi.trace.sections import Section
 from fdi.trace.trace import MAIN, Check, Floats, Trace
+from plant.signals import Signal, Signals
 from rig.network.node_objects import NAMES
 from rig.sequences.measures import SI_OF_UNIT
 from rig.view.viewer import ShownView, import_rerun
@@ -251,26 +253,41 @@ class RunLine(NamedTuple):
     width: float = 1.5
 
 
-PLOTS = {  # origin, title -> lines
-    ("position", "Position [mm]"): (RunLine("com", 1e3, "command", "Com command [mm]", COMMAND, 4.0),
-                                    RunLine("xj", 1e3, "ram", "XJ ram [mm]", MEASURED)),
-    ("error", "Following error [um]"): (RunLine("error", 1e6, "error", "Com - XJ [um]", 0xE8A33DFF),),
-    ("current", "Current [mA]"): (RunLine("cor", 1e3, "current", "Cor current [mA]", 0xB57EDCFF),),
-    ("pressure", "Differential pressure [bar]"): (
-        RunLine("p12", 1e-5, "pressure", "P12 pressure [bar]", 0x45B8ACFF),),
-    ("spool", "Spool position [um]"): (RunLine("xs", 1e6, "spool", "XS spool [um]", 0xD96BA0FF),),
-    ("load", "Load on the ram [N]"): (RunLine("load", 1.0, "load", "load [N]", 0xD9A441FF),),
-    ("timing", "Cycle timing [us]"): (
+DRIVE, LOAD = 0xB57EDCFF, 0xD9A441FF
+OUTPUTS = (MEASURED, 0x45B8ACFF, 0xD96BA0FF, 0x9ACD5BFF, 0x6FA8DCFF)  # the controlled one first
+Plots = dict[tuple[str, str], tuple[RunLine, ...]]  # origin, title -> lines
+
+
+@cache
+def list_plots(signals: Signals) -> Plots:
+    """The plots of a run of the plant that has these signals."""
+    command, controlled, drive = signals.command, signals.controlled, signals.drive
+    moves = "Position" if controlled.unit == "m" else controlled.quantity.capitalize()
+    size, fine = choose_unit(controlled.unit, 0.0)
+    symbol, unit, scale = controlled.symbol, controlled.shown_unit, controlled.shown_scale
+    plots: Plots = {
+        ("position", f"{moves} [{unit}]"): (
+            RunLine(command.name, scale, "command", f"{command.symbol} command [{unit}]", COMMAND, 4.0),
+            RunLine(controlled.name, scale, controlled.called, f"{symbol} {controlled.called} [{unit}]", MEASURED)),
+        ("error", f"Following error [{fine}]"): (
+            RunLine("error", 1.0 / size, "error", f"{command.symbol} - {symbol} [{fine}]", 0xE8A33DFF),)}
+    others = [(drive, DRIVE), *((s, OUTPUTS[k % len(OUTPUTS)]) for k, s in enumerate(signals.outputs) if k)]
+    for signal, colour in [*others, *([(signals.load, LOAD)] if signals.load else [])]:
+        title = f"{signal.quantity[:1].upper()}{signal.quantity[1:]} [{signal.shown_unit}]"
+        name = " ".join(dict.fromkeys((signal.symbol, signal.called)))
+        plots[signal.called, title] = (RunLine(signal.name, signal.shown_scale, signal.called,
+                                               f"{name} [{signal.shown_unit}]", colour),)
+    return plots | {("timing", "Cycle timing [us]"): (
         RunLine("lateness", 1e6, "lateness", "SYNC lateness [us]", 0xF2C94CFF, 1.0),
         RunLine("response", 1e6, "response", "controller's response [us]", 0x7FD46BFF, 1.0),
-        RunLine("work", 1e6, "work", "bench's own work [us]", 0x8C7AE6FF, 1.0)),
-}
+        RunLine("work", 1e6, "work", "bench's own work [us]", 0x8C7AE6FF, 1.0))}
 
 
 def draw_run(trace: Trace) -> Drawing:
     """Draw a trace; set-up has negative times, main starts at 0."""
-    plots = [plot._replace(curves=[*plot.curves, *_list_limits(plot.origin, trace.checks)])
-             for plot in draw_signals(list_columns(trace))]
+    layout = list_plots(trace.declared)
+    plots = [plot._replace(curves=[*plot.curves, *_list_limits(plot.origin, trace.checks, layout)])
+             for plot in draw_signals(list_columns(trace), layout)]
     facts = "\n".join(f"- {key}: {value}" for key, value in trace.provenance.items())
     log = _list_texts(trace)
     shown = [ShownView(plot.title, tuple(curve.colour for curve in plot.curves if curve.colour != LIMIT))
@@ -286,24 +303,25 @@ def draw_run(trace: Trace) -> Drawing:
 def list_columns(trace: Trace) -> dict[str, tuple[Floats, Floats]]:
     """Signal -> times, s, and values in SI; signals without a value are left out, and lateness that is 0 throughout."""
     timing = trace.timing
-    columns = {name: (trace.t, trace.column(name)) for name in ("com", "xj", "cor", "p12", "xs", "load")}
-    columns["error"] = trace.t, trace.com - trace.xj
+    columns = {name: (trace.t, column) for name, column in trace.columns.items()}
+    columns["error"] = trace.t, trace.command - trace.controlled
     columns |= {name: (timing.t, getattr(timing, name)) for name in ("lateness", "response", "work")}
+    seldom = {"lateness", *([trace.declared.load.name] if trace.declared.load else [])}
     return {name: (t, values) for name, (t, values) in columns.items() if not np.isnan(values).all()
-            and (name not in ("load", "lateness") or np.nan_to_num(values).any())}  # in lockstep nothing is ever late
+            and (name not in seldom or np.nan_to_num(values).any())}  # in lockstep nothing is ever late
 
 
-def draw_signals(columns: Mapping[str, tuple[Floats, Floats]]) -> list[Plot]:
+def draw_signals(columns: Mapping[str, tuple[Floats, Floats]], layout: Plots) -> list[Plot]:
     """The plots of the signals that there are."""
     plots = [Plot(origin, title, [
         Curve(line.path, line.name, line.colour, columns[line.signal][0], columns[line.signal][1] * line.scale,
-              line.width) for line in lines if line.signal in columns]) for (origin, title), lines in PLOTS.items()]
+              line.width) for line in lines if line.signal in columns]) for (origin, title), lines in layout.items()]
     return [plot for plot in plots if plot.curves]
 
 
-def _list_limits(origin: str, checks: tuple[Check, ...]) -> Iterator[Curve]:
+def _list_limits(origin: str, checks: tuple[Check, ...], layout: Plots) -> Iterator[Curve]:
     """Limits of a plotted signal as red lines over the check's window."""
-    scales = {line.signal: line.scale for (own, _), lines in PLOTS.items() for line in lines if own == origin}
+    scales = {line.signal: line.scale for (own, _), lines in layout.items() for line in lines if own == origin}
     for number, check in enumerate(checks):
         signal = "error" if check.kind == "max_error" else check.signal
         if check.kind in LIMITS_OF and signal in scales and not math.isnan(check.t0 + check.high):
@@ -336,7 +354,8 @@ def list_verdict_lanes(trace: Trace, group: str, offset: float) -> list[Lane]:
 
 def make_command_lane(trace: Trace, group: str, offset: float) -> Lane:
     """The sections of the command, `offset` s later than in the trace."""
-    sections = [(float(trace.t[s.start]) + offset, s.kind, _describe_section(s)) for s in trace.sections()]
+    sections = [(float(trace.t[s.start]) + offset, s.kind, _describe_section(s, trace.declared.command))
+                for s in trace.sections()]
     return Lane(f"{group}/command", [(t, text) for t, _, text in sections],
                 {text: SECTIONS[kind] for _, kind, text in sections})
 
@@ -395,10 +414,11 @@ def _make_check_lane(check: Check, trace: Trace) -> Lane:
     return Lane(path, states, {text: VALUE, word: colour}, {word: " "})
 
 
-def _describe_section(section: Section) -> str:
+def _describe_section(section: Section, command: Signal) -> str:
+    scale, unit = command.shown_scale, command.shown_unit
     if section.kind == "ramp":
-        return f"ramp {section.rate * 1e3:.3g} mm/s"
-    return section.kind if section.kind == "dynamic" else f"{section.kind} {section.last * 1e3:.3g} mm"
+        return f"ramp {section.rate * scale:.3g} {unit}/s"
+    return section.kind if section.kind == "dynamic" else f"{section.kind} {section.last * scale:.3g} {unit}"
 
 
 def _describe_measurement(check: Check) -> str:
@@ -438,9 +458,9 @@ def draw_runs(found: RunDifferences) -> Drawing:
     """Draw runs and their differences, on the time of the first run: two plots for each signal, below each other."""
     plots: list[Plot] = []
     for name, (size, unit) in choose_difference_units(found).items():
-        shown, scale = LEVELS[name]
-        plots.append(Plot(name, f"{SIGNAL_NAMES[name]} [{shown}]", _draw_signal(found, name, scale)))
-        plots.append(Plot(f"difference_{name}", f"{SIGNAL_NAMES[name]} minus that of A [{unit}]",
+        signal = found.runs[0].trace.declared.find(name)
+        plots.append(Plot(name, label_signal(signal), _draw_signal(found, name, signal.shown_scale)))
+        plots.append(Plot(f"difference_{name}", f"{signal.symbol} minus that of A [{unit}]",
                           _draw_difference(found, name, 1.0 / size)))
     # a run has one colour in all plots, so they are counted together
     colours = {curve.colour for plot in plots for curve in plot.curves} - {NOISE, REFERENCE}
@@ -499,7 +519,7 @@ def describe_result(found: RunDifferences) -> str:
     runs = [f"- {run.label}: {run.source}" for run in found.runs]
     lines = [f"### {found.verdict}", "", describe_differences(found), "", *runs, "",
              "| run | signal | RMS difference | largest | times the noise |", "|---|---|---|---|---|"]
-    lines += [f"| {pair.run.label} - A | {SIGNAL_NAMES[s.name]} | {format_amount(s.rms, s.unit)} | "
+    lines += [f"| {pair.run.label} - A | {s.signal.symbol} | {format_amount(s.rms, s.unit)} | "
               f"{format_amount(s.largest, s.unit)} at {s.t:.3f} s | {format_ratio(s.ratio)} |"
               for pair in found.pairs for s in pair.signals]
     changed = [check for check in found.checks if check.is_changed]
@@ -517,8 +537,8 @@ def _judge(result: Any) -> str:
 
 BEFORE, FLOOR = 0xE5534BFF, MEASURED
 # each plot has a colour of its own, so that a picture shows which one is empty
-MODELS = {"xj": 0xE8A33DFF, "p12": 0x45B8ACFF, "xs": 0xD96BA0FF}
-RESIDUALS = {"xj": 0xC2A83EFF, "p12": 0x7FD46BFF, "xs": 0xB57EDCFF}
+MODELS = (0xE8A33DFF, 0x45B8ACFF, 0xD96BA0FF, 0x9ACD5BFF, 0x6FA8DCFF)
+RESIDUALS = (0xC2A83EFF, 0x7FD46BFF, 0xB57EDCFF, 0x5FAF8FFF, 0x8FA3D9FF)
 COMMAND_AND_ERROR = "Command and error"
 NOT_JUDGED = "not judged"
 
@@ -528,7 +548,7 @@ def draw_comparison(c: Comparison, before: Comparison | None) -> Drawing:
     models = ([("before", before)] if before else []) + [("model", c)]
     plots = [draw(name, [(word, found) for word, found in models if name in found.signals])
              for name in c.signals for draw in (_draw_replay, _draw_residual)]
-    own = {*MODELS.values(), *RESIDUALS.values()}
+    own = {*MODELS, *RESIDUALS}
     shown = [ShownView(plot.title, tuple({curve.colour for curve in plot.curves} & own)) for plot in plots]
     shown.append(ShownView(COMMAND_AND_ERROR, (PASS, FAIL, *SECTIONS.values()), is_lanes=True))
     lanes = [make_command_lane(c.trace, "run", 0.0), *(_make_error_lane(word, found) for word, found in models),
@@ -539,26 +559,30 @@ def draw_comparison(c: Comparison, before: Comparison | None) -> Drawing:
 
 def _draw_replay(name: str, models: Sequence[tuple[str, Comparison]]) -> Plot:
     """Measured, and what each model makes of the measured current."""
-    (unit, scale), trace = LEVELS[name], models[-1][1].trace
-    curves = [Curve("1_measured", f"{SIGNAL_NAMES[name]} measured", COMMAND, trace.t,
+    trace = models[-1][1].trace
+    signal, scale = trace.declared.find(name), trace.declared.find(name).shown_scale
+    colour = MODELS[trace.output_names.index(name) % len(MODELS)]
+    curves = [Curve("1_measured", f"{signal.symbol} measured", COMMAND, trace.t,
                     trace.mask_unusable(name) * scale, 4.0)]
-    curves += [Curve(f"{number}_{word}", "before the change" if word == "before" else "model, from the current",
-                     BEFORE if word == "before" else MODELS[name], found.trace.t, found.replay.model[name] * scale)
+    model = f"model, from the {trace.declared.drive.called}"
+    curves += [Curve(f"{number}_{word}", "before the change" if word == "before" else model,
+                     BEFORE if word == "before" else colour, found.trace.t, found.replay.model[name] * scale)
                for number, (word, found) in enumerate(models, 2)]
-    return Plot(name, f"{SIGNAL_NAMES[name]} [{unit}]", curves)
+    return Plot(name, label_signal(signal), curves)
 
 
 def _draw_residual(name: str, models: Sequence[tuple[str, Comparison]]) -> Plot:
     """Measured minus model, and the band of the noise floor."""
     last = models[-1][1]
-    unit, scale = choose_drawn_unit(name, max(found.signals[name].error for _, found in models))
+    signal, colour = last.signals[name].signal, RESIDUALS[last.trace.output_names.index(name) % len(RESIDUALS)]
+    unit, scale = choose_drawn_unit(signal, max(found.signals[name].error for _, found in models))
     curves = [Curve(f"{number}_{word}", "before the change" if word == "before" else "residual",
-                    BEFORE if word == "before" else RESIDUALS[name], found.trace.t,
+                    BEFORE if word == "before" else colour, found.trace.t,
                     found.replay.residual[name] * scale) for number, (word, found) in enumerate(models, 1)]
     floor = NOISE_BAND_RATIO * last.signals[name].floor.value * scale
     curves += [Curve(f"3_floor_{side}", f"noise floor, {NOISE_BAND_RATIO:g} SD", FLOOR, last.trace.t[[0, -1]],
                      np.full(2, sign * floor)) for side, sign in (("high", 1.0), ("low", -1.0))]
-    return Plot(f"residual_{name}", f"Residual of {SIGNAL_NAMES[name]}, measured minus model [{unit}]", curves)
+    return Plot(f"residual_{name}", f"Residual of {signal.symbol}, measured minus model [{unit}]", curves)
 
 
 def _list_left_out(c: Comparison) -> Iterator[Lane]:
@@ -590,7 +614,7 @@ def describe_comparison(c: Comparison, before: Comparison | None) -> str:
              f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
     for s in c.signals.values():
         earlier = before.signals.get(s.name) if before else None
-        cells = [SIGNAL_NAMES[s.name], *([format_signal(earlier.error, s.name) if earlier else "-"] if before else []),
-                 format_signal(s.error, s.name), format_signal(s.floor.value, s.name), format_ratio(s.ratio)]
+        cells = [s.signal.symbol, *([format_signal(earlier.error, s.signal) if earlier else "-"] if before else []),
+                 format_signal(s.error, s.signal), format_signal(s.floor.value, s.signal), format_ratio(s.ratio)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join([*lines, "", *(f"- {note}" for note in c.notes)])

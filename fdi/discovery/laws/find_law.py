@@ -48,6 +48,7 @@ from fdi.thresholds import (
     WHITE_SQUARE_POOR,
 )
 from fdi.trace.trace import Floats
+from plant.signals import Signals
 
 MOST_TERMS = 3
 PROPOSED = 14  # terms of each balance that a replay looks at
@@ -116,6 +117,7 @@ class LawSearch:
     catalogue: Hypothesis | None  # the catalogue's best
     holdout: Mapping[str, Mapping[str, float]]  # errors of "base" and "catalogue" on the held-out run
     floor: Mapping[str, float]  # under the law where it holds, else under the model without it
+    signals: Signals  # of the plant
     curve: LawCurve | None = None
 
 
@@ -156,7 +158,7 @@ def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, flo
     errors = {name: _measure_holdout(search, h) for name, h in known if h}
     curve = None if law is None else compute_law_curve(law, search, base.effects)
     said = law.floor if law is not None and law.holds else floor
-    return LawSearch(missing, hidden, law, base, catalogue, errors, said, curve)
+    return LawSearch(missing, hidden, law, base, catalogue, errors, said, search.problem.trace.declared, curve)
 
 
 def find_law_beside(e: Explanation, progress: Progress = ignore_progress) -> LawSearch:

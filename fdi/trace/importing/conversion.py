@@ -13,14 +13,11 @@ import numpy as np
 
 from fdi.trace.importing.formats import OTHER_UNITS, Channel, Measurement
 from fdi.trace.sensor_dynamics import SensorDynamics
-from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Floats, Trace
 from plant.errors import InputError, show_value, suggest_name
 from plant.parameters import parse_toml
+from plant.signals import EHA, Signals
 from plant.units import UNITS, Unit, find_unit, require_unit
-
-REQUIRED_SIGNALS = ("com", "xj", "cor")
-SIGNAL_NAMES = tuple(name for name in SIGNALS if name != "t")
 
 
 @dataclass(frozen=True)
@@ -65,6 +62,7 @@ class ImportMap:
 
     path: Path
     text: str
+    declared: Signals  # of the plant that was recorded
     signals: Mapping[str, SignalMap]
     time: TimeBase | None
     period: float | None  # s, of the trace's rows
@@ -160,8 +158,8 @@ def _read_table(where: object, name: str, values: Any, keys: Mapping[str, Key]) 
             for word, value in found.items()}
 
 
-def read_map(path: Path) -> ImportMap:
-    """Read a map.
+def read_map(path: Path, declared: Signals = EHA) -> ImportMap:
+    """Read a map of a recording of a plant with the `declared` signals.
 
     Raises:
         InputError: a file that cannot be read, is no TOML, or has a key or value that a map cannot have.
@@ -170,29 +168,29 @@ def read_map(path: Path) -> ImportMap:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(path, "", f"a readable map ({getattr(error, 'strerror', None) or error})") from error
-    return parse_map(text, path)
+    return parse_map(text, path, declared)
 
 
-def parse_map(text: str, path: Path) -> ImportMap:
-    """The map that a TOML text holds; `path` is its name in messages.
+def parse_map(text: str, path: Path, declared: Signals = EHA) -> ImportMap:
+    """The map that a TOML text holds; `path` is its name in messages, `declared` are the signals that it may name.
 
     Raises:
         InputError: as of `read_map`; or a map without a signal that every analysis needs, or with a column that is two
             signals.
     """
     top = _read_table(path, "", parse_toml(text, path), MAP)
-    signals = {name: _parse_signal(path, name, table) for name, table in top["signals"].items()}
-    for name in REQUIRED_SIGNALS:
+    signals = {name: _parse_signal(path, name, table, declared) for name, table in top["signals"].items()}
+    for name in declared.required:
         if name not in signals:
-            raise InputError(path, f"signals.{name}", "a table with the source of "
-                                                      f"{SIGNALS[name].symbol}, {SIGNALS[name].quantity}")
+            needed = declared.find(name)
+            raise InputError(path, f"signals.{name}", f"a table with the source of {needed.symbol}, {needed.quantity}")
     owner: dict[str, str] = {}
     for name, signal in signals.items():
         other = owner.setdefault(signal.term.source, name)
         if other != name and signal.minus is None and signals[other].minus is None:
             raise InputError(path, f"signals.{name}.source",
                              f"a column of its own; signals.{other} has {signal.term.source!r} already")
-    return ImportMap(path, text, signals, _parse_time(path, "time", top["time"]),
+    return ImportMap(path, text, declared, signals, _parse_time(path, "time", top["time"]),
                      **_read_table(path, "trace", top["trace"], ROWS), **_read_table(path, "file", top["file"], FILE))
 
 
@@ -211,12 +209,12 @@ def _parse_time(path: Path, name: str, values: Any) -> TimeBase | None:
     return TimeBase(source, _require_unit(table["unit"], "s", path, f"{name}.unit") if has_unit else None, rate, bits)
 
 
-def _parse_signal(path: Path, signal: str, values: Any) -> SignalMap:
+def _parse_signal(path: Path, signal: str, values: Any, declared: Signals) -> SignalMap:
     name = f"signals.{signal}"
-    if signal not in SIGNAL_NAMES:
-        raise InputError(path, name, f"one of {', '.join(SIGNAL_NAMES)}{suggest_name(signal, SIGNAL_NAMES)}")
+    if signal not in declared.names:
+        raise InputError(path, name, f"one of {', '.join(declared.names)}{suggest_name(signal, declared.names)}")
     table = _read_table(path, name, values, SIGNAL)
-    si, minus = SIGNALS[signal].unit, table["minus"]
+    si, minus = declared.find(signal).unit, table["minus"]
     term = _parse_term(path, name, {word: table[word] for word in TERM}, si)
     if isinstance(minus, str):
         minus = {"source": minus}
@@ -228,9 +226,10 @@ def _parse_signal(path: Path, signal: str, values: Any) -> SignalMap:
     if isinstance(dead, bool):
         dead = [(-math.inf, math.inf)] if dead else []
     dynamics = SensorDynamics(**{**sensor, "quantum": sensor["quantum"] * float(term.unit.factor)})
-    if dynamics.filters and signal not in OUTPUTS:
-        raise InputError(path, f"{name}.sensor", f"moving_mean and lag for {', '.join(OUTPUTS)} alone; {signal} is "
-                                                 "an input of the model and is used as recorded")
+    if dynamics.filters and declared.find(signal).role != "output":
+        outputs = ", ".join(s.name for s in declared.outputs)
+        raise InputError(path, f"{name}.sensor", f"moving_mean and lag for {outputs} alone; {signal} is an input of "
+                                                 "the model and is used as recorded")
     return SignalMap(signal, term, minus, _parse_time(path, f"{name}.time", table["time"]), table["delay"],
                      table["method"], table["low_pass"], dynamics, tuple((float(a), float(b)) for a, b in dead))
 
@@ -323,7 +322,7 @@ def require_growth(t: Floats, where: object, field: str) -> None:
                                        "(a counter that wraps needs bits and rate)")
 
 
-CYCLE_PARTS = {"cor": "answer", "com": "demand"}  # where in a cycle a held value comes
+CYCLE_PARTS = {"drive": "answer", "command": "demand"}  # by role, where in a cycle a held value comes
 MOST_ROWS = 100_000_000  # of a trace: a time in the wrong unit would fill the memory
 
 
@@ -364,15 +363,15 @@ def import_measurement(measurement: Measurement, chosen: ImportMap, cycle: float
     """
     channels = _read_channels(measurement, chosen)
     samples = {name: _scale(measurement, chosen, signal, channels) for name, signal in chosen.signals.items()}
-    period = chosen.period or _measure_cycle(samples["xj"], cycle)
+    period = chosen.period or _measure_cycle(samples[chosen.declared.controlled.name], cycle)
     rows = _make_rows(chosen, samples, period)
-    columns, done, sensors = {}, [], {}
+    columns, done, sensors, signals = {}, [], {}, chosen.declared
     for name, signal in chosen.signals.items():
-        own = samples[name]
-        x, how = place_samples(own, rows, period, signal.method, signal.low_pass, CYCLE_PARTS.get(name, ""))
+        own, part = samples[name], CYCLE_PARTS.get(signals.find(name).role, "")
+        x, how = place_samples(own, rows, period, signal.method, signal.low_pass, part)
         if np.isnan(x).all():
             raise InputError(chosen.path, f"signals.{name}", "samples within the time of the other signals")
-        sensors[name], how = _find_sensor(signal, own, rows, how, period)
+        sensors[name], how = _find_sensor(signal, own, rows, how, period, signals.find(name).unit)
         columns[name] = x
         source = f"{signal.term.source} - {signal.minus.source}" if signal.minus else signal.term.source
         done.append(ImportedSignal(name, source, _describe_unit(signal.term), 1.0 / own.period,
@@ -382,7 +381,7 @@ def import_measurement(measurement: Measurement, chosen: ImportMap, cycle: float
               "imported.format": measurement.format, "imported.map": chosen.path.name,
               "imported.map_sha256": hashlib.sha256(chosen.text.encode()).hexdigest(),
               "imported.start": repr(float(rows[0]))}
-    trace = replace(Trace.from_columns(columns, period, origin),
+    trace = replace(Trace.from_columns(columns, period, origin, signals),
                     sensors={name: sensor for name, sensor in sensors.items() if not sensor.is_ideal})
     return Imported(trace, tuple(done), frozenset(channels))
 
@@ -460,7 +459,7 @@ def _find_times(measurement: Measurement, chosen: ImportMap, signal: SignalMap, 
 
 
 def _measure_cycle(own: Samples, cycle: float) -> float:
-    """The model's cycle, or the period of XJ if that is longer; as the recording's own clock has it if that drifts."""
+    """The model's cycle, or the controlled signal's period if longer; by the recording's clock if that drifts."""
     nominal = cycle if own.period < 1.25 * cycle else round(own.period, 6)
     rows = float(np.rint(np.diff(own.t) / own.period).sum())
     mean = float(own.t[-1] - own.t[0]) / rows
@@ -471,15 +470,15 @@ def _measure_cycle(own: Samples, cycle: float) -> float:
 
 
 def _make_rows(chosen: ImportMap, samples: Mapping[str, Samples], period: float) -> Floats:
-    """Times of the rows: from the first sample that XJ, Com and Cor share to the last, on XJ's samples."""
-    needed = [samples[name] for name in REQUIRED_SIGNALS]
+    """Times of the rows: from the first sample that all required signals share to the last, on the controlled one's."""
+    needed = [samples[name] for name in chosen.declared.required]
     first = max(-math.inf if chosen.start is None else chosen.start, *(s.t[0] for s in needed))
     last = min(math.inf if chosen.end is None else chosen.end, *(s.t[-1] for s in needed))
-    origin = _find_origin(samples, period)
+    origin = _find_origin(samples[chosen.declared.controlled.name], samples[chosen.declared.drive.name], period)
     start = origin + period * math.ceil((first - origin) / period - 0.5)
     count = math.floor((last - start) / period + 0.5) + 1
     if count < 2:
-        raise InputError(chosen.path, "signals", "com, xj and cor recorded at the same time")
+        raise InputError(chosen.path, "signals", f"{', '.join(chosen.declared.required)} recorded at the same time")
     if count > MOST_ROWS:
         raise InputError(chosen.path, "time", f"at most {MOST_ROWS} rows of {period:g} s, not {count}; is the unit of "
                                               "the time right?")
@@ -487,18 +486,17 @@ def _make_rows(chosen: ImportMap, samples: Mapping[str, Samples], period: float)
     return out
 
 
-def _find_origin(samples: Mapping[str, Samples], period: float) -> float:
-    """The time of a row: the first sample of XJ, or where a held XJ or Cor brings its first new value."""
-    xj = samples["xj"]
-    for held in (xj, samples["cor"]):
+def _find_origin(controlled: Samples, drive: Samples, period: float) -> float:
+    """The time of a row: the first sample of the controlled signal, or where one of both, held, brings a new value."""
+    for held in (controlled, drive):
         ratio = round(period / held.period)
         phase = find_hold(held, ratio) if ratio > 1 else None
         if phase is not None:
             return float(held.t[0] + phase * held.period)
-    return float(xj.t[0])
+    return float(controlled.t[0])
 
 
-def _find_sensor(signal: SignalMap, samples: Samples, rows: Floats, how: str, period: float
+def _find_sensor(signal: SignalMap, samples: Samples, rows: Floats, how: str, period: float, unit: str
                  ) -> tuple[SensorDynamics, str]:
     """The dynamics as the trace keeps them, and the whole list of what was done."""
     sensor = replace(signal.sensor, sample_period=0.0)
@@ -514,7 +512,7 @@ def _find_sensor(signal: SignalMap, samples: Samples, rows: Floats, how: str, pe
     if signal.dead:
         parts.append("dead spans left out")
     if not sensor.is_ideal:
-        parts.append(f"the model gets {sensor.describe(period, SIGNALS[signal.name].unit)}")
+        parts.append(f"the model gets {sensor.describe(period, unit)}")
     return sensor, "; ".join(parts)
 
 

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.csv_table import open_text, report_unreadable
-from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Floats, Trace
 from plant.errors import InputError
 from plant.units import find_unit
@@ -72,7 +71,7 @@ def _as_floats(path: Path, name: str, values: Any) -> Floats:
 
 def _open_log(path: Path) -> Measurement:
     trace = Trace.read(path)
-    units = {name: SIGNALS[name].unit for name in ("t", *trace.signals)}
+    units = {name: trace.units[name] for name in ("t", *trace.signals)}
     return Measurement(path, f"trace of {trace.provenance.get('version.eha-rig', 'this software')}", units,
                        read_singly(lambda name: Channel(trace.column(name))))
 

@@ -8,40 +8,48 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
 
 from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION
-from fdi.trace.importing.conversion import REQUIRED_SIGNALS, SIGNAL_NAMES
 from fdi.trace.importing.formats import Channel, Measurement, split_unit
 from fdi.trace.sensor_dynamics import find_comb
-from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Floats
 from plant.errors import InputError
 from plant.parameters import load_nominal_values
+from plant.signals import EHA, Signal, Signals
 from plant.units import UNITS, Unit, find_unit
 
-# Words of a column's name, in English, German, French, Spanish and Italian, and how much each says for a signal.
+# Words of a column's name, in English, German, French, Spanish and Italian, and how much each says for a signal: of a
+# role, or of an output with that SI unit. Name and symbol of the signal itself say most.
 WORDS: Mapping[str, Sequence[tuple[str, float]]] = {
-    "com": (("com|cmd|command|demand|setpoint|set ?point|soll|consigne|consigna|comando|posref|referencia", 3),
-            ("ref|reference|target|desired|ziel", 2), ("pos|position|weg|stroke|lage|posicion|posizione", 1)),
-    "xj": (("xj|lvdt|posfb|ist|istwert|actual|measured|feedback|fb", 2),
-           ("pos|position|stroke|displacement|weg|hub|course|deplacement|recorrido|posicion|posizione|corsa|lage", 2),
-           ("ram|rod|piston|kolben|jack|cylinder|zylinder|verin|cilindro", 1)),
-    "p12": (("p12|dp|delta ?p|differenzdruck|pl", 3),
-            ("pressure|druck|pression|presion|pressione|press|p", 2), ("diff|difference|load|last", 1),
-            ("pa|pb|p1|p2", 2)),
-    "xs": (("xs|spool|schieber|tiroir|corredera|cursore", 3), ("valve ?pos|ventilweg|ventilhub", 3)),
-    "cor": (("cor|current|strom|courant|corriente|corrente|ventilstrom", 3), ("i|iv|servo|coil", 1.5),
-            ("valve|ventil|vanne|valvula", 0.5)),
+    "command": (("com|cmd|command|demand|setpoint|set ?point|soll|consigne|consigna|comando|posref|referencia", 3),
+                ("ref|reference|target|desired|ziel", 2), ("pos|position|weg|stroke|lage|posicion|posizione", 1)),
+    "controlled": (("lvdt|posfb|ist|istwert|actual|measured|feedback|fb", 2),
+                   ("pos|position|stroke|displacement|weg|hub|course|deplacement|recorrido|posicion|posizione|corsa|lage",
+                    2), ("ram|rod|piston|kolben|jack|cylinder|zylinder|verin|cilindro", 1)),
+    "Pa": (("dp|delta ?p|differenzdruck|pl", 3), ("pressure|druck|pression|presion|pressione|press|p", 2),
+           ("diff|difference|load|last", 1), ("pa|pb|p1|p2", 2)),
+    "m": (("spool|schieber|tiroir|corredera|cursore", 3), ("valve ?pos|ventilweg|ventilhub", 3)),
+    "A": (("current|strom|courant|corriente|corrente|ventilstrom", 3), ("i|iv|servo|coil", 1.5),
+          ("valve|ventil|vanne|valvula", 0.5)),
+    "V": (("voltage|spannung|tension|tensione|volt", 3), ("u|v|motor", 1.5)),
+    "N m": (("torque|moment|drehmoment|couple|par|coppia", 3), ("m|t|motor", 1)),
+    "rad": (("angle|winkel|angulo|angolo", 3), ("theta|phi", 2)),
+    "rad/s": (("speed|velocity|drehzahl|vitesse|velocidad|velocita", 3), ("omega|w|n", 1)),
     "load": (("load|force|kraft|last|effort|fuerza|forza|carga|carico", 3), ("f|fext|extern", 1)),
 }
+OWN_WORD = 3.0  # points of a signal's own name or symbol
 TIME_WORDS = r"t|time|zeit|temps|tiempo|tempo|timestamp|timestamps|seconds|sec|uhrzeit|exp time"
 COUNTER_WORDS = r"cnt|count|counter|cycle|tick|ticks|zahler|zaehler|compteur|contador|frame|sample|seq"
-RANGES = {  # SI: smallest and largest amplitude that an actuator has; units that are tried, the usual ones first
-    "com": (5e-4, 1.0, ("mm", "m", "um")), "xj": (5e-4, 1.0, ("mm", "m", "um")), "xs": (5e-6, 5e-3, ("um", "mm", "m")),
-    "p12": (2e5, 6e7, ("bar", "Pa", "MPa", "psi")), "cor": (5e-4, 0.4, ("mA", "A")), "load": (20.0, 1e6, ("N", "kN")),
+# SI: smallest and largest amplitude that an actuator has; units that are tried, the usual ones first. By SI unit; of a
+# length by role, as a valve's is shorter.
+RANGES: Mapping[str, tuple[float, float, tuple[str, ...]]] = {
+    "command": (5e-4, 1.0, ("mm", "m", "um")), "controlled": (5e-4, 1.0, ("mm", "m", "um")),
+    "output": (5e-6, 5e-3, ("um", "mm", "m")), "Pa": (2e5, 6e7, ("bar", "Pa", "MPa", "psi")),
+    "A": (5e-4, 0.4, ("mA", "A")), "N": (20.0, 1e6, ("N", "kN")),
 }
 SAMPLE = 200_000  # values of a column that are looked at
 
@@ -95,30 +103,31 @@ class GuessedMap(NamedTuple):
     text: str
     chosen: Mapping[str, tuple[str, str]]  # signal (and "time") to column and confidence
     left: Mapping[str, str]  # columns that are no signal: their range, or why they are none
+    signals: Signals  # of the plant
 
 
-def guess_map(measurement: Measurement) -> GuessedMap:
-    """The map of a recording whose meaning is not known."""
+def guess_map(measurement: Measurement, signals: Signals = EHA) -> GuessedMap:
+    """The map of a recording of a plant with these `signals`, whose columns are not known."""
     every = Columns(_read_numbers(measurement),
                     {name: said or split_unit(name)[1] for name, said in measurement.units.items()})
     time_lines, time_source, time_confidence = _guess_time(measurement, every)
     columns = every._replace(data={name: x for name, x in every.data.items() if name != time_source})
-    found = _assign(columns)
-    _scale_position(found, columns)
-    _find_signs(found, columns)
-    _find_steps(found, columns)
+    found = _assign(columns, signals)
+    _scale_position(found, columns, signals)
+    _find_signs(found, columns, signals)
+    _find_steps(found, columns, signals)
     chosen = {"time": (time_source or "its own times", time_confidence)}
     chosen |= {name: (guess.source, guess.confidence) for name, guess in found.items()}
     lines = [f"# First map of {measurement.path.name} ({measurement.format}), guessed: check every line.",
              f"# Then: rig import {measurement.path.name} --map THIS_FILE", "", *_list_file_lines(measurement),
              *time_lines, ""]
-    for name in SIGNAL_NAMES:
-        lines += _list_signal_lines(name, found.get(name), columns)
+    for signal in signals[1:]:
+        lines += _list_signal_lines(signal, signals, found.get(signal.name), columns)
     used = {column for guess in found.values() for column in (guess.source, guess.minus)} | {time_source}
-    left = {name: _describe_left(name, columns, found) for name in measurement.units if name not in used}
+    left = {name: _describe_left(name, columns, found, signals) for name in measurement.units if name not in used}
     if left:
         lines += ["# Columns that were left out:", *(f"#   {name} ({why})" for name, why in left.items())]
-    return GuessedMap("\n".join(lines) + "\n", chosen, left)
+    return GuessedMap("\n".join(lines) + "\n", chosen, left, signals)
 
 
 def _read_numbers(measurement: Measurement) -> dict[str, Floats]:
@@ -235,40 +244,57 @@ def _guess_time_unit(said: str, x: Floats) -> str:
     return f'unit = "{name}"  # unsure: steps of {step:g} would be {rate:g} rows a second'
 
 
-def _assign(columns: Columns) -> dict[str, Guess]:
+def _assign(columns: Columns, signals: Signals) -> dict[str, Guess]:
     """Each signal's column: the pair of most points first."""
-    rated = [(name, guess) for column, x in columns.data.items() if float(np.ptp(x)) > 0.0 for name in SIGNAL_NAMES
-             if (guess := _rate_column(name, column, columns)) is not None]
+    rated = [(signal.name, guess) for column, x in columns.data.items() if float(np.ptp(x)) > 0.0
+             for signal in signals[1:] if (guess := _rate_column(signal, signals, column, columns)) is not None]
     found: dict[str, Guess] = {}
     for name, guess in sorted(rated, key=lambda pair: -pair[1].points):
         if name not in found and guess.source not in {g.source for g in found.values()}:
             found[name] = guess
-    _guess_by_motion(found, columns)
-    _pair_chambers(found, columns.data)
-    return {name: found[name] for name in SIGNAL_NAMES if name in found}
+    _guess_by_motion(found, columns, signals)
+    for signal in signals.outputs[1:]:
+        if signal.unit == "Pa" and signal.name in found:
+            _pair_chambers(found[signal.name], columns.data)
+    return {name: found[name] for name in signals.names if name in found}
 
 
-def _rate_column(name: str, column: str, columns: Columns) -> Guess | None:
+def _list_words(signal: Signal, signals: Signals) -> list[tuple[str, float]]:
+    """The words that speak for a signal, each set with its points."""
+    by_role = {signals.command: "command", signals.controlled: "controlled", signals.load: "load"}
+    first, *others = WORDS.get(by_role.get(signal, signal.unit), ()) or ((None, 0.0),)
+    own = "|".join(dict.fromkeys(re.escape(word.strip()) for word in map(_simplify_name, (signal.name, signal.symbol))
+                                 if word.strip()))
+    if first[0] is None:
+        return [(own, OWN_WORD)]
+    return [(f"{own}|{first[0]}", first[1]), *others]
+
+
+def _rate_column(signal: Signal, signals: Signals, column: str, columns: Columns) -> Guess | None:
     """How well a column fits a signal by name, unit and range; None if its name or its unit excludes it."""
-    said, si = columns.units[column], SIGNALS[name].unit
+    said, si = columns.units[column], signal.unit
     unit = find_unit(said)
     if unit is not None and unit.si != si:
         return None
-    guess = Guess(column, unit or UNITS[si])
-    for words, worth in WORDS[name]:
+    guess = Guess(column, unit or find_unit(si) or Unit(si, si, Fraction(1)))
+    for words, worth in _list_words(signal, signals):
         word = _has_word(column, words)
         if word:
             guess.note(worth, f"its name has {word!r}")
     if not guess.points:
         return None
-    low, high, units = RANGES[name]
+    place = "controlled" if signal == signals.controlled else signal.role
+    known = RANGES.get(place if si == "m" else si)
+    low, high, units = known or (0.0, math.inf, (si,))
     x = columns.data[column]
     size = float(np.percentile(np.abs(x - np.median(x)), 99))
-    fitting = [u for u in units if low <= size * float(UNITS[u].factor) <= high]
+    fitting = [u for u in units if known and low <= size * float(UNITS[u].factor) <= high]
     if unit is not None:
         guess.note(2.0, f"its unit is {said}")
     elif said:
         guess.note(-2.0, f"its unit {said!r} needs scale and offset")
+    elif not known:
+        guess.note(0.0, "no unit given")
     elif fitting:
         guess.unit = UNITS[fitting[0]]
         guess.note(1.0 if len(fitting) == 1 else 0.0,
@@ -276,18 +302,15 @@ def _rate_column(name: str, column: str, columns: Columns) -> Guess | None:
     else:
         guess.note(-1.0, f"no unit given, and its range of {size:.3g} suits none: counts?")
     amplitude = size * float(guess.unit.factor)
-    if low <= amplitude <= high:
+    if known and low <= amplitude <= high:
         guess.note(0.5, "its range is plausible")
-    elif unit is not None:
+    elif known and unit is not None:
         guess.note(-1.0, f"its range, {amplitude:.3g} {si}, is unusual")
     return guess
 
 
-def _pair_chambers(found: Mapping[str, Guess], data: Mapping[str, Floats]) -> None:
-    """P12 from the pressures of two chambers: columns whose names differ by A and B, or by 1 and 2, alone."""
-    guess = found.get("p12")
-    if guess is None:
-        return
+def _pair_chambers(guess: Guess, data: Mapping[str, Floats]) -> None:
+    """A pressure from those of two chambers: columns whose names differ by A and B, or by 1 and 2, alone."""
     plain = {column: re.sub(r"[^a-z0-9]", "", _simplify_name(column)) for column in data}
     mine = guess.source
     for column, other in plain.items():
@@ -298,12 +321,18 @@ def _pair_chambers(found: Mapping[str, Guess], data: Mapping[str, Floats]) -> No
             return
 
 
-def _guess_by_motion(found: dict[str, Guess], columns: Columns) -> None:
-    """Com and XJ where names say nothing: the two free columns that follow each other best; the later one is XJ."""
+def _guess_by_motion(found: dict[str, Guess], columns: Columns, signals: Signals) -> None:
+    """Command and controlled signal where names say nothing: the two free columns that follow each other best.
+
+    The later one is the controlled signal.
+    """
+    command, controlled = signals.command.name, signals.controlled.name
+    si = signals.controlled.unit
     data, taken = columns.data, {guess.source for guess in found.values()}
-    free = [c for c in data if c not in taken and (columns.measures(c, "m") or find_unit(columns.units[c]) is None)]
-    known = {name: found[name] for name in ("com", "xj") if name in found}
-    firsts, seconds = ([known[name].source] if name in known else free for name in ("com", "xj"))
+    free = [c for c in data if c not in taken and (columns.measures(c, si) or find_unit(columns.units[c]) is None)]
+    known = {name: found[name] for name in (command, controlled) if name in found}
+    firsts, seconds = ([known[name].source] if name in known else free
+                       for name in (command, controlled))
     pairs = [(abs(correlate(data[a], data[b])), a, b) for a in firsts for b in seconds
              if a != b and len(data[a]) == len(data[b])]
     if len(known) == 2 or not pairs or max(pairs)[0] <= 0.9:
@@ -311,8 +340,9 @@ def _guess_by_motion(found: dict[str, Guess], columns: Columns) -> None:
     r, a, b = max(pairs)
     if not known and measure_lead(data[a], data[b]) < 0:
         a, b = b, a
-    unit = next((guess.unit for guess in known.values()), UNITS["mm"])
-    for name, column, other, order in (("com", a, b, "first"), ("xj", b, a, "later")):
+    unit = next((guess.unit for guess in known.values()),
+                UNITS["mm"] if si == "m" else find_unit(si) or Unit(si, si, Fraction(1)))
+    for name, column, other, order in ((command, a, b, "first"), (controlled, b, a, "later")):
         more = "" if known else f", and it comes {order}"
         found.setdefault(name, Guess(column, unit, 1.5, [f"no name says so; correlation {r:.3f} with {other}{more}"]))
 
@@ -332,9 +362,10 @@ def measure_lead(a: Floats, b: Floats) -> float:
     return abs(correlate(a[:n - shift], b[shift:n])) - abs(correlate(a[shift:n], b[:n - shift]))
 
 
-def _scale_position(found: Mapping[str, Guess], columns: Columns) -> None:
-    """Scale and offset of a position in counts or volts, roughly, from the other position and Cor."""
-    for name, other in (("xj", "com"), ("com", "xj")):
+def _scale_position(found: Mapping[str, Guess], columns: Columns, signals: Signals) -> None:
+    """Scale and offset of a position in counts or volts, roughly, from the other position and the drive."""
+    command, controlled, drive = signals.command.name, signals.controlled.name, signals.drive.name
+    for name, other in ((controlled, command), (command, controlled)):
         if (not {name, other} <= found.keys() or not columns.has_raw_unit(found[name].source)
                 or columns.has_raw_unit(found[other].source)):
             continue
@@ -342,7 +373,7 @@ def _scale_position(found: Mapping[str, Guess], columns: Columns) -> None:
         raw, x = columns.data[guess.source], columns.data[base.source]
         if len(raw) != len(x) or abs(correlate(raw, x)) < LEAST_SCALING_CORRELATION:
             continue
-        cor = columns.data[found["cor"].source] if "cor" in found else np.zeros(0)
+        cor = columns.data[found[drive].source] if drive in found else np.zeros(0)
         slope, shift = fit_scale(raw, x, cor if len(cor) == len(x) else np.zeros(len(x)))
         guess.sign, guess.unit, guess.scale = int(np.sign(slope)), base.unit, float(f"{abs(slope):.4g}")
         guess.offset = float(f"{guess.sign * shift:.4g}")
@@ -368,45 +399,47 @@ def fit_scale(raw: Floats, x: Floats, cor: Floats) -> tuple[float, float]:
     return usual, float(x.mean()) - usual * middle
 
 
-def _find_steps(found: Mapping[str, Guess], columns: Columns) -> None:
+def _find_steps(found: Mapping[str, Guess], columns: Columns, signals: Signals) -> None:
     """The step of readings that are whole multiples of it, where its noise counts beside that of the sensor."""
     nominal = load_nominal_values()
-    for name in OUTPUTS:
-        guess = found.get(name)
+    for signal in signals.outputs:
+        guess = found.get(signal.name)
         if guess is None or guess.minus or (guess.scale is None and columns.has_raw_unit(guess.source)):
             continue
         comb = find_comb(columns.data[guess.source])
         if comb is not None:
             quantum = float(f"{comb.step * (guess.scale or 1.0):.6g}")
             noise = quantum * float(guess.unit.factor) / math.sqrt(12.0)
-            if noise >= LEAST_QUANTUM_NOISE * nominal[SIGNALS[name].noise]:
+            if noise >= LEAST_QUANTUM_NOISE * nominal.get(signal.noise, 0.0):
                 guess.quantum = quantum
 
 
-def _find_signs(found: Mapping[str, Guess], columns: Columns) -> None:
-    """Signs by what a position loop does: XJ follows Com, and Cor is positive while Com is above XJ."""
-    if not {"com", "xj"} <= found.keys():
+def _find_signs(found: Mapping[str, Guess], columns: Columns, signals: Signals) -> None:
+    """Signs by what a position loop does: position follows command, and the drive has the sign of their difference."""
+    if not {signals.command.name, signals.controlled.name} <= found.keys():
         return
+    command, controlled = found[signals.command.name], found[signals.controlled.name]
     com, xj = ((1.0 if guess.scale is None else guess.scale) * columns.data[guess.source] + guess.offset
-               for guess in (found["com"], found["xj"]))
-    com = found["com"].sign * com
-    r = correlate(com, found["xj"].sign * xj)
+               for guess in (command, controlled))
+    com = command.sign * com
+    r = correlate(com, controlled.sign * xj)
     if r < -0.8:
-        found["xj"].sign = -1
-        found["xj"].note(0.0, f"it moves against {found['com'].source} (correlation {r:.2f}): one sign is turned")
+        controlled.sign = -1
+        controlled.note(0.0, f"it moves against {command.source} (correlation {r:.2f}): one sign is turned")
     elif r > 0.8:
-        found["xj"].note(0.5, f"it follows {found['com'].source} (correlation {r:.3f})")
+        controlled.note(0.5, f"it follows {command.source} (correlation {r:.3f})")
     else:
-        found["xj"].note(-1.0, f"it hardly follows {found['com'].source} (correlation {r:.2f}): check it")
-    if "cor" in found and len(com) == len(xj):
-        scale = [float(found[name].unit.factor) for name in ("com", "xj")]
-        error = com * scale[0] - found["xj"].sign * xj * scale[1]
-        r = correlate(columns.data[found["cor"].source], error)
+        controlled.note(-1.0, f"it hardly follows {command.source} (correlation {r:.2f}): check it")
+    drive = found.get(signals.drive.name)
+    if drive is not None and len(com) == len(xj):
+        error = com * float(command.unit.factor) - controlled.sign * xj * float(controlled.unit.factor)
+        r = correlate(columns.data[drive.source], error)
+        above, below = signals.command.symbol, signals.controlled.symbol
         if r < -0.3:
-            found["cor"].sign = -1
-            found["cor"].note(0.0, f"it is negative while Com is above XJ (correlation {r:.2f}): sign turned")
+            drive.sign = -1
+            drive.note(0.0, f"it is negative while {above} is above {below} (correlation {r:.2f}): sign turned")
         elif r > 0.3:
-            found["cor"].note(0.5, f"it has the sign of Com - XJ (correlation {r:.2f})")
+            drive.note(0.5, f"it has the sign of {above} - {below} (correlation {r:.2f})")
 
 
 def _quote(text: str) -> str:
@@ -423,13 +456,13 @@ def _list_file_lines(measurement: Measurement) -> list[str]:
     return [*lines, *([f"header = {layout.name_line}"] if layout.name_line else []), ""]
 
 
-def _list_signal_lines(name: str, guess: Guess | None, columns: Columns) -> list[str]:
-    quantity = f"{SIGNALS[name].symbol}, {SIGNALS[name].quantity}"
+def _list_signal_lines(signal: Signal, signals: Signals, guess: Guess | None, columns: Columns) -> list[str]:
+    name, quantity = signal.name, f"{signal.symbol}, {signal.quantity}"
     if guess is None:
-        if name not in REQUIRED_SIGNALS:
+        if name not in signals.required:
             return []
         return [f"# [signals.{name}]  # {quantity}: no column found; every analysis needs it", '# source = ""',
-                f'# unit = "{SIGNALS[name].unit}"', ""]
+                f'# unit = "{signal.unit}"', ""]
     unit = guess.unit.name
     lines = [f"[signals.{name}]  # {quantity}; {guess.confidence}: {'; '.join(guess.reasons)}",
              f"source = {_quote(guess.source)}", f'unit = "{unit}"']
@@ -446,14 +479,14 @@ def _list_signal_lines(name: str, guess: Guess | None, columns: Columns) -> list
     return [*lines, ""]
 
 
-def _describe_left(column: str, columns: Columns, found: Mapping[str, Guess]) -> str:
+def _describe_left(column: str, columns: Columns, found: Mapping[str, Guess], signals: Signals) -> str:
     """The range of a column that is no signal, or why it is none."""
     if column not in columns.data:
         return "no numbers"
     x = columns.data[column]
     if float(np.ptp(x)) > 0.0:
         return f"{x.min():.4g} .. {x.max():.4g}"
-    rated = [(guess.points, name) for name in SIGNAL_NAMES if name not in found
-             and (guess := _rate_column(name, column, columns)) is not None]
-    meant = f"; by its name it would be {SIGNALS[max(rated)[1]].symbol}" if rated else ""
+    rated = [(guess.points, signal.name, signal.symbol) for signal in signals[1:] if signal.name not in found
+             and (guess := _rate_column(signal, signals, column, columns)) is not None]
+    meant = f"; by its name it would be {max(rated)[2]}" if rated else ""
     return f"always {x[0]:.4g}{meant}"

@@ -8,7 +8,6 @@ from math import isfinite
 from typing import Any
 
 from fdi.report.report import Cell, Column, Report, Section, Table
-from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError
 from plant.model import (
     SHIPPED_MODELS,
@@ -76,11 +75,12 @@ def _describe_range(q: Quantity) -> str:
 
 def list_signals(model: Model) -> Rows:
     """The columns of a trace."""
-    required = ("t", "com", "xj", "cor")
+    signals = model.kind.signals
+    required = ("t", *signals.required)
     return [{"name": s.name, "symbol": s.symbol, "unit": s.unit, "content": s.quantity,
              "in a trace": "required" if s.name in required else "optional",
-             "noise of the model": model.values.get(s.noise) if s.name in OUTPUTS else None}
-            for s in SIGNALS.values()]
+             "noise of the model": model.values.get(s.noise) if s.role == "output" else None}
+            for s in signals]
 
 
 def list_sequences(model: Model) -> Rows:

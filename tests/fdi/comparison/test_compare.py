@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -210,14 +209,14 @@ def test_the_same_firmware_agrees_to_the_last_digit(c: Trace) -> None:
 def test_rounding_in_a_file_is_no_disagreement(c: Trace, digits: int) -> None:
     rounded = {name: np.array([float(f"{v:.{digits - 1}e}") for v in c.column(name).tolist()])
                for name in ("cor", "xj")}
-    assert compare_controller(replace(c, **rounded), MODEL).ratio < CONTROLLER_ERROR_RATIO
+    assert compare_controller(c.with_columns(rounded), MODEL).ratio < CONTROLLER_ERROR_RATIO
 
 
 def test_rounding_on_the_bus_is_no_disagreement(c: Trace) -> None:
     """The firmware sees what the bus carries, and its answer is rounded to 1e-8 A."""
     xj = np.round(c.xj / 1e-7) * 1e-7
     cor = np.round(np.clip(3.8 * (c.com - xj), -8e-3, 8e-3) / 1e-8) * 1e-8
-    assert compare_controller(replace(c, xj=xj, cor=cor), MODEL).ratio < 1.2
+    assert compare_controller(c.with_columns({"xj": xj, "cor": cor}), MODEL).ratio < 1.2
 
 
 @pytest.mark.parametrize("changes", [
@@ -226,7 +225,7 @@ def test_rounding_on_the_bus_is_no_disagreement(c: Trace) -> None:
 def test_another_firmware_is_told(c: Trace, changes: dict[str, float]) -> None:
     model = MODEL.replace(changes)
     run = simulate(model, record_healthy().com, seed=1, steps=20)
-    other = replace(c, com=run.com, xj=run.xj, cor=run.cor)
+    other = c.with_columns({"com": run.com, "xj": run.xj, "cor": run.cor})
     found = compare_controller(other, MODEL)
     assert found.ratio > 100 and (found.com_lag, found.xj_lag) == (0, 0)
     assert compare_controller(other, model).ratio <= 1.0
@@ -236,13 +235,13 @@ def test_another_firmware_is_told(c: Trace, changes: dict[str, float]) -> None:
 @pytest.mark.parametrize(("com", "xj"), [(3, 0), (-2, 0), (0, 2), (2, 2)])
 def test_columns_that_are_late(c: Trace, com: int, xj: int) -> None:
     """`com` cycles before row k is what Cor_k answers, the file having it earlier than it should."""
-    found = compare_controller(replace(c, com=shift_rows(c.com, -com), xj=shift_rows(c.xj, -xj)), MODEL)
+    found = compare_controller(c.with_columns({"com": shift_rows(c.com, -com), "xj": shift_rows(c.xj, -xj)}), MODEL)
     assert (found.com_lag, found.xj_lag) == (com, xj) and found.ratio <= 1.0
     assert find_lags(c, 8e-3)[:2] == (0, 0)
 
 
 def test_a_recorder_that_rounds_positions_is_no_error_of_the_controller(c: Trace) -> None:
-    rounded = replace(c, xj=7.3e-6 * np.round(c.xj / 7.3e-6))
+    rounded = c.with_columns({"xj": 7.3e-6 * np.round(c.xj / 7.3e-6)})
     other = MODEL.replace({"controller.proportional_gain": 1.1 * MODEL["controller.proportional_gain"]})
     assert 0.5 < compare_controller(rounded, MODEL).ratio < CONTROLLER_ERROR_RATIO
     assert compare_controller(rounded, other).ratio > CONTROLLER_ERROR_RATIO
@@ -250,5 +249,5 @@ def test_a_recorder_that_rounds_positions_is_no_error_of_the_controller(c: Trace
 
 def test_missing_samples_are_not_judged(c: Trace) -> None:
     xj = np.where(np.isin(np.arange(len(c)), [100, 101, 102]), np.nan, c.xj)
-    found = compare_controller(replace(c, xj=xj), MODEL)
+    found = compare_controller(c.with_columns({"xj": xj}), MODEL)
     assert np.isnan(found.residual[100:104]).all() and found.ratio <= 1.0 and not np.isnan(found.residual[104])

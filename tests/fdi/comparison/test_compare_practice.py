@@ -79,9 +79,11 @@ def test_conditions_in_words(case: str, words: str) -> None:
 
 @pytest.mark.skipif(not RIG.exists(), reason="no ../shared/data: no measurements of another actuator")
 def test_measurements_of_another_plant() -> None:
-    """No valve and no known firmware there: signals, places and drift are told, blocks are not."""
+    """No balances and no known firmware there: the plant is one block."""
     found = compare(Trace.read(RIG / "exp_data_1_1.csv.gz"), load_model("ehs"))
-    assert found.verdict == "MODEL_INCOMPLETE" and set(found.blocks.values()) == {None} and not found.named
+    worst = max(signal.ratio for signal in found.signals.values())
+    assert found.verdict == "MODEL_INCOMPLETE" and found.named == ("plant",)
+    assert found.blocks == {"controller": None, "plant": worst, "sensors": None}
     assert found.signals["xj"].floor.value == pytest.approx(2.5e-5 / 12**0.5, rel=0.05)  # rounding to a count
     assert "the model does not explain" in describe_verdict(found).lower() and len(found.where) > 3
 

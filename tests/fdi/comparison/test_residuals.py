@@ -61,7 +61,7 @@ def test_motion_of_the_ram(c: Trace, m: Motion) -> None:
 @pytest.mark.parametrize(("chosen", "words"), [
     (lambda c, m: np.abs(m.v) > 0.05, "ram faster than 50 mm/s"),
     (lambda c, m: m.reversed_for < 0.02, "within 20 ms after a reversal"),
-    (lambda c, m: np.abs(m.p12) > 1e6, r"\|P12\| above 10 bar"),
+    (lambda c, m: np.abs(m.others["p12"]) > 1e6, r"\|P12\| above 10 bar"),
     (lambda c, m: np.abs(m.x) > 2e-3, "ram further than 2 mm from the middle"),
     (lambda c, m: np.abs(c.cor) > 0.99 * LIMIT, "current at its limit"),
     (lambda c, m: m.v > 5e-4, "ram extends"),

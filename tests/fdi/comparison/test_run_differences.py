@@ -17,7 +17,7 @@ from fdi.comparison.run_differences import (
 from fdi.report.diff_report import build_diff_report
 from fdi.report.report import render_html
 from fdi.report.terminal import format_report
-from fdi.trace.trace import PER_ROW, Check, Trace
+from fdi.trace.trace import Check, Trace
 
 ROWS = 4000
 NOISE = 2e-6  # m rms
@@ -66,8 +66,7 @@ def test_runs_with_other_clocks_are_aligned_by_the_command(start: float) -> None
 
 def test_a_run_that_was_recorded_later_is_aligned_by_its_steps() -> None:
     whole = make_run(1)
-    shifted = {name: getattr(whole, name)[700:] for name in PER_ROW} | {"t": whole.t[700:] - whole.t[700]}
-    late = replace(whole, **shifted)
+    late = whole.take_rows(slice(700, None), t=whole.t[700:] - whole.t[700])
     assert find_offset(make_run(0), late) == pytest.approx(0.7) and compare_two(late)[0].verdict == "SAME"
 
 
@@ -82,8 +81,8 @@ def test_a_slower_run_is_compared_in_its_own_rows(is_first: bool) -> None:
 def test_of_different_commands_only_equal_parts_are_compared() -> None:
     other = make_run(1)
     far = other.com + np.where(other.t > 2.5, 1e-3, 0.0)
-    found, pair, signals = compare_two(replace(other, com=far, xj=other.xj + far - other.com))
-    nothing, _, none = compare_two(replace(other, com=other.com + 1.0))
+    found, pair, signals = compare_two(other.with_columns({"com": far, "xj": other.xj + far - other.com}))
+    nothing, _, none = compare_two(other.with_columns({"com": other.com + 1.0}))
     assert (found.verdict, nothing.verdict, none) == ("DIFFERENT", "DIFFERENT", {}) and not pair.has_same_command
     assert pair.common == pytest.approx(2.5, abs=0.01) and signals["xj"].is_within_noise
     assert "elsewhere they differ" in build_diff_report(found).sentence
@@ -94,7 +93,7 @@ def test_of_different_commands_only_equal_parts_are_compared() -> None:
 def test_missing_samples_signals_and_units_are_left_out() -> None:
     other = make_run(1)
     holes = np.where((np.arange(ROWS) >= 100) & (np.arange(ROWS) < 200), np.nan, other.xj)
-    other = replace(other, xj=holes, p12=np.full(ROWS, np.nan), units={**other.units, "cor": "rad/s"})
+    other = other.with_columns({"xj": holes, "p12": np.full(ROWS, np.nan)}, units={**other.units, "cor": "rad/s"})
     _, pair, signals = compare_two(other)
     assert list(signals) == ["xj"] and signals["xj"].samples == ROWS - 100
     assert pair.not_compared == {"p12": "only A has it", "cor": "in A in A, in rad/s in B"}

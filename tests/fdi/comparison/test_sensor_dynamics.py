@@ -48,7 +48,7 @@ def measure(sensors: Mapping[str, SensorDynamics], is_told: bool) -> Comparison:
     """The nominal plant behind filters, compared with or without them."""
     trace = run_nominal()
     shown = {name: filter_by_loop(trace.column(name), sensor) for name, sensor in sensors.items()}
-    return compare(replace(trace, **shown, sensors=sensors if is_told else {}), Model())
+    return compare(trace.with_columns(shown, sensors=sensors if is_told else {}), Model())
 
 
 @pytest.mark.parametrize("sensors", [{"p12": SensorDynamics(moving_mean=8.0)}, {"xj": SensorDynamics(lag=5e-3)},
@@ -66,7 +66,7 @@ def test_filters_of_sensors_are_no_error_of_the_model(sensors: Mapping[str, Sens
 def test_rounding_is_noise() -> None:
     """A step of 1 bar is 0.29 bar of noise, beside the 0.2 bar of the sensor."""
     trace = run_nominal()
-    rounded = replace(trace, p12=1e5 * np.round(trace.p12 / 1e5), sensors={"p12": SensorDynamics(quantum=1e5)})
+    rounded = trace.with_columns({"p12": 1e5 * np.round(trace.p12 / 1e5)}, sensors={"p12": SensorDynamics(quantum=1e5)})
     found = compare(rounded, Model()).signals["p12"]
     assert found.floor.value == pytest.approx(np.hypot(2e4, 1e5 / np.sqrt(12.0)), rel=1e-6)
     assert 0.8 < found.ratio < 1.2

@@ -143,7 +143,7 @@ def test_a_converter_with_few_bits_leaves_a_comb() -> None:
 def test_a_recorder_that_rounds_positions_is_no_effect() -> None:
     def record_rounded(changes: dict[str, float], seed: int) -> Trace:
         trace = record_plant(changes, SHORT, seed)
-        return hold_inputs(replace(trace, xj=2e-6 * np.round(trace.xj / 2e-6)))
+        return hold_inputs(trace.with_columns({"xj": 2e-6 * np.round(trace.xj / 2e-6)}))
 
     healthy = find_marks(Model(), [record_rounded({}, 3)])
     assert healthy.is_recorder and healthy.controller < 2.0 and not healthy.prints

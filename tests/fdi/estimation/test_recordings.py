@@ -247,7 +247,7 @@ def test_a_fit_is_judged_on_all_of_the_recording() -> None:
     problem = make_problem(part)
     fit = fit_nothing(problem, part)
     rows, k = round(PIECE / trace.period), np.arange(len(trace))
-    slipped = replace(trace, xs=trace.xs + 4e-6 * ((k >= 30_000) & (k < 39_000)))  # after the part
+    slipped = trace.with_columns({"xs": trace.xs + 4e-6 * ((k >= 30_000) & (k < 39_000))})  # after the part
     good, bad = (judge_on_all(problem, [fit], each, 20)[0] for each in (trace, slipped))
     assert good.holds(LEVELS) and not bad.holds(LEVELS) and good.find_worst_piece(LEVELS, rows, ()) is None
     assert good.errors["xj"] == pytest.approx(LEVELS["xj"], rel=0.05)

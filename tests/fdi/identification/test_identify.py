@@ -187,7 +187,7 @@ def test_regressions_find_size_and_controller(runs: tuple[Trace, Trace, Trace]) 
     for name, symbol in (("jack.area", "AJ"), ("valve.flow_gain", "GQ"), ("jack.travel", "XJM")):
         assert begun[name] == pytest.approx(truth[symbol], rel=0.15), name
     lagged = np.convolve(runs[0].cor, np.full(40, 1.0 / 40.0))[:len(runs[0])]
-    gains, other = read_controller(own.fitted), read_controller([replace(runs[0], cor=lagged)])
+    gains, other = read_controller(own.fitted), read_controller([runs[0].with_inputs(drive=lagged)])
     assert gains is not None and gains.is_proportional
     assert gains.limit == pytest.approx(model["controller.current_limit"])
     assert other is not None and not other.is_proportional and not other.values  # another law is left alone

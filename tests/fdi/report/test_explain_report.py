@@ -34,6 +34,7 @@ from fdi.report.report import Figure, Report, Table, render_html, to_plain
 from fdi.report.terminal import format_report
 from fdi.trace.trace import Trace
 from plant import Model
+from plant.signals import EHA
 
 FLOOR = {"xj": 2e-6, "p12": 2e4}
 ERROR = {"xj": 45e-6, "p12": 3e5}
@@ -50,7 +51,7 @@ def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, is_at
     base = SimpleNamespace(is_at_floor=is_at_floor, is_far=False, effects=(), ratio={"xj": 22.5, "p12": 15.0})
     explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, marks=Marks(1.0, 1e-6, ()),
                                   ledger=[base], unseen={}, excerpt="",
-                                  search=SimpleNamespace(problem=SimpleNamespace(trace=None)))
+                                  search=SimpleNamespace(problem=SimpleNamespace(trace=SimpleNamespace(declared=EHA))))
     baseline = {"error": ERROR, "floor": FLOOR, "holdout": {"xj": 44e-6, "p12": 3e5}}
     blind = (Blind("sensor_gain", "sensor_gain.error", 0.02, "1", "a stop"),
              Blind("sensor_offset", "sensor_offset.offset", 1e-4, "m", "a stop"))
@@ -152,7 +153,7 @@ def test_roles_of_runs(count: int, has_holdout: bool, roles: list[str]) -> None:
 def update(helps: bool) -> ModelUpdate:
     steps = [SimpleNamespace(error=by, holdout=by, hypothesis=None) for by in (ERROR, FLOOR)]
     refit = SimpleNamespace(helps=helps, steps=steps, last=steps[-1], floor=FLOOR,
-                            search=SimpleNamespace(problem=SimpleNamespace(trace=None)))
+                            search=SimpleNamespace(problem=SimpleNamespace(trace=SimpleNamespace(declared=EHA))))
     known = Provenance(trace=Source("est.csv", "1"), holdout=Source("holdout.csv", "2"), floor=FLOOR,
                        ledger=(Row(None, ERROR, ERROR), Row("a", FLOOR, FLOOR)), history=("rig add a",), effects=("a",))
     return ModelUpdate(Model(), known, ("a",), "", cast(Any, refit),
@@ -186,7 +187,7 @@ OFFSETS = {"xj": 0.0, "p12": 3e5, "xs": 8e-6}  # of the sensors; XJ is drawn to 
 def record_offset() -> Trace:
     """A trace whose sensors of P12 and XS show too much, so that measured minus model is positive."""
     trace = record_plant(com=SHORT, seed=2)
-    return replace(trace, p12=trace.p12 + OFFSETS["p12"], xs=trace.xs + OFFSETS["xs"])
+    return trace.with_columns({name: trace.column(name) + size for name, size in OFFSETS.items()})
 
 
 @cache

@@ -30,7 +30,7 @@ from rig.benches.bench_file import load_bench
 from rig.recorder import Check, Event, NmtState, Record, Recorder, Signals, Timing
 from rig.sequences import load_sequence
 from rig.view.live_process import find_viewer_place, show_live
-from rig.view.live_run import COLUMNS, LiveRun, find_named_node, make_live_plan
+from rig.view.live_run import LiveRun, find_named_node, make_live_plan
 from rig.view.live_show import describe_line, draw_screen, follow_log
 from rig.view.viewer import find_free_port, is_listening
 
@@ -143,7 +143,7 @@ def test_a_limit_that_is_passed_fails_at_once(preflight: Path) -> None:
     add(run, records[:8000])
     assert run.checks["position"].word == "FAIL" and run.checks["position"].value == pytest.approx(7.0)
     assert run.checks["pressure, unloaded"].word == "measures"
-    assert run.read_rows_from(0).shape == (4000, len(COLUMNS)) and run.read_last("xj", 2000)[0] == 7e-3
+    assert run.read_rows_from(0).shape == (4000, len(run.plan.columns)) and run.read_last("xj", 2000)[0] == 7e-3
 
 
 EVENTS = """title = "Events"

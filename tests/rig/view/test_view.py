@@ -26,8 +26,9 @@ from fdi.report.numbers import format_ratio
 from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace.trace import Trace
 from plant import Model, simulate
+from plant.signals import EHA
 from rig.view import viewer
-from rig.view.recording import LANES, LIMITS, PLOTS, TEXTS, Lane, draw_run, make_lane_path, write_recording
+from rig.view.recording import LANES, LIMITS, TEXTS, Lane, draw_run, list_plots, make_lane_path, write_recording
 from rig.view.viewer import ViewerError
 
 REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"  # forbids skips
@@ -107,8 +108,9 @@ faults = [{ name = "offset of XS / small", kind = "offset", signal = "xs", value
             if entity.startswith("/fault/")} == {
         "/fault/offset_of_XS_small": [(0.1, "active"), (0.3, "")],
         "/fault/parameter_filter.clogging": [(0.2, "active")]}
-    np.testing.assert_allclose([value for _, value in rows["/load/load"]], trace.load, atol=1e-9)
-    assert trace.load.max() == 500.0 and "Load on the ram [N]" in {view.title for view in draw_run(trace).shown}
+    np.testing.assert_allclose([value for _, value in rows["/load/load"]], trace.load / 1e3, atol=1e-9)
+    assert trace.load.max() == 500.0
+    assert "External force on the ram [kN]" in {view.title for view in draw_run(trace).shown}
 
 
 def test_recording_holds_every_event_and_check(trace: Trace, rows: dict[str, list[tuple[float, object]]]) -> None:
@@ -140,7 +142,7 @@ def test_headless_screenshot_shows_everything(trace: Trace, tmp_path: Path,
                                               capsys: pytest.CaptureFixture[str]) -> None:
     write_recording(draw_run(trace), tmp_path / "view.rrd")
     pixels = viewer.take_screenshot(draw_run(trace).shown, tmp_path / "view.rrd", tmp_path / "view.png")
-    assert {*pixels} == {*(title for origin, title in PLOTS if origin != "load"), LANES, TEXTS, LIMITS}
+    assert {*pixels} == {*(title for origin, title in list_plots(EHA) if origin != "load"), LANES, TEXTS, LIMITS}
     assert (tmp_path / "view.png").stat().st_size > 50_000
     # of the limits at least the two lines of the position
     assert pixels[LANES] > 20_000 and pixels[TEXTS] > 200 and pixels[LIMITS] > 600

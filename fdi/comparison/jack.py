@@ -1,0 +1,247 @@
+"""The blocks of the electrohydraulic actuator: flow and force of its jack, balanced from measured signals.
+
+For a plant whose declaration says that `plant.forced` can balance it (`Plant.balances`).
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from fdi.estimation.noise import Floor, find_floors, floor_from_data, simulate_reading_noise
+from fdi.estimation.replay import BRIDGED_ROWS, Columns, Repeat, align_columns, differentiate, extend_flags
+from fdi.thresholds import BLOCK_EXCESS_LEAST, NOISY_SENSOR_RATIO, SHAPE_TIE_GAIN, SPOOL_FITS_RATIO
+from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, rms
+from plant.forced import compute_flow_balance, compute_force_balance
+from plant.model import Model
+
+XJ, P12, XS = "xj", "p12", "xs"
+SPAN = 0.02  # s; the flow is compared over the ram's way in it: longer adds up noise of XS, shorter shows that of XJ
+MEAN = 0.011  # s, over which the direction of motion is told
+SURE = 5.0  # standard deviations of the speed that tell a moving ram
+LOOSE = 2e-3  # m/s; the speed of the sensed position must show the direction too
+PLAYS = (2e-5, 6e-5, 1.5e-4)  # m, hysteresis of any shape as a sum of plays
+FEWEST_FORCE_ROWS = 400  # with known forces; fewer are the ends of steps, where speed is hardest to tell
+OWN = {"way": 5e-7, "force": 8e3}  # m, Pa: what straight lines between the samples leave of a perfect model
+
+
+class Balance(NamedTuple):
+    """The jack's two residuals and what they were made of, columns (n,)."""
+
+    way: Floats  # m, XJ sensed less XJ from the flow, gained over SPAN; NaN where it cannot be told
+    force: Floats  # Pa, P12 less what the motion takes; NaN unless the ram surely moves, and without P12
+    gain: float  # by which the ram moves further than the flow says, as a fraction
+    speed: Floats  # m/s, from the flow
+    position: Floats  # m, as the flow adds it up
+
+
+def compute_balance(trace: Trace, model: Model, replayed: Columns) -> Balance:
+    """Flow and force of the jack from measured XS and P12; an XS that was not measured is the replay's."""
+    chosen = [trace.column(name) if name in trace.outputs else replayed[name] for name in (P12, XS)]
+    (p12, lost), (xs, missing) = (bridge_gaps(column, BRIDGED_ROWS) for column in chosen)
+    xj = bridge_gaps(trace.controlled, BRIDGED_ROWS)[0]
+    seen = differentiate(xj, max(5, round(MEAN / trace.period) | 1), 1) / trace.period
+    bad = lost | missing | ~trace.usable
+    if P12 not in trace.outputs:  # not the replay's, which hangs on the valve, but what motion takes where it is sure
+        error = _compute_force_residual(trace, model, p12, xj, seen)
+        p12, bad = p12 - np.nan_to_num(error), bad | np.isnan(error)
+    saturated_share = 0.98  # of the supply pressure: the edges' law says nothing about the speed there
+    bad |= np.abs(p12) > saturated_share * model["supply.pressure"]
+    sensed, speed = compute_flow_balance(model, xs, p12, float(xj[0]))
+    lag = count_span_rows(trace.period)
+    way = difference_over(trace.controlled - sensed, lag)
+    way[extend_flags(bad, lag)] = np.nan
+    dx = difference_over(xj, lag)
+    there = ~np.isnan(way) & ~np.isnan(dx)
+    power = float(np.sum(dx[there] ** 2))
+    gain = float(np.sum(dx[there] * way[there])) / power if power > 0.0 else 0.0
+    # without a measured spool the flow is the servovalve's, and the forces take their speed from the position
+    known = speed * (1 + max(-0.2, min(gain, 0.2))) if XS in trace.outputs else seen
+    force = np.full(len(trace), np.nan)
+    if P12 in trace.outputs:
+        force = _compute_force_residual(trace, model, p12, xj, known)
+    force[bad] = np.nan
+    return Balance(way, force, gain, speed, sensed)
+
+
+def count_span_rows(period: float) -> int:
+    """SPAN in rows."""
+    return max(1, round(SPAN / period))
+
+
+def difference_over(x: Floats, rows: int) -> Floats:
+    """x less what it was so many rows before; NaN at the start."""
+    out = np.full(len(x), np.nan)
+    out[rows:] = x[rows:] - x[:-rows]
+    return out
+
+
+def _compute_force_residual(trace: Trace, model: Model, p12: Floats, xj: Floats, speed: Floats) -> Floats:
+    takes, _, dynamic = compute_force_balance(model, xj, speed, p12, trace.load)
+    size = max(1, round(MEAN / trace.period)) | 1
+    kernel = np.ones(size) / size
+    mean = np.convolve(speed, kernel, "same")
+    noise = float(np.median(np.abs(np.diff(speed, 2)))) / 0.6745 / math.sqrt(6.0 * size)
+    seen = np.convolve(np.gradient(xj, trace.period), kernel, "same")
+    direction = np.where(mean > SURE * noise, 1.0, np.where(mean < -SURE * noise, -1.0, 0.0))
+    direction[(np.abs(seen) > LOOSE) & (np.sign(seen) != direction)] = 0.0
+    turned = extend_flags(np.diff(direction, prepend=direction[0]) != 0.0, size)
+    turned |= np.roll(turned, -size) | ~_find_resolved(speed, trace.period)
+    pushed = np.abs(np.diff(trace.load, prepend=trace.load[0])) > OWN["force"] * model["jack.area"]
+    turned |= extend_flags(pushed, size)  # a step of the known load: the speed changes within a sample
+    out: Floats = p12 - (takes + direction * dynamic) / model["jack.area"]
+    return np.where((direction == 0.0) | turned, np.nan, out)
+
+
+def _find_resolved(speed: Floats, period: float) -> Flags:
+    """Where the change of speed is the same over two and over four samples: there is no jerk between them."""
+    near, wide = np.gradient(speed, period), np.zeros(len(speed))
+    wide[2:-2] = (speed[4:] - speed[:-4]) / (4 * period)
+    apart = np.abs(near - wide)
+    most_apart = 4.0  # standard deviations by which accelerations over two and four samples may differ
+    return apart <= most_apart * float(np.median(apart)) / 0.6745
+
+
+def share_error(trace: Trace, b: Balance, xs: Floats, p12: Floats, floor: float, is_noisy: bool
+                ) -> tuple[float, float]:
+    """Ratios of flow and sensor to the floor, m: the one at fault carries all, the other what it alone explains.
+
+    At fault is whichever error describes `b.way` better; xs m, p12 Pa, (n,), as in the balance. `is_noisy`: the sensed
+    position changes from sample to sample by more than its noise, as no flow can make it.
+
+    The descriptions are least-squares fits of a few shapes of each kind. None of them is made of the sensed position,
+    whose noise is in the residual itself.
+    """
+    lag, x = count_span_rows(trace.period), b.position
+    rates = [np.concatenate([[0.0], np.cumsum(r)[:-1]]) * trace.period for r in _list_rate_shapes(xs, p12)]
+    places = [x, b.speed, p12, *(apply_play(x, width) for width in PLAYS)]
+    there = ~np.isnan(b.way)
+    columns = [difference_over(s, lag)[there] for s in (*rates, *places)]
+    error, (rate, place, gain, both) = _measure_remainders(b.way[there], columns, len(rates))
+    effective = int(there.sum()) / lag
+
+    def measure_evidence(one: float, other: float) -> float:
+        """Twice the log likelihood by which `one` describes worse than `other`."""
+        return effective * math.log(max(one, 1e-3 * floor) ** 2 / max(other, 1e-3 * floor) ** 2)
+
+    whole = error / floor
+    gain_suffices = measure_evidence(gain, both) < SHAPE_TIE_GAIN + len(columns)
+    is_tie = gain_suffices or abs(measure_evidence(rate, place)) < SHAPE_TIE_GAIN
+    if whole**2 - 1.0 < BLOCK_EXCESS_LEAST or (is_tie and not is_noisy):
+        return whole, whole
+    if not is_tie and rate < place:
+        return whole, math.sqrt(1.0 + max(0.0, rate**2 - both**2) / floor**2)
+    return math.sqrt(1.0 + max(0.0, place**2 - both**2) / floor**2), whole
+
+
+def _measure_remainders(y: Floats, columns: list[Floats], first: int
+                        ) -> tuple[float, tuple[float, float, float, float]]:
+    """RMS of y, and of what the `first` columns, the others, the first of the others, and all of them leave of it."""
+    every = [*columns, y]
+    size = np.sqrt([np.mean(c**2) for c in every])
+    scale, gram = np.where(size > 0.0, size, 1.0), np.zeros((len(every), len(every)))
+    rows = 100_000  # at a time
+    for k in range(0, len(y), rows):
+        z = np.column_stack([c[k:k + rows] for c in every]) / scale
+        # not z.T @ z, here and elsewhere: the threads of BLAS wait for a busy core, and 1 ms becomes 0.9 s
+        gram += np.einsum("ki,kj->ij", z, z) / len(y)
+
+    def measure_remainder(pick: slice) -> float:
+        inverse = np.linalg.pinv(gram[pick, pick], rcond=1e-9, hermitian=True)
+        part = gram[pick, -1]
+        return float(size[-1]) * math.sqrt(max(0.0, 1.0 - float(part @ inverse @ part)))
+
+    parts = slice(0, first), slice(first, -1), slice(first, first + 1), slice(0, -1)
+    return float(size[-1]), tuple(measure_remainder(part) for part in parts)  # type: ignore[return-value]
+
+
+def _list_rate_shapes(xs: Floats, p12: Floats) -> list[Floats]:
+    """Errors of speed that a valve or a jack can make, as functions of opening and pressure, each of order one."""
+    x, p = xs / 1e-4, p12 / 1e6
+    edge, narrow, held = np.tanh(xs / 2e-5), np.tanh(xs / 5e-6), np.tanh(p / 0.3)
+    return [np.ones(len(x)), x, np.abs(x), p, np.abs(p), x * p, x * np.abs(x), np.abs(x) * p, x * x * p,
+            x * np.abs(p), x * p * p, edge, narrow, held, edge * np.abs(p)]
+
+
+def apply_play(x: Floats, width: float) -> Floats:
+    """x behind a play of that width, m: the elementary hysteresis."""
+    out, held, half = [], float(x[0]), 0.5 * width
+    for value in x.tolist():
+        held = min(max(held, value - half), value + half)
+        out.append(held)
+    return np.array(out)
+
+
+class Jack(NamedTuple):
+    """Ratios to their floors of the parts that flow and force decide; None where they cannot be told."""
+
+    flow: float | None = None
+    force: float | None = None
+    sensor: float | None = None
+    gain: float | None = None  # by which the ram moves further than the flow says, as a fraction
+
+
+def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, int, Columns]],
+               level: Mapping[str, float]) -> Jack:
+    """The jack and the sensor of a trace; repeats with their shift in rows, `run` and theirs the replays they go with.
+
+    Nothing is told where too few rows hang together.
+
+    The floor comes from the repeats, as everywhere; without them the noise `level` of each signal, SI, is put in once
+    more, and what that changes is what noise does.
+    """
+    b = compute_balance(trace, model, run)
+    found = {"way": b.way, "force": b.force}
+    if repeats:
+        others = [(late, compute_balance(other, model, theirs)) for other, late, theirs in repeats]
+        pairs = [align_columns({"way": o.way, "force": o.force}, late, len(trace)) for late, o in others]
+        floor = {name: f.value for name, f in find_floors(found, pairs, trace.period).items()}
+    else:
+        again = compute_balance(add_noise(trace, level), model, run)
+        floor = {"way": rms(again.way - b.way), "force": rms(again.force - b.force)}
+    floor = {name: math.hypot(value, OWN[name]) for name, value in floor.items()}
+    known = [trace.column(name) if name in trace.outputs else run[name] for name in (XS, P12)]
+    xs, p12 = (bridge_gaps(column, BRIDGED_ROWS)[0] for column in known)
+    if (~np.isnan(b.way)).sum() < FEWEST_FORCE_ROWS or not floor.get("way", 0.0) > 0.0:
+        return Jack()
+    is_noisy = (XJ in level
+                and floor_from_data(trace.mask_unusable(XJ)).value > NOISY_SENSOR_RATIO * level[XJ])
+    flow, sensor = share_error(trace, b, xs, p12, floor["way"], is_noisy)
+    flow = flow if XS in trace.outputs else max(flow, sensor)
+    most_missing = 0.2  # of the rows; where more are missing, accelerations are guesses
+    is_enough = (~np.isnan(b.force)).sum() >= FEWEST_FORCE_ROWS and trace.filled.mean() < most_missing
+    is_told = is_enough and floor.get("force", 0.0) > 0.0
+    return Jack(flow, rms(b.force) / floor["force"] if is_told else None, sensor, b.gain)
+
+
+def add_noise(trace: Trace, level: Mapping[str, float]) -> Trace:
+    """The trace with noise of each signal's level added, always the same."""
+    rng = np.random.default_rng(0)
+    noisy = {name: trace.column(name) + size * rng.standard_normal(len(trace)) for name, size in level.items()}
+    return trace.with_columns(noisy)
+
+
+def judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],
+                 signal: Mapping[str, float], noise: Mapping[str, Floor]
+                 ) -> tuple[dict[str, float | None], dict[str, float | None]]:
+    """Ratios of servovalve, jack and sensor, None where nothing measured can tell, and the parts of the jack's.
+
+    `signal` holds the error over the floor of each measured output. Where the spool is as the model says, an error of
+    P12 in the replay is the jack's too: it sees standstill and reversals, which the balance of forces leaves out.
+    Without a measured spool the servovalve is judged with its metering edges, as current to flow, and the jack by its
+    forces alone; a sensor cannot be told from a valve then.
+    """
+    pairs = [(other.trace, other.late, theirs) for other, theirs in repeats]
+    level = {XJ: simulate_reading_noise(model, trace.controlled)} | {name: f.value for name, f in noise.items()}
+    # the balances of flow and force take the measured signals as the true ones
+    is_balanced = bool({P12, XS} & set(trace.outputs)) and not trace.filtered
+    j = judge_jack(trace, model, run, pairs, level) if is_balanced else Jack()
+    ratios = {"servovalve": j.flow, "jack": j.force, "sensor": None}
+    if XS in trace.outputs:
+        known = [x for x in (j.flow, j.force) if x is not None]
+        if known and P12 in signal and signal[XS] < SPOOL_FITS_RATIO:
+            known.append(signal[P12])
+        ratios |= {"servovalve": signal[XS], "jack": max(known, default=None), "sensor": j.sensor}
+    return ratios, {"flow": j.flow, "force": j.force, "gain": j.gain}
