@@ -103,8 +103,8 @@ PUBLIC = {
     },
     "rig.sequences": {"Sequence", "load_sequence"},
     "rig.recorder": {
-        "U32", "CanFrame", "Check", "CycleBlock", "Event", "NmtState", "Observer", "Record", "Recorder", "RecorderError",
-        "Signals", "Timing",
+        "U32", "CanFrame", "Check", "CycleBlock", "Event", "NmtState", "Observer", "Record", "Recorder",
+        "RecorderError", "Signals", "Timing",
     },
     "dbc": {"DBC", "EDS"},
 }

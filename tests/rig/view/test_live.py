@@ -357,7 +357,7 @@ def test_what_arrives_is_what_the_log_holds(tmp_path: Path) -> None:
     assert said.status == 1 and said.err == "" and "too small" in said.out
     rows, trace = read_recording(tmp_path / "live.rrd"), Trace.read(tmp_path / "run", all=True)
     for entity, values in (("/position/ram", trace.xj * 1e3), ("/spool/spool", trace.xs * 1e6),
-                           ("/load/load", trace.load)):
+                           ("/load/load", 1e-3 * trace.load)):
         np.testing.assert_allclose(rows[entity], np.column_stack([trace.t, values]), atol=1e-6, rtol=1e-9)
     assert [state for _, state in rows["/run/phase"]] == ["set-up", "main"] and trace.load.max() == 100.0
     assert rows["/run/phase"][1][0] == pytest.approx(0.0, abs=1e-6)
