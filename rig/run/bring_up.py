@@ -5,27 +5,30 @@ from collections.abc import Callable
 
 from plant.errors import InputError
 from rig.benches.frame_map import Role
+from rig.benches.profiles import PROFILES, State
 from rig.network.clock import WallClock
 from rig.network.link import EmbeddedWire
 from rig.network.master import HEARTBEAT_LIMIT, PATIENT, Master
 from rig.network.node_objects import CONTROLLER, Gains, Identity, read_gains
 from rig.nodes.scenario import Scenario
 from rig.run.attribution import Mask, find_start_problem
+from rig.run.cyclic_values import BEFORE
+from rig.run.enabling import Enabling
 from rig.run.job import Job
-from rig.run.loop import History
+from rig.run.loop import History, Loop
 from rig.run.loops import open_loop
 from rig.run.probe import (
     ATTEMPTS,
-    BEFORE,
     PROBES,
-    WARM_UP,
     Step,
     count_cycles,
+    find_disabled,
     find_gap,
     find_on_time,
     has_no_answers,
     list_first_steps,
     list_inputs,
+    list_warm_up,
 )
 from rig.run.state import Journal, SafeState, Stage
 from rig.sequences.faults import Plan, Schedule
@@ -67,21 +70,19 @@ class BringUp:
         self._wait_for_operational(job.sequence.timing.operational)
 
     def play_probes(self) -> None:
-        """Play the probes before set-up, each after a reset of the nodes.
+        """Play the probes before set-up, each after a reset of the nodes, if there are nodes.
 
-        They are made for CiA 408. In real time a probe with a gap is repeated. If the bench itself cannot deliver one,
-        none is judged.
+        In real time a probe with a gap is repeated. If the bench itself cannot deliver one, none is judged.
 
         Raises:
             BusError: a node does not answer or refuses.
         """
-        if self._job.bench.profile != "cia408":
-            return
-        steps = list_first_steps(self._job.sequence.protocol.step_delay, self._job.bench.rate)
+        bench = self._job.bench
+        steps = list_first_steps(self._job.sequence.protocol, bench)
         cycles = count_cycles(steps)
-        steps = (*WARM_UP, *steps) if self._job.realtime else steps
+        steps = (*list_warm_up(bench), *steps) if self._job.realtime else steps
         self._stage.is_probing = True
-        for _ in range(PROBES):
+        for _ in range(PROBES if bench.nodes else 1):
             probe = self._play_probe(steps)
             attempts = ATTEMPTS if self._job.realtime else 1
             while ((gap := find_gap(probe, self.find_on_time_of(probe), cycles)) and (attempts := attempts - 1)
@@ -106,11 +107,10 @@ class BringUp:
         loop = self._stage.loop = open_loop(self._master, self._job.bench, scenario, Schedule(scenario.plan), probe,
                                             self._job.bus, self._job.realtime)
         try:
-            for step in list_inputs(steps, BEFORE, 0.0):
-                loop.cycle(step)
-                if self._job.realtime and self._stop():
-                    self._safety.stop()
-                if self._safety.aborted or has_no_answers(probe):
+            for step in steps:
+                if problem := self._enable(loop) if step.begins_enabled else "":
+                    self._journal.log("WARN", "probe", problem)
+                if problem or not self._play_step(loop, step, probe):
                     loop.hold(BEFORE)
                     break
             loop.finish()
@@ -121,6 +121,25 @@ class BringUp:
             loop.close()
             self._stage.loop = None
         return probe
+
+    def _play_step(self, loop: Loop, step: Step, probe: History) -> bool:
+        """Play a step of a probe; False when that is to end."""
+        for each in list_inputs(step):
+            loop.cycle(each)
+            if self._job.realtime and self._stop():
+                self._safety.stop()
+            if self._safety.aborted or has_no_answers(probe):
+                return False
+        return True
+
+    def _enable(self, loop: Loop) -> str:
+        """Enable the controller for a probe; why that failed, or ""."""
+        bench = self._job.bench
+        enabling = Enabling(bench, loop, self._job.realtime, lambda: bool(self._safety.aborted) or self._stop())
+        problem = enabling.enable(0.0) if bench.profile != "none" else ""
+        if problem or not bench.ready:
+            return problem
+        return enabling.await_ready(0.0, find_disabled(bench), PROFILES[bench.profile].ladder[State.ACTIVE])
 
     def _identify_nodes(self) -> None:
         """Read and log what the nodes say about themselves; refuse another device, and a firmware that the sequence is

@@ -8,7 +8,9 @@ from typing import NamedTuple
 from rig.benches.bench import OUTPUTS, Bench
 from rig.benches.frame_map import Role
 
-_PHASES = ("setup", "main", "cleanup")
+# Numbers of phases: set-up, main, clean-up; then those of the probes, of which the log has the frames only
+BEFORE, AFTER, BEFORE_MAIN = 3, 4, 5
+_PHASES = ("setup", "main", "cleanup", "setup", "cleanup", "main")  # whose values are sent
 _GIVEN = ("position_demand", "load_force", "control_word", "mode")
 _READ = ("ram_position", "load_pressure", "spool_position", "flags")  # in the order of the transducers
 
@@ -16,7 +18,7 @@ _READ = ("ram_position", "load_pressure", "spool_position", "flags")  # in the o
 class CycleInput(NamedTuple):
     """Inputs of one cycle."""
 
-    phase: int  # 0 set-up, 1 main, 2 clean-up
+    phase: int  # 0 set-up, 1 main, 2 clean-up; of the probes see above
     demand: float  # m
     load: float  # N, force on the ram from the scenario
     control: int  # control word; of a controller without one: 0 for the values of the safe state
@@ -38,7 +40,7 @@ class CyclicValues:
 
     def list_given(self, step: CycleInput) -> list[float]:
         """The values that the rig gives in a cycle, SI; of fields of the device the physical value of its DBC."""
-        phase = _PHASES[min(max(step.phase, 0), 2)] if step.control else "safe"
+        phase = _PHASES[step.phase] if step.control else "safe"
         return [step.demand, step.load, float(step.control), self._mode,
                 *(find_phase_value(values, phase) for values in self._phases.values())]
 

@@ -1,10 +1,12 @@
 """The probes: short plays before and after a sequence that show what its own cycles cannot.
 
-In a sequence the control word leaves ACTIVE only where demand and position agree, so a firmware that ignores it sends
-next to no current there either. A probe asks for a position 1 mm away while the control word is not ACTIVE, then steps
-the demand while it is. It is played twice before set-up, each time after a reset, on the healthy plant in its initial
-state: the two must be answered alike. The reset that follows brings plant and controller back to the same state, so
-the rows of the sequence are those of a run without probes. After clean-up the control word leaves ACTIVE once more.
+In a sequence the controller is disabled only where demand and position agree, so a firmware that ignores it sends next
+to no current there either. A probe asks for a position 1 mm away while the controller is disabled, then steps the
+demand while it is enabled. It is played before set-up, on the healthy plant in its initial state. On CANopen it is
+played twice, each time after a reset, and the two must be answered alike; the reset that follows brings plant and
+controller back to the same state, so the rows of the sequence are those of a run without probes. Plain CAN has no
+reset: there it is played once, and the ram goes back to where it began. After clean-up the controller is disabled once
+more.
 """
 from __future__ import annotations
 
@@ -12,16 +14,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rig.benches.profiles import Control
-from rig.run.cyclic_values import CycleInput
+from rig.benches.bench import Bench
+from rig.benches.profiles import PROFILES, State
+from rig.run.cyclic_values import AFTER, BEFORE, BEFORE_MAIN, CycleInput
 from rig.run.loop import History
 from rig.sequences.faults import Schedule
-from rig.sequences.protocol import Mask, Rows
+from rig.sequences.protocol import Mask, ProtocolLimits, Rows
 
-BEFORE, AFTER = 3, 4  # phase numbers, beside those of set-up, main and clean-up; the log has their frames only
-PROBES = 2  # before set-up
+PROBES = 2  # before set-up, of a controller that can be reset
 ATTEMPTS = 5  # at each of them, in real time
-DISTANCE = 1e-3  # m: from the position to the demand while the control word is not ACTIVE
+DISTANCE = 1e-3  # m: from the position to the demand while the controller is disabled
+RETURN_TIME = 0.3  # s: until the ram is back, some time constants of a position loop
 _MISSED_LIMIT = 5  # cycles in a row without an answer: then the probe ends, because each costs a timeout
 
 
@@ -31,21 +34,48 @@ class Step(NamedTuple):
     control: int
     demand: float
     cycles: int
+    phase: int = BEFORE
+    begins_enabled: bool = False  # before it the controller is enabled, in cycles that do not count
 
 
-WARM_UP = (Step(0, DISTANCE, 30), Step(Control.RESET, DISTANCE, 1))  # real time: the first cycles may be late
-LAST_STEPS = (Step(0, DISTANCE, 8),)
+def list_warm_up(bench: Bench) -> tuple[Step, ...]:
+    """Real time: the first cycles may be late."""
+    words = PROFILES[bench.profile]
+    first = Step(find_disabled(bench), DISTANCE, 30)
+    return (first,) if words.is_confirmed else (first, Step(words.reset, DISTANCE, 1))
 
 
-def list_first_steps(step_delay: float, rate: float) -> tuple[Step, ...]:
-    """The steps of a probe before set-up, whose demand step may be answered `step_delay` s late.
+def find_disabled(bench: Bench) -> int:
+    """The control word of a probe with which the controller is disabled."""
+    words = PROFILES[bench.profile]
+    return words.ladder[State.READY] if bench.profile == "none" and not bench.is_enabled("setup") else words.ladder[0]
 
-    `rate`: cycles a second.
-    """
+
+def list_last_steps(bench: Bench) -> tuple[Step, ...]:
+    """The probe after clean-up."""
+    return (Step(0, DISTANCE, 8 + _count_release(bench), AFTER),)
+
+
+def list_first_steps(limits: ProtocolLimits, bench: Bench) -> tuple[Step, ...]:
+    """The steps of a probe before set-up, whose demand step may be answered as late as the limits say."""
     step = 0.5e-3  # m; its current is far below the limit
-    return (Step(0, DISTANCE, 4), Step(Control.DISABLE, DISTANCE, 2), Step(Control.DISABLE | Control.HOLD, DISTANCE, 2),
-            Step(Control.ACTIVE, 0.0, 3), Step(Control.ACTIVE, step, 3 + round(step_delay * rate)),
-            Step(0, DISTANCE, 8))
+    active, off = PROFILES[bench.profile].ladder[State.ACTIVE], find_disabled(bench)
+    steps = []
+    if bench.profile != "none":
+        low, high = PROFILES[bench.profile].ladder[1:3]
+        steps = [Step(off, DISTANCE, 4), Step(low, DISTANCE, 2), Step(high, DISTANCE, 2)]
+    elif bench.enables:
+        steps = [Step(off, DISTANCE, 8)]
+    steps += [Step(active, 0.0, 3, BEFORE_MAIN, begins_enabled=True),
+              Step(active, step, 3 + round(limits.find_step_delay(bench) * bench.rate), BEFORE_MAIN)]
+    if not bench.nodes:
+        steps.append(Step(active, 0.0, round(RETURN_TIME * bench.rate), BEFORE_MAIN))
+    return (*steps, Step(off, DISTANCE, 8 + _count_release(bench)))
+
+
+def _count_release(bench: Bench) -> int:
+    """Cycles until a controller without a control word has switched its current off."""
+    return round(PROFILES["none"].delay * bench.rate) if bench.profile == "none" else 0
 
 
 def count_cycles(steps: tuple[Step, ...]) -> int:
@@ -53,10 +83,9 @@ def count_cycles(steps: tuple[Step, ...]) -> int:
     return sum(step.cycles for step in steps)
 
 
-def list_inputs(steps: tuple[Step, ...], phase: int, demand: float) -> list[CycleInput]:
-    """The cycles of a probe at the position `demand`, m."""
-    return [CycleInput(phase, demand + step.demand, 0.0, int(step.control)) for step in steps
-            for _ in range(step.cycles)]
+def list_inputs(step: Step, demand: float = 0.0) -> list[CycleInput]:
+    """The cycles of a step at the position `demand`, m."""
+    return [CycleInput(step.phase, demand + step.demand, 0.0, step.control)] * step.cycles
 
 
 def has_no_answers(probe: History) -> bool:

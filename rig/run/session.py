@@ -27,7 +27,7 @@ from rig.nodes.scenario import FORCE_RESOLUTION
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.attribution import Mask, find_injected
 from rig.run.bring_up import BringUp
-from rig.run.cyclic_values import CycleInput
+from rig.run.cyclic_values import AFTER, CycleInput
 from rig.run.embedded_cycle import MOST
 from rig.run.enabling import Enabling
 from rig.run.job import Job
@@ -35,11 +35,10 @@ from rig.run.loop import History
 from rig.run.loops import open_loop
 from rig.run.participants import Participants, find_firmware_parameters
 from rig.run.probe import (
-    AFTER,
-    LAST_STEPS,
     count_cycles,
     list_first_steps,
     list_inputs,
+    list_last_steps,
     read_rows,
 )
 from rig.run.state import Journal, SafeState, Stage
@@ -374,13 +373,14 @@ class Session:
         if self.safety.is_safe or self.safety.aborted or not self.job.sequence.protocol.probe:
             return
         self.stage.playing.wait_until_played(lambda: bool(self.safety.aborted))
-        for step in list_inputs(LAST_STEPS, AFTER, self._demand):
-            self.stage.playing.cycle(step)
+        for step in list_last_steps(self.job.bench):
+            for each in list_inputs(step, self._demand):
+                self.stage.playing.cycle(each)
 
     def read_protocol_record(self, judged: Mask) -> ProtocolRecord:
         """All that the protocol checks of this run are judged by; `judged`: cycles in which the bench was on time."""
         job, model, start = self.job, self.job.model, self.starter
-        cycles = count_cycles(list_first_steps(job.sequence.protocol.step_delay, job.bench.rate))
+        cycles = count_cycles(list_first_steps(job.sequence.protocol, job.bench))
 
         def read(history: History) -> Rows:
             rows = read_rows(history, start.find_on_time_of(history))

@@ -75,6 +75,16 @@ class ProtocolLimits:
         """The limit `status` for a profile, s, at `rate` cycles a second."""
         return max(words.delay, 2 / rate) if self.status is None else self.status
 
+    def find_step_delay(self, bench: Bench) -> float:
+        """The limit `step_delay` on a bench, s.
+
+        What comes in every n-th cycle adds n - 1 of them, and a drive frame without the number of the cycle that it
+        answers adds one: it may answer the cycle before.
+        """
+        demand, drive = bench.frames.find_role("command"), bench.frames.drive
+        cycles = demand.every + drive.every - 2 + (not drive.has("cycle"))
+        return self.step_delay + cycles / bench.rate
+
 
 class Rows(NamedTuple):
     """Consecutive cycles as columns, SI; NaN: no frame with this cycle's number.
@@ -231,7 +241,8 @@ def _judge_status(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
     delay = limits.find_delay(record.words, record.bench.rate)
     if record.words is CIA402:
         whole = record.join_rows()
-        wrong = list_wrong_changes(whole, round(delay * record.bench.rate))
+        wrong = [change for rows in (whole, *record.probes)
+                 for change in list_wrong_changes(rows, round(delay * record.bench.rate))]
         yield _make_result("status word follows the states of CiA 402", "status word", float(len(wrong)), "1", high=0.0,
                            detail="; ".join(wrong[:3]))
         ages = measure_delays(whole)
@@ -374,17 +385,16 @@ def _judge_probes(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
     node, parameter = record.bench.nodes.get(Role.CONTROLLER), "controller.proportional_gain"
     objects = {name: name_object(index, sub) for index, sub, name in (node.settings if node is not None else ())}
     gain_name = f"gain against {objects.get(parameter, 'its object').partition(':')[0]}"
-    if record.words is not CIA408:
-        for name in (delay_name, gain_name, repeat_name):
-            yield SkippedCheck(name, "the probe is made for CANopen and CiA 408")
-        return
+    if node is None:
+        yield SkippedCheck(repeat_name, "plain CAN has no reset")
     if not record.probes:
         return
     first = record.probes[0]
-    delay, detail = measure_step_delay(first, record.bench.rate)
-    yield _make_result(delay_name, "current", delay, "ms", high=limits.step_delay * 1e3, detail=detail)
+    delay, detail = measure_step_delay(first, record.bench.rate, record.words)
+    high = limits.find_step_delay(record.bench) * 1e3
+    yield _make_result(delay_name, "current", delay, "ms", high=high, detail=detail)
     if record.gains is not None:
-        gain, detail = measure_gain(first, record.gains)
+        gain, detail = measure_gain(first, record.gains, record.words)
         tolerance = 100 * limits.gain
         yield _make_result(gain_name, "current", 100 * gain, "%", 100 - tolerance, 100 + tolerance, detail)
     else:
@@ -394,22 +404,22 @@ def _judge_probes(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
         yield _make_result(repeat_name, "current", difference * 1e3, "mA", high=0.0, detail=detail)
 
 
-def _find_active(rows: Rows) -> Whole:
-    active: Whole = np.flatnonzero(rows.control.astype(int) & _LEVELS == _LEVELS)
+def _find_active(rows: Rows, words: ProfileWords) -> Whole:
+    active: Whole = np.flatnonzero(map_words(rows.control, lambda word: find_wanted(words, word)) == State.ACTIVE)
     return active
 
 
-def measure_step_delay(probe: Rows, rate: float) -> tuple[float, str]:
+def measure_step_delay(probe: Rows, rate: float, words: ProfileWords = CIA408) -> tuple[float, str]:
     """Time from the demand step to the first answer that follows it in the same direction, ms, and a remark.
 
     An answer follows when the current has changed by a fifth of the largest change since the step.
     """
-    active = _find_active(probe)
+    active = _find_active(probe, words)
     steps = active[1:][np.diff(probe.com[active]) != 0]
     if not len(steps):
         return nan, "the probe ended before its step"
-    k = int(steps[0])
-    change = (probe.cor[k:active[-1] + 1] - probe.cor[k - 1]) * np.sign(probe.com[k] - probe.com[k - 1])
+    k, end = int(steps[0]), int([*steps, active[-1] + 1][1])
+    change = (probe.cor[k:end] - probe.cor[k - 1]) * np.sign(probe.com[k] - probe.com[k - 1])
     if np.isnan(change).any():
         return nan, "a drive frame is missing at the step"
     if change.max() <= 0.0:
@@ -417,9 +427,9 @@ def measure_step_delay(probe: Rows, rate: float) -> tuple[float, str]:
     return float(np.flatnonzero(change >= 0.2 * change.max())[0]) * 1e3 / rate, ""
 
 
-def measure_gain(probe: Rows, gains: object) -> tuple[float, str]:
+def measure_gain(probe: Rows, gains: object, words: ProfileWords = CIA408) -> tuple[float, str]:
     """Current in the ACTIVE cycles of a probe over that of the documented law with these gains, 1, and a remark."""
-    active = _find_active(probe)
+    active = _find_active(probe, words)
     loop, wanted = Loop(), []
     for demand, position in zip(probe.com[active], probe.xj[active], strict=True):
         current, loop = compute_current(loop, float(demand), float(position), gains)
@@ -431,8 +441,12 @@ def measure_gain(probe: Rows, gains: object) -> tuple[float, str]:
 
 
 def measure_difference(probes: Sequence[Rows]) -> tuple[float, str]:
-    """Largest difference of the current between probes that see the same demand and the same plant, A, and a remark."""
-    first, *others = probes
+    """Largest difference of the current between probes that see the same demand and the same plant, A, and a remark.
+
+    Before the first drive frame, which may come in the second cycle, there is nothing to compare.
+    """
+    begin = max(int(np.argmin(np.isnan(probe.cor))) for probe in probes)
+    first, *others = [Rows._make(column[begin:] for column in probe) for probe in probes]
     largest = 0.0
     for other in others:
         if len(other.cor) != len(first.cor) or np.isnan(other.cor - first.cor).any():
