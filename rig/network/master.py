@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
-from functools import cache
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import canopen
@@ -71,12 +70,6 @@ class _Node(canopen.RemoteNode):
         client = CheckedSdoClient(rx_cobid, tx_cobid, self.object_dictionary)
         self.sdo_channels.append(client)
         return client
-
-
-@cache
-def _read_dictionary(name: str, text: str, node: int) -> Any:
-    """The library's object dictionary of a node. The library does not change it; to read it takes 20 ms."""
-    return read_dictionary(name, text, node)
 
 
 class _Network(canopen.Network):
@@ -151,7 +144,7 @@ class Master:
     def _join(self, role: Role) -> Any:  # the library's node; its types are too loose to help
         name, text = self._bench.read_data_sheet(role)
         number = self._bench.nodes[role].node
-        remote = _Node(number, _read_dictionary(name, text, number))
+        remote = _Node(number, read_dictionary(name, text, number))
         self.network.add_node(remote)
         remote.emcy.add_callback(lambda error: self.hooks.on_emcy(role, error))
         remote.nmt.add_heartbeat_callback(lambda state: self._take_heartbeat(role, state))

@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 from rig.network.frame import Frame
 from rig.recorder.schema import CHANNELS, CanFrame, Signals, Timing, list_row_fields, make_packer
 
+_NAMES = [tuple(field.name for field in fields(record)) for record in (Signals, Timing)]
+
 
 class CycleBlock(NamedTuple):
     """Some cycles: the frames of all, and the rows of all but the last, which is still under way."""
 
     t_ns: NDArray[np.int64]  # (n,) time of each
     frames: Sequence[tuple[int, NDArray[np.int64] | None]]  # in order: COB-ID, (n,) payloads of 8 bytes; None: 0 bytes
-    columns: Mapping[str, NDArray[Any]]  # (n,) each field of Signals and Timing
+    columns: Mapping[str, Any]  # each field of Signals and Timing: (n,), or one value for all
 
     def list_frames(self, cob_id: int) -> list[Frame]:
         """The frames with this COB-ID."""
@@ -29,9 +31,9 @@ class CycleBlock(NamedTuple):
 
     def make_row(self, i: int) -> tuple[Signals, Timing]:
         """A cycle as records."""
-        signals, timing = ({field.name: self.columns[field.name][i].item() for field in fields(record)}
-                           for record in (Signals, Timing))
-        return Signals(**signals), Timing(**timing)
+        row = {name: column[i].item() if isinstance(column, np.ndarray) else column
+               for name, column in self.columns.items()}
+        return Signals(*map(row.get, _NAMES[0])), Timing(*map(row.get, _NAMES[1]))  # type: ignore[arg-type]
 
     def list_rows(self) -> Iterator[tuple[int, Signals | Timing]]:
         """Time and record of each row."""

@@ -1,7 +1,8 @@
 """The cycle loop of the embedded bus in lockstep: quiet cycles run compiled, many at a time, all others in Python.
 
-Both give the same rows and frames. A cycle with a timer that runs out (a heartbeat), a fault that begins, acts or ends,
-a frame that waits, or a node that is not well is played by `CycleLoop` and the nodes themselves.
+Both give the same rows and frames. A cycle with a fault that begins, acts or ends, a frame that waits, or a node that
+is not well is played by `CycleLoop` and the nodes themselves. Timers, such as those of heartbeats, run in Python
+between the compiled cycles.
 """
 from __future__ import annotations
 
@@ -75,16 +76,17 @@ class EmbeddedLoop(CycleLoop):
             firmware.loop = Loop(*b.reals[ec.LOOP:ec.GAINS].tolist())
             emulator.pass_quiet(played, int(b.payloads[played - 1, ec.DRIVE]).to_bytes(8, "little", signed=True))
             self._take_cycles(phase, control, played)
+            self._run_timers(emulator, firmware)
         return played
 
     def _count_quiet(self, emulator: Emulator, firmware: Firmware, control: int, most: int) -> int:
-        """How many of the cycles to come are quiet, at most `most`."""
+        """How many of the cycles to come are quiet, at most `most`; the last may be one in which a timer runs out."""
         if (self._open is None or self._seen.came != self._roles or self._held or self.problem
                 or not self._embedded.is_idle or not emulator.is_quiet(self.k) or not firmware.is_quiet(control)):
             return 0
         due = min(self._master.find_due(), *(node.device.find_due() for node in (emulator, firmware)))
         busy = self._busy[np.searchsorted(self._busy, self.k):][:1]
-        return int(min(most, (due - self._t_ns) // self._period, *(busy - self.k).tolist()))
+        return int(min(most, max(due - self._t_ns, 0) // self._period + 1, *(busy - self.k).tolist()))
 
     def _bind(self, emulator: Emulator) -> Callable[[], object] | None:
         """The compiled code on the plant of the emulator, which is another one after each reset."""
@@ -109,24 +111,30 @@ class EmbeddedLoop(CycleLoop):
             "valve_response": fed, "execution": (sync - begun) * 1e-9}
         payloads = iter(b.payloads[:played].T.copy())
         command = next(payloads)
-        block = CycleBlock(
-            self._t_ns + self._period * np.arange(played),
-            [(self._frames[0].identifier, command), (self._sync_id, None),
-             *((frame.identifier, payload) for frame, payload in zip(self._frames[1:], payloads, strict=True))],
-            {name: np.broadcast_to(column, played) for name, column in columns.items()})
+        answers = ((frame.identifier, payload) for frame, payload in zip(self._frames[1:], payloads, strict=True))
+        block = CycleBlock(self._t_ns + self._period * np.arange(played),
+                           [(self._frames[0].identifier, command), (self._sync_id, None), *answers], columns)
         self._log.cycles(block)
         self.outputs.update({name: float(column[-1]) for name, column in values.items()})
-        self._step = CycleInput(phase, 0.0, 0.0, control)
+        self._step = CycleInput(phase, float(b.inputs[played - 1, 0]), float(b.inputs[played - 1, 1]), control)
         self._open = int(block.t_ns[-1]), *block.make_row(-1)
         self._sent[self._mine[0][0]] += played
         self._begun += played
         self._played += played
-        self.k += played
         for answer in self._answers.values():
             answer.last = self._begun - 1
         self._seen = Seen(set(self._roles))
-        self._t_ns += played * self._period
-        self._embedded.clock.sleep_until(self._t_ns - self._period)
+        self.k, self._t_ns = first + played - 1, int(block.t_ns[-1])
+
+    def _run_timers(self, emulator: Emulator, firmware: Firmware) -> None:
+        """End the cycle under way: its frames are there, and the timers of nodes and rig run."""
+        for node in (emulator, firmware):
+            node.device.sync.notice(self._t_ns)
+        self._embedded.wait_for_answers(self._t_ns, lambda: True)
+        self._master.tick()
+        self.k += 1
+        self._t_ns += self._period
+        self._embedded.deliver(self._t_ns)  # the heartbeat of the rig
 
 
 @cache

@@ -418,7 +418,10 @@ class History:
 
     def cycles(self, block: CycleBlock) -> None:
         """Append several cycles (called by a loop)."""
-        self._numbers.frombytes(np.column_stack([block.columns[name][:-1] for name in _FIELDS]).astype(float).tobytes())
+        table = np.empty((len(block.t_ns), len(_FIELDS)))
+        for i, name in enumerate(_FIELDS):
+            table[:, i] = block.columns[name]
+        self._numbers.frombytes(table[:-1].tobytes())
 
     def column(self, name: str, phase: int | None = None) -> Array:
         """All cycles, or those of one phase. Raises ValueError for a name that is no field."""

@@ -285,7 +285,9 @@ class Session:
         loads, known = np.zeros(len(demands)), self._loads[k:k + len(demands)]
         if phase == MAIN:
             loads[:len(known)] = known
-        return self.stage.playing.play_many(phase, demands, loads, control)
+        played = self.stage.playing.play_many(phase, demands, loads, control)
+        self._injected += max(played - 1, 0)  # in these cycles no frames of other nodes were due
+        return played
 
     def _must_end(self) -> bool:
         """Before each cycle of set-up and main: whether something ends main."""

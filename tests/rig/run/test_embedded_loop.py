@@ -9,6 +9,7 @@ import pytest
 from short_sequences import SHORT, job, play
 
 from fdi.trace.mcap_log import open_log
+from fdi.trace.trace import Trace
 from plant.run import NoiseStream
 from plant.segments import Array
 from rig.run import loops
@@ -81,7 +82,7 @@ def test_the_log_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pl
 
 
 def test_a_plant_that_diverges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, played: list[int]) -> None:
-    """No number is made up: the cycle in which it has diverged is played by the nodes."""
+    """No exception and no number that is made up, in either loop: EMCY, and clean-up without current."""
     original = NoiseStream.__init__
 
     def begin(self: NoiseStream, seed: int) -> None:
@@ -91,7 +92,10 @@ def test_a_plant_that_diverges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
 
     monkeypatch.setattr(NoiseStream, "__init__", begin)
     outcome = play_both(monkeypatch, tmp_path)
-    assert outcome.safe and sum(played) > 150
+    assert (outcome.verdict, outcome.safe) == ("ABORTED", True) and "node 3 plant 0x6000" in outcome.aborted
+    trace = Trace.read(tmp_path / "alone", all=True)
+    assert np.isnan(trace.xj[200:]).all() and not np.nan_to_num(trace.cor[-50:]).any()
+    assert sum(played) > 150
 
 
 def test_python_plays_the_cycles_in_which_a_fault_begins_acts_or_ends() -> None:
