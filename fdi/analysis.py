@@ -241,7 +241,7 @@ def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
         trace: the measured run, or its file.
         model: a `Model`, a model file, or the name of a nominal plant.
         repeats: runs of the same command; they measure the noise floor.
-        signals: some of "xj", "p12", "xs"; default: all that the trace has.
+        signals: names of outputs of the plant; default: all that the trace has.
         trust: whether effect files that a model file names may run; each is listed first, with its SHA-256.
 
     Raises:
@@ -266,7 +266,7 @@ def explain(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
         model: a `Model`, a model file, or the name of a nominal plant.
         repeats: runs of the same command; they discriminate noise from physics.
         holdout: a run of another command that no fit sees; it reveals overfitting.
-        signals: some of "xj", "p12", "xs"; default: all that the trace has.
+        signals: names of outputs of the plant; default: all that the trace has.
         seed: of the simulated runs behind the p-values.
         effect_file: where to write the shape of the residual as an effect to edit.
         trust: whether effect files that a model file names may run; each is listed first, with its SHA-256.
@@ -296,7 +296,7 @@ def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPa
         model: a `Model`, a model file, or the name of a nominal plant.
         repeats: runs of the same command, which are fitted as well.
         holdout: a run of another command that no fit sees.
-        signals: some of "xj", "p12", "xs"; default: all that the trace has.
+        signals: names of outputs of the plant; default: all that the trace has.
         trust: whether effect files that a model file names may run; each is listed first, with its SHA-256.
 
     Raises:
@@ -323,7 +323,7 @@ def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eh
         runs: measured runs of any commands, or their files.
         model: with the values of the data sheet: a `Model`, a model file, or the name of a nominal plant.
         holdouts: runs that no fit sees.
-        signals: some of "xj", "p12", "xs"; default: all that every run has.
+        signals: names of outputs of the plant; default: all that every run has.
         free: what is free, as the table [identify] of a model file: {"jack": {"area": 4.0}}; default: what the model
             file, or that of the nominal model, says.
         seed: of the scattered starts.

@@ -292,7 +292,10 @@ RESIDUAL_WORST = 5.0
 # RMS residual over noise above which a fit does not start again elsewhere: something other than the faults is off.
 #
 # Of 80 units with Kintas 0.3 and more, five were judged only because such a fit starts again.
-RESIDUAL_HOPELESS = {"xj": 7.0, "p12": 7.0, "xs": 2.0}
+RESIDUAL_HOPELESS = 7.0
+
+# The same of the position of a valve, which follows the drive without a load.
+RESIDUAL_HOPELESS_VALVE = 2.0
 
 # RMS residual over noise above which a fit says nothing of any size: neither a level nor a suspect is reported.
 RESIDUAL_JUDGES_NOTHING = 1.5

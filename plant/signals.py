@@ -24,6 +24,7 @@ class Signal(NamedTuple):
     slight: float = 0.0  # change, SI, that a friction level off by a thousandth makes without any change of a stop
     faint: float = 0.0  # range, SI; a signal that moves by less is in another unit
     shown: str = ""  # unit of its axes; default: its own
+    alias: str = ""  # its word in bench files and sequences, beside its name
     noun: str = ""  # what people call that of which it is: ram, spool, current; default: its symbol
 
     @property
@@ -122,14 +123,16 @@ class Signals(tuple[Signal, ...]):
 
 EHA = Signals(
     Signal("com", "Com", "m", "position demand", "command", largest=1.0, limit="jack.travel",
-           shown="mm"),
+           shown="mm", alias="position_demand"),
     Signal("xj", "XJ", "m", "sensed ram position", noise="sensors.position_noise", limit="jack.travel", finest=5e-8,
-           slight=1e-6, shown="mm", noun="ram"),
+           slight=1e-6, shown="mm", alias="ram_position", noun="ram"),
     Signal("cor", "Cor", "A", "current command of the servovalve", "drive", limit="controller.current_limit",
-           shown="mA", noun="current"),
+           shown="mA", alias="current", noun="current"),
     Signal("p12", "P12", "Pa", "pressure difference across the jack", noise="sensors.pressure_noise",
-           limit="supply.pressure", finest=2e3, slight=5e3, faint=1e3, shown="bar", noun="pressure"),
+           limit="supply.pressure", finest=2e3, slight=5e3, faint=1e3, shown="bar", alias="load_pressure",
+           noun="pressure"),
     Signal("xs", "XS", "m", "spool position", noise="sensors.spool_noise", limit="spool.travel", finest=5e-8,
-           slight=5e-7, faint=1e-9, shown="um", noun="spool"),
-    Signal("load", "load", "N", "external force on the ram", "load", largest=1e6, shown="kN", noun="load"),
+           slight=5e-7, faint=1e-9, shown="um", alias="spool_position", noun="spool"),
+    Signal("load", "load", "N", "external force on the ram", "load", largest=1e6, shown="kN", alias="load_force",
+           noun="load"),
 )

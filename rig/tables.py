@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import MISSING, dataclass, field, fields
 from difflib import get_close_matches
@@ -49,6 +49,23 @@ class Range(NamedTuple):
                 if isfinite(bound)]
         text = " and ".join(said).replace(" and at most", " to") if "from" in said[0] else " and ".join(said)
         return text if self.unit == "1" else f"{text} {self.unit}"
+
+
+class Choice(NamedTuple):
+    """Names that a text of a file may have, asked when it is read; `aliases` are other words for some of them."""
+
+    list_names: Callable[[], tuple[str, ...]]
+    list_aliases: Callable[[], Mapping[str, str]] = dict
+
+    @property
+    def expected(self) -> str:
+        """The names in words."""
+        return list_choices(None, self.list_names())
+
+    def convert(self, value: object) -> str | None:
+        """The name that a value stands for; None if it stands for none."""
+        name = self.list_aliases().get(value, value) if isinstance(value, str) else value
+        return name if isinstance(name, str) and name in self.list_names() else None
 
 
 @dataclass(frozen=True)
@@ -157,6 +174,10 @@ def _convert(value: Any, hint: Any, place: Place, kinds: Kinds) -> Any:
     """`value` as the annotated type, or InputError at `place`."""
     bare, *notes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     origin, args = get_origin(bare), get_args(bare)
+    for choice in (note for note in notes if isinstance(note, Choice)):
+        if (name := choice.convert(value)) is None:
+            raise place.refuse(list_choices(value, choice.list_names()))
+        return name
     if bare in _SCALARS:
         if _is_scalar(value, bare) and not any(isinstance(note, Range) and note.refuses(value) for note in notes):
             return bare(value)
@@ -210,6 +231,8 @@ def describe_annotation(hint: Any) -> str:
     if origin is Annotated:
         words = describe_annotation(args[0])
         note = args[1]
+        if isinstance(note, Choice):
+            return note.expected
         return f"{words} {note.expected}" if isinstance(note, Range) else f"{words} in {note}"
     if origin is Literal:
         return list_choices(None, args)

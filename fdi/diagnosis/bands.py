@@ -321,7 +321,8 @@ def judge_trace(source: Trace, bands: Bands, where: object = "trace") -> BandVer
 
 def read_columns(source: Trace) -> tuple[Floats, Floats, Floats, float, float]:
     """Command without holes, position with NaN where it cannot be used, load, period and first time of a trace."""
-    return hold_last(source.com), source.mask_unusable("xj"), source.load, source.period, float(source.t[0])
+    position = source.mask_unusable(source.declared.controlled.name)
+    return hold_last(source.command), position, source.load, source.period, float(source.t[0])
 
 
 def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: Floats | None = None, t0: float = 0.0,

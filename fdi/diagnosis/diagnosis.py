@@ -46,7 +46,6 @@ from fdi.thresholds import (
     SUSPECT_SMALLEST,
     UNIT_TOLERANCE,
 )
-from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
@@ -104,7 +103,8 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     progress("reading", 0.0)
     trace = prepare_trace(trace, model, None, source)
     model = match_period(model, trace, SAME_PERIOD)
-    if float(np.ptp(trace.com)) < MOVING_RAM and float(np.nanmax(trace.xj) - np.nanmin(trace.xj)) < MOVING_RAM:
+    way = float(np.nanmax(trace.controlled) - np.nanmin(trace.controlled))
+    if max(way, float(np.ptp(trace.command))) < MOVING_RAM:
         raise InputError(source, "com",
                          f"a ram that moves {1e3 * MOVING_RAM:g} mm or more: at rest it shows no fault")
     notes = list(trace.notes)
@@ -176,7 +176,7 @@ def _find_own_bands(trace: Trace, model: Model, notes: list[str]) -> Bands | Non
     for fits, reason in (
             (is_nominal_plant(model), "the software's own are of the nominal unit; rig fdi --learn-bands makes others"),
             (not is_loaded(trace.load), "the ram is loaded, and the software's own are of a free one"),
-            (matches_command(own, trace.com, trace.period),
+            (matches_command(own, trace.command, trace.period),
              "the software's own are of the preflight command, this is another")):
         if not fits:
             notes.append(f"no bands: {reason}")
@@ -185,7 +185,7 @@ def _find_own_bands(trace: Trace, model: Model, notes: list[str]) -> Bands | Non
 
 
 def _search_grid(trace: Trace, model: Model, notes: list[str]) -> Grid | None:
-    kinds = {s.kind for s in find_sections(trace.com, trace.period)}
+    kinds = {s.kind for s in trace.sections()}
     if not kinds & {"step", "ramp"}:
         notes.append("no RMS grid: the command has neither steps nor ramps")
         return None

@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fdi.comparison.jack import P12
 from fdi.diagnosis.faults import FAULTS, Estimate, Fault, Level, compute_severity, judge_size
 from fdi.discovery.explain import find_marks
 from fdi.discovery.explain_runs import list_fitted_parameters
@@ -70,6 +71,7 @@ from fdi.thresholds import (
     PRIORS_KNOW_MORE_MISFIT,
     RESIDUAL_HELD_OUT,
     RESIDUAL_HOPELESS,
+    RESIDUAL_HOPELESS_VALVE,
     RESIDUAL_IS_NOISE,
     RESIDUAL_WORST,
     UNIT_TOLERANCE,
@@ -379,7 +381,7 @@ def _fit_finely(problem: CountedProblem, first: Fit) -> Fit:
     signals = problem.trace.outputs
     for parts in ((1.0, 0.5), (0.75, -0.25), (0.25, 1.25)):
         ratios = dict(zip(signals, measure_ratios(problem, last), strict=True))
-        if is_noise_left(problem, last) or any(x > RESIDUAL_HOPELESS[s] for s, x in ratios.items()):
+        if is_noise_left(problem, last) or any(x > find_hopeless_ratio(problem.trace, s) for s, x in ratios.items()):
             break
         last = _restart_fit(problem, last, parts)
     return last
@@ -501,16 +503,22 @@ def estimate_offsets(problem: Problem) -> dict[str, float]:
     trace, p = problem.trace, problem.model.values
     way = 0.0
     for part in trace.parts or (span_all_rows(trace),):
-        x = trace.xj[part.first:part.stop]
+        x = trace.controlled[part.first:part.stop]
         x = x[~np.isnan(x)]
         way += float(x[-1] - x[0])
     speed = way / (len(trace) * p["controller.period"])
     per_speed = p["jack.area"] / p["valve.flow_gain"] * p["feedback_spring.stiffness"] / p["torque_motor.gain"]
-    found = {"null_bias.current": per_speed * speed - float(trace.cor.mean())}
-    if "p12" in trace.outputs:
-        pressure = trace.mask_unusable("p12")
+    found = {"null_bias.current": per_speed * speed - float(trace.drive.mean())}
+    if P12 in trace.outputs:
+        pressure = trace.mask_unusable(P12)
         found["constant_load.force"] = p["jack.area"] * float(np.nanmean(pressure)) - float(trace.load.mean())
     return found
+
+
+def find_hopeless_ratio(trace: Trace, name: str) -> float:
+    """RMS residual over noise above which a fit does not start again elsewhere; of the way of a valve it is less."""
+    signal, controlled = trace.declared.find(name), trace.declared.controlled
+    return RESIDUAL_HOPELESS_VALVE if signal.unit == controlled.unit and signal != controlled else RESIDUAL_HOPELESS
 
 
 def learn_left_noise(problem: CountedProblem, found: Fit) -> CountedProblem:
@@ -592,7 +600,9 @@ def _read_marks(model: Model, trace: Trace, floor: Mapping[str, float]
     """Effects that are read off without noise, and the floors with the rounding of the position among them."""
     marks, floor = find_marks(model, [trace]), dict(floor)
     if marks.step and "quantisation" not in model.effects:
-        floor["xj"] = max(floor["xj"], float(np.hypot(model["sensors.position_noise"], marks.rounding)))
+        controlled = trace.declared.controlled
+        rounded = float(np.hypot(model.values.get(controlled.noise, 0.0), marks.rounding))
+        floor[controlled.name] = max(floor[controlled.name], rounded)
     return {p.effect: {name: Estimate(*of) for name, of in p.parameters.items()} for p in marks.prints}, floor
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from fdi.diagnosis.faults import CLOGGING, FRICTION
 from fdi.estimation.replay import has_known_start, read_cycles
 from fdi.thresholds import ANCHOR_RATE
-from fdi.trace.sections import find_sections
 from fdi.trace.trace import Flags, Floats, Trace
 from plant.errors import InputError
 from plant.model import Model
@@ -90,9 +89,9 @@ def search_grid(trace: Trace, model: Model | None = None, kintas: Floats = KINTA
         trace = read_cycles(trace, model)[0]
     if drive not in DRIVES:
         raise InputError("grid", "drive", f"one of {', '.join(DRIVES)}")
-    parts = find_sections(trace.com, trace.period)
+    parts = trace.sections()
     kinds = np.repeat([s.kind for s in parts], [s.stop - s.start for s in parts])
-    measured = ~np.isnan(trace.mask_unusable("xj"))
+    measured = ~np.isnan(trace.mask_unusable(trace.declared.controlled.name))
     rows = {kind: chosen for kind in ("step", "ramp") if (chosen := (kinds == kind) & measured).any()}
     if not rows:
         raise InputError("trace", "com", "steps or ramps, for the RMS grid")
@@ -128,18 +127,18 @@ def _compute_maps(trace: Trace, model: Model, values: Floats, drive: str, slidin
     def reduce_runs(runs: Floats) -> Floats:
         found = []
         for chosen in rows.values():
-            left = runs[:, 0].T[chosen] - trace.xj[chosen, None]
+            left = runs[:, 0].T[chosen] - trace.controlled[chosen, None]
             left -= left.mean(axis=0)  # a load or a null bias is but an offset, as the ram is pulled
             found.append(np.sqrt(np.einsum("ij,ij->j", left, left) / len(left)))
         return np.stack(found, -1)
 
     monitor = Monitor(model, sliding=sliding)
     if drive == "command":
-        start = float(trace.xj[0]) if has_known_start(trace) else 0.0
-        out = monitor.closed_loop(values, trace.com, start, reduced=reduce_runs)
+        start = float(trace.controlled[0]) if has_known_start(trace) else 0.0
+        out = monitor.closed_loop(values, trace.command, start, reduced=reduce_runs)
     else:
-        position = trace.xj if has_known_start(trace) else None
-        out = monitor.replay(values, trace.cor, position, ANCHOR_RATE, reduced=reduce_runs)
+        position = trace.controlled if has_known_start(trace) else None
+        out = monitor.replay(values, trace.drive, position, ANCHOR_RATE, reduced=reduce_runs)
     return dict(zip(rows, out.T, strict=True))
 
 

@@ -225,8 +225,8 @@ class Report:
 def to_json(data: Mapping[str, Any]) -> str:
     """The JSON text of an answer, in one line.
 
-    >>> to_json({"error": np.float64(1.5), "ratio": float("nan"), "signals": ("xj", "p12")})
-    '{"error": 1.5, "ratio": null, "signals": ["xj", "p12"]}'
+    >>> to_json({"error": np.float64(1.5), "ratio": float("nan"), "names": ("a", "b")})
+    '{"error": 1.5, "ratio": null, "names": ["a", "b"]}'
     """
     return json.dumps(to_plain(data), allow_nan=False)
 

@@ -27,6 +27,7 @@ from plant import Actuator, simulate
 from plant.lanes import Lanes
 from plant.model import Model, build_kernel
 from plant.run import sample_noise
+from plant.signals import EHA
 from plant.solve import run_closed_loop
 from rig.bench.realtime import (
     FLAGS,
@@ -278,10 +279,10 @@ def record_unit(com: Floats, seed: int) -> Trace:
     noise = [x * model[f"sensors.{name}_noise"] / model["sensors.position_noise"]
              for x, name in zip(noise, ("position", "pressure", "spool"), strict=True)]
     run = Lanes(model, list(sizes), 100).closed_loop(values, com - noise[0], np.zeros(len(com)))[0].T
-    columns = {"com": com, "xj": run[0] + noise[0], "cor": run[1], "p12": run[2] + noise[1], "xs": run[3] + noise[2],
-               "load": np.zeros(len(com))}
-    digits = {"xj": 7, "cor": 8, "p12": 0, "xs": 8}
-    return Trace.from_columns(columns | {name: np.round(columns[name], n) for name, n in digits.items()}, 1e-3, {})
+    columns = {EHA.command.name: com, "load": np.zeros(len(com))}
+    for name, x, shown, digits in zip(EHA.loop, run, (noise[0], 0.0, *noise[1:]), (7, 8, 0, 8), strict=True):
+        columns[name] = np.round(x + shown, digits)
+    return Trace.from_columns(columns, 1e-3, {})
 
 
 def _measure_cost(command: str, length: float, file: Path, is_interrupted: bool) -> dict[str, Any]:

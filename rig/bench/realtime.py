@@ -501,7 +501,7 @@ setup = [{{ kind = "hold", time = 0.3 }}]
 main = [{{ name = "sine", kind = "sine", amplitude = 3e-3, frequency = 1.0, time = {seconds:g} }}]
 checks = [
   {{ name = "tracking", kind = "rms_error", high = 1, unit = "mm" }},
-  {{ name = "position", kind = "never_exceeds", signal = "xj", high = 6, unit = "mm" }},
+  {{ name = "position", kind = "never_exceeds", signal = "ram_position", high = 6, unit = "mm" }},
 ]
 """
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
+from plant.signals import EHA
 from plant.units import find_unit
 from rig.benches.bench import INPUTS, OUTPUTS
 from rig.benches.can_map import read_database
@@ -26,13 +27,17 @@ UNSURE = "# unsure: "
 _WORDS: dict[str, tuple[set[str], set[str]]] = {
     "position_demand": ({"position", "pos", "target", "stroke"},
                         {"demand", "target", "command", "cmd", "setpoint", "set", "reference", "ref", "desired"}),
-    "ram_position": ({"position", "pos", "ram", "xj", "stroke"},
-                     {"actual", "act", "feedback", "fb", "measured", "sensor", "ram", "xj"}),
-    "load_pressure": ({"pressure", "p12", "press"}, {"load", "differential", "diff", "delta", "p12"}),
-    "spool_position": ({"spool", "xs"}, {"position", "pos", "xs"}),
+    "ram_position": ({"position", "pos", "ram", "stroke"},
+                     {"actual", "act", "feedback", "fb", "measured", "sensor", "ram"}),
+    "load_pressure": ({"pressure", "press"}, {"load", "differential", "diff", "delta"}),
+    "spool_position": ({"spool"}, {"position", "pos"}),
     "load_force": ({"force"}, {"load", "external", "cell", "measured"}),
-    "current": ({"current", "cor", "coil"}, {"demand", "actual", "coil", "motor", "cor", "drive", "output"}),
+    "current": ({"current", "coil"}, {"demand", "actual", "coil", "motor", "drive", "output"}),
 }
+for _signal in EHA[1:]:  # its name in a recording says both
+    if _signal.role in ("output", "drive"):
+        for _words in _WORDS[_signal.alias]:
+            _words.add(_signal.name)
 _WORDS_OF_PROFILES = ("control_word", "status_word", "mode", "mode_display")
 _NEEDED = ("position_demand", "ram_position", "current")
 _USUAL = {"m": "1 um", "Pa": "1 kPa", "N": "1 N", "A": "1 uA"}  # counts, where the file says nothing

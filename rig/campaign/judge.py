@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -34,16 +34,21 @@ from plant.model import Model, find_effect, find_quantity, parse_model
 from plant.parameters import load_nominal_values, parse_toml, parse_value, read_toml
 from plant.quantity import Quantity
 from plant.segments import RATE
+from plant.signals import EHA
 from plant.solve import NOISES
 from plant.threads import count_threads
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, import_extra, read_rows, run_batch
 from rig.network.clock import WallClock
 from rig.sequences import load_sequence
-from rig.tables import Place, Range, build_dataclass
+from rig.tables import Choice, Place, Range, build_dataclass
 
 OWN_SIMULATOR = "plant"
 HEALTHY = "healthy"
 Tolerance = Annotated[float, Range("1", low=0.0, high=0.2)]
+
+
+MEASURED = tuple(",".join(s.name for s in EHA.outputs[:count]) for count in range(len(EHA.outputs), 0, -1))
+"""Signals that may be measured in a campaign."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +61,7 @@ class Settings:
     simulator: str = OWN_SIMULATOR  # plant.simulate in 10 us steps, or "module:function"
     colour: Annotated[float, Range("1", low=0.0, high=0.99)] = 0.8  # correlation of xj's noise between cycles
     hum: Annotated[float, Range("m", low=0.0, high=1e-3)] = 0.7e-6  # of the mains on the position sensor
-    signals: Literal["xj,p12,xs", "xj,p12", "xj"] = "xj,p12,xs"  # measured
+    signals: Annotated[str, Choice(lambda: MEASURED)] = MEASURED[0]  # measured
 
     def __post_init__(self) -> None:
         if self.tolerance == ():
@@ -231,7 +236,7 @@ def parse_faults(words: Sequence[str]) -> list[dict[str, Any]]:
     return blocks
 
 
-FLOORS = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
+FLOORS = {s.name: load_nominal_values()[s.noise] for s in EHA.outputs}
 """RMS noise of the sensors: m, Pa, m."""
 SCATTERED_PARAMETERS = (
     "torque_motor.gain", "flapper.inertia", "flapper.damping", "flapper.stiffness", "feedback_spring.stiffness",
@@ -265,7 +270,7 @@ def simulate_case(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
     scatter, noise = sample_random_parts(case, len(command), spec["colour"], spec["hum"])
     columns = load_simulator(spec["simulator"])(
         Unit(model, scatter, case.sizes, command, noise, restore_faults(spec)))
-    measured = {"com", "cor", "load", *spec["signals"].split(",")}
+    measured = {EHA.command.name, EHA.drive.name, "load", *spec["signals"].split(",")}
     return Trace.from_columns({name: columns[name] for name in columns if name in measured}, model["controller.period"],
                               {"source": case.label, "seed": str(case.seed)})
 
@@ -295,7 +300,7 @@ def sample_random_parts(case: Case, cycles: int, colour: float, hum: float) -> t
     nominal = load_nominal_values()
     scatter = {name: value / nominal[name] for name, value in sample_healthy_plant(case.tolerance, rng).items()}
     position = sample_position_noise(cycles, colour, hum, rng)
-    return scatter, np.column_stack([position / FLOORS["xj"], rng.standard_normal((cycles, NOISES - 1))])
+    return scatter, np.column_stack([position / FLOORS[EHA.controlled.name], rng.standard_normal((cycles, NOISES - 1))])
 
 
 def sample_healthy_plant(spread: float, rng: np.random.Generator) -> dict[str, float]:
@@ -313,7 +318,7 @@ def sample_position_noise(n: int, colour: float, hum: float, rng: np.random.Gene
         hum: amplitude of the mains hum, m.
         rng: source of the random numbers.
     """
-    white = FLOORS["xj"] * rng.standard_normal(n)
+    white = FLOORS[EHA.controlled.name] * rng.standard_normal(n)
     noise, last = np.empty(n), float(white[0])
     noise[0] = last
     for k, innovation in enumerate((np.sqrt(1 - colour**2) * white).tolist()[1:], start=1):

@@ -22,6 +22,7 @@ from plant.compile import ForeignCall, keep_apart
 from plant.flat import list_state_values
 from plant.machine_code import ADVANCE_CALL, READ_CALL
 from plant.run import PRESSURE, SENSED, SPOOL
+from plant.signals import EHA
 from plant.solve import NOISES
 from rig.benches.bench import Flags
 from rig.benches.frame_map import FrameSpec, Role
@@ -94,7 +95,7 @@ COMMANDED = 256  # + the NMT command
 # states last, because in lockstep they end the rig's wait. Bus-off is on the whole node.
 _DRIVE, FEEDBACK_FRAME, _VALVE, _SYNC, _BUS_OFF = range(5)
 _FRAMES = ("drive", "feedback", "valve_state", "sync")
-_SIGNALS = ("xj", "p12", "xs")
+_SIGNALS = tuple(s.name for s in EHA.outputs)
 # Values of the frames
 CHANNELS = ("ram_position", "load_pressure", "spool_position", "flags", "current", "status_word")
 _FLAGS, _CURRENT = CHANNELS.index("flags"), CHANNELS.index("current")

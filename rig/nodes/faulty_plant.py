@@ -4,11 +4,12 @@ from __future__ import annotations
 from math import isfinite
 
 from plant import Actuator
+from plant.signals import EHA
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import Schedule
 
 DIVERGED = "the plant has diverged: a signal is not a finite number"
-_SIGNALS = ("xj", "p12", "xs")
+_SIGNALS = tuple(s.name for s in EHA.outputs)
 
 
 class FaultyPlant:

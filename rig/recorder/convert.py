@@ -154,8 +154,7 @@ def import_frames(source: Path, out: Path, bench: Bench, dbc: Path | None = None
     return len(starts)
 
 
-_COLUMNS = {"position_demand": "com", "ram_position": "xj", "load_pressure": "p12", "spool_position": "xs",
-            "load_force": "load", "current": "cor", "control_word": "control", "status_word": "status",
+_COLUMNS = {**{s.alias: s.name for s in plant_signals.EHA[1:]}, "control_word": "control", "status_word": "status",
             "flags": "flags"}
 _WORDS = ("control", "status", "flags")
 _LASTING = ("position_demand", "control_word")  # in force until the next one comes

@@ -20,6 +20,7 @@ from plant.controller import Loop, compute_current
 from plant.machine_code import ADVANCE_CALL, StoredCode
 from plant.model import Model
 from plant.run import PRESSURE, SENSED, SPOOL, Actuator, LentPlant, sample_noise
+from plant.signals import EHA
 from plant.solve import NOISES
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
@@ -38,7 +39,7 @@ COMMAND, FEEDBACK, VALVE, DRIVE = range(4)  # frames, columns of the payloads
 # Reals: the controller's loop and gains, period, the limits of the guards, their signals, scratch
 LOOP, GAINS, PERIOD, LOW, HIGH, _GUARDED, _SCRATCH = 0, 3, 8, 9, 16, 23, 30
 _REALS = 32
-GUARDED = ("xj", "p12", "xs", "com", "cor", "load", "error")
+GUARDED = (*(s.name for s in EHA.outputs), EHA.command.name, EHA.drive.name, "load", "error")
 SYNC_AT, PLANT_AT, DRIVE_AT, END_AT, BEGUN_AT = range(5)  # columns of the times
 
 _KNOWN = {"position_demand", "control_word", "cycle", "ram_position", "load_pressure", "spool_position", "flags",

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from plant.controller import Loop
 from plant.segments import Array
+from plant.signals import EHA
 from rig.benches.bench import Bench
 from rig.network.link import EmbeddedWire
 from rig.network.master import Master
@@ -103,9 +104,9 @@ class EmbeddedLoop(CycleLoop):
         values = dict(zip(names, b.values[:played].T.copy(), strict=True))
         fed, answered = (plant - sync) * 1e-9, (drive - sync) * 1e-9
         columns = {
-            "cycle": first + np.arange(played), "phase": phase, "com": values["position_demand"],
-            "xj": values["ram_position"], "cor": values["current"], "p12": values["load_pressure"],
-            "xs": values["spool_position"], "load": b.inputs[:played, 1].copy(), "control": control,
+            "cycle": first + np.arange(played), "phase": phase,
+            **{s.name: values[s.alias] for s in EHA[1:] if s.role != "load"},
+            "load": b.inputs[:played, 1].copy(), "control": control,
             "status": values["status_word"].astype(np.int64), "flags": values["flags"].astype(np.int64),
             "overrun": False, "lateness": 0.0, "response": answered, "work": answered, "feedback_response": fed,
             "valve_response": fed, "execution": (sync - begun) * 1e-9}

@@ -19,6 +19,7 @@ from typing import Protocol
 import numpy as np
 
 from plant.segments import Array
+from plant.signals import EHA
 from rig.benches.bench import Bench, Flags
 from rig.benches.frame_map import FrameSpec, Role, check_guards, make_reader, make_writer
 from rig.network.clock import WallClock
@@ -397,8 +398,8 @@ class CycleLoop(Loop):
         self._log.cycle(t_ns, row, timing)
 
 
-_FIELDS = ("phase", "com", "xj", "cor", "p12", "xs", "load", "flags", "lateness", "response",
-           "feedback_response", "valve_response", "execution", "control", "status")
+_FIELDS = ("phase", *EHA.names, "flags", "lateness", "response", "feedback_response", "valve_response", "execution",
+           "control", "status")
 
 
 class History:

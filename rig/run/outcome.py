@@ -20,6 +20,7 @@ from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
 from plant.segments import Array
+from plant.signals import Signals
 from rig.benches.frame_map import Role
 from rig.network.node_objects import NAMES, PLANT, Identity
 from rig.run.attribution import Attribution, Cause, Trouble, count_most_in_a_row
@@ -275,10 +276,12 @@ class LimitReached(NamedTuple):
     t: float  # s of main, when it was reached first
     seconds: float  # how long the signal was there, in all
 
-    def describe(self) -> str:
+    def describe(self, signals: Signals) -> str:
         """The limit in words, such as "ram at its stop (40 mm) for 120 ms, first at t = 1.250 s"."""
-        words = {"xj": "ram at its stop", "xs": "spool at its stop", "cor": "current at its limit"}[self.signal]
-        return (f"{words} ({1e3 * self.limit:.3g} {'mA' if self.signal == 'cor' else 'mm'}) for "
+        signal = signals.find(self.signal)
+        words = f"{signal.called} at its {'limit' if signal.role == 'drive' else 'stop'}"
+        shown = signals.controlled if signal.unit == signals.controlled.unit else signal
+        return (f"{words} ({shown.shown_scale * self.limit:.3g} {shown.shown_unit}) for "
                 f"{1e3 * self.seconds:.0f} ms, first at t = {self.t:.3f} s")
 
 
@@ -290,19 +293,20 @@ def find_limits(column: Callable[[str], NDArray[np.float64]], model: Model, zero
         model: its travels, current limit, cycle and sensor noise.
         zero: the cycle in which main starts.
     """
-    margins = {
-        "xj": ("jack.travel", NEAR_A_STOP * model["sensors.position_noise"]),
-        "xs": ("spool.travel", NEAR_A_STOP * model["sensors.spool_noise"]),
-        "cor": ("controller.current_limit", 2e-8),  # A: two counts of the drive frame
-    }
+    signals = model.kind.signals
+    ways = [s for s in signals.outputs if s.unit == signals.controlled.unit]
     period, found = model["controller.period"], []
-    for signal, (parameter, margin) in margins.items():
-        limit = model.values.get(parameter)
-        if limit is None:  # another plant
+    for signal in (*ways, signals.drive):
+        limit = model.values.get(signal.limit)
+        if limit is None:  # the plant declares none
             continue
-        rows = np.flatnonzero(np.abs(column(signal)) >= limit - margin)
+        margin = NEAR_A_STOP * model.values.get(signal.noise, 0.0)
+        if signal.role == "drive":
+            margin = 2.5e-6 * limit  # two counts of the drive frame
+        rows = np.flatnonzero(np.abs(column(signal.name)) >= limit - margin)
         if len(rows):
-            found.append(LimitReached(parameter, signal, limit, (int(rows[0]) - zero) * period, len(rows) * period))
+            found.append(LimitReached(signal.limit, signal.name, limit, (int(rows[0]) - zero) * period,
+                                      len(rows) * period))
     return tuple(found)
 
 

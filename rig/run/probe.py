@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from plant.signals import EHA
 from rig.benches.bench import Bench
 from rig.benches.profiles import PROFILES, State
 from rig.run.cyclic_values import AFTER, BEFORE, BEFORE_MAIN, CycleInput
@@ -90,7 +91,7 @@ def list_inputs(step: Step, demand: float = 0.0) -> list[CycleInput]:
 
 def has_no_answers(probe: History) -> bool:
     """Whether the last cycles were all without a drive frame."""
-    last = probe.column("cor")[-_MISSED_LIMIT:]
+    last = probe.column(EHA.drive.name)[-_MISSED_LIMIT:]
     return len(last) == _MISSED_LIMIT and bool(np.isnan(last).all())
 
 
@@ -99,8 +100,8 @@ def find_gap(probe: History, on_time: Mask, cycles: int) -> str:
 
     An answer that is missing where the bench was not `on_time`, (n,), is the bench's gap.
     """
-    missing = np.isnan(probe.column("cor")[-cycles:])
-    if np.isnan(probe.column("xj")[-cycles:]).any() or (missing & ~on_time[-cycles:]).any():
+    missing = np.isnan(probe.column(EHA.drive.name)[-cycles:])
+    if np.isnan(probe.column(EHA.controlled.name)[-cycles:]).any() or (missing & ~on_time[-cycles:]).any():
         return "bench"
     return "controller" if missing.any() else ""
 
@@ -113,7 +114,7 @@ def read_rows(history: History, on_time: Mask) -> Rows:
 def find_on_time(history: History, faults: Schedule | None, realtime: bool, period: float, reach: int = 1) -> Mask:
     """Cycles that the bench delivered: neither this SYNC nor the next was late, feedback came within half a cycle, and
     no injected fault touched a frame of this cycle or of the `reach` before it."""
-    on_time: Mask = ~np.isnan(history.column("xj"))
+    on_time: Mask = ~np.isnan(history.column(EHA.controlled.name))
     if realtime:
         on_time &= history.column("feedback_response") <= 0.5 * period
         late = history.column("lateness") > 0.1 * period

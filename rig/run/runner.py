@@ -14,6 +14,7 @@ from fdi.progress import Progress
 from fdi.trace.trace import Trace
 from plant import Actuator, Columns, InputError
 from plant.segments import Array
+from plant.signals import EHA
 from rig.benches.bench import Flags
 from rig.network.clock import WallClock
 from rig.network.node_objects import CycleRecord
@@ -130,7 +131,9 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
         recorder.metadata("not_applicable", {check.name: check.reason for check in skipped})
     recorder.metadata("differences", {"text": find_differences(job).describe()})
     if outcome.limits:
-        recorder.metadata("limits", {f"{number:02d}": limit.describe() for number, limit in enumerate(outcome.limits)})
+        signals = job.model.kind.signals
+        recorder.metadata("limits", {f"{number:02d}": limit.describe(signals)
+                                     for number, limit in enumerate(outcome.limits)})
     if outcome.fdi:
         found = {key: str(outcome.fdi.get(key, "")) for key in ("verdict", "sentence")}
         recorder.metadata("fdi", {**found, "faults": describe_faults(outcome.fdi)})
@@ -159,7 +162,7 @@ def judge_run(job: Job, session: Session, judged: Mask) -> tuple[list[CheckResul
 
 def make_main_trace(job: Job, folder: Path, history: History) -> Trace:
     """The main phase of a run as `Trace.read` gives it from the log."""
-    columns = {name: history.column(name, MAIN) for name in ("com", "xj", "cor", "p12", "xs", "load")}
+    columns = {name: history.column(name, MAIN) for name in job.model.kind.signals.names}
     settings = {name: str(value) for name, value in job.list_settings().items()}
     return Trace.from_columns(columns, job.period_ns * 1e-9, {"source": str(folder), **settings})
 
@@ -228,8 +231,8 @@ def open_recorder(job: Job, folder: Path, epoch_ns: int = 0, observer: Observer 
 def _count_lost_frames(history: History) -> dict[str, int]:
     """Count the cycles with missing answers: those the rig saw and those the plant flagged."""
     flags = history.column("flags").astype(int)
-    return {"no_feedback": int(np.isnan(history.column("xj")).sum()),
-            "no_drive": int(np.isnan(history.column("cor")).sum()),
+    return {"no_feedback": int(np.isnan(history.column(EHA.controlled.name)).sum()),
+            "no_drive": int(np.isnan(history.column(EHA.drive.name)).sum()),
             "plant_drive_missing": int((flags & Flags.DRIVE_MISSING != 0).sum()),
             "plant_drive_late": int((flags & Flags.DRIVE_LATE != 0).sum())}
 

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
+from operator import attrgetter
 
 import numpy as np
 
 from fdi.progress import Progress
 from plant.profile import Profile, build_profile
 from plant.segments import Array, Hold
+from plant.signals import EHA
 from rig.benches.frame_map import make_reader
 from rig.benches.profiles import PROFILES, State
 from rig.network.frame import Frame
@@ -52,6 +54,9 @@ SETUP, MAIN, CLEANUP = 0, 1, 2
 PHASES = ("setup", "main", "cleanup")
 _SETTLING = 20  # cycles of clean-up that nodes started again have to get rid of their errors
 _MOST_DRIVES = 2_000_000  # half an hour; a longer run is judged on what was kept
+
+
+_get_signals = attrgetter(*EHA.names)
 
 
 class CycleLog:
@@ -122,7 +127,7 @@ class CycleLog:
         """The first guard that one of the rows since the last call has passed."""
         rows, self._unjudged = self._unjudged, []
         for row in rows:
-            signals = {"com": row.com, "xj": row.xj, "cor": row.cor, "p12": row.p12, "xs": row.xs, "load": row.load}
+            signals = dict(zip(EHA.names, _get_signals(row), strict=True))
             if passed := self._guards.find_passed({**signals, "error": row.com - row.xj}):
                 return passed
         return None

@@ -11,23 +11,24 @@ from cmath import phase
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import degrees, inf, isfinite, nan
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from plant.errors import InputError
 from plant.run import Columns
 from plant.segments import LONGEST, RATE, Array
+from plant.signals import EHA, Signals
 from rig.benches.bench import Bench
 from rig.benches.profiles import CIA408, State, find_state
 from rig.sequences import measures
 from rig.sequences.faults import Time
-from rig.sequences.measures import MAIN, NO_DRIVES, UNIT_OF_SIGNAL, DriveFrames, NotMeasurable, RunData, find_scale
+from rig.sequences.measures import MAIN, NO_DRIVES, DriveFrames, NotMeasurable, RunData, find_scale
 from rig.sequences.python_parts import Argument, UserFunction, describe_value, require_function_name
+from rig.sequences.signals import Controlled, Guarded, Measured, find_controlled, find_tested, find_unit
 from rig.tables import Range
 
 LEFT_OPERATIONAL = "controller left OPERATIONAL:"  # words of the event
-Signal = Literal["com", "xj", "error", "speed", "cor", "p12", "xs", "load"]
 InSI = Annotated[float, "SI units"]
 InUnit = Annotated[float, "the check's unit"]
 
@@ -71,6 +72,7 @@ class Check:
     high: InUnit | None = None
     unit: str = ""
     requirement: str | tuple[str, ...] = ()  # id of the requirement that it verifies, or several
+    signals: Signals = field(default_factory=find_tested, metadata={"key": False}, repr=False)  # of the plant
 
     def __post_init__(self) -> None:
         require_check(self.low is not None or self.high is not None, "", "a low, a high, or both")
@@ -96,12 +98,19 @@ class Check:
     @property
     def shown_unit(self) -> str:
         """The unit of the limits; by default that of the kind, or of the signal."""
-        return self.unit or KINDS[self.kind].unit or UNIT_OF_SIGNAL[self.about]
+        return self.unit or self._si
 
     @property
     def scale(self) -> float:
         """How many SI units the unit of the limits is."""
-        return find_scale(self.shown_unit, KINDS[self.kind].unit or UNIT_OF_SIGNAL[self.about])
+        return find_scale(self.shown_unit, self._si)
+
+    @property
+    def _si(self) -> str:
+        """The SI unit of the number: that of the kind, where an error is one of the controlled signal, or the signal's.
+        """
+        unit = KINDS[self.kind].unit or find_unit(self.signals, self.about)
+        return self.signals.controlled.unit if unit == "m" and KINDS[self.kind].unit else unit
 
     def judge(self, run: RunData) -> CheckResult:
         """Measure the number and compare it with the limits."""
@@ -151,7 +160,7 @@ def require_check(holds: bool, key: str, expected: str) -> None:
 class OfPosition(Check):
     """A number of the position against the demand."""
 
-    signal: Literal["xj"] = "xj"
+    signal: Controlled = field(default_factory=find_controlled)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +181,7 @@ class AtFrequency(OfPosition):
 class OfSignal(Check):
     """A number of any signal."""
 
-    signal: Signal
+    signal: Measured
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +190,7 @@ class Response(Check):
 
     after: str | Time
     event: str = ""
-    signal: Signal | None = None
+    signal: Measured | None = None
     above: InSI | None = None
     below: InSI | None = None
 
@@ -307,8 +316,8 @@ def _measure_recovery(check: Check, run: RunData, span: slice) -> float:
 
 
 def _read_response(check: AtFrequency, run: RunData, span: slice) -> complex:
-    return measures.measure_response(run.read_signal("xj", span), run.read_signal("com", span), run.rate,
-                                     check.frequency)
+    position, demand = (run.read_signal(s.name, span) for s in (run.signals.controlled, run.signals.command))
+    return measures.measure_response(position, demand, run.rate, check.frequency)
 
 
 def _count_events(check: OfEvent, run: RunData, span: slice) -> float:
@@ -334,7 +343,7 @@ KINDS: dict[str, Kind] = {
     "steady_error": Kind("Size of the mean position error, m.", "m",
                          lambda check, run, span: abs(float(run.read_signal("error", span).mean()))),
     "ramp_error": Kind("Mean lag behind a ramp, m.", "m", lambda check, run, span: measures.measure_ramp_error(
-        run.read_signal("error", span), run.read_signal("com", span))),
+        run.read_signal("error", span), run.read_signal(run.signals.command.name, span))),
     "break_away": Kind("Position error before the spool lets go on a slow ramp, m.", "m",
                        lambda check, run, span: measures.measure_break_away(run.read_signal("error", span), run.rate)),
     "max_error": Kind("Largest position error in either direction, m.", "m", lambda check, run, span: float(
@@ -364,7 +373,7 @@ KEYS: dict[str, type[Check]] = {name: kind.keys for name, kind in KINDS.items()}
 
 def evaluate_checks(checks: Iterable[Check], trace: Columns, sections: Mapping[str, slice], events: Sequence[Any] = (),
                     starts: Mapping[str, float] | None = None, drives: DriveFrames = NO_DRIVES,
-                    rate: float = RATE) -> list[CheckResult]:
+                    rate: float = RATE, signals: Signals = EHA) -> list[CheckResult]:
     """Judge a run.
 
     Args:
@@ -375,8 +384,9 @@ def evaluate_checks(checks: Iterable[Check], trace: Columns, sections: Mapping[s
         starts: when each fault began, s of main, by its label.
         drives: all drive frames, for the checks of a reaction.
         rate: rows of the trace a second.
+        signals: of the plant.
     """
-    run = RunData(trace, sections, events, starts or {}, drives, rate)
+    run = RunData(trace, sections, events, starts or {}, drives, rate, signals)
     return [check.judge(run) for check in checks]
 
 
@@ -385,11 +395,12 @@ class Guard:
     """`signal` must not be outside low..high (in `unit`, default SI) for `cycles` cycles in a row."""
 
     name: str
-    signal: Literal["com", "xj", "error", "cor", "p12", "xs", "load"]
+    signal: Guarded
     low: float | None = None
     high: float | None = None
     unit: str = ""
     cycles: Annotated[int, Range("1", low=1)] = 3  # one noisy sample is no excursion
+    signals: Signals = field(default_factory=find_tested, metadata={"key": False}, repr=False)  # of the plant
 
     def __post_init__(self) -> None:
         low, high = self.compute_limits()
@@ -398,7 +409,7 @@ class Guard:
 
     def compute_limits(self) -> tuple[float, float]:
         """Low and high in SI; infinite where there is none."""
-        si = UNIT_OF_SIGNAL[self.signal]
+        si = find_unit(self.signals, self.signal)
         size = find_scale(self.unit or si, si)
         return (-inf if self.low is None else self.low * size), (inf if self.high is None else self.high * size)
 

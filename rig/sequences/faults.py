@@ -24,10 +24,10 @@ from plant.segments import RATE, Second
 from rig import tables
 from rig.benches.bench import Bench
 from rig.benches.frame_map import Role
+from rig.sequences.signals import Sensed
 from rig.tables import Range
 
 Table = NDArray[np.int64]
-Sensor = Literal["xj", "p12", "xs"]
 FrameName = Literal["feedback", "valve_state", "drive", "command", "sync"]
 PdoName = Literal["feedback", "valve_state", "drive", "command"]
 BenchNode = Literal["rig", "plant"]
@@ -97,7 +97,7 @@ class Offset(_Ramped):
     """A sensor reads too high by `value`."""
 
     kind = "offset"
-    signal: Sensor
+    signal: Sensed
     value: Size
 
 
@@ -113,7 +113,7 @@ class Stuck(Fault):
     """A sensor stays at `value` or, without one, at its last reading."""
 
     kind = "stuck"
-    signal: Sensor
+    signal: Sensed
     value: Size | None = None
 
 

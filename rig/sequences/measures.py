@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from plant.errors import InputError
 from plant.run import Columns
 from plant.segments import RATE, Array
+from plant.signals import EHA, Signals
 from rig import tables
 from rig.benches.profiles import CIA408, ProfileWords, find_state
+from rig.sequences.signals import DERIVED
 
 MEDIAN_SPAN = 5e-3  # s
 SPEED_SPAN = 20e-3  # s between the two samples of a speed: 2 um rms of position noise become 0.14 mm/s rms
@@ -154,12 +156,11 @@ SI_OF_UNIT: dict[str, tuple[str, float]] = {  # unit: (SI unit, how many of thos
     "A": ("A", 1.0), "mA": ("A", 1e-3),
     "%": ("%", 1.0), "deg": ("deg", 1.0), "1": ("1", 1.0),
 }
-UNIT_OF_SIGNAL = {"com": "m", "xj": "m", "error": "m", "speed": "m/s", "cor": "A", "p12": "Pa", "xs": "m", "load": "N"}
 
 
 def find_scale(unit: str, si: str) -> float:
     """How many of the SI unit `si` one `unit` is; InputError at the key `unit` if it measures something else."""
-    fitting = {name: scale for name, (base, scale) in SI_OF_UNIT.items() if base == si}
+    fitting = {name: scale for name, (base, scale) in SI_OF_UNIT.items() if base == si} | {si: 1.0}
     if unit not in fitting:
         raise InputError("unit", "unit", tables.list_choices(unit, fitting))
     return fitting[unit]
@@ -209,6 +210,7 @@ class RunData:
     starts: Mapping[str, float] = field(default_factory=dict)
     drives: DriveFrames = NO_DRIVES
     rate: float = RATE
+    signals: Signals = EHA  # of the plant
 
     def find_start(self, after: str | float) -> float:
         """The start of the cycle nearest to a time, s of main, or in which the fault of a label begins."""
@@ -231,23 +233,25 @@ class RunData:
 
     def read_signal(self, name: str, span: slice, largest_missing_share: float = 0.01) -> Array:
         """A signal's samples in a span, few missing ones bridged by straight lines; NotMeasurable without it."""
-        if name == "error":
-            return self.read_signal("com", span) - self.read_signal("xj", span)
-        if name == "speed":
-            return compute_speed(self.read_signal("xj", span), self.rate)
+        command, controlled = self.signals.command.name, self.signals.controlled.name
+        if name == "error" and name not in self.signals.names:
+            return self.read_signal(command, span) - self.read_signal(controlled, span)
+        if name == "speed" and name not in self.signals.names:
+            return compute_speed(self.read_signal(controlled, span), self.rate)
         return bridge_gaps(np.asarray(getattr(self.trace, name), float)[span], name, largest_missing_share)
 
     def count_missing(self, name: str, span: slice) -> int:
         """How many samples of a signal were bridged."""
-        name = {"error": "xj", "speed": "xj"}.get(name, name)
-        column = getattr(self.trace, name) if name in Columns._fields else np.zeros(0)  # an event has none
+        known = self.signals.names
+        name = self.signals.controlled.name if name in DERIVED and name not in known else name
+        column = getattr(self.trace, name) if name in known else np.zeros(0)  # an event has none
         return int(np.isnan(np.asarray(column, float)[span]).sum())
 
     def read_step(self, span: slice) -> tuple[Array, Array, float, float]:
         """Position and demand in a span, the demand before it (at the very start: where the ram is), and the rate."""
-        position = self.read_signal("xj", span)
-        before = float(self.trace.com[span.start - 1] if span.start else position[0])
-        return position, self.read_signal("com", span), before, self.rate
+        position, command = self.read_signal(self.signals.controlled.name, span), self.signals.command.name
+        before = float(getattr(self.trace, command)[span.start - 1] if span.start else position[0])
+        return position, self.read_signal(command, span), before, self.rate
 
     def find_events(self, event: str, t0: float, t1: float = float("inf")) -> list[Any]:
         """Events in t0 <= t < t1 whose kind and text have all words of `event`, whatever their case, by time."""

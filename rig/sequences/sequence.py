@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
@@ -18,11 +19,12 @@ import numpy as np
 
 from plant import segments
 from plant.errors import InputError
-from plant.model import Model, find_quantity
+from plant.model import Model, find_quantity, load_model
 from plant.parameters import parse_value
 from plant.profile import Profile, build_profile, list_section_names, parse_columns
 from plant.quantity import Quantity
 from plant.segments import FARTHEST, RATE, STRONGEST, Array, Csv, Segment
+from plant.signals import EHA, Signals
 from rig import tables
 from rig.sequences import checks, faults
 from rig.sequences.checks import Check, Guard, PythonCheck
@@ -30,6 +32,7 @@ from rig.sequences.faults import Fault, Parameter, Plan, find_contradiction
 from rig.sequences.measures import MAIN
 from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.python_parts import PythonSegment, Step, load_function, require_function_name, run_file
+from rig.sequences.signals import name_signals_of
 from rig.sequences.timing import TimingPolicy
 from rig.tables import Place, Range
 
@@ -188,12 +191,13 @@ class Sequence:
         return parse_sequence(tables.decode_text(bundle[sources[0]], sources[0]), sources[0], read_file, rate)
 
 
-def load_sequence(name_or_path: str | Path, rate: float = RATE) -> Sequence:
+def load_sequence(name_or_path: str | Path, rate: float = RATE, signals: Signals | None = None) -> Sequence:
     """Read a sequence: a TOML file, or the name of one that comes with the rig.
 
     Args:
         name_or_path: e.g. "preflight" or "tests/mine.toml"; CSV and Python files in it are sought beside it.
         rate: cycles a second of the bench that is to play it.
+        signals: of the plant that it is to test; None: of the model that it names.
 
     Raises:
         InputError: no such sequence, or the file, line and key that cannot be used and what was expected there.
@@ -203,26 +207,28 @@ def load_sequence(name_or_path: str | Path, rate: float = RATE) -> Sequence:
     if str(name_or_path) in shipped:
         entry = shipped[str(name_or_path)]
         return parse_sequence(entry.read_text(encoding="utf-8"), entry.name, lambda name: tables.read_file(Path(name)),
-                              rate)
+                              rate, signals)
     path = Path(name_or_path)
     if path.suffix != ".toml":
         raise InputError(name_or_path, "", f"a .toml file, or {tables.list_choices(str(name_or_path), shipped)}")
     return parse_sequence(tables.decode_text(tables.read_file(path), path), str(path),
-                          lambda name: tables.read_file(path.parent / name), rate)
+                          lambda name: tables.read_file(path.parent / name), rate, signals)
 
 
-def parse_sequence(text: str, name: str, read_file: ReadFile, rate: float = RATE) -> Sequence:
+def parse_sequence(text: str, name: str, read_file: ReadFile, rate: float = RATE, signals: Signals | None = None
+                   ) -> Sequence:
     """The sequence of a TOML text; `read_file` gives the bytes of the CSV and Python files that it names.
 
-    The Python files run. `rate`: cycles a second.
+    The Python files run. `rate`: cycles a second. `signals`: of the plant; None: of the model that the text names.
 
     Raises:
         InputError: the file, line and key that cannot be used, or the line of a Python file.
     """
     table, place = tables.parse_table(text, name)
-    sequence = replace(tables.build_dataclass(Sequence, table, place, _KINDS), name=Path(name).name, source=text,
-                       rate=rate)
-    sequence = _fill_in_files(sequence, place, read_file)
+    with name_signals_of(_find_signals(table) if signals is None else signals):
+        sequence = replace(tables.build_dataclass(Sequence, table, place, _KINDS), name=Path(name).name, source=text,
+                           rate=rate)
+        sequence = _fill_in_files(sequence, place, read_file)
     _check_phases(sequence, place)
     _check_faults(sequence, place.at("faults"))
     _check_parameters(sequence, place)
@@ -231,6 +237,15 @@ def parse_sequence(text: str, name: str, read_file: ReadFile, rate: float = RATE
         if (limit := getattr(sequence.timing, key) or 0.0) * rate > 1.0 + 1e-9:
             raise place.at("timing", key).refuse(f"at most a cycle, {1 / rate:g} s, not {limit:g}")
     return sequence
+
+
+def _find_signals(table: Mapping[str, Any]) -> Signals:
+    """The signals of the model that a sequence names; a model that cannot be read is refused later."""
+    chosen = table.get("model")
+    name = chosen.get("name") if isinstance(chosen, dict) else None
+    with suppress(InputError):
+        return load_model(name).kind.signals if isinstance(name, str) else EHA
+    return EHA
 
 
 def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Sequence:

@@ -32,6 +32,7 @@ from plant import Model, simulate
 from plant.model import find_quantity
 from plant.run import Columns
 from plant.segments import Array
+from plant.signals import EHA
 from rig.nodes.scenario import require_servovalve
 from rig.run.job import Job, find_differences
 from rig.run.outcome import LimitReached, find_limits
@@ -52,7 +53,6 @@ from rig.sequences.faults import (
     Stuck,
     require_sensible,
 )
-from rig.sequences.measures import UNIT_OF_SIGNAL
 from rig.sequences.sequence import Sequence as TestSequence
 
 OF_EVENTS = ("response_within", "shut_off", "recovers", "event_occurs", "event_never")  # without a bus no events
@@ -115,7 +115,8 @@ class DryRun(NamedTuple):
         found = [f"{each.name} {each.describe(each.value)} beyond {each.describe(each.limit)} ({each.parameter}) in "
                  f"{each.section!r}, t = {each.t:.3f} s"
                  for each in self.demands if each.limit is not None and each.is_violated]
-        found += [each.describe() for each in self.limits if each.signal == "xj"]
+        signals = self.job.model.kind.signals
+        found += [each.describe(signals) for each in self.limits if each.signal == signals.controlled.name]
         found += [f"guard {trip.name!r} violated at t = {trip.t:.3f} s" for trip in self.trips]
         return found + [f"check {check.name!r}: {check.detail}" for check in self.checks if check.value != check.value]
 
@@ -281,7 +282,7 @@ def describe_size(fault: Fault, base: Mapping[str, float]) -> str:
             parts = [" to ".join(words.get(value) or format_amount(value, quantity.unit) for value in values)]
         case Offset() | Stuck():
             of_noise = " RMS" if isinstance(fault, Noise) else ""
-            unit = UNIT_OF_SIGNAL[fault.signal]
+            unit = EHA.find(fault.signal).unit
             parts = ["its last reading" if fault.value is None else format_amount(fault.value, unit) + of_noise]
         case Late():
             parts = [format_amount(fault.delay, "s")]
@@ -382,7 +383,7 @@ def describe_prediction(dry: DryRun) -> list[tuple[str, str]]:
              ("error", f"largest {1e3 * np.abs(error[main]).max():.4g} mm, RMS "
                        f"{1e3 * math.sqrt(float(np.mean(error[main] ** 2))):.4g} mm in main")]
     if dry.limits:
-        lines.append(("reaches", "; ".join(each.describe() for each in dry.limits)))
+        lines.append(("reaches", "; ".join(each.describe(dry.job.model.kind.signals) for each in dry.limits)))
     return lines
 
 

@@ -243,8 +243,8 @@ def open_text_table(path: Path, separator: str | None = None, decimal: str | Non
 def split_unit(name: str) -> tuple[str, str]:
     """A name and the unit in brackets, or behind a slash or underscore, at its end; "" if there is none.
 
-    >>> split_unit("Kolbenweg [mm]"), split_unit("p12_bar"), split_unit("state")
-    (('Kolbenweg', 'mm'), ('p12', 'bar'), ('state', ''))
+    >>> split_unit("Kolbenweg [mm]"), split_unit("druck_bar"), split_unit("state")
+    (('Kolbenweg', 'mm'), ('druck', 'bar'), ('state', ''))
     """
     found = re.fullmatch(r"(.*?)\s*[\[(<{]\s*([^\])>}]*)\s*[\])>}]\s*", name)
     if found:

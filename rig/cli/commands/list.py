@@ -122,7 +122,8 @@ def _describe_keys(kind: type[Any]) -> Iterator[str]:
     common = {f.name for f in fields(Check)} - {"window"}
     for f in fields(kind):
         if f.name not in common and f.metadata.get("key", True):
-            yield f.name if f.default is MISSING else f"{f.name} = {f.default!r}"
+            default = f.default if f.default_factory is MISSING else f.default_factory()
+            yield f.name if default is MISSING else f"{f.name} = {default!r}"
 
 
 def list_models(model: Model) -> Rows:
