@@ -195,6 +195,12 @@ def keep_apart(function: AnyFunction) -> AnyFunction:
     return function
 
 
+def bind_later(function: AnyFunction) -> AnyFunction:
+    """Mark a function that stands for another one, which is bound to its name when its caller is compiled."""
+    vars(function)["is_bound_later"] = True
+    return function
+
+
 def _declare_part(f: Function) -> Function:
     """A function below the one to be compiled, as numba gets it."""
     import numba
@@ -204,7 +210,7 @@ def _declare_part(f: Function) -> Function:
 
 def _link_calls(function: Function, ports: Mapping[str, Function], make: Callable[[Function], Function],
                 declare: Callable[[ForeignCall], Any] = lambda call: call) -> Function:
-    """Copy the call graph below `function`, names in `ports` replaced by theirs.
+    """Copy the call graph below `function`; functions marked by `bind_later` are replaced by those of `ports`.
 
     Each copy goes through `make`, each function of the C library through `declare`.
     """
@@ -215,7 +221,8 @@ def _link_calls(function: Function, ports: Mapping[str, Function], make: Callabl
         if not isinstance(f, FunctionType):
             return f
         if f not in made:
-            calls = {name: link(ports.get(name, g)) for name, g in _find_calls(f).items()}
+            calls = {name: link(ports.get(name, g) if "is_bound_later" in vars(g) else g)
+                     for name, g in _find_calls(f).items()}
             external = {name: declare(g) for name, g in _find_globals(f).items() if isinstance(g, ForeignCall)}
             made[f] = make(rebind_names(f, **calls, **external, **_copy_libraries(f, link)))
         return made[f]
@@ -277,10 +284,10 @@ def _find_calls(function: Function) -> dict[str, Function]:
     return {name: g for name, g in named.items() if isinstance(g, FunctionType) or hasattr(g, "py_func")}
 
 
-def list_called_names(function: Function) -> set[str]:
-    """The names of all functions that `function` calls, directly or through others."""
+def find_called_functions(function: Function) -> dict[str, Function]:
+    """All functions that `function` calls, directly or through others, by the names that the code has for them."""
     below = _find_calls(function)
-    return set(below).union(*(list_called_names(g) for g in below.values()))
+    return {name: g for call in below.values() for name, g in find_called_functions(call).items()} | below
 
 
 @cache

@@ -1,74 +1,55 @@
-"""The controller as the reference firmware has it: effects on the demand, then a PID law on the sensed error, limited.
-
-By default the law is proportional only. `compute_answers` runs the controller alone over recorded columns.
-"""
+"""The controller: effects on the demand, then the law of the plant's controller, alone over recorded columns too."""
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.effects import combine_laws
-from plant.friction import clip
+from plant.flat import unpack_state
+from plant.kernels import control_plant, get_readings, start_control
 from plant.model import Model, build_kernel
+from plant.pid import Loop, compute_current
 from plant.ports import at_command
-from plant.state import Input, Memory, State
+from plant.state import Input, Memory, Sampled
 
+__all__ = ["Loop", "compute_answers", "compute_current", "take_demand"]
 Array = NDArray[np.float64]
 
 
-class Loop(NamedTuple):
-    """What the law remembers from cycle to cycle."""
-
-    integral: float = 0.0  # A, the integral part of the current
-    error: float = 0.0  # m, of the cycle before
-    cycles: float = 0.0  # cycles since it was enabled
+def take_demand(com: float, m: Memory, sensed: float, t: float, p: Any) -> tuple[float, Memory]:
+    """The demand that the loop closes on, and the memories; effects know nothing of the plant but what is `sensed`."""
+    return at_command(com, m, Sampled(sensed), Input(0.0, 0.0, 0.0, t, 0.0, p.controller.period), p)
 
 
-def compute_current(c: Loop, demand: float, position: float, p: Any) -> tuple[float, Loop]:
-    """Current for the next cycle, A, and the memory, from demand and sensed position, m.
-
-    `p` has the fields of `plant.parameters.Controller`. The integral part waits while the output is at its limit and
-    the error would drive it further (anti-windup). The derivative is the backward difference of the error, none in the
-    first cycle.
-    """
-    error = demand - position
-    rate = (error - c.error) / p.period if c.cycles > 0.0 else 0.0
-    integral = c.integral + p.integral_gain * error * p.period
-    wanted = p.proportional_gain * error + integral + p.derivative_gain * rate
-    current = clip(wanted, p.current_limit)
-    winding = current != wanted and wanted * error > 0.0
-    return current, Loop(c.integral if winding else integral, error, c.cycles + 1.0)
-
-
-def apply_command_effects(com: float, m: Memory, xj: float, t: float, p: Any) -> tuple[float, Memory]:
-    """The demand that the loop closes on, m, and the memory of the effects; the firmware knows no state but `xj`, m."""
-    nothing: Memory = 0.0
-    s = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, xj, nothing)
-    return at_command(com, m, s, Input(0.0, 0.0, 0.0, t, 0.0, p.controller.period), p)
-
-
-def run_controller(m: Memory, com: Any, xj: Any, record: Any, out: Any) -> None:
-    """The controller alone over demands and sensed positions; fills out[k] = Cor, A.
+def run_controller(flat: Any, com: Any, readings: Any, record: Any, out: Any) -> None:
+    """The controller alone over demands and readings; fills out[k] with its drive.
 
     Args:
-        m: memory of the port `command` at the start.
-        com: (n,) demand, m.
-        xj: (n,) sensed position, m.
+        flat: state of the plant at the start; only its memories are used.
+        com: (n,) demand.
+        readings: (n, outputs).
         record: (1,) parameters of the model.
         out: (n,), written.
     """
     p = record[0]
-    c = Loop(0.0, 0.0, 0.0)
+    m = unpack_state(flat)[1]
+    c = start_control()
     for k in range(len(com)):
-        demand, m = apply_command_effects(com[k], m, xj[k], k * p.controller.period, p)
-        out[k], c = compute_current(c, demand, xj[k], p.controller)
+        y = get_readings(readings, k)
+        demand, m = take_demand(com[k], m, y[0], k * p.controller.period, p)
+        out[k], c = control_plant(c, demand, y, p)
 
 
-def compute_answers(model: Model, com: Array, xj: Array) -> Array:
-    """Cor, (n,) A, that the model's controller answers to demands `com` and sensed positions `xj`, (n,) m each."""
+def compute_answers(model: Model, com: Array, readings: Array) -> Array:
+    """The drive, (n,), that the model's controller answers to demands `com`, (n,).
+
+    `readings` are those of all outputs, (n, outputs), or of the controlled one alone, (n,): others are NaN then.
+    """
     out = np.empty(len(com))
-    memory = combine_laws("command", model.effects)[1]
-    build_kernel(run_controller, model.effects)(memory, com, xj, model.build_record(), out)
+    if readings.ndim == 1:
+        others = np.full((len(com), len(model.kind.signals.outputs) - 1), np.nan)
+        readings = np.column_stack([readings, others])
+    run = build_kernel(run_controller, model.effects, plant=model.plant)
+    run(model.build_flat_state(), com, np.ascontiguousarray(readings), model.build_record(), out)
     return out

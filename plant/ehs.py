@@ -10,21 +10,21 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from plant import signals
-from plant.effects import register_base
 from plant.effects.sensors import Quantisation
 from plant.effects.valve import Compressibility
+from plant.eha import step_jack, update_compliance
 from plant.friction import clip
 from plant.parameters import GROUPS, convert_group_unit, read_shipped_model
-from plant.plants import Array, MeasuredPressures, Plant, Table, Term
-from plant.ports import at_current, at_position, at_valve
-from plant.quantity import Quantity
+from plant.plants import Array, MeasuredPressures, Plant, Table, Term, base_effect
+from plant.ports import at_position, at_valve, port
+from plant.quantity import Metre, MetrePerSecond, Pascal, Quantity
 from plant.signals import Signals
-from plant.state import Input, Line, Ports, State
-from plant.step import measure, step_jack
+from plant.state import Input, Line, Memory
 
 ROD_SIDE = 0.686  # area of the rod side over that of the piston side; a 50 mm piston usually has a 28 mm rod
 COUNT = 2.5e-5  # m a count of the position sensor and of the demand
 RAW_PER_TURN = 60.0 / 0.88  # raw/(turn/s): the firmware calls its unit rpm; by the encoder one is 0.88 rpm
+at_current = port("raw", "speed of the motor")
 SEAL_LEAKAGE = 1e-16  # m3/s/Pa, negligible; it keeps the pressure finite in a model without leakage
 
 
@@ -57,23 +57,31 @@ def compute_servo_coefficients(p: Any, h: float) -> Any:
                         1.0 / (mass + h * p.jack.area * slope))
 
 
-def step_servo(s: State, u: Input, p: Any, k: Any) -> State:
-    """The state `u.h` seconds later; P12 is the force on the ram over the area of the piston's larger side.
+class State(NamedTuple):
+    """The servo at one instant; all zero is the ram at rest in the middle."""
+
+    jack_position: Metre = 0.0  # XJ
+    jack_speed: MetrePerSecond = 0.0
+    pressure: Pascal = 0.0  # P12, the force on the ram over the area of the piston's larger side
+    sensed: Metre = 0.0  # XJ as its transducer shows it, without noise
+
+
+def step_servo(s: State, m: Memory, u: Input, p: Any, k: Any) -> tuple[State, Memory]:
+    """The state `u.h` seconds later.
 
     Where the pressures were measured and are given as a load, the ram has the speed at which the pump's line has that
     pressure, XJ' = (p0 - p)/slope: the flow alone, without the forces on the ram.
     """
-    m = s.memory
-    w, m_current = at_current(u.current, m.current, s, u, p)
+    w, m = at_current(u.drive, m, s, u, p)
     r = 1.0 if (w if w != 0.0 else s.pressure) >= 0.0 else p.pump.area_ratio  # without flow the valve is closed
     rest = (1.0 - p.pump.area_ratio) * p.pump.return_pressure  # one pressure on unequal areas
     held = s.pressure * (1.0 if w * s.pressure >= 0.0 else p.pump.drain / (p.pump.drain + u.h))
     is_given, given = p.pump.pressure_given > 0.5, u.load / p.jack.area
     held = (s.pressure if given * s.pressure > 0.0 else given) if is_given else held  # another chamber starts anew
-    before = State(0.0, 0.0, 0.0, 0.0, s.jack_position, s.jack_speed, held, s.sensed, m)
+    before = State(s.jack_position, s.jack_speed, held, s.sensed)
     pump = Line(r * k.gain * w, r * r * k.valve_slope, p.supply.pressure, 0.0)
-    line, m_valve = at_valve(pump, m.valve, before, u, p)
-    x, v, p12, m_load, m_drag = step_jack(s, u, p, k, line, 0.0)
+    line, m = at_valve(pump, m, before, u, p)
+    x, v, p12, m = step_jack(s, m, u, p, k, line, 0.0)
     flow_speed = (line.offset - given) / line.slope
     x = clip(s.jack_position + u.h * flow_speed, p.jack.travel) if is_given else x
     v = flow_speed if is_given else v
@@ -82,10 +90,18 @@ def step_servo(s: State, u: Input, p: Any, k: Any) -> State:
     settled = line.offset + clip(rest - line.offset, u.h * p.pump.settling)
     p12 = clip(settled, line.limit) if is_locked else p12
     p12 = given if is_given else p12
-    sensed, m_position = at_position(x, m.position, State(0.0, 0.0, 0.0, 0.0, x, v, p12, s.sensed, m), u, p)
-    return State(0.0, 0.0, 0.0, 0.0, x, v, p12, sensed, Ports(
-        m.command, m_current, m.supply, m.viscosity, m.nozzle, m.feedback, m.spool_force, m.metering, m_valve, m_load,
-        m_drag, m_position, m.reading))
+    return sense_ram(State(x, v, p12, s.sensed), m, u, p)
+
+
+def sense_ram(s: State, m: Memory, u: Input, p: Any) -> tuple[State, Memory]:
+    """The state with what the ram's transducer shows of it."""
+    sensed, m = at_position(s.jack_position, m, s, u, p)
+    return State(s.jack_position, s.jack_speed, s.pressure, sensed), m
+
+
+def measure(s: State, p: Any) -> tuple[float, float, float]:
+    """What the transducers show: XJ m, P12 Pa, and XS, which a servo without a spool does not have, 0."""
+    return s.sensed, s.pressure, 0.0
 
 
 def estimate_load(columns: Mapping[str, Array]) -> Array:
@@ -149,17 +165,17 @@ def compute_centred_mean(x: Array, rows: int) -> Array:
     return mean
 
 
-register_base("check_valve", "pump.least_speed", groups={"pump": Pump}, plant="ehs", starts=(10.0, 40.0),
-              law="XJ' = 0 while the motor is slower than that",
-              symptoms="at rest the pressure falls and the ram stays",
-              source="a pilot-operated check valve between pump and cylinder")
-register_base("return_pressure", "pump.return_pressure", groups={"pump": Pump}, plant="ehs", starts=(1e5, 5e5),
-              law="Q = AJ XJ' + CLK (P12 - (1 - ratio) pR)",
-              symptoms="at rest P12 falls to the same pressure from both sides",
-              source="a return line under pressure and unequal areas")
-register_base("unequal_areas", "pump.area_ratio", groups={"pump": Pump}, plant="ehs",
-              law="AJ times the ratio, backwards",
-              symptoms="another speed backwards for the same drive", starts=(0.9, 0.7, 0.5), source="a rod on one side")
+base_effect("check_valve", Pump, "least_speed", starts=(10.0, 40.0),
+            law="XJ' = 0 while the motor is slower than that",
+            symptoms="at rest the pressure falls and the ram stays",
+            source="a pilot-operated check valve between pump and cylinder")
+base_effect("return_pressure", Pump, "return_pressure", starts=(1e5, 5e5),
+            law="Q = AJ XJ' + CLK (P12 - (1 - ratio) pR)",
+            symptoms="at rest P12 falls to the same pressure from both sides",
+            source="a return line under pressure and unequal areas")
+base_effect("unequal_areas", Pump, "area_ratio",
+            law="AJ times the ratio, backwards",
+            symptoms="another speed backwards for the same drive", starts=(0.9, 0.7, 0.5), source="a rod on one side")
 
 PARAMETER_GROUPS: dict[str, type[Any]] = {
     "controller": convert_group_unit(GROUPS["controller"], "A", "raw", 1e6),
@@ -189,7 +205,7 @@ LOGGER_COLUMNS = {
 LOGGER_SOURCES = ("time", "ADC1_Channel_2", "ADC1_Channel_3", "ADC1_Channel_6", "ADC1_Channel_16")
 
 PLANT = Plant(
-    name="ehs",
+    title="electrohydrostatic servo: a pump moves the ram",
     signals=Signals(*(s._replace(unit="raw", quantity="speed of the motor", noun="motor") if s.role == "drive" else s
                       for s in signals.EHA[1:])),
     parameters=PARAMETER_GROUPS,
@@ -198,6 +214,8 @@ PLANT = Plant(
     measure=measure,
     moves=("jack_position",),
     coefficients=compute_servo_coefficients,
+    sense=sense_ram,
+    variants={"compute_compliance": (update_compliance, frozenset())},
     values=NOMINAL,
     has=("quantisation",),
     lacks=("constant_load", "aero_stiffness", "sensor_gain", "sensor_lag", "sensor_offset"),

@@ -8,13 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from plant.compile import Function
-from plant.state import Memory, Ports, State
+from plant.compile import Function, bind_later
+from plant.state import Memory
 
 
-def make_packers(state: State) -> tuple[Function, Function]:
-    """Two functions, `pack(state, array)` and `unpack(array) -> state`, for states with the fields of `state`."""
-    pack, unpack, _ = _make_converters(state, "", lambda i: f"a[{i}]")
+def make_packers(shape: Any, first: int = 0) -> tuple[Function, Function]:
+    """Functions `pack(x, array)` and `unpack(array) -> x` for tuples like `shape`, such as a state with its memories.
+
+    The numbers of `shape` begin with number `first` of the array.
+    """
+    pack, unpack, _ = _make_converters(shape, "", lambda i: f"a[{first + i}]")
     return pack, unpack
 
 
@@ -38,11 +41,16 @@ def _make_converters(shape: Any, lane: str, place: Callable[[int], str]) -> tupl
     return made["keep"], made["at"], len(paths)
 
 
-def list_state_values(state: State) -> list[float]:
-    """The numbers of `state` in the order of the array: the fields of `State` first, then what effects remember."""
-    array: dict[int, float] = {}
-    make_packers(state)[0](state, array)
-    return [float(x) for x in array.values()]
+def list_state_values(start: Any) -> list[float]:
+    """The numbers of a state with its memories in the order of the array: the state first, then what effects keep."""
+    if not isinstance(start, tuple):
+        return [float(start)]
+    return [x for part in start if isinstance(part, tuple) or not _is_bare(start) for x in list_state_values(part)]
+
+
+def _is_bare(x: tuple[Any, ...]) -> bool:
+    """Whether a bare number in `x`, memories of ports or of effects, says that nothing is remembered there."""
+    return hasattr(x, "holds_memories") or not hasattr(x, "_fields")
 
 
 def _build_expression(x: Memory, path: str, kinds: dict[str, type[Any]], paths: list[str],
@@ -53,8 +61,7 @@ def _build_expression(x: Memory, path: str, kinds: dict[str, type[Any]], paths: 
         return place(len(paths) - 1)
     named = getattr(x, "_fields", None)
     parts = [(part, f"{path}.{named[i]}" if named else f"{path}[{i}]") for i, part in enumerate(x)]
-    # a bare number among ports or effects says that nothing is remembered there
-    bare = isinstance(x, Ports) or not named
+    bare = _is_bare(x)
     inner = ["0.0" if bare and not isinstance(part, tuple) else _build_expression(part, p, kinds, paths, place)
              for part, p in parts]
     if not named:
@@ -64,11 +71,13 @@ def _build_expression(x: Memory, path: str, kinds: dict[str, type[Any]], paths: 
     return f"{kind}({', '.join(inner)})"
 
 
-def pack_state(s: State, a: Any) -> None:
-    """Write `s` into the array `a`. A placeholder: each model binds its own function."""
+@bind_later
+def pack_state(x: Any, a: Any) -> None:
+    """Write `x`, a state and its memories, into the array `a`. A placeholder: each model binds its own function."""
     raise TypeError("no model is bound")
 
 
+@bind_later
 def unpack_state(a: Any) -> Any:
-    """The state that the array `a` holds. A placeholder: each model binds its own function."""
+    """The state and the memories that the array `a` holds. A placeholder: each model binds its own function."""
     raise TypeError("no model is bound")

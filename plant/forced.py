@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.anchor import rest_at_reading
-from plant.effects import CATALOGUE
+from plant.eha import Coefficients, State, apply_oil, compute_coefficients, compute_metering_line, sense_ram
+from plant.flat import unpack_state
 from plant.model import Model, build_kernel
-from plant.ports import at_jack_drag, at_load, at_position
-from plant.state import Drag, Input, Memory, Ports, State
-from plant.step import Coefficients, apply_oil, compute_coefficients, compute_metering_line
+from plant.ports import at_jack_drag, at_load
+from plant.state import Drag, Input, Memory
 
 Array = NDArray[np.float64]
 STEPS, FINE = 5, 100  # a cycle: what was stiff is given here, only effects that remember want many
@@ -31,7 +31,7 @@ def compute_flow_balance(model: Model, spool: Array, pressure: Array, position: 
     out = np.empty((len(spool), 2))
     columns = np.ascontiguousarray(np.column_stack([spool, pressure]), float)
     run = build_kernel(run_flow_balance, model.effects)
-    run(model.build_state(), columns, float(position), model.build_record(), _choose_steps(model), out)
+    run(model.build_flat_state(), columns, float(position), model.build_record(), _choose_steps(model), out)
     return out[:, 0].copy(), out[:, 1].copy()
 
 
@@ -46,45 +46,44 @@ def compute_force_balance(model: Model, position: Array, speed: Array, pressure:
     rate = np.gradient(speed, model["controller.period"])
     columns = np.ascontiguousarray(np.column_stack([position, speed, rate, pressure, load]), float)
     run = build_kernel(run_force_balance, model.effects)
-    run(model.build_state(), columns, model.build_record(), _choose_steps(model), out)
+    run(model.build_flat_state(), columns, model.build_record(), _choose_steps(model), out)
     return out[:, 0].copy(), out[:, 1].copy(), out[:, 2].copy()
 
 
 def _choose_steps(model: Model) -> int:
-    return FINE if any(CATALOGUE[e].memory is not None for e in model.effects) else STEPS
+    return FINE if any(model.find_effect(e).memory is not None for e in model.effects) else STEPS
 
 
-def compute_pressure_excess(v: float, s: State, u: Input, p: Any, constant: Coefficients) -> tuple[float, Ports]:
+def compute_pressure_excess(v: float, s: State, m: Memory, u: Input, p: Any, constant: Coefficients
+                            ) -> tuple[float, Memory]:
     """Pressure of the metering edges at ram speed `v` less the pressure of the state, Pa; and the memories after it."""
-    m = s.memory
     s = State(s.flapper_position, s.flapper_speed, s.spool_position, s.spool_speed, s.jack_position, v, s.pressure,
-              s.sensed, m)
-    k, m_supply, m_viscosity = apply_oil(constant, s, u, p)
-    line, m_metering, m_valve = compute_metering_line(s, u, p, k, s.spool_position)
-    ports = Ports(m.command, m.current, m_supply, m_viscosity, m.nozzle, m.feedback, m.spool_force, m_metering,
-                  m_valve, m.load, m.jack_drag, m.position, m.reading)
-    return line.offset - line.slope * v, ports
+              s.sensed)
+    k, m = apply_oil(constant, s, m, u, p)
+    line, m = compute_metering_line(s, m, u, p, k, s.spool_position)
+    return line.offset - line.slope * v, m
 
 
-def solve_ram_speed(s: State, p12: float, u: Input, p: Any, constant: Coefficients) -> tuple[float, Ports]:
+def solve_ram_speed(s: State, m: Memory, p12: float, u: Input, p: Any, constant: Coefficients) -> tuple[float, Memory]:
     """Ram speed at which the metering edges leave `p12`, Pa; by the secant method, exact for a straight line."""
     v0 = s.jack_speed
-    f0, ports = compute_pressure_excess(v0, s, u, p, constant)
+    f0, after = compute_pressure_excess(v0, s, m, u, p, constant)
     v1 = v0 + (f0 - p12) / constant.valve_slope
     for _ in range(3):
-        f1, ports = compute_pressure_excess(v1, s, u, p, constant)
+        f1, after = compute_pressure_excess(v1, s, m, u, p, constant)
         slope = (f1 - f0) / (v1 - v0) if v1 != v0 else 0.0
         v2 = v1 - (f1 - p12) / slope if slope != 0.0 else v1
         v0, f0, v1 = v1, f1, v2
-    return v1, ports
+    return v1, after
 
 
-def run_flow_balance(s: State, measured: Any, position: float, record: Any, steps: int, out: Any) -> None:
+def run_flow_balance(flat: Any, measured: Any, position: float, record: Any, steps: int, out: Any) -> None:
     """Fills out[k] = XJ as sensed and v at sample k, from measured (n, 2): spool position m, pressure Pa."""
     p = record[0]
     h = p.controller.period / steps
     constant = compute_coefficients(p, h)
-    s = rest_at_reading(s, position, p, steps)
+    s, m = unpack_state(flat)
+    s, m = rest_at_reading(s, m, position, p, steps)
     last = len(measured) - 1
     for k in range(len(measured)):
         ahead = k + 1 if k < last else k
@@ -93,22 +92,14 @@ def run_flow_balance(s: State, measured: Any, position: float, record: Any, step
             xs = measured[k, 0] + part * (measured[ahead, 0] - measured[k, 0])
             p12 = measured[k, 1] + part * (measured[ahead, 1] - measured[k, 1])
             u = Input(0.0, 0.0, 0.0, k * p.controller.period + i * h, i * h, h)
-            s = State(0.0, 0.0, xs, 0.0, s.jack_position, s.jack_speed, s.pressure, s.sensed, s.memory)
-            v, m = solve_ram_speed(s, p12, u, p, constant)
+            s = State(0.0, 0.0, xs, 0.0, s.jack_position, s.jack_speed, s.pressure, s.sensed)
+            v, m = solve_ram_speed(s, m, p12, u, p, constant)
             if i == 0:
                 out[k, 0], out[k, 1] = s.sensed, v
-            now = State(0.0, 0.0, xs, 0.0, s.jack_position + h * v, v, p12, s.sensed, m)
-            sensed, m_position = at_position(now.jack_position, m.position, now, u, p)
-            s = State(0.0, 0.0, xs, 0.0, now.jack_position, v, p12, sensed, replace_position_memory(m, m_position))
+            s, m = sense_ram(State(0.0, 0.0, xs, 0.0, s.jack_position + h * v, v, p12, s.sensed), m, u, p)
 
 
-def replace_position_memory(m: Ports, position: Memory) -> Ports:
-    """`m` with another memory of the port `position`."""
-    return Ports(m.command, m.current, m.supply, m.viscosity, m.nozzle, m.feedback, m.spool_force, m.metering, m.valve,
-                 m.load, m.jack_drag, position, m.reading)
-
-
-def run_force_balance(s: State, motion: Any, record: Any, steps: int, out: Any) -> None:
+def run_force_balance(flat: Any, motion: Any, record: Any, steps: int, out: Any) -> None:
     """Fills out[k] = MJ a + CJ v + FR, static and dynamic friction, N, at sample k of a given motion.
 
     `motion` (n, 5): position m, speed m/s, acceleration m/s2, P12 Pa, load N.
@@ -117,15 +108,15 @@ def run_force_balance(s: State, motion: Any, record: Any, steps: int, out: Any) 
     g = p.jack
     h = p.controller.period / steps
     constant = compute_coefficients(p, h)
-    m_load, m_drag = s.memory.load, s.memory.jack_drag
+    m = unpack_state(flat)[1]
     for k in range(len(motion)):
         x, v, rate, p12, load = motion[k, 0], motion[k, 1], motion[k, 2], motion[k, 3], motion[k, 4]
         for i in range(steps):
             u = Input(0.0, load, 0.0, k * p.controller.period + i * h, i * h, h)
-            now = State(0.0, 0.0, 0.0, 0.0, x + i * h * v, v + i * h * rate, p12, x, s.memory)
-            outside, m_load = at_load(load, m_load, now, u, p)
-            drag, m_drag = at_jack_drag(Drag(0.0, 0.0, g.static_friction, g.dynamic_friction), m_drag, now, u, p)
+            now = State(0.0, 0.0, 0.0, 0.0, x + i * h * v, v + i * h * rate, p12, x)
+            outside, m = at_load(load, m, now, u, p)
+            drag, m = at_jack_drag(Drag(0.0, 0.0, g.static_friction, g.dynamic_friction), m, now, u, p)
             if i == 0:
-                oil, _, _ = apply_oil(constant, now, u, p)
+                oil, _ = apply_oil(constant, now, m, u, p)
                 out[k, 0] = g.mass * rate + (oil.jack_damping + drag.damping) * v + outside + drag.force
                 out[k, 1], out[k, 2] = drag.static, drag.dynamic

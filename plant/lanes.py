@@ -16,25 +16,26 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.anchor import initialise_sensed_position, pull_ram, rest_at_reading, set_sample_memories
+from plant.anchor import pull_plant, rest_at_reading, show_start
 from plant.compile import (
     Function,
+    bind_later,
     compile_function,
     is_costly,
     is_function_stored,
     make_record_reader,
     rebind_names,
 )
-from plant.controller import Loop, apply_command_effects, compute_current
-from plant.effects import CATALOGUE, Effect
+from plant.controller import take_demand
+from plant.effects import Effect
 from plant.errors import InputError
-from plant.flat import list_state_values, make_lane_packers
+from plant.flat import make_lane_packers
 from plant.kernel_use import KernelUse
-from plant.model import Model, build_bare_model, build_initial_state, collect_bindings
-from plant.plants import MeasuredPressures, find_plant
-from plant.ports import at_reading
+from plant.kernels import compute_plant_coefficients, control_plant, keep_answer, keep_sample, measure_plant, step_plant
+from plant.model import Model, build_bare_model
+from plant.plants import MeasuredPressures, Plant
+from plant.solve import read_controlled
 from plant.state import Input
-from plant.step import compute_coefficients, step_plant
 from plant.threads import count_threads, map_in_threads
 
 Array = NDArray[np.float64]
@@ -91,16 +92,17 @@ class Lanes:
 
         Args:
             values: (m, len(names)) parameters of each run, SI.
-            current: (n,) A; current[k - 1] acts from sample k to k + 1, none before.
-            load: (n,) N, external force on the ram, positive against extension.
-            position: (n,) m, measured, NaN where missing: runs start at rest where it shows position[0].
-            anchor: 1/s, how fast the ram is pulled to the measured position; 0 is a free run.
+            current: (n,) drive; current[k - 1] acts from sample k to k + 1, none before.
+            load: (n,) external load, of the EHA N on the ram, positive against extension.
+            position: (n,) measured controlled signal, NaN where missing: runs start at rest where it shows the first.
+            anchor: 1/s, how fast the plant is pulled to the measured signal; 0 is a free run.
             parts: pieces of a longer recording that the rows consist of: each begins anew; none: one piece.
             chambers: (n, 2) Pa, pressures of both chambers as they were read; None: the model's forces move the ram.
                 A plant without `measured_pressures` does not use them.
 
         Returns:
-            (m, n, 3): XJ as sensed m, P12 Pa, XS m at each sample, without noise; `[..., i]` has contiguous rows.
+            (m, n, outputs): the readings at each sample, without noise; `[..., i]` has contiguous rows. Of the EHA XJ
+            m, P12 Pa, XS m.
 
         Raises:
             InputError: shapes that do not fit.
@@ -147,7 +149,7 @@ class Lanes:
         work, inputs = self._prepare(values, current, load, where, anchor, False)
         for first in range(0, len(current), rows):
             stop = min(first + rows, len(current))
-            out = np.empty((len(values) + 1, 3, stop - first))
+            out = np.empty((len(values) + 1, self._count_columns(False), stop - first))
 
             def go_on(block: Block, first: int = first, stop: int = stop, out: Array = out) -> None:
                 block.run(block.buffer, *inputs, first, stop, first, 0, first == 0, block.rows, out)
@@ -164,7 +166,8 @@ class Lanes:
             load: (n,) N, external force on the ram, positive against extension.
 
         Returns:
-            (m, n, 4): XJ as sensed m, Cor A, P12 Pa, XS m at each sample, without noise.
+            (m, n, columns): readings without noise and drive at each sample, in the order of the plant's signals. Of
+            the EHA XJ m, Cor A, P12 Pa, XS m.
 
         Raises:
             InputError: shapes that do not fit.
@@ -174,7 +177,7 @@ class Lanes:
     def _run(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool,
              parts: Sequence[Part] = ()) -> Array:
         blocks, inputs = self._prepare(values, driven, load, position, anchor, closed)
-        out = np.empty((len(values) + 1, 4 if closed else 3, len(driven)))  # the last for idle lanes
+        out = np.empty((len(values) + 1, self._count_columns(closed), len(driven)))  # the last for idle lanes
         work = [(block, part) for block in blocks for part in parts or (Part(0, len(driven), 0),)]
 
         def do(task: tuple[Block, Part]) -> None:
@@ -186,6 +189,10 @@ class Lanes:
 
         map_in_threads(do, work, self.workers)
         return out[:-1].transpose(0, 2, 1)
+
+    def _count_columns(self, closed: bool) -> int:
+        signals = self.model.kind.signals
+        return len(signals.columns if closed else signals.outputs)
 
     def _prepare(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool
                  ) -> tuple[list[Block], tuple[Any, ...]]:
@@ -213,7 +220,7 @@ class Lanes:
         effects = self.model.effects
         if len(self._rungs) == 1:
             return [(self._rungs[0], np.arange(len(values)))]
-        at_work = np.column_stack([self._find_active_runs(CATALOGUE[name], values) for name in effects])
+        at_work = np.column_stack([self._find_active_runs(self.model.find_effect(name), values) for name in effects])
         left, shared = np.ones(len(values), bool), []
         for rung in self._rungs:
             others = [name not in rung.model.effects for name in effects]
@@ -277,16 +284,16 @@ class KernelVariant:
     def __init__(self, model: Model, effects: tuple[str, ...]) -> None:
         own = set(build_bare_model(model.plant).with_effects(effects).values)
         self.model = replace(model, effects=effects, values={n: v for n, v in model.values.items() if n in own})
-        self._names, self._laws = self.model.list_names(), list_laws(effects)
+        self._names, self._laws = self.model.list_names(), model.kind.list_laws(effects)
         self._state: Array | None = None
         self._parameters = self.model.build_record().view(np.float64)[:, None]
 
     def is_ready(self, steps: float) -> bool:
         """Whether the kernel can make so many steps of all lanes now: see `KernelUse.is_ready`."""
-        key = self.model.plant, self.model.effects, self._laws
+        key = self.model.kind, self.model.effects, self._laws
 
         def is_stored() -> bool:
-            plan = plan_layout(self.model.effects, self.model.plant, NARROW)
+            plan = plan_layout(self.model.effects, self.model.kind, NARROW)
             return is_function_stored(plan.loop, plan.names)
 
         return KERNEL_USE.is_ready(key, steps, is_stored, self.prepare)
@@ -295,7 +302,8 @@ class KernelVariant:
         """Load or compile the kernel by a run of no samples."""
         none = np.empty(0)
         for run, buffer, rows in self.build_blocks((), np.zeros((1, 0)), np.arange(1)):
-            run(buffer, none, none, none, 0.0, False, 1.0, 1, 0, 0, 0, 0, True, rows, np.empty((2, 3, 0)))
+            out = np.empty((2, len(self.model.kind.signals.outputs), 0))
+            run(buffer, none, none, none, 0.0, False, 1.0, 1, 0, 0, 0, 0, True, rows, out)
 
     def build_blocks(self, names: Sequence[str], values: Array, members: NDArray[np.int64]) -> Iterator[Block]:
         """The runs `members` in blocks.
@@ -304,9 +312,9 @@ class KernelVariant:
         """
         model = self.model
         width = WIDE if len(members) >= 2 * WIDE and not model.effects else NARROW
-        plan, run = _compile_layout(model.effects, self._laws, model.plant, width)
+        plan, run = _compile_layout(model.effects, self._laws, model.kind, width)
         if self._state is None:  # not sooner: it asks laws, which may be wrong
-            self._state = np.array(list_state_values(model.build_state()))
+            self._state = model.build_flat_state()
         start = np.zeros((plan.numbers, width))
         start[:len(self._state)] = self._state[:, None]
         start[plan.parameters:] = self._parameters
@@ -335,7 +343,7 @@ def list_kernel_variants(model: Model) -> list[KernelVariant]:
     """
     if len(model.effects) <= FEW:
         return [KernelVariant(model, model.effects)]
-    cheap = tuple(name for name in model.effects if _is_cheap(CATALOGUE[name]))
+    cheap = tuple(name for name in model.effects if _is_cheap(model.find_effect(name)))
     return [KernelVariant(model, effects) for effects in dict.fromkeys(((), cheap, model.effects))]
 
 
@@ -359,15 +367,11 @@ def _is_cheap(effect: Effect) -> bool:
     return effect.function.__module__.startswith("plant.") and not is_costly(effect.function)
 
 
-def list_laws(effects: tuple[str, ...]) -> tuple[Any, ...]:
-    """The laws of the effects as they are now: a user's file may have been loaded again."""
-    return tuple(CATALOGUE[e].function for e in effects)
-
-
 @cache
-def _compile_layout(effects: tuple[str, ...], laws: tuple[Any, ...], plant: str, width: int) -> tuple[Layout, Function]:
+def _compile_layout(effects: tuple[str, ...], laws: tuple[Any, ...], kind: Plant, width: int
+                    ) -> tuple[Layout, Function]:
     # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
-    plan = plan_layout(effects, plant, width)
+    plan = plan_layout(effects, kind, width)
     return plan, compile_function(plan.loop, plan.names)
 
 
@@ -381,12 +385,13 @@ class Layout(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """Current through the torque motor, A: in this cycle, and the controller's answer for the next."""
+    """The drive: in this cycle, and the controller's answer for the next."""
 
     now: float = 0.0
     next: float = 0.0
 
 
+@bind_later
 def raise_unbound(*arguments: Any) -> Any:
     """Stands for a function that is bound later."""
     raise TypeError("no layout is bound")
@@ -397,12 +402,12 @@ state_at = parameters_at = coefficients_at = loop_at = drive_at = raise_unbound
 keep_state = keep_coefficients = keep_loop = keep_drive = raise_unbound
 
 
-def plan_layout(effects: tuple[str, ...], plant: str, width: int = NARROW) -> Layout:
+def plan_layout(effects: tuple[str, ...], kind: Plant, width: int = NARROW) -> Layout:
     """The layout for a plant with `effects`, `width` lanes."""
-    record = build_bare_model(plant).with_effects(effects).build_record()
-    shapes = {"state": build_initial_state(effects), "loop": Loop(), "drive": Drive(),
-              "coefficients": find_plant(plant).coefficients(record[0], 1.0)}
-    made, place = collect_bindings(effects, plant), 0
+    made, place = kind.bind_functions(effects), 0
+    record = build_bare_model(kind.key).with_effects(effects).build_record()
+    shapes = {"state": kind.build_start(effects), "loop": kind.build_control_memory(), "drive": Drive(),
+              "coefficients": made["compute_plant_coefficients"](record[0], 1.0)}
     for name, shape in shapes.items():
         made[f"keep_{name}"], made[f"{name}_at"], place = make_lane_packers(shape, width, place)
     made["parameters_at"] = make_record_reader(record.dtype, place * width, width)
@@ -413,14 +418,14 @@ def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, closed:
               first: int, stop: int, origin: int, later: int, begins: bool, rows: Any, out: Any) -> None:
     """Simulates a block of runs over the samples k = first..stop-1.
 
-    Fills out[rows[lane], :, k - origin] = XJ as sensed, (Cor in closed loop,) P12, XS at sample k.
+    Fills out[rows[lane], :, k - origin] = the readings at sample k, in closed loop the drive too.
 
     Args:
         a: the block's buffer: state at the start and parameters in place, the rest zero. Used up.
-        com: (n,) demand m in closed loop, else the measured current A: com[k - 1] acts from k to k + 1.
-        load: (n,) N, external force against extension.
-        position: (n,) m, measured; NaN where missing; or (0,).
-        anchor: 1/s, how fast the ram is pulled to the measured position.
+        com: (n,) demand in closed loop, else the measured drive: com[k - 1] acts from k to k + 1.
+        load: (n,) external load.
+        position: (n,) measured controlled signal; NaN where missing; or (0,).
+        anchor: 1/s, how fast the plant is pulled to it.
         closed: with the model's own controller.
         period: of a cycle, s.
         steps: steps a cycle.
@@ -430,56 +435,59 @@ def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, closed:
         later: samples by which the time is later than k says.
         begins: lanes begin at rest at the first sample; else they go on from where the buffer left them.
         rows: (WIDTH,) where in `out` each lane goes.
-        out: (m, 3 or 4, n), written.
+        out: (m, outputs or columns, n), written.
     """
-    h, columns = period / steps, out.shape[1]
+    h = period / steps
     if begins:
         for lane in range(WIDTH):
             begin_lane(a, lane, position[first:], steps, h)
     for k in range(first, stop):
         t, column = (k + later) * period, k - origin
-        for lane in range(WIDTH):
-            row = rows[lane]
-            out[row, 0, column], out[row, columns - 2, column], out[row, columns - 1, column] = sample_lane(a, lane, t)
         given = com[k - 1] if k > first or not begins else 0.0
         for lane in range(WIDTH):
+            y = sample_lane(a, lane, t)
+            keep_sample(y, out, rows[lane], column, closed)
             if closed:
-                out[rows[lane], 1, column] = control_lane(a, lane, t, com[k], out[rows[lane], 0, column])
+                keep_answer(control_lane(a, lane, t, com[k], y), out, rows[lane], column)
             else:
                 keep_drive(Drive(given, 0.0), a, lane)
         if len(position):
             for lane in range(WIDTH):
-                keep_state(pull_ram(state_at(a, lane), anchor * period, position[k]), a, lane)
+                s, m = state_at(a, lane)
+                keep_state(pull_plant(s, m, anchor * period, position[k], parameters_at(a, lane)), a, lane)
         for i in range(steps):
             # the loop that everything is for
             for lane in range(WIDTH):
                 u = Input(drive_at(a, lane).now, load[k], 0.0, t + i * h, i * h, h)
-                keep_state(step_plant(state_at(a, lane), u, parameters_at(a, lane), coefficients_at(a, lane)), a, lane)
+                s, m = state_at(a, lane)
+                keep_state(step_plant(s, m, u, parameters_at(a, lane), coefficients_at(a, lane)), a, lane)
 
 
 def begin_lane(a: Any, lane: int, position: Any, steps: int, h: float) -> None:
-    """Put one lane at rest where the transducer shows position[0], or at zero, and compute its coefficients."""
-    s, p = state_at(a, lane), parameters_at(a, lane)
-    keep_coefficients(compute_coefficients(p, h), a, lane)
-    rest = rest_at_reading(s, position[0], p, steps) if len(position) else initialise_sensed_position(s, p)
-    keep_state(rest, a, lane)
-
-
-def sample_lane(a: Any, lane: int, t: float) -> tuple[float, float, float]:
-    """Readings of one lane at `t`: XJ m, P12 Pa, XS m; as `plant.solve.read_sensors`, without noise."""
-    s = state_at(a, lane)
+    """Put one lane at rest where its sensor shows position[0], or as it is, and compute its coefficients."""
+    s, m = state_at(a, lane)
     p = parameters_at(a, lane)
-    xj, m_reading = at_reading(s.sensed, s.memory.reading, s, Input(0.0, 0.0, 0.0, t, 0.0, p.controller.period), p)
-    keep_state(set_sample_memories(s, s.memory.command, m_reading), a, lane)
-    return xj, s.pressure, s.spool_position
+    keep_coefficients(compute_plant_coefficients(p, h), a, lane)
+    keep_state(rest_at_reading(s, m, position[0], p, steps) if len(position) else (show_start(s, m, p), m), a, lane)
 
 
-def control_lane(a: Any, lane: int, t: float, com: float, xj: float) -> float:
-    """Cor, A, of one lane's controller for the demand `com` and the sensed position `xj`, m; it acts a cycle later."""
-    s, p, d = state_at(a, lane), parameters_at(a, lane), drive_at(a, lane)
-    demand, m_command = apply_command_effects(com, s.memory.command, xj, t, p)
-    cor, c = compute_current(loop_at(a, lane), demand, xj, p.controller)
+def sample_lane(a: Any, lane: int, t: float) -> Any:
+    """The readings of one lane at `t`, as `plant.solve.read_sensors` without noise."""
+    s, m = state_at(a, lane)
+    p = parameters_at(a, lane)
+    y, m = read_controlled(measure_plant(s, p), s, m, 0.0, t, p)
+    keep_state((s, m), a, lane)
+    return y
+
+
+def control_lane(a: Any, lane: int, t: float, com: float, y: Any) -> float:
+    """The drive that one lane's controller answers to a demand and the readings; it acts a cycle later."""
+    s, m = state_at(a, lane)
+    p, d = parameters_at(a, lane), drive_at(a, lane)
+    demand, m = take_demand(com, m, y[0], t, p)
+    drive: float
+    drive, c = control_plant(loop_at(a, lane), demand, y, p)
     keep_loop(c, a, lane)
-    keep_state(set_sample_memories(s, m_command, s.memory.reading), a, lane)
-    keep_drive(Drive(d.next, cor), a, lane)
-    return cor
+    keep_state((s, m), a, lane)
+    keep_drive(Drive(d.next, drive), a, lane)
+    return drive

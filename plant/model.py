@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plant import flat, plants
-from plant import step as step_module
+from plant import plants
+from plant.anchor import show_start
 from plant.compile import Function, compile_function, interpret_function
-from plant.effects import CATALOGUE, Effect, combine_laws, combine_shifts
+from plant.effects import Effect
 from plant.errors import InputError, suggest_name
+from plant.flat import list_state_values
 from plant.parameters import check_combinations, find_field, flatten_tables, parse_value, read_toml
 from plant.plants import Plant
 from plant.quantity import Quantity
-from plant.state import Input, Ports, State
 
 SHIPPED_MODELS = ("servo",)  # plant/models/NAME.toml, beside the nominal values of the plants
 STEP = 1e-5  # s, of the solver; its error is measured in the docs
@@ -30,14 +30,13 @@ STEP = 1e-5  # s, of the solver; its error is measured in the docs
 def find_parameter_groups(effects: Iterable[str] | None = None, plant: str = "eha") -> dict[str, type[Any]]:
     """The parameter groups of a plant and of `effects` (default: all effects of the catalogue that suit the plant)."""
     kind = plants.find_plant(plant)
-    chosen = list_offered_effects(plant) if effects is None else [CATALOGUE[name] for name in effects]
+    chosen = kind.list_effects() if effects is None else [kind.find_effect(name) for name in effects]
     return {**kind.groups, **{e.name: e.group for e in chosen if e.group is not None}}
 
 
 def list_offered_effects(plant: str = "eha") -> list[Effect]:
     """The effects of the catalogue that suit a plant."""
-    kind = plants.find_plant(plant)
-    return [e for e in CATALOGUE.list_all().values() if kind.offers(e)]
+    return plants.find_plant(plant).list_effects()
 
 
 def list_searched_effects(plant: str = "eha") -> list[Effect]:
@@ -85,6 +84,10 @@ class Model:
         """The plant that the values belong to."""
         return plants.find_plant(self.plant)
 
+    def find_effect(self, name: str) -> Effect:
+        """The effect of that name, as the plant has it. Raises KeyError."""
+        return self.kind.find_effect(name)
+
     def replace(self, changes: Mapping[str, object], where: object = "--set") -> Model:
         """The model with some parameters changed; naming an effect's parameter gives the model that effect.
 
@@ -97,17 +100,17 @@ class Model:
         model = self.with_effects(name.partition(".")[0] for name in changes)
         merged = {**model.values, **values}
         check_combinations(where, merged)
-        check_exclusions(where, model.effects, merged)
+        check_exclusions(where, model, merged)
         return replace(model, values=merged)
 
     def with_effects(self, groups: Iterable[str]) -> Model:
         """The model with the effects among `groups` added at their off values."""
         wanted = set(groups) | set(self.effects)
-        effects = tuple(e.name for e in CATALOGUE.list_all().values() if e.name in wanted and not e.base)
+        found = [e for e in self.kind.list_effects() if e.name in wanted and not e.base]
         usual = self.nominal
-        off = {name: usual.get(name, value) for e in effects if e not in self.effects
-               for name, value in CATALOGUE[e].off.items()}
-        return replace(self, values={**self.values, **off}, effects=effects)
+        off = {name: usual.get(name, value) for e in found if e.name not in self.effects
+               for name, value in e.off.items()}
+        return replace(self, values={**self.values, **off}, effects=tuple(e.name for e in found))
 
     def __getitem__(self, name: str) -> float:
         return self.values[name]
@@ -151,14 +154,18 @@ class Model:
         row = tuple(tuple(self.values[f"{group}.{f}"] for f in cls._fields) for group, cls in groups.items())
         return np.array([row], np.dtype((np.record, list(inner.items()))))
 
-    def build_state(self) -> State:
-        """The actuator at rest in the middle, with the memories of its effects, as its transducer shows it."""
-        s = build_initial_state(self.effects)
-        if not any(CATALOGUE[e].port == "position" for e in self.effects):
-            return s
+    def build_start(self) -> tuple[Any, Any]:
+        """The plant at rest as its sensors show it, and the memories of its effects."""
+        s, m = self.kind.build_start(self.effects)
+        if self.kind.sense is None:
+            return s, m
         # once in plain Python, because the first sample is read before the first step
-        law = combine_laws("position", self.effects)[0]
-        return s._replace(sensed=float(law(s.jack_position, s.memory.position, s, Input(), self.build_record()[0])[0]))
+        shown = build_kernel(show_start, self.effects, False, self.plant)(s, m, self.build_record()[0])
+        return self.kind.state(*map(float, shown)), m
+
+    def build_flat_state(self) -> NDArray[np.float64]:
+        """`build_start` as an array, the state first."""
+        return np.array(list_state_values(self.build_start()))
 
 
 def load_model(source: str | Path = "eha") -> Model:
@@ -222,15 +229,15 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     return sized.with_effects(effects).replace(values, where)
 
 
-def check_exclusions(where: object, effects: Iterable[str], values: Mapping[str, float]) -> None:
+def check_exclusions(where: object, model: Model, values: Mapping[str, float]) -> None:
     """Refuse two active effects that exclude each other; an effect at its off value is not active.
 
     Raises:
         InputError: the names of both.
     """
-    working = {e for e in effects if CATALOGUE[e].is_active(values)}
+    working = {e for e in model.effects if model.find_effect(e).is_active(values)}
     for e in sorted(working):
-        for other in working.intersection(CATALOGUE[e].excludes):
+        for other in working.intersection(model.find_effect(e).excludes):
             raise InputError(where, e, f"{e} or {other}, not both at work")
 
 
@@ -247,11 +254,6 @@ def find_effect(name: str, plant: str = "eha") -> Effect:
     return known[name]
 
 
-def build_initial_state(effects: tuple[str, ...]) -> State:
-    """The actuator at rest with the memory of `effects`."""
-    return State(memory=Ports(*(combine_laws(port, effects)[1] for port in Ports._fields)))
-
-
 def build_kernel(function: Function, effects: tuple[str, ...], fast: bool = True, plant: str = "eha") -> Function:
     """`function`, which calls the physics, for a plant with `effects`.
 
@@ -261,26 +263,17 @@ def build_kernel(function: Function, effects: tuple[str, ...], fast: bool = True
         fast: compiled, once for each set of effects; False runs the same source in plain Python.
         plant: whose step it takes.
     """
-    laws = tuple(CATALOGUE[e].function for e in effects)
-    return _build_kernel(function, effects, laws, fast, plant)
+    kind = plants.find_plant(plant)
+    return _build_kernel(function, effects, kind.list_laws(effects), fast, kind)
 
 
 @cache
-def _build_kernel(function: Function, effects: tuple[str, ...], laws: tuple[Any, ...], fast: bool, plant: str
+def _build_kernel(function: Function, effects: tuple[str, ...], laws: tuple[Any, ...], fast: bool, kind: Plant
                   ) -> Function:
     # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
-    return (compile_function if fast else interpret_function)(function, collect_bindings(effects, plant))
+    return (compile_function if fast else interpret_function)(function, kind.bind_functions(effects))
 
 
 def collect_bindings(effects: tuple[str, ...], plant: str = "eha") -> dict[str, Function]:
-    """The functions that replace step, ports and state packing in the kernels of a plant with `effects`."""
-    ports = {f"at_{port}": combine_laws(port, effects)[0] for port in Ports._fields}
-    ports["shift_position_memory"] = combine_shifts(effects)
-    kind = plants.find_plant(plant)
-    ports["step_plant"], ports["compute_coefficients"] = kind.step, kind.coefficients
-    ports["pack_state"], ports["unpack_state"] = flat.make_packers(build_initial_state(effects))
-    if any(CATALOGUE[e].port in ("supply", "viscosity") for e in effects):
-        ports["apply_oil"] = step_module.apply_changing_oil
-    if kind.step is not step_module.step_plant or any(CATALOGUE[e].port in ("valve", "jack_drag") for e in effects):
-        ports["compute_compliance"] = step_module.update_compliance
-    return ports
+    """The functions that take the place of the placeholders in the kernels of a plant with `effects`."""
+    return plants.find_plant(plant).bind_functions(effects)

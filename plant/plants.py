@@ -5,13 +5,16 @@ name), so single runs, lanes, emulator and fits work with every plant.
 """
 from __future__ import annotations
 
+import dis
 import hashlib
 import importlib
+import inspect
 import re
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, NamedTuple, cast
@@ -19,24 +22,35 @@ from typing import Annotated, Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from plant import signals
-from plant import step as reference
-from plant.compile import Function, list_called_names
-from plant.effects import Effect, build_base_effect, build_effect
+from plant.compile import Function, find_called_functions, rebind_names
+from plant.effects import CATALOGUE, Effect, build_base_effect, build_effect, combine_laws
 from plant.errors import InputError
 from plant.faults import Fault
-from plant.parameters import GROUPS, load_nominal_values
-from plant.ports import port
+from plant.flat import make_packers
+from plant.kernels import write_constant, write_mover, write_signal_functions
+from plant.pid import Loop, control_by_pid
+from plant.ports import (
+    PORTS,
+    Port,
+    at_command,
+    at_reading,
+    bind_port,
+    bind_shifts,
+    chain_shifts,
+    make_memory_type,
+    port,
+)
 from plant.quantity import Quantity
 from plant.segments import Segment
 from plant.signals import Signals
-from plant.state import State
+from plant.state import Sampled
 
 __all__ = ["Fault", "MeasuredPressures", "Plant", "Table", "Term", "base_effect", "effect", "find_plant", "list_plants",
            "load_plant", "port"]
 
 Array = NDArray[np.float64]
-MODULES = {"ehs": "plant.ehs"}  # plants beside the reference model; read when first named
+MODULES = {"eha": "plant.eha", "ehs": "plant.ehs"}  # the shipped plants; read when first named
+CONTROL_AT = 2  # of an exported unit: behind the cycles of its plant and the answer of its controller
 OWN_EFFECTS = "__effects__"  # where a plant file keeps the effects that it declares
 
 
@@ -106,9 +120,13 @@ class Plant:
     scatter: Mapping[str, float] | None = None  # tolerances, a fraction, of parameters; None: as their types say
     balances: bool = False  # `plant.forced` balances flow and force of its jack, as measured signals have them
     solver_step: float = 1e-5  # s
+    # functions of its code by name, marked by `plant.compile.bind_later`, that others replace where an effect acts at
+    # one of the ports; none: always
+    variants: Mapping[str, tuple[Function, frozenset[str]]] = field(default_factory=dict, repr=False)
     tables: tuple[Table, ...] = field(default=(), repr=False)  # of the files that its rig writes
     measured_pressures: MeasuredPressures | None = None  # how they drive the plant; None: they cannot
     file: Path | None = None  # of a user's plant
+    key: str = ""  # what a model calls it: its name, or the path of a user's file as it was named
     effects: Mapping[str, Effect] = field(default_factory=dict, repr=False)  # its own
 
     def __post_init__(self) -> None:
@@ -148,52 +166,163 @@ class Plant:
         return q.tolerance if self.scatter is None else self.scatter.get(name, 0.0)
 
     @cached_property
-    def ports(self) -> frozenset[str]:
-        """The ports at which effects can act: those that its step calls, and those of the sampled loop around it."""
-        calls = list_called_names(self.step)
-        if self.step is reference.step_plant:
-            calls = calls | list_called_names(reference.apply_changing_oil)
-        return frozenset({"command", "reading"} | {name[3:] for name in calls if name.startswith("at_")})
+    def ports(self) -> Mapping[str, Port]:
+        """The ports at which effects can act, in their order: those of its step, and those of the sampled loop."""
+        whole = [f for f in (self.step, self.sense, *(v for v, _ in self.variants.values())) if f is not None]
+        found = {name[3:]: g.port for f in whole for name, g in find_called_functions(f).items() if hasattr(g, "port")}
+        ordered = sorted(found.items(), key=lambda item: item[1].number)
+        unit = self.signals.controlled.unit
+        command, reading = (f.port._replace(unit=unit) for f in (at_command, at_reading))
+        return {"command": command, **dict(ordered), "reading": reading}
+
+    @cached_property
+    def memory(self) -> type[Any]:
+        """The type of the memories of effects."""
+        return make_memory_type(list(self.ports))
 
     @property
     def unit(self) -> str:
         """Unit of what drives it."""
         return self.signals.drive.unit
 
+    def list_effects(self) -> list[Effect]:
+        """The effects it can have: those of the catalogue that suit it, then its own, which may have their names."""
+        shared = (e for e in CATALOGUE.list_all().values() if e.name not in self.effects)
+        return [*(e for e in shared if self.offers(e)), *self.effects.values()]
+
+    def find_effect(self, name: str) -> Effect:
+        """Its own effect of that name, else that of the catalogue. Raises KeyError."""
+        return self.effects.get(name) or CATALOGUE[name]
+
+    def list_laws(self, names: tuple[str, ...]) -> tuple[Any, ...]:
+        """The laws of the effects as they are now: a user's file may have been loaded again."""
+        return tuple(self.find_effect(name).function for name in names)
+
+    def replace_effect(self, e: Effect) -> None:
+        """Put an effect with other start values in the place of the one of its name."""
+        if e.name in self.effects:
+            cast("dict[str, Effect]", self.effects)[e.name] = e
+        else:
+            CATALOGUE[e.name] = e
+
     def offers(self, e: Effect) -> bool:
-        """Whether the plant has the port, the parameters and the unit of current that an effect needs."""
+        """Whether a shared effect suits it: it has the port, in the same unit, and what else the law names."""
         if e.plant not in ("", self.name) or e.name in self.lacks:
             return False
         if e.base:
             return all(name in self.nominal for name in e.fitted)
-        return e.port in self.ports and (self.unit == "A" or "A" not in {q.unit for q in e.parameters.values()})
+        if e.port not in self.ports:
+            return False
+        shared, own = PORTS[e.port].unit or self.signals.controlled.unit, self.ports[e.port].unit
+        has_unit = shared == own or not any(shared in q.unit.split() for q in e.parameters.values())
+        return has_unit and (e.plant == self.name or self._has_what_law_names(e))
+
+    def _has_what_law_names(self, e: Effect) -> bool:
+        """Whether the state has the fields, and the parameters the groups, that the law of an effect names."""
+        state = Sampled if e.port == "command" else self.state
+        return all(name in state._fields for name in find_fields_of(e.function, "s")) and all(
+            name == e.name or name in self.parameters for name in find_fields_of(e.function, "p"))
+
+    def bind_functions(self, names: tuple[str, ...]) -> dict[str, Function]:
+        """The functions that take the place of the placeholders in every kernel, for the plant with these effects."""
+        effects = [self.find_effect(name) for name in names]
+        bound = dict(self._functions)
+        for name in self.ports:
+            acting = [e for e in effects if e.port == name]
+            law, _ = combine_laws(name, acting)
+            bound[f"at_{name}"] = law if not acting else bind_port(
+                name, law, any(e.memory is not None for e in acting), self.memory)
+        shifts = {name: [e.shift for e in effects if e.port == name] for name in self.ports}
+        bound["shift_memories"] = bind_shifts(
+            ((name, chain_shifts(own)) for name, own in shifts.items() if any(own)), self.memory)
+        bound["pack_state"], bound["unpack_state"] = make_packers(self.build_start(names))
+        acting_at = {e.port for e in effects}
+        return bound | {name: f for name, (f, ports) in self.variants.items() if not ports or ports & acting_at}
+
+    @cached_property
+    def _functions(self) -> dict[str, Function]:
+        """What does not depend on effects."""
+        step = self.step
+        if len(inspect.signature(step).parameters) == 4:
+            step = rebind_names(_step_without_coefficients, step=step)
+        moves = self.moves if callable(self.moves) else write_mover(self.state, self.moves)
+        store, load = make_packers(self.build_control_memory(), CONTROL_AT)
+        return {"step_plant": step, "store_control": store, "load_control": load,
+                "measure_plant": self.measure, "move_plant": moves,
+                "sense_plant": self.sense or _sense_nothing, "control_plant": self.control or control_by_pid,
+                "start_control": write_constant("start_control", self.build_control_memory()),
+                "compute_plant_coefficients": self.coefficients or _compute_no_coefficients,
+                **write_signal_functions(self.signals)}
+
+    def find_shown_fields(self) -> list[int] | None:
+        """The numbers of the fields of the state that `measure` shows as they are; None: it computes something."""
+        marks = [object() for _ in self.state._fields]
+        try:
+            shown = self.measure(self.state(*marks), None)
+        except Exception:  # it computes with what is no number here
+            return None
+        found = [i for y in shown for i, mark in enumerate(marks) if y is mark]
+        return found if len(found) == len(self.signals.outputs) else None
+
+    def build_control_memory(self) -> Any:
+        """What the law of the controller remembers at the start."""
+        if self.control is None:
+            return Loop()
+        return self.control_memory() if self.control_memory else 0.0
+
+    def build_start(self, names: tuple[str, ...]) -> tuple[Any, Any]:
+        """The plant at rest and the memories of the effects `names` at the start."""
+        effects = [self.find_effect(name) for name in names]
+        return self.state(), self.memory(*(combine_laws(port, effects)[1] for port in self.ports))
+
+
+def _step_without_coefficients(s: Any, m: Any, u: Any, p: Any, k: Any) -> Any:
+    return step(s, m, u, p)
+
+
+def _compute_no_coefficients(p: Any, h: float) -> float:
+    return 0.0
+
+
+def _sense_nothing(s: Any, m: Any, u: Any, p: Any) -> Any:
+    return s, m
+
+
+step: Function = _step_without_coefficients  # bound for a plant whose step needs no coefficients
+
+
+@cache
+def find_fields_of(function: Any, argument: str) -> frozenset[str]:
+    """The fields of an argument that a function names, as x in s.x."""
+    code = list(dis.get_instructions(getattr(function, "py_func", function)))
+    return frozenset(there.argval for here, there in pairwise(code)
+                     if here.opname == "LOAD_FAST" and here.argval == argument and there.opname == "LOAD_ATTR")
+
+
+_LOADED: dict[str, Plant] = {}  # users' plants, by the path that they were named by
 
 
 def find_plant(name: str) -> Plant:
-    """The plant of that name.
+    """The shipped plant of that name, or the user's plant that `load_plant` has loaded from that path.
 
     Raises:
         InputError: there is none.
     """
-    if name == "eha":
-        return _build_reference_plant()
+    if name in _LOADED:
+        return _LOADED[name]
     if name not in MODULES:
-        raise InputError("plant", name, f"one of {', '.join(list_plants())}")
-    plant: Plant = importlib.import_module(MODULES[name]).PLANT
-    return plant
+        raise InputError("plant", name, f"one of {', '.join(MODULES)}, or a Python file that declares a plant")
+    return _find_shipped_plant(name)
 
 
 def list_plants() -> tuple[str, ...]:
-    """All plants."""
-    return ("eha", *MODULES)
+    """All shipped plants."""
+    return tuple(MODULES)
 
 
 @cache
-def _build_reference_plant() -> Plant:
-    return Plant(name="eha", title="electrohydraulic actuator", signals=signals.EHA, parameters=GROUPS, state=State,
-                 step=reference.step_plant, measure=reference.measure, moves=("jack_position",),
-                 control=reference.measure, coefficients=reference.compute_coefficients, values=load_nominal_values(),
-                 balances=True)
+def _find_shipped_plant(name: str) -> Plant:
+    return find_declared_plant(importlib.import_module(MODULES[name]), name)
 
 
 def name_group(cls: type[Any]) -> str:
@@ -237,14 +366,14 @@ def base_effect(name: str, group: type[Any], *fields: str, **more: Any) -> None:
 
 
 def load_plant(path: Path, source: bytes | None = None) -> Plant:
-    """Run a user's plant file; the plant that it declares as PLANT.
+    """Run a user's plant file; the plant that it declares as PLANT. From now on `find_plant` finds it by its path.
 
     `source` is its content where that has been read already; exactly these bytes run.
 
     Raises:
         InputError: unreadable, not Python, or what it declares is incomplete.
     """
-    path = path.absolute()
+    named, path = path, path.absolute()
     if not path.is_file() and source is None:
         raise InputError(path, "", "a Python file that declares a plant; it does not exist")
     try:
@@ -260,10 +389,11 @@ def load_plant(path: Path, source: bytes | None = None) -> Plant:
         raise InputError(f"{path}:{error.lineno}", "", f"Python ({error.msg})") from error
     except Exception as error:
         raise InputError(path, "", f"a file that Python can run ({type(error).__name__}: {error})") from error
-    return find_declared_plant(module, path.stem, path)
+    plant = _LOADED[str(named)] = find_declared_plant(module, path.stem, path, str(named))
+    return plant
 
 
-def find_declared_plant(module: ModuleType, name: str, file: Path | None = None) -> Plant:
+def find_declared_plant(module: ModuleType, name: str, file: Path | None = None, key: str = "") -> Plant:
     """The plant that a module declares as PLANT, with the effects beside it.
 
     Raises:
@@ -272,5 +402,8 @@ def find_declared_plant(module: ModuleType, name: str, file: Path | None = None)
     plant = vars(module).get("PLANT")
     if not isinstance(plant, Plant):
         raise InputError(file or name, "PLANT", "PLANT = Plant(...)")
-    own = vars(module).get(OWN_EFFECTS, {})
-    return replace(plant, name=plant.name or name, file=file, effects=own)
+    own = {name: replace(e, plant=plant.name or name) for name, e in vars(module).get(OWN_EFFECTS, {}).items()}
+    made = replace(plant, name=plant.name or name, file=file, effects=own, key=key or name)
+    PORTS.update({name: port for name, port in made.ports.items() if name not in PORTS})
+    CATALOGUE.of_plants.update(own)
+    return made

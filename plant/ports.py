@@ -1,19 +1,31 @@
-"""The ports of the signal path: places where effects act, and how several effects become one function.
+"""The ports: places in a plant's step where effects act, and how several effects become one function.
 
-`plant.step` calls `at_<port>` at each place. The functions here pass the signal unchanged; a model's kernels are
-compiled with its effects instead (`plant.compile`). A function at a port gets the signal, its memory, the state at the
-start of the step, the inputs and the parameters; it returns the signal and its new memory.
+A step calls `at_<port>` at each place: `x, m = at_load(x, m, s, u, p)` gets the signal, the memories of all effects,
+the state at the start of the step, the inputs and the parameters; it returns the signal and the memories. The functions
+here pass the signal unchanged; a model's kernels are compiled with its effects instead (`plant.compile`).
 """
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+from collections import namedtuple
+from collections.abc import Iterable, Sequence
+from itertools import count
+from typing import Any, NamedTuple
 
-from plant.compile import Function, rebind_names
-from plant.state import Input, Memory, State
+from plant.compile import Function, bind_later, rebind_names
+from plant.state import Input, Memory
+
+_NUMBERS = count()
 
 
-def pass_signal(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
+class Port(NamedTuple):
+    """What passes a port."""
+
+    unit: str
+    meaning: str  # for people
+    number: int = 0  # ports act in the order of their declaration
+
+
+def pass_signal(x: Any, m: Memory, s: Any, u: Input, p: Any) -> tuple[Any, Memory]:
     """A port without effects: the signal passes."""
     return x, m
 
@@ -27,13 +39,59 @@ def port(unit: str, meaning: str) -> Function:
         unit: of the signal.
         meaning: of the signal, for people.
     """
-    made = rebind_names(pass_signal)
-    made.port = (unit, meaning)
+    made: Any = bind_later(rebind_names(pass_signal))
+    made.port = Port(unit, meaning, next(_NUMBERS))
     return made
 
 
-at_command = at_current = at_nozzle = at_feedback = at_spool_force = at_metering = pass_signal
-at_valve = at_load = at_jack_drag = at_position = at_reading = at_supply = at_viscosity = pass_signal
+# around every plant's step, once a cycle; in the unit of the controlled signal
+at_command = port("", "demand as the controller takes it")
+at_reading = port("", "controlled signal with its noise, as it is sent")
+
+at_current = port("A", "current in the torque motor's coil")
+at_supply = port("1", "supply pressure over nominal r; PSR and GPF follow with r, GQF and GQ with sqrt r")
+at_viscosity = port("1", "viscosity of the oil over nominal; CJ, BF and 1/CLK follow")
+at_nozzle = port("m", "flapper displacement as the nozzles feel it")
+at_feedback = port("m", "spool displacement as the feedback spring feels it")
+at_spool_force = port("N", "extra force on the spool, positive as XS")
+at_metering = port("m", "spool displacement as the metering edges feel it")
+at_valve = port("Pa, Pa s/m", "Line, P12 against the ram's speed")
+at_load = port("N", "external force FR on the ram, positive against extension")
+at_jack_drag = port("N, N s/m", "Drag, all that resists the ram in the jack")
+at_position = port("m", "ram position as its transducer feels it")
+
+PORTS: dict[str, Port] = {name[3:]: value.port for name, value in list(globals().items()) if name.startswith("at_")}
+"""Ports by name: the shared ones, and those of plants that have been loaded."""
+
+
+def make_memory_type(names: Sequence[str]) -> type[Any]:
+    """The memories of all effects of a plant with these ports: a NamedTuple with a field for each port."""
+    make: Any = namedtuple
+    made: type[Any] = make("Memory", names)
+    made.holds_memories = True
+    return made
+
+
+def bind_port(name: str, law: Function, remembers: bool, memory: type[Any]) -> Function:
+    """at_NAME for a chain of laws (see `chain_laws`) in a plant whose memories have the type `memory`."""
+    own = ", ".join("own" if field == name else f"m.{field}" for field in memory._fields)
+    lines = ([f"    x, own = law(x, m.{name}, s, u, p)", f"    return x, Memory({own})"] if remembers else
+             [f"    return law(x, m.{name}, s, u, p)[0], m"])
+    made: dict[str, Any] = {"law": law, "Memory": memory}
+    exec("\n".join([f"def at_{name}(x, m, s, u, p):", *lines]), made)
+    return made[f"at_{name}"]
+
+
+def bind_shifts(shifts: Iterable[tuple[str, Function]], memory: type[Any]) -> Function:
+    """`(m, moved)`: the memories after the controlled body was moved, by the shift of each port that has one."""
+    made: dict[str, Any] = {f"shift_{name}": shift for name, shift in shifts}
+    if not made:
+        return keep_memory
+    own = ", ".join(f"shift_{field}(m.{field}, moved)" if f"shift_{field}" in made else f"m.{field}"
+                    for field in memory._fields)
+    made["Memory"] = memory
+    exec(f"def shift_memories(m, moved):\n    return Memory({own})", made)
+    return made["shift_memories"]
 
 
 def chain_laws(laws: Iterable[tuple[Function, type[Any] | None]]) -> tuple[Function, Memory]:
@@ -52,15 +110,12 @@ def chain_laws(laws: Iterable[tuple[Function, type[Any] | None]]) -> tuple[Funct
 
 
 def keep_memory(m: Memory, moved: float) -> Memory:
-    """The memory of a port without a position of the ram in it, after the ram was moved by `moved` m: as it was."""
+    """The memory of a port without a position in it, after the controlled body was moved by `moved`: as it was."""
     return m
 
 
-shift_position_memory = keep_memory
-
-
 def chain_shifts(shifts: Iterable[Function | None]) -> Function:
-    """What moves the memories of several effects along with the ram (None: such a memory stays), as one function."""
+    """What moves the memories of several effects along with the body (None: such a memory stays), as one function."""
     whole: Function | None = None
     for shift in shifts:
         one = shift or keep_memory
@@ -73,11 +128,11 @@ first: Function = pass_signal
 second: Function = pass_signal  # these three are bound in each link of a chain
 
 
-def _apply_without_memory(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
+def _apply_without_memory(x: Any, m: Memory, s: Any, u: Input, p: Any) -> tuple[Any, Memory]:
     return law(x, s, u, p), m
 
 
-def _apply_in_sequence(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
+def _apply_in_sequence(x: Any, m: Memory, s: Any, u: Input, p: Any) -> tuple[Any, Memory]:
     x, a = first(x, m[0], s, u, p)
     x, b = second(x, m[1], s, u, p)
     return x, (a, b)

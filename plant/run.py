@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import traceback
+from collections import namedtuple
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache, partial
@@ -11,22 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.compile import compute_fingerprint, find_cache_folder, interpret_function
-from plant.controller import apply_command_effects
-from plant.effects import CATALOGUE
+from plant.controller import take_demand
 from plant.errors import InputError
-from plant.flat import list_state_values, make_packers
+from plant.flat import make_packers
+from plant.kernels import write_reader
 from plant.machine_code import Call, StoredCode
-from plant.model import Model, build_initial_state, build_kernel, collect_bindings
-from plant.solve import NOISES, advance_flat_state, read_flat_sensors, run_closed_loop, step_cycle
-from plant.state import State
+from plant.model import Model, build_kernel, collect_bindings
+from plant.plants import Plant, find_plant
+from plant.signals import EHA
+from plant.solve import advance_flat_state, read_flat_sensors, run_closed_loop, step_cycle
 from plant.threads import run_beside
 
 Array = NDArray[np.float64]
-SENSED, PRESSURE, SPOOL = (State._fields.index(name) for name in ("sensed", "pressure", "spool_position"))
+NOISES = len(EHA.outputs) + 1  # standard normal numbers a cycle of the EHA: position, pressure, spool, effects
 
 
 class Columns(NamedTuple):
-    """A simulated run, one row per cycle: `t` s, `com` and `xj` m, `cor` A, `p12` Pa, `xs` m, `load` N; each (n,)."""
+    """A simulated run of the EHA, a row a cycle: `t` s, `com`, `xj` m, `cor` A, `p12` Pa, `xs` m, `load` N; (n,)."""
 
     t: Array
     com: Array
@@ -37,17 +39,24 @@ class Columns(NamedTuple):
     load: Array
 
 
-def sample_noise(seed: int, cycles: int) -> Array:
-    """The random numbers of a run, (cycles, NOISES), standard normal; the same for a bench run and a simulation."""
-    return np.random.default_rng(seed).standard_normal((cycles, NOISES))
+@cache
+def make_columns_type(kind: Plant) -> type[Any]:
+    """The type of a simulated run of a plant: a field for each of its signals; (n,) each."""
+    names = tuple(s.name for s in kind.signals)
+    return Columns if names == Columns._fields else namedtuple("Columns", names)
+
+
+def sample_noise(seed: int, cycles: int, numbers: int = NOISES) -> Array:
+    """The random numbers of a run, (cycles, numbers), standard normal; the same for a bench run and a simulation."""
+    return np.random.default_rng(seed).standard_normal((cycles, numbers))
 
 
 class NoiseStream:
     """The rows of `sample_noise` without end; drawn in blocks, which costs a tenth of drawing single rows."""
 
-    def __init__(self, seed: int, block: int = 64) -> None:
+    def __init__(self, seed: int, numbers: int = NOISES, block: int = 64) -> None:
         self._rng, self._block = np.random.default_rng(seed), block
-        self._drawn, self._at = np.empty((0, NOISES)), 0
+        self._drawn, self._at = np.empty((0, numbers)), 0
 
     def take(self) -> list[float]:
         """The next row."""
@@ -56,9 +65,9 @@ class NoiseStream:
         return row
 
     def look_ahead(self, rows: int) -> Array:
-        """The next rows, (rows, NOISES), which stay the next ones; see `skip`."""
+        """The next rows, (rows, numbers), which stay the next ones; see `skip`."""
         if self._at + rows > len(self._drawn):
-            more = self._rng.standard_normal((max(rows, self._block), NOISES))
+            more = self._rng.standard_normal((max(rows, self._block), self._drawn.shape[1]))
             self._drawn, self._at = np.concatenate((self._drawn[self._at:], more)), 0
         return self._drawn[self._at: self._at + rows]
 
@@ -73,12 +82,15 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
 
     Args:
         model: the plant.
-        command: (n,) demand in m, one a cycle.
-        load: (n,) external force on the ram in N, positive against extension; none by default.
+        command: (n,) demand, one a cycle; of the EHA m.
+        load: (n,) external load; of the EHA N on the ram, positive against extension; none by default.
         seed: of the noise.
-        steps: steps a cycle; default: one every 10 us.
+        steps: steps a cycle; default: those of the plant, for the EHA one every 10 us.
         fast: compiled; False runs the same source in plain Python.
-        drawn: (n, NOISES) random numbers in place of those of `seed`: noise that is not white.
+        drawn: (n, outputs + 1) random numbers in place of those of `seed`: noise that is not white.
+
+    Returns:
+        The columns of the plant's signals, with those names; of the EHA `Columns`.
 
     Raises:
         InputError: an empty command, or a load of another length.
@@ -86,34 +98,37 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
     com = np.ascontiguousarray(command, float)
     force = np.zeros_like(com) if load is None else np.ascontiguousarray(load, float)
     if com.ndim != 1 or not len(com) or force.shape != com.shape:
-        raise InputError("command", "com", f"one demand and one load a cycle, not shapes {com.shape} and {force.shape}")
-    out = np.empty((len(com), 4))
-    record = model.build_record()
+        raise InputError("command", model.kind.signals.command.name,
+                         f"one demand and one load a cycle, not shapes {com.shape} and {force.shape}")
+    signals = model.kind.signals
+    out = np.empty((len(com), len(signals.columns)))
     with report_law_errors(model):
         run = build_kernel(run_closed_loop, model.effects, fast, model.plant)
-        noise = sample_noise(seed, len(com)) if drawn is None else drawn
-        if fast:
-            run_beside(partial(run, model.build_state(), com, force, noise, record, steps or model.steps, out))
-        else:
-            run(model.build_state(), com, force, noise, record, steps or model.steps, out)
+        noise = sample_noise(seed, len(com), len(signals.outputs) + 1) if drawn is None else drawn
+        record = model.build_record()
+        work = partial(run, model.build_flat_state(), com, force, noise, record, steps or model.steps, out)
+        run_beside(work) if fast else work()
     t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
-    xj, cor, p12, xs = (out[:, i].copy() for i in range(4))
-    return Columns(t, com, xj, cor, p12, xs, force)
+    found = {s.name: out[:, i].copy() for i, s in enumerate(signals.columns)}
+    given = {"time": t, "command": com, "load": force}
+    columns = (found[s.name] if s.name in found else given[s.role] for s in signals)
+    return cast(Columns, make_columns_type(model.kind)(*columns))
 
 
 @contextmanager
 def report_law_errors(model: Model) -> Iterator[None]:
-    """Report an error in a user's own law as bad input, whatever numba or Python raised.
+    """Report an error in a user's own law or plant as bad input, whatever numba or Python raised.
 
     Raises:
-        InputError: the law, with its file and line where they are known. A model without effects raises what it raised.
+        InputError: the law, with its file and line where they are known. A shipped model without effects raises what it
+            raised.
     """
     try:
         yield
     except Exception as error:
-        if not model.effects:
+        if not model.effects and model.kind.file is None:
             raise
-        where, cause = _find_law_error(model) or ("effects", error)
+        where, cause = _find_law_error(model) or (model.kind.file or "effects", error)
         said = next((line.strip() for line in reversed(str(cause).splitlines()) if line.strip()), "")
         raise InputError(where, ", ".join(model.effects),
                          f"laws that can be compiled and run ({type(cause).__name__}: {said})") from error
@@ -121,11 +136,11 @@ def report_law_errors(model: Model) -> Iterator[None]:
 
 def _find_law_error(model: Model) -> tuple[str, Exception] | None:
     """The same mistake as Python tells it, with file and line, if it makes it too: numba says neither."""
-    laws = [CATALOGUE[name].function for name in model.effects]
+    laws = [*model.kind.list_laws(model.effects), model.kind.step]
     files = {law.__code__.co_filename for law in laws if law is not None}
     try:
         step = build_kernel(step_cycle, model.effects, False, model.plant)
-        step(model.build_state(), 0.0, 0.0, 0.0, 0.0, model.build_record(), 1)
+        step(*model.build_start(), 0.0, 0.0, 0.0, 0.0, model.build_record(), 1)
     except Exception as error:
         frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in files]
         return (f"{frames[-1].filename}:{frames[-1].lineno}", error) if frames else None
@@ -136,9 +151,9 @@ class Demand:
     """The demand after the effects at the port `command`, cycle by cycle: what the firmware closes its loop on."""
 
     def __init__(self, model: Model) -> None:
-        self.is_changed = any(CATALOGUE[effect].port == "command" for effect in model.effects)
-        self._law = build_kernel(apply_command_effects, model.effects, fast=False) if self.is_changed else None
-        self._first = build_initial_state(model.effects).memory.command
+        self.is_changed = any(model.find_effect(effect).port == "command" for effect in model.effects)
+        self._law = build_kernel(take_demand, model.effects, False, model.plant) if self.is_changed else None
+        self._first = model.kind.build_start(model.effects)[1]
         self._record = model.build_record()[0]
         self._period = model["controller.period"]
         self.restart()
@@ -157,10 +172,11 @@ class Demand:
 
 
 class LentPlant(NamedTuple):
-    """State and parameters of a plant, places of the noise of its three transducers, address of its machine code."""
+    """State and parameters of a plant, where its readings and their noise are in these, address of its machine code."""
 
     flat: Array
     live: Array
+    fields: list[int]
     levels: list[int]
     advance: int
 
@@ -172,26 +188,34 @@ class Actuator:
         self.model, self.steps = model, steps or model.steps
         self.cycle = 0
         with report_law_errors(model):
-            state = model.build_state()
-        self._flat = np.array(list_state_values(state))
-        self._unpack = make_packers(state)[1]
+            self._flat = model.build_flat_state()
+        self._unpack = make_packers(model.kind.build_start(model.effects))[1]
         self._record = model.build_record()
         self._live = self._record.view(np.float64)  # the same numbers, in the order of their names
         self._index = {name: i for i, name in enumerate(model.list_names())}
-        self._levels = [self._index[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
-        self.noise = NoiseStream(seed)
-        self._noise = [0.0] * NOISES
+        outputs = model.kind.signals.outputs
+        self.noise = NoiseStream(seed, len(outputs) + 1)
+        self._noise = [0.0] * (len(outputs) + 1)
         self._code = load_stored_advance(model.effects, model.plant) if fast else None
         self._advance = self._bind_advance()
-        # a reading that nothing changes is faster without a call of compiled code
-        changed = any(CATALOGUE[e].port == "reading" for e in model.effects)
-        self._read = build_kernel(read_flat_sensors, model.effects, fast) if changed else None
+        # readings that are fields of the state, and that nothing changes, are faster without a call of compiled code
+        shown = model.kind.find_shown_fields()
+        changed = any(model.find_effect(e).port == "reading" for e in model.effects)
+        is_direct = shown is not None and not changed and all(s.noise for s in outputs)
+        self._places = list(zip(shown or (), (self._index[s.noise] for s in outputs), strict=True)) if is_direct else []
+        self._read_fields: Any = write_reader(self._places) if is_direct else None
+        self._read = None if is_direct else build_kernel(read_flat_sensors, model.effects, fast, model.plant)
         self._period = model["controller.period"]
 
     @property
-    def state(self) -> State:
+    def state(self) -> Any:
         """The present state of the plant."""
-        return cast(State, self._unpack(self._flat.tolist()))
+        return self._unpack(self._flat.tolist())[0]
+
+    @property
+    def memory(self) -> Any:
+        """What the effects remember now, by port."""
+        return self._unpack(self._flat.tolist())[1]
 
     def warm(self) -> None:
         """Compile now, so that the first cycle is not late.
@@ -205,34 +229,35 @@ class Actuator:
             if self._read:
                 self._read(self._flat.copy(), np.array(self._noise), 0.0, self._record)
 
-    def sample(self) -> tuple[float, float, float]:
-        """The readings of the transducers: XJ m, P12 Pa, XS m. Call it once per cycle: it draws the cycle's noise."""
+    def sample(self) -> tuple[float, ...]:
+        """The readings of the sensors in the order of the outputs; of the EHA XJ m, P12 Pa, XS m.
+
+        Call it once per cycle: it draws the cycle's noise.
+        """
         n = self._noise = self.noise.take()
         if self._read:
-            return cast("tuple[float, float, float]", self._read(
-                self._flat, np.array(n), self.cycle * self._period, self._record))
-        level, state = self._live.item, self._flat.item
-        position, pressure, spool = self._levels
-        return (state(SENSED) + level(position) * n[0], state(PRESSURE) + level(pressure) * n[1],
-                state(SPOOL) + level(spool) * n[2])
+            t = self.cycle * self._period
+            return cast("tuple[float, ...]", self._read(self._flat, np.array(n), t, self._record))
+        return cast("tuple[float, ...]", self._read_fields(self._flat.item, self._live.item, n))
 
-    def advance(self, current: float, load: float = 0.0) -> None:
-        """Simulate one cycle with `current`, A, in the torque motor and `load`, N, on the ram."""
+    def advance(self, drive: float, load: float = 0.0) -> None:
+        """Simulate one cycle with a drive and an external load, of the EHA A in the torque motor and N."""
         t = self.cycle * self._period
-        self._advance(current, load, self._noise[3], t)
+        self._advance(drive, load, self._noise[-1], t)
         self.cycle += 1
 
     def lend(self) -> LentPlant | None:
         """What compiled code needs to run cycles of this plant itself; None where that takes more than `advance`."""
         if self._code is None or self._read is not None:
             return None
-        return LentPlant(self._flat, self._live, self._levels, self._code.find_address())
+        fields, levels = map(list, zip(*self._places, strict=True))
+        return LentPlant(self._flat, self._live, fields, levels, self._code.find_address())
 
     def _bind_advance(self) -> Call:
         if self._code is not None:
             return self._code.bind((self._flat,), 4, (self._record, self.steps))
         run = build_kernel(advance_flat_state, self.model.effects, fast=False, plant=self.model.plant)
-        return lambda current, load, noise, t: run(self._flat, current, load, noise, t, self._record, self.steps)
+        return lambda drive, load, noise, t: run(self._flat, drive, load, noise, t, self._record, self.steps)
 
     def set(self, name: str, value: float) -> None:
         """Change the parameter "group.field" of the running plant; its effect must be in the model.
@@ -247,12 +272,13 @@ class Actuator:
 
 def load_stored_advance(effects: tuple[str, ...], plant: str = "eha") -> StoredCode:
     """`advance_flat_state` for a plant with `effects`: machine code from disk if it was stored there."""
-    return _load_stored_advance(effects, tuple(CATALOGUE[e].function for e in effects), plant)
+    kind = find_plant(plant)
+    return _load_stored_advance(effects, kind.list_laws(effects), kind)
 
 
 @cache
-def _load_stored_advance(effects: tuple[str, ...], laws: tuple[Any, ...], plant: str) -> StoredCode:
+def _load_stored_advance(effects: tuple[str, ...], laws: tuple[Any, ...], kind: Plant) -> StoredCode:
     # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
-    source = compute_fingerprint(interpret_function(advance_flat_state, collect_bindings(effects, plant)))
-    compile_code = partial(build_kernel, advance_flat_state, effects, True, plant)
+    source = compute_fingerprint(interpret_function(advance_flat_state, collect_bindings(effects, kind.key)))
+    compile_code = partial(build_kernel, advance_flat_state, effects, True, kind.key)
     return StoredCode(find_cache_folder() / source, compile_code)

@@ -7,23 +7,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.effects import CATALOGUE, Effect
-from plant.model import Model
+from plant.effects import Effect
+from plant.model import build_bare_model
+from plant.plants import find_plant
 from plant.run import simulate
 from plant.starts import compute_changes, compute_levels, compute_rms, find_starts
 
 Array = NDArray[np.float64]
-SHORT = np.concatenate([np.zeros(5), np.full(25, 2e-3), np.linspace(2e-3, -1e-3, 20)])  # m, what it runs
+# what plain Python runs, over the largest demand of the command
+SHORT = np.concatenate([np.zeros(5), np.full(25, 1.0), np.linspace(1.0, -0.5, 20)])
 
 
 class Shown(NamedTuple):
     """How much an effect of one size changes a signal: RMS over a command, and that over the noise of the sensor."""
 
     start: Mapping[str, float]
-    xj: float  # m
-    p12: float  # Pa
-    xs: float  # m
-    level: float  # largest of the three over its sensor's noise; 1 is as large as the noise
+    changes: Mapping[str, float]  # by output, SI
+    level: float  # largest of them over its sensor's noise; 1 is as large as the noise
 
 
 class Report(NamedTuple):
@@ -39,26 +39,29 @@ class Report(NamedTuple):
         return any(shown.level >= 1.0 for shown in self.shown)
 
 
-def check_effect(name: str, command: Array, load: Array | None = None) -> Report:
-    """Test an effect of the catalogue on `command` (n,) m and `load` (n,) N.
+def check_effect(name: str, command: Array, load: Array | None = None, plant: str = "eha") -> Report:
+    """Test an effect of a plant on `command` (n,) and `load` (n,).
 
     Raises:
         InputError: a law that cannot be compiled and run.
     """
-    effect = CATALOGUE[name]
+    kind = find_plant(plant)
+    effect, outputs = kind.find_effect(name), kind.signals.outputs
     if effect.base or effect.disturbance:
         return Report(name, (), ())
-    starts = find_starts(effect, command, load)
-    change = compute_changes(effect, starts, command, load) if starts else np.zeros((0, len(command), 3))
-    shown = tuple(Shown(dict(start), xj, p12, xs, most) for start, (xj, p12, xs), most in zip(
-        starts, compute_rms(change).tolist(), compute_levels(change).max(axis=1, initial=0.0).tolist(), strict=True))
-    return Report(name, tuple(_find_faults(effect, starts, command, load)), shown)
+    starts = find_starts(effect, command, load, plant)
+    change = (compute_changes(effect, starts, command, load, plant) if starts else
+              np.zeros((0, len(command), len(outputs))))
+    shown = tuple(Shown(dict(start), dict(zip((s.name for s in outputs), sizes, strict=True)), most)
+                  for start, sizes, most in zip(starts, compute_rms(change).tolist(), compute_levels(
+                      change, plant).max(axis=1, initial=0.0).tolist(), strict=True))
+    return Report(name, tuple(_find_faults(effect, starts, command, load, plant)), shown)
 
 
-def _find_faults(effect: Effect, starts: tuple[Mapping[str, float], ...], command: Array,
-                 load: Array | None) -> list[str]:
-    bare, off = Model(), Model().with_effects([effect.name])
-    faults = []
+def _find_faults(effect: Effect, starts: tuple[Mapping[str, float], ...], command: Array, load: Array | None,
+                 plant: str) -> list[str]:
+    bare = build_bare_model(plant)
+    off, faults = bare.with_effects([effect.name]), []
     if not _are_equal(simulate(bare, command, load), simulate(off, command, load)):
         faults.append("at its off value it changes the plant")
     if not starts:
@@ -70,8 +73,8 @@ def _find_faults(effect: Effect, starts: tuple[Mapping[str, float], ...], comman
         model, said = off.replace(starts[-1]), _format_values(starts[-1])
         if not _are_equal(*(simulate(model, command, load) for _ in range(2))):
             faults.append(f"with {said} two runs of one seed differ")
-        steps = 20  # a cycle: plain Python runs too
-        if not _are_equal(*(simulate(model, SHORT, steps=steps, fast=fast) for fast in (True, False))):
+        steps, short = 20, SHORT * np.abs(command).max()  # plain Python runs too
+        if not _are_equal(*(simulate(model, short, steps=steps, fast=fast) for fast in (True, False))):
             faults.append(f"with {said} compiled code and plain Python differ")
     return faults
 

@@ -116,6 +116,11 @@ class Signals(tuple[Signal, ...]):
         return tuple(s for s in self if s.role == "output")
 
     @property
+    def columns(self) -> tuple[Signal, ...]:
+        """What a simulated run computes: readings and drive, in the order of the recording's columns."""
+        return tuple(s for s in self if s.role in ("output", "drive"))
+
+    @property
     def controlled(self) -> Signal:
         """The signal that the controller controls."""
         return self.outputs[0]

@@ -1,77 +1,90 @@
 """One sampled cycle and one closed-loop run, as functions for `plant.model.build_kernel`.
 
-Timing (physics of a synchronous bus): cycle k senses XJ_k at t_k, the firmware answers Cor_k, and Cor_k drives the
-torque motor from t_k+1 to t_k+2. Row k of a log holds Com_k, XJ_k, Cor_k and the pressure and spool position at t_k.
+Timing (physics of a synchronous bus): cycle k reads the sensors at t_k, the controller answers a drive, which acts on
+the plant from t_k+1 to t_k+2. Row k of a log holds demand, drive and readings of cycle k.
 """
 from __future__ import annotations
 
 from typing import Any
 
-from plant.controller import Loop, apply_command_effects, compute_current
+from plant.controller import take_demand
 from plant.flat import pack_state, unpack_state
+from plant.kernels import (
+    add_noise,
+    compute_plant_coefficients,
+    control_plant,
+    keep_row,
+    measure_plant,
+    replace_first,
+    start_control,
+    step_plant,
+)
 from plant.ports import at_reading
-from plant.state import Input, Memory, Ports, State
-from plant.step import compute_coefficients, step_plant
-
-NOISES = 4  # standard normal numbers a cycle: position, pressure, spool, and one for effects that are noise
+from plant.state import Input, Memory
 
 
-def read_sensors(s: State, m: Memory, noise: Any, t: float, p: Any) -> tuple[float, float, float, Memory]:
-    """The readings of the transducers at time `t`: XJ m, P12 Pa, XS m; and the memory of the port `reading`."""
-    g = p.sensors
-    u = Input(0.0, 0.0, noise[3], t, 0.0, p.controller.period)
-    xj, m = at_reading(s.sensed + g.position_noise * noise[0], m, s, u, p)
-    return xj, s.pressure + g.pressure_noise * noise[1], s.spool_position + g.spool_noise * noise[2], m
+def read_sensors(s: Any, m: Memory, noise: Any, t: float, p: Any) -> tuple[Any, Memory]:
+    """The readings at time `t`, a tuple in the order of the outputs, and the memories.
+
+    `noise` is a standard normal number for each, and one for effects that are noise.
+    """
+    y = add_noise(measure_plant(s, p), noise, p)
+    return read_controlled(y, s, m, noise[len(y)], t, p)
 
 
-def read_flat_sensors(flat: Any, noise: Any, t: float, record: Any) -> tuple[float, float, float]:
-    """`read_sensors` on a flat state, which keeps the memory."""
-    s = unpack_state(flat)
-    xj, p12, xs, m_reading = read_sensors(s, s.memory.reading, noise, t, record[0])
-    m = s.memory
-    ports = Ports(m.command, m.current, m.supply, m.viscosity, m.nozzle, m.feedback, m.spool_force, m.metering,
-                  m.valve, m.load, m.jack_drag, m.position, m_reading)
-    pack_state(State(s.flapper_position, s.flapper_speed, s.spool_position, s.spool_speed, s.jack_position,
-                     s.jack_speed, s.pressure, s.sensed, ports), flat)
-    return xj, p12, xs
+def read_controlled(y: Any, s: Any, m: Memory, noise: float, t: float, p: Any) -> tuple[Any, Memory]:
+    """The readings `y` as effects at the port `reading` change them, and the memories."""
+    x, m = at_reading(y[0], m, s, Input(0.0, 0.0, noise, t, 0.0, p.controller.period), p)
+    return replace_first(y, x), m
 
 
-def step_cycle(s: State, current: float, load: float, noise: float, t: float, record: Any, steps: int) -> State:
-    """The state one cycle after `t`, current, A, and load, N, held, in `steps` equal steps; `record` of the model."""
+def read_flat_sensors(flat: Any, noise: Any, t: float, record: Any) -> Any:
+    """`read_sensors` on a flat state, which keeps the memories."""
+    s, m = unpack_state(flat)
+    y, m = read_sensors(s, m, noise, t, record[0])
+    pack_state((s, m), flat)
+    return y
+
+
+def step_cycle(s: Any, m: Memory, drive: float, load: float, noise: float, t: float, record: Any,
+               steps: int) -> tuple[Any, Memory]:
+    """State and memories one cycle after `t`, drive and load held, in `steps` equal steps; `record` of the model."""
     p = record[0]
     h = p.controller.period / steps
-    k = compute_coefficients(p, h)
+    k = compute_plant_coefficients(p, h)
     for i in range(steps):
-        s = step_plant(s, Input(current, load, noise, t + i * h, i * h, h), p, k)
-    return s
+        s, m = step_plant(s, m, Input(drive, load, noise, t + i * h, i * h, h), p, k)
+    return s, m
 
 
-def advance_flat_state(flat: Any, current: float, load: float, noise: float, t: float, record: Any, steps: int) -> None:
+def advance_flat_state(flat: Any, drive: float, load: float, noise: float, t: float, record: Any, steps: int) -> None:
     """`step_cycle` in place on a flat state: passing tuples to Python and back costs twice as much as the physics."""
-    pack_state(step_cycle(unpack_state(flat), current, load, noise, t, record, steps), flat)
+    s, m = unpack_state(flat)
+    pack_state(step_cycle(s, m, drive, load, noise, t, record, steps), flat)
 
 
-def run_closed_loop(s: State, com: Any, load: Any, noise: Any, record: Any, steps: int, out: Any) -> State:
-    """Runs the plant with its controller over the command `com`; fills out[k] = XJ, Cor, P12, XS of cycle k.
+def run_closed_loop(flat: Any, com: Any, load: Any, noise: Any, record: Any, steps: int, out: Any) -> None:
+    """Runs the plant with its controller over the command `com`; fills out[k] with the columns of cycle k.
 
     Args:
-        s: state at the start.
-        com: (n,) demand, m.
-        load: (n,) external force against extension, N.
-        noise: (n, NOISES) standard normal numbers.
+        flat: state at the start; at the end that after the last cycle.
+        com: (n,) demand.
+        load: (n,) external load.
+        noise: (n, outputs + 1) standard normal numbers.
         record: (1,) parameters of the model.
         steps: steps a cycle.
-        out: (n, 4), written.
+        out: (n, columns), written: readings and drive in the order of the plant's signals.
     """
     p = record[0]
-    c = Loop(0.0, 0.0, 0.0)  # numba does not know the defaults of a named tuple
-    current, m_reading, m_command = 0.0, s.memory.reading, s.memory.command
+    s, m = unpack_state(flat)
+    c = start_control()
+    drive = 0.0
     for k in range(len(com)):
         t = k * p.controller.period
-        xj, p12, xs, m_reading = read_sensors(s, m_reading, noise[k], t, p)
-        demand, m_command = apply_command_effects(com[k], m_command, xj, t, p)
-        cor, c = compute_current(c, demand, xj, p.controller)
-        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = xj, cor, p12, xs
-        s = step_cycle(s, current, load[k], noise[k, 3], t, record, steps)
-        current = cor
-    return s
+        y, m = read_sensors(s, m, noise[k], t, p)
+        demand, m = take_demand(com[k], m, y[0], t, p)
+        answer, c = control_plant(c, demand, y, p)
+        keep_row(y, answer, out, k)
+        s, m = step_cycle(s, m, drive, load[k], noise[k, len(y)], t, record, steps)
+        drive = answer
+    pack_state((s, m), flat)

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.controller import compute_answers
-from plant.effects import CATALOGUE, Effect
+from plant.effects import Effect
 from plant.lanes import Lanes
-from plant.model import Model
+from plant.model import Model, build_bare_model
+from plant.plants import find_plant
 from plant.quantity import Quantity
 from plant.run import report_law_errors, simulate
 
@@ -20,13 +21,13 @@ VISIBLE = (3.0, 30.0, 300.0)  # noise levels that starts are to show
 SHAPES = (1.0, 0.4, 2.5)  # times the usual value, for a parameter that does nothing alone
 DECADES = (-15, 13)  # where the size of a parameter without a hint is looked for
 ANCHOR = 2.0  # 1/s
-NOISE = {f"sensors.{name}_noise": 0.0 for name in ("position", "pressure", "spool")}
 PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3, "M": 1e6, "G": 1e9}
 _NUMBER = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER})\s*-\s*({_NUMBER})\s*([^\s,;:]*)")
 
 
-def find_starts(effect: Effect, command: Array, load: Array | None = None) -> tuple[Mapping[str, float], ...]:
+def find_starts(effect: Effect, command: Array, load: Array | None = None, plant: str = "eha"
+                ) -> tuple[Mapping[str, float], ...]:
     """Values of all fitted parameters to start from: the effect's own, or found from its ranges and its visibility.
 
     A parameter that says in what range it is typical ("0.2-5 kN") starts at both ends and between. Of one that says
@@ -34,8 +35,9 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None) -> tu
 
     Args:
         effect: with a law.
-        command: (n,) demand, m, one a cycle.
-        load: (n,) external force, N; none by default.
+        command: (n,) demand, one a cycle.
+        load: (n,) external load; none by default.
+        plant: that has the effect.
 
     Returns:
         Starts, "group.field" to SI value; none when nothing can be seen over this command.
@@ -46,7 +48,7 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None) -> tu
     if effect.starts or effect.base or not effect.fitted:
         return effect.starts
     usual = {name: effect.off[name] for name in effect.fitted}
-    sized = {name: sizes for name in usual if (sizes := _find_sizes(effect, name, command, load))}
+    sized = {name: sizes for name in usual if (sizes := _find_sizes(effect, name, command, load, plant))}
     found = [usual | {name: size} for name, sizes in sized.items() for size in sizes]
     for name, value in usual.items():
         if name not in sized and (value or parse_hint(effect.parameters[name])):
@@ -56,74 +58,83 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None) -> tu
     return tuple(found)
 
 
-def ensure_starts(name: str, command: Array, load: Array | None = None) -> Effect:
-    """The effect of that name; the catalogue has its start values from now on (see `find_starts`).
+def ensure_starts(name: str, command: Array, load: Array | None = None, plant: str = "eha") -> Effect:
+    """The effect of that name; its plant has the start values from now on (see `find_starts`).
 
-    `command` in m and `load` in N, (n,) each, are those of the run that is to show the effect.
+    `command` and `load`, (n,) each, are those of the run that is to show the effect.
     """
-    effect = CATALOGUE[name]
+    kind = find_plant(plant)
+    effect = kind.find_effect(name)
     if not effect.starts:
-        CATALOGUE[name] = effect = replace(effect, starts=find_starts(effect, command, load))
+        effect = replace(effect, starts=find_starts(effect, command, load, plant))
+        kind.replace_effect(effect)
     return effect
 
 
 def compute_changes(effect: Effect, values: Sequence[Mapping[str, float]], command: Array,
-            load: Array | None = None) -> Array:
-    """How an effect changes the signals of the nominal plant, driven by the same current, without noise.
+            load: Array | None = None, plant: str = "eha") -> Array:
+    """How an effect changes the signals of the nominal plant, driven by the same drive, without noise.
 
-    An effect in the firmware changes no plant: then the first column is its current over the loop's gain, m, when it
-    sees the same positions, and the others are zero.
+    An effect in the firmware changes no plant: then the first column is its drive over the loop's gain when it sees the
+    same readings, and the others are zero.
 
     Args:
-        effect: any of the catalogue.
+        effect: any that the plant can have.
         values: m sets of parameters, SI.
-        command: (n,) demand, m, that the nominal closed loop makes the current from.
-        load: (n,) external force, N.
+        command: (n,) demand that the nominal closed loop makes the drive from.
+        load: (n,) external load.
+        plant: whose signals they are.
 
     Returns:
-        (m, n, 3): change of XJ m, P12 Pa, XS m.
+        (m, n, outputs): change of each output; of the EHA XJ m, P12 Pa, XS m.
     """
-    bare = Model().replace(NOISE)
+    bare = build_bare_model(plant)
+    bare = bare.replace({s.noise: 0.0 for s in bare.kind.signals.outputs if s.noise})
     force = np.zeros_like(command) if load is None else load
-    run = simulate(bare, command, force)
+    run, signals = simulate(bare, command, force), bare.kind.signals
     model = bare if effect.base else bare.with_effects([effect.name])
+    outputs = np.column_stack([getattr(run, s.name) for s in signals.outputs])
     if effect.firmware:
-        return _compute_firmware_changes(model, values, run.com, run.xj)
+        return _compute_firmware_changes(model, values, command, outputs)
     names = list(dict.fromkeys(name for row in values for name in row))
     rows = [[model[name] for name in names], *([row.get(name, model[name]) for name in names] for row in values)]
     with report_law_errors(model):
-        out = Lanes(model, names).replay(np.array(rows), run.cor, force, run.xj, ANCHOR)
+        out = Lanes(model, names).replay(np.array(rows), getattr(run, signals.drive.name), force, outputs[:, 0], ANCHOR)
     return out[1:] - out[:1]
 
 
 def compute_rms(change: Array) -> Array:
-    """RMS of each column of a `change` (m, n, 3), SI, (m, 3); infinite where the simulation diverged."""
+    """RMS of each column of a `change` (m, n, outputs), SI, (m, outputs); infinite where the simulation diverged."""
     with np.errstate(over="ignore", invalid="ignore"):
         square: Array = (change**2).mean(axis=1)
     return np.sqrt(np.nan_to_num(square, nan=np.inf, posinf=np.inf))
 
 
-def compute_levels(change: Array) -> Array:
-    """RMS of a `change` (m, n, 3) over the noise of each column's sensor, (m, 3)."""
-    noise: Array = compute_rms(change) / np.array([Model()[name] for name in NOISE])
-    return noise
+def compute_levels(change: Array, plant: str = "eha") -> Array:
+    """RMS of a `change` (m, n, outputs) over the noise of each column's sensor, (m, outputs)."""
+    kind = find_plant(plant)
+    noise = np.array([kind.nominal.get(s.noise, 0.0) for s in kind.signals.outputs])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        levels: Array = compute_rms(change) / noise
+    return np.nan_to_num(levels, nan=0.0, posinf=np.inf)
 
 
-def _compute_firmware_changes(model: Model, values: Sequence[Mapping[str, float]], com: Array, xj: Array) -> Array:
-    out = np.zeros((len(values) + 1, len(com), 3))
+def _compute_firmware_changes(model: Model, values: Sequence[Mapping[str, float]], com: Array, readings: Array
+                              ) -> Array:
+    out = np.zeros((len(values) + 1, *readings.shape))
     for row, changed in zip(out, ({}, *values), strict=True):
         with report_law_errors(model):
-            row[:, 0] = compute_answers(model.replace(changed), com, xj)
-    return (out[1:] - out[:1]) / model["controller.proportional_gain"]
+            row[:, 0] = compute_answers(model.replace(changed), com, readings)
+    return (out[1:] - out[:1]) / model.values.get("controller.proportional_gain", 1.0)
 
 
-def _find_sizes(effect: Effect, name: str, command: Array, load: Array | None) -> list[float]:
+def _find_sizes(effect: Effect, name: str, command: Array, load: Array | None, plant: str) -> list[float]:
     """Values of one parameter that can be seen with the others as usual; both signs where it may be negative."""
     quantity, off = effect.parameters[name], effect.off[name]
 
     def find_highest_level(values: Array) -> Array:
-        change = compute_changes(effect, [{name: float(x)} for x in values], command, load)
-        highest: Array = compute_levels(change).max(axis=1)
+        change = compute_changes(effect, [{name: float(x)} for x in values], command, load, plant)
+        highest: Array = compute_levels(change, plant).max(axis=1)
         return highest
 
     if hints := parse_hint(quantity):

@@ -94,7 +94,7 @@ CLOCK_FILES = (
 # Public names of each package: what `from package import *` gives.
 PUBLIC = {
     "plant": {"Actuator", "Columns", "InputError", "Model", "RigError", "load_model", "simulate"},
-    "plant.effects": {"CATALOGUE", "Effect", "Law", "combine_laws", "combine_shifts", "effect", "load_effects",
+    "plant.effects": {"CATALOGUE", "Effect", "Law", "combine_laws", "effect", "load_effects",
                       "register_base"},
     "fdi": {"Trace", "add_effect", "compare", "diagnose", "explain", "identify", "read_trace"},
     "fdi.discovery": {"Explanation", "explain"},

@@ -18,9 +18,10 @@ from rig_command import rig
 
 from plant import Model, load_model, simulate
 from plant.effects import CATALOGUE, effect, load_effects
+from plant.eha import State
 from plant.parameters import GROUPS
 from plant.quantity import list_quantities
-from plant.state import Input, Ports, State
+from plant.state import Input
 from rig.cli import main
 from rig.cli.command_list import COMMANDS
 from rig.sequences import faults
@@ -89,9 +90,9 @@ def test_the_effects_in_the_manual_work(tmp_path: Path) -> None:
         command = np.full(100, 1e-3)
         plain, loose = (simulate(model, command).xj for model in (Model(), Model().replace({"rod_play.width": 1e-4})))
         assert np.abs(plain - loose).max() > 1e-5
-        for port in Ports._fields:
+        for port in load_model().kind.ports:
             assert f"| `{port}` |" in text
-        for field in (*State._fields[:-1], *Input._fields):
+        for field in (*State._fields, *Input._fields):
             assert f"`{field}`" in text
         for argument in inspect.signature(effect).parameters.keys() - {"port", "group", "law", "memory", "more"}:
             assert f"| `{argument}` |" in text

@@ -25,7 +25,7 @@ WORDS = {"force": "a force on the ram, against extension", "flow": "a flow that 
 CAUSES = {"force": ("position", "speed", "spool", "time"), "flow": ("pressure", "spool", "position", "time"),
           "current": ("current", "spool", "pressure", "position", "time")}
 STATES = {"position": ("m", "s.jack_position"), "speed": ("m/s", "s.jack_speed"), "pressure": ("Pa", "s.pressure"),
-          "spool": ("m", "s.spool_position"), "current": ("A", "u.current"), "time": ("s", "u.t")}
+          "spool": ("m", "s.spool_position"), "current": ("A", "u.drive"), "time": ("s", "u.t")}
 PORTS = {"force": ("load", "x + {0}"), "flow": ("metering", "x - ({0}) / p.valve.flow_gain"),
          "current": ("current", "x - ({0})")}
 PUMPED = ("current", "x - ({0}) / p.pump.displacement")  # a flow, where a pump delivers it

@@ -28,7 +28,7 @@ from fdi.thresholds import (
     REPEAT_FLOOR_RATIO,
 )
 from fdi.trace.trace import Flags, Floats, Trace, rms
-from plant.effects import CATALOGUE, combine_laws
+from plant.effects import combine_laws
 from plant.model import Model
 from plant.signals import Signals
 from plant.state import Input
@@ -114,12 +114,12 @@ def simulate_reading_noise(model: Model, controlled: Floats) -> float:
     A sweep through it, as neither is in a replay.
     """
     level = model.values.get(model.kind.signals.controlled.noise, 0.0)
-    law, memory = combine_laws("reading", model.effects)
-    if not any(CATALOGUE[name].port == "reading" for name in model.effects):
+    law, memory = combine_laws("reading", [model.find_effect(name) for name in model.effects])
+    if not any(model.find_effect(name).port == "reading" for name in model.effects):
         return level
     noise = level * np.random.default_rng(0).standard_normal(SWEEP)
     true = np.linspace(float(np.nanmin(controlled)), float(np.nanmax(controlled)), SWEEP)
-    s, p, out = model.build_state(), model.build_record()[0], np.empty(SWEEP)
+    s, p, out = model.build_start()[0], model.build_record()[0], np.empty(SWEEP)
     for k, x in enumerate((true + noise).tolist()):
         u = Input(0.0, 0.0, 0.0, k * model["controller.period"], 0.0, model["controller.period"])
         out[k], memory = law(x, memory, s, u, p)

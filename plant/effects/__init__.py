@@ -1,6 +1,6 @@
 """The catalogue: physical effects that a model may have or lack.
 
-An effect is a law at one port of the signal path (`plant.state.Ports`): it gets the port's signal, the state at the
+An effect is a law at one port of the signal path (`plant.ports`): it gets the port's signal, the state at the
 start of the step, the inputs and the parameters, and returns the signal changed. Several effects at one port act in the
 order of the catalogue. A law that remembers something also gets and returns its memory, a NamedTuple of floats.
 
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -26,11 +26,11 @@ from typing import Any
 from plant.compile import Function
 from plant.errors import InputError
 from plant.parameters import GROUPS
-from plant.ports import chain_laws, chain_shifts
+from plant.ports import PORTS, chain_laws
 from plant.quantity import Quantity, list_quantities
-from plant.state import Memory, Ports
+from plant.state import Memory
 
-__all__ = ["CATALOGUE", "Effect", "Law", "combine_laws", "combine_shifts", "effect", "load_effects", "register_base"]
+__all__ = ["CATALOGUE", "Effect", "Law", "combine_laws", "effect", "load_effects", "register_base"]
 
 Law = Function
 
@@ -80,14 +80,18 @@ class Effect:
 
 
 class Catalogue(dict[str, Effect]):
-    """Effects by name. Those of one plant, or searched in some plants only, are found by name, but not listed."""
+    """Effects by name. Those of one plant, or searched in some plants only, are found by name, but not listed.
+
+    Effects that a plant file declares are found by name where no other has it: `Model.find_effect` knows the right one.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.special: dict[str, Effect] = {}
+        self.of_plants: dict[str, Effect] = {}
 
     def __missing__(self, name: str) -> Effect:
-        return self.special[name]
+        return self.special[name] if name in self.special else self.of_plants[name]
 
     def add_effect(self, e: Effect) -> None:
         """Put an effect in its place."""
@@ -123,8 +127,8 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
     Raises:
         ValueError: unknown port or field, a parameter without default, or a name already taken.
     """
-    if port not in Ports._fields:
-        raise ValueError(f"no port {port!r}; there are {', '.join(Ports._fields)}")
+    if port not in PORTS:
+        raise ValueError(f"no port {port!r}; there are {', '.join(PORTS)}")
 
     def register(function: Law) -> Law:
         function = getattr(function, "py_func", function)  # an @njit function is welcome too
@@ -202,15 +206,9 @@ def load_effects(path: Path, source: bytes | None = None) -> list[str]:
     return new
 
 
-def combine_laws(port: str, names: tuple[str, ...]) -> tuple[Law, Memory]:
-    """All of the named effects that act at `port` as one function, with their initial memory."""
-    acting = [entry for entry in (CATALOGUE[name] for name in names) if entry.port == port]
-    return chain_laws((entry.function, entry.memory) for entry in acting)
-
-
-def combine_shifts(names: tuple[str, ...]) -> Function:
-    """What moves the memory of the port `position` along with the ram, for a plant with the named effects."""
-    return chain_shifts(entry.shift for entry in (CATALOGUE[name] for name in names) if entry.port == "position")
+def combine_laws(port: str, effects: Iterable[Effect]) -> tuple[Law, Memory]:
+    """All of the effects that act at `port` as one function, with their initial memory."""
+    return chain_laws((e.function, e.memory) for e in effects if e.port == port)
 
 
 for _family in ("reference", "controller", "current", "servovalve", "valve", "supply", "jack", "friction", "press",

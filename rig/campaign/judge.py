@@ -33,9 +33,9 @@ from plant.errors import InputError, RigError
 from plant.model import Model, find_effect, find_quantity, parse_model
 from plant.parameters import load_nominal_values, parse_toml, parse_value, read_toml
 from plant.quantity import Quantity
+from plant.run import NOISES
 from plant.segments import RATE
 from plant.signals import EHA
-from plant.solve import NOISES
 from plant.threads import count_threads
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, import_extra, read_rows, run_batch
 from rig.network.clock import WallClock

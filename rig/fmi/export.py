@@ -30,9 +30,8 @@ from plant.flat import list_state_values
 from plant.machine_code import emit_object
 from plant.model import STEP, Model, build_kernel, find_quantity
 from plant.run import report_law_errors
-from plant.solve import NOISES
 from rig.firmware.build import find_compiler
-from rig.fmi.unit_cycle import INPUTS, LOOP, advance_unit
+from rig.fmi.unit_cycle import INPUTS, advance_unit
 
 FOLDER = Path(__file__).parent
 VERSIONS = ("2", "3")
@@ -151,13 +150,18 @@ def find_platforms() -> list[tuple[Platform, str]]:
 
 def _compile_cycle(model: Model) -> Any:
     """numba's dispatcher of the unit's cycle, compiled."""
-    flat = np.array(list_state_values(model.build_state()))
     with report_law_errors(model):
+        flat = model.build_flat_state()
         run = build_kernel(advance_unit, model.effects, True, model.plant)
-        loop = np.array([0.0] * (LOOP - 1) + [-1.0])
-        run(flat, loop, np.zeros(INPUTS), np.zeros(NOISES), model.build_record(), model.steps,
-            np.zeros(len(model.kind.signals.outputs) + 1))
+        outputs = len(model.kind.signals.outputs)
+        run(flat, np.array(_list_loop_start(model)), np.zeros(INPUTS), np.zeros(outputs + 1), model.build_record(),
+            model.steps, np.zeros(outputs + 1))
     return run
+
+
+def _list_loop_start(model: Model) -> list[float]:
+    """The state of the sampled loop of a unit that has not started: `rig.fmi.unit_cycle.advance_unit`."""
+    return [-1.0, 0.0, *list_state_values(model.kind.build_control_memory())]
 
 
 def list_variables(model: Model) -> list[Variable]:
@@ -201,9 +205,11 @@ def write_tables(model: Model, variables: Sequence[Variable], seed: int) -> str:
     outputs = [i for i, v in enumerate(variables) if v.role == "OUTPUT"]
     parameters = [i for i, v in enumerate(variables) if v.role in ("FIXED", "TUNABLE")]
     period = next(i for i in parameters if variables[i].name == "controller.period")
-    flat = list_state_values(model.build_state())
-    counts = {"REALS": len(variables), "STATES": len(flat), "NOISES": NOISES, "TIME_AT": 0, "INPUTS": 1,
-              "OUTPUTS": outputs[0], "OUTPUT_COUNT": len(outputs), "PARAMETERS": parameters[0],
+    flat, loop = model.build_flat_state().tolist(), _list_loop_start(model)
+    counts = {"REALS": len(variables), "STATES": len(flat), "LOOP": len(loop), "NOISES": len(outputs),
+              "TIME_AT": 0, "INPUTS": 1,
+              "OUTPUTS": outputs[0],
+              "OUTPUT_COUNT": len(outputs), "PARAMETERS": parameters[0],
               "PARAMETER_COUNT": len(parameters), "PERIOD": period, "SEED_AT": len(variables),
               "CLOSED_AT": len(variables) + 1, "SEED": seed, "SOLVER_STEP": STEP.hex(),
               "ZIGGURAT_R": normal.r.hex(), "ZIGGURAT_INVERSE_R": normal.inverse_r.hex()}
@@ -212,6 +218,7 @@ def write_tables(model: Model, variables: Sequence[Variable], seed: int) -> str:
                            f'{", ".join(float(number).hex() for number in (v.start, v.low, v.high))}}}'
                            for v in variables],
         "FLAT_TABLE": [value.hex() for value in flat],
+        "LOOP_TABLE": [value.hex() for value in loop],
         "ZIGGURAT_K": [f"UINT64_C({k})" for k in normal.k],
         "ZIGGURAT_W": [w.hex() for w in normal.w],
         "ZIGGURAT_F": [f.hex() for f in normal.f],

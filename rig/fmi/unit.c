@@ -15,7 +15,7 @@
 int32_t advance_unit(void *, void *, ARRAY, ARRAY, ARRAY, ARRAY, ARRAY, int64_t, ARRAY);
 
 static const Variable VARIABLES[REALS] = VARIABLE_TABLE;
-static const double FLAT[STATES] = FLAT_TABLE;
+static const double FLAT[STATES] = FLAT_TABLE, LOOP_START[LOOP] = LOOP_TABLE;
 
 /* -------------------------------------------------------------------------------------------------- random numbers
  * Those of numpy.random.default_rng(seed).standard_normal: SeedSequence, PCG64, and the ziggurat of Marsaglia and Tsang
@@ -123,7 +123,7 @@ static Status run_cycle(Unit *u) {
     void *result = NULL, *failure = NULL;
     double period = s->reals[PERIOD], steps = rint(period / SOLVER_STEP);
     double inputs[5] = {s->reals[INPUTS], s->reals[INPUTS + 1], s->reals[INPUTS + 2], s->closed, s->noise[NOISES - 1]};
-    int32_t status = advance_unit(&result, &failure, PASS(s->flat, STATES, 8), PASS(s->loop, 5, 8), PASS(inputs, 5, 8),
+    int32_t status = advance_unit(&result, &failure, PASS(s->flat, STATES, 8), PASS(s->loop, LOOP, 8), PASS(inputs, 5, 8),
                              PASS(s->noise + NOISES, NOISES, 8), PASS(s->reals + PARAMETERS, 1, 8 * PARAMETER_COUNT),
                              steps > 1 ? (int64_t)steps : 1, PASS(s->reals + OUTPUTS, OUTPUT_COUNT, 8));
     int is_finite = status == 0;
@@ -138,8 +138,7 @@ static Status calculate_start(Unit *u) {
     if (!s->is_dirty) return OK;
     s->is_dirty = 0;
     memcpy(s->flat, FLAT, sizeof FLAT);
-    memset(s->loop, 0, sizeof s->loop);
-    s->loop[4] = -1.0;
+    memcpy(s->loop, LOOP_START, sizeof LOOP_START);
     s->reals[TIME_AT] = s->start;
     seed_random(s->random, (uint32_t)s->seed);
     draw_cycle(s);
@@ -163,7 +162,7 @@ Status unit_step(Unit *u, double t, double length) {
         draw_cycle(s);
         Status status = run_cycle(u);
         if (status != OK) return status;
-        s->reals[TIME_AT] = s->start + s->loop[4] * period;
+        s->reals[TIME_AT] = s->start + s->loop[0] * period;
     }
     return OK;
 }

@@ -27,7 +27,7 @@ typedef struct { const char *name; Role role; double start, low, high; } Variabl
 typedef struct {
     double reals[REALS];
     double flat[STATES];      /* of the plant */
-    double loop[5];           /* of the controller: integral part, error, cycles, answer; cycles of the plant */
+    double loop[LOOP];        /* cycles of the plant, -1: not started; answer of the controller; what it remembers */
     double noise[2 * NOISES]; /* random numbers of this cycle and of the next */
     double start;             /* s */
     uint64_t random[4];       /* state and increment of the generator, low word first */

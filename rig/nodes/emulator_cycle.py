@@ -19,11 +19,9 @@ from numpy.typing import NDArray
 
 from plant import Model
 from plant.compile import ForeignCall, keep_apart
-from plant.flat import list_state_values
 from plant.machine_code import ADVANCE_CALL, READ_CALL
-from plant.run import PRESSURE, SENSED, SPOOL
+from plant.run import NOISES
 from plant.signals import EHA
-from plant.solve import NOISES
 from rig.benches.bench import Flags
 from rig.benches.frame_map import FrameSpec, Role
 from rig.benches.packing import (
@@ -706,7 +704,7 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
     off = schedule.list_bus_off_cycles("plant")
     hits = [*map(schedule.list_frame_hits, _FRAMES), np.column_stack((off, np.ones_like(off), np.zeros_like(off)))]
     record = model.build_record()
-    state = list_state_values(model.build_state())
+    state = model.build_flat_state()
     words, places = _join_tables(_TABLES_AT, np.int64, parameters, signals, *hits)
     reals, real_places = _join_tables(_REAL_TABLES_AT, np.float64, values, load, state, record.view(np.float64))
     words[STATE], words[SYNCED] = INITIALISING, -1
@@ -717,7 +715,7 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
     words[FAULT_VALUES_AT], words[LOAD_AT], words[FLAT_AT], words[LIVE_AT], _ = real_places
     words[RECORD_SIZE], words[ADVANCE], words[READ] = record.dtype.itemsize, advance, read
     words[LEVELS_AT: LEVELS_AT + 3] = [names[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
-    words[SENSORS_AT: SENSORS_AT + 3] = SENSED, PRESSURE, SPOOL
+    words[SENSORS_AT: SENSORS_AT + 3] = model.kind.find_shown_fields()
     reals[_PERIOD] = model["controller.period"]
     return Memory(words, reals, make_layout(frames, CHANNELS, Role.PLANT))
 

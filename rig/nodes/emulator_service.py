@@ -18,13 +18,11 @@ import numpy as np
 
 from plant import Model
 from plant.compile import compile_function
-from plant.effects import CATALOGUE
 from plant.errors import RigError
-from plant.flat import list_state_values
 from plant.machine_code import find_function_address
 from plant.model import build_kernel
-from plant.run import load_stored_advance, report_law_errors
-from plant.solve import NOISES, read_flat_sensors
+from plant.run import NOISES, load_stored_advance, report_law_errors
+from plant.solve import read_flat_sensors
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.benches.packing import VALUES_AT
@@ -303,11 +301,11 @@ def compile_plant(model: Model) -> tuple[int, int]:
         InputError: an effect's law that cannot be compiled.
     """
     with report_law_errors(model):
-        flat, record = np.array(list_state_values(model.build_state())), model.build_record()
+        flat, record = model.build_flat_state(), model.build_record()
         code = load_stored_advance(model.effects, model.plant)
         code.warm(lambda: (flat.copy(), 5e-3, 100.0, 0.0, 0.0, record, 10))
         read = 0
-        if any(CATALOGUE[name].port == "reading" for name in model.effects):
+        if any(model.find_effect(name).port == "reading" for name in model.effects):
             run = build_kernel(read_flat_sensors, model.effects)
             run(flat, np.zeros(NOISES), 0.0, record)
             read = find_function_address(run)

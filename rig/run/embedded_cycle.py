@@ -19,9 +19,8 @@ from plant.compile import ForeignCall, compile_function, compute_fingerprint, fi
 from plant.controller import Loop, compute_current
 from plant.machine_code import ADVANCE_CALL, StoredCode
 from plant.model import Model
-from plant.run import PRESSURE, SENSED, SPOOL, Actuator, LentPlant, sample_noise
+from plant.run import NOISES, Actuator, LentPlant, sample_noise
 from plant.signals import EHA
-from plant.solve import NOISES
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.benches.frame_map import FrameSpec, Role
@@ -34,6 +33,7 @@ from rig.run.cyclic_values import CyclicValues
 ASKED, DONE, FIRST, PLANT_CYCLE, ADVANCE, STEPS, RECORD_SIZE, CLOCK, TIME, FRAMES_AT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 10
 LEVELS_AT = 14  # places of the noise of the three transducers among the parameters
 DEMAND, LOAD, READINGS, CURRENT = range(17, 21)  # places among the values; readings are three
+FIELDS_AT = 21  # places of what the three transducers show in the state
 _WORDS = 24
 COMMAND, FEEDBACK, VALVE, DRIVE = range(4)  # frames, columns of the payloads
 # Reals: the controller's loop and gains, period, the limits of the guards, their signals, scratch
@@ -74,9 +74,9 @@ def play_quiet_cycles(b: Buffers, flat: NDArray[np.float64], live: NDArray[np.fl
     words[DONE] = 0
     for i in range(words[ASKED]):
         _note_time(b, i, BEGUN_AT)
-        xj = flat[SENSED] + live[words[LEVELS_AT]] * b.noise[i, 0]
-        p12 = flat[PRESSURE] + live[words[LEVELS_AT + 1]] * b.noise[i, 1]
-        xs = flat[SPOOL] + live[words[LEVELS_AT + 2]] * b.noise[i, 2]
+        xj = flat[words[FIELDS_AT]] + live[words[LEVELS_AT]] * b.noise[i, 0]
+        p12 = flat[words[FIELDS_AT + 1]] + live[words[LEVELS_AT + 1]] * b.noise[i, 1]
+        xs = flat[words[FIELDS_AT + 2]] + live[words[LEVELS_AT + 2]] * b.noise[i, 2]
         if _is_outside(b) or not np.isfinite(xj + p12 + xs):
             break
         in_force = m.doubles[at + words[CURRENT]]  # what the controller answered to the cycle before
@@ -171,7 +171,7 @@ def bind_code(b: Buffers, plant: LentPlant, actuator: Actuator) -> Callable[[], 
 
 def _lend_plant(b: Buffers, plant: LentPlant, actuator: Actuator) -> None:
     b.words[ADVANCE], b.words[STEPS], b.words[RECORD_SIZE] = plant.advance, actuator.steps, 8 * len(plant.live)
-    b.words[LEVELS_AT:LEVELS_AT + 3] = plant.levels
+    b.words[LEVELS_AT:LEVELS_AT + 3], b.words[FIELDS_AT:FIELDS_AT + 3] = plant.levels, plant.fields
     b.reals[PERIOD] = actuator.model["controller.period"]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import Model
-from plant.step import compute_coefficients
+from plant.eha import compute_coefficients
 from rig.bench.realtime import build_library
 from studies.peers.rivals import Replay
 
@@ -138,12 +138,12 @@ def _define_progpy_plant(task: Task) -> Any:
 
 
 def _make_namespaces(groups: Mapping[str, Mapping[str, Any]]) -> Any:
-    """The groups as objects with attributes, as `plant.step` reads its parameters."""
+    """The groups as objects with attributes, as `plant.eha` reads its parameters."""
     return SimpleNamespace(**{group: SimpleNamespace(**fields) for group, fields in groups.items()})
 
 
 def step_bare_model(xp: Any, s: Any, current: Any, load: Any, p: Any, k: Any, h: float) -> tuple[Any, ...]:
-    """`plant.step.step_plant` of the bare model on arrays of the library `xp`: XF, XF', XS, XS', XJ, XJ', P12."""
+    """`plant.eha.step_actuator` of the bare model on arrays of the library `xp`: XF, XF', XS, XS', XJ, XJ', P12."""
     xf, vf, xs, vs, xj, vj, _ = s
     torque = p.torque_motor.gain * current - p.flapper.stiffness * xf - p.feedback_spring.stiffness * (
         xs + 0.5 * h * vs)

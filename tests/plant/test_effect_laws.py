@@ -20,10 +20,11 @@ from plant.effects import CATALOGUE
 from plant.effects.current import Behind, coil_lag
 from plant.effects.sensors import Lag, Recoil, mount_compliance, sensor_lag
 from plant.effects.supply import Drawn, supply_droop
-from plant.model import build_initial_state, collect_bindings
-from plant.state import Input, Ports, State
-from plant.step import compute_coefficients, compute_metering_line, step_plant
-from plant.step import step_jack as ram
+from plant.eha import State, compute_coefficients, compute_metering_line, step_actuator
+from plant.eha import step_jack as ram
+from plant.flat import unpack_state
+from plant.model import collect_bindings
+from plant.state import Input
 from rig.benches.profiles import Control
 
 MILLI = 1e-3
@@ -166,18 +167,16 @@ def test_viscosity_moves_three_parameters_together() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-15)
 
 
-def _moved(s, spool, load, record, h, out):
+def _moved(flat, spool, load, record, h, out):
     """Metering edges and ram alone, the spool on a given path; rows XJ, P12."""
     p = record[0]
+    s, m = unpack_state(flat)
     k = compute_coefficients(p, h)
     for i in range(len(spool)):
         u = Input(0.0, load[i], 0.0, i * h, 0.0, h)
-        line, a, b = compute_metering_line(s, u, p, k, spool[i])
-        x, v, p12, c, d = ram(s, u, p, k, line, load[i])
-        m = s.memory
-        s = State(0.0, 0.0, spool[i], 0.0, x, v, p12, x, Ports(
-            m.command, m.current, m.supply, m.viscosity, m.nozzle, m.feedback, m.spool_force, a, b, c, d, m.position,
-            m.reading))
+        line, m = compute_metering_line(s, m, u, p, k, spool[i])
+        x, v, p12, m = ram(s, m, u, p, k, line, load[i])
+        s = State(0.0, 0.0, spool[i], 0.0, x, v, p12, x)
         out[0, i], out[1, i] = x, p12
 
 
@@ -204,7 +203,7 @@ def test_implicit_effects_against_an_explicit_integration(changes: dict[str, flo
     every = round(h / fine)
     ours = np.empty((2, len(paths[h][0])))
     run = compile_function(_moved, collect_bindings(model.effects))
-    run(build_initial_state(model.effects), *paths[h], model.build_record(), h, ours)
+    run(model.build_flat_state(), *paths[h], model.build_record(), h, ours)
     error = ours - simulate_jack(model.values, *paths[fine], fine)[:, every - 1::every]
     assert (np.sqrt((error**2).mean(axis=1)) * [1e6, 1e-5] < [um, bar]).all()
 
@@ -215,7 +214,8 @@ def test_compressibility_resonates_where_it_should_and_the_step_damps_nothing(h:
     model = EASY.replace({"compressibility.coefficient": 1e-9})
     v, stored = model.values, 0.25 * 1.5e-4 * 1e-9
     out = np.empty((2, round(0.05 / h)))
-    start = build_initial_state(model.effects)._replace(jack_speed=0.01)
+    start = model.build_flat_state()
+    start[State._fields.index("jack_speed")] = 0.01
     run = compile_function(_moved, collect_bindings(model.effects))
     run(start, *np.zeros((2, out.shape[1])), model.build_record(), h, out)
     matrix = np.array([[-v["jack.damping"] / v["jack.mass"], v["jack.area"] / v["jack.mass"]],
@@ -396,19 +396,20 @@ def test_the_firmware_alone_answers_as_in_the_loop(changes: dict[str, float]) ->
 def test_friction_only_takes_energy(v: float, rise: float, speed: float, asymmetry: float, deflection: float) -> None:
     """A ram on a closed valve: kinetic energy and that of the bristles never grow."""
     names = ("stribeck", "friction_asymmetry", "presliding")
-    p = WHOLE.with_effects(names).replace({"stribeck.rise": abs(rise), "stribeck.speed": speed,
-                                     "friction_asymmetry.asymmetry": 0.0 if deflection else asymmetry,
-                                     "presliding.deflection": deflection}).build_record()[0]
-    k, u, s = compute_coefficients(p, H), Input(h=H), build_initial_state(names)._replace(jack_speed=v)
-    moved = interpret_function(step_plant, collect_bindings(names))
+    model = WHOLE.with_effects(names).replace({"stribeck.rise": abs(rise), "stribeck.speed": speed,
+                                               "friction_asymmetry.asymmetry": 0.0 if deflection else asymmetry,
+                                               "presliding.deflection": deflection})
+    p, (s, m) = model.build_record()[0], model.build_start()
+    k, u, s = compute_coefficients(p, H), Input(h=H), s._replace(jack_speed=v)
+    moved = interpret_function(step_actuator, collect_bindings(names))
     stiffness = 800.0 / deflection if deflection else 0.0
     last = np.inf
     for _ in range(60):
-        bristle = s.memory.jack_drag[1]
+        bristle = m.jack_drag[1]
         bent = bristle.kept * (bristle.deflection + H * s.jack_speed)
         now = 0.5 * 100.0 * s.jack_speed**2 + 0.5 * stiffness * bent**2
         assert now <= last * (1 + 1e-9) + 1e-15
-        last, s = now, moved(s, u, p, k)
+        last, (s, m) = now, moved(s, m, u, p, k)
 
 
 def test_the_order_of_the_sensors_chain_is_that_of_its_signal() -> None:

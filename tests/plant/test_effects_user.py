@@ -70,7 +70,7 @@ def test_the_users_effect_with_memory(file: Path) -> None:
         plant.advance(current)
         places.append(plant.state.jack_position)
     way = np.abs(np.diff(places)).sum()
-    assert plant.state.memory.load[1].travelled == pytest.approx(way, rel=0.01) and way > 1e-3
+    assert plant.memory.load[1].travelled == pytest.approx(way, rel=0.01) and way > 1e-3
 
 
 @pytest.mark.parametrize(("text", "said"), [

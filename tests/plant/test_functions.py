@@ -164,7 +164,7 @@ def in_the_coil(changes: dict[str, float], cycles: int, sent: float = 1e-3, seed
     for k in range(cycles):
         plant.sample()
         plant.advance(sent)
-        out[k] = plant.state.memory.current[1].current
+        out[k] = plant.memory.current[1].current
     return out
 
 

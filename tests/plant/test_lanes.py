@@ -15,20 +15,15 @@ from refusals import catch_refusal
 
 from plant import Actuator, Model, kernel_use, simulate
 from plant import lanes as lanes_module
-from plant.anchor import (
-    initialise_sensed_position,
-    pull_ram,
-    rest_at_reading,
-    set_sample_memories,
-)
+from plant.anchor import pull_plant, rest_at_reading, show_start
 from plant.compile import compile_function, interpret_function
 from plant.effects import CATALOGUE, load_effects
+from plant.flat import unpack_state
 from plant.kernel_use import KernelUse
 from plant.lanes import NARROW, Lanes, Part, compile_kernels, list_kernel_variants, plan_layout
 from plant.model import collect_bindings
 from plant.monitor import FAULTS, Cell, Monitor, Motion, compute_cells, step_monitor
 from plant.solve import read_sensors, step_cycle
-from plant.state import State
 from rig.sequences import load_sequence
 
 QUIET = Model().replace({f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")})
@@ -39,38 +34,38 @@ FORCE = np.linspace(0.0, 3e3, len(CURRENT))
 EFFECTS = [name for name, entry in CATALOGUE.items() if not entry.base]
 
 
-def replay_current(s: State, current: Any, load: Any, position: Any, anchor: float, record: Any, steps: int,
-                   out: Any) -> None:
-    """The plant driven by a measured current; fills out[k] = XJ as sensed, P12, XS at sample k, all without noise.
+def replay_drive(flat: Any, drive: Any, load: Any, position: Any, anchor: float, record: Any, steps: int,
+                 out: Any) -> None:
+    """The plant driven by a measured drive; fills out[k] with the readings at sample k, without noise.
 
     Args:
-        s: state at the start.
-        current: (n,) A; current[k - 1] acts from k to k + 1, none before.
-        load: (n,) N, external force against extension.
-        position: (n,) m, measured; NaN where missing; or (0,): the run starts as `s` is.
-        anchor: 1/s, how fast the ram is pulled to the measured position.
+        flat: state at the start.
+        drive: (n,); drive[k - 1] acts from k to k + 1, none before.
+        load: (n,) external load.
+        position: (n,) measured controlled signal; NaN where missing; or (0,): the run starts as `flat` is.
+        anchor: 1/s, how fast the plant is pulled to it.
         record: (1,) parameters of the model.
         steps: steps a cycle.
-        out: (n, 3), written.
+        out: (n, outputs), written.
     """
     p = record[0]
-    s = rest_at_reading(s, position[0], p, steps) if len(position) else initialise_sensed_position(s, p)
-    for k in range(len(current)):
+    s, m = unpack_state(flat)
+    s, m = rest_at_reading(s, m, position[0], p, steps) if len(position) else (show_start(s, m, p), m)
+    for k in range(len(drive)):
         t = k * p.controller.period
-        out[k, 0], out[k, 1], out[k, 2], m = read_sensors(s, s.memory.reading, (0.0, 0.0, 0.0, 0.0), t, p)
-        s = set_sample_memories(s, s.memory.command, m)
+        out[k], m = read_sensors(s, m, np.zeros(out.shape[1] + 1), t, p)
         if len(position):
-            s = pull_ram(s, anchor * p.controller.period, position[k])
-        s = step_cycle(s, current[k - 1] if k else 0.0, load[k], 0.0, t, record, steps)
+            s, m = pull_plant(s, m, anchor * p.controller.period, position[k], p)
+        s, m = step_cycle(s, m, drive[k - 1] if k else 0.0, load[k], 0.0, t, record, steps)
 
 
 def one_run(model: Model, current: np.ndarray, load: np.ndarray, position: np.ndarray | None = None,
             anchor: float = 0.0, steps: int = 10) -> np.ndarray:
-    """The same in plain Python, one run, (n, 3)."""
-    out = np.empty((len(current), 3))
-    run = interpret_function(replay_current, collect_bindings(model.effects))
+    """The same in plain Python, one run, (n, outputs)."""
+    out = np.empty((len(current), len(model.kind.signals.outputs)))
+    run = interpret_function(replay_drive, collect_bindings(model.effects, model.plant))
     position = np.empty(0) if position is None else position
-    run(model.build_state(), current, load, position, anchor, model.build_record(), steps, out)
+    run(model.build_flat_state(), current, load, position, anchor, model.build_record(), steps, out)
     return out
 
 
@@ -225,7 +220,7 @@ def test_what_does_not_fit_is_refused() -> None:
 def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop over the lanes became vector code: nothing in the step stops it."""
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path))  # what comes from the cache cannot be read as assembly
-    plan = plan_layout((), "eha")
+    plan = plan_layout((), Model().kind)
     run = compile_function(plan.loop, plan.names)
     run(np.zeros(plan.numbers * NARROW), CURRENT, FORCE, np.empty(0), 0.0, False, 1e-3, 10,
         0, len(CURRENT), 0, 0, True, np.arange(NARROW, dtype=np.uint64), np.empty((NARROW, 3, len(CURRENT))))
@@ -274,11 +269,11 @@ def test_an_anchored_replay_does_not_pull_the_ram_through_the_play_of_its_rod() 
 def test_the_transducer_moves_along_where_the_ram_is_pulled() -> None:
     """With play, a lag and an elastic mount before the transducer: an anchored run shows the pull at once and whole."""
     model = Model().replace({"rod_backlash.width": 4e-5, "sensor_lag.time": 3e-3, "mount_compliance.compliance": 1e-9})
-    pull, initialise = (interpret_function(f, collect_bindings(model.effects))
-                        for f in (pull_ram, initialise_sensed_position))
+    pull, show = (interpret_function(f, collect_bindings(model.effects)) for f in (pull_plant, show_start))
     p = model.build_record()[0]
-    before = initialise(model.build_state(), p)
-    after = initialise(pull(before, 0.5, before.sensed + 2e-5), p)
+    before, m = model.build_start()
+    after, m = pull(before, m, 0.5, before.sensed + 2e-5, p)
+    after = show(after, m, p)
     moved = (after.jack_position - before.jack_position, after.sensed - before.sensed)
     assert moved == pytest.approx((1e-5, 1e-5))
 

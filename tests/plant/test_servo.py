@@ -17,6 +17,7 @@ from plant.effects.current import Cascade, Switched, flow_delay, valve_switching
 from plant.effects.valve import ATMOSPHERE, undissolved_air
 from plant.ehs import (
     RAW_PER_TURN,
+    State,
     compute_centred_mean,
     compute_pressure_force,
     derive_logger_columns,
@@ -25,7 +26,7 @@ from plant.ehs import (
 from plant.forced import compute_flow_balance, compute_force_balance
 from plant.lanes import Lanes
 from plant.model import Model, list_offered_effects, list_searched_effects
-from plant.state import Input, Line, State
+from plant.state import Input, Line
 
 CYCLE = 1e-3
 SPEED = 800.0  # raw

@@ -10,8 +10,9 @@ from synthetic_run import build_command
 
 from fdi.trace.trace import Trace
 from plant import Actuator, Model
-from plant.run import PRESSURE, SENSED, SPOOL
+from plant.eha import State
 
+SENSED, PRESSURE, SPOOL = (State._fields.index(name) for name in ("sensed", "pressure", "spool_position"))
 LEVELS = np.array([2e-6, 2e4, 1e-6])  # of the nominal transducers: m, Pa, m
 TURN = 0.78  # of one sample of coloured noise, what the next one keeps: a corner at 40 Hz, as on the practice bench
 HUM = 0.4  # amplitude over the level, 50 Hz

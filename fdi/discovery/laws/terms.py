@@ -24,7 +24,7 @@ from plant.effects import CATALOGUE, Effect, effect
 
 # The states in a formula: what they are in a law, and their units; `way` is the distance since the last reversal.
 STATES = {"position": ("s.jack_position", "m"), "speed": ("s.jack_speed", "m/s"), "pressure": ("s.pressure", "Pa"),
-          "spool": ("s.spool_position", "m"), "spool_speed": ("s.spool_speed", "m/s"), "current": ("u.current", "A"),
+          "spool": ("s.spool_position", "m"), "spool_speed": ("s.spool_speed", "m/s"), "current": ("u.drive", "A"),
           "time": ("u.t", "s"), "way": ("way", "m")}
 
 # The ways in which a term enters its balance: the balance, what the factor is multiplied by there, in words.

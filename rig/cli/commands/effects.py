@@ -11,11 +11,13 @@ from fdi.report.report import Cell, Column, Item, Line, Paragraph, Report, Secti
 from plant.effects import Effect
 from plant.model import find_effect, list_offered_effects, load_model
 from plant.plants import find_plant
+from plant.profile import build_profile
 from plant.selftest import Report as SelfTest
 from plant.selftest import check_effect
-from plant.state import UNITS
 from rig.cli.answer import Places, give_answer
 from rig.cli.inputs import load_user_effects
+
+CONVENIENT = {"m": (1e6, "um"), "Pa": (1e-5, "bar")}  # units of a table
 
 
 def run_command(args: argparse.Namespace) -> int:
@@ -25,17 +27,21 @@ def run_command(args: argparse.Namespace) -> int:
     chosen = [find_effect(args.name, plant)] if args.name else list_offered_effects(plant)
     own = {file.absolute() for file in args.effects}
     tested = chosen if args.test or (args.name and chosen[0].file in own) else []
-    tests = {e.name: test_effect(e) for e in tested}
+    tests = {e.name: test_effect(e, plant) for e in tested}
     report = build_effects_report(chosen, plant, tests, is_detailed=bool(args.name))
     status = int(any(test.faults for test in tests.values()))
     return give_answer(report, args, status, Places(answer=Path(args.out) if args.out else None))
 
 
-def test_effect(e: Effect) -> SelfTest:
-    """Test an effect on the preflight command."""
+def test_effect(e: Effect, plant: str = "eha") -> SelfTest:
+    """Test an effect on the nominal test of its plant, of the EHA the preflight."""
+    kind = find_plant(plant)
+    if kind.profile:
+        rate = round(1.0 / kind.nominal["controller.period"])
+        return check_effect(e.name, build_profile(kind.profile, rate=rate).command, plant=plant)
     from rig.sequences import load_sequence  # here: it takes half a second
 
-    return check_effect(e.name, load_sequence("preflight").main_profile().command)
+    return check_effect(e.name, load_sequence("preflight").main_profile().command, plant=plant)
 
 
 def build_effects_report(chosen: Sequence[Effect], plant: str, tests: Mapping[str, SelfTest], *,
@@ -45,13 +51,14 @@ def build_effects_report(chosen: Sequence[Effect], plant: str, tests: Mapping[st
     for name, test in tests.items():
         row = next(row for row in rows if row["effect"] == name)
         row["self_test"] = {"faults": list(test.faults), "visible": test.visible,
-                            "shown": [shown._asdict() for shown in test.shown]}
+                            "shown": [{"start": shown.start, **shown.changes, "level": shown.level}
+                                      for shown in test.shown]}
     title, sentence = "effects", ""
     if is_detailed:
         law = ((chosen[0].function.__doc__ if chosen[0].function else "") or "").partition("\n")[0]
         title, sentence = chosen[0].name, ": ".join(filter(None, (chosen[0].name, law)))
-    sections = [Section("", _list_properties(chosen[0], rows[0]) if is_detailed else _tabulate_effects(chosen))]
-    sections += [Section(f"self-test of {name}", _show_test(test)) for name, test in tests.items()]
+    sections = [Section("", _list_properties(chosen[0], rows[0], plant) if is_detailed else _tabulate_effects(chosen))]
+    sections += [Section(f"self-test of {name}", _show_test(test, plant)) for name, test in tests.items()]
     return Report("effects", title, sentence=sentence, sections=sections, data={"effects": rows})
 
 
@@ -76,8 +83,8 @@ def _tabulate_effects(chosen: Sequence[Effect]) -> list[Item]:
         "group. rig effects EFFECT shows its law.")]
 
 
-def _list_properties(e: Effect, row: Mapping[str, Any]) -> list[Item]:
-    port = f"{e.port} ({getattr(UNITS, e.port)})" if e.port else "the reference model itself"
+def _list_properties(e: Effect, row: Mapping[str, Any], plant: str) -> list[Item]:
+    port = f"{e.port} ({find_plant(plant).ports[e.port].unit})" if e.port else "the reference model itself"
     properties = [("law", e.law), ("acts on", port), ("symptoms", e.symptoms), ("source", e.source),
                   ("confused with", ", ".join(e.confused_with)), ("excludes", ", ".join(e.excludes))]
     for name, p in row["parameters"].items():
@@ -89,17 +96,18 @@ def _list_properties(e: Effect, row: Mapping[str, Any]) -> list[Item]:
     return [Line(label, text) for label, text in properties if text]
 
 
-def _show_test(test: SelfTest) -> list[Item]:
+def _show_test(test: SelfTest, plant: str) -> list[Item]:
     """The faults that a self-test found, and what each size changes."""
     items: list[Item] = []
     if test.shown:
+        units = {s: CONVENIENT.get(s.unit, (1.0, s.unit)) for s in find_plant(plant).signals.outputs}
         rows = [[", ".join(f"{name.partition('.')[2]} = {value:.3g}" for name, value in shown.start.items()),
-                 *map(format_digits, (shown.xj * 1e6, shown.p12 * 1e-5, shown.xs * 1e6, shown.level))]
-                for shown in test.shown]
-        columns = [Column("size"), Column("XJ", "um", "right"), Column("P12", "bar", "right"),
-                   Column("XS", "um", "right"), Column("over noise", align="right")]
-        items.append(Table(columns, rows, f"What {test.effect} changes: RMS over the preflight, driven by the same "
-                                          "current; and the largest change over the noise of its sensor."))
+                 *(format_digits(shown.changes[s.name] * factor) for s, (factor, _) in units.items()),
+                 format_digits(shown.level)] for shown in test.shown]
+        columns = [Column("size"), *(Column(s.symbol, unit, "right") for s, (_, unit) in units.items()),
+                   Column("over noise", align="right")]
+        items.append(Table(columns, rows, f"What {test.effect} changes: RMS over the nominal test, driven by the "
+                                          "same drive; and the largest change over the noise of its sensor."))
     items += [Line("FAULT", f"{test.effect}: {fault}", "bad") for fault in test.faults]
     if not test.faults:
         hidden = "" if test.visible or not test.shown else "; below the noise on this command"

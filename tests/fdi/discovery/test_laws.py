@@ -37,7 +37,8 @@ from fdi.discovery.search import Search
 from fdi.trace.trace import Trace
 from plant import Model, simulate
 from plant.effects import CATALOGUE, combine_laws, load_effects
-from plant.state import Drag, Input, Line, State
+from plant.eha import State
+from plant.state import Drag, Input, Line
 
 BY_NAME = {term.name: term for term in TERMS}
 
@@ -172,7 +173,7 @@ OUTSIDE: Mapping[str, Outside] = {
     "friction that grows with the pressure": Outside(
         "jack_drag", "Drag(x.force, x.damping, x.static + size * abs(s.pressure), x.dynamic + size * abs(s.pressure))",
         "friction_pressure", 3e-4),
-    "dead band of the current": Outside("current", "x - size * min(max(u.current, -3e-4), 3e-4)", "dead_band", 0.3),
+    "dead band of the current": Outside("current", "x - size * min(max(u.drive, -3e-4), 3e-4)", "dead_band", 0.3),
     "displacement that grows along the stroke": Outside(
         "valve", "Line(x.offset, x.slope * (1.0 + size / p.jack.area * s.jack_position), x.limit, x.drive)",
         "area_slope", 0.05),

@@ -1,4 +1,4 @@
-"""One step of the reference model (Fig. 5 of the paper), component by component along the signal path.
+"""The electrohydraulic actuator: the paper's reference model (Fig. 5), component by component along the signal path.
 
 Stiff terms are implicit: the pressure-flow damping has time constants of 3 us and 22 us, and dry friction is a set.
 Positions follow the mean of the old and the new velocity, the flapper the trapezoidal rule with the spool where it
@@ -11,7 +11,12 @@ from __future__ import annotations
 from math import sqrt
 from typing import Any, NamedTuple
 
+from plant import signals
+from plant.compile import bind_later
 from plant.friction import clip, solve_velocity
+from plant.parameters import GROUPS, load_nominal_values
+from plant.pid import Loop, control_by_pid
+from plant.plants import Plant
 from plant.ports import (
     at_current,
     at_feedback,
@@ -25,7 +30,21 @@ from plant.ports import (
     at_valve,
     at_viscosity,
 )
-from plant.state import Drag, Input, Line, Memory, Ports, State
+from plant.quantity import Metre, MetrePerSecond, Pascal
+from plant.state import Drag, Input, Line, Memory
+
+
+class State(NamedTuple):
+    """The plant at one instant; all zero is the centred actuator at rest."""
+
+    flapper_position: Metre = 0.0  # XF, at the nozzles
+    flapper_speed: MetrePerSecond = 0.0
+    spool_position: Metre = 0.0  # XS
+    spool_speed: MetrePerSecond = 0.0
+    jack_position: Metre = 0.0  # XJ
+    jack_speed: MetrePerSecond = 0.0
+    pressure: Pascal = 0.0  # P12, across the piston
+    sensed: Metre = 0.0  # XJ as its transducer shows it, without noise
 
 
 class Coefficients(NamedTuple):
@@ -90,17 +109,18 @@ def compute_coefficients(p: Any, h: float) -> Coefficients:
     )
 
 
-def apply_steady_oil(k: Coefficients, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory, Memory]:
-    """Coefficients at nominal oil, unchanged; and the memories of the ports supply and viscosity."""
-    return k, s.memory.supply, s.memory.viscosity
+@bind_later
+def apply_steady_oil(k: Coefficients, s: State, m: Memory, u: Input, p: Any) -> tuple[Coefficients, Memory]:
+    """Coefficients at nominal oil, unchanged, and the memories of effects."""
+    return k, m
 
 
-def apply_changing_oil(k: Coefficients, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory, Memory]:
+def apply_changing_oil(k: Coefficients, s: State, m: Memory, u: Input, p: Any) -> tuple[Coefficients, Memory]:
     """Coefficients at the present supply pressure and viscosity (`k`, to the last bit, at nominal ones); memories."""
-    ratio, m_supply = at_supply(1.0, s.memory.supply, s, u, p)
-    thick, m_viscosity = at_viscosity(1.0, s.memory.viscosity, s, u, p)
+    ratio, m = at_supply(1.0, m, s, u, p)
+    thick, m = at_viscosity(1.0, m, s, u, p)
     ratio, thick = max(ratio, LEAST_RATIO), max(thick, LEAST_RATIO)
-    return scale_coefficients(k, ratio, thick, u.h, p), m_supply, m_viscosity
+    return scale_coefficients(k, ratio, thick, u.h, p), m
 
 
 LEAST_RATIO = 1e-3  # of supply pressure and viscosity: neither quite vanishes
@@ -143,39 +163,40 @@ def move_between_stops(x0: float, v0: float, v: float, h: float, limit: float) -
     return clip(x, limit), v if abs(x) <= limit else 0.0
 
 
-def step_flapper(s: State, u: Input, p: Any, k: Coefficients) -> tuple[float, float, Memory, Memory]:
-    """Torque motor and flapper (trapezoidal rule): XF, XF', memory of the current and of the feedback."""
-    current, m_current = at_current(u.current, s.memory.current, s, u, p)
+def step_flapper(s: State, m: Memory, u: Input, p: Any, k: Coefficients) -> tuple[float, float, Memory]:
+    """Torque motor and flapper (trapezoidal rule): XF, XF', memories."""
+    current, m = at_current(u.drive, m, s, u, p)
     ahead = s.spool_position + 0.5 * u.h * s.spool_speed
-    spring, m_feedback = at_feedback(ahead, s.memory.feedback, s, u, p)
+    spring, m = at_feedback(ahead, m, s, u, p)
     own = p.torque_motor.gain * current - p.flapper.stiffness * s.flapper_position
     torque = own - p.feedback_spring.stiffness * spring  # Tact - KF XF; the spool's part last, it is known last
     v = k.flapper_keep * s.flapper_speed + k.flapper_push * torque
     x, v = move_between_stops(s.flapper_position, s.flapper_speed, v, u.h, p.flapper.travel)
-    return x, v, m_current, m_feedback
+    return x, v, m
 
 
-def step_spool(s: State, u: Input, p: Any, k: Coefficients, xf: float) -> tuple[float, float, Memory, Memory]:
-    """Pilot pressure and spool: XS, XS', memory of the nozzle and of the force."""
-    xf, m_nozzle = at_nozzle(xf, s.memory.nozzle, s, u, p)
-    force, m_force = at_spool_force(0.0, s.memory.spool_force, s, u, p)
+def step_spool(s: State, m: Memory, u: Input, p: Any, k: Coefficients, xf: float) -> tuple[float, float, Memory]:
+    """Pilot pressure and spool: XS, XS', memories."""
+    xf, m = at_nozzle(xf, m, s, u, p)
+    force, m = at_spool_force(0.0, m, s, u, p)
     v0, g = s.spool_speed, p.spool
     dry = u.h * g.static_friction if v0 == 0.0 else u.h * g.dynamic_friction
     impulse = g.mass * v0 + u.h * force
     v = solve_velocity(v0, impulse, k.spool_push, k.pilot_gain * xf, k.pilot_slope, k.pilot_limit, dry, k.spool_free,
                        k.spool_coupled)
     x, v = move_between_stops(s.spool_position, v0, v, u.h, g.travel)
-    return x, v, m_nozzle, m_force
+    return x, v, m
 
 
-def compute_metering_line(s: State, u: Input, p: Any, k: Coefficients, xs: float) -> tuple[Line, Memory, Memory]:
-    """Metering edges with leakage: P12 as a function of the ram's speed; memories of the ports metering and valve."""
-    opening, m_metering = at_metering(xs, s.memory.metering, s, u, p)
+def compute_metering_line(s: State, m: Memory, u: Input, p: Any, k: Coefficients, xs: float) -> tuple[Line, Memory]:
+    """Metering edges with leakage: P12 as a function of the ram's speed; memories."""
+    opening, m = at_metering(xs, m, s, u, p)
     drive = k.valve_gain * opening
-    line, m_valve = at_valve(Line(drive, k.valve_slope, k.valve_limit, drive), s.memory.valve, s, u, p)
-    return line, m_metering, m_valve
+    line, m = at_valve(Line(drive, k.valve_slope, k.valve_limit, drive), m, s, u, p)
+    return line, m
 
 
+@bind_later
 def keep_compliance(k: Coefficients, drag: Drag, line: Line, p: Any, h: float) -> tuple[float, float]:
     """Speed of the ram per impulse, 1/kg, at the limit of the pressure and on its slope, if no effect changes it."""
     return k.jack_free, k.jack_coupled
@@ -192,36 +213,57 @@ def update_compliance(k: Coefficients, drag: Drag, line: Line, p: Any, h: float)
 compute_compliance = keep_compliance
 
 
-def step_jack(s: State, u: Input, p: Any, k: Coefficients, line: Line,
-         given: float) -> tuple[float, float, float, Memory, Memory]:
-    """The ram against a `given` load, N: XJ, XJ', P12, memory of the load and of the drag."""
+def step_jack(s: Any, m: Memory, u: Input, p: Any, k: Any, line: Line,
+              given: float) -> tuple[float, float, float, Memory]:
+    """The ram against a `given` load, N: XJ, XJ', P12, memories."""
     g, h, v0 = p.jack, u.h, s.jack_speed
-    load, m_load = at_load(given, s.memory.load, s, u, p)
-    drag, m_drag = at_jack_drag(Drag(0.0, 0.0, g.static_friction, g.dynamic_friction), s.memory.jack_drag, s, u, p)
+    load, m = at_load(given, m, s, u, p)
+    drag, m = at_jack_drag(Drag(0.0, 0.0, g.static_friction, g.dynamic_friction), m, s, u, p)
     push = h * g.area
     free, coupled = compute_compliance(k, drag, line, p, h)
     dry = h * drag.static if v0 == 0.0 else h * drag.dynamic
     impulse = g.mass * v0 - h * (load + drag.force)
     v = solve_velocity(v0, impulse, push, line.offset, line.slope, line.limit, dry, free, coupled)
     x, v = move_between_stops(s.jack_position, v0, v, h, g.travel)
-    return x, v, clip(line.offset - line.slope * v, line.limit), m_load, m_drag
+    return x, v, clip(line.offset - line.slope * v, line.limit), m
 
 
-def step_plant(s: State, u: Input, p: Any, k: Coefficients) -> State:
+def step_actuator(s: State, m: Memory, u: Input, p: Any, k: Coefficients) -> tuple[State, Memory]:
     """The state `u.h` seconds later."""
-    k, m_supply, m_viscosity = apply_oil(k, s, u, p)
-    xf, vf, m_current, m_feedback = step_flapper(s, u, p, k)
-    xs, vs, m_nozzle, m_force = step_spool(s, u, p, k, xf)
-    line, m_metering, m_valve = compute_metering_line(s, u, p, k, xs)
-    xj, vj, p12, m_load, m_drag = step_jack(s, u, p, k, line, u.load)
-    m = s.memory
-    now = State(xf, vf, xs, vs, xj, vj, p12, s.sensed, m)  # the transducer feels the end of the step
-    sensed, m_position = at_position(xj, m.position, now, u, p)
-    return State(xf, vf, xs, vs, xj, vj, p12, sensed, Ports(
-        m.command, m_current, m_supply, m_viscosity, m_nozzle, m_feedback, m_force, m_metering, m_valve, m_load,
-        m_drag, m_position, m.reading))
+    k, m = apply_oil(k, s, m, u, p)
+    xf, vf, m = step_flapper(s, m, u, p, k)
+    xs, vs, m = step_spool(s, m, u, p, k, xf)
+    line, m = compute_metering_line(s, m, u, p, k, xs)
+    xj, vj, p12, m = step_jack(s, m, u, p, k, line, u.load)
+    return sense_ram(State(xf, vf, xs, vs, xj, vj, p12, s.sensed), m, u, p)  # it feels the end of the step
+
+
+def sense_ram(s: State, m: Memory, u: Input, p: Any) -> tuple[State, Memory]:
+    """The state with what the ram's transducer shows of it."""
+    sensed, m = at_position(s.jack_position, m, s, u, p)
+    return State(s.flapper_position, s.flapper_speed, s.spool_position, s.spool_speed, s.jack_position, s.jack_speed,
+                 s.pressure, sensed), m
 
 
 def measure(s: State, p: Any) -> tuple[float, float, float]:
     """What the transducers show: XJ m, P12 Pa, XS m."""
     return s.sensed, s.pressure, s.spool_position
+
+
+PLANT = Plant(
+    title="electrohydraulic actuator with a servovalve",
+    signals=signals.EHA,
+    parameters=GROUPS,
+    state=State,
+    step=step_actuator,
+    measure=measure,
+    moves=("jack_position",),
+    control=control_by_pid,
+    control_memory=Loop,
+    coefficients=compute_coefficients,
+    sense=sense_ram,
+    variants={"apply_oil": (apply_changing_oil, frozenset({"supply", "viscosity"})),
+              "compute_compliance": (update_compliance, frozenset({"valve", "jack_drag"}))},
+    values=load_nominal_values(),
+    balances=True,
+)
