@@ -27,8 +27,9 @@ from rig.recorder import CycleBlock
 from rig.run import embedded_cycle as ec
 from rig.run.cyclic_values import CycleInput
 from rig.run.loop import CycleLoop, CycleObserver, Seen
-from rig.sequences.faults import Parameter, Plan, Schedule
+from rig.sequences.faults import Frames, Jitter, Parameter, Plan, Schedule
 
+FRAMES = ("command", "sync", "feedback", "valve_state", "drive")  # that faults act on
 Limits = Mapping[str, tuple[float, float]]  # of signals, SI
 
 
@@ -43,7 +44,7 @@ class EmbeddedLoop(CycleLoop):
         super().__init__(master, bench, scenario, faults, log, realtime=False)
         assert isinstance(master.wire, EmbeddedWire)
         self._embedded = master.wire
-        self._busy = find_busy_cycles(scenario.plan)
+        self._busy = find_busy_cycles(scenario.plan, faults)
         self._buffers = ec.make_buffers(bench, self._values.names, guards)
         self._buffers.words[ec.CLOCK] = find_clock()
         self._frames, self._sync_id = ec.list_frames(bench), bench.frames.sync or 0
@@ -144,19 +145,20 @@ def find_clock() -> int:
     return ctypes.cast(ctypes.CDLL(None).clock_gettime, ctypes.c_void_p).value or 0
 
 
-def find_busy_cycles(plan: Plan) -> NDArray[np.int64]:
+def find_busy_cycles(plan: Plan, schedule: Schedule) -> NDArray[np.int64]:
     """The cycles that Python plays because of faults, in order: where one begins, acts or ends, and their neighbours.
 
-    A parameter acts on the plant by itself, but where it changes.
+    A parameter acts on the plant by itself, but where it changes; a frame that is lost or late concerns the cycles to
+    come as well, until the nodes are well again.
     """
-    ranges = []
+    ranges = [range(edge.cycle - 1, edge.cycle + 2) for edge in schedule.edges]
+    ranges += [range(k - 1, k + 3) for name in FRAMES for k in schedule.list_frame_hits(name)[:, 0].tolist()]
     for fault in plan.faults:
         first, last = plan.find_cycles(fault)
         if isinstance(fault, Parameter):
-            end = min(first + ceil(fault.ramp * plan.rate) + 1, last)
-            ranges += [range(first - 1, end + 1), range(last - 1, last + 2)]
-        else:
-            ranges.append(range(first - 1, last + 2))
+            ranges.append(range(first, min(first + ceil(fault.ramp * plan.rate) + 2, last)))
+        elif not isinstance(fault, Frames | Jitter):
+            ranges.append(range(first, last))
     return np.array(sorted({k for each in ranges for k in each}), np.int64)
 
 

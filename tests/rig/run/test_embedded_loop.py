@@ -15,7 +15,7 @@ from plant.segments import Array
 from rig.run import loops
 from rig.run.embedded_loop import EmbeddedLoop, find_busy_cycles
 from rig.run.outcome import Outcome
-from rig.sequences.faults import Late, Noise, Parameter, Plan
+from rig.sequences.faults import Late, Noise, Parameter, Plan, Schedule
 
 LOADED = SHORT.replace("main = [", 'load = [{ kind = "ramp", to = 1500, time = 0.3 }]\nmain = [')
 GUARDED = SHORT + 'guards = [{ name = "g", signal = "error", low = -0.5, high = 0.1, unit = "mm", cycles = %d }]'
@@ -69,6 +69,10 @@ def play_both(monkeypatch: pytest.MonkeyPatch, folder: Path, *given: Any, **sett
     (with_fault('kind = "noise", signal = "p12", value = 1e4, start = 0.1, end = 0.2'), {}, 200),
     (with_fault('kind = "stuck", signal = "xj", start = 0.1, end = 0.12'), {}, 300),
     (with_fault('kind = "late", frame = "drive", delay = 2.5e-3, start = 0.1, end = 0.15'), {}, 100),
+    *((with_fault(f'kind = "{kind}", frame = "{frame}", start = 0.1, end = 0.3, every = 17, probability = 0.7'), {},
+       200)
+      for kind, frame in (("lost", "feedback"), ("lost", "sync"), ("duplicated", "sync"), ("duplicated", "drive"),
+                          ("corrupted", "feedback"), ("corrupted", "valve_state"))),
     (with_fault('kind = "lost", frame = "feedback", start = 0.2, end = 0.22'), {}, 100),
     (with_fault('kind = "heartbeat", node = "rig", start = 0.05, end = 0.32'), {}, 50),
     (with_fault('kind = "foreign", start = 0.1, end = 0.2, every = 3'), {}, 200),
@@ -99,8 +103,10 @@ def test_a_plant_that_diverges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_python_plays_the_cycles_in_which_a_fault_begins_acts_or_ends() -> None:
-    """A parameter needs Python where it changes, any other fault all the time."""
-    ramped = Parameter(parameter="filter.clogging", value=0.4, start=0.1, end=0.2, ramp=0.01)
-    busy = find_busy_cycles(Plan(faults=(ramped, Late(frame="drive", delay=1e-3, start=0.3, end=0.302),
-                                         Noise(signal="xj", value=1e-6, start=0.4, end=0.401)), start=50, stop=500))
-    assert busy.tolist() == [*range(149, 162), *range(249, 252), *range(349, 354), *range(449, 453)]
+    """A parameter needs Python where it changes, a frame where it is hit, any other fault all the time."""
+    plan = Plan(faults=(Parameter(parameter="filter.clogging", value=0.4, start=0.1, end=0.2, ramp=0.01),
+                        Late(frame="drive", delay=1e-3, start=0.3, end=0.32, every=10),
+                        Noise(signal="xj", value=1e-6, start=0.4, end=0.401)), start=50, stop=500)
+    busy = find_busy_cycles(plan, Schedule(plan, {"filter.clogging": 0.0}))
+    assert busy.tolist() == [*range(149, 162), *range(249, 252), *range(349, 353), *range(359, 363), *range(369, 372),
+                             *range(449, 453)]
