@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi.diagnosis.ambiguity import Group, cut_intervals, find_groups
+from fdi.diagnosis.ambiguity import Group, cut_intervals, find_groups, find_rivals
 from fdi.diagnosis.bands import (
     Bands,
     BandVerdict,
@@ -150,10 +150,12 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     levels = _judge_sizes(sizes, refinement)
     groups: tuple[Group, ...] = ()
     if refinement.is_explained and None in levels.values():
-        undecided = [name for name, level in levels.items() if level is None]
-        sizes |= cut_intervals(refinement, undecided, sizes)
+        sizes |= cut_intervals(refinement, _name_undecided(levels), sizes)
         levels = _judge_sizes(sizes, refinement)
-        groups = find_groups(refinement, [name for name, level in levels.items() if level is None])
+        groups = find_groups(refinement, _name_undecided(levels))
+    if refinement.is_explained and beside is None:
+        groups += find_rivals(refinement, [name for name, level in levels.items() if level])
+        levels |= {name: None for group in groups for name in group.names}
     if beside is not None:
         levels |= dict.fromkeys(beside.disputed)
     progress("done", 1.0)
@@ -162,6 +164,10 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
                      ruling=find_ruling_fault(faults, sizes, levels), sizes=sizes, refinement=refinement, grid=grid,
                      precursors=precursors, band_verdict=band_verdict, others=_find_unhealthy(refinement, model),
                      trace=trace, model=model, floor=floor, bands=bands, notes=tuple(notes), beside=beside)
+
+
+def _name_undecided(levels: Mapping[str, Level | None]) -> list[str]:
+    return [name for name, level in levels.items() if level is None]
 
 
 def _complete_sizes(faults: Sequence[Fault], pair: Sizes) -> Sizes:

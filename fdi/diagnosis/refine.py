@@ -40,6 +40,7 @@ from fdi.estimation.fit import (
     list_all_unknowns,
     list_effect_unknowns,
     scale_noise,
+    scaled_bounds,
     silence_readings,
     span_all_rows,
 )
@@ -55,6 +56,7 @@ from fdi.estimation.unidentifiable import (
     find_flat_directions,
     guess_covariance,
     linearise_across,
+    list_directions_of_faults,
     start_fit,
     take_logarithm,
 )
@@ -68,6 +70,7 @@ from fdi.thresholds import (
     GAIN_WORTH_A_FIT,
     INTERVAL_95_SD,
     LINEAR_FAULT_SPREAD,
+    NARROWEST_LINEAR,
     PRIORS_KNOW_MORE_MISFIT,
     RESIDUAL_HELD_OUT,
     RESIDUAL_HOPELESS,
@@ -124,7 +127,7 @@ SUSPECTS = (
 
 def get_positive(model: Model, name: str) -> float:
     """A parameter of the model, bounded below by 0.1 % of its nominal value, as a logarithm needs it."""
-    return max(model[name], 1e-3 * model.nominal[name])
+    return max(model[name], 1e-3 * model.nominal.get(name, model[name]))
 
 
 def list_unknowns(model: Model, faults: Sequence[Fault] = FAULTS, fault_spread: float = 150.0) -> tuple[Free, ...]:
@@ -148,14 +151,14 @@ def list_unknowns(model: Model, faults: Sequence[Fault] = FAULTS, fault_spread: 
 def _make_fault_unknowns(fault: Fault, model: Model, spread: float) -> list[Free]:
     """A fault's size and what follows it as unknowns.
 
-    What is lost from a whole goes by the logarithm of what is left, a size of which a healthy unit has some by its own
-    logarithm, and any other is linear, in units of MidBand.
+    What is lost from a whole goes by the logarithm of what is left, a parameter of the plant of which a healthy unit
+    has some by its own logarithm, and any other is linear, in units of MidBand.
     """
     low, high = fault.range
     if ORIGINS.get(fault.parameter) == 1.0:
         return [LogOpenFilter(fault.parameter, math.log(1.0 - fault.healthy), UNIT_TOLERANCE, spread,
                               math.log(1.0 - high), math.log(1.0 - low), 1.0)]
-    if low < 0.0 or fault.healthy <= 0.0:
+    if not _is_scaled(fault):
         healthy, middle, _ = fault.limits
         factors = {fault.parameter: 1.0, **fault.follow}
         return [Free(name, by * fault.healthy, abs(by) * (middle - healthy), LINEAR_FAULT_SPREAD,
@@ -233,7 +236,7 @@ def list_coarse_starts(faults: Sequence[Fault]) -> list[Sizes]:
 
 def _list_ladder(fault: Fault) -> list[float]:
     """Sizes of a fault in coarse steps: by a factor where a healthy unit has some, else by parts of MidBand."""
-    if _is_scaled(fault):
+    if _is_scaled(fault) and not fault.falls:
         return [x for x in fault.healthy * 1.4 ** np.arange(-1.0, 10.0) if x <= fault.range[1]]
     healthy, middle, _ = fault.limits
     ways = (-1.0, 1.0) if fault.both_ways else (1.0,)
@@ -244,9 +247,9 @@ def _list_ladder(fault: Fault) -> list[float]:
 
 
 def _is_scaled(fault: Fault) -> bool:
-    """Whether a size grows by factors: a healthy unit has some of it, and it is no share of a whole."""
-    return (fault.healthy > 0.0 and fault.range[0] >= 0.0 and not fault.falls
-            and ORIGINS.get(fault.parameter) != 1.0)
+    """Whether a size grows by factors: one of the plant itself of which a healthy unit has some, and no share."""
+    return (fault.healthy > 0.0 and fault.range[0] >= 0.0 and ORIGINS.get(fault.parameter) != 1.0
+            and fault.parameter.partition(".")[0] not in CATALOGUE.list_all())
 
 
 def _pick_two(ladder: Sequence[float]) -> list[float]:
@@ -272,6 +275,7 @@ class Refinement:
     method: str = "least squares"
     everywhere: Mapping[str, float] = field(default_factory=dict)  # of a long recording: typical error over noise
     worst: float = RESIDUAL_WORST  # error over noise that a few stops of the ram may leave
+    problem: CountedProblem | None = field(default=None, repr=False)  # that was fitted
 
     @property
     def correlation(self) -> float:
@@ -353,7 +357,10 @@ def refine_sizes(model: Model, trace: Trace, starts: Sequence[Sizes] | None = No
     free = list_unknowns(problem.model, faults)
     first = _fit_coarsely(problem, free, starts or list_coarse_starts(faults))
     problem = learn_left_noise(problem, first)
-    return report_fit(_fit_finely(problem, first), problem, whole)
+    last = _fit_finely(problem, first)
+    if len(faults) > 2:  # of fewer, the start from a healthy unit is the only one that lacks a fault
+        last = _retry_without(problem, last)
+    return report_fit(last, problem, whole)
 
 
 def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequence[Sizes]) -> Fit:
@@ -407,6 +414,58 @@ def _restart_fit(problem: CountedProblem, found: Fit, parts: Sequence[float], ro
     return min(found, *map_in_threads(fit_from, parts, problem.workers), key=lambda f: f.cost)
 
 
+def _retry_without(problem: CountedProblem, found: Fit, most: int = 2) -> Fit:
+    """The best of a fit and some that begin without one of the faults that it blames: one fault may stand for another.
+
+    They begin at the same unit, and where the fault looks like parameters of the plant, with these in its place.
+    """
+    fine = replace(problem, workers=1, steps=FINE_STEPS, _lanes={})
+    alone = replace(problem, workers=1, _lanes={})
+
+    def fit_without(fault: Fault) -> Fit:
+        x = set_sizes(found, fault, fault.healthy)
+        starts = np.array([x, *(_move_instead(problem, found, fault, x))])
+        best = starts[int(np.argmin(problem.compute_costs(found.free, starts)))]
+        begun = descend(alone, start_fit(found.free, best), NOISE_SCHEDULE[1:])
+        return descend_valley(fine, begun, 8, find_flat(alone, found.free, begun.x))
+
+    for _ in range(most):
+        blamed = [fault for fault in problem.faults if _blames(fault, found)]
+        fits = map_in_threads(fit_without, blamed, problem.workers)
+        best = min(fits, key=lambda f: f.cost, default=found)
+        if best.cost >= found.cost:
+            break
+        found = best
+    return found
+
+
+def _move_instead(problem: CountedProblem, found: Fit, fault: Fault, x: Floats) -> list[Floats]:
+    """Starts (p,) at which parameters that look like a fault have moved by as much as its size has gone back."""
+    at, names = problem.list_values(found.free, found.x), [f.name for f in found.free]
+    k, moved = names.index(fault.parameter), []
+    for way in list_directions_of_faults(at):
+        if next(iter(way)) == fault.parameter and way[fault.parameter]:
+            part = (x[k] - found.x[k]) * found.free[k].scale / way[fault.parameter]
+            shift = np.array([way.get(f.name, 0.0) * part / f.scale for f in found.free])
+            low, high = scaled_bounds(found.free)
+            moved.append(np.clip(np.where(np.arange(len(x)) == k, x, found.x + shift), low, high))
+    return moved
+
+
+def set_sizes(found: Fit, fault: Fault, size: float) -> Floats:
+    """Scaled unknowns (p,) of a fit with another size of one fault, within the bounds."""
+    x, changes = found.x.copy(), fault.list_changes(size)
+    for k, f in enumerate(found.free):
+        if f.name in changes:
+            x[k] = (min(max(place_value(f, changes[f.name]), f.low), f.high) - f.centre) / f.scale
+    return x
+
+
+def _blames(fault: Fault, found: Fit) -> bool:
+    size = found.values[fault.parameter]
+    return fault.measure_departure(size) > FAULT_BLAMED_SHARE * fault.limits[1]
+
+
 def descend(problem: CountedProblem, found: Fit, schedule: Sequence[tuple[float, int]],
             shown_by: CountedProblem | None = None) -> Fit:
     """The fit after (factor, rounds) each: the noise so many times as large, so that small stops of the ram count late.
@@ -430,15 +489,16 @@ def guess_first_covariance(free: Sequence[Free]) -> Floats:
 
 
 def find_flat(problem: CountedProblem, free: Sequence[Free], x: Floats) -> Floats:
-    """Directions (p, k) at `x` (p,) that no signal shows, with what of the effects goes along."""
-    return find_flat_directions(problem, free, x, (FLAPPER,), EFFECT_POWERS, PRIORS_KNOW_MORE_MISFIT)
+    """Directions (p, k) at `x` (p,) that no signal shows, with what of the effects and of the faults goes along."""
+    at = problem.list_values(free, x)
+    others = [each for each in list_directions_of_faults(at) if next(iter(each)) in problem.fault_parameters]
+    return find_flat_directions(problem, free, x, (FLAPPER, *others), EFFECT_POWERS, PRIORS_KNOW_MORE_MISFIT)
 
 
 def _blames_a_fault(problem: CountedProblem, free: Sequence[Free], x: Floats) -> bool:
     """Whether scaled unknowns, (p,), hold one of the faults for far gone."""
-    known = {f.name: f.value(float(v)) for f, v in zip(free, x, strict=True)}
-    return any(fault.measure_departure(known[fault.parameter]) > FAULT_BLAMED_SHARE * fault.limits[1]
-               for fault in problem.faults)
+    here = replace(start_fit(free, x), x=x)
+    return any(_blames(fault, here) for fault in problem.faults)
 
 
 def make_healthy_start(problem: CountedProblem, free: Sequence[Free]) -> Floats:
@@ -539,21 +599,27 @@ def report_fit(last: Fit, problem: CountedProblem, whole: Trace | None = None) -
     places = [names.index(fault.parameter) for fault in problem.faults]
     spread = np.sqrt(np.diag(last.covariance))[places]
     correlations = last.covariance[np.ix_(places, places)] / np.outer(spread, spread)
-    sizes = {fault.name: estimate_parameter(last, fault.parameter, fault.interval_factor) for fault in problem.faults}
+    sizes = {fault.name: estimate_parameter(last, fault.parameter, fault.interval_factor,
+                                            NARROWEST_LINEAR if type(last.free[k]) is Free else 0.0)
+             for fault, k in zip(problem.faults, places, strict=True)}
     suspects = list_suspects(problem.model, problem.faults)
     found = Refinement(problem.faults, sizes, correlations,
                        {s.parameter: estimate_parameter(last, s.parameter) for s in suspects}, last, errors, floor,
-                       sum(problem.counts))
+                       sum(problem.counts), problem=replace(problem, _lanes={}))
     if whole is None or whole is problem.trace:
         return found
     judged = judge_on_all(problem, [last], whole, FINE_STEPS)[0]
     return replace(found, errors=judged.errors, everywhere=judged.typical_ratio(found.floor))
 
 
-def estimate_parameter(found: Fit, name: str, factor: float = 1.0) -> Estimate:
-    """A parameter with its 95 % interval, `factor` times as wide as the fit's covariance says, within its bounds."""
+def estimate_parameter(found: Fit, name: str, factor: float = 1.0, least: float = 0.0) -> Estimate:
+    """A parameter with its 95 % interval, `factor` times as wide as the fit's covariance says, within its bounds.
+
+    `least`: of the scaled unknown, half the narrowest interval.
+    """
     i = [f.name for f in found.free].index(name)
     half = factor * INTERVAL_95_SD * float(np.sqrt(found.covariance[i, i]))
+    half = max(half, least)
     low, high = sorted(found.free[i].value(float(found.x[i]) + way * half) for way in (-1.0, 1.0))
     return Estimate(found.free[i].value(float(found.x[i])), low, high)
 

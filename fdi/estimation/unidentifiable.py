@@ -41,7 +41,8 @@ TRIED_SHARES = (1.0, -1.0, 0.3, -0.3)  # of TRIED
 LOAD = "constant_load.force"  # one that nobody measured goes with the area that it acts against
 # Some parameters move by their distance from another value than 0: what a filter lets through is 1 - Kintas, what a
 # sensor shows of a position 1 + error.
-ORIGINS: Mapping[str, float] = {"filter.clogging": 1.0, "sensor_gain.error": -1.0}
+ORIGINS: Mapping[str, float] = {"filter.clogging": 1.0, "magnet_loss.share": 1.0, "coil_short.share": 1.0,
+                                "sensor_gain.error": -1.0}
 # Powers with which parameters move together.
 FLAT: tuple[Mapping[str, float], ...] = (
     {"filter.clogging": 1.0, "pilot.flow_gain": -0.5, "pilot.pressure_gain": -1.0, "supply.pressure": -1.0},
@@ -99,6 +100,23 @@ POSITION_SCALE: Mapping[str, float] = {
 
 
 BALANCED = {"valve.pressure_gain", "valve.flow_gain", "jack.leakage"}  # a plant without them has other directions
+
+
+def list_directions_of_faults(at: Mapping[str, float]) -> list[Mapping[str, float]]:
+    """Directions along which a fault looks like a parameter of the plant or another fault; the fault is named first.
+
+    `at` are parameters by name, SI. The powers of linear unknowns are shifts.
+    """
+    leak = {name: at.get(name, 0.0) for name in ("land_clearance.clearance", "jack.leakage")}
+    clearance = leak["land_clearance.clearance"]
+    flow = at.get("land_clearance.circumference", 0.013) * clearance**3 / 0.18e-3  # of the clearance, m3/s/Pa
+    most = max(leak["jack.leakage"], 3.0 * flow, 1e-300)
+    linear = {"constant_load.force": at.get("constant_load.force", 0.0),
+              "sensor_gain.error": 1.0 + at.get("sensor_gain.error", 0.0)}
+    return [{"magnet_loss.share": 1.0, "torque_motor.gain": -1.0},
+            {"coil_short.share": 1.0, "torque_motor.gain": -1.0},
+            {"land_clearance.clearance": clearance * leak["jack.leakage"] / most, "jack.leakage": -3.0 * flow / most},
+            {name: power * linear.get(name, 1.0) for name, power in POSITION_SCALE.items()}]
 
 
 def list_directions(problem: Problem, at: Mapping[str, float]) -> list[Direction]:

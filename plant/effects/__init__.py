@@ -212,5 +212,5 @@ def combine_laws(port: str, effects: Iterable[Effect]) -> tuple[Law, Memory]:
 
 
 for _family in ("reference", "controller", "current", "servovalve", "valve", "supply", "jack", "friction", "press",
-                "sensors"):
+                "sensors", "wear"):
     importlib.import_module(f"plant.effects.{_family}")
