@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import other_cpus
 import pytest
 from short_sequences import SHORT, job, play
 
@@ -89,8 +90,8 @@ def test_a_plant_that_diverges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     """No exception and no number that is made up, in either loop: EMCY, and clean-up without current."""
     original = NoiseStream.__init__
 
-    def begin(self: NoiseStream, seed: int) -> None:
-        original(self, seed)
+    def begin(self: NoiseStream, *given: int) -> None:
+        original(self, *given)
         self._drawn = self.look_ahead(300)
         self._drawn[200, 1] = np.nan
 
@@ -110,3 +111,22 @@ def test_python_plays_the_cycles_in_which_a_fault_begins_acts_or_ends() -> None:
     busy = find_busy_cycles(plan, Schedule(plan, {"filter.clogging": 0.0}))
     assert busy.tolist() == [*range(149, 162), *range(249, 252), *range(349, 353), *range(359, 363), *range(369, 372),
                              *range(449, 453)]
+
+
+RUN = """
+import hashlib, json
+from pathlib import Path
+from short_sequences import job, play
+from fdi.trace.mcap_log import open_log
+play(job(seed=3), Path("run"))
+log = open_log(Path("run/trace.mcap"))
+kept = [each for each in log.list_raw_messages() if log.channels[each[0]].topic != "/timing"]
+print(json.dumps(hashlib.sha256(repr(kept).encode()).hexdigest()))
+"""
+
+
+def test_the_log_is_the_same_on_every_cpu(tmp_path: Path) -> None:
+    program = tmp_path / "run.py"
+    program.write_text(RUN)
+    answers = other_cpus.run_on_each_cpu(str(program), folder=tmp_path)
+    assert len(answers) >= 2 and len(set(answers.values())) == 1
