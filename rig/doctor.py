@@ -212,7 +212,8 @@ def listen_to_bench(bench: Bench, spec: str, seconds: float) -> list[Finding]:
         remedy = ""
         if not each.received and not is_ours:
             status, remedy = "missing", "power, wiring, bit rate" + (
-                "; PDOs come after NMT start" if bench.nodes and load.content else "")
+                "; PDOs come after NMT start" if bench.nodes and load.content else "") + (
+                "; some devices send it when the rig has set 0x1017" if load.name.startswith("heartbeat") else "")
         elif is_ours and each.received:
             remedy = "another rig is on the bus; end it"
         if each.wrong_lengths:

@@ -64,6 +64,7 @@ class Bench:
     plant: str = "eha"
     cycle_ns: int = 1_000_000
     bitrate: int = 1_000_000  # bit/s
+    data_bitrate: int | None = None  # bit/s, of the data of CAN FD frames with BRS; None: not known
     timeout_ns: int | None = None  # without a drive frame for so long the controller is gone; None: three cycles
     phases: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # field: phase -> counts
     ready: Mapping[str, float] = field(default_factory=dict)  # field of a frame of the controller: counts in main

@@ -82,6 +82,7 @@ class BenchKeys:
     plant_node: NodeKeys | None = None
     cycle: str = "1 ms"
     bitrate: Annotated[int, Range("bit/s", low=10_000, high=1_000_000)] = 1_000_000
+    data_bitrate: Annotated[int, Range("bit/s", low=10_000, high=20_000_000)] | None = None
 
 
 @dataclass(frozen=True)
@@ -221,8 +222,8 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, *, is_t
         raise reader.place.refuse(f"at most {MOST_FRAMES} frames or pages of multiplexed ones")
     phases, ready = _list_states(frames, uses)
     bench = Bench(name=keys.name, frames=FrameMap(frames=tuple(specs), sync=sync), nodes=nodes, plant=keys.plant,
-                  cycle_ns=cycle_ns, bitrate=keys.bitrate, timeout_ns=timeout_ns, phases=phases, ready=ready,
-                  files=reader.files)
+                  cycle_ns=cycle_ns, bitrate=keys.bitrate, data_bitrate=keys.data_bitrate, timeout_ns=timeout_ns,
+                  phases=phases, ready=ready, files=reader.files)
     _check_identifiers(bench, reader.place)
     return bench
 

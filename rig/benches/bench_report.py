@@ -25,7 +25,9 @@ def build_bench_report(bench: Bench, files: Sequence[tuple[str, str]] = ()) -> R
              ("profile", bench.profile), ("plant", bench.plant), ("cycle", f"{bench.cycle_ns / 1e6:g} ms")]
     notes = []
     if any(each.identifier & SWITCHED for each in loads):
-        notes.append("BRS: the data go at the higher bit rate of the bus; the frames are counted at this one")
+        data_rate = "that of 'bitrate': give 'data_bitrate'" if bench.data_bitrate is None else (
+            f"{bench.data_bitrate / 1e6:g} Mbit/s")
+        notes.append(f"BRS: the data of these frames are counted at {data_rate}")
     verdict = "WITHIN_LIMITS" if is_possible else "BEYOND_LIMITS"
     return Report(command="check", title=f"Bench: {bench.name}", verdict=verdict, mood="good" if is_possible else "bad",
                   sentence=sentence, facts=facts, notes=notes, sections=[Section("Frames", [tabulate_frames(loads)])],

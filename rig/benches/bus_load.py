@@ -4,7 +4,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from rig.benches.bench import Bench
-from rig.benches.frame_map import EXTENDED, FD, FrameSpec, Guard, Role
+from rig.benches.frame_map import EXTENDED, FD, SWITCHED, FrameSpec, Guard, Role
 
 HEARTBEAT = 0.1  # s, of each node of the rig
 
@@ -38,6 +38,20 @@ def count_bits(identifier: int, length: int) -> int:
     return head + (head - 1) // 4 + checksum + -(-checksum // 4) + 13
 
 
+def compute_time(identifier: int, length: int, bitrate: float, data_bitrate: float | None = None) -> float:
+    """The time that a frame takes on the bus at most, s; of CAN FD with BRS all from ESI to the CRC at `data_bitrate`.
+
+    >>> compute_time(0x123 | FD | SWITCHED, 64, 1e6), compute_time(0x123 | FD | SWITCHED, 64, 1e6, 5e6)
+    (0.000712, 0.0001696)
+    """
+    bits = count_bits(identifier, length)
+    if not identifier & SWITCHED or data_bitrate is None:
+        return bits / bitrate
+    head = 36 if identifier & EXTENDED else 17  # up to BRS
+    slow = head + (head - 1) // 4 + 13
+    return slow / bitrate + (bits - slow) / data_bitrate
+
+
 def list_loads(bench: Bench) -> list[FrameLoad]:
     """The cyclic frames of a bench, then SYNC and the heartbeats."""
     cycle = bench.cycle_ns / 1e9
@@ -48,7 +62,8 @@ def list_loads(bench: Bench) -> list[FrameLoad]:
     nodes = {Role.RIG: bench.rig_node, **{role: each.node for role, each in bench.nodes.items()}} if bench.nodes else {}
     for role, node in sorted(nodes.items()):
         found.append((f"heartbeat {node}", 0x700 + node, f"{role.name.lower()} > all", 1, (), HEARTBEAT))
-    return [FrameLoad(*each, share=count_bits(each[1], each[3]) / bench.bitrate / each[5]) for each in found]
+    return [FrameLoad(*each, share=compute_time(each[1], each[3], bench.bitrate, bench.data_bitrate) / each[5])
+            for each in found]
 
 
 def _describe_direction(bench: Bench, spec: FrameSpec) -> str:

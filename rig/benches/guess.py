@@ -29,10 +29,10 @@ _WORDS: dict[str, tuple[set[str], set[str]]] = {
                         {"demand", "target", "command", "cmd", "setpoint", "set", "reference", "ref", "desired"}),
     "ram_position": ({"position", "pos", "ram", "stroke"},
                      {"actual", "act", "feedback", "fb", "measured", "sensor", "ram"}),
-    "load_pressure": ({"pressure", "press"}, {"load", "differential", "diff", "delta"}),
+    "load_pressure": ({"pressure", "press", "dp"}, {"load", "differential", "diff", "delta", "dp"}),
     "spool_position": ({"spool"}, {"position", "pos"}),
     "load_force": ({"force"}, {"load", "external", "cell", "measured"}),
-    "current": ({"current", "coil"}, {"demand", "actual", "coil", "motor", "drive", "output"}),
+    "current": ({"current", "coil", "cur", "torque"}, {"demand", "actual", "coil", "motor", "drive", "output"}),
 }
 for _signal in EHA[1:]:  # its name in a recording says both
     if _signal.role in ("output", "drive"):
@@ -43,7 +43,8 @@ _NEEDED = ("position_demand", "ram_position", "current")
 _USUAL = {"m": "1 um", "Pa": "1 kPa", "N": "1 N", "A": "1 uA"}  # counts, where the file says nothing
 _KNOWN_OBJECTS = {"0x607A": "position_demand", "0x6078": "current"}  # CiA 402
 _RATED_CURRENT = 0x6075  # mA; 0x6078 counts thousandths of it
-_ENABLING = {"enable", "enabled", "active", "activate", "request", "run", "on", "operational", "ready"}
+_ENABLING = {"enable", "enabled", "active", "activate", "engage", "engaged", "request", "run", "on", "operational",
+             "ready"}
 
 
 @dataclass(frozen=True)
@@ -138,16 +139,17 @@ def _write_states(messages: Sequence[Any], sent: Sequence[Any]) -> list[str]:
     for message in messages:
         for signal in message.signals:
             words, key = split_words(signal.name), f'"{message.name}.{signal.name}"'
-            if words & {"crc", "checksum", "chk", "cs"}:
+            values = [str(text) for text in (signal.choices or {}).values() if split_words(str(text)) & _ENABLING]
+            if any(word.startswith(("crc", "checksum", "chk")) or word == "cs" for word in words):
                 tables["protection"].append(f'{key} = "crc8_sae_j1850"  {UNSURE}which checksum it is')
             elif words & {"counter", "cnt", "alive", "rolling", "sequence"}:
                 tables["protection"].append(f'{key} = "counter"')
-            elif message in sent and words & {"state", "status"}:
-                names = [str(text) for text in (signal.choices or {}).values() if split_words(str(text)) & _ENABLING]
-                if names:
-                    tables["ready"].append(f'{key} = "{names[0]}"  {UNSURE}the state in which main begins')
-            elif message not in sent and words & _ENABLING and signal.length <= 8:
-                tables["phases"].append(f"{key} = {{ setup = 0, main = 1, cleanup = 0 }}  {UNSURE}what enables")
+            elif message in sent and words & {"state", "status", "mode"}:
+                if values:
+                    tables["ready"].append(f'{key} = "{values[0]}"  {UNSURE}the state in which main begins')
+            elif message not in sent and words & (_ENABLING | {"mode"} if values else _ENABLING) and signal.length <= 8:
+                main = f'"{values[0]}"' if values else 1
+                tables["phases"].append(f"{key} = {{ setup = 0, main = {main}, cleanup = 0 }}  {UNSURE}what enables")
     return [line for name, lines in tables.items() if lines for line in ("", f"[controller.{name}]", *lines)]
 
 

@@ -136,10 +136,11 @@ class BringUp:
         """Enable the controller for a probe; why that failed, or ""."""
         bench = self._job.bench
         enabling = Enabling(bench, loop, self._job.realtime, lambda: bool(self._safety.aborted) or self._stop())
-        problem = enabling.enable(0.0) if bench.profile != "none" else ""
+        has_word, active = bench.profile != "none", PROFILES[bench.profile].ladder[State.ACTIVE]
+        problem = enabling.enable(0.0) if has_word else ""
         if problem or not bench.ready:
             return problem
-        return enabling.await_ready(0.0, find_disabled(bench), PROFILES[bench.profile].ladder[State.ACTIVE])
+        return enabling.await_ready(0.0, active if has_word else find_disabled(bench), active)
 
     def _identify_nodes(self) -> None:
         """Read and log what the nodes say about themselves; refuse another device, and a firmware that the sequence is
