@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from plant.errors import InputError, show_value, suggest_name
-from plant.parameters import read_toml
+from plant.parameters import find_field, read_toml
 
 SHOWN_BY = ("", "steps", "ramps")
 WORD = re.compile(r"[a-z][a-z0-9_]*")  # of a fault: a key of JSON and a column of a campaign
@@ -122,6 +122,14 @@ def read_faults(path: Path, kind: Any) -> tuple[Fault, ...]:
     return place_faults((_read_fault(path, name, table) for name, table in found.items()), kind, path)
 
 
+def is_fault_file(path: Path) -> bool:
+    """Whether a file has tables [faults.NAME], as no sequence has."""
+    try:
+        return path.is_file() and isinstance(read_toml(path).get("faults"), dict)
+    except InputError:
+        return False
+
+
 def _read_fault(path: Path, name: str, table: object) -> Fault:
     where = f"faults.{name}"
     if not isinstance(table, dict):
@@ -196,14 +204,14 @@ def place_fault(fault: Fault, kind: Any, where: object = "faults") -> Fault:
     Raises:
         InputError: a parameter that the plant lacks, another unit, or limits that contradict each other or the range.
     """
-    from plant.model import find_quantity  # models know plants, and plants know faults
+    groups = {**kind.groups, **{e.name: e.group for e in kind.list_effects() if e.group is not None}}
 
     def refuse(key: str, expected: str) -> InputError:
         return InputError(where, f"faults.{fault.name}.{key}".rstrip("."), expected)
 
     def look_up(key: str, name: object) -> Any:
         try:
-            return find_quantity(str(name), where, kind.name)
+            return find_field(where, str(name), groups)
         except InputError as error:
             raise refuse(key, f"a parameter of the plant {kind.name} or of an effect, not {name} "
                               f"(there expected {error.expected})") from error
@@ -230,9 +238,7 @@ def place_fault(fault: Fault, kind: Any, where: object = "faults") -> Fault:
 
 def _find_usual(name: str, kind: Any) -> float:
     """The nominal value of a parameter: the plant's own, or the off value of the effect that has it."""
-    from plant.model import list_offered_effects
-
-    off = {key: value for e in list_offered_effects(kind.name) for key, value in e.off.items()}
+    off = {key: value for e in kind.list_effects() for key, value in e.off.items()}
     return float({**off, **kind.nominal}.get(name, 0.0))
 
 
@@ -257,3 +263,21 @@ def _check_limits(f: Fault, q: Any, refuse: Any) -> None:
         raise refuse("shown_by", f"steps or ramps, not {f.shown_by}")
     if not 0.1 <= f.interval_factor <= 10.0:
         raise refuse("interval_factor", f"a factor from 0.1 to 10, not {f.interval_factor:g}")
+
+
+EXAMPLE = """\
+# A fault of your own for `rig fdi TRACE --faults {file}`; add tables [faults.NAME] to look for several at once.
+# `rig check {file}` tests this file, `rig list parameters` lists what a fault may change. All numbers are SI.
+
+[faults.{name}]
+title = "backlash of the feedback spring"           # for people
+parameter = "feedback_gap.gap"                      # of the plant or of an effect; unit and symbol come from it
+range = [0, 5e-4]                                   # sizes that are possible, a healthy unit's among them
+acceptable = 4e-5                                   # MidBand: up to here acceptable
+maintenance = 9e-5                                  # MaxBand: up to here maintenance is due, above it non-nominal
+source = "3 and 7 % of the spool's half stroke"     # where the limits come from
+# symbol = "gap"                                    # of the size, in tables and as its key in JSON
+# healthy = 0                                       # size of a new unit; default: the nominal value of the parameter
+# both_ways = true                                  # the limits are distances from the healthy size, either way
+# follow = ["group.field"]                          # grow in proportion; or a table, {{ "group.field" = factor }}
+"""

@@ -3,11 +3,16 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from fdi.diagnosis.faults import load_faults
 from fdi.output import require_writable, write_text
 from fdi.report.report import Line, Report, Section
 from plant.errors import InputError
+from plant.faults import EXAMPLE, WORD
 from rig.benches.bench import decode_device_text
 from rig.benches.bench_file import load_bench
 from rig.benches.guess import UNSURE, guess_can, guess_canopen
@@ -23,14 +28,25 @@ def run_command(args: argparse.Namespace) -> int:
     if path.exists() and not args.force:
         raise InputError("--out", str(path), "a file that does not exist yet, or --force")
     require_writable(path, "--out")
-    text = write_bench(path, args)
+    write, check, use = KINDS[args.kind]
+    text = write(path, args)
     write_text(path, text)
     try:
-        load_bench(str(path))
+        check(str(path))
         problem = ""
     except InputError as error:
         problem = str(error)
-    return give_answer(build_new_report(path, text, problem), args)
+    report = build_new_report(path, text, problem)
+    return give_answer(replace(report, next_command=use.format(path), files=[(args.kind, str(path))]), args)
+
+
+def write_fault(path: Path, args: argparse.Namespace) -> str:
+    """The text of a fault file at `path` with one example."""
+    if args.eds or args.dbc or args.node:
+        raise InputError("rig new fault", "", "no device: --eds, --dbc and --node are of a bench")
+    if not WORD.fullmatch(path.stem):
+        raise InputError("NAME", path.stem, "small letters, digits and _ : the name is also that of the first fault")
+    return EXAMPLE.format(file=path, name=path.stem)
 
 
 def write_bench(path: Path, args: argparse.Namespace) -> str:
@@ -52,6 +68,12 @@ def build_new_report(path: Path, text: str, problem: str) -> Report:
         sentence = f"{path} can be used; check what it marks as unsure."
     return Report("new", str(path), "INCOMPLETE" if problem else "COMPLETE", "doubtful" if problem else "good",
                   sentence, sections=[Section("Unsure", [Line("unsure", line) for line in marked])],
-                  next_command=f"rig check --bench {path}", files=[("bench", str(path))],
                   data={"verdict": "INCOMPLETE" if problem else "COMPLETE", "file": str(path), "problem": problem,
                         "unsure": marked})
+
+
+# what writes a file of a kind, what reads it, and the command that checks it
+KINDS: Mapping[str, tuple[Callable[[Path, argparse.Namespace], str], Callable[[str], Any], str]] = {
+    "bench": (write_bench, load_bench, "rig check --bench {}"),
+    "fault": (write_fault, load_faults, "rig check {}"),
+}

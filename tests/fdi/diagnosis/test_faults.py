@@ -1,0 +1,141 @@
+"""Faults as data: the shipped lists, bad files in one line, levels of faults that fall or go both ways, groups."""
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from refusals import catch_refusal
+from rig_command import rig
+
+from fdi.diagnosis.ambiguity import cut_intervals, find_groups
+from fdi.diagnosis.faults import (
+    CLOGGING,
+    FAULTS,
+    FRICTION,
+    Estimate,
+    Level,
+    choose_faults,
+    classify_size,
+    compute_severity,
+    judge_size,
+    list_fault_files,
+    load_faults,
+)
+from fdi.estimation.fit import Free
+from fdi.estimation.unidentifiable import LogFree
+from plant.faults import Fault, place_fault
+from plant.plants import find_plant
+
+GAP = {"title": "play", "parameter": "feedback_gap.gap", "range": [0.0, 5e-4], "acceptable": 4e-5, "maintenance": 9e-5}
+EHA = find_plant("eha")
+
+
+def write(path: Path, **keys: Any) -> Path:
+    """A fault file with one fault: GAP with other keys; None leaves one out."""
+    table = {key: value for key, value in {**GAP, **keys}.items() if value is not None}
+    lines = [f"{key} = {json.dumps(value).replace(': ', ' = ')}" for key, value in table.items()]
+    path.write_text("\n".join(["[faults.play]", *lines]) + "\n")
+    return path
+
+
+def test_the_papers_faults_are_a_file_with_the_limits_of_table_2() -> None:
+    assert list_fault_files() == ["paper", "wider"] and load_faults() == FAULTS
+    assert [(f.name, f.symbol, f.unit, *f.limits) for f in FAULTS] == [
+        ("filter_clogging", "Kintas", "1", 0.0, 0.25, 0.35), ("spool_friction", "FSS", "N", 5.0, 35.0, 70.0)]
+    assert FRICTION.list_changes(45.0) == {"spool.static_friction": 45.0, "spool.dynamic_friction": pytest.approx(30.0)}
+    wider = load_faults("wider")
+    assert len(wider) == 11 and set(FAULTS) <= set(wider) and all(f.source and f.title for f in wider)
+
+
+@pytest.mark.parametrize(("keys", "words"), [
+    ({"parameter": "no.such"}, ["parameter", "plant eha"]),
+    ({"parameter": "feedback_gap.width"}, ["parameter", "(gap)"]),
+    ({"acceptable": 2e-4, "maintenance": 1e-4}, ["acceptable", "between"]),
+    ({"maintenance": 1.0}, ["maintenance", "within the range"]),
+    ({"acceptable": -1.0}, ["acceptable", "within the range"]),
+    ({"range": [1e-5, 5e-4]}, ["range", "healthy size"]),
+    ({"range": [-1.0, 1.0]}, ["range", "at least 0 m"]),
+    ({"range": [1.0]}, ["range", "[least, largest]"]),
+    ({"unit": "mm"}, ["unit", "m, that of feedback_gap.gap"]),
+    ({"mantenance": 1.0}, ["mantenance", "did you mean maintenance?"]),
+    ({"title": None}, ["also the key title"]),
+    ({"acceptable": "much"}, ["acceptable", "a number"]),
+    ({"follow": ["jack.mass"]}, ["follow", "table of factors"]),
+    ({"follow": {"no.such": 1.0}}, ["follow", "plant eha"]),
+    ({"both_ways": 1}, ["both_ways", "true or false"]),
+    ({"shown_by": "sine"}, ["shown_by", "steps or ramps"])])
+def test_a_bad_fault_is_one_line_with_status_2(tmp_path: Path, keys: dict[str, Any], words: list[str]) -> None:
+    file = write(tmp_path / "bad.toml", **keys)
+    text = catch_refusal(load_faults, file)
+    assert "bad.toml: faults.play" in text and "\n" not in text and all(word in text for word in words), text
+
+
+def test_bad_files_and_lists(tmp_path: Path) -> None:
+    for content, word in (("", "at least one table"), ("[faults]\n", "at least one table"), ("x = 1\n", "only tables"),
+                          ("[faults.a]\n", "also the key title"), ("[faults\n", "TOML")):
+        (tmp_path / "bad.toml").write_text(content)
+        assert word in catch_refusal(load_faults, tmp_path / "bad.toml")
+    write(tmp_path / "two.toml").open("a").write((tmp_path / "two.toml").read_text().replace("play]", "other]"))
+    assert "of its own" in catch_refusal(load_faults, tmp_path / "two.toml")
+    assert "a fault file" in catch_refusal(choose_faults, None, find_plant("ehs"))
+    for words in (["fdi", "x.csv", "--faults", "none"], ["check", str(tmp_path / "bad.toml")]):
+        assert rig(*words).status == 2
+
+
+def test_a_new_fault_passes_its_own_checks_and_is_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert rig("new", "fault", "my_gap", "--json").json["verdict"] == "COMPLETE"
+    assert rig("list", "faults", "--faults", "my_gap.toml", "--json").json["faults"][0]["maintenance"] == 9e-5
+    assert rig("check", "my_gap.toml").status == 0
+
+
+DRIFT = place_fault(Fault("drift", "", "sensor_gain.error", (-0.5, 0.5), 0.1, 0.2, both_ways=True), EHA)
+WEAK = place_fault(Fault("weak", "", "torque_motor.gain", (0.5, 3.0), 1.8, 1.4), EHA)
+
+
+@pytest.mark.parametrize(("fault", "size", "level"), [
+    (DRIFT, Estimate(-0.15, -0.18, -0.12), Level.MAINTENANCE), (DRIFT, Estimate(0.0, -0.05, 0.05), Level.ACCEPTABLE),
+    (DRIFT, Estimate(0.09, -0.05, 0.2), None), (DRIFT, Estimate(-0.25, -0.28, -0.22), Level.NON_NOMINAL),
+    (WEAK, Estimate(2.2, 2.1, 2.3), Level.ACCEPTABLE), (WEAK, Estimate(1.6, 1.5, 1.7), Level.MAINTENANCE),
+    (WEAK, Estimate(1.3, 1.2, 1.35), Level.NON_NOMINAL), (WEAK, Estimate(2.0, 1.7, 2.3), None)])
+def test_levels_of_faults_that_fall_or_go_both_ways(fault: Fault, size: Estimate, level: Level | None) -> None:
+    assert judge_size(fault, size) == level
+    assert classify_size(fault, fault.healthy) == Level.ACCEPTABLE and compute_severity(fault, fault.healthy) == 0.0
+    ends = [fault.place_size(departure) for departure in fault.limits[1:]]
+    assert [compute_severity(fault, end) for end in ends] == pytest.approx([1.0, 2.0])
+    assert fault.turn_up().limits == pytest.approx(fault.limits)
+
+
+def pair(x: float, total: float, each: float) -> Any:
+    """A posterior of two linear sizes: their sum is known to `total` s.d., their difference to `each`."""
+    first = replace(CLOGGING, name="a", parameter="one.size", range=(0.0, 1.0))
+    second = replace(CLOGGING, name="b", parameter="two.size", range=(0.0, 1.0))
+    free = tuple(Free(f.parameter, 0.0, 1.0, 10.0, 0.0, 1.0, 0.02) for f in (first, second))
+    same, apart = np.ones((2, 2)) / 2, np.array([[1.0, -1.0], [-1.0, 1.0]]) / 2
+    fit = SimpleNamespace(free=free, x=np.array([x, x]), covariance=total**2 * same + each**2 * apart)
+    return SimpleNamespace(faults=(first, second), fit=fit)
+
+
+@pytest.mark.parametrize(("x", "total", "grouped"), [(0.0, 0.02, False), (0.2, 0.02, False), (0.35, 0.02, True),
+                                                     (0.35, 0.5, False)])
+def test_faults_that_only_show_as_a_sum_are_a_group(x: float, total: float, grouped: bool) -> None:
+    """Each may be absent, but both acceptable, at most 0.25, need a sum of at most 0.5."""
+    found = pair(x, total, 5.0)
+    wide = {name: Estimate(x, 0.0, 1.0) for name in "ab"}
+    cut = cut_intervals(found, ["a", "b"], wide)
+    assert [group.names for group in find_groups(found, ["a", "b"])] == [("a", "b")] * grouped
+    if x == 0.0:  # neither can be less than nothing, so neither can be much
+        assert all(size.high < 0.08 for size in cut.values())
+    if x == 0.35:
+        assert all(size.low == 0.0 for size in cut.values())
+
+
+def test_a_logarithm_keeps_its_bounds_in_a_group() -> None:
+    found = pair(0.2, 0.02, 5.0)
+    found.fit.free = (found.fit.free[0], LogFree("two.size", -1.6, 1.0, 1.0, -4.0, 0.0, 1.0))
+    assert find_groups(found, []) == ()
