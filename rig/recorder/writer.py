@@ -61,6 +61,7 @@ CHUNK_BYTES = 64 * 1024
 CHUNK_NS = 250_000_000  # run time
 CHUNK_WALL = 0.2  # s
 DRAIN_EVERY = 0.01  # s
+MOST_BLOCKS = 300  # waiting, of up to 500 cycles
 QUEUE_LIMIT = 2_000_000  # items; a disk that hangs must not eat the memory
 LIBRARY = "eha-rig"
 
@@ -145,7 +146,12 @@ class Recorder:
             self._tell()
 
     def cycles(self, block: CycleBlock) -> None:
-        """Record cycles that were played together; raises RecorderError once when the log is lost."""
+        """Record cycles that were played together; raises RecorderError once when the log is lost.
+
+        They come faster than any clock: a disk that is slower holds the run up, and memory does not fill.
+        """
+        while len(self._queue) > MOST_BLOCKS and self._thread.is_alive():
+            time.sleep(DRAIN_EVERY)
         self.put(int(block.t_ns[0]), block)
 
     def put(self, t_ns: int, record: Record | CycleBlock) -> None:

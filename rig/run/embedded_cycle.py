@@ -163,16 +163,21 @@ def set_values(b: Buffers, values: Sequence[float]) -> None:
     b.layout.doubles[at:at + len(values)] = values
 
 
-def bind_code(b: Buffers, plant: LentPlant, actuator: Actuator) -> Callable[[], object]:
-    """The compiled cycles on a plant; note where its code and parameters are."""
-    _lend_plant(b, plant, actuator)
-    return load_code().bind((b, plant.flat, plant.live))
+def bind_code(b: Buffers, actuator: Actuator) -> Callable[[], object] | None:
+    """The compiled cycles on a plant; None for one whose readings need more than its state and noise."""
+    plant = _lend_plant(b, actuator)
+    return None if plant is None else load_code().bind((b, plant.flat, plant.live))
 
 
-def _lend_plant(b: Buffers, plant: LentPlant, actuator: Actuator) -> None:
+def _lend_plant(b: Buffers, actuator: Actuator) -> LentPlant | None:
+    """A plant for the compiled code, which is told where its code, its parameters and its readings are."""
+    plant = actuator.lend()
+    if plant is None or len(plant.fields) != 3:
+        return None
     b.words[ADVANCE], b.words[STEPS], b.words[RECORD_SIZE] = plant.advance, actuator.steps, 8 * len(plant.live)
     b.words[LEVELS_AT:LEVELS_AT + 3], b.words[FIELDS_AT:FIELDS_AT + 3] = plant.levels, plant.fields
     b.reals[PERIOD] = actuator.model["controller.period"]
+    return plant
 
 
 def is_compiled() -> bool:
@@ -184,10 +189,9 @@ def make_trial() -> tuple[Buffers, Any, Any]:
     """Arguments of some cycles of the shipped bench, without times."""
     bench, actuator = load_bench(), Actuator(Model())
     actuator.warm()
-    plant = actuator.lend()
-    assert plant is not None
     b = make_buffers(bench, CyclicValues(bench).names, {})
-    _lend_plant(b, plant, actuator)
+    plant = _lend_plant(b, actuator)
+    assert plant is not None
     b.words[ASKED], b.inputs[:, 0], b.noise[:20] = 20, 1e-3, sample_noise(0, 20)
     b.reals[GAINS:GAINS + len(Gains._fields)] = read_gains(actuator.model.values)
     return b, plant.flat, plant.live

@@ -94,8 +94,7 @@ class EmbeddedLoop(CycleLoop):
         """The compiled code on the plant of the emulator, which is another one after each reset."""
         actuator = emulator.plant.actuator
         if self._lent is not actuator:
-            plant, self._lent = actuator.lend(), actuator
-            self._run = None if plant is None else ec.bind_code(self._buffers, plant, actuator)
+            self._lent, self._run = actuator, ec.bind_code(self._buffers, actuator)
         return self._run
 
     def _take_cycles(self, phase: int, control: int, played: int) -> None:
