@@ -85,7 +85,7 @@ def compare_step_with_c(command: Floats, rounds: int = 15, steps: int = 100) -> 
 def _make_python_run(model: Model, command: Floats, draws: Floats, steps: int) -> tuple[Work, Floats]:
     out, load = np.empty((len(command), 4)), np.zeros_like(command)
     run, state, record = build_kernel(run_closed_loop, model.effects), model.build_flat_state(), model.build_record()
-    return lambda: run(state, command, load, draws, record, steps, out), out
+    return lambda: run(state.copy(), command, load, draws, record, steps, out), out
 
 
 def _make_c_run(library: ctypes.CDLL, model: Model, command: Floats, draws: Floats, steps: int) -> tuple[Work, Floats]:
