@@ -177,8 +177,8 @@ def _make_fault_unknowns(fault: Fault, model: Model, spread: float) -> list[Free
 def list_suspects(model: Model, faults: Sequence[Fault]) -> list[Suspect]:
     """The suspects that this plant can have and that are not among the faults."""
     own = {name for fault in faults for name in fault.parameters}
-    return [s for s in SUSPECTS if s.parameter not in own and (s.parameter in model.values or
-                                                               model.kind.offers(CATALOGUE[s.effect]))]
+    return [s for s in SUSPECTS if s.parameter not in own and (
+        model.nominal.get(s.parameter, 0.0) > 0.0 if s.is_ratio else model.kind.offers(CATALOGUE[s.effect]))]
 
 
 def _make_suspect(s: Suspect, model: Model) -> Free:
@@ -558,9 +558,11 @@ def estimate_offsets(problem: Problem) -> dict[str, float]:
     """Null bias, A, and load, N, from the means of current and pressure, as starts of a fit.
 
     The mean opening is the one that moves the ram as far as it moved; the rest of the mean current makes up for a bias.
-    The mean pressure carries the load.
+    The mean pressure carries the load. Of a plant without metering edges nothing is known beforehand.
     """
     trace, p = problem.trace, problem.model.values
+    if "valve.flow_gain" not in p:
+        return {}
     way = 0.0
     for part in trace.parts or (span_all_rows(trace),):
         x = trace.controlled[part.first:part.stop]
