@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from plant.kernels import measure_plant, move_plant, sense_plant, shift_memories
+from plant.kernels import correct_plant, measure_plant, move_plant, sense_plant, shift_memories
 from plant.state import Input, Memory
 
 
@@ -34,4 +34,4 @@ def pull_plant(s: Any, m: Memory, share: float, measured: float, p: Any) -> tupl
     its rod end, and the play would seem 1 um smaller than it is.
     """
     moved = share * (measured - measure_plant(s, p)[0]) if measured == measured else 0.0
-    return move_plant(s, moved, p), shift_memories(m, moved)
+    return correct_plant(s, moved, p), shift_memories(m, moved)

@@ -11,8 +11,11 @@ Permanent Magnet Synchronous and Brushless DC Motor Drives, 2010). Backlash as a
 (Nordin and Gutman, Automatica 38, 2002); dry friction after Karnopp 1985. Faults and their ranges: Dalla Vedova,
 Germana, Berri and Maggiore, Aerospace 6(9), 94, 2019.
 """
+from collections.abc import Mapping
 from math import cos, exp, pi
 from typing import Annotated, Any, NamedTuple
+
+import numpy as np
 
 from plant.declare import (
     Chirp,
@@ -30,13 +33,14 @@ from plant.declare import (
     port,
     solve_sliding,
 )
+from plant.plants import Array, Table, Term
 from plant.signals import Signals
 
 
 class Motor(NamedTuple):
     """The motor, with the inertia of gear and screw."""
 
-    torque_constant: Annotated[float, Quantity("N m/A", "Kt", low=1e-4, high=100, tolerance=0.02)] = 0.2
+    torque_constant: Annotated[float, Quantity("N m/A", "Kt", low=1e-4, high=100)] = 0.2
     inertia: Annotated[float, Quantity("kg m2", "J", low=1e-12, high=10, tolerance=0.02)] = 2e-4
     damping: Annotated[float, Quantity("N m s/rad", "B", low=0, high=10)] = 1e-4
     resistance: Annotated[float, Quantity("ohm", "R", low=1e-3, high=100)] = 0.5
@@ -81,6 +85,12 @@ class Controller(NamedTuple):
     current_limit: Annotated[float, Quantity("A", low=1e-3, high=1e4)] = 20.0
     measured_speed: Annotated[float, Quantity("1", words={"motor": 1.0, "position": 0.0})] = 1.0
     period: Annotated[float, Quantity("s", low=1e-4, high=0.1)] = 1e-3
+
+
+class Observer(NamedTuple):
+    """How replays of a recording follow the measured position: the faster, the finer its sensor is."""
+
+    rate: Annotated[float, Quantity("1/s", "w", low=1, high=300, typical="40: 1 um of noise; 200: 50 nm")] = 40.0
 
 
 class State(NamedTuple):
@@ -217,6 +227,31 @@ def follow(s: State, distance: float, p: Any) -> State:
     """The whole actuator moved by a distance, m."""
     return State(s.current, s.integral, s.motor_position + distance, s.motor_speed, s.position + distance, s.speed,
                  s.sensed)
+
+
+def correct(s: State, distance: float, p: Any) -> State:
+    """The actuator after a correction of a replay: an observer of position and speed with both poles at its rate w.
+
+    A position drawn alone leaves the speed wrong for as long as friction takes to slow it: errors of force add up to
+    waves of seconds, in which friction, mass and load trade places. This residual is force/(mass w^2) within 1/w.
+    Every replay is drawn at 20 1/s; here it is drawn at 2 w, and the speed by w/2 of that.
+    """
+    moved = distance * p.observer.rate * (2.0 / 20.0)
+    gained = 0.5 * p.observer.rate * moved
+    return State(s.current, s.integral, s.motor_position + moved, s.motor_speed + gained, s.position + moved,
+                 s.speed + gained, s.sensed)
+
+
+def compute_needed_current(x: float, v: float, a: float, m: Any, u: Any, p: Any) -> tuple[float, Any]:
+    """Motor current, A, for a motion with the rigid screw; the surface at rest is taken to need no friction."""
+    s = State(0.0, 0.0, x, v, x, v, x)
+    load, m = at_load(u.load, m, s, u, p)
+    level = p.surface.friction
+    friction, m = at_friction(Friction(0.0, level * (1.0 + p.surface.stiction), level), m, s, u, p)
+    side = (1.0 if v > 0.0 else 0.0) - (1.0 if v < 0.0 else 0.0)
+    force = p.surface.mass * a + p.surface.damping * v + friction.force + side * friction.dynamic + load
+    r = p.screw.lead / (2.0 * pi * p.screw.ratio)
+    return (r * force + (p.motor.inertia * a + p.motor.damping * v) / r) / p.motor.torque_constant, m
 
 
 def sense(s: State, m: Any, u: Any, p: Any) -> tuple[State, Any]:
@@ -368,6 +403,16 @@ def winding_short(x: float, s: Any, u: Any, p: Any) -> Any:
     return x - third * (x * (1.0 - cos(2.0 * p.winding_short.pole_pairs * s.motor_position * turned)) + drag)
 
 
+def derive_emps_columns(sources: Mapping[str, Array]) -> dict[str, Array]:
+    """The demand of EMPS (plant/models/emps.toml) in the rows of a trace, whose drive acts a cycle later.
+
+    A row of its files holds the control signal that acts from there on. The force pulses of the second file are in it.
+    """
+    return {"current_demand": np.append(sources["vir"][1:], sources["vir"][-1])}
+
+
+EMPS_COLUMNS = {"t": (Term("t"),), "demand": (Term("qg"),), "position": (Term("qm"),)}
+
 PLANT = Plant(
     name="ema",
     title="electromechanical actuator",
@@ -378,9 +423,12 @@ PLANT = Plant(
         Signal("motor_speed", "w", "rad/s", "speed of the motor", noise=0.05),
         Signal("current", "i", "A", "motor current", noise=0.02),
         Signal("load", "load", "N", "external force on the surface", "load", largest=1e6)),
-    parameters={"motor": Motor, "drive": Drive, "screw": Screw, "surface": Surface, "controller": Controller},
-    state=State, step=step, coefficients=compute_coefficients, measure=measure, moves=follow, sense=sense,
+    parameters={"motor": Motor, "drive": Drive, "screw": Screw, "surface": Surface, "controller": Controller,
+                "observer": Observer},
+    state=State, step=step, coefficients=compute_coefficients, measure=measure, moves=follow, correct=correct,
+    inverse=compute_needed_current, sense=sense,
     control=control, control_memory=Loops,
+    lacks=("sensor_gain", "torque_motor_hysteresis", "coil_lag", "flow_delay", "valve_switching", "asymmetric_gain"),
     faults=(
         Fault("dry_friction", "dry friction of screw and bearings", "surface.friction", (100.0, 400.0), 150.0,
               250.0, "limits are ours: 1.5 and 2.5 times nominal; law and range (to 3 times): " + _FAULTS),
@@ -390,6 +438,7 @@ PLANT = Plant(
               "limits are ours: a short grows within hours beyond a fifth; law and range (to a half): " + _FAULTS),
         Fault("eccentricity", "eccentricity of the rotor", "eccentricity.share", (0.0, 0.5), 0.1, 0.25,
               "limits are ours: contact of rotor and stator at 1; law and range (to 0.42): " + _FAULTS)),
+    tables=(Table(EMPS_COLUMNS, derive=derive_emps_columns, derived_from=("vir",)),),
     profile=(Hold(time=0.5), Step(to=5e-3, time=1.0), Step(to=0.0, time=1.0), Ramp(to=1e-3, time=2.0), Hold(time=0.5),
              Ramp(to=0.0, time=2.0), Hold(time=0.5), Ramp(to=0.03, time=1.0), Hold(time=0.3), Ramp(to=0.0, time=1.0),
              Sine(amplitude=3e-3, frequency=1.0, time=2.0),

@@ -18,10 +18,11 @@ def raise_unbound(*arguments: Any) -> Any:
     raise TypeError("no plant is bound")
 
 
-step_plant = measure_plant = sense_plant = move_plant = control_plant = shift_memories = raise_unbound
+step_plant = measure_plant = sense_plant = move_plant = correct_plant = control_plant = raise_unbound
+shift_memories = raise_unbound
 compute_plant_coefficients = start_control = add_noise = replace_first = get_readings = raise_unbound
 keep_row = keep_sample = keep_answer = raise_unbound
-load_readings = store_readings = load_control = store_control = raise_unbound
+invert_plant = load_readings = store_readings = load_control = store_control = raise_unbound
 
 
 def write_signal_functions(signals: Signals) -> dict[str, Function]:

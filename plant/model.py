@@ -23,7 +23,7 @@ from plant.parameters import check_combinations, find_field, flatten_tables, par
 from plant.plants import Plant
 from plant.quantity import Quantity
 
-SHIPPED_MODELS = ("servo",)  # plant/models/NAME.toml, beside the nominal values of the plants
+SHIPPED_MODELS = ("servo", "emps")  # plant/models/NAME.toml, beside the nominal values of the plants
 STEP = 1e-5  # s, of the solver; its error is measured in the docs
 
 

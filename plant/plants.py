@@ -27,7 +27,7 @@ from plant.effects import CATALOGUE, Effect, build_base_effect, build_effect, co
 from plant.errors import InputError
 from plant.faults import Fault
 from plant.flat import make_packers
-from plant.kernels import write_constant, write_mover, write_signal_functions
+from plant.kernels import raise_unbound, write_constant, write_mover, write_signal_functions
 from plant.pid import Loop, control_by_pid
 from plant.ports import (
     PORTS,
@@ -49,7 +49,7 @@ __all__ = ["Fault", "MeasuredPressures", "Plant", "Table", "Term", "base_effect"
            "load_plant", "port"]
 
 Array = NDArray[np.float64]
-MODULES = {"eha": "plant.eha", "ehs": "plant.ehs"}  # the shipped plants; read when first named
+MODULES = {"eha": "plant.eha", "ehs": "plant.ehs", "ema": "plant.ema"}  # the shipped plants; read when first named
 CONTROL_AT = 2  # of an exported unit: behind the cycles of its plant and the answer of its controller
 OWN_EFFECTS = "__effects__"  # where a plant file keeps the effects that it declares
 
@@ -112,6 +112,11 @@ class Plant:
     control_memory: type[Any] | None = None  # of c, a NamedTuple of floats; None: a number that nobody needs
     coefficients: Function = None  # (p, h) -> a NamedTuple of floats, once for all steps
     sense: Function | None = None  # (s, m, u, p) -> (s, m): sensors with dynamics follow a plant at rest
+    # (s, distance, p) -> s: how a replay that departs from the measured signal is corrected, by `distance` in a cycle
+    # (20 1/s times period times error); None: it is moved. An observer corrects the speed as well.
+    correct: Function | None = None
+    # (x, v, a, m, u, p) -> (drive, m): the drive that a motion of the controlled signal needs
+    inverse: Function | None = None
     faults: tuple[Fault, ...] = ()  # its own, for rig fdi
     profile: tuple[Segment, ...] = field(default=(), repr=False)  # nominal test: segments of its command
     values: Mapping[str, float] = field(default_factory=dict, repr=False)  # nominal, in place of the types' defaults
@@ -248,7 +253,8 @@ class Plant:
         moves = self.moves if callable(self.moves) else write_mover(self.state, self.moves)
         store, load = make_packers(self.build_control_memory(), CONTROL_AT)
         return {"step_plant": step, "store_control": store, "load_control": load,
-                "measure_plant": self.measure, "move_plant": moves,
+                "measure_plant": self.measure, "move_plant": moves, "correct_plant": self.correct or moves,
+                "invert_plant": self.inverse or raise_unbound,
                 "sense_plant": self.sense or _sense_nothing, "control_plant": self.control or control_by_pid,
                 "start_control": write_constant("start_control", self.build_control_memory()),
                 "compute_plant_coefficients": self.coefficients or _compute_no_coefficients,

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fdi.comparison.inverse_model import measure_drive_error
 from fdi.comparison.jack import judge_blocks
 from fdi.comparison.residuals import (
     Place,
@@ -195,6 +196,7 @@ class Comparison:
     condition: str  # of the whole trace
     free_error: float  # RMS of the controlled signal in a replay without anchor
     drift: float  # a second, at which that replay departs
+    drive_error: float | None  # share of the drive that the measured motion does not need; None: not asked for
     scatter: Scatter | None  # None: nothing to explain
     diagnoses: Mapping[str, ResidualTests]
     replay: Replay
@@ -246,9 +248,9 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     progress("done", 1.0)
     named = _list_blocks_above(ratios, table)
     return Comparison(source, model, trace, verdict, reason, table, found, ratios, parts, named, tuple(sections),
-                      when, free, speed, scattered, diagnoses, replay, closed, len(others),
-                      (*trace.notes, *([doubtful] if doubtful and verdict != "CANNOT_TELL" else []),
-                       *_list_notes(floor, replay, trace)))
+                      when, free, speed, measure_drive_error(trace, model), scattered, diagnoses, replay, closed,
+                      len(others), (*trace.notes, *([doubtful] if doubtful and verdict != "CANNOT_TELL" else []),
+                                    *_list_notes(floor, replay, trace)))
 
 
 def _measure_signal(signal: Signal, residual: Floats, floor: Floor, noise: Floor, closed: Floats,

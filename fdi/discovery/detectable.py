@@ -25,7 +25,6 @@ from fdi.estimation.replay import hold_inputs
 from fdi.estimation.unidentifiable import VISCOSITY, list_powers, scale_together
 from fdi.thresholds import GAIN_DETECTED, MISFIT_DISCRIMINATES
 from fdi.trace.trace import Floats, Trace
-from plant.effects import CATALOGUE
 from plant.lanes import Lanes
 from plant.model import Model
 from plant.threads import map_in_threads
@@ -69,14 +68,13 @@ def find_hidden_effects(problem: Problem, fit: Fit, effects: Iterable[str]) -> l
     ways = [way for name in effects for way in list_directions(name, problem.model)]
     won = VirtualTest(problem, fit).measure_gains(ways, [way.most for way in ways]) if ways else []
     usual = {way.effect: way.most for way, gained in zip(ways, won, strict=True) if gained < GAIN_DETECTED}
-    firsts = {effect: CATALOGUE[effect].fitted[0] for effect in usual}
-    return [Blind(effect, first, usual[effect], CATALOGUE[effect].parameters[first].unit, CATALOGUE[effect].revealed_by)
-            for effect, first in firsts.items()]
+    return [Blind(e.name, e.fitted[0], usual[e.name], e.parameters[e.fitted[0]].unit, e.revealed_by)
+            for e in map(problem.model.find_effect, usual)]
 
 
 def list_directions(effect: str, model: Model) -> list[Direction]:
     """One for each sign of the first parameter."""
-    entry = CATALOGUE[effect]
+    entry = model.find_effect(effect)
     first = entry.fitted[0]
     off = entry.off.get(first, model.nominal.get(first, 0.0))
     found: dict[bool, Direction] = {}
@@ -121,7 +119,8 @@ class VirtualTest:
         run = self._predict_values(self.simulated, names, rows)
         with_effect = compute_misfit(self._whiten(self._predict_values(self.problem, names, rows) - run))
         with_effect = np.minimum(with_effect, self.moved_stops)
-        own = np.array([[name in CATALOGUE[way.effect].fitted for name in self.names] for way in ways])
+        model = self.problem.model
+        own = np.array([[name in model.find_effect(way.effect).fitted for name in self.names] for way in ways])
         known = np.where(own, 0.0, self.prior) @ self.fit.x**2  # the effect has no prior on its own parameters
         begun = np.array([self._list_beginnings(dict(zip(names, row, strict=True))) for row in rows])
         costs, left = self._measure_costs(begun, run)
@@ -211,7 +210,7 @@ class VirtualTest:
         values = {**model.values, **self.fit.values}
         rows = []
         for way, size in zip(ways, sizes, strict=True):
-            entry, at = CATALOGUE[way.effect], {}
+            entry, at = model.find_effect(way.effect), {}
             for name, start in way.start.items():
                 off = entry.off.get(name, model.nominal.get(name, 0.0))
                 moved = values[name] + (start - off) * size / way.reach

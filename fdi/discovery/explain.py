@@ -59,7 +59,6 @@ from fdi.thresholds import (
 from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
 from fdi.trace.trace import Floats, Trace, hold_last
 from plant.controller import compute_answers
-from plant.effects import CATALOGUE
 from plant.model import Model, list_searched_effects
 
 NOISE_LEFT = ("NOTHING_MISSING", "NOT_RESOLVABLE", "EXPLAINED", "AMBIGUOUS")
@@ -238,7 +237,7 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
     explained = close[0] if close and verdict == "EXPLAINED" else base
     blind = compute_sensitivity(search.problem, explained.fit, search.effects)
     progress("what this test cannot see", 0.94)
-    hard_to_see = [e for e in search.effects if CATALOGUE[e].revealed_by and e not in named]
+    hard_to_see = [e for e in search.effects if search.model.find_effect(e).revealed_by and e not in named]
     hidden = find_hidden_effects(search.problem, explained.fit, hard_to_see if verdict in NOISE_LEFT else ())
     return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, marks, blind, search,
                        unseen, tuple(hidden))
@@ -295,7 +294,7 @@ def shows_effect(model: Model, h: Hypothesis) -> bool:
 
     If none does, the fit is better only by a stop that it met by chance.
     """
-    entry = CATALOGUE[h.effects[-1]]
+    entry = model.find_effect(h.effects[-1])
     values = h.fit.values
     return any(abs(values[name] - entry.off.get(name, model.nominal.get(name, 0.0)))
                > INTERVAL_95_SD * h.fit.spread(name) for name in entry.fitted)
@@ -329,7 +328,7 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
         floor: of each signal, SI.
     """
     prints = tuple(f.effect for f in marks.prints)
-    firmware_left = marks.is_firmware_different and not any(CATALOGUE[effect].firmware for effect in prints)
+    firmware_left = marks.is_firmware_different and not any(p.is_firmware for p in marks.prints)
     if not close:
         if not base.is_at_floor:
             return ("PARTLY" if prints else "UNEXPLAINED"), prints
@@ -390,6 +389,7 @@ class Fingerprint(NamedTuple):
     parameters: dict[str, tuple[float, float, float]]
     before: float  # residual without it, in units of its own resolution
     after: float  # with it
+    is_firmware: bool = False
 
 
 class Marks(NamedTuple):
@@ -432,8 +432,8 @@ def find_marks(model: Model, traces: Sequence[Trace]) -> Marks:
     error, firmware = 0.0, list[Fingerprint]()
     if model.kind.controller:
         error = _measure_rms(model, traces) / resolution
-        tried = [_fit_size(model, traces, name, error, resolution) for name, e in CATALOGUE.items()
-                 if e.firmware and name not in model.effects and len(e.fitted) == 1 and error > FIRMWARE_DIFFERS]
+        tried = [_fit_size(model, traces, e.name, error, resolution) for e in model.kind.list_effects()
+                 if e.firmware and e.name not in model.effects and len(e.fitted) == 1 and error > FIRMWARE_DIFFERS]
         firmware = sorted((f for f in tried if f.after < 0.7 * error), key=lambda f: f.after)
     return Marks(error, resolution, (*prints, *firmware[:1]), step, is_recorder, tuple(firmware[1:]))
 
@@ -451,7 +451,7 @@ def measure_firmware_resolution(model: Model, trace: Trace) -> float:
 
 def compute_firmware_residual(model: Model, trace: Trace) -> Floats:
     """Cor of the model's controller on the measured com and XJ, minus the measured Cor: (n,) A, NaN where missing."""
-    own = replace(model, effects=tuple(e for e in model.effects if CATALOGUE[e].firmware))
+    own = replace(model, effects=tuple(e for e in model.effects if model.find_effect(e).firmware))
     answers = compute_answers(own, trace.command, hold_last(trace.anchor))
     return answers - np.where(trace.incomplete, np.nan, trace.drive)
 
@@ -462,7 +462,7 @@ def _measure_rms(model: Model, traces: Sequence[Trace]) -> float:
 
 def _fit_size(model: Model, traces: Sequence[Trace], name: str, before: float, unit: float) -> Fingerprint:
     """The size of a firmware effect: a logarithmic search over all sizes, then closer and closer."""
-    entry = CATALOGUE[name]
+    entry = model.find_effect(name)
     parameter = entry.fitted[0]
     usual = [abs(s[parameter]) for s in entry.starts]
     low, high = np.log(min(usual) / 10.0), np.log(max(usual) * 10.0)
@@ -473,4 +473,5 @@ def _fit_size(model: Model, traces: Sequence[Trace], name: str, before: float, u
         k = int(np.argmin(errors))
         low, high = sizes[max(k - 1, 0)], sizes[min(k + 1, SIZES - 1)]
     value = float(np.exp(sizes[k]))
-    return Fingerprint(name, {parameter: (value, float(np.exp(low)), float(np.exp(high)))}, before, errors[k])
+    interval = value, float(np.exp(low)), float(np.exp(high))
+    return Fingerprint(name, {parameter: interval}, before, errors[k], entry.firmware)

@@ -116,7 +116,7 @@ def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: 
         InputError: a user's effect that cannot be compiled and run.
     """
     for name in [e.name for e in list_searched_effects(runs.model.plant)] if effects is None else effects:
-        if not CATALOGUE[name].starts and CATALOGUE[name].fitted:
+        if not runs.model.find_effect(name).starts and runs.model.find_effect(name).fitted:
             progress(f"looking for sizes of {name}", 0.0)
             ensure_starts(name, runs.est.command, runs.est.load)
     if effects is None:
@@ -124,7 +124,7 @@ def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: 
         with report_law_errors(whole_model):
             compile_kernels(whole_model, lambda stage, share: progress(stage, 0.0))
         return
-    replayed = [name for name in effects if CATALOGUE[name].port not in UNREPLAYED]
+    replayed = [name for name in effects if runs.model.find_effect(name).port not in UNREPLAYED]
     model = lean_model(runs.model, replayed)
     with report_law_errors(model):
         progress("compiling the plant with it, once", 0.0)
@@ -140,7 +140,7 @@ def lean_model(model: Model, effects: Sequence[str]) -> Model:
 
 def _compile_kernels(model: Model, effects: Sequence[str]) -> None:
     """A replay of a few samples without and with each effect: compiles the kernels that these take, and no others."""
-    sizes = {e.fitted[0]: e.starts[-1][e.fitted[0]] for e in map(CATALOGUE.__getitem__, effects) if e.starts}
+    sizes = {e.fitted[0]: e.starts[-1][e.fitted[0]] for e in map(model.find_effect, effects) if e.starts}
     names = list(sizes) or [next(iter(model.values))]
     usual = np.array([model[name] for name in names])
     rows = usual + np.vstack([0.0 * usual, np.diag([sizes.get(n, x) - x for n, x in zip(names, usual, strict=True)])])
@@ -215,7 +215,7 @@ class Answer:
 
 def assess_explanation(e: Explanation, seed: int) -> Answer:
     """An explanation worked out; `seed` is that of the simulated runs behind the p-values."""
-    hand = [p for p in e.marks.prints if CATALOGUE[p.effect].firmware]
+    hand = [p for p in e.marks.prints if p.is_firmware]
     baseline = {"error": dict(e.base.errors), "holdout": dict(e.holdout.get((), {})), "floor": dict(e.floor)}
     if hand:
         unit = e.marks.resolution
@@ -232,7 +232,7 @@ def assess_explanation(e: Explanation, seed: int) -> Answer:
 def list_fitted_parameters(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
     """The parameters of an effect as fitted, with 95 % intervals within what is possible."""
     found = {}
-    values, entry = limit_friction_values(fit.values), CATALOGUE[effect]
+    values, entry = limit_friction_values(fit.values), model.find_effect(effect)
     for f in fit.free:
         if f.name in entry.fitted:
             value = values[f.name]
@@ -293,9 +293,10 @@ def _choose_word(e: Explanation, h: Hypothesis, effect: str) -> str:
 
 def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:
     """An effect that was found by a mark without noise."""
-    values = {name: Value(*of, CATALOGUE[p.effect].parameters[name].unit) for name, of in p.parameters.items()}
+    meaning = e.search.model.find_effect(p.effect).parameters
+    values = {name: Value(*of, meaning[name].unit) for name, of in p.parameters.items()}
     error, ratios = dict(e.base.errors), dict(e.base.ratio)
-    if CATALOGUE[p.effect].firmware:
+    if p.is_firmware:
         drive = e.search.problem.trace.declared.drive.name
         error[drive] = p.after * e.marks.resolution
         ratios = {drive: p.after}

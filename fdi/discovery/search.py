@@ -14,6 +14,7 @@ from scipy.special import chdtrc
 
 from fdi.estimation import noise as noises
 from fdi.estimation.fit import (
+    BLOCK,
     Fit,
     Free,
     Problem,
@@ -32,6 +33,7 @@ from fdi.estimation.fit import (
     scaled_bounds,
     silence_readings,
     span_all_rows,
+    sum_blocks,
     turn_amplitudes_positive,
     weigh_priors,
 )
@@ -40,6 +42,7 @@ from fdi.estimation.noise import Noise
 from fdi.estimation.unidentifiable import finish_fit, list_powers, scale_together
 from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import (
+    BLOCK_FITTED_SQUARE,
     GAIN_DOUBTFUL,
     GAIN_WORTH_A_FIT,
     NULL_DRAWS,
@@ -49,7 +52,6 @@ from fdi.thresholds import (
     WHITE_SQUARE_POOR,
 )
 from fdi.trace.trace import Floats, Trace
-from plant.effects import CATALOGUE
 from plant.lanes import Part
 from plant.model import Model
 from plant.signals import Signal
@@ -110,7 +112,7 @@ class Hypothesis:
 def choose_search_excerpt(model: Model, trace: Trace, effects: Iterable[str], progress: Progress = ignore_progress
                           ) -> Excerpt:
     """The part of a long recording that says most about the tolerances and these effects at a usual size."""
-    starts = [CATALOGUE[name].starts for name in effects]
+    starts = [model.find_effect(name).starts for name in effects]
     changes = [each[len(each) // 2] for each in starts if each]
     floor = {name: f.value for name, f in noises.sensor_floors(trace, model).items()}
     return choose_excerpt(trace, complete_model(model), floor, changes, progress)
@@ -142,7 +144,7 @@ class Search:
         self.problem = Problem(ready, trace, self.noise, workers=1, bare=bare)
         self.repeats = [Problem(ready, r, self.noise, bare=bare) for r in repeats]
         self.fine: Problem | None = None  # with the steps of last residuals
-        self.effects = [e for e in effects if e not in model.effects or CATALOGUE[e].base]
+        self.effects = [e for e in effects if e not in model.effects or model.find_effect(e).base]
         self.stage = NO_STAGE  # of the work: each fit, and each round of a last fit, is a step
 
     def fit_base(self) -> Hypothesis:
@@ -191,9 +193,9 @@ class Search:
 
     def list_further_effects(self, present: Sequence[str]) -> list[str]:
         """The effects of the search that may stand beside these."""
-        excluded = {name for e in present for name in CATALOGUE[e].excludes}
+        excluded = {name for e in present for name in self.model.find_effect(e).excludes}
         return [e for e in self.effects if e not in present and e not in excluded
-                and not set(CATALOGUE[e].excludes) & set(present)]
+                and not set(self.model.find_effect(e).excludes) & set(present)]
 
     def add_each_effect(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
         """`start` with one more effect: the promising ones fitted, best first."""
@@ -262,7 +264,7 @@ class Search:
         usual = {f.name: f for f in list_all_unknowns(self.model)}
 
         def fit_without(gone: str) -> Hypothesis:
-            own = set(CATALOGUE[gone].fitted)
+            own = set(self.model.find_effect(gone).fitted)
             free = [usual.get(f.name) if f.name in own else f for f in h.fit.free]
             kept = [f for f in free if f is not None]
             x = [(h.fit.values[f.name] - f.centre) / f.scale for f in kept]
@@ -286,7 +288,7 @@ class Search:
 
     def _begin_fit(self, p: Prospect) -> Fit:
         """Begin at the scan's linear forecast, or with all but the effect left where it was, if that is better."""
-        own = np.isin([f.name for f in p.free], CATALOGUE[p.effect].fitted)
+        own = np.isin([f.name for f in p.free], self.model.find_effect(p.effect).fitted)
         starts = np.array([p.x, np.where(own, p.x, 0.0)])
         return linearise(self.problem, p.free, starts[int(np.argmin(self.problem.compute_costs(p.free, starts)))])
 
@@ -347,6 +349,23 @@ class Search:
         self.problem = replace(self.problem, noise=self.noise)
         self.repeats = [replace(p, noise=self.noise) for p in self.repeats]
 
+    def match_noise(self, best: Hypothesis) -> None:
+        """Take the noise for so large that 99 of 100 blocks of the best hypothesis count by their squares.
+
+        For a model that is not complete, where no repeat tells the noise and an observer keeps the residual short:
+        without one a single missed stop would outweigh the run. With the noise of the sensors its blocks
+        would count by the logarithms of their squares, and those that it happens to fit would decide. What it leaves
+        keeps its sign for long, so it says as little as fewer samples do; the intervals are then as wide as they are.
+        """
+        if best.others or best.is_at_floor or self.model.kind.correct is None:
+            return
+        white = best.fit.white[:, :len(self.problem.trace)]
+        size = np.sqrt(np.quantile(sum_blocks(white) / BLOCK, 0.99, axis=1) / BLOCK_FITTED_SQUARE)
+        size /= np.sqrt([noises.measure_freedom(row) for row in white])
+        self.noise = tuple(n._replace(innovation=max(1.0, float(s)) * n.innovation)
+                           for n, s in zip(self.noise, size, strict=True))
+        self.problem = replace(self.problem, noise=self.noise)
+
     def estimate_floor(self, best: Hypothesis) -> dict[str, float]:
         """What the sensors' noise alone leaves of each signal, RMS SI, under the best hypothesis."""
         found = learn_noise(best, self.problem.trace, self.noise)
@@ -359,7 +378,7 @@ class Search:
 
     def finish_hypothesis(self, h: Hypothesis, rounds: int = 5) -> Hypothesis:
         """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
-        begin = turn_amplitudes_positive(h.fit.free, h.fit.x)
+        begin = turn_amplitudes_positive(h.fit.free, h.fit.x, self.model.kind.list_effects())
         near = fit_unknowns(self.problem, h.fit.free, begin, 2)
         return self.judge_fit(h.effects, finish_fit(self.fine or self.problem, near, rounds, self.problem, self.stage))
 
@@ -489,7 +508,7 @@ def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: in
     frequencies.
     """
     first = [(name, start, along) for name in effects for along in ((False, True) if name in GOES_WITH else (False,))
-             for start in (*CATALOGUE[name].starts, *find_tones(problem, fit, name))]
+             for start in (*problem.model.find_effect(name).starts, *find_tones(problem, fit, name))]
     best = _keep_best(simulate_starts(problem, fit, first, workers))
     for factors, count in zip(ZOOM, LOOKED_AT, strict=True):
         near = [(t.effect, start, t.along) for t in best[:count] for start in _list_starts_around(problem, t, factors)]
@@ -500,7 +519,7 @@ def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: in
 
 
 def _make_prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
-    mine = {u.name: u for u in list_effect_unknowns(CATALOGUE[t.effect], problem.model)}
+    mine = {u.name: u for u in list_effect_unknowns(problem.model.find_effect(t.effect), problem.model)}
     kept = tuple(mine.get(f.name, f) for f in fit.free)  # a suspect of the reference model loses its tolerance
     own = tuple(u for name, u in mine.items() if name not in {f.name for f in fit.free})
     found = {f.name: f.centre + f.scale * float(v) for f, v in zip(fit.free, t.x, strict=True)}
@@ -511,7 +530,8 @@ def _make_prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
 
 def _list_starts_around(problem: Problem, t: Trial, factors: Sequence[float]) -> list[dict[str, float]]:
     """Starts around a trial's: the parameters of one unit, which belong together, times each factor."""
-    free, meaning = list_effect_unknowns(CATALOGUE[t.effect], problem.model), CATALOGUE[t.effect].parameters
+    entry = problem.model.find_effect(t.effect)
+    free, meaning = list_effect_unknowns(entry, problem.model), entry.parameters
     units = dict.fromkeys(meaning[u.name].unit for u in free if meaning[u.name].unit not in ("Hz", "rad"))
     return [{**t.start, **{u.name: min(max(u.centre + factor * (t.start[u.name] - u.centre), u.low), u.high)
                            for u in free if meaning[u.name].unit == unit}} for unit in units for factor in factors]
@@ -524,7 +544,8 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     that answer has a line where the effect has its frequency. The lines that stand out most from what is around, in all
     signals together, are tried, at four phases as the answer may lag, and larger as what is fast is weakened.
     """
-    entry, named = CATALOGUE[effect], name_sine(effect)
+    entry = problem.model.find_effect(effect)
+    named = name_sine(entry)
     if named is None:
         return []
     size, tone, phase = named
@@ -560,7 +581,8 @@ def _list_lines_beside(problem: Problem, t: Trial) -> list[dict[str, float]]:
     A line in what a wrong fit leaves stands a little beside the effect's own frequency. A fit gets there only from
     less than half a turn away: it does not leave the line that it begins in.
     """
-    named = name_sine(t.effect)
+    entry = problem.model.find_effect(t.effect)
+    named = name_sine(entry)
     if named is None:
         return []
     _, tone, phase = named
@@ -568,7 +590,7 @@ def _list_lines_beside(problem: Problem, t: Trial) -> list[dict[str, float]]:
     period = problem.model.values["controller.period"]
     turn = 1.0 / (period * (longest.stop - longest.first))  # Hz
     middle = 2.0 * np.pi * period * (longest.later + 0.5 * (longest.first + longest.stop))  # where the phase stays
-    low = CATALOGUE[t.effect].parameters[tone].low
+    low = entry.parameters[tone].low
     changes = turn * np.arange(-3.0, 3.5, 0.5)
     return [{**t.start, tone: float(max(t.start[tone] + change, low)),
              phase: float(t.start[phase] - middle * change + eighth * 0.25 * np.pi)}
@@ -673,7 +695,8 @@ class Sensitivity(NamedTuple):
 
 def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> Sensitivity:
     """Directions of the effects' starts at the fit, in whitened residuals, the fit's unknowns projected out."""
-    starts = [(e, s) for e in effects for s in CATALOGUE[e].starts if CATALOGUE[e].port not in ("command", "reading")]
+    starts = [(e.name, s) for e in map(problem.model.find_effect, effects) for s in e.starts
+              if e.port not in ("command", "reading")]
     names = list(dict.fromkeys([*fit.values, *(n for _, s in starts for n in s)]))
     held = [fit.values.get(n, problem.model.values[n]) for n in names]
     rows = np.array([held, *([s.get(n, v) for n, v in zip(names, held, strict=True)] for _, s in starts)])

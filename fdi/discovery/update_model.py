@@ -36,6 +36,7 @@ from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.model import Model, find_effect, find_quantity, list_offered_effects, parse_model
 from plant.parameters import read_toml
+from plant.plants import find_plant, list_plants
 
 FIRST, THEN = 4, 6  # rounds of a first fit, along the parameters and along principal directions
 LAST_FIT_ROUNDS, EARLIER_FIT_ROUNDS = 8, 2  # of the last fit, and of those before it in the ledger
@@ -75,7 +76,7 @@ class Refit:
             return True
         before, after = self.steps[-2:]
         name = str(after.effect)
-        if CATALOGUE[name].port in UNREPLAYED:
+        if self.original.find_effect(name).port in UNREPLAYED:
             return True  # it was found without noise, or it would not be here
         worse = any(x > 1.02 * before.holdout[s] for s, x in after.holdout.items() if x > 1.15 * self.floor[s])
         return measure_gain(before.hypothesis, after.hypothesis) > GAIN_SEEN and not worse
@@ -101,7 +102,7 @@ def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: 
     """
     check_addable(original, effects)
     marks = _read_marks(original, effects, [est, *repeats])
-    replayed = [e for e in effects if CATALOGUE[e].port not in UNREPLAYED]
+    replayed = [e for e in effects if original.find_effect(e).port not in UNREPLAYED]
     first = [e for e in effects[:done] if e in replayed]
     whole, said = list[Trace](), ""
     if can_be_cut(est, original):
@@ -129,6 +130,7 @@ def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: 
 def _finish_chain(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesis]:
     """All of them with the noise that the last one leaves, with the repeats and with finer steps."""
     search.learn_noise(chain[-1])
+    search.match_noise(chain[-1])
     coarse = search.problem.steps
     search.refine_steps(LAST_FIT_STEPS, LAST_FIT_STEPS)
     slopes = replace(search.problem, steps=coarse, _lanes={})
@@ -159,7 +161,7 @@ def _choose_nearer_start(search: Search, fit: Fit, other: Fit) -> Fit:
 
 def _start_fit(search: Search, effects: Sequence[str], begin: Mapping[str, float]) -> Fit:
     """The model's own unknowns and those of `effects` fitted, from where they were left."""
-    own = [u for name in effects for u in list_effect_unknowns(CATALOGUE[name], search.model)]
+    own = [u for name in effects for u in list_effect_unknowns(search.model.find_effect(name), search.model)]
     taken = {u.name for u in own}
     free = (*(f for f in list_all_unknowns(search.model) if f.name not in taken), *own)
     x = np.array([(begin.get(f.name, f.centre) - f.centre) / f.scale for f in free])
@@ -174,15 +176,15 @@ def check_addable(model: Model, effects: Sequence[str]) -> None:
     """
     present = list(list_active_effects(model))
     for name in effects:
-        entry = CATALOGUE[name]
         if name not in [e.name for e in list_offered_effects(model.plant)]:
             raise InputError("effect", name, f"an effect that the plant {model.plant} can have")
+        entry = model.find_effect(name)
         if name in present:
             raise InputError("effect", name, f"one that is not in the model already (rig remove {name} takes it out)")
         if not entry.fitted:
             raise InputError("effect", name, "an effect with parameters to fit; this is noise of the bench")
         for other in present:
-            if name in CATALOGUE[other].excludes or other in entry.excludes:
+            if name in model.find_effect(other).excludes or other in entry.excludes:
                 raise InputError("effect", name, f"{name} or {other} in a model, not both")
         present.append(name)
 
@@ -198,7 +200,7 @@ def _add_effect(search: Search, before: Hypothesis, name: str) -> Hypothesis:
     best = search.judge_fit((*before.effects, name), _fit_best(search, _begin_fits(search, found)))
     if best.is_at_floor:
         return best
-    free, sizes = best.fit.free, CATALOGUE[name].starts
+    free, sizes = best.fit.free, search.model.find_effect(name).starts
     x = np.array([[(size[f.name] - f.centre) / f.scale if f.name in size else float(v)
                    for f, v in zip(free, place_in_healthy_unit(free, best.fit.x), strict=True)]
                   for size in sizes])
@@ -227,12 +229,13 @@ def _read_marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -
     """Parameters of effects that a replay does not show: they are read off the firmware's answers and the positions."""
     found: dict[str, tuple[float, float, float]] = {}
     for name in effects:
-        if CATALOGUE[name].port not in UNREPLAYED:
+        port = model.find_effect(name).port
+        if port not in UNREPLAYED:
             continue
         marks = find_marks(model, traces)
         prints = [p for p in (*marks.prints, *marks.rivals) if p.effect == name]
         if not prints:
-            where = "steps in the measured positions" if CATALOGUE[name].port == "reading" else \
+            where = "steps in the measured positions" if port == "reading" else \
                 "a difference between Cor and the model's firmware that it explains"
             raise InputError("effect", name, f"{where}; this trace has none")
         found |= prints[0].parameters
@@ -244,7 +247,7 @@ def _list_steps(search: Search, effects: Sequence[str], done: int, chain: Sequen
     held = [search.measure_holdout(h) for h in chain]
     steps, at = [Step(effects[done - 1] if done else None, chain[0], chain[0].errors, held[0])], 0
     for name in effects[done:]:
-        at += CATALOGUE[name].port not in UNREPLAYED
+        at += search.model.find_effect(name).port not in UNREPLAYED
         steps.append(Step(name, chain[at], chain[at].errors, held[at]))
     return tuple(steps)
 
@@ -482,7 +485,9 @@ def load_model_file(path: Path) -> tuple[Model, Provenance]:
     found = read_provenance(path)
     tables = read_toml(path)
     named = tables.get("effects", [])
-    gone = [e for e in named if e not in CATALOGUE.list_all()] if isinstance(named, list) else []
+    plant = tables.get("plant", "eha")
+    own = find_plant(plant).effects if plant in list_plants() else {}
+    gone = [e for e in named if e not in CATALOGUE.list_all() and e not in own] if isinstance(named, list) else []
     if gone and found.effect_files:
         files = " ".join(f"--effects {file}" for file in found.effect_files)
         raise InputError(path, "effects", f"{files} with it, where {gone[0]} is defined")
@@ -491,7 +496,7 @@ def load_model_file(path: Path) -> tuple[Model, Provenance]:
 
 def remove_all_effects(model: Model, p: Provenance) -> Model:
     """The model as it was before any effect was added, tolerances included."""
-    added = [CATALOGUE[name] for name in p.effects]
+    added = [model.find_effect(name) for name in p.effects]
     theirs = {name for e in added if not e.base for name in e.off}
     values = {name: value for name, value in {**model.values, **(p.before or {})}.items() if name not in theirs}
     return replace(model, values=values, effects=tuple(e for e in model.effects if e not in p.effects))
@@ -503,7 +508,7 @@ def remove_effect(model: Model, p: Provenance, name: str) -> tuple[Model, Proven
     Raises:
         InputError: it has no such effect.
     """
-    entry = CATALOGUE[name]
+    entry = model.find_effect(name)
     if not entry.base and name in model.effects:
         values = {n: v for n, v in model.values.items() if n not in entry.off}
         found = replace(model, values=values, effects=tuple(e for e in model.effects if e != name))

@@ -18,7 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 from fdi.estimation.noise import Noise
 from fdi.thresholds import ANCHOR_RATE, BLOCK_FITTED_SQUARE, CONVERGED_GAIN, CONVERGED_SHARE, HEALTHY_TOLERANCES
 from fdi.trace.trace import Floats, Trace
-from plant.effects import CATALOGUE, Effect
+from plant.effects import Effect
 from plant.lanes import Lanes, Part
 from plant.model import Model, find_quantity, list_offered_effects, list_searched_effects
 from plant.threads import map_in_threads
@@ -268,9 +268,8 @@ def list_effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) ->
     return tuple(free)
 
 
-def name_sine(effect: str) -> tuple[str, str, str] | None:
+def name_sine(entry: Effect) -> tuple[str, str, str] | None:
     """Names of the amplitude, the frequency and the phase of an effect that has them."""
-    entry = CATALOGUE[effect]
     named = {entry.parameters[n].unit: n for n in entry.fitted}
     size = next((n for n in entry.fitted if entry.parameters[n].unit not in ("Hz", "rad")), None)
     if size is None or not {"Hz", "rad"} <= set(named) or not entry.starts:
@@ -278,10 +277,10 @@ def name_sine(effect: str) -> tuple[str, str, str] | None:
     return size, named["Hz"], named["rad"]
 
 
-def turn_amplitudes_positive(free: Sequence[Free], x: Floats) -> Floats:
+def turn_amplitudes_positive(free: Sequence[Free], x: Floats, effects: Iterable[Effect]) -> Floats:
     """Scaled unknowns, (p,), of the same sines with amplitudes that are not negative and phases within half a turn."""
     x, place = x.copy(), {f.name: k for k, f in enumerate(free)}
-    for sine in map(name_sine, CATALOGUE):
+    for sine in map(name_sine, effects):
         if sine is None or sine[0] not in place:
             continue
         size, angle = place[sine[0]], place[sine[2]]
@@ -300,7 +299,7 @@ def list_active_effects(model: Model) -> tuple[str, ...]:
 
 def list_active_unknowns(model: Model) -> tuple[Free, ...]:
     """The parameters of the active effects as unknowns of a fit, from their present values and without prior."""
-    replayed = [CATALOGUE[name] for name in list_active_effects(model) if CATALOGUE[name].port not in UNREPLAYED]
+    replayed = [e for e in map(model.find_effect, list_active_effects(model)) if e.port not in UNREPLAYED]
     return tuple(u._replace(centre=model[u.name]) for e in replayed for u in list_effect_unknowns(e, model))
 
 
@@ -330,7 +329,7 @@ def complete_model(model: Model) -> Model:
 
 def silence_readings(model: Model) -> Model:
     """The model without sensor noise and rounding: these are what fits allow for."""
-    readings = [CATALOGUE[name] for name in model.effects if CATALOGUE[name].port == "reading"]
+    readings = [e for e in map(model.find_effect, model.effects) if e.port == "reading"]
     return silence_sensors(model).replace({name: value for e in readings for name, value in e.off.items()})
 
 

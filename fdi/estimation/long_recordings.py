@@ -33,7 +33,7 @@ from fdi.trace.trace import Flags, Floats, Trace
 from plant.lanes import TURN, Lanes, Part
 from plant.model import Model
 
-LONGEST_WHOLE = 20.0  # s; a shorter recording is fitted whole
+LONGEST_WHOLE = 30.0  # s; a shorter recording is fitted whole: the best pieces of it are more than half of it
 PIECE = 3.0  # s
 PIECES = 3  # for information
 LEAD_IN = 1.0  # s before a piece, in which a replay that is drawn to the measured position forgets how it began

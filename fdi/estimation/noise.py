@@ -182,6 +182,12 @@ def _cut_windows(x: Floats, window: int) -> Floats:
     return x[:n].reshape(-1, window)
 
 
+def measure_freedom(x: Floats) -> float:
+    """Independent samples in one of x, (n,), as to its mean square: 1 for white noise, less for what keeps its sign."""
+    pieces = _cut_windows(x, WINDOW)
+    return _measure_freedom(pieces) / pieces.shape[1] if len(pieces) else 1.0
+
+
 def _measure_freedom(pieces: Floats) -> float:
     """Degrees of freedom of a window's mean square: samples over the sum of the squared autocorrelation."""
     x = np.nan_to_num(pieces)

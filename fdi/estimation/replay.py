@@ -41,7 +41,6 @@ from plant.plants import MODULES
 Columns = dict[str, Floats]  # by signal, (n,)
 
 REPLAY_STEPS, FINEST_REPLAY_STEPS = 50, 800  # a cycle
-FRICTIONS = ("jack.static_friction", "jack.dynamic_friction", "spool.static_friction", "spool.dynamic_friction")
 SCATTER_DIFFERENCE = 0.3  # tolerances, of the differences that the Jacobian is made of
 ALIKE = 20  # neighbouring samples that say the same thing
 
@@ -106,7 +105,7 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
 def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str, float]
                                  ) -> tuple[Columns, Flags, dict[str, float]]:
     """The replay, the rows that hang on a knife's edge, and by how much a guessed current moves it elsewhere, RMS."""
-    names = [name for name in FRICTIONS if name in model.values]
+    names = list(filter(is_friction, model.values))
     values = vary_frictions(names, model.values)
     lanes = Lanes(silence_sensors(model), names, REPLAY_STEPS)
     position = trace.unlagged if has_known_start(trace) else None
@@ -168,10 +167,15 @@ def compute_residuals(trace: Trace, model: Columns) -> Columns:
     return {name: trace.mask_unusable(name) - model[name] for name in trace.outputs}
 
 
+def is_friction(name: str) -> bool:
+    """Whether a parameter is a level of dry friction, by its name."""
+    return name.endswith("friction")
+
+
 def vary_frictions(names: Sequence[str], values: Mapping[str, float]) -> Floats:
     """Rows (m, p) of the named parameters: as they are, and with each friction level a little higher and lower."""
     base = np.array([values[name] for name in names])
-    shifts = FRICTION_UNCERTAINTY * np.eye(len(names))[[name in FRICTIONS for name in names]]
+    shifts = FRICTION_UNCERTAINTY * np.eye(len(names))[list(map(is_friction, names))]
     return limit_dynamic_friction(names, np.concatenate([base[None], base * (1 + shifts), base * (1 - shifts)]))
 
 
@@ -180,7 +184,7 @@ def find_large_windows(moved: Floats, floor: float, window: int = WINDOW) -> Fla
     n = moved.shape[1]
     starts = np.arange(0, n, window)
     sizes = np.diff(np.append(starts, n))
-    power = np.add.reduceat(moved**2, starts, axis=1).max(axis=0) / sizes
+    power = np.add.reduceat(moved**2, starts, axis=1).max(axis=0, initial=0.0) / sizes
     return np.repeat(power > floor**2, sizes)
 
 
@@ -197,7 +201,7 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
         floor: of each signal, SI; smaller changes do not count.
     """
     values = {**problem.model.values, **fit.values}
-    names = list(dict.fromkeys([*(f.name for f in fit.free), *(name for name in FRICTIONS if name in values)]))
+    names = list(dict.fromkeys([*(f.name for f in fit.free), *filter(is_friction, values)]))
     runs = problem.predict_outputs(names, vary_frictions(names, values))
     changes = np.abs(runs[1:] - runs[0])
     undecided = np.zeros(runs.shape[2], bool)
@@ -211,7 +215,11 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
 def measure_drift(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> tuple[float, float]:
     """Of a replay without anchor: RMS of the residual of the controlled signal, SI, and its rate of departure, SI/s."""
     name = trace.declared.controlled.name
-    free = trace.mask_unusable(name) - replay_current(trace, model, steps, 0.0)[name]
+    begun, rate = trace, 0.0
+    if not trace.usable[0] and has_known_start(trace):  # in motion: drawn to the measured one until it is judged
+        known = np.arange(len(trace)) <= int(np.argmax(trace.usable))
+        begun, rate = trace.with_columns({name: np.where(known, trace.unlagged, np.nan)}), ANCHOR_RATE
+    free = trace.mask_unusable(name) - replay_current(begun, model, steps, rate)[name]
     there = ~np.isnan(free)
     t = trace.t[there] - trace.t[there].mean()
     return rms(free), float(np.sum(t * free[there]) / np.sum(t**2))

@@ -22,7 +22,6 @@ from fdi.sources import hash_sources
 from fdi.trace.csv_table import report_unreadable
 from fdi.trace.trace import Trace
 from plant.compile import find_cache_folder
-from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.model import Model
 
@@ -228,7 +227,7 @@ def _find_answer_file(file: Path, model: Model, faults: Sequence[Fault]) -> Path
     """File for the answer of a trace: its name is a hash of the trace, the model, the faults and the code."""
     with report_unreadable(file, "UTF-8"):
         content = file.read_bytes()
-    theirs = {f for e in model.effects if (f := CATALOGUE[e].file)}
+    theirs = {f for e in model.effects if (f := model.find_effect(e).file)}
     own = [hashlib.sha256(Path(f).read_bytes()).hexdigest() for f in sorted(theirs)]
     text = json.dumps([sorted(model.values.items()), model.effects, own, model.plant, hash_sources("plant", "fdi"),
                        [asdict(fault) for fault in faults]])

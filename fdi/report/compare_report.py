@@ -213,6 +213,8 @@ def _describe_controller(c: Comparison) -> str:
     lags = [f"{symbol} {count_nouns(lag, 'cycle')} earlier" for symbol, lag in late if lag > 0]
     if lags:
         path += f" (from {' and '.join(lags)})"
+    if not math.isfinite(a.error):
+        return f"{path}: its law remembers rows that are not known"
     if a.ratio <= CONTROLLER_ERROR_RATIO:
         return f"{path}: equal to the last digit"
     factor, shown = (1e6, "uA") if d.drive.unit == "A" else (1.0, d.drive.unit)
@@ -229,7 +231,8 @@ def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6
     The page and the JSON answer have all places and changes.
     """
     is_wrong = c.verdict != "WITHIN_FLOOR"
-    changes = [f"{name} = {value:g}" for name, value in sorted(c.model.list_changes().items())]
+    changes = [f"{name} = {value:g}" for name, value in sorted(c.model.list_changes().items())
+               if c.model.design.get(name) != value]
     errors = ", ".join(f"{s.signal.symbol} by {format_signal(s.solver_error, s.signal)}" for s in c.signals.values())
     lines = [
         Line("floor", _describe_floor(c)),
@@ -240,6 +243,8 @@ def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6
         Line("when", c.condition if is_wrong else ""),
         Line("flow", _describe_flow(c)),
         Line("drift", _describe_drift(c)),
+        Line("inverse", "" if c.drive_error is None else
+             f"{100 * c.drive_error:.2f} % of {c.trace.declared.drive.symbol} is not what the measured motion needs"),
         *(Line("residual", _describe_residual(c.signals[name].signal, d)) for name, d in c.diagnoses.items()
           if c.signals[name].ratio > c.signals[name].limit),
         Line("scatter", _describe_scatter(c)),
@@ -273,7 +278,8 @@ def _describe_drift(c: Comparison, notable: float = 1e-6) -> str:
         return ""
     what = "position" if controlled.unit == "m" else controlled.symbol
     return (f"a replay that is not corrected towards the measured {what} drifts by "
-            f"{format_amount(c.drift, f'{controlled.unit}/s')}")
+            f"{format_amount(c.drift, f'{controlled.unit}/s')}; its error is "
+            f"{format_amount(c.free_error, controlled.unit)} RMS")
 
 
 def _describe_scatter(c: Comparison) -> str:
@@ -328,7 +334,7 @@ def collect_data(c: Comparison) -> dict[str, Any]:
         "condition": c.condition, "blocks": dict(c.blocks), "disagree": list(c.named), "parts": dict(c.parts),
         "controller": {"error": c.answer.error, "floor": c.answer.floor, "com_lag": c.answer.com_lag,
                        "xj_lag": c.answer.xj_lag, "gain": c.answer.gain},
-        "drift": {"speed": c.drift, "free_error": c.free_error},
+        "drift": {"speed": c.drift, "free_error": c.free_error}, "drive_error": c.drive_error,
         "tolerances": None if c.scatter is None else {
             "enough": c.scatter.enough, "error": c.scatter.error, "ratio": c.scatter.ratio, "moved": c.scatter.moved},
         "diagnostics": {name: {

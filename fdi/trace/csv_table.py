@@ -7,7 +7,7 @@ import gzip
 import io
 import math
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,17 +39,28 @@ def read_csv(path: Path, signals: Signals) -> CsvColumns:
     """
     with report_unreadable(path, "UTF-8"), open_text(path) as stream:
         header = stream.readline()
-        for plant in map(find_plant, list_plants()):
-            for table in plant.tables:
-                names = {name.strip() for name in next(csv.reader([header], delimiter=table.separator), [])}
-                if table.sources <= names:
-                    rows = csv.reader(chain([header], stream), delimiter=table.separator)
-                    sources, notes = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
-                    return CsvColumns(_combine_columns(sources, table), notes, plant)
+        def list_names(separator: str) -> set[str]:
+            return {name.strip() for name in next(csv.reader([header], delimiter=separator), [])}
+
+        found = find_own_table(list_names)
+        if found is not None:
+            plant, table = found
+            rows = csv.reader(chain([header], stream), delimiter=table.separator)
+            sources, notes = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
+            return CsvColumns(combine_columns(sources, table), notes, plant)
         rows = csv.reader(chain([header], stream))
         required = ("t", *signals.required)
         optional = tuple(name for name in signals.names if name not in required)
         return CsvColumns(*_parse_rows(path, rows, required, optional), None)
+
+
+def find_own_table(list_names: Callable[[str], Collection[str]]) -> tuple[Plant, Table] | None:
+    """The plant whose rig writes a file with these columns, and how; None if no plant's does.
+
+    `list_names` gives the names in the file, which may depend on the separator of a text.
+    """
+    tables = ((plant, table) for plant in map(find_plant, list_plants()) for table in plant.tables)
+    return next(((plant, table) for plant, table in tables if table.sources <= set(list_names(table.separator))), None)
 
 
 @contextlib.contextmanager
@@ -157,7 +168,7 @@ def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...]
     return {name: np.array(column) for name, column in values.items()}, tuple(notes)
 
 
-def _combine_columns(sources: Mapping[str, Floats], table: Table) -> dict[str, Floats]:
+def combine_columns(sources: Mapping[str, Floats], table: Table) -> dict[str, Floats]:
     """The columns of a trace from those of a plant's own rig; NaN where a part of one is missing."""
     def shift_term(term: Term) -> Floats:
         values = term.factor * sources[term.source]

@@ -335,7 +335,16 @@ def list_units(signals: Signals) -> dict[str, str]:
 
 def _from_csv(path: Path, signals: Signals) -> Trace:
     columns, notes, plant = read_csv(path, signals)
-    signals = plant.signals if plant else signals
+    return make_table_trace(path, columns, plant.signals if plant else signals, notes, plant.name if plant else "")
+
+
+def make_table_trace(path: Path, columns: dict[str, Floats], signals: Signals, notes: tuple[str, ...] = (),
+                     plant: str = "") -> Trace:
+    """The trace of the columns of a file, t among them, (rows,); `plant`: whose rig wrote it in its own columns.
+
+    Raises:
+        InputError: fewer than two rows, or more than one a cycle.
+    """
     t = columns.pop("t")
     if len(t) < 2:
         raise InputError(path, "t", "at least two rows")
@@ -348,7 +357,7 @@ def _from_csv(path: Path, signals: Signals) -> Trace:
     grid = _spread_rows(path, rows, {**columns, "t": t})
     grid["t"] = np.where(np.isnan(grid["t"]), np.round(t[0] + period * np.arange(len(grid["t"])), 9), grid["t"])
     return _make_trace(grid, signals, period, rows, notes=notes,
-                       provenance={"source": path.name} | ({"plant": plant.name} if plant else {}))
+                       provenance={"source": path.name} | ({"plant": plant} if plant else {}))
 
 
 def _spread_rows(path: Path, rows: NDArray[np.int64], columns: Mapping[str, Floats]) -> dict[str, Floats]:

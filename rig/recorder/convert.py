@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fdi.output import require_writable, write_whole
+from fdi.trace.csv_table import combine_columns, find_own_table
 from fdi.trace.importing.conversion import ImportMap
-from fdi.trace.importing.formats import Channel, Measurement
+from fdi.trace.importing.formats import Channel, Measurement, open_measurement
 from fdi.trace.mcap_log import open_log
 from fdi.trace.sensor_dynamics import write_sensors
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Trace, make_table_trace
 from plant import signals as plant_signals
 from plant.errors import InputError
 from rig.benches.bench import Bench
@@ -77,8 +78,30 @@ def read_raw_frames(path: Path) -> Iterator[Frame]:
 
 def import_csv(source: Path, out: Path) -> int:
     """Make a log with signals only from a CSV trace; -> cycles."""
-    trace = Trace.read(source)
-    write_mcap(trace, out, collect_provenance(imported=source.name, period=trace.period, pace="imported"))
+    return _write_own(Trace.read(source), source, out)
+
+
+def import_own_table(source: Path, out: Path) -> int | None:
+    """Make a log of a file in the columns of a plant's own rig, such as a MAT file; -> cycles, None: they are not.
+
+    Raises:
+        InputError: a file that cannot be read.
+    """
+    measurement = open_measurement(source)
+    found = find_own_table(lambda _: measurement.units)
+    if found is None:
+        return None
+    plant, table = found
+    channels = measurement.read(sorted(table.sources), ())
+    columns = combine_columns({name: channel.values for name, channel in channels.items()}, table)
+    unused = sorted(set(measurement.units) - table.sources)
+    notes = (f"columns that are not used: {', '.join(unused)}",) if unused else ()
+    return _write_own(make_table_trace(source, columns, plant.signals, notes, plant.name), source, out)
+
+
+def _write_own(trace: Trace, source: Path, out: Path) -> int:
+    own = {key: trace.provenance[key] for key in ("plant",) if key in trace.provenance}
+    write_mcap(trace, out, collect_provenance(imported=source.name, period=trace.period, pace="imported", **own))
     return len(trace)
 
 

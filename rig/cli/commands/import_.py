@@ -15,7 +15,7 @@ from plant.errors import InputError
 from plant.parameters import load_nominal_values
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import give_answer
-from rig.recorder.convert import RAW_SUFFIXES, import_csv, import_frames, open_can_log, write_imported
+from rig.recorder.convert import RAW_SUFFIXES, import_csv, import_frames, import_own_table, open_can_log, write_imported
 
 
 def run_command(args: argparse.Namespace) -> int:
@@ -42,7 +42,7 @@ def run_command(args: argparse.Namespace) -> int:
 
 
 def import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
-    """Import our own columns or frames.
+    """Import our own columns or frames, or those of a rig that a plant knows.
 
     Raises:
         InputError: another format, or other columns.
@@ -58,6 +58,8 @@ def import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
                 raise
             raise InputError(error.where, error.field, f"{error.expected}; for other columns: "
                                                        f"rig import --guess {source}") from error
+    elif (own := import_own_table(source, out)) is not None:
+        cycles = own
     else:
         raise InputError(source, "", f"--map for other formats than .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}; "
                                      "--guess writes one")

@@ -213,7 +213,7 @@ def test_a_sine_has_a_positive_amplitude() -> None:
     free = (*list_all_unknowns(Model()), *list_effect_unknowns(CATALOGUE["supply_ripple"], Model()))
     ripple = {"supply_ripple.amplitude": -0.03, "supply_ripple.frequency": 20.0, "supply_ripple.phase": 9.0}
     x = np.array([(ripple.get(f.name, f.centre) - f.centre) / f.scale for f in free])
-    turned = turn_amplitudes_positive(free, x)
+    turned = turn_amplitudes_positive(free, x, CATALOGUE.values())
     values = {f.name: f.centre + f.scale * v for f, v in zip(free, turned, strict=True)}
     assert values["supply_ripple.amplitude"] == pytest.approx(0.03)
     assert abs(values["supply_ripple.phase"]) <= np.pi
