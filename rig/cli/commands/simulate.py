@@ -38,18 +38,19 @@ def run_command(args: argparse.Namespace) -> int:
     require_new(require_writable(out, "--out", source=args.command_file), is_forced=args.force)
     columns = simulate(model, com, load, args.seed, args.steps)
     trace = Trace.from_columns(columns._asdict(), period, {"model": model.name, "seed": str(args.seed),
-                                                           "command": name})
+                                                           "command": name}, model.kind.signals)
     if out.suffix == ".mcap":
         from rig.recorder.convert import write_mcap  # here: it loads python-can
 
         write_mcap(trace, out)
     else:
         trace.write_csv(out)
-    error = columns.com - columns.xj
+    error = trace.command - trace.controlled
+    unit = model.kind.signals.controlled.unit
     summary: dict[str, Any] = {"trace": str(out), "cycles": len(com), "seconds": len(com) * period,
                                "rms_error": float((error**2).mean() ** 0.5), "max_error": float(abs(error).max())}
     sentence = (f"{out}: {summary['cycles']} cycles, {summary['seconds']:g} s; following error "
-                f"{format_amount(summary['rms_error'], 'm')} RMS, {format_amount(summary['max_error'], 'm')} at most")
+                f"{format_amount(summary['rms_error'], unit)} RMS, {format_amount(summary['max_error'], unit)} at most")
     return give_answer(Report("simulate", str(out), sentence=sentence, data=summary), args)
 
 
@@ -69,7 +70,8 @@ def write_samples(args: argparse.Namespace) -> int:
     steps = args.steps or 400  # a cycle: finer than those of a fit, as a real unit is
     for seed, (name, com) in enumerate(runs.items(), args.seed + 1):
         columns = simulate(model, com, load[:len(com)], seed, steps)
-        Trace.from_columns(columns._asdict(), period, {"seed": str(seed)}).write_csv(places[name])
+        Trace.from_columns(columns._asdict(), period, {"seed": str(seed)},
+                           model.kind.signals).write_csv(places[name])
     sentence = (f"{', '.join(map(str, places.values()))}: a run, its repeat, and a run of another command. Next: "
                 f"rig compare {places['run.csv']} --repeat {places['run2.csv']}")
     data = {"traces": [str(place) for place in places.values()]}
