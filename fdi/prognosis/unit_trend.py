@@ -190,7 +190,9 @@ def read_start_time(file: Path, model: Model, again: bool = False, faults: Seque
         InputError: a file that is not a trace.
     """
     found = _read_answer(_find_answer_file(file, model, faults), again)
-    return str(found["started"]) if found else Trace.read(file).provenance.get("started", "")
+    if found is not None:
+        return str(found["started"])
+    return Trace.read(file, signals=model.kind.signals).provenance.get("started", "")
 
 
 def diagnose_once(file: Path, model: Model, again: bool = False, faults: Sequence[Fault] = FAULTS) -> dict[str, Any]:
@@ -204,7 +206,7 @@ def diagnose_once(file: Path, model: Model, again: bool = False, faults: Sequenc
     if found is None:
         from fdi.diagnosis.diagnosis import diagnose
 
-        trace = Trace.read(file)
+        trace = Trace.read(file, signals=model.kind.signals)
         d = diagnose(trace, model, source=str(file), faults=faults)
         found = {"started": trace.provenance.get("started", ""),
                  "sizes": {name: list(size) for name, size in d.sizes.items()},
