@@ -15,27 +15,31 @@ from rig.cli.commands import list as list_command
 
 def write_effect_page() -> list[str]:
     """The page of the catalogue."""
-    effects = list({e.name: e for plant in list_plants() for e in list_offered_effects(plant)}.values())
+    found: dict[str, tuple[Effect, str]] = {}  # of one name, that of the first plant
+    for plant in list_plants():
+        for e in list_offered_effects(plant):
+            found.setdefault(e.name, (e, plant))
+    effects = [e for e, _ in found.values()]
     rows = [(f"[{e.name}](#{name_anchor('effect', e.name)})", e.port or "reference model", quote_code(e.law))
             for e in effects]
     lines = ["# Catalogue of effects", "", MADE, "",
              "An effect is a physical cause that a model may have or lack. [Effects](../docs/effects.md) shows how to "
              "add your own, [the plant](../docs/physics.md) has the equations.",
              *make_table(("effect", "acts on", "law"), rows)]
-    for e in effects:
-        lines += describe_effect(e)
+    for e, plant in found.values():
+        lines += describe_effect(e, plant)
     return lines
 
 
-def describe_effect(e: Effect) -> list[str]:
-    """The section of one effect."""
-    nominal = load_model(e.plant or "eha")
+def describe_effect(e: Effect, plant: str) -> list[str]:
+    """The section of one effect, with the nominal values of a plant that has it."""
+    nominal = load_model(plant)
     rows = [(quote_code(name), q.unit, f"{e.off.get(name, nominal.values.get(name, 0.0)):g}", q.expected, q.typical,
              "yes" if name in e.fitted else "no") for name, q in e.parameters.items()]
     facts = [("Acts on", e.port or "the reference model, as one of its own parameters"), ("Law", quote_code(e.law)),
              ("Symptoms", e.symptoms), ("Looks like", ", ".join(map(quote_code, e.confused_with))),
              ("Revealed by", e.revealed_by), ("Excludes", ", ".join(map(quote_code, e.excludes))),
-             ("Plant", e.plant), ("Source", e.source)]
+             ("Plant", plant if e.plant else ""), ("Source", e.source)]
     return [f"({name_anchor('effect', e.name)})=", f"## {e.name}", "",
             *(f"- {name}: {escape_markup(text)}" for name, text in facts if text),
             *make_table(("parameter", "unit", "off or nominal", "allowed", "typical", "fitted"), rows)]
