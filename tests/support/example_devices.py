@@ -22,6 +22,7 @@ from rig.network.bus import open_can
 
 DRIVE, ECU = ROOT / "examples" / "cia402_drive", ROOT / "examples" / "can_ecu"
 LIMIT = 60.0  # s: a frame that does not come within this does not come
+PATIENT = {DRIVE: (), ECU: ("--timeout", "60000")}  # in lockstep the rig may stop for as long as the machine likes
 
 
 @contextlib.contextmanager

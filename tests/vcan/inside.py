@@ -1,11 +1,11 @@
-"""What runs where a vcan0 is: the bus tests, one whole preflight run by three processes with candump listening, and a
-minute at 1 kHz, both with the C firmware.
+"""What runs where a vcan0 is: the bus tests, one whole preflight run by three processes with candump listening, that of
+each controller in examples/, and a minute at 1 kHz with the C firmware.
 
-    python tests/vcan/inside.py OUT compile|bus|preflight|minute ...
+    python tests/vcan/inside.py OUT compile|bus|preflight|examples|minute ...
 
-Leaves in OUT: bus.xml (junit) from `bus`; run/, run.json, candump.log and one .log per process from `preflight`;
-minute/ and minute.json from `minute`. `compile` fills the cache of compiled code. It is meant for the host, which does
-it ten times as fast as its guest: both have the same files and the same CPU.
+Leaves in OUT: bus.xml (junit) from `bus`; run/, run.json, candump.log and one .log per process from `preflight`; NAME/
+and NAME.json of each of `examples`; minute/ and minute.json from `minute`. `compile` fills the cache of compiled code.
+It is meant for the host, which does it ten times as fast as its guest: both have the same files and the same CPU.
 """
 from __future__ import annotations
 
@@ -145,6 +145,18 @@ def play_preflight(out: Path, attempt: int) -> int:
     return status
 
 
+def examples(out: Path) -> int:
+    """The preflight of each controller in examples/; the first status that is not 0."""
+    from example_devices import DRIVE, ECU, PATIENT, run_device
+
+    statuses = []
+    for folder in (DRIVE, ECU):
+        words = ["run", "--bench", folder / "bench.toml", "--bus", BUS, "--json", "--out", out / folder.name]
+        with run_device(folder, BUS, *PATIENT[folder]), (out / f"{folder.name}.json").open("wb") as answer:
+            statuses.append(subprocess.run([RIG, *words], stdout=answer, stdin=subprocess.DEVNULL).returncode)
+    return next((status for status in statuses if status), 0)
+
+
 def minute(out: Path) -> int:
     """60,000 cycles in lockstep with the C firmware; the run's exit status."""
     (out / "minute.toml").write_text(MINUTE)
@@ -158,7 +170,7 @@ def main() -> int:
     out = Path(sys.argv[1]).resolve()
     out.mkdir(parents=True, exist_ok=True)
     os.chdir(TESTS.parent)
-    parts = {"compile": compile_all, "bus": bus_tests, "preflight": preflight, "minute": minute}
+    parts = {"compile": compile_all, "bus": bus_tests, "preflight": preflight, "examples": examples, "minute": minute}
     statuses = [parts[name](out) for name in sys.argv[2:]]
     return next((status for status in statuses if status), 0)
 

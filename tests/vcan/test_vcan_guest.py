@@ -39,7 +39,8 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
         skip_or_fail("gcc is missing")
     folder = tmp_path_factory.mktemp("vcan")
     subprocess.run([sys.executable, FOLDER / "inside.py", folder, "compile"], check=True)
-    parts = ["preflight"] if kernel_has_vcan0() else ["bus", "preflight"]  # with a vcan0 here the bus tests ran here
+    parts = ["preflight", "examples"]
+    parts = parts if kernel_has_vcan0() else ["bus", *parts]  # with a vcan0 here the bus tests ran here
     done = in_guest(sys.executable, FOLDER / "inside.py", folder, *parts)
     (folder / "output.txt").write_text(done.stdout)
     return folder
@@ -86,6 +87,17 @@ def test_preflight_passes_with_three_processes(
     if facts["attempt"] > 1:
         words += f"; attempt {facts['attempt']}, because the bench could not judge the one before"
     record_property(NOTE, f"vcan0: preflight by three processes, {words}")
+
+
+@pytest.mark.parametrize("name", ["cia402_drive", "can_ecu"])
+def test_preflight_of_an_example_passes(out: Path, name: str, record_property: Callable[[str, object], None]) -> None:
+    """The whole of it, in lockstep: the guest is too slow for real time."""
+    text = (out / f"{name}.json").read_text()
+    assert text, (out / "output.txt").read_text()
+    answer = json.loads(text)
+    failed = [check["name"] for check in answer["checks"] if not check["passed"]]
+    assert (answer["verdict"], failed, answer["timing"]["cycles"]) == ("PASS", [], 14_500), answer["why"]
+    record_property(NOTE, f"vcan0: preflight of {name} in lockstep, {answer['speed']} times real time")
 
 
 def test_preflight_rows_are_byte_for_byte_those_of_the_builtin_controller(

@@ -155,7 +155,7 @@ def test_a_foreign_node_is_not_written_to() -> None:
 
 
 @pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
-@pytest.mark.parametrize(("node", "chapters"), [("controller", "36"), ("plant", "4"), ("c", "346")])
+@pytest.mark.parametrize(("node", "chapters"), [("plant", "4"), ("c", "346")])
 def test_our_nodes_pass_on_a_can_interface(bus_kind: str, node: str, chapters: str) -> None:
     """SDO, PDO and NMT over the kernel's CAN, each by the firmware in C and by one of the two nodes of one slave core.
 

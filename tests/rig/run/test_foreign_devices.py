@@ -159,8 +159,8 @@ def run_device(device: PythonDevice) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("start", DEVICES, ids=lambda start: start.__name__.removeprefix("start_"))
-@pytest.mark.parametrize("is_compiled", [True, False], ids=["compiled", "python"])
-@pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
+@pytest.mark.parametrize(("bus_kind", "is_compiled"), [
+    ("udp_multicast", True), ("udp_multicast", False), ("socketcan", True)], indirect=["bus_kind"])
 def test_a_foreign_controller_closes_the_loop(start: object, bus_kind: str, is_compiled: bool, tmp_path: Path,
                                               monkeypatch: pytest.MonkeyPatch) -> None:
     """The ram moves as a simulation of the same law does, whatever frames carry demand, position and current."""
