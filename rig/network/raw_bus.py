@@ -5,7 +5,7 @@ A COB-ID has the flags of frame.py: EXTENDED for an identifier of 29 bits, FD_FR
 A loop that must not be late is a plain function that calls `receive_frame` and `send_frame`, compiled as a whole by
 `plant.compile.compile_function`. It runs without the interpreter lock; it makes no Python object and allocates nothing.
 
-    with open_raw_bus("udp_multicast:239.0.0.1", (codec.SYNC, codec.DRIVE)) as bus:   # Python: opens, sets the filters
+    with open_raw_bus("udp_multicast:239.0.0.1", (sync, drive)) as bus:   # COB-IDs; Python: opens, sets the filters
         run = compile_function(my_loop)
         run(bus.port, ...)                                                            # in a thread of its own
 
