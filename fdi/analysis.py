@@ -12,7 +12,7 @@ from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
-from fdi.foreign_code import load_effects_of_model
+from fdi.foreign_code import load_effects_of_model, load_plant_of_model
 from fdi.output import write_text
 from fdi.report.drawing import Drawing, convert_figure, save_drawing
 from fdi.report.report import Figure, Medium, Report, render_html, to_plain
@@ -224,13 +224,15 @@ class DiagnosisResult(Result):
     diagnosis: Diagnosis = field(repr=False)
 
 
-def read_trace(path: str | Path) -> Trace:
-    """Read a trace: trace.mcap, the folder of a run, or a CSV with t,com,xj,cor[,p12,xs,load] in SI units.
+def read_trace(path: str | Path, plant: str = "eha") -> Trace:
+    """Read a trace: trace.mcap, the folder of a run, or a CSV in SI units with the signals of the plant as columns.
+
+    Of the EHA they are t,com,xj,cor[,p12,xs,load].
 
     Raises:
         InputError: a file that cannot be read, naming its line or field.
     """
-    return Trace.read(path)
+    return Trace.read(path, signals=load_model(plant).kind.signals)
 
 
 def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence[TraceOrPath] = (),
@@ -250,8 +252,9 @@ def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
     from fdi.comparison.compare import compare as compare_trace
     from fdi.report.compare_report import build_comparison_report
 
-    measured = _load_trace(trace)
-    comparison = compare_trace(measured, _load_model(model, trust), [_load_trace(r) for r in repeats], signals,
+    own_model = _load_model(model, trust)
+    measured = _load_trace(trace, own_model)
+    comparison = compare_trace(measured, own_model, [_load_trace(r, own_model) for r in repeats], signals,
                                source=measured.provenance.get("source", "trace"))
     return ComparisonResult(build_comparison_report(comparison), comparison)
 
@@ -344,8 +347,8 @@ def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eh
     source = None if isinstance(model, Model) else model
     ranges = read_free_parameters(own_model, source) if free is None else parse_free_parameters(free, own_model, "free")
     fitted = [runs] if isinstance(runs, Trace | str | Path) else list(runs)
-    own = collect_identification_runs(own_model, ranges, [_load_trace(r) for r in fitted],
-                                      [_load_trace(r) for r in holdouts], signals)
+    own = collect_identification_runs(own_model, ranges, [_load_trace(r, own_model) for r in fitted],
+                                      [_load_trace(r, own_model) for r in holdouts], signals)
     found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources, seed)
     return IdentificationResult(build_identification_report(found, own_model.name), found)
 
@@ -367,23 +370,25 @@ def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Pat
     from fdi.diagnosis.diagnosis import diagnose as diagnose_trace
     from fdi.report.diagnosis_report import build_diagnosis_report
 
-    measured, known_bands = _load_trace(trace), None if bands is None else load_bands(bands)
-    diagnosis = diagnose_trace(measured, _load_model(model, trust), known_bands,
+    own_model = _load_model(model, trust)
+    measured, known_bands = _load_trace(trace, own_model), None if bands is None else load_bands(bands)
+    diagnosis = diagnose_trace(measured, own_model, known_bands,
                                source=measured.provenance.get("source", "trace"))
     return DiagnosisResult(build_diagnosis_report(diagnosis), diagnosis)
 
 
-def _load_trace(trace: TraceOrPath) -> Trace:
-    """The trace itself; one that was read gets the name of its file, so that messages can say it."""
+def _load_trace(trace: TraceOrPath, model: Model) -> Trace:
+    """A trace of the plant of `model`; one that was read gets the name of its file, so that messages can say it."""
     if isinstance(trace, Trace):
         return trace
-    found = Trace.read(trace)
+    found = Trace.read(trace, signals=model.kind.signals)
     return replace(found, provenance={**found.provenance, "source": str(trace)})
 
 
 def _load_model(model: ModelOrPath, trust: bool) -> Model:
     if isinstance(model, Model):
         return model
+    load_plant_of_model(model, is_trusted=trust)
     load_effects_of_model(model, is_trusted=trust)
     return load_model(model)
 
@@ -392,7 +397,8 @@ def _load_model_file(model: ModelOrPath, trust: bool) -> tuple[Model, Provenance
     """A model and where it comes from, which only a model file knows."""
     from fdi.discovery.update_model import Provenance, load_model_file
 
-    if not isinstance(model, Model) and Path(model).is_file():
+    if not isinstance(model, Model) and Path(model).suffix != ".py" and Path(model).is_file():
+        load_plant_of_model(model, is_trusted=trust)
         load_effects_of_model(model, is_trusted=trust)
         return load_model_file(Path(model))
     return _load_model(model, trust), Provenance()
@@ -402,5 +408,5 @@ def _collect_runs(model: Model, trace: TraceOrPath, repeats: Sequence[TraceOrPat
                   signals: Sequence[str] | None) -> Runs:
     from fdi.discovery.runs import collect_runs
 
-    unseen = None if holdout is None else _load_trace(holdout)
-    return collect_runs(model, _load_trace(trace), [_load_trace(r) for r in repeats], unseen, signals)
+    unseen = None if holdout is None else _load_trace(holdout, model)
+    return collect_runs(model, _load_trace(trace, model), [_load_trace(r, model) for r in repeats], unseen, signals)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from plant.effects import CATALOGUE, load_effects
 from plant.errors import InputError, escape_control_characters
 from plant.parameters import read_toml
+from plant.plants import load_plant
 
 Announce = Callable[[str], None]
 
@@ -77,13 +78,37 @@ def load_effects_of_model(model: str | Path | None, given: Sequence[Path] = (), 
     return tuple(found)
 
 
+def load_plant_of_model(model: str | Path | None, *, is_trusted: bool,
+                        announce: Announce = print_on_standard_error) -> None:
+    """Run the plant file that is the model, or that a model file names if the user trusts it; neither: do nothing.
+
+    The file of a model file is looked for beside it and in this folder.
+
+    Raises:
+        InputError: a plant file that is not trusted, not there, or no plant.
+    """
+    path = Path(model or "")
+    if path.suffix == ".py":
+        load_plant(path)
+    elif path.suffix == ".toml" and path.is_file():
+        named: Any = read_toml(path).get("plant")
+        if not isinstance(named, str) or not named.endswith(".py"):
+            return
+        places = [place for place in (path.parent / named, Path(named)) if place.is_file()]
+        if not places:
+            raise InputError(path, "plant", f"a file that exists, not {named!r}")
+        code = ForeignCode(str(places[0]), _read(places[0]))
+        require_trust(path, [code], is_trusted=is_trusted, announce=announce)
+        load_plant(places[0], code.content)
+
+
 def find_effect_files(model: str | Path | None, given: Sequence[Path] = ()) -> list[Path]:
     """The effect files that a model file names and that exist, without those of the same name as one in `given`.
 
     Raises:
         InputError: the model file cannot be read.
     """
-    if model is None or not Path(model).is_file():
+    if model is None or Path(model).suffix == ".py" or not Path(model).is_file():
         return []
     provenance: Any = read_toml(Path(model)).get("provenance", {})
     names = provenance.get("effect_files", []) if isinstance(provenance, Mapping) else []

@@ -124,7 +124,8 @@ class Model:
         """The text of a model file, which `load_model` reads."""
         effects = ", ".join(f'"{e}"' for e in self.effects)
         name = json.dumps(self.name, ensure_ascii=False).replace("\x7f", "\\u007f")  # a JSON text is TOML but for this
-        plant = [] if self.plant == "eha" else [f'plant = "{self.plant}"']
+        plant = [] if self.plant == "eha" else [f"plant = {json.dumps(self.plant, ensure_ascii=False)}"]
+        plant += [f'plant_sha256 = "{self.kind.sha256}"'] if self.kind.sha256 else []
         lines = [f"name = {name}", *plant, f"effects = [{effects}]"]
         usual = self.nominal
         own = {name: value for name, value in self.values.items() if usual.get(name) != value}
@@ -169,14 +170,17 @@ class Model:
 
 
 def load_model(source: str | Path = "eha") -> Model:
-    """The nominal model of a plant ("eha", "ehs"), a shipped model ("servo"), or the model of a TOML file.
+    """The nominal model of a plant ("eha", "my_plant.py"), a shipped model ("servo"), or the model of a TOML file.
 
     A file lists what is not nominal. One that has the name of a plant or of a shipped model is given with its folder.
+    A plant file runs; one that a model file names must have been loaded before (`plant.plants.load_plant`).
 
     Raises:
         InputError: no such file, or an unknown group, field, effect or impossible value in it.
     """
-    if str(source) in plants.list_plants():
+    if Path(source).suffix == ".py":
+        plants.load_plant(Path(source))
+    if str(source) in plants.list_plants() or Path(source).suffix == ".py":
         return build_bare_model(str(source)).with_effects(plants.find_plant(str(source)).has)
     path = find_shipped_model(str(source)) or Path(source)
     if not path.is_file():
@@ -212,8 +216,12 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     design = tables.pop("design", {})
     if not isinstance(name, str) or not name:
         raise InputError(where, "name", f"a text, not {name!r}")
-    if plant not in plants.list_plants():
-        raise InputError(where, "plant", f"one of {', '.join(plants.list_plants())}, not {plant!r}")
+    tables.pop("plant_sha256", None)
+    loaded = plants.find_loaded_plant(plant, where) if isinstance(plant, str) and plant.endswith(".py") else None
+    if loaded is None and plant not in plants.list_plants():
+        more = "a plant file (.py), which runs with --trust"
+        raise InputError(where, "plant", f"one of {', '.join(plants.list_plants())}, or {more}, not {plant!r}")
+    plant = plant if loaded is None else loaded.key
     known = [e.name for e in list_offered_effects(plant)]  # a list, as what stands in a file need not be hashable
     unknown = [e for e in effects if e not in known] if isinstance(effects, list) else [effects]
     if unknown:

@@ -11,6 +11,7 @@ import importlib
 import inspect
 import re
 import sys
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -29,6 +30,7 @@ from plant.faults import Fault
 from plant.flat import make_packers
 from plant.kernels import raise_unbound, write_constant, write_mover, write_signal_functions
 from plant.pid import Loop, control_by_pid
+from plant.plant_check import check_declaration
 from plant.ports import (
     PORTS,
     Port,
@@ -132,6 +134,7 @@ class Plant:
     measured_pressures: MeasuredPressures | None = None  # how they drive the plant; None: they cannot
     file: Path | None = None  # of a user's plant
     key: str = ""  # what a model calls it: its name, or the path of a user's file as it was named
+    source: bytes = field(default=b"", repr=False)  # of a user's file
     effects: Mapping[str, Effect] = field(default_factory=dict, repr=False)  # its own
 
     def __post_init__(self) -> None:
@@ -146,6 +149,11 @@ class Plant:
                  for s in self.signals if s.role != "time")
         for key, value in (("parameters", parameters), ("signals", Signals(*named))):
             object.__setattr__(self, key, value)
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of a user's file, hexadecimal; empty for a shipped plant."""
+        return hashlib.sha256(self.source).hexdigest() if self.source else ""
 
     @property
     def groups(self) -> Mapping[str, type[Any]]:
@@ -218,9 +226,13 @@ class Plant:
             return all(name in self.nominal for name in e.fitted)
         if e.port not in self.ports:
             return False
-        shared, own = PORTS[e.port].unit or self.signals.controlled.unit, self.ports[e.port].unit
-        has_unit = shared == own or not any(shared in q.unit.split() for q in e.parameters.values())
-        return has_unit and (e.plant == self.name or self._has_what_law_names(e))
+        if e.plant == self.name:
+            return True
+        shared, own = PORTS[e.port].unit or "m", self.ports[e.port].unit  # those of the EHA, for which it was written
+        is_own = e.function is not None and not e.function.__module__.startswith("plant.")  # in a file of the user's
+        has_unit = is_own or shared == own or not any(
+            shared in re.split(r"[ /()]", q.unit) for q in e.parameters.values())
+        return has_unit and self._has_what_law_names(e)
 
     def _has_what_law_names(self, e: Effect) -> bool:
         """Whether the state has the fields, and the parameters the groups, that the law of an effect names."""
@@ -321,6 +333,11 @@ def find_plant(name: str) -> Plant:
     return _find_shipped_plant(name)
 
 
+def find_loaded_plant(name: str, where: object) -> Plant | None:
+    """The user's plant that the model file `where` calls `name`: beside it, or from this folder; None: not loaded."""
+    return next((_LOADED[key] for key in (str(Path(str(where)).parent / name), name) if key in _LOADED), None)
+
+
 def list_plants() -> tuple[str, ...]:
     """All shipped plants."""
     return tuple(MODULES)
@@ -328,7 +345,9 @@ def list_plants() -> tuple[str, ...]:
 
 @cache
 def _find_shipped_plant(name: str) -> Plant:
-    return find_declared_plant(importlib.import_module(MODULES[name]), name)
+    plant = find_declared_plant(importlib.import_module(MODULES[name]), name)
+    CATALOGUE.of_plants.update(plant.effects)
+    return plant
 
 
 def name_group(cls: type[Any]) -> str:
@@ -371,22 +390,29 @@ def base_effect(name: str, group: type[Any], *fields: str, **more: Any) -> None:
     there.setdefault(OWN_EFFECTS, {})[made.name] = made
 
 
-def load_plant(path: Path, source: bytes | None = None) -> Plant:
+def load_plant(path: Path, source: bytes | None = None, key: str = "") -> Plant:
     """Run a user's plant file; the plant that it declares as PLANT. From now on `find_plant` finds it by its path.
 
-    `source` is its content where that has been read already; exactly these bytes run.
+    Args:
+        path: of the file.
+        source: its content where that has been read already; exactly these bytes run.
+        key: what models call it instead of the path.
 
     Raises:
         InputError: unreadable, not Python, or what it declares is incomplete.
     """
-    named, path = path, path.absolute()
+    key, path = key or str(path), path.absolute()
     if not path.is_file() and source is None:
         raise InputError(path, "", "a Python file that declares a plant; it does not exist")
     try:
         code = path.read_bytes() if source is None else source
     except OSError as error:
         raise InputError(path, "", f"a readable file ({error.strerror})") from error
-    module = ModuleType(f"plant_of_{path.stem}_{hashlib.sha256(code).hexdigest()[:8]}")
+    digest = hashlib.sha256(code).hexdigest()
+    known = _LOADED.get(key)
+    if known is not None and (known.file, known.source) == (path, code):
+        return known
+    module = ModuleType(f"plant_of_{path.stem}_{digest[:8]}")
     module.__file__ = str(path)
     sys.modules[module.__name__] = module  # where annotations written as text, and types, are looked up
     try:
@@ -394,8 +420,18 @@ def load_plant(path: Path, source: bytes | None = None) -> Plant:
     except SyntaxError as error:
         raise InputError(f"{path}:{error.lineno}", "", f"Python ({error.msg})") from error
     except Exception as error:
-        raise InputError(path, "", f"a file that Python can run ({type(error).__name__}: {error})") from error
-    plant = _LOADED[str(named)] = find_declared_plant(module, path.stem, path, str(named))
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        raise InputError(f"{path}:{lines[-1]}" if lines else path, "",
+                         f"a file that Python can run ({type(error).__name__}: {error})") from error
+    plant = replace(find_declared_plant(module, path.stem, path, key), source=code)
+    before, _LOADED[key] = known, plant
+    try:
+        check_declaration(plant, path)
+    except InputError:
+        _LOADED.pop(key)
+        _LOADED.update({key: before} if before is not None else {})
+        raise
+    CATALOGUE.of_plants.update(plant.effects)
     return plant
 
 
@@ -411,5 +447,4 @@ def find_declared_plant(module: ModuleType, name: str, file: Path | None = None,
     own = {name: replace(e, plant=plant.name or name) for name, e in vars(module).get(OWN_EFFECTS, {}).items()}
     made = replace(plant, name=plant.name or name, file=file, effects=own, key=key or name)
     PORTS.update({name: port for name, port in made.ports.items() if name not in PORTS})
-    CATALOGUE.of_plants.update(own)
     return made

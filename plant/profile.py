@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import ceil, isfinite
 from pathlib import Path
 from typing import NamedTuple
@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from plant.errors import InputError
-from plant.segments import FARTHEST, LONGEST, RATE, STRONGEST, Array, Segment, require
+from plant.segments import LONGEST, RATE, Array, Segment, require
+from plant.signals import EHA, Signals
 from plant.unpacking import UnpackingError, unpack_gzip
 
 SLACK = 0.01  # of a cycle: a time within it of a row is that row's
-_LARGEST = {"com": FARTHEST, "load": STRONGEST}  # m, N; a value is either, and judged by whoever knows which
 
 
 class Section(NamedTuple):
@@ -69,8 +69,10 @@ def build_profile(segments: Sequence[Segment], start: float = 0.0, rate: float =
     return Profile(np.concatenate(pieces), tuple(sections), last)
 
 
-def read_command(path: str | Path, period: float = 1 / RATE) -> Command:
-    """A command file for `rig simulate`: CSV (or .csv.gz) with columns t, com and optionally load, SI units.
+def read_command(path: str | Path, period: float = 1 / RATE, signals: Signals = EHA) -> Command:
+    """A command file for `rig simulate`: CSV (or .csv.gz) with columns t, command and optionally load, SI units.
+
+    Their names are those of the plant's signals, of the EHA com and load.
 
     One value per cycle of `period` s, as `resample_on_cycles` makes it.
 
@@ -81,14 +83,16 @@ def read_command(path: str | Path, period: float = 1 / RATE) -> Command:
         data = Path(path).read_bytes()
     except OSError as error:
         raise InputError(path, "", f"a CSV file that can be read ({error.strerror})") from error
-    columns = parse_columns(data, path, period)
+    columns = parse_columns(data, path, period, signals)
     if "com" not in columns:
-        raise InputError(path, "line 1", "a header with the columns t and com")
+        raise InputError(path, "line 1", f"a header with the columns t and {signals.command.name}")
     return Command(columns["com"], columns.get("load"))
 
 
-def parse_columns(data: bytes, where: object, period: float = 1 / RATE) -> dict[str, Array]:
+def parse_columns(data: bytes, where: object, period: float = 1 / RATE, signals: Signals = EHA) -> dict[str, Array]:
     """The columns com, value and load of a CSV text, those that it has, one value per cycle from its first row.
+
+    com and load stand for the command and the load of the plant's `signals`, by whose names the text has them.
 
     Rows need not be one cycle apart: see `resample_on_cycles`. Other columns are ignored, so a trace is a command too.
 
@@ -100,8 +104,11 @@ def parse_columns(data: bytes, where: object, period: float = 1 / RATE) -> dict[
     titles = [title.strip().lower() for title in header]
     if "t" not in titles:
         raise InputError(where, "line 1", "a header with a column t and commas between columns")
-    picked: dict[str, int] = {name: titles.index(name) for name in ("t", "com", "value", "load") if name in titles}
-    table = {name: np.array(values) for name, values in _parse_numbers(rows, picked, where).items()}
+    named = {"t": "t", "com": signals.command.name, "value": "value"}
+    named |= {"load": signals.load.name} if signals.load else {}
+    picked = {key: titles.index(name.lower()) for key, name in named.items() if name.lower() in titles}
+    largest = {"com": signals.command.largest, "load": signals.load.largest if signals.load else 0.0}
+    table = {key: np.array(values) for key, values in _parse_numbers(rows, picked, where, largest).items()}
     t = table.pop("t")
     return {name: resample_on_cycles(t, values, period) for name, values in table.items()}
 
@@ -139,8 +146,8 @@ def _read_rows(data: bytes, where: object) -> Iterator[tuple[int, list[str]]]:
         raise InputError(where, f"line {rows.line_num}", f"CSV ({error})") from error
 
 
-def _parse_numbers(rows: Iterator[tuple[int, list[str]]], picked: dict[str, int],
-                   where: object) -> dict[str, list[float]]:
+def _parse_numbers(rows: Iterator[tuple[int, list[str]]], picked: dict[str, int], where: object,
+                   largest: Mapping[str, float]) -> dict[str, list[float]]:
     """The picked columns as numbers, checked row by row so that a refusal can name the line."""
     table: dict[str, list[float]] = {name: [] for name in picked}
     t = table["t"]
@@ -158,7 +165,7 @@ def _parse_numbers(rows: Iterator[tuple[int, list[str]]], picked: dict[str, int]
             raise InputError(where, f"line {line}, t", f"a time after {t[-2]:g} s, not {t[-1]:g}")
         if t[-1] - t[0] > LONGEST:
             raise InputError(where, f"line {line}, t", f"seconds, and at most {LONGEST:g} of them, not {t[-1]:g}")
-        for name, most in _LARGEST.items():
+        for name, most in largest.items():
             if name in table and abs(table[name][-1]) > most:
                 raise InputError(where, f"line {line}, {name}", f"at most {most:g} either way, not {table[name][-1]:g}")
     if not t:

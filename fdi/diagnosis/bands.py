@@ -628,7 +628,7 @@ def make_bands_file(sources: Sequence[str | Path], out: str | Path, model: Model
         traces = []
         for done, source in enumerate(sources):
             progress("reading", done / len(sources))
-            traces.append(Trace.read(source))
+            traces.append(Trace.read(source, signals=(model or load_model()).kind.signals))
         bands = learn_bands(traces, model, [str(source) for source in sources], progress)
     elif com is None:
         raise InputError("--learn-bands", "", "traces, or a command to simulate")

@@ -110,11 +110,11 @@ COMMANDS = {
                     help="function that judges a case instead of rig fdi"))))),
     "check": Command(
         "dry run of a sequence: its command against travel, speed and current, checks on the predicted run; the frames "
-        "of a bench; the faults of a fault file",
+        "of a bench; a plant file over its nominal test; the faults of a fault file",
         "Nothing is opened and nothing moves. --bench alone lists the frames and their share of the bus. Exit status 1 "
         "if a limit is violated; --out FILE.html has a picture.",
         (option("sequence", nargs="?", metavar="SEQUENCE",
-                help="test sequence: a .toml file, or the name of a shipped one; or a fault file"),
+                help="test sequence: a .toml file, or the name of a shipped one; or a plant file or fault file"),
          *MODEL, BENCH)),
     "compare": Command(
         "compare a model with a measured trace: how large the error is, where, when and in which block",
@@ -231,11 +231,13 @@ COMMANDS = {
          option("word", nargs="?", default="", metavar="WORD", help="only names that contain this word"), *MODEL,
          FAULTS)),
     "new": Command(
-        "write a first file of your own, commented: a bench from the EDS, DCF or DBC of your controller, or a fault",
-        "It goes to --out (default: NAME.toml). Lines that are guesses say so (# unsure).",
-        (option("kind", choices=("bench", "fault"), metavar="KIND",
-                help="bench: which device is under test (docs/bench.md); fault: what rig fdi measures (docs/fdi.md)"),
-         option("name", metavar="NAME", help="name of the file, without .toml"),
+        "write a first file of your own, commented: a bench from the EDS, DCF or DBC of your controller, a plant, a "
+        "fault",
+        "It goes to --out (default: NAME.toml or NAME.py). Lines that are guesses say so (# unsure).",
+        (option("kind", choices=("bench", "plant", "fault"), metavar="KIND",
+                help="bench: which device is under test (docs/bench.md); plant: an actuator (docs/plants.md); fault: "
+                     "what rig fdi measures (docs/fdi.md)"),
+         option("name", metavar="NAME", help="name of the file, without .toml or .py"),
          option("--eds", type=Path, metavar="FILE", help="EDS or DCF of a CANopen device"),
          option("--dbc", type=Path, metavar="FILE", help="DBC of a device on plain CAN"),
          option("--node", type=parse_count, metavar="N", help="node-ID of the CANopen device (default: the DCF's, or "

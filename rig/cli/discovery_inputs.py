@@ -22,7 +22,7 @@ def load_known_model(args: argparse.Namespace) -> tuple[Model, Provenance]:
         InputError: a file or a value that cannot be used, or a model file with code that --trust does not allow.
     """
     load_chosen_effects(args)
-    is_file = args.model and Path(args.model).is_file()
+    is_file = args.model and Path(args.model).suffix != ".py" and Path(args.model).is_file()
     model, known = load_model_file(Path(args.model)) if is_file else (load_model(args.model or "eha"), Provenance())
     files = tuple(dict.fromkeys([*known.effect_files, *map(str, args.effects)]))
     return model.replace(parse_changes(args.set)), replace(known, effect_files=files)
@@ -55,7 +55,8 @@ def choose_model_file(args: argparse.Namespace, trace: str | None) -> Path:
     Raises:
         InputError: a place that cannot be written, or another kind of file.
     """
-    own = args.model if args.model and Path(args.model).is_file() else "model.toml"
+    named = Path(args.model or "")
+    own = args.model if named.suffix == ".toml" and named.is_file() else "model.toml"
     path = choose_file(args.out or own, (".toml",), trace)
     assert path is not None
     return path

@@ -46,6 +46,7 @@ def load_chosen_effects(args: argparse.Namespace) -> None:
     Raises:
         InputError: an invalid file, code that --trust does not allow, or two files of one name.
     """
+    foreign_code.load_plant_of_model(args.model, is_trusted=args.trust)
     load_user_effects(args.effects)
     brought = foreign_code.load_effects_of_model(args.model, args.effects, is_trusted=args.trust)
     foreign_code.require_different_names((*args.effects, *brought))

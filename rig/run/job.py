@@ -12,6 +12,7 @@ from fdi.foreign_code import (
     Announce,
     ForeignCode,
     load_effects_of_model,
+    load_plant_of_model,
     print_on_standard_error,
     require_different_names,
     require_trust,
@@ -22,6 +23,7 @@ from plant import InputError, Model, load_model
 from plant.effects import load_effects
 from plant.model import find_quantity, parse_model
 from plant.parameters import parse_toml
+from plant.plants import load_plant
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench, load_bench_from_files
 from rig.nodes.scenario import Scenario
@@ -30,7 +32,8 @@ from rig.sequences import Sequence, load_sequence
 from rig.sequences.faults import require_possible
 
 _REQUIRED_SETTINGS = {"seed", "bus", "pace", "controller", "plant", "max_overruns"}
-_EFFECT_FOLDER, _SEQUENCE_FOLDER, _BENCH_FOLDER = "effects/", "sequence/", "bench/"  # folders of the attachments
+# folders of the attachments
+_EFFECT_FOLDER, _SEQUENCE_FOLDER, _BENCH_FOLDER, _PLANT_FOLDER = "effects/", "sequence/", "bench/", "plant/"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +92,8 @@ class Job:
         found = {"model.toml": ("application/toml", self.model.to_toml().encode())}
         found |= {_SEQUENCE_FOLDER + name: ("text/plain", data) for name, data in self.sequence.bundle().items()}
         found |= {_EFFECT_FOLDER + path.name: ("text/x-python", path.read_bytes()) for path in self.effects}
+        own = self.model.kind
+        found |= {_PLANT_FOLDER + own.file.name: ("text/x-python", own.source)} if own.file else {}
         return found | {_BENCH_FOLDER + name: ("text/plain", data) for name, data in self.bench.files.items()}
 
     def list_settings(self) -> dict[str, object]:
@@ -136,19 +141,25 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
         raise InputError(path, "attachments", "the sequence and the model of a run; only logs of `rig run` have them")
     effect_codes = [ForeignCode(name, content) for name, content in attachments.items()
                     if name.startswith(_EFFECT_FOLDER)]
-    codes = [*effect_codes, *(ForeignCode(_SEQUENCE_FOLDER + name, content) for name, content in bundle.items()
-                              if name.endswith(".py"))]
+    plant_codes = [ForeignCode(name, content) for name, content in attachments.items()
+                   if name.startswith(_PLANT_FOLDER)]
+    codes = [*effect_codes, *plant_codes, *(ForeignCode(_SEQUENCE_FOLDER + name, content)
+                                            for name, content in bundle.items() if name.endswith(".py"))]
     for name in (*(code.name for code in codes), *(_SEQUENCE_FOLDER + name for name in bundle if name[-5:] == ".toml")):
         _require_file_name(path, name)
     settings = _read_settings(path, said)
     require_trust(path, codes, is_trusted=is_trusted, announce=announce)
-    effects = _load_effect_files(effect_codes)
     where = f"{path}: model.toml"
     try:
-        text = attachments["model.toml"].decode()
+        tables = parse_toml(attachments["model.toml"].decode(), where)
     except UnicodeDecodeError as error:
         raise InputError(path, "attachment model.toml", "text in UTF-8") from error
-    model = parse_model(parse_toml(text, where), where)
+    for code, file in zip(plant_codes, _store_code(plant_codes), strict=True):
+        load_plant(file, code.content, str(tables.get("plant")))
+    effects = _store_code(effect_codes)
+    for code, file in zip(effect_codes, effects, strict=True):
+        load_effects(file, code.content)
+    model = parse_model(tables, where)
     bench = _read_bench(attachments, said.get("bench", ""), is_trusted=is_trusted)
     require_bench_cycle(model, bench, where)
     return Job(sequence=Sequence.from_bundle(bundle, bench.rate), model=model, bench=bench, effects=effects, **settings)
@@ -200,8 +211,8 @@ def _read_settings(log: Path, said: Mapping[str, str]) -> dict[str, Any]:
             "max_overruns": share}
 
 
-def _load_effect_files(codes: list[ForeignCode]) -> tuple[Path, ...]:
-    """Write user effects to files and run them. The files outlive this process: nodes in other processes read them."""
+def _store_code(codes: list[ForeignCode]) -> tuple[Path, ...]:
+    """Write a user's code to files, which outlive this process: nodes in other processes read them."""
     from plant.compile import find_cache_folder, make_private_folder
 
     digest = hashlib.sha256(repr([(code.name, code.content) for code in codes]).encode()).hexdigest()
@@ -209,13 +220,12 @@ def _load_effect_files(codes: list[ForeignCode]) -> tuple[Path, ...]:
     for code in codes:
         try:
             folder = make_private_folder(find_cache_folder() / f"effects-{digest}")
-            file = folder / code.name.removeprefix(_EFFECT_FOLDER)
+            file = folder / code.name.partition("/")[2]
             if not file.is_file() or file.read_bytes() != code.content:
                 with write_whole(file) as part:
                     part.write_bytes(code.content)
         except OSError as error:
             raise InputError(code.name, "", f"room for its code in the cache folder ({error.strerror})") from error
-        load_effects(file, code.content)
         files.append(file)
     return tuple(files)
 
@@ -251,11 +261,12 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
         InputError: a sequence, model, effect or value that cannot be used.
     """
     require_different_names(choice.effects)
-    for file in choice.effects:
-        load_effects(file)
     bench = load_bench(choice.bench or "eha", is_trusted=is_trusted)
     sequence = load_sequence(choice.sequence, bench.rate) if built is None else built
     name = choice.model or sequence.model.name
+    load_plant_of_model(name, is_trusted=is_trusted, announce=announce)
+    for file in choice.effects:
+        load_effects(file)
     brought = load_effects_of_model(name, choice.effects, is_trusted=is_trusted, announce=announce)
     require_different_names((*choice.effects, *brought))
     model = load_model(name).replace(sequence.model.overrides, sequence.name).replace(choice.changes)

@@ -32,6 +32,8 @@ def name_schema(words: Sequence[str]) -> str:
         return "_".join(["bench", *kind]) + ".json"
     if command == "check" and "--bench" in words[1:2] and set(words[3:]) <= {"--json"}:
         return "check_bench.json"  # without a sequence
+    if command == "check" and words[1:2] and str(words[1]).endswith(".py"):
+        return "check_plant.json"
     for name, option in (("fdi", "--learn-bands"), ("trend", "--score")):
         if command == name and option in words:
             return f"{name}_{option.strip('-').replace('-', '_')}.json"

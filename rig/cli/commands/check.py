@@ -1,13 +1,15 @@
-"""`rig check`: a dry run of a sequence, against the limits of the actuator; the frames of a bench; a fault file."""
+"""`rig check`: a dry run of a sequence; the frames of a bench; a plant file over its nominal test; a fault file."""
 from __future__ import annotations
 
 import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from fdi.report.report import Section
+from fdi.report.report import Column, Line, Report, Section, Table
 from plant.errors import InputError
 from plant.faults import is_fault_file
+from plant.model import load_model
+from plant.plant_check import check_behaviour
 from rig.benches.bench_file import load_bench
 from rig.benches.bench_report import build_bench_report, collect_data, tabulate_frames
 from rig.benches.bus_load import list_loads
@@ -23,6 +25,8 @@ def run_command(args: argparse.Namespace) -> int:
     """Exit status 1 if a limit is violated."""
     if args.sequence is None:
         return check_bench(args)
+    if args.sequence.endswith(".py"):
+        return check_plant(args)
     if is_fault_file(Path(args.sequence)):
         found = list_faults(load_chosen_model(args), args.sequence)
         return give_answer(build_list_report("faults", "Measure them with rig fdi TRACE --faults FILE.", found), args)
@@ -39,6 +43,33 @@ def run_command(args: argparse.Namespace) -> int:
         report = replace(report, sections=[*report.sections, Section("Frames", [tabulate_frames(loads)])],
                          data={**report.data, "bench": collect_data(bench, loads)})
     return give_answer(report, args, int(bool(dry.problems)), places)
+
+
+def check_plant(args: argparse.Namespace) -> int:
+    """Exit status 1 if a plant file fails a check over its nominal test."""
+    model = load_model(args.sequence).replace(parse_changes(args.set))
+    kind = model.kind
+    if not kind.profile:
+        raise InputError(args.sequence, "profile", "segments of a nominal test, over which the plant is checked")
+    places, findings = choose_places(args, "", args.sequence), []
+    with show_progress(is_silent=args.json or args.quiet) as progress:
+        progress("compiling and simulating", 0.0)
+        for found in check_behaviour(model):
+            findings.append(found)
+            progress(found.check, len(findings) / (len(kind.effects) + 6))
+    failed = [f.check for f in findings if not f.passed]
+    verdict = "UNSOUND" if failed else "SOUND"
+    sentence = f"{kind.title or kind.name}: {len(kind.state._fields)} states, {len(kind.nominal)} parameters, " + (
+        f"{len(kind.effects)} own effects, {len(kind.faults)} faults")
+    lines = [Line(f.check, f.text, "good" if f.passed else "bad") for f in findings]
+    signals = Table([Column("signal"), Column("role"), Column("unit"), Column("content")],
+                    [[s.name, s.role, s.unit, s.quantity] for s in kind.signals])
+    report = Report("check", args.sequence, verdict, "bad" if failed else "good", sentence, sections=[
+        Section("Checks", lines), Section("Signals", [signals])], files=places.files,
+        next_command=f"rig simulate --model {args.sequence}",
+        data={"verdict": verdict, "file": args.sequence, "plant": kind.name,
+              "checks": [f._asdict() for f in findings]})
+    return give_answer(report, args, int(bool(failed)), places)
 
 
 def check_bench(args: argparse.Namespace) -> int:

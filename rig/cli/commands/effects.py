@@ -10,7 +10,7 @@ from fdi.report.numbers import format_digits
 from fdi.report.report import Cell, Column, Item, Line, Paragraph, Report, Section, Table
 from plant.effects import Effect
 from plant.model import find_effect, list_offered_effects, load_model
-from plant.plants import find_plant
+from plant.plants import find_plant, load_plant
 from plant.profile import build_profile
 from plant.selftest import Report as SelfTest
 from plant.selftest import check_effect
@@ -22,6 +22,8 @@ CONVENIENT = {"m": (1e6, "um"), "Pa": (1e-5, "bar")}  # units of a table
 
 def run_command(args: argparse.Namespace) -> int:
     """An effect of --effects, or any with --test, is also tested: exit status 1 if it fails."""
+    if args.model.endswith(".py"):
+        load_plant(Path(args.model))
     load_user_effects(args.effects)
     plant = load_model(args.model).plant
     chosen = [find_effect(args.name, plant)] if args.name else list_offered_effects(plant)

@@ -44,7 +44,7 @@ def learn_bands(args: argparse.Namespace) -> int:
     if not args.out or Path(args.out).suffix != ".toml":
         raise InputError("--out", str(args.out or ""), "FILE.toml, where the bands go")
     model = load_chosen_model(args)
-    com, _, name = load_command(args.command_file, model["controller.period"])
+    com, _, name = load_command(args.command_file, model["controller.period"], model.kind)
     with show_progress(is_silent=args.json or args.quiet) as progress:
         made = make_bands_file(args.learn_bands, args.out, model, com, name, args.seed, progress)
     return give_answer(build_bands_report(made), args)

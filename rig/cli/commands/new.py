@@ -5,6 +5,7 @@ import argparse
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from fdi.output import require_writable, write_text
 from fdi.report.report import Line, Report, Section
 from plant.errors import InputError
 from plant.faults import EXAMPLE, WORD
+from plant.plants import load_plant
 from rig.benches.bench import decode_device_text
 from rig.benches.bench_file import load_bench
 from rig.benches.guess import UNSURE, guess_can, guess_canopen
@@ -22,9 +24,10 @@ from rig.tables import read_file
 
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 also where the file is to be completed."""
-    path = Path(args.out or f"{args.name.removesuffix('.toml')}.toml")
-    if path.suffix != ".toml":
-        raise InputError("--out", str(path), "FILE.toml")
+    suffix = ".py" if args.kind == "plant" else ".toml"
+    path = Path(args.out or f"{args.name.removesuffix(suffix)}{suffix}")
+    if path.suffix != suffix:
+        raise InputError("--out", str(path), f"FILE{suffix}")
     if path.exists() and not args.force:
         raise InputError("--out", str(path), "a file that does not exist yet, or --force")
     require_writable(path, "--out")
@@ -47,6 +50,13 @@ def write_fault(path: Path, args: argparse.Namespace) -> str:
     if not WORD.fullmatch(path.stem):
         raise InputError("NAME", path.stem, "small letters, digits and _ : the name is also that of the first fault")
     return EXAMPLE.format(file=path, name=path.stem)
+
+
+def write_plant(path: Path, args: argparse.Namespace) -> str:
+    """The text of a plant file: a DC motor, to be changed."""
+    if args.eds or args.dbc or args.node:
+        raise InputError("rig new plant", "", "no device: --eds, --dbc and --node are of a bench")
+    return files("plant").joinpath("models", "new_plant.py").read_text(encoding="utf-8")
 
 
 def write_bench(path: Path, args: argparse.Namespace) -> str:
@@ -75,5 +85,6 @@ def build_new_report(path: Path, text: str, problem: str) -> Report:
 # what writes a file of a kind, what reads it, and the command that checks it
 KINDS: Mapping[str, tuple[Callable[[Path, argparse.Namespace], str], Callable[[str], Any], str]] = {
     "bench": (write_bench, load_bench, "rig check --bench {}"),
+    "plant": (write_plant, lambda path: load_plant(Path(path)), "rig check {}"),
     "fault": (write_fault, load_faults, "rig check {}"),
 }

@@ -12,8 +12,11 @@ from fdi.report.numbers import format_amount
 from fdi.report.report import Report
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
+from plant.plant_check import find_divergence
+from plant.plants import Plant
 from plant.profile import build_profile, read_command, resample_on_cycles
 from plant.segments import RATE, Array, Points
+from plant.signals import EHA
 from rig.cli.answer import give_answer
 from rig.cli.inputs import load_chosen_model
 
@@ -29,24 +32,29 @@ def run_command(args: argparse.Namespace) -> int:
         return write_samples(args)
     model = load_chosen_model(args)
     period = model["controller.period"]
-    com, load, name = load_command(args.command_file, period)
+    signals = model.kind.signals
+    com, load, name = load_command(args.command_file, period, model.kind)
     if args.steps == 0:
         raise InputError("--steps", "0", "at least 1 step a cycle")
     out = Path(args.out or "simulation.csv")
     if not out.name.endswith((".csv", ".csv.gz", ".mcap")):
         raise InputError("--out", str(out), "a file .csv, .csv.gz or .mcap")
     require_new(require_writable(out, "--out", source=args.command_file), is_forced=args.force)
-    columns = simulate(model, com, load, args.seed, args.steps)
-    trace = Trace.from_columns(columns._asdict(), period, {"model": model.name, "seed": str(args.seed),
-                                                           "command": name}, model.kind.signals)
+    columns = simulate(model, com, load, args.seed, args.steps)._asdict()
+    diverged = find_divergence(model, columns)
+    if diverged:
+        raise InputError(args.model or "--set", "", f"a plant that stays finite; {diverged} (rig simulate --steps "
+                                                    "takes shorter steps)")
+    trace = Trace.from_columns(columns, period, {"model": model.name, "seed": str(args.seed), "command": name,
+                                                 **({} if model.plant == "eha" else {"plant": model.plant})}, signals)
     if out.suffix == ".mcap":
         from rig.recorder.convert import write_mcap  # here: it loads python-can
 
         write_mcap(trace, out)
     else:
         trace.write_csv(out)
-    error = trace.command - trace.controlled
-    unit = model.kind.signals.controlled.unit
+    error = columns[signals.command.name] - columns[signals.controlled.name]
+    unit = signals.controlled.unit
     summary: dict[str, Any] = {"trace": str(out), "cycles": len(com), "seconds": len(com) * period,
                                "rms_error": float((error**2).mean() ** 0.5), "max_error": float(abs(error).max())}
     sentence = (f"{out}: {summary['cycles']} cycles, {summary['seconds']:g} s; following error "
@@ -63,7 +71,7 @@ def write_samples(args: argparse.Namespace) -> int:
         raise InputError("--out", str(folder), "a folder that exists")
     model = load_model().replace(SAMPLE_UNIT)
     period = model["controller.period"]
-    usual, load, _ = load_command(None, period)
+    usual, load, _ = load_command(None, period, model.kind)
     other = build_profile((Points(points=SAMPLE_POINTS),)).command
     runs = {"run.csv": usual, "run2.csv": usual, "held.csv": other}
     places = {name: require_new(folder / name, is_forced=args.force) for name in runs}
@@ -78,14 +86,19 @@ def write_samples(args: argparse.Namespace) -> int:
     return give_answer(Report("simulate", "samples", sentence=sentence, data=data), args)
 
 
-def load_command(file: str | None, period: float) -> tuple[Any, Any, str]:
-    """Demand, m, and load, N, of every cycle of `period` s, and their name; by default those of preflight.
+def load_command(file: str | None, period: float, kind: Plant) -> tuple[Any, Any, str]:
+    """Demand and load of every cycle of `period` s, and their name; by default the nominal test, of the EHA preflight.
 
     Raises:
-        InputError: a file that cannot be read.
+        InputError: a file that cannot be read, or none for a plant that declares no test.
     """
     if file is not None:
-        return (*read_command(file, period), file)
+        return (*read_command(file, period, kind.signals), file)
+    if kind.profile:
+        return build_profile(kind.profile, rate=1.0 / period).command, None, f"profile of {kind.name}"
+    if kind.signals.names != EHA.names:
+        raise InputError("--command", "", f"FILE with the columns t and {kind.signals.command.name}: {kind.name} "
+                                          "declares no profile")
     try:
         return (*sample_preflight(1.0 / period), "preflight")
     except InputError:  # its segments are not whole cycles of this period

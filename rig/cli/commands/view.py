@@ -113,7 +113,7 @@ def draw(args: argparse.Namespace, progress: Progress) -> Drawing:
     if not args.compare:
         return draw_run(Trace.read(args.trace, all=True))
     model, before = load_models(args)
-    trace, repeats = Trace.read(args.trace), [Trace.read(file) for file in args.repeat]
+    trace, *repeats = (Trace.read(file, signals=model.kind.signals) for file in (args.trace, *args.repeat))
 
     def replay(model: Model, word: str, part: int) -> Comparison:
         def show(stage: str, share: float) -> None:

@@ -1,0 +1,188 @@
+"""Checks of a plant: what its file declares, at each loading; and how it behaves over its nominal test, `rig check`."""
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from math import isfinite
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.errors import InputError, suggest_name
+from plant.faults import Fault
+from plant.quantity import Quantity, list_quantities
+from plant.segments import Segment
+
+if TYPE_CHECKING:
+    from plant.model import Model
+    from plant.plants import Plant
+
+MOST_STEP_ERROR = 0.01  # RMS change of an output with half the step, over its range in the nominal test
+MOST_FOLLOWING_ERROR = 0.5  # RMS, over the range of the command
+ARGUMENTS = {"step": (4, 5), "measure": (2,), "control": (4,), "coefficients": (2,), "sense": (4,), "moves": (3,)}
+
+
+def check_declaration(plant: Plant, where: object) -> None:
+    """Refuse a plant that is not declared completely; `where` is its file.
+
+    Raises:
+        InputError: the field of the declaration and what was expected there.
+    """
+    def require(is_right: bool, field: str, expected: str) -> None:
+        if not is_right:
+            raise InputError(where, field, expected)
+
+    for signal in plant.signals:
+        require(isinstance(signal.unit, str) and bool(signal.unit), f"signal {signal.name}", 'a unit, "1" for none')
+    _check_parameters(plant, require)
+    is_tuple = isinstance(plant.state, type) and hasattr(plant.state, "_fields")
+    require(is_tuple, "state", "a NamedTuple of floats, class State(NamedTuple)")
+    for name in plant.state._fields:
+        default = plant.state._field_defaults.get(name)
+        require(isinstance(default, float | int), f"State.{name}", "a number as default, the plant at rest")
+    for name, counts in ARGUMENTS.items():
+        function = getattr(plant, name)
+        if name == "moves" and not callable(function):
+            unknown = [f for f in function if f not in plant.state._fields]
+            require(not unknown, "moves", f"fields of the state ({', '.join(plant.state._fields)}), not {unknown[:1]}")
+        elif function is not None or name in ("step", "measure"):
+            require(callable(function) and len(inspect.signature(function).parameters) in counts, name,
+                    f"a function of {' or '.join(map(str, counts))} arguments")
+    known = {f"{group}.{name}" for group, cls in plant.parameters.items() for name in cls._fields}
+    for signal in plant.signals:
+        for use, name in (("noise", signal.noise), ("limit", signal.limit)):
+            require(not name or name in known, f"signal {signal.name}, {use}", f"a parameter, not {name!r}")
+    for e in plant.effects.values():
+        require(e.base or e.port in plant.ports, f"effect {e.name}",
+                f"one of the ports that the step has ({', '.join(plant.ports)}), not {e.port!r}")
+        require(e.base or e.name not in plant.parameters, f"effect {e.name}", "a name that no parameter group has")
+        require(set(e.fitted) <= (known if e.base else set(e.parameters)), f"effect {e.name}",
+                f"parameters that exist, not {', '.join(e.fitted)}")
+    known |= {name for e in plant.list_effects() for name in e.parameters}
+    for fault in plant.faults:
+        require(isinstance(fault, Fault), "faults", "values Fault(...)")
+        require(fault.parameter in known, f"fault {fault.name}, parameter",
+                f"a parameter of the plant or of an effect{suggest_name(fault.parameter, known)}")
+    require(all(isinstance(s, Segment) for s in plant.profile), "profile", "segments such as Step(to=1e-3, time=1.0)")
+    _check_readings(plant, require)
+
+
+def _check_parameters(plant: Plant, require: Callable[[bool, str, str], None]) -> None:
+    for group, cls in plant.parameters.items():
+        try:
+            quantities: Mapping[str, Any] = list_quantities(cls)
+        except (IndexError, TypeError, AttributeError, NameError) as error:
+            require(False, f"parameters, {group}",
+                    f'a NamedTuple whose fields are Annotated[float, Quantity("unit")] ({error})')
+        for name, q in quantities.items():
+            field = f"{group}.{name}"
+            require(isinstance(q, Quantity) and bool(q.unit), field, 'Quantity("unit"), "1" for none')
+            value = plant.values.get(field, cls._field_defaults.get(name))
+            if value is None and plant.file is None:
+                continue  # a shipped plant: what its model file leaves out is zero
+            require(isinstance(value, float | int), field, f"a nominal value as default, not {value!r}")
+            require(not q.refuses(float(value or 0.0)), field, f"{q.expected}, not {value:g}")
+    require("controller.period" in plant.nominal, "parameters",
+            "a group Controller with the field period, s, the cycle of the controller")
+
+
+def _check_readings(plant: Plant, require: Callable[[bool, str, str], None]) -> None:
+    """One call of `measure` and of `step`, in plain Python, on the plant at rest."""
+    from plant.model import build_bare_model, build_kernel
+    from plant.solve import step_cycle
+
+    names = [s.name for s in plant.signals.outputs]
+    model = build_bare_model(plant.key)
+    record = model.build_record()
+    if plant.file is None:
+        return
+    try:
+        y = plant.measure(plant.state(), record[0])
+        field, after = "step", build_kernel(step_cycle, (), False, plant.key)(
+            *plant.build_start(()), 0.0, 0.0, 0.0, 0.0, record, 1)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(*_find_place(error, plant), f"code that runs ({type(error).__name__}: {error})") from error
+    require(isinstance(y, tuple) and len(y) == len(names) and all(isinstance(x, float | int) for x in y), "measure",
+            f"a tuple of {len(names)} numbers, {', '.join(names)}, not {y!r}")
+    is_right = isinstance(after, tuple) and len(after) == 2 and isinstance(after[0], plant.state)
+    require(is_right, field, "the new State and the memories, return State(...), m")
+
+
+def _find_place(error: Exception, plant: Plant) -> tuple[str, str]:
+    """File with line, and the function, where the plant's own code went wrong."""
+    trace, place, function = error.__traceback__, str(plant.file), "step"
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == str(plant.file):
+            place, function = f"{plant.file}:{trace.tb_lineno}", trace.tb_frame.f_code.co_name
+        trace = trace.tb_next
+    return place, function
+
+
+# ---------------------------------------------------------------------------------------------------- behaviour
+
+
+class Finding(NamedTuple):
+    """The result of one check over the nominal test."""
+
+    check: str
+    passed: bool
+    text: str
+
+
+def find_divergence(model: Model, columns: Mapping[str, NDArray[np.float64]]) -> str:
+    """Which signal is not a finite number first, and when; empty if all are finite."""
+    for signal in model.kind.signals.columns:
+        bad = np.flatnonzero(~np.isfinite(columns[signal.name]))
+        if len(bad):
+            return f"{signal.name} is no finite number from t = {bad[0] * model['controller.period']:g} s on"
+    return ""
+
+
+def check_behaviour(model: Model) -> Iterator[Finding]:
+    """The checks of a plant over its nominal test, one after the other."""
+    from plant.profile import build_profile
+    from plant.run import simulate
+    from plant.selftest import check_effect
+
+    kind = model.kind
+    period = model["controller.period"]
+    command = build_profile(kind.profile, rate=round(1.0 / period)).command
+    quiet = model.replace({s.noise: 0.0 for s in kind.signals.outputs if s.noise})
+
+    def run(steps: int | None = None, rows: int = len(command), *, fast: bool = True) -> dict[str, Any]:
+        return simulate(quiet, command[:rows], steps=steps, fast=fast)._asdict()
+
+    once = run()
+    diverged = find_divergence(model, once)
+    yield Finding("finite", not diverged, diverged or f"{len(command) * period:g} s of the nominal test")
+    if diverged:
+        return
+    silent = [s.name for s in kind.signals.outputs if np.ptp(once[s.name]) == 0.0]
+    yield Finding("signals", not silent, f"{', '.join(silent)} never change" if silent else "every output changes")
+    few = min(len(command), 300)
+    compiled, plain = run(20, few), run(20, few, fast=False)
+    same = all(np.array_equal(compiled[name], plain[name]) for name in compiled)
+    yield Finding("compiled code", same, "the bits of plain Python" if same else "differs from plain Python")
+    finer = run(2 * model.steps)
+    errors = {s.name: rms(finer[s.name] - once[s.name]) / max(np.ptp(once[s.name]), 1e-300)
+              for s in kind.signals.outputs if s.name not in silent}
+    worst = max(errors, key=lambda name: errors[name], default="")
+    if worst:
+        yield Finding("step", errors[worst] < MOST_STEP_ERROR, f"half the step changes {worst} by "
+                      f"{100 * errors[worst]:.2g} % of its range (limit {100 * MOST_STEP_ERROR:g} %)")
+    error = rms(once[kind.signals.command.name] - once[kind.signals.controlled.name]) / max(np.ptp(command), 1e-300)
+    yield Finding("control", error < MOST_FOLLOWING_ERROR, f"following error {100 * error:.2g} % of the command's "
+                  f"range (limit {100 * MOST_FOLLOWING_ERROR:g} %)")
+    for name, e in kind.effects.items():
+        found = check_effect(name, command, plant=kind.key)
+        yield Finding(f"effect {name}", not found.faults, "; ".join(found.faults) or (
+            "a parameter of the plant" if e.base else "exact at its off value, finite, repeatable"))
+
+
+def rms(x: NDArray[np.float64]) -> float:
+    """Root mean square; infinite for what is not finite."""
+    value = float(np.sqrt(np.mean(x * x)))
+    return value if isfinite(value) else np.inf
