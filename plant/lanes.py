@@ -166,8 +166,8 @@ class Lanes:
             load: (n,) N, external force on the ram, positive against extension.
 
         Returns:
-            (m, n, columns): readings without noise and drive at each sample, in the order of the plant's signals. Of
-            the EHA XJ m, Cor A, P12 Pa, XS m.
+            (m, n, columns): readings without noise and drive at each sample, in the order of `Signals.columns`. Of the
+            EHA XJ m, Cor A, P12 Pa, XS m.
 
         Raises:
             InputError: shapes that do not fit.

@@ -91,9 +91,8 @@ class Signals(tuple[Signal, ...]):
 
     @property
     def loop(self) -> tuple[str, ...]:
-        """Names of the columns of a closed loop: controlled signal, drive, the other outputs."""
-        controlled, *others = (s.name for s in self.outputs)
-        return (controlled, self.drive.name, *others)
+        """Names of the columns of a closed loop."""
+        return tuple(s.name for s in self.columns)
 
     @property
     def command(self) -> Signal:
@@ -117,8 +116,8 @@ class Signals(tuple[Signal, ...]):
 
     @property
     def columns(self) -> tuple[Signal, ...]:
-        """What a simulated run computes: readings and drive, in the order of the recording's columns."""
-        return tuple(s for s in self if s.role in ("output", "drive"))
+        """What a closed loop computes: controlled signal, drive, the other outputs."""
+        return (self.controlled, self.drive, *self.outputs[1:])
 
     @property
     def controlled(self) -> Signal:

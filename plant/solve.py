@@ -73,7 +73,7 @@ def run_closed_loop(flat: Any, com: Any, load: Any, noise: Any, record: Any, ste
         noise: (n, outputs + 1) standard normal numbers.
         record: (1,) parameters of the model.
         steps: steps a cycle.
-        out: (n, columns), written: readings and drive in the order of the plant's signals.
+        out: (n, columns), written: readings and drive in the order of `Signals.columns`.
     """
     p = record[0]
     s, m = unpack_state(flat)

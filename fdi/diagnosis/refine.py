@@ -83,6 +83,7 @@ from fdi.thresholds import (
 from fdi.trace.trace import Floats, Trace
 from plant.effects import CATALOGUE
 from plant.model import Model, find_quantity, list_searched_effects
+from plant.starts import ensure_starts
 from plant.threads import R, T, map_in_threads
 
 SMALLEST_SHARE = 0.01  # of the healthy size, bound of a fit by logarithms
@@ -182,7 +183,7 @@ def list_suspects(model: Model, faults: Sequence[Fault]) -> list[Suspect]:
 
 
 def _make_suspect(s: Suspect, model: Model) -> Free:
-    own = next(u for u in list_effect_unknowns(CATALOGUE[s.effect], model) if u.name == s.parameter)
+    own = next(u for u in list_effect_unknowns(model.find_effect(s.effect), model) if u.name == s.parameter)
     if s.is_ratio:
         usual = get_positive(model, s.parameter)
         return LogFree(s.parameter, math.log(usual), s.spread, 1.0, math.log(0.05 * usual), math.log(100.0 * usual),
@@ -249,7 +250,7 @@ def _list_ladder(fault: Fault) -> list[float]:
 def _is_scaled(fault: Fault) -> bool:
     """Whether a size grows by factors: one of the plant itself of which a healthy unit has some, and no share."""
     return (fault.healthy > 0.0 and fault.range[0] >= 0.0 and ORIGINS.get(fault.parameter) != 1.0
-            and fault.parameter.partition(".")[0] not in CATALOGUE.list_all())
+            and fault.parameter.partition(".")[0] not in {**CATALOGUE.list_all(), **CATALOGUE.of_plants})
 
 
 def _pick_two(ladder: Sequence[float]) -> list[float]:
@@ -320,7 +321,7 @@ def make_problem(model: Model, trace: Trace, floor: Mapping[str, float] | None =
     """The model with faults and suspects ready in it, and the run to compare it with; `floor` RMS noise by signal, SI.
     """
     level = {name: floor[name] if floor else model[trace.declared.find(name).noise] for name in trace.outputs}
-    own = [s.effect for s in list_suspects(model, faults) if not CATALOGUE[s.effect].base]
+    own = [s.effect for s in list_suspects(model, faults) if not model.find_effect(s.effect).base]
     own += [name.partition(".")[0] for fault in faults for name in fault.parameters]
     ready = silence_readings(model).with_effects(own)
     noise = tuple(noises.white_noise(level[name]) for name in trace.outputs)
@@ -642,6 +643,8 @@ def find_effects_beside(model: Model, trace: Trace, alone: Refinement, floor: Ma
     marks, floor = _read_marks(model, whole or trace, floor)
     faults = alone.faults
     problem = make_joint_problem(model, trace, floor, workers, faults)
+    for name in (e.name for e in list_searched_effects(model.plant) if e.fitted and e.port not in UNREPLAYED):
+        ensure_starts(name, trace.command, trace.load, model.plant)  # where the file of a user's plant gives none
     search = JointSearch(problem, list_other_effects(model, faults), progress)
     fits = search.find_explanations(alone.fit)
     explanations = [_explain(effects, fit, search.problem, whole) for effects, fit in fits]
@@ -745,7 +748,7 @@ class JointSearch:
     def add_effects(self, parent: Named, count: int, is_enough: bool) -> list[Named]:
         """The parent with one more effect each: the promising ones fitted; `is_enough`: the faults leave noise only."""
         present, fit = parent
-        effects = [e for e in self.effects if e not in present and not _excludes(e, present)]
+        effects = [e for e in self.effects if e not in present and not _excludes(self.problem.model, e, present)]
         prospects = [self.scan(fit, effects, fit.cost)]
         if count == 1:
             # The forecast from a start that nobody has fitted is poor beside a finished fit. Where that fit leaves more
@@ -861,7 +864,7 @@ class JointSearch:
     def _leave_out(self, named: Named, effect: str) -> Named:
         """The fit without one of its effects: the search may have needed it only to leave a local minimum."""
         effects, fit = named
-        dropped = set(CATALOGUE[effect].fitted)
+        dropped = set(self.problem.model.find_effect(effect).fitted)
         kept = [k for k, f in enumerate(fit.free) if f.name not in dropped]
         begun = start_fit([fit.free[k] for k in kept], fit.x[kept])
         return tuple(e for e in effects if e != effect), self.descend(begun, ((3.0, 4), (1.0, 8)))
@@ -901,7 +904,8 @@ class JointSearch:
 
     def _name_added(self, fit: Fit, present: Sequence[str]) -> str:
         names = {f.name for f in fit.free}
-        return next(e for e in self.effects if e not in present and set(CATALOGUE[e].fitted) & names)
+        return next(e for e in self.effects if e not in present
+                    and set(self.problem.model.find_effect(e).fitted) & names)
 
 
 def _get_cost(each: Named) -> float:
@@ -912,8 +916,9 @@ def _describe(effects: Sequence[str]) -> str:
     return " and ".join(effects) or "the faults alone"
 
 
-def _excludes(effect: str, present: Sequence[str]) -> bool:
-    return any(effect in CATALOGUE[e].excludes or e in CATALOGUE[effect].excludes for e in present)
+def _excludes(model: Model, effect: str, present: Sequence[str]) -> bool:
+    own = model.find_effect(effect)
+    return any(effect in model.find_effect(e).excludes or e in own.excludes for e in present)
 
 
 def _takes_fair_share(before: Fit, after: Fit) -> bool:

@@ -118,7 +118,7 @@ def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: 
     for name in [e.name for e in list_searched_effects(runs.model.plant)] if effects is None else effects:
         if not runs.model.find_effect(name).starts and runs.model.find_effect(name).fitted:
             progress(f"looking for sizes of {name}", 0.0)
-            ensure_starts(name, runs.est.command, runs.est.load)
+            ensure_starts(name, runs.est.command, runs.est.load, runs.model.plant)
     if effects is None:
         whole_model = complete_model(runs.model)
         with report_law_errors(whole_model):

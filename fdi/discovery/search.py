@@ -697,6 +697,8 @@ def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> S
     """Directions of the effects' starts at the fit, in whitened residuals, the fit's unknowns projected out."""
     starts = [(e.name, s) for e in map(problem.model.find_effect, effects) for s in e.starts
               if e.port not in ("command", "reading")]
+    if not starts:
+        return Sensitivity((), np.empty((0, 0)))
     names = list(dict.fromkeys([*fit.values, *(n for _, s in starts for n in s)]))
     held = [fit.values.get(n, problem.model.values[n]) for n in names]
     rows = np.array([held, *([s.get(n, v) for n, v in zip(names, held, strict=True)] for _, s in starts)])

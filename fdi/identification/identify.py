@@ -124,7 +124,8 @@ def read_free_parameters(model: Model, source: str | Path | None) -> tuple[Range
             table, and no parameter with a tolerance.
     """
     path = find_shipped_model(str(source)) or Path(str(source))
-    named = read_toml(path).get("identify") if source is not None and path.is_file() else None
+    is_model_file = source is not None and path.suffix == ".toml" and path.is_file()
+    named = read_toml(path).get("identify") if is_model_file else None
     if named is not None:
         return parse_free_parameters(named, model, source)
     usual = Path(str(files("plant").joinpath("models", "nominal.toml")))

@@ -78,7 +78,7 @@ from fdi.thresholds import BAND_NEAREST_LIMIT_SD
 from fdi.trace.sections import Section as CommandSection
 from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace
-from plant.model import find_quantity, list_offered_effects
+from plant.model import Model, find_quantity, list_offered_effects
 
 LEVEL_NAMES = {Level.ACCEPTABLE: "acceptable", Level.MAINTENANCE: "maintenance", Level.NON_NOMINAL: "non-nominal",
                None: "cannot be judged"}
@@ -365,7 +365,7 @@ def _show_effects(d: Diagnosis) -> list[Item]:
     for e in b.explanations:
         levels = [(f, e.levels[f.name] if d.refinement.is_explained else None) for f in d.faults]
         rows.append([
-            name_explanation(e), f"{100 * e.weight:.0f}", _format_parameters(e.parameters) or NO_NUMBER,
+            name_explanation(e), f"{100 * e.weight:.0f}", _format_parameters(e.parameters, d.model) or NO_NUMBER,
             *(cell for f, level in levels for cell in (
                 format_size(f, e.sizes[f.name]), Cell(LEVEL_NAMES[level], LEVEL_MOODS[level]))),
             format_ratio(max(e.refinement.ratio.values()))])
@@ -374,13 +374,15 @@ def _show_effects(d: Diagnosis) -> list[Item]:
     if not b.is_explained:
         caption = "The best that the search found; it leaves more than noise, so no level follows from it."
     return [Table(columns, rows, caption),
-            *(Line(effect, f"{_format_parameters(own)}, read off without noise") for effect, own in b.marks.items()),
+            *(Line(effect, f"{_format_parameters(own, d.model)}, read off without noise")
+              for effect, own in b.marks.items()),
             *(Paragraph(f"The level of {fault.title} depends on which of these is right: cannot be judged.")
               for fault in d.faults if fault.name in b.disputed)]
 
 
-def _format_parameters(sizes: Mapping[str, Any]) -> str:
-    return "; ".join(f"{name} {format_interval(size.value, size.low, size.high, find_quantity(name).unit)}"
+def _format_parameters(sizes: Mapping[str, Any], model: Model) -> str:
+    units = {name: find_quantity(name, plant=model.plant).unit for name in sizes}
+    return "; ".join(f"{name} {format_interval(size.value, size.low, size.high, units[name])}"
                      for name, size in sizes.items())
 
 
@@ -526,7 +528,7 @@ def _collect_beside(d: Diagnosis) -> dict[str, Any]:
         "marks": {effect: {name: e._asdict() for name, e in own.items()} for effect, own in b.marks.items()},
         "explanations": [
             {"effects": list(e.effects), "probability": e.weight,
-             "parameters": {name: {**v._asdict(), "unit": find_quantity(name).unit}
+             "parameters": {name: {**v._asdict(), "unit": find_quantity(name, plant=d.model.plant).unit}
                             for name, v in e.parameters.items()},
              **{f.key: e.sizes[f.name]._asdict() for f in d.faults},
              "level": {name: level.word if level is not None and e.refinement.is_explained else None

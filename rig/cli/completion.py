@@ -46,12 +46,12 @@ def complete_parameter(prefix: str, **_: Any) -> Iterable[str]:
 
 
 def complete_model(prefix: str, **_: Any) -> Iterable[str]:
-    """Shipped models and model files."""
+    """Shipped models, model files and plant files."""
     from plant.model import SHIPPED_MODELS
     from plant.plants import list_plants
 
     shipped = (*list_plants(), *SHIPPED_MODELS)
-    return [name for name in shipped if name.startswith(prefix)] + _list_files(prefix, (".toml",))
+    return [name for name in shipped if name.startswith(prefix)] + _list_files(prefix, (".toml", ".py"))
 
 
 def complete_sequence(prefix: str, **_: Any) -> Iterable[str]:

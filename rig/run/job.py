@@ -290,11 +290,12 @@ class Differences(NamedTuple):
     effects: tuple[str, ...]  # of the model
     effect_files: tuple[str, ...]  # the user's own
     faults: tuple[str, ...]  # of the sequence, with their times
+    plant: str = "eha"  # whose parameters they are
 
     def describe(self) -> str:
         """All differences in one line; "nothing" if there are none."""
         parts = [f"model {self.model}"] if self.model else []
-        parts += [_describe_parameter(name, value) for name, value in self.parameters.items()]
+        parts += [_describe_parameter(name, value, self.plant) for name, value in self.parameters.items()]
         parts += [f"effect {name}" for name in self.effects if not any(key.startswith(f"{name}.")
                                                                        for key in self.parameters)]
         parts += [f"effects of {name}" for name in self.effect_files]
@@ -303,7 +304,7 @@ class Differences(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """The entry `differences` of verdict.json."""
-        return {**self._asdict(), "text": self.describe()}
+        return {**{key: value for key, value in self._asdict().items() if key != "plant"}, "text": self.describe()}
 
 
 def find_differences(job: Job) -> Differences:
@@ -313,11 +314,11 @@ def find_differences(job: Job) -> Differences:
                    for fault in job.sequence.faults)
     return Differences(model="" if model.name == "eha" else model.name, parameters=model.list_changes(),
                        effects=tuple(model.effects), effect_files=tuple(path.name for path in job.effects),
-                       faults=faults)
+                       faults=faults, plant=model.plant)
 
 
-def _describe_parameter(name: str, value: float) -> str:
-    quantity = find_quantity(name)
+def _describe_parameter(name: str, value: float, plant: str) -> str:
+    quantity = find_quantity(name, plant=plant)
     word = next((word for word, number in quantity.words.items() if number == value), None)
     unit = "" if quantity.unit == "1" else f" {quantity.unit}"
     return f"{name} = {word}" if word else f"{name} = {value:g}{unit}"

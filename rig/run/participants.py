@@ -12,7 +12,6 @@ from functools import partial
 from typing import NamedTuple
 
 from plant import InputError, Model
-from plant.effects import CATALOGUE
 from rig.benches.frame_map import Role
 from rig.network.bus import open_can
 from rig.network.clock import VirtualClock, WallClock
@@ -129,7 +128,7 @@ def require_firmware_bus(bus: str) -> None:
 
 def find_firmware_parameters(model: Model) -> dict[str, float]:
     """The parameters of the effects at work in a model's firmware."""
-    acting = [CATALOGUE[name] for name in model.effects if CATALOGUE[name].firmware]
+    acting = [e for e in map(model.find_effect, model.effects) if e.firmware]
     return {name: model[name] for effect in acting if effect.is_active(model.values) for name in effect.parameters}
 
 

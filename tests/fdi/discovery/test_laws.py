@@ -120,7 +120,7 @@ def test_a_written_law_is_what_the_library_replayed(place: str, tmp_path: Path) 
 
         def run(model: Model) -> list[object]:
             record, out = model.build_record()[0], []
-            law, memory = combine_laws(CATALOGUE[model.effects[0]].port, model.effects)
+            law, memory = combine_laws(CATALOGUE[model.effects[0]].port, map(model.find_effect, model.effects))
             for k in range(300):
                 s = State(spool_position=states["spool"][k], spool_speed=states["spool_speed"][k],
                           jack_position=states["position"][k], jack_speed=states["speed"][k],
