@@ -125,7 +125,7 @@ def test_a_written_law_is_what_the_library_replayed(place: str, tmp_path: Path) 
                 s = State(spool_position=states["spool"][k], spool_speed=states["spool_speed"][k],
                           jack_position=states["position"][k], jack_speed=states["speed"][k],
                           pressure=states["pressure"][k])
-                x, memory = law(signal, memory, s, Input(current=states["current"][k], t=1e-3 * k, h=1e-3), record)
+                x, memory = law(signal, memory, s, Input(drive=states["current"][k], t=1e-3 * k, h=1e-3), record)
                 out.append(x)
             return out
 
