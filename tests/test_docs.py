@@ -47,7 +47,7 @@ def documented_keys() -> Iterator[tuple[str, str]]:
             yield kind, kind
             yield from ((kind, f.name) for f in fields(cls) if f.metadata.get("key", True))
     yield from (("sequence", f.name) for f in fields(Sequence) if f.metadata.get("key", True))
-    yield from (("guard", f.name) for f in fields(Guard))
+    yield from (("guard", f.name) for f in fields(Guard) if f.metadata.get("key", True))
     yield from (("step", f.name) for f in fields(Step) if f.metadata.get("key", True))
 
 

@@ -72,7 +72,8 @@ def test_the_first_steps_are_commands_that_exist() -> None:
 
 @pytest.mark.parametrize(("kind", "begin", "names"), [
     ("parameter", "filter.c", ["filter.clogging="]), ("effect", "null_b", ["null_bias"]),
-    ("model", "", ["eha", "ehs", "ema", "servo", "emps", "own.py", "own.toml", "ownfolder/"]), ("sequence", "pre", ["preflight"]),
+    ("model", "", ["eha", "ehs", "ema", "servo", "emps", "own.py", "own.toml", "ownfolder/"]),
+    ("sequence", "pre", ["preflight"]),
     ("sequence", "own", ["own.toml", "ownfolder/"])])
 def test_names_that_options_take(kind: str, begin: str, names: list[str], tmp_path: Path,
                                  monkeypatch: pytest.MonkeyPatch) -> None:
