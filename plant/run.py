@@ -1,11 +1,13 @@
 """Runs a model: one cycle at a time (`Actuator`), or over a whole command (`simulate`)."""
 from __future__ import annotations
 
+import re
 import traceback
 from collections import namedtuple
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache, partial
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -128,10 +130,27 @@ def report_law_errors(model: Model) -> Iterator[None]:
     except Exception as error:
         if not model.effects and model.kind.file is None:
             raise
+        told = find_compile_error(error)
+        if told is not None:
+            raise told from error
         where, cause = _find_law_error(model) or (model.kind.file or "effects", error)
         said = next((line.strip() for line in reversed(str(cause).splitlines()) if line.strip()), "")
         raise InputError(where, ", ".join(model.effects),
                          f"laws that can be compiled and run ({type(cause).__name__}: {said})") from error
+
+
+def find_compile_error(error: Exception) -> InputError | None:
+    """The line of a user's file that numba cannot compile, as bad input; None if the error is not of that kind."""
+    if type(error).__module__.partition(".")[0] != "numba":
+        return None
+    text, own = str(error), str(Path(__file__).parents[1])
+    places = [(file, line) for file, line in re.findall(r"at (/.+?) \((\d+)\)", text)
+              if not file.startswith(own) and "site-packages" not in file]
+    if not places:
+        return None
+    said = next((line.strip() for line in text.splitlines()
+                 if line.strip() and not line.startswith(("Failed in", "During"))), "")
+    return InputError(f"{places[0][0]}:{places[0][1]}", "", f"Python that can be compiled ({said})")
 
 
 def _find_law_error(model: Model) -> tuple[str, Exception] | None:

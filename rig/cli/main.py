@@ -142,6 +142,11 @@ def run_command_line(words: Sequence[str]) -> int:
             return _report_error(name, f"no space left for the output or the results ({error.strerror})", 2)
         from traceback import print_exc
 
+        from plant.run import find_compile_error
+
+        told = find_compile_error(error)  # a function of a user's plant file is compiled where it is first needed
+        if told is not None:
+            return _report_error(name, str(told), told.status)
         print_exc()  # an internal error; Python's own exit status 1 would read as a failed check
         return INTERNAL
 
