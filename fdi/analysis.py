@@ -224,15 +224,13 @@ class DiagnosisResult(Result):
     diagnosis: Diagnosis = field(repr=False)
 
 
-def read_trace(path: str | Path, plant: str = "eha") -> Trace:
-    """Read a trace: trace.mcap, the folder of a run, or a CSV in SI units with the signals of the plant as columns.
-
-    Of the EHA they are t,com,xj,cor[,p12,xs,load].
+def read_trace(path: str | Path, model: ModelOrPath = "eha", *, trust: bool = False) -> Trace:
+    """Read a trace: trace.mcap, the folder of a run, or a CSV with t and the signals of the model's plant in SI units.
 
     Raises:
         InputError: a file that cannot be read, naming its line or field.
     """
-    return Trace.read(path, signals=load_model(plant).kind.signals)
+    return Trace.read(path, signals=_load_model(model, trust).kind.signals)
 
 
 def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence[TraceOrPath] = (),

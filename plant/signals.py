@@ -90,11 +90,6 @@ class Signals(tuple[Signal, ...]):
         return tuple(name for name in self.names if name in needed)
 
     @property
-    def loop(self) -> tuple[str, ...]:
-        """Names of the columns of a closed loop."""
-        return tuple(s.name for s in self.columns)
-
-    @property
     def command(self) -> Signal:
         """What the controller is asked for."""
         return next(s for s in self if s.role == "command")

@@ -324,7 +324,8 @@ def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tu
     lanes = Lanes(problem.model, names, problem.steps, 1)
     out = lanes.closed_loop(np.array([[h.fit.values[n] for n in names]]), com, load)[0]
     d = problem.trace.declared
-    columns = {d.command.name: com, **dict(zip(d.loop, out.T, strict=True))} | ({d.load.name: load} if d.load else {})
+    columns = {d.command.name: com, **{s.name: x for s, x in zip(d.columns, out.T, strict=True)}}
+    columns |= {d.load.name: load} if d.load else {}
     return hold_inputs(Trace.from_columns(columns, period, {}, d), signals)
 
 

@@ -232,11 +232,11 @@ def _read_marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -
         port = model.find_effect(name).port
         if port not in UNREPLAYED:
             continue
-        marks = find_marks(model, traces)
+        marks, drive = find_marks(model, traces), model.kind.signals.drive.symbol
         prints = [p for p in (*marks.prints, *marks.rivals) if p.effect == name]
         if not prints:
             where = "steps in the measured positions" if port == "reading" else \
-                "a difference between Cor and the model's firmware that it explains"
+                f"a difference between {drive} and the model's firmware that it explains"
             raise InputError("effect", name, f"{where}; this trace has none")
         found |= prints[0].parameters
     return found

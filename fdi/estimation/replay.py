@@ -234,7 +234,7 @@ def replay_command(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> Col
     lanes = Lanes(silence_sensors(model), (), steps)
     out = lanes.closed_loop(np.empty((1, 0)), command, load)[0]
     drive = trace.declared.drive.name
-    place = trace.declared.loop.index(drive)
+    place = trace.declared.columns.index(trace.declared.drive)
     shown = trace.pass_sensors(np.delete(out, place, axis=-1))[before:]
     whole = {name: shown[:, i] for i, name in enumerate(trace.output_names)} | {drive: out[before:, place]}
     return {name: trace.mask_unusable(name) - whole[name] for name in (*trace.outputs, drive)}

@@ -431,7 +431,8 @@ def _simulate(model: Model, com: Floats, load: Floats, outputs: Sequence[str]) -
     """The closed loop on a command, as a recording without noise."""
     out = Lanes(silence_readings(model), (), STEPS).closed_loop(np.empty((1, 0)), com, load)[0]
     d = model.kind.signals
-    columns = {d.command.name: com, **dict(zip(d.loop, out.T, strict=True))} | ({d.load.name: load} if d.load else {})
+    columns = {d.command.name: com, **{s.name: x for s, x in zip(d.columns, out.T, strict=True)}}
+    columns |= {d.load.name: load} if d.load else {}
     return hold_inputs(Trace.from_columns(columns, model["controller.period"], {}, d), tuple(outputs))
 
 

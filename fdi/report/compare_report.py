@@ -73,16 +73,17 @@ def build_comparison_report(c: Comparison, next_command: str = "", files: Sequen
         Section("Blocks", [_tabulate_blocks(c)]),
         Section("Findings", describe_findings(c)),
         Section("Measured and replayed", [Figure(
-            "Each signal as measured and as replayed from the measured current, and its residual (measured minus "
-            "model) below. Green: two noise floors on either side; noise stays within for 95 % of the time. Shaded: "
-            "ramps (blue) and dynamic sections (violet) of the command. Red: not judged.", partial(draw_overview, c))]),
+            f"Each signal as measured and as replayed from the measured {t.declared.drive.called}, and its residual "
+            "(measured minus model) below. Green: two noise floors on either side; noise stays within for 95 % of the "
+            "time. Shaded: ramps (blue) and dynamic sections (violet) of the command. Red: not judged.",
+            partial(draw_overview, c))]),
         Section("Where", [_tabulate_places(c), Figure(
             "Share of each section in the squared error. The longest bar shows where to look first.",
             partial(draw_error_shares, c))] if c.where else [], medium=Medium.PAGE),
         Section("By speed and amplitude", [Figure(
-            "Error over noise floor by speed of the ram (over 20 rows) and by amplitude (half its range within 0.25 s "
-            "before and after). 1 is noise; dark cells show at which motion the model fails. Empty: fewer than 30 "
-            "rows.", partial(draw_deviation_map, c))]),
+            f"Error over noise floor by speed of the {t.declared.controlled.called} (over 20 rows) and by amplitude "
+            "(half its range within 0.25 s before and after). 1 is noise; dark cells show at which motion the model "
+            "fails. Empty: fewer than 30 rows.", partial(draw_deviation_map, c))]),
         Section("Is the residual noise", [Figure(
             "From the left: autocorrelation, cumulative periodogram, correlation with an input. Noise stays within "
             "green: the 99 % band of the correlations and Bartlett's 95 % band of the periodogram. Where a repeat "
@@ -151,7 +152,8 @@ def _tabulate_signals(c: Comparison) -> Table:
         (Column("error from the command alone", align="right"), lambda s: format_signal(s.closed_loop_error, s.signal)),
         (Column("solver error", align="right", medium=page),
          lambda s: Cell(format_signal(s.solver_error, s.signal), "muted")),
-        caption="Error: RMS of the residual (measured minus model) with the measured current as input. Noise floor: "
+        caption="Error: RMS of the residual (measured minus model) with the measured "
+                f"{c.trace.declared.drive.called} as input. Noise floor: "
                 "RMS that noise alone leaves. A perfect model has ratio 1.")
 
 

@@ -55,6 +55,7 @@ from fdi.report.report import (
     write_html,
 )
 from fdi.trace.trace import Check, Event, Floats, Trace
+from plant.signals import EHA, Signals
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",
                           "NOT_JUDGED": "doubtful"}
@@ -64,13 +65,13 @@ KINDS_OF_TIMING = {"hard real time": "the rig's cycle ran as compiled code",
                    "soft real time": "the rig's cycle ran in Python, on a bus that compiled code cannot use"}
 
 
-def write_run_page(source: str | Path, out: str | Path) -> None:
-    """Read a trace (see Trace.read) and write its report as one HTML file.
+def write_run_page(source: str | Path, out: str | Path, signals: Signals = EHA) -> None:
+    """Read a trace (see Trace.read) and write its report as one HTML file; `signals` are those of a CSV.
 
     Raises:
         InputError: a trace that cannot be read, or a file that cannot be written.
     """
-    trace = Trace.read(source, all=True)
+    trace = Trace.read(source, all=True, signals=signals)
     write_html(build_run_report(trace), require_writable(out, "--out", source=source))
 
 

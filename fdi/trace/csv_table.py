@@ -30,10 +30,11 @@ class CsvColumns(NamedTuple):
     columns: dict[str, Floats]  # the known ones, shape (rows,), NaN where a field is empty
     notes: tuple[str, ...]  # what a reader should know: columns left out, fields that say "nan"
     plant: Plant | None  # whose rig wrote the file in its own columns; None for a trace of this software
+    signals: Signals  # that the columns are
 
 
 def read_csv(path: Path, signals: Signals) -> CsvColumns:
-    """Read a CSV of t and these signals, or of a plant's own rig, told by the names in its header.
+    """Read a CSV of t and these signals, or of those of another plant, or of a plant's own rig: the header tells.
 
     Raises InputError naming the line for anything but numbers, and for t that does not grow.
     """
@@ -47,11 +48,14 @@ def read_csv(path: Path, signals: Signals) -> CsvColumns:
             plant, table = found
             rows = csv.reader(chain([header], stream), delimiter=table.separator)
             sources, notes = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
-            return CsvColumns(combine_columns(sources, table), notes, plant)
+            return CsvColumns(combine_columns(sources, table), notes, plant, plant.signals)
         rows = csv.reader(chain([header], stream))
+        names = {name.strip() for name in next(csv.reader([header]), [])}
+        known = (signals, *(find_plant(name).signals for name in list_plants() if not {*signals.required} <= names))
+        signals = next((s for s in known if {*s.required} <= names), signals)
         required = ("t", *signals.required)
         optional = tuple(name for name in signals.names if name not in required)
-        return CsvColumns(*_parse_rows(path, rows, required, optional), None)
+        return CsvColumns(*_parse_rows(path, rows, required, optional), None, signals)
 
 
 def find_own_table(list_names: Callable[[str], Collection[str]]) -> tuple[Plant, Table] | None:

@@ -334,8 +334,8 @@ def list_units(signals: Signals) -> dict[str, str]:
 
 
 def _from_csv(path: Path, signals: Signals) -> Trace:
-    columns, notes, plant = read_csv(path, signals)
-    return make_table_trace(path, columns, plant.signals if plant else signals, notes, plant.name if plant else "")
+    columns, notes, plant, signals = read_csv(path, signals)
+    return make_table_trace(path, columns, signals, notes, plant.name if plant else "")
 
 
 def make_table_trace(path: Path, columns: dict[str, Floats], signals: Signals, notes: tuple[str, ...] = (),

@@ -280,8 +280,8 @@ def record_unit(com: Floats, seed: int) -> Trace:
              for x, name in zip(noise, ("position", "pressure", "spool"), strict=True)]
     run = Lanes(model, list(sizes), 100).closed_loop(values, com - noise[0], np.zeros(len(com)))[0].T
     columns = {EHA.command.name: com, "load": np.zeros(len(com))}
-    for name, x, shown, digits in zip(EHA.loop, run, (noise[0], 0.0, *noise[1:]), (7, 8, 0, 8), strict=True):
-        columns[name] = np.round(x + shown, digits)
+    for column, x, shown, digits in zip(EHA.columns, run, (noise[0], 0.0, *noise[1:]), (7, 8, 0, 8), strict=True):
+        columns[column.name] = np.round(x + shown, digits)
     return Trace.from_columns(columns, 1e-3, {})
 
 

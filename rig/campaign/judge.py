@@ -365,7 +365,7 @@ def judge_case(case: Case, spec: Mapping[str, Any], expected_sources: str) -> Ro
         raise RigError(f"the code on {platform.node()} differs from the code of the campaign: install the same version")
     clock, row, model = WallClock(), describe_case(case, spec), _parse_healthy_model(spec)
     try:
-        trace = Trace.read(case.trace) if case.trace else simulate_case(case, spec, model)
+        trace = Trace.read(case.trace, signals=model.kind.signals) if case.trace else simulate_case(case, spec, model)
         start = clock.now()
         row |= {"status": OK, **_judge_trace(spec, trace, model), "seconds": (clock.now() - start) * 1e-9}
     except RigError as error:

@@ -268,7 +268,7 @@ COMMANDS = {
     "report": Command(
         "write one HTML file about a trace; it needs no network",
         "The page goes to --out (default: report.html beside the trace).",
-        (option("trace", metavar="TRACE", help=ANY_TRACE),)),
+        (option("trace", metavar="TRACE", help=ANY_TRACE), *PLANT[:1], TRUST)),
     "run": Command(
         "run a test sequence on the bench: log, checks, verdict",
         "Results go to the folder --out (default: a new one in runs/). Exit status 0 if no check failed.",
@@ -337,7 +337,7 @@ COMMANDS = {
          option("--compare", action="store_true",
                 help="the trace beside the model's replay, with residual and noise floor, as rig compare does; if "
                      "--model or --set adds effects or values, before and after that"),
-         Group("with --compare", (*PLANT, SEED_IF_GIVEN, REPEAT, SIGNALS)),
+         Group("with --compare; --model alone says whose signals a CSV has", (*PLANT, SEED_IF_GIVEN, REPEAT, SIGNALS)),
          option("--save", metavar="FILE.rrd", help="write the recording of the viewer and do not open it"),
          option("--theme", choices=("light", "dark"),
                 help="show it in a web browser in this theme until Ctrl-C (the viewer's window has a setting for it)"),

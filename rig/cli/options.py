@@ -61,7 +61,7 @@ OF_EVERY_COMMAND = (
     option("--out", metavar="PATH", help="where to write the result"),
     option("--quiet", action="store_true", help="print nothing but errors"))
 ANY_TRACE = "trace.mcap, the folder of a run, or a CSV"
-MEASURED_TRACE = f"{ANY_TRACE} with t,com,xj,cor[,p12,xs,load]"
+MEASURED_TRACE = f"{ANY_TRACE} with t and the signals of the plant (rig list signals)"
 TRUST = option("--trust", action="store_true",
                help="run the code that a log, model or bench file brings along; it is listed first, with its hash")
 PLANT = (
@@ -77,7 +77,8 @@ SEED_IF_GIVEN = option("--seed", **{**SEED.settings, "default": None})  # so tha
 MODEL = (*PLANT, SEED)
 REPEAT = option("--repeat", action="append", default=[], metavar="TRACE",
                 help="another run of the same command: measures the noise floor (repeatable)")
-SIGNALS = option("--signals", metavar="xj,p12,xs", help="signals to use (default: all that the trace has)")
+SIGNALS = option("--signals", metavar="NAME,..", help="outputs of the plant to use, such as xj,p12,xs (default: all "
+                                                    "that the trace has)")
 RUNS = (REPEAT, option("--holdout", metavar="TRACE", help="a run of another command that no fit sees: reveals "
                                                           "overfitting"), SIGNALS)
 FAULTS = option("--faults", metavar="FILE|NAME",

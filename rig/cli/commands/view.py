@@ -17,10 +17,11 @@ from fdi.report.report import Report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
+from plant.signals import EHA
 from rig.cli.answer import give_answer
 from rig.cli.commands.diff import read_and_compare_runs
 from rig.cli.discovery_inputs import load_known_model
-from rig.cli.inputs import list_signals
+from rig.cli.inputs import list_signals, load_chosen_model
 from rig.cli.interruption import catch_signals
 from rig.cli.progress_bar import show_progress
 from rig.view import viewer
@@ -76,7 +77,7 @@ def require_options_that_fit(args: argparse.Namespace) -> None:
         raise InputError("--theme", args.theme, "no --screenshot, --save or --out with it: they open no browser")
     if args.compare and args.others:
         raise InputError("--compare", args.others[0], "one trace; rig view A B holds traces against each other")
-    for option in ("model", "set", "effects", "trust", "seed", "repeat", "signals"):
+    for option in ("set", "effects", "seed", "repeat", "signals"):
         given = getattr(args, option)
         if given not in (None, []) and given is not False and not args.compare:
             raise InputError(f"--{option}", "", "--compare with it")
@@ -111,7 +112,8 @@ def draw(args: argparse.Namespace, progress: Progress) -> Drawing:
         return draw_runs(read_and_compare_runs([args.trace, *args.others], progress))
     progress("reading", 0.0)
     if not args.compare:
-        return draw_run(Trace.read(args.trace, all=True))
+        signals = load_chosen_model(args).kind.signals if args.model else EHA
+        return draw_run(Trace.read(args.trace, all=True, signals=signals))
     model, before = load_models(args)
     trace, *repeats = (Trace.read(file, signals=model.kind.signals) for file in (args.trace, *args.repeat))
 
