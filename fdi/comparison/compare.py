@@ -26,6 +26,7 @@ from fdi.estimation.replay import (
     Replay,
     Scatter,
     align_columns,
+    answer_readings,
     compute_residuals,
     find_controller_gain,
     find_repeat,
@@ -55,7 +56,6 @@ from fdi.thresholds import (
 )
 from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
 from fdi.trace.trace import Floats, Trace, hold_last, rms, shift_rows
-from plant.controller import compute_answers
 from plant.model import Model
 from plant.signals import Signal
 
@@ -85,7 +85,7 @@ def compare_controller(trace: Trace, model: Model) -> ControllerBlock:
     if not model.kind.controller:
         return ControllerBlock(np.full(len(trace), np.nan), math.nan, math.nan, limit=limit)
     found = _compare_at_lags(trace, model, 0, 0)
-    if found.ratio <= CONTROLLER_ERROR_RATIO:
+    if not found.ratio > CONTROLLER_ERROR_RATIO:  # or it cannot be told
         return found
     com, xj, gain = find_lags(trace, limit)
     found = found._replace(gain=gain)
@@ -98,9 +98,8 @@ def compare_controller(trace: Trace, model: Model) -> ControllerBlock:
 def _compare_at_lags(trace: Trace, model: Model, com: int, xj: int) -> ControllerBlock:
     limit = model.values.get(model.kind.signals.drive.limit, math.inf)
     sensed = shift_rows(trace.controlled, xj)
-    answers = compute_answers(model, shift_rows(trace.command, com), hold_last(sensed))
-    residual = trace.drive - answers
-    unknown = np.isnan(sensed) | ~trace.usable
+    residual = trace.drive - answer_readings(model, trace, shift_rows(trace.command, com), hold_last(sensed))
+    unknown = np.isnan(sensed) | np.isnan(residual) | ~trace.usable
     unknown[1:] |= unknown[:-1].copy()  # a derivative looks back by one
     if has_controller_memory(model) and unknown.any():
         unknown[int(np.argmax(unknown)):] = True  # what the integral did in a gap is not known
@@ -295,7 +294,7 @@ def _judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tu
     A plant that declares no balances is one block, as wrong as its worst signal; its sensors cannot be told from it.
     """
     signal = {name: s.ratio for name, s in table.items()}
-    ratios = {"controller": found.ratio if model.kind.controller else None}
+    ratios = {"controller": found.ratio if math.isfinite(found.error) else None}
     if not model.kind.balances:
         return ratios | {"plant": max(signal.values()), "sensors": None}, dict.fromkeys(("flow", "force", "gain"))
     own, parts = judge_blocks(trace, model, run, repeats, signal, noise)

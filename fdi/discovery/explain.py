@@ -40,7 +40,7 @@ from fdi.discovery.detectable import Blind, find_hidden_effects
 from fdi.discovery.residual_pattern import is_periodic_in_position
 from fdi.discovery.search import FINE, Hypothesis, Search, Sensitivity, compute_sensitivity
 from fdi.estimation.fit import compute_typical_rms
-from fdi.estimation.replay import find_controller_gain, find_undecided_rows
+from fdi.estimation.replay import answer_readings, find_controller_gain, find_undecided_rows
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (
     ERROR_PARTLY_EXPLAINED,
@@ -58,7 +58,6 @@ from fdi.thresholds import (
 )
 from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
 from fdi.trace.trace import Floats, Trace, hold_last
-from plant.controller import compute_answers
 from plant.model import Model, list_searched_effects
 
 NOISE_LEFT = ("NOTHING_MISSING", "NOT_RESOLVABLE", "EXPLAINED", "AMBIGUOUS")
@@ -452,7 +451,7 @@ def measure_firmware_resolution(model: Model, trace: Trace) -> float:
 def compute_firmware_residual(model: Model, trace: Trace) -> Floats:
     """Cor of the model's controller on the measured com and XJ, minus the measured Cor: (n,) A, NaN where missing."""
     own = replace(model, effects=tuple(e for e in model.effects if model.find_effect(e).firmware))
-    answers = compute_answers(own, trace.command, hold_last(trace.anchor))
+    answers = answer_readings(own, trace, trace.command, hold_last(trace.anchor))
     return answers - np.where(trace.incomplete, np.nan, trace.drive)
 
 

@@ -240,6 +240,16 @@ def replay_command(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> Col
     return {name: trace.mask_unusable(name) - whole[name] for name in (*trace.outputs, drive)}
 
 
+def answer_readings(model: Model, trace: Trace, command: Floats, controlled: Floats) -> Floats:
+    """The drive that the model's controller answers to a command and a controlled signal without gaps, (n,) each.
+
+    The other readings are those of the trace; NaN where the law needs one that was not measured.
+    """
+    others = [trace.column(name) for name in trace.output_names[1:]]
+    held = [x if np.isnan(x).all() else hold_last(x) for x in others]
+    return compute_answers(model, command, np.column_stack([controlled, *held]))
+
+
 def find_controller_gain(model: Model, period: float) -> tuple[float, float]:
     """Drive for each unit of the controlled signal, and for each unit by which it changes within a cycle; no sign.
 
@@ -248,8 +258,8 @@ def find_controller_gain(model: Model, period: float) -> tuple[float, float]:
     if "controller.proportional_gain" in model.values:
         return abs(model["controller.proportional_gain"]), abs(model["controller.derivative_gain"]) / period
     size = 1e-6 * (model.kind.signals.command.largest if math.isfinite(model.kind.signals.command.largest) else 1.0)
-    sensed = np.zeros(50)
-    sensed[20:] = size
+    sensed = np.zeros((50, len(model.kind.signals.outputs)))
+    sensed[20:, 0] = size
     answers = compute_answers(model, np.zeros(50), sensed)
     steady = abs(float(answers[21] - answers[19])) / size
     return steady, max(abs(float(answers[20] - answers[19])) / size - steady, 0.0)

@@ -209,20 +209,20 @@ def describe_block(c: Comparison, name: str) -> str:
 def _describe_controller(c: Comparison) -> str:
     d, a = c.trace.declared, c.answer
     path = f"{d.command.symbol} and {d.controlled.symbol} to {d.drive.symbol}"
-    if c.blocks["controller"] is None:
+    if not c.model.kind.controller:
         return f"{path}: the firmware is not known"
     late = ((d.command.symbol, a.com_lag), (d.controlled.symbol, a.xj_lag))
     lags = [f"{symbol} {count_nouns(lag, 'cycle')} earlier" for symbol, lag in late if lag > 0]
     if lags:
         path += f" (from {' and '.join(lags)})"
     if not math.isfinite(a.error):
-        return f"{path}: its law remembers rows that are not known"
+        return f"{path}: its law needs readings that are not known"
     if a.ratio <= CONTROLLER_ERROR_RATIO:
         return f"{path}: equal to the last digit"
     factor, shown = (1e6, "uA") if d.drive.unit == "A" else (1.0, d.drive.unit)
     found = f"{path}: error {factor * a.error:.3g} {shown} RMS, floor {factor * a.floor:.3g} {shown}"
     gain, unit = find_controller_gain(c.model, c.trace.period)[0], f"{d.drive.unit}/{d.controlled.unit}"
-    if math.isfinite(a.gain) and abs(a.gain / gain - 1) > 0.002:
+    if math.isfinite(a.gain) and abs(a.gain - gain) > 0.002 * gain:
         found += f"; its gain is {a.gain:.4g} {unit}, the model's {gain:.4g} {unit}"
     return found
 
