@@ -82,7 +82,7 @@ class NormalTables(NamedTuple):
 
 
 def read_normal_tables() -> NormalTables:
-    """The tables with which `numpy.random.Generator.standard_normal` draws, which numba has a copy of."""
+    """The tables with which NumPy's generator draws normal numbers, which numba has a copy of."""
     import numba.np.random._constants as numbers
 
     return NormalTables(numbers.ki_double.tolist(), numbers.wi_double.tolist(), numbers.fi_double.tolist(),

@@ -33,7 +33,7 @@ def read_sensors(s: Any, m: Memory, noise: Any, t: float, p: Any) -> tuple[Any, 
 
 
 def read_controlled(y: Any, s: Any, m: Memory, noise: float, t: float, p: Any) -> tuple[Any, Memory]:
-    """The readings `y` as effects at the port `reading` change them, and the memories."""
+    """The readings `y` as effects at the port "reading" change them, and the memories."""
     x, m = at_reading(y[0], m, s, Input(0.0, 0.0, noise, t, 0.0, p.controller.period), p)
     return replace_first(y, x), m
 

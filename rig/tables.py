@@ -52,7 +52,7 @@ class Range(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """Names that a text of a file may have, asked when it is read; `aliases` are other words for some of them."""
+    """Names that a text of a file may have, asked when it is read; the aliases are other words for some of them."""
 
     list_names: Callable[[], tuple[str, ...]]
     list_aliases: Callable[[], Mapping[str, str]] = dict

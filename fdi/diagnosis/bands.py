@@ -1068,27 +1068,37 @@ def measure_precursors(source: Trace, bands: Bands | None = None) -> dict[str, P
         return {}
     rows = np.arange(len(xj))
     whole = np.interp(rows, rows[~missing], xj[~missing])
-    found = compute_features(com, whole[None], period, find_sections(com, period))
+    unit = source.declared.controlled.unit
+    found = compute_features(com, whole[None], period, find_sections(com, period), unit)
     known = bands.precursors if bands is not None else {}
-    return {name: _make_precursor(name, float(values[0]), known.get(name, {})) for name, values in found.items()}
+    return {name: _make_precursor(name, float(values[0]), unit, known.get(name, {})) for name, values in found.items()}
 
 
-def _make_precursor(name: str, value: float, known: Mapping[str, float]) -> Precursor:
-    kind = MEANINGS[find_kind(name)]
-    size = f", {name.rpartition('_')[2].replace('mm', ' mm')}" if find_kind(name) in OF_STEPS else ""
-    si_unit = {"ms": "s", "um": "m", "mm/s": "m/s"}.get(kind.unit, kind.unit)
+def _make_precursor(name: str, value: float, unit: str, known: Mapping[str, float]) -> Precursor:
+    kind, of_size = MEANINGS[find_kind(name)], _choose_size_unit(unit)[0]
+    size = f", {name.rpartition('_')[2].removesuffix(of_size)} {of_size}" if find_kind(name) in OF_STEPS else ""
+    si_unit = {"ms": "s", "um": unit, "mm/s": f"{unit}/s"}.get(kind.unit, kind.unit)
     numbers = (known.get(key, math.nan) for key in ("healthy", "noise", CLOGGING.name, FRICTION.name))
-    return Precursor(value, si_unit, kind.words + size, format_precursor(value, name), *numbers)
+    return Precursor(value, si_unit, kind.words + size, format_precursor(value, name, si_unit), *numbers)
 
 
-def format_precursor(value: float, name: str) -> str:
-    """A value of a precursor in the unit that people use.
+def format_precursor(value: float, name: str, si_unit: str = "m") -> str:
+    """A value of a precursor in the unit that people use; `si_unit` is its own, of a signal other than a position.
 
     >>> format_precursor(1.912e-05, "break_away"), format_precursor(7.41, "overshoot_5mm")
     ('19.1 um', '7.41 %')
+    >>> format_precursor(1.8e-4, "rest_error", "rad")
+    '0.00018 rad'
     """
-    kind = MEANINGS[find_kind(name)]
-    return f"{value * kind.scale:.3g} {kind.unit}" if math.isfinite(value) else "-"
+    _, unit, scale = MEANINGS[find_kind(name)]
+    if unit in ("um", "mm/s") and si_unit not in ("m", "m/s"):
+        unit, scale = si_unit, 1.0
+    return f"{value * scale:.3g} {unit}" if math.isfinite(value) else "-"
+
+
+def _choose_size_unit(unit: str) -> tuple[str, float]:
+    """The unit of the size of a step, and how many of them make one `unit`."""
+    return ("mm", 1e3) if unit == "m" else (unit, 1.0)
 
 
 def find_kind(name: str) -> str:
@@ -1096,11 +1106,11 @@ def find_kind(name: str) -> str:
     return name if name in MEANINGS else name.rpartition("_")[0]
 
 
-def compute_features(com: Floats, x: Floats, period: float, parts: Sequence[Section], least_step: float = 2e-4
-                     ) -> dict[str, Floats]:
-    """Values of all precursors for runs `x` (m, n) m of a command (n,) m, by name as in MEANINGS, SI or %; (m,) each.
+def compute_features(com: Floats, x: Floats, period: float, parts: Sequence[Section], unit: str = "m",
+                     least_step: float = 2e-4) -> dict[str, Floats]:
+    """Values of all precursors for runs `x` (m, n) of a command (n,) in `unit`, by name as in MEANINGS, (m,) each.
 
-    Precursors of steps carry the step's size in their name, such as overshoot_5mm; a step below `least_step` m shows
+    Precursors of steps carry the step's size in their name, such as overshoot_5mm; a step below `least_step` shows
     little but noise and friction and is left out. Precursors that the command cannot show are missing; those that a run
     does not show (an oscillation that never settles) are NaN.
     """
@@ -1109,7 +1119,8 @@ def compute_features(com: Floats, x: Floats, period: float, parts: Sequence[Sect
     for s in parts:
         rows = slice(s.start, s.stop)
         if s.kind == "step" and abs(s.last - s.first) >= least_step:
-            size = f"{1e3 * abs(s.last - s.first):.3g}mm"
+            of_size, scale = _choose_size_unit(unit)
+            size = f"{scale * abs(s.last - s.first):.3g}{of_size}"
             for word, values in _measure_step(x[:, rows], s, period):
                 out.setdefault(word if word == "rest_error" else f"{word}_{size}", []).append(values)
         elif is_slow_ramp(s, period):

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -347,8 +347,8 @@ def _tabulate_faults(d: Diagnosis) -> Table:
         (Column("MidBand", align="right", medium=Medium.PAGE), lambda f: format_limits_of_fault(f)[0]),
         (Column("MaxBand", align="right", medium=Medium.PAGE), lambda f: format_limits_of_fault(f)[1]),
         (Column("grid", align="right"), show_grid), (Column("by bands"), show_bands),
-        caption=f"Size: fitted by replay of the measured current. Grid: minimum of the RMS maps. By bands: level by "
-                f"the response alone. Limits (MidBand and MaxBand): {limits}."
+        caption=f"Size: fitted by replay of the measured {d.trace.declared.drive.called}. Grid: minimum of the RMS "
+                f"maps. By bands: level by the response alone. Limits (MidBand and MaxBand): {limits}."
                 + (" * marks the ruling fault." if d.ruling else ""))
 
 
@@ -463,20 +463,20 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
     def show_deviation(x: float) -> str:
         return f"{x:+.1f}" if math.isfinite(x) else NO_NUMBER
 
-    def number(title: str) -> Column:
-        return Column(title, "", "right", Medium.PAGE)
+    found, number = d.precursors, partial(Column, unit="", align="right", medium=Medium.PAGE)
 
-    found = d.precursors
+    def show_value(title: str, find_value: Callable[[Precursor], float]) -> tuple[Column, Callable[[str], str]]:
+        return number(title), lambda name: format_precursor(find_value(found[name]), name, found[name].unit)
+
     return [tabulate(
         found, (Column("precursor"), lambda name: found[name].words),
         (Column("measured", align="right"), lambda name: Cell(found[name].shown, is_strong=True)),
-        (number("healthy"), lambda name: format_precursor(found[name].healthy, name)),
-        (number("healthy s.d."), lambda name: format_precursor(found[name].noise, name)),
+        show_value("healthy", lambda p: p.healthy), show_value("healthy s.d.", lambda p: p.noise),
         (Column("deviation", "s.d.", "right"), lambda name: Cell(
             show_deviation(found[name].departure), "bad" if 4.0 < abs(found[name].departure) < math.inf else "")),
-        (number(f"Kintas {CLOGGING.acceptable:g} adds"), lambda name: format_precursor(found[name].clogging, name)),
+        show_value(f"Kintas {CLOGGING.acceptable:g} adds", lambda p: p.clogging),
         (number("in s.d."), lambda name: show_deviation(found[name].clogging_ratio)),
-        (number(f"FSS {FRICTION.acceptable:g} N adds"), lambda name: format_precursor(found[name].friction, name)),
+        show_value(f"FSS {FRICTION.acceptable:g} N adds", lambda p: p.friction),
         (number("in s.d."), lambda name: show_deviation(found[name].friction_ratio)),
         caption="Deviation: measured minus healthy mean, in standard deviations of healthy units; red beyond 4."),
         Figure("How far a fault at MidBand moves each precursor, in standard deviations of healthy units: longer bars "

@@ -1,4 +1,4 @@
-"""Wear and damage of the servovalve that `rig fdi` measures with the list of faults `wider`.
+"""Wear and damage of the servovalve that `rig fdi` measures with the list of faults "wider".
 
 Each law is that of its source; what a signal shows of it looks like a parameter of the reference model, so `rig
 explain` names that parameter and does not test these effects unasked.

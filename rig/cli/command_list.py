@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from rig.cli.options import (
     ANY_TRACE,
     BENCH,
+    CSV_OF,
     FAULTS,
     FORCE,
     JUNIT,
@@ -101,7 +102,7 @@ COMMANDS = {
                     help="standard deviation of the base parameters, relative (default 0.015)"),
              option("--simulator", metavar="MODULE:FUNCTION",
                     help="function that simulates a unit (rig.campaign.judge.Unit) instead of the plant model"),
-             option("--signals", metavar="xj,p12,xs", help="what is measured (default: all three)"),
+             option("--signals", metavar="NAME,..", help="outputs that are measured, such as xj,p12 (default: all)"),
              option("--model", metavar="FILE|NAME", help="the healthy plant (default eha)"),
              option("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
                     help="change a parameter of this plant (repeatable)"),
@@ -146,7 +147,7 @@ COMMANDS = {
         "Exit status 0 if noise explains all differences and no check changed, 1 otherwise.",
         (option("trace", metavar="A", help=f"the reference: {ANY_TRACE}"),
          option("others", metavar="B", nargs="+", help="a run to compare with the reference (repeatable)"),
-         offer_page("diff.html", "the first B"))),
+         *CSV_OF, offer_page("diff.html", "the first B"))),
     "doctor": Command(
         "report what this machine can do: CAN, vcan, real-time rights, viewer",
         "Exit status 1 if the embedded bench cannot run here.",
@@ -205,7 +206,7 @@ COMMANDS = {
         (option("runs", nargs="+", metavar="RUN", help=f"runs to fit, of any commands: {MEASURED_TRACE}"),
          option("--holdout", action="append", default=[], metavar="RUN",
                 help="a run that no fit sees: shows whether the model holds (repeatable)"),
-         option("--signals", metavar="xj,p12,xs", help="signals to use (default: all that every run to fit has)"),
+         option("--signals", metavar="NAME,..", help="outputs to use (default: all that every run to fit has)"),
          *MODEL)),
     "import": Command(
         "make a trace.mcap from a recording: CSV, MF4, MAT, Parquet, CAN log; --guess writes the map it needs",
@@ -268,7 +269,7 @@ COMMANDS = {
     "report": Command(
         "write one HTML file about a trace; it needs no network",
         "The page goes to --out (default: report.html beside the trace).",
-        (option("trace", metavar="TRACE", help=ANY_TRACE), *PLANT[:1], TRUST)),
+        (option("trace", metavar="TRACE", help=ANY_TRACE), *CSV_OF)),
     "run": Command(
         "run a test sequence on the bench: log, checks, verdict",
         "Results go to the folder --out (default: a new one in runs/). Exit status 0 if no check failed.",
@@ -304,7 +305,7 @@ COMMANDS = {
                 help="repeat the run recorded in this log"))),
     "simulate": Command(
         "run a model on a command and write a trace",
-        "Plant and controller in closed loop; t,com,xj,cor,p12,xs,load go to --out (default: simulation.csv).",
+        "Plant and controller in closed loop; t and the signals of the plant go to --out (default: simulation.csv).",
         (*MODEL,
          option("--command", dest="command_file", metavar="FILE",
                 help="CSV with t,com and optionally load (default: the main phase of preflight). Of rows at most 1 ms "

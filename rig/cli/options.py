@@ -72,6 +72,8 @@ PLANT = (
     option("--effects", action="append", default=[], type=Path, metavar="FILE.py",
            help="your own effects (repeatable)"),
     TRUST)
+CSV_OF = (option("--model", metavar="FILE|NAME", help="whose signals a CSV has: model file, plant file or model name"),
+          TRUST)
 SEED = option("--seed", type=parse_whole_number, default=0, metavar="N", help="seed of the noise (default 0)")
 SEED_IF_GIVEN = option("--seed", **{**SEED.settings, "default": None})  # so that one that is given is noticed
 MODEL = (*PLANT, SEED)

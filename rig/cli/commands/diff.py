@@ -8,7 +8,9 @@ from fdi.comparison.run_differences import RunDifferences, compare_runs
 from fdi.progress import Progress
 from fdi.report.diff_report import build_diff_report
 from fdi.trace.trace import Trace
+from plant.signals import Signals
 from rig.cli.answer import choose_places, give_answer
+from rig.cli.inputs import load_declared_signals
 from rig.cli.progress_bar import show_progress
 
 
@@ -16,13 +18,13 @@ def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 if noise explains all differences and no check changed, 1 otherwise."""
     places = choose_places(args, "diff.html", args.others[0])
     with show_progress(is_silent=args.json or args.quiet) as progress:
-        found = read_and_compare_runs([args.trace, *args.others], progress)
+        found = read_and_compare_runs([args.trace, *args.others], load_declared_signals(args), progress)
         report = build_diff_report(found, places.files)
     return give_answer(report, args, int(found.verdict != "SAME"), places)
 
 
-def read_and_compare_runs(sources: Sequence[str], progress: Progress) -> RunDifferences:
-    """Read traces, and subtract the first from the others.
+def read_and_compare_runs(sources: Sequence[str], signals: Signals, progress: Progress) -> RunDifferences:
+    """Read traces, of which a CSV has `signals`, and subtract the first from the others.
 
     Raises:
         InputError: a trace that cannot be read.
@@ -30,6 +32,6 @@ def read_and_compare_runs(sources: Sequence[str], progress: Progress) -> RunDiff
     traces = []
     for i, source in enumerate(sources):
         progress(f"reading {source}", i / (len(sources) + 1))
-        traces.append(Trace.read(source, all=True))
+        traces.append(Trace.read(source, all=True, signals=signals))
     progress("aligning and subtracting", len(sources) / (len(sources) + 1))
     return compare_runs(sources, traces)

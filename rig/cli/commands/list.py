@@ -157,7 +157,7 @@ def list_faults(model: Model, source: str | None = None) -> Rows:
 
 KINDS: Mapping[str, tuple[Callable[[Model], Rows], str]] = {  # what lists them, and how to use one
     "parameters": (list_parameters, "Change one with --set NAME=VALUE."),
-    "signals": (list_signals, "Choose outputs with --signals xj,p12,xs."),
+    "signals": (list_signals, "Choose outputs with --signals NAME,NAME."),
     "sequences": (list_sequences, "Run one with rig run NAME."),
     "effects": (list_effects, "Add one with --set EFFECT.PARAMETER=VALUE; rig effects NAME shows its law."),
     "checks": (list_checks, "Use one in a sequence by its kind; every check also takes name, low, high, unit, window, "

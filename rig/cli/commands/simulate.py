@@ -27,7 +27,7 @@ SAMPLE_POINTS = ((0.0, 0.0), (0.5, 0.0), (0.501, 2e-3), (1.5, 2e-3), (3.0, -3e-3
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Plant and controller in closed loop; t,com,xj,cor,p12,xs,load go to --out (default: simulation.csv)."""
+    """Plant and controller in closed loop; t and the signals of the plant go to --out (default: simulation.csv)."""
     if args.samples:
         return write_samples(args)
     model = load_chosen_model(args)

@@ -17,11 +17,10 @@ from fdi.report.report import Report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
-from plant.signals import EHA
 from rig.cli.answer import give_answer
 from rig.cli.commands.diff import read_and_compare_runs
 from rig.cli.discovery_inputs import load_known_model
-from rig.cli.inputs import list_signals, load_chosen_model
+from rig.cli.inputs import list_signals, load_declared_signals
 from rig.cli.interruption import catch_signals
 from rig.cli.progress_bar import show_progress
 from rig.view import viewer
@@ -109,11 +108,10 @@ def draw(args: argparse.Namespace, progress: Progress) -> Drawing:
         InputError: a trace, model or option that cannot be used.
     """
     if args.others:
-        return draw_runs(read_and_compare_runs([args.trace, *args.others], progress))
+        return draw_runs(read_and_compare_runs([args.trace, *args.others], load_declared_signals(args), progress))
     progress("reading", 0.0)
     if not args.compare:
-        signals = load_chosen_model(args).kind.signals if args.model else EHA
-        return draw_run(Trace.read(args.trace, all=True, signals=signals))
+        return draw_run(Trace.read(args.trace, all=True, signals=load_declared_signals(args)))
     model, before = load_models(args)
     trace, *repeats = (Trace.read(file, signals=model.kind.signals) for file in (args.trace, *args.repeat))
 

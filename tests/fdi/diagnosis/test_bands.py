@@ -43,7 +43,7 @@ from fdi.diagnosis.bands import (
     smooth_spikes,
 )
 from fdi.diagnosis.diagnosis import diagnose
-from fdi.diagnosis.faults import Estimate, Level
+from fdi.diagnosis.faults import FAULTS, Estimate, Level
 from fdi.report.diagnosis_report import draw_precursor_shifts, draw_sizes
 from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
@@ -480,5 +480,5 @@ def test_the_page(tmp_path: Path) -> None:
 def test_pictures_without_bands() -> None:
     """Sizes can be drawn without grid and bands; precursors without a table are not."""
     sizes = {CLOGGING: Estimate(0.9, 0.8, 0.97), FRICTION: Estimate(150.0, 140.0, 170.0)}
-    assert draw_sizes(sizes, None, None).startswith("<svg")
+    assert draw_sizes(FAULTS, sizes, None, None).startswith("<svg")
     assert draw_precursor_shifts(measure_precursors(run())) == ""
