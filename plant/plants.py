@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from itertools import pairwise
+from itertools import takewhile
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, NamedTuple, cast
@@ -237,8 +237,10 @@ class Plant:
     def _has_what_law_names(self, e: Effect) -> bool:
         """Whether the state has the fields, and the parameters the groups, that the law of an effect names."""
         state = Sampled if e.port == "command" else self.state
+        known = {*self.nominal, *e.parameters}
         return all(name in state._fields for name in find_fields_of(e.function, "s")) and all(
-            name == e.name or name in self.parameters for name in find_fields_of(e.function, "p"))
+            any(each == name or each.startswith(f"{name}.") for each in known)
+            for name in find_fields_of(e.function, "p", 2))
 
     def bind_functions(self, names: tuple[str, ...]) -> dict[str, Function]:
         """The functions that take the place of the placeholders in every kernel, for the plant with these effects."""
@@ -310,11 +312,13 @@ step: Function = _step_without_coefficients  # bound for a plant whose step need
 
 
 @cache
-def find_fields_of(function: Any, argument: str) -> frozenset[str]:
-    """The fields of an argument that a function names, as x in s.x."""
+def find_fields_of(function: Any, argument: str, depth: int = 1) -> frozenset[str]:
+    """The fields of an argument that a function names, as x in s.x; with `depth` 2 also "group.field" in p.group.field.
+    """
     code = list(dis.get_instructions(getattr(function, "py_func", function)))
-    return frozenset(there.argval for here, there in pairwise(code)
-                     if here.opname == "LOAD_FAST" and here.argval == argument and there.opname == "LOAD_ATTR")
+    chains = ([step.argval for step in takewhile(lambda step: step.opname == "LOAD_ATTR", code[k + 1:k + 1 + depth])]
+              for k, load in enumerate(code) if load.opname == "LOAD_FAST" and load.argval == argument)
+    return frozenset(".".join(chain) for chain in chains if chain)
 
 
 _LOADED: dict[str, Plant] = {}  # users' plants, by the path that they were named by
