@@ -282,8 +282,9 @@ def measure_level(difference: Floats, block: int = WINDOW) -> float:
     blocks = _cut_windows(difference, block)
     if not len(blocks):
         return float(np.nanstd(difference))
-    with np.errstate(invalid="ignore"):
-        variance = np.nanmean(blocks**2, axis=1)
+    known = ~np.isnan(blocks)
+    with np.errstate(invalid="ignore", divide="ignore"):  # a block may have no value at all
+        variance = np.nansum(blocks**2, axis=1) / known.sum(axis=1)
     mean_over_median = 1.0 / 0.993  # mean over median of the variance of BLOCK normal samples
     return float(np.sqrt(np.nanmedian(variance) * mean_over_median))
 
