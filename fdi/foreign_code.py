@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from plant.effects import CATALOGUE, load_effects
 from plant.errors import InputError, escape_control_characters
 from plant.parameters import read_toml
+from plant.plant_files import read_model_tables
 from plant.plants import load_plant
 
 Announce = Callable[[str], None]
@@ -110,7 +111,7 @@ def find_effect_files(model: str | Path | None, given: Sequence[Path] = ()) -> l
     """
     if model is None or Path(model).suffix == ".py" or not Path(model).is_file():
         return []
-    provenance: Any = read_toml(Path(model)).get("provenance", {})
+    provenance: Any = read_model_tables(Path(model)).get("provenance", {})
     names = provenance.get("effect_files", []) if isinstance(provenance, Mapping) else []
     files = [Path(name) for name in names if isinstance(name, str) and "\0" not in name]
     places = [next((p for p in (file, Path(model).parent / file) if p.is_file()), None) for file in files]

@@ -79,7 +79,7 @@ def write_mover(state: type[Any], names: Sequence[str]) -> Function:
 
 
 def _tuple(items: Sequence[str]) -> str:
-    return f"({', '.join(items)},)"
+    return f"({''.join(f'{item}, ' for item in items)})"
 
 
 def _write(name: str, arguments: str, lines: Sequence[str], **known: Any) -> dict[str, Function]:

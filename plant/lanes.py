@@ -30,6 +30,7 @@ from plant.controller import take_demand
 from plant.effects import Effect
 from plant.errors import InputError
 from plant.flat import make_lane_packers
+from plant.foreign import run_foreign
 from plant.kernel_use import KernelUse
 from plant.kernels import compute_plant_coefficients, control_plant, keep_answer, keep_sample, measure_plant, step_plant
 from plant.model import Model, build_bare_model
@@ -146,6 +147,9 @@ class Lanes:
             InputError: shapes that do not fit.
         """
         where = np.empty(0) if position is None else position
+        if self.model.kind.foreign is not None:
+            yield 0, self.replay(values, current, load, position, anchor)
+            return
         work, inputs = self._prepare(values, current, load, where, anchor, False)
         for first in range(0, len(current), rows):
             stop = min(first + rows, len(current))
@@ -176,6 +180,8 @@ class Lanes:
 
     def _run(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool,
              parts: Sequence[Part] = ()) -> Array:
+        if self.model.kind.foreign is not None:
+            return run_foreign(self.model, self.names, values, driven, load, position, anchor, closed, parts)
         blocks, inputs = self._prepare(values, driven, load, position, anchor, closed)
         out = np.empty((len(values) + 1, self._count_columns(closed), len(driven)))  # the last for idle lanes
         work = [(block, part) for block in blocks for part in parts or (Part(0, len(driven), 0),)]

@@ -19,7 +19,8 @@ from plant.compile import Function, compile_function, interpret_function
 from plant.effects import Effect
 from plant.errors import InputError, suggest_name
 from plant.flat import list_state_values
-from plant.parameters import check_combinations, find_field, flatten_tables, parse_value, read_toml
+from plant.parameters import check_combinations, find_field, flatten_tables, parse_value
+from plant.plant_files import READERS, read_model_tables, read_named_plant
 from plant.plants import Plant
 from plant.quantity import Quantity
 
@@ -185,9 +186,9 @@ def load_model(source: str | Path = "eha") -> Model:
     path = find_shipped_model(str(source)) or Path(source)
     if not path.is_file():
         names = ", ".join((*plants.list_plants(), *SHIPPED_MODELS))
-        missing = "; it does not exist" if path.suffix == ".toml" else ""
+        missing = "; it does not exist" if path.suffix in READERS else ""
         raise InputError(source, "", f"a model file, or one of {names}{missing}")
-    return parse_model(read_toml(path), path, path.stem)
+    return parse_model(read_model_tables(path), path, path.stem)
 
 
 def find_shipped_model(name: str) -> Path | None:
@@ -210,7 +211,7 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     """
     tables = dict(tables)
     name, effects = tables.pop("name", name), tables.pop("effects", [])
-    plant = tables.pop("plant", "eha")
+    plant = read_named_plant(tables.pop("plant", "eha"), where)
     tables.pop("provenance", None)
     tables.pop("identify", None)
     design = tables.pop("design", {})
@@ -218,8 +219,8 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
         raise InputError(where, "name", f"a text, not {name!r}")
     tables.pop("plant_sha256", None)
     loaded = plants.find_loaded_plant(plant, where) if isinstance(plant, str) and plant.endswith(".py") else None
-    if loaded is None and plant not in plants.list_plants():
-        more = "a plant file (.py), which runs with --trust"
+    if loaded is None and not (isinstance(plant, str) and plants.is_known(plant)):
+        more = "an FMU, or a plant file (.py), which runs with --trust"
         raise InputError(where, "plant", f"one of {', '.join(plants.list_plants())}, or {more}, not {plant!r}")
     plant = plant if loaded is None else loaded.key
     known = [e.name for e in list_offered_effects(plant)]  # a list, as what stands in a file need not be hashable
@@ -272,6 +273,8 @@ def build_kernel(function: Function, effects: tuple[str, ...], fast: bool = True
         plant: whose step it takes.
     """
     kind = plants.find_plant(plant)
+    if fast:
+        kind.require_equations()
     return _build_kernel(function, effects, kind.list_laws(effects), fast, kind)
 
 

@@ -28,6 +28,7 @@ from plant.effects import CATALOGUE, Effect, build_base_effect, build_effect, co
 from plant.errors import InputError
 from plant.faults import Fault
 from plant.flat import make_packers
+from plant.foreign import Program
 from plant.kernels import raise_unbound, write_constant, write_mover, write_signal_functions
 from plant.pid import Loop, control_by_pid
 from plant.plant_check import check_declaration
@@ -135,6 +136,7 @@ class Plant:
     file: Path | None = None  # of a user's plant
     key: str = ""  # what a model calls it: its name, or the path of a user's file as it was named
     source: bytes = field(default=b"", repr=False)  # of a user's file
+    foreign: Callable[[float], Program] | None = field(default=None, repr=False)  # runs it in place of its step
     effects: Mapping[str, Effect] = field(default_factory=dict, repr=False)  # its own
 
     def __post_init__(self) -> None:
@@ -198,6 +200,11 @@ class Plant:
         """Unit of what drives it."""
         return self.signals.drive.unit
 
+    def require_equations(self) -> None:
+        """Refuse a plant whose equations are another program's. Raises InputError."""
+        if self.foreign is not None:
+            raise InputError(self.file, "", "a plant with equations for this; those of an FMU cannot be read")
+
     def list_effects(self) -> list[Effect]:
         """The effects it can have: those of the catalogue that suit it, then its own, which may have their names."""
         shared = (e for e in CATALOGUE.list_all().values() if e.name not in self.effects)
@@ -220,7 +227,7 @@ class Plant:
 
     def offers(self, e: Effect) -> bool:
         """Whether a shared effect suits it: it has the port, in the same unit, and what else the law names."""
-        if e.plant not in ("", self.name) or e.name in self.lacks:
+        if e.plant not in ("", self.name) or e.name in self.lacks or self.foreign is not None:
             return False
         if e.base:
             return all(name in self.nominal for name in e.fitted)
@@ -324,6 +331,7 @@ def find_fields_of(function: Any, argument: str, depth: int = 1) -> frozenset[st
 _LOADED: dict[str, Plant] = {}  # users' plants, by the path that they were named by
 
 
+
 def find_plant(name: str) -> Plant:
     """The shipped plant of that name, or the user's plant that `load_plant` has loaded from that path.
 
@@ -340,6 +348,11 @@ def find_plant(name: str) -> Plant:
 def find_loaded_plant(name: str, where: object) -> Plant | None:
     """The user's plant that the model file `where` calls `name`: beside it, or from this folder; None: not loaded."""
     return next((_LOADED[key] for key in (str(Path(str(where)).parent / name), name) if key in _LOADED), None)
+
+
+def is_known(name: str) -> bool:
+    """Whether `find_plant` finds it."""
+    return name in _LOADED or name in MODULES
 
 
 def list_plants() -> tuple[str, ...]:
@@ -436,6 +449,12 @@ def load_plant(path: Path, source: bytes | None = None, key: str = "") -> Plant:
         _LOADED.update({key: before} if before is not None else {})
         raise
     CATALOGUE.of_plants.update(plant.effects)
+    return plant
+
+
+def keep_plant(plant: Plant) -> Plant:
+    """Let `find_plant` find a plant by its key."""
+    _LOADED[plant.key] = plant
     return plant
 
 

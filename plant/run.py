@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from plant.compile import compute_fingerprint, find_cache_folder, interpret_function
 from plant.controller import take_demand
-from plant.errors import InputError
+from plant.errors import InputError, RigError
 from plant.flat import make_packers
+from plant.foreign import run_foreign_loop
 from plant.kernels import write_reader
 from plant.machine_code import Call, StoredCode
 from plant.model import Model, build_kernel, collect_bindings
@@ -105,11 +106,14 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
     signals = model.kind.signals
     out = np.empty((len(com), len(signals.columns)))
     with report_law_errors(model):
-        run = build_kernel(run_closed_loop, model.effects, fast, model.plant)
-        noise = sample_noise(seed, len(com), len(signals.outputs) + 1) if drawn is None else drawn
-        record = model.build_record()
-        work = partial(run, model.build_flat_state(), com, force, noise, record, steps or model.steps, out)
-        run_beside(work) if fast else work()
+        if model.kind.foreign is not None:
+            run_foreign_loop(Actuator(model, seed), com, force, out)
+        else:
+            run = build_kernel(run_closed_loop, model.effects, fast, model.plant)
+            noise = sample_noise(seed, len(com), len(signals.outputs) + 1) if drawn is None else drawn
+            record = model.build_record()
+            work = partial(run, model.build_flat_state(), com, force, noise, record, steps or model.steps, out)
+            run_beside(work) if fast else work()
     t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
     found = {s.name: out[:, i].copy() for i, s in enumerate(signals.columns)}
     given = {"time": t, "command": com, "load": force}
@@ -127,6 +131,8 @@ def report_law_errors(model: Model) -> Iterator[None]:
     """
     try:
         yield
+    except RigError:
+        raise
     except Exception as error:
         if not model.effects and model.kind.file is None:
             raise
@@ -204,7 +210,7 @@ class Actuator:
     """One plant that runs cycle by cycle: the core of the emulator. It knows neither clock nor bus."""
 
     def __init__(self, model: Model, seed: int = 0, steps: int | None = None, fast: bool = True) -> None:
-        self.model, self.steps = model, steps or model.steps
+        self.model, self.steps, self._seed = model, steps or model.steps, seed
         self.cycle = 0
         with report_law_errors(model):
             self._flat = model.build_flat_state()
@@ -215,6 +221,9 @@ class Actuator:
         outputs = model.kind.signals.outputs
         self.noise = NoiseStream(seed, len(outputs) + 1)
         self._noise = [0.0] * (len(outputs) + 1)
+        foreign = model.kind.foreign
+        self._program = None if foreign is None else foreign(model["controller.period"])
+        fast = fast and foreign is None
         self._code = load_stored_advance(model.effects, model.plant) if fast else None
         self._advance = self._bind_advance()
         # readings that are fields of the state, and that nothing changes, are faster without a call of compiled code
@@ -242,6 +251,8 @@ class Actuator:
         Raises:
             InputError: an effect's law that cannot be compiled.
         """
+        if self._program is not None:
+            self._flat[:] = self._program.begin({**self.model.values, "seed": self._seed})
         with report_law_errors(self.model):
             if self._code is not None:
                 self._code.warm(lambda: (self._flat.copy(), 5e-3, 100.0, 0.0, 0.0, self._record, 10))
@@ -275,6 +286,9 @@ class Actuator:
     def _bind_advance(self) -> Call:
         if self._code is not None:
             return self._code.bind((self._flat,), 4, (self._record, self.steps))
+        program = self._program
+        if program is not None:
+            return lambda drive, load, noise, t: np.copyto(self._flat, program.step(drive, load))
         run = build_kernel(advance_flat_state, self.model.effects, fast=False, plant=self.model.plant)
         return lambda drive, load, noise, t: run(self._flat, drive, load, noise, t, self._record, self.steps)
 
@@ -287,6 +301,8 @@ class Actuator:
         if name not in self._index:
             raise InputError("set", name, f"a parameter of the running model ({self.model.name})")
         self._live[self._index[name]] = value
+        if self._program is not None:
+            self._program.change(name, value)
 
 
 def load_stored_advance(effects: tuple[str, ...], plant: str = "eha") -> StoredCode:

@@ -1,2 +1,5 @@
 """The bench: buses, nodes, master, loop, sequences, log, viewer and the `rig` command."""
 import plant  # noqa: F401  selects the kernels of linear algebra before anything imports NumPy
+from plant.plant_files import READERS
+
+READERS[".fmu"] = READERS[".toml"] = "rig.fmi.plant_file:load_fmu_plant"

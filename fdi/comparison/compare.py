@@ -19,6 +19,7 @@ from fdi.comparison.residuals import (
     find_condition,
     locate_error,
 )
+from fdi.estimation.fit import list_tolerance_sizes
 from fdi.estimation.noise import Floor, describe_doubtful_repeats, find_floors, sensor_floors
 from fdi.estimation.replay import (
     Columns,
@@ -243,6 +244,7 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
                                      for name, r in (theirs[0] if theirs else {}).items()}, m)
     progress("tolerances", 6 / STAGES)
     plant = verdict == "MODEL_INCOMPLETE" and any(s.ratio > s.limit for s in table.values())
+    plant = plant and bool(list_tolerance_sizes(model))
     scattered = fit_scatter(trace, model, {name: s.floor.value for name, s in table.items()}) if plant else None
     progress("done", 1.0)
     named = _list_blocks_above(ratios, table)

@@ -35,7 +35,7 @@ from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.model import Model, find_effect, find_quantity, list_offered_effects, parse_model
-from plant.parameters import read_toml
+from plant.plant_files import read_model_tables
 from plant.plants import find_plant, list_plants
 
 FIRST, THEN = 4, 6  # rounds of a first fit, along the parameters and along principal directions
@@ -458,7 +458,7 @@ def read_provenance(path: Path) -> Provenance:
     Raises:
         InputError: a table that this software did not write.
     """
-    said = read_toml(path).get("provenance", {})
+    said = read_model_tables(path).get("provenance", {})
     try:
         runs = [Source(*pair) for pair in zip(said.get("repeats", []), said.get("repeats_sha256", []), strict=True)]
         rows = [Row(r.get("effect"), r["error"], r.get("holdout", {}), r.get("removed", False))
@@ -483,7 +483,7 @@ def load_model_file(path: Path) -> tuple[Model, Provenance]:
         InputError: a file that cannot be used, or a user's effect in it that nothing has loaded.
     """
     found = read_provenance(path)
-    tables = read_toml(path)
+    tables = read_model_tables(path)
     named = tables.get("effects", [])
     plant = tables.get("plant", "eha")
     own = find_plant(plant).effects if plant in list_plants() else {}

@@ -132,8 +132,13 @@ def read_free_parameters(model: Model, source: str | Path | None) -> tuple[Range
     tables = read_toml(usual)["identify"]
     if {f"{group}.{field}" for group, fields in tables.items() for field in fields} <= model.values.keys():
         return parse_free_parameters(tables, model, usual.name)
-    scattering = {name: _parse_range(name, USUAL_FACTOR, model, model.name)
-                  for name in list_relative_tolerances(model, model.list_names()) if model[name] > 0.0}
+    widths: dict[str, Any] = dict.fromkeys(list_relative_tolerances(model, model.list_names()), USUAL_FACTOR)
+    if model.kind.foreign is not None:  # the map of an FMU gives ranges
+        known = {name: find_quantity(name, plant=model.plant) for name in model.list_names()}
+        widths |= {name: [q.low, q.high] for name, q in known.items()
+                   if math.isfinite(q.high - q.low) and not name.startswith("controller.")}
+    scattering = {name: _parse_range(name, width, model, model.name) for name, width in widths.items()
+                  if model[name] > 0.0 or isinstance(width, list)}
     if not scattering:
         raise InputError(source, "identify", "tables [identify.GROUP] that say what is free (docs/identify.md)")
     return tuple(scattering.values())

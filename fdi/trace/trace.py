@@ -385,7 +385,9 @@ def _make_trace(grid: Mapping[str, Floats], signals: Signals, period: float, row
 
 
 def _from_log(log: Log, everything: bool, declared: Signals) -> Trace:
-    declared = read_declaration(log.path, log.metadata.get(DECLARATION, {})) or declared
+    recorded = read_declaration(log.path, log.metadata.get(DECLARATION, {}))
+    if recorded is not None and not set(declared.names) < set(recorded.names):  # a model need not know all of them
+        declared = recorded
     signals, timing = log.read_columns("/signals"), log.read_columns("/timing")
     rest = {name: [(time_ns, message) for _, time_ns, message in log.read_messages(name, most=MOST_MESSAGES)]
             for name in ("/events", "/nmt", "/checks")}

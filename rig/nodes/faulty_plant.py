@@ -1,9 +1,9 @@
 """The plant of a run, cycle by cycle: the actuator with the faults and the load of its scenario. No bus, no clock."""
 from __future__ import annotations
 
-from math import isfinite
+from math import isfinite, nan
 
-from plant import Actuator
+from plant import Actuator, RigError
 from plant.signals import EHA
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import Schedule
@@ -22,11 +22,13 @@ class FaultyPlant:
         self._load = scenario.load()
         self.actuator = Actuator(scenario.model, scenario.seed)
         self.actuator.warm()
+        self._names = [s.name for s in scenario.model.kind.signals.outputs]
+        self.problem = ""  # why the plant can go on no more
         self._changed = -1  # the last cycle whose parameters are in force
         self._last: tuple[int, tuple[float, float, float] | None] = -1, None  # cycle and what the transducers said
 
     def read(self, k: int) -> tuple[float, float, float] | None:
-        """What the transducers say in cycle k: XJ m, P12 Pa, XS m; None when the plant has diverged.
+        """What the transducers say in cycle k: XJ m, P12 Pa, XS m, NaN where there is none; None if the plant failed.
 
         The first call in a cycle draws the noise and puts the faults of this cycle in force; another one says the same.
         """
@@ -36,16 +38,21 @@ class FaultyPlant:
 
     def _draw_readings(self, k: int) -> tuple[float, float, float] | None:
         self._change_parameters(k)
-        readings = self.actuator.sample()
-        if not isfinite(sum(readings)):
+        readings = dict(zip(self._names, self.actuator.sample(), strict=True))
+        if not self.problem and not isfinite(sum(readings.values())):
+            self.problem = DIVERGED
+        if self.problem:
             return None
-        xj, p12, xs = (self.faults.change_signal(name, value, k)
-                       for name, value in zip(_SIGNALS, readings, strict=True))
+        xj, p12, xs = (self.faults.change_signal(name, readings.get(name, nan), k) for name in _SIGNALS)
         return xj, p12, xs
 
     def move(self, k: int) -> None:
         """Advance by cycle k under its load and the current in force."""
-        self.actuator.advance(self.current, self._load[k] if k < len(self._load) else 0.0)
+        if not self.problem:
+            try:
+                self.actuator.advance(self.current, self._load[k] if k < len(self._load) else 0.0)
+            except RigError as error:  # another program moves the plant: its run ends, this one ends with a verdict
+                self.problem = str(error)
 
     def pass_unread(self, k: int) -> None:
         """A cycle whose readings nobody asks for: the transducers go on as well."""

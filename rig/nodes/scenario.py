@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from plant import InputError, Model
+from plant.model import build_bare_model
+from plant.plants import find_plant
 from plant.segments import Array
 from rig.sequences.faults import Plan, require_sensible
 
@@ -49,7 +51,8 @@ class Scenario(NamedTuple):
         """
         changes = np.diff(np.array(self.force, np.int64), n=2, prepend=[0, 0]).tolist()
         data = zlib.compress(json.dumps({
-            "model": {"name": self.model.name, "effects": self.model.effects, "values": self.model.list_changes()},
+            "model": {"name": self.model.name, "effects": self.model.effects, "values": self.model.list_changes(),
+                      "plant": self.model.plant},
             "plan": self.plan.to_json(), "load": changes, "seed": self.seed}).encode(), 9)
         if len(data) > LARGEST_DOWNLOAD:
             raise InputError("load", "", f"a load (and faults) of at most {LARGEST_DOWNLOAD >> 10} KiB compressed, not "
@@ -67,7 +70,8 @@ class Scenario(NamedTuple):
             largest = 1 << 26  # bytes of JSON: six hours of random load
             table: dict[str, Any] = json.loads(zlib.decompressobj().decompress(data, largest))
             named = table["model"]
-            model = Model(str(named["name"])).with_effects(named["effects"]).replace(named["values"], WHERE)
+            bare = build_bare_model(str(named.get("plant", "eha")), str(named["name"]))
+            model = bare.with_effects(named["effects"]).replace(named["values"], WHERE)
             force = np.cumsum(np.cumsum(np.array(table["load"], np.int64))).tolist()
             plan, seed = Plan.from_json(table["plan"]), int(table["seed"])
             if min(seed, plan.seed) < 0 or not 0 <= plan.start <= plan.stop <= LONGEST_PLAN:
@@ -81,8 +85,10 @@ class Scenario(NamedTuple):
 
 
 def require_servovalve(model: Model) -> None:
-    """Refuse a plant other than the servovalve actuator: the bus carries the current of a servovalve."""
-    if model.plant != "eha":
+    """Refuse a plant without the signals of a servovalve actuator: the bus carries its current."""
+    known, own = find_plant("eha").signals, model.kind.signals
+    if (own.drive.name, own.drive.unit, own.controlled.name) != (known.drive.name, known.drive.unit,
+                                                                 known.controlled.name):
         raise InputError("--model", model.name, "a model of eha; the bench drives a servovalve")
 
 

@@ -24,8 +24,10 @@ from plant.effects import load_effects
 from plant.model import find_quantity, parse_model
 from plant.parameters import parse_toml
 from plant.plants import load_plant
-from rig.benches.bench import Bench
+from plant.signals import EHA
+from rig.benches.bench import MEASURED, Bench
 from rig.benches.bench_file import load_bench, load_bench_from_files
+from rig.benches.frame_map import Role
 from rig.nodes.scenario import Scenario
 from rig.run.choices import CONTROLLERS, PACES, PLANTS
 from rig.sequences import Sequence, load_sequence
@@ -263,7 +265,7 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     require_different_names(choice.effects)
     bench = load_bench(choice.bench or "eha", is_trusted=is_trusted)
     sequence = load_sequence(choice.sequence, bench.rate) if built is None else built
-    name = choice.model or sequence.model.name
+    name = choice.model or (sequence.model.name if sequence.model.name != "eha" else bench.plant)
     load_plant_of_model(name, is_trusted=is_trusted, announce=announce)
     for file in choice.effects:
         load_effects(file)
@@ -271,6 +273,7 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     require_different_names((*choice.effects, *brought))
     model = load_model(name).replace(sequence.model.overrides, sequence.name).replace(choice.changes)
     require_bench_cycle(model, bench, "--set")
+    _require_signals(model, bench)
     foreign = [name for name in model.list_changes() if name.startswith("controller.") and name != "controller.period"]
     is_ours = speaks_as_shipped(bench)
     controller = choice.controller or ("builtin" if is_ours else "external")
@@ -280,6 +283,15 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     job = Job(sequence=sequence, model=model, bench=bench, seed=choice.seed, effects=(*choice.effects, *brought),
               bus=choice.bus, controller=controller, plant=plant, max_overruns=sequence.timing.share)
     return replace_settings(job, pace=choice.pace, max_overruns=choice.max_overruns)
+
+
+def _require_signals(model: Model, bench: Bench) -> None:
+    """Refuse a plant that lacks a signal which the bench sends to the controller or the rig. Raises InputError."""
+    has = {signal.name for signal in model.kind.signals.outputs}
+    sent = {each.name for spec in bench.frames.frames if spec.sender is not Role.CONTROLLER for each in spec.fields}
+    for name, signal in zip(MEASURED, EHA.outputs, strict=False):
+        if name in sent and signal.name not in has:
+            raise InputError(bench.name, name, f"a plant that has this signal; {model.name} has {', '.join(has)}")
 
 
 class Differences(NamedTuple):

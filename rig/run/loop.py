@@ -25,7 +25,8 @@ from rig.benches.frame_map import FrameSpec, Role, check_guards, make_reader, ma
 from rig.network.clock import WallClock
 from rig.network.frame import BIT_RATE_SWITCH, Frame
 from rig.network.master import Master
-from rig.nodes.faulty_plant import DIVERGED, FaultyPlant
+from rig.nodes.emulator import Emulator
+from rig.nodes.faulty_plant import FaultyPlant
 from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock, Signals, Timing
 from rig.run.cyclic_values import CycleInput, CyclicValues
@@ -151,6 +152,7 @@ class CycleLoop(Loop):
         self._sent = dict.fromkeys((each for each, _, _ in self._mine), 0)
         self._answers = {each: _Answer(each) for each in bench.frames.frames if each.sender is not Role.RIG}
         self._plant = None if bench.has_plant_node else FaultyPlant(scenario)
+        self._emulators = [node for node in getattr(self._wire, "nodes", ()) if isinstance(node, Emulator)]
         self.outputs = dict.fromkeys(self._values.names, 0.0)
         self._open: tuple[int, Signals, Timing] | None = None  # the cycle under way
         self._step = CycleInput(0, 0.0, 0.0, 0)  # its inputs
@@ -205,6 +207,8 @@ class CycleLoop(Loop):
             self._wait_for_answers(delay)
             self._release_held(self._t_ns + self._period)
         master.tick()
+        for emulator in self._emulators:
+            self.problem = self.problem or emulator.plant.problem
         self.k += step.is_counted
         self._played += 1
         self._t_ns += self._period
@@ -237,7 +241,7 @@ class CycleLoop(Loop):
             return
         readings = plant.read(k)
         if readings is None:
-            self.problem = DIVERGED
+            self.problem = plant.problem
             return
         self.outputs.update(zip(("ram_position", "load_pressure", "spool_position"), readings, strict=True))
 

@@ -32,7 +32,8 @@ def open_loop(master: Master, bench: Bench, scenario: Scenario, faults: Schedule
     Raises:
         RigError: the bus cannot be opened.
     """
-    if can_open(bus) and isinstance(master.wire, LinkWire):
+    is_compiled = bench.has_plant_node or scenario.model.kind.foreign is None  # or Python moves the plant
+    if can_open(bus) and isinstance(master.wire, LinkWire) and is_compiled:
         from rig.network.raw_bus import open_raw_bus  # here: on the embedded bus a run needs none of it
         from rig.run.hard_loop import HardLoop, list_cyclic_frames
 

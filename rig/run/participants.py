@@ -141,6 +141,8 @@ def _make_command(job: Job, node: Role) -> list[str]:
         return [str(build_controller()), job.bus, *parent]
     words = [sys.executable, "-m", "rig.cli.main", "node", NAMES[node], "--bus", job.bus, "--quiet", *parent]
     words += [word for path in job.effects for word in ("--effects", str(path))]
+    if node == PLANT and job.model.kind.foreign is not None:
+        words += ["--model", job.model.plant]
     if node == CONTROLLER:  # all else about the model comes by SDO
         for parameter, value in find_firmware_parameters(job.model).items():
             words += ["--set", f"{parameter}={value!r}"]

@@ -48,7 +48,7 @@ def run_command(args: argparse.Namespace) -> int:
         given = "" if args.bus == "auto" else args.bus
         raise InputError("--bus", given, "a bus between programs, such as udp_multicast or socketcan:vcan0")
     places = Places(answer=None if args.out is None else require_writable(args.out, "--out"))
-    is_compiled = args.node == "plant" and can_open(bus)
+    is_compiled = args.node == "plant" and can_open(bus) and load_chosen_model(args).kind.foreign is None
     clock = WallClock()
     ended: list[int] = []
     with contextlib.ExitStack() as stack:

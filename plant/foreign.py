@@ -1,0 +1,89 @@
+"""Runs of a plant whose equations are another program's, such as an FMU: in closed loop, and replays of recordings.
+
+`Plant.foreign` gives the program for cycles of so many seconds.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.pid import control_by_pid
+
+Array = NDArray[np.float64]
+
+
+class Program(Protocol):
+    """What moves a plant, a cycle at a time. A plant without load does not look at the load."""
+
+    def begin(self, values: Mapping[str, float]) -> Array:
+        """Start anew with these parameters, and the `seed` of the run; the readings at time 0."""
+
+    def step(self, drive: float, load: float) -> Array:
+        """One cycle with these inputs; the readings at its end."""
+
+    def change(self, name: str, value: float) -> None:
+        """Change a parameter while it runs."""
+
+    def run(self, values: Mapping[str, float], given: Array) -> Array:
+        """The readings (n, outputs) before each cycle of a whole run; `given` has drive and load of each, (n, 2)."""
+
+
+@lru_cache(2)
+def _find_program(foreign: Any, period: float) -> Program:
+    """The program for replays: one serves them all, because each begins anew."""
+    program: Program = foreign(period)
+    return program
+
+
+def run_foreign_loop(actuator: Any, com: Array, load: Array, out: Array) -> None:
+    """A plant in closed loop with its controller: as `plant.solve.run_closed_loop`, for a `plant.run.Actuator`.
+
+    Args:
+        actuator: the plant.
+        com: (n,) demand.
+        load: (n,) external load.
+        out: (n, columns), written: readings, and the drive that the controller answers.
+    """
+    actuator.warm()
+    kind, p = actuator.model.kind, actuator.model.build_record()[0]
+    names = [s.name for s in kind.signals.columns]
+    shown, driven = [names.index(s.name) for s in kind.signals.outputs], names.index(kind.signals.drive.name)
+    drive, memory = 0.0, kind.build_control_memory()
+    for k in range(len(com)):
+        out[k, shown] = readings = actuator.sample()
+        actuator.advance(drive, float(load[k]))
+        drive, memory = (kind.control or control_by_pid)(memory, float(com[k]), readings, p)
+        out[k, driven] = drive
+
+
+def run_foreign(model: Any, names: Sequence[str], values: Array, driven: Array, load: Array, position: Array,
+                anchor: float, closed: bool, parts: Sequence[Any]) -> Array:
+    """The runs of `plant.lanes.Lanes` for a plant that another program moves, one after the other.
+
+    Its state cannot be pulled to the measured position. So the movement that it shows from row to row is added up, and
+    what has been added up is pulled.
+    """
+    if closed:
+        from plant.run import simulate
+
+        runs = (simulate(model.replace(dict(zip(names, row.tolist(), strict=True))), driven, load) for row in values)
+        return np.array([[getattr(run, s.name) for s in model.kind.signals.columns] for run in runs]).transpose(0, 2, 1)
+    period = model["controller.period"]
+    program = _find_program(model.kind.foreign, period)
+    out = np.empty((len(values), len(driven), len(model.kind.signals.outputs)))
+    for first, stop in [(part.first, part.stop) for part in parts] or [(0, len(driven))]:
+        given = np.column_stack([np.append(0.0, driven[first:stop - 1]), load[first:stop]])
+        for i, row in enumerate(values):
+            out[i, first:stop] = program.run({**model.values, **dict(zip(names, row, strict=True))}, given)
+        if len(position):
+            moved = np.diff(out[:, first:stop, 0], append=0.0)
+            x = out[:, first, 0].copy() if np.isnan(position[first]) else np.full(len(values), position[first])
+            for k in range(first, stop):
+                out[:, k, 0] = x
+                pull = 0.0 if np.isnan(position[k]) else anchor * period * (position[k] - x)
+                x = x + moved[:, k - first] + pull
+    return out

@@ -1,0 +1,224 @@
+"""A foreign unit as a plant: what its file says of it, the map of its variables, and the process that runs it.
+
+    [plant]
+    file = "ema.fmu"                                  # FMI 2.0 or 3.0, co-simulation
+    [plant.inputs]                                    # signal of the bench = variable of the unit
+    current = { variable = "motor.i_ref", count = "1 mA" }
+    load_force = "F_ext"
+    [plant.outputs]
+    ram_position = { variable = "x", count = "1 mm", noise = "1 um" }
+    [plant.parameters]                                # what --set and rig identify may change
+    screw.stiffness = { variable = "k_screw", range = [1e6, 1e9], unit = "N/m" }
+"""
+from __future__ import annotations
+
+import contextlib
+import re
+import signal as signals_of_processes
+import socket
+import subprocess
+import sys
+import tempfile
+import weakref
+import zipfile
+from collections.abc import Mapping, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from threading import RLock
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.errors import InputError, RigError, suggest_name
+from rig.fmi.host import Settings, Variable
+from rig.tables import Place
+
+Array = NDArray[np.float64]
+LONGEST_CALL = 20.0  # s, of one cycle or of starting: a unit that takes longer hangs
+_NUMBERS = {"Real": "Real", "Integer": "Integer", "Enumeration": "Integer", "Boolean": "Boolean"}  # FMI 2
+
+
+class Port(NamedTuple):
+    """A signal of the rig as a variable of the unit: signal = worth * variable."""
+
+    name: str  # of the signal or parameter
+    variable: Variable
+    worth: float = 1.0  # of one of the variable, in the SI unit of the signal
+
+
+class Description(NamedTuple):
+    """What the file of a unit says of it."""
+
+    path: Path
+    library: str  # in the archive
+    variables: Mapping[str, Any]  # of FMPy, by name
+    version: str
+    step: float | None  # s, where the unit has a fixed one
+
+
+def read_description(path: Path) -> Description:
+    """The description of a unit that can run here.
+
+    Raises:
+        InputError: no unit, or one that cannot run here, and what would.
+    """
+    try:
+        import fmpy
+    except ImportError:
+        raise InputError(path, "", "the package fmpy to run FMUs: pip install 'eha-rig[fmu]'") from None
+    if not zipfile.is_zipfile(path):
+        raise InputError(path, "", "an FMU, a zip archive with a modelDescription.xml" if path.is_file() else
+                         "an FMU; it does not exist")
+    version = "none"
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+            version = (re.findall(rb"""fmiVersion\s*=\s*["'](.*?)["']""", archive.read("modelDescription.xml")) or
+                       [b"none"])[0].decode(errors="replace")
+        if version[:2] in ("2.", "3."):
+            found = fmpy.read_model_description(str(path), validate=False)
+    except Exception as error:  # FMPy raises Exception itself
+        said = " ".join(str(error).split())
+        raise InputError(path, "modelDescription.xml", f"that of an FMU 2.0 or 3.0 ({said})") from error
+    if version[:2] not in ("2.", "3."):
+        raise InputError(path, "fmiVersion", f"2.0 or 3.0, not {version}")
+    unit = found.coSimulation
+    if unit is None:
+        kind = "model exchange" if found.modelExchange is not None else "scheduled execution"
+        raise InputError(path, "", f"an FMU for co-simulation; this one is for {kind} only")
+    if unit.needsExecutionTool:
+        raise InputError(path, "needsExecutionTool", "an FMU that runs without the tool that made it")
+    folders = [fmpy.platform_tuple, *([fmpy.platform] if version[0] == "2" else [])]
+    libraries = [f"binaries/{folder}/{unit.modelIdentifier}{fmpy.sharedLibraryExtension}" for folder in folders]
+    library = next((name for name in libraries if name in names), None)
+    if library is None:
+        there = sorted({name.split("/")[1] for name in names if name.startswith("binaries/") and name.count("/") > 1})
+        offered = f"only {', '.join(there)}" if there else "none"
+        if any(name.startswith("sources/") for name in names):
+            offered += f" and source code: python -m fmpy compile {path.name}"
+        raise InputError(path, "binaries", f"a library for {folders[-1]}; it has {offered}")
+    variables = {v.name: v for v in found.modelVariables}
+    step = unit.fixedInternalStepSize
+    return Description(path, library, variables, version, None if step is None else float(step))
+
+
+def find_variable(description: Description, name: str, causality: Sequence[str], place: Place) -> Variable:
+    """A number of the unit, by its name; `place` is where it is named.
+
+    Raises:
+        InputError: there is none, or one of another kind.
+    """
+    found = description.variables.get(name)
+    if found is None:
+        hint = suggest_name(name, list(description.variables))
+        raise place.refuse(f"a variable of {description.path.name}, not {name!r}{hint}")
+    if found.causality not in causality:
+        raise place.refuse(f"a variable that is {' or '.join(causality)}; {name} is {found.causality}")
+    kind = _NUMBERS.get(found.type) if description.version[0] == "2" else found.type.replace("Enumeration", "Int64")
+    if kind is None or kind in ("String", "Binary", "Clock") or found.dimensions:
+        raise place.refuse(f"a variable that is one number; {name} is of type {found.type}")
+    return int(found.valueReference), kind
+
+
+class Unit:
+    """A foreign unit that runs in a process of its own; the first call starts it."""
+
+    def __init__(self, description: Description, inputs: Sequence[Port], outputs: Sequence[Port],
+                 parameters: Sequence[Port], cycle: float) -> None:
+        """Unpacks the unit. `cycle` is the length of a step in s.
+
+        Raises:
+            InputError: the unit takes steps of another length.
+        """
+        fixed = description.step
+        if fixed and abs(cycle / fixed - round(cycle / fixed)) > 1e-6:
+            raise InputError(description.path, "fixedInternalStepSize",
+                             f"a step of which the cycle of {cycle * 1e3:g} ms is a multiple, not {fixed * 1e3:g} ms")
+        self._path, self._library, self._cycle = description.path, description.library, cycle
+        self._inputs, self._outputs, self._parameters = tuple(inputs), tuple(outputs), tuple(parameters)
+        self._lock = RLock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._connection: Connection | None = None
+
+    def begin(self, values: Mapping[str, float]) -> Array:
+        """Start anew with these parameters; the readings at time 0."""
+        self._k = 0
+        return self._scale(self._ask("begin", self._list_settings(values)))
+
+    def change(self, name: str, value: float) -> None:
+        """Change a parameter of the running unit."""
+        self._ask("change", self._list_settings({name: value}))
+
+    def step(self, drive: float, load: float) -> Array:
+        """One cycle with these inputs; the readings at its end."""
+        self._k += 1
+        return self._scale(self._ask("step", [x / p.worth for x, p in zip((drive, load), self._inputs, strict=False)]))
+
+    def run(self, values: Mapping[str, float], given: Array) -> Array:
+        """The readings (n, outputs) before each cycle of a whole run; `given` has drive and load of each, (n, 2)."""
+        worth = [port.worth for port in self._inputs]
+        rows = (given[:, :len(worth)] / worth).tolist()
+        return self._scale(self._ask("run", self._list_settings(values), rows, seconds=float(len(rows))))
+
+    def close(self) -> None:
+        """End the process."""
+        process, self._process = self._process, None
+        if process is not None and self._connection is not None:
+            self._connection.close()
+            process.kill()
+            process.wait()
+
+    def _scale(self, values: Any) -> Array:
+        found: Array = np.asarray(values, float) * [port.worth for port in self._outputs]
+        if not np.isfinite(found).all():
+            rows = np.atleast_2d(found)
+            k, i = np.argwhere(~np.isfinite(rows))[0]
+            t = (self._k if found.ndim == 1 else k) * self._cycle
+            raise RigError(f"{self._path}: the unit gives {rows[k, i]} for {self._outputs[i].name} at {t:.6g} s")
+        return found
+
+    def _list_settings(self, values: Mapping[str, float]) -> Settings:
+        return [(port.variable, values[port.name] / port.worth) for port in self._parameters if port.name in values]
+
+    def _ask(self, name: str, *arguments: Any, seconds: float = 0.0) -> Any:
+        """The answer of the process. Raises RigError: the unit refuses, crashes or hangs."""
+        with self._lock:  # analyses run in threads
+            return self._ask_alone(name, arguments, LONGEST_CALL + seconds)
+
+    def _ask_alone(self, name: str, arguments: Sequence[Any], seconds: float) -> Any:
+        if self._process is None:
+            self._start()
+        process, connection = self._process, self._connection
+        assert process is not None and connection is not None
+        with contextlib.suppress(OSError, EOFError):
+            connection.send((name, arguments))
+            if connection.poll(seconds):
+                word, result = connection.recv()
+                if word == "done":
+                    return result
+                self.close()
+                raise RigError(f"{self._path}: {result}")
+            self.close()
+            raise RigError(f"{self._path}: the unit has not answered for {seconds:g} s in {name}; it was stopped")
+        status = process.wait()
+        self.close()
+        cause = signals_of_processes.Signals(-status).name if status < 0 else f"exit status {status}"
+        said = Path(self._folder.name, "messages.txt").read_text(errors="replace").split("\n")
+        last = next((f"; its last message: {line.strip()}" for line in reversed(said) if line.strip()), "")
+        raise RigError(f"{self._path}: the unit crashed in {name} ({cause}){last}")
+
+    def _start(self) -> None:
+        """Unpack the unit, and load it in a process of its own."""
+        self._folder = tempfile.TemporaryDirectory(prefix="eha-rig-fmu-")
+        with zipfile.ZipFile(self._path) as archive:
+            archive.extractall(self._folder.name)  # it refuses names that lead out of the folder
+        ours, theirs = socket.socketpair()
+        with Path(self._folder.name, "messages.txt").open("wb") as messages, theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "rig.fmi.host", str(theirs.fileno())], pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL, stdout=messages, stderr=messages, start_new_session=True)
+        self._connection = Connection(ours.detach())
+        weakref.finalize(self, self._process.kill)
+        self._ask("load", self._folder.name, str(Path(self._folder.name, self._library)),
+                  [port.variable for port in self._inputs], [port.variable for port in self._outputs], self._cycle)

@@ -1,0 +1,143 @@
+"""Runs a foreign unit in a process of its own: `python -m rig.fmi.host CONNECTION`.
+
+A unit is somebody else's machine code. If it crashes or hangs, only this process does. Requests are a name and its
+arguments, the first one `load`; answers are ("done", result) or ("failed", what went wrong). rig/fmi/foreign.py asks.
+"""
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
+from typing import Any
+
+Variable = tuple[int, str]  # value reference, and type in the names of FMPy's functions: Real, Float64, Boolean, ..
+Settings = Sequence[tuple[Variable, float]]
+_STATE_CALLS = {"2": ("getFMUstate", "setFMUstate", "freeFMUstate"),
+                "3": ("getFMUState", "setFMUState", "freeFMUState")}
+
+
+Groups = dict[str, tuple[list[int], list[int]]]  # by type: places in a list of values, and value references
+
+
+def _group(variables: Sequence[Variable]) -> Groups:
+    """Variables of one type are set and read by one call."""
+    groups: Groups = {}
+    for i, (reference, kind) in enumerate(variables):
+        places, references = groups.setdefault(kind, ([], []))
+        places.append(i)
+        references.append(reference)
+    return groups
+
+
+class Host:
+    """An instance of an unpacked unit."""
+
+    def __init__(self, folder: str, library: str, inputs: Sequence[Variable], outputs: Sequence[Variable],
+                 cycle: float) -> None:
+        import fmpy
+
+        self._place, self._cycle = (folder, library), cycle
+        self._inputs, self._outputs = _group(inputs), _group(outputs)
+        self._count = len(outputs)
+        self._description = fmpy.read_model_description(folder, validate=False)
+        self._version = self._description.fmiVersion[0]
+        self._get_state, self._set_state, self._free_state = _STATE_CALLS[self._version]
+        self._unit: Any = None
+        self._start: Any = None  # its state after initialisation
+        self._settings: Settings = ()  # the parameters of that state
+        self._k = 0
+        self.said = ""  # its last message
+
+    def begin(self, settings: Settings) -> list[float]:
+        """Start anew with these parameters; the outputs at time 0. The state of the last start is used where it can be.
+        """
+        self._k = 0
+        if self._start is not None and self._settings == settings:
+            getattr(self._unit, self._set_state)(self._start)
+            return self._read()
+        self._instantiate()
+        if self._version == "2":
+            self._unit.setupExperiment(startTime=0.0)
+        self.change(settings)
+        self._unit.enterInitializationMode()
+        self._unit.exitInitializationMode()
+        if self._description.coSimulation.canGetAndSetFMUstate:
+            self._start, self._settings = getattr(self._unit, self._get_state)(), settings
+        return self._read()
+
+    def change(self, settings: Settings) -> None:
+        """Set parameters, those of a running unit too."""
+        self._write(_group([variable for variable, _ in settings]), [value for _, value in settings])
+
+    def step(self, values: Sequence[float]) -> list[float]:
+        """One cycle with these inputs; the outputs at its end."""
+        self._write(self._inputs, values)
+        t = self._k * self._cycle
+        answer = self._unit.doStep(t, self._cycle)
+        if answer and answer[1]:
+            raise RuntimeError("the unit asks to end the simulation")
+        if answer and abs(answer[3] - t - self._cycle) > 0.5 * self._cycle:
+            raise RuntimeError(f"the unit stopped within a step, at {answer[3]:.6g} s")
+        self._k += 1
+        return self._read()
+
+    def run(self, settings: Settings, rows: Sequence[Sequence[float]]) -> list[list[float]]:
+        """The outputs before each cycle of a whole run, from the inputs of each cycle."""
+        return [self.begin(settings), *(self.step(row) for row in rows[:-1])]
+
+    def describe_failure(self, error: Exception) -> str:
+        """When and how a call failed, with the last message of the unit."""
+        said = f"; its message: {self.said}" if self.said else ""
+        return f"{str(error).rstrip('.')} at {self._k * self._cycle:.6g} s{said}"
+
+    def _instantiate(self) -> None:
+        from fmpy.simulation import instantiate_fmu
+
+        if self._unit is not None:
+            if self._start is not None:
+                getattr(self._unit, self._free_state)(self._start)
+            self._unit.freeInstance()
+        self._unit = self._start = None
+        folder, library = self._place
+        self._unit = instantiate_fmu(folder, self._description, "CoSimulation", logger=self._log, library_path=library,
+                                     require_functions=False)
+
+    def _write(self, groups: Groups, values: Sequence[float]) -> None:
+        for kind, (places, references) in groups.items():
+            exact = [values[i] if kind in ("Real", "Float64", "Float32") else round(values[i]) for i in places]
+            getattr(self._unit, f"set{kind}")(references, exact)
+
+    def _read(self) -> list[float]:
+        found = [0.0] * self._count
+        for kind, (places, references) in self._outputs.items():
+            for i, value in zip(places, getattr(self._unit, f"get{kind}")(references), strict=True):
+                found[i] = float(value)
+        return found
+
+    def _log(self, *words: Any) -> None:
+        """A message of the unit; its text is the last argument in both versions."""
+        self.said = " ".join(words[-1].decode(errors="replace").split())
+        print(self.said, file=sys.stderr, flush=True)
+
+
+def serve(connection: Connection) -> None:
+    """Answer requests until the other end closes."""
+    host: Host | None = None
+    while True:
+        try:
+            name, arguments = connection.recv()
+        except (EOFError, OSError):
+            return
+        try:
+            if host is None:
+                host, result = Host(*arguments), None
+            else:
+                result = getattr(host, name)(*arguments)
+        except Exception as error:
+            connection.send(("failed", str(error) if host is None else host.describe_failure(error)))
+        else:
+            connection.send(("done", result))
+
+
+if __name__ == "__main__":
+    serve(Connection(int(sys.argv[1])))

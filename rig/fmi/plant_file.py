@@ -1,0 +1,204 @@
+"""Makes a plant of a foreign unit: from a table [plant] that maps its variables, or from the names of the unit alone.
+
+    [plant]
+    file = "ema.fmu"
+    seed = "noise_seed"                             # optional: the variable that takes the seed of a run
+    [plant.inputs]                                  # signal = variable, or with what one of the variable is worth
+    current = { variable = "motor.i_ref", count = "1 mA" }
+    load_force = "F_ext"
+    [plant.outputs]                                 # the first is the one that the controller controls
+    ram_position = { variable = "x", count = "1 mm", noise = "1 um" }
+    [plant.parameters]                              # what --set and rig identify may change
+    screw.stiffness = { variable = "k", range = [1e6, 1e9] }
+"""
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from math import inf
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, cast
+
+from plant.parameters import Controller, convert_group_unit
+from plant.plants import Plant, find_plant, keep_plant
+from plant.quantity import Quantity
+from plant.signals import Signal
+from plant.units import find_unit, parse_quantity
+from rig.fmi.foreign import Description, Port, Unit, find_variable, read_description
+from rig.tables import Place, build_dataclass, decode_text, parse_table, read_file
+
+# Names of benches for the signals of an EHA, which keep their columns and meaning; others are new signals.
+_COLUMNS = {"position_demand": "com", "ram_position": "xj", "load_pressure": "p12", "spool_position": "xs",
+            "current": "cor", "load_force": "load"}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What a signal or parameter is in the unit."""
+
+    variable: str
+    count: str | None = None  # what one of the variable is worth; default: its unit in the description
+    noise: str | None = None  # of the sensor of an output, RMS
+    role: str | None = None  # "load" of a new input that is none of a drive
+    range: tuple[float, float] | None = None  # of a parameter
+
+
+
+Entries = dict[str, tuple[Entry, Place]]
+
+
+def load_fmu_plant(path: Path) -> Plant:
+    """The plant of an FMU whose variables have the names of signals, or of a TOML file with a table [plant].
+
+    Raises:
+        InputError: the FMU cannot run here, or a key that cannot be used, and what was expected.
+    """
+    if path.suffix == ".fmu":
+        return declare_plant(path, {}, Place(str(path), {}), str(path))
+    tables, place = parse_table(decode_text(read_file(path), path), str(path))
+    table = tables.get("plant")
+    if not isinstance(table, dict) or not isinstance(table.get("file"), str):
+        raise place.at("plant").refuse('a table [plant] with file = "NAME.fmu"')
+    return declare_plant(path.parent / table["file"], table, place.at("plant"), str(path))
+
+
+def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str) -> Plant:
+    """The plant of the unit in `file` as `table` maps it; `key` is what models call it.
+
+    Raises:
+        InputError: see `load_fmu_plant`.
+    """
+    about = read_description(file)
+    known = ("file", "seed", "inputs", "outputs", "parameters")
+    for name in table:
+        if name not in known:
+            raise place.at(name).refuse(f"one of {', '.join(known)}")
+    inputs, outputs, parameters = (
+        dict(_list_entries(table[name], place.at(name))) if name in table else _guess_entries(about, name, place)
+        for name in known[2:])
+    if not inputs or not outputs:
+        has = ", ".join(f"{v.causality} {n}" for n, v in about.variables.items() if v.causality in ("input", "output"))
+        raise place.refuse(f"tables [plant.inputs] and [plant.outputs], SIGNAL = VARIABLE; the unit has {has}")
+    given = [_map_signal(about, name, *entry, "input") for name, entry in inputs.items()]
+    shown = [_map_signal(about, name, *entry, "output") for name, entry in outputs.items()]
+    if sorted(s.role for s, _ in given) not in (["drive"], ["drive", "load"]):
+        raise place.at("inputs").refuse('one signal that drives the plant, and at most one of role = "load"')
+    given.sort(key=lambda item: item[0].role)
+    first, drive = shown[0][0], given[0][0]
+    usual = find_plant("eha")
+    command = usual.signals.command if first.name == usual.signals.controlled.name else Signal(
+        "demand", f"{first.symbol}_c", first.unit, f"demand of {first.quantity}", "command")
+    groups: dict[str, dict[str, Any]] = {}
+    values: dict[str, float] = {}
+    ports = [Port("seed", find_variable(about, table.get("seed", "seed"), ("parameter",), place.at("seed")))
+             ] if "seed" in table or (not table and "seed" in about.variables) else []
+    for name, (entry, where) in parameters.items():
+        port, quantity, values[name] = _map_parameter(about, name, entry, where)
+        group, _, field = name.partition(".")
+        groups.setdefault(group, {})[field] = Annotated[float, quantity]
+        ports.append(port)
+    types: dict[str, Any] = {
+        group: NamedTuple(group.title().replace("_", ""), list(fields.items()))
+        for group, fields in groups.items()}
+    is_usual = drive.unit == usual.unit
+    types["controller"] = Controller if is_usual else convert_group_unit(Controller, usual.unit, drive.unit, inf)
+    values |= {name: value for name, value in usual.nominal.items()
+               if name == "controller.period" or (is_usual and name.startswith("controller."))}
+    state = make_state_type(tuple(signal.name for signal, _ in shown))
+    columns = (command, first, drive, *(s for s, _ in shown[1:]), *(s for s, _ in given[1:]))
+    return keep_plant(Plant(
+        signals=cast(Any, columns), parameters=types, state=state, step=_stay, measure=_show_state, moves=(),
+        title=f"FMU {file.name}", name=file.stem, values=values, file=file, key=key,
+        foreign=partial(Unit, about, [port for _, port in given], [port for _, port in shown], ports)))
+
+
+def make_state_type(names: tuple[str, ...]) -> type[Any]:
+    """The state of the plant as far as it is known: what the unit has shown last."""
+    made: Any = NamedTuple("Held", [(name, float) for name in names])  # type: ignore[misc]
+    made.__new__.__defaults__ = (0.0,) * len(names)
+    return cast("type[Any]", made)
+
+
+def _stay(s: Any, m: Any, u: Any, p: Any) -> Any:
+    """Stands for the step, which the unit keeps to itself."""
+    return s, m
+
+
+def _show_state(s: Any, p: Any) -> Any:
+    """The readings, which are the state."""
+    return s
+
+
+def _list_entries(table: object, place: Place, prefix: str = "") -> Iterator[tuple[str, tuple[Entry, Place]]]:
+    """The entries of a table by name; a table without `variable` holds names with a dot."""
+    if not isinstance(table, dict):
+        raise place.refuse("a table NAME = VARIABLE")
+    for key, value in table.items():
+        at = place.at(key)
+        if isinstance(value, str):
+            yield prefix + key, (Entry(value), at)
+        elif isinstance(value, dict) and isinstance(value.get("variable", {}), dict):
+            yield from _list_entries(value, at, f"{prefix}{key}.")
+        else:
+            yield prefix + key, (build_dataclass(Entry, value, at), at)
+
+
+def _guess_entries(about: Description, table: str, place: Place) -> Entries:
+    """Variables that have the names of signals of the EHA; as parameters those with one dot in their name."""
+    signals = {**{name: name for name in find_plant("eha").signals.names}, **_COLUMNS}
+    kinds = {"inputs": "input", "outputs": "output", "parameters": "parameter"}
+    return {name: (Entry(name), place) for name, v in about.variables.items()
+            if v.causality == kinds[table] and v.type in ("Real", "Float64")
+            and (re.fullmatch(r"(?!controller\b)\w+\.\w+", name) if table == "parameters" else
+                 signals.get(name) in _COLUMNS.values() and signals.get(name) != "com")}
+
+
+def _map_signal(about: Description, name: str, entry: Entry, place: Place, causality: str) -> tuple[Signal, Port]:
+    """A signal and its variable."""
+    eha = {s.name: s for s in find_plant("eha").signals}
+    signal = eha.get(_COLUMNS.get(name, name))
+    worth, unit = _find_worth(about, entry, "" if signal is None else signal.unit, place)
+    noise = float(parse_quantity(entry.noise, unit, place, "noise")) if entry.noise else ""
+    if signal is None:
+        role = (entry.role or "drive") if causality == "input" else "output"
+        signal = Signal(name, name, unit, name.replace("_", " "), role)
+    return signal._replace(noise=noise, limit="", role="output" if causality == "output" else signal.role), Port(
+        signal.name, find_variable(about, entry.variable, (causality,), place), worth)
+
+
+def _find_worth(about: Description, entry: Entry, unit: str, place: Place) -> tuple[float, str]:
+    """What one of a variable is worth, and the SI unit; `unit` is that of the signal, "" if it has none of its own."""
+    stated = getattr(about.variables.get(entry.variable), "unit", None) or ""
+    if entry.count is not None:
+        number, _, named = entry.count.partition(" ")
+        known = find_unit(named)
+        si = unit or (known.si if known else named or "1")
+        if not unit and known is None:
+            return float(parse_quantity(number, "", place, "count")), si
+        return float(parse_quantity(entry.count, si, place, "count")), si
+    known = find_unit(stated)
+    if known is not None and unit in ("", known.si):
+        return float(known.factor), known.si
+    if unit and stated not in ("", unit):
+        raise place.refuse(f'count = ".. {unit}": the variable {entry.variable} is in {stated}')
+    return 1.0, unit or stated or "1"
+
+
+def _map_parameter(about: Description, name: str, entry: Entry, place: Place) -> tuple[Port, Quantity, float]:
+    """A parameter, its meaning and its nominal value."""
+    if not re.fullmatch(r"\w+\.\w+", name):
+        raise place.refuse("GROUP.NAME = VARIABLE")
+    port = Port(name, find_variable(about, entry.variable, ("parameter",), place))
+    worth, unit = _find_worth(about, entry, "", place)
+    variable = about.variables[entry.variable]
+    low, high = entry.range or (_read_number(variable.min, -inf), _read_number(variable.max, inf))
+    quantity = Quantity(unit, low=low, high=high)
+    return port._replace(worth=worth), quantity, worth * _read_number(variable.start, 0.0)
+
+
+def _read_number(text: Any, default: float) -> float:
+    """A number of the description; true is 1."""
+    words = {"true": 1.0, "false": 0.0, None: default}
+    return words[text] if text in words else float(text)
