@@ -2,4 +2,4 @@
 import plant  # noqa: F401  selects the kernels of linear algebra before anything imports NumPy
 from plant.plant_files import READERS
 
-READERS[".fmu"] = READERS[".toml"] = "rig.fmi.plant_file:load_fmu_plant"
+READERS.update(dict.fromkeys((".fmu", ".toml"), "rig.fmi.plant_file:load_fmu_plant"))

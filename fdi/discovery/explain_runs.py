@@ -113,8 +113,9 @@ def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: 
     """Find starting sizes for effects that have none, and compile what these effects need; by default all there are.
 
     Raises:
-        InputError: a user's effect that cannot be compiled and run.
+        InputError: a user's effect that cannot be compiled and run, or a plant whose equations cannot be read.
     """
+    runs.model.kind.require_equations()
     for name in [e.name for e in list_searched_effects(runs.model.plant)] if effects is None else effects:
         if not runs.model.find_effect(name).starts and runs.model.find_effect(name).fitted:
             progress(f"looking for sizes of {name}", 0.0)

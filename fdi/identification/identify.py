@@ -136,7 +136,7 @@ def read_free_parameters(model: Model, source: str | Path | None) -> tuple[Range
     if model.kind.foreign is not None:  # the map of an FMU gives ranges
         known = {name: find_quantity(name, plant=model.plant) for name in model.list_names()}
         widths |= {name: [q.low, q.high] for name, q in known.items()
-                   if math.isfinite(q.high - q.low) and not name.startswith("controller.")}
+                   if math.isfinite(q.high - q.low) and name.partition(".")[0] not in ("controller", "sensors")}
     scattering = {name: _parse_range(name, width, model, model.name) for name, width in widths.items()
                   if model[name] > 0.0 or isinstance(width, list)}
     if not scattering:

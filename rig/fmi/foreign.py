@@ -87,8 +87,6 @@ def read_description(path: Path) -> Description:
     if unit is None:
         kind = "model exchange" if found.modelExchange is not None else "scheduled execution"
         raise InputError(path, "", f"an FMU for co-simulation; this one is for {kind} only")
-    if unit.needsExecutionTool:
-        raise InputError(path, "needsExecutionTool", "an FMU that runs without the tool that made it")
     folders = [fmpy.platform_tuple, *([fmpy.platform] if version[0] == "2" else [])]
     libraries = [f"binaries/{folder}/{unit.modelIdentifier}{fmpy.sharedLibraryExtension}" for folder in folders]
     library = next((name for name in libraries if name in names), None)

@@ -88,7 +88,8 @@ class Host:
     def describe_failure(self, error: Exception) -> str:
         """When and how a call failed, with the last message of the unit."""
         said = f"; its message: {self.said}" if self.said else ""
-        return f"{str(error).rstrip('.')} at {self._k * self._cycle:.6g} s{said}"
+        tool = "; it needs the tool that made it" if self._description.coSimulation.needsExecutionTool else ""
+        return f"{str(error).rstrip('.')} at {self._k * self._cycle:.6g} s{said}{tool}"
 
     def _instantiate(self) -> None:
         from fmpy.simulation import instantiate_fmu

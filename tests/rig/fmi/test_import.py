@@ -110,7 +110,7 @@ def test_identify_finds_the_parameters_that_the_map_gives_a_range(folder: Path) 
     build_fmu(Path("slide.fmu"))
     answer("simulate", "--model", "slide.toml", "--command", "command.csv", "--set", "drive.gain=2.4", "--out",
            "run.csv")
-    found = answer("identify", "run.csv", "--model", "slide.toml", "--out", "found.toml", status=None)
+    found = answer("identify", "run.csv", "--model", "slide.toml", "--out", "found.toml")
     assert found["parameters"]["drive.gain"]["value"] == pytest.approx(2.4, rel=0.01)
 
 
@@ -146,7 +146,7 @@ REFUSED = {
     "source code": ({"sources": True}, "it has none and source code: python -m fmpy compile slide.fmu"),
     "version": ({"fmi": "1.0"}, "fmiVersion: expected 2.0 or 3.0, not 1.0"),
     "model exchange": ({"kind": "ModelExchange"}, "an FMU for co-simulation; this one is for model exchange only"),
-    "its tool": ({"unit": 'needsExecutionTool="true"'}, "an FMU that runs without the tool that made it"),
+    "its tool": ({"unit": 'needsExecutionTool="true"', "does": "REFUSE", "at": 1}, "needs the tool that made it"),
     "step": ({"unit": 'fixedInternalStepSize="0.0003"'}, "a step of which the cycle of 1 ms is a multiple, not 0.3 ms"),
     "event mode": ({"does": "EVENT_MODE"}, "its message: this unit needs event mode"),
     "end": ({"does": "END", "at": 3}, "the unit asks to end the simulation"),
@@ -156,7 +156,8 @@ REFUSED = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_unit_that_cannot_run_here_is_refused(folder: Path, name: str) -> None:
     build_fmu(Path("slide.fmu"), **REFUSED[name][0])  # type: ignore[arg-type]
-    assert REFUSED[name][1] in refuse("simulate", "--model", "slide.toml", "--out", "run.csv")
+    assert REFUSED[name][1] in refuse(
+        "simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
 
 
 MAPS = {  # replaced in SLIDE
