@@ -237,16 +237,14 @@ class Plant:
             return True
         shared, own = PORTS[e.port].unit or "m", self.ports[e.port].unit  # those of the EHA, for which it was written
         is_own = e.function is not None and not e.function.__module__.startswith("plant.")  # in a file of the user's
-        has_unit = is_own or shared == own or not any(
-            shared in re.split(r"[ /()]", q.unit) for q in e.parameters.values())
-        return has_unit and self._has_what_law_names(e)
+        has_unit = shared == own or not any(shared in re.split(r"[ /()]", q.unit) for q in e.parameters.values())
+        return is_own or (has_unit and self._has_what_law_names(e))
 
     def _has_what_law_names(self, e: Effect) -> bool:
         """Whether the state has the fields, and the parameters the groups, that the law of an effect names."""
         state = Sampled if e.port == "command" else self.state
-        known = {*self.nominal, *e.parameters}
         return all(name in state._fields for name in find_fields_of(e.function, "s")) and all(
-            any(each == name or each.startswith(f"{name}.") for each in known)
+            name in self.nominal or name in self.parameters or name.partition(".")[0] == e.name
             for name in find_fields_of(e.function, "p", 2))
 
     def bind_functions(self, names: tuple[str, ...]) -> dict[str, Function]:

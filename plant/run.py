@@ -136,10 +136,10 @@ def report_law_errors(model: Model) -> Iterator[None]:
     except Exception as error:
         if not model.effects and model.kind.file is None:
             raise
-        told = find_compile_error(error)
-        if told is not None:
+        found, told = _find_law_error(model), find_compile_error(error)
+        if found is None and told is not None:
             raise told from error
-        where, cause = _find_law_error(model) or (model.kind.file or "effects", error)
+        where, cause = found or (model.kind.file or "effects", error)
         said = next((line.strip() for line in reversed(str(cause).splitlines()) if line.strip()), "")
         raise InputError(where, ", ".join(model.effects),
                          f"laws that can be compiled and run ({type(cause).__name__}: {said})") from error

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import ForeignCall, compile_function, keep_apart
+from plant.compile import ForeignCall, bind_later, compile_function, keep_apart
 from plant.errors import InputError
 from plant.machine_code import find_function_address
 from rig.benches.checksums import CHECKSUMS, find_user_checksum
@@ -347,6 +347,7 @@ def _fill_field(m: Layout, at: int, field: Field, rule: int, channel: int) -> No
                                                          float(field.offset), *field.range)
 
 
+@bind_later
 def users_checksum(data: NDArray[np.uint8], counter: int) -> int:
     """The place of a user's function in `call_users_checksum`."""
     raise NotImplementedError

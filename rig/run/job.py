@@ -264,11 +264,12 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     """
     require_different_names(choice.effects)
     bench = load_bench(choice.bench or "eha", is_trusted=is_trusted)
-    sequence = load_sequence(choice.sequence, bench.rate) if built is None else built
-    name = choice.model or (sequence.model.name if sequence.model.name != "eha" else bench.plant)
-    load_plant_of_model(name, is_trusted=is_trusted, announce=announce)
+    load_plant_of_model(choice.model or bench.plant, is_trusted=is_trusted, announce=announce)
     for file in choice.effects:
         load_effects(file)
+    sequence = load_sequence(choice.sequence, bench.rate) if built is None else built  # it may name such an effect
+    name = choice.model or (sequence.model.name if sequence.model.name != "eha" else bench.plant)
+    load_plant_of_model(name, is_trusted=is_trusted, announce=announce)
     brought = load_effects_of_model(name, choice.effects, is_trusted=is_trusted, announce=announce)
     require_different_names((*choice.effects, *brought))
     model = load_model(name).replace(sequence.model.overrides, sequence.name).replace(choice.changes)

@@ -32,7 +32,7 @@ PARTS = (
     Part("docs/commands.md", "Look at a run",
          f"{SAMPLES}\nmv run.csv before.csv; mv run2.csv after.csv; cp before.csv bench.csv\n"
          "rig run --quiet && rig run --quiet"),
-    Part("docs/commands.md", "Use your own controller"),
+    Part("docs/commands.md", "Use your own controller", EXAMPLES),
     Part("docs/commands.md", "Test any CANopen node"),
     Part("docs/commands.md", "Simulate"),
     Part("docs/commands.md", "Find missing physics", f"{SAMPLES}\ncp held.csv other.csv"),
@@ -46,7 +46,11 @@ PARTS = (
     Part("docs/diff.md"),
     Part("docs/effects.md"),
     Part("docs/firmware.md"),
+    Part("docs/fmu.md", "A model as a unit",
+         f"cp '{ROOT}/examples/cogging.py' my_effects.py\n"
+         "printf 'effects = [\"cogging\"]\\n[cogging]\\nforce = 500.0\\n' > worn.toml"),
     Part("docs/import.md", "", SAMPLES),
+    Part("docs/plants.md"),
     Part("docs/trend.md", "", f"{DATED}\nrig trend unit7/ --out unit7.json --quiet"),
     Part("docs/worked_cases.md"),
 )
@@ -84,6 +88,7 @@ NOT_PLAYED_PAGES = {
     "docs/real_data.md": "needs recordings of others",
     "docs/statistics.md": _HOURS,
     "docs/suite.md": "tests/rig/suite runs the suite of the page",
+    "docs/tutorial_emps.md": "needs recordings of others",
 }
 
 

@@ -28,6 +28,7 @@ from plant import Model, simulate
 from plant.monitor import Monitor
 from plant.profile import build_profile
 from plant.segments import Chirp, Hold, Ramp, Step
+from plant.signals import EHA
 from rig.sequences import load_sequence
 
 PREFLIGHT = load_sequence("preflight").main_profile()
@@ -176,7 +177,8 @@ def diagnosis(kintas: float, explained: bool = True, others: dict[str, Estimate]
                            ramp=point(0.0), joint=point(kintas), merged=SimpleNamespace(kintas=kintas, fss=5.0))
     sizes = {CLOGGING.name: Estimate(0.001, 0.0, 0.02), FRICTION.name: Estimate(5.0, 4.0, 6.0)}
     refinement = SimpleNamespace(errors={"xj": 2e-6}, is_explained=explained)
-    return cast(Any, SimpleNamespace(grid=grid, sizes=sizes, others=others or {}, refinement=refinement))
+    return cast(Any, SimpleNamespace(grid=grid, sizes=sizes, others=others or {}, refinement=refinement,
+                                     trace=SimpleNamespace(declared=EHA)))
 
 
 def test_a_grid_that_contradicts_the_fit_says_why() -> None:

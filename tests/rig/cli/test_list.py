@@ -126,7 +126,7 @@ def test_can_finding_is_true(findings: list[doctor.Finding]) -> None:
 
 def test_versions_are_the_installed_ones(findings: list[doctor.Finding]) -> None:
     assert any(finding.name == "packages" and f"numpy {np.__version__}" in finding.found for finding in findings)
-    extras = {"view", "dev", "fleet", "learn", "bench", "measure", "plots", "shell", "docs"}
+    extras = {"view", "dev", "fleet", "learn", "bench", "measure", "plots", "shell", "docs", "fmu"}
     assert set(doctor.read_requirements()) == {""} | extras
     assert doctor.read_versions(["no-such-distribution"]) == {"no-such-distribution": ""}
 

@@ -281,7 +281,6 @@ def test_runs_are_overlaid_and_subtracted_on_the_time_of_the_first(folder: Path,
     (["--compare", "--headless"], "--headless: expected --screenshot FILE.png with it"),
     (["other.csv", "--compare"], "--compare: other.csv: expected one trace; rig view A B holds traces against each "
                                  "other"),
-    (["--model", "eha"], "--model: expected --compare with it"),
     (["--headless"], "--headless: expected --screenshot FILE.png with it"),
     (["--theme", "light", "--save", "x.rrd"], "--theme: light: expected no --screenshot, --save or --out with it: they "
                                               "open no browser"),
