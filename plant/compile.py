@@ -201,6 +201,12 @@ def bind_later(function: AnyFunction) -> AnyFunction:
     return function
 
 
+@bind_later
+def raise_unbound(*arguments: Any) -> Any:
+    """Stands for any function that is bound later; each place gives it a name of its own."""
+    raise TypeError("no function is bound")
+
+
 def _declare_part(f: Function) -> Function:
     """A function below the one to be compiled, as numba gets it."""
     import numba

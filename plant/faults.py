@@ -204,7 +204,7 @@ def place_fault(fault: Fault, kind: Any, where: object = "faults") -> Fault:
     Raises:
         InputError: a parameter that the plant lacks, another unit, or limits that contradict each other or the range.
     """
-    groups = {**kind.groups, **{e.name: e.group for e in kind.list_effects() if e.group is not None}}
+    groups = kind.list_groups()
 
     def refuse(key: str, expected: str) -> InputError:
         return InputError(where, f"faults.{fault.name}.{key}".rstrip("."), expected)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from plant.compile import Function, bind_later
+from plant.compile import Function, raise_unbound
 from plant.state import Memory
 
 
@@ -71,13 +71,5 @@ def _build_expression(x: Memory, path: str, kinds: dict[str, type[Any]], paths: 
     return f"{kind}({', '.join(inner)})"
 
 
-@bind_later
-def pack_state(x: Any, a: Any) -> None:
-    """Write `x`, a state and its memories, into the array `a`. A placeholder: each model binds its own function."""
-    raise TypeError("no model is bound")
-
-
-@bind_later
-def unpack_state(a: Any) -> Any:
-    """The state and the memories that the array `a` holds. A placeholder: each model binds its own function."""
-    raise TypeError("no model is bound")
+# each model binds its own: pack_state((state, memories), array), and unpack_state(array) -> (state, memories)
+pack_state = unpack_state = raise_unbound

@@ -8,15 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from plant.compile import Function, bind_later
+from plant.compile import Function, raise_unbound
 from plant.signals import Signals
-
-
-@bind_later
-def raise_unbound(*arguments: Any) -> Any:
-    """Stands for a function of a plant that is bound later."""
-    raise TypeError("no plant is bound")
-
 
 step_plant = measure_plant = sense_plant = move_plant = correct_plant = control_plant = raise_unbound
 shift_memories = raise_unbound

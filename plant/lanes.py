@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from plant.anchor import pull_plant, rest_at_reading, show_start
 from plant.compile import (
     Function,
-    bind_later,
     compile_function,
     is_costly,
     is_function_stored,
     make_record_reader,
+    raise_unbound,
     rebind_names,
 )
 from plant.controller import take_demand
@@ -395,12 +395,6 @@ class Drive(NamedTuple):
 
     now: float = 0.0
     next: float = 0.0
-
-
-@bind_later
-def raise_unbound(*arguments: Any) -> Any:
-    """Stands for a function that is bound later."""
-    raise TypeError("no layout is bound")
 
 
 # each of these stands for a model's own, which is put in its place: x_at(buffer, lane), keep_x(x, buffer, lane)

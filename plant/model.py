@@ -30,9 +30,7 @@ STEP = 1e-5  # s, of the solver; its error is measured in the docs
 
 def find_parameter_groups(effects: Iterable[str] | None = None, plant: str = "eha") -> dict[str, type[Any]]:
     """The parameter groups of a plant and of `effects` (default: all effects of the catalogue that suit the plant)."""
-    kind = plants.find_plant(plant)
-    chosen = kind.list_effects() if effects is None else [kind.find_effect(name) for name in effects]
-    return {**kind.groups, **{e.name: e.group for e in chosen if e.group is not None}}
+    return plants.find_plant(plant).list_groups(effects)
 
 
 def list_offered_effects(plant: str = "eha") -> list[Effect]:
@@ -199,7 +197,7 @@ def find_shipped_model(name: str) -> Path | None:
 def build_bare_model(plant: str, name: str = "") -> Model:
     """A plant at its nominal values, without effects."""
     kind = plants.find_plant(plant)
-    own = {n: v for n, v in kind.nominal.items() if n.partition(".")[0] in kind.groups}
+    own = {n: v for n, v in kind.nominal.items() if n.partition(".")[0] in kind.parameters}
     return Model(name or plant, own, (), plant)
 
 

@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import Function, compile_function
+from plant.compile import Function, compile_function, raise_unbound
 from plant.controller import Loop, compute_current
 from plant.errors import InputError
 from plant.flat import make_lane_packers
 from plant.friction import clip, soften
-from plant.lanes import Drive, raise_unbound
+from plant.lanes import Drive
 from plant.model import Model
 from plant.parameters import Controller
 from plant.threads import count_threads, map_in_threads

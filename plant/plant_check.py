@@ -24,7 +24,7 @@ ARGUMENTS = {"step": (4, 5), "measure": (2,), "control": (4,), "coefficients": (
 
 
 def check_declaration(plant: Plant, where: object) -> None:
-    """Refuse a plant that is not declared completely; `where` is its file.
+    """Refuse a user's plant that is not declared completely; `where` is its file.
 
     Raises:
         InputError: the field of the declaration and what was expected there.
@@ -79,8 +79,6 @@ def _check_parameters(plant: Plant, require: Callable[[bool, str, str], None]) -
             field = f"{group}.{name}"
             require(isinstance(q, Quantity) and bool(q.unit), field, 'Quantity("unit"), "1" for none')
             value = plant.values.get(field, cls._field_defaults.get(name))
-            if value is None and plant.file is None:
-                continue  # a shipped plant: what its model file leaves out is zero
             require(isinstance(value, float | int), field, f"a nominal value as default, not {value!r}")
             require(not q.refuses(float(value or 0.0)), field, f"{q.expected}, not {value:g}")
     require("controller.period" in plant.nominal, "parameters",
@@ -95,8 +93,6 @@ def _check_readings(plant: Plant, require: Callable[[bool, str, str], None]) -> 
     names = [s.name for s in plant.signals.outputs]
     model = build_bare_model(plant.key)
     record = model.build_record()
-    if plant.file is None:
-        return
     try:
         y = plant.measure(plant.state(), record[0])
         field, after = "step", build_kernel(step_cycle, (), False, plant.key)(

@@ -12,7 +12,7 @@ import inspect
 import re
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from itertools import takewhile
@@ -23,13 +23,13 @@ from typing import Annotated, Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import Function, find_called_functions, rebind_names
+from plant.compile import Function, find_called_functions, raise_unbound, rebind_names
 from plant.effects import CATALOGUE, Effect, build_base_effect, build_effect, combine_laws
 from plant.errors import InputError
 from plant.faults import Fault
 from plant.flat import make_packers
 from plant.foreign import Program
-from plant.kernels import raise_unbound, write_constant, write_mover, write_signal_functions
+from plant.kernels import write_constant, write_mover, write_signal_functions
 from plant.pid import Loop, control_by_pid
 from plant.plant_check import check_declaration
 from plant.ports import (
@@ -158,11 +158,6 @@ class Plant:
         return hashlib.sha256(self.source).hexdigest() if self.source else ""
 
     @property
-    def groups(self) -> Mapping[str, type[Any]]:
-        """Its parameters, group name to NamedTuple."""
-        return self.parameters
-
-    @property
     def controller(self) -> bool:
         """Whether its controller is known, so that its drive can be held against command and controlled signal."""
         return self.control is not None
@@ -209,6 +204,11 @@ class Plant:
         """The effects it can have: those of the catalogue that suit it, then its own, which may have their names."""
         shared = (e for e in CATALOGUE.list_all().values() if e.name not in self.effects)
         return [*(e for e in shared if self.offers(e)), *self.effects.values()]
+
+    def list_groups(self, names: Iterable[str] | None = None) -> dict[str, type[Any]]:
+        """The parameter groups of the plant and of the effects `names`, by default of all that it can have."""
+        chosen = self.list_effects() if names is None else [self.find_effect(name) for name in names]
+        return {**self.parameters, **{e.name: e.group for e in chosen if e.group is not None}}
 
     def find_effect(self, name: str) -> Effect:
         """Its own effect of that name, else that of the catalogue. Raises KeyError."""
@@ -327,7 +327,6 @@ def find_fields_of(function: Any, argument: str, depth: int = 1) -> frozenset[st
 
 
 _LOADED: dict[str, Plant] = {}  # users' plants, by the path that they were named by
-
 
 
 def find_plant(name: str) -> Plant:

@@ -136,8 +136,9 @@ def report_law_errors(model: Model) -> Iterator[None]:
     except Exception as error:
         if not model.effects and model.kind.file is None:
             raise
-        found, told = _find_law_error(model), find_compile_error(error)
-        if found is None and told is not None:
+        found = _find_law_error(model)
+        told = None if found else find_compile_error(error)
+        if told is not None:
             raise told from error
         where, cause = found or (model.kind.file or "effects", error)
         said = next((line.strip() for line in reversed(str(cause).splitlines()) if line.strip()), "")

@@ -84,6 +84,11 @@ class Signals(tuple[Signal, ...]):
         return tuple(s.name for s in self[1:])
 
     @property
+    def aliases(self) -> dict[str, str]:
+        """Names by the words that bench files and sequences have for them."""
+        return {s.alias: s.name for s in self if s.alias}
+
+    @property
     def required(self) -> tuple[str, ...]:
         """Names of those without which nothing can be replayed: command, controlled signal, drive; in their order."""
         needed = {self.command.name, self.controlled.name, self.drive.name}

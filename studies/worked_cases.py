@@ -46,7 +46,7 @@ def format_minima(name: str, drive: str, trace: Trace) -> str:
 def format_scatter(kintas: float, fss: float, command: np.ndarray) -> str:
     """Mean and standard deviation of the errors under 1.5 % scatter of every base parameter, as a row of the table."""
     nominal, found = Model(), []
-    tolerances = [name for name in nominal.list_names() if nominal.kind.groups[name.split(".")[0]].__name__ not in (
+    tolerances = [name for name in nominal.list_names() if nominal.kind.parameters[name.split(".")[0]].__name__ not in (
         "Controller", "Sensors") and name not in ("filter.clogging", "filter.law") and "friction" not in name]
     for seed in range(SCATTERED):
         rng = np.random.default_rng(seed)

@@ -243,9 +243,9 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     diagnoses = examine_residuals(trace, judged, {name: (replay.residual[name] - r) / math.sqrt(2.0)
                                      for name, r in (theirs[0] if theirs else {}).items()}, m)
     progress("tolerances", 6 / STAGES)
-    plant = verdict == "MODEL_INCOMPLETE" and any(s.ratio > s.limit for s in table.values())
-    plant = plant and bool(list_tolerance_sizes(model))
-    scattered = fit_scatter(trace, model, {name: s.floor.value for name, s in table.items()}) if plant else None
+    is_plant_wrong = verdict == "MODEL_INCOMPLETE" and any(s.ratio > s.limit for s in table.values())
+    floors = {name: s.floor.value for name, s in table.items()}
+    scattered = fit_scatter(trace, model, floors) if is_plant_wrong and list_tolerance_sizes(model) else None
     progress("done", 1.0)
     named = _list_blocks_above(ratios, table)
     return Comparison(source, model, trace, verdict, reason, table, found, ratios, parts, named, tuple(sections),

@@ -135,9 +135,11 @@ def find_rivals(found: Refinement, gone: Sequence[str], sizes: int = 24, rounds:
         rounds: of the fit of a rival.
     """
     groups = []
-    for fault in (f for f in found.faults if f.name in gone):
+    blamed = [fault for fault in found.faults if fault.name in gone]
+    most = replay_fit(_require_problem(found), found.fit, found.fit.x).cost + GAIN_TIE if blamed else np.inf
+    for fault in blamed:
         rivals = [other for other in _list_candidates(found, fault, sizes)
-                  if _replaces(found, fault, other, rounds)]
+                  if _fit_in_place(found, fault, other, rounds) < most]
         if rivals:
             groups.append(Group((fault.name, *(other.fault.name for other in rivals)), 0.0))
     return tuple(groups)
@@ -180,14 +182,13 @@ def _spread_sizes(fault: Fault, ends: tuple[float, float], count: int) -> list[f
     return sorted(set(np.concatenate(sides if is_inside else [between]).tolist()))
 
 
-def _replaces(found: Refinement, fault: Fault, rival: _Candidate, rounds: int) -> bool:
-    """Whether the fit without `fault`, begun at the rival's size, is as likely as that of all faults."""
+def _fit_in_place(found: Refinement, fault: Fault, rival: _Candidate, rounds: int) -> float:
+    """The cost of the fit without `fault`, begun at the rival's size."""
     problem, own = _require_problem(found), set(fault.parameters)
     kept = [k for k, f in enumerate(found.fit.free) if f.name not in own]
     begun = start_fit([found.fit.free[k] for k in kept], rival.x[kept])
     alone = replace(problem, model=problem.model.replace(fault.list_changes(fault.healthy)), _lanes={})
-    fit = descend(alone, begun, ((3.0, 4), (1.0, rounds)))
-    return fit.cost < replay_fit(problem, found.fit, found.fit.x).cost + GAIN_TIE
+    return descend(alone, begun, ((3.0, 4), (1.0, rounds))).cost
 
 
 def _require_problem(found: Refinement) -> CountedProblem:

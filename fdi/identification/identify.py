@@ -730,7 +730,7 @@ def build_model(model: Model, problem: LogProblem, fit: Fit, gains: ControllerGa
     complete = limit_friction_values({**model.values, **found})
     nominal = model.kind.nominal
     own = {n for n in nominal if n in model.values and model.values[n] != nominal[n]}
-    own |= {n for n in found if n.partition(".")[0] in model.kind.groups}
+    own |= {n for n in found if n.partition(".")[0] in model.kind.parameters}
     return replace(model, values=complete, design={n: complete[n] for n in model.list_names() if n in own})
 
 

@@ -165,8 +165,10 @@ def describe_verdict(d: Diagnosis) -> str:
         rest = _describe_rest(d, worst)
         middle, most = format_limits_of_fault(worst)
         sentence = (f"{worst.title.capitalize()} {need}: {worst.symbol} "
-                    f"{format_size(worst, d.sizes[worst.name])}, MidBand {middle}, MaxBand {most}"
-                    + (f"; {rest}." if rest else ".") + (f" {groups}" if groups else ""))
+                    f"{format_size(worst, d.sizes[worst.name])}, MidBand {middle}, MaxBand {most}")
+        sentence += f"; {rest}." if rest else "."
+        if groups:
+            sentence += f" {groups}"
     if d.beside is not None and d.beside.is_explained and d.beside.effects:
         sentence += f" Beside the faults: {_join_alternatives(d.beside)}."
     return sentence + (f" Other deviations: {_list_others(d)}." if d.others else "")

@@ -7,6 +7,7 @@ from enum import IntFlag
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from plant.signals import EHA
 from rig.benches.frame_map import Field, FrameMap, Role
 
 Profile = Literal["cia402", "cia408", "none"]
@@ -17,7 +18,7 @@ SERVICES = {0x080: "EMCY", 0x580: "SDO", 0x600: "SDO", 0x700: "heartbeat"}  # of
 INPUTS = {"position_demand": "m", "ram_position": "m", "load_pressure": "Pa", "spool_position": "m", "load_force": "N",
           "control_word": "", "mode": "", "cycle": "", "flags": ""}
 OUTPUTS = {"current": "A", "status_word": "", "mode_display": "", "cycle": ""}
-MEASURED = ("ram_position", "load_pressure", "spool_position", "load_force")  # by the plant's transducers
+MEASURED = tuple(s.alias for s in EHA if s.role in ("output", "load"))  # by the plant's transducers
 
 
 class Flags(IntFlag):

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import ForeignCall, bind_later, compile_function, keep_apart
+from plant.compile import ForeignCall, compile_function, keep_apart, raise_unbound
 from plant.errors import InputError
 from plant.machine_code import find_function_address
 from rig.benches.checksums import CHECKSUMS, find_user_checksum
@@ -347,17 +347,14 @@ def _fill_field(m: Layout, at: int, field: Field, rule: int, channel: int) -> No
                                                          float(field.offset), *field.range)
 
 
-@bind_later
-def users_checksum(data: NDArray[np.uint8], counter: int) -> int:
-    """The place of a user's function in `call_users_checksum`."""
-    raise NotImplementedError
+users_checksum = raise_unbound  # the place of a user's function (bytes, counter) -> int
 
 
 def call_users_checksum(data: NDArray[np.uint8], counter: int) -> int:
     """What is compiled for a user's function: the compiler looks for the file of the function that it is given, and the
     one in a log has none.
     """
-    return users_checksum(data, counter)
+    return int(users_checksum(data, counter))
 
 
 _COMPILED: dict[str, Any] = {}  # kept: the loops call the code by its address

@@ -1,15 +1,4 @@
-"""A foreign unit as a plant: what its file says of it, the map of its variables, and the process that runs it.
-
-    [plant]
-    file = "ema.fmu"                                  # FMI 2.0 or 3.0, co-simulation
-    [plant.inputs]                                    # signal of the bench = variable of the unit
-    current = { variable = "motor.i_ref", count = "1 mA" }
-    load_force = "F_ext"
-    [plant.outputs]
-    ram_position = { variable = "x", count = "1 mm", noise = "1 um" }
-    [plant.parameters]                                # what --set and rig identify may change
-    screw.stiffness = { variable = "k_screw", range = [1e6, 1e9], unit = "N/m" }
-"""
+"""A foreign unit as a plant: what its file says of it, and the process that runs it."""
 from __future__ import annotations
 
 import contextlib

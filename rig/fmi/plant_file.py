@@ -24,14 +24,12 @@ from typing import Annotated, Any, NamedTuple, cast
 from plant.parameters import Controller, convert_group_unit
 from plant.plants import Plant, find_plant, keep_plant
 from plant.quantity import Quantity
-from plant.signals import Signal
+from plant.signals import EHA, Signal
 from plant.units import find_unit, parse_quantity
 from rig.fmi.foreign import Description, Port, Unit, find_variable, read_description
 from rig.tables import Place, build_dataclass, decode_text, parse_table, read_file
 
-# Names of benches for the signals of an EHA, which keep their columns and meaning; others are new signals.
-_COLUMNS = {"position_demand": "com", "ram_position": "xj", "load_pressure": "p12", "spool_position": "xs",
-            "current": "cor", "load_force": "load"}
+_COLUMNS = EHA.aliases  # these keep their columns and meaning; other names are new signals
 
 
 @dataclass(frozen=True)
@@ -41,9 +39,8 @@ class Entry:
     variable: str
     count: str | None = None  # what one of the variable is worth; default: its unit in the description
     noise: str | None = None  # of the sensor of an output, RMS
-    role: str | None = None  # "load" of a new input that is none of a drive
+    role: str | None = None  # "load" for a new input that is an external load; default: it drives the plant
     range: tuple[float, float] | None = None  # of a parameter
-
 
 
 Entries = dict[str, tuple[Entry, Place]]

@@ -12,6 +12,7 @@ from typing import NamedTuple, cast
 
 from plant import Model
 from plant.errors import InputError
+from plant.signals import EHA
 from rig.benches.bench import Bench, CanopenNode, Flags
 from rig.benches.bench_file import load_bench
 from rig.benches.frame_map import FrameSpec
@@ -23,7 +24,7 @@ from rig.nodes.faulty_plant import FaultyPlant
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import DELAY, DOUBLE, Plan, apply_action
 
-READINGS = ("ram_position", "load_pressure", "spool_position")  # signals of the transducers, in the plant's order
+READINGS = tuple(s.alias for s in EHA.outputs)  # signals of the transducers, in the plant's order
 _NO_FLAGS = Flags(0)  # made once: an operation on an IntFlag takes a microsecond
 
 

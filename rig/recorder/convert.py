@@ -177,7 +177,7 @@ def import_frames(source: Path, out: Path, bench: Bench, dbc: Path | None = None
     return len(starts)
 
 
-_COLUMNS = {**{s.alias: s.name for s in plant_signals.EHA[1:]}, "control_word": "control", "status_word": "status",
+_COLUMNS = {**plant_signals.EHA.aliases, "control_word": "control", "status_word": "status",
             "flags": "flags"}
 _WORDS = ("control", "status", "flags")
 _LASTING = ("position_demand", "control_word")  # in force until the next one comes

@@ -43,11 +43,6 @@ from rig.sequences.faults import CUT, DELAY, DOUBLE, DROP, NORMAL, Plan, Schedul
 _US = 1000  # ns
 
 
-def list_cyclic_frames(bench: Bench) -> list[int]:
-    """Identifiers of the frames that the loop takes in; those that the rig sends itself may come from a second rig."""
-    return bench.frames.identifiers
-
-
 @cache
 def compile_cycle(realtime: bool) -> Any:
     """Compile the cycle of a pace: some seconds on a new machine, half a second afterwards."""
@@ -116,7 +111,7 @@ class HardLoop(Loop):
         self.outputs = dict.fromkeys(self._values.names, 0.0)
         self._write_frame, master.hooks.on_frame = master.hooks.on_frame, self._keep_frame
         self._receive, wire.receive = wire.receive, self._receive_service
-        wire.link.leave_out(list_cyclic_frames(bench))
+        wire.link.leave_out(bench.frames.identifiers)  # those that the rig sends itself may come from a second rig
         self._warm_up()
         self._t_ns = wire.clock.now() + self._period  # lockstep: time of the cycle under way or to come
 

@@ -25,7 +25,7 @@ from plant.model import find_quantity, parse_model
 from plant.parameters import parse_toml
 from plant.plants import load_plant
 from plant.signals import EHA
-from rig.benches.bench import MEASURED, Bench
+from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench, load_bench_from_files
 from rig.benches.frame_map import Role
 from rig.nodes.scenario import Scenario
@@ -264,12 +264,14 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     """
     require_different_names(choice.effects)
     bench = load_bench(choice.bench or "eha", is_trusted=is_trusted)
-    load_plant_of_model(choice.model or bench.plant, is_trusted=is_trusted, announce=announce)
+    first = choice.model or bench.plant
+    load_plant_of_model(first, is_trusted=is_trusted, announce=announce)
     for file in choice.effects:
         load_effects(file)
     sequence = load_sequence(choice.sequence, bench.rate) if built is None else built  # it may name such an effect
     name = choice.model or (sequence.model.name if sequence.model.name != "eha" else bench.plant)
-    load_plant_of_model(name, is_trusted=is_trusted, announce=announce)
+    if name != first:
+        load_plant_of_model(name, is_trusted=is_trusted, announce=announce)
     brought = load_effects_of_model(name, choice.effects, is_trusted=is_trusted, announce=announce)
     require_different_names((*choice.effects, *brought))
     model = load_model(name).replace(sequence.model.overrides, sequence.name).replace(choice.changes)
@@ -288,11 +290,12 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
 
 def _require_signals(model: Model, bench: Bench) -> None:
     """Refuse a plant that lacks a signal which the bench sends to the controller or the rig. Raises InputError."""
-    has = {signal.name for signal in model.kind.signals.outputs}
+    has = [signal.name for signal in model.kind.signals.outputs]
     sent = {each.name for spec in bench.frames.frames if spec.sender is not Role.CONTROLLER for each in spec.fields}
-    for name, signal in zip(MEASURED, EHA.outputs, strict=False):
-        if name in sent and signal.name not in has:
-            raise InputError(bench.name, name, f"a plant that has this signal; {model.name} has {', '.join(has)}")
+    for signal in EHA.outputs:
+        if signal.alias in sent and signal.name not in has:
+            raise InputError(bench.name, signal.alias,
+                             f"a plant that has this signal; {model.name} has {', '.join(has)}")
 
 
 class Differences(NamedTuple):

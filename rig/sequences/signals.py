@@ -43,7 +43,7 @@ def find_unit(signals: Signals, name: str) -> str:
 
 
 def _list_aliases() -> Mapping[str, str]:
-    return {s.alias: s.name for s in find_tested() if s.alias}
+    return find_tested().aliases
 
 
 def _list_measured() -> tuple[str, ...]:

@@ -32,7 +32,7 @@ from rig.network.udp import PORT, Turn
 from rig.nodes.scenario import Scenario
 from rig.recorder import Signals, Timing
 from rig.run.cyclic_values import CycleInput
-from rig.run.hard_loop import HardLoop, compile_cycle, list_cyclic_frames
+from rig.run.hard_loop import HardLoop, compile_cycle
 from rig.sequences.faults import (
     BusOff,
     Corrupted,
@@ -118,7 +118,7 @@ class Bench:
         self.master.hooks.on_frame = self.frames.append
         schedule = Schedule(Plan(faults=faults, stop=1000))
         bench = replace(load_bench(), cycle_ns=PERIOD)
-        bus = open_raw_bus(where, list_cyclic_frames(bench))
+        bus = open_raw_bus(where, bench.frames.identifiers)
         self.loop = HardLoop(self.master, bench, Scenario(Model(), Plan(stop=0)), schedule, self, bus, realtime, ahead)
         self._markers = 0
 
