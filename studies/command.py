@@ -6,10 +6,10 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from fdi.report.report import Report, to_json
+from fdi.report.report import Report
 from plant.errors import RigError
 from rig.campaign.batch import BatchProgress
-from rig.cli.answer import choose_file, show_answer
+from rig.cli.answer import Places, choose_file, give_answer
 from rig.cli.options import parse_whole_number
 
 
@@ -35,13 +35,10 @@ def run_study_command(name: str, text: str | None, arguments: Sequence[str] | No
     try:
         out = choose_file(args.out, (".json",), None)
         report, is_met = run(args)
-        if out is not None:
-            out.write_text(to_json(report.data) + "\n", encoding="utf-8")
-        show_answer(report, args)
+        return give_answer(report, args, int(not is_met), Places(answer=out))
     except RigError as error:
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         return error.status
-    return 0 if is_met else 1
 
 
 def report_progress(stage: str, share: float) -> None:

@@ -1,19 +1,22 @@
-"""Where the answer of a command goes: standard output as text or JSON, a page, a JSON file."""
+"""What a command tells: the answer on standard output as text or JSON, a page, a JSON file; progress meanwhile."""
 from __future__ import annotations
 
 import argparse
 import contextlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from threading import Timer
 from typing import TYPE_CHECKING, NamedTuple
 
 from fdi.output import require_writable, write_text
+from fdi.progress import Progress, ignore_progress
 from plant.errors import InputError
-from rig.cli.progress_bar import show_progress
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from fdi.report.report import Report
 
 
@@ -79,39 +82,106 @@ def make_folder(path: Path) -> Path:
 
 
 def give_answer(report: Report, args: argparse.Namespace, status: int = 0, places: Places = NOWHERE) -> int:
-    """Write the files of a report, print it, and return the exit status.
+    """Write the files of a report, print it as --json and --quiet ask, and return the exit status.
+
+    --json comes before --quiet.
 
     Raises:
         InputError: a file that cannot be written.
     """
+    from fdi.report import report as reports  # here: `rig --help` needs no reports
+
     if places.answer is not None:
-        from fdi.report.report import to_json
-
-        write_text(places.answer, to_json(report.data) + "\n")
+        write_text(places.answer, reports.to_json(report.data) + "\n")
     if places.page is not None:
-        from fdi.report.report import write_html
-
         with show_progress(is_silent=args.json or args.quiet) as progress:
             progress("writing", 0.0)
-            write_html(report, places.page)
-    show_answer(report, args)
+            reports.write_html(report, places.page)
+    if args.json:
+        print(reports.to_json(report.data))
+    elif not args.quiet:
+        from fdi.report.terminal import print_report
+
+        print_report(report, open_console())
     return status
 
 
-def show_answer(report: Report, args: argparse.Namespace) -> None:
-    """Print a report on standard output as --json and --quiet ask; --json comes before --quiet."""
-    if args.json:
-        from fdi.report.report import to_json
+def open_console() -> Console:
+    """A rich console on standard output that colours only what it is told to.
 
-        print(to_json(report.data))
-    elif not args.quiet:
-        from fdi.report.terminal import print_report
-        from rig.cli.terminal import open_console
+    It prints nothing more once the reader of its pipe has gone: a verdict does not depend on it.
+    """
+    from rich.console import Console
 
-        print_report(report, open_console())
+    class Pipe(Console):
+        def on_broken_pipe(self) -> None:  # rich's own method ends the program with status 1
+            self.quiet = True
+            discard_output()
+
+    return Pipe(highlight=False)
 
 
 def discard_output() -> None:
     """Redirect standard output to /dev/null: what is still in its buffer must not end the program in an error."""
     with contextlib.suppress(OSError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextlib.contextmanager
+def show_progress(*, is_silent: bool, is_realtime: bool = False) -> Iterator[Progress]:
+    """Give a `Progress` whose calls move a bar on standard error; the bar disappears at the end.
+
+    Args:
+        is_silent: show nothing.
+        is_realtime: show a plain line without a refreshing thread, which would delay a real-time loop.
+
+    Nothing is shown where standard error is no terminal.
+    """
+    if is_silent or not sys.stderr.isatty():
+        yield ignore_progress
+        return
+    with _show_line() if is_realtime else _show_bar() as update:
+        yield update
+
+
+@contextlib.contextmanager
+def _show_bar(delay: float = 2.0) -> Iterator[Progress]:
+    """A bar that appears after `delay` s: shorter work needs none."""
+    from rich.console import Console  # here: 0.1 s that a command without a bar does not spend
+    from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    bar = Bar(SpinnerColumn("line"), TextColumn("{task.description:<14}", markup=False), BarColumn(20),
+              TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(),
+              console=Console(stderr=True), transient=True)
+    task = bar.add_task("starting", total=None)
+
+    def update(stage: str, share: float) -> None:
+        bar.update(task, description=stage, completed=share, total=1.0 if share > 0.0 else None)
+
+    starter = Timer(delay, bar.start)
+    starter.daemon = True
+    starter.start()
+    try:
+        yield update
+    finally:
+        starter.cancel()
+        starter.join()
+        bar.stop()
+
+
+@contextlib.contextmanager
+def _show_line() -> Iterator[Progress]:
+    shown = ("", -1)
+
+    def update(stage: str, share: float) -> None:
+        nonlocal shown
+        now = (stage, int(20 * share))  # each write may cost the loop some microseconds: only every 5 %
+        if now != shown:
+            shown = now
+            print(f"\r\033[K{stage:<14} {100 * share:3.0f} %", end="", file=sys.stderr, flush=True)
+
+    try:
+        yield update
+    finally:  # the headline begins a line, also in a capture
+        print("\r\033[K", end="\n" if shown[0] else "", file=sys.stderr, flush=True)

@@ -16,11 +16,10 @@ from fdi.report.report import Line, Medium, Report, Section
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
-from rig.cli.answer import choose_file, give_answer
+from rig.cli.answer import choose_file, give_answer, open_console, show_progress
 from rig.cli.command_list import LIVE_ON_TERMINAL
 from rig.cli.inputs import is_suite_file, parse_changes
-from rig.cli.interruption import catch_signals
-from rig.cli.progress_bar import show_progress
+from rig.interrupts import catch_signals
 from rig.network.bus import choose_bus
 from rig.network.clock import WallClock
 from rig.recorder import Event, Observer, Record
@@ -146,8 +145,6 @@ def announce_run(job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
 
 def print_settings(job: Job, why: str) -> None:
     """Say on standard output what runs on which bus and `why` on that."""
-    from rig.cli.terminal import open_console
-
     text = f"{job.sequence.title}, {job.sequence.duration:g} s, {job.pace}, seed {job.seed}, {why}"
     open_console().print(text, markup=False, soft_wrap=True)
 

@@ -14,10 +14,9 @@ from fdi.report.report import Cell
 from fdi.report.terminal import style_of
 from plant.errors import InputError
 from rig.benches.bench_file import load_bench
-from rig.cli.answer import Places, choose_file, give_answer, make_folder
+from rig.cli.answer import Places, choose_file, give_answer, make_folder, open_console
 from rig.cli.inputs import is_suite_file
-from rig.cli.interruption import catch_signals
-from rig.cli.terminal import open_console
+from rig.interrupts import catch_signals
 from rig.network.clock import WallClock
 from rig.run.job import JobChoice
 from rig.run.participants import EMBEDDED_NAMES

@@ -8,8 +8,7 @@ from pathlib import Path
 from fdi.progress import Progress
 from fdi.report.report import Report
 from plant.errors import InputError
-from rig.cli.answer import Places, give_answer
-from rig.cli.progress_bar import show_progress
+from rig.cli.answer import Places, give_answer, show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:

@@ -13,10 +13,9 @@ from plant.plant_check import check_behaviour
 from rig.benches.bench_file import load_bench
 from rig.benches.bench_report import build_bench_report, collect_data, tabulate_frames
 from rig.benches.bus_load import list_loads
-from rig.cli.answer import choose_places, give_answer
+from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.commands.list import build_list_report, list_faults
 from rig.cli.inputs import load_chosen_model, parse_changes
-from rig.cli.progress_bar import show_progress
 from rig.run.job import JobChoice, build_job
 from rig.suite.dry_run import build_dry_run_report, make_dry_run
 

@@ -6,9 +6,8 @@ import argparse
 from fdi.comparison.compare import compare
 from fdi.report.compare_report import build_comparison_report
 from fdi.trace.trace import Trace
-from rig.cli.answer import choose_places, give_answer
+from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.inputs import format_arguments, list_signals, load_chosen_model
-from rig.cli.progress_bar import show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:

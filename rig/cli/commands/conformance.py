@@ -12,8 +12,7 @@ from fdi.output import write_text
 from plant.errors import InputError, RigError
 from rig.benches.bench_file import load_bench
 from rig.benches.frame_map import Role
-from rig.cli.answer import Places, choose_file, give_answer, make_folder
-from rig.cli.progress_bar import show_progress
+from rig.cli.answer import Places, choose_file, give_answer, make_folder, show_progress
 from rig.conformance.run_cases import Subject, build_conformance_report, choose_cases, run_cases, write_junit
 from rig.conformance.target import DataSheet, Options, Target
 from rig.firmware.build import build_controller

@@ -9,9 +9,8 @@ from fdi.progress import Progress
 from fdi.report.diff_report import build_diff_report
 from fdi.trace.trace import Trace
 from plant.signals import Signals
-from rig.cli.answer import choose_places, give_answer
+from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.inputs import load_declared_signals
-from rig.cli.progress_bar import show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:

@@ -6,10 +6,9 @@ import argparse
 from fdi.discovery.explain_runs import Answer, explain_runs
 from fdi.discovery.runs import read_runs
 from fdi.report.explain_report import build_explanation_report
-from rig.cli.answer import choose_file, choose_places, give_answer
+from rig.cli.answer import choose_file, choose_places, give_answer, show_progress
 from rig.cli.discovery_inputs import format_command_line, load_known_model
 from rig.cli.inputs import format_arguments, list_signals
-from rig.cli.progress_bar import show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:

@@ -11,10 +11,9 @@ from fdi.diagnosis.faults import choose_faults
 from fdi.report.diagnosis_report import build_bands_report, build_diagnosis_report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
-from rig.cli.answer import choose_places, give_answer
+from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.commands.simulate import load_command
 from rig.cli.inputs import format_arguments, load_chosen_model
-from rig.cli.progress_bar import show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:

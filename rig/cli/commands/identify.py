@@ -13,10 +13,9 @@ from fdi.identification.identify import (
     write_identified_model,
 )
 from fdi.report.identify_report import build_identification_report
-from rig.cli.answer import Places, choose_file, give_answer
+from rig.cli.answer import Places, choose_file, give_answer, show_progress
 from rig.cli.discovery_inputs import format_command_line, load_known_model
 from rig.cli.inputs import list_signals
-from rig.cli.progress_bar import show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:

@@ -10,9 +10,8 @@ from fdi.prognosis.unit_trend import UnitTrend, follow_unit, gather_sizes, read_
 from fdi.report.drawing import save_drawing
 from fdi.report.trend_report import build_trend_report, draw_trends
 from plant.errors import InputError
-from rig.cli.answer import Places, choose_file, give_answer
+from rig.cli.answer import Places, choose_file, give_answer, show_progress
 from rig.cli.inputs import load_chosen_model
-from rig.cli.progress_bar import show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:

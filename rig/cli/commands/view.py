@@ -17,12 +17,11 @@ from fdi.report.report import Report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
-from rig.cli.answer import give_answer
+from rig.cli.answer import give_answer, show_progress
 from rig.cli.commands.diff import read_and_compare_runs
 from rig.cli.discovery_inputs import load_known_model
 from rig.cli.inputs import list_signals, load_declared_signals
-from rig.cli.interruption import catch_signals
-from rig.cli.progress_bar import show_progress
+from rig.interrupts import catch_signals
 from rig.view import viewer
 from rig.view.recording import Drawing, draw_comparison, draw_run, draw_runs, write_recording
 
