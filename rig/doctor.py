@@ -1,24 +1,27 @@
 """What this machine can do: each finding says what was found, what it is used for, and how to get it."""
 from __future__ import annotations
 
+import contextlib
 import ctypes.util
 import os
 import platform
 import shutil
-import socket
-import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from rig.benches.bench import Bench
+from rig.benches.bus_load import list_loads
 from rig.benches.frame_map import describe_identifier
-from rig.network import bus
-from rig.network.listening import count_frames, listen
+from rig.network import bus, udp
+from rig.network.clock import WallClock
+from rig.network.frame import Frame
+from rig.network.link import Link
 from rig.run import priority
 
 Status = Literal["ok", "limited", "missing"]
@@ -96,20 +99,14 @@ def examine_python() -> Iterator[Finding]:
         yield finding._replace(found="missing: " + ", ".join(absent)) if absent else finding
 
 
-def is_multicast_working(group: str = "239.74.163.2", port: int = 43113) -> bool:
-    """True if a datagram sent to a multicast group on the loopback interface comes back."""
-    local = socket.inet_aton("127.0.0.1")
+def is_multicast_working(group: str = "239.74.163.1") -> bool:
+    """True if a datagram comes back that is sent as on the UDP bus; `group` is none that a run uses by default."""
     try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(("", port))
-            member = struct.pack("4s4s", socket.inet_aton(group), local)
-            listener.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
-            listener.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, local)
-            listener.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
-            listener.settimeout(1)
-            listener.sendto(b"eha-rig", (group, port))
-            return listener.recv(16) == b"eha-rig"
+        with contextlib.ExitStack() as stack:
+            receiver, sender, _ = udp.open_sockets(group, udp.PORT, stack)
+            receiver.settimeout(1)
+            sender.sendto(b"eha-rig", (group, udp.PORT))
+            return receiver.recv(16) == b"eha-rig"
     except OSError:
         return False
 
@@ -122,20 +119,12 @@ def examine_buses() -> list[Finding]:
         _find("bus", "udp_multicast", "multicast on lo" if is_multicast_working() else "",
               "nodes in processes of their own, without CAN",
               "ip link set lo multicast on; ip route add 224.0.0.0/4 dev lo"),
-        _find("bus", "CAN in the kernel", _describe_kernel_can(), "socketcan: real and virtual CAN",
+        _find("bus", "CAN in the kernel", "AF_CAN" if bus.has_socketcan() else "", "socketcan: real and virtual CAN",
               "a kernel with CONFIG_CAN"),
         _find("bus", "CAN interface", ", ".join(bus.list_can_interfaces()),
               "rig run --bus socketcan:vcan0, or hardware", bus.explain_socketcan_problem("vcan0")),
         _find("bus", "CAN guest", "" if absent else "User-Mode Linux with a vcan0",
               "the socketcan tests on a kernel without CAN", _advise_apt(" ".join(absent)))]
-
-
-def _describe_kernel_can() -> str:
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except (OSError, AttributeError):
-        return ""
-    return "AF_CAN"
 
 
 _SEARCH_PATH = os.environ.get("PATH", "") + ":/usr/local/sbin:/usr/sbin:/sbin"  # users seldom have the last three
@@ -196,28 +185,50 @@ def examine_storage() -> list[Finding]:
         _grade("storage", "disk", hours > 1, f"{free / 1e9:.1f} GB free", f"about {hours:.0f} h of logs", "make room")]
 
 
-def listen_to_bench(bench: Bench, spec: str, seconds: float) -> list[Finding]:
-    """Which frames of a bench are on the bus `spec`; nothing is sent.
+def listen(bench: Bench, spec: str, seconds: float) -> list[Frame]:
+    """All frames on the bus `spec` for so long; nothing is sent.
 
     Raises:
         RigError: the bus cannot be opened.
     """
-    heard, others = count_frames(bench, listen(bench, spec, seconds))
+    clock = WallClock()
+    link = Link(bus.open_can(spec, bench.bitrate, bench.frames.is_fd), clock.now)
+    with contextlib.closing(link):
+        frames, end = [], clock.now() + round(seconds * 1e9)
+        while (left := end - clock.now()) > 0:
+            frames += link.poll(min(left / 1e9, 0.05))
+        return frames
+
+
+def count_frames(bench: Bench, frames: Iterable[Frame]) -> tuple[dict[str, Counter[int]], Counter[str]]:
+    """How many of each frame of the bench are among `frames`, by length in bytes; the identifiers of the others."""
+    loads = list_loads(bench)
+    services = {each.identifier: each.name for each in loads[len(bench.frames.frames):]}  # SYNC, heartbeats
+    heard, others = {each.name: Counter[int]() for each in loads}, Counter[str]()
+    for frame in frames:
+        spec = bench.frames.find(frame.cob_id, frame.data)
+        name = services.get(frame.cob_id) if spec is None else spec.name
+        if name is None:
+            others[describe_identifier(frame.cob_id)] += 1
+        else:
+            heard[name][len(frame.data)] += 1
+    return heard, others
+
+
+def judge_frames(bench: Bench, heard: dict[str, Counter[int]], others: Counter[str], seconds: float) -> list[Finding]:
+    """Which frames of a bench were heard within `seconds`."""
     found = []
-    for each in heard:
-        load = each.frame
-        is_ours = load.direction.startswith("rig")
-        status: Status = "limited" if each.wrong_lengths or (is_ours and each.received) else "ok"
-        text = f"{each.received} frames in {seconds:g} s" if each.received or not is_ours else "none; the rig sends it"
-        remedy = ""
-        if not each.received and not is_ours:
+    for load in list_loads(bench):
+        received, is_ours = heard[load.name].total(), load.direction.startswith("rig")
+        wrong = sorted(length for length in heard[load.name] if length != load.length)
+        status: Status = "limited" if wrong or (is_ours and received) else "ok"
+        text = f"{received} frames in {seconds:g} s" if received or not is_ours else "none; the rig sends it"
+        text += f", some of {' and '.join(map(str, wrong))} bytes, not {load.length}" if wrong else ""
+        remedy = "another rig is on the bus; end it" if is_ours and received else ""
+        if not received and not is_ours:
             status, remedy = "missing", "power, wiring, bit rate" + (
                 "; PDOs come after NMT start" if bench.nodes and load.content else "") + (
                 "; some devices send it when the rig has set 0x1017" if load.name.startswith("heartbeat") else "")
-        elif is_ours and each.received:
-            remedy = "another rig is on the bus; end it"
-        if each.wrong_lengths:
-            text += f", of {' and '.join(map(str, each.wrong_lengths))} bytes, not {load.length}"
         found.append(Finding(bench.name, f"{load.name} {describe_identifier(load.identifier)}", status, text,
                              f"{load.direction}, every {1000 * load.period:g} ms", remedy))
     if others:

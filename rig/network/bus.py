@@ -136,13 +136,20 @@ def list_can_interfaces() -> list[str]:
     return [name for name in names if not explain_socketcan_problem(name)]
 
 
+def has_socketcan() -> bool:
+    """Whether the kernel has SocketCAN."""
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (AttributeError, OSError):
+        return False
+    return True
+
+
 def explain_socketcan_problem(interface: str, fd: bool = False) -> str:
     """Why a kernel CAN interface cannot be used and how to get it, in one line; empty if it can. `fd`: for CAN FD."""
     virtual = interface.startswith("vcan")
     up = f"sudo ip link set {interface} up" + ("" if virtual else f" type can bitrate {BITRATE}")
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except (AttributeError, OSError):
+    if not has_socketcan():
         return "this kernel has no SocketCAN; tests/vcan/guest.sh COMMAND runs a command on a guest kernel with vcan0"
     folder = _NETWORK / interface
     if not folder.exists():

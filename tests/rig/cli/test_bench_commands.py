@@ -12,6 +12,7 @@ from device_files import BENCH, write_bench
 from places import ROOT
 from rig_command import refuse, rig
 
+from rig import doctor
 from rig.benches.bench import INPUTS, OUTPUTS
 from rig.benches.bench_file import ControllerKeys, NodeKeys, load_bench
 from rig.benches.bus_load import list_loads
@@ -22,7 +23,6 @@ from rig.network.bus import open_can
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
 from rig.network.link import Link
-from rig.network.listening import count_frames
 
 PAGE = (ROOT / "docs" / "bench.md").read_text()
 DRIVE, ECU = ROOT / "examples" / "cia402_drive", ROOT / "examples" / "can_ecu"
@@ -91,12 +91,15 @@ def test_a_sheet_without_the_signals_is_completed_by_the_user(tmp_path: Path) ->
 
 def test_what_is_heard_is_sorted_by_the_frames_of_the_bench() -> None:
     bench = load_bench(str(ECU / "bench.toml"))
-    drive = bench.frames.list_from(Role.CONTROLLER)[0]
-    frames = [Frame(0, drive.identifier, pack(drive, {})), Frame(1, drive.identifier, b"12"), Frame(2, 0x123, b"")]
-    heard, others = count_frames(bench, frames)
-    assert [(each.frame.name, each.received, each.wrong_lengths) for each in heard] == [
-        ("Demand", 0, ()), ("Feedback", 0, ()), ("Drive", 1, (2,))]
-    assert others == {"0x123": 1}
+    drive, demand = bench.frames.list_from(Role.CONTROLLER)[0], bench.frames.list_from(Role.RIG)[0]
+    frames = [Frame(0, drive.identifier, pack(drive, {})), Frame(1, drive.identifier, b"12"), Frame(2, 0x123, b""),
+              Frame(3, demand.identifier, pack(demand, {}))]
+    found = {each.name.partition(" ")[0]: each
+             for each in doctor.judge_frames(bench, *doctor.count_frames(bench, frames), 1.0)}
+    assert (found["Drive"].status, found["Drive"].found) == (
+        "limited", f"2 frames in 1 s, some of 2 bytes, not {drive.length}")
+    assert "another rig" in found["Demand"].remedy and found["Feedback"].found == "none; the rig sends it"
+    assert found["other"].found == "0x123 (1)"
 
 
 def test_the_doctor_listens_for_a_bench() -> None:
