@@ -22,9 +22,9 @@ from rig.run.job import JobChoice
 from rig.run.participants import EMBEDDED_NAMES
 from rig.suite.suite import (
     MOODS,
+    Case,
     CaseResult,
     Suite,
-    Variant,
     build_suite,
     build_suite_report,
     find_status,
@@ -72,23 +72,23 @@ def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
     Raises:
         InputError: what cannot be used, or an option that a suite file has to say.
     """
-    variants: list[Variant] = []
+    cases: list[Case] = []
     titles: dict[str, str] = {}  # of each suite file
     rate = load_bench(base.bench or "eha", is_trusted=args.trust).rate
     requirements: dict[str, str] = {}
     for name in args.sequence:
         if not is_suite_file(name):
-            variants.append(Variant(Path(name).stem, base._replace(sequence=name)))
+            cases.append(Case(Path(name).stem, base._replace(sequence=name)))
             continue
         if args.model or args.set or args.seed is not None:
             raise InputError("--model, --set, --seed", "", f"in the suite file {name}, as keys of its cases")
         content, own = read_suite_file(Path(name), base, rate)
-        variants += own
+        cases += own
         titles[name] = content.title
         listed = content.requirements
         requirements |= dict.fromkeys(listed, "") if isinstance(listed, tuple) else dict(listed)
     title = next(iter(titles.values())) if len(titles) == 1 else f"{len(args.sequence)} sequences"
-    return build_suite(title, variants, requirements, ", ".join(titles), is_trusted=args.trust)
+    return build_suite(title, cases, requirements, ", ".join(titles), is_trusted=args.trust)
 
 
 def choose_processes(args: argparse.Namespace, base: JobChoice, cases: int) -> int:

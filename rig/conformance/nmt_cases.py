@@ -1,7 +1,7 @@
 """Chapter 6, the NMT state machine, and 7, how long the node takes; CiA 301 sets few limits for that."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from rig.conformance.error_cases import LIMIT, beat_as, measure_periods, watch
@@ -73,28 +73,25 @@ def check_broadcast(t: Target) -> str:
     return "start, stop, enter PRE-OPERATIONAL, reset"
 
 
-def check_ignored(t: Target, state: NmtState, frames: list[bytes], text: str) -> str:
+def check_ignored(t: Target, state: NmtState, make_frames: Callable[[Target], list[bytes]], what: str) -> str:
     """NMT commands that must not change the state."""
     t.beat()
     t.enter(state)
-    for data in frames:
+    for data in make_frames(t):
         t.send(0x000, data)
-    t.require_state(state, f"{text} in {name_state(state)}")
-    require(all(frame.data != b"\0" for frame in t.heard(0, t.heartbeat_id)), f"{text}: the node booted")
+    t.require_state(state, f"{what} in {name_state(state)}")
+    require(all(frame.data != b"\0" for frame in t.heard(0, t.heartbeat_id)), f"{what}: the node booted")
     return name_state(state)
 
 
-def check_foreign_commands(t: Target, state: NmtState) -> str:
-    """To a node-ID that nobody on the bus has."""
-    free = t.find_free_node()
-    frames = [bytes((command, free)) for command in NmtCommand]
-    return check_ignored(t, state, frames, f"5 commands to node {free}")
+def make_foreign_commands(t: Target) -> list[bytes]:
+    """All commands, to a node-ID that nobody on the bus has."""
+    return [bytes((command, t.find_free_node())) for command in NmtCommand]
 
 
-def check_malformed_commands(t: Target, state: NmtState) -> str:
+def make_malformed_commands(t: Target) -> list[bytes]:
     """Commands 0, 3 and 127; one byte; none."""
-    frames = [*(bytes((command, t.node)) for command in (0, 3, 127)), b"\1", b"\x81", b""]
-    return check_ignored(t, state, frames, "6 malformed commands")
+    return [*(bytes((command, t.node)) for command in (0, 3, 127)), b"\1", b"\x81", b""]
 
 
 def check_sdo_by_state(t: Target, state: NmtState) -> str:
@@ -298,9 +295,11 @@ CASES = (
          check_transitions),
     Case("6.5", "commands to all nodes", "7.2.8.3.1", "node-ID 0 addresses the node too", check_broadcast),
     Case("6.6", "commands to other nodes", "7.2.8.3.1", "ignored in each state",
-         for_each(lambda t: COMMANDS, check_foreign_commands, text="5 commands ignored in {}")),
+         for_each(lambda t: COMMANDS, partial(check_ignored, make_frames=make_foreign_commands,
+                                              what="5 commands to another node"), text="5 commands ignored in {}")),
     Case("6.7", "malformed commands", "7.2.8.3.1", "unknown commands and frames of another length are ignored",
-         for_each(lambda t: COMMANDS, check_malformed_commands, text="6 frames ignored in {}")),
+         for_each(lambda t: COMMANDS, partial(check_ignored, make_frames=make_malformed_commands,
+                                              what="6 malformed commands"), text="6 frames ignored in {}")),
     Case("6.8", "SDO by state", "7.3.2.3, table 39", "in PRE-OPERATIONAL and OPERATIONAL, not in STOPPED",
          for_each(lambda t: COMMANDS, check_sdo_by_state)),
     Case("6.9", "PDO by state", "7.3.2.3, table 39", "sent and received in OPERATIONAL only",

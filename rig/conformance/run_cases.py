@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 from fdi.progress import Progress, ignore_progress
 from fdi.report.numbers import count_nouns
-from fdi.report.report import Cell, Column, Line, Medium, Mood, Report, Section, Table
+from fdi.report.report import Cell, Column, Line, Medium, Mood, Report, Section, Table, tabulate
 from plant.errors import RigError
 from rig import junit
 from rig.conformance import eds_cases, error_cases, nmt_cases, object_cases, pdo_cases, sdo_cases
 from rig.conformance.object_cases import read_values
-from rig.conformance.target import CHAPTERS, HISTORY, Case, CaseEnd, CaseFailed, DataSheet, Target, Variable, Verdict
+from rig.conformance.target import CHAPTERS, HISTORY, Case, CaseEnd, CaseFailed, Target, Variable, Verdict
 
 CASES: list[Case] = [
     *eds_cases.CASES, *object_cases.CASES, *sdo_cases.CASES, *pdo_cases.CASES, *error_cases.CASES, *nmt_cases.CASES,
@@ -150,39 +150,29 @@ MOODS: dict[Verdict, Mood] = {Verdict.PASS: "good", Verdict.FAIL: "bad", Verdict
                               Verdict.SKIPPED: "doubtful"}
 
 
-class Subject(NamedTuple):
-    """What was tested, as the report names it."""
-
-    sheet: DataSheet
-    bus: str
-    may_write: bool
-
-
-def build_conformance_report(outcome: Outcome, subject: Subject, files: Sequence[tuple[str, str]] = ()) -> Report:
+def build_conformance_report(outcome: Outcome, target: Target, bus: str, files: Sequence[tuple[str, str]] = ()
+                             ) -> Report:
     """Report on a conformance test: a table for each chapter, and on the terminal only what needs attention."""
-    sheet, results = subject.sheet, outcome.results
+    sheet, results = target.sheet, outcome.results
     moods: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful"}
     counts = _count(results)
-    facts = [("node", str(sheet.node)), ("EDS", sheet.path.name), ("bus", subject.bus),
+    facts = [("node", str(sheet.node)), ("EDS", sheet.path.name), ("bus", bus),
              ("tests", ", ".join(f"{count} {verdict.value}" for verdict, count in counts.items() if count))]
     chapters = _by_chapter(results)
     summary = Table([Column("chapter"), Column(""), *(Column(verdict.value, align="right") for verdict in Verdict)],
                     [_summarise_chapter(title, own) for title, own in chapters])
     open_items = [Line(f"{each.case.number} {each.verdict.value}", f"{each.case.name}: {each.measured}",
                        MOODS[each.verdict]) for each in results if each.verdict in (Verdict.FAIL, Verdict.SKIPPED)]
-    columns = [Column("no."), Column("test"), Column("CiA 301", medium=Medium.PAGE),
-               Column("expected", medium=Medium.PAGE), Column("measured"), Column("verdict")]
     return Report(
         command="conformance", title=f"Conformance of node {sheet.node}, {sheet.name}", verdict=outcome.verdict,
         mood=moods[outcome.verdict], sentence=_describe(outcome), facts=facts,
         notes=[*outcome.notes, "A test against CiA 301 as far as it goes (docs/conformance.md); not a certificate."],
         sections=[Section("Chapters", [summary]), Section("Open", open_items, medium=Medium.TERMINAL),
-                  *(Section(title, [Table(columns, [_tabulate(each) for each in own])], title_medium=Medium.BOTH)
-                    for title, own in chapters)],
+                  *(Section(title, _tabulate(own), title_medium=Medium.BOTH) for title, own in chapters)],
         files=files,
         data={
             "verdict": outcome.verdict, "node": sheet.node, "product": sheet.name, "eds": str(sheet.path),
-            "bus": subject.bus, "write": subject.may_write,
+            "bus": bus, "write": target.options.may_write,
             "counts": {verdict.value: count for verdict, count in counts.items()},
             "tests": [{"number": case.number, "name": case.name, "section": case.section, "expected": case.expected,
                        "measured": measured, "verdict": verdict.value, "seconds": seconds, "chapter": case.chapter}
@@ -191,9 +181,8 @@ def build_conformance_report(outcome: Outcome, subject: Subject, files: Sequence
         })
 
 
-def write_junit(outcome: Outcome, subject: Subject) -> str:
+def write_junit(outcome: Outcome, node: int) -> str:
     """The results as JUnit XML: a suite for each chapter, a test case for each case."""
-    node = subject.sheet.node
     suites = [junit.TestSuite(title, [_make_test_case(result, node) for result in results])
               for title, results in _by_chapter(outcome.results)]
     return junit.write_junit(f"conformance of node {node}", suites)
@@ -225,9 +214,14 @@ def _summarise_chapter(title: str, results: Sequence[Result]) -> list[Cell | str
     return [title, state, *(str(count or "") for count in counts.values())]
 
 
-def _tabulate(result: Result) -> list[Cell | str]:
-    return [result.case.number, result.case.name, Cell(result.case.section, "muted"), result.case.expected,
-            result.measured, Cell(result.verdict.value, MOODS[result.verdict])]
+def _tabulate(results: Sequence[Result]) -> list[Table]:
+    return [tabulate(
+        results,
+        (Column("no."), lambda each: each.case.number), (Column("test"), lambda each: each.case.name),
+        (Column("CiA 301", medium=Medium.PAGE), lambda each: Cell(each.case.section, "muted")),
+        (Column("expected", medium=Medium.PAGE), lambda each: each.case.expected),
+        (Column("measured"), lambda each: each.measured),
+        (Column("verdict"), lambda each: Cell(each.verdict.value, MOODS[each.verdict])))]
 
 
 def _by_chapter(results: Sequence[Result]) -> list[tuple[str, list[Result]]]:

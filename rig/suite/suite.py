@@ -23,7 +23,7 @@ from fdi.report.run_report import MOODS as RUN_MOODS
 from fdi.report.run_report import format_limits, format_value, write_run_page
 from plant.errors import InputError, RigError
 from rig import junit
-from rig.campaign.batch import run_in_processes
+from rig.campaign.batch import UNLIMITED, run_in_processes
 from rig.network.clock import WallClock
 from rig.run.job import JobChoice, build_job, find_differences
 from rig.run.outcome import INTERRUPTED, Outcome, describe_faults, describe_finding, diagnose_servovalve, has_fault
@@ -81,17 +81,26 @@ class Suite(NamedTuple):
         return self._replace(cases=[case._replace(folder=folder / case.folder) for case in self.cases])
 
 
-class Variant(NamedTuple):
-    """A run before it has its place in the suite."""
+class PlannedCheck(NamedTuple):
+    """A check of the sequence of a case, as it is known before the run."""
 
     name: str
+    requirement: tuple[str, ...]
+
+
+class Case(NamedTuple):
+    """One run of a suite; folder and checks are known when it has been tried (`build_suite`)."""
+
+    name: str  # then unique in the suite
     choice: JobChoice
-    timeout: float | None = None
-    requirement: tuple[str, ...] = ()
+    timeout: float | None = None  # s of wall-clock time; None: by the length of its sequence
+    requirement: tuple[str, ...] = ()  # that the run as a whole verifies
+    folder: Path = Path()  # of its results
+    checks: tuple[PlannedCheck, ...] = ()
 
 
-def read_suite_file(path: Path, base: JobChoice, rate: float) -> tuple[SuiteFile, list[Variant]]:
-    """The content of a suite file and its variants; `base` has what the command line chooses for all of them.
+def read_suite_file(path: Path, base: JobChoice, rate: float) -> tuple[SuiteFile, list[Case]]:
+    """The content of a suite file and its cases; `base` has what the command line chooses for all of them.
 
     `rate`: cycles a second of the bench.
 
@@ -102,22 +111,22 @@ def read_suite_file(path: Path, base: JobChoice, rate: float) -> tuple[SuiteFile
     suite = build_dataclass(SuiteFile, table, place)
     if not suite.case:
         raise place.at("case").refuse("at least one case")
-    variants: list[Variant] = []
+    cases: list[Case] = []
     for i, entry in enumerate(suite.case):
-        for variant in _vary(entry, path.parent, base):
+        for case in _vary(entry, path.parent, base):
             try:
-                load_sequence(variant.choice.sequence, rate)
+                load_sequence(case.choice.sequence, rate)
             except InputError as error:  # refused with the line of the suite file, if it is not there
-                if error.where == variant.choice.sequence:
+                if error.where == case.choice.sequence:
                     raise place.at("case", i, "sequence").refuse(f"a sequence; {error}") from error
                 raise
-            variants.append(variant)
-            if len(variants) > MOST_CASES:
+            cases.append(case)
+            if len(cases) > MOST_CASES:
                 raise place.at("case", i).refuse(f"at most {MOST_CASES} cases in all")
-    return suite, variants
+    return suite, cases
 
 
-def _vary(entry: CaseEntry, folder: Path, base: JobChoice) -> Iterator[Variant]:
+def _vary(entry: CaseEntry, folder: Path, base: JobChoice) -> Iterator[Case]:
     """Every combination of the lists of an entry."""
     sequences, seeds = _as_tuple(entry.sequence), _as_tuple(entry.seed)
     models, benches = (_as_tuple(names) or (None,) for names in (entry.model, entry.bench))
@@ -135,29 +144,29 @@ def _vary(entry: CaseEntry, folder: Path, base: JobChoice) -> Iterator[Variant]:
                                model=None if model is None else _find_beside(folder, model),
                                bench=base.bench if bench is None else _find_beside(folder, bench),
                                is_diagnosed=base.is_diagnosed or entry.fdi)
-        yield Variant(", ".join(words), choice, entry.timeout, _as_tuple(entry.requirement))
+        yield Case(", ".join(words), choice, entry.timeout, _as_tuple(entry.requirement))
 
 
-def build_suite(title: str, variants: Sequence[Variant], requirements: Mapping[str, str], source: str = "", *,
+def build_suite(title: str, cases: Sequence[Case], requirements: Mapping[str, str], source: str = "", *,
                 is_trusted: bool = False) -> Suite:
-    """The suite of these variants; each is tried first: sequence, model, parameters, effects.
+    """The suite of these cases; each is tried first: sequence, model, parameters, effects.
 
     The folders of its cases are names without a place, see `Suite.put_into`.
 
     Raises:
-        InputError: a variant that cannot run, or code that a model brings along and that is not trusted.
+        InputError: a case that cannot run, or code that a model brings along and that is not trusted.
     """
-    cases: list[Case] = []
+    tried: list[Case] = []
     names: set[str] = set()
     folders: set[str] = {"suite.html", "suite.json"}
-    for variant in variants:
-        name = _find_free(variant.name, names, " ({})")
-        slug = _find_free(re.sub(r"[^\w.=+-]+", "-", variant.name).strip("-.")[:80] or "case", folders, "-{}")
-        job = build_job(variant.choice, is_trusted=is_trusted)
-        checks = tuple(PlannedCheck(check.name, check.requirements) for check in job.sequence.checks)
-        seconds = 300.0 + 10.0 * job.sequence.duration if variant.timeout is None else variant.timeout
-        cases.append(Case(name, Path(slug), variant.choice, seconds, checks, variant.requirement))
-    return Suite(title, cases, requirements, source)
+    for case in cases:
+        slug = re.sub(r"[^\w.=+-]+", "-", case.name).strip("-.")[:80] or "case"
+        job = build_job(case.choice, is_trusted=is_trusted)
+        tried.append(case._replace(
+            name=_find_free(case.name, names, " ({})"), folder=Path(_find_free(slug, folders, "-{}")),
+            timeout=300.0 + 10.0 * job.sequence.duration if case.timeout is None else case.timeout,
+            checks=tuple(PlannedCheck(check.name, check.requirements) for check in job.sequence.checks)))
+    return Suite(title, tried, requirements, source)
 
 
 def _find_free(name: str, taken: set[str], pattern: str) -> str:
@@ -182,24 +191,6 @@ def _show(value: Value) -> str:
 
 
 NO_VERDICT = ("ERROR", "NOT_RUN")  # cases without a run that was judged
-
-
-class PlannedCheck(NamedTuple):
-    """A check of the sequence of a case, as it is known before the run."""
-
-    name: str
-    requirement: tuple[str, ...]
-
-
-class Case(NamedTuple):
-    """One run of a suite."""
-
-    name: str  # unique in the suite
-    folder: Path  # of its results
-    choice: JobChoice
-    timeout: float  # s of wall-clock time
-    checks: tuple[PlannedCheck, ...] = ()
-    requirement: tuple[str, ...] = ()  # that the run as a whole verifies
 
 
 class CaseResult(NamedTuple):
@@ -273,7 +264,7 @@ def run_cases(cases: Sequence[Case], processes: int, show: Callable[[CaseResult]
     found: dict[str, CaseResult] = {}
     is_interrupted = False
     finished = run_in_processes(play_case, cases, processes, lambda case, reason: CaseResult(case, "ERROR", reason),
-                                attempts=1, choose_limit=lambda case: case.timeout, patience=patience)
+                                attempts=1, choose_limit=lambda case: case.timeout or UNLIMITED, patience=patience)
     with contextlib.closing(finished):  # type: ignore[type-var]  # a generator
         try:
             for case, result in finished:
@@ -504,7 +495,7 @@ def write_junit_of_run(outcome: Outcome, seconds: float) -> str:
     job = outcome.job
     checks = tuple(PlannedCheck(check.name, check.requirements) for check in job.sequence.checks)
     choice = JobChoice(job.sequence.name, job.model.name, {}, job.seed)
-    case = Case(Path(job.sequence.name).stem, outcome.folder, choice, 0.0, checks)
+    case = Case(Path(job.sequence.name).stem, choice, folder=outcome.folder, checks=checks)
     return write_junit("rig run", [make_result(case, outcome, seconds)])
 
 

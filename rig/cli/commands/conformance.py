@@ -13,7 +13,7 @@ from plant.errors import InputError, RigError
 from rig.benches.bench_file import load_bench
 from rig.benches.frame_map import Role
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, show_progress
-from rig.conformance.run_cases import Subject, build_conformance_report, choose_cases, run_cases, write_junit
+from rig.conformance.run_cases import build_conformance_report, choose_cases, run_cases, write_junit
 from rig.conformance.target import DataSheet, Options, Target
 from rig.firmware.build import build_controller
 from rig.network.bus import choose_bus, open_can
@@ -47,13 +47,13 @@ def run_command(args: argparse.Namespace) -> int:
     bus, _ = choose_bus(args.bus)
     options = Options(may_write=args.write or is_own, timeout=args.timeout, tolerance=1e-3 * args.tolerance)
     with open_wire(name, bus) as wire, show_progress(is_silent=args.json or args.quiet) as progress:
-        outcome = run_cases(Target(wire, sheet, options), cases, progress)
-    subject = Subject(sheet, bus, options.may_write)
+        target = Target(wire, sheet, options)
+        outcome = run_cases(target, cases, progress)
     files = [*places.files, *([("JUnit", str(junit))] if junit else [])]
     status = {"PASS": 0, "FAIL": 1, "INVALID_TIMING": 3}[outcome.verdict]
-    status = give_answer(build_conformance_report(outcome, subject, files), args, status, places)
+    status = give_answer(build_conformance_report(outcome, target, bus, files), args, status, places)
     if junit is not None:
-        write_text(junit, write_junit(outcome, subject), "--junit")
+        write_text(junit, write_junit(outcome, node), "--junit")
     return status
 
 

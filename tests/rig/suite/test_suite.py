@@ -220,7 +220,7 @@ def make_result(verdict: str, *passed: bool, fdi: dict[str, str] | None = None) 
     checks = tuple(CheckResult(name, "max_error", "xj", 1.0, "m", 0.0, 2.0, is_passed, 0.0, 1.0, "", ("R-1",))
                    for name, is_passed in zip("abc", passed, strict=False))
     planned = tuple(PlannedCheck(check.name, ("R-1",)) for check in checks)
-    case = Case("case", Path("case"), JobChoice(is_diagnosed=bool(fdi)), 1.0, planned, ("R-2",))
+    case = Case("case", JobChoice(is_diagnosed=bool(fdi)), 1.0, ("R-2",), Path("case"), planned)
     return CaseResult(case, verdict, "because", 1.0, checks, fdi=fdi or {})
 
 
@@ -251,8 +251,8 @@ def test_the_example_of_the_page(tmp_path: Path) -> None:
     assert block is not None
     (tmp_path / "acceptance.toml").write_text(re.sub(r"(?m)^    ", "", block[0]))
     assert is_suite_file(str(tmp_path / "acceptance.toml"))
-    content, variants = read_suite_file(tmp_path / "acceptance.toml", JobChoice(), 1000.0)
-    cases = build_suite(content.title, variants, {}).cases
+    content, cases = read_suite_file(tmp_path / "acceptance.toml", JobChoice(), 1000.0)
+    cases = build_suite(content.title, cases, {}).cases
     assert len(cases) == 7 and "This file makes 3 + 4 cases".lower() in " ".join(text.lower().split())
     for name in ("preflight, seed 2", "reactions, lost_feedback, jack.mass=80"):
         assert f"`{name}`" in text and name in [case.name for case in cases]
