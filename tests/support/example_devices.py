@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import can
 import canopen
 import cantools
+import pytest
 from c_device import skip_without_compiler
 from c_program import run_program
 from canopen.profiles.p402 import BaseNode402, State402
@@ -21,6 +22,8 @@ from rig.firmware.build import build_device
 from rig.network.bus import open_can
 
 DRIVE, ECU = ROOT / "examples" / "cia402_drive", ROOT / "examples" / "can_ecu"
+# frames, identifiers, times; how a device answers them is the same code on every bus
+on_each_bus = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
 LIMIT = 60.0  # s: a frame that does not come within this does not come
 PATIENT = {DRIVE: (), ECU: ("--timeout", "60000")}  # in lockstep the rig may stop for as long as the machine likes
 

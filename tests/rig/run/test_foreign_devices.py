@@ -147,6 +147,9 @@ def start_multiplexed(folder: Path, where: str) -> PythonDevice:
 
 
 DEVICES = [start_event_driven, start_synchronous, start_every_second, start_can_fd, start_multiplexed]
+ON_CAN = [start_event_driven, start_can_fd, start_multiplexed]  # 11 bits, FD, 29 bits
+CASES = [*((start, bus, is_compiled) for start in DEVICES for bus, is_compiled in (
+    ("udp_multicast", True), ("udp_multicast", False))), *((start, "socketcan", True) for start in ON_CAN)]
 
 
 @contextlib.contextmanager
@@ -158,9 +161,8 @@ def run_device(device: PythonDevice) -> Iterator[None]:
         device.close()
 
 
-@pytest.mark.parametrize("start", DEVICES, ids=lambda start: start.__name__.removeprefix("start_"))
-@pytest.mark.parametrize(("bus_kind", "is_compiled"), [
-    ("udp_multicast", True), ("udp_multicast", False), ("socketcan", True)], indirect=["bus_kind"])
+@pytest.mark.parametrize(("start", "bus_kind", "is_compiled"), CASES, indirect=["bus_kind"],
+                         ids=lambda value: getattr(value, "__name__", str(value)).removeprefix("start_"))
 def test_a_foreign_controller_closes_the_loop(start: object, bus_kind: str, is_compiled: bool, tmp_path: Path,
                                               monkeypatch: pytest.MonkeyPatch) -> None:
     """The ram moves as a simulation of the same law does, whatever frames carry demand, position and current."""
