@@ -281,7 +281,7 @@ def list_values(dictionary: Any) -> tuple[tuple[int, int, bytes], ...]:
             ordered.append((parameter, 1, off.to_bytes(4, "little")))
         count = mapping.pop(0, None)
         if count is not None and mapping:
-            ordered.append((parameter + MAPPING, 0, b"\0"))
+            ordered.append((parameter + MAPPING, 0, bytes(len(count))))
         ordered += [(parameter + MAPPING, sub, data) for sub, data in mapping.items()]
         ordered += [(parameter + MAPPING, 0, count)] if count is not None else []
         ordered += [(parameter, sub, data) for sub, data in own.items()]

@@ -108,6 +108,7 @@ class Master:
         self.hooks = Hooks()
         self.silent = False  # a fault: no heartbeat of ours
         self.is_deaf = False  # a fault: the rig receives nothing
+        self.played_until = 0  # ns: a loop in lockstep counts the time, and the next one begins after it
         self.states = dict.fromkeys(sorted(bench.nodes), -1)
         self.heard_ns: dict[Role, int] = {}  # when the last heartbeat of a node came, by the wire's clock
         self._booted: set[Role] = set()

@@ -164,7 +164,7 @@ def import_frames(source: Path, out: Path, bench: Bench, dbc: Path | None = None
     starts = [t_ns for t_ns, _ in cycles.rows]
     if not starts:
         sync = bench.frames.sync
-        begin = f"{bench.frames.find_role('command').name} frame" if sync is None else f"SYNC frame (0x{sync:03X})"
+        begin = f"{cycles.begin.name} frame" if sync is None else f"SYNC frame (0x{sync:03X})"
         raise InputError(source, "", f"at least one {begin}")
     spans = np.sort(np.diff(starts))
     period = bench.cycle_ns / 1e9
@@ -190,7 +190,8 @@ class _CycleBuilder:
     def __init__(self, bench: Bench, readers: Readers) -> None:
         self.rows: list[tuple[int, Signals]] = []
         self._frames, self._is_canopen, self._readers = bench.frames, bool(bench.nodes), readers
-        self._begin = bench.frames.find_role("command")  # a cycle begins with it where there is no SYNC
+        # without SYNC a cycle begins with the first frame of the rig, of those that it sends most often
+        self.begin = min(bench.frames.list_from(Role.RIG), key=lambda each: each.every)
         self._waiting: dict[str, float] = {}  # values for the next cycle
         self._sent: int | None = None  # cycle of the command since the last SYNC
         self._recent: deque[tuple[int, Signals]] = deque(maxlen=8)  # an answer is late by a few cycles at most
@@ -234,7 +235,7 @@ class _CycleBuilder:
             for sent, row in list(self._recent)[-1 if "cycle" not in values else 0:]:
                 if sent == values.get("cycle", sent):
                     _fill(row, values)
-        elif spec.is_before_sync or (self._frames.sync is None and spec is self._begin):
+        elif spec.is_before_sync or (self._frames.sync is None and spec is self.begin):
             self._waiting |= values
             self._sent = int(values["cycle"]) if "cycle" in values else self._sent
             if not spec.is_before_sync:

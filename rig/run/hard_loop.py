@@ -113,7 +113,8 @@ class HardLoop(Loop):
         self._receive, wire.receive = wire.receive, self._receive_service
         wire.link.leave_out(bench.frames.identifiers)  # those that the rig sends itself may come from a second rig
         self._warm_up()
-        self._t_ns = wire.clock.now() + self._period  # lockstep: time of the cycle under way or to come
+        # lockstep: time of the cycle under way or to come
+        self._t_ns = max(wire.clock.now(), master.played_until) + self._period
 
     # ------------------------------------------------------------------------------------ what the session sees
 
@@ -209,6 +210,7 @@ class HardLoop(Loop):
         if self._thread is not None:
             self._thread.join()
         self._bus.close()
+        self._master.played_until = 0 if self._realtime else self._t_ns
         self._wire.link.leave_out(())
         try:
             self._drain()

@@ -161,7 +161,8 @@ class CycleLoop(Loop):
         self._played = 0  # cycles
         self._missed = 0  # drive frames in a row
         self._wall = WallClock()
-        self._t_ns = self._wire.clock.now() + self._period  # when the cycle under way, or to come, is due
+        # when the cycle under way, or to come, is due
+        self._t_ns = max(self._wire.clock.now(), master.played_until) + self._period
         self._sync = 0
         self._held: list[tuple[int, int, int, bytes]] = []  # late frames: due, order, identifier, payload
         self._order = 0
@@ -170,6 +171,10 @@ class CycleLoop(Loop):
     def now(self) -> int:
         """See `Loop`."""
         return self._wire.clock.now() if self._realtime else self._t_ns
+
+    def close(self) -> None:
+        """See `Loop`."""
+        self._master.played_until = 0 if self._realtime else self._t_ns
 
     def hold(self, phase: int) -> float:
         """See `Loop`; the next cycle follows at once."""

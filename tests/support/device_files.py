@@ -41,10 +41,10 @@ def format_eds(objects: Mapping[str, Entry], rpdos: Sequence[Mapped] = (), tpdos
     parts += [format_variable(section, entry) for section, entry in objects.items()]
     for base, pdos in ((0x1400, rpdos), (0x1800, tpdos)):
         for index, pdo in enumerate(pdos, base):
-            words = [len(pdo.words), *pdo.words]
             for record, entries in ((index, [Entry(5, default="2"), Entry(7, "rw", pdo.cob_id, pdo.value),
                                              Entry(5, "rw", str(pdo.kind))]),
-                                    (index + 0x200, [Entry(7, "rw", hex(word)) for word in words])):
+                                    (index + 0x200, [Entry(5, "rw", str(len(pdo.words))),
+                                                     *(Entry(7, "rw", hex(word)) for word in pdo.words)])):
                 parts.append(f"[{record:04X}]\nParameterName=PDO\nObjectType=0x9\nSubNumber=0x3\n\n")
                 parts += [format_variable(f"{record:04X}sub{sub:X}", entry) for sub, entry in enumerate(entries)]
     return "".join(parts)

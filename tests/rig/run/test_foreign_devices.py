@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -14,13 +13,14 @@ import numpy as np
 import pytest
 from bus_stations import spec
 from device_files import Entry, Mapped, format_eds
-from python_devices import CanDevice, CanopenDevice, PythonDevice
+from python_devices import CanDevice, CanopenDevice, PythonDevice, RemappedDevice
 
 from fdi.progress import ignore_progress
 from fdi.trace.trace import Trace
-from plant import Model, simulate
-from rig.benches.bench_file import load_bench
+from plant import simulate
+from rig.benches.bench import Bench
 from rig.benches.frame_map import Role
+from rig.recorder.convert import export_trace, import_frames
 from rig.run import loops
 from rig.run.job import JobChoice, build_job
 from rig.run.runner import run_job
@@ -146,7 +146,23 @@ def start_multiplexed(folder: Path, where: str) -> PythonDevice:
     return CanDevice(where, PAGES_DBC, "Feedback", 1e-6, 1e-3)
 
 
-DEVICES = [start_event_driven, start_synchronous, start_every_second, start_can_fd, start_multiplexed]
+def start_remapped(folder: Path, where: str) -> PythonDevice:
+    """A DCF puts demand and position, as shipped in no PDO, into one with another COB-ID; cycle of 0.5 ms."""
+    objects = {**IDENTITY, "2000": Entry(4), "2001": Entry(4), "2002": Entry(3, "ro"), "2003": Entry(3)}
+    sheet = format_eds(objects, [Mapped((0x2003_0010, 0x2003_0010), "$NODEID+0x200")],
+                       [Mapped((0x2003_0010,), "$NODEID+0x180")])
+    (folder / "device.eds").write_text(sheet)
+    for section, value in {"1400sub1": "0x3A2", "1600sub0": "2", "1600sub1": "0x20010020", "1600sub2": "0x20000020",
+                           "1800sub1": "0x2A2", "1A00sub0": "1", "1A00sub1": "0x20020010"}.items():
+        sheet = sheet.replace(f"[{section}]\n", f"[{section}]\nParameterValue={value}\n")
+    (folder / "device.dcf").write_text(sheet)
+    bench = CANOPEN.format(node=34, position="0.1 um", current="1 uA").replace("device.eds", "device.dcf")
+    (folder / "bench.toml").write_text(bench.replace("[controller]", 'cycle = "0.5 ms"\n[controller]', 1))
+    return RemappedDevice(where, 34, str(folder / "device.eds"),
+                          {0x2000: ("position_demand", 1e-7), 0x2001: ("ram_position", 1e-7)}, 1e-6)
+
+
+DEVICES = [start_event_driven, start_synchronous, start_every_second, start_can_fd, start_multiplexed, start_remapped]
 ON_CAN = [start_event_driven, start_can_fd, start_multiplexed]  # 11 bits, FD, 29 bits
 CASES = [*((start, bus, is_compiled) for start in DEVICES for bus, is_compiled in (
     ("udp_multicast", True), ("udp_multicast", False))), *((start, "socketcan", True) for start in ON_CAN)]
@@ -171,16 +187,32 @@ def test_a_foreign_controller_closes_the_loop(start: object, bus_kind: str, is_c
     where = spec(bus_kind)
     device = start(tmp_path, where)  # type: ignore[operator]
     (tmp_path / "steps.toml").write_text(SEQUENCE)
-    job = build_job(JobChoice(sequence=str(tmp_path / "steps.toml"), bus=where, controller="external", seed=3))
-    job = replace(job, bench=load_bench(str(tmp_path / "bench.toml")))
+    bench = str(tmp_path / "bench.toml")
+    job = build_job(JobChoice(sequence=str(tmp_path / "steps.toml"), bench=bench, bus=where, seed=3))
     with run_device(device):
         outcome = run_job(job, tmp_path / "run", ignore_progress, lambda: False)
     assert not outcome.aborted, outcome.aborted
     trace = Trace.read(tmp_path / "run")
-    law = simulate(Model(), trace.com, seed=3)
+    law = simulate(job.model, trace.com, seed=3)
     difference = float(np.sqrt(np.nanmean((trace.xj - law.xj) ** 2)))
     assert difference < 60e-6  # m, of 2 mm: one more cycle of delay, coarser counts
     assert not np.isnan(trace.cor[5:]).any()
+    require_same_columns_from_a_capture(tmp_path, job.bench, trace)
+
+
+def require_same_columns_from_a_capture(folder: Path, bench: Bench, trace: Trace) -> None:
+    """`rig import --bench`: the frames of the run alone, as another tool would have captured them, give its columns."""
+    export_trace(folder / "run" / "trace.mcap", folder / "capture.log")
+    import_frames(folder / "capture.log", folder / "capture.mcap", bench)
+    found = Trace.read(folder / "capture.mcap", all=True)
+    starts = range(len(found.xj) - len(trace.xj) + 1)  # the capture has the cycles before and after the run too
+    begin = [k for k in starts if np.allclose(found.xj[k:k + len(trace.xj)], trace.xj, rtol=0.0, atol=1e-9)]
+    assert len(begin) == 1
+    rows = slice(begin[0], begin[0] + len(trace.xj))
+    np.testing.assert_allclose(found.com[rows], trace.com, rtol=0.0, atol=1e-9)
+    answered = ~np.isnan(found.cor[rows])  # the run keeps the last current, a capture has what came
+    assert answered.mean() > 0.49
+    np.testing.assert_allclose(found.cor[rows][answered], trace.cor[answered], rtol=0.0, atol=1e-9)
 
 
 class Mute(CanDevice):
