@@ -160,44 +160,6 @@ def test_acyclic_transmission_waits_for_the_next_sync() -> None:
     rack.play("wait 0 ->\n080 -> 183 *, 283 *\n080 -> 283 *")
 
 
-RESTRICTED = (0x000, 0x001, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x77F, 0x780, 0x7FF)
-PERMITTED = (0x081, 0x0FF, 0x100, 0x181, 0x580, 0x600, 0x680, 0x6DF, 0x700)
-
-
-@pytest.mark.parametrize("base", [0x1400, 0x1800])
-def test_restricted_identifiers_are_refused_and_their_neighbours_are_not(base: int) -> None:
-    """CiA 301, table 40, at both ends of each range; and the SYNC that this device consumes."""
-    rack = running()
-    for can_id in (*RESTRICTED, 0x080, *PERMITTED):
-        assert rack.download(base, 1, bytes.fromhex("83010080")) == "ok"
-        expected = "ok" if can_id in PERMITTED else "06090030"
-        assert rack.download(base, 1, can_id.to_bytes(4, "little")) == expected, hex(can_id)
-        assert (rack.device.read(base, 1) == can_id) is (can_id in PERMITTED)
-
-
-@pytest.mark.parametrize(("base", "valid"), [("1400", "820100"), ("1800", "830100")])
-def test_the_identifier_of_a_valid_pdo_is_fixed(base: str, valid: str) -> None:
-    """CiA 301, 7.5.2.35: it is first made invalid. The same value, or only bit 30, may be written at any time."""
-    running().play(f"""
-        write {base}:1 45030000 -> 08000022
-        {base}:1 = {int.from_bytes(bytes.fromhex(valid), "little")}
-        write {base}:1 {valid}00 -> ok
-        write {base}:1 {valid}40 -> ok
-        write {base}:1 45030080 -> ok
-        write {base}:1 45030000 -> ok
-        write {base}:1 {valid}00 -> 08000022""")
-
-
-def test_identifier_of_emcy_follows_the_same_rules(tmp_path: Path) -> None:
-    running(eds=change_sheet(tmp_path, ("1014", "AccessType=const", "AccessType=rw"))).play("""
-        write 1014:0 84000000 -> 08000022
-        write 1014:0 83000080 -> ok
-        182 ->
-        write 1014:0 01070000 -> 06090030
-        write 1014:0 84000000 -> ok
-        182 0100000002000300 -> 084 0000000000000000""")
-
-
 def test_identifier_of_sync_may_not_be_restricted_nor_make_a_producer(tmp_path: Path) -> None:
     running(eds=change_sheet(tmp_path, ("1005", "AccessType=const", "AccessType=rw"))).play("""
         write 1005:0 80000040 -> 06090030
