@@ -5,7 +5,6 @@ import random
 import struct
 import tomllib
 from collections.abc import Callable, Iterator
-from configparser import RawConfigParser
 from importlib.resources import files
 from typing import NamedTuple, cast
 
@@ -18,15 +17,16 @@ from cantools.database.can import Database
 from codec import SIGNALS, Signal
 
 from dbc import DBC, EDS
+from rig.conformance.run_cases import choose_cases, run_cases
+from rig.conformance.target import DataSheet, Target, Verdict
+from rig.network.clock import VirtualClock
+from rig.network.link import EmbeddedWire
 
 FRAMES = (codec.COMMAND, codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE)
 NODES = {1: "Rig", 2: "Controller", 3: "Plant"}
 SENDERS = {codec.COMMAND: 1, codec.FEEDBACK: 3, codec.VALVE_STATE: 3, codec.DRIVE: 2}
 RECEIVERS = {codec.COMMAND: {2}, codec.FEEDBACK: {1, 2}, codec.VALVE_STATE: {1}, codec.DRIVE: {1, 3}}
 WIDTHS = {datatypes.INTEGER32: (32, True), datatypes.UNSIGNED16: (16, False)}
-nodes = pytest.mark.parametrize("node", EDS)
-
-
 class Pdo(NamedTuple):
     """One PDO of one dictionary."""
 
@@ -133,49 +133,18 @@ def test_dbc_names_the_services_of_all_nodes() -> None:
     assert set(ids) == set(FRAMES)
 
 
-@nodes
-def test_dictionary_has_the_objects_of_its_role(node: int) -> None:
-    od = canopen.import_od(str(EDS[node]), node)
-    common = {0x1000, 0x1001, 0x1003, 0x1005, 0x1006, 0x1008, 0x1009, 0x100A, 0x1014, 0x1016, 0x1017, 0x1018, 0x1029}
-    own = {
-        1: {0x1280, 0x1281, 0x1F80},
-        2: {0x1200, 0x2100, 0x2101, 0x2102, 0x2103, 0x2104, 0x2105, 0x2110, 0x6040, 0x6041},
-        3: {0x1200, 0x2200, 0x2201, 0x2202, 0x2203, 0x2204, 0x2205, 0x2206, 0x2207, 0x2210, 0x2211},
-    }
-    assert common | own[node] <= set(od)
-    assert (od[0x1005].default & 0x7FF) == codec.SYNC
-    assert bool(od[0x1005].default & 1 << 30) is (node == 1)  # only the rig produces it
-
-
-@nodes
-def test_eds_is_well_formed(node: int) -> None:
-    """CiA 306: lists name exactly the objects there, counts are right, every object has its keys."""
-    eds = RawConfigParser()
-    eds.optionxform = str  # type: ignore[assignment, method-assign]
-    eds.read(EDS[node])
-    assert eds["FileInfo"]["FileName"] == EDS[node].name
-    listed: list[int] = []
-    for section in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects"):
-        count = int(eds[section]["SupportedObjects"])
-        assert len(eds[section]) == count + 1
-        listed += [int(eds[section][str(n)], 16) for n in range(1, count + 1)]
-    assert len(set(listed)) == len(listed)
-    objects = {int(name, 16): eds[name] for name in eds.sections() if len(name) == 4}
-    assert set(objects) == set(listed)
-    for index, section in objects.items():
-        subs = [name for name in eds.sections() if name.startswith(f"{index:04X}sub")]
-        assert len(subs) == int(section.get("SubNumber", "0"), 16)
-        if subs and index != 0x1003:  # there sub 0 counts the errors
-            highest = max(int(name[7:], 16) for name in subs)
-            assert int(eds[f"{index:04X}sub0"]["DefaultValue"], 16) == highest
-        for name in subs or [section.name]:
-            assert {"ParameterName", "ObjectType", "DataType", "AccessType", "PDOMapping"} <= set(eds[name])
-    assert int(eds["DeviceInfo"]["NrOfRXPDO"]) == sum(0x1400 <= index < 0x1600 for index in objects)
-    assert int(eds["DeviceInfo"]["NrOfTXPDO"]) == sum(0x1800 <= index < 0x1A00 for index in objects)
-
-
 def test_gains_in_the_dictionary_are_the_nominal_ones() -> None:
     nominal = tomllib.loads(files("plant").joinpath("models", "nominal.toml").read_text())["controller"]
     od = canopen.import_od(str(EDS[2]), 2)
     names = ("proportional_gain", "integral_gain", "derivative_gain", "current_limit", "period")
     assert [od[0x2110][sub].default for sub in range(1, 6)] == [nominal[name] for name in names]
+
+
+@pytest.mark.parametrize("node", EDS)
+def test_eds_is_well_formed_and_only_the_rig_makes_sync(node: int) -> None:
+    """By chapter 1 of the conformance test: lists, counts, types, PDOs, identity and COB-IDs."""
+    sheet = DataSheet(EDS[node], node)
+    outcome = run_cases(Target(EmbeddedWire(VirtualClock(), []), sheet), choose_cases(["1"]))
+    assert [(each.case.number, each.measured) for each in outcome.results if each.verdict is Verdict.FAIL] == []
+    assert sheet.default(0x1005) == codec.SYNC | (node == 1) << 30
+    assert sheet.text.get("FileInfo", "FileName") == EDS[node].name
