@@ -18,6 +18,7 @@ import tempfile
 import termios
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from fcntl import ioctl
 from functools import partial
@@ -38,7 +39,6 @@ from fdi.report.report import Cell, Column, Line, Mood, Report, Section, Table, 
 from fdi.trace.trace import Floats, Trace
 from plant import Model
 from plant.errors import InputError, RigError
-from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.benches.frame_map import Role
 from rig.firmware.build import build_device
@@ -65,7 +65,7 @@ from rig.run.priority import (
     suspend_garbage_collection,
 )
 from rig.sequences.faults import Plan, Schedule
-from rig.view.viewer import find_free_port, is_listening, kill_viewer, make_viewer_command
+from rig.view.viewer import find_free_port, is_listening, kill_viewer, start_viewer
 
 Work = Callable[[], object]
 
@@ -273,40 +273,32 @@ def list_contenders(bus: str) -> dict[str, Callable[[float], Times]]:
     def measure_cyclictest(seconds: float) -> Times:
         return {"lateness": run_cyclictest(seconds, choose_priority(), list_cpus()[-1])}
 
-    def measure_compiled(seconds: float) -> Times:
-        with run_emulator(bus, is_compiled=True):
-            return play_block(bus, seconds)
+    def measure_cycle(seconds: float, run_peer: Callable[[], AbstractContextManager[object]], **options: Any) -> Times:
+        with run_peer():
+            return play_block(bus, seconds, **options)
 
-    def measure_c(seconds: float) -> Times:
-        with run_c_responder(bus):
-            return play_block(bus, seconds)
+    def run_example(folder: Path) -> AbstractContextManager[object]:
+        return _run_process([str(build_device(folder)), bus])
 
-    def measure_python(seconds: float) -> Times:
-        with run_emulator(bus, is_compiled=False):
-            return play_block(bus, seconds, is_compiled=False)
-
-    def make_mapped(folder: Path) -> Callable[[float], Times]:
-        def measure_mapped(seconds: float) -> Times:
-            with _run_process([str(build_device(folder)), bus]):
-                return play_block(bus, seconds, bench=load_bench(str(folder / "bench.toml")))
-
-        return measure_mapped
-
-    rows = ((CYCLICTEST, measure_cyclictest, find_cyclictest()), (COMPILED, measure_compiled, "always"),
-            (IN_C, measure_c, find_gcc()), (PYTHON, measure_python, "always"))
-    found = {name: measure for name, measure, is_there in rows if is_there}
     examples = Path(__file__).parents[2] / "examples"  # of a checkout
-    return found | {name: make_mapped(examples / folder) for name, folder in MAPPED.items()
-                    if find_gcc() and (examples / folder).is_dir()}
+    rows: list[tuple[str, object, Callable[[float], Times]]] = [
+        (CYCLICTEST, find_cyclictest(), measure_cyclictest),
+        (COMPILED, True, partial(measure_cycle, run_peer=partial(run_emulator, bus, is_compiled=True))),
+        (IN_C, find_gcc(), partial(measure_cycle, run_peer=partial(run_c_responder, bus))),
+        (PYTHON, True, partial(measure_cycle, run_peer=partial(run_emulator, bus, is_compiled=False),
+                               is_compiled=False)),
+        *((name, find_gcc() and (examples / folder).is_dir(), partial(
+            measure_cycle, run_peer=partial(run_example, examples / folder), bench=examples / folder / "bench.toml"))
+          for name, folder in MAPPED.items())]
+    return {name: measure for name, is_there, measure in rows if is_there}
 
 
-def play_block(bus: str, seconds: float, is_compiled: bool = True, period_ns: int = 1_000_000,
-               bench: Bench | None = None) -> Times:
-    """Times of the rig's cycle on a bus, with its log, without the first cycles; NaN where no answer came.
+def play_block(bus: str, seconds: float, is_compiled: bool = True, bench: Path | None = None) -> Times:
+    """Times of the rig's cycle of 1 ms on a bus, with its log, without the first cycles; NaN where no answer came.
 
-    `bench`: that of a foreign controller, which is started.
+    `bench`: the bench file of a foreign controller, which is started.
     """
-    is_foreign, bench = bench is not None, bench or load_bench()
+    is_foreign, chosen = bench is not None, replace(load_bench(str(bench or "eha")), cycle_ns=1_000_000)
     history = History()
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         recorder = Recorder(Path(folder) / "trace.mcap", {}, {})
@@ -314,19 +306,21 @@ def play_block(bus: str, seconds: float, is_compiled: bool = True, period_ns: in
         clock = WallClock()
         wire = LinkWire(Link(open_can(bus), clock.now), clock)
         stack.callback(wire.close)
-        master = Master(wire, clock.now, stamped=True, bench=bench)
-        if is_foreign and bench.nodes:
+        master = Master(wire, clock.now, stamped=True, bench=chosen)
+        if is_foreign and chosen.nodes:
             master.is_present(Role.CONTROLLER, 5.0)
             master.start()
         master.hooks.on_frame = recorder.frame
         log = _Log(history, recorder)
-        bench, plan = replace(bench, cycle_ns=period_ns), Plan(stop=0)
+        plan = Plan(stop=0)
         scenario, faults = Scenario(Model(), plan), Schedule(plan)
-        loop: Loop = (open_loop(master, bench, scenario, faults, log, bus, True) if is_compiled else
-                      CycleLoop(master, bench, scenario, faults, log, True))
+        loop: Loop = (open_loop(master, chosen, scenario, faults, log, bus, True) if is_compiled else
+                      CycleLoop(master, chosen, scenario, faults, log, True))
         stack.callback(loop.close)
-        stack.enter_context(enter_real_time(is_compiled))
-        for _ in range(round(seconds * 1e9 / period_ns)):
+        for right in (raise_priority(1 if is_compiled else LOOP_PRIORITY), lock_memory(), prevent_deep_sleep(),
+                      suspend_garbage_collection()):  # as a run in real time takes them
+            stack.enter_context(right)
+        for _ in range(round(seconds * 1000)):
             loop.cycle(CycleInput(1, 0.0, 0.0, 0))
         loop.finish()
     named = ("lateness", "execution") if is_foreign else _QUANTITIES  # its plant has no frames
@@ -346,14 +340,6 @@ class _Log:
     def cycles(self, block: CycleBlock) -> None:
         self._history.cycles(block)
         self._recorder.cycles(block)
-
-
-@contextlib.contextmanager
-def enter_real_time(is_compiled: bool) -> Iterator[None]:
-    """The rights that a run takes in real time."""
-    with (raise_priority(1 if is_compiled else LOOP_PRIORITY), lock_memory(), prevent_deep_sleep(),
-          suspend_garbage_collection()):
-        yield
 
 
 def summarise_contenders(times: Mapping[str, Times]) -> dict[str, Any]:
@@ -538,23 +524,16 @@ def open_hidden_viewer(patience: float = 60.0) -> Iterator[int]:
     Raises:
         RigError: it does not start, for example without a Vulkan driver.
     """
-    port = find_free_port()
-    cpus = list_cpus()
-    before = os.sched_getaffinity(0)
+    port, cpus, before = find_free_port(), list_cpus(), os.sched_getaffinity(0)
     os.sched_setaffinity(0, cpus[:-1] or cpus)  # the viewer inherits it
     try:
-        viewer = subprocess.Popen([*make_viewer_command(port), "--headless", "--window-size", "1280x800"],
-                                  stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-                                  start_new_session=True)
+        viewer = start_viewer(port, "--headless", "--window-size", "1280x800", patience=patience)
     finally:
         os.sched_setaffinity(0, before)
-    clock = WallClock()
     try:
-        while not is_listening(port):
-            if viewer.poll() is not None or clock.now() > patience * 1e9:
-                raise RigError("the viewer does not start without a display; it needs a Vulkan driver (Debian: "
-                               "mesa-vulkan-drivers libvulkan1)")
-            clock.sleep_until(clock.now() + 100_000_000)
+        if not is_listening(port):
+            raise RigError("the viewer does not start without a display; it needs a Vulkan driver (Debian: "
+                           "mesa-vulkan-drivers libvulkan1)")
         yield port
     finally:
         kill_viewer(viewer)
@@ -590,21 +569,15 @@ def run_in_terminal(words: Sequence[str], size: tuple[int, int] = (40, 120)) -> 
         os.close(theirs)
         text = b""
         try:
-            while data := _read_some(ours):
-                text = (text + data)[-4096:]
+            with contextlib.suppress(OSError):  # the other end is closed
+                while data := os.read(ours, 65536):
+                    text = (text + data)[-4096:]
         finally:
             process.send_signal(signal.SIGTERM)  # without effect on one that has ended
             process.wait()
     finally:
         os.close(ours)
     return process.returncode, text.decode(errors="replace")
-
-
-def _read_some(number: int) -> bytes:
-    try:
-        return os.read(number, 65536)
-    except OSError:  # the other end is closed
-        return b""
 
 
 def summarise_live_runs(found: Mapping[str, list[Times]]) -> dict[str, Any]:

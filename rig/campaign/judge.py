@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import os
 import platform
 import tomllib
 import zlib
@@ -25,6 +24,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from fdi.diagnosis.faults import FAULTS, Fault, Level
+from fdi.output import write_text, write_whole
 from fdi.prognosis.unit_trend import list_traces
 from fdi.sources import hash_sources, import_function
 from fdi.trace.trace import Floats, Trace
@@ -264,24 +264,17 @@ def simulate_case(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
     """The preflight check of a plant with the faults, scatter and noise of a case.
 
     Raises:
-        InputError: values that contradict each other, or a fault or change that the chosen simulator does not have.
+        InputError: values that contradict each other, no such simulator, or a fault or change that it does not have.
     """
     command = np.round(load_sequence("preflight").main_profile().command, 12)
     scatter, noise = sample_random_parts(case, len(command), spec["colour"], spec["hum"])
-    columns = load_simulator(spec["simulator"])(
-        Unit(model, scatter, case.sizes, command, noise, restore_faults(spec)))
+    simulator: Simulator = simulate_unit
+    if spec["simulator"] != OWN_SIMULATOR:
+        simulator = import_function(spec["simulator"], "--simulator", "a simulator of units")
+    columns = simulator(Unit(model, scatter, case.sizes, command, noise, restore_faults(spec)))
     measured = {EHA.command.name, EHA.drive.name, "load", *spec["signals"].split(",")}
     return Trace.from_columns({name: columns[name] for name in columns if name in measured}, model["controller.period"],
                               {"source": case.label, "seed": str(case.seed)})
-
-
-def load_simulator(name: str) -> Simulator:
-    """`simulate_unit`, or the function "module:function".
-
-    Raises:
-        InputError: there is no such function.
-    """
-    return simulate_unit if name == OWN_SIMULATOR else import_function(name, "--simulator", "a simulator of units")
 
 
 def simulate_unit(unit: Unit) -> dict[str, Floats]:
@@ -349,9 +342,6 @@ def add_faults(model: Model, sizes: Mapping[str, float], faults: Sequence[Fault]
     return model
 
 
-Judgement = Callable[[Trace, Model], Row]
-"""A function that judges a run: from the trace and the healthy model to a flat row of JSON values."""
-
 OK, REFUSED, FAILED = "ok", "refused", "failed"
 
 
@@ -367,7 +357,9 @@ def judge_case(case: Case, spec: Mapping[str, Any], expected_sources: str) -> Ro
     try:
         trace = Trace.read(case.trace, signals=model.kind.signals) if case.trace else simulate_case(case, spec, model)
         start = clock.now()
-        row |= {"status": OK, **_judge_trace(spec, trace, model), "seconds": (clock.now() - start) * 1e-9}
+        judge = _load_judgement(spec)
+        judged = judge(trace, model, restore_faults(spec)) if judge is judge_by_fdi else judge(trace, model)
+        row |= {"status": OK, **judged, "seconds": (clock.now() - start) * 1e-9}
     except RigError as error:
         row |= {"status": REFUSED, "reason": " ".join(str(error).split())}
     except Exception as error:
@@ -386,12 +378,8 @@ def describe_case(case: Case, spec: Mapping[str, Any]) -> Row:
                   for fault in restore_faults(spec)}
 
 
-def _judge_trace(spec: Mapping[str, Any], trace: Trace, model: Model) -> Row:
-    judge = _load_judgement(spec)
-    return judge_by_fdi(trace, model, restore_faults(spec)) if judge is judge_by_fdi else judge(trace, model)
-
-
-def _load_judgement(spec: Mapping[str, Any]) -> Judgement:
+def _load_judgement(spec: Mapping[str, Any]) -> Callable[..., Row]:
+    """The function that judges a run: from the trace and the healthy model to a flat row of JSON values."""
     return import_function(spec["work"], "--work", "a judgement")
 
 
@@ -493,7 +481,6 @@ def _has_failed(row: Row) -> bool:
 
 
 MATRIX, ROWS, RESULTS = "campaign.json", "finished.jsonl", "results.parquet"
-PART = ".part"
 
 
 def open_campaign(path: str | Path, matrix: Matrix, sources: str) -> RowFile:
@@ -516,10 +503,10 @@ def open_campaign(path: str | Path, matrix: Matrix, sources: str) -> RowFile:
                                                 f"{', '.join(changed)}")
             if present["code"] != sources:
                 raise InputError(path, "--out", "a new folder: the code has changed since this campaign was started")
-        elif any(not file.name.endswith(PART) for file in folder.iterdir()):
+        elif any(not file.name.startswith(".part-") for file in folder.iterdir()):
             raise InputError(path, "--out", "an empty folder, or one of this campaign")
         else:
-            replace_file(folder / MATRIX, (json.dumps(expected, indent=1) + "\n").encode())
+            write_text(folder / MATRIX, json.dumps(expected, indent=1) + "\n")
     except OSError as error:
         raise InputError(path, "", f"a folder that can be written ({error.strerror})") from error
     return RowFile(folder / ROWS)
@@ -561,22 +548,8 @@ def write_results(folder: str | Path, rows: Iterable[Row]) -> None:
     names = list(dict.fromkeys(name for row in newest for name in row))
     table = pa.table({name: pa.array([row.get(name) for row in newest]) for name in names})
     table = table.replace_schema_metadata({"campaign": json.dumps(_read_campaign(Path(folder)))})
-    part = path.with_name(path.name + PART)
-    parquet.write_table(table, part)
-    part.replace(path)
-
-
-def replace_file(path: Path, data: bytes) -> None:
-    """Write a file as a whole: a reader sees the old content or the new one. Raises InputError."""
-    part = path.with_name(path.name + PART)
-    try:
-        with part.open("wb") as out:
-            out.write(data)
-            out.flush()
-            os.fsync(out.fileno())
-        part.replace(path)
-    except PermissionError as error:
-        raise InputError(path, "", f"a place that can be written ({error.strerror})") from None
+    with write_whole(path) as part:
+        parquet.write_table(table, part)
 
 
 def _read_campaign(folder: Path) -> dict[str, Any]:

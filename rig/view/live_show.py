@@ -15,7 +15,6 @@ import os
 import pickle
 import select
 import struct
-import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -61,7 +60,7 @@ from rig.view.recording import (
     name_node_lane,
     read_fault_event,
 )
-from rig.view.viewer import find_free_port, is_listening, make_viewer_command, wait_until
+from rig.view.viewer import find_free_port, is_listening, start_viewer
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
 
@@ -447,7 +446,6 @@ def show_in_viewer(log: Path, plan: LivePlan, port: int, file: str) -> None:
     os.environ["RUST_LOG"] = "off"  # a viewer that is gone is one line of ours, not many of its library
     import rerun as rr
 
-
     drawing, viewer = draw_plan(plan), None
     blueprint = build_blueprint(drawing, "following")
     stream = rr.RecordingStream("eha-rig", recording_id=f"live-{os.getpid()}")
@@ -456,7 +454,7 @@ def show_in_viewer(log: Path, plan: LivePlan, port: int, file: str) -> None:
     else:
         if not port:
             port = find_free_port()
-            viewer = open_viewer(port)
+            viewer = start_viewer(port)
         stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy", default_blueprint=blueprint)
     view = LiveView(Recording(stream, drawing), plan)
     run, next_look = LiveRun(plan), time.monotonic()
@@ -470,14 +468,6 @@ def show_in_viewer(log: Path, plan: LivePlan, port: int, file: str) -> None:
     view.finish(run)
     stream.flush()
     stream.disconnect()
-
-
-def open_viewer(port: int, patience: float = 20.0) -> subprocess.Popen[bytes]:
-    """Open the viewer's window at a port of 127.0.0.1 and wait until it listens."""
-    viewer = subprocess.Popen(make_viewer_command(port), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                              stderr=subprocess.DEVNULL, start_new_session=True)
-    wait_until(lambda: is_listening(port), viewer, patience)
-    return viewer
 
 
 def main() -> None:

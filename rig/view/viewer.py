@@ -65,6 +65,14 @@ def make_viewer_command(port: int | str, *words: str) -> list[str]:
     return [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen", *words]
 
 
+def start_viewer(port: int, *words: str, patience: float = 20.0) -> subprocess.Popen[bytes]:
+    """Start a silent viewer in a session of its own and wait until it listens at a port, has ended, or is too slow."""
+    viewer = subprocess.Popen(make_viewer_command(port, *words), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                              stderr=subprocess.DEVNULL, start_new_session=True)
+    wait_until(lambda: is_listening(port), viewer, patience)
+    return viewer
+
+
 @contextlib.contextmanager
 def serve_in_browser(rrd: Path, theme: str, patience: float = 20.0) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     """Serve the viewer for a web browser on 127.0.0.1; -> the address with `theme` (light, dark) and the server.

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi.diagnosis.faults import choose_faults, load_faults
+from fdi.output import write_text
 from plant import InputError, load_model
 from rig.campaign.batch import BatchProgress, Row, Workers
 from rig.campaign.judge import (
@@ -26,7 +27,6 @@ from rig.campaign.judge import (
     read_campaign_rows,
     read_matrix,
     read_matrix_of_folder,
-    replace_file,
     restore_faults,
     run_campaign,
 )
@@ -68,12 +68,12 @@ def give_summary(rows: Sequence[Row], folder: Path, args: argparse.Namespace) ->
 
 def write_statistics(figures: dict[str, Any], folder: Path) -> None:
     """Write summary.json, and a figure of the detection rates for each tolerance that has several sizes."""
-    replace_file(folder / "summary.json", (json.dumps(figures, indent=1) + "\n").encode())
+    write_text(folder / "summary.json", json.dumps(figures, indent=1) + "\n")
     for part in figures["tolerances"]:
         if any(len(points) > 1 for points in part["curves"].values()):
             alone = len(figures["tolerances"]) == 1
             name = "detection.svg" if alone else f"detection-{100 * part['tolerance']:g}.svg"
-            replace_file(folder / name, draw_detection_curves(part, restore_faults(figures)).encode())
+            write_text(folder / name, draw_detection_curves(part, restore_faults(figures)))
 
 
 def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
