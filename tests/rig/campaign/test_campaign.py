@@ -169,16 +169,6 @@ def test_a_case_that_kills_every_worker_of_a_cluster_has_failed(local: Path) -> 
     assert not plan_batch(whole, "", redo_failed=True).is_valid(row)
 
 
-def test_progress_counts_the_cases_and_estimates_the_time_left(local: Path, tmp_path: Path) -> None:
-    seen: list[BatchProgress] = []
-    found = run_campaign(judge.read_matrix_of_folder(local), tmp_path / "there", Workers(), seen.append, count=8)
-    assert [(p.done, p.total) for p in seen] == [(i + 1, 8) for i in range(8)]
-    assert seen[-1].left == 0.0 < seen[0].left and seen[-1].failed == 1
-    assert [row["case"] for row in found] == list(range(8))
-    run_campaign(judge.read_matrix_of_folder(local), tmp_path / "there", Workers(), seen.append)
-    assert len(seen) == 8  # nothing was left to do
-
-
 def test_a_failed_case_is_kept_with_its_reason_and_judged_again_on_demand(local: Path, tmp_path: Path) -> None:
     failed = [row for row in rows(local) if row["status"] == "failed"]
     assert [(row["label"], row["seed"], row["reason"]) for row in failed] == [
@@ -202,6 +192,7 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
     assert "the code has changed" in catch_refusal(judge.open_campaign, local, whole, "another")
     with judge.open_campaign(local, whole, sources):
         assert "no other rig process" in catch_refusal(judge.open_campaign, local, whole, sources)
+    assert "a folder that can be written" in catch_refusal(RowFile, local / judge.ROWS / "rows.jsonl")
 
 
 @pytest.mark.parametrize(("words", "complaint"), [
@@ -466,14 +457,3 @@ def test_finished_jobs_are_not_done_again_and_rows_of_another_version_do_not_cou
     with RowFile(path) as file:
         run_batch(make_batch(range(3), version=2), file, Workers(), seen.append)
     assert [(p.done, p.total) for p in seen[5:]] == [(1, 3), (2, 3), (3, 3)]
-
-
-def test_a_row_file_is_open_in_one_process_and_each_row_is_on_disk_at_once(tmp_path: Path) -> None:
-    path = tmp_path / "rows.jsonl"
-    with RowFile(path) as file:
-        file.append({"number": 1})
-        assert json.loads(path.read_text()) == {"number": 1}
-        assert "no other rig process is at work" in catch_refusal(RowFile, path)
-    with RowFile(path) as file:
-        assert file.rows == [{"number": 1}]
-    assert "a folder that can be written" in catch_refusal(RowFile, path / "rows.jsonl")

@@ -172,14 +172,6 @@ def test_malformed_frames_do_not_reach_the_library(cob_id: int) -> None:
     assert heard == []
 
 
-def test_a_short_sdo_response_is_none() -> None:
-    master = alone()
-    for length in range(1, 8):
-        master.receive(Frame(0, 0x583, b"\x80" + bytes(length - 1)))
-    with pytest.raises(BusError, match="No SDO response"):
-        master.configure(SCENARIO, None, 0)
-
-
 @pytest.mark.parametrize("end", [Frame(0, 0x083, bytes(8)), Frame(0, 0x703, bytes(1))], ids=["EMCY", "boot-up"])
 def test_emergencies_come_and_go(end: Frame) -> None:
     """An EMCY without an error ends them, and so does a boot-up: no EMCY says so."""

@@ -268,7 +268,7 @@ def test_screen_of_a_run(tmp_path: Path) -> None:
     assert any("Position [mm]" in frame for frame in frames[1:])
 
 
-def test_screen_follows_the_run(tmp_path: Path) -> None:
+def test_screen_follows_the_run_and_ctrl_c_restores_the_terminal(tmp_path: Path) -> None:
     """A run that lasts until all of it was seen, however slowly the screen is drawn."""
     sequence = tmp_path / "watched.toml"
     sequence.write_text(WATCHED)
@@ -289,24 +289,11 @@ def test_screen_follows_the_run(tmp_path: Path) -> None:
             stopped.append(number)
             os.kill(number, signal.SIGINT)
 
-    _, status = run_in_terminal([str(sequence), "--live", "--out", str(tmp_path / "run")], look)
+    text, status = run_in_terminal([str(sequence), "--live", "--out", str(tmp_path / "run")], look)
+    require_restored(text)
+    assert (tmp_path / "run" / "verdict.json").exists()
     assert stopped and status == 130, {name: sorted(each)[:2] for name, each in seen.items()}
     assert "overshoot" in seen["passed"] and "position" in seen["measures"] and "position" not in seen["passed"]
-
-
-def test_ctrl_c_restores_the_terminal(tmp_path: Path) -> None:
-    sequence = tmp_path / "long.toml"
-    sequence.write_text(LONG)
-    stopped: list[int] = []
-
-    def stop(text: str, number: int) -> None:
-        if not stopped and "rest  " in text:
-            stopped.append(number)
-            os.kill(number, signal.SIGINT)
-
-    text, status = run_in_terminal([str(sequence), "--live", "--out", str(tmp_path / "run")], stop)
-    require_restored(text)
-    assert stopped and status == 130 and (tmp_path / "run" / "verdict.json").exists()
 
 
 def test_lines_without_a_terminal(tmp_path: Path) -> None:
@@ -334,9 +321,11 @@ def test_dead_node_is_announced_before_the_run_ends(tmp_path: Path) -> None:
     assert "ABORTED" in said.out and said.status == 1
 
 
-def test_a_suite_is_not_shown(tmp_path: Path) -> None:
-    line = refuse("run", "preflight", "lost_sync", "--live", "--out", tmp_path / "runs")
-    assert line == "rig run: --live: expected one sequence; runs of a suite run side by side\n"
+@pytest.mark.parametrize(("words", "line"), [
+    (("preflight", "lost_sync", "--live"), "--live: expected one sequence; runs of a suite run side by side"),
+    (("--live", "absent.toml"), "absent.toml")])  # a word after --live may be a sequence
+def test_what_is_not_shown(words: tuple[str, ...], line: str, tmp_path: Path) -> None:
+    assert line in refuse("run", *words, "--out", tmp_path / "runs")
 
 
 needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="pip install 'eha-rig[view]'")
@@ -424,7 +413,3 @@ def test_places_that_cannot_be_used(word: str, monkeypatch: pytest.MonkeyPatch) 
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert "--live" in catch_refusal(find_viewer_place, word.format(port=find_free_port()))
-
-
-def test_a_word_after_live_may_be_a_sequence() -> None:
-    assert "absent.toml" in refuse("run", "--live", "absent.toml")

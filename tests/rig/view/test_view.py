@@ -180,11 +180,6 @@ def test_without_a_display_one_line_says_so_and_the_viewer_listens_on_this_machi
     assert words[words.index("--bind") + 1] == "127.0.0.1"
 
 
-def test_command(short_run: Path, tmp_path: Path) -> None:
-    said = finished(started("view", short_run, "--save", tmp_path / "x.rrd"))
-    assert said == (0, f"{tmp_path / 'x.rrd'}\n", ""), said
-
-
 BIAS = "null_bias.current=1.5e-4"
 
 
