@@ -1,7 +1,10 @@
 """Shared by all tests."""
 from __future__ import annotations
 
+import fcntl
+import os
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -46,17 +49,33 @@ def bus_kind(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="session")
 def preflight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a real preflight run, not to be written to."""
-    folder = tmp_path_factory.mktemp("preflight")
-    assert rig("run", "--quiet", "--out", folder).status == 0
-    return folder
+    def run(folder: Path) -> None:
+        assert rig("run", "--quiet", "--out", folder).status == 0
+
+    return share_folder(tmp_path_factory, "preflight", run)
 
 
 @pytest.fixture(scope="session")
 def aborted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a real run with lost frames that a guard ended within a ramp; not to be written to."""
-    folder = tmp_path_factory.mktemp("aborted")
-    (folder / "guarded.toml").write_text(GUARDED)
-    assert rig("run", folder / "guarded.toml", "--quiet", "--out", folder).status == 1
+    def run(folder: Path) -> None:
+        (folder / "guarded.toml").write_text(GUARDED)
+        assert rig("run", folder / "guarded.toml", "--quiet", "--out", folder).status == 1
+
+    return share_folder(tmp_path_factory, "aborted", run)
+
+
+def share_folder(tmp_path_factory: pytest.TempPathFactory, name: str, fill: Callable[[Path], None]) -> Path:
+    """A folder that the first worker to ask for it fills for all of them."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # closing it, also by a kill, frees it
+        if not folder.exists():
+            part = folder.with_suffix(".part")
+            part.mkdir(exist_ok=True)
+            fill(part)
+            part.rename(folder)
     return folder
 
 
