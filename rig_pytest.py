@@ -44,8 +44,8 @@ def rig_bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]
     for run in bench.runs:
         properties.append(("rig_run", f"{run.verdict} {run.folder}"))
         for check in run.checks.values():
-            word = "PASS" if check.passed else "FAIL"
-            properties += [("requirement", f"{requirement} {word} {check.name}") for requirement in check.requirement]
+            properties += [("requirement", f"{requirement} {check.verdict} {check.name}")
+                           for requirement in check.requirement]
 
 
 @pytest.hookimpl(wrapper=True)

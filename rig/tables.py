@@ -181,6 +181,8 @@ def _convert(value: Any, hint: Any, place: Place, kinds: Kinds) -> Any:
     if bare in _SCALARS:
         if _is_scalar(value, bare) and not any(isinstance(note, Range) and note.refuses(value) for note in notes):
             return bare(value)
+    elif bare is Any:
+        return value
     elif origin is Literal:
         if value in args:
             return value

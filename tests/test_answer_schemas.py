@@ -128,6 +128,9 @@ def test_the_answers_of_runs(preflight: Path, aborted: Path) -> None:
     answers[1]["fdi"] = {"verdict": "CANNOT_TELL", "sentence": "not judged: too short"}
     answers[1]["judged"]["lateness"] = [{"t": 0.0, "cycle": 1, "last": 1, "source": "rig", "text": "late"}]
     answers[1]["limits"] = [{"parameter": "p", "signal": "xj", "limit": 1.0, "t": 0.0, "seconds": 1.0}]
+    answers[1]["calibration"] = {"xj": {
+        "signal": "xj", "unit": "m", "identifier": "K-118", "date": "2026-03-01", "expiry": "2027-03-01", "u": 1e-6,
+        "distribution": "normal", "gain": 0.0, "noise": 0.0, "problem": ""}}
     assert_all_seen("run", *answers)
 
 

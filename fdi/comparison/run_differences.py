@@ -322,7 +322,7 @@ def match_checks(checks_of_runs: Sequence[Sequence[Check]]) -> list[MatchedCheck
     tables = [_number_checks(checks) for checks in checks_of_runs]
     keys = dict.fromkeys(key for table in tables for key in table)
     return [MatchedCheck(key[0], tuple(table.get(key) for table in tables),
-                         len({table[key].passed if key in table else None
+                         len({table[key].verdict if key in table else None
                               for table in tables if table}) > 1) for key in keys]
 
 

@@ -160,7 +160,7 @@ def _show_value(check: Check | None) -> Cell | str:
 
 
 def _join_verdicts(results: Sequence[Check | None]) -> Cell:
-    words = ["-" if check is None else {True: "pass", False: "FAIL"}[check.passed] for check in results]
+    words = ["-" if check is None else check.verdict.replace("PASS", "pass") for check in results]
     text = " -> ".join(words) if len(set(words)) > 1 else words[0]
     if "FAIL" in words:
         return Cell(text, "bad")

@@ -58,7 +58,10 @@ from fdi.trace.trace import Check, Event, Floats, Trace
 from plant.signals import EHA, Signals
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",
-                          "NOT_JUDGED": "doubtful"}
+                          "NOT_JUDGED": "doubtful", "CANNOT_TELL": "doubtful"}
+DECISIONS = {"simple": "simple acceptance: by the value alone, U is not used",
+             "guarded": "guard band of U at each limit",
+             "shared": "shared risk: by the value alone, if U is small against the limits"}
 _SKIPPED = "not_applicable."  # before the names of checks that do not apply to the bench, in the provenance
 EVENT_MOODS: dict[str, Mood] = {"ERROR": "bad", "WARN": "doubtful"}
 KINDS_OF_TIMING = {"hard real time": "the rig's cycle ran as compiled code",
@@ -89,8 +92,8 @@ def build_run_report(trace: Trace) -> Report:
         Section("Signals", [Figure(
             "Command, ram position, following error, current, pressure difference and spool position over time. "
             "Shaded: ramps (blue) and dynamic sections (violet) of the command, injected faults (orange). The bars at "
-            "the bottom are the windows of the checks, green for passed and red for failed; a check whose window was "
-            "not reached has no bar.", partial(draw_signals, trace))]),
+            "the bottom are the windows of the checks, green for passed, red for failed and amber for CANNOT_TELL; a "
+            "check whose window was not reached has no bar.", partial(draw_signals, trace))]),
         Section("Cycle timing", _show_timing(trace), medium=page),
         Section("Events", _tabulate_events(trace.events)),
         Section("NMT states", [tabulate(
@@ -118,6 +121,7 @@ def _list_facts(trace: Trace) -> list[tuple[str, str]]:
     facts = [("main phase", f"{main * trace.period:.3f} s, {main} cycles"), *passed,
              *((name, notes.get(name, "")) for name in ("model", "seed", "bus", "pace", "started", "host")),
              ("differs from nominal", notes.get("differences.text", "")),
+             ("decision rule", DECISIONS.get(notes.get("metrology.decision", ""), "")),
              ("timing", f"{kind}: {why}" if kind in KINDS_OF_TIMING else "")]
     return [(name, text) for name, text in facts if text]
 
@@ -180,19 +184,22 @@ def _list_notes(trace: Trace, most: int = 5) -> list[str]:
 def _tabulate_checks(checks: Sequence[Check], heading: str, remark: Medium) -> Table:
     """The checks of a sequence, or the protocol checks, which judge the whole run."""
     page = Medium.PAGE
-    is_windowed = heading == "check"
+    is_windowed, is_uncertain = heading == "check", any(check.uncertainty < math.inf for check in checks)
     columns = [
         (True, Column(heading), lambda check: check.name),
         (is_windowed, Column("kind", medium=page), lambda check: Cell(_name_measure(check), "muted")),
-        (True, Column(""), lambda check: Cell("pass", "good") if check.passed else Cell("FAIL", "bad")),
+        (True, Column(""), lambda check: Cell(check.verdict.replace("PASS", "pass"), MOODS[check.verdict])),
         (True, Column("measured", align="right"), lambda check: Cell(format_value(check.value), is_strong=True)),
+        (is_uncertain, Column("U", align="right"),
+         lambda check: format_uncertainty(check.uncertainty)),
         (True, Column("limits", align="right"), lambda check: format_limits(check.low, check.high)),
         (True, Column("unit"), lambda check: "" if check.unit == "1" else check.unit),
         (is_windowed, Column("window", medium=page), lambda check: Cell(_format_window(check), "muted")),
         (any(check.requirement for check in checks), Column("requirement"), lambda check: check.requirement),
         (any(check.detail for check in checks), Column("remark", medium=remark),
          lambda check: Cell(check.detail, "muted"))]
-    return tabulate(checks, *((column, show) for is_shown, column, show in columns if is_shown))
+    caption = "U: expanded uncertainty of the measured number (k = 2, about 95 %)." if is_uncertain else ""
+    return tabulate(checks, *((column, show) for is_shown, column, show in columns if is_shown), caption=caption)
 
 
 def _tabulate_skipped(trace: Trace) -> Table:
@@ -204,7 +211,7 @@ def _tabulate_skipped(trace: Trace) -> Table:
 
 def _show_failed_checks(trace: Trace, most: int = 12) -> list[Item]:
     """A close-up of each of the first `most` failed checks that have a window and a signal."""
-    failed = [check for check in trace.sequence_checks if not check.passed and not math.isnan(check.t0)]
+    failed = [check for check in trace.sequence_checks if check.verdict == "FAIL" and not math.isnan(check.t0)]
     items: list[Item] = []
     for number, check in enumerate(failed[:most]):
         measured = f"{attach_unit(format_value(check.value), check.unit)} measured"
@@ -226,6 +233,15 @@ def _name_measure(check: Check) -> str:
 def format_value(value: float) -> str:
     """What a check measured."""
     return "not measurable" if math.isnan(value) else f"{value:.4g}"
+
+
+def format_uncertainty(uncertainty: float) -> str:
+    """U with two digits; nothing for an unknown one.
+
+    >>> format_uncertainty(0.4334), format_uncertainty(0.0), format_uncertainty(float("nan"))
+    ('0.43', '0', '')
+    """
+    return f"{uncertainty:.2g}" if uncertainty < math.inf else ""
 
 
 def format_limits(low: float, high: float) -> str:
@@ -274,7 +290,7 @@ def _tabulate_events(events: Sequence[Event], most: int = 12, most_on_page: int 
 class Verdict(NamedTuple):
     """The result of a run."""
 
-    word: str  # PASS, FAIL, INVALID_TIMING, ABORTED; NOT_JUDGED without checks
+    word: str  # PASS, FAIL, CANNOT_TELL, INVALID_TIMING, ABORTED; NOT_JUDGED without checks
     why: str  # the reason; empty if the run passed
 
     def __str__(self) -> str:
@@ -284,8 +300,9 @@ class Verdict(NamedTuple):
 def read_verdict(trace: Trace) -> Verdict:
     """The verdict in the log of the run; of a trace without one (recovered, CSV) that of its checks."""
     notes = trace.provenance
-    failed = [check.name for check in trace.checks if not check.passed]
-    judged = ("FAIL" if failed else "PASS") if trace.checks else "NOT_JUDGED"
+    failed = [check.name for check in trace.checks if check.verdict == "FAIL"]
+    words = {check.verdict for check in trace.checks}
+    judged = next((word for word in ("FAIL", "CANNOT_TELL", "PASS") if word in words), "NOT_JUDGED")
     word, why = notes.get("verdict.verdict") or judged, notes.get("verdict.why", "")
     if word == "INVALID_TIMING":
         why = notes.get("verdict.timing", why)
@@ -297,6 +314,9 @@ def read_verdict(trace: Trace) -> Verdict:
 
 
 BRIDGED = 5  # cycles
+CHECK_COLOURS = {"PASS": GREEN, "FAIL": RED, "CANNOT_TELL": AMBER}
+
+
 def draw_signals(trace: Trace) -> str:
     """Command and controlled signal, error, drive, other outputs and load over one time axis, with sections and checks.
     """
@@ -396,7 +416,7 @@ def _draw_checks(trace: Trace) -> Panel:
         if math.isnan(check.t0) and math.isnan(check.value):
             name, colour = f"{check.name}: not measured", RED
         else:
-            bars.append((row, t1 - t0, t0, GREEN if check.passed else RED))
+            bars.append((row, t1 - t0, t0, CHECK_COLOURS[check.verdict]))
             if last - t1 > far:
                 x, colour = t1 + room, INK
             elif t0 - first > far:

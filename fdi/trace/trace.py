@@ -77,6 +77,15 @@ class Check(NamedTuple):
     after: float = math.nan  # s, from which the time of a reaction counts
     above: float = math.nan  # level that a signal has to pass, SI
     below: float = math.nan
+    uncertainty: float = math.nan  # U (k = 2) of the value
+    cannot_tell: bool = False  # the decision rule leaves the verdict open
+
+    @property
+    def verdict(self) -> str:
+        """PASS, FAIL or CANNOT_TELL."""
+        if self.cannot_tell:
+            return "CANNOT_TELL"
+        return "PASS" if self.passed else "FAIL"
 
     @property
     def is_protocol(self) -> bool:

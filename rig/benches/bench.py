@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from plant.signals import EHA
+from rig.benches.calibration import Decision, SensorCalibration
 from rig.benches.frame_map import Field, FrameMap, Role
 
 Profile = Literal["cia402", "cia408", "none"]
@@ -70,6 +71,8 @@ class Bench:
     phases: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # field: phase -> counts
     ready: Mapping[str, float] = field(default_factory=dict)  # field of a frame of the controller: counts in main
     files: Mapping[str, bytes] = field(default_factory=dict)  # bench file, EDS, DBC: name -> content, for the log
+    decision: Decision = "simple"  # rule by which a value with an uncertainty passes a limit
+    calibration: Mapping[str, SensorCalibration] = field(default_factory=dict)  # by signal of the plant
 
     @property
     def rate(self) -> float:

@@ -13,6 +13,7 @@ from dbc import EDS
 from fdi.foreign_code import ForeignCode, require_trust
 from plant.errors import InputError
 from plant.parameters import GROUPS, find_field
+from plant.signals import EHA
 from plant.units import parse_quantity
 from rig.benches import canopen_map
 from rig.benches.bench import (
@@ -25,6 +26,7 @@ from rig.benches.bench import (
     SignalObject,
     decode_device_text,
 )
+from rig.benches.calibration import read_calibration
 from rig.benches.can_map import map_messages, read_database
 from rig.benches.checksums import CHECKSUMS, load_checksum
 from rig.benches.frame_map import FD, MOST_FRAMES, FrameMap, FrameSpec, Guard, Role, describe_identifier
@@ -83,6 +85,7 @@ class BenchKeys:
     cycle: str = "1 ms"
     bitrate: Annotated[int, Range("bit/s", low=10_000, high=1_000_000)] = 1_000_000
     data_bitrate: Annotated[int, Range("bit/s", low=10_000, high=20_000_000)] | None = None
+    calibration: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -221,9 +224,11 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, *, is_t
     if len(specs) > MOST_FRAMES:
         raise reader.place.refuse(f"at most {MOST_FRAMES} frames or pages of multiplexed ones")
     phases, ready = _list_states(frames, uses)
+    decision, calibration = read_calibration(_group_keys(keys.calibration, 0), reader.place.at("calibration"), EHA)
     bench = Bench(name=keys.name, frames=FrameMap(frames=tuple(specs), sync=sync), nodes=nodes, plant=keys.plant,
                   cycle_ns=cycle_ns, bitrate=keys.bitrate, data_bitrate=keys.data_bitrate, timeout_ns=timeout_ns,
-                  phases=phases, ready=ready, files=reader.files)
+                  phases=phases, ready=ready, files=reader.files, decision=decision,
+                  calibration=calibration)
     _check_identifiers(bench, reader.place)
     return bench
 

@@ -119,6 +119,8 @@ class Check:
                                    "s", default=math.nan)
     above: float = _describe_field("level that a signal has to pass, SI; NaN: none", default=math.nan)
     below: float = _describe_field("level that a signal has to pass downwards, SI; NaN: none", default=math.nan)
+    uncertainty: float = _describe_field("expanded uncertainty (k = 2) of the value; NaN: not known", default=math.nan)
+    cannot_tell: bool = _describe_field("the decision rule leaves the verdict open", default=False)
     name: str = _describe_field("as in the sequence")
     kind: str = _describe_field("what was measured: overshoot, settling, never_exceeds, ...", default="")
     signal: str = _describe_field("what was looked at")
@@ -198,7 +200,7 @@ def make_packer(record: type) -> Callable[[int, Any], bytes]:
         if code:  # fields of fixed width come first
             layout, args = layout + "B" + code, [*args, tag, 0]
         else:
-            blobs.append((item.name, bytes([tag])))
+            blobs.append((item.name, _encode_varint(tag)))
     fixed = struct.Struct(layout)
     size = fixed.size - 9
     names = [item.name for item in fields(record)][: (len(args) - 6) // 2]
@@ -233,12 +235,17 @@ def _make_frame_packer(pack_head: Callable[..., bytes], args: list[int], size: i
 def _encode_blob(value: str | bytes) -> bytes:
     """Length-delimited field: varint length, then the bytes."""
     raw = value.encode() if isinstance(value, str) else value
-    n, out = len(raw), bytearray()
+    return _encode_varint(len(raw)) + raw
+
+
+def _encode_varint(n: int) -> bytes:
+    """A whole number in groups of 7 bits, the lowest first."""
+    out = bytearray()
     while n > 0x7F:
         out.append(n & 0x7F | 0x80)
         n >>= 7
     out.append(n)
-    return bytes(out) + raw
+    return bytes(out)
 
 
 RECORDED_PACKAGES = ("eha-rig", "numpy", "numba", "python-can", "canopen", "mcap", "protobuf")

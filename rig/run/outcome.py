@@ -29,8 +29,9 @@ from rig.run.loop import History, Loop
 from rig.run.state import SessionEvent
 from rig.sequences.checks import CheckResult, SkippedCheck
 from rig.sequences.protocol import HEARTBEAT
+from rig.sequences.uncertainty import NO_METROLOGY, Metrology
 
-STATUS_OF_VERDICT = {"PASS": 0, "NOT_JUDGED": 0, "FAIL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
+STATUS_OF_VERDICT = {"PASS": 0, "NOT_JUDGED": 0, "FAIL": 1, "CANNOT_TELL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
 INTERRUPTED = 130
 
 
@@ -55,10 +56,12 @@ class Outcome:
     skipped: Sequence[SkippedCheck] = ()  # they do not apply to the bench
     limits: Sequence[LimitReached] = ()  # of travel and current, that the run reached
     fdi: dict[str, Any] = field(default_factory=dict)  # diagnosis of `rig fdi`, if it was requested
+    metrology: Metrology = NO_METROLOGY
+    started_ns: int = 0  # since 1970
 
     @property
     def verdict(self) -> str:
-        """PASS, FAIL, INVALID_TIMING, ABORTED or NOT_JUDGED.
+        """PASS, FAIL, CANNOT_TELL, INVALID_TIMING, ABORTED or NOT_JUDGED.
 
         If the bench itself was late, the controller is not judged. Without checks in the sequence nothing says what
         the actuator should have done: then the protocol checks can fail a run, but not pass it.
@@ -69,6 +72,8 @@ class Outcome:
             return "ABORTED"
         if self.failures:
             return "FAIL"
+        if self._list_checks("CANNOT_TELL"):
+            return "CANNOT_TELL"
         # Whether anything says what the actuator should do: a check, the end of the sequence, or `rig fdi`.
         sequence = self.job.sequence
         is_judged = sequence.checks or sequence.ends == "safe_state" or self.fdi.get("verdict") == "ACCEPTABLE"
@@ -76,13 +81,16 @@ class Outcome:
 
     @property
     def failures(self) -> list[str]:
-        """The checks that did not pass, an end other than the one the sequence requires, and the faults found."""
-        failed = [check.name for check in self.checks if not check.passed]
+        """The checks that failed, an end other than the one the sequence requires, and the faults found."""
+        failed = [check.name for check in self._list_checks("FAIL")]
         if self.job.sequence.ends == "safe_state" and not self.safe:
             failed.append("the run did not end in the safe state")
         if has_fault(self.fdi):
             failed.append(f"rig fdi: {self.fdi['sentence'].rstrip('.')}")
         return failed
+
+    def _list_checks(self, verdict: str) -> list[CheckResult]:
+        return [check for check in self.checks if check.verdict == verdict]
 
     @property
     def timing_problem(self) -> str:
@@ -96,7 +104,7 @@ class Outcome:
             return problem
         if self.aborted or not self.failures:
             return ""
-        failed = [check for check in self.checks if not check.passed]
+        failed = self._list_checks("FAIL")
         is_fault_found = has_fault(self.fdi)
         is_affected = (len(failed) + is_fault_found == len(self.failures) and all(map(self._is_affected, failed))
                        and (not is_fault_found or bool(self.attribution.affected.any())))
@@ -164,12 +172,15 @@ class Outcome:
 
     @property
     def why(self) -> str:
-        """The reason of a verdict other than PASS, in words."""
+        """The reason of a verdict other than PASS, in words, and the calibrations that do not hold."""
         passed = sum(check.passed for check in self.checks)
         words = {"NOT_JUDGED": f"the sequence has no checks; {passed} protocol checks passed",
                  "FAIL": "; ".join(self.failures), "INVALID_TIMING": self.timing_problem,
+                 "CANNOT_TELL": "too uncertain for a verdict: " + "; ".join(
+                     check.name for check in self._list_checks("CANNOT_TELL")),
                  "ABORTED": self.describe_cause() or self.aborted}
-        return words.get(self.verdict, "")
+        reason, problems = words.get(self.verdict, ""), list(self.metrology.problems.values())
+        return "; ".join([reason or "every check passed", *problems] if problems else [reason])
 
     @property
     def status(self) -> int:
@@ -180,10 +191,12 @@ class Outcome:
         """The content of `rig run --json` and verdict.json; null for NaN and infinity."""
         events, omitted = select_events(self.events)
         return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.why,
-                "checks": [to_plain(check._asdict()) for check in self.checks],
+                "checks": [to_plain(check.collect_data()) for check in self.checks],
                 "not_applicable": [check._asdict() for check in self.skipped],
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
                 **self._attribution_to_json(), "differences": find_differences(self.job).to_json(),
+                "decision": self.metrology.decision, "calibration": {
+                    name: each.to_json(self.started_ns) for name, each in self.metrology.calibration.items()},
                 "limits": [limit._asdict() for limit in self.limits],
                 "nodes": {str(self.job.bench.find_number(role)): {
                     "name": NAMES[role], "identity": self.identities[role]._asdict(),

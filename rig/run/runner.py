@@ -39,6 +39,7 @@ from rig.sequences.checks import CheckResult, SkippedCheck, evaluate_checks, fin
 from rig.sequences.faults import Schedule
 from rig.sequences.protocol import judge_protocol
 from rig.sequences.python_parts import StepRun
+from rig.sequences.uncertainty import NO_METROLOGY, Metrology, collect_metrology
 
 Diagnose = Callable[[Trace], dict[str, Any]]
 
@@ -116,7 +117,9 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     recorder.metadata("timing", {"kind": kind, "reason": reason})
     history = session.log.history
     attribution = attribute_run(job, session)
-    checks, skipped = judge_run(job, session, attribution.judged)
+    started_ns = read_epoch_ns()
+    metrology = collect_metrology(job.bench, job.model.kind.signals, job.sequence.decision, started_ns)
+    checks, skipped = judge_run(job, session, attribution.judged, metrology)
     for check in checks:
         recorder.put(session.stage.now(), _make_check_record(check))
     diagnosis = diagnose(make_main_trace(job, folder, history)) if diagnose and not session.safety.interrupted else {}
@@ -126,10 +129,14 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
         safe=safety.is_safe, interrupted=safety.interrupted, fdi=diagnosis, attribution=attribution,
         timing=summarise_timing(history, loop, scheduled, kind, reason), counters=_count_lost_frames(history),
         speed=len(history) * job.period_ns * 1e-9 / spent, due_ns=tuple(log.due_ns), start_times=starter.start_times,
-        identities=starter.identities, limits=find_limits(history.column, job.model, job.scenario.plan.start))
+        identities=starter.identities, metrology=metrology, started_ns=started_ns,
+        limits=find_limits(history.column, job.model, job.scenario.plan.start))
     if skipped:
         recorder.metadata("not_applicable", {check.name: check.reason for check in skipped})
     recorder.metadata("differences", {"text": find_differences(job).describe()})
+    if metrology.is_used:
+        recorder.metadata("metrology", {"decision": metrology.decision, **{
+            name: each.describe() for name, each in metrology.calibration.items()}})
     if outcome.limits:
         signals = job.model.kind.signals
         recorder.metadata("limits", {f"{number:02d}": limit.describe(signals)
@@ -144,7 +151,8 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     return outcome
 
 
-def judge_run(job: Job, session: Session, judged: Mask) -> tuple[list[CheckResult], list[SkippedCheck]]:
+def judge_run(job: Job, session: Session, judged: Mask,
+              metrology: Metrology = NO_METROLOGY) -> tuple[list[CheckResult], list[SkippedCheck]]:
     """Judge the main phase by the checks of the sequence, and the whole run by the protocol checks.
 
     Returns the results, and the checks that do not apply to the bench.
@@ -155,7 +163,7 @@ def judge_run(job: Job, session: Session, judged: Mask) -> tuple[list[CheckResul
     unsaid = {check.name: skipped for check in sequence.checks if (skipped := find_skipped(check, job.bench))}
     results = evaluate_checks([check for check in sequence.checks if check.name not in unsaid], Columns(t, *main),
                               sequence.sections(), session.journal.events, sequence.fault_starts(),
-                              session.log.read_drives(), sequence.rate)
+                              session.log.read_drives(), sequence.rate, metrology=metrology)
     protocol, inapplicable = judge_protocol(session.read_protocol_record(judged), sequence.protocol)
     return [*results, *protocol], [*unsaid.values(), *inapplicable]
 
@@ -240,4 +248,5 @@ def _count_lost_frames(history: History) -> dict[str, int]:
 def _make_check_record(check: CheckResult) -> Check:
     return Check(name=check.name, kind=check.kind, signal=check.signal, value=check.value, unit=check.unit,
                  low=check.low, high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, after=check.after,
-                 above=check.above, below=check.below, detail=check.detail, requirement=", ".join(check.requirement))
+                 above=check.above, below=check.below, detail=check.detail, requirement=", ".join(check.requirement),
+                 uncertainty=check.uncertainty, cannot_tell=check.cannot_tell)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from cmath import phase
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import degrees, inf, isfinite, nan
 from typing import Annotated, Any, NamedTuple
 
@@ -25,7 +25,8 @@ from rig.sequences import measures
 from rig.sequences.faults import Time
 from rig.sequences.measures import MAIN, NO_DRIVES, DriveFrames, NotMeasurable, RunData, find_scale
 from rig.sequences.python_parts import Argument, UserFunction, describe_value, require_function_name
-from rig.sequences.signals import Controlled, Guarded, Measured, find_controlled, find_tested, find_unit
+from rig.sequences.signals import DERIVED, Controlled, Guarded, Measured, find_controlled, find_tested, find_unit
+from rig.sequences.uncertainty import NO_METROLOGY, Metrology, compute_expanded_uncertainty, decide
 from rig.tables import Range
 
 LEFT_OPERATIONAL = "controller left OPERATIONAL:"  # words of the event
@@ -51,6 +52,19 @@ class CheckResult(NamedTuple):
     after: float = nan  # s of main, from which a time is measured; NaN: the check measures none
     above: float = nan  # level that a signal has to pass, SI
     below: float = nan
+    uncertainty: float = nan  # U (k = 2) of the value; NaN: not known, or not asked for
+    cannot_tell: bool = False  # the decision rule leaves it open; then it has not passed either
+
+    @property
+    def verdict(self) -> str:
+        """PASS, FAIL or CANNOT_TELL."""
+        if self.cannot_tell:
+            return "CANNOT_TELL"
+        return "PASS" if self.passed else "FAIL"
+
+    def collect_data(self) -> dict[str, Any]:
+        """All of it by name, for an answer in JSON."""
+        return {**self._asdict(), "verdict": self.verdict}
 
 
 class SkippedCheck(NamedTuple):
@@ -114,23 +128,58 @@ class Check:
 
     def judge(self, run: RunData) -> CheckResult:
         """Measure the number and compare it with the limits."""
-        value, t0, t1, detail = nan, nan, nan, ""
+        value, t0, t1, detail, uncertainty = nan, nan, nan, "", nan
         try:
             span = run.find_rows(self.window, self.skip)
             t0, t1 = span.start / run.rate, span.stop / run.rate
             missing = run.count_missing(self.about, span)
-            measured = KINDS[self.kind].measure(self, run, span) / self.scale
-            if not isfinite(measured):
-                raise NotMeasurable(f"the measure came to {measured:g}")
-            value, detail = measured, f"{missing} missing samples bridged" if missing else ""
+            value, detail = self._measure(run, span), f"{missing} missing samples bridged" if missing else ""
         except NotMeasurable as reason:
             detail = str(reason)
         except (ArithmeticError, ValueError) as error:  # one bad check must not cost a run its verdict
             detail = f"the measure failed ({type(error).__name__}: {error})"
+        if run.metrology.is_used and t1 == t1:
+            uncertainty, problem = self._compute_uncertainty(run, span, value)
+            detail = "; ".join(filter(None, (detail, problem)))
         low, high = (nan if limit is None else limit for limit in (self.low, self.high))
-        passed = not (value != value or value < low or value > high)  # NaN limits compare false
-        return CheckResult(self.name, self.kind, self.about, value, self.shown_unit, low, high, passed, t0, t1, detail,
-                           self.requirements, *self._find_reference(run))
+        passed = decide(value, low, high, uncertainty, run.metrology.decision)
+        return CheckResult(self.name, self.kind, self.about, value, self.shown_unit, low, high, passed is True, t0, t1,
+                           detail, self.requirements, *self._find_reference(run), uncertainty, passed is None)
+
+    def _measure(self, run: RunData, span: slice) -> float:
+        """The number, in the unit of the limits. Raises NotMeasurable."""
+        measured = KINDS[self.kind].measure(self, run, span) / self.scale
+        if not isfinite(measured):
+            raise NotMeasurable(f"the measure came to {measured:g}")
+        return measured
+
+    def _compute_uncertainty(self, run: RunData, span: slice, value: float) -> tuple[float, str]:
+        """U of the number, NaN if it is not known, and what is wrong with the calibrations that it depends on."""
+        def measure(trace: Columns) -> float:
+            try:
+                return self._measure(replace(run, trace=trace), span)
+            except (NotMeasurable, ArithmeticError, ValueError):
+                return nan
+
+        signals, known = run.signals, run.metrology.calibration
+        names = self._list_readings(signals)
+        missing = [s.name for s in signals if s.name in names and s.role in ("output", "load") and s.name not in known]
+        if missing and not (self.kind == "python" and known):  # which columns a function reads is not known
+            return nan, f"no calibration of {', '.join(missing)}"
+        step = 1 / run.rate / self.scale if KINDS[self.kind].is_rounded else 0.0
+        found = compute_expanded_uncertainty(measure, value, run.trace, names, run.metrology, step)
+        problems = [run.metrology.problems[name] for name in names if name in run.metrology.problems]
+        problems += ["errors of the sensor decide whether it can be measured"] if found == inf else []
+        return found, "; ".join(problems)
+
+    def _list_readings(self, signals: Signals) -> tuple[str, ...]:
+        """The signals that the number depends on; the demand is exact."""
+        name = getattr(self, "signal", None)
+        if self.kind == "python":
+            return tuple(s.name for s in signals[1:] if s.role != "command")
+        if name in DERIVED and name not in signals.names:
+            name = signals.controlled.name
+        return (name,) if name in signals.names and name != signals.command.name else ()
 
     def _find_reference(self, run: RunData) -> tuple[float, float, float]:
         """What a reaction is measured against: the time from which it counts, s of main, and levels; NaN for none."""
@@ -331,13 +380,14 @@ class Kind(NamedTuple):
     unit: str  # SI; "" for that of the check's signal
     measure: Callable[[Any, RunData, slice], float]  # in the rows of a window, SI; raises NotMeasurable with the reason
     keys: type[Check] = OfPosition
+    is_rounded: bool = False  # to whole cycles
 
 
 KINDS: dict[str, Kind] = {
     "overshoot": Kind("How far a step goes beyond its target, % of the step.", "%",
                       lambda check, run, span: measures.measure_overshoot(*run.read_step(span))),
     "settling_time": Kind("Time until a step stays within +-`band` of its target, s.", "s", lambda check, run, span:
-                          measures.measure_settling_time(*run.read_step(span), check.band), Settling),
+                          measures.measure_settling_time(*run.read_step(span), check.band), Settling, is_rounded=True),
     "rise_time": Kind("Time from 10 % to 90 % of a step, s.", "s",
                       lambda check, run, span: measures.measure_rise_time(*run.read_step(span))),
     "steady_error": Kind("Size of the mean position error, m.", "m",
@@ -357,11 +407,11 @@ KINDS: dict[str, Kind] = {
     "phase_lag": Kind("By how much the position is behind the demand at one frequency, deg.", "deg",
                       lambda *given: -degrees(phase(_read_response(*given))), AtFrequency),
     "response_within": Kind("Time from `after` (a fault's name or s of main) to an event, or to a signal passing a "
-                            "level for 3 samples, s.", "s", _measure_response, Response),
+                            "level for 3 samples, s.", "s", _measure_response, Response, is_rounded=True),
     "shut_off": Kind("Time from `after` to the drive frame from which on the controller says zero current and no "
-                     "closed loop, s.", "s", _measure_shut_off, ShutOff),
+                     "closed loop, s.", "s", _measure_shut_off, ShutOff, is_rounded=True),
     "recovers": Kind("Time from the start of clean-up until the status word says ACTIVE, and does so to the end, s.",
-                     "s", _measure_recovery, Check),
+                     "s", _measure_recovery, Check, is_rounded=True),
     "event_occurs": Kind("How often an event happens: at least once unless limits say otherwise.", "1", _count_events,
                          OfEvent),
     "event_never": Kind("How often an event happens that should not.", "1", _count_events, NoEvent),
@@ -373,7 +423,8 @@ KEYS: dict[str, type[Check]] = {name: kind.keys for name, kind in KINDS.items()}
 
 def evaluate_checks(checks: Iterable[Check], trace: Columns, sections: Mapping[str, slice], events: Sequence[Any] = (),
                     starts: Mapping[str, float] | None = None, drives: DriveFrames = NO_DRIVES,
-                    rate: float = RATE, signals: Signals = EHA) -> list[CheckResult]:
+                    rate: float = RATE, signals: Signals = EHA, metrology: Metrology = NO_METROLOGY,
+                    ) -> list[CheckResult]:
     """Judge a run.
 
     Args:
@@ -385,8 +436,9 @@ def evaluate_checks(checks: Iterable[Check], trace: Columns, sections: Mapping[s
         drives: all drive frames, for the checks of a reaction.
         rate: rows of the trace a second.
         signals: of the plant.
+        metrology: calibrations of the sensors, and the decision rule.
     """
-    run = RunData(trace, sections, events, starts or {}, drives, rate, signals)
+    run = RunData(trace, sections, events, starts or {}, drives, rate, signals, metrology)
     return [check.judge(run) for check in checks]
 
 

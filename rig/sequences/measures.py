@@ -23,6 +23,7 @@ from plant.signals import EHA, Signals
 from rig import tables
 from rig.benches.profiles import CIA408, ProfileWords, find_state
 from rig.sequences.signals import DERIVED
+from rig.sequences.uncertainty import NO_METROLOGY, Metrology
 
 MEDIAN_SPAN = 5e-3  # s
 SPEED_SPAN = 20e-3  # s between the two samples of a speed: 2 um rms of position noise become 0.14 mm/s rms
@@ -211,6 +212,7 @@ class RunData:
     drives: DriveFrames = NO_DRIVES
     rate: float = RATE
     signals: Signals = EHA  # of the plant
+    metrology: Metrology = NO_METROLOGY
 
     def find_start(self, after: str | float) -> float:
         """The start of the cycle nearest to a time, s of main, or in which the fault of a label begins."""

@@ -26,6 +26,7 @@ from plant.quantity import Quantity
 from plant.segments import FARTHEST, RATE, STRONGEST, Array, Csv, Segment
 from plant.signals import EHA, Signals
 from rig import tables
+from rig.benches.calibration import Decision
 from rig.sequences import checks, faults
 from rig.sequences.checks import Check, Guard, PythonCheck
 from rig.sequences.faults import Fault, Parameter, Plan, find_contradiction
@@ -102,6 +103,7 @@ class Sequence:
     guards: tuple[Guard, ...] = ()
     steps: tuple[Step, ...] = ()
     ends: Literal["completed", "safe_state"] = "completed"
+    decision: Decision | None = None  # rule by which checks pass; None: that of the bench
     model: ModelChoice = ModelChoice()
     protocol: ProtocolLimits = field(default_factory=ProtocolLimits)
     timing: TimingPolicy = field(default_factory=TimingPolicy)

@@ -414,7 +414,7 @@ def collect_data(dry: DryRun) -> dict[str, Any]:
         "predicted": {"current": float(np.abs(run.cor).max()), "error": float(np.abs(error).max()),
                       "limits": [each._asdict() for each in dry.limits],
                       "guards": [trip._asdict() for trip in dry.trips]},
-        "checks": [to_plain(check._asdict()) for check in dry.checks], "not_predicted": dry.not_predicted}
+        "checks": [to_plain(check.collect_data()) for check in dry.checks], "not_predicted": dry.not_predicted}
 
 
 def draw_dry_run(dry: DryRun) -> str:

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from math import inf
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, NamedTuple
@@ -20,7 +21,7 @@ from fdi.progress import ignore_progress
 from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table, tabulate, to_plain
 from fdi.report.run_report import MOODS as RUN_MOODS
-from fdi.report.run_report import format_limits, format_value, write_run_page
+from fdi.report.run_report import format_limits, format_uncertainty, format_value, write_run_page
 from plant.errors import InputError, RigError
 from rig import junit
 from rig.campaign.batch import UNLIMITED, run_in_processes
@@ -231,7 +232,8 @@ class CaseResult(NamedTuple):
         return has_fault(self.fdi)
 
 
-_STATUS = {"ERROR": 1, "FAIL": 1, "ABORTED": 1, "NOT_RUN": 1, "INVALID_TIMING": 3, "NOT_JUDGED": 0}  # worst first
+_STATUS = {"ERROR": 1, "FAIL": 1, "ABORTED": 1, "NOT_RUN": 1, "INVALID_TIMING": 3, "CANNOT_TELL": 1,
+           "NOT_JUDGED": 0}  # worst first
 
 
 def find_verdict(results: Sequence[CaseResult]) -> str:
@@ -363,7 +365,7 @@ def build_suite_report(suite: Suite, results: Sequence[CaseResult], seconds: flo
         command="run", title=suite.title, verdict=verdict, mood=MOODS[verdict], sentence=_describe(results),
         facts=facts, notes=[f"no check verifies {', '.join(missing)}"] if missing else [],
         sections=[Section("Cases", _tabulate_cases(results, folder)),
-                  Section("Checks that failed", _tabulate_failures(results, folder), title_medium=Medium.BOTH),
+                  Section("Checks that did not pass", _tabulate_failures(results, folder), title_medium=Medium.BOTH),
                   Section("Servovalve", _tabulate_faults(results, folder), title_medium=Medium.BOTH),
                   Section("Requirements", _tabulate_requirements(requirements), title_medium=Medium.BOTH)],
         files=files, conclusion="" if verdict == "PASS" else f"{verdict}: {_describe(results)}",
@@ -411,8 +413,9 @@ def _tabulate_failures(results: Sequence[CaseResult], folder: Path) -> list[Tabl
         [(result, check) for result in results for check in result.failed],
         (Column("case"), lambda row: Cell(row[0].case.name, link=_link(row[0], folder))),
         (Column("check"), lambda row: row[1].name),
-        (Column("measured", align="right"),
-         lambda row: Cell(format_value(row[1].value), "bad" if row[0].verdict == "FAIL" else "doubtful")),
+        (Column("verdict"), lambda row: Cell(row[1].verdict, "bad" if row[0].verdict == "FAIL" else "doubtful")),
+        (Column("measured", align="right"), lambda row: format_value(row[1].value)),
+        (Column("U", align="right"), lambda row: format_uncertainty(row[1].uncertainty)),
         (Column("limits", align="right"), lambda row: format_limits(row[1].low, row[1].high)),
         (Column("unit"), lambda row: "" if row[1].unit == "1" else row[1].unit),
         (Column("requirement"), lambda row: ", ".join(row[1].requirement)), terminal_rows=30)]
@@ -476,7 +479,7 @@ def collect_data(suite: Suite, results: Sequence[CaseResult], requirements: Sequ
             "folder": str(result.case.folder), "sequence": choice.sequence, "model": choice.model,
             "bench": choice.bench, "set": dict(choice.changes), "seed": choice.seed,
             "requirement": list(result.case.requirement),
-            "differences": result.differences, "checks": [to_plain(check._asdict()) for check in result.checks],
+            "differences": result.differences, "checks": [to_plain(check.collect_data()) for check in result.checks],
             "not_applicable": [check._asdict() for check in result.skipped], "fdi": dict(result.fdi)})
     return {"verdict": find_verdict(results), "title": suite.title, "cases": cases,
             "counts": dict(Counter(result.verdict for result in results)), "seconds": round(seconds, 3),
@@ -530,15 +533,18 @@ def _make_run_test(result: CaseResult, classname: str) -> junit.TestCase:
 
 def _make_check_test(check: CheckResult, result: CaseResult, classname: str) -> junit.TestCase:
     unit = "" if check.unit == "1" else f" {check.unit}"
-    measured = f"measured {format_value(check.value)}{unit}, limits {format_limits(check.low, check.high)}{unit}"
+    uncertain = f", U {format_uncertainty(check.uncertainty)}{unit}" if check.uncertainty < inf else ""
+    measured = f"measured {format_value(check.value)}{unit}{uncertain}"
+    measured += f", limits {format_limits(check.low, check.high)}{unit}"
     measured += f" ({check.detail})" if check.detail else ""
     window = "" if check.t0 != check.t0 else f"; window {check.t0:.3f} to {check.t1:.3f} s"
     test = junit.TestCase(check.name, classname, output="\n".join(
         filter(None, (measured + window, _name_requirements(check.requirement)))))
     if check.passed:
         return test
-    if result.verdict in ("INVALID_TIMING", *NO_VERDICT):
-        return test._replace(problem="skipped", message=f"{result.verdict}: {measured}")
+    if check.cannot_tell or result.verdict in ("INVALID_TIMING", *NO_VERDICT):
+        word = check.verdict if check.cannot_tell else result.verdict
+        return test._replace(problem="skipped", message=f"{word}: {measured}")
     return test._replace(problem="failure", message=measured, detail=f"{check.kind} {check.signal}".strip() + window)
 
 
@@ -605,4 +611,4 @@ def _judge_check(result: CaseResult, name: str) -> str:
     check = next((check for check in result.checks if check.name == name), None)
     if check is None or result.verdict in ("INVALID_TIMING", *NO_VERDICT):
         return "OPEN"
-    return "PASS" if check.passed else "FAIL"
+    return "OPEN" if check.cannot_tell else check.verdict

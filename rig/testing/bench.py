@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,13 @@ from numpy.typing import NDArray
 
 from fdi.output import write_text
 from fdi.progress import ignore_progress
-from fdi.report.run_report import draw_failed_check, draw_signals, format_limits, write_run_page
+from fdi.report.run_report import (
+    draw_failed_check,
+    draw_signals,
+    format_limits,
+    format_uncertainty,
+    write_run_page,
+)
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.segments import RATE
@@ -42,7 +49,7 @@ class BenchRun:
 
     @property
     def verdict(self) -> str:
-        """PASS, FAIL, ABORTED or NOT_JUDGED (no checks)."""
+        """PASS, FAIL, CANNOT_TELL, ABORTED or NOT_JUDGED (no checks)."""
         return self.outcome.verdict
 
     @property
@@ -118,7 +125,9 @@ def describe_failure(check: CheckResult) -> str:
     """A failed check in one line: name, measured value, limits, window, requirement."""
     unit = "" if check.unit == "1" else f" {check.unit}"
     value = "not measurable" if check.value != check.value else f"{check.value:.4g}{unit}"
-    parts = [f"measured {value}", f"limits {format_limits(check.low, check.high)}{unit}"]
+    parts = [f"measured {value}"]
+    parts += [f"U {format_uncertainty(check.uncertainty)}{unit}"] if check.uncertainty < inf else []
+    parts += [f"limits {format_limits(check.low, check.high)}{unit}"]
     parts += [f"{check.t0:.3f} to {check.t1:.3f} s"] if check.t0 == check.t0 else []
     parts += [check.detail] if check.detail else []
     parts += [f"requirement {', '.join(check.requirement)}"] if check.requirement else []

@@ -75,7 +75,7 @@ def make_live_plan(sequence: Sequence, pace: str, bench: Bench) -> LivePlan:
 
 
 class CheckState(NamedTuple):
-    """A check on the screen. `word`: waits, measures, PASS, FAIL, or, for one judged at the end only, after the run."""
+    """A check on the screen. `word`: waits, measures, a verdict, or, for one judged at the end only, after the run."""
 
     name: str
     word: str
@@ -87,12 +87,14 @@ class CheckState(NamedTuple):
     @classmethod
     def read(cls, check: recorder.Check) -> CheckState:
         """What the run itself says of a check at its end."""
-        return cls(check.name, "PASS" if check.passed else "FAIL", check.value, check.unit, True, check.detail)
+        word = "PASS" if check.passed else "FAIL"
+        word = "CANNOT_TELL" if check.cannot_tell else word
+        return cls(check.name, word, check.value, check.unit, True, check.detail)
 
     @property
     def is_judged(self) -> bool:
         """Whether it has a verdict."""
-        return self.word in ("PASS", "FAIL")
+        return self.word in ("PASS", "FAIL", "CANNOT_TELL")
 
     @property
     def measured(self) -> str:

@@ -110,9 +110,10 @@ def _list_chunks(data: bytes) -> Iterator[tuple[bytes, int]]:
             yield unpack_chunk(chunk), at
 
 
-_STYLES = {"PASS": "green", "FAIL": "bold red", "measures": "bold cyan", "waits": "dim", "after the run": "dim"}
+_STYLES = {"PASS": "green", "FAIL": "bold red", "CANNOT_TELL": "bold yellow", "measures": "bold cyan", "waits": "dim",
+           "after the run": "dim"}
 _NODE_STYLES = {"operational": "green", "pre-operational": "yellow", "stopped": "red"}
-_ORDER = ("FAIL", "measures", "PASS", "waits", "after the run")
+_ORDER = ("FAIL", "CANNOT_TELL", "measures", "PASS", "waits", "after the run")
 
 
 def draw_screen(run: LiveRun, width: int, height: int, silence: float) -> Text:
@@ -187,7 +188,7 @@ def _draw_checks(run: LiveRun, count: int) -> list[Text]:
                           (f" of {len(states)}", "bold"))
     shown = [state for word in _ORDER for state in states if state.word == word]
     done = [state for state in states if state.word == "PASS"]
-    room = count - 1 - sum(word in ("FAIL", "measures") for word in words)
+    room = count - 1 - sum(word in ("FAIL", "CANNOT_TELL", "measures") for word in words)
     if len(shown) > count - 1:  # the newest of those that passed
         keep = done[len(done) - max(min(room - 1, len(done)), 0):]
         shown = [state for state in shown if state.word != "PASS" or state in keep]
@@ -280,7 +281,8 @@ def _list_dots(values: NDArray[np.float64], low: float, high: float, across: int
     return found
 
 
-_WORDS = {"waits": NEUTRAL, "measures": MEASURED, "after the run": NEUTRAL, "PASS": PASS, "FAIL": FAIL}
+_WORDS = {"waits": NEUTRAL, "measures": MEASURED, "after the run": NEUTRAL, "PASS": PASS, "FAIL": FAIL,
+          "CANNOT_TELL": 0xD9A441FF}
 
 
 def draw_plan(plan: LivePlan) -> Drawing:

@@ -230,7 +230,7 @@ def widen_range(low: float, high: float) -> tuple[float, float] | None:
     return (below * step, above * step) if is_sparse else None
 
 
-VERDICTS = {"PASS": PASS, "FAIL": FAIL, "ABORTED": FAIL, "INVALID_TIMING": 0xD9A441FF}
+VERDICTS = {"PASS": PASS, "FAIL": FAIL, "ABORTED": FAIL, "INVALID_TIMING": 0xD9A441FF, "CANNOT_TELL": 0xD9A441FF}
 STATES = {"operational": PASS, "pre-operational": 0xD9A441FF, "stopped": FAIL, "boot-up": NEUTRAL}
 PHASES = {"set-up": NEUTRAL, "main": MEASURED, "clean-up": NEUTRAL}
 SECTIONS = {"hold": NEUTRAL, "step": MEASURED, "ramp": 0x2A8C82FF, "dynamic": 0x8E5BBFFF}
@@ -402,11 +402,11 @@ def _make_check_lane(check: Check, trace: Trace) -> Lane:
     if math.isnan(start):
         main = trace.t[trace.phase == MAIN]
         start, stop = (float(main[0]), float(main[-1]) + trace.period) if len(main) else (first, last)
-    word, colour = ("PASS", PASS) if check.passed else ("FAIL", NEUTRAL if unreached else FAIL)
+    word, colour = check.verdict, NEUTRAL if unreached else VERDICTS[check.verdict]
     text = f"{word} {_describe_measurement(check)}"
     if math.isnan(check.value) and check.detail:
         text = f"{word} {describe_value(check.value, check.unit)}: {check.detail}"
-    path = f"check/{'pass' if check.passed else 'FAIL'}/{check.name}"
+    path = f"check/{'pass' if check.passed else word}/{check.name}"
     if stop - start > max(start - first, last - stop):
         return Lane(path, [(start, text), (stop, "")], {text: colour})
     states = [(first, text), (start, word), (stop, "")] if start - first > last - stop else [(start, word),
@@ -443,7 +443,7 @@ def _list_texts(trace: Trace) -> list[LogText]:
              for event in trace.events]
     for check in trace.checks:
         t = float(trace.t[-1]) if math.isnan(check.t0) else check.t0
-        word, level = ("PASS", "INFO") if check.passed else ("FAIL", "ERROR")
+        word, level = check.verdict, "INFO" if check.passed else "ERROR"
         text = f"{t:8.3f} s  {word} {check.name}: {_describe_measurement(check)} {check.detail}".rstrip()
         texts.append(LogText("log/checks", t, text, level))
     return texts
@@ -532,7 +532,7 @@ def describe_result(found: RunDifferences) -> str:
 
 
 def _judge(result: Any) -> str:
-    return "-" if result is None else "pass" if result.passed else "FAIL"
+    return "-" if result is None else result.verdict.replace("PASS", "pass")
 
 
 BEFORE, FLOOR = 0xE5534BFF, MEASURED
