@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import ast
 import builtins
+import doctest
+import importlib
 import io
 import keyword
 import re
@@ -83,3 +85,9 @@ def test_names_in_backticks_exist() -> None:
 def test_a_name_of_nothing_is_found() -> None:
     text = '"""As `starts_of` does; see `plant.run.simulate` and `own`."""\n# `no_such_name(x)`\nown = 1\n'
     assert find_unknown_names(text) == ["starts_of", "no_such_name"]
+
+
+def test_examples_in_docstrings_are_true() -> None:
+    files = [path.relative_to(ROOT).with_suffix("") for path in FILES if ">>> " in path.read_text()]
+    wrong = {str(file): doctest.testmod(importlib.import_module(".".join(file.parts))).failed for file in files}
+    assert len(files) > 20 and not any(wrong.values()), wrong

@@ -1,7 +1,6 @@
 """`rig explain`, `rig add` and `rig remove` on runs made with a tenth of their step: answers, pages, model files."""
 from __future__ import annotations
 
-import doctest
 import json
 import re
 import shutil
@@ -16,7 +15,6 @@ from short_runs import HIDDEN, build_command, list_trace_arguments, write_measur
 
 from fdi.discovery import update_model
 from fdi.estimation.fit import Value, list_active_effects, list_active_unknowns, list_all_unknowns
-from fdi.report import numbers as spoken
 from plant import Model, load_model
 from plant.effects import CATALOGUE
 
@@ -127,10 +125,6 @@ def test_effects_of_a_model_are_free_from_where_they_are() -> None:
     names = [f.name for f in list_all_unknowns(model)]
     assert len(names) == len(set(names)) and {"jack.mass", "null_bias.current"} <= set(names)
     assert not list_active_effects(Model()) and not list_active_unknowns(Model().with_effects(["null_bias"]))
-
-
-def test_numbers_in_words() -> None:
-    assert doctest.testmod(spoken).failed == 0
 
 
 SHARED = SHARED / "practice"
