@@ -42,7 +42,9 @@ def run_sequence(args: argparse.Namespace, pages: PageWriter) -> int:
         if args.live:
             raise InputError("--live", "", "one sequence; runs of a suite run side by side")
         pages.close()  # each case of a suite writes its own
-        return start_suite(args)
+        from rig.cli.suite import run_suite  # here: it loads rich, which a run with --json does not need
+
+        return run_suite(args)
     is_silent, is_on_screen = args.json or args.quiet, args.live == LIVE_ON_TERMINAL
     place = find_viewer_place(args.live) if args.live and not is_on_screen else None
     job = repeat_job(args.source, args) if args.source else build_job(build_choice(args), is_trusted=args.trust)
@@ -70,23 +72,6 @@ def run_sequence(args: argparse.Namespace, pages: PageWriter) -> int:
 
         write_text(junit, write_junit_of_run(outcome, 1e-9 * clock.now()), "--junit")
     return outcome.status
-
-
-def start_suite(args: argparse.Namespace) -> int:
-    """Run several sequences or suite files; return the exit status.
-
-    Raises:
-        RigError: bad input; nothing has run then.
-    """
-    from rig.cli.suite import run_suite  # here: it loads rich, which a run with --json does not need
-
-    bus, _ = choose_bus_of_run(args, args.bus, args.controller)
-    name = Path(args.sequence[0]).stem if len(args.sequence) == 1 else "suite"
-
-    def choose_folder() -> Path:  # not before everything has been tried: an error leaves no folder behind
-        return Path(args.out) if args.out else make_new_folder(Path("runs"), name)
-
-    return run_suite(args, build_choice(args)._replace(bus=bus), choose_folder)
 
 
 def choose_bus_of_run(args: argparse.Namespace, wanted: str, controller: str | None) -> tuple[str, str]:

@@ -16,6 +16,7 @@ from plant.errors import InputError
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, open_console
 from rig.cli.inputs import is_suite_file
+from rig.cli.single_run import build_choice, choose_bus_of_run, make_new_folder
 from rig.interrupts import catch_signals
 from rig.network.clock import WallClock
 from rig.run.job import JobChoice
@@ -34,20 +35,17 @@ from rig.suite.suite import (
 )
 
 
-def run_suite(args: argparse.Namespace, base: JobChoice, choose_folder: Callable[[], Path]) -> int:
+def run_suite(args: argparse.Namespace) -> int:
     """Run all sequences and suite files of the command line; write page, JSON and JUnit; return the exit status.
-
-    Args:
-        args: of the command line.
-        base: what its options choose for every case.
-        choose_folder: gives the folder of the results; called when all cases have been tried.
 
     Raises:
         RigError: a sequence, model or parameter that cannot be used; nothing has run then.
     """
+    base = build_choice(args)._replace(bus=choose_bus_of_run(args, args.bus, args.controller)[0])
     tried = read_suite(args, base)
     processes = choose_processes(args, base, len(tried.cases))
-    folder = choose_folder()
+    name = Path(args.sequence[0]).stem if len(args.sequence) == 1 else "suite"
+    folder = Path(args.out) if args.out else make_new_folder(Path("runs"), name)  # not before all has been tried
     suite = tried.put_into(folder)
     for path in (folder, *(case.folder for case in suite.cases)):
         make_folder(path)

@@ -7,9 +7,12 @@ One integer, the COB-ID, says everywhere which frame it is: the identifier, with
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from rig.benches import frame_map
+
+if TYPE_CHECKING:
+    import can
 
 EXTENDED = frame_map.EXTENDED  # in a COB-ID: the identifier has 29 bits, as CAN_EFF_FLAG in Linux's can_id
 FD_FRAME = frame_map.FD  # a CAN FD frame, of up to 64 bytes
@@ -44,3 +47,22 @@ class Node(Protocol):
 def has_valid_length(cob_id: int, length: int) -> bool:
     """Whether a frame of this kind can have `length` bytes: 0 to 8, in CAN FD also those of `FD_LENGTHS`."""
     return 0 <= length <= 8 or (cob_id & FD_FRAME != 0 and length in FD_LENGTHS)
+
+
+def make_message(cob_id: int, data: bytes, **options: Any) -> can.Message:
+    """A frame as python-can's message; `options` are those of can.Message, such as its time."""
+    import can  # here: who only reads logs need not load it
+
+    return can.Message(arbitration_id=cob_id & IDENTIFIER, is_extended_id=bool(cob_id & EXTENDED),
+                       is_fd=bool(cob_id & FD_FRAME), bitrate_switch=bool(cob_id & BIT_RATE_SWITCH), data=data,
+                       **options)
+
+
+def find_cob_id(message: can.Message) -> int:
+    """The COB-ID of a data frame of python-can, with its flags; not the error state indicator of CAN FD."""
+    cob_id = message.arbitration_id
+    for flag, is_set in ((EXTENDED, message.is_extended_id), (FD_FRAME, message.is_fd),
+                         (BIT_RATE_SWITCH, message.bitrate_switch)):
+        if is_set:
+            cob_id |= flag
+    return cob_id

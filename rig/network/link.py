@@ -17,8 +17,18 @@ from plant.errors import RigError
 from rig.network.bus import EmbeddedBus
 from rig.network.can_interface import UdpBus
 from rig.network.clock import Clock, WallClock
-from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, IDENTIFIER, Frame, Node, Send, has_valid_length
-from rig.network.message import find_cob_id, make_message
+from rig.network.frame import (
+    BIT_RATE_SWITCH,
+    EXTENDED,
+    FD_FRAME,
+    IDENTIFIER,
+    Frame,
+    Node,
+    Send,
+    find_cob_id,
+    has_valid_length,
+    make_message,
+)
 from rig.network.udp import SO_RXQ_OVFL, SO_TIMESTAMPNS, set_receive_options
 
 _CAN_FRAME, _CANFD_FRAME = struct.Struct("=IBxxx8s"), struct.Struct("=IBBxx64s")  # linux/can.h

@@ -24,8 +24,7 @@ from plant import signals as plant_signals
 from plant.errors import InputError
 from rig.benches.bench import Bench
 from rig.benches.frame_map import EXTENDED, FrameSpec, Role, describe_identifier, make_reader
-from rig.network.frame import BIT_RATE_SWITCH, FD_FRAME, Frame
-from rig.network.message import find_cob_id, make_message
+from rig.network.frame import BIT_RATE_SWITCH, FD_FRAME, Frame, find_cob_id, make_message
 from rig.network.node_objects import NmtState as State
 from rig.recorder.schema import Event, NmtState, Record, Signals, collect_provenance, make_row_record
 from rig.recorder.writer import Recorder

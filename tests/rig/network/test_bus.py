@@ -14,9 +14,8 @@ from bus_stations import gather, spec, stations
 from plant.errors import RigError
 from rig.network.bus import open_can
 from rig.network.can_interface import UdpBus
-from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, Frame
+from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, Frame, find_cob_id
 from rig.network.link import Link
-from rig.network.message import find_cob_id
 from rig.network.udp import PORT
 
 only_socketcan = pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)

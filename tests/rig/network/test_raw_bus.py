@@ -23,8 +23,16 @@ from plant.compile import compile_function
 from plant.errors import InputError, RigError
 from rig.network import raw_bus
 from rig.network.bus import can_open, open_can
-from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, IDENTIFIER, has_valid_length
-from rig.network.message import find_cob_id, make_message
+from rig.network.frame import (
+    BIT_RATE_SWITCH,
+    EXTENDED,
+    FD_FRAME,
+    FD_LENGTHS,
+    IDENTIFIER,
+    find_cob_id,
+    has_valid_length,
+    make_message,
+)
 from rig.network.raw_bus import (
     FAILED,
     FRAME,

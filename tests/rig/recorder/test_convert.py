@@ -14,8 +14,7 @@ import dbc
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from rig.benches.bench_file import load_bench
-from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, Frame
-from rig.network.message import make_message
+from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, Frame, make_message
 from rig.recorder import Recorder
 from rig.recorder.convert import (
     RAW_SUFFIXES,
