@@ -1,20 +1,15 @@
 """The robustness study in small: the same code as `python -m studies.robustness`, with fewer frames and runs."""
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from c_device import CFirmware
-from short_sequences import job, play
 
 from rig.network.frame import Frame, Send
 from rig.nodes.firmware import Firmware
 from studies.robustness import fuzz
-from studies.robustness.datagrams import fuzz_datagrams
-from studies.robustness.disturb import PROCESSES, disturb_run, find_processes, has_semaphores, judge_verdict
+from studies.robustness.disturb import disturb_run, find_processes, has_semaphores, judge_verdict
 from studies.robustness.frames import invent_frames
-from studies.robustness.fuzz import fuzz_node, fuzz_rig
-from studies.robustness.logs import fuzz_logs
+from studies.robustness.fuzz import fuzz_node
 from studies.robustness.nodes import Usage
 from studies.robustness.run_study import build_robustness_report, run_study
 from studies.robustness.soak import Soak
@@ -28,18 +23,10 @@ def test_a_seed_gives_the_same_frames_again() -> None:
     assert len({frame.cob_id for frame in frames}) > 300
 
 
-@pytest.mark.parametrize(("target", "firmware"), [
-    ("plant", Firmware), ("controller", Firmware), ("controller", CFirmware)])
-def test_fuzz_frames_into_a_node(target: str, firmware: type, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fuzz, "Firmware", firmware)
-    count = fuzz_node(target, 20_000, 5)
+def test_fuzz_frames_into_the_firmware_in_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fuzz, "Firmware", CFirmware)
+    count = fuzz_node("controller", 20_000, 5)
     assert count.failures == () and count.works and count.answers > 500
-    assert count.growth < 16 << 20 or firmware is CFirmware
-
-
-def test_fuzz_frames_into_the_rig() -> None:
-    count = fuzz_rig(20_000, 7)
-    assert count.failures == () and count.works and count.frames >= 20_000
 
 
 def test_a_node_that_breaks_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,12 +48,7 @@ def test_a_node_that_breaks_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(count.failures) == 10 and "IndexError: three bytes" in count.failures[0] and not count.works
 
 
-def test_fuzz_datagrams_on_the_udp_bus() -> None:
-    count = fuzz_datagrams(3000, 9, "239.74.164.9")
-    assert count.verdict == "PASS" and count.problems == () and max(count.growth.values()) < 16 << 20
-
-
-@pytest.mark.parametrize("victim", PROCESSES)
+@pytest.mark.parametrize("victim", ["plant", "rig"])
 def test_a_killed_process(victim: str) -> None:
     trials = []
     for seed in range(11, 17):  # a moment may come before the first cycle
@@ -111,18 +93,20 @@ def test_what_a_soak_calls_growth() -> None:
         assert [line.split()[1] for line in found] == grown
 
 
-def test_the_study_as_a_whole(tmp_path: Path) -> None:
-    figures = run_study(1000, 0, 0.05, 1, "builtin", lambda stage, share: None)
+def test_the_study_as_a_whole() -> None:
+    """Fuzz frames into both nodes and the rig, datagrams on the bus, changed logs, and runs one after the other.
+
+    Some of the changed logs are still good enough to be read; the others are refused, and nothing else happens.
+    """
+    figures = run_study(20_000, 0, 0.05, 1, "builtin", lambda stage, share: None)
     assert figures["problems"] == [] and figures["soak"]["verdicts"] == {"PASS": figures["soak"]["runs"]}
+    assert [count["works"] and count["frames"] >= 20_000 for count in figures["frames"]] == [True] * 3
+    assert min(count["answers"] for count in figures["frames"][:2]) > 500
+    assert max(figures["datagrams"]["growth"].values()) < 16 << 20
+    accepted, refused = figures["logs"]["accepted"], figures["logs"]["refused"]
+    assert accepted["recover"] > 15 and 0 < accepted["report"] < 20 == accepted["report"] + refused["report"]
     report = build_robustness_report(figures)
     assert report.verdict == "PASS" and len(report.sections) == 4
     assert not has_semaphores("239.1.1.1") and not find_processes("239.1.1.1")
     assert build_robustness_report({**figures, "problems": ["it hung"]}).verdict == "FAIL"
 
-
-def test_changed_logs(tmp_path: Path) -> None:
-    """Some are still good enough to be read; the others are refused, and nothing else happens."""
-    play(job(), tmp_path / "run")
-    count = fuzz_logs(tmp_path / "run" / "trace.mcap", tmp_path, 60, 10)
-    assert count.failures == () and count.accepted["recover"] > 50
-    assert 10 < count.accepted["report"] < 50 and count.accepted["report"] + count.refused["report"] == 60
