@@ -1,6 +1,7 @@
 """Chapter 5: SYNC, emergencies, error register and history, heartbeat producer and consumer, error behaviour."""
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 from statistics import fmean
 
@@ -48,28 +49,17 @@ BEAT = 0.02  # s, of the heartbeat that the tester sends
 LIMIT = 200  # ms, of the supervision that the tester sets
 
 
-def check_sync_identifier(t: Target) -> str:
-    """0x1005, where the node has it."""
-    word = t.read(*t.variable(0x1005).key)
-    require(not word & EXTENDED, f"0x{word:08X} asks for a 29-bit identifier")
-    return refuse_restricted(t, 0x1005)
-
-
-def check_emcy_identifier(t: Target) -> str:
-    """0x1014, where the node has it."""
-    word, expected = t.read(*t.variable(0x1014).key), t.sheet.default(0x1014)
+def check_identifier(t: Target, index: int) -> str:
+    """The COB-ID of SYNC (0x1005) or EMCY (0x1014), where the node has it; only that of EMCY can be valid or not."""
+    variable, word = t.variable(index), t.read(*t.variable(index).key)
+    expected, text = t.sheet.default(index), f"0x{word & 0x7FF:03X}"
     require(expected in (word, None), f"0x{word:08X}, the EDS says 0x{expected or 0:08X}")
-    if t.sheet.is_writable(0x1014):
-        require_fixed(t, (0x1014, 0))
-    return refuse_restricted(t, 0x1014)
-
-
-def refuse_restricted(t: Target, index: int) -> str:
-    """A COB-ID refuses the restricted identifiers, if it can be written at all."""
-    text = f"0x{t.read(index) & 0x7FF:03X}"
-    if not t.sheet.is_writable(index):
-        return f"{text}, {t.variable(index).access}"
-    require_unrestricted(t, (index, 0))
+    require(variable.has_valid_bit or not word & EXTENDED, f"0x{word:08X} asks for a 29-bit identifier")
+    if not variable.is_writable:
+        return f"{text}, {variable.access}"
+    if variable.has_valid_bit:
+        require_fixed(t, variable.key)
+    require_unrestricted(t, variable.key)
     return f"{text}; {len(RESTRICTED_ENDS)} identifiers refused"
 
 
@@ -323,9 +313,9 @@ def beat_as(t: Target, node: int, count: int) -> int:
 
 CASES = (
     Case("5.1", "COB-ID of SYNC", "7.5.2.5", "0x080 unless the EDS says otherwise; restricted identifiers are refused",
-         check_sync_identifier),
+         partial(check_identifier, index=0x1005)),
     Case("5.2", "COB-ID of EMCY", "7.5.2.17", "0x080 + node-ID unless the EDS says otherwise; fixed while it is valid",
-         check_emcy_identifier),
+         partial(check_identifier, index=0x1014)),
     Case("5.3", "emergency", "7.2.7",
          "8 bytes: error code, error register as in 0x1001 with bit 0 set; the history gets the code",
          check_emergency),

@@ -443,14 +443,11 @@ class Master:
         """Wait for a heartbeat of each node, at most `seconds`; returns the nodes that sent none."""
         begin = self.wire.clock.now()
 
-        def are_heard() -> bool:
-            self.tick()
-            return not find_unheard()
-
         def find_unheard() -> list[Role]:
+            self.tick()
             return [role for role in self.watched if self.heard_ns.get(role, -1) < begin]
 
-        self.wire.wait(are_heard, seconds)
+        self.wire.wait(lambda: not find_unheard(), seconds)
         return find_unheard()
 
     def stop(self) -> None:
@@ -505,11 +502,9 @@ class Master:
         self._settings[role, index, sub] = value
 
     def _write(self, role: Role, index: int, sub: int, value: Any) -> None:
-        try:
+        with self._name_failure(role, index, sub):
             variable = self._find_entry(role, index, sub)
             repeat_transfer(lambda: setattr(variable, "raw", value))
-        except (SdoAbortedError, SdoCommunicationError, KeyError) as error:
-            raise BusError(f"{self._bench.describe_node(role)}, object {name_object(index, sub)}: {error}") from error
 
     def _find_entry(self, role: Role, index: int, sub: int) -> Any:
         entry = self._nodes[role].sdo[index]
@@ -519,11 +514,18 @@ class Master:
         sdo = self._nodes[role].sdo
         usual, sdo.RESPONSE_TIMEOUT = sdo.RESPONSE_TIMEOUT, seconds
         try:
-            repeat_transfer(lambda: sdo.download(index, sub, data))
-        except (SdoAbortedError, SdoCommunicationError) as error:
-            raise BusError(f"{self._bench.describe_node(role)}, object {name_object(index, sub)}: {error}") from error
+            with self._name_failure(role, index, sub):
+                repeat_transfer(lambda: sdo.download(index, sub, data))
         finally:
             sdo.RESPONSE_TIMEOUT = usual
+
+    @contextlib.contextmanager
+    def _name_failure(self, role: Role, index: int, sub: int) -> Iterator[None]:
+        """Turn a transfer that fails within into a BusError that names node and object."""
+        try:
+            yield
+        except (SdoAbortedError, SdoCommunicationError, KeyError) as error:
+            raise BusError(f"{self._bench.describe_node(role)}, object {name_object(index, sub)}: {error}") from error
 
 
 class ExpectedObject(NamedTuple):
@@ -555,6 +557,7 @@ def list_pdo_objects(dictionary: Any, node: int) -> Iterator[ExpectedObject]:
                 value = read_number(dictionary, index, sub)
                 if value is not None:
                     yield ExpectedObject(index, sub, value)
+
 
 def repeat_transfer(transfer: Callable[[], R], attempts: int = 3) -> R:
     """Make an SDO transfer, and repeat it when the server has lost it: one of the two may have stood still meanwhile.

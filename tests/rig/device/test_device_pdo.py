@@ -4,7 +4,6 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-import codec
 import pytest
 from changed_sheets import change_sheet
 from device_bench import Rack
@@ -129,28 +128,6 @@ def test_fresh_says_whether_a_frame_came_since_the_last_sync() -> None:
     for is_fresh in (True, False):
         rack.sync()
         assert rack.device.pdo.rpdos[1].fresh is is_fresh
-
-
-def test_asynchronous_rpdo_is_there_when_its_hook_is_called() -> None:
-    rack, seen = running(2), []
-    rack.device.on_rpdo = lambda n: seen.append((n, rack.device.read(0x2102), rack.device.read(0x2103)))
-    rack.send(0x183, struct.pack("<ii", -7, 9))
-    assert seen == [(2, -7, 9)]
-
-
-def test_node_2_answers_feedback_with_drive_and_latches_the_command_at_sync() -> None:
-    rack = running(2)
-    device = rack.device
-
-    def answer(_: int) -> None:
-        device.write(0x2104, 0, int(device.read(0x2100)) - int(device.read(0x2102)))
-        device.transmit(1)
-
-    device.on_rpdo = answer
-    rack.send(0x202, codec.pack_command(100e-7, 0, 0))
-    assert rack.send(0x183, codec.pack_feedback(1e-7, 0)) == [(0x182, codec.pack_drive(-1e-8, 0, 0))]
-    rack.sync()
-    assert rack.send(0x183, codec.pack_feedback(1e-7, 0)) == [(0x182, codec.pack_drive(99e-8, 0, 0))]
 
 
 def test_acyclic_transmission_waits_for_the_next_sync() -> None:
