@@ -72,7 +72,8 @@ FLAT_WITH_EFFECTS: tuple[Mapping[str, float], ...] = (
     {"supply_droop.slope": 1.0},
     {},
     {"constant_load.force": 1.0, "aero_stiffness.stiffness": 1.0, "compressibility.coefficient": 1.0,
-     "mount_compliance.compliance": -1.0, "mount_compliance.mass": 1.0, "supply_droop.slope": -1.0},
+     "mount_compliance.compliance": -1.0, "mount_compliance.mass": 1.0, "structural_resonance.mass": 1.0,
+     "supply_droop.slope": -1.0},
 )
 
 # How far the spool moves: all that meets it moves with it. In a run in which it meets its stops the position shows it.
@@ -95,8 +96,8 @@ VISCOSITY: Mapping[str, float] = {"viscosity_drift.factor": -1.0, "jack.damping"
 POSITION_SCALE: Mapping[str, float] = {
     "sensor_gain.error": 1.0, "jack.area": 1.0, "jack.mass": 2.0, "jack.damping": 2.0, "jack.static_friction": 1.0,
     "jack.dynamic_friction": 1.0, "constant_load.force": 1.0, "aero_stiffness.stiffness": 2.0,
-    "mount_compliance.compliance": -2.0, "mount_compliance.mass": 2.0, "rod_backlash.width": -1.0,
-    "stribeck.speed": -1.0, "presliding.deflection": -1.0}
+    "mount_compliance.compliance": -2.0, "mount_compliance.mass": 2.0, "structural_resonance.mass": 2.0,
+    "rod_backlash.width": -1.0, "stribeck.speed": -1.0, "presliding.deflection": -1.0}
 
 
 BALANCED = {"valve.pressure_gain", "valve.flow_gain", "jack.leakage"}  # a plant without them has other directions

@@ -11,7 +11,7 @@ from effects_reference import simulate_jack
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from node_bench import FirmwareDesk
-from physics_cases import SILENT
+from physics_cases import SILENT, SMOOTH
 
 from plant import Actuator, Model, simulate
 from plant.compile import compile_function, interpret_function
@@ -24,7 +24,7 @@ from plant.eha import State, compute_coefficients, compute_metering_line, step_a
 from plant.eha import step_jack as ram
 from plant.flat import unpack_state
 from plant.model import collect_bindings
-from plant.state import Input
+from plant.state import Input, Line
 from rig.benches.profiles import Control
 
 MILLI = 1e-3
@@ -427,3 +427,30 @@ def test_a_heavy_body_on_its_mount_rings_as_its_equation_says() -> None:
     exact = compliance * AREA * 1e6 * (1.0 - decay * (np.cos(damped * t) + ratio * w / damped * np.sin(damped * t)))
     np.testing.assert_allclose(sensed, exact, atol=0.01 * exact.max())
     assert exact.max() > 1.8 * compliance * AREA * 1e6, "it overshoots"
+
+
+def test_a_mass_on_the_ram_has_the_antiresonance_and_the_resonance_of_two_masses() -> None:
+    """A ram without pressure, pushed by a cosine: X/F in amplitude and phase; it hardly moves at f, most above it."""
+    mass, f, ratio, push, h = 60.0, 60.0, 0.03, 500.0, 4e-5
+    model = SMOOTH.replace({"structural_resonance.mass": mass, "structural_resonance.frequency": f,
+                            "structural_resonance.damping_ratio": ratio})
+    p, moved = model.build_record()[0], interpret_function(ram, collect_bindings(["structural_resonance"]))
+    k, resonance = compute_coefficients(p, h), f * np.sqrt(1.0 + mass / p.jack.mass)
+    k = k._replace(jack_coupled=k.jack_free)  # as the oil has no part in it
+    sizes = []
+    for hertz in (20.0, f, resonance, 120.0):
+        (s, m), w, t = model.build_start(), 2.0 * np.pi * hertz, h * np.arange(1, round(0.7 / h) + 1)
+        x = np.empty(len(t))
+        for i, force in enumerate(push * np.cos(w * (t - 0.5 * h))):  # at mid step; a cosine gives the ram no drift
+            x[i], v, _, m = moved(s, m, Input(h=h), p, k, Line(0.0, 0.0, 0.0, 0.0), force)
+            s = s._replace(jack_position=x[i], jack_speed=v)
+        last = slice(-round(0.2 / h), None)  # the start has died away
+        waves = np.exp(1j * w * t[last])
+        (real, imaginary, _), *_ = np.linalg.lstsq(np.c_[waves.real, -waves.imag, np.ones(len(waves))], x[last])
+        spring, damper = mass * (2.0 * np.pi * f) ** 2, 2.0 * ratio * mass * 2.0 * np.pi * f
+        link = spring + 1j * w * damper
+        held = -w**2 * mass * link / (link - w**2 * mass)  # force on the ram for each metre that it moves
+        exact = -push / (-w**2 * p.jack.mass + 1j * w * p.jack.damping + held)
+        assert abs(real + 1j * imaginary - exact) < 0.03 * abs(exact), hertz
+        sizes.append(abs(exact) * w**2)  # of the acceleration: what the mass alone does not change
+    assert sizes[1] < 0.2 * sizes[0] and sizes[2] > 3.0 * max(sizes[0], sizes[3])

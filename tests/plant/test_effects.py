@@ -20,7 +20,7 @@ CANONICAL = (
     "spool_overlap", "spool_underlap", "orifice_root", "flow_force", "supply_droop", "supply_ripple", "compressibility",
     "viscosity_drift", "stribeck", "presliding", "friction_asymmetry", "mount_compliance", "rod_backlash",
     "aero_stiffness", "constant_load", "sensor_lag", "sensor_gain", "sensor_offset", "quantisation", "transport_delay",
-    "command_rate_limit",
+    "command_rate_limit", "structural_resonance",
 )
 COMMAND = np.r_[np.zeros(10), np.full(150, 2e-3), 2e-3 + 1e-3 * np.sin(np.arange(250) * 0.02)]
 SHORT = np.r_[np.zeros(3), np.full(22, 3e-3)]  # what plain Python runs
