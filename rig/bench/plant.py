@@ -13,7 +13,7 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -45,16 +45,6 @@ from rig.sequences import load_sequence
 
 FRICTIONLESS = {f"{body}.{kind}_friction": 0.0 for body in ("spool", "jack") for kind in ("static", "dynamic")}
 QUIET = {f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")}
-
-
-class Accuracy(NamedTuple):
-    """Error of one step size over a command, against the finest; position in um."""
-
-    steps: int  # a cycle
-    rms: float
-    largest: float
-    rms_friction: float
-    largest_friction: float
 
 
 def compare_step_with_c(command: Floats, rounds: int = 15, steps: int = 100) -> dict[str, Any] | None:
@@ -98,23 +88,19 @@ def _make_c_run(library: ctypes.CDLL, model: Model, command: Floats, draws: Floa
     return lambda: library.closed_loop(*pointers, len(command), steps, result), out
 
 
-def measure_accuracy(command: Floats, steps: tuple[int, ...] = (20, 50, 100, 200, 500), finest: int = 5000
-                     ) -> list[Accuracy]:
+def measure_accuracy(command: Floats, steps: tuple[int, ...] = (20, 50, 100, 200, 500)) -> list[dict[str, float]]:
     """Error in XJ of some step sizes over `command` (n,) m, closed loop, without noise; friction off and on.
 
-    The truth is the same run with `finest` steps a cycle: 5000 are steps of 0.2 us.
+    RMS and largest error, um, against the same run with 5000 steps a cycle, of 0.2 us.
     """
-    columns = {}
-    for friction in (False, True):
-        model = Model().replace(QUIET | ({} if friction else FRICTIONLESS))
-        truth = simulate(model, command, steps=finest).xj
-        columns[friction] = [_measure_error(simulate(model, command, steps=n).xj - truth) for n in steps]
-    return [Accuracy(n, *off, *on) for n, off, on in zip(steps, columns[False], columns[True], strict=True)]
-
-
-def _measure_error(error: Floats) -> tuple[float, float]:
-    """RMS and largest absolute value, um."""
-    return float(np.sqrt((error**2).mean())) * 1e6, float(np.abs(error).max()) * 1e6
+    rows: list[dict[str, float]] = [{"steps": n} for n in steps]
+    for name, changes in (("", QUIET | FRICTIONLESS), ("_friction", QUIET)):
+        model = Model().replace(changes)
+        truth = simulate(model, command, steps=5000).xj
+        for row, n in zip(rows, steps, strict=True):
+            error = 1e6 * (simulate(model, command, steps=n).xj - truth)
+            row |= {f"rms{name}": float(np.sqrt((error**2).mean())), f"largest{name}": float(np.abs(error).max())}
+    return rows
 
 
 def measure_cycle_cost(cycles: int = 5000, rounds: int = 9) -> float:
@@ -188,7 +174,7 @@ def run_benchmarks(command: Floats, progress: Progress = ignore_progress) -> dic
 def build_plant_report(figures: Mapping[str, Any]) -> Report:
     """Report on the figures of `rig.bench.plant.run_benchmarks`, which are its `data`.
 
-    They may hold "accuracy": rows of `rig.bench.plant.Accuracy` as dicts.
+    They may hold "accuracy": the rows of `measure_accuracy`.
     """
     return Report(
         command="bench", title="plant",

@@ -13,11 +13,13 @@ import numpy as np
 from fdi.comparison.compare import Comparison
 from fdi.comparison.run_differences import Run, RunDifferences
 from fdi.output import require_writable
-from fdi.report.compare_report import describe_verdict
-from fdi.report.diff_report import choose_difference_units, describe_differences
+from fdi.report.compare_report import build_comparison_report
+from fdi.report.diff_report import build_diff_report, choose_difference_units
 from fdi.report.drawing import choose_drawn_unit, label_signal
-from fdi.report.numbers import choose_unit, format_amount, format_ratio, format_signal, join_words
+from fdi.report.numbers import choose_unit, format_ratio, join_words
+from fdi.report.report import Report
 from fdi.report.run_report import read_verdict
+from fdi.report.terminal import format_report
 from fdi.thresholds import NOISE_BAND_RATIO, SIGNAL_ERROR_RATIO
 from fdi.trace.sections import Section
 from fdi.trace.trace import MAIN, Check, Floats, Trace
@@ -449,6 +451,11 @@ def _list_texts(trace: Trace) -> list[LogText]:
     return texts
 
 
+def format_document(report: Report) -> str:
+    """A report as the command prints it, in Markdown."""
+    return f"```text\n{format_report(report)}```"
+
+
 REFERENCE, NOISE = COMMAND, 0x7FD46BFF
 COLOURS = (0xE8A33DFF, 0xD96BA0FF, 0x45B8ACFF, 0xB57EDCFF, 0x3D8FE0FF)  # of the runs after the first, in rotation
 SIGNALS, RUN_LANES = "signals and differences", "Runs"  # the first is all plots together
@@ -467,7 +474,7 @@ def draw_runs(found: RunDifferences) -> Drawing:
     lanes = {PASS, NEUTRAL, *SECTIONS.values(), *VERDICTS.values()}
     views = [ShownView(SIGNALS, tuple(colours)), ShownView(RUN_LANES, tuple(lanes), is_lanes=True)]
     return Drawing(join_words([run.source for run in found.runs]), plots, RUN_LANES, _list_lanes_of_runs(found),
-                   ("Result", describe_result(found)), views, verdict=found.verdict)
+                   ("Result", format_document(build_diff_report(found))), views, verdict=found.verdict)
 
 
 def _draw_signal(found: RunDifferences, name: str, scale: float) -> list[Curve]:
@@ -514,27 +521,6 @@ def _list_lanes_of_runs(found: RunDifferences) -> list[Lane]:
     return lanes
 
 
-def describe_result(found: RunDifferences) -> str:
-    """Verdict, differences beside the noise, checks that changed, and notes, as Markdown."""
-    runs = [f"- {run.label}: {run.source}" for run in found.runs]
-    lines = [f"### {found.verdict}", "", describe_differences(found), "", *runs, "",
-             "| run | signal | RMS difference | largest | times the noise |", "|---|---|---|---|---|"]
-    lines += [f"| {pair.run.label} - A | {s.signal.symbol} | {format_amount(s.rms, s.unit)} | "
-              f"{format_amount(s.largest, s.unit)} at {s.t:.3f} s | {format_ratio(s.ratio)} |"
-              for pair in found.pairs for s in pair.signals]
-    changed = [check for check in found.checks if check.is_changed]
-    if changed:
-        labels = [run.label for run in found.runs]
-        lines += ["", f"| check | {' | '.join(labels)} |", f"|{'---|' * (1 + len(labels))}"]
-        lines += [f"| {check.name} | {' | '.join(_judge(result) for result in check.results)} |" for check in changed]
-    notes = dict.fromkeys(note for pair in found.pairs for note in pair.notes)
-    return "\n".join([*lines, "", *(f"- {note}" for note in notes)])
-
-
-def _judge(result: Any) -> str:
-    return "-" if result is None else result.verdict.replace("PASS", "pass")
-
-
 BEFORE, FLOOR = 0xE5534BFF, MEASURED
 # each plot has a colour of its own, so that a picture shows which one is empty
 MODELS = (0xE8A33DFF, 0x45B8ACFF, 0xD96BA0FF, 0x9ACD5BFF, 0x6FA8DCFF)
@@ -553,8 +539,11 @@ def draw_comparison(c: Comparison, before: Comparison | None) -> Drawing:
     shown.append(ShownView(COMMAND_AND_ERROR, (PASS, FAIL, *SECTIONS.values()), is_lanes=True))
     lanes = [make_command_lane(c.trace, "run", 0.0), *(_make_error_lane(word, found) for word, found in models),
              *_list_left_out(c)]
-    return Drawing(f"{c.source}, {c.model.name}", plots, COMMAND_AND_ERROR, lanes,
-                   ("Result", describe_comparison(c, before)), shown, verdict=c.verdict)
+    text = format_document(build_comparison_report(c))
+    if before:
+        text += f"\n\nBefore the change:\n\n{format_document(build_comparison_report(before))}"
+    return Drawing(f"{c.source}, {c.model.name}", plots, COMMAND_AND_ERROR, lanes, ("Result", text), shown,
+                   verdict=c.verdict)
 
 
 def _draw_replay(name: str, models: Sequence[tuple[str, Comparison]]) -> Plot:
@@ -604,17 +593,3 @@ def _make_error_lane(word: str, c: Comparison) -> Lane:
         if following is None or following.t0 > place.t1 + 1e-9:  # no state begins where this one ends
             states.append((place.t1, ""))
     return Lane(f"error over floor/{word}", states, colours)
-
-
-def describe_comparison(c: Comparison, before: Comparison | None) -> str:
-    """Verdict, the errors beside the noise floor, and notes, as Markdown."""
-    head = ["signal", *(["error before", "error after"] if before else ["error"]), "noise floor", "ratio"]
-    first = [f"Before the change: {before.verdict}. {describe_verdict(before)}", ""] if before else []
-    lines = [f"### {c.verdict}", "", f"Model {c.model.name}. {describe_verdict(c)}", "", *first,
-             f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
-    for s in c.signals.values():
-        earlier = before.signals.get(s.name) if before else None
-        cells = [s.signal.symbol, *([format_signal(earlier.error, s.signal) if earlier else "-"] if before else []),
-                 format_signal(s.error, s.signal), format_signal(s.floor.value, s.signal), format_ratio(s.ratio)]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join([*lines, "", *(f"- {note}" for note in c.notes)])

@@ -120,15 +120,14 @@ def test_filter_laws_against_an_explicit_scheme(law: str, exponent: float) -> No
 def test_error_of_the_step_is_what_the_page_says() -> None:
     """docs/statistics.md holds the numbers of `rig bench --accuracy`, not older ones; finer steps are better."""
     table = measure_accuracy(PREFLIGHT, (50, 100, 200))
-    assert table[0].rms > table[1].rms > table[2].rms
-    default = table[1]
-    assert default.rms < 0.005 and default.largest < 0.05
-    assert default.rms_friction < 0.7 and default.largest_friction < 3
+    assert table[0]["rms"] > table[1]["rms"] > table[2]["rms"]
+    most = {"rms": 0.005, "largest": 0.05, "rms_friction": 0.7, "largest_friction": 3.0}  # um
+    assert all(table[1][key] < limit for key, limit in most.items())
     page = (ROOT / "docs/statistics.md").read_text()
     for row in table:
-        line = next(line for line in page.splitlines() if line.startswith(f"| {1000 / row.steps:g} |"))
+        line = next(line for line in page.splitlines() if line.startswith(f"| {1000 / row['steps']:g} |"))
         said = [float(cell) for cell in line.split("|")[3:7]]
-        measured = (row.rms, row.largest, row.rms_friction, row.largest_friction)
+        measured = [row[key] for key in most]
         assert said[:2] == pytest.approx(measured[:2], rel=0.1, abs=2e-4), line
         assert said[2:] == pytest.approx(measured[2:], rel=0.5), line  # the phase of stick-slip may differ by machine
 

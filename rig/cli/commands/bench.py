@@ -30,7 +30,7 @@ def measure_plant(args: argparse.Namespace, progress: Progress) -> Report:
     figures = run_benchmarks(command, progress)
     if args.accuracy:
         progress("accuracy of the step", 0.0)
-        figures["accuracy"] = [row._asdict() for row in measure_accuracy(command)]
+        figures["accuracy"] = measure_accuracy(command)
     return build_plant_report(figures)
 
 

@@ -234,7 +234,7 @@ def test_before_the_change_is_the_model_without_the_added_effect(folder: Path, c
     np.testing.assert_allclose(read_values(rows, "/xs/2_before"), before.replay.model["xs"] * 1e6)
     assert (names["/residual_xj/1_before"], names["/xj/1_measured"]) == ("before the change", "XJ measured")
     assert "/error_over_floor/before" in rows
-    assert f"### {compared[1]}" in text and "Before the change: MODEL_INCOMPLETE." in text
+    assert text.startswith(f"```text\n{compared[1]}") and "Before the change:\n\n```text\nMODEL_INCOMPLETE" in text
 
 
 def test_before_a_model_file_is_the_file_without_its_effects(folder: Path, tmp_path: Path) -> None:
@@ -269,7 +269,7 @@ def test_runs_are_overlaid_and_subtracted_on_the_time_of_the_first(folder: Path,
             np.testing.assert_allclose(drawn, np.column_stack([pair.t, pair.differences[name] * scale]), atol=1e-8)
     assert np.abs(read_values(rows, "/difference_xj/02_C")).max() < 1e-6  # um; C is A, later
     text = str(rows["/log/result"][0][1])
-    assert "### DIFFERENT" in text and "B - A | XJ" in text and "aligned by the command" in text
+    assert "DIFFERENT" in text and "B - A  XJ" in text and "aligned by the command" in text
 
 
 @pytest.mark.parametrize(("words", "message"), [
