@@ -16,7 +16,6 @@ import subprocess
 import sys
 import tempfile
 import termios
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -42,12 +41,10 @@ from plant.errors import InputError, RigError
 from rig.benches.bench_file import load_bench
 from rig.benches.frame_map import Role
 from rig.firmware.build import build_device
-from rig.network import heartbeat
 from rig.network.bus import can_open, open_can
 from rig.network.clock import WallClock
 from rig.network.link import Link, LinkWire, serve_node
 from rig.network.master import Master
-from rig.network.node_objects import PLANT
 from rig.network.raw_bus import open_raw_bus
 from rig.nodes.emulator import Emulator
 from rig.nodes.scenario import Scenario
@@ -158,8 +155,7 @@ def describe_conditions(figures: Mapping[str, Any]) -> Line:
                             f"{figures['bus']}, 1 ms a cycle, {figures['cpus']} CPUs, {priority}")
 
 
-_NMT = 0x000
-_START, _RESET = 1, 130  # NMT commands, CiA 301 section 7.2.8.3.1
+Peer = subprocess.Popen[bytes]  # a node opposite the cycle
 
 
 def build_responder(folder: Path) -> Path:
@@ -198,42 +194,14 @@ def _pack(bus: str, cob_id: int) -> bytes:
     return cob_id.to_bytes(4, sys.byteorder) + bytes([8, 0, 0, 0]) + _PAYLOAD  # struct can_frame
 
 
-@contextlib.contextmanager
-def run_emulator(bus: str, is_compiled: bool) -> Iterator[None]:
-    """Run the plant emulator on a bus while the context lasts, alone and OPERATIONAL.
-
-    Raises:
-        RigError: it does not boot.
-    """
+def run_emulator(bus: str, is_compiled: bool) -> AbstractContextManager[Peer]:
+    """Run the plant emulator on a bus while the context lasts."""
     module = ["rig.cli.main", "node", "plant", "--quiet", "--bus"] if is_compiled else ["rig.bench.realtime"]
-    plant = load_bench().nodes[PLANT]
-    with _run_process([sys.executable, "-m", *module, bus]) as process:
-        link = Link(open_can(bus), time.monotonic_ns)
-        try:
-            _wait_for(link, lambda: link.send(_NMT, bytes([_RESET, plant.node])),
-                      plant.find_cob_id(heartbeat.COB_ID), process)
-            link.send(_NMT, bytes([_START, plant.node]))
-            time.sleep(0.3)
-        finally:
-            link.close()
-        yield
-
-
-def _wait_for(link: Link, ask: Callable[[], None], boot_up: int, process: subprocess.Popen[bytes],
-              limit: float = 120.0) -> None:
-    """Ask the emulator every second until its boot-up comes."""
-    end = time.monotonic() + limit
-    while time.monotonic() < end and process.poll() is None:
-        ask()
-        again = time.monotonic() + 1.0
-        while time.monotonic() < again:
-            if any(frame.cob_id == boot_up and frame.data == b"\0" for frame in link.poll(0.1)):
-                return
-    raise RigError("the plant emulator does not boot")
+    return _run_process([sys.executable, "-m", *module, bus])
 
 
 @contextlib.contextmanager
-def _run_process(words: list[str], *descriptors: int) -> Iterator[subprocess.Popen[bytes]]:
+def _run_process(words: list[str], *descriptors: int) -> Iterator[Peer]:
     process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, pass_fds=descriptors)
     try:
         yield process
@@ -273,11 +241,12 @@ def list_contenders(bus: str) -> dict[str, Callable[[float], Times]]:
     def measure_cyclictest(seconds: float) -> Times:
         return {"lateness": run_cyclictest(seconds, choose_priority(), list_cpus()[-1])}
 
-    def measure_cycle(seconds: float, run_peer: Callable[[], AbstractContextManager[object]], **options: Any) -> Times:
-        with run_peer():
-            return play_block(bus, seconds, **options)
+    def measure_cycle(seconds: float, run_peer: Callable[[], AbstractContextManager[Peer | None]], **options: Any
+                      ) -> Times:
+        with run_peer() as peer:
+            return play_block(bus, seconds, peer, **options)
 
-    def run_example(folder: Path) -> AbstractContextManager[object]:
+    def run_example(folder: Path) -> AbstractContextManager[Peer]:
         return _run_process([str(build_device(folder)), bus])
 
     examples = Path(__file__).parents[2] / "examples"  # of a checkout
@@ -293,10 +262,19 @@ def list_contenders(bus: str) -> dict[str, Callable[[float], Times]]:
     return {name: measure for name, is_there, measure in rows if is_there}
 
 
-def play_block(bus: str, seconds: float, is_compiled: bool = True, bench: Path | None = None) -> Times:
+def play_block(bus: str, seconds: float, peer: Peer | None = None, is_compiled: bool = True,
+               bench: Path | None = None) -> Times:
     """Times of the rig's cycle of 1 ms on a bus, with its log, without the first cycles; NaN where no answer came.
 
-    `bench`: the bench file of a foreign controller, which is started.
+    Args:
+        bus: where the cycle and its peer are.
+        seconds: how long.
+        peer: the process of a node that is to boot and to be started; None: nothing to start.
+        is_compiled: whether the cycle is compiled code.
+        bench: the bench file of the peer, a foreign controller; None: the peer is the plant of the shipped bench.
+
+    Raises:
+        RigError: the peer does not boot.
     """
     is_foreign, chosen = bench is not None, replace(load_bench(str(bench or "eha")), cycle_ns=1_000_000)
     history = History()
@@ -307,8 +285,10 @@ def play_block(bus: str, seconds: float, is_compiled: bool = True, bench: Path |
         wire = LinkWire(Link(open_can(bus), clock.now), clock)
         stack.callback(wire.close)
         master = Master(wire, clock.now, stamped=True, bench=chosen)
-        if is_foreign and chosen.nodes:
-            master.is_present(Role.CONTROLLER, 5.0)
+        if peer is not None and chosen.nodes:
+            role = Role.CONTROLLER if is_foreign else Role.PLANT
+            if not any(master.is_present(role, 1.0) for _ in range(120) if peer.poll() is None):
+                raise RigError(f"{chosen.describe_node(role)} does not boot")
             master.start()
         master.hooks.on_frame = recorder.frame
         log = _Log(history, recorder)

@@ -35,13 +35,11 @@ from rig.bench.realtime import (
     parse_histogram,
     play_run,
     run_c_responder,
-    run_emulator,
     run_in_terminal,
     summarise_contenders,
     summarise_live_runs,
 )
 from rig.network.bus import open_can
-from rig.network.frame import Frame
 from rig.network.link import Link
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {realtime.GET_GCC}")
@@ -184,28 +182,6 @@ def test_the_responder_in_c_sends_the_frames_of_the_emulator(bus_kind: str) -> N
             assert (feedback.cob_id, len(feedback.data), valve.cob_id) == (codec.FEEDBACK, 8, codec.VALVE_STATE)
             assert codec.unpack_valve_state(valve.data).cycle == cycle
     link.close()
-
-
-@pytest.mark.parametrize("is_compiled", [False, True])
-def test_the_emulator_answers_alone(is_compiled: bool) -> None:
-    where = spec("udp_multicast")
-    with run_emulator(where, is_compiled):
-        link = Link(open_can(where), lambda: 0)
-        errors: list[int] = []
-        for cycle in range(5):
-            link.send(codec.SYNC, b"")
-            frames: list[Frame] = []
-            while not {codec.FEEDBACK, codec.VALVE_STATE} <= {frame.cob_id for frame in frames}:
-                frames += (more := gather(link, 1))
-                assert more, f"no answer in cycle {cycle}"
-            valves = [codec.unpack_valve_state(frame.data) for frame in frames if frame.cob_id == codec.VALVE_STATE]
-            assert [valve.cycle for valve in valves] == [cycle]
-            # Nobody answers: one EMCY after three cycles, which may be read with the answers of the cycle after.
-            usual = {codec.FEEDBACK, codec.VALVE_STATE, 0x703}  # the last: it has the default heartbeat of 100 ms
-            errors += [frame.cob_id for frame in frames if frame.cob_id not in usual]
-            assert not errors or cycle >= 3
-        assert errors in ([], [0x083])
-        link.close()
 
 
 def test_percentiles_ratios_and_targets() -> None:
