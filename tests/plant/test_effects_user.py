@@ -101,8 +101,7 @@ def test_a_law_that_cannot_run_is_refused(file: Path, body: str) -> None:
 
 
 @pytest.mark.parametrize(("text", "name", "sized"), [
-    (COGGING, "cogging", "cogging.force"), (STIFF.format(scale=1.0), "spring", "spring.stiffness"),
-    (MEMORY, "wear", "wear.rate"), (DEMAND, "rounding", "rounding.step")])
+    (COGGING, "cogging", "cogging.force"), (MEMORY, "wear", "wear.rate"), (DEMAND, "rounding", "rounding.step")])
 def test_an_effect_without_a_hint_starts_where_it_shows(file: Path, text: str, name: str, sized: str) -> None:
     """Nothing is said about how large it is: sizes are found that show 3, 30 and 300 times the noise."""
     file.write_text(text)
@@ -134,16 +133,16 @@ def test_the_trial_of_a_sound_effect(file: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@pytest.mark.parametrize(("old", "new", "said"), [
-    ("return x +", "return x + 1.0 +", "at its off value it changes the plant"),
-    ("return x +", "return x + 0.0 *", "no size of it changes anything"),
-    ("return x +", "return x * (1.0 + p.cogging.force) ** 400 +", "has no number any more"),
+@pytest.mark.parametrize(("new", "said"), [
+    ("return x + 1.0 + 0.0 *", ["at its off value it changes the plant", "no size of it changes anything"]),
+    ("return x * (1.0 + p.cogging.force) ** 400 +", ["has no number any more"]),
 ])
-def test_the_trial_of_an_unsound_one(file: Path, old: str, new: str, said: str) -> None:
-    text = COGGING.replace(old, new).replace('Quantity("N")', 'Quantity("N", low=0, high=1e3)')
+def test_the_trial_of_an_unsound_one(file: Path, new: str, said: list[str]) -> None:
+    text = COGGING.replace("return x +", new).replace('Quantity("N")', 'Quantity("N", low=0, high=1e3)')
     file.write_text(text.replace('"load"', '"position"'))
     load_effects(file)
-    assert any(said in fault for fault in check_effect("cogging", COMMAND).faults)
+    faults = " ".join(check_effect("cogging", COMMAND).faults)
+    assert [words for words in said if words not in faults] == []
 
 
 def test_the_catalogue_is_told_for_machines() -> None:

@@ -257,7 +257,7 @@ def test_parts_begin_anew_at_their_own_time() -> None:
 def test_an_anchored_replay_does_not_pull_the_ram_through_the_play_of_its_rod() -> None:
     """While the ram rests within the play, XJ does not show where: the width that fits best is the true one."""
     widths = 4e-5 + 1e-6 * np.arange(-2.0, 2.1, 0.25)
-    lanes = Lanes(Model().with_effects(["rod_backlash"]), ["rod_backlash.width"], 50)
+    lanes = Lanes(Model().with_effects(EFFECTS), ["rod_backlash.width"], 50)
     best = []
     for seed in (1, 2, 3):
         trace = record_plant({"rod_backlash.width": 4e-5}, seed=seed)

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import pytest
@@ -18,6 +19,8 @@ needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {re
 def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(realtime.shutil, "which", lambda name: None)
     monkeypatch.setattr(rivals.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(command, "compare_many_runs", partial(many_runs.compare_many_runs, rounds=1, cycles=300))
+    monkeypatch.setattr(command, "compare_grid_runs", partial(grid_runs.compare_grid_runs, rounds=1))
     assert command.main([]) == 0
     words = " ".join(capsys.readouterr().out.split())
     assert "C, one run after the other skipped, gcc is not installed; to get it: apt-get install gcc" in words

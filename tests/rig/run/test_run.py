@@ -184,7 +184,7 @@ def test_compiled_cycles_in_lockstep_are_those_in_python(bus_with_nodes: str, na
 def test_so_they_are_on_a_can_interface(bus_kind: str, tmp_path: Path) -> None:
     where = spec(bus_kind)
     with stand_nodes(where, PLANT, CONTROLLER):
-        require_equal_runs(where, "frames", tmp_path)
+        require_equal_runs(where, "lost frames", tmp_path)
 
 
 def require_equal_runs(where: str, name: str, tmp_path: Path) -> None:
