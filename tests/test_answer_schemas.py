@@ -58,7 +58,8 @@ def test_a_schema_is_valid_named_in_the_page_and_refers_to_what_is_there(name: s
 
 def test_every_command_that_answers_in_json_has_a_schema() -> None:
     words = [[command] for command in COMMANDS] + [["bench", kind] for kind in KINDS_OF_BENCH]
-    more = {"common.json", "fdi_learn_bands.json", "suite.json", "check_bench.json", "check_plant.json"}
+    more = {"common.json", "evidence_verify.json", "fdi_learn_bands.json", "suite.json", "check_bench.json",
+            "check_plant.json"}
     assert {name_schema(each) for each in words} | more == set(SCHEMAS)
     assert name_schema(["bench", "--json"]) == "bench.json"
     assert name_schema(["fdi", "--learn-bands", "a.csv"]) == "fdi_learn_bands.json"

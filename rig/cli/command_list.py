@@ -22,6 +22,7 @@ from rig.cli.options import (
     MODEL,
     PLANT,
     REPEAT,
+    REQUIREMENTS,
     RUNS,
     SEED_IF_GIVEN,
     SIGNALS,
@@ -166,6 +167,17 @@ COMMANDS = {
                 help="your own effects (repeatable); one that is shown is tested as well"),
          option("--test", action="store_true",
                 help="test the effect, or all of them, on the preflight command; exit status 1 for a fault"))),
+    "evidence": Command(
+        "pack runs with inputs, versions and requirements into one sealed folder or zip, or verify such a package",
+        "The package goes to --out (default: evidence.zip). Exit status 1 of --verify if a file was changed, removed "
+        "or added.",
+        (option("runs", nargs="*", metavar="RUN", help="folders of runs or of a suite"),
+         option("--verify", metavar="PATH", help="check every byte of a package against its manifest"),
+         REQUIREMENTS,
+         option("--sign", metavar="KEY", help="sign the manifest: secret key file of minisign, or name of a GPG key"),
+         option("--key", metavar="KEY",
+                help="with --verify: demand a signature by this key: public key file of minisign, or GPG fingerprint"),
+         FORCE)),
     "explain": Command(
         "find the physical effects that a model lacks, and rank the candidates",
         "Exit status 0 if nothing is missing, 1 otherwise.",
@@ -293,7 +305,7 @@ COMMANDS = {
                      "the sequence, 0.001)"),
          option("--fdi", action="store_true",
                 help="also diagnose the servovalve like rig fdi, against a nominal unit"),
-         JUNIT,
+         JUNIT, REQUIREMENTS,
          option("--jobs", type=parse_count, metavar="N",
                 help="runs at a time of several sequences or a suite (default: all cores; 1 in real time or on a CAN "
                      "bus)"),

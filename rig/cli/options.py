@@ -89,6 +89,8 @@ FAULTS = option("--faults", metavar="FILE|NAME",
 BENCH = option("--bench", metavar="FILE|NAME",
                help="bench file: which controller is under test, and its frames (default: eha, the shipped one)")
 FORCE = option("--force", action="store_true", help="replace the file of --out if there is one")
+REQUIREMENTS = option("--requirements", metavar="FILE",
+                      help="requirements to cover, .csv (id, text) or .reqif; an id that it lacks is refused")
 JUNIT = option("--junit", metavar="FILE.xml", help="also write the results as JUnit XML, for build servers")
 
 

@@ -38,7 +38,9 @@ def run_sequence(args: argparse.Namespace, pages: PageWriter) -> int:
         args.live, args.sequence = LIVE_ON_TERMINAL, [args.live, *args.sequence]  # the word behind --live is a sequence
     if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
         raise InputError("--max-overruns", "", f"a fraction from 0 to 1, not {args.max_overruns:g}")
-    if not args.source and (len(args.sequence) > 1 or any(map(is_suite_file, args.sequence))):
+    if args.requirements and args.source:
+        raise InputError("--requirements", "", "sequences or a suite file, not --from")
+    if not args.source and (len(args.sequence) > 1 or args.requirements or any(map(is_suite_file, args.sequence))):
         if args.live:
             raise InputError("--live", "", "one sequence; runs of a suite run side by side")
         pages.close()  # each case of a suite writes its own

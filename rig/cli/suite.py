@@ -17,6 +17,7 @@ from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, open_console
 from rig.cli.inputs import is_suite_file
 from rig.cli.single_run import build_choice, choose_bus_of_run, make_new_folder
+from rig.evidence.requirements import read_requirements, require_listed
 from rig.interrupts import catch_signals
 from rig.network.clock import WallClock
 from rig.run.job import JobChoice
@@ -41,6 +42,7 @@ def run_suite(args: argparse.Namespace) -> int:
     Raises:
         RigError: a sequence, model or parameter that cannot be used; nothing has run then.
     """
+    args.sequence = args.sequence or ["preflight"]
     base = build_choice(args)._replace(bus=choose_bus_of_run(args, args.bus, args.controller)[0])
     tried = read_suite(args, base)
     processes = choose_processes(args, base, len(tried.cases))
@@ -74,6 +76,7 @@ def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
     titles: dict[str, str] = {}  # of each suite file
     rate = load_bench(base.bench or "eha", is_trusted=args.trust).rate
     requirements: dict[str, str] = {}
+    files = [Path(args.requirements)] if args.requirements else []
     for name in args.sequence:
         if not is_suite_file(name):
             cases.append(Case(Path(name).stem, base._replace(sequence=name)))
@@ -84,9 +87,16 @@ def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
         cases += own
         titles[name] = content.title
         listed = content.requirements
-        requirements |= dict.fromkeys(listed, "") if isinstance(listed, tuple) else dict(listed)
-    title = next(iter(titles.values())) if len(titles) == 1 else f"{len(args.sequence)} sequences"
-    return build_suite(title, cases, requirements, ", ".join(titles), is_trusted=args.trust)
+        files += [Path(name).parent / listed] if isinstance(listed, str) else []
+        if not isinstance(listed, str):
+            requirements |= dict.fromkeys(listed, "") if isinstance(listed, tuple) else dict(listed)
+    for file in files:
+        requirements |= read_requirements(file)
+    title = next(iter(titles.values())) if len(titles) == 1 else count_nouns(len(args.sequence), "sequence")
+    suite = build_suite(title, cases, requirements, ", ".join(titles), is_trusted=args.trust)
+    if files:
+        require_listed((case.planned for case in suite.cases), requirements, " or ".join(map(str, files)))
+    return suite
 
 
 def choose_processes(args: argparse.Namespace, base: JobChoice, cases: int) -> int:

@@ -25,6 +25,14 @@ from fdi.report.run_report import format_limits, format_uncertainty, format_valu
 from plant.errors import InputError, RigError
 from rig import junit
 from rig.campaign.batch import UNLIMITED, run_in_processes
+from rig.evidence.requirements import (
+    NO_VERDICT,
+    JudgedCheck,
+    JudgedRun,
+    Requirement,
+    tabulate_requirements,
+    trace_requirements,
+)
 from rig.network.clock import WallClock
 from rig.run.job import JobChoice, build_job, find_differences
 from rig.run.outcome import INTERRUPTED, Outcome, describe_faults, describe_finding, diagnose_servovalve, has_fault
@@ -62,11 +70,11 @@ class CaseEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteFile:
-    """The keys of a suite file. `requirements`: a list of ids, or a table of ids and texts."""
+    """The keys of a suite file. `requirements`: a file beside it, a list of ids, or a table of ids and texts."""
 
     title: str
     case: tuple[CaseEntry, ...]
-    requirements: tuple[str, ...] | Mapping[str, str] = ()
+    requirements: str | tuple[str, ...] | Mapping[str, str] = ()
 
 
 class Suite(NamedTuple):
@@ -82,13 +90,6 @@ class Suite(NamedTuple):
         return self._replace(cases=[case._replace(folder=folder / case.folder) for case in self.cases])
 
 
-class PlannedCheck(NamedTuple):
-    """A check of the sequence of a case, as it is known before the run."""
-
-    name: str
-    requirement: tuple[str, ...]
-
-
 class Case(NamedTuple):
     """One run of a suite; folder and checks are known when it has been tried (`build_suite`)."""
 
@@ -97,7 +98,12 @@ class Case(NamedTuple):
     timeout: float | None = None  # s of wall-clock time; None: by the length of its sequence
     requirement: tuple[str, ...] = ()  # that the run as a whole verifies
     folder: Path = Path()  # of its results
-    checks: tuple[PlannedCheck, ...] = ()
+    checks: tuple[JudgedCheck, ...] = ()  # without verdicts
+
+    @property
+    def planned(self) -> JudgedRun:
+        """What it will say about requirements."""
+        return JudgedRun(self.name, "NOT_RUN", self.requirement, self.checks)
 
 
 def read_suite_file(path: Path, base: JobChoice, rate: float) -> tuple[SuiteFile, list[Case]]:
@@ -166,7 +172,7 @@ def build_suite(title: str, cases: Sequence[Case], requirements: Mapping[str, st
         tried.append(case._replace(
             name=_find_free(case.name, names, " ({})"), folder=Path(_find_free(slug, folders, "-{}")),
             timeout=300.0 + 10.0 * job.sequence.duration if case.timeout is None else case.timeout,
-            checks=tuple(PlannedCheck(check.name, check.requirements) for check in job.sequence.checks)))
+            checks=tuple(JudgedCheck(check.name, check.requirements) for check in job.sequence.checks)))
     return Suite(title, tried, requirements, source)
 
 
@@ -191,7 +197,6 @@ def _show(value: Value) -> str:
     return f"{value:g}" if isinstance(value, float) else value
 
 
-NO_VERDICT = ("ERROR", "NOT_RUN")  # cases without a run that was judged
 
 
 class CaseResult(NamedTuple):
@@ -210,6 +215,13 @@ class CaseResult(NamedTuple):
     def failed(self) -> list[CheckResult]:
         """The checks that did not pass."""
         return [check for check in self.checks if not check.passed]
+
+    @property
+    def judged(self) -> JudgedRun:
+        """What it says about requirements."""
+        verdicts = {check.name: check.verdict for check in self.checks}
+        return self.case.planned._replace(verdict=self.verdict, checks=[
+            check._replace(verdict=verdicts.get(check.name, "")) for check in self.case.checks])
 
     @property
     def reason(self) -> str:
@@ -337,8 +349,7 @@ def catch_termination(bus: str, patience: float = 1.0) -> Iterator[Callable[[], 
             signal.signal(number, handler)
 
 
-MOODS: dict[str, Mood] = {**RUN_MOODS, "ERROR": "bad", "NOT_RUN": "doubtful", "OPEN": "doubtful",
-                          "NOT_COVERED": "doubtful"}
+MOODS: dict[str, Mood] = {**RUN_MOODS, "ERROR": "bad", "NOT_RUN": "doubtful"}
 
 
 def build_suite_report(suite: Suite, results: Sequence[CaseResult], seconds: float, processes: int, folder: Path,
@@ -353,7 +364,7 @@ def build_suite_report(suite: Suite, results: Sequence[CaseResult], seconds: flo
         folder: where the page will be; links are relative to it.
         files: (label, path) of the files written.
     """
-    requirements = trace_requirements(results, suite.requirements)
+    requirements = trace_requirements((result.judged for result in results), suite.requirements)
     verdict = find_verdict(results)
     verdicts = [each.verdict for each in requirements]
     facts = [("cases", count_verdicts([result.verdict for result in results])),
@@ -367,7 +378,7 @@ def build_suite_report(suite: Suite, results: Sequence[CaseResult], seconds: flo
         sections=[Section("Cases", _tabulate_cases(results, folder)),
                   Section("Checks that did not pass", _tabulate_failures(results, folder), title_medium=Medium.BOTH),
                   Section("Servovalve", _tabulate_faults(results, folder), title_medium=Medium.BOTH),
-                  Section("Requirements", _tabulate_requirements(requirements), title_medium=Medium.BOTH)],
+                  Section("Requirements", tabulate_requirements(requirements), title_medium=Medium.BOTH)],
         files=files, conclusion="" if verdict == "PASS" else f"{verdict}: {_describe(results)}",
         data=collect_data(suite, results, requirements, seconds, processes))
 
@@ -445,29 +456,6 @@ def _tabulate_faults(results: Sequence[CaseResult], folder: Path) -> list[Table]
         caption="A fault beyond acceptable, or another deviation, fails the case.")]
 
 
-def _tabulate_requirements(requirements: Sequence[Requirement]) -> list[Table]:
-    return [tabulate(
-        requirements,
-        (Column("requirement"), lambda each: each.id),
-        (Column("text", medium=Medium.PAGE), lambda each: each.text),
-        (Column("verdict"), lambda each: Cell(each.verdict, MOODS[each.verdict])),
-        (Column("checks", align="right"), lambda each: f"{sum(proof.verdict == 'PASS' for proof in each.evidence)}/"
-                                                       f"{len(each.evidence)}"),
-        (Column("verified by", medium=Medium.PAGE), lambda each: describe_evidence(each.evidence)),
-        caption="OPEN: a check that verifies it was not judged. NOT_COVERED: no check verifies it.")]
-
-
-def describe_evidence(evidence: Sequence[Evidence], most: int = 3) -> str:
-    """What verifies a requirement: each check with the cases that it passed in, and the names of the others."""
-    parts = []
-    for check in dict.fromkeys(each.check for each in evidence):
-        own = [each for each in evidence if each.check == check]
-        bad = [f"{each.verdict} in {each.case}" for each in own if each.verdict != "PASS"]
-        more = [f"{len(bad) - most} more"] if len(bad) > most else []
-        parts.append(", ".join([f"{check}: PASS in {len(own) - len(bad)} of {len(own)}", *bad[:most], *more]))
-    return "; ".join(parts)
-
-
 def collect_data(suite: Suite, results: Sequence[CaseResult], requirements: Sequence[Requirement], seconds: float,
                  processes: int) -> dict[str, Any]:
     """The JSON answer of a suite."""
@@ -484,8 +472,7 @@ def collect_data(suite: Suite, results: Sequence[CaseResult], requirements: Sequ
     return {"verdict": find_verdict(results), "title": suite.title, "cases": cases,
             "counts": dict(Counter(result.verdict for result in results)), "seconds": round(seconds, 3),
             "jobs": processes,
-            "requirements": [{"id": each.id, "text": each.text, "verdict": each.verdict,
-                              "checks": [evidence._asdict() for evidence in each.evidence]} for each in requirements]}
+            "requirements": [each.to_json() for each in requirements]}
 
 
 def write_junit(title: str, results: Sequence[CaseResult]) -> str:
@@ -496,7 +483,7 @@ def write_junit(title: str, results: Sequence[CaseResult]) -> str:
 def write_junit_of_run(outcome: Outcome, seconds: float) -> str:
     """The JUnit XML of one run, which took `seconds` of wall-clock time."""
     job = outcome.job
-    checks = tuple(PlannedCheck(check.name, check.requirements) for check in job.sequence.checks)
+    checks = tuple(JudgedCheck(check.name, check.requirements) for check in job.sequence.checks)
     choice = JobChoice(job.sequence.name, job.model.name, {}, job.seed)
     case = Case(Path(job.sequence.name).stem, choice, folder=outcome.folder, checks=checks)
     return write_junit("rig run", [make_result(case, outcome, seconds)])
@@ -560,55 +547,3 @@ def _make_diagnosis_test(result: CaseResult, classname: str) -> junit.TestCase:
 
 def _name_requirements(names: Sequence[str]) -> str:
     return f"requirement {', '.join(names)}" if names else ""
-
-
-RUN = "whole run"  # the name of what verifies a requirement of a case
-
-
-class Evidence(NamedTuple):
-    """A check of a case, or its whole run, that verifies a requirement."""
-
-    case: str
-    check: str
-    verdict: str  # PASS, FAIL, or OPEN: not judged
-
-
-class Requirement(NamedTuple):
-    """A requirement with all that verifies it."""
-
-    id: str
-    text: str
-    evidence: tuple[Evidence, ...]
-
-    @property
-    def verdict(self) -> str:
-        """FAIL if a check failed, OPEN if one was not judged, PASS, or NOT_COVERED without any check."""
-        words = {each.verdict for each in self.evidence}
-        return next((word for word in ("FAIL", "OPEN", "PASS") if word in words), "NOT_COVERED")
-
-
-def trace_requirements(results: Sequence[CaseResult], listed: Mapping[str, str]) -> list[Requirement]:
-    """All requirements: those that the suite lists, in its order, then others that a check or case names."""
-    found: dict[str, list[Evidence]] = {name: [] for name in listed}
-    for result in results:
-        for name in result.case.requirement:
-            found.setdefault(name, []).append(Evidence(result.case.name, RUN, _judge_run(result)))
-        for check in result.case.checks:
-            for name in check.requirement:
-                evidence = Evidence(result.case.name, check.name, _judge_check(result, check.name))
-                found.setdefault(name, []).append(evidence)
-    return [Requirement(name, listed.get(name, ""), tuple(evidence)) for name, evidence in found.items()]
-
-
-def _judge_run(result: CaseResult) -> str:
-    if result.verdict in ("PASS", "FAIL"):
-        return result.verdict
-    return "FAIL" if result.verdict == "ABORTED" else "OPEN"
-
-
-def _judge_check(result: CaseResult, name: str) -> str:
-    """The verdict of a check. If the bench was late, the checks of that run prove nothing."""
-    check = next((check for check in result.checks if check.name == name), None)
-    if check is None or result.verdict in ("INVALID_TIMING", *NO_VERDICT):
-        return "OPEN"
-    return "OPEN" if check.cannot_tell else check.verdict

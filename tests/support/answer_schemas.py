@@ -34,7 +34,7 @@ def name_schema(words: Sequence[str]) -> str:
         return "check_bench.json"  # without a sequence
     if command == "check" and words[1:2] and str(words[1]).endswith(".py"):
         return "check_plant.json"
-    for name, option in (("fdi", "--learn-bands"), ("trend", "--score")):
+    for name, option in (("fdi", "--learn-bands"), ("evidence", "--verify"), ("trend", "--score")):
         if command == name and option in words:
             return f"{name}_{option.strip('-').replace('-', '_')}.json"
     return f"{command}.json"

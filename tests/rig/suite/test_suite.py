@@ -14,18 +14,16 @@ from short_sequences import SHORT
 
 from fdi.trace.trace import Trace
 from rig.cli.inputs import is_suite_file
+from rig.evidence.requirements import Evidence, JudgedCheck, trace_requirements
 from rig.run.job import JobChoice
 from rig.sequences.checks import CheckResult
 from rig.suite.suite import (
     Case,
     CaseResult,
-    Evidence,
-    PlannedCheck,
     build_suite,
     find_status,
     find_verdict,
     read_suite_file,
-    trace_requirements,
     write_junit,
 )
 
@@ -219,7 +217,7 @@ def make_result(verdict: str, *passed: bool, fdi: dict[str, str] | None = None) 
     """A result of a case with checks "a", "b", .. that verify R-1; diagnosed if `fdi` is given."""
     checks = tuple(CheckResult(name, "max_error", "xj", 1.0, "m", 0.0, 2.0, is_passed, 0.0, 1.0, "", ("R-1",))
                    for name, is_passed in zip("abc", passed, strict=False))
-    planned = tuple(PlannedCheck(check.name, ("R-1",)) for check in checks)
+    planned = tuple(JudgedCheck(check.name, ("R-1",)) for check in checks)
     case = Case("case", JobChoice(is_diagnosed=bool(fdi)), 1.0, ("R-2",), Path("case"), planned)
     return CaseResult(case, verdict, "because", 1.0, checks, fdi=fdi or {})
 
@@ -236,7 +234,7 @@ def test_the_exit_status_is_the_worst(verdicts: str, status: int, worst: str) ->
 def test_a_late_bench_proves_nothing(tmp_path: Path) -> None:
     """Neither a passed nor a failed check of a run with invalid timing verifies a requirement; JUnit skips failures."""
     late = make_result("INVALID_TIMING", True, False)
-    traced = trace_requirements([late], {})
+    traced = trace_requirements([late.judged], {})
     assert [(each.id, each.verdict) for each in traced] == [("R-2", "OPEN"), ("R-1", "OPEN")]
     assert traced[1].evidence == (Evidence("case", "a", "OPEN"), Evidence("case", "b", "OPEN"))
     (tmp_path / "j.xml").write_text(write_junit("t", [late, make_result("ABORTED", True), make_result("NOT_JUDGED")]))

@@ -1,0 +1,1 @@
+"""Requirements with what verifies them, and sealed packages of runs."""

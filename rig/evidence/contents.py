@@ -1,0 +1,130 @@
+"""What goes into a package: runs as they were written, their inputs from the logs, versions, machine, coverage."""
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fdi.trace.trace import Trace
+from plant.errors import InputError
+from rig.evidence.bill import build_bill
+from rig.evidence.package import INDEX
+from rig.evidence.requirements import RUN, JudgedCheck, JudgedRun, Requirement
+from rig.tables import decode_text, read_file
+
+BILL = "sbom.cdx.json"
+_SETTINGS = ("sequence", "model", "bench", "seed", "bus", "pace", "controller", "plant", "started", "git.commit",
+             "git.state")
+
+
+class PackedRun(NamedTuple):
+    """A run that goes into a package."""
+
+    folder: Path
+    answer: Mapping[str, Any]  # verdict.json
+    trace: Trace
+    judged: JudgedRun  # what it says about requirements; its name is that of its folder in the package
+
+
+class Package(NamedTuple):
+    """The runs of a package, cases of suites that have no run, the ids and texts that suites list, and all files."""
+
+    runs: list[PackedRun]
+    lost: list[JudgedRun]
+    listed: dict[str, str]
+    files: dict[str, bytes | Path]
+
+
+def collect_runs(sources: Iterable[str]) -> Package:
+    """All runs in these folders, of single runs or of suites, with everything that lies in them.
+
+    Raises:
+        InputError: a folder without a run, or a run whose verdict.json is not what its log says.
+    """
+    package = Package([], [], {}, {})
+    taken: set[str] = set()
+    for source in map(Path, sources):
+        root = source.parent if source.name == "trace.mcap" else source
+        verdicts = sorted(root.rglob("verdict.json"))
+        if not verdicts:
+            raise InputError(source, "", "the folder of a run or suite, with the verdict.json of a run in it")
+        stem = root.resolve().name
+        base = next(name for number in range(1, len(taken) + 2)
+                    if (name := stem if number == 1 else f"{stem}-{number}") not in taken)
+        taken.add(base)
+        package.files.update({f"runs/{base}/{file.relative_to(root).as_posix()}": file
+                              for file in sorted(root.rglob("*")) if file.is_file()})
+        cases = _read_suite(root / "suite.json", base, package) if (root / "suite.json").is_file() else {}
+        for file in verdicts:
+            name = Path(base, file.parent.relative_to(root)).as_posix()
+            run = _read_run(file, name, cases.pop(file.parent.name, JudgedRun(name, "", (), ())).requirement)
+            package.runs.append(run)
+            package.files.update({f"inputs/{name}/{kept}": data for kept, data in run.trace.attachments.items()})
+        package.lost.extend(cases.values())
+    return package
+
+
+def _read_json(file: Path) -> Any:
+    try:
+        return json.loads(decode_text(read_file(file), file))
+    except (ValueError, RecursionError) as error:
+        raise InputError(file, "", f"JSON as rig run writes it ({error})") from error
+
+
+def _read_suite(file: Path, base: str, package: Package) -> dict[str, JudgedRun]:
+    """The cases of a suite by their folder; its requirements are added to the package."""
+    try:
+        answer = _read_json(file)
+        cases = {}
+        for case in answer["cases"]:
+            checks = [JudgedCheck(proof["check"], (each["id"],)) for each in answer["requirements"]
+                      for proof in each["checks"] if proof["case"] == case["name"] and proof["check"] != RUN]
+            folder = Path(case["folder"]).name
+            cases[folder] = JudgedRun(f"{base}/{folder}", case["verdict"], tuple(case["requirement"]), checks)
+        package.listed.update({each["id"]: each["text"] for each in answer["requirements"]})
+    except (KeyError, TypeError) as error:
+        raise InputError(file, "", f"the answer of a suite ({error})") from error
+    return cases
+
+
+def _read_run(file: Path, name: str, requirement: tuple[str, ...]) -> PackedRun:
+    """A run, whose verdict.json and log must say the same."""
+    trace = Trace.read(file.parent / "trace.mcap", all=True)
+    try:
+        answer = _read_json(file)
+        said = {each["name"]: each["passed"] for each in answer["checks"]}
+        checks = [JudgedCheck(each["name"], tuple(each["requirement"]), each["verdict"]) for each in answer["checks"]
+                  if each["requirement"]]
+        judged = JudgedRun(name, answer["verdict"], requirement, checks)
+    except (KeyError, TypeError) as error:
+        raise InputError(file, "", f"the verdict of a run by this version ({error})") from error
+    logged = trace.provenance.get("verdict.verdict", "")
+    if judged.verdict != logged or said != {check.name: check.passed for check in trace.checks}:
+        raise InputError(file, "verdict", f"what its log says, {logged or 'no verdict'}, check by check")
+    return PackedRun(file.parent, answer, trace, judged)
+
+
+def add_index(package: Package, requirements: Iterable[Requirement], created: str) -> dict[str, Any]:
+    """Add the index, which is returned, and the bill of materials to the files of a package.
+
+    `created`: time in UTC, ISO 8601.
+    """
+    bill = build_bill(created)
+    now = {each["name"]: each["version"] for each in (bill["metadata"]["component"], *bill["components"])
+           if "version" in each}
+    runs = []
+    for run in package.runs:
+        notes = run.trace.provenance
+        versions = {key.removeprefix("version."): text for key, text in notes.items() if key.startswith("version.")}
+        runs.append({
+            "name": run.judged.name, "verdict": run.judged.verdict, "why": run.answer["why"],
+            "decision": run.answer.get("decision"), "calibration": run.answer.get("calibration", {}),
+            "settings": {key: notes[key] for key in _SETTINGS if key in notes},
+            "machine": {key: notes.get(key, "") for key in ("host", "system", "python")}, "versions": versions,
+            "other_versions": {name: now.get(name, "") for name, text in versions.items() if now.get(name) != text}})
+    index: dict[str, Any] = {"created": created, "runs": runs,
+                             "requirements": [each.to_json() for each in requirements]}
+    package.files[INDEX] = json.dumps(index, indent=1).encode() + b"\n"
+    package.files[BILL] = json.dumps(bill, indent=1).encode() + b"\n"
+    return index

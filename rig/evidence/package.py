@@ -1,0 +1,256 @@
+"""Sealed packages of runs: a folder or zip with a manifest of SHA-256 sums, and its verification.
+
+The manifest has the format of sha256sum, so `sha256sum -c MANIFEST.sha256` checks a folder without this program. A zip
+is written without compression and without dates: the same files give the same bytes, and every byte can be verified.
+"""
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import re
+import shutil
+import subprocess
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import IO, NamedTuple
+
+from fdi.output import write_whole
+from fdi.progress import Progress
+from plant.errors import InputError, show_value
+
+MANIFEST, INDEX = "MANIFEST.sha256", "evidence.json"
+SIGNATURES = {"minisign": f"{MANIFEST}.minisig", "gpg": f"{MANIFEST}.asc"}
+Files = Mapping[str, Callable[[], IO[bytes]]]  # name -> opens its content
+_DAMAGE = (OSError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+
+
+class Verification(NamedTuple):
+    """What a package holds against its manifest. `seal`: SHA-256 of the manifest, which names the whole package."""
+
+    files: int
+    seal: str
+    signature: str  # in words
+    changed: list[str]
+    missing: list[str]
+    added: list[str]
+
+    @property
+    def is_intact(self) -> bool:
+        """Whether nothing was changed, removed or added."""
+        return not (self.changed or self.missing or self.added)
+
+
+def open_content(content: bytes | Path) -> IO[bytes]:
+    """Bytes, or a plain file, for reading. Raises OSError, also for a link."""
+    if isinstance(content, bytes):
+        return io.BytesIO(content)
+    if content.is_symlink() or not content.is_file():
+        raise OSError(f"{content} is no plain file")
+    return content.open("rb")
+
+
+def is_inside(name: str) -> bool:
+    """Whether a name in a package or log stays below its folder."""
+    path = PurePosixPath(name)
+    return "\\" not in name and not path.is_absolute() and ".." not in path.parts and path.as_posix() == name != "."
+
+
+def write_package(contents: Mapping[str, bytes | Path], out: Path, key: str, progress: Progress) -> str:
+    """Write files with their manifest into a zip, or into a folder that is new or empty; return the seal.
+
+    `key`: signs the manifest; "" for none.
+
+    Raises:
+        InputError: a place that cannot be written, a name that could leave the folder, a key that does not sign.
+    """
+    files = {name: partial(open_content, content) for name, content in contents.items()}
+    hashes = {}
+    for number, name in enumerate(sorted(files)):
+        if not is_inside(name) or not name.isprintable():
+            raise InputError(out, "", f"files whose names stay in the folder, not {show_value(name)}")
+        hashes[name] = _compute_sha256(files[name])
+        progress("sealing", 0.5 * number / len(files))
+    manifest = _format_manifest(hashes)
+    files[MANIFEST] = partial(open_content, manifest)
+    if key:
+        tool = "minisign" if Path(key).is_file() else "gpg"
+        files[SIGNATURES[tool]] = partial(open_content, _sign(manifest, tool, key))
+    try:
+        if out.suffix == ".zip":
+            with write_whole(out) as part, part.open("wb") as handle:
+                _write_zip(files, handle.write)
+        else:
+            out.mkdir(parents=True, exist_ok=True)
+            for name, open_file in files.items():
+                (out / name).parent.mkdir(parents=True, exist_ok=True)
+                with open_file() as source, (out / name).open("xb") as target:
+                    shutil.copyfileobj(source, target)
+    except OSError as error:
+        raise InputError("--out", str(out), f"a place that can be written ({error.strerror or error})") from error
+    return hashlib.sha256(manifest).hexdigest()
+
+
+def verify_package(path: Path, key: str = "") -> Verification:
+    """Compare every byte of a package with its manifest; with `key`, demand a signature by it.
+
+    Raises:
+        InputError: no package, or a name in it that leads out of its folder.
+    """
+    with contextlib.ExitStack() as stack:
+        files: dict[str, Callable[[], IO[bytes]]] = {}
+        if path.is_dir():
+            files = {each.relative_to(path).as_posix(): partial(open_content, each) for each in path.rglob("*")
+                     if each.is_symlink() or not each.is_dir()}
+        else:
+            try:
+                archive = stack.enter_context(zipfile.ZipFile(path))
+                files = {name: partial(archive.open, name) for name in archive.namelist() if name[-1:] != "/"}
+            except (*_DAMAGE, ValueError) as error:
+                if path.is_file() and _read_start(path)[:2] == b"PK":
+                    return Verification(0, "", "not checked", [f"{path.name} (damaged: {error})"], [], [])
+                raise InputError(path, "", "a folder or zip that rig evidence made") from error
+        if MANIFEST not in files:
+            start = b"" if path.is_dir() else _read_start(path)
+            if INDEX in files or MANIFEST.encode() in start:  # the first file of a zip, whose directory is damaged
+                return Verification(0, "", "not checked", [], [MANIFEST], [])
+            raise InputError(path, MANIFEST, "a package of rig evidence, which has this file")
+        found = _compare_files(path, files, key)
+        if not path.is_dir() and found.is_intact and not _is_as_written(files, path):
+            found.changed.append(f"{path.name} (the zip itself; its files are as sealed)")
+        return found
+
+
+def _read_start(path: Path) -> bytes:
+    with path.open("rb") as handle:
+        return handle.read(1024)
+
+
+def _compare_files(path: Path, files: Files, key: str) -> Verification:
+    manifest = b""
+    with contextlib.suppress(*_DAMAGE), files[MANIFEST]() as handle:
+        manifest = handle.read()
+    hashes = {}
+    for number, line in enumerate(manifest.decode("utf-8", "replace").split("\n"), 1):
+        if (entry := re.fullmatch(r"([0-9a-f]{64})  (.+)", line)) is not None:
+            hashes[entry[2]] = entry[1]
+            if not is_inside(entry[2]):
+                raise InputError(f"{path}: {MANIFEST}:{number}", "", f"a file of the package, not {entry[2][:200]!r}")
+    for name in files:
+        if not is_inside(name):
+            raise InputError(path, "", f"names that stay in the package, not {show_value(name)}")
+    changed = [] if _format_manifest(hashes) == manifest else [MANIFEST]
+    changed += [name for name in sorted(hashes.keys() & files) if _compute_sha256(files[name]) != hashes[name]]
+    missing = sorted(hashes.keys() - files)
+    signature, tool = "none", next((tool for tool, name in SIGNATURES.items() if name in files), "")
+    if tool:
+        is_valid, signature = _check_signature(manifest, tool, files[SIGNATURES[tool]], key)
+        changed += [] if is_valid else [f"{SIGNATURES[tool]} ({signature})"]
+    elif key:
+        missing.append(f"a signature by {key}")
+    added = sorted(files.keys() - hashes.keys() - {MANIFEST, SIGNATURES.get(tool)})
+    return Verification(len(hashes), hashlib.sha256(manifest).hexdigest(), signature, changed, missing, added)
+
+
+def _format_manifest(hashes: Mapping[str, str]) -> bytes:
+    return "".join(f"{hashes[name]}  {name}\n" for name in sorted(hashes)).encode("utf-8", "replace")
+
+
+def _compute_sha256(open_file: Callable[[], IO[bytes]]) -> str:
+    """The sum of a file, "" for one that cannot be read."""
+    with contextlib.suppress(*_DAMAGE), open_file() as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()  # type: ignore[arg-type]
+    return ""
+
+
+class _Stream:
+    """A file that cannot seek, so that a zip is written from front to back."""
+
+    def __init__(self, write: Callable[[bytes], int]) -> None:
+        self.write = write
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+
+def _write_zip(files: Files, write: Callable[[bytes], int]) -> None:
+    """Write the zip of files piece by piece; the same files give the same bytes."""
+    with zipfile.ZipFile(_Stream(write), "w") as archive:  # type: ignore[call-overload]
+        for name in sorted(files):
+            info = zipfile.ZipInfo(name)  # of 1980
+            info.external_attr, info.create_system = 0o644 << 16, 3
+            with files[name]() as source, archive.open(info, "w", force_zip64=True) as target:
+                shutil.copyfileobj(source, target)
+
+
+def _is_as_written(files: Files, path: Path) -> bool:
+    """Whether a zip has the bytes that its files give, and no others."""
+    with path.open("rb") as handle:
+        differs: list[bool] = []
+
+        def compare(data: bytes) -> int:
+            if handle.read(len(data)) != bytes(data):
+                differs.append(True)
+            return len(data)
+
+        _write_zip(files, compare)
+        return not differs and not handle.read(1)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Signatures, by minisign or GPG
+# ---------------------------------------------------------------------------------------------------------------------
+
+def _sign(manifest: bytes, tool: str, key: str) -> bytes:
+    """The signature of a manifest. Raises InputError for a key, or a program, that is not there."""
+    with _store({MANIFEST: manifest}) as folder:
+        file, out = str(folder / MANIFEST), folder / SIGNATURES[tool]
+        said = _call(["minisign", "-S", "-s", key, "-m", file, "-x", str(out)] if tool == "minisign" else
+                     ["gpg", "--batch", "--yes", "--local-user", key, "--armor", "--output", str(out), "--detach-sign",
+                      file], capture=False)
+        if said is None or not out.is_file():
+            raise InputError("--sign", key, f"a key with which {tool} signs"
+                                            f"{', but it is not installed' if said is None else ''}")
+        return out.read_bytes()
+
+
+def _check_signature(manifest: bytes, tool: str, open_signature: Callable[[], IO[bytes]], key: str) -> tuple[bool, str]:
+    """Whether nothing speaks against a signature, and in words what is known of it."""
+    with open_signature() as handle, _store({MANIFEST: manifest, SIGNATURES[tool]: handle.read()}) as folder:
+        file, signature = str(folder / MANIFEST), str(folder / SIGNATURES[tool])
+        if tool == "minisign" and not key:
+            return True, "by minisign, not checked: --key names the public key"
+        said = _call(["minisign", "-V", "-p", key, "-m", file, "-x", signature] if tool == "minisign" else
+                     ["gpg", "--batch", "--status-fd", "1", "--verify", signature, file])
+    if said is None and not key:
+        return True, f"not checked: {tool} is not installed"
+    if said is None:
+        raise InputError("--key", key, f"{tool}, which is not installed")
+    if tool == "gpg" and not key and "NO_PUBKEY" in said.stdout:
+        return True, "not checked: GPG does not have the public key"
+    signers = re.findall(r"VALIDSIG (\w+).*?(\w+)$", said.stdout, re.MULTILINE)  # of the key, and of its primary key
+    wanted = key.replace(" ", "").upper()
+    is_own = tool == "minisign" or any(each.endswith(wanted) for pair in signers for each in pair)
+    is_valid = said.returncode == 0 and is_own
+    return is_valid, f"valid, by {key or signers[0][-1]}" if is_valid else f"not a valid signature by {key or 'a key'}"
+
+
+@contextlib.contextmanager
+def _store(contents: Mapping[str, bytes]) -> Iterator[Path]:
+    with tempfile.TemporaryDirectory() as name:
+        for file, content in contents.items():
+            (Path(name) / file).write_bytes(content)
+        yield Path(name)
+
+
+def _call(command: list[str], *, capture: bool = True) -> subprocess.CompletedProcess[str] | None:
+    """Run a program, which may ask for a passphrase if its output is not captured; None if it is not installed."""
+    try:
+        return subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE if capture else None, text=True,
+                              check=False)
+    except FileNotFoundError:
+        return None
