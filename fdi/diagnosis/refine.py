@@ -92,15 +92,6 @@ Sizes = tuple[float, ...]
 # (factor on the noise, rounds): small stops of the ram count only once the fit is near
 NOISE_SCHEDULE = ((30.0, 4), (6.0, 4), (1.0, 8))
 FINE_STEPS = 20  # solver steps a cycle of the last fit
-# powers of effects' parameters in the directions of `fdi.estimation.unidentifiable.FLAT`: pressures, spool
-# forces, torques, and all that goes with the jack's area
-EFFECT_POWERS: tuple[Mapping[str, float], ...] = (
-    {"supply_droop.slope": -1.0},
-    {"supply_droop.slope": 1.0, "flow_force.coefficient": 1.0},
-    {},
-    {"supply_droop.slope": -1.0, "compressibility.coefficient": 1.0, "aero_stiffness.stiffness": 1.0,
-     "mount_compliance.compliance": -1.0, "mount_compliance.mass": 1.0},
-)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -493,7 +484,7 @@ def find_flat(problem: CountedProblem, free: Sequence[Free], x: Floats) -> Float
     """Directions (p, k) at `x` (p,) that no signal shows, with what of the effects and of the faults goes along."""
     at = problem.list_values(free, x)
     others = [each for each in list_directions_of_faults(at) if next(iter(each)) in problem.fault_parameters]
-    return find_flat_directions(problem, free, x, (FLAPPER, *others), EFFECT_POWERS, PRIORS_KNOW_MORE_MISFIT)
+    return find_flat_directions(problem, free, x, (FLAPPER, *others), allowed=PRIORS_KNOW_MORE_MISFIT)
 
 
 def _blames_a_fault(problem: CountedProblem, free: Sequence[Free], x: Floats) -> bool:

@@ -38,7 +38,6 @@ from fdi.trace.trace import Flags, Floats
 TRIED = 0.01  # of the logarithms: a way along a direction that is said to be flat
 # A stop of the spool that moves by chance can hide a flat direction in one of these trials, hardly in all four.
 TRIED_SHARES = (1.0, -1.0, 0.3, -0.3)  # of TRIED
-LOAD = "constant_load.force"  # one that nobody measured goes with the area that it acts against
 # Some parameters move by their distance from another value than 0: what a filter lets through is 1 - Kintas, what a
 # sensor shows of a position 1 + error.
 ORIGINS: Mapping[str, float] = {"filter.clogging": 1.0, "magnet_loss.share": 1.0, "coil_short.share": 1.0,
@@ -242,18 +241,16 @@ def relax_fit(problem: Problem, found: Fit, directions: Sequence[Direction]) -> 
 
 def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
                          others: Sequence[Mapping[str, float]] = (),
-                         scaled: Sequence[Mapping[str, float]] = ({}, {}, {}, {}),
                          allowed: float = FLAT_DIRECTION_MISFIT) -> Floats:
     """Directions of `FLAT` and `others` that hold at `x` (p,) of scaled logarithms, as columns (p, k).
 
     A direction holds if one of the trial replays along it, of four lengths, changes no more than its share of
-    `FLAT_DIRECTION_MISFIT`, or of `allowed` for one of the `others`. `scaled` are parameters that are not logarithms,
-    with their powers in each of `FLAT`.
+    `FLAT_DIRECTION_MISFIT`, or of `allowed` for one of the `others`. Parameters of effects are no logarithms:
+    they move by their power of their value.
     """
     at = {f.name: f.value(float(v)) for f, v in zip(free, x, strict=True)}
-    said = [{**flat, LOAD: at.get(LOAD, 0.0)} if "jack.area" in flat else flat for flat in list_powers(problem)]
-    said = [{**flat, **{name: power * at[name] for name, power in more.items() if name in at}}
-            for flat, more in zip(said, scaled, strict=True)]
+    said = [{**flat, **{name: power * at[name] for name, power in effects.items() if name in at}}
+            for flat, effects in zip(list_powers(problem), FLAT_WITH_EFFECTS, strict=True)]
     every = [flat for flat in (*said, *others) if next(iter(flat)) in {f.name for f in free}]
     ways = np.array([[_get_power(flat, f) / f.scale for f in free] for flat in every]).reshape(-1, len(free))
     if not len(ways):

@@ -24,7 +24,6 @@ from fdi.diagnosis.faults import (
     judge_size,
 )
 from fdi.diagnosis.refine import (
-    EFFECT_POWERS,
     Beside,
     Explanation,
     Refinement,
@@ -200,14 +199,25 @@ def test_the_answer_lists_effects_with_sizes_and_probability(worn: Diagnosis) ->
     assert "--with-effects" in plain.sentence and "with_effects" not in plain.data
 
 
-def test_what_is_not_a_logarithm_goes_along_with_a_flat_direction() -> None:
-    """A ram on a spring: its area and all forces may be scaled only if the stiffness of the spring goes along."""
-    problem = make_joint_problem(MODEL, hold_inputs(record_plant({"aero_stiffness.stiffness": 1e6}, COMMAND)),
+@pytest.mark.parametrize(("name", "size", "powers"), [
+    ("aero_stiffness.stiffness", 1e6, {"jack.area": 1.0}),  # all forces on the ram go along
+    ("structural_resonance.mass", 60.0, {"jack.area": 1.0}),
+    # with less pressure its force on the spool must stay; with larger forces on the spool it grows by itself
+    ("flow_force.coefficient", 1e-3, {"filter.clogging": 1.0, "spool.static_friction": 0.0}),
+])
+def test_what_is_not_a_logarithm_goes_along_with_a_flat_direction(name: str, size: float,
+                                                                  powers: dict[str, float]) -> None:
+    """Each direction in which an effect has its power is found, as replays along it confirm."""
+    problem = make_joint_problem(MODEL, hold_inputs(record_plant({name: size}, COMMAND)),
                                  {"xj": 2e-6, "p12": 2e4, "xs": 1e-6})
-    free = (*list_unknowns(MODEL), *list_effect_unknowns(CATALOGUE["aero_stiffness"], problem.model))
-    x = np.r_[make_start(list_unknowns(MODEL), FAULTS, (0.2, 20.0)), 1e6 / free[-1].scale]
-    along = find_flat_directions(problem, free, x, (), EFFECT_POWERS)
-    assert along.shape[1] > find_flat_directions(problem, free, x).shape[1] and np.abs(along[-1]).max() > 0.0
+    usual = list_unknowns(MODEL)
+    own = [each for each in list_effect_unknowns(CATALOGUE[name.partition(".")[0]], problem.model) if each.name == name]
+    free = (*usual, *own)
+    flat = find_flat_directions(problem, free, np.r_[make_start(usual, FAULTS, (0.2, 20.0)), size / own[0].scale])
+    for leading, power in powers.items():
+        along, = (way for way in flat.T if way[[each.name for each in free].index(leading)])
+        assert along[-1] * own[0].scale == pytest.approx(power * size)
+
 
 
 def test_how_far_the_flapper_moves_shows_only_where_it_meets_its_stops() -> None:
