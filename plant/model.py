@@ -181,12 +181,38 @@ def load_model(source: str | Path = "eha") -> Model:
         plants.load_plant(Path(source))
     if str(source) in plants.list_plants() or Path(source).suffix == ".py":
         return build_bare_model(str(source)).with_effects(plants.find_plant(str(source)).has)
+    path = _find_model_file(source)
+    return parse_model(read_model_tables(path), path, path.stem)
+
+
+def _find_model_file(source: str | Path) -> Path:
     path = find_shipped_model(str(source)) or Path(source)
     if not path.is_file():
         names = ", ".join((*plants.list_plants(), *SHIPPED_MODELS))
         missing = "; it does not exist" if path.suffix in READERS else ""
         raise InputError(source, "", f"a model file, or one of {names}{missing}")
-    return parse_model(read_model_tables(path), path, path.stem)
+    return path
+
+
+def find_plant_of_model(source: str | Path) -> str:
+    """What models call the plant of a model as `load_model` takes it; its effects need not be known.
+
+    Raises:
+        InputError: no such file, or a plant that is not known or loaded.
+    """
+    if str(source) in plants.list_plants() or Path(source).suffix == ".py":
+        return str(source)
+    path = _find_model_file(source)
+    return _find_plant(read_model_tables(path).get("plant", "eha"), path)
+
+
+def _find_plant(named: Any, where: object) -> str:
+    plant = read_named_plant(named, where)
+    loaded = plants.find_loaded_plant(plant, where) if isinstance(plant, str) and plant.endswith(".py") else None
+    if loaded is None and not (isinstance(plant, str) and plants.is_known(plant)):
+        more = "an FMU, or a plant file (.py), which runs with --trust"
+        raise InputError(where, "plant", f"one of {', '.join(plants.list_plants())}, or {more}, not {plant!r}")
+    return str(plant) if loaded is None else loaded.key
 
 
 def find_shipped_model(name: str) -> Path | None:
@@ -209,18 +235,14 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     """
     tables = dict(tables)
     name, effects = tables.pop("name", name), tables.pop("effects", [])
-    plant = read_named_plant(tables.pop("plant", "eha"), where)
+    named = tables.pop("plant", "eha")
     tables.pop("provenance", None)
     tables.pop("identify", None)
     design = tables.pop("design", {})
     if not isinstance(name, str) or not name:
         raise InputError(where, "name", f"a text, not {name!r}")
     tables.pop("plant_sha256", None)
-    loaded = plants.find_loaded_plant(plant, where) if isinstance(plant, str) and plant.endswith(".py") else None
-    if loaded is None and not (isinstance(plant, str) and plants.is_known(plant)):
-        more = "an FMU, or a plant file (.py), which runs with --trust"
-        raise InputError(where, "plant", f"one of {', '.join(plants.list_plants())}, or {more}, not {plant!r}")
-    plant = plant if loaded is None else loaded.key
+    plant = _find_plant(named, where)
     known = [e.name for e in list_offered_effects(plant)]  # a list, as what stands in a file need not be hashable
     unknown = [e for e in effects if e not in known] if isinstance(effects, list) else [effects]
     if unknown:

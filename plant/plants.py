@@ -347,6 +347,16 @@ def find_loaded_plant(name: str, where: object) -> Plant | None:
     return next((_LOADED[key] for key in (str(Path(str(where)).parent / name), name) if key in _LOADED), None)
 
 
+def find_key(name: str) -> str:
+    """What this process calls a user's plant of another one, which may have loaded its file from another folder."""
+    return next((key for key in _LOADED if Path(key).name == Path(name).name), name)
+
+
+def is_loaded(path: Path, source: bytes) -> bool:
+    """Whether this content of a plant file has run already."""
+    return any(plant.file == path.absolute() and plant.source == source for plant in _LOADED.values())
+
+
 def is_known(name: str) -> bool:
     """Whether `find_plant` finds it."""
     return name in _LOADED or name in MODULES

@@ -22,7 +22,7 @@ from plant.kernels import write_reader
 from plant.machine_code import Call, StoredCode
 from plant.model import Model, build_kernel, collect_bindings
 from plant.plants import Plant, find_plant
-from plant.signals import EHA
+from plant.signals import EHA, Signals
 from plant.solve import advance_flat_state, read_flat_sensors, run_closed_loop, step_cycle
 from plant.threads import run_beside
 
@@ -43,9 +43,9 @@ class Columns(NamedTuple):
 
 
 @cache
-def make_columns_type(kind: Plant) -> type[Any]:
-    """The type of a simulated run of a plant: a field for each of its signals; (n,) each."""
-    names = tuple(s.name for s in kind.signals)
+def make_columns_type(signals: Signals) -> type[Any]:
+    """The type of a simulated run of a plant with these signals: a field for each; (n,) each."""
+    names = tuple(s.name for s in signals)
     return Columns if names == Columns._fields else namedtuple("Columns", names)
 
 
@@ -118,7 +118,7 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
     found = {s.name: out[:, i].copy() for i, s in enumerate(signals.columns)}
     given = {"time": t, "command": com, "load": force}
     columns = (found[s.name] if s.name in found else given[s.role] for s in signals)
-    return cast(Columns, make_columns_type(model.kind)(*columns))
+    return cast(Columns, make_columns_type(signals)(*columns))
 
 
 @contextmanager
@@ -197,6 +197,19 @@ class Demand:
         return float(taken)
 
 
+def find_direct_readings(model: Model) -> list[tuple[int, int]]:
+    """Where each reading is in the flat state, and its noise among the parameters.
+
+    Empty where a reading is more than a field of the state with noise: something computed, or with an effect on it.
+    """
+    shown, outputs = model.kind.find_shown_fields(), model.kind.signals.outputs
+    if shown is None or not all(s.noise for s in outputs) or any(
+            model.find_effect(e).port == "reading" for e in model.effects):
+        return []
+    index = {name: i for i, name in enumerate(model.list_names())}
+    return list(zip(shown, (index[s.noise] for s in outputs), strict=True))
+
+
 class LentPlant(NamedTuple):
     """State and parameters of a plant, where its readings and their noise are in these, address of its machine code."""
 
@@ -227,13 +240,9 @@ class Actuator:
         fast = fast and foreign is None
         self._code = load_stored_advance(model.effects, model.plant) if fast else None
         self._advance = self._bind_advance()
-        # readings that are fields of the state, and that nothing changes, are faster without a call of compiled code
-        shown = model.kind.find_shown_fields()
-        changed = any(model.find_effect(e).port == "reading" for e in model.effects)
-        is_direct = shown is not None and not changed and all(s.noise for s in outputs)
-        self._places = list(zip(shown or (), (self._index[s.noise] for s in outputs), strict=True)) if is_direct else []
-        self._read_fields: Any = write_reader(self._places) if is_direct else None
-        self._read = None if is_direct else build_kernel(read_flat_sensors, model.effects, fast, model.plant)
+        self._places = find_direct_readings(model)  # faster without a call of compiled code
+        self._read_fields: Any = write_reader(self._places) if self._places else None
+        self._read = None if self._places else build_kernel(read_flat_sensors, model.effects, fast, model.plant)
         self._period = model["controller.period"]
 
     @property

@@ -45,6 +45,16 @@ class Signal(NamedTuple):
         """What it is of, in a word."""
         return self.noun or self.symbol
 
+    @property
+    def word(self) -> str:
+        """Its word in bench files and in the frames of a bench."""
+        return self.alias or self.name
+
+    @property
+    def phrase(self) -> str:
+        """What sentences call it."""
+        return self.noun or self.name.replace("_", " ")
+
     def __repr__(self) -> str:
         return f"<Signal {self.name}: {self.quantity}, {self.unit}>"
 

@@ -25,11 +25,17 @@ UNITS: Mapping[str, Unit] = {name: Unit(name, si, Fraction(factor)) for si, fact
     "A": {"A": "1", "mA": "1/1000", "uA": "1/1000000", "nA": "1/1000000000"},
     "N": {"N": "1", "kN": "1000", "MN": "1000000", "daN": "10", "lbf": "4.4482216152605"},
     "s": {"s": "1", "ms": "1/1000", "us": "1/1000000", "ns": "1/1000000000", "min": "60", "h": "3600"},
+    "V": {"V": "1", "mV": "1/1000", "kV": "1000"},
+    "N m": {"N m": "1", "mN m": "1/1000", "kN m": "1000"},
+    "rad": {"rad": "1", "mrad": "1/1000", "urad": "1/1000000", "deg": "0.017453292519943295"},
+    "rad/s": {"rad/s": "1", "mrad/s": "1/1000", "deg/s": "0.017453292519943295", "rpm": "0.10471975511965977"},
+    "m/s": {"m/s": "1", "mm/s": "1/1000", "um/s": "1/1000000"},
 }.items() for name, factor in factors.items()}
 SPELLINGS = {"µm": "um", "μm": "um", "µs": "us", "μs": "us", "µA": "uA", "μA": "uA", "in": "inch", "sec": "s",
              "seconds": "s", "second": "s", "msec": "ms", "usec": "us", "pa": "Pa", "kpa": "kPa", "mpa": "MPa",
              "Bar": "bar", "BAR": "bar", "MM": "mm", "a": "A", "ma": "mA", "n": "N", "kn": "kN", "S": "s", "MS": "ms",
-             "PSI": "psi", "Volt": "V", "v": "V", "micron": "um", "metre": "m", "meter": "m"}
+             "PSI": "psi", "Volt": "V", "v": "V", "Nm": "N m", "mNm": "mN m", "micron": "um", "metre": "m",
+             "meter": "m"}
 _QUANTITY = re.compile(r"\s*([+-]?(?:\d{1,30}\.?\d{0,30}|\.\d{1,30})(?:[eE][+-]?\d{1,2})?)\s*(.*?)\s*")
 
 
@@ -45,7 +51,9 @@ def require_unit(name: str, si: str, where: object, field: str) -> Unit:
         InputError: an unknown unit, or one of another quantity.
     """
     unit = find_unit(name)
-    fitting = [known for known, u in UNITS.items() if u.si == si]
+    if name == si:  # also one that only the plant knows
+        return Unit(si, si, Fraction(1))
+    fitting = [known for known, u in UNITS.items() if u.si == si] or [si]
     if unit is None or unit.si != si:
         raise InputError(where, field, f"one of {', '.join(fitting)}, not {name!r}{suggest_name(name, fitting)}")
     return unit

@@ -2,24 +2,52 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntFlag
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from plant.signals import EHA
+from plant.errors import InputError
+from plant.signals import EHA, Signals
 from rig.benches.calibration import Decision, SensorCalibration
 from rig.benches.frame_map import Field, FrameMap, Role
 
 Profile = Literal["cia402", "cia408", "none"]
 SERVICES = {0x080: "EMCY", 0x580: "SDO", 0x600: "SDO", 0x700: "heartbeat"}  # of a node: CiA 301, table of 7.3.5
 
-# Signals that the rig and its plant give (inputs of the controller) and take (outputs), by the names of bench files,
-# with their units. "" is a number without a unit.
-INPUTS = {"position_demand": "m", "ram_position": "m", "load_pressure": "Pa", "spool_position": "m", "load_force": "N",
-          "control_word": "", "mode": "", "cycle": "", "flags": ""}
-OUTPUTS = {"current": "A", "status_word": "", "mode_display": "", "cycle": ""}
-MEASURED = tuple(s.alias for s in EHA if s.role in ("output", "load"))  # by the plant's transducers
+RIG_INPUTS = ("control_word", "mode", "cycle", "flags")  # of a controller: what the rig gives beside the plant
+RIG_OUTPUTS = ("status_word", "mode_display", "cycle")
+
+
+def list_inputs(signals: Signals) -> dict[str, str]:
+    """What a controller may receive on a bench with a plant that has these signals: word and unit.
+
+    "" is a number without a unit.
+    """
+    given = (signals.command, *signals.outputs, *([signals.load] if signals.load else []))
+    return {s.word: _show_unit(s.unit) for s in given} | dict.fromkeys(RIG_INPUTS, "")
+
+
+def list_outputs(signals: Signals) -> dict[str, str]:
+    """What a controller may send: word and unit."""
+    return {signals.drive.word: _show_unit(signals.drive.unit)} | dict.fromkeys(RIG_OUTPUTS, "")
+
+
+def list_measured(signals: Signals) -> tuple[str, ...]:
+    """The words of what transducers of the plant read, the load among them."""
+    return tuple(s.word for s in signals if s.role in ("output", "load"))
+
+
+def find_word(signals: Signals, said: str) -> str:
+    """The word of a signal that is called by it, by its name, or as on every bench: position_demand, load."""
+    load = {} if signals.load is None else {"load": signals.load.word}
+    words = {s.word: s.word for s in signals[1:]}
+    return {"position_demand": signals.command.word, **load, **{s.name: s.word for s in signals[1:]}, **words}.get(
+        said, said)
+
+
+def _show_unit(unit: str) -> str:
+    return "" if unit == "1" else unit
 
 
 class Flags(IntFlag):
@@ -63,7 +91,10 @@ class Bench:
     name: str
     frames: FrameMap
     nodes: Mapping[Role, CanopenNode]  # empty on plain CAN; without PLANT the rig itself moves the plant
-    plant: str = "eha"
+    plant: str = "eha"  # model that runs unless another is chosen
+    kind: str = "eha"  # what models call its plant
+    signals: Signals = EHA  # of the plant that runs; their words are names of fields in the frames
+    noise: float = 2e-6  # SI, nominal, of the sensor of the controlled signal; 0: not known
     cycle_ns: int = 1_000_000
     bitrate: int = 1_000_000  # bit/s
     data_bitrate: int | None = None  # bit/s, of the data of CAN FD frames with BRS; None: not known
@@ -73,6 +104,33 @@ class Bench:
     files: Mapping[str, bytes] = field(default_factory=dict)  # bench file, EDS, DBC: name -> content, for the log
     decision: Decision = "simple"  # rule by which a value with an uncertainty passes a limit
     calibration: Mapping[str, SensorCalibration] = field(default_factory=dict)  # by signal of the plant
+
+    @property
+    def fineness(self) -> float:
+        """What differences of the controlled signal are measured by: noise of its sensor, or a part of a demand count.
+        """
+        word = self.signals.command.word
+        counts = [float(abs(each.count)) for spec in self.frames.frames for each in spec.fields if each.name == word]
+        return max(self.noise or 2e-6, 0.2 * max(counts, default=0.0))
+
+    def replace_signals(self, signals: Signals, noise: float, model: str) -> Bench:
+        """The bench with the plant of another model: its signals, and the noise of the controlled one's sensor.
+
+        Raises:
+            InputError: it lacks a signal that the bench uses, or has it in another unit.
+        """
+        if signals == self.signals:
+            return replace(self, noise=noise)
+        used = {each.name for spec in self.frames.frames for each in spec.fields}
+        own = {s.word: s for s in signals[1:]}
+        for s in self.signals[1:]:
+            if s.word in used or s.role in ("command", "drive"):
+                found = own.get(s.word)
+                if found is None or (found.unit, found.role) != (s.unit, s.role):
+                    has = ", ".join(f"{each.word} ({each.unit})" for each in own.values())
+                    raise InputError(self.name, s.word, f"a plant that has this signal, as {s.role} in {s.unit}; "
+                                                        f"{model} has {has}")
+        return replace(self, signals=signals, noise=noise)
 
     @property
     def rate(self) -> float:

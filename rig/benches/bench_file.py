@@ -10,21 +10,23 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from dbc import EDS
-from fdi.foreign_code import ForeignCode, require_trust
+from fdi.foreign_code import ForeignCode, load_plant_of_model, require_trust
 from plant.errors import InputError
-from plant.parameters import GROUPS, find_field
-from plant.signals import EHA
+from plant.model import find_plant_of_model, find_quantity
+from plant.plants import find_plant, is_known, is_loaded, load_plant
+from plant.signals import Signals
 from plant.units import parse_quantity
 from rig.benches import canopen_map
 from rig.benches.bench import (
-    INPUTS,
-    MEASURED,
-    OUTPUTS,
     Bench,
     CanopenNode,
     Profile,
     SignalObject,
     decode_device_text,
+    find_word,
+    list_inputs,
+    list_measured,
+    list_outputs,
 )
 from rig.benches.calibration import read_calibration
 from rig.benches.can_map import map_messages, read_database
@@ -111,7 +113,7 @@ def load_bench(name_or_path: str = "eha", *, is_trusted: bool = False) -> Bench:
 
     Args:
         name_or_path: e.g. "eha" or "drive_x.toml"; the files that it names lie beside it.
-        is_trusted: whether a Python file that it names for a checksum may run.
+        is_trusted: whether a Python file that it names, a plant or a checksum, may run.
 
     Raises:
         InputError: no such bench, or the file, line and key that cannot be used and what was expected there.
@@ -139,8 +141,9 @@ def _load_shipped(name: str) -> Bench:
                         is_trusted=True)
 
 
-def load_bench_from_files(content: Mapping[str, bytes], *, is_trusted: bool = False) -> Bench:
-    """The bench of a log, from `Bench.files`: the TOML file, and those that it names.
+def load_bench_from_files(content: Mapping[str, bytes], signals: Signals | None = None, *,
+                          is_trusted: bool = False) -> Bench:
+    """The bench of a log, from `Bench.files`: the TOML file, and those that it names; `signals`: of the plant that ran.
 
     Raises:
         InputError: as of `load_bench`; or a file is missing.
@@ -152,7 +155,7 @@ def load_bench_from_files(content: Mapping[str, bytes], *, is_trusted: bool = Fa
             raise InputError(bench_file or "log", "", "a file of the log")
         return content[name]
 
-    return _parse_bench(bench_file, read(bench_file), read, Path(), is_trusted=is_trusted)
+    return _parse_bench(bench_file, read(bench_file), read, Path(), signals, is_trusted=is_trusted)
 
 
 class _Reader:
@@ -161,6 +164,7 @@ class _Reader:
     def __init__(self, name: str, source: bytes, read: ReadFile, *, is_trusted: bool) -> None:
         table, self.place = parse_table(decode_text(source, name), name)
         self.keys: BenchKeys = build_dataclass(BenchKeys, table, self.place)
+        self.plant = self.kind = self.keys.plant  # the model, and what models call its plant
         self.files = {Path(name).name: source}
         self._read, self._is_trusted = read, is_trusted
 
@@ -194,18 +198,26 @@ class _Reader:
         return load_checksum(file, source, function)
 
 
-def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, *, is_trusted: bool) -> Bench:
-    """The bench of a file; `read` gives the content of the files that it names, `folder` is where they lie."""
+def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, signals: Signals | None = None, *,
+                 is_trusted: bool) -> Bench:
+    """The bench of a file; `read` gives the content of the files that it names, `folder` is where they lie.
+
+    `signals`: of its plant; None: the plant is found and loaded.
+    """
     reader = _Reader(name, source, read, is_trusted=is_trusted)
     keys, place = reader.keys, reader.place.at("controller")
+    if signals is None:
+        reader.plant, reader.kind = _find_plant(reader, folder, is_trusted=is_trusted)
+        signals = find_plant(reader.kind).signals
     cycle_ns = _read_time(keys.cycle, reader.place.at("cycle"), *_CYCLES)
     timeout_ns = None
     if keys.controller.timeout is not None:
         timeout_ns = _read_time(keys.controller.timeout, place.at("timeout"), Fraction(cycle_ns, 10**9), Fraction(10))
     is_canopen = keys.controller.protocol == "canopen"
-    uses = _list_uses(keys.controller, place, INPUTS, OUTPUTS, is_canopen=is_canopen)
+    uses = _list_uses(keys.controller, place, signals, is_canopen=is_canopen)
     uses = _add_states(reader, uses, keys.controller, place, is_canopen=is_canopen)
-    _check_signals(uses, ("position_demand", "ram_position"), ("current",), place)
+    command, controlled, drive = signals.command.word, signals.controlled.word, signals.drive.word
+    _check_signals(uses, (command, controlled), (drive,), place)
     for use in uses.values():
         if use.signal in ("control_word", "mode") and keys.controller.profile == "none":
             raise use.place.refuse("a profile that gives it a meaning, or values in [controller.phases]")
@@ -218,17 +230,19 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, *, is_t
         text = reader.read_text(keys.controller.dbc, place.at("dbc"), "DBC")
         dbc = keys.controller.dbc or ""
         frames = map_messages(dbc, read_database(dbc, text), uses, cycle_ns)
-    specs = [_build_spec(frame, uses, Role.RIG if frame.is_received else Role.CONTROLLER) for frame in frames]
+    specs = [_build_spec(frame, uses, Role.RIG if frame.is_received else Role.CONTROLLER, signals) for frame in frames]
     if keys.plant_node is not None:
-        specs, nodes[Role.PLANT] = _join_plant_node(reader, specs, sync, nodes, folder)
+        specs, nodes[Role.PLANT] = _join_plant_node(reader, specs, sync, nodes, folder, signals)
     if len(specs) > MOST_FRAMES:
         raise reader.place.refuse(f"at most {MOST_FRAMES} frames or pages of multiplexed ones")
     phases, ready = _list_states(frames, uses)
-    decision, calibration = read_calibration(_group_keys(keys.calibration, 0), reader.place.at("calibration"), EHA)
-    bench = Bench(name=keys.name, frames=FrameMap(frames=tuple(specs), sync=sync), nodes=nodes, plant=keys.plant,
-                  cycle_ns=cycle_ns, bitrate=keys.bitrate, data_bitrate=keys.data_bitrate, timeout_ns=timeout_ns,
-                  phases=phases, ready=ready, files=reader.files, decision=decision,
-                  calibration=calibration)
+    decision, calibration = read_calibration(_group_keys(keys.calibration, 0), reader.place.at("calibration"), signals)
+    nominal = find_plant(reader.kind).nominal if is_known(reader.kind) else {}
+    noise = nominal.get(signals.controlled.noise, 0.0)
+    bench = Bench(name=keys.name, frames=FrameMap(frames=tuple(specs), sync=sync), nodes=nodes, plant=reader.plant,
+                  kind=reader.kind, signals=signals, noise=noise, cycle_ns=cycle_ns, bitrate=keys.bitrate,
+                  data_bitrate=keys.data_bitrate, timeout_ns=timeout_ns, phases=phases, ready=ready, files=reader.files,
+                  decision=decision, calibration=calibration)
     _check_identifiers(bench, reader.place)
     return bench
 
@@ -255,15 +269,36 @@ def _refuse_canopen_keys(keys: BenchKeys, place: Place) -> None:
 # What each value of the device is for
 # ---------------------------------------------------------------------------------------------------------------------
 
-def _list_uses(keys: NodeKeys, place: Place, inputs: Mapping[str, str], outputs: Mapping[str, str], *,
-               is_canopen: bool) -> dict[str, Use]:
-    """The signals of [inputs] and [outputs] by the object or MESSAGE.SIGNAL that carries them."""
+def _find_plant(reader: _Reader, folder: Path, *, is_trusted: bool) -> tuple[str, str]:
+    """The model of a bench file, and what models call its plant; a Python file runs, if the user trusts it."""
+    named, place = reader.keys.plant, reader.place.at("plant")
+    path = folder / named if Path(named).suffix and (folder / named).is_file() else Path(named)
+    if path.suffix == ".py":
+        content = reader.read_file(named, place)
+        if not is_loaded(path, content):  # a user who names it himself trusts it
+            require_trust(place.file, [ForeignCode(named, content)], is_trusted=is_trusted)
+        load_plant(path, content)
+    else:
+        load_plant_of_model(path, is_trusted=is_trusted)
+    with place.locate():
+        return str(path), find_plant_of_model(str(path))
+
+
+def _list_uses(keys: NodeKeys, place: Place, signals: Signals, *, is_canopen: bool, is_plant: bool = False,
+               ) -> dict[str, Use]:
+    """The signals of [inputs] and [outputs] by the object or MESSAGE.SIGNAL that carries them.
+
+    `is_plant`: they are those of the plant node, which receives what a controller sends.
+    """
     uses: dict[str, Use] = {}
-    for table, known, is_received in (("inputs", inputs, True), ("outputs", outputs, False)):
-        for signal, entry in _group_keys(getattr(keys, table), 0).items():
-            own = place.at(table, signal)
+    inputs, outputs = list_inputs(signals), list_outputs(signals)
+    needed = {signals.drive.word, *list_measured(signals)}
+    for table, known, is_received in (("inputs", outputs if is_plant else inputs, True),
+                                      ("outputs", inputs if is_plant else outputs, False)):
+        for named, entry in _group_keys(getattr(keys, table), 0).items():
+            own, signal = place.at(table, named), find_word(signals, named)
             if signal not in known:
-                raise own.refuse(f"a signal of the bench: {list_choices(signal, known)}")
+                raise own.refuse(f"a signal of the bench and its plant: {list_choices(named, known)}")
             word = "object" if is_canopen else "signal"
             said = build_dataclass(SignalKeys, {word if key == "" else key: text for key, text in entry.items()}, own)
             name = said.object if is_canopen else said.signal
@@ -277,8 +312,9 @@ def _list_uses(keys: NodeKeys, place: Place, inputs: Mapping[str, str], outputs:
                         numbers[key] = parse_quantity(text, known[signal], "", "")
             if numbers.get("count") == 0:
                 raise own.at("count").refuse("a number other than 0")
-            _add_use(uses, name, Use(place=own, is_received=is_received, signal=signal, unit=known[signal],
-                                     count=numbers.get("count"), offset=numbers.get("offset")), is_canopen=is_canopen)
+            use = Use(place=own, is_received=is_received, signal=signal, unit=known[signal], count=numbers.get("count"),
+                      offset=numbers.get("offset"), is_needed=signal in needed)
+            _add_use(uses, name, use, is_canopen=is_canopen)
     return uses
 
 
@@ -394,7 +430,7 @@ def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use
         if keys.profile == "cia402" and mode is None:
             mode = CYCLE_POSITION
         node = replace(node, profile=keys.profile, mode=mode, settings=tuple(_list_settings(
-            reader.keys.plant, dictionary, keys.parameters, place.at("parameters"))),
+            reader.kind, dictionary, keys.parameters, place.at("parameters"))),
             values=(*node.values, *_list_values(dictionary, keys.values, place.at("values"))))
     frames = canopen_map.map_pdos(eds, dictionary, keys.node, uses)
     node = replace(node, inputs=_list_objects(frames, uses, is_received=True),
@@ -450,30 +486,30 @@ def _list_settings(plant: str, dictionary: Any, parameters: Mapping[str, str],
     for name, parameter in parameters.items():
         own = place.at(name)
         found = _find_writable(dictionary, name, own)
-        if plant == "eha":
+        if is_known(plant):
             with own.locate():
-                find_field("", parameter, GROUPS)
+                find_quantity(parameter, "", plant)
         yield found.index, found.subindex, parameter
 
 
-def _build_spec(frame: DeviceFrame, uses: Mapping[str, Use], sender: Role) -> FrameSpec:
+def _build_spec(frame: DeviceFrame, uses: Mapping[str, Use], sender: Role, signals: Signals) -> FrameSpec:
     """A frame of the controller as one of the bench."""
     spec = FrameSpec(name=frame.name, identifier=frame.identifier, length=frame.length, sender=sender,
                      fields=build_fields(frame, uses), every=frame.every, is_before_sync=frame.is_before_sync,
                      is_answer=frame.is_answer, is_switched=frame.is_switched)
-    roles = {"drive": sender is Role.CONTROLLER and spec.has(*OUTPUTS),
-             "command": sender is Role.RIG and spec.has("position_demand", "control_word"),
-             "feedback": sender is Role.RIG and spec.has(*MEASURED)}
+    roles = {"drive": sender is Role.CONTROLLER and spec.has(signals.drive.word),
+             "command": sender is Role.RIG and spec.has(signals.command.word, "control_word"),
+             "feedback": sender is Role.RIG and spec.has(*list_measured(signals))}
     return replace(spec, roles=tuple(role for role, is_own in roles.items() if is_own))
 
 
 def _join_plant_node(reader: _Reader, specs: list[FrameSpec], sync: int | None, nodes: Mapping[Role, CanopenNode],
-                     folder: Path) -> tuple[list[FrameSpec], CanopenNode]:
+                     folder: Path, signals: Signals) -> tuple[list[FrameSpec], CanopenNode]:
     """The frames with those of [plant_node], and the node; a frame that both know is one."""
     keys, place = reader.keys.plant_node, reader.place.at("plant_node")
     assert keys is not None
-    uses = _list_uses(keys, place, OUTPUTS, INPUTS, is_canopen=True)
-    _check_signals(uses, ("current",), ("ram_position",), place)
+    uses = _list_uses(keys, place, signals, is_canopen=True, is_plant=True)
+    _check_signals(uses, (signals.drive.word,), (signals.controlled.word,), place)
     uses, frames, own_sync, node = _map_node(reader, keys, place, uses, folder)
     if node.node == nodes[Role.CONTROLLER].node:
         raise place.at("node").refuse(f"a node-ID other than {node.node}, which the controller has")
@@ -481,7 +517,7 @@ def _join_plant_node(reader: _Reader, specs: list[FrameSpec], sync: int | None, 
         raise place.at("eds").refuse("the controller's identifier of SYNC in 0x1005")
     joined = {spec.identifier: spec for spec in specs}
     for frame in frames:
-        own = replace(_build_spec(frame, uses, Role.PLANT), name=f"plant {frame.name}", roles=("valve_state",))
+        own = replace(_build_spec(frame, uses, Role.PLANT, signals), name=f"plant {frame.name}", roles=("valve_state",))
         other = joined.get(frame.identifier)
         if other is None and frame.is_received:
             raise place.at("inputs").refuse(f"a frame of the controller; it has none with the COB-ID of {frame.name}, "

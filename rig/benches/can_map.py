@@ -101,12 +101,12 @@ def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns:
     for page in pages:
         on_page = [replace(slots[signal.name], start=page[signal.name], is_selector=True) if signal.name in page else
                    slots[signal.name] for signal in message.signals if _is_on_page(signals, signal.name, page)]
-        carries_current = any(slot.name in uses and uses[slot.name].signal == "current" for slot in on_page)
+        is_needed = any(slot.name in uses and uses[slot.name].is_needed for slot in on_page)
         yield DeviceFrame(
             name=f"{message.name}[{'.'.join(map(str, page.values()))}]" if page else message.name,
             identifier=identifier, length=message.length, is_received=True in ways, slots=tuple(on_page),
             every=_find_period(name, message, cycle_ns),
-            is_answer=True in ways or carries_current or (len(pages) == 1 and bool(message.cycle_time)))
+            is_answer=True in ways or is_needed or (len(pages) == 1 and bool(message.cycle_time)))
 
 
 Page = Mapping[str, int]  # values of selectors

@@ -12,7 +12,6 @@ from canopen.objectdictionary import ODVariable, datatypes
 from canopen.objectdictionary.eds import import_eds
 
 from plant.errors import InputError
-from rig.benches.bench import MEASURED
 from rig.benches.frame_map import EXTENDED, Field, Kind
 from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 
@@ -21,7 +20,6 @@ LONG = 1 << 29  # in a COB-ID: the identifier has 29 bits
 RPDO, TPDO, MAPPING = 0x1400, 0x1800, 0x200
 _LONGEST = 64  # bits of a PDO
 _EVENT = (254, 255)  # transmission types
-AWAITED = ("current", *MEASURED)  # signals without which a cycle cannot go on
 _KINDS = {datatypes.BOOLEAN: Kind.UNSIGNED, datatypes.REAL32: Kind.FLOAT, datatypes.REAL64: Kind.FLOAT,
           **dict.fromkeys(datatypes.SIGNED_TYPES, Kind.SIGNED),
           **dict.fromkeys(datatypes.UNSIGNED_TYPES, Kind.UNSIGNED)}
@@ -165,7 +163,7 @@ def map_pdos(name: str, dictionary: Any, node: int, uses: Mapping[str, Use]) -> 
         if not any(key in keys and use.is_received in (pdo.is_received, None) for pdo, keys in on):
             raise use.place.refuse(_describe_unmapped(dictionary, pdos, key, use))
     synchronous = {key for pdo, keys in on for key in keys if not pdo.is_received and 1 <= pdo.kind <= 240}
-    awaited = {key for key, use in uses.items() if use.signal in AWAITED} - synchronous  # only this PDO brings them
+    awaited = {key for key, use in uses.items() if use.is_needed} - synchronous  # only this PDO brings them
     frames = []
     for pdo, keys in on:
         own = {key for key in keys if key in uses and uses[key].is_received in (pdo.is_received, None)}

@@ -293,14 +293,12 @@ class FrameMap:
         Raises:
             StopIteration: there is none.
         """
-        if role == "drive":
-            return self.drive
         return next(each for each in self.frames if role in each.roles)
 
     @cached_property
     def drive(self) -> FrameSpec:
         """The frame in which the controller sends its output."""
-        return next(each for each in self.list_from(Role.CONTROLLER) if each.has("current"))
+        return self.find_role("drive")
 
     def list_from(self, *senders: Role) -> tuple[FrameSpec, ...]:
         """The frames of these senders."""

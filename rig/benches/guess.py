@@ -10,7 +10,7 @@ from typing import Any
 
 from plant.signals import EHA
 from plant.units import find_unit
-from rig.benches.bench import INPUTS, OUTPUTS
+from rig.benches.bench import list_inputs, list_outputs
 from rig.benches.can_map import read_database
 from rig.benches.canopen_map import (
     INVALID,
@@ -23,6 +23,7 @@ from rig.benches.canopen_map import (
 )
 
 UNSURE = "# unsure: "
+INPUTS, OUTPUTS = list_inputs(EHA), list_outputs(EHA)
 # What a name says of a signal: the quantity, and which of several it is.
 _WORDS: dict[str, tuple[set[str], set[str]]] = {
     "position_demand": ({"position", "pos", "target", "stroke"},

@@ -27,6 +27,7 @@ class Use:
     is_received: bool | None  # by the device; None: it is protection, in any frame
     signal: str = ""  # of the bench
     unit: str = ""  # of the signal, SI
+    is_needed: bool = False  # a cycle cannot go on without it: what drives the plant, or is measured of it
     count: Fraction | None = None  # what a count is worth, if the file says so
     offset: Fraction | None = None
     values: Mapping[str, float | str] = field(default_factory=dict)  # by phase; a state that is awaited: in "main"

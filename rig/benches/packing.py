@@ -29,6 +29,7 @@ FRAMES_AT = 24
 FRAME_WORDS = 16
 # Roles of a frame, bits of ROLES; above them each frame has a bit of its own
 COMMAND, FEEDBACK, VALVE, DRIVE = 1, 2, 4, 8
+BITS = {"command": COMMAND, "feedback": FEEDBACK, "valve_state": VALVE, "drive": DRIVE}
 ALL_ROLES = 0xFF
 _FIRST_OWN_BIT = 8
 # Columns of a field; the last five are doubles
@@ -318,9 +319,7 @@ def list_frame_places(m: Layout) -> range:
 
 def _find_roles(frame: FrameSpec) -> int:
     """Bits of the roles that faults and rows know; of the controller's frames the drive is the one with its output."""
-    bits = {"command": COMMAND, "feedback": FEEDBACK, "valve_state": VALVE, "drive": DRIVE}
-    is_drive = frame.has("current")
-    return sum(bits[role] for role in frame.roles if role != "drive" or is_drive)
+    return sum(BITS[role] for role in frame.roles)
 
 
 def _find_rule(field: Field) -> int:

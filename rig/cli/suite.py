@@ -13,7 +13,6 @@ from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell
 from fdi.report.terminal import style_of
 from plant.errors import InputError
-from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, open_console
 from rig.cli.inputs import is_suite_file
 from rig.cli.single_run import build_choice, choose_bus_of_run, make_new_folder
@@ -74,7 +73,6 @@ def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
     """
     cases: list[Case] = []
     titles: dict[str, str] = {}  # of each suite file
-    rate = load_bench(base.bench or "eha", is_trusted=args.trust).rate
     requirements: dict[str, str] = {}
     files = [Path(args.requirements)] if args.requirements else []
     for name in args.sequence:
@@ -83,7 +81,7 @@ def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
             continue
         if args.model or args.set or args.seed is not None:
             raise InputError("--model, --set, --seed", "", f"in the suite file {name}, as keys of its cases")
-        content, own = read_suite_file(Path(name), base, rate)
+        content, own = read_suite_file(Path(name), base, is_trusted=args.trust)
         cases += own
         titles[name] = content.title
         listed = content.requirements

@@ -10,9 +10,9 @@ import heapq
 from collections.abc import Callable
 from typing import NamedTuple, cast
 
-from plant import Model
+from plant import load_model
 from plant.errors import InputError
-from plant.signals import EHA
+from plant.signals import Signals
 from rig.benches.bench import Bench, CanopenNode, Flags
 from rig.benches.bench_file import load_bench
 from rig.benches.frame_map import FrameSpec
@@ -24,7 +24,6 @@ from rig.nodes.faulty_plant import FaultyPlant
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import DELAY, DOUBLE, Plan, apply_action
 
-READINGS = tuple(s.alias for s in EHA.outputs)  # signals of the transducers, in the plant's order
 _NO_FLAGS = Flags(0)  # made once: an operation on an IntFlag takes a microsecond
 
 
@@ -50,7 +49,9 @@ class PlantPlace(NamedTuple):
     feedback: FrameSpec
     valve_state: FrameSpec
     drive: FrameSpec
-    most_missed: int  # drive frames in a row until the current is zeroed
+    most_missed: int  # drive frames in a row until the plant is not driven any more
+    signals: Signals  # of the plant
+    plant: str  # model of it
 
     @property
     def frames(self) -> tuple[FrameSpec, FrameSpec, FrameSpec]:
@@ -62,19 +63,34 @@ class PlantPlace(NamedTuple):
         """That of a bench.
 
         Raises:
-            InputError: the bench has none, or one with other signals than those of the shipped bench.
+            InputError: the bench has none, or one that lacks a signal or frame of our emulator.
         """
+        readings = [s.word for s in bench.signals.outputs]
         try:
             node = bench.nodes[PLANT]
             found = cls(node, bench.frames.sync or 0, bench.frames.find_role("feedback"),
-                        bench.frames.find_role("valve_state"), bench.frames.drive, bench.most_missed)
-            for signals, known in (((*READINGS, "flags", "cycle"), node.outputs), (("current", "cycle"), node.inputs)):
+                        bench.frames.find_role("valve_state"), bench.frames.drive, bench.most_missed, bench.signals,
+                        bench.plant)
+            for signals, known in (((*readings, "flags", "cycle"), node.outputs),
+                                   ((bench.signals.drive.word, "cycle"), node.inputs)):
                 for signal in signals:
                     known[signal]
         except (KeyError, StopIteration) as error:
-            raise InputError(bench.name, "plant_node", "frames of feedback and of valve state with the signals of the "
-                             f"shipped bench ({error})") from error
+            raise InputError(bench.name, "plant_node", "a frame of feedback and one of valve state, which carry all "
+                             f"outputs of the plant, flags and cycle ({error})") from error
         return found
+
+    def make_scenario(self) -> Scenario:
+        """The plant of the bench without faults and loads, for as long as no rig has sent another scenario."""
+        return Scenario(load_model(self.plant), Plan(stop=0))
+
+    def require_plant(self, scenario: Scenario) -> None:
+        """Refuse a scenario of a plant with other signals than those of the bench. Raises InputError."""
+        named = [(s.word, s.unit) for s in (*self.signals.outputs, self.signals.drive)]
+        own = scenario.model.kind.signals
+        if [(s.word, s.unit) for s in (*own.outputs, own.drive)] != named:
+            words = ", ".join(f"{word} ({unit})" for word, unit in named)
+            raise InputError("--model", scenario.model.name, f"a plant with the signals of the bench: {words}")
 
 
 class Emulator:
@@ -85,9 +101,9 @@ class Emulator:
         self._place = place = PlantPlace.find(bench or load_bench())
         self._heartbeat = place.node.find_cob_id(heartbeat.COB_ID)
         self._names = {place.feedback.identifier: "feedback", place.valve_state.identifier: "valve_state"}
-        self._written = [place.node.outputs[signal] for signal in READINGS]
+        self._written = [place.node.outputs[s.word] for s in place.signals.outputs]
         self._flags, self._number = (place.node.outputs[signal] for signal in ("flags", "cycle"))
-        self._current, self._answered = (place.node.inputs[signal] for signal in ("current", "cycle"))
+        self._driving, self._answered = (place.node.inputs[word] for word in (place.signals.drive.word, "cycle"))
         self.device = Device(place.node.node, place.node.eds, self._transmit)
         self.device.on_sync = self._on_sync
         self.device.on_write = self._on_write
@@ -96,7 +112,7 @@ class Emulator:
         self._drive = next(pdo for pdo in self.device.pdo.rpdos.values() if pdo.cob_id == place.drive.identifier)
         self._held: list[tuple[int, int, int, bytes]] = []  # late frames: due, order, COB-ID, data
         self._late: list[tuple[int, int, Frame]] = []
-        self.load_scenario(scenario or Scenario(Model(), Plan(stop=0)))
+        self.load_scenario(scenario or place.make_scenario())
 
     def load_scenario(self, scenario: Scenario) -> None:
         """Load a plant with its faults and loads; it is compiled now, not in the first cycle.
@@ -104,6 +120,7 @@ class Emulator:
         Raises:
             InputError: a scenario that cannot be run; the previous one stays.
         """
+        self._place.require_plant(scenario)
         self._begin(scenario, FaultyPlant(scenario))
 
     def _begin(self, scenario: Scenario, plant: FaultyPlant) -> None:
@@ -240,7 +257,7 @@ class Emulator:
         """
         fresh = self._drive.fresh
         if fresh and self._od[self._answered.key] == self._answered.field.wrap_number(k - 1):
-            self.plant.current = self._current.field.compute_value(cast(float, self._od[self._current.key]))
+            self.plant.drive = self._driving.field.compute_value(cast(float, self._od[self._driving.key]))
             if self._missed >= self._place.most_missed:
                 self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
             self._missed = 0
@@ -253,7 +270,7 @@ class Emulator:
         self._od[COUNTERS, counter] = cast(int, self._od[COUNTERS, counter]) + 1
         if self._missed < self._place.most_missed:
             return _NO_FLAGS
-        self.plant.current = 0.0
+        self.plant.drive = 0.0
         self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, bytes((self._drive.n,)))
         return Flags.CURRENT_ZEROED
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from plant import Model
 from plant.compile import ForeignCall, keep_apart
 from plant.machine_code import ADVANCE_CALL, READ_CALL
-from plant.run import NOISES
-from plant.signals import EHA
+from plant.run import find_direct_readings
+from plant.signals import Signals
 from rig.benches.bench import Flags
 from rig.benches.frame_map import FrameSpec, Role
 from rig.benches.packing import (
@@ -74,14 +74,15 @@ ID, TYPE, COUNT, DATA = range(4)  # COB-ID, -1: none; transmission type; and of 
 # .. of the node: its node-ID, RPDO of the drive, mask of the cycle's number in it, and how many drives may be missing
 # in a row before the current is zeroed
 NODE, DRIVE_NUMBER, NUMBER_MASK, MISSED_LIMIT = range(48, 52)
-LEVELS_AT, SENSORS_AT = 80, 83  # of the three transducers: where their noise is in the record, their value in the state
+# .. of the transducers: how many, their readings in the reals, their values in the state and noise in the record, and
+# how many numbers of noise a cycle has
+SENSORS, READINGS_AT, SENSORS_AT, NOISES = 80, 81, 82, 83
 HITS_AT = 86  # of the kinds of frames below: where the rows begin, and behind the last where they end
 _WORDS = 96
 EVENTS_AT, _HELD_AT = _WORDS, _WORDS + EVENT_RING
 TIMES_AT = _HELD_AT + 4 * _HELD_FRAMES
 _TABLES_AT = TIMES_AT + 6 * RING
-IN_FORCE, _PERIOD, READINGS, _FAILURE, NOISE_AT = 0, 1, 4, 8, 16  # in the real numbers
-_REAL_TABLES_AT = NOISE_AT + NOISES * NOISE_RING
+IN_FORCE, _PERIOD, _RESULT, _FAILURE, NOISE_AT = 0, 1, 4, 8, 16  # in the real numbers
 
 # what the loop returns
 ENDED, RESET, BROKEN = 0, 1, 2
@@ -93,10 +94,6 @@ COMMANDED = 256  # + the NMT command
 # states last, because in lockstep they end the rig's wait. Bus-off is on the whole node.
 _DRIVE, FEEDBACK_FRAME, _VALVE, _SYNC, _BUS_OFF = range(5)
 _FRAMES = ("drive", "feedback", "valve_state", "sync")
-_SIGNALS = tuple(s.name for s in EHA.outputs)
-# Values of the frames
-CHANNELS = ("ram_position", "load_pressure", "spool_position", "flags", "current", "status_word")
-_FLAGS, _CURRENT = CHANNELS.index("flags"), CHANNELS.index("current")
 _ADDED, _HOLDS_READING, _HOLDS_VALUE = range(3)  # faults of a sensor
 
 DRIVE_MISSING, DRIVE_LATE, CURRENT_ZEROED = map(int, Flags)
@@ -120,8 +117,8 @@ class Memory(NamedTuple):
     cycle); signals are rows of (signal, kind, first cycle, end, place of the added values, or of the one at which it is
     stuck); frames are rows of (cycle, code, argument), see `Schedule.list_frame_hits`.
 
-    reals: current in force, A; period, s; readings of the transducers; a ring of noise, NOISES a cycle;
-    values of the faults; load, N a cycle; state and parameters of the plant.
+    reals: drive in force; period, s; a ring of noise, NOISES a cycle; values of the faults; load, one a cycle; state
+    and parameters of the plant; readings of the transducers.
 
     frames: drive, feedback and valve state as the bench has them, with their values.
     """
@@ -372,7 +369,7 @@ def _judge_drive(port: Port, m: Memory, k: int, fresh: int) -> int:
     """Flags of this cycle and the current to use until the next SYNC: see `Emulator._judge`."""
     words = m.words
     if fresh and words[ANSWERED] == (k - 1) & words[NUMBER_MASK]:
-        m.reals[IN_FORCE] = m.frames.doubles[m.frames.words[VALUES_AT] + _CURRENT]
+        m.reals[IN_FORCE] = m.frames.doubles[m.frames.words[VALUES_AT] + words[SENSORS] + 1]
         words[MISSED] = 0
         _announce_timeout(port, m, 0)
         return 0
@@ -413,31 +410,34 @@ def read_plant(m: Memory, k: int) -> bool:
     """Change the parameters of this cycle and read the transducers, which faults may disturb; False if it diverged."""
     words, reals = m.words, m.reals
     _set_parameters(m, k)
-    noise, flat = NOISE_AT + NOISES * (words[PLANT_CYCLE] % NOISE_RING), words[FLAT_AT]
+    noise, flat = NOISE_AT + words[NOISES] * (words[PLANT_CYCLE] % NOISE_RING), words[FLAT_AT]
+    readings = words[READINGS_AT]
     if words[READ]:
         base = reals.ctypes.data
-        _call_read(words[READ], base + 8 * READINGS, base + 8 * _FAILURE,
+        _call_read(words[READ], base + 8 * readings, base + 8 * _FAILURE,
                    0, 0, words[FLAT], 8, base + 8 * flat, words[FLAT], 8,
-                   0, 0, NOISES, 8, base + 8 * noise, NOISES, 8,
+                   0, 0, words[NOISES], 8, base + 8 * noise, words[NOISES], 8,
                    words[PLANT_CYCLE] * reals[_PERIOD],
                    0, 0, 1, words[RECORD_SIZE], base + 8 * words[LIVE_AT], 1, words[RECORD_SIZE])
     else:  # as in `plant.Actuator.sample`
-        for i in range(3):
-            level = reals[words[LIVE_AT] + words[LEVELS_AT + i]]
-            reals[READINGS + i] = reals[flat + words[SENSORS_AT + i]] + level * reals[noise + i]
-    if not np.isfinite(reals[READINGS] + reals[READINGS + 1] + reals[READINGS + 2]):
-        return False
-    for i in range(3):
-        reals[READINGS + i] = _disturb(m, i, reals[READINGS + i], k)
+        for i in range(words[SENSORS]):
+            at = words[SENSORS_AT] + 2 * i
+            reals[readings + i] = reals[flat + words[at]] + reals[words[LIVE_AT] + words[at + 1]] * reals[noise + i]
+    for i in range(words[SENSORS]):
+        if not np.isfinite(reals[readings + i]):
+            return False
+    for i in range(words[SENSORS]):
+        reals[readings + i] = _disturb(m, i, reals[readings + i], k)
     return True
 
 
 def _fill_frames(m: Memory, k: int, flags: int) -> None:
     """Put the readings of this cycle into the objects and the frames."""
     frames, values = m.frames, m.frames.words[VALUES_AT]
-    for i in range(3):
-        frames.doubles[values + i] = m.reals[READINGS + i]
-    frames.doubles[values + _FLAGS] = flags
+    sensors = m.words[SENSORS]
+    for i in range(sensors):
+        frames.doubles[values + i] = m.reals[m.words[READINGS_AT] + i]
+    frames.doubles[values + sensors] = flags
     m.words[FRAME_CYCLE] = k
     for what in (FEEDBACK_FRAME, _VALVE):
         pack_frame(frames, _find_place(what), k)
@@ -446,14 +446,14 @@ def _fill_frames(m: Memory, k: int, flags: int) -> None:
 
 @keep_apart
 def advance_plant(m: Memory, k: int) -> None:
-    """One cycle under the current in force and the load of this cycle."""
+    """One cycle under the drive in force and the load of this cycle."""
     words, reals = m.words, m.reals
     load = 0.0
     if k < words[LOAD]:
         load = reals[words[LOAD_AT] + k]
-    noise = reals[NOISE_AT + NOISES * (words[PLANT_CYCLE] % NOISE_RING) + NOISES - 1]
+    noise = reals[NOISE_AT + words[NOISES] * (words[PLANT_CYCLE] % NOISE_RING) + words[NOISES] - 1]
     base = reals.ctypes.data
-    _call_advance(words[ADVANCE], base + 8 * READINGS, base + 8 * _FAILURE,
+    _call_advance(words[ADVANCE], base + 8 * _RESULT, base + 8 * _FAILURE,
                   0, 0, words[FLAT], 8, base + 8 * words[FLAT_AT], words[FLAT], 8,
                   reals[IN_FORCE], load, noise, words[PLANT_CYCLE] * reals[_PERIOD],
                   0, 0, 1, words[RECORD_SIZE], base + 8 * words[LIVE_AT], 1, words[RECORD_SIZE], words[STEPS])
@@ -668,20 +668,22 @@ def fill_noise(m: Memory, rng: np.random.Generator, least: int = 1024) -> None:
     free = int(m.words[PLANT_CYCLE]) + NOISE_RING - filled
     if free < least:
         return
-    rows = rng.standard_normal((free, NOISES))
+    numbers = int(m.words[NOISES])
+    rows = rng.standard_normal((free, numbers))
     first = min(free, NOISE_RING - filled % NOISE_RING)  # up to the ring's end, then from its start
     start = filled % NOISE_RING
-    noise = m.reals[NOISE_AT: NOISE_AT + NOISES * NOISE_RING].reshape(-1, NOISES)
+    noise = m.reals[NOISE_AT: NOISE_AT + numbers * NOISE_RING].reshape(-1, numbers)
     noise[start: start + first], noise[: free - first] = rows[:first], rows[first:]
     m.words[NOISE_FILLED] = filled + free
 
 
 def make_memory(model: Model, load: list[float], schedule: Schedule, advance: int = 0, read: int = 0,
                 frames: Sequence[FrameSpec] = ()) -> Memory:
-    """Memory of the loop for a plant at rest, its load (N a cycle) and its faults; no noise is drawn yet.
+    """Memory of the loop for a plant at rest, its load (one a cycle) and its faults; no noise is drawn yet.
 
-    `advance`, `read`: addresses of the compiled `plant.solve.advance_flat_state` and, for a model with effects on its
-    readings, `read_flat_sensors`. `frames`: drive, feedback and valve state, for a plant that is a node of its own.
+    `advance`, `read`: addresses of the compiled `plant.solve.advance_flat_state` and, for a model whose readings are
+    not direct (`find_direct_readings`), `read_flat_sensors`. `frames`: drive, feedback and valve state, for a plant
+    that is a node of its own.
     """
     names = {name: i for i, name in enumerate(model.list_names())}
     parameters: list[tuple[int, ...]] = []
@@ -696,8 +698,8 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
             course[change.first - first: change.last - first] = change.base + (change.value - change.base) * growth
         parameters.append((names[changes[0].name], first, len(course), len(values)))
         values += course.tolist()
-    for number, name in enumerate(_SIGNALS):
-        for fault in schedule.signals.get(name, ()):
+    for number, output in enumerate(model.kind.signals.outputs):
+        for fault in schedule.signals.get(output.name, ()):
             kind = _HOLDS_READING if fault.value is None else _HOLDS_VALUE
             signals.append((number, kind if fault.added is None else _ADDED, fault.first, fault.last, len(values)))
             values += [fault.value or 0.0] if fault.added is None else fault.added
@@ -705,19 +707,26 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
     hits = [*map(schedule.list_frame_hits, _FRAMES), np.column_stack((off, np.ones_like(off), np.zeros_like(off)))]
     record = model.build_record()
     state = model.build_flat_state()
-    words, places = _join_tables(_TABLES_AT, np.int64, parameters, signals, *hits)
-    reals, real_places = _join_tables(_REAL_TABLES_AT, np.float64, values, load, state, record.view(np.float64))
+    words, places = _join_tables(_TABLES_AT, np.int64, parameters, signals, *hits, find_direct_readings(model))
+    sensors = len(model.kind.signals.outputs)
+    reals, real_places = _join_tables(NOISE_AT + (sensors + 1) * NOISE_RING, np.float64, values, load, state,
+                                      record.view(np.float64), np.zeros(sensors))
     words[STATE], words[SYNCED] = INITIALISING, -1
     words[CYCLE_TIME], words[STEPS] = round(model["controller.period"] * 1e9), model.steps
     words[PARAMETERS], words[SIGNALS], words[LOAD], words[FLAT] = len(parameters), len(signals), len(load), len(state)
     words[PARAMETERS_AT], words[SIGNALS_AT] = places[:2]
-    words[HITS_AT: HITS_AT + len(hits) + 1] = places[2:]
-    words[FAULT_VALUES_AT], words[LOAD_AT], words[FLAT_AT], words[LIVE_AT], _ = real_places
+    *places_of_hits, words[SENSORS_AT], _ = places[2:]
+    words[HITS_AT: HITS_AT + len(hits) + 1] = [*places_of_hits, words[SENSORS_AT]]
+    words[FAULT_VALUES_AT], words[LOAD_AT], words[FLAT_AT], words[LIVE_AT], words[READINGS_AT], _ = real_places
     words[RECORD_SIZE], words[ADVANCE], words[READ] = record.dtype.itemsize, advance, read
-    words[LEVELS_AT: LEVELS_AT + 3] = [names[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
-    words[SENSORS_AT: SENSORS_AT + 3] = model.kind.find_shown_fields()
+    words[SENSORS], words[NOISES] = sensors, sensors + 1
     reals[_PERIOD] = model["controller.period"]
-    return Memory(words, reals, make_layout(frames, CHANNELS, Role.PLANT))
+    return Memory(words, reals, make_layout(frames, list_channels(model.kind.signals), Role.PLANT))
+
+
+def list_channels(signals: Signals) -> tuple[str, ...]:
+    """The values of the frames of a plant with these signals: readings, flags, drive, status word."""
+    return (*(s.word for s in signals.outputs), "flags", signals.drive.word, "status_word")
 
 
 def _join_tables(start: int, kind: Any, *tables: Any) -> tuple[NDArray[Any], list[int]]:

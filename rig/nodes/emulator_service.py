@@ -21,7 +21,7 @@ from plant.compile import compile_function
 from plant.errors import RigError
 from plant.machine_code import find_function_address
 from plant.model import build_kernel
-from plant.run import NOISES, load_stored_advance, report_law_errors
+from plant.run import find_direct_readings, load_stored_advance, report_law_errors
 from plant.solve import read_flat_sensors
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
@@ -75,7 +75,7 @@ class EmulatorService:
         self.device.on_write = self._on_write
         self.device.on_nmt = self._on_nmt
         self._od = self.device.od.values
-        self.load_scenario(scenario or Scenario(Model(), Plan(stop=0)))
+        self.load_scenario(scenario or place.make_scenario())
 
     def load_scenario(self, scenario: Scenario) -> None:
         """Load a plant with its faults and loads; it is compiled now, not in the first cycle.
@@ -83,6 +83,7 @@ class EmulatorService:
         Raises:
             InputError: a scenario that cannot be run; the previous one stays.
         """
+        self._place.require_plant(scenario)
         self._begin(scenario, None if self._scenario else ec.INITIALISING)
 
     def _begin(self, scenario: Scenario, state: int | None) -> None:
@@ -262,7 +263,8 @@ class EmulatorService:
         """Put the loop's values into the dictionary, which an SDO request is about to read."""
         shared, od = self._memory.words, self._od
         node, frames = self._place.node, self._memory.frames
-        values = dict(zip(ec.CHANNELS, frames.doubles[frames.words[VALUES_AT]:], strict=False))
+        values = dict(zip(ec.list_channels(self._place.signals), frames.doubles[frames.words[VALUES_AT]:],
+                          strict=False))
         for places, cycle in ((node.outputs, ec.FRAME_CYCLE), (node.inputs, ec.ANSWERED)):
             for signal, (key, field) in places.items():
                 if signal == "cycle":
@@ -295,19 +297,19 @@ def _encode_cob_id(cob_id: int | None) -> int:
 
 
 def compile_plant(model: Model) -> tuple[int, int]:
-    """Addresses of the compiled plant for `make_memory`; some seconds for effects that were never compiled before.
+    """Addresses of the compiled plant for `make_memory`; some seconds for what was never compiled before.
 
     Raises:
-        InputError: an effect's law that cannot be compiled.
+        InputError: a law that cannot be compiled.
     """
     with report_law_errors(model):
         flat, record = model.build_flat_state(), model.build_record()
         code = load_stored_advance(model.effects, model.plant)
         code.warm(lambda: (flat.copy(), 5e-3, 100.0, 0.0, 0.0, record, 10))
         read = 0
-        if any(model.find_effect(name).port == "reading" for name in model.effects):
-            run = build_kernel(read_flat_sensors, model.effects)
-            run(flat, np.zeros(NOISES), 0.0, record)
+        if not find_direct_readings(model):
+            run = build_kernel(read_flat_sensors, model.effects, plant=model.plant)
+            run(flat, np.zeros(len(model.kind.signals.outputs) + 1), 0.0, record)
             read = find_function_address(run)
     return code.find_address(), read
 

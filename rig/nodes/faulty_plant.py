@@ -1,15 +1,13 @@
 """The plant of a run, cycle by cycle: the actuator with the faults and the load of its scenario. No bus, no clock."""
 from __future__ import annotations
 
-from math import isfinite, nan
+from math import isfinite
 
 from plant import Actuator, RigError
-from plant.signals import EHA
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import Schedule
 
 DIVERGED = "the plant has diverged: a signal is not a finite number"
-_SIGNALS = tuple(s.name for s in EHA.outputs)
 
 
 class FaultyPlant:
@@ -18,17 +16,17 @@ class FaultyPlant:
     def __init__(self, scenario: Scenario) -> None:
         """A plant at rest. Raises InputError for an effect that cannot be compiled: it is, now."""
         self.faults = Schedule(scenario.plan, scenario.model.values)
-        self.current = 0.0  # A, in force until the next cycle
+        self.drive = 0.0  # in force until the next cycle
         self._load = scenario.load()
         self.actuator = Actuator(scenario.model, scenario.seed)
         self.actuator.warm()
         self._names = [s.name for s in scenario.model.kind.signals.outputs]
         self.problem = ""  # why the plant can go on no more
         self._changed = -1  # the last cycle whose parameters are in force
-        self._last: tuple[int, tuple[float, float, float] | None] = -1, None  # cycle and what the transducers said
+        self._last: tuple[int, tuple[float, ...] | None] = -1, None  # cycle and what the transducers said
 
-    def read(self, k: int) -> tuple[float, float, float] | None:
-        """What the transducers say in cycle k: XJ m, P12 Pa, XS m, NaN where there is none; None if the plant failed.
+    def read(self, k: int) -> tuple[float, ...] | None:
+        """What the transducers say in cycle k, in the order of the plant's outputs; None if the plant failed.
 
         The first call in a cycle draws the noise and puts the faults of this cycle in force; another one says the same.
         """
@@ -36,21 +34,21 @@ class FaultyPlant:
             self._last = k, self._draw_readings(k)
         return self._last[1]
 
-    def _draw_readings(self, k: int) -> tuple[float, float, float] | None:
+    def _draw_readings(self, k: int) -> tuple[float, ...] | None:
         self._change_parameters(k)
-        readings = dict(zip(self._names, self.actuator.sample(), strict=True))
-        if not self.problem and not isfinite(sum(readings.values())):
+        readings = self.actuator.sample()
+        if not self.problem and not isfinite(sum(readings)):
             self.problem = DIVERGED
         if self.problem:
             return None
-        xj, p12, xs = (self.faults.change_signal(name, readings.get(name, nan), k) for name in _SIGNALS)
-        return xj, p12, xs
+        return tuple(self.faults.change_signal(name, reading, k)
+                     for name, reading in zip(self._names, readings, strict=True))
 
     def move(self, k: int) -> None:
-        """Advance by cycle k under its load and the current in force."""
+        """Advance by cycle k under its load and the drive in force."""
         if not self.problem:
             try:
-                self.actuator.advance(self.current, self._load[k] if k < len(self._load) else 0.0)
+                self.actuator.advance(self.drive, self._load[k] if k < len(self._load) else 0.0)
             except RigError as error:  # another program moves the plant: its run ends, this one ends with a verdict
                 self.problem = str(error)
 

@@ -3,45 +3,45 @@ from __future__ import annotations
 
 import json
 import zlib
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from plant import InputError, Model
 from plant.model import build_bare_model
-from plant.plants import find_plant
+from plant.plants import find_key
 from plant.segments import Array
 from rig.sequences.faults import Plan, require_sensible
 
-FORCE_RESOLUTION = 1e-3  # N per count: loads travel as whole numbers, because those compress to next to nothing
 LARGEST_DOWNLOAD = 1 << 20  # bytes in one SDO download, as the node's server has it
 LONGEST_PLAN = 20_000_000  # cycles; noise is drawn for all of them beforehand
 WHERE = "scenario (object 0x2210)"
 
 
 class Scenario(NamedTuple):
-    """A plant with its faults and load; `force` is the load on the ram, cycle by cycle, in FORCE_RESOLUTION."""
+    """A plant with its faults and load; `load_counts`: cycle by cycle, see `find_load_count`."""
 
     model: Model
     plan: Plan
-    force: tuple[int, ...] = ()
+    load_counts: tuple[int, ...] = ()
     seed: int = 0
 
     @classmethod
     def build(cls, model: Model, plan: Plan, load: Array, seed: int) -> Scenario:
-        """With `load` in N over main, shape (cycles of main,); set-up and clean-up are without load.
+        """With `load` in SI over main, shape (cycles of main,); set-up and clean-up are without load.
 
         Raises:
-            InputError: a fault that contradicts this model's parameters, or a plant that this bus cannot drive.
+            InputError: a fault that contradicts this model's parameters.
         """
-        require_servovalve(model)
         require_sensible(plan, model)
-        counts = [0] * plan.start + np.rint(load / FORCE_RESOLUTION).astype(int).tolist()
+        counts = [0] * plan.start + np.rint(load / find_load_count(model)).astype(int).tolist()
         return cls(model.with_effects(_find_changed_groups(plan)), plan, tuple(counts), seed)
 
     def load(self) -> list[float]:
-        """Load on the ram in N, one a cycle; none after the last."""
-        return [count * FORCE_RESOLUTION for count in self.force]
+        """The load, SI, one a cycle; none after the last."""
+        worth = find_load_count(self.model)
+        return [count * worth for count in self.load_counts]
 
     def to_bytes(self) -> bytes:
         """JSON, compressed. Loads are second differences: constant and ramp are zeros.
@@ -49,7 +49,7 @@ class Scenario(NamedTuple):
         Raises:
             InputError: it is longer than the SDO server accepts.
         """
-        changes = np.diff(np.array(self.force, np.int64), n=2, prepend=[0, 0]).tolist()
+        changes = np.diff(np.array(self.load_counts, np.int64), n=2, prepend=[0, 0]).tolist()
         data = zlib.compress(json.dumps({
             "model": {"name": self.model.name, "effects": self.model.effects, "values": self.model.list_changes(),
                       "plant": self.model.plant},
@@ -70,10 +70,10 @@ class Scenario(NamedTuple):
             largest = 1 << 26  # bytes of JSON: six hours of random load
             table: dict[str, Any] = json.loads(zlib.decompressobj().decompress(data, largest))
             named = table["model"]
-            bare = build_bare_model(str(named.get("plant", "eha")), str(named["name"]))
+            bare = build_bare_model(find_key(str(named.get("plant", "eha"))), str(named["name"]))
             model = bare.with_effects(named["effects"]).replace(named["values"], WHERE)
             force = np.cumsum(np.cumsum(np.array(table["load"], np.int64))).tolist()
-            plan, seed = Plan.from_json(table["plan"]), int(table["seed"])
+            plan, seed = Plan.from_json(table["plan"], bare.plant), int(table["seed"])
             if min(seed, plan.seed) < 0 or not 0 <= plan.start <= plan.stop <= LONGEST_PLAN:
                 raise InputError(WHERE, "plan", f"seeds from 0, and at most {LONGEST_PLAN} cycles")
             require_sensible(plan, model)
@@ -84,12 +84,13 @@ class Scenario(NamedTuple):
             raise InputError(WHERE, "", f"compressed JSON of a scenario ({type(error).__name__}: {error})") from error
 
 
-def require_servovalve(model: Model) -> None:
-    """Refuse a plant without the signals of a servovalve actuator: the bus carries its current."""
-    known, own = find_plant("eha").signals, model.kind.signals
-    if (own.drive.name, own.drive.unit, own.controlled.name) != (known.drive.name, known.drive.unit,
-                                                                 known.controlled.name):
-        raise InputError("--model", model.name, "a model of eha; the bench drives a servovalve")
+def find_load_count(model: Model) -> float:
+    """What a count of the load is worth: loads travel as whole numbers, because those compress to next to nothing.
+
+    1 mN for the EHA, the 1e-9th part of the largest load; 1e-6 where the plant has no largest one.
+    """
+    load = model.kind.signals.load
+    return load.largest * 1e-9 if load is not None and isfinite(load.largest) else 1e-6
 
 
 def _find_changed_groups(plan: Plan) -> set[str]:

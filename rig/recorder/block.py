@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 from rig.network.frame import Frame
 from rig.recorder.schema import CHANNELS, CanFrame, Signals, Timing, list_row_fields, make_packer
 
-_NAMES = [tuple(field.name for field in fields(record)) for record in (Signals, Timing)]
-
 
 class CycleBlock(NamedTuple):
     """Some cycles: the frames of all, and the rows of all but the last, which is still under way."""
 
     t_ns: NDArray[np.int64]  # (n,) time of each
     frames: Sequence[tuple[int, NDArray[np.int64] | None]]  # in order: COB-ID, (n,) payloads of 8 bytes; None: 0 bytes
-    columns: Mapping[str, Any]  # each field of Signals and Timing: (n,), or one value for all
+    columns: Mapping[str, Any]  # each field of `record` and Timing: (n,), or one value for all
+    record: Any = Signals  # type of a row
 
     def list_frames(self, cob_id: int) -> list[Frame]:
         """The frames with this COB-ID."""
@@ -33,7 +32,9 @@ class CycleBlock(NamedTuple):
         """A cycle as records."""
         row = {name: column[i].item() if isinstance(column, np.ndarray) else column
                for name, column in self.columns.items()}
-        return Signals(*map(row.get, _NAMES[0])), Timing(*map(row.get, _NAMES[1]))  # type: ignore[arg-type]
+        timing: Any = Timing
+        signals, timing = (kind(*map(row.get, _list_names(kind))) for kind in (self.record, timing))
+        return signals, timing
 
     def list_rows(self) -> Iterator[tuple[int, Signals | Timing]]:
         """Time and record of each row."""
@@ -41,12 +42,18 @@ class CycleBlock(NamedTuple):
             yield from ((t_ns, record) for record in self.make_row(i))
 
 
+@cache
+def _list_names(record: Any) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(record))
+
+
 def pack_block(block: CycleBlock, epoch_ns: int) -> tuple[bytes, dict[int, NDArray[np.uint64]]]:
     """The messages of a block in the order in which they were sent, and for each channel its pairs of an index.
 
     A pair is the log time and the place of the message in the bytes.
     """
-    kind, template = _make_template(tuple((cob_id, payload is not None) for cob_id, payload in block.frames))
+    kind, template = _make_template(tuple((cob_id, payload is not None) for cob_id, payload in block.frames),
+                                    block.record)
     count, times = len(block.t_ns), (block.t_ns + epoch_ns).astype(np.uint64)
     table = np.frombuffer(template * count, kind).copy()
     for i, (_, payload) in enumerate(block.frames):
@@ -61,7 +68,7 @@ def pack_block(block: CycleBlock, epoch_ns: int) -> tuple[bytes, dict[int, NDArr
     places = {name: int(offset) for name, (_, offset) in (kind.fields or {}).items()}  # type: ignore[misc]
     starts = np.arange(count, dtype=np.uint64) * np.uint64(kind.itemsize)
     kinds: dict[type, tuple[list[str], int]] = {CanFrame: ([f"{i}" for i in range(len(block.frames))], count)}
-    kinds |= {record: ([record.__name__], count - 1) for record in (Signals, Timing)}
+    kinds |= {record: ([record.__name__], count - 1) for record in (block.record, Timing)}
     index = {}
     for record, (names, rows) in kinds.items():
         pairs = np.empty((rows, len(names), 2), np.uint64)
@@ -72,7 +79,7 @@ def pack_block(block: CycleBlock, epoch_ns: int) -> tuple[bytes, dict[int, NDArr
 
 
 @cache
-def _make_template(frames: tuple[tuple[int, bool], ...]) -> tuple[np.dtype[Any], bytes]:
+def _make_template(frames: tuple[tuple[int, bool], ...], row: Any) -> tuple[np.dtype[Any], bytes]:
     """The messages of one cycle as a type and as bytes, numbers and payloads zero: its frames, then its row."""
     pack = make_packer(CanFrame)
     names, kinds, parts = [], [], []
@@ -81,7 +88,7 @@ def _make_template(frames: tuple[tuple[int, bool], ...]) -> tuple[np.dtype[Any],
         names.append(f"{i}")
         kinds.append(np.dtype([*list_row_fields(CanFrame), *tail]))
         parts.append(pack(0, (0, cob_id, bytes(8 * has_payload))))
-    for record in (Signals, Timing):
+    for record in (row, Timing):
         names.append(record.__name__)
         kinds.append(np.dtype(list_row_fields(record)))
         parts.append(make_packer(record)(0, record(*[0] * len(fields(record)))))  # type: ignore[arg-type]

@@ -172,14 +172,11 @@ def import_frames(source: Path, out: Path, bench: Bench, dbc: Path | None = None
     items = sorted([*items, *cycles.rows], key=lambda item: item[0])
     decoding = {} if dbc is None else {dbc.name: dbc.read_bytes()}
     _write_log(out, {name: ("text/plain", data) for name, data in {**bench.files, **decoding}.items()},
-               collect_provenance(imported=source.name, period=period, pace="imported"), items)
+               collect_provenance(imported=source.name, period=period, pace="imported"), items, bench.signals)
     return len(starts)
 
 
-_COLUMNS = {**plant_signals.EHA.aliases, "control_word": "control", "status_word": "status",
-            "flags": "flags"}
-_WORDS = ("control", "status", "flags")
-_LASTING = ("position_demand", "control_word")  # in force until the next one comes
+_WORDS = {"control_word": "control", "status_word": "status", "flags": "flags"}
 Readers = Mapping[FrameSpec, Callable[[bytes], Mapping[str, float]]]
 
 
@@ -191,6 +188,9 @@ class _CycleBuilder:
         self._frames, self._is_canopen, self._readers = bench.frames, bool(bench.nodes), readers
         # without SYNC a cycle begins with the first frame of the rig, of those that it sends most often
         self.begin = min(bench.frames.list_from(Role.RIG), key=lambda each: each.every)
+        self._record: Any = make_row_record(bench.signals)
+        self._columns = {**{s.word: s.name for s in bench.signals[1:]}, **_WORDS}
+        self._lasting = (bench.signals.command.word, "control_word")  # in force until the next one comes
         self._waiting: dict[str, float] = {}  # values for the next cycle
         self._sent: int | None = None  # cycle of the command since the last SYNC
         self._recent: deque[tuple[int, Signals]] = deque(maxlen=8)  # an answer is late by a few cycles at most
@@ -222,35 +222,34 @@ class _CycleBuilder:
         sent = expected if self._sent is None else self._sent
         skipped = (sent - expected) & 0xFFFF if self.rows else 0
         cycle += skipped if skipped < 1000 else 0  # the counter of a bench started anew is no gap
-        row = Signals(cycle, 1, nan, nan, nan, nan, nan, nan, 0, 0, 0)
-        _fill(row, self._waiting)
+        row = self._record(cycle, 1, *(nan for _ in range(len(self._columns) - len(_WORDS))), 0, 0, 0)
+        self._fill(row, self._waiting)
         self.rows.append((t_ns, row))
         self._recent.append((sent & 0xFFFF, row))
-        self._waiting = {name: value for name, value in self._waiting.items() if name in _LASTING}
+        self._waiting = {name: value for name, value in self._waiting.items() if name in self._lasting}
         self._sent = None
 
     def _take(self, t_ns: int, spec: FrameSpec, values: Mapping[str, float]) -> None:
         if spec.sender is Role.CONTROLLER:
             for sent, row in list(self._recent)[-1 if "cycle" not in values else 0:]:
                 if sent == values.get("cycle", sent):
-                    _fill(row, values)
+                    self._fill(row, values)
         elif spec.is_before_sync or (self._frames.sync is None and spec is self.begin):
             self._waiting |= values
             self._sent = int(values["cycle"]) if "cycle" in values else self._sent
             if not spec.is_before_sync:
                 self._open(t_ns)
         else:
-            self._waiting |= {name: value for name, value in values.items() if name in _LASTING}
+            self._waiting |= {name: value for name, value in values.items() if name in self._lasting}
             if self.rows:
-                _fill(self.rows[-1][1], values)
+                self._fill(self.rows[-1][1], values)
 
-
-def _fill(row: Signals, values: Mapping[str, float]) -> None:
-    """Put the values of a frame into a row."""
-    for name, value in values.items():
-        column = _COLUMNS.get(name)
-        if column is not None:
-            setattr(row, column, round(value) if column in _WORDS else value)
+    def _fill(self, row: Signals, values: Mapping[str, float]) -> None:
+        """Put the values of a frame into a row."""
+        for name, value in values.items():
+            column = self._columns.get(name)
+            if column is not None:
+                setattr(row, column, round(value) if name in _WORDS else value)
 
 
 def _read_frames(source: Path) -> Iterator[Frame]:

@@ -100,7 +100,8 @@ class BringUp:
     def _play_probe(self, steps: tuple[Step, ...]) -> History:
         """Play one probe after a reset of the nodes. Raises BusError."""
         # The plant of the run in its initial state, without faults and loads.
-        scenario, probe = Scenario(self._job.scenario.model, Plan(stop=0), (), self._job.seed), History()
+        bench = self._job.bench
+        scenario, probe = Scenario(self._job.scenario.model, Plan(stop=0), (), self._job.seed), History(bench.signals)
         self.start_nodes(scenario)
         if self._safety.aborted:  # a node did not become OPERATIONAL
             return probe

@@ -19,8 +19,8 @@ from plant.compile import ForeignCall, compile_function, compute_fingerprint, fi
 from plant.controller import Loop, compute_current
 from plant.machine_code import ADVANCE_CALL, StoredCode
 from plant.model import Model
-from plant.run import NOISES, Actuator, LentPlant, sample_noise
-from plant.signals import EHA
+from plant.run import Actuator, LentPlant, sample_noise
+from plant.signals import Signals
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.benches.frame_map import FrameSpec, Role
@@ -31,19 +31,16 @@ from rig.run.cyclic_values import CyclicValues
 # Words: cycles to play and played, the number of the first; of the plant its cycle, the address of its code, steps and
 # size of its parameters; address of the C library's clock (0: no times) and its answer; places of the frames
 ASKED, DONE, FIRST, PLANT_CYCLE, ADVANCE, STEPS, RECORD_SIZE, CLOCK, TIME, FRAMES_AT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 10
-LEVELS_AT = 14  # places of the noise of the three transducers among the parameters
-DEMAND, LOAD, READINGS, CURRENT = range(17, 21)  # places among the values; readings are three
-FIELDS_AT = 21  # places of what the three transducers show in the state
-_WORDS = 24
+SENSORS = 14  # transducers of the plant
+DEMAND, LOAD, READINGS, DRIVE_VALUE = range(15, 19)  # places among the values; the readings stand together
+SENSORS_AT = 20  # for each transducer: place of what it shows in the state, and of its noise among the parameters
 COMMAND, FEEDBACK, VALVE, DRIVE = range(4)  # frames, columns of the payloads
-# Reals: the controller's loop and gains, period, the limits of the guards, their signals, scratch
-LOOP, GAINS, PERIOD, LOW, HIGH, _GUARDED, _SCRATCH = 0, 3, 8, 9, 16, 23, 30
-_REALS = 32
-GUARDED = (*(s.name for s in EHA.outputs), EHA.command.name, EHA.drive.name, "load", "error")
+# Reals: the controller's loop and gains, period, scratch; then the readings of a cycle, and for each signal with limits
+# (readings, demand, drive, load, error) its value, the lower and the upper limit
+LOOP, GAINS, PERIOD, _SCRATCH, _READ_AT = 0, 3, 8, 9, 12
+_LIMITED = 4  # signals with limits beside the readings
 SYNC_AT, PLANT_AT, DRIVE_AT, END_AT, BEGUN_AT = range(5)  # columns of the times
 
-_KNOWN = {"position_demand", "control_word", "cycle", "ram_position", "load_pressure", "spool_position", "flags",
-          "current", "status_word"}  # what our own nodes put into frames
 MOST = 500  # cycles a call
 _call_advance, _call_clock = ForeignCall(ADVANCE_CALL), ForeignCall("iiq")
 _MONOTONIC = 1
@@ -55,8 +52,8 @@ class Buffers(NamedTuple):
     words: NDArray[np.int64]
     reals: NDArray[np.float64]
     layout: Layout
-    inputs: NDArray[np.float64]  # (MOST, 3): demand m, load for the rig N, load on the plant N
-    noise: NDArray[np.float64]  # (MOST, NOISES)
+    inputs: NDArray[np.float64]  # (MOST, 3), SI: demand, load for the rig, load on the plant
+    noise: NDArray[np.float64]  # (MOST, transducers + 1)
     values: NDArray[np.float64]  # (MOST, values of the bench), SI
     payloads: NDArray[np.int64]  # (MOST, 4)
     times: NDArray[np.int64]  # (MOST, 5), ns
@@ -71,30 +68,33 @@ def play_quiet_cycles(b: Buffers, flat: NDArray[np.float64], live: NDArray[np.fl
     at = m.words[VALUES_AT]
     loop = Loop(reals[LOOP], reals[LOOP + 1], reals[LOOP + 2])
     gains = Gains(reals[GAINS], reals[GAINS + 1], reals[GAINS + 2], reals[GAINS + 3], reals[GAINS + 4])
-    words[DONE] = 0
+    words[DONE], sensors = 0, words[SENSORS]
     for i in range(words[ASKED]):
         _note_time(b, i, BEGUN_AT)
-        xj = flat[words[FIELDS_AT]] + live[words[LEVELS_AT]] * b.noise[i, 0]
-        p12 = flat[words[FIELDS_AT + 1]] + live[words[LEVELS_AT + 1]] * b.noise[i, 1]
-        xs = flat[words[FIELDS_AT + 2]] + live[words[LEVELS_AT + 2]] * b.noise[i, 2]
-        if _is_outside(b) or not np.isfinite(xj + p12 + xs):
+        is_finite = True
+        for j in range(sensors):
+            place = SENSORS_AT + 2 * j
+            reals[_READ_AT + j] = flat[words[place]] + live[words[place + 1]] * b.noise[i, j]
+            is_finite &= bool(np.isfinite(reals[_READ_AT + j]))
+        if _is_outside(b) or not is_finite:
             break
-        in_force = m.doubles[at + words[CURRENT]]  # what the controller answered to the cycle before
+        in_force = m.doubles[at + words[DRIVE_VALUE]]  # what the controller answered to the cycle before
         m.doubles[at + words[DEMAND]], m.doubles[at + words[LOAD]] = b.inputs[i, 0], b.inputs[i, 1]
         _pack(b, i, COMMAND)
         _note_time(b, i, SYNC_AT)
         readings = at + words[READINGS]
-        m.doubles[readings], m.doubles[readings + 1], m.doubles[readings + 2] = xj, p12, xs
+        for j in range(sensors):
+            m.doubles[readings + j] = reals[_READ_AT + j]
         _pack(b, i, FEEDBACK)
         _pack(b, i, VALVE)
         _note_time(b, i, PLANT_AT)
-        m.doubles[at + words[CURRENT]], loop = compute_current(
+        m.doubles[at + words[DRIVE_VALUE]], loop = compute_current(
             loop, m.doubles[at + words[DEMAND]], m.doubles[readings], gains)
         _pack(b, i, DRIVE)
         _note_time(b, i, DRIVE_AT)
         _call_advance(words[ADVANCE], reals.ctypes.data + 8 * _SCRATCH, reals.ctypes.data + 8 * (_SCRATCH + 1),
                       0, 0, len(flat), 8, flat.ctypes.data, len(flat), 8,
-                      in_force, b.inputs[i, 2], b.noise[i, NOISES - 1], (words[PLANT_CYCLE] + i) * reals[PERIOD],
+                      in_force, b.inputs[i, 2], b.noise[i, sensors], (words[PLANT_CYCLE] + i) * reals[PERIOD],
                       0, 0, 1, words[RECORD_SIZE], live.ctypes.data, 1, words[RECORD_SIZE], words[STEPS])
         _note_time(b, i, END_AT)
         for channel in range(b.values.shape[1]):
@@ -106,14 +106,16 @@ def play_quiet_cycles(b: Buffers, flat: NDArray[np.float64], live: NDArray[np.fl
 def _is_outside(b: Buffers) -> bool:
     """Whether a value of the cycle before is outside the limits of the guards."""
     words, reals, at = b.words, b.reals, b.layout.words[VALUES_AT]
-    for i in range(3):
-        reals[_GUARDED + i] = b.layout.doubles[at + words[READINGS] + i]
-    reals[_GUARDED + 3] = b.layout.doubles[at + words[DEMAND]]
-    reals[_GUARDED + 4] = b.layout.doubles[at + words[CURRENT]]
-    reals[_GUARDED + 5] = b.layout.doubles[at + words[LOAD]]
-    reals[_GUARDED + 6] = reals[_GUARDED + 3] - reals[_GUARDED]
-    for i in range(7):  # noqa: SIM110 - compiled
-        if not reals[LOW + i] <= reals[_GUARDED + i] <= reals[HIGH + i]:
+    sensors, first = words[SENSORS], _READ_AT + words[SENSORS]
+    for i in range(sensors):
+        reals[first + 3 * i] = b.layout.doubles[at + words[READINGS] + i]
+    rest = first + 3 * sensors
+    reals[rest] = b.layout.doubles[at + words[DEMAND]]
+    reals[rest + 3] = b.layout.doubles[at + words[DRIVE_VALUE]]
+    reals[rest + 6] = b.layout.doubles[at + words[LOAD]]
+    reals[rest + 9] = reals[rest] - reals[first]
+    for place in range(first, rest + 3 * _LIMITED, 3):
+        if not reals[place + 1] <= reals[place] <= reals[place + 2]:
             return True
     return False
 
@@ -137,22 +139,34 @@ def _note_time(b: Buffers, i: int, column: int) -> None:
 def make_buffers(bench: Bench, names: Sequence[str], guards: Mapping[str, tuple[float, float]]) -> Buffers:
     """Buffers for a bench whose values have these names. `guards`: limits by signal, SI."""
     m = make_layout(bench.frames.list_of(Role.RIG), names, Role.RIG)
-    b = Buffers(np.zeros(_WORDS, np.int64), np.zeros(_REALS), m, np.zeros((MOST, 3)), np.zeros((MOST, NOISES)),
-                np.zeros((MOST, len(names))), np.zeros((MOST, 4), np.int64), np.zeros((MOST, 5), np.int64))
+    guarded, sensors = list_guarded(bench.signals), len(bench.signals.outputs)
+    first = _READ_AT + sensors
+    b = Buffers(np.zeros(SENSORS_AT + 2 * sensors, np.int64), np.zeros(first + 3 * len(guarded)), m,
+                np.zeros((MOST, 3)), np.zeros((MOST, sensors + 1)), np.zeros((MOST, len(names))),
+                np.zeros((MOST, 4), np.int64), np.zeros((MOST, 5), np.int64))
+    b.words[SENSORS] = sensors
     places = dict(zip((each.identifier for each in bench.frames.list_of(Role.RIG)), list_frame_places(m), strict=True))
     b.words[FRAMES_AT:FRAMES_AT + 4] = [places[each.identifier] for each in list_frames(bench)]
-    b.words[DEMAND:CURRENT + 1] = [names.index(name) for name in ("position_demand", "load_force", "ram_position",
-                                                                  "current")]
-    limits = [guards.get(signal, (-np.inf, np.inf)) for signal in GUARDED]
-    b.reals[LOW:LOW + len(GUARDED)], b.reals[HIGH:HIGH + len(GUARDED)] = zip(*limits, strict=True)
+    values = CyclicValues(bench)
+    b.words[DEMAND:DRIVE_VALUE + 1] = [names.index(name) for name in (values.command, values.load, values.readings[0],
+                                                                      values.drive)]
+    b.reals[first:].reshape(-1, 3)[:, 1:] = [guards.get(signal, (-np.inf, np.inf)) for signal in guarded]
     return b
+
+
+def list_guarded(signals: Signals) -> tuple[str, ...]:
+    """What may have limits, in the order of the compiled code."""
+    load = "load" if signals.load is None else signals.load.name
+    return (*(s.name for s in signals.outputs), signals.command.name, signals.drive.name, load, "error")
 
 
 def list_frames(bench: Bench) -> list[FrameSpec]:
     """The frames of a cycle in the order of the payloads; empty unless there is one of each kind, in each cycle."""
     found = [each for role in ("command", "feedback", "valve_state", "drive")
              for each in bench.frames.frames if role in each.roles]
-    is_plain = all(each.every == 1 and each.length == 8 and {one.name for one in each.fields} <= _KNOWN
+    known = {bench.signals.command.word, *(s.word for s in bench.signals.outputs), bench.signals.drive.word,
+             "control_word", "status_word", "flags", "cycle"}  # what our own nodes put into frames
+    is_plain = all(each.every == 1 and each.length == 8 and {one.name for one in each.fields} <= known
                    for each in found)
     return found if is_plain and len(bench.frames.frames) == len(set(found)) == len(found) == 4 else []
 
@@ -172,10 +186,10 @@ def bind_code(b: Buffers, actuator: Actuator) -> Callable[[], object] | None:
 def _lend_plant(b: Buffers, actuator: Actuator) -> LentPlant | None:
     """A plant for the compiled code, which is told where its code, its parameters and its readings are."""
     plant = actuator.lend()
-    if plant is None or len(plant.fields) != 3:
+    if plant is None or len(plant.fields) != b.words[SENSORS]:
         return None
     b.words[ADVANCE], b.words[STEPS], b.words[RECORD_SIZE] = plant.advance, actuator.steps, 8 * len(plant.live)
-    b.words[LEVELS_AT:LEVELS_AT + 3], b.words[FIELDS_AT:FIELDS_AT + 3] = plant.levels, plant.fields
+    b.words[SENSORS_AT:].reshape(-1, 2)[:] = np.column_stack((plant.fields, plant.levels))
     b.reals[PERIOD] = actuator.model["controller.period"]
     return plant
 

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from plant.controller import Loop
 from plant.segments import Array
-from plant.signals import EHA
 from rig.benches.bench import Bench
 from rig.network.link import EmbeddedWire
 from rig.network.master import Master
@@ -24,6 +23,7 @@ from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock
+from rig.recorder.schema import make_row_record
 from rig.run import embedded_cycle as ec
 from rig.run.cyclic_values import CycleInput
 from rig.run.loop import CycleLoop, CycleObserver, Seen
@@ -99,22 +99,22 @@ class EmbeddedLoop(CycleLoop):
 
     def _take_cycles(self, phase: int, control: int, played: int) -> None:
         """Log the cycles that were played, all but the last, which is the cycle under way now."""
-        b, names, first = self._buffers, self._values.names, self.k
+        b, names, first, signals = self._buffers, self._values.names, self.k, self._bench.signals
         begun, sync, plant, drive = (b.times[:played, i] for i in (ec.BEGUN_AT, ec.SYNC_AT, ec.PLANT_AT, ec.DRIVE_AT))
         values = dict(zip(names, b.values[:played].T.copy(), strict=True))
         fed, answered = (plant - sync) * 1e-9, (drive - sync) * 1e-9
         columns = {
             "cycle": first + np.arange(played), "phase": phase,
-            **{s.name: values[s.alias] for s in EHA[1:] if s.role != "load"},
-            "load": b.inputs[:played, 1].copy(), "control": control,
+            **{s.name: values[s.word] for s in signals[1:] if s.role != "load"},
+            **({signals.load.name: b.inputs[:played, 1].copy()} if signals.load else {}), "control": control,
             "status": values["status_word"].astype(np.int64), "flags": values["flags"].astype(np.int64),
             "overrun": False, "lateness": 0.0, "response": answered, "work": answered, "feedback_response": fed,
             "valve_response": fed, "execution": (sync - begun) * 1e-9}
         payloads = iter(b.payloads[:played].T.copy())
         command = next(payloads)
         answers = ((frame.identifier, payload) for frame, payload in zip(self._frames[1:], payloads, strict=True))
-        block = CycleBlock(self._t_ns + self._period * np.arange(played),
-                           [(self._frames[0].identifier, command), (self._sync_id, None), *answers], columns)
+        frames = [(self._frames[0].identifier, command), (self._sync_id, None), *answers]
+        block = CycleBlock(self._t_ns + self._period * np.arange(played), frames, columns, make_row_record(signals))
         self._log.cycles(block)
         self.outputs.update({name: float(column[-1]) for name, column in values.items()})
         self._step = CycleInput(phase, float(b.inputs[played - 1, 0]), float(b.inputs[played - 1, 1]), control)

@@ -90,7 +90,7 @@ class Enabling:
         self._loop.cycle(step)
         self._loop.wait_until_played(self._stop)
         outputs = self._loop.outputs
-        current = nan if self._has_flag(Flags.DRIVE_MISSING) else outputs.get("current", nan)
+        current = nan if self._has_flag(Flags.DRIVE_MISSING) else outputs.get(self._bench.signals.drive.word, nan)
         self._said.append((step.control, outputs.get("status_word", 0.0), current))
         is_silent = self._has_flag(Flags.CURRENT_ZEROED) and not self._bench.has_plant_node
         self._silent = self._silent + 1 if is_silent else 0

@@ -64,7 +64,8 @@ from rig.nodes.emulator_cycle import (
     DRIVE_MISSING,
     FEEDBACK_FRAME,
     IN_FORCE,
-    READINGS,
+    READINGS_AT,
+    SENSORS,
     Memory,
     advance_plant,
     find_action,
@@ -77,7 +78,7 @@ DONE, WAITING = 0, 1  # what `play_cycle_in_lockstep` returns
 
 # Words that Python writes; the cycle sets CANCEL back
 (PERIOD, LEAD, SPIN, SPINS_ALWAYS, GRACE, TAIL, CANCEL, OVERRIDE_LIMIT, FINISH, DRY, FRAMES_READ, ROWS_READ,
- MAY_IDLE_AT, SYNC_ID, MOVES_PLANT, MISSED_LIMIT, SLACK, DRIVEN, SENT_CHANNELS, READINGS_AT, CURRENT_AT,
+ MAY_IDLE_AT, SYNC_ID, MOVES_PLANT, MISSED_LIMIT, SLACK, DRIVEN, SENT_CHANNELS, SENSED_AT, DRIVE_VALUE_AT,
  FLAGS_AT) = range(22)
 # Words that the cycle writes; DUE is set by Python before the start. FAILURE is the status of a bus that failed
 (DUE, HEAD, CYCLES, OVERRUNS, UNDERRUNS, ROWS, FRAMES_DONE, COMPLETE_UNTIL, FAILURE, DIVERGED) = range(24, 34)
@@ -442,9 +443,9 @@ def _read_transducers(buffers: Buffers, m: Layout, plant: Memory) -> None:
     if not read_plant(plant, words[CYCLES]):
         words[DIVERGED] = 1
     if not words[DIVERGED]:
-        at = m.words[VALUES_AT] + words[READINGS_AT]
-        for i in range(3):
-            m.doubles[at + i] = plant.reals[READINGS + i]
+        at = m.words[VALUES_AT] + words[SENSED_AT]
+        for i in range(plant.words[SENSORS]):
+            m.doubles[at + i] = plant.reals[plant.words[READINGS_AT] + i]
 
 
 def _judge_drive(buffers: Buffers, m: Layout, plant: Memory) -> int:
@@ -453,7 +454,7 @@ def _judge_drive(buffers: Buffers, m: Layout, plant: Memory) -> int:
     if not words[HAS_BEGUN]:
         return 0
     if words[CAME] & DRIVE:
-        plant.reals[IN_FORCE] = m.doubles[m.words[VALUES_AT] + words[CURRENT_AT]]
+        plant.reals[IN_FORCE] = m.doubles[m.words[VALUES_AT] + words[DRIVE_VALUE_AT]]
         words[DRIVES_MISSED] = 0
         return 0
     words[DRIVES_MISSED] += 1

@@ -323,7 +323,7 @@ class HardLoop(Loop):
         # without a SYNC the controller has its own clock: its frame may slip from one cycle of the rig to the next
         words[hc.SLACK] = sync is None and self._realtime
         words[hc.DRIVEN], words[hc.SENT_CHANNELS] = len(self._values.given), len(self._values.sent)
-        words[hc.READINGS_AT], words[hc.CURRENT_AT] = place["ram_position"], place["current"]
+        words[hc.SENSED_AT], words[hc.DRIVE_VALUE_AT] = place[self._values.readings[0]], place[self._values.drive]
         words[hc.FLAGS_AT] = place["flags"]
 
     # ------------------------------------------------------------------------------------ from the cycle
@@ -386,17 +386,16 @@ class HardLoop(Loop):
         step = self._inputs[row[hc.INPUT] % len(self._inputs)]
         phase = self._idle_phase if row[hc.INPUT_HELD] and self._idle_phase else step.phase
         came = row[hc.ANSWERS]
-        has_xj, has_xs, has_cor = came & packing.FEEDBACK, came & packing.VALVE, came & packing.DRIVE
-        signals = Signals(
-            row[hc.CYCLE], phase, said["position_demand"], said["ram_position"] if has_xj else nan,
-            said["current"] if has_cor else nan, said["load_pressure"] if has_xj else nan,
-            said["spool_position"] if has_xs else nan, step.load, int(said["control_word"]),
-            int(said["status_word"]) if has_cor else 0, int(said["flags"]) if has_xs else 0)
+        roles = {role for role, bit in packing.BITS.items() if came & bit}
+        signals = self._values.open_row(row[hc.CYCLE], phase, said[self._values.command], step.load,
+                                        int(said["control_word"]))
+        self._values.fill_row(signals, said, roles)
         timing = Timing(
             row[hc.CYCLE], bool(row[hc.OVERRUN]), row[hc.LATENESS] * 1e-9 if self._realtime else 0.0,
-            row[hc.DRIVE_AT] * 1e-9 if has_cor else nan, row[hc.COMPLETE_AT] * 1e-9 if row[hc.COMPLETE_AT] else nan,
-            row[hc.FEEDBACK_AT] * 1e-9 if has_xj else nan, row[hc.VALVE_AT] * 1e-9 if has_xs else nan,
-            row[hc.EXECUTION] * 1e-9)
+            row[hc.DRIVE_AT] * 1e-9 if "drive" in roles else nan,
+            row[hc.COMPLETE_AT] * 1e-9 if row[hc.COMPLETE_AT] else nan,
+            row[hc.FEEDBACK_AT] * 1e-9 if "feedback" in roles else nan,
+            row[hc.VALVE_AT] * 1e-9 if "valve_state" in roles else nan, row[hc.EXECUTION] * 1e-9)
         if self._realtime:
             self._log.cycle(row[hc.DUE_AT] - self._origin, signals, timing)
         else:

@@ -21,13 +21,12 @@ from fdi.output import write_whole
 from fdi.trace.trace import Trace
 from plant import InputError, Model, load_model
 from plant.effects import load_effects
-from plant.model import find_quantity, parse_model
+from plant.model import find_plant_of_model, find_quantity, parse_model
 from plant.parameters import parse_toml
 from plant.plants import load_plant
-from plant.signals import EHA
+from plant.signals import Signals
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench, load_bench_from_files
-from rig.benches.frame_map import Role
 from rig.nodes.scenario import Scenario
 from rig.run.choices import CONTROLLERS, PACES, PLANTS
 from rig.sequences import Sequence, load_sequence
@@ -60,6 +59,9 @@ class Job:
     max_overruns: float = 1e-3  # of all cycles, in real time
 
     def __post_init__(self) -> None:
+        kind = self.model.kind
+        noise = kind.nominal.get(kind.signals.controlled.noise, 0.0)
+        object.__setattr__(self, "bench", self.bench.replace_signals(kind.signals, noise, self.model.name))
         require_possible(self.sequence.faults, self.bench, self.sequence.name)
         if self.plant == "external" and not self.bench.has_plant_node:
             raise InputError("--plant", self.plant, f"auto: the rig moves the plant of {self.bench.name!r}, which has "
@@ -162,18 +164,22 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
     for code, file in zip(effect_codes, effects, strict=True):
         load_effects(file, code.content)
     model = parse_model(tables, where)
-    bench = _read_bench(attachments, said.get("bench", ""), is_trusted=is_trusted)
+    bench = _read_bench(attachments, said.get("bench", ""), model.kind.signals, is_trusted=is_trusted)
     require_bench_cycle(model, bench, where)
-    return Job(sequence=Sequence.from_bundle(bundle, bench.rate), model=model, bench=bench, effects=effects, **settings)
+    sequence = Sequence.from_bundle(bundle, bench.rate, model.plant)
+    return Job(sequence=sequence, model=model, bench=bench, effects=effects, **settings)
 
 
-def _read_bench(attachments: Mapping[str, bytes], name: str, *, is_trusted: bool) -> Bench:
-    """The bench of a log, whose file has this name; a log without one was made on the shipped bench."""
+def _read_bench(attachments: Mapping[str, bytes], name: str, signals: Signals, *, is_trusted: bool) -> Bench:
+    """The bench of a log, whose file has this name; a log without one was made on the shipped bench.
+
+    `signals`: of the plant that ran.
+    """
     files = {key.removeprefix(_BENCH_FOLDER): data for key, data in attachments.items()
              if key.startswith(_BENCH_FOLDER)}
     if not files:
         return load_bench()
-    return load_bench_from_files({name: files.get(name, b""), **files}, is_trusted=is_trusted)
+    return load_bench_from_files({name: files.get(name, b""), **files}, signals, is_trusted=is_trusted)
 
 
 def speaks_as_shipped(bench: Bench) -> bool:
@@ -249,6 +255,36 @@ class JobChoice(NamedTuple):
     is_diagnosed: bool = False  # whether `rig fdi` judges the servovalve after the run
 
 
+def load_tested_plant(choice: JobChoice, *, is_trusted: bool = False, announce: Announce = print_on_standard_error,
+                      ) -> tuple[Bench, str]:
+    """The bench, and what models call the plant on it, which is loaded. Raises InputError."""
+    if choice.model:  # first: a plant that the user names himself is trusted in the bench file as well
+        load_plant_of_model(choice.model, is_trusted=is_trusted, announce=announce)
+    bench = load_bench(choice.bench or "eha", is_trusted=is_trusted)
+    return bench, find_plant_of_model(choice.model) if choice.model else bench.kind
+
+
+def load_tested_sequence(choice: JobChoice, *, is_trusted: bool = False) -> Sequence:
+    """The sequence for the plant and the rate of its bench. Raises InputError."""
+    bench, plant = load_tested_plant(choice, is_trusted=is_trusted)
+    return load_sequence(choice.sequence, bench.rate, plant)
+
+
+def load_tested_model(choice: JobChoice, *, is_trusted: bool = False, announce: Announce = print_on_standard_error,
+                      ) -> tuple[Bench, Model, tuple[Path, ...]]:
+    """The bench, the model that runs on it, with its plant and effects loaded, and the effect files that this brought.
+
+    Raises:
+        InputError: a file that cannot be used, or code that is not trusted.
+    """
+    bench, _ = load_tested_plant(choice, is_trusted=is_trusted, announce=announce)
+    name = choice.model or bench.plant
+    for file in choice.effects:
+        load_effects(file)
+    brought = load_effects_of_model(name, choice.effects, is_trusted=is_trusted, announce=announce)
+    return bench, load_model(name), brought
+
+
 def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: bool = False,
               announce: Announce = print_on_standard_error) -> Job:
     """The job that a user chose; his model and changes override the sequence's own.
@@ -263,20 +299,18 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
         InputError: a sequence, model, effect or value that cannot be used.
     """
     require_different_names(choice.effects)
-    bench = load_bench(choice.bench or "eha", is_trusted=is_trusted)
-    first = choice.model or bench.plant
-    load_plant_of_model(first, is_trusted=is_trusted, announce=announce)
-    for file in choice.effects:
-        load_effects(file)
-    sequence = load_sequence(choice.sequence, bench.rate) if built is None else built  # it may name such an effect
-    name = choice.model or (sequence.model.name if sequence.model.name != "eha" else bench.plant)
-    if name != first:
-        load_plant_of_model(name, is_trusted=is_trusted, announce=announce)
-    brought = load_effects_of_model(name, choice.effects, is_trusted=is_trusted, announce=announce)
+    bench, model, brought = load_tested_model(choice, is_trusted=is_trusted, announce=announce)
+    sequence = load_sequence(choice.sequence, bench.rate, model.plant) if built is None else built
+    if sequence.plant != model.plant and sequence.plant != "eha" and choice.model is None and (
+            sequence.model.name == "eha"):
+        raise InputError(sequence.name, "plant", f"a bench or model of {sequence.plant}, not of {model.plant}")
+    if choice.model is None and sequence.model.name != "eha":
+        own = choice._replace(model=sequence.model.name)
+        _, model, more = load_tested_model(own, is_trusted=is_trusted, announce=announce)
+        brought = (*brought, *more)
     require_different_names((*choice.effects, *brought))
-    model = load_model(name).replace(sequence.model.overrides, sequence.name).replace(choice.changes)
+    model = model.replace(sequence.model.overrides, sequence.name).replace(choice.changes)
     require_bench_cycle(model, bench, "--set")
-    _require_signals(model, bench)
     foreign = [name for name in model.list_changes() if name.startswith("controller.") and name != "controller.period"]
     is_ours = speaks_as_shipped(bench)
     controller = choice.controller or ("builtin" if is_ours else "external")
@@ -286,16 +320,6 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     job = Job(sequence=sequence, model=model, bench=bench, seed=choice.seed, effects=(*choice.effects, *brought),
               bus=choice.bus, controller=controller, plant=plant, max_overruns=sequence.timing.share)
     return replace_settings(job, pace=choice.pace, max_overruns=choice.max_overruns)
-
-
-def _require_signals(model: Model, bench: Bench) -> None:
-    """Refuse a plant that lacks a signal which the bench sends to the controller or the rig. Raises InputError."""
-    has = [signal.name for signal in model.kind.signals.outputs]
-    sent = {each.name for spec in bench.frames.frames if spec.sender is not Role.CONTROLLER for each in spec.fields}
-    for signal in EHA.outputs:
-        if signal.alias in sent and signal.name not in has:
-            raise InputError(bench.name, signal.alias,
-                             f"a plant that has this signal; {model.name} has {', '.join(has)}")
 
 
 class Differences(NamedTuple):
@@ -328,7 +352,8 @@ def find_differences(job: Job) -> Differences:
     model = job.model
     faults = tuple(f"{fault.label!r} from {fault.start:g} s" + ("" if fault.end is None else f" to {fault.end:g} s")
                    for fault in job.sequence.faults)
-    return Differences(model="" if model.name == "eha" else model.name, parameters=model.list_changes(),
+    is_usual = model.name == "eha" or Path(model.name).name == Path(job.bench.plant).name
+    return Differences(model="" if is_usual else model.name, parameters=model.list_changes(),
                        effects=tuple(model.effects), effect_files=tuple(path.name for path in job.effects),
                        faults=faults, plant=model.plant)
 

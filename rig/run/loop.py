@@ -14,12 +14,13 @@ from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import isnan, nan
+from operator import attrgetter
 from typing import Protocol
 
 import numpy as np
 
+from plant import signals as plant_signals
 from plant.segments import Array
-from plant.signals import EHA
 from rig.benches.bench import Bench, Flags
 from rig.benches.frame_map import FrameSpec, Role, check_guards, make_reader, make_writer
 from rig.network.clock import WallClock
@@ -113,8 +114,6 @@ class _Answer:
 
     def __init__(self, spec: FrameSpec) -> None:
         self.spec, self.read, self.roles = spec, make_reader(spec), set(spec.roles)
-        if not spec.has("current"):
-            self.roles.discard("drive")
         self.cycle_mask = max(((1 << each.length) - 1 for each in spec.fields if each.name == "cycle"), default=0)
         self.is_guarded = any(each.guard for each in spec.fields)
         self.last = -1  # the cycle in which it came
@@ -198,12 +197,12 @@ class CycleLoop(Loop):
         delay = self._send_sync()
         if self._plant is not None:
             self.outputs["flags"] = self._judge_drive(self._plant)
-        row = Signals(k, step.phase, self.outputs["position_demand"], nan, nan, nan, nan, step.load, step.control, 0, 0)
+        row = self._values.open_row(k, step.phase, self.outputs[self._values.command], step.load, step.control)
         self._open = self._t_ns, row, timing
         self._expect_answers(delay is not None)
         self._send_frames(is_before_sync=False)
         if self._plant is not None:
-            row.xj, row.p12, row.xs, row.flags = self._list_readings()
+            self._values.fill_row(row, self.outputs, _OF_PLANT)
             timing.feedback_response = timing.valve_response = 0.0
             if step.is_counted and not self.problem:
                 self._plant.move(k)
@@ -248,25 +247,21 @@ class CycleLoop(Loop):
         if readings is None:
             self.problem = plant.problem
             return
-        self.outputs.update(zip(("ram_position", "load_pressure", "spool_position"), readings, strict=True))
+        self.outputs.update(zip(self._values.readings, readings, strict=True))
 
     def _judge_drive(self, plant: FaultyPlant) -> int:
         """Flags of this cycle, and the current until the next one: see hard_cycle.py."""
         if not self._begun:
             return 0
         if "drive" in self._seen.came:
-            plant.current, self._missed = self.outputs["current"], 0
+            plant.drive, self._missed = self.outputs[self._values.drive], 0
             return 0
         self._missed += 1
         flags = int(Flags.DRIVE_LATE if self._seen.is_late else Flags.DRIVE_MISSING)
         if self._missed >= self._bench.most_missed:
-            plant.current = 0.0
+            plant.drive = 0.0
             flags |= int(Flags.CURRENT_ZEROED)
         return flags
-
-    def _list_readings(self) -> tuple[float, float, float, int]:
-        values = self.outputs
-        return values["ram_position"], values["load_pressure"], values["spool_position"], int(values["flags"])
 
     # ------------------------------------------------------------------------------------ frames out
 
@@ -397,44 +392,40 @@ class CycleLoop(Loop):
         (t_ns, row, timing), self._open = self._open, None
         if not self._step.is_counted:
             return
-        values = self.outputs
-        if self._plant is None and "feedback" in self._seen.came:
-            row.xj, row.p12 = values["ram_position"], values["load_pressure"]
-        if self._plant is None and "valve_state" in self._seen.came:
-            row.xs, row.flags = values["spool_position"], int(values["flags"])
-        if "drive" in self._seen.came:
-            row.cor, row.status = values["current"], int(values["status_word"])
+        self._values.fill_row(row, self.outputs, self._seen.came - (_OF_PLANT if self._plant is not None else set()))
         self._log.cycle(t_ns, row, timing)
 
 
-_FIELDS = ("phase", *EHA.names, "flags", "lateness", "response", "feedback_response", "valve_response", "execution",
-           "control", "status")
+_OF_PLANT = frozenset({"feedback", "valve_state"})
+_TIMES = ("lateness", "response", "feedback_response", "valve_response", "execution")
 
 
 class History:
     """The complete cycles of a run. A field by name is a column, (cycles,) SI; missing samples are NaN."""
 
-    def __init__(self) -> None:
+    def __init__(self, signals: plant_signals.Signals = plant_signals.EHA) -> None:
+        """`signals`: of the plant."""
+        self.signals, row = signals, ("phase", *signals.names, "flags", "control", "status")
+        self._fields = (*row, *_TIMES)
+        self._read_row, self._read_times = attrgetter(*row), attrgetter(*_TIMES)
         self._numbers = array("d")
 
     def __len__(self) -> int:
-        return len(self._numbers) // len(_FIELDS)
+        return len(self._numbers) // len(self._fields)
 
     def cycle(self, t_ns: int, row: Signals, timing: Timing) -> None:
         """Append one cycle (called by a loop)."""
-        self._numbers.extend((row.phase, row.com, row.xj, row.cor, row.p12, row.xs, row.load, row.flags,
-                              timing.lateness, timing.response, timing.feedback_response, timing.valve_response,
-                              timing.execution, row.control, row.status))
+        self._numbers.extend((*self._read_row(row), *self._read_times(timing)))
 
     def cycles(self, block: CycleBlock) -> None:
         """Append several cycles (called by a loop)."""
-        table = np.empty((len(block.t_ns), len(_FIELDS)))
-        for i, name in enumerate(_FIELDS):
+        table = np.empty((len(block.t_ns), len(self._fields)))
+        for i, name in enumerate(self._fields):
             table[:, i] = block.columns[name]
         self._numbers.frombytes(table[:-1].tobytes())
 
     def column(self, name: str, phase: int | None = None) -> Array:
         """All cycles, or those of one phase. Raises ValueError for a name that is no field."""
-        table = np.frombuffer(self._numbers).reshape(-1, len(_FIELDS))
-        column: Array = table[:, _FIELDS.index(name)]
+        table = np.frombuffer(self._numbers).reshape(-1, len(self._fields))
+        column: Array = table[:, self._fields.index(name)]
         return column.copy() if phase is None else column[table[:, 0] == phase]  # no view: it would pin the buffer

@@ -292,7 +292,7 @@ class LimitReached(NamedTuple):
     def describe(self, signals: Signals) -> str:
         """The limit in words, such as "ram at its stop (40 mm) for 120 ms, first at t = 1.250 s"."""
         signal = signals.find(self.signal)
-        words = f"{signal.called} at its {'limit' if signal.role == 'drive' else 'stop'}"
+        words = f"{signal.phrase} at its {'limit' if signal.role == 'drive' else 'stop'}"
         shown = signals.controlled if signal.unit == signals.controlled.unit else signal
         return (f"{words} ({shown.shown_scale * self.limit:.3g} {shown.shown_unit}) for "
                 f"{1e3 * self.seconds:.0f} ms, first at t = {self.t:.3f} s")

@@ -12,9 +12,9 @@ import numpy as np
 
 from fdi.progress import Progress
 from fdi.trace.trace import Trace
-from plant import Actuator, Columns, InputError
+from plant import Actuator, InputError
+from plant.run import make_columns_type
 from plant.segments import Array
-from plant.signals import EHA
 from rig.benches.bench import Flags
 from rig.network.clock import WallClock
 from rig.network.node_objects import CycleRecord
@@ -157,13 +157,15 @@ def judge_run(job: Job, session: Session, judged: Mask,
 
     Returns the results, and the checks that do not apply to the bench.
     """
-    main = [session.log.history.column(name, MAIN) for name in Columns._fields[1:]]
+    kind = job.model.kind
+    main = [session.log.history.column(name, MAIN) for name in kind.signals.names]
     t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
     sequence = job.sequence
     unsaid = {check.name: skipped for check in sequence.checks if (skipped := find_skipped(check, job.bench))}
-    results = evaluate_checks([check for check in sequence.checks if check.name not in unsaid], Columns(t, *main),
+    results = evaluate_checks([check for check in sequence.checks if check.name not in unsaid],
+                              make_columns_type(kind.signals)(t, *main),
                               sequence.sections(), session.journal.events, sequence.fault_starts(),
-                              session.log.read_drives(), sequence.rate, metrology=metrology)
+                              session.log.read_drives(), sequence.rate, kind.signals, metrology=metrology)
     protocol, inapplicable = judge_protocol(session.read_protocol_record(judged), sequence.protocol)
     return [*results, *protocol], [*unsaid.values(), *inapplicable]
 
@@ -229,7 +231,7 @@ def open_recorder(job: Job, folder: Path, epoch_ns: int = 0, observer: Observer 
     for name in ("verdict.json", "report.html"):  # of the run before
         (folder / name).unlink(missing_ok=True)
     recorder = Recorder(folder / "trace.mcap", job.build_attachments(), collect_provenance(**job.list_settings()),
-                        epoch_ns, observer)
+                        epoch_ns, observer, job.model.kind.signals)
     try:
         yield recorder
     finally:
@@ -239,8 +241,8 @@ def open_recorder(job: Job, folder: Path, epoch_ns: int = 0, observer: Observer 
 def _count_lost_frames(history: History) -> dict[str, int]:
     """Count the cycles with missing answers: those the rig saw and those the plant flagged."""
     flags = history.column("flags").astype(int)
-    return {"no_feedback": int(np.isnan(history.column(EHA.controlled.name)).sum()),
-            "no_drive": int(np.isnan(history.column(EHA.drive.name)).sum()),
+    return {"no_feedback": int(np.isnan(history.column(history.signals.controlled.name)).sum()),
+            "no_drive": int(np.isnan(history.column(history.signals.drive.name)).sum()),
             "plant_drive_missing": int((flags & Flags.DRIVE_MISSING != 0).sum()),
             "plant_drive_late": int((flags & Flags.DRIVE_LATE != 0).sum())}
 

@@ -16,16 +16,15 @@ from operator import attrgetter
 import numpy as np
 
 from fdi.progress import Progress
+from plant.pid import control_by_pid
 from plant.profile import Profile, build_profile
 from plant.segments import Array, Hold
-from plant.signals import EHA
 from rig.benches.frame_map import make_reader
 from rig.benches.profiles import PROFILES, State
 from rig.network.frame import Frame
 from rig.network.link import EmbeddedWire
 from rig.network.master import HEARTBEAT, Master
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, CycleRecord, NmtState
-from rig.nodes.scenario import FORCE_RESOLUTION
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.attribution import Mask, find_injected
 from rig.run.bring_up import BringUp
@@ -56,9 +55,6 @@ _SETTLING = 20  # cycles of clean-up that nodes started again have to get rid of
 _MOST_DRIVES = 2_000_000  # half an hour; a longer run is judged on what was kept
 
 
-_get_signals = attrgetter(*EHA.names)
-
-
 class CycleLog:
     """The cycles that are complete: recorded, kept for the verdict, and watched for overruns and by the guards."""
 
@@ -68,8 +64,10 @@ class CycleLog:
         self._period_ns = job.period_ns
         self._guards = GuardWatch(job.sequence.guards)
         self.guarded = self._guards.list_limits()
-        self.history = History()
-        self.after = History()  # the probe after clean-up
+        self._signals = job.bench.signals
+        self.history = History(self._signals)
+        self.after = History(self._signals)  # the probe after clean-up
+        self._read_row = attrgetter(*self._signals.names)
         self.due_ns = array("q")  # log time of each cycle
         self._drive = job.bench.frames.drive
         self._drives: list[Frame] = []
@@ -120,15 +118,16 @@ class CycleLog:
         cycle = np.searchsorted(due, came, "right") - 1
         since = np.clip(came - due[np.maximum(cycle, 0)], 0, self._period_ns - 1) if len(due) else came
         t = np.where(cycle < 0, -np.inf, (cycle - self._start) / self._rate + since * 1e-9)
-        return DriveFrames(t, np.array([drive["current"] for drive in drives]),
+        return DriveFrames(t, np.array([drive[self._signals.drive.word] for drive in drives]),
                            np.array([drive.get("status_word", 0) for drive in drives]).astype(np.int64), self._words)
 
     def find_passed_guard(self) -> Guard | None:
         """The first guard that one of the rows since the last call has passed."""
         rows, self._unjudged = self._unjudged, []
         for row in rows:
-            signals = dict(zip(EHA.names, _get_signals(row), strict=True))
-            if passed := self._guards.find_passed({**signals, "error": row.com - row.xj}):
+            values = dict(zip(self._signals.names, self._read_row(row), strict=True))
+            error = values[self._signals.command.name] - values[self._signals.controlled.name]
+            if passed := self._guards.find_passed({"error": error, **values}):
                 return passed
         return None
 
@@ -143,7 +142,7 @@ class Session:
         self._setup, self._main = job.sequence.setup_profile(), job.sequence.main_profile()  # now, not between cycles
         self.scenario = job.scenario
         plan = self.scenario.plan
-        self._loads = np.array(self.scenario.force, float) * FORCE_RESOLUTION
+        self._loads = np.array(self.scenario.load())
         self._faults = Schedule(plan, self.scenario.model.values)
         self._is_embedded = isinstance(wire, EmbeddedWire)
         self.stage = Stage(wire.clock, plan.start, plan.rate)
@@ -392,7 +391,7 @@ class Session:
         def read(history: History) -> Rows:
             rows = read_rows(history, start.find_on_time_of(history))
             if job.realtime:  # without feedback there is nothing to answer to
-                return rows._replace(cor=np.where(np.isnan(rows.xj), np.nan, rows.cor))
+                return rows._replace(drive=np.where(np.isnan(rows.position), np.nan, rows.drive))
             return rows
 
         history, after = self.log.history, self.log.after
@@ -406,6 +405,8 @@ class Session:
             deaf=(self._master.wire.stalled_ns - self._stalled_ns) * 1e-9,
             deaf_cycles=self._faults.list_bus_off_cycles("rig").tolist(), heartbeat_period=HEARTBEAT * 1e-3,
             bench=job.bench,
-            current_limit=model["controller.current_limit"] if start.gains is None else start.gains.current_limit,
+            drive_limit=model.values.get(model.kind.signals.drive.limit, np.nan) if start.gains is None
+            else start.gains.current_limit,
+            still_limit=50.0 * job.bench.fineness if model.kind.control is control_by_pid else np.nan,
             gains=None if find_firmware_parameters(model) else start.gains, realtime=job.realtime,
             is_response_judged=job.realtime and not self._is_embedded)

@@ -40,6 +40,7 @@ class NodeWatch:
         self.emergencies: list[Emergency] = []
         self.heartbeats: dict[Role, list[Heartbeat]] = {role: [] for role in master.watched}
         self.last_answers = {CONTROLLER: -1, PLANT: -1}  # last cycle with a cyclic frame of it
+        self._answers = {PLANT: bench.signals.outputs[-1].name, CONTROLLER: bench.signals.drive.name}  # who sends it
         self._operational: set[Role] = set()
         self._patience, self._missed = patience, 0  # cycles in a row for which the rig's own plant had no drive frame
         self._next_look = 0  # when to look again whether the nodes are alive
@@ -66,10 +67,10 @@ class NodeWatch:
 
     def add(self, signals: Signals) -> None:
         """Take in a complete cycle: who answered in it."""
-        if signals.xs == signals.xs:  # not NaN
-            self.last_answers[PLANT] = signals.cycle
-        if signals.cor == signals.cor:
-            self.last_answers[CONTROLLER] = signals.cycle
+        for role, name in self._answers.items():
+            value = getattr(signals, name)
+            if value == value:  # not NaN
+                self.last_answers[role] = signals.cycle
         if not self._bench.has_plant_node and not self._master.is_deaf:
             self._watch_drive(bool(signals.flags & Flags.CURRENT_ZEROED))
 

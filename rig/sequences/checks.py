@@ -299,19 +299,28 @@ class PythonCheck(Check):
         return 1.0
 
 
-class Window(Columns):
-    """What a user's check gets: the cycles of its window as columns, SI units, NaN where a sample is missing."""
+class Window:
+    """What a user's check gets: the cycles of its window as columns by the names of the plant's signals, SI units.
+
+    NaN where a sample is missing. `t` counts from the start of main.
+    """
+
+    def __init__(self, signals: Signals, columns: Mapping[str, Array]) -> None:
+        self._signals = signals
+        vars(self).update(columns)
 
     @property
     def error(self) -> Array:
-        """Demand minus position, m."""
-        return self.com - self.xj
+        """Demand minus controlled signal, SI."""
+        error: Array = vars(self)[self._signals.command.name] - vars(self)[self._signals.controlled.name]
+        return error
 
 
 def _measure_python(check: PythonCheck, run: RunData, span: slice) -> float:
     assert check.function is not None
-    columns = [np.array(getattr(run.trace, name)[span], dtype=np.float64) for name in Window._fields[1:]]
-    value = check.function.call(Window(np.arange(span.start, span.stop) / run.rate, *columns), **check.arguments)
+    columns = {name: np.array(getattr(run.trace, name)[span], dtype=np.float64) for name in run.signals.names}
+    columns["t"] = np.arange(span.start, span.stop) / run.rate
+    value = check.function.call(Window(run.signals, columns), **check.arguments)
     if value is None:
         raise NotMeasurable(f"{check.python} returned no value")
     try:

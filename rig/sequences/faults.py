@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from math import ceil
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -19,12 +19,13 @@ from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.model import Model, find_quantity
 from plant.parameters import check_combinations, parse_value
+from plant.plants import find_plant
 from plant.quantity import Quantity
 from plant.segments import RATE, Second
 from rig import tables
 from rig.benches.bench import Bench
 from rig.benches.frame_map import Role
-from rig.sequences.signals import Sensed
+from rig.sequences.signals import Sensed, name_signals_of
 from rig.tables import Range
 
 Table = NDArray[np.int64]
@@ -283,6 +284,7 @@ class Plan:
     stop: int
     seed: int = 0
     rate: Annotated[float, Range("1/s", low=1.0, high=1e6)] = RATE
+    plant: str = field(default="eha", metadata={"key": False})  # whose parameters and signals the faults change
 
     def find_cycles(self, fault: Fault) -> tuple[int, int]:
         """First cycle in which a fault acts and the one in which it no longer does."""
@@ -296,9 +298,11 @@ class Plan:
                 "rate": self.rate}
 
     @classmethod
-    def from_json(cls, data: object) -> Plan:
-        """The plan that was sent; InputError if it is none."""
-        return tables.build_dataclass(cls, data, tables.Place("scenario"), {Fault: KINDS})
+    def from_json(cls, data: object, plant: str = "eha") -> Plan:
+        """The plan that was sent, for this plant; InputError if it is none."""
+        with name_signals_of(find_plant(plant).signals):
+            found: Plan = tables.build_dataclass(cls, data, tables.Place("scenario"), {Fault: KINDS})
+        return replace(found, plant=plant)
 
 
 class ParameterChange(NamedTuple):
@@ -343,7 +347,7 @@ class Schedule:
     """
 
     def __init__(self, plan: Plan, base: Mapping[str, float] | None = None) -> None:
-        self._base, self._stop, self.rate = base or {}, plan.stop, plan.rate
+        self._base, self._stop, self.rate, self._plant = base or {}, plan.stop, plan.rate, plan.plant
         self.parameters: dict[str, list[ParameterChange]] = {}  # of several faults in a cycle the first counts
         self.signals: dict[str, list[SignalChange]] = {}  # in the order in which they act
         self._frames: dict[str, list[tuple[int, Table]]] = {}  # from which cycle on, and code and argument in each
@@ -364,7 +368,7 @@ class Schedule:
             case Parameter():
                 if fault.parameter not in self._base:
                     raise InputError("faults", fault.parameter, tables.list_choices(fault.parameter, self._base))
-                target = fault.find_target(find_quantity(fault.parameter, "faults"))
+                target = fault.find_target(find_quantity(fault.parameter, "faults", self._plant))
                 self.parameters.setdefault(fault.parameter, []).append(ParameterChange(
                     fault.parameter, first, last, self._base[fault.parameter], target, fault.ramp))
             case Offset():  # or noise

@@ -240,6 +240,8 @@ class RunData:
             return self.read_signal(command, span) - self.read_signal(controlled, span)
         if name == "speed" and name not in self.signals.names:
             return compute_speed(self.read_signal(controlled, span), self.rate)
+        if not hasattr(self.trace, name):
+            raise NotMeasurable(f"the plant has no signal {name}")
         return bridge_gaps(np.asarray(getattr(self.trace, name), float)[span], name, largest_missing_share)
 
     def count_missing(self, name: str, span: slice) -> int:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import isfinite, nan
+from math import isfinite, isnan, nan
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from plant.controller import Loop, compute_current
 from plant.segments import Array, Second
+from plant.signals import Signal
 from rig.benches.bench import Bench, Flags
 from rig.benches.bench_file import load_bench
 from rig.benches.canopen_map import name_object
@@ -87,15 +88,15 @@ class ProtocolLimits:
 
 
 class Rows(NamedTuple):
-    """Consecutive cycles as columns, SI; NaN: no frame with this cycle's number.
+    """Consecutive cycles as columns, SI: demand, controlled signal, drive; NaN: no frame with this cycle's number.
 
     `on_time`: the bench delivered the cycle and the next one on time and no injected fault touches its frames, so a
     missing drive frame is the controller's.
     """
 
-    com: Array
-    xj: Array
-    cor: Array
+    demand: Array
+    position: Array
+    drive: Array
     control: Array
     status: Array
     flags: Array
@@ -140,7 +141,8 @@ class ProtocolRecord:
     deaf_cycles: Sequence[int] = ()
     heartbeat_period: Second = 0.1
     bench: Bench = field(default_factory=load_bench)
-    current_limit: float = nan
+    drive_limit: float = nan  # NaN: the plant declares none
+    still_limit: float = 1e-4  # SI: how far the error may move while the drive stands still; NaN: not to be judged
     gains: object | None = None
     realtime: bool = False
     is_response_judged: bool = False
@@ -186,19 +188,24 @@ def _make_result(name: str, signal: str, value: float, unit: str, low: float = n
 def _judge_current(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
     """Largest current while it must be zero; and in all cycles."""
     rate = record.bench.rate
-    idle = _drop_missing([rows.cor[find_idle(rows, record.words, limits, rate)] for rows in record.stretches])
-    current = _drop_missing([rows.cor for rows in record.stretches])
-    name = f"no current unless {record.words.active}"
+    idle = _drop_missing([rows.drive[find_idle(rows, record.words, limits, rate)] for rows in record.stretches])
+    drive = record.bench.signals.drive
+    name, limited = f"no {drive.phrase} unless {record.words.active}", f"{drive.phrase} within its limit"
     if record.bench.profile == "none" and not record.bench.enables:
         yield SkippedCheck(name, "the bench has no control word, and no value of its phases enables the controller")
     else:
-        yield _judge_largest(name, idle, limits.idle_current, f"{len(idle)} cycles")
-    yield _judge_largest("current within its limit", current, record.current_limit, "")
+        yield _judge_largest(name, drive, idle, limits.idle_current, f"{len(idle)} cycles")
+    if isnan(record.drive_limit):
+        yield SkippedCheck(limited, "the plant declares no limit of it")
+    else:
+        yield _judge_largest(limited, drive, _drop_missing([rows.drive for rows in record.stretches]),
+                             record.drive_limit, "")
 
 
-def _judge_largest(name: str, values: Array, limit: float, detail: str) -> CheckResult:
+def _judge_largest(name: str, drive: Signal, values: Array, limit: float, detail: str) -> CheckResult:
     largest, detail = (float(np.abs(values).max()), detail) if len(values) else (nan, NO_FRAME)
-    return _make_result(name, "current", largest * 1e3, "mA", high=limit * 1e3, detail=detail)
+    scale = drive.shown_scale
+    return _make_result(name, drive.word, largest * scale, drive.shown_unit, high=limit * scale, detail=detail)
 
 
 def _drop_missing(parts: Sequence[Array]) -> Array:
@@ -220,7 +227,7 @@ def find_idle(rows: Rows, words: ProfileWords, limits: ProtocolLimits, rate: flo
     wanted = map_words(rows.control, lambda word: find_wanted(words, word))
     idle = _find_over(wanted == State.ACTIVE, round(limits.find_delay(words, rate) * rate))
     if words is CIA402:
-        powered = np.isnan(rows.cor) | (rows.status.astype(int) & words.powered != 0)
+        powered = np.isnan(rows.drive) | (rows.status.astype(int) & words.powered != 0)
         idle |= _find_over(powered, round(ProtocolLimits().find_delay(CIA408, rate) * rate))
     return idle
 
@@ -262,7 +269,7 @@ def list_wrong_changes(rows: Rows, delay: int) -> list[str]:
     states, control = find_states(rows, CIA402), rows.control.astype(int)
     wanted = map_words(control, lambda word: find_wanted(CIA402, word))
     rises = np.diff(control & CIA402.reset, prepend=0) > 0
-    answered = np.flatnonzero(~np.isnan(rows.cor))
+    answered = np.flatnonzero(~np.isnan(rows.drive))
     before = np.concatenate(([int(State.NOT_READY)], states[answered]))[:-1]
     wrong = []
     for i in np.flatnonzero(states[answered] != before).tolist():
@@ -283,7 +290,7 @@ def measure_delays(rows: Rows) -> Whole:
     due = {state * len(State) + word for state, word in list_transitions()}
     k = np.arange(len(pairs))
     begin = np.maximum.accumulate(np.where(np.diff(pairs, prepend=-1) != 0, k, 0))  # of the run of this pair
-    found: Whole = np.where(np.isin(pairs, list(due)), k - begin, 0)[~np.isnan(rows.cor)]
+    found: Whole = np.where(np.isin(pairs, list(due)), k - begin, 0)[~np.isnan(rows.drive)]
     return found
 
 
@@ -298,7 +305,7 @@ def measure_status_ages(rows: Rows, faulty: Mask | None = None) -> Whole:
     matches = status == expected
     if faulty is not None:
         matches |= faulty & (status & _READY == 0) & (status & _LEVELS == 0)
-    answered = ~np.isnan(rows.cor)
+    answered = ~np.isnan(rows.drive)
     ages = np.zeros(len(status), int)
     if not (matches | ~answered).all():
         last: dict[int, int] = {}
@@ -341,7 +348,7 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
         judged = rows.on_time & ~_find_faulty(record) if rows is record.run else rows.on_time
         flags = np.append(rows.flags[1:], 0).astype(int)  # what the plant found at the next SYNC
         is_wrong = judged & (flags & int(Flags.DRIVE_LATE) != 0)
-        is_missing = judged & ~is_wrong & (np.isnan(rows.cor) | (flags & int(Flags.DRIVE_MISSING) != 0))
+        is_missing = judged & ~is_wrong & (np.isnan(rows.drive) | (flags & int(Flags.DRIVE_MISSING) != 0))
         wrong += int(is_wrong.sum())
         missing += int(is_missing.sum())
         cycles += int(judged.sum())
@@ -356,10 +363,15 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
 
 
 def _judge_frozen(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
-    """How far the position error moved while the current of the closed loop stood still."""
-    change = measure_frozen(record.run, record.current_limit if record.gains is not None else None, record.words)
-    largest = 100.0  # um: fifty times the noise of the position sensor
-    yield _make_result("current follows the error", "current", change * 1e6, "um", high=largest)
+    """How far the position error moved while the drive of the closed loop stood still."""
+    signals = record.bench.signals
+    name, unit = f"{signals.drive.phrase} follows the error", signals.controlled.unit
+    if isnan(record.still_limit):
+        yield SkippedCheck(name, "the law of the plant's controller is not one of the error alone")
+        return
+    change = measure_frozen(record.run, record.drive_limit if record.gains is not None else None, record.words)
+    scale, shown = (1e6, "um") if unit == "m" else (1.0, unit)
+    yield _make_result(name, signals.drive.word, change * scale, shown, high=round(record.still_limit * scale, 9))
 
 
 def measure_frozen(rows: Rows, limit: float | None, words: ProfileWords = CIA408) -> float:
@@ -368,12 +380,12 @@ def measure_frozen(rows: Rows, limit: float | None, words: ProfileWords = CIA408
     Only cycles in which control and status word say ACTIVE, and not those within 2 % of the current limit. `limit`:
     what the controller says it is, A; None: it does not say, and the largest current of the run counts as the limit.
     """
-    largest = np.nanmax(np.abs(rows.cor), initial=0.0) if limit is None else limit
-    is_limited = np.abs(rows.cor) >= 0.98 * largest
+    largest = np.nanmax(np.abs(rows.drive), initial=0.0) if limit is None else limit
+    is_limited = np.abs(rows.drive) >= 0.98 * largest
     wanted = map_words(rows.control, lambda word: find_wanted(words, word))
     closed = (wanted == State.ACTIVE) & (find_states(rows, words) == State.ACTIVE) & ~is_limited
-    error = rows.com - rows.xj
-    stays = closed[1:] & closed[:-1] & (rows.cor[1:] == rows.cor[:-1]) & ~np.isnan(error[1:] + error[:-1])
+    error = rows.demand - rows.position
+    stays = closed[1:] & closed[:-1] & (rows.drive[1:] == rows.drive[:-1]) & ~np.isnan(error[1:] + error[:-1])
     edges = np.flatnonzero(np.diff(np.concatenate(([0], stays.astype(int), [0]))))
     ranges = [float(np.ptp(error[first:last + 1])) for first, last in edges.reshape(-1, 2) if last - first > 1]
     return max(ranges, default=0.0)
@@ -392,16 +404,18 @@ def _judge_probes(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
     first = record.probes[0]
     delay, detail = measure_step_delay(first, record.bench.rate, record.words)
     high = limits.find_step_delay(record.bench) * 1e3
-    yield _make_result(delay_name, "current", delay, "ms", high=high, detail=detail)
+    drive = record.bench.signals.drive
+    yield _make_result(delay_name, drive.word, delay, "ms", high=high, detail=detail)
     if record.gains is not None:
         gain, detail = measure_gain(first, record.gains, record.words)
         tolerance = 100 * limits.gain
-        yield _make_result(gain_name, "current", 100 * gain, "%", 100 - tolerance, 100 + tolerance, detail)
+        yield _make_result(gain_name, drive.word, 100 * gain, "%", 100 - tolerance, 100 + tolerance, detail)
     else:
         yield SkippedCheck(gain_name, "the controller has no objects that hold its gains, or does not follow them")
     if len(record.probes) > 1:
         difference, detail = measure_difference(record.probes)
-        yield _make_result(repeat_name, "current", difference * 1e3, "mA", high=0.0, detail=detail)
+        yield _make_result(repeat_name, drive.word, difference * drive.shown_scale, drive.shown_unit, high=0.0,
+                           detail=detail)
 
 
 def _find_active(rows: Rows, words: ProfileWords) -> Whole:
@@ -415,15 +429,15 @@ def measure_step_delay(probe: Rows, rate: float, words: ProfileWords = CIA408) -
     An answer follows when the current has changed by a fifth of the largest change since the step.
     """
     active = _find_active(probe, words)
-    steps = active[1:][np.diff(probe.com[active]) != 0]
+    steps = active[1:][np.diff(probe.demand[active]) != 0]
     if not len(steps):
         return nan, "the probe ended before its step"
     k, end = int(steps[0]), int([*steps, active[-1] + 1][1])
-    change = (probe.cor[k:end] - probe.cor[k - 1]) * np.sign(probe.com[k] - probe.com[k - 1])
+    change = (probe.drive[k:end] - probe.drive[k - 1]) * np.sign(probe.demand[k] - probe.demand[k - 1])
     if np.isnan(change).any():
         return nan, "a drive frame is missing at the step"
     if change.max() <= 0.0:
-        return nan, "the current does not follow the demand"
+        return nan, "the answer does not follow the demand"
     return float(np.flatnonzero(change >= 0.2 * change.max())[0]) * 1e3 / rate, ""
 
 
@@ -431,10 +445,10 @@ def measure_gain(probe: Rows, gains: object, words: ProfileWords = CIA408) -> tu
     """Current in the ACTIVE cycles of a probe over that of the documented law with these gains, 1, and a remark."""
     active = _find_active(probe, words)
     loop, wanted = Loop(), []
-    for demand, position in zip(probe.com[active], probe.xj[active], strict=True):
+    for demand, position in zip(probe.demand[active], probe.position[active], strict=True):
         current, loop = compute_current(loop, float(demand), float(position), gains)
         wanted.append(current)
-    law, cor = np.array(wanted), probe.cor[active]
+    law, cor = np.array(wanted), probe.drive[active]
     if np.isnan(law + cor).any():
         return nan, "frames of the probe are missing"
     return (float(law @ cor / (law @ law)), "") if law.any() else (nan, "the gains are zero")
@@ -445,16 +459,16 @@ def measure_difference(probes: Sequence[Rows]) -> tuple[float, str]:
 
     Before the first drive frame, which may come in the second cycle, there is nothing to compare.
     """
-    begin = max(int(np.argmin(np.isnan(probe.cor))) for probe in probes)
+    begin = max(int(np.argmin(np.isnan(probe.drive))) for probe in probes)
     first, *others = [Rows._make(column[begin:] for column in probe) for probe in probes]
     largest = 0.0
     for other in others:
-        if len(other.cor) != len(first.cor) or np.isnan(other.cor - first.cor).any():
+        if len(other.drive) != len(first.drive) or np.isnan(other.drive - first.drive).any():
             return nan, "a drive frame of the probes is missing"
-        apart = np.flatnonzero(first.xj != other.xj)  # after the first difference the positions follow the currents
-        same = int(apart[0]) if len(apart) else len(first.cor)
+        apart = np.flatnonzero(first.position != other.position)  # after the first difference they follow the drives
+        same = int(apart[0]) if len(apart) else len(first.drive)
         if same:
-            largest = max(largest, float(np.abs(other.cor - first.cor)[:same].max()))
+            largest = max(largest, float(np.abs(other.drive - first.drive)[:same].max()))
     return largest, ""
 
 

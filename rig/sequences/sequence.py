@@ -6,6 +6,7 @@ bench of a run says how many cycles a second has.
 """
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -19,12 +20,13 @@ import numpy as np
 
 from plant import segments
 from plant.errors import InputError
-from plant.model import Model, find_quantity, load_model
+from plant.model import build_bare_model, find_quantity, load_model
 from plant.parameters import parse_value
+from plant.plant_check import MOST_FOLLOWING_ERROR
+from plant.plants import Plant, find_plant
 from plant.profile import Profile, build_profile, list_section_names, parse_columns
 from plant.quantity import Quantity
-from plant.segments import FARTHEST, RATE, STRONGEST, Array, Csv, Segment
-from plant.signals import EHA, Signals
+from plant.segments import RATE, Array, Csv, Segment
 from rig import tables
 from rig.benches.calibration import Decision
 from rig.sequences import checks, faults
@@ -33,11 +35,12 @@ from rig.sequences.faults import Fault, Parameter, Plan, find_contradiction
 from rig.sequences.measures import MAIN
 from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.python_parts import PythonSegment, Step, load_function, require_function_name, run_file
-from rig.sequences.signals import name_signals_of
+from rig.sequences.signals import find_tested, name_signals_of
 from rig.sequences.timing import TimingPolicy
 from rig.tables import Place, Range
 
 PHASES = ("setup", "main", "cleanup", "load")
+PREFLIGHT = "preflight.toml"
 Unsigned32 = Annotated[int, Range("1", low=0, high=0xFFFFFFFF)]
 
 
@@ -88,14 +91,15 @@ class ModelChoice:
 class Sequence:
     """A test as the file describes it, and the text it was read from.
 
-    `load` is made of segments in N and lies over main from its start; after its end the last value stays. `ends` says
-    how the run must end to pass: "completed", or "safe_state" for a test whose point is that it is broken off.
+    `load` is made of segments in N, or in the unit of the plant's load, and lies over main from its start; after its
+    end the last value stays. Without `main` it is the nominal test that the plant declares. `ends` says how the run
+    must end to pass: "completed", or "safe_state" for a test whose point is that it is broken off.
     """
 
     title: str
     description: str = ""
     setup: tuple[Segment, ...] = ()
-    main: tuple[Segment, ...]
+    main: tuple[Segment, ...] = ()
     cleanup: tuple[Segment, ...] = ()
     load: tuple[Segment, ...] = ()
     faults: tuple[Fault, ...] = ()
@@ -112,6 +116,7 @@ class Sequence:
     source: str = field(default="", metadata=_OWN, repr=False)
     files: Mapping[str, bytes] = field(default_factory=dict, metadata=_OWN, repr=False)  # CSV and Python files, by name
     rate: float = field(default=RATE, metadata=_OWN)  # cycles a second
+    plant: str = "eha"  # whose signals and parameters it names; default: that of the bench or model
 
     @property
     def duration(self) -> float:
@@ -119,7 +124,7 @@ class Sequence:
         return sum(segment.duration for segment in self.main)
 
     def setup_profile(self) -> Profile:
-        """The command before main, from 0 m."""
+        """The command before main, from 0."""
         return build_profile(self.setup, rate=self.rate)
 
     def main_profile(self) -> Profile:
@@ -127,7 +132,7 @@ class Sequence:
         return build_profile(self.main, self.setup_profile().end, self.rate)
 
     def cleanup_profile(self, start: float) -> Profile:
-        """The command after main, or after it was broken off at the demand `start` (m)."""
+        """The command after main, or after it was broken off at the demand `start`, SI."""
         return build_profile(self.cleanup, start, self.rate)
 
     def sections(self) -> dict[str, slice]:
@@ -135,7 +140,7 @@ class Sequence:
         return {section.name: slice(section.start, section.stop) for section in self.main_profile().sections}
 
     def load_profile(self) -> Array:
-        """Force on the ram in N for every cycle of main."""
+        """The load, SI, for every cycle of main."""
         force, _, end = build_profile(self.load, rate=self.rate)
         cycles = round(self.duration * self.rate)
         return np.concatenate((force, np.full(cycles - len(force), end)))
@@ -144,7 +149,7 @@ class Sequence:
         """The faults by cycle of the run."""
         start = round(sum(segment.duration for segment in self.setup) * self.rate)
         stop = start + round(self.duration * self.rate)
-        return Plan(faults=self.faults, start=start, stop=stop, seed=seed, rate=self.rate)
+        return Plan(faults=self.faults, start=start, stop=stop, seed=seed, rate=self.rate, plant=self.plant)
 
     @property
     def loses_frames(self) -> bool:
@@ -172,11 +177,11 @@ class Sequence:
         Raises:
             InputError: the line of what such cycles cannot show.
         """
-        return self if rate == self.rate else Sequence.from_bundle(self.bundle(), rate)
+        return self if rate == self.rate else Sequence.from_bundle(self.bundle(), rate, self.plant)
 
     @classmethod
-    def from_bundle(cls, bundle: Mapping[str, bytes], rate: float = RATE) -> Sequence:
-        """The sequence of a bundle, for `rate` cycles a second; Python files in it run.
+    def from_bundle(cls, bundle: Mapping[str, bytes], rate: float = RATE, plant: str = "eha") -> Sequence:
+        """The sequence of a bundle, for `rate` cycles a second and this plant; Python files in it run.
 
         Raises:
             InputError: a file is not in it or does not make a sequence.
@@ -190,16 +195,17 @@ class Sequence:
                 raise InputError("bundle", name, "to be part of the bundle")
             return bundle[name]
 
-        return parse_sequence(tables.decode_text(bundle[sources[0]], sources[0]), sources[0], read_file, rate)
+        return parse_sequence(tables.decode_text(bundle[sources[0]], sources[0]), sources[0], read_file, rate, plant)
 
 
-def load_sequence(name_or_path: str | Path, rate: float = RATE, signals: Signals | None = None) -> Sequence:
+def load_sequence(name_or_path: str | Path, rate: float = RATE, plant: str = "eha") -> Sequence:
     """Read a sequence: a TOML file, or the name of one that comes with the rig.
 
     Args:
-        name_or_path: e.g. "preflight" or "tests/mine.toml"; CSV and Python files in it are sought beside it.
+        name_or_path: e.g. "preflight" or "tests/mine.toml"; CSV and Python files in it are sought beside it. The
+            preflight is that of the plant.
         rate: cycles a second of the bench that is to play it.
-        signals: of the plant that it is to test; None: of the model that it names.
+        plant: that it is to test, unless it names a model.
 
     Raises:
         InputError: no such sequence, or the file, line and key that cannot be used and what was expected there.
@@ -207,29 +213,35 @@ def load_sequence(name_or_path: str | Path, rate: float = RATE, signals: Signals
     found = files("rig.sequences").iterdir()
     shipped = {Path(entry.name).stem: entry for entry in found if entry.name.endswith(".toml")}
     if str(name_or_path) in shipped:
-        entry = shipped[str(name_or_path)]
+        entry, kind = shipped[str(name_or_path)], find_plant(plant)
+        if entry.name == PREFLIGHT and kind.profile:  # the shipped one is that of the EHA
+            entry = shipped.get(f"preflight_{kind.key}", entry)
+            if entry.name == PREFLIGHT:
+                return parse_sequence(write_preflight(kind), PREFLIGHT, lambda _: b"", rate, plant)
         return parse_sequence(entry.read_text(encoding="utf-8"), entry.name, lambda name: tables.read_file(Path(name)),
-                              rate, signals)
+                              rate, plant)
     path = Path(name_or_path)
     if path.suffix != ".toml":
         raise InputError(name_or_path, "", f"a .toml file, or {tables.list_choices(str(name_or_path), shipped)}")
     return parse_sequence(tables.decode_text(tables.read_file(path), path), str(path),
-                          lambda name: tables.read_file(path.parent / name), rate, signals)
+                          lambda name: tables.read_file(path.parent / name), rate, plant)
 
 
-def parse_sequence(text: str, name: str, read_file: ReadFile, rate: float = RATE, signals: Signals | None = None
-                   ) -> Sequence:
+def parse_sequence(text: str, name: str, read_file: ReadFile, rate: float = RATE, plant: str = "eha") -> Sequence:
     """The sequence of a TOML text; `read_file` gives the bytes of the CSV and Python files that it names.
 
-    The Python files run. `rate`: cycles a second. `signals`: of the plant; None: of the model that the text names.
+    The Python files run. `rate`: cycles a second. `plant`: that of the test, unless the text names a model.
 
     Raises:
         InputError: the file, line and key that cannot be used, or the line of a Python file.
     """
     table, place = tables.parse_table(text, name)
-    with name_signals_of(_find_signals(table) if signals is None else signals):
-        sequence = replace(tables.build_dataclass(Sequence, table, place, _KINDS), name=Path(name).name, source=text,
-                           rate=rate)
+    plant = _find_plant(table, place) or plant
+    kind = find_plant(plant)
+    with name_signals_of(kind.signals):
+        sequence: Sequence = tables.build_dataclass(Sequence, table, place, _KINDS)
+        sequence = replace(sequence, name=Path(name).name, source=text, rate=rate, plant=plant,
+                           main=sequence.main or kind.profile)
         sequence = _fill_in_files(sequence, place, read_file)
     _check_phases(sequence, place)
     _check_faults(sequence, place.at("faults"))
@@ -241,13 +253,33 @@ def parse_sequence(text: str, name: str, read_file: ReadFile, rate: float = RATE
     return sequence
 
 
-def _find_signals(table: Mapping[str, Any]) -> Signals:
-    """The signals of the model that a sequence names; a model that cannot be read is refused later."""
-    chosen = table.get("model")
+def _find_plant(table: Mapping[str, Any], place: Place) -> str:
+    """The plant that a sequence names, or that of its model, or ""; a model that cannot be read is refused later."""
+    chosen, named = table.get("model"), table.get("plant", "")
+    if named:
+        with place.at("plant").locate():
+            return find_plant(str(named)).key
     name = chosen.get("name") if isinstance(chosen, dict) else None
     with suppress(InputError):
-        return load_model(name).kind.signals if isinstance(name, str) else EHA
-    return EHA
+        return load_model(name).plant if isinstance(name, str) else ""
+    return ""
+
+
+def write_preflight(kind: Plant) -> str:
+    """A preflight for any plant, as TOML: its nominal test, and whether the loop follows at all. The limits are wide.
+    """
+    command = build_profile(kind.profile, rate=round(1.0 / kind.nominal["controller.period"])).command
+    span = float(np.ptp(np.append(command, 0.0)))
+    name, last = json.dumps(kind.signals.controlled.name), list_section_names(kind.profile)[-1]
+    return "\n".join([
+        f"title = {json.dumps('Preflight, ' + (kind.title or kind.name))}",
+        'setup = [{ kind = "hold", time = 0.5 }]',
+        'cleanup = [{ kind = "ramp", to = 0.0, time = 0.5 }, { kind = "hold", time = 0.2 }]', "checks = [",
+        f'  {{ name = "following error", kind = "rms_error", high = {MOST_FOLLOWING_ERROR * span!r} }},',
+        f'  {{ name = "error at the end", kind = "max_error", window = {json.dumps(last)}, high = {0.2 * span!r} }},',
+        f'  {{ name = "far out", kind = "never_exceeds", signal = {name}, high = {1.5 * span!r} }},',
+        '  { name = "no emergency", kind = "event_never", event = "EMCY" },', "]",
+        f'guards = [{{ name = "runs away", signal = {name}, low = {-3.0 * span!r}, high = {3.0 * span!r} }}]', ""])
 
 
 def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Sequence:
@@ -287,12 +319,13 @@ def _read_column(file: str, read: Callable[[str, Place, str], bytes], phase: str
     expected = "a readable command file"
     data = read(file, here, expected)
     try:
-        columns = parse_columns(data, file, period)
+        columns = parse_columns(data, file, period, find_tested())
     except InputError as error:
         raise here.refuse(f"{expected}; {error}") from error
     values = columns.get("value" if phase == "load" or "com" not in columns else "com")
     if values is None:
-        raise here.refuse(f"a file with the columns t and {'value' if phase == 'load' else 'com'}")
+        command = find_tested().command.name
+        raise here.refuse(f"a file with the columns t and {'value' if phase == 'load' else command}")
     return tuple(values.tolist())
 
 
@@ -317,9 +350,12 @@ def _check_phases(sequence: Sequence, place: Place) -> None:
 
 def _check_sizes(sequence: Sequence, place: Place) -> None:
     """No demand and no load of a size that can only be a slip of units."""
-    start = 0.0
+    start, signals = 0.0, find_plant(sequence.plant).signals
+    if sequence.load and signals.load is None:
+        raise place.at("load").refuse("no load: the plant has none")
     for phase in PHASES:
-        most, unit, begin = (STRONGEST, "N", 0.0) if phase == "load" else (FARTHEST, "m", start)
+        signal, begin = (signals.load or signals.command, 0.0) if phase == "load" else (signals.command, start)
+        most, unit = signal.largest, signal.unit
         with np.errstate(all="ignore"):  # what overflows is refused below
             try:
                 values, sections, start = build_profile(getattr(sequence, phase), begin, sequence.rate)
@@ -357,26 +393,26 @@ def _check_parameters(sequence: Sequence, place: Place) -> None:
     chosen, plan = sequence.model, sequence.plan(0)
     overrides, injected = place.at("model", "overrides"), place.at("faults")
     for name, value in chosen.overrides.items():
-        quantity = _find_meaning(name, overrides.at(name))
+        quantity = _find_meaning(name, overrides.at(name), sequence.plant)
         with overrides.at(name).locate():
             parse_value("", "", quantity, value)
     for i, fault in enumerate(plan.faults):
         if isinstance(fault, Parameter):
-            quantity = _find_meaning(fault.parameter, injected.at(i, "parameter"))
+            quantity = _find_meaning(fault.parameter, injected.at(i, "parameter"), sequence.plant)
             with injected.at(i).locate(has_field=True):
                 fault.find_target(quantity)
     if chosen.name == "eha":  # another model's values are known when it runs
         try:
-            model = Model().replace(chosen.overrides)
+            model = build_bare_model(sequence.plant).replace(chosen.overrides)
         except InputError as error:
             raise overrides.refuse(f"{error.field} {error.expected}") from error
         if (found := find_contradiction(plan, model)) is not None:
             raise injected.at(found[0]).refuse(found[1])
 
 
-def _find_meaning(name: str, place: Place) -> Quantity:
+def _find_meaning(name: str, place: Place, plant: str) -> Quantity:
     try:
-        return find_quantity(name)
+        return find_quantity(name, plant=plant)
     except InputError as error:
         raise place.refuse(f"{error.expected}, not {name!r}") from error
 

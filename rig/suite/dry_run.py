@@ -30,10 +30,10 @@ from fdi.report.report import Cell, Column, Figure, Line, Medium, Report, Sectio
 from fdi.report.run_report import format_limits
 from plant import Model, simulate
 from plant.model import find_quantity
-from plant.run import Columns
+from plant.plants import Plant
+from plant.run import Columns, make_columns_type
 from plant.segments import Array
-from plant.signals import EHA
-from rig.nodes.scenario import require_servovalve
+from plant.signals import Signals
 from rig.run.job import Job, find_differences
 from rig.run.outcome import LimitReached, find_limits
 from rig.sequences.checks import CheckResult, Guard, evaluate_checks
@@ -58,7 +58,6 @@ from rig.sequences.sequence import Sequence as TestSequence
 OF_EVENTS = ("response_within", "shut_off", "recovers", "event_occurs", "event_never")  # without a bus no events
 
 
-SHOWN_UNITS = {"m": ("mm", 1e3), "m/s": ("mm/s", 1e3), "m/s2": ("m/s2", 1.0), "N": ("kN", 1e-3)}  # and SI value to it
 
 
 class Demand(NamedTuple):
@@ -67,6 +66,7 @@ class Demand(NamedTuple):
     name: str
     value: float
     unit: str
+    shown: tuple[str, float]  # unit of tables, and how many of it an SI unit is
     t: float  # s of main, where it is reached
     section: str
     limit: float | None
@@ -74,11 +74,11 @@ class Demand(NamedTuple):
 
     def describe(self, value: float) -> str:
         """A value of this figure in the unit of tables: "5 mm"."""
-        return f"{self.show(value)} {SHOWN_UNITS[self.unit][0]}"
+        return f"{self.show(value)} {self.shown[0]}"
 
     def show(self, value: float) -> str:
         """The number alone."""
-        return f"{SHOWN_UNITS[self.unit][1] * value:.4g}"
+        return f"{self.shown[1] * value:.4g}"
 
     @property
     def is_violated(self) -> bool:
@@ -100,8 +100,8 @@ class DryRun(NamedTuple):
     durations: dict[str, float]  # s, of setup, main and cleanup
     demands: list[Demand]
     t: Array  # s of main
-    speed: Array  # m/s, of the command; 0 where it jumps
-    load: Array  # N
+    speed: Array  # SI, of the command; 0 where it jumps
+    load: Array  # SI
     faults: list[PlannedFault]  # that the run will inject
     predicted: Columns  # of setup, main and cleanup, without the faults
     limits: tuple[LimitReached, ...]  # that the predicted run reaches
@@ -125,9 +125,8 @@ def make_dry_run(job: Job) -> DryRun:
     """Hold the command and load of a job against the model's limits, and simulate it without bus and faults.
 
     Raises:
-        InputError: a plant that the bench cannot drive, or a fault that contradicts the model's parameters.
+        InputError: a fault that contradicts the model's parameters.
     """
-    require_servovalve(job.model)
     faults = plan_faults(job)
     sequence, model = job.sequence, job.model
     setup, main = sequence.setup_profile(), sequence.main_profile()
@@ -140,7 +139,8 @@ def make_dry_run(job: Job) -> DryRun:
     t = (np.arange(len(command)) - first) / rate
     predicted = simulate(model, command, load, job.seed)
     sections = name_rows(sequence, (setup.command, main.command, cleanup.command))
-    columns = Columns(np.arange(last - first) / rate, *(column[first:last] for column in predicted[1:]))
+    columns = make_columns_type(model.kind.signals)(np.arange(last - first) / rate,
+                                                    *(column[first:last] for column in predicted[1:]))
     chosen = [check for check in sequence.checks if check.kind not in OF_EVENTS]
     return DryRun(
         job=job, durations={"setup": first / rate, "main": (last - first) / rate,
@@ -149,9 +149,10 @@ def make_dry_run(job: Job) -> DryRun:
         speed=split_jumps(command, [row for row, _ in sections], rate)[0], load=load, faults=faults,
         predicted=predicted,
         limits=find_limits(lambda name: getattr(predicted, name), model, first),
-        checks=evaluate_checks(chosen, columns, sequence.sections(), (), sequence.fault_starts(), rate=rate),
+        checks=evaluate_checks(chosen, columns, sequence.sections(), (), sequence.fault_starts(), rate=rate,
+                               signals=model.kind.signals),
         not_predicted=[check.name for check in sequence.checks if check.kind in OF_EVENTS],
-        trips=[] if sequence.faults else find_trips(sequence.guards, columns))
+        trips=[] if sequence.faults else find_trips(sequence.guards, columns, model.kind.signals))
 
 
 def name_rows(sequence: TestSequence, commands: Sequence[Array]) -> list[tuple[int, str]]:
@@ -176,18 +177,24 @@ def measure_demands(command: Array, load: Array, t: Array, sections: Sequence[tu
     is_start = np.isin(np.arange(len(command)), starts)
     is_known = ~is_start & ~np.roll(is_start, 1)  # rows whose speed and the one before are of the same section
     acceleration = np.where(is_known, np.diff(speed, prepend=0.0) * rate, 0.0)
-    limits = find_capabilities(model)
+    limits, signals = find_capabilities(model), model.kind.signals
+    unit, shown = signals.command.unit, (signals.command.shown_unit, signals.command.shown_scale)
+    moved = "position" if unit == "m" else signals.controlled.phrase
 
-    def find(name: str, values: Array, unit: str, parameter: str, back: int = 0) -> Demand:
+    def find(name: str, values: Array, unit: str, shown: tuple[str, float], parameter: str, back: int = 0) -> Demand:
         row = int(np.argmax(np.abs(values)))
         section = sections[int(np.searchsorted(starts, max(row - back, 0), side="right")) - 1][1]
-        return Demand(name, float(np.abs(values[row])), unit, float(t[row]), section, limits.get(parameter), parameter)
+        return Demand(name, float(np.abs(values[row])), unit, shown, float(t[row]), section, limits.get(parameter),
+                      parameter)
 
-    return [find("position", command, "m", "jack.travel"),
-            find("step", jumps, "m", ""),
-            find("speed", speed, "m/s", "no-load speed", back=1),  # from the row before, which may be another section's
-            find("acceleration", acceleration, "m/s2", ""),
-            find("load", load, "N", "stall force")]
+    found = [find(moved, command, unit, shown, signals.controlled.limit), find("step", jumps, unit, shown, ""),
+             # from the row before, which may be another section's
+             find("speed", speed, f"{unit}/s", (f"{shown[0]}/s", shown[1]), "no-load speed", back=1),
+             find("acceleration", acceleration, f"{unit}/s2", (f"{unit}/s2", 1.0), "")]
+    if signals.load is not None:
+        found.append(find("load", load, signals.load.unit, (signals.load.shown_unit, signals.load.shown_scale),
+                          "stall force"))
+    return found
 
 
 def split_jumps(command: Array, starts: Sequence[int], rate: float) -> tuple[Array, Array]:
@@ -208,20 +215,21 @@ def find_capabilities(model: Model) -> dict[str, float]:
     The no-load speed is the flow of the open valve over the area of the piston, GQ XSM / AJ; the stall force is the
     supply pressure on that area, PSR AJ (physics.md).
     """
-    found = {"jack.travel": model["jack.travel"]}
-    values = model.values
+    values, limit = model.values, model.kind.signals.controlled.limit
+    found = {limit: values[limit]} if limit else {}
     if {"valve.flow_gain", "spool.travel"} <= values.keys():
         found["no-load speed"] = model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"]
         found["stall force"] = model["supply.pressure"] * model["jack.area"]
     return found
 
 
-def find_trips(guards: Sequence[Guard], columns: Columns) -> list[GuardTrip]:
+def find_trips(guards: Sequence[Guard], columns: Columns, signals: Signals) -> list[GuardTrip]:
     """The guards that the predicted main phase violates."""
     trips = []
     for guard in guards:
         low, high = guard.compute_limits()
-        values = columns.com - columns.xj if guard.signal == "error" else getattr(columns, guard.signal)
+        values = compute_error(columns, signals) if guard.signal not in signals.names else getattr(
+            columns, guard.signal)
         outside = np.convolve((values < low) | (values > high), np.ones(guard.cycles))[:len(values)] >= guard.cycles
         if outside.any():
             trips.append(GuardTrip(guard.name, float(columns.t[int(np.argmax(outside))])))
@@ -258,7 +266,7 @@ def plan_faults(job: Job) -> list[PlannedFault]:
     schedule = Schedule(plan, model.values)
     require_sensible(plan, model)
     return [PlannedFault(fault.label, fault.kind, name_target(fault), (begin.cycle - plan.start) / plan.rate,
-                         (end.cycle - plan.start) / plan.rate, describe_size(fault, model.values))
+                         (end.cycle - plan.start) / plan.rate, describe_size(fault, model.values, model.kind))
             for fault, begin, end in zip(plan.faults, schedule.edges[::2], schedule.edges[1::2], strict=True)]
 
 
@@ -271,18 +279,18 @@ def name_target(fault: Fault) -> str:
     return "frame sync" if isinstance(fault, Jitter) else "node controller"
 
 
-def describe_size(fault: Fault, base: Mapping[str, float]) -> str:
-    """How large a fault is, in words; `base` has the model's own parameters."""
+def describe_size(fault: Fault, base: Mapping[str, float], kind: Plant) -> str:
+    """How large a fault of a plant is, in words; `base` has the model's own parameters."""
     parts: list[str] = []
     match fault:
         case Parameter():
-            quantity = find_quantity(fault.parameter)
+            quantity = find_quantity(fault.parameter, plant=kind.key)
             words = {number: word for word, number in quantity.words.items()}
             values = base[fault.parameter], fault.find_target(quantity)
             parts = [" to ".join(words.get(value) or format_amount(value, quantity.unit) for value in values)]
         case Offset() | Stuck():
             of_noise = " RMS" if isinstance(fault, Noise) else ""
-            unit = EHA.find(fault.signal).unit
+            unit = kind.signals.find(fault.signal).unit
             parts = ["its last reading" if fault.value is None else format_amount(fault.value, unit) + of_noise]
         case Late():
             parts = [format_amount(fault.delay, "s")]
@@ -354,7 +362,7 @@ def _tabulate_demands(demands: Sequence[Demand]) -> list[Table]:
         (Column("value", align="right"),
          lambda each: Cell(each.show(each.value), "bad" if each.is_violated else "", True)),
         (Column("limit", align="right"), lambda each: "" if each.limit is None else each.show(each.limit)),
-        (Column("unit"), lambda each: SHOWN_UNITS[each.unit][0]),
+        (Column("unit"), lambda each: each.shown[0]),
         (Column("limit from"), lambda each: "" if each.limit is None else each.parameter),
         (Column("section"), lambda each: each.section), (Column("t", "s", "right"), lambda each: f"{each.t:.3f}"),
         caption="A jump between two sections is a step and counts neither as speed nor as acceleration.")]
@@ -373,18 +381,31 @@ def _tabulate_faults(faults: Sequence[PlannedFault]) -> list[Table]:
 
 
 def describe_prediction(dry: DryRun) -> list[tuple[str, str]]:
-    """The figures of the predicted run: current, following error, limits that it reaches."""
-    run = dry.predicted
-    error = run.com - run.xj
-    limit = dry.job.model.values.get("controller.current_limit")
-    current = f"largest {1e3 * np.abs(run.cor).max():.3g} mA" + (f" of {1e3 * limit:.3g} mA" if limit else "")
+    """The figures of the predicted run: drive, following error, limits that it reaches."""
+    signals = dry.job.model.kind.signals
+    error, drive, limit = compute_error(dry.predicted, signals), signals.drive, find_drive_limit(dry)
+    scale, unit = drive.shown_scale, drive.shown_unit
+    largest = float(np.abs(getattr(dry.predicted, drive.name)).max())
+    text = f"largest {scale * largest:.3g} {unit}" + (f" of {scale * limit:.3g} {unit}" if limit else "")
     main = (dry.t >= 0.0) & (dry.t < dry.durations["main"])
-    lines = [("current", current),
-             ("error", f"largest {1e3 * np.abs(error[main]).max():.4g} mm, RMS "
-                       f"{1e3 * math.sqrt(float(np.mean(error[main] ** 2))):.4g} mm in main")]
+    scale, unit = signals.controlled.shown_scale, signals.controlled.shown_unit
+    lines = [(drive.phrase, text),
+             ("error", f"largest {scale * np.abs(error[main]).max():.4g} {unit}, RMS "
+                       f"{scale * math.sqrt(float(np.mean(error[main] ** 2))):.4g} {unit} in main")]
     if dry.limits:
         lines.append(("reaches", "; ".join(each.describe(dry.job.model.kind.signals) for each in dry.limits)))
     return lines
+
+
+def find_drive_limit(dry: DryRun) -> float | None:
+    """The limit of the drive, SI; None where the plant declares none."""
+    return dry.job.model.values.get(dry.job.model.kind.signals.drive.limit)
+
+
+def compute_error(columns: Columns, signals: Signals) -> Array:
+    """Command less controlled signal, SI, (n,)."""
+    error: Array = getattr(columns, signals.command.name) - getattr(columns, signals.controlled.name)
+    return error
 
 
 def _tabulate_checks(checks: Sequence[CheckResult]) -> list[Table]:
@@ -404,14 +425,17 @@ def _tabulate_checks(checks: Sequence[CheckResult]) -> list[Table]:
 
 def collect_data(dry: DryRun) -> dict[str, Any]:
     """The JSON answer of a dry run."""
-    run, error = dry.predicted, dry.predicted.com - dry.predicted.xj
+    signals = dry.job.model.kind.signals
+    error, drive = compute_error(dry.predicted, signals), signals.drive
+    largest = float(np.abs(getattr(dry.predicted, drive.name)).max())
     return {
         "verdict": "BEYOND_LIMITS" if dry.problems else "WITHIN_LIMITS", "problems": dry.problems,
         "sequence": dry.job.sequence.title, "model": dry.job.model.name,
         "differences": find_differences(dry.job).describe(), "durations": dry.durations,
         "faults": [{**each._asdict(), "duration": each.duration} for each in dry.faults],
-        "demands": [{**each._asdict(), "violated": each.is_violated} for each in dry.demands],
-        "predicted": {"current": float(np.abs(run.cor).max()), "error": float(np.abs(error).max()),
+        "demands": [{key: value for key, value in each._asdict().items() if key != "shown"}
+                    | {"violated": each.is_violated} for each in dry.demands],
+        "predicted": {drive.phrase: largest, "error": float(np.abs(error).max()),
                       "limits": [each._asdict() for each in dry.limits],
                       "guards": [trip._asdict() for trip in dry.trips]},
         "checks": [to_plain(check.collect_data()) for check in dry.checks], "not_predicted": dry.not_predicted}
@@ -419,15 +443,21 @@ def collect_data(dry: DryRun) -> dict[str, Any]:
 
 def draw_dry_run(dry: DryRun) -> str:
     """Position, speed, following error, current and load over time, with limits in red; faults, windows of checks."""
-    limits = {each.name: each.limit for each in dry.demands}
+    demands = {each.name: each for each in dry.demands}
+    signals, first = dry.job.model.kind.signals, dry.demands[0]
     run, start, end = dry.predicted, float(dry.t[0]), float(dry.t[-1]) + 1.0 / dry.job.sequence.rate
+    command, controlled, drive = (getattr(run, s.name) for s in (signals.command, signals.controlled, signals.drive))
+    unit, scale = first.shown
     shown: list[tuple[str, list[tuple[Array, str, str | None]], float, float | None]] = [
-        ("position [mm]", [(run.com, COMMAND, "command"), (run.xj, BLUE, "predicted")], 1e3, limits["position"]),
-        ("speed [mm/s]", [(dry.speed, GREY, None)], 1e3, limits["speed"]),
-        ("error [mm]", [(run.com - run.xj, ORANGE, None)], 1e3, None),
-        ("current [mA]", [(run.cor, "#8250df", None)], 1e3, dry.job.model.values.get("controller.current_limit"))]
+        (f"{first.name} [{unit}]", [(command, COMMAND, "command"), (controlled, BLUE, "predicted")], scale,
+         first.limit),
+        (f"speed [{unit}/s]", [(dry.speed, GREY, None)], scale, demands["speed"].limit),
+        (f"error [{unit}]", [(command - controlled, ORANGE, None)], scale, None),
+        (f"{signals.drive.phrase} [{signals.drive.shown_unit}]", [(drive, "#8250df", None)], signals.drive.shown_scale,
+         find_drive_limit(dry))]
     if dry.load.any():
-        shown.append(("load [kN]", [(dry.load, GREY, None)], 1e-3, limits["load"]))
+        load = demands["load"]
+        shown.append((f"load [{load.shown[0]}]", [(dry.load, GREY, None)], load.shown[1], load.limit))
     faults = [shade(each.t0, each.t1, FAULT, 0.5) for each in dry.faults]
     panels: list[list[Mark]] = [[
         *(line(dry.t, values * scale, colour, name, 1.2) for values, colour, name in lines),

@@ -34,12 +34,11 @@ from rig.evidence.requirements import (
     trace_requirements,
 )
 from rig.network.clock import WallClock
-from rig.run.job import JobChoice, build_job, find_differences
+from rig.run.job import JobChoice, build_job, find_differences, load_tested_sequence
 from rig.run.outcome import INTERRUPTED, Outcome, describe_faults, describe_finding, diagnose_servovalve, has_fault
 from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import run_job
 from rig.sequences.checks import CheckResult, SkippedCheck
-from rig.sequences.sequence import load_sequence
 from rig.tables import Range, build_dataclass, decode_text, parse_table, read_file
 
 Value = float | str
@@ -106,10 +105,10 @@ class Case(NamedTuple):
         return JudgedRun(self.name, "NOT_RUN", self.requirement, self.checks)
 
 
-def read_suite_file(path: Path, base: JobChoice, rate: float) -> tuple[SuiteFile, list[Case]]:
+def read_suite_file(path: Path, base: JobChoice, *, is_trusted: bool = False) -> tuple[SuiteFile, list[Case]]:
     """The content of a suite file and its cases; `base` has what the command line chooses for all of them.
 
-    `rate`: cycles a second of the bench.
+    `is_trusted`: whether Python files that benches and models name may run.
 
     Raises:
         InputError: the file, line and key that cannot be used.
@@ -122,7 +121,7 @@ def read_suite_file(path: Path, base: JobChoice, rate: float) -> tuple[SuiteFile
     for i, entry in enumerate(suite.case):
         for case in _vary(entry, path.parent, base):
             try:
-                load_sequence(case.choice.sequence, rate)
+                load_tested_sequence(case.choice, is_trusted=is_trusted)
             except InputError as error:  # refused with the line of the suite file, if it is not there
                 if error.where == case.choice.sequence:
                     raise place.at("case", i, "sequence").refuse(f"a sequence; {error}") from error

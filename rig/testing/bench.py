@@ -25,9 +25,9 @@ from fdi.report.run_report import (
 )
 from fdi.trace.trace import Trace
 from plant.errors import InputError
+from plant.plants import find_plant
 from plant.segments import RATE
-from rig.benches.bench_file import load_bench
-from rig.run.job import JobChoice, build_job
+from rig.run.job import JobChoice, build_job, load_tested_plant
 from rig.run.outcome import Outcome
 from rig.run.runner import run_job
 from rig.run.state import SessionEvent
@@ -167,11 +167,12 @@ class Bench:
         __tracebackhide__ = True  # pytest shows the line of the test
         folder = self.folder / f"run-{len(self.runs) + 1}"
         try:
-            built = build_sequence(None if sequence is None else str(sequence), command, load_bench(str(bench)).rate,
-                                   faults=faults, checks=checks, load=load, guards=guards)
             chosen = self.model if model is None else str(model)
-            job = build_job(JobChoice(built.name, chosen, set or {}, seed, tuple(map(Path, effects)),
-                                      str(bench)), built)
+            choice = JobChoice("", chosen, set or {}, seed, tuple(map(Path, effects)), str(bench))
+            tested, plant = load_tested_plant(choice)
+            built = build_sequence(None if sequence is None else str(sequence), command, tested.rate, plant,
+                                   faults=faults, checks=checks, load=load, guards=guards)
+            job = build_job(choice._replace(sequence=built.name), built)
             run = BenchRun(folder, run_job(job, folder, ignore_progress, _never))
         except InputError as error:
             raise InputError(error.where, error.field, error.expected) from None
@@ -189,7 +190,7 @@ Command = NDArray[np.float64] | Sequence[Table]
 _COMMAND_FILE = "command.csv"
 
 
-def build_sequence(sequence: str | None, command: Command | None, rate: float = RATE,
+def build_sequence(sequence: str | None, command: Command | None, rate: float = RATE, plant: str = "eha",
                    **more: Sequence[Table]) -> TestSequence:
     """A sequence from a file or name, or from a command.
 
@@ -197,6 +198,7 @@ def build_sequence(sequence: str | None, command: Command | None, rate: float = 
         sequence: a file, or the name of a shipped sequence.
         command: in its place, a demand in m for each cycle, or a list of segments as tables.
         rate: cycles a second.
+        plant: that it tests.
         more: entries as tables that are added to those of the sequence, by key: faults, checks, guards, load.
 
     Raises:
@@ -204,14 +206,14 @@ def build_sequence(sequence: str | None, command: Command | None, rate: float = 
     """
     added = {key: list(entries) for key, entries in more.items() if len(entries)}
     if command is None:
-        named = load_sequence(sequence or "preflight", rate)
+        named = load_sequence(sequence or "preflight", rate, plant)
         if not added:
             return named
         table, files, name = tomllib.loads(named.source), dict(named.files), named.name
     else:
         if sequence is not None:
             raise InputError("sequence", sequence, "either a sequence or a command")
-        table, files = _make_table(command, rate)
+        table, files = _make_table(command, rate, find_plant(plant).signals.command.name)
         name = "command.toml"
     for key, entries in added.items():
         table[key] = [*table.get(key, []), *entries]
@@ -221,17 +223,17 @@ def build_sequence(sequence: str | None, command: Command | None, rate: float = 
             raise InputError(file, "", "a file of the sequence")
         return files[file]
 
-    return parse_sequence(write_toml(table), name, read_file, rate)
+    return parse_sequence(write_toml(table), name, read_file, rate, plant)
 
 
-def _make_table(command: Command, rate: float) -> tuple[dict[str, Any], dict[str, bytes]]:
+def _make_table(command: Command, rate: float, column: str) -> tuple[dict[str, Any], dict[str, bytes]]:
     """The table of a sequence that plays a command, and its files."""
     main: Any = list(command)
     files = {}
     if isinstance(command, np.ndarray):
         rows = "\n".join(f"{k / rate!r},{float(value)!r}" for k, value in enumerate(np.atleast_1d(command)))
         main = [{"name": "command", "kind": "csv", "file": _COMMAND_FILE}]
-        files[_COMMAND_FILE] = f"t,com\n{rows}\n".encode()
+        files[_COMMAND_FILE] = f"t,{column}\n{rows}\n".encode()
     return {"title": "Command from Python", "main": main}, files
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant import Columns
+from plant.run import make_columns_type
 from plant.signals import EHA, Signals
 from rig import recorder
 from rig.benches.bench import Bench
@@ -71,7 +71,7 @@ def make_live_plan(sequence: Sequence, pace: str, bench: Bench) -> LivePlan:
             unknown.append(check.name)
     return LivePlan(sequence.title, sequence.duration, sequence.rate, pace, tuple(known), tuple(unknown),
                     sequence.sections(), dict(sequence.fault_starts()), bool(sequence.load),
-                    bench.list_participants())
+                    bench.list_participants(), signals=bench.signals)
 
 
 class CheckState(NamedTuple):
@@ -199,9 +199,10 @@ class LiveRun:
         if self._main_from < 0 or rows < 1:
             return
         table = self._table[self._main_from:self._main_from + rows]
-        columns = [table[:, self._column[name]] for name in Columns._fields[1:]]
-        data = RunData(Columns(np.arange(rows) / self.plan.rate, *columns), self.plan.sections, tuple(self.events),
-                       self.plan.starts, rate=self.plan.rate)
+        signals = self.plan.signals
+        columns = [table[:, self._column[name]] for name in signals.names]
+        data = RunData(make_columns_type(signals)(np.arange(rows) / self.plan.rate, *columns), self.plan.sections,
+                       tuple(self.events), self.plan.starts, rate=self.plan.rate, signals=signals)
         for check in self.plan.checks:
             state = self.checks[check.name]
             if state.is_judged or state.word == "after the run":

@@ -21,10 +21,10 @@ from rig.network.frame import Node
 from rig.network.link import Link, serve_node
 from rig.network.node_objects import CONTROLLER, PLANT, read_gains
 from rig.network.raw_bus import open_raw_bus
-from rig.nodes.emulator import Emulator
+from rig.nodes.emulator import Emulator, PlantPlace
 from rig.nodes.emulator_service import EmulatorService, list_unheard
 from rig.nodes.firmware import Firmware
-from rig.nodes.scenario import Scenario, require_servovalve
+from rig.nodes.scenario import Scenario
 from rig.run.job import speaks_as_shipped
 from rig.run.participants import EMBEDDED_NAMES
 from rig.run.priority import LOOP_PRIORITY, enter_loop_thread, lock_memory, raise_priority
@@ -42,8 +42,11 @@ def run_command(args: argparse.Namespace) -> int:
     """
     bus, _ = choose_bus(args.bus)
     bench = load_bench(args.bench or "eha", is_trusted=args.trust)
-    if not speaks_as_shipped(bench):
-        raise InputError("--bench", args.bench, "a bench with the frames of the shipped one: our nodes have no others")
+    if args.node == "plant":
+        PlantPlace.find(bench)  # refuses a bench without one
+        args.model = args.model or bench.plant
+    elif not speaks_as_shipped(bench):
+        raise InputError("--bench", args.bench, "a bench with the frames of the shipped one, as our firmware has")
     if bus.partition(":")[0] in EMBEDDED_NAMES:
         given = "" if args.bus == "auto" else args.bus
         raise InputError("--bus", given, "a bus between programs, such as udp_multicast or socketcan:vcan0")
@@ -111,11 +114,5 @@ def make_node(args: argparse.Namespace, bench: Bench, link: Link, stack: context
 
 
 def choose_scenario(args: argparse.Namespace) -> Scenario:
-    """The plant that the options describe, without faults.
-
-    Raises:
-        InputError: a model that the bench cannot drive.
-    """
-    model = load_chosen_model(args)
-    require_servovalve(model)
-    return Scenario(model, Plan(stop=0), (), args.seed)
+    """The plant that the options describe, without faults. Raises InputError."""
+    return Scenario(load_chosen_model(args), Plan(stop=0), (), args.seed)

@@ -163,7 +163,7 @@ MISTAKES = [
     ("[controller]", 'cycle = "1 h"\n[controller]', "cycle: expected whole microseconds from 0.1 to 100 ms, not '1 h'"),
     ("[controller]\n", '[controller]\ntimeout = "0.5 ms"\n', "controller.timeout: expected whole microseconds from 1"),
     ("[controller]", "bitrate = 5\n[controller]", "bitrate: expected a whole number from 10000 to 1000000 bit/s, not"),
-    ("position_demand", "positon_demand", "inputs.positon_demand: expected a signal of the bench: 'control_word', "),
+    ("position_demand", "positon_demand", "inputs.positon_demand: expected a signal of the bench and its "),
     ('position_demand = { object = "0x2000", count = "1 um" }', "", "inputs: expected also the signal position_demand"),
     ('current = { object = "0x2002", count = "20 uA" }', "", "controller.outputs: expected also the signal current"),
     ("0x2000", "0x2222", "inputs.position_demand: expected an object of x.eds; it has no 0x2222"),
@@ -221,7 +221,7 @@ CAN_MISTAKES = [
     ("[controller.outputs]", '[plant_node]\nnode = 3\n[controller.outputs]', "plant_node: expected protocol = \"canop"),
     ('ram_position = {', 'control_word = "Demand.Enable"\nram_position = {', "each value of the device once"),
     ('[controller.phases]\n"Demand.Enable" = { main = "on", cleanup = 0 }', 'control_word = "Demand.Enable"',
-     "outputs.control_word: expected a signal of the bench: 'current', 'cycle', 'mode_display' or 'status_word'"),
+     "expected a signal of the bench and its plant: 'current', 'cycle', 'mode_display' or 'status_word'"),
 ]
 
 

@@ -73,7 +73,7 @@ def test_missing_and_late_drives(drives: str, flags: list[int], counted: tuple[i
     desk = PlantDesk(scenario())
     assert [desk.cycle(None if drive == "-" else 2e-3, answers=60_000 if drive == "<" else None)[1].flags
             for drive in drives] == flags
-    assert (counters(desk), desk.emergencies(), desk.node.plant.current) == (counted, emergencies, current)
+    assert (counters(desk), desk.emergencies(), desk.node.plant.drive) == (counted, emergencies, current)
 
 
 def test_the_cycle_number_wraps_without_a_miss() -> None:
@@ -289,7 +289,7 @@ def test_a_plant_that_is_bus_off_moves_without_current_and_comes_back() -> None:
         desk.wait(MS)
     cycles = [codec.unpack_valve_state(data).cycle for data in desk.frames(codec.VALVE_STATE)]
     assert cycles == [*range(10), *range(30, 40)]
-    assert desk.node.plant.current == 5e-3 and desk.node._od[COUNTERS, 1] >= 20
+    assert desk.node.plant.drive == 5e-3 and desk.node._od[COUNTERS, 1] >= 20
     assert not [t_ns for t_ns, _, _ in desk.heard if 10 * MS <= t_ns < 30 * MS]
 
 

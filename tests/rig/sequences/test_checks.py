@@ -301,7 +301,7 @@ def judge_heartbeats(beats: Sequence[Heartbeat], seconds: float = 1.0, deaf: flo
     nothing = np.zeros(5)
     rows = Rows(*[nothing] * 7, on_time=np.ones(5, bool))
     record = ProtocolRecord(run=rows, heartbeats={"controller": beats}, heard=(0.0, seconds), deaf=deaf,
-                            current_limit=8e-3)
+                            drive_limit=8e-3)
     found = [check for check in judge_protocol(record, ProtocolLimits())[0] if check.signal == "heartbeat"]
     return found[0] if found else None
 
@@ -334,7 +334,7 @@ def test_a_current_that_stands_still_below_the_limit_is_found(
     error = np.linspace(0.0, 1e-3, cycles)
     current = np.where(np.arange(cycles) < 50, 1e-5 * np.sin(np.arange(cycles)), frozen)
     zero, words = np.zeros(cycles), np.full(cycles, 15.0)
-    rows = Rows(com=error, xj=zero, cor=current, control=words, status=words, flags=zero, response=zero,
+    rows = Rows(demand=error, position=zero, drive=current, control=words, status=words, flags=zero, response=zero,
                 on_time=np.ones(cycles, bool))
     assert (measure_frozen(rows, limit) > 4e-4) == is_found
 

@@ -23,13 +23,13 @@ SOUND = [*ENABLED, (0x00, 0x0250, 0.0, 20)]
 def make_rows(parts: list[tuple[int, int, float, int]]) -> Rows:
     columns = [np.repeat([part[i] for part in parts], [part[3] for part in parts]).astype(float) for i in range(3)]
     zero = np.zeros(len(columns[0]))
-    return Rows(com=zero, xj=zero, cor=columns[2], control=columns[0], status=columns[1], flags=zero, response=zero,
-                on_time=np.ones(len(zero), bool))
+    return Rows(demand=zero, position=zero, drive=columns[2], control=columns[0], status=columns[1], flags=zero,
+                response=zero, on_time=np.ones(len(zero), bool))
 
 
 def judge(rows: Rows, bench: Bench, limits: ProtocolLimits | None = None,
           ) -> tuple[dict[str, CheckResult], dict[str, str]]:
-    record = ProtocolRecord(run=rows, bench=bench, current_limit=8e-3)
+    record = ProtocolRecord(run=rows, bench=bench, drive_limit=8e-3)
     checks, skipped = judge_protocol(record, limits or ProtocolLimits())
     return {check.name: check for check in checks}, {check.name: check.reason for check in skipped}
 
@@ -62,7 +62,7 @@ def test_the_cycles_in_which_a_drive_is_enabled_are_judged_with_the_run() -> Non
     """They come before the run, whose first row finds the drive enabled."""
     enabled = make_rows([(0x0F, 0x1237, 1e-3, 50)])
     for before, passed in ((make_rows(ENABLED), True), (make_rows([(0x0F, 0x1237, 0.0, 5)]), False)):
-        record = ProtocolRecord(run=enabled, enabling=[(0, before)], bench=DRIVE, current_limit=8e-3)
+        record = ProtocolRecord(run=enabled, enabling=[(0, before)], bench=DRIVE, drive_limit=8e-3)
         found = {check.name: check.passed for check in judge_protocol(record, ProtocolLimits())[0]}
         assert found[STATES] is passed
 

@@ -249,7 +249,7 @@ def test_the_example_of_the_page(tmp_path: Path) -> None:
     assert block is not None
     (tmp_path / "acceptance.toml").write_text(re.sub(r"(?m)^    ", "", block[0]))
     assert is_suite_file(str(tmp_path / "acceptance.toml"))
-    content, cases = read_suite_file(tmp_path / "acceptance.toml", JobChoice(), 1000.0)
+    content, cases = read_suite_file(tmp_path / "acceptance.toml", JobChoice())
     cases = build_suite(content.title, cases, {}).cases
     assert len(cases) == 7 and "This file makes 3 + 4 cases".lower() in " ".join(text.lower().split())
     for name in ("preflight, seed 2", "reactions, lost_feedback, jack.mass=80"):
@@ -358,7 +358,7 @@ def test_the_option_holds_for_all_cases_and_the_key_for_one(tmp_path: Path) -> N
     (tmp_path / "short.toml").write_text(SHORT)
     (tmp_path / "suite.toml").write_text(UNITS)
     for base, expected in ((False, [True, True, False]), (True, [True] * 3)):
-        _, variants = read_suite_file(tmp_path / "suite.toml", JobChoice(is_diagnosed=base), 1000.0)
+        _, variants = read_suite_file(tmp_path / "suite.toml", JobChoice(is_diagnosed=base))
         assert [variant.choice.is_diagnosed for variant in variants] == expected
     (tmp_path / "suite.toml").write_text(UNITS.replace("fdi = true", "fdi = 1"))
     line = refuse("run", tmp_path / "suite.toml", "--out", tmp_path / "out")
