@@ -275,6 +275,7 @@ def _find_plant(reader: _Reader, folder: Path, *, is_trusted: bool) -> tuple[str
     path = folder / named if Path(named).suffix and (folder / named).is_file() else Path(named)
     if path.suffix == ".py":
         content = reader.read_file(named, place)
+        reader.files.pop(named)  # a log has it as the plant of the run
         if not is_loaded(path, content):  # a user who names it himself trusts it
             require_trust(place.file, [ForeignCode(named, content)], is_trusted=is_trusted)
         load_plant(path, content)

@@ -47,10 +47,25 @@ def load_chosen_effects(args: argparse.Namespace) -> None:
     Raises:
         InputError: an invalid file, code that --trust does not allow, or two files of one name.
     """
+    args.model = args.model or find_recorded_plant(args)
     foreign_code.load_plant_of_model(args.model, is_trusted=args.trust)
     load_user_effects(args.effects)
     brought = foreign_code.load_effects_of_model(args.model, args.effects, is_trusted=args.trust)
     foreign_code.require_different_names((*args.effects, *brought))
+
+
+def find_recorded_plant(args: argparse.Namespace) -> str | None:
+    """The plant that the first log among the arguments was recorded on; None for `eha`, and where there is no log.
+
+    Raises:
+        InputError: the log brings a plant along that --trust does not allow.
+    """
+    from rig.run.job import load_plant_of_log  # here: commands without a log need none of it
+
+    given = [getattr(args, "trace", None), *(getattr(args, name, None) or [] for name in ("traces", "words"))]
+    names = [name for each in given if each for name in ([each] if isinstance(each, str | Path) else each)]
+    log = next((path for path in map(Path, names) if path.suffix == ".mcap" or (path / "trace.mcap").is_file()), None)
+    return None if log is None else load_plant_of_log(log, is_trusted=args.trust) or None
 
 
 def load_chosen_model(args: argparse.Namespace) -> Model:

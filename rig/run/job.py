@@ -18,12 +18,14 @@ from fdi.foreign_code import (
     require_trust,
 )
 from fdi.output import write_whole
+from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import Trace
 from plant import InputError, Model, load_model
 from plant.effects import load_effects
 from plant.model import find_plant_of_model, find_quantity, parse_model
 from plant.parameters import parse_toml
-from plant.plants import load_plant
+from plant.plant_files import read_named_plant
+from plant.plants import is_known, load_plant
 from plant.signals import Signals
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench, load_bench_from_files
@@ -97,7 +99,8 @@ class Job:
         found |= {_SEQUENCE_FOLDER + name: ("text/plain", data) for name, data in self.sequence.bundle().items()}
         found |= {_EFFECT_FOLDER + path.name: ("text/x-python", path.read_bytes()) for path in self.effects}
         own = self.model.kind
-        found |= {_PLANT_FOLDER + own.file.name: ("text/x-python", own.source)} if own.file else {}
+        found |= {_PLANT_FOLDER + path.name: ("text/plain", own.source or path.read_bytes())
+                  for path in ((own.file, Path(own.key)) if own.foreign else (own.file,)) if path is not None}
         return found | {_BENCH_FOLDER + name: ("text/plain", data) for name, data in self.bench.files.items()}
 
     def list_settings(self) -> dict[str, object]:
@@ -158,8 +161,8 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
         tables = parse_toml(attachments["model.toml"].decode(), where)
     except UnicodeDecodeError as error:
         raise InputError(path, "attachment model.toml", "text in UTF-8") from error
-    for code, file in zip(plant_codes, _store_code(plant_codes), strict=True):
-        load_plant(file, code.content, str(tables.get("plant")))
+    if plant_codes:
+        tables["plant"] = _load_stored_plant(plant_codes, str(tables.get("plant")), keeps_name=True)
     effects = _store_code(effect_codes)
     for code, file in zip(effect_codes, effects, strict=True):
         load_effects(file, code.content)
@@ -168,6 +171,43 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
     require_bench_cycle(model, bench, where)
     sequence = Sequence.from_bundle(bundle, bench.rate, model.plant)
     return Job(sequence=sequence, model=model, bench=bench, effects=effects, **settings)
+
+
+def load_plant_of_log(path: Path, *, is_trusted: bool = False, announce: Announce = print_on_standard_error) -> str:
+    """The plant that a log was recorded on, as models call it; a user's, which the log holds, runs if it is trusted.
+
+    "" for the plant `eha`, and for what is no log of a run.
+
+    Raises:
+        InputError: it is not trusted, or cannot be used.
+    """
+    try:
+        log = open_log(path / "trace.mcap" if path.is_dir() else path)
+        tables = parse_toml(log.attachments.get("model.toml", b"").decode(), f"{path}: model.toml")
+    except (InputError, UnicodeDecodeError):  # whoever reads it as a trace says what is wrong
+        return ""
+    named = str(tables.get("plant", ""))
+    codes = [ForeignCode(name, content) for name, content in log.attachments.items() if name.startswith(_PLANT_FOLDER)]
+    if not codes or is_known(named):
+        return named
+    for code in codes:
+        _require_file_name(path, code.name)
+    require_trust(path, codes, is_trusted=is_trusted, announce=announce)
+    return _load_stored_plant(codes, named)
+
+
+def _load_stored_plant(codes: list[ForeignCode], named: str, *, keeps_name: bool = False) -> str:
+    """Load the plant that a log calls so, from the files in it; what models call it from now on.
+
+    That is the path of a file which other processes can read, or, with `keeps_name`, its name in the log.
+    """
+    files = dict(zip(codes, _store_code(codes), strict=True))
+    code = next((code for code in codes if Path(code.name).name == Path(named).name), codes[0])
+    file = files[code]
+    if file.suffix != ".py":
+        return str(read_named_plant(str(file), file))
+    is_same = Path(named).is_file() and Path(named).read_bytes() == code.content
+    return load_plant(Path(named) if is_same else file, code.content, named if keeps_name or is_same else "").key
 
 
 def _read_bench(attachments: Mapping[str, bytes], name: str, signals: Signals, *, is_trusted: bool) -> Bench:
