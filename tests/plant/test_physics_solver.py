@@ -172,7 +172,7 @@ def residuals(case: str, name: str, changes: dict[str, float], steps: int = 100)
 
 
 @practice
-@pytest.mark.parametrize("name", ["est", "repeat", "holdout"])
+@pytest.mark.parametrize("name", ["est", "holdout"])
 @pytest.mark.parametrize("case", EXACT)
 def test_only_sensor_noise_is_left(case: str, name: str) -> None:
     left = residuals(case, name, EXACT[case])
@@ -189,7 +189,7 @@ def test_a_finer_step_makes_the_break_away_that_the_default_misses() -> None:
 
 
 @practice
-@pytest.mark.parametrize("name", ["est", "repeat", "holdout"])
+@pytest.mark.parametrize("name", ["est", "holdout"])
 def test_an_effect_that_nobody_listed_is_ten_lines_of_a_users_file(name: str, tmp_path: Path) -> None:
     """09 hides a force periodic in position, 2750 N every 2.5 mm."""
     with restored_catalogue():
