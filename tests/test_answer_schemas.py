@@ -15,7 +15,7 @@ from answer_schemas import KINDS_OF_BENCH, build_validator, check_answer, load_s
 from jsonschema import Draft202012Validator
 from places import ROOT
 from rig_command import rig
-from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
+from short_runs import HIDDEN, write_measured_runs
 
 from rig.cli.command_list import COMMANDS
 
@@ -154,11 +154,6 @@ def test_the_answers_of_small_commands(preflight: Path, tmp_path: Path, monkeypa
     assert_all_seen("doctor", rig("doctor", "--json").json)
 
 
-@pytest.fixture(scope="module")
-def short_runs_with_a_null_bias(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return write_measured_runs(tmp_path_factory.mktemp("measured"), HIDDEN)
-
-
 def test_the_answer_of_a_diagnosis(preflight: Path) -> None:
     answer = rig("fdi", preflight, "--json").json
     assert answer["events"] == []
@@ -170,14 +165,9 @@ def test_the_answer_of_a_diagnosis(preflight: Path) -> None:
     assert_all_seen("fdi", answer, {**answer, "events": [event], "with_effects": beside})
 
 
-def test_the_answer_of_a_comparison(short_runs_with_a_null_bias: dict[str, Path]) -> None:
-    runs = short_runs_with_a_null_bias
+def test_the_answer_of_a_comparison(tmp_path: Path) -> None:
+    runs = write_measured_runs(tmp_path, HIDDEN)
     assert_all_seen("compare", rig("compare", runs["est"], "--repeat", runs["repeat"], "--json").json)
-
-
-def test_the_answer_of_an_explanation(short_runs_with_a_null_bias: dict[str, Path]) -> None:
-    answer = rig("explain", *list_trace_arguments(short_runs_with_a_null_bias), "--json").json
-    assert answer["candidates"] and answer["blind_to"] and answer["notes"] == []
 
 
 def test_a_key_that_a_schema_lacks_and_one_that_an_answer_lacks_are_found() -> None:

@@ -40,7 +40,7 @@ def test_the_effect_is_named_with_its_evidence(found: Said) -> None:
     assert best["ratio"] < 1.1 and best["evidence"] > 1000.0 and best["p_value"] < 1e-6
     current = best["parameters"]["null_bias.current"]
     assert current["unit"] == "A" and current["low"] < hidden < current["high"] < current["low"] + 0.1 * hidden
-    assert all(other["ratio"] > best["ratio"] for other in others)
+    assert all(other["ratio"] > best["ratio"] for other in others) and said["blind_to"] and said["notes"] == []
 
 
 def test_baseline_and_floor(found: Said) -> None:
