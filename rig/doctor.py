@@ -21,7 +21,7 @@ from rig.benches.frame_map import describe_identifier
 from rig.network import bus, udp
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
-from rig.network.link import Link
+from rig.network.link import Link, LinkWire
 from rig.run import priority
 
 Status = Literal["ok", "limited", "missing"]
@@ -191,13 +191,12 @@ def listen(bench: Bench, spec: str, seconds: float) -> list[Frame]:
     Raises:
         RigError: the bus cannot be opened.
     """
-    clock = WallClock()
-    link = Link(bus.open_can(spec, bench.bitrate, bench.frames.is_fd), clock.now)
-    with contextlib.closing(link):
-        frames, end = [], clock.now() + round(seconds * 1e9)
-        while (left := end - clock.now()) > 0:
-            frames += link.poll(min(left / 1e9, 0.05))
-        return frames
+    clock, frames = WallClock(), list[Frame]()
+    with contextlib.closing(LinkWire(Link(bus.open_can(spec, bench.bitrate, bench.frames.is_fd), clock.now), clock)
+                            ) as wire:
+        wire.receive = frames.append
+        wire.run_until(clock.now() + round(seconds * 1e9))
+    return frames
 
 
 def count_frames(bench: Bench, frames: Iterable[Frame]) -> tuple[dict[str, Counter[int]], Counter[str]]:

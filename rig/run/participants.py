@@ -132,21 +132,25 @@ def find_firmware_parameters(model: Model) -> dict[str, float]:
     return {name: model[name] for effect in acting if effect.is_active(model.values) for name in effect.parameters}
 
 
-def _make_command(job: Job, node: Role) -> list[str]:
-    """The command that runs a node of this job as a process of its own, which ends when this one does."""
-    parent = ["--parent", str(os.getpid())]
-    if node == CONTROLLER and job.controller == "c":
+def make_node_command(node: Role, bus: str, *words: str, is_in_c: bool = False) -> list[str]:
+    """The command that runs a node of ours as a process of its own, which ends when this one does."""
+    parent = ("--parent", str(os.getpid()))
+    if is_in_c:
         from rig.firmware.build import build_controller
 
-        return [str(build_controller()), job.bus, *parent]
-    words = [sys.executable, "-m", "rig.cli.main", "node", NAMES[node], "--bus", job.bus, "--quiet", *parent]
-    words += [word for path in job.effects for word in ("--effects", str(path))]
+        return [str(build_controller()), bus, *parent]
+    return [sys.executable, "-m", "rig.cli.main", "node", NAMES[node], "--bus", bus, "--quiet", *parent, *words]
+
+
+def _make_command(job: Job, node: Role) -> list[str]:
+    """The command that runs a node of this job."""
+    words = [word for path in job.effects for word in ("--effects", str(path))]
     if node == PLANT and job.model.kind.foreign is not None:
         words += ["--model", job.model.plant]
     if node == CONTROLLER:  # all else about the model comes by SDO
         for parameter, value in find_firmware_parameters(job.model).items():
             words += ["--set", f"{parameter}={value!r}"]
-    return words
+    return make_node_command(node, job.bus, *words, is_in_c=node == CONTROLLER and job.controller == "c")
 
 
 def is_replaced(master: Master, node: Role, processes: NodeProcesses, seconds: int = 180) -> bool:

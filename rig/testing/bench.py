@@ -173,16 +173,11 @@ class Bench:
             built = build_sequence(None if sequence is None else str(sequence), command, tested.rate, plant,
                                    faults=faults, checks=checks, load=load, guards=guards)
             job = build_job(choice._replace(sequence=built.name), built)
-            run = BenchRun(folder, run_job(job, folder, ignore_progress, _never))
+            run = BenchRun(folder, run_job(job, folder, ignore_progress, lambda: False))
         except InputError as error:
             raise InputError(error.where, error.field, error.expected) from None
         self.runs.append(run)
         return run
-
-
-def _never() -> bool:
-    """Nobody stops the run."""
-    return False
 
 
 Table = Mapping[str, Any]

@@ -3,8 +3,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,13 +13,12 @@ from rig.benches.frame_map import Role
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, show_progress
 from rig.conformance.run_cases import build_conformance_report, choose_cases, run_cases, write_junit
 from rig.conformance.target import DataSheet, Options, Target
-from rig.firmware.build import build_controller
 from rig.network.bus import choose_bus, open_can
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.link import EmbeddedWire, Link, LinkWire, Wire
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
-from rig.run.participants import EMBEDDED_NAMES, NodeProcesses, require_firmware_bus
+from rig.run.participants import EMBEDDED_NAMES, NodeProcesses, make_node_command, require_firmware_bus
 
 OWN_NODES = {"controller": Role.CONTROLLER, "plant": Role.PLANT, "c": Role.CONTROLLER}  # c: in C
 
@@ -132,16 +129,14 @@ def start_node(name: str, bus: str, wire: Wire, processes: NodeProcesses) -> Non
         RigError: it does not boot.
     """
     booted: list[int] = []
-    node, boot_up, parent = OWN_NODES[name], 0x700 + OWN_NODES[name], ("--parent", str(os.getpid()))
+    node, boot_up = OWN_NODES[name], 0x700 + OWN_NODES[name]
     wire.receive = lambda frame: booted.append(frame.cob_id) if frame.data == b"\0" else None
     wire.send(0x000, bytes((130, node)))
     if wire.wait(lambda: boot_up in booted, 0.7):
         return
-    command = [sys.executable, "-m", "rig.cli.main", "node", name, "--bus", bus, "--quiet", *parent]
     if name == "c":
         require_firmware_bus(bus)
-        command = [str(build_controller()), bus, *parent]
-    processes.start(node, command)
+    processes.start(node, make_node_command(node, bus, is_in_c=name == "c"))
     for _ in range(120):  # s: it may have to compile the plant first
         if wire.wait(lambda: boot_up in booted, 1.0) or processes.find_ended():
             break
