@@ -45,6 +45,9 @@ PARTS = (
     Part("docs/conformance.md"),
     Part("docs/diff.md"),
     Part("docs/effects.md"),
+    Part("docs/evidence.md", "",
+         "printf 'id,text\\nREQ-1,A reaction\\n' > requirements.csv\n"
+         "printf 'title = \"a\"\\n[[case]]\\nsequence = \"lost_sync\"\\nrequirement = \"REQ-1\"\\n' > acceptance.toml"),
     Part("docs/firmware.md"),
     Part("docs/fmu.md", "A model as a unit",
          f"cp '{ROOT}/examples/cogging.py' my_effects.py\n"
