@@ -54,7 +54,7 @@ def collect_runs(sources: Iterable[str]) -> Package:
                     if (name := stem if number == 1 else f"{stem}-{number}") not in taken)
         taken.add(base)
         package.files.update({f"runs/{base}/{file.relative_to(root).as_posix()}": file
-                              for file in sorted(root.rglob("*")) if file.is_file()})
+                              for file in sorted(root.rglob("*")) if file.is_file() and not file.is_symlink()})
         cases = _read_suite(root / "suite.json", base, package) if (root / "suite.json").is_file() else {}
         for file in verdicts:
             name = Path(base, file.parent.relative_to(root)).as_posix()

@@ -14,7 +14,7 @@ import subprocess
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import IO, NamedTuple
@@ -24,9 +24,25 @@ from fdi.progress import Progress
 from plant.errors import InputError, show_value
 
 MANIFEST, INDEX = "MANIFEST.sha256", "evidence.json"
-SIGNATURES = {"minisign": f"{MANIFEST}.minisig", "gpg": f"{MANIFEST}.asc"}
 Files = Mapping[str, Callable[[], IO[bytes]]]  # name -> opens its content
 _DAMAGE = (OSError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+
+
+class Signer(NamedTuple):
+    """A program that signs: the file of its signature, and its arguments to sign and to verify."""
+
+    file: str
+    sign: str
+    verify: str
+
+
+SIGNERS = {
+    "minisign": Signer(f"{MANIFEST}.minisig", "-S -s {key} -m {manifest} -x {signature}",
+                       "-V -p {key} -m {manifest} -x {signature}"),
+    "gpg": Signer(f"{MANIFEST}.asc",
+                  "--batch --yes --local-user {key} --armor --output {signature} --detach-sign {manifest}",
+                  "--batch --status-fd 1 --verify {signature} {manifest}"),
+}
 
 
 class Verification(NamedTuple):
@@ -74,12 +90,14 @@ def write_package(contents: Mapping[str, bytes | Path], out: Path, key: str, pro
         if not is_inside(name) or not name.isprintable():
             raise InputError(out, "", f"files whose names stay in the folder, not {show_value(name)}")
         hashes[name] = _compute_sha256(files[name])
+        if not hashes[name]:
+            raise InputError(name, "", "a file that can be read")
         progress("sealing", 0.5 * number / len(files))
     manifest = _format_manifest(hashes)
     files[MANIFEST] = partial(open_content, manifest)
     if key:
-        tool = "minisign" if Path(key).is_file() else "gpg"
-        files[SIGNATURES[tool]] = partial(open_content, _sign(manifest, tool, key))
+        file, signature = _sign(manifest, key)
+        files[file] = partial(open_content, signature)
     try:
         if out.suffix == ".zip":
             with write_whole(out) as part, part.open("wb") as handle:
@@ -103,6 +121,7 @@ def verify_package(path: Path, key: str = "") -> Verification:
     """
     with contextlib.ExitStack() as stack:
         files: dict[str, Callable[[], IO[bytes]]] = {}
+        start = _read(partial(open_content, path), 1024)
         if path.is_dir():
             files = {each.relative_to(path).as_posix(): partial(open_content, each) for each in path.rglob("*")
                      if each.is_symlink() or not each.is_dir()}
@@ -111,11 +130,10 @@ def verify_package(path: Path, key: str = "") -> Verification:
                 archive = stack.enter_context(zipfile.ZipFile(path))
                 files = {name: partial(archive.open, name) for name in archive.namelist() if name[-1:] != "/"}
             except (*_DAMAGE, ValueError) as error:
-                if path.is_file() and _read_start(path)[:2] == b"PK":
+                if start.startswith(b"PK"):
                     return Verification(0, "", "not checked", [f"{path.name} (damaged: {error})"], [], [])
                 raise InputError(path, "", "a folder or zip that rig evidence made") from error
         if MANIFEST not in files:
-            start = b"" if path.is_dir() else _read_start(path)
             if INDEX in files or MANIFEST.encode() in start:  # the first file of a zip, whose directory is damaged
                 return Verification(0, "", "not checked", [], [MANIFEST], [])
             raise InputError(path, MANIFEST, "a package of rig evidence, which has this file")
@@ -125,16 +143,15 @@ def verify_package(path: Path, key: str = "") -> Verification:
         return found
 
 
-def _read_start(path: Path) -> bytes:
-    with path.open("rb") as handle:
-        return handle.read(1024)
+def _read(open_file: Callable[[], IO[bytes]], most: int = -1) -> bytes:
+    """The beginning of a file, or all of it; nothing of one that cannot be read."""
+    with contextlib.suppress(*_DAMAGE), open_file() as handle:
+        return handle.read(most)
+    return b""
 
 
 def _compare_files(path: Path, files: Files, key: str) -> Verification:
-    manifest = b""
-    with contextlib.suppress(*_DAMAGE), files[MANIFEST]() as handle:
-        manifest = handle.read()
-    hashes = {}
+    manifest, hashes = _read(files[MANIFEST]), {}
     for number, line in enumerate(manifest.decode("utf-8", "replace").split("\n"), 1):
         if (entry := re.fullmatch(r"([0-9a-f]{64})  (.+)", line)) is not None:
             hashes[entry[2]] = entry[1]
@@ -146,13 +163,13 @@ def _compare_files(path: Path, files: Files, key: str) -> Verification:
     changed = [] if _format_manifest(hashes) == manifest else [MANIFEST]
     changed += [name for name in sorted(hashes.keys() & files) if _compute_sha256(files[name]) != hashes[name]]
     missing = sorted(hashes.keys() - files)
-    signature, tool = "none", next((tool for tool, name in SIGNATURES.items() if name in files), "")
-    if tool:
-        is_valid, signature = _check_signature(manifest, tool, files[SIGNATURES[tool]], key)
-        changed += [] if is_valid else [f"{SIGNATURES[tool]} ({signature})"]
-    elif key:
-        missing.append(f"a signature by {key}")
-    added = sorted(files.keys() - hashes.keys() - {MANIFEST, SIGNATURES.get(tool)})
+    signature, signed = "none", [tool for tool, signer in SIGNERS.items() if signer.file in files]
+    for tool in signed:
+        file = SIGNERS[tool].file
+        is_valid, signature = _check_signature(manifest, tool, _read(files[file]), key)
+        changed += [] if is_valid else [f"{file} ({signature})"]
+    missing += [f"a signature by {key}"] if key and not signed else []
+    added = sorted(files.keys() - hashes.keys() - {MANIFEST, *(SIGNERS[tool].file for tool in signed)})
     return Verification(len(hashes), hashlib.sha256(manifest).hexdigest(), signature, changed, missing, added)
 
 
@@ -205,52 +222,47 @@ def _is_as_written(files: Files, path: Path) -> bool:
 # Signatures, by minisign or GPG
 # ---------------------------------------------------------------------------------------------------------------------
 
-def _sign(manifest: bytes, tool: str, key: str) -> bytes:
-    """The signature of a manifest. Raises InputError for a key, or a program, that is not there."""
-    with _store({MANIFEST: manifest}) as folder:
-        file, out = str(folder / MANIFEST), folder / SIGNATURES[tool]
-        said = _call(["minisign", "-S", "-s", key, "-m", file, "-x", str(out)] if tool == "minisign" else
-                     ["gpg", "--batch", "--yes", "--local-user", key, "--armor", "--output", str(out), "--detach-sign",
-                      file], capture=False)
-        if said is None or not out.is_file():
-            raise InputError("--sign", key, f"a key with which {tool} signs"
-                                            f"{', but it is not installed' if said is None else ''}")
-        return out.read_bytes()
+def _sign(manifest: bytes, key: str) -> tuple[str, bytes]:
+    """Name and content of the signature. Raises InputError for a key, or a program, that is not there."""
+    tool = "minisign" if Path(key).is_file() else "gpg"
+    said, signature = _call(tool, SIGNERS[tool].sign, key, manifest, b"")
+    if said is None or not signature:
+        raise InputError("--sign", key, f"a key with which {tool} signs{_describe_absence(said)}")
+    return SIGNERS[tool].file, signature
 
 
-def _check_signature(manifest: bytes, tool: str, open_signature: Callable[[], IO[bytes]], key: str) -> tuple[bool, str]:
+def _check_signature(manifest: bytes, tool: str, signature: bytes, key: str) -> tuple[bool, str]:
     """Whether nothing speaks against a signature, and in words what is known of it."""
-    with open_signature() as handle, _store({MANIFEST: manifest, SIGNATURES[tool]: handle.read()}) as folder:
-        file, signature = str(folder / MANIFEST), str(folder / SIGNATURES[tool])
-        if tool == "minisign" and not key:
-            return True, "by minisign, not checked: --key names the public key"
-        said = _call(["minisign", "-V", "-p", key, "-m", file, "-x", signature] if tool == "minisign" else
-                     ["gpg", "--batch", "--status-fd", "1", "--verify", signature, file])
-    if said is None and not key:
-        return True, f"not checked: {tool} is not installed"
+    if tool == "minisign" and not key:
+        return True, "by minisign, not checked: --key names the public key"
+    said, _ = _call(tool, SIGNERS[tool].verify, key, manifest, signature)
+    if not key and (said is None or "NO_PUBKEY" in said.stdout):
+        return True, f"not checked{_describe_absence(said) or ': GPG does not have the public key'}"
     if said is None:
-        raise InputError("--key", key, f"{tool}, which is not installed")
-    if tool == "gpg" and not key and "NO_PUBKEY" in said.stdout:
-        return True, "not checked: GPG does not have the public key"
+        raise InputError("--key", key, f"a key of {tool}{_describe_absence(said)}")
     signers = re.findall(r"VALIDSIG (\w+).*?(\w+)$", said.stdout, re.MULTILINE)  # of the key, and of its primary key
-    wanted = key.replace(" ", "").upper()
-    is_own = tool == "minisign" or any(each.endswith(wanted) for pair in signers for each in pair)
+    is_own = tool == "minisign" or any(each.endswith(key.replace(" ", "").upper()) for pair in signers for each in pair)
     is_valid = said.returncode == 0 and is_own
     return is_valid, f"valid, by {key or signers[0][-1]}" if is_valid else f"not a valid signature by {key or 'a key'}"
 
 
-@contextlib.contextmanager
-def _store(contents: Mapping[str, bytes]) -> Iterator[Path]:
+def _describe_absence(said: object) -> str:
+    return ", but this program is not installed" if said is None else ""
+
+
+def _call(tool: str, arguments: str, key: str, manifest: bytes,
+          signature: bytes) -> tuple[subprocess.CompletedProcess[str] | None, bytes]:
+    """What a program says, None if it is not installed, and the signature then; without one before, it is to sign."""
     with tempfile.TemporaryDirectory() as name:
-        for file, content in contents.items():
-            (Path(name) / file).write_bytes(content)
-        yield Path(name)
-
-
-def _call(command: list[str], *, capture: bool = True) -> subprocess.CompletedProcess[str] | None:
-    """Run a program, which may ask for a passphrase if its output is not captured; None if it is not installed."""
-    try:
-        return subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE if capture else None, text=True,
-                              check=False)
-    except FileNotFoundError:
-        return None
+        places = {"key": key, "manifest": f"{name}/{MANIFEST}", "signature": f"{name}/{SIGNERS[tool].file}"}
+        for file, content in (("manifest", manifest), ("signature", signature)):
+            if content:
+                Path(places[file]).write_bytes(content)
+        output = subprocess.PIPE if signature else 2  # it may ask for a passphrase
+        try:
+            said = subprocess.run([tool, *(word.format(**places) for word in arguments.split())], stdout=output,
+                                  stderr=subprocess.PIPE, text=True, check=False)
+        except FileNotFoundError:
+            return None, b""
+        made = Path(places["signature"])
+        return said, made.read_bytes() if made.is_file() else b""
