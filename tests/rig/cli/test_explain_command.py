@@ -97,24 +97,6 @@ def test_a_users_effect_is_ranked_with_the_others(tmp_path: Path, monkeypatch: p
     assert stiffness["low"] < 4e5 < stiffness["high"]
 
 
-@pytest.mark.parametrize(("words", "complaint"), [
-    (["est", "--holdout", "est"], "a run that no fit has seen"),
-    (["est", "--repeat", "est"], "the same command run again"),
-    (["est", "--repeat", "holdout"], "another command is no repeat"),
-    (["est", "--signals", "xj,q"], "--signals: q: expected some of xj,p12,xs"),
-    (["est", "--out", "x.txt"], "FILE.html for a page, or FILE.json"),
-    (["est", "--write-effect", "x.txt"], "FILE.py"),
-    (["est", "--holdout", "nowhere.csv"], "a trace that can be read"),
-    (["bare"], "cor"),
-])
-def test_bad_input_of_explain_is_told_in_one_line(words: list[str], complaint: str, runs: dict[str, Path],
-                                       tmp_path: Path) -> None:
-    columns = np.loadtxt(runs["est"], delimiter=",", skiprows=1)[:, :3]
-    np.savetxt(tmp_path / "bare.csv", columns, delimiter=",", header="t,com,xj", comments="")
-    files = {**runs, "bare": tmp_path / "bare.csv"}
-    assert complaint in refuse("explain", *(files.get(word, word) for word in words))
-
-
 def test_effects_of_a_model_are_free_from_where_they_are() -> None:
     model = Model().replace({"null_bias.current": 1e-4, "spool.static_friction": 45.0, "spool.dynamic_friction": 30.0,
                              "jack.mass": 101.0, "command_rate_limit.rate": 0.1})
@@ -212,6 +194,14 @@ def test_a_base_effect_comes_out_at_its_value_before(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("line", "complaint"), [
+    (["explain", "est", "--holdout", "est"], "a run that no fit has seen"),
+    (["explain", "est", "--repeat", "est"], "the same command run again"),
+    (["explain", "est", "--repeat", "holdout"], "another command is no repeat"),
+    (["explain", "est", "--signals", "xj,q"], "--signals: q: expected some of xj,p12,xs"),
+    (["explain", "est", "--out", "x.txt"], "FILE.html for a page, or FILE.json"),
+    (["explain", "est", "--write-effect", "x.txt"], "FILE.py"),
+    (["explain", "est", "--holdout", "nowhere.csv"], "a trace that can be read"),
+    (["explain", "bare"], "cor"),
     (["add", "nul_bias", "est"], "did you mean null_bias?"),
     (["add", "null_bias"], "the measured run to fit"),
     (["add", "null_bias", "est", "--model", "model"], "one that is not in the model already"),
@@ -229,8 +219,10 @@ def test_a_base_effect_comes_out_at_its_value_before(tmp_path: Path) -> None:
 def test_bad_input_is_told_in_one_line(line: list[str], complaint: str, runs: dict[str, Path], model: Path,
                                        monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(model.parent)
-    before = model.read_text()
-    assert complaint in refuse(*({**runs, "model": model}.get(word, word) for word in line))
+    columns, before = np.loadtxt(runs["est"], delimiter=",", skiprows=1)[:, :3], model.read_text()
+    np.savetxt("bare.csv", columns, delimiter=",", header="t,com,xj", comments="")
+    files = {**runs, "model": model, "bare": "bare.csv"}
+    assert complaint in refuse(*(files.get(word, word) for word in line))
     assert model.read_text() == before and not Path("model.toml").exists()
 
 
