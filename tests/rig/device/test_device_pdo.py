@@ -62,6 +62,9 @@ SCRIPTS = {
         write 1800:2 fc -> 06090030
         write 1800:1 83010020 -> 06090030
         write 1800:1 000800a0 -> 06090030
+        write 1800:1 83010080 -> ok
+        write 1800:1 80000000 -> 06090030
+        write 1800:1 83010000 -> ok
         080 -> 183 *, 283 *""",
     "a frame that waits for SYNC is dropped when its PDO is switched off": """
         182 0100000002000300 ->
