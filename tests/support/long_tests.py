@@ -4,7 +4,8 @@ from __future__ import annotations
 # Those of half a minute and more begin first: none is left to one worker at the end.
 LONGEST = (
     "vcan/", "rig/view/", "fdi/diagnosis/test_refine.py", "fdi/identification/", "fdi/discovery/test_discovery.py",
-    "fdi/comparison/test_compare.py", "studies/", "rig/campaign/", "rig/run/",
+    "fdi/comparison/test_compare.py", "studies/", "rig/campaign/", "rig/run/", "examples/", "plant/test_lanes.py",
+    "plant/test_plant_on_other_cpus.py", "test_docs_site.py",
 )
 LONG_TESTS = (
     "examples/",
@@ -33,6 +34,7 @@ LONG_TESTS = (
     "plant/test_lanes.py",
     "plant/test_physics_solver.py",
     "plant/test_plant_on_other_cpus.py",
+    "plant/test_plants.py",
     "plant/test_servo.py",
     "rig/bench/test_bench.py",
     "rig/campaign/test_campaign.py",
@@ -52,6 +54,9 @@ LONG_TESTS = (
     "rig/network/test_raw_bus.py",
     "rig/network/test_turn.py",
     "rig/recorder/test_recover.py",
+    "rig/run/test_cycle_times.py",
+    "rig/run/test_embedded_loop.py",
+    "rig/run/test_foreign_devices.py",
     "rig/run/test_hard_loop.py",
     "rig/run/test_job.py",
     "rig/run/test_node_numbers.py",
