@@ -155,7 +155,7 @@ COMMANDS = {
         (option("--seconds", type=float, default=1.0, metavar="S",
                 help="duration of each timer measurement, and of listening; 0: no measurement (default 1)"),
          Group("listen for a bench", (
-             BENCH,
+             BENCH, TRUST,
              option("--bus", default="auto", metavar="INTERFACE:CHANNEL",
                     help="with --bench: where to listen, such as socketcan:can0 or udp_multicast"))))),
     "effects": Command(

@@ -65,9 +65,11 @@ class PlantPlace(NamedTuple):
         Raises:
             InputError: the bench has none, or one that lacks a signal or frame of our emulator.
         """
-        readings = [s.word for s in bench.signals.outputs]
+        if PLANT not in bench.nodes:
+            raise InputError(bench.name, "plant_node", "a table with the plant as a node; the rig itself moves the "
+                                                       "plant of this bench")
+        readings, node = [s.word for s in bench.signals.outputs], bench.nodes[PLANT]
         try:
-            node = bench.nodes[PLANT]
             found = cls(node, bench.frames.sync or 0, bench.frames.find_role("feedback"),
                         bench.frames.find_role("valve_state"), bench.frames.drive, bench.most_missed, bench.signals,
                         bench.plant)

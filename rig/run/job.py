@@ -25,7 +25,7 @@ from plant.effects import load_effects
 from plant.model import find_plant_of_model, find_quantity, parse_model
 from plant.parameters import parse_toml
 from plant.plant_files import read_named_plant
-from plant.plants import is_known, load_plant
+from plant.plants import load_plant
 from plant.signals import Signals
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench, load_bench_from_files
@@ -188,7 +188,7 @@ def load_plant_of_log(path: Path, *, is_trusted: bool = False, announce: Announc
         return ""
     named = str(tables.get("plant", ""))
     codes = [ForeignCode(name, content) for name, content in log.attachments.items() if name.startswith(_PLANT_FOLDER)]
-    if not codes or is_known(named):
+    if not codes:
         return named
     for code in codes:
         _require_file_name(path, code.name)

@@ -435,7 +435,7 @@ def collect_data(dry: DryRun) -> dict[str, Any]:
         "faults": [{**each._asdict(), "duration": each.duration} for each in dry.faults],
         "demands": [{key: value for key, value in each._asdict().items() if key != "shown"}
                     | {"violated": each.is_violated} for each in dry.demands],
-        "predicted": {drive.phrase: largest, "error": float(np.abs(error).max()),
+        "predicted": {"current": largest, "error": float(np.abs(error).max()),
                       "limits": [each._asdict() for each in dry.limits],
                       "guards": [trip._asdict() for trip in dry.trips]},
         "checks": [to_plain(check.collect_data()) for check in dry.checks], "not_predicted": dry.not_predicted}

@@ -1,0 +1,138 @@
+"""Benches and runs of plants with signals of their own: an EMA with a drive, and a user's plant in one file."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from bus_stations import spec
+from example_devices import DRIVE, PATIENT, run_device
+from places import ROOT
+from rig_command import Said, refuse, rig
+
+from fdi.trace.trace import Trace
+
+PLANT = ROOT / "tests" / "support" / "trim_jack.py"
+BENCH = """
+name = "Trim jack with drive"
+plant = "trim_jack.py"
+[controller]
+node = 5
+eds = "drive.eds"
+profile = "cia402"
+[controller.values]
+"0x6075" = 1000
+"0x6073" = 800
+"0x2002:1" = 6.25
+"0x2002:2" = 0.43
+[controller.inputs]
+trim_cmd = { object = "0x607A", count = "1 urad" }
+trim_angle = { object = "0x2001", count = "1 mrad" }
+[controller.outputs]
+torque_ref = { object = "0x6078", count = "1 mN m" }
+"""
+SHORT = """
+title = "A step"
+setup = [{ kind = "hold", time = 0.05 }]
+main = [{ kind = "hold", time = 0.05 }, { name = "step", kind = "step", to = 2e-3, time = 1.0 }]
+cleanup = [{ kind = "ramp", to = 0.0, time = 0.1 }]
+checks = [
+  { name = "settled", kind = "max_error", window = "step", skip = 0.2, high = 60, unit = "um" },
+  { name = "motor", kind = "never_exceeds", signal = "current", high = 21 },
+]
+"""
+
+
+def play(folder: Path, *words: object, fault: str = "none") -> Said:
+    """`rig run` on the drive of the example, in lockstep on UDP."""
+    where = spec("udp_multicast")
+    with run_device(DRIVE, where, *PATIENT[DRIVE], "--fault", fault):
+        return rig("run", *words, "--controller", "external", "--bus", where, "--out", folder)
+
+
+def write_bench(folder: Path, **changes: str) -> Path:
+    """The plant and its bench file beside the drive's EDS; `changes`: of the plant's text, old to new."""
+    text = PLANT.read_text()
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "trim_jack.py").write_text(text)
+    (folder / "drive.eds").write_bytes((DRIVE / "drive.eds").read_bytes())
+    (folder / "trim.toml").write_text(BENCH)
+    return folder / "trim.toml"
+
+
+@pytest.mark.parametrize("fault", ["none", "wrong_sign", "wrong_scaling", "ignores_enable", "stops_sending",
+                                   "stuck_status"])
+def test_an_ema_with_a_cia402_drive(fault: str, tmp_path: Path) -> None:
+    """A sound drive passes the preflight of the EMA; each faulty one is found in a short step."""
+    (tmp_path / "short.toml").write_text(SHORT)
+    sequence = "preflight" if fault == "none" else tmp_path / "short.toml"
+    said = play(tmp_path / "run", sequence, "--bench", DRIVE / "ema.toml", fault=fault)
+    assert said.status == (0 if fault == "none" else 1), said
+    if fault == "none":
+        trace = Trace.read(tmp_path / "run")
+        assert trace.signals == ("demand", "position", "current_demand", "motor_speed", "current", "load")
+        assert abs(trace.position[-1]) < 2e-5 and abs(trace.column("motor_speed")).max() > 100.0
+
+
+def test_from_a_plant_file_to_its_hidden_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One Python file and one bench file, five measured signals: check, run, compare, explain, fdi, run --from."""
+    write_bench(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    Path("stiff.toml").write_text('plant = "trim_jack.py"\neffects = ["tight_seal"]\n[tight_seal]\ntorque = 0.02\n')
+    checked = rig("check", "preflight", "--bench", "trim.toml", "--trust", "--json").json
+    carried = {signal for each in checked["bench"]["frames"] for signal in each["signals"]}
+    assert checked["verdict"] == "WITHIN_LIMITS" and {"trim_cmd", "trim_angle", "torque_ref"} <= carried
+    run = play(tmp_path / "hidden", "--bench", "trim.toml", "--model", "stiff.toml", "--trust")
+    assert run.status == 0, run
+    assert {"shaft_rate", "phase_amps", "gear_torque", "case_rise"} <= {*Trace.read(tmp_path / "hidden").signals}
+    where = spec("udp_multicast")
+    elsewhere = tmp_path / "elsewhere"  # the log has the plant with it
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    assert "--trust, because it brings code along" in refuse("compare", tmp_path / "hidden")
+    assert rig("compare", tmp_path / "hidden", "--trust", "--json").json["verdict"] == "MODEL_INCOMPLETE"
+    explained = rig("explain", tmp_path / "hidden", "--trust", "--json").json
+    assert (explained["verdict"], explained["effects"]) == ("EXPLAINED", ["tight_seal"])
+    level = rig("fdi", tmp_path / "hidden", "--trust", "--json").json["level"]
+    assert level == {"seal": "maintenance", "magnet": "acceptable"}
+    with run_device(DRIVE, where, *PATIENT[DRIVE]):
+        again = rig("run", "--from", tmp_path / "hidden", "--trust", "--bus", where, "--out", elsewhere / "again")
+    assert again.status == 0, again
+    first, second = (Trace.read(folder) for folder in (tmp_path / "hidden", elsewhere / "again"))
+    assert (first.column("trim_angle") == second.column("trim_angle")).all()
+
+
+@pytest.mark.parametrize(("old", "new", "line"), [
+    ('trim_angle = {', 'ram_position = {', "inputs.ram_position: expected a signal of the bench and its plant: "
+     "'case_rise', 'control_word', 'cycle', 'flags', 'gear_torque', 'hinge', 'mode', 'phase_amps'"),
+    ('torque_ref = {', 'current = {', "outputs.current: expected a signal of the bench and its plant: 'cycle', "
+     "'mode_display', 'status_word' or 'torque_ref'"),
+    ('trim_cmd = { object = "0x607A", count = "1 urad" }', "", "inputs: expected also the signal trim_cmd"),
+    ('"1 mN m"', '"20 mA"', "torque_ref.count: expected one of N m, mN m, kN m, not 'mA'"),
+    ('plant = "trim_jack.py"', 'plant = "absent.py"', "trim.toml:3: plant: expected"),
+    ('plant = "trim_jack.py"', 'plant = "emma"', "trim.toml:3: plant: expected")])
+def test_a_mistake_in_a_bench_of_an_own_plant(old: str, new: str, line: str, tmp_path: Path) -> None:
+    """One line that says which signals the plant has, status 2."""
+    bench = write_bench(tmp_path)
+    assert old in BENCH
+    rig("check", "--bench", bench, "--trust")  # announces the plant, once
+    bench.write_text(BENCH.replace(old, new))
+    assert line in refuse("check", "--bench", bench, "--trust")
+
+
+@pytest.mark.parametrize(("role", "line"), [
+    ('"drive", limit="controller.torque_limit"', "expected one signal of role drive, not []"),
+    ('"command", largest=2.0', "expected one signal of role command, not []")])
+def test_a_plant_without_a_role_is_refused(role: str, line: str, tmp_path: Path) -> None:
+    """A bench needs what drives the plant and what commands it."""
+    bench = write_bench(tmp_path, **{f", {role})": ")"})
+    said = rig("check", "--bench", bench, "--trust")
+    assert said.status == 2 and line in said.err
+
+
+def test_a_plant_file_is_code(tmp_path: Path) -> None:
+    """A bench file is data that people send to each other: the plant in it runs with --trust only."""
+    bench = write_bench(tmp_path, **{"stabiliser trim jack": "another jack"})
+    for words in (("check", "--bench", bench), ("run", "--bench", bench), ("doctor", "--bench", bench)):
+        assert "expected --trust, because it brings code along that would run here: trim_jack.py" in refuse(*words)
