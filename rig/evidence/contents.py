@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fdi.report.report import to_plain
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from rig.evidence.bill import build_bill
@@ -21,7 +22,6 @@ _SETTINGS = ("sequence", "model", "bench", "seed", "bus", "pace", "controller", 
 class PackedRun(NamedTuple):
     """A run that goes into a package."""
 
-    folder: Path
     answer: Mapping[str, Any]  # verdict.json
     trace: Trace
     judged: JudgedRun  # what it says about requirements; its name is that of its folder in the package
@@ -93,16 +93,18 @@ def _read_run(file: Path, name: str, requirement: tuple[str, ...]) -> PackedRun:
     trace = Trace.read(file.parent / "trace.mcap", all=True)
     try:
         answer = _read_json(file)
-        said = {each["name"]: each["passed"] for each in answer["checks"]}
+        said = [(each["name"], each["value"], each["verdict"], ", ".join(each["requirement"]))
+                for each in answer["checks"]]
         checks = [JudgedCheck(each["name"], tuple(each["requirement"]), each["verdict"]) for each in answer["checks"]
                   if each["requirement"]]
         judged = JudgedRun(name, answer["verdict"], requirement, checks)
     except (KeyError, TypeError) as error:
         raise InputError(file, "", f"the verdict of a run by this version ({error})") from error
     logged = trace.provenance.get("verdict.verdict", "")
-    if judged.verdict != logged or said != {check.name: check.passed for check in trace.checks}:
+    known = [(check.name, to_plain(check.value), check.verdict, check.requirement) for check in trace.checks]
+    if judged.verdict != logged or said != known:
         raise InputError(file, "verdict", f"what its log says, {logged or 'no verdict'}, check by check")
-    return PackedRun(file.parent, answer, trace, judged)
+    return PackedRun(answer, trace, judged)
 
 
 def add_index(package: Package, requirements: Iterable[Requirement], created: str) -> dict[str, Any]:

@@ -119,6 +119,7 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     attribution = attribute_run(job, session)
     started_ns = read_epoch_ns()
     metrology = collect_metrology(job.bench, job.model.kind.signals, job.sequence.decision, started_ns)
+    progress("checks", 0.0)
     checks, skipped = judge_run(job, session, attribution.judged, metrology)
     for check in checks:
         recorder.put(session.stage.now(), _make_check_record(check))

@@ -158,7 +158,8 @@ def test_bad_packages_are_refused_in_one_line(runs: Path, package: Path, tmp_pat
 def test_bad_input_of_packing_is_refused(runs: Path, tmp_path: Path) -> None:
     forged = Path(shutil.copytree(runs / "run", tmp_path / "run"))
     told = json.loads((forged / "verdict.json").read_text())
-    (forged / "verdict.json").write_text(json.dumps({**told, "verdict": "FAIL"}))
+    told["checks"][0]["value"] += 1.0
+    (forged / "verdict.json").write_text(json.dumps(told))
     (tmp_path / "other.csv").write_text("id\nREQ-1\n")
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken/verdict.json").write_text("[]")
