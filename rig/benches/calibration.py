@@ -91,6 +91,8 @@ def read_calibration(tables: Mapping[str, Mapping[str, Any]], place: Place,
         if word not in sensed:
             raise own.refuse(f"decision or a measured signal: {list_choices(word, sensed)}")
         signal = sensed[word]
+        if signal.name in found:
+            raise own.refuse(f"each signal once; {signal.name} and {signal.alias} are the same")
         keys = build_dataclass(SensorKeys, {key: str(value) if isinstance(value, datetime.date) else value
                                             for key, value in table.items()}, own)
         first, last = (_read_date(getattr(keys, key), own.at(key)) for key in ("date", "expiry"))

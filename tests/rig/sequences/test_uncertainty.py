@@ -162,7 +162,7 @@ def test_a_bench_file_has_the_calibrations(tmp_path: Path) -> None:
     ('"2099-03-01"', "2099-13-01", "expected TOML; "), ('"2 um"', '"2"', "expected a number and a unit"),
     ('"2 um"', '"2 bar"', "calibration.ram_position.u: expected one of m, cm, mm, um"), ('"2 um"', '"0 um"', "above 0"),
     ('u = "2 um"', "", "also the key 'u'"), ("gain = 1e-3", "gain = 2", "gain: expected a number from 0 and below 1"),
-    ("identifier = \"P 12\"", "serial = 5", "a key: ")])
+    ("identifier = \"P 12\"", "serial = 5", "a key: "), ("calibration.p12]", "calibration.xj]", "each signal once")])
 def test_mistakes_are_one_line_each(old: str, new: str, message: str, tmp_path: Path) -> None:
     path = write_bench(tmp_path, CALIBRATION.replace(old, new))
     with pytest.raises(InputError) as refused:
