@@ -88,9 +88,9 @@ class Controller(NamedTuple):
 
 
 class Observer(NamedTuple):
-    """How replays of a recording follow the measured position: the faster, the finer its sensor is."""
+    """How replays follow the measured position: the faster, the finer its sensor; M w^2 noise is small beside FD."""
 
-    rate: Annotated[float, Quantity("1/s", "w", low=1, high=300, typical="40: 1 um of noise; 200: 50 nm")] = 40.0
+    rate: Annotated[float, Quantity("1/s", "w", low=1, high=300, typical="25: 1 um of noise; 200: 50 nm")] = 25.0
 
 
 class State(NamedTuple):
@@ -234,10 +234,11 @@ def correct(s: State, distance: float, p: Any) -> State:
 
     A position drawn alone leaves the speed wrong for as long as friction takes to slow it: errors of force add up to
     waves of seconds, in which friction, mass and load trade places. This residual is force/(mass w^2) within 1/w.
-    Every replay is drawn at 20 1/s; here it is drawn at 2 w, and the speed by w/2 of that.
+    Every replay is drawn at 20 1/s; here it is drawn at 2 w, and the speed by w/2 of that. The speed of a surface that
+    friction holds is known: it is 0, and the noise of the position must not tear it off its stiction.
     """
     moved = distance * p.observer.rate * (2.0 / 20.0)
-    gained = 0.5 * p.observer.rate * moved
+    gained = 0.5 * p.observer.rate * moved if s.speed != 0.0 else 0.0
     return State(s.current, s.integral, s.motor_position + moved, s.motor_speed + gained, s.position + moved,
                  s.speed + gained, s.sensed)
 

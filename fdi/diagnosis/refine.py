@@ -45,6 +45,7 @@ from fdi.estimation.fit import (
     span_all_rows,
 )
 from fdi.estimation.long_recordings import Excerpt, choose_excerpt, judge_on_all
+from fdi.estimation.replay import find_unpredictable_rows, measure_decided_errors
 from fdi.estimation.unidentifiable import (
     FLAPPER,
     ORIGINS,
@@ -154,7 +155,8 @@ def _make_fault_unknowns(fault: Fault, model: Model, spread: float) -> list[Free
         healthy, middle, _ = fault.limits
         factors = {fault.parameter: 1.0, **fault.follow}
         return [Free(name, by * fault.healthy, abs(by) * (middle - healthy), LINEAR_FAULT_SPREAD,
-                     min(by * low, by * high), max(by * low, by * high), 0.02) for name, by in factors.items()]
+                     min(by * low, by * high), max(by * low, by * high), 0.02) for name, by in factors.items()
+                ] + _make_shape_unknowns(fault, model)
     least = max(low, SMALLEST_SHARE * fault.healthy)
     same = find_quantity(fault.parameter, plant=model.plant).unit
 
@@ -164,6 +166,19 @@ def _make_fault_unknowns(fault: Fault, model: Model, spread: float) -> list[Free
 
     return [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, spread, *take_bounds(name), 1.0)
             for name in fault.parameters]
+
+
+def _make_shape_unknowns(fault: Fault, model: Model) -> list[Free]:
+    """What a fit of the fault's effect frees beside its size, such as a phase, known to be of its starts' size."""
+    return [u._replace(prior=2.0) for u in _list_shapes(fault, model)]
+
+
+def _list_shapes(fault: Fault, model: Model) -> list[Free]:
+    known = {e.name: e for e in model.kind.list_effects()}
+    effect = known.get(fault.parameter.partition(".")[0])
+    if effect is None or effect.base or fault.parameter not in effect.fitted:
+        return []
+    return [u for u in list_effect_unknowns(effect, model) if u.name not in fault.parameters]
 
 
 def list_suspects(model: Model, faults: Sequence[Fault]) -> list[Suspect]:
@@ -283,8 +298,10 @@ class Refinement:
     @property
     def is_explained(self) -> bool:
         """Whether only noise is left, except for a few stops of the ram that the model makes or misses."""
-        usual = compute_typical_rms(self.fit.residuals)
-        near = all(float(t) <= RESIDUAL_IS_NOISE * floor for t, floor in zip(usual, self.floor.values(), strict=True))
+        left = self.fit.residuals
+        usual = compute_typical_rms(left[:, ~np.isnan(left).all(axis=0)])
+        near = all(min(float(t), self.errors[name]) <= RESIDUAL_IS_NOISE * self.floor[name]
+                   for t, name in zip(usual, self.floor, strict=True))
         near &= all(ratio <= RESIDUAL_HELD_OUT for ratio in self.everywhere.values())
         return near and max(self.ratio.values()) <= self.worst
 
@@ -349,6 +366,8 @@ def refine_sizes(model: Model, trace: Trace, starts: Sequence[Sizes] | None = No
     free = list_unknowns(problem.model, faults)
     first = _fit_coarsely(problem, free, starts or list_coarse_starts(faults))
     problem = learn_left_noise(problem, first)
+    if problem.model.kind.correct is not None:  # with an observer a stop hangs on the noise of the measurement
+        problem = _leave_out_stops(problem, first)
     last = _fit_finely(problem, first)
     if len(faults) > 2:  # of fewer, the start from a healthy unit is the only one that lacks a fault
         last = _retry_without(problem, last)
@@ -367,6 +386,13 @@ def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequenc
         fits.append(descend(problem, start_fit(free, healthy), NOISE_SCHEDULE))
     best = min(fits, key=lambda f: f.cost)
     return best if is_noise_left(problem, best) else descend(problem, best, ((3.0, 4), (1.0, 8)))
+
+
+def _leave_out_stops(problem: CountedProblem, found: Fit) -> CountedProblem:
+    """The problem without the rows that hang on a stop of the plant: what they say of its parameters is chance."""
+    floor = {s: n.level for s, n in zip(problem.trace.outputs, problem.noise, strict=True)}
+    usable = problem.trace.usable & ~find_unpredictable_rows(problem, found, floor)
+    return replace(problem, trace=replace(problem.trace, usable=usable), _lanes={})
 
 
 def _fit_finely(problem: CountedProblem, first: Fit) -> Fit:
@@ -514,14 +540,16 @@ def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence
     offsets, faults = estimate_offsets(problem), problem.faults
     usual = {name: problem.model[name] for fault in faults for name in fault.follow}
 
-    def try_starts(tried: Sequence[Sizes], stays: Mapping[str, float]) -> tuple[float, Sizes, Floats]:
-        x = np.array([make_start(free, faults, s, offsets, stays) for s in tried])
+    def try_starts(tried: Sequence[Sizes], way: tuple[Mapping[str, float], Mapping[str, float]]
+                   ) -> tuple[float, Sizes, Floats]:
+        shape, stays = way
+        x = np.array([make_start(free, faults, s, {**offsets, **shape}, stays) for s in tried])
         costs = compute_misfit(loud.compute_white_residuals(free, x))
         k = int(np.argmin(costs))
         return float(costs[k]), tried[k], x[k]
 
-    def search(stays: Mapping[str, float]) -> tuple[float, Floats]:
-        cost, best, x = try_starts(starts, stays)
+    def search(way: tuple[Mapping[str, float], Mapping[str, float]]) -> tuple[float, Floats]:
+        cost, best, x = try_starts(starts, way)
         # of the two faults that are furthest gone
         moved = sorted(sorted(range(len(faults)), key=lambda i: -compute_severity(faults[i], best[i]))[:2])
         for part, factor in ((0.2, 1.2), (0.08, 1.08), (0.04, 1.03)):  # of MidBand, and of sizes by their logarithm
@@ -531,12 +559,23 @@ def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence
                 for i, step in zip(moved, steps, strict=True):
                     sizes[i] = _step_size(faults[i], best[i], step, part, factor)
                 around.append(tuple(sizes))
-            cost, best, x = try_starts(around, stays)
+            cost, best, x = try_starts(around, way)
         return cost, x
 
-    # dynamic friction goes with the static one, or has stayed what it was
-    ways = ({}, usual) if usual else ({},)
+    # dynamic friction goes with the static one, or has stayed what it was; phases and the like as in effects' starts
+    ways = product(_list_shape_starts(problem), ({}, usual) if usual else ({},))
     return min(map_in_threads(search, ways, problem.workers), key=lambda each: each[0])[1]
+
+
+def _list_shape_starts(problem: CountedProblem) -> list[dict[str, float]]:
+    """Values to begin at of what faults' effects have beside their size: one that has none is {}."""
+    found: list[dict[str, float]] = [{}]
+    for fault in problem.faults:
+        names = [u.name for u in _list_shapes(fault, problem.model)]
+        starts = problem.model.find_effect(fault.parameter.partition(".")[0]).starts if names else ()
+        shapes = {tuple(start[name] for name in names): None for start in starts} or {(): None}
+        found = [{**each, **dict(zip(names, shape, strict=True))} for each in found for shape in shapes]
+    return found
 
 
 def _step_size(fault: Fault, size: float, steps: int, part: float, factor: float) -> float:
@@ -587,8 +626,8 @@ def learn_left_noise(problem: CountedProblem, found: Fit) -> CountedProblem:
 def report_fit(last: Fit, problem: CountedProblem, whole: Trace | None = None) -> Refinement:
     """What a fit found, with the noise of its problem as the floor; judged on the `whole` recording if it is cut."""
     outputs = problem.trace.outputs
-    errors = {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(outputs, last.residuals, strict=True)}
     floor = {s: n.level for s, n in zip(outputs, problem.noise, strict=True)}
+    errors = measure_decided_errors(problem, last, floor)
     names = [f.name for f in last.free]
     places = [names.index(fault.parameter) for fault in problem.faults]
     spread = np.sqrt(np.diag(last.covariance))[places]

@@ -39,6 +39,7 @@ from fdi.estimation.fit import (
 )
 from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, is_long, judge_on_all
 from fdi.estimation.noise import Noise
+from fdi.estimation.replay import measure_decided_errors
 from fdi.estimation.unidentifiable import finish_fit, list_powers, scale_together
 from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import (
@@ -302,6 +303,7 @@ class Search:
         others = [p.compute_residuals(found.free, x)[0] for p in self.repeats]
         if not others:
             floor = {s: float(np.hypot(n.level, c)) for s, n, c in zip(signals, self.noise, coarse, strict=True)}
+            errors = measure_decided_errors(self.problem, found, floor)
             return Hypothesis(effects, found, errors, {s: errors[s] / floor[s] for s in signals})
         pairs = zip(self.repeats, others, strict=True)
         cost = float(np.mean([compute_misfit(p.whiten_residuals(r[None]))[0] for p, r in pairs]))

@@ -19,12 +19,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.estimation.fit import Fit, Problem, limit_dynamic_friction, list_tolerance_sizes, silence_sensors
+from fdi.estimation.fit import (
+    Fit,
+    Problem,
+    compute_typical_rms,
+    limit_dynamic_friction,
+    list_tolerance_sizes,
+    silence_sensors,
+)
 from fdi.estimation.long_recordings import choose_excerpt, cut_excerpt, is_long, replay_in_turns
 from fdi.estimation.noise import WINDOW
 from fdi.thresholds import (
     ANCHOR_RATE,
     FRICTION_UNCERTAINTY,
+    HELD_OUT_UNDECIDED_SHARE,
+    RESIDUAL_HELD_OUT,
+    RESIDUAL_IS_NOISE,
     RESIDUAL_IS_SCATTER,
     SAME_COMMAND_POSITION,
     SCATTER_LARGE_RESIDUAL,
@@ -42,6 +52,7 @@ Columns = dict[str, Floats]  # by signal, (n,)
 
 REPLAY_STEPS, FINEST_REPLAY_STEPS = 50, 800  # a cycle
 SCATTER_DIFFERENCE = 0.3  # tolerances, of the differences that the Jacobian is made of
+NEAR_NOISE = 2.0  # floors, in the better half of a run: else physics is missing, and no stop matters
 ALIKE = 20  # neighbouring samples that say the same thing
 
 
@@ -110,8 +121,11 @@ def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str,
     lanes = Lanes(silence_sensors(model), names, REPLAY_STEPS)
     position = trace.unlagged if has_known_start(trace) else None
     turns = [replay_in_turns(lanes, values, trace, position, ANCHOR_RATE)]
+    currents = guess_current(trace)
     turns += [replay_in_turns(lanes, values[:1], trace.with_inputs(drive=current), position, ANCHOR_RATE)
-              for current in guess_current(trace)]
+              for current in currents]
+    turns += [replay_in_turns(lanes, values[:1], trace, position + shift, ANCHOR_RATE)
+              for noise in guess_anchor_noise(trace, model, floor) if position is not None for shift in (noise, -noise)]
     outputs = trace.declared.outputs
     found = np.empty((len(outputs), len(trace)))
     undecided = np.zeros(len(trace), bool)
@@ -125,7 +139,7 @@ def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str,
                 moved = np.abs(runs[1:, :, i] - runs[:1, :, i])
                 large = find_large_windows(moved, max(floor[signal.name], signal.slight))
                 undecided[rows] |= large & ~np.isnan(trace.mask_unusable(signal.name)[rows])
-        guessed = (runs[len(values):] - runs[:1])[:, ~undecided[rows]]
+        guessed = (runs[len(values):len(values) + len(currents)] - runs[:1])[:, ~undecided[rows]]
         power, count = power + (guessed**2).sum(axis=(0, 1)), count + guessed.shape[0] * guessed.shape[1]
     blind = {name: math.sqrt(float(power[i]) / count) if count else 0.0 for i, name in enumerate(trace.output_names)}
     return {name: found[i] for i, name in enumerate(trace.output_names)}, undecided, blind
@@ -160,6 +174,17 @@ def guess_current(trace: Trace) -> list[Floats]:
     near = odd[np.clip(np.searchsorted(odd, np.arange(len(trace))), 0, len(odd) - 1)]
     signs = np.random.default_rng(0).choice([-1.0, 1.0], len(trace))
     return [trace.drive + np.where(trace.filled, sign * signs * error[near], 0.0) for sign in (1.0, -1.0)]
+
+
+def guess_anchor_noise(trace: Trace, model: Model, floor: Mapping[str, float]) -> list[Floats]:
+    """Noise, (n,), that the controlled signal may have had instead; none where it only moves the replay along.
+
+    A plant with an observer of its own takes it for a speed, and so for a force. What hangs on that is undecided.
+    """
+    size = floor.get(trace.declared.controlled.name, 0.0)
+    if model.kind.correct is None or not size:
+        return []
+    return [size * np.random.default_rng(0).standard_normal(len(trace))]
 
 
 def compute_residuals(trace: Trace, model: Columns) -> Columns:
@@ -202,7 +227,15 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
     """
     values = {**problem.model.values, **fit.values}
     names = list(dict.fromkeys([*(f.name for f in fit.free), *filter(is_friction, values)]))
-    runs = problem.predict_outputs(names, vary_frictions(names, values))
+    tried = vary_frictions(names, values)
+    runs = problem.predict_outputs(names, tried)
+    name = problem.trace.declared.controlled.name
+    for sign in (1.0, -1.0):
+        noisy = [run.with_columns({name: run.controlled + sign * noise}) for run in (problem.trace, *problem.also)
+                 for noise in guess_anchor_noise(run, problem.model, floor)]
+        if noisy:
+            shifted = replace(problem, trace=noisy[0], also=tuple(noisy[1:]))
+            runs = np.concatenate([runs, shifted.predict_outputs(names, tried[:1])])
     changes = np.abs(runs[1:] - runs[0])
     undecided = np.zeros(runs.shape[2], bool)
     for i, signal in enumerate(problem.trace.outputs):
@@ -210,6 +243,39 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
         large = find_large_windows(changes[:, i], max(floor[signal], slight))
         undecided |= large & ~np.isnan(problem.trace.measurements[i])
     return undecided
+
+
+def find_unpredictable_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) -> Flags:
+    """Rows of the first run, (n,), that hang on a stop, and those after them until only noise is left again.
+
+    A replay that has missed a stop goes on beside the measurement, as its neighbours do, so these do not show it.
+    None where more than `HELD_OUT_UNDECIDED_SHARE` of the run hangs on stops, or half of it is not near noise.
+    """
+    names, left = problem.trace.outputs, fit.residuals[:, :len(problem.trace)]
+    levels = np.array([[floor[s]] for s in names])
+    none = np.zeros(left.shape[1], bool)
+    if (compute_typical_rms(left[:, problem.trace.usable], 0.5) > NEAR_NOISE * levels[:, 0]).any():
+        return none
+    undecided = find_undecided_rows(replace(problem, also=()), fit, floor) | ~problem.trace.usable
+    is_off = find_large_windows(np.abs(np.nan_to_num(left)) / levels, RESIDUAL_HELD_OUT)
+    for first in range(WINDOW, len(undecided), WINDOW):
+        undecided[first:first + WINDOW] |= undecided[first - 1] & is_off[first:first + WINDOW]
+    return undecided if undecided.mean() <= HELD_OUT_UNDECIDED_SHARE else none
+
+
+def measure_decided_errors(problem: Problem, fit: Fit, floor: Mapping[str, float]) -> dict[str, float]:
+    """RMS residuals of the first run, SI; where that is more than noise, of the typical rows that hang on no stop.
+
+    A repeat stops elsewhere, so it tells a stop that was missed from physics; without one, only this does.
+    """
+    names, left = problem.trace.outputs, fit.residuals[:, :len(problem.trace)]
+    errors = dict(zip(names, map(rms, left), strict=True))
+    if any(errors[s] > RESIDUAL_IS_NOISE * floor[s] for s in names):
+        undecided = find_unpredictable_rows(problem, fit, floor)
+        if undecided.any():
+            kept = left[:, ~undecided & problem.trace.usable]
+            return dict(zip(names, compute_typical_rms(kept).tolist(), strict=True))
+    return errors
 
 
 def measure_drift(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> tuple[float, float]:

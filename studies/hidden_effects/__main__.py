@@ -17,7 +17,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the trial."""
     add = parser.add_argument
     add("--cases", type=int, default=200, metavar="N", help="number of cases (default: 200)")
-    add("--signals", metavar="NAMES", help="measure these in every case: xj or xj,p12 or xj,p12,xs (default: random)")
+    add("--plant", default="eha", metavar="NAME|FILE", help="shipped plant, or a plant file (default: eha)")
+    add("--signals", metavar="NAMES", help="measure these in every case, of the EHA xj or xj,p12 or xj,p12,xs "
+                                           "(default: random)")
     add("--jobs", type=int, default=2, metavar="N", help="cases at a time; use 1 for reliable timings (default: 2)")
     add("--folder", metavar="DIR", help="keep cases and answers there; an interrupted trial resumes there")
 
@@ -33,7 +35,8 @@ def run_trial_command(args: argparse.Namespace) -> tuple[Report, bool]:
             raise InputError(option, str(count), "1 or more")
     with tempfile.TemporaryDirectory() as temporary:
         seeds, folder = range(args.seed, args.seed + args.cases), Path(args.folder or temporary)
-        rows = run_trial(RIG_EXPLAIN, seeds, folder, args.jobs, make_row_progress(describe_progress), args.signals)
+        rows = run_trial(RIG_EXPLAIN, seeds, folder, args.jobs, make_row_progress(describe_progress), args.signals,
+                         args.plant)
     figures = summarise_trial(rows)
     return build_trial_report(figures), all(rate["met"] or not rate["of"] for rate in figures["rates"])
 

@@ -136,8 +136,8 @@ def measure_effect_ratios(case: Case, measured: Measured, without: Iterable[str]
     """The RMS effect on each signal in noise floors: the trace against a replay of the plant `without` the effects.
 
     The replay is driven by the measured current. `xj_drift` is the whole difference in position, which drifts; `xj` is
-    its change over 20 cycles. `cor` is the difference between the controller's answer and the control law, in units of
-    what the position's noise floor does to the answer.
+    its change over 20 cycles. `controller` is the difference between the controller's answer and the control law, in
+    units of what the position's noise floor does to the answer.
     """
     run, noise = measured.trace, measured.noise
     bare = simulate_truth(run.com, list_changed_symbols(case, without), None, run.load, run.cor)
@@ -148,7 +148,7 @@ def measure_effect_ratios(case: Case, measured: Measured, without: Iterable[str]
             "xj_drift": _measure_rms(xj) / FLOORS["xj"],
             "p12": _measure_rms(run.p12 - noise["p12"] - bare.p12) / FLOORS["p12"],
             "xs": _measure_rms(run.xs - noise["xs"] - bare.xs) / FLOORS["xs"],
-            "cor": _measure_rms(run.cor - law) / (p["GAP"] * FLOORS["xj"])}
+            "controller": _measure_rms(run.cor - law) / (p["GAP"] * FLOORS["xj"])}
 
 
 def _measure_rms(x: Array) -> float:

@@ -19,21 +19,22 @@ from typing import Any
 
 from fdi.sources import hash_sources, import_function
 from plant.errors import InputError
+from plant.plants import Plant, find_plant, load_plant
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
 from rig.network.clock import WallClock
-from studies.hidden_effects import cases, truth
+from studies.hidden_effects import any_plant, cases, truth
 
-Explain = Callable[[Path, Path, Sequence[Path], Sequence[str]], dict[str, Any]]
-"""From est, holdout, repeats and signals to the JSON of `rig explain`."""
+Explain = Callable[..., dict[str, Any]]
+"""From est, holdout, repeats and signals to the JSON of `rig explain`; of another plant than the EHA with `model`."""
 
 RESULTS = "results.jsonl"
 CASE_SOURCES = tuple(f"studies/hidden_effects/{name}" for name in ("truth.c", "truth.py", "command.py", "hidden.py",
-                                                              "cases.py"))
+                                                              "cases.py", "any_plant.py", "outside_ema.py"))
 
 
 def run_trial(explain: str, seeds: Sequence[int], folder: Path, processes: int = 2,
-              report_progress: Callable[[BatchProgress], None] = lambda _: None, signals: str | None = None
-              ) -> list[Row]:
+              report_progress: Callable[[BatchProgress], None] = lambda _: None, signals: str | None = None,
+              plant: str = "eha") -> list[Row]:
     """The rows of the cases of `seeds`, in their order; cases with a row in `folder` are not done again.
 
     Args:
@@ -42,48 +43,59 @@ def run_trial(explain: str, seeds: Sequence[int], folder: Path, processes: int =
         folder: for rows and traces.
         processes: cases at a time.
         report_progress: called after each finished case.
-        signals: what is measured in every case, one of `cases.SIGNALS`; default: random, from the seed.
+        signals: what is measured in every case, the first outputs of the plant; default: random, from the seed.
+        plant: shipped, or a plant file; the cases of the EHA are made by the simulator in C.
 
     Raises:
         InputError: there is no such function, there are no such signals, no C compiler, or the folder cannot be made.
     """
     load_explain(explain)
-    if signals is not None and signals not in cases.SIGNALS:
-        raise InputError("--signals", signals, " or ".join(cases.SIGNALS))
-    truth.parameter_names()  # compile the simulator before several processes need it
+    outputs = [s.name for s in name_plant(plant).signals.outputs]
+    known = [",".join(outputs[:count]) for count in range(1, len(outputs) + 1)]
+    if signals is not None and signals not in known:
+        raise InputError("--signals", signals, " or ".join(known))
+    if plant == "eha":
+        truth.parameter_names()  # compile the simulator before several processes need it
     with RowFile(folder / RESULTS) as file:
-        rows = run_batch(plan_batch(explain, seeds, folder, signals), file, Workers(processes), report_progress)
+        rows = run_batch(plan_batch(explain, seeds, folder, signals, plant), file, Workers(processes), report_progress)
     return list(rows.values())
 
 
-def plan_batch(explain: str, seeds: Sequence[int], folder: Path, signals: str | None) -> Batch:
+def name_plant(name: str) -> Plant:
+    """A shipped plant, or that of a file, which is loaded. Raises InputError."""
+    return load_plant(Path(name)) if name.endswith(".py") else find_plant(name)
+
+
+def plan_batch(explain: str, seeds: Sequence[int], folder: Path, signals: str | None, plant: str = "eha") -> Batch:
     """The cases of `seeds` as a batch; `signals` are those of every case, None if they are random."""
     sources = hash_trial_sources()
 
     def describe_failure(seed: int, reason: str) -> Row:
-        hidden = read_truth(prepare_case(seed, folder, signals))
+        hidden = read_truth(prepare_case(seed, folder, signals, plant))
         return make_row(explain, seed, signals, hidden, describe_crash(reason), 0.0)
 
     def is_valid(row: Row) -> bool:
-        return bool(row["sources"] == sources and row["by"] == explain and row["signals"] == signals)
+        return bool(row["sources"] == sources and row["by"] == explain and row["signals"] == signals
+                    and row["truth"].get("plant", "eha") == plant)
 
     def is_failed(row: Row) -> bool:
         return bool(row["answer"]["verdict"] == "CRASHED")
 
-    work = partial(explain_case, explain=explain, folder=folder, signals=signals)
+    work = partial(explain_case, explain=explain, folder=folder, signals=signals, plant=plant)
     return Batch(jobs={seed: seed for seed in seeds}, work=work, key="seed", describe_failure=describe_failure,
                  is_valid=is_valid, is_failed=is_failed)
 
 
-def explain_case(seed: int, explain: str, folder: Path, signals: str | None) -> Row:
+def explain_case(seed: int, explain: str, folder: Path, signals: str | None, plant: str = "eha") -> Row:
     """Explain one case: its truth, the shortened answer and the time it took. A crash is an answer as well."""
-    case = prepare_case(seed, folder, signals)
+    case = prepare_case(seed, folder, signals, plant)
     hidden = read_truth(case)
     clock = WallClock()
     start = clock.now()
+    more = {} if plant == "eha" else {"model": plant}
     try:
         answer = shorten_answer(load_explain(explain)(case / "est.csv.gz", case / "holdout.csv.gz",
-                                                      [case / "repeat.csv.gz"], hidden["signals"].split(",")))
+                                                      [case / "repeat.csv.gz"], hidden["signals"].split(","), **more))
     except Exception as error:
         answer = describe_crash(f"{type(error).__name__}: {error}")
     return make_row(explain, seed, signals, hidden, answer, (clock.now() - start) * 1e-9)
@@ -101,14 +113,20 @@ def describe_crash(reason: str) -> dict[str, Any]:
     return {"verdict": "CRASHED", "effects": [], "error": reason}
 
 
-def prepare_case(seed: int, folder: Path, signals: str | None) -> Path:
+def prepare_case(seed: int, folder: Path, signals: str | None, plant: str = "eha") -> Path:
     """The folder with the traces of a seed; they are made if they are missing. `signals`: None if they are random."""
     chosen = f"-{signals.replace(',', '-')}" if signals else ""
+    chosen += "" if plant == "eha" else f"-{Path(plant).stem}-{hash_sources('plant')[:8]}"
     target = folder / f"cases-{hash_sources(*CASE_SOURCES)[:8]}{chosen}" / f"{seed:05d}"
     if not target.exists():
         part = target.with_name(target.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
-        cases.write_case(cases.sample_case(seed, signals=signals), part)
+        if plant == "eha":
+            cases.write_case(cases.sample_case(seed, signals=signals), part)
+        else:
+            name_plant(plant)
+            case = any_plant.sample_case(plant, seed)
+            any_plant.write_case(plant, case._replace(signals=signals or case.signals), part)
         part.rename(target)
     return target
 
@@ -145,15 +163,16 @@ RIG_EXPLAIN = "studies.hidden_effects.run_trial:run_rig_explain"
 """The name of `run_rig_explain` for `studies.hidden_effects.run_trial`."""
 
 
-def run_rig_explain(est: Path, holdout: Path, repeats: Sequence[Path], signals: Sequence[str], timeout: float = 600.0
-                    ) -> dict[str, Any]:
-    """The JSON of `rig explain` for a case; `timeout` in s.
+def run_rig_explain(est: Path, holdout: Path, repeats: Sequence[Path], signals: Sequence[str], timeout: float = 600.0,
+                    model: str = "eha") -> dict[str, Any]:
+    """The JSON of `rig explain` for a case of a `model`; `timeout` in s.
 
     Raises:
         RuntimeError: the command ended with an error; the text is the last line of its standard error.
         subprocess.TimeoutExpired: the command took longer.
     """
-    arguments = ["explain", est, "--holdout", holdout, "--signals", ",".join(signals), "--json"]
+    arguments = ["explain", est, "--holdout", holdout, "--signals", ",".join(signals), "--json",
+                 "--model", model]
     for repeat in repeats:
         arguments += ["--repeat", repeat]
     command = [sys.executable, "-m", "rig.cli.main", *map(str, arguments)]

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 from fdi.estimation.binomial import clopper_pearson_interval
 from fdi.report.numbers import NO_NUMBER, format_duration
 from fdi.report.report import Cell, Column, Item, Line, Report, Section, Table
-from plant.effects import CATALOGUE
+from plant.effects import Effect
+from plant.plants import find_plant
 from rig.campaign.batch import BatchProgress
 
 Record = Mapping[str, Any]
@@ -17,8 +18,6 @@ Record = Mapping[str, Any]
 
 VISIBLE = 2.0  # noise floors; a hidden effect of this size or more has to be found
 TIME = 20.0  # s, for an answer
-ALL_SIGNALS = "xj,p12,xs"
-"""The signals of the cases that the rates are required of; with fewer signals more effects look alike."""
 
 
 class Rate(NamedTuple):
@@ -50,7 +49,7 @@ def measure_visibility(record: Record, ratio: Mapping[str, float] | None = None)
     because the position of a replay drifts with any difference.
     """
     ratios = record["truth"]["base_ratio"] if ratio is None else ratio
-    return max(ratios[name] for name in [*record["truth"]["signals"].split(","), "cor"])
+    return max(ratios[name] for name in [*record["truth"]["signals"].split(","), "controller"])
 
 
 def is_truth_named(record: Record) -> bool:
@@ -61,7 +60,7 @@ def is_truth_named(record: Record) -> bool:
 def is_truth_admitted(record: Record) -> bool:
     """Whether the answer names the hidden effect, or says that at its size it is not detectable in this test."""
     hidden = record["truth"]["hidden"][0]
-    entry = CATALOGUE[hidden["effect"]]
+    entry = _find_hidden_effect(record)
     size = abs(hidden["value"] - entry.off.get(entry.fitted[0], 0.0))
     blind_to = record["answer"].get("blind_to") or ()
     return is_truth_named(record) or any(each["effect"] == entry.name and size <= each["usual"] for each in blind_to)
@@ -70,11 +69,16 @@ def is_truth_admitted(record: Record) -> bool:
 def is_truth_covered(record: Record) -> bool | None:
     """Whether the interval of the hidden effect's first parameter contains the truth; None without an interval."""
     hidden = record["truth"]["hidden"][0]
-    parameter = CATALOGUE[hidden["effect"]].fitted[0]
+    parameter = _find_hidden_effect(record).fitted[0]
     estimate = _find_candidate(record, hidden["effect"]).get("parameters", {}).get(parameter)
     if estimate is None or estimate.get("low") is None or math.isnan(hidden["value"]):
         return None
     return bool(estimate["low"] <= hidden["value"] <= estimate["high"])
+
+
+def _find_hidden_effect(record: Record) -> Effect:
+    truth = record["truth"]
+    return find_plant(truth.get("plant", "eha")).find_effect(truth["hidden"][0]["effect"])
 
 
 def measure_holdout_error(record: Record) -> float | None:
@@ -202,13 +206,15 @@ def _describe_failure(record: Record, against: Sequence[str]) -> dict[str, Any]:
 
 def summarise_trial(records: Sequence[Record]) -> dict[str, Any]:
     """All figures as JSON values: the rates over cases with all signals, and their counts by the measured signals."""
+    outputs = [s.name for s in find_plant(records[0]["truth"].get("plant", "eha")).signals.outputs]
+    groups = [",".join(outputs[:count]) for count in range(len(outputs), 0, -1)]  # the rates are required of the first
     by_signals = {signals: [record for record in records if record["truth"]["signals"] == signals]
-                  for signals in (ALL_SIGNALS, "xj,p12", "xj")}
-    names = average_named_effects(by_signals[ALL_SIGNALS])
+                  for signals in groups}
+    names = average_named_effects(by_signals[groups[0]])
     seconds = sorted(record["seconds"] for record in records)
     return {"cases": len(records),
             "rates": [rate._asdict() | {"share": rate.share if rate.of else None, "met": rate.met}
-                      for rate in count_rates(by_signals[ALL_SIGNALS])],
+                      for rate in count_rates(by_signals[groups[0]])],
             "by_signals": {signals: {rate.name: [rate.good, rate.of] for rate in count_rates(group)}
                            for signals, group in by_signals.items()},
             "names_on_average": None if math.isnan(names) else names,

@@ -137,7 +137,7 @@ def test_a_case_repeats_by_its_seed(tmp_path: Path) -> None:
         assert holdout[name] == pytest.approx(getattr(again, name), rel=1e-8), name
     truth = tomllib.loads((tmp_path / "truth.toml").read_text())
     assert truth["effects"] == [h["effect"] for h in truth["hidden"]] and truth["base_ratio"].keys() == {
-        "xj", "xj_drift", "p12", "xs", "cor"}
+        "xj", "xj_drift", "p12", "xs", "controller"}
     est, repeat = (Trace.read(tmp_path / f"{name}.csv.gz") for name in ("est", "repeat"))
     assert len(est) == 13_500 and (est.com == repeat.com).all() and not (est.xj == repeat.xj).any()
 
@@ -178,7 +178,7 @@ def test_nothing_hidden_leaves_no_trace_of_an_effect() -> None:
 def record(seed: int, kind: str, effects: Sequence[str], verdict: str, named: Sequence[str], floors: float = 9.0,
            **more: Any) -> dict[str, Any]:
     """A record as a trial writes it."""
-    shown = {"xj": floors, "xj_drift": 99.0, "p12": floors, "xs": 0.0, "cor": 0.0}
+    shown = {"xj": floors, "xj_drift": 99.0, "p12": floors, "xs": 0.0, "controller": 0.0}
     each = [{"effect": name, "size": 1.0, "value": 20.0} | ({"ratio": shown} if len(effects) > 1 else {})
             for name in effects]
     truth = {"kind": kind, "effects": list(effects), "signals": "xj,p12,xs", "base_ratio": shown, "hidden": each}

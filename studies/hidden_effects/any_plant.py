@@ -1,0 +1,184 @@
+"""Cases of the blind trial for any declared plant: its own file says what to hide, how large, and what is measured.
+
+The truth is the plant's own equations in steps of 2 us, with parameters that scatter by their tolerances and with
+coloured noise; the trial's simulator in C has the EHA alone. Effects outside the catalogue are laws of a file beside
+this one, which `rig explain` never loads.
+"""
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.estimation.fit import list_relative_tolerances
+from plant import simulate
+from plant.effects import Effect, load_effects
+from plant.model import Model, build_bare_model, list_searched_effects
+from plant.plants import find_plant
+from plant.profile import build_profile
+from plant.segments import Hold, Ramp, Segment
+from plant.starts import compute_changes, ensure_starts
+from rig.campaign import judge
+from studies.hidden_effects.cases import KINDS
+
+Array = NDArray[np.float64]
+
+STEPS = 500  # a cycle
+LEVELS = {"one": (3.0, 100.0), "two": (17.0, 100.0), "outside": (20.0, 200.0)}
+"""Noise floors, in the signal that shows an effect best: what is hidden is as large. One outside must not be so small
+that an effect of the catalogue is as good."""
+LAG = 20  # cycles over which a change of the controlled signal counts: a replay's drifts with any difference
+NAMES = ("est", "repeat", "holdout")
+
+
+class Case(NamedTuple):
+    """The hidden effects of a case with all their parameters, and everything else that its traces depend on."""
+
+    seed: int
+    kind: str
+    hidden: tuple[tuple[str, Mapping[str, float]], ...]
+    signals: str
+    scatter: Mapping[str, float]  # parameter to the factor on its value
+    colour: float  # correlation of the controlled signal's noise from one cycle to the next
+    hum: float  # m, as for the position of the EHA
+
+
+def list_outside_effects(plant: str) -> list[Effect]:
+    """The effects outside the catalogue of a shipped plant; none of another."""
+    file = Path(__file__).with_name(f"outside_{plant}.py")
+    kind = find_plant(plant)
+    if not file.exists():
+        return []
+    return [kind.find_effect(name) for name in load_effects(file)]
+
+
+def sample_case(plant: str, seed: int) -> Case:
+    """The case of a seed; of two effects none excludes the other."""
+    rng = np.random.default_rng([seed, 3])
+    kind_of = str(rng.choice(list(KINDS), p=list(KINDS.values())))
+    kind, command = find_plant(plant), make_command(plant)
+    tolerances = list_relative_tolerances(build_bare_model(plant), kind.nominal)
+    level = float(rng.uniform(0.0, 1.0))
+    scatter = {name: 1.0 + level * t * float(rng.standard_normal()) for name, t in tolerances.items() if t > 0.0}
+    is_white = rng.random() < 1 / 3
+    colour, hum = float(rng.uniform(0.6, 0.85)), float(rng.uniform(0.3e-6, 1.1e-6))
+    outside = list_outside_effects(plant)
+    own = [e for e in list_searched_effects(plant) if not e.disturbance and ensure_starts(e.name, command, None, plant)]
+    own = [e for e in own if e not in outside]
+    pool, count = (outside, 1) if kind_of == "outside" else (own, {"nothing": 0, "one": 1, "two": 2}[kind_of])
+    while True:
+        chosen = [pool[int(i)] for i in rng.choice(len(pool), count, replace=False)] if count else []
+        if not any(a.name in b.excludes for a in chosen for b in chosen):
+            break
+    low, high = LEVELS.get(kind_of, (1.0, 1.0))
+    hidden = tuple((e.name, sample_size(plant, e, command, low * (high / low) ** float(rng.random()), rng))
+                   for e in chosen)
+    outputs = [s.name for s in kind.signals.outputs]
+    measured = len(outputs) if rng.random() < 0.5 else int(rng.integers(1, len(outputs) + 1))
+    return Case(seed, kind_of, hidden, ",".join(outputs[:measured]), scatter, 0.0 if is_white else colour,
+                0.0 if is_white else hum)
+
+
+def sample_size(plant: str, effect: Effect, command: Array, level: float, rng: np.random.Generator
+                ) -> dict[str, float]:
+    """One of the effect's starts, its first parameter so far from its off value that `level` noise floors show it."""
+    kind = find_plant(plant)
+    starts = ensure_starts(effect.name, command, None, plant).starts
+    start, first = dict(starts[int(rng.integers(len(starts)))]), effect.fitted[0]
+    off, q = effect.off.get(first, kind.nominal.get(first, 0.0)), effect.parameters[first]
+    sizes = (start[first] - off) * np.geomspace(1e-3, 1e3, 37)
+    sizes = sizes[[not q.refuses(off + x) for x in sizes]]
+    shown = np.array([max(measure_levels(plant, effect, start | {first: off + x}, command).values()) for x in sizes])
+    shown = np.nan_to_num(shown, nan=np.inf)
+    nearest = int(np.abs(np.log(np.clip(shown, 1e-9, 1e12) / level)).argmin())
+    return start | {first: off + float(sizes[nearest])}
+
+
+def measure_levels(plant: str, effect: Effect, values: Mapping[str, float], command: Array) -> dict[str, float]:
+    """RMS change over the noise by signal, of the nominal plant; "controller": of an effect in the firmware."""
+    change = compute_changes(effect, [values], command, None, plant)[0]
+    change = np.column_stack([change[LAG:, 0] - change[:-LAG, 0], change[LAG:, 1:]])
+    signals, nominal = find_plant(plant).signals.outputs, find_plant(plant).nominal
+    with np.errstate(over="ignore", invalid="ignore"):  # sizes at which the simulation diverges are tried too
+        rms = np.sqrt(np.nanmean(np.square(change), axis=0))
+    levels = {s.name: float(x) / (nominal[s.noise] * (1.0 if i else 2**0.5))
+              for i, (s, x) in enumerate(zip(signals, rms, strict=True))}
+    if effect.firmware:
+        return dict.fromkeys(levels, 0.0) | {"controller": levels[signals[0].name]}
+    return levels | {"controller": 0.0}
+
+
+def make_command(plant: str) -> Array:
+    """The command of the plant's nominal test, (n,)."""
+    return np.round(build_profile(find_plant(plant).profile, rate=_get_rate(plant)).command, 12)
+
+
+def sample_holdout_command(plant: str, rng: np.random.Generator) -> Array:
+    """Six segments of the nominal test in another order, of other sizes and signs, with rests between them, (n,)."""
+    moving = [s for s in find_plant(plant).profile if not isinstance(s, Hold)]
+    parts: list[Segment] = [Hold(time=0.3)]
+    for i in rng.choice(len(moving), 6):
+        factor = float(rng.uniform(0.4, 1.2)) * (-1.0 if rng.random() < 0.5 else 1.0)
+        segment = moving[int(i)]
+        size = {key: factor * getattr(segment, key) for key in ("to", "amplitude") if hasattr(segment, key)}
+        parts += [replace(segment, name="", **size), Hold(time=0.3)]
+    return np.round(build_profile([*parts, Ramp(to=0.0, time=1.0), Hold(time=0.3)], rate=_get_rate(plant)).command, 12)
+
+
+def _get_rate(plant: str) -> float:
+    return 1.0 / find_plant(plant).nominal["controller.period"]
+
+
+def build_truth(plant: str, case: Case) -> Model:
+    """The unit of a case."""
+    model = build_bare_model(plant)
+    model = model.replace({name: factor * model[name] for name, factor in case.scatter.items()})
+    for name, values in case.hidden:
+        effect = find_plant(plant).find_effect(name)
+        model = (model if effect.base else model.with_effects([*model.effects, name])).replace(dict(values), name)
+    return model
+
+
+def write_case(plant: str, case: Case, folder: Path) -> None:
+    """Write the traces and truth.toml of a case into `folder`, which is made if it is missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    kind, truth = find_plant(plant), build_truth(plant, case)
+    for turn, name in enumerate(NAMES):
+        rng = np.random.default_rng([case.seed, 5, turn])
+        command = sample_holdout_command(plant, rng) if name == "holdout" else make_command(plant)
+        noise = rng.standard_normal((len(command), len(kind.signals.outputs) + 1))
+        noise[:, 0] = judge.sample_position_noise(len(command), case.colour, case.hum, rng) / judge.FLOORS["xj"]
+        run = simulate(truth, command, steps=STEPS, drawn=noise)
+        names = ("t", *kind.signals.names)
+        rows = np.column_stack([getattr(run, name) for name in names])
+        text = "\n".join([",".join(names), *(",".join(f"{x:.9g}" for x in row) for row in rows.tolist())])
+        (folder / f"{name}.csv.gz").write_bytes(gzip.compress(text.encode() + b"\n", compresslevel=4, mtime=0))
+    (folder / "truth.toml").write_text(_format_truth(plant, case), encoding="utf-8")
+
+
+def _format_truth(plant: str, case: Case) -> str:
+    kind, command = find_plant(plant), make_command(plant)
+    levels = {name: measure_levels(plant, kind.find_effect(name), values, command) for name, values in case.hidden}
+    names = [*(s.name for s in kind.signals.outputs), "controller"]
+    together = {name: max((each[name] for each in levels.values()), default=0.0) for name in names}
+    lines = [f"seed = {case.seed}", f'plant = "{plant}"', f'kind = "{case.kind}"',
+             f"effects = {json.dumps([name for name, _ in case.hidden])}", f'signals = "{case.signals}"',
+             f"colour = {case.colour:.6g}", "", "[base_ratio]", *_format_table(together)]
+    for name, values in case.hidden:
+        effect = kind.find_effect(name)
+        lines += ["", "[[hidden]]", f'effect = "{name}"', f"size = {values[effect.fitted[0]]:.8g}",
+                  f"value = {values[effect.fitted[0]]:.8g}", "[hidden.changes]",
+                  *_format_table({f'"{key}"': x for key, x in values.items()})]
+        if len(levels) > 1:
+            lines += ["[hidden.ratio]", *_format_table(levels[name])]
+    return "\n".join([*lines, "", "[scatter]", *_format_table({f'"{k}"': x for k, x in case.scatter.items()}), ""])
+
+
+def _format_table(values: Mapping[str, float]) -> Sequence[str]:
+    return [f"{key} = {value:.8g}" for key, value in values.items()]
