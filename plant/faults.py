@@ -25,7 +25,6 @@ from typing import Any
 from plant.errors import InputError, show_value, suggest_name
 from plant.parameters import find_field, read_toml
 
-SHOWN_BY = ("", "steps", "ramps")
 WORD = re.compile(r"[a-z][a-z0-9_]*")  # of a fault: a key of JSON and a column of a campaign
 
 
@@ -45,7 +44,6 @@ class Fault:
     healthy: float = math.nan  # size of a healthy unit; default the nominal value of the parameter
     follow: Mapping[str, float] = field(default_factory=dict, hash=False)  # factors on the size; NaN: as nominal
     both_ways: bool = False  # the limits are distances from the healthy size, above and below it
-    shown_by: str = ""  # sections of a command on which bands judge it: steps, ramps or, by default, none
     interval_factor: float = 1.0  # on the 95 % interval of a fit, where simulations show that it is too narrow
 
     def __post_init__(self) -> None:
@@ -259,8 +257,6 @@ def _check_limits(f: Fault, q: Any, refuse: Any) -> None:
     if not (healthy < f.acceptable < f.maintenance or (healthy > f.acceptable > f.maintenance and not f.both_ways)):
         raise refuse("acceptable", f"a size between that of a healthy unit, {healthy:g}, and maintenance, "
                                    f"{f.maintenance:g} {f.unit}, not {f.acceptable:g}")
-    if f.shown_by not in SHOWN_BY:
-        raise refuse("shown_by", f"steps or ramps, not {f.shown_by}")
     if not 0.1 <= f.interval_factor <= 10.0:
         raise refuse("interval_factor", f"a factor from 0.1 to 10, not {f.interval_factor:g}")
 

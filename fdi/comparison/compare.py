@@ -350,7 +350,8 @@ def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> lis
         said.append(f"the error differs between the repeats, as with stick-slip: {', '.join(apart)} noise floors")
     if replay.undecided.any() and replay.undecided.mean() <= UNDECIDED_SHARE:
         seconds = float(replay.undecided.sum()) * trace.period
-        said.append(f"{seconds:.1f} s are not judged: whether the ram stops {_describe_cause(replay)}")
+        said.append(f"{seconds:.1f} s are not judged: whether the {trace.declared.controlled.phrase} stops "
+                    f"{_describe_cause(replay)}")
     return said
 
 

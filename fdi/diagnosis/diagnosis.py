@@ -104,9 +104,10 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     trace = prepare_trace(trace, model, None, source)
     model = match_period(model, trace, SAME_PERIOD)
     way = float(np.nanmax(trace.controlled) - np.nanmin(trace.controlled))
-    if max(way, float(np.ptp(trace.command))) < MOVING_RAM:
-        raise InputError(source, "com",
-                         f"a ram that moves {1e3 * MOVING_RAM:g} mm or more: at rest it shows no fault")
+    command, controlled, least = trace.declared.command, trace.declared.controlled, MOVING_RAM * trace.scale
+    if max(way, float(np.ptp(trace.command))) < least:
+        raise InputError(source, command.name, f"a test in which the {controlled.phrase} moves {least:g} "
+                                               f"{controlled.unit} or more: at rest it shows no fault")
     notes = list(trace.notes)
     progress("bands", 0.03)
     if not set(FAULTS) <= set(faults):

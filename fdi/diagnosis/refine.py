@@ -45,7 +45,7 @@ from fdi.estimation.fit import (
     span_all_rows,
 )
 from fdi.estimation.long_recordings import Excerpt, choose_excerpt, judge_on_all
-from fdi.estimation.replay import find_unpredictable_rows, measure_decided_errors
+from fdi.estimation.replay import find_unpredictable_rows, is_friction, measure_decided_errors
 from fdi.estimation.unidentifiable import (
     FLAPPER,
     ORIGINS,
@@ -65,6 +65,7 @@ from fdi.progress import NO_STAGE, Progress, Stage, ignore_progress
 from fdi.thresholds import (
     FAULT_BLAMED_SHARE,
     FITTED_RUN_WORST,
+    FRICTION_UNCERTAINTY,
     FURTHER_EFFECT_SHARE,
     GAIN_CONVINCES,
     GAIN_TIE,
@@ -366,12 +367,17 @@ def refine_sizes(model: Model, trace: Trace, starts: Sequence[Sizes] | None = No
     free = list_unknowns(problem.model, faults)
     first = _fit_coarsely(problem, free, starts or list_coarse_starts(faults))
     problem = learn_left_noise(problem, first)
-    if problem.model.kind.correct is not None:  # with an observer a stop hangs on the noise of the measurement
-        problem = _leave_out_stops(problem, first)
-    last = _fit_finely(problem, first)
+    last = first
+    for _ in range(2 if problem.model.kind.correct is not None else 0):  # an observer's stops hang on the noise
+        problem = _leave_out_stops(problem, last)
+        last = _fit_finely(problem, last)
+        if is_noise_left(problem, last):
+            break
+    else:
+        last = _fit_finely(problem, last)
     if len(faults) > 2:  # of fewer, the start from a healthy unit is the only one that lacks a fault
         last = _retry_without(problem, last)
-    return report_fit(last, problem, whole)
+    return report_fit(last, problem, None if whole is trace else whole)
 
 
 def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequence[Sizes]) -> Fit:
@@ -632,8 +638,7 @@ def report_fit(last: Fit, problem: CountedProblem, whole: Trace | None = None) -
     places = [names.index(fault.parameter) for fault in problem.faults]
     spread = np.sqrt(np.diag(last.covariance))[places]
     correlations = last.covariance[np.ix_(places, places)] / np.outer(spread, spread)
-    sizes = {fault.name: estimate_parameter(last, fault.parameter, fault.interval_factor,
-                                            NARROWEST_LINEAR if type(last.free[k]) is Free else 0.0)
+    sizes = {fault.name: estimate_parameter(last, fault.parameter, fault.interval_factor, _find_narrowest(last.free[k]))
              for fault, k in zip(problem.faults, places, strict=True)}
     suspects = list_suspects(problem.model, problem.faults)
     found = Refinement(problem.faults, sizes, correlations,
@@ -643,6 +648,13 @@ def report_fit(last: Fit, problem: CountedProblem, whole: Trace | None = None) -
         return found
     judged = judge_on_all(problem, [last], whole, FINE_STEPS)[0]
     return replace(found, errors=judged.errors, everywhere=judged.typical_ratio(found.floor))
+
+
+def _find_narrowest(f: Free) -> float:
+    """Half the narrowest interval of a fault's scaled unknown."""
+    if type(f) is Free:
+        return NARROWEST_LINEAR
+    return FRICTION_UNCERTAINTY / f.scale if is_friction(f.name) else 0.0
 
 
 def estimate_parameter(found: Fit, name: str, factor: float = 1.0, least: float = 0.0) -> Estimate:

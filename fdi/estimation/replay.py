@@ -604,7 +604,8 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
             usable &= ~frozen
     if _starts_in_motion(rows):
         start = round(recovery / rows.period)
-        notes.append(f"the ram already moves in the first row: the first {start * rows.period:g} s are not judged")
+        notes.append(f"the {rows.declared.controlled.phrase} already moves in the first row: the first "
+                     f"{start * rows.period:g} s are not judged")
         usable[:start] = False
     if usable.sum() < FEWEST_ROWS:
         raise InputError(source, rows.declared.drive.name,
@@ -659,14 +660,17 @@ def _find_frozen(x: Floats, mover: Floats, scale: float, longest: int = 200, mov
 def _starts_in_motion(trace: Trace, rows: int = 16, fast: float = 2e-3) -> bool:
     """Whether the plant moves faster than `fast` m/s, times the scale, in the first row: replays start at rest.
 
-    The speed is that of a parabola through the first `rows` positions.
+    The speed is that of a parabola through the first `rows` positions. Beside a smaller one than five times the
+    standard deviation that its residual, the noise, gives it, the plant may as well be at rest.
     """
     first = trace.controlled[:rows]
     if np.isnan(first).any():
         return False
     k = np.arange(rows)
     parabola = np.linalg.pinv(np.vander(k.astype(float), 3, increasing=True))
-    return abs(float(parabola[1] @ first) / trace.period) > fast * trace.scale
+    noise = float(np.linalg.norm(first - np.vander(k.astype(float), 3, increasing=True) @ (parabola @ first)))
+    certain = 5.0 * noise / math.sqrt(rows - 3) * float(np.linalg.norm(parabola[1]))
+    return abs(float(parabola[1] @ first)) > max(fast * trace.scale * trace.period, certain)
 
 
 class Repeat(NamedTuple):

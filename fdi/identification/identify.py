@@ -816,7 +816,7 @@ def decide_verdict(estimates: Sequence[Estimate], errors: Sequence[RunError]) ->
         return "PARTLY", f"these runs do not show {len(unseen)} of {len(estimates)} free parameters"
     worst = max((e for e in errors if not e.is_held_out), key=lambda e: e.ratio)
     if worst.ratio > FITTED_RUN_WORST:
-        return "PARTLY", (f"single stops of the ram in {worst.source.file} come at the wrong moment "
+        return "PARTLY", (f"single stops in {worst.source.file} come at the wrong moment "
                           f"({worst.ratio:.3g} noise floors over all of the run), so frictions and gains may be off by "
                           "more than their intervals")
     return "IDENTIFIED", ""

@@ -220,7 +220,7 @@ def _describe_undecided(a: Answer) -> str:
     if held is None or not held.decided:
         return ""
     worst = max(held.decided[s] / a.explanation.floor[s] for s in held.decided)
-    return (f"{held.undecided:.0%} of it is not judged, because stops of the ram or the spool there depend on a "
+    return (f"{held.undecided:.0%} of it is not judged, because stops there depend on a "
             f"thousandth of a friction level; the rest is at {format_ratio(worst)} times the noise floor")
 
 

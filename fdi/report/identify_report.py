@@ -152,7 +152,7 @@ def _describe_findings(found: Identification) -> list[Line]:
              if at_bound else "", "bad"),
         Line("correlated", f"{pairs}: the ratio or product is known better than each" if pairs else ""),
         *(Line("held-out run", f"{format_percent(e.undecided, 2)} of {e.source.file} cannot be predicted, because "
-                               "stops of ram or spool there depend on a thousandth of a friction level; the rest is at "
+                               "stops there depend on a thousandth of a friction level; the rest is at "
                                f"{format_ratio(e.decided_ratio)} noise floors")
           for e in found.holdouts if 0.0 < e.undecided <= HELD_OUT_UNDECIDED_SHARE),
         Line("controller", law)]

@@ -67,8 +67,7 @@ def test_the_papers_faults_are_a_file_with_the_limits_of_table_2() -> None:
     ({"acceptable": "much"}, ["acceptable", "a number"]),
     ({"follow": ["jack.mass"]}, ["follow", "table of factors"]),
     ({"follow": {"no.such": 1.0}}, ["follow", "plant eha"]),
-    ({"both_ways": 1}, ["both_ways", "true or false"]),
-    ({"shown_by": "sine"}, ["shown_by", "steps or ramps"])])
+    ({"both_ways": 1}, ["both_ways", "true or false"])])
 def test_a_bad_fault_is_one_line_with_status_2(tmp_path: Path, keys: dict[str, Any], words: list[str]) -> None:
     file = write(tmp_path / "bad.toml", **keys)
     text = catch_refusal(load_faults, file)
