@@ -49,6 +49,9 @@ def find_quantity(name: str, where: object = "--set", plant: str = "eha") -> Qua
     Raises:
         InputError: there is no such parameter.
     """
+    own = {e.name: e.fitted for e in list_offered_effects(plant) if e.base}.get(name.partition(".")[0])
+    if own and name not in own:
+        raise InputError(where, name, f"{' or '.join(own)}: the parameter that this effect is in this plant")
     return find_field(where, name, find_parameter_groups(plant=plant))
 
 
@@ -93,8 +96,7 @@ class Model:
         Raises:
             InputError: an unknown name, an impossible value, or values that contradict each other.
         """
-        known = find_parameter_groups(plant=self.plant)
-        values = {name: parse_value(where, name, find_field(where, name, known), value)
+        values = {name: parse_value(where, name, find_quantity(name, where, self.plant), value)
                   for name, value in changes.items()}
         model = self.with_effects(name.partition(".")[0] for name in changes)
         merged = {**model.values, **values}

@@ -244,12 +244,13 @@ COMMANDS = {
          option("word", nargs="?", default="", metavar="WORD", help="only names that contain this word"), *MODEL,
          FAULTS)),
     "new": Command(
-        "write a first file of your own, commented: a bench from the EDS, DCF or DBC of your controller, a plant, a "
-        "fault",
+        "write a first file of your own, commented: a bench from the EDS, DCF or DBC of your controller, a plant, "
+        "a test sequence, an effect, a fault",
         "It goes to --out (default: NAME.toml or NAME.py). Lines that are guesses say so (# unsure).",
-        (option("kind", choices=("bench", "plant", "fault"), metavar="KIND",
-                help="bench: which device is under test (docs/bench.md); plant: an actuator (docs/plants.md); fault: "
-                     "what rig fdi measures (docs/fdi.md)"),
+        (option("kind", choices=("bench", "plant", "sequence", "effect", "fault"), metavar="KIND",
+                help="bench: which device is under test (docs/bench.md); plant: an actuator (docs/plants.md); "
+                     "sequence: a test (docs/sequences.md); effect: physics that a model may lack (docs/effects.md); "
+                     "fault: what rig fdi measures (docs/fdi.md)"),
          option("name", metavar="NAME", help="name of the file, without .toml or .py"),
          option("--eds", type=Path, metavar="FILE", help="EDS or DCF of a CANopen device"),
          option("--dbc", type=Path, metavar="FILE", help="DBC of a device on plain CAN"),

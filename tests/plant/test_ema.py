@@ -11,9 +11,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from plant import ema
+from fdi.estimation.replay import prepare_trace, replay_with_checked_steps
+from fdi.trace.trace import Trace, rms
+from plant import ema, simulate
 from plant.compile import compile_function
 from plant.ema import compute_coefficients, step
+from plant.model import load_model
+from plant.profile import build_profile
 
 Array = NDArray[np.float64]
 GROUPS = ema.PLANT.parameters
@@ -163,3 +167,19 @@ def test_the_surface_stops_at_the_end_of_its_travel() -> None:
     s = run(USUAL, hold(10.0, 3.0, 1e-4), 1e-4)
     assert np.abs(s[:, 3]).max() <= USUAL.surface.travel
     assert s[-1, 4] == 0.0 and np.isfinite(s).all()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_replay_of_a_healthy_unit_leaves_noise_where_no_stop_decides(seed: int) -> None:
+    """The noise of the position, as the observer takes it, tears no held surface off its stiction."""
+    model = load_model("ema")
+    command = build_profile(ema.PLANT.profile[:3]).command  # a step out and back
+    run = simulate(model, command, seed=seed)._asdict()
+    t = run.pop("t")
+    trace = prepare_trace(Trace.from_columns(run, float(t[1]), {}, model.kind.signals), model, None, "trace")
+    floor = {name: model[trace.declared.find(name).noise] for name in trace.outputs}
+    found = replay_with_checked_steps(trace, model, floor)
+    assert found.undecided.mean() < 0.6
+    assert all(rms(left[~found.undecided]) < 1.1 * floor[name] for name, left in found.residual.items())
+    held = ema.State(position=1e-3)
+    assert ema.correct(held, 1e-6, USUAL).speed == 0.0

@@ -7,11 +7,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fdi.diagnosis.faults import load_faults
 from fdi.output import require_writable, write_text
 from fdi.report.report import Line, Report, Section
+from plant.effects import load_effects
 from plant.errors import InputError
 from plant.faults import EXAMPLE, WORD
 from plant.plants import load_plant
@@ -19,44 +20,42 @@ from rig.benches.bench import decode_device_text
 from rig.benches.bench_file import load_bench
 from rig.benches.guess import UNSURE, guess_can, guess_canopen
 from rig.cli.answer import give_answer
+from rig.sequences import load_sequence
 from rig.tables import read_file
 
 
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 also where the file is to be completed."""
-    suffix = ".py" if args.kind == "plant" else ".toml"
+    suffix, write, read, check = KINDS[args.kind]
     path = Path(args.out or f"{args.name.removesuffix(suffix)}{suffix}")
     if path.suffix != suffix:
         raise InputError("--out", str(path), f"FILE{suffix}")
     if path.exists() and not args.force:
         raise InputError("--out", str(path), "a file that does not exist yet, or --force")
     require_writable(path, "--out")
-    write, check, use = KINDS[args.kind]
     text = write(path, args)
     write_text(path, text)
     try:
-        check(str(path))
+        read(path)
         problem = ""
     except InputError as error:
         problem = str(error)
     report = build_new_report(path, text, problem)
-    return give_answer(replace(report, next_command=use.format(path), files=[(args.kind, str(path))]), args)
+    return give_answer(replace(report, next_command=check.format(path=path), files=[(args.kind, str(path))]), args)
 
 
-def write_fault(path: Path, args: argparse.Namespace) -> str:
-    """The text of a fault file at `path` with one example."""
+def write_example(path: Path, args: argparse.Namespace) -> str:
+    """The text of a file of the kinds that need no device: a shipped example, with the name of the file in it."""
+    kind = args.kind
     if args.eds or args.dbc or args.node:
-        raise InputError("rig new fault", "", "no device: --eds, --dbc and --node are of a bench")
-    if not WORD.fullmatch(path.stem):
-        raise InputError("NAME", path.stem, "small letters, digits and _ : the name is also that of the first fault")
-    return EXAMPLE.format(file=path, name=path.stem)
-
-
-def write_plant(path: Path, args: argparse.Namespace) -> str:
-    """The text of a plant file: a DC motor, to be changed."""
-    if args.eds or args.dbc or args.node:
-        raise InputError("rig new plant", "", "no device: --eds, --dbc and --node are of a bench")
-    return files("plant").joinpath("models", "new_plant.py").read_text(encoding="utf-8")
+        raise InputError(f"rig new {kind}", "", "no device: --eds, --dbc and --node are of a bench")
+    if kind in ("fault", "effect") and not WORD.fullmatch(path.stem):
+        raise InputError("NAME", path.stem, f"small letters, digits and _ : the name is also that of the {kind}")
+    if kind == "fault":
+        return EXAMPLE.format(file=path, name=path.stem)
+    package, *place = EXAMPLES[kind]
+    text = files(package).joinpath(*place).read_text(encoding="utf-8")
+    return text if kind == "plant" else text.format(file=path, name=path.stem)
 
 
 def write_bench(path: Path, args: argparse.Namespace) -> str:
@@ -82,9 +81,23 @@ def build_new_report(path: Path, text: str, problem: str) -> Report:
                         "unsure": marked})
 
 
-# what writes a file of a kind, what reads it, and the command that checks it
-KINDS: Mapping[str, tuple[Callable[[Path, argparse.Namespace], str], Callable[[str], Any], str]] = {
-    "bench": (write_bench, load_bench, "rig check --bench {}"),
-    "plant": (write_plant, lambda path: load_plant(Path(path)), "rig check {}"),
-    "fault": (write_fault, load_faults, "rig check {}"),
+EXAMPLES = {"plant": ("plant", "models", "new_plant.py"), "effect": ("rig.cli", "new_effect.txt"),
+            "sequence": ("rig.cli", "new_sequence.toml")}
+
+
+class Kind(NamedTuple):
+    """A kind of file."""
+
+    suffix: str
+    write: Callable[[Path, argparse.Namespace], str]
+    read: Callable[[Path], Any]  # refuses what cannot be used
+    check: str  # the command that checks it
+
+
+KINDS: Mapping[str, Kind] = {
+    "bench": Kind(".toml", write_bench, lambda path: load_bench(str(path)), "rig check --bench {path}"),
+    "plant": Kind(".py", write_example, load_plant, "rig check {path}"),
+    "sequence": Kind(".toml", write_example, load_sequence, "rig check {path}"),
+    "effect": Kind(".py", write_example, load_effects, "rig effects --effects {path} {path.stem}"),
+    "fault": Kind(".toml", write_example, lambda path: load_faults(str(path)), "rig check {path}"),
 }
