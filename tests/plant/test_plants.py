@@ -178,3 +178,13 @@ def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -
     assert not (tmp_path / "s.csv").exists()
     (first,) = (f for f in check_behaviour(load_model(file)))
     assert not first.passed and "t = 0.1" in first.text
+
+
+@pytest.mark.parametrize(("kind", "check"), [("sequence", ["check", "my_new.toml"]),
+                                             ("effect", ["effects", "--effects", "my_new.py", "my_new"])])
+def test_a_new_file_passes_its_own_check(kind: str, check: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+                                         ) -> None:
+    monkeypatch.chdir(tmp_path)
+    answer = rig("new", kind, "my_new", "--json").json
+    assert answer["verdict"] == "COMPLETE" and rig(*check).status == 0
+    assert "are of a bench" in rig("new", kind, "other", "--node", "3").err

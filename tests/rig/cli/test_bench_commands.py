@@ -89,16 +89,6 @@ def test_a_sheet_without_the_signals_is_completed_by_the_user(tmp_path: Path) ->
     assert "a DBC" in refuse("new", "bench", "y", "--dbc", tmp_path / "x.eds", "--out", tmp_path / "y.toml")
 
 
-@pytest.mark.parametrize(("kind", "check"), [("sequence", ["check", "my_new.toml"]),
-                                             ("effect", ["effects", "--effects", "my_new.py", "my_new"])])
-def test_a_new_file_passes_its_own_check(kind: str, check: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-                                         ) -> None:
-    monkeypatch.chdir(tmp_path)
-    answer = rig("new", kind, "my_new", "--json").json
-    assert answer["verdict"] == "COMPLETE" and rig(*check).status == 0
-    assert "are of a bench" in refuse("new", kind, "other", "--node", "3")
-
-
 def test_what_is_heard_is_sorted_by_the_frames_of_the_bench() -> None:
     bench = load_bench(str(ECU / "bench.toml"))
     drive, demand = bench.frames.list_from(Role.CONTROLLER)[0], bench.frames.list_from(Role.RIG)[0]
