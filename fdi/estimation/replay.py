@@ -47,6 +47,7 @@ from plant.errors import InputError
 from plant.lanes import Lanes
 from plant.model import Model
 from plant.plants import MODULES
+from plant.signals import EHA
 
 Columns = dict[str, Floats]  # by signal, (n,)
 
@@ -396,6 +397,9 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
     return Scatter(error, ratio, moved, max(ratio.values()) < RESIDUAL_IS_SCATTER)
 
 
+# Of a run, in which the plant still follows the drive of set-up, which is not in the recording. Those of the EHA, which
+# follows over hundreds of rows, are judged.
+SETTLING_ROWS = 10
 FEWEST_ROWS = 200  # of a recording; fewer cannot tell anything
 PERIODS = (1e-4, 0.1)  # s, shortest and longest of a controller: the bounds of `controller.period`
 SAME_PERIOD = 0.01  # of a period: two periods that differ by less are the same
@@ -607,6 +611,8 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
         notes.append(f"the {rows.declared.controlled.phrase} already moves in the first row: the first "
                      f"{start * rows.period:g} s are not judged")
         usable[:start] = False
+    if "pace" in rows.provenance and rows.declared.names != EHA.names:  # a run: main begins behind set-up
+        usable[:SETTLING_ROWS] = False
     if usable.sum() < FEWEST_ROWS:
         raise InputError(source, rows.declared.drive.name,
                          f"at least {FEWEST_ROWS} rows that can be replayed, not {int(usable.sum())}")
