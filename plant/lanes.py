@@ -8,9 +8,9 @@ single run; that step must not branch.
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from functools import cache
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,7 +37,7 @@ from plant.model import Model, build_bare_model
 from plant.plants import MeasuredPressures, Plant
 from plant.solve import read_controlled
 from plant.state import Input
-from plant.threads import count_threads, map_in_threads
+from plant.threads import count_threads, do_together, map_in_threads
 
 Array = NDArray[np.float64]
 STEPS = 20  # steps a cycle: 50 us
@@ -68,6 +68,84 @@ class Block(NamedTuple):
     run: Function
     buffer: Array
     rows: NDArray[np.uint64]
+
+
+class Share(NamedTuple):
+    """Runs that one kernel makes: its parameters `names`, their `values` (m, p), and the rows (m,) of the output."""
+
+    kernel: KernelVariant
+    names: tuple[str, ...]
+    values: Array
+    rows: NDArray[np.int64]
+
+
+@dataclass(eq=False)
+class Batch:
+    """Runs over one set of inputs, that of `run_block`; `make_runs` fills `out`, (runs, columns, n)."""
+
+    shares: list[Share]
+    inputs: tuple[Any, ...]
+    parts: tuple[Part, ...]
+    runs: int
+    columns: int
+    out: Array = field(default_factory=lambda: np.empty((0, 0, 0)))
+
+    @property
+    def key(self) -> Hashable:
+        """The same for batches with equal inputs."""
+        return tuple(x.tobytes() if isinstance(x, np.ndarray) else x for x in self.inputs), self.parts, self.columns
+
+
+def make_runs(batches: Sequence[Batch], workers: int) -> None:
+    """Make the runs of some batches, those with equal inputs in common blocks."""
+    equal: dict[Hashable, list[Batch]] = {}
+    for batch in batches:
+        equal.setdefault(batch.key, []).append(batch)
+    work = [task for group in equal.values() for task in _plan_group(group)]
+    map_in_threads(lambda task: task(), work, workers)
+
+
+def _plan_group(batches: Sequence[Batch]) -> Iterator[Callable[[], None]]:
+    """What is to be done for batches with equal inputs; each may be done in a thread of its own."""
+    count, columns, inputs = sum(batch.runs for batch in batches), batches[0].columns, batches[0].inputs
+    out = np.empty((count + 1, columns, len(inputs[0])))  # the last row is that of idle lanes
+    shares, first = [], 0
+    for batch in batches:
+        batch.out = out[first:first + batch.runs]
+        shares += [share._replace(rows=share.rows + first) for share in batch.shares]
+        first += batch.runs
+
+    def run_part(block: Block, part: Part) -> None:
+        buffer = block.buffer.copy() if batches[0].parts else block.buffer
+        for first in range(part.first, part.stop, TURN):  # so that Ctrl-C is heard in between
+            stop = min(first + TURN, part.stop)
+            block.run(buffer, *inputs, first, stop, 0, part.later, first == part.first, block.rows, out)
+
+    for block in build_blocks(shares, count):
+        for part in batches[0].parts or (Part(0, len(inputs[0]), 0),):
+            yield partial(run_part, block, part)
+
+
+def build_blocks(shares: Iterable[Share], idle: int) -> list[Block]:
+    """The runs in blocks, those of one kernel side by side.
+
+    Idle lanes repeat the last run; the row of their output is `idle`.
+    """
+    by_kernel: dict[Hashable, list[Share]] = {}
+    for share in shares:
+        by_kernel.setdefault(share.kernel.key, []).append(share)
+    blocks = []
+    for group in by_kernel.values():
+        kernel, rows = group[0].kernel, np.concatenate([share.rows for share in group])
+        width = WIDE if len(rows) >= 2 * WIDE and not kernel.model.effects else NARROW
+        plan, run = kernel.compile(width)
+        lanes = np.concatenate([share.kernel.fill_lanes(plan, share.names, share.values) for share in group], axis=1)
+        for first in range(0, len(rows), width):
+            used = np.minimum(np.arange(first, first + width), len(rows) - 1)
+            places = np.where(np.arange(first, first + width) < len(rows), rows[used], idle)
+            # unsigned: no test for counting from the end
+            blocks.append(Block(run, lanes[:, used].reshape(-1), places.astype(np.uint64)))
+    return blocks
 
 
 class Lanes:
@@ -150,7 +228,8 @@ class Lanes:
         if self.model.kind.foreign is not None:
             yield 0, self.replay(values, current, load, position, anchor)
             return
-        work, inputs = self._prepare(values, current, load, where, anchor, False)
+        shares, inputs = self._prepare(values, current, load, where, anchor, False)
+        work = build_blocks(shares, len(values))
         for first in range(0, len(current), rows):
             stop = min(first + rows, len(current))
             out = np.empty((len(values) + 1, self._count_columns(False), stop - first))
@@ -182,27 +261,18 @@ class Lanes:
              parts: Sequence[Part] = ()) -> Array:
         if self.model.kind.foreign is not None:
             return run_foreign(self.model, self.names, values, driven, load, position, anchor, closed, parts)
-        blocks, inputs = self._prepare(values, driven, load, position, anchor, closed)
-        out = np.empty((len(values) + 1, self._count_columns(closed), len(driven)))  # the last for idle lanes
-        work = [(block, part) for block in blocks for part in parts or (Part(0, len(driven), 0),)]
-
-        def do(task: tuple[Block, Part]) -> None:
-            block, part = task
-            buffer = block.buffer.copy() if parts else block.buffer
-            for first in range(part.first, part.stop, TURN):  # so that Ctrl-C is heard in between
-                stop = min(first + TURN, part.stop)
-                block.run(buffer, *inputs, first, stop, 0, part.later, first == part.first, block.rows, out)
-
-        map_in_threads(do, work, self.workers)
-        return out[:-1].transpose(0, 2, 1)
+        shared, inputs = self._prepare(values, driven, load, position, anchor, closed)
+        batch = Batch(shared, inputs, tuple(parts), len(values), self._count_columns(closed))
+        do_together(batch, make_runs, self.workers)
+        return batch.out.transpose(0, 2, 1)
 
     def _count_columns(self, closed: bool) -> int:
         signals = self.model.kind.signals
         return len(signals.columns if closed else signals.outputs)
 
     def _prepare(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool
-                 ) -> tuple[list[Block], tuple[Any, ...]]:
-        """The runs in blocks, and the inputs that they share.
+                 ) -> tuple[list[Share], tuple[Any, ...]]:
+        """The runs by their kernels, and the inputs of all.
 
         Raises:
             InputError: shapes that do not fit.
@@ -213,10 +283,10 @@ class Lanes:
         if driven.ndim != 1 or load.shape != driven.shape or position.shape not in (driven.shape, (0,)):
             raise InputError("lanes", "load", "one number a cycle in each input, not shapes "
                              f"{driven.shape}, {load.shape} and {position.shape}")
-        blocks = [block for rung, members in self._assign_runs(values, len(driven))
-                  for block in rung.build_blocks(self.names, values, members)]
+        shares = [Share(rung, self.names, values[members], members)
+                  for rung, members in self._assign_runs(values, len(driven))]
         period = float(self.model["controller.period"])
-        return blocks, (driven, load, position, float(anchor), closed, period, self.steps)
+        return shares, (driven, load, position, float(anchor), closed, period, self.steps)
 
     def _assign_runs(self, values: Array, samples: int) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
         """The runs of each kernel: a run goes to the kernel with the fewest effects that has all its active ones.
@@ -296,43 +366,39 @@ class KernelVariant:
 
     def is_ready(self, steps: float) -> bool:
         """Whether the kernel can make so many steps of all lanes now: see `KernelUse.is_ready`."""
-        key = self.model.kind, self.model.effects, self._laws
-
         def is_stored() -> bool:
             plan = plan_layout(self.model.effects, self.model.kind, NARROW)
             return is_function_stored(plan.loop, plan.names)
 
-        return KERNEL_USE.is_ready(key, steps, is_stored, self.prepare)
+        return KERNEL_USE.is_ready(self.key, steps, is_stored, self.prepare)
+
+    @property
+    def key(self) -> Hashable:
+        """What tells the kernel from others: one kernel makes the runs of models that differ in parameters alone."""
+        return self.model.kind, self.model.effects, self._laws
 
     def prepare(self) -> None:
         """Load or compile the kernel by a run of no samples."""
         none = np.empty(0)
-        for run, buffer, rows in self.build_blocks((), np.zeros((1, 0)), np.arange(1)):
+        for run, buffer, rows in build_blocks([Share(self, (), np.zeros((1, 0)), np.zeros(1, np.int64))], 1):
             out = np.empty((2, len(self.model.kind.signals.outputs), 0))
             run(buffer, none, none, none, 0.0, False, 1.0, 1, 0, 0, 0, 0, True, rows, out)
 
-    def build_blocks(self, names: Sequence[str], values: Array, members: NDArray[np.int64]) -> Iterator[Block]:
-        """The runs `members` in blocks.
+    def compile(self, width: int) -> tuple[Layout, Function]:
+        """The kernel with so many lanes, and the layout of its buffer."""
+        return _compile_layout(self.model.effects, self._laws, self.model.kind, width)
 
-        Idle lanes repeat the last run; their rows come after all others.
-        """
-        model = self.model
-        width = WIDE if len(members) >= 2 * WIDE and not model.effects else NARROW
-        plan, run = _compile_layout(model.effects, self._laws, model.kind, width)
+    def fill_lanes(self, plan: Layout, names: Sequence[str], values: Array) -> Array:
+        """The numbers of a lane for each run, (numbers, m), whose named parameters are `values` (m, p)."""
         if self._state is None:  # not sooner: it asks laws, which may be wrong
-            self._state = model.build_flat_state()
-        start = np.zeros((plan.numbers, width))
-        start[:len(self._state)] = self._state[:, None]
-        start[plan.parameters:] = self._parameters
-        for first in range(0, len(members), width):
-            lanes = members[first:first + width]
-            buffer = start.copy()
-            for column, name in enumerate(names):
-                if name in self._names:
-                    place = buffer[plan.parameters + self._names.index(name)]
-                    place[:len(lanes)], place[len(lanes):] = values[lanes, column], values[lanes[-1], column]
-            rows = np.r_[lanes, np.full(width - len(lanes), len(values))]
-            yield Block(run, buffer.reshape(-1), rows.astype(np.uint64))  # unsigned: no test for counting from the end
+            self._state = self.model.build_flat_state()
+        lanes = np.zeros((plan.numbers, len(values)))
+        lanes[:len(self._state)] = self._state[:, None]
+        lanes[plan.parameters:] = self._parameters
+        for column, name in enumerate(names):
+            if name in self._names:
+                lanes[plan.parameters + self._names.index(name)] = values[:, column]
+        return lanes
 
 
 def _count_blocks(runs: int) -> int:

@@ -1,12 +1,17 @@
-"""Runs work in threads: kernels and NumPy release the interpreter lock while they compute."""
+"""Runs work in threads: kernels and NumPy release the interpreter lock while they compute.
+
+A kernel makes a block of runs in the time of one. Fits that go on side by side each ask for a few, so
+`map_together` has them wait for each other, and what they ask for is made in common blocks.
+"""
 from __future__ import annotations
 
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 THREAD_NAME = "side_by_side"  # how the names of these threads begin
 T = TypeVar("T")
@@ -32,12 +37,114 @@ def _open_pool(workers: int) -> Iterator[ThreadPoolExecutor]:
 
 
 def map_in_threads(do: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
-    """`do(item)` of each item, in order, in `workers` threads; a single item or one worker uses the calling thread."""
+    """`do(item)` of each item, in order, in `workers` threads; a single item or one worker uses the calling thread.
+
+    So does a thread of `map_together`.
+    """
     work = list(items)
-    if min(workers, len(work)) < 2:
+    if min(workers, len(work)) < 2 or _is_in_meeting():
         return [do(item) for item in work]
     with _open_pool(min(workers, len(work))) as pool:
         return list(pool.map(do, work))
+
+
+MOST_TOGETHER = 16  # threads of one `map_together`
+_thread = threading.local()  # `.meeting`: of a thread of `map_together`
+
+
+@dataclass(eq=False)
+class _Request:
+    """Work that a thread waits for."""
+
+    work: Any
+    is_taken: bool = False
+    is_done: bool = False
+    error: BaseException | None = None
+
+
+class _Meeting:
+    """Threads whose requests are met together, by one of them, as soon as each of them has made one."""
+
+    def __init__(self, tasks: int, workers: int) -> None:
+        self._tasks, self._workers = tasks, workers
+        self._waiting = list[_Request]()
+        self._change = threading.Condition()
+
+    def meet_request(self, work: Any, do: Callable[[Sequence[Any], int], None]) -> None:
+        """Return when the work is done: `do` gets that of several threads and the number of workers."""
+        mine, together = _Request(work), list[_Request]()
+        with self._change:
+            self._waiting.append(mine)
+            self._change.wait_for(lambda: mine.is_taken or len(self._waiting) >= min(self._tasks, MOST_TOGETHER))
+            if not mine.is_taken:
+                together, self._waiting = self._waiting, together
+                for each in together:
+                    each.is_taken = True
+                self._change.notify_all()
+        if together:
+            self._meet(together, do)
+        with self._change:
+            self._change.wait_for(lambda: mine.is_done)
+        if mine.error is not None:
+            raise mine.error
+
+    def _meet(self, together: Sequence[_Request], do: Callable[[Sequence[Any], int], None]) -> None:
+        error: BaseException | None = None
+        _thread.meeting = None  # what is done together may use threads
+        try:
+            do([each.work for each in together], self._workers)
+        except BaseException as raised:
+            error = raised
+        finally:
+            _thread.meeting = self
+        with self._change:
+            for each in together:
+                each.is_done, each.error = True, error
+            self._change.notify_all()
+
+    def end_task(self, tasks: int = 1) -> None:
+        """So many tasks make no further requests."""
+        with self._change:
+            self._tasks -= tasks
+            self._change.notify_all()
+
+
+def map_together(do: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
+    """`do(item)` of each item, in order, in threads of their own, whose calls of `do_together` wait for each other.
+
+    A thread of such a map does another map itself. `workers` is for the work that is done together.
+    """
+    work = list(items)
+    if len(work) < 2 or _is_in_meeting():
+        return [do(item) for item in work]
+    meeting = _Meeting(len(work), workers)
+
+    def do_item(item: T) -> R:
+        _thread.meeting = meeting
+        try:
+            return do(item)
+        finally:
+            _thread.meeting = None
+            meeting.end_task()
+
+    with _open_pool(min(len(work), MOST_TOGETHER)) as pool:
+        try:
+            return list(pool.map(do_item, work))
+        except BaseException:
+            meeting.end_task(len(work))  # nobody waits for a task that does not begin
+            raise
+
+
+def do_together(work: Any, do: Callable[[Sequence[Any], int], None], workers: int) -> None:
+    """`do([work, ..], workers)`: in a thread of `map_together` with the work of the others, else at once."""
+    if _is_in_meeting():
+        _thread.meeting.meet_request(work, do)
+    else:
+        do([work], workers)
+
+
+def _is_in_meeting() -> bool:
+    return getattr(_thread, "meeting", None) is not None
 
 
 def run_beside(do: Callable[[], R]) -> R:

@@ -185,7 +185,7 @@ def _improves(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
         return True
     floor = search.estimate_floor(after)
     noise = np.array([floor[s] for s in search.holdout.outputs])
-    left = [compute_typical_rms(search.replay_holdout(h)[1]) / noise for h in (before, after)]
+    left = [compute_typical_rms(each) / noise for each in search.replay_holdout([before, after])[1]]
     excess = [float(np.sum(np.maximum(x**2 - 1.0, 0.0))) for x in left]
     return excess[1] < ERROR_PARTLY_EXPLAINED * excess[0]
 
@@ -225,7 +225,8 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
     parents = [next((p for p in levels[i] if p.effects == close[0].effects[:i]), levels[i][0]) for i in range(1, depth)]
     base, *close = search.judge_on_all([base, *close], FINE)
     ledger = [base, *parents, *close[:1]]
-    held = {h.effects: search.measure_holdout(h) for h in [base, *close, *others[:3]]}
+    told = [base, *close, *others[:3]]
+    held = dict(zip((h.effects for h in told), search.measure_holdout(told), strict=True))
     unseen = {h.effects: _judge_unseen_run(search, h, floor) for h in close}
     holding = [h for h in close if unseen[h.effects].holds]
     part = bool(close) and _improves(search, base, close[0])
@@ -267,8 +268,9 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
     # where no effect helps, the base is fitted until that is beyond doubt
     rounds = 2 if depth or levels[0][0].is_at_floor else LONG
     search.stage = Stage(progress, "last fits, with finer steps", 0.5, 0.93, rounds + 6 * len(close))
-    base = search.finish_hypothesis(levels[0][0], rounds)
-    close = _sort_by_cost(search.map_parallel(search.finish_hypothesis, close))
+    base, *close = search.map_parallel(lambda work: search.finish_hypothesis(*work),
+                                       [(levels[0][0], rounds), *((h, 5) for h in close)])
+    close = _sort_by_cost(close)
     close = _sort_by_cost([*search.map_parallel(search.begin_again, close[:2]), *close[2:]])
     return _doubt_small_gain(search, base, close, depth)
 
@@ -361,7 +363,7 @@ def _judge_unseen_run(search: Search, h: Hypothesis, floor: Mapping[str, float])
     """Whether noise alone is left of the held-out run; if not of all of it, of what does not hang on a small stop."""
     if search.holdout is None:
         return HeldOut(True)
-    (problem, left), trace = search.replay_holdout(h), search.holdout
+    (problem, (left,)), trace = search.replay_holdout([h]), search.holdout
     if _is_noise(left, trace, floor):
         return HeldOut(True)
     undecided = find_undecided_rows(problem, h.fit, floor)

@@ -56,7 +56,7 @@ from fdi.trace.trace import Floats, Trace
 from plant.lanes import Part
 from plant.model import Model
 from plant.signals import Signal
-from plant.threads import R, T, count_threads, map_in_threads
+from plant.threads import R, T, count_threads, map_together
 
 FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage
@@ -145,6 +145,7 @@ class Search:
         self.problem = Problem(ready, trace, self.noise, workers=1, bare=bare)
         self.repeats = [Problem(ready, r, self.noise, bare=bare) for r in repeats]
         self.fine: Problem | None = None  # with the steps of last residuals
+        self._left_unseen: dict[Hypothesis, Floats] = {}
         self.effects = [e for e in effects if e not in model.effects or model.find_effect(e).base]
         self.stage = NO_STAGE  # of the work: each fit, and each round of a last fit, is a step
 
@@ -201,10 +202,11 @@ class Search:
     def add_each_effect(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
         """`start` with one more effect: the promising ones fitted, best first."""
         effects = self.list_further_effects(start.effects)
-        prospects = scan_effects(self.problem, start.fit, effects, self.workers)
+        begun = [start.fit]
         if not start.effects:  # a fit that had to do without a large effect may sit in a wrong basin
-            nominal = linearise(self.problem, start.fit.free, np.zeros(len(start.fit.free)))
-            prospects = _keep_best([*prospects, *scan_effects(self.problem, nominal, effects, self.workers)])
+            begun.append(linearise(self.problem, start.fit.free, np.zeros(len(start.fit.free))))
+        scans = map_together(lambda fit: scan_effects(self.problem, fit, effects, self.workers), begun, self.workers)
+        prospects = _keep_best(p for scan in scans for p in scan)
         worth = [p for p in prospects if p.cost < start.cost - GAIN_WORTH_A_FIT][:fitted]
         fits = list(zip([p.effect for p in worth], self.map_parallel(self._begin_fit, worth), strict=True))
         for rounds, kept in RACE:
@@ -276,13 +278,13 @@ class Search:
         return sorted(self.map_parallel(fit_without, h.effects), key=lambda each: each.cost)
 
     def map_parallel(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
-        """By all threads; what runs in one of them keeps to itself, as `problem` has one worker until `refine`."""
+        """In threads whose replays are made together: side by side in the lanes of a kernel."""
         def do_step(item: T) -> R:
             found = do(item)
             self.stage.finish_step()
             return found
 
-        return map_in_threads(do_step, items, self.workers)
+        return map_together(do_step, items, self.workers)
 
     def _continue_begun_fit(self, rounds: int, each: tuple[str, Fit]) -> tuple[str, Fit]:
         return each[0], each[1] if each[1].converged else continue_fit(self.problem, each[1], rounds)
@@ -293,14 +295,13 @@ class Search:
         starts = np.array([p.x, np.where(own, p.x, 0.0)])
         return linearise(self.problem, p.free, starts[int(np.argmin(self.problem.compute_costs(p.free, starts)))])
 
-    def judge_fit(self, effects: tuple[str, ...], found: Fit) -> Hypothesis:
-        """What a fit leaves, on its own run and on the repeats."""
+    def judge_fit(self, effects: tuple[str, ...], found: Fit, others: Sequence[Floats] = ()) -> Hypothesis:
+        """What a fit leaves, on its own run and on the repeats: `others`, (s, n) SI each, where that is known."""
         signals = self.problem.trace.outputs
         own = found.residuals[:, :len(self.problem.trace)]  # the first run of a fit to several
         errors = _measure_rms(own, signals)
         coarse = [self.coarse.get(s, 0.0) for s in signals]
-        x = found.x[None, :]
-        others = [p.compute_residuals(found.free, x)[0] for p in self.repeats]
+        others = others or [p.compute_residuals(found.free, found.x[None])[0] for p in self.repeats]
         if not others:
             floor = {s: float(np.hypot(n.level, c)) for s, n, c in zip(signals, self.noise, coarse, strict=True)}
             errors = measure_decided_errors(self.problem, found, floor)
@@ -315,15 +316,20 @@ class Search:
         assert self.holdout is not None
         return replace(self.problem, trace=self.holdout, steps=steps or self.problem.steps, also=(), _lanes={})
 
-    def replay_holdout(self, h: Hypothesis) -> tuple[Problem, Floats]:
-        """The held-out run, and what a hypothesis leaves of it, (s, n) SI."""
+    def replay_holdout(self, hypotheses: Sequence[Hypothesis]) -> tuple[Problem, list[Floats]]:
+        """The held-out run, and what each hypothesis leaves of it, (s, n) SI; none is replayed twice."""
         assert self.holdout is not None
         problem = self.make_unseen_problem(FINE if is_long(self.holdout) else TRUEST)
-        return problem, problem.compute_residuals(h.fit.free, h.fit.x[None])[0]
+        new = [h for h in dict.fromkeys(hypotheses) if h not in self._left_unseen]
+        left = map_together(lambda h: problem.compute_residuals(h.fit.free, h.fit.x[None])[0], new, self.workers)
+        self._left_unseen.update(zip(new, left, strict=True))
+        return problem, [self._left_unseen[h] for h in hypotheses]
 
-    def measure_holdout(self, h: Hypothesis) -> dict[str, float]:
-        """RMS residual on the run that no fit saw, SI units; {} without one."""
-        return _measure_rms(self.replay_holdout(h)[1], self.holdout.outputs) if self.holdout is not None else {}
+    def measure_holdout(self, hypotheses: Sequence[Hypothesis]) -> list[dict[str, float]]:
+        """RMS residuals on the run that no fit saw, SI units; {} without one."""
+        if self.holdout is None:
+            return [{} for _ in hypotheses]
+        return [_measure_rms(left, self.holdout.outputs) for left in self.replay_holdout(hypotheses)[1]]
 
     def judge_on_all(self, hypotheses: Sequence[Hypothesis], steps: int) -> list[Hypothesis]:
         """The hypotheses with their errors on all of the recordings that the runs were cut from.
@@ -382,7 +388,9 @@ class Search:
         """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
         begin = turn_amplitudes_positive(h.fit.free, h.fit.x, self.model.kind.list_effects())
         near = fit_unknowns(self.problem, h.fit.free, begin, 2)
-        return self.judge_fit(h.effects, finish_fit(self.fine or self.problem, near, rounds, self.problem, self.stage))
+        found = finish_fit(self.fine or self.problem, near, rounds, self.problem, self.stage)
+        ends = np.cumsum([len(run) for run in (self.problem.trace, *self.problem.also)])
+        return self.judge_fit(h.effects, found, np.split(found.residuals, ends[:-1], axis=1)[1:])
 
     def reaches_floor(self, h: Hypothesis) -> bool:
         """Whether a hypothesis leaves only noise, if need be with finer steps: a little more may be the solver's error.
@@ -644,7 +652,7 @@ def simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Star
         return found
 
     parts = np.array_split(np.arange(len(rows)), min(len(rows), max(workers, -(-len(rows) // TOGETHER))))
-    return [trial for several in map_in_threads(run_trials, parts, workers) for trial in several]
+    return [trial for several in map_together(run_trials, parts, workers) for trial in several]
 
 
 def _move_along(fit: Fit, effect: str, start: Start, ways: Sequence[Mapping[str, float]]) -> Floats:

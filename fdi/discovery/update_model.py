@@ -244,7 +244,7 @@ def _read_marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -
 
 def _list_steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hypothesis]) -> tuple[Step, ...]:
     """One for the start and one for each effect; one that a replay does not show leaves its errors as they are."""
-    held = [search.measure_holdout(h) for h in chain]
+    held = search.measure_holdout(chain)
     steps, at = [Step(effects[done - 1] if done else None, chain[0], chain[0].errors, held[0])], 0
     for name in effects[done:]:
         at += search.model.find_effect(name).port not in UNREPLAYED

@@ -24,6 +24,7 @@ from plant.lanes import NARROW, Lanes, Part, compile_kernels, list_kernel_varian
 from plant.model import collect_bindings
 from plant.monitor import FAULTS, Cell, Monitor, Motion, compute_cells, step_monitor
 from plant.solve import read_sensors, step_cycle
+from plant.threads import map_together
 from rig.sequences import load_sequence
 
 QUIET = Model().replace({f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")})
@@ -195,6 +196,27 @@ def test_threads_do_not_matter() -> None:
     alone, shared = (Lanes(QUIET, ["spool.static_friction"], 10, workers).replay(values, CURRENT, FORCE)
                      for workers in (1, 3))
     assert (alone == shared).all() and len(np.unique(alone[:, -1, 0])) > 50
+
+
+def test_runs_of_side_by_side_fits_share_blocks_and_keep_their_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of other models, parameters and inputs: only what has the same kernel and the same inputs shares a block."""
+    heavy = QUIET.replace({"jack.mass": 900.0})
+    biased = QUIET.with_effects(["null_bias"]).replace({"null_bias.current": 1e-4})
+    tasks = [(QUIET, ["spool.static_friction"], 5.0, CURRENT), (heavy, ["jack.damping", "jack.area"], 2.0, CURRENT),
+             (biased, ["jack.mass"], 400.0, CURRENT), (QUIET, ["jack.mass"], 400.0, 2.0 * CURRENT)]
+
+    def replay(task: tuple[Model, list[str], float, Any]) -> Any:
+        model, names, value, current = task
+        values = np.outer(np.linspace(1.0, 1.1, 5), [value, 1e-3][:len(names)])
+        return Lanes(model, names, 10).replay(values, current, FORCE)
+
+    alone = [replay(task) for task in tasks]
+    blocks = []
+    build = lanes_module.build_blocks
+    monkeypatch.setattr(lanes_module, "build_blocks", lambda *given: blocks.append(build(*given)) or blocks[-1])
+    for one, other in zip(alone, map_together(replay, tasks, 2), strict=True):
+        assert np.array_equal(one, other)
+    assert sorted(len(each) for each in blocks) == [1, 2]
 
 
 def test_warming_tells_how_far_it_is() -> None:

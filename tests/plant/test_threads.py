@@ -5,10 +5,11 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 
 import pytest
 
-from plant.threads import THREAD_NAME, count_threads, map_in_threads, run_beside
+from plant.threads import THREAD_NAME, count_threads, do_together, map_in_threads, map_together, run_beside
 
 
 def test_answers_come_in_the_order_of_the_questions_and_an_error_reaches_who_asked() -> None:
@@ -50,6 +51,45 @@ def test_an_error_leaves_what_is_still_at_work() -> None:
         thread.join(10.0)
     assert 1 in done
     assert len(done) < 4  # of 39
+
+
+def test_requests_of_side_by_side_tasks_are_met_together_until_each_has_ended() -> None:
+    met: list[list[tuple[int, int]]] = []
+
+    def do(requests: Sequence[tuple[int, int]], workers: int) -> None:
+        assert workers == 2
+        assert len(map_in_threads(lambda _: threading.get_ident(), range(2), 2)) == 2  # it may use threads
+        met.append(sorted(requests))
+
+    def make_requests(task: int) -> int:
+        for turn in range(task):
+            do_together((turn, task), do, 2)
+            assert map_together(lambda x: x, [turn, task], 2) == [turn, task]  # one inside another
+        return task
+
+    assert map_together(make_requests, [1, 3, 2], 2) == [1, 3, 2]
+    assert met == [[(0, 1), (0, 2), (0, 3)], [(1, 2), (1, 3)], [(2, 3)]]
+    met.clear()
+    assert map_together(make_requests, [2], 2) == [2] and met == [[(0, 2)], [(1, 2)]]  # nobody to wait for
+
+
+@pytest.mark.parametrize("fails_in_task", [True, False])
+def test_no_task_waits_for_one_that_failed(fails_in_task: bool) -> None:
+    def do(requests: Sequence[int], workers: int) -> None:
+        assert fails_in_task or len(requests) < 3, "the work fails"
+
+    def make_requests(task: int) -> int:
+        do_together(task, do, 1)
+        assert not fails_in_task or task, "the task fails"
+        do_together(task, do, 1)
+        return task
+
+    with pytest.raises(AssertionError, match="the task fails" if fails_in_task else "the work fails"):
+        map_together(make_requests, range(3), 1)
+    left = [t for t in threading.enumerate() if t.name.startswith(THREAD_NAME)]
+    for thread in left:
+        thread.join(10.0)
+        assert not thread.is_alive()
 
 
 def test_ctrl_c_ends_a_long_simulation_at_once() -> None:

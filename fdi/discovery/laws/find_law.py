@@ -142,7 +142,7 @@ def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, flo
     unseen = search.make_unseen_problem() if search.holdout is not None else None
     balances, states = compute_balances(search.problem, base, floor)
     there = compute_balances(unseen, base, floor) if unseen is not None else None
-    missing = tuple(_describe_balance(b, states, there) for b in balances)
+    missing = tuple(describe_balance(b, states, there) for b in balances)
     outputs = search.problem.trace.outputs
     hidden = {place: why for place, (signal, why) in HIDDEN.items()
               if signal not in outputs and any(b.place == place for b in balances)}
@@ -183,19 +183,24 @@ def _measure_left(found: LawSearch, floor: Mapping[str, float]) -> float:
     return measure_excess(found.law.holdout or found.law.hypothesis.errors, floor)
 
 
-def _describe_balance(b: Balance, states: States, there: tuple[list[Balance], States] | None) -> Missing:
+def describe_balance(b: Balance, states: States, there: tuple[list[Balance], States] | None) -> Missing:
+    """What is missing in a balance, and on which states it depends, `there` on the held-out run too."""
     if b.ratio < PATTERN_VISIBLE_RATIO:
         return Missing(b, False)
     unseen = None
     if there is not None:
         same = next(other for other in there[0] if other.place == b.place)
         unseen = _screen_rows(same, there[1])
-    return Missing(b, True, tuple(find_dependences(*_screen_rows(b, states), unseen)))
+    own = _screen_rows(b, states)
+    return Missing(b, True, () if own is None else tuple(find_dependences(*own, unseen)))
 
 
-def _screen_rows(b: Balance, states: States) -> tuple[Floats, dict[str, Floats]]:
+def _screen_rows(b: Balance, states: States) -> tuple[Floats, dict[str, Floats]] | None:
+    """What is missing and the quantities that it may depend on, in a part of the rows; None without smooth ones."""
     inner = np.arange(EDGE, len(b.missing) - EDGE, THINNED)
     inner = inner[b.smooth[inner]]
+    if not len(inner):
+        return None
     y = b.missing[inner]
     return (np.clip(y, *np.percentile(y, [0.5, 99.5])), {name: getattr(states, name)[inner] for name in SCREENED})
 
