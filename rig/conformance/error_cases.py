@@ -92,6 +92,8 @@ def check_error_reset(t: Target) -> str:
     """A PDO of the right length follows the one that was too short."""
     pdo = find_rpdo(t)
     values = read_mapped(t, pdo)
+    if t.sheet.is_writable(*CYCLE):
+        t.try_download(*CYCLE, 0)  # or else the pause of SYNC before the register is read is an error, too
     with operational(t):
         require(send_short(t, pdo, values), "no EMCY for a PDO that is too short")
         mark = len(t.frames)
