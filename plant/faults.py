@@ -99,6 +99,7 @@ class Fault:
         return healthy, middle, most
 
 
+SCATTER = 5.0  # tolerances, by which a healthy unit may be off its nominal size: a fit must be able to say so
 KEYS = {f.name: f for f in fields(Fault) if f.name != "name"}
 REQUIRED = ("title", "parameter", "range", "acceptable", "maintenance")
 NUMBERS = ("acceptable", "maintenance", "healthy", "interval_factor")
@@ -231,7 +232,10 @@ def place_fault(fault: Fault, kind: Any, where: object = "faults") -> Fault:
     placed = replace(fault, unit=q.unit, symbol=fault.symbol or q.symbol or fault.name, follow=follow,
                      healthy=usual[fault.parameter] if math.isnan(fault.healthy) else fault.healthy)
     _check_limits(placed, q, refuse)
-    return placed
+    scatter = SCATTER * kind.find_tolerance(placed.parameter, q) * abs(placed.healthy)
+    ends = placed.healthy - scatter, placed.healthy + scatter  # a range may begin at the nominal size
+    low, high = (end if q.refuses(wider) else wider for end, wider in zip(placed.range, ends, strict=True))
+    return replace(placed, range=(min(placed.range[0], low), max(placed.range[1], high)))
 
 
 def _find_usual(name: str, kind: Any) -> float:

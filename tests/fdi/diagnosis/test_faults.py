@@ -138,3 +138,10 @@ def test_a_logarithm_keeps_its_bounds_in_a_group() -> None:
     found = pair(0.2, 0.02, 5.0)
     found.fit.free = (found.fit.free[0], LogFree("two.size", -1.6, 1.0, 1.0, -4.0, 0.0, 1.0))
     assert find_groups(found, []) == ()
+
+
+def test_a_range_that_begins_at_the_nominal_size_holds_every_healthy_unit() -> None:
+    """Else the fit of a unit at the low end of its tolerance leaves more than noise, and no fault explains it."""
+    kind = find_plant("ema")
+    declared, placed = kind.faults[0], choose_faults(None, kind)[0]
+    assert declared.range[0] == placed.healthy > placed.range[0] and declared.range[1] == placed.range[1]
