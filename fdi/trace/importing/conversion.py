@@ -244,7 +244,8 @@ def _parse_term(path: Path, name: str, table: Mapping[str, Any], si: str) -> Sou
 
 def _require_unit(name: str, si: str, where: object, field: str) -> Unit:
     """As of `plant.units`; of a unit that is raw it says what to do."""
-    if find_unit(name) is None and name in OTHER_UNITS:
+    unit = find_unit(name)
+    if name in OTHER_UNITS and (unit is None or unit.si != si):
         fitting = next(known for known, u in UNITS.items() if u.si == si)
         raise InputError(where, field, f"the unit that scale and offset lead to, such as {fitting} ({name} is raw: "
                                        f"value = sign * (scale * raw + offset) in `unit`)")

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION
-from fdi.trace.importing.formats import Channel, Measurement, split_unit
+from fdi.trace.importing.formats import OTHER_UNITS, Channel, Measurement, split_unit
 from fdi.trace.sensor_dynamics import find_comb
 from fdi.trace.trace import Floats
 from plant.errors import InputError
@@ -87,9 +87,10 @@ class Columns(NamedTuple):
     data: Mapping[str, Floats]  # those of numbers: their first values, missing ones held
     units: Mapping[str, str]  # of all: what the file says, "" for nothing
 
-    def has_raw_unit(self, name: str) -> bool:
-        """Whether the recording names a unit that scale and offset must convert."""
-        return bool(self.units[name]) and find_unit(self.units[name]) is None
+    def has_raw_unit(self, name: str, si: str) -> bool:
+        """Whether the recording names a unit that scale and offset must convert to the quantity with this SI unit."""
+        said, unit = self.units[name], find_unit(self.units[name])
+        return bool(said) and (unit is None or (unit.si != si and said in OTHER_UNITS))
 
     def measures(self, name: str, si: str) -> bool:
         """Whether the unit of a column is one of the quantity with this SI unit."""
@@ -273,7 +274,7 @@ def _list_words(signal: Signal, signals: Signals) -> list[tuple[str, float]]:
 def _rate_column(signal: Signal, signals: Signals, column: str, columns: Columns) -> Guess | None:
     """How well a column fits a signal by name, unit and range; None if its name or its unit excludes it."""
     said, si = columns.units[column], signal.unit
-    unit = find_unit(said)
+    unit = None if columns.has_raw_unit(column, si) else find_unit(said)
     if unit is not None and unit.si != si:
         return None
     guess = Guess(column, unit or find_unit(si) or Unit(si, si, Fraction(1)))
@@ -329,7 +330,8 @@ def _guess_by_motion(found: dict[str, Guess], columns: Columns, signals: Signals
     command, controlled = signals.command.name, signals.controlled.name
     si = signals.controlled.unit
     data, taken = columns.data, {guess.source for guess in found.values()}
-    free = [c for c in data if c not in taken and (columns.measures(c, si) or find_unit(columns.units[c]) is None)]
+    free = [c for c in data if c not in taken and (
+        columns.measures(c, si) or not columns.units[c] or columns.has_raw_unit(c, si))]
     known = {name: found[name] for name in (command, controlled) if name in found}
     firsts, seconds = ([known[name].source] if name in known else free
                        for name in (command, controlled))
@@ -366,8 +368,9 @@ def _scale_position(found: Mapping[str, Guess], columns: Columns, signals: Signa
     """Scale and offset of a position in counts or volts, roughly, from the other position and the drive."""
     command, controlled, drive = signals.command.name, signals.controlled.name, signals.drive.name
     for name, other in ((controlled, command), (command, controlled)):
-        if (not {name, other} <= found.keys() or not columns.has_raw_unit(found[name].source)
-                or columns.has_raw_unit(found[other].source)):
+        if (not {name, other} <= found.keys()
+                or not columns.has_raw_unit(found[name].source, signals.find(name).unit)
+                or columns.has_raw_unit(found[other].source, signals.find(other).unit)):
             continue
         guess, base = found[name], found[other]
         raw, x = columns.data[guess.source], columns.data[base.source]
@@ -404,7 +407,7 @@ def _find_steps(found: Mapping[str, Guess], columns: Columns, signals: Signals) 
     nominal = load_nominal_values()
     for signal in signals.outputs:
         guess = found.get(signal.name)
-        if guess is None or guess.minus or (guess.scale is None and columns.has_raw_unit(guess.source)):
+        if guess is None or guess.minus or (guess.scale is None and columns.has_raw_unit(guess.source, signal.unit)):
             continue
         comb = find_comb(columns.data[guess.source])
         if comb is not None:
@@ -470,7 +473,7 @@ def _list_signal_lines(signal: Signal, signals: Signals, guess: Guess | None, co
         lines.append(f"minus = {_quote(guess.minus)}")
     if guess.sign < 0:
         lines.append("sign = -1")
-    if columns.has_raw_unit(guess.source):
+    if columns.has_raw_unit(guess.source, signal.unit):
         scale, offset = (f"{1.0 if guess.scale is None else guess.scale:g}", f"{guess.offset:g}")
         lines.append(f"scale = {scale}  # {unit} for each {columns.units[guess.source]}: put in the true one")
         lines.append(f"offset = {offset}  # {unit}")

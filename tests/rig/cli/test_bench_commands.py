@@ -12,8 +12,9 @@ from device_files import BENCH, write_bench
 from places import ROOT
 from rig_command import refuse, rig
 
+from plant.signals import EHA
 from rig import doctor
-from rig.benches.bench import INPUTS, OUTPUTS
+from rig.benches.bench import list_inputs, list_outputs
 from rig.benches.bench_file import ControllerKeys, NodeKeys, load_bench
 from rig.benches.bus_load import list_loads
 from rig.benches.checksums import CHECKSUMS
@@ -134,7 +135,7 @@ def test_the_bits_of_a_frame_grow_with_its_identifier_and_length() -> None:
 def test_every_key_signal_and_checksum_is_on_the_page() -> None:
     for each in (*fields(ControllerKeys), *fields(NodeKeys)):
         assert re.search(rf"\b{each.name}\b", PAGE), each.name
-    for name in (*INPUTS, *OUTPUTS, *CHECKSUMS):
+    for name in (*list_inputs(EHA), *list_outputs(EHA), *CHECKSUMS):
         assert f"`{name}`" in PAGE, name
 
 

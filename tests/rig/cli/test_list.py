@@ -72,7 +72,7 @@ def test_the_first_steps_are_commands_that_exist() -> None:
 @pytest.mark.parametrize(("kind", "begin", "names"), [
     ("parameter", "filter.c", ["filter.clogging="]), ("effect", "null_b", ["null_bias"]),
     ("model", "", ["eha", "ehs", "ema", "servo", "emps", "own.py", "own.toml", "ownfolder/"]),
-    ("sequence", "pre", ["preflight"]),
+    ("sequence", "pre", ["preflight", "preflight_ema"]),
     ("sequence", "own", ["own.toml", "ownfolder/"])])
 def test_names_that_options_take(kind: str, begin: str, names: list[str], tmp_path: Path,
                                  monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,7 +86,8 @@ def test_names_that_options_take(kind: str, begin: str, names: list[str], tmp_pa
 
 @pytest.mark.skipif(importlib.util.find_spec("argcomplete") is None, reason="no argcomplete (extra shell)")
 @pytest.mark.parametrize(("line", "expected"), [
-    ("rig con", {"conformance"}), ("rig run --set filter.c", {"filter.clogging="}), ("rig run pref", {"preflight"}),
+    ("rig con", {"conformance"}), ("rig run --set filter.c", {"filter.clogging="}),
+    ("rig run pref", {"preflight", "preflight_ema"}),
     ("rig run --model eh", {"eha", "ehs"}), ("rig list para", {"parameters"}),
     ("rig compare --rep", {"--repeat", "--report"})])
 def test_the_answer_to_the_shell(line: str, expected: set[str], tmp_path: Path) -> None:

@@ -135,7 +135,8 @@ def test_guess_finds_a_counter_and_takes_its_rate_from_its_unit(name: str, step:
     assert (guessed.chosen["time"][1] == "unsure") == (name == "cnt")
 
 
-def test_guess_scales_counts_and_writes_their_step(tmp_path: Path) -> None:
+@pytest.mark.parametrize("unit", ["counts", "V"])  # no unit, and that of another quantity
+def test_guess_scales_counts_and_writes_their_step(tmp_path: Path, unit: str) -> None:
     """Counts of 5 um, offset 1000, of a ram that lags and meets an end stop: scale from Com and Cor; Cor not reversed.
 
     A column that does not change is no signal; the map says which one its name means.
@@ -144,13 +145,13 @@ def test_guess_scales_counts_and_writes_their_step(tmp_path: Path) -> None:
     xj = np.array(list(accumulate(com, lambda x, to: min(x + 0.02 * min(max(to - x, -3.0), 3.0), 7.0))))
     cor = np.clip(3.8 * (com - xj), -8.0, 8.0)
     rows = zip(com, np.rint(xj / 0.005) + 1000, cor, strict=True)
-    lines = ["t [s];Soll [mm];Ist [counts];i [mA];Kraft [kN]"]
+    lines = [f"t [s];Soll [mm];Ist [{unit}];i [mA];Kraft [kN]"]
     lines += [f"{k / 1000};{c:g};{x:.0f};{i:.5f};0" for k, (c, x, i) in enumerate(rows)]
     guessed = guess(tmp_path, lines)
     signals = parse_map(guessed.text, tmp_path / "x.map.toml").signals
     scaling = signals["xj"].term
     assert (scaling.scale, scaling.offset, signals["xj"].sensor.quantum) == pytest.approx((0.005, -5.0, 5e-6), rel=0.02)
-    assert signals["cor"].term.sign == 1.0 and guessed.chosen["xj"] == ("Ist [counts]", "unsure")
+    assert signals["cor"].term.sign == 1.0 and guessed.chosen["xj"] == (f"Ist [{unit}]", "unsure")
     assert guessed.left == {"Kraft [kN]": "always 0; by its name it would be load"}
 
 
