@@ -7,8 +7,8 @@
 PYTHON ?= python3
 VENV   ?= .venv
 ARGS   ?=
-# two more than there are CPUs: tests of programs on a bus wait for half of their time, and one waits for the guest
-WORKERS ?= $(shell expr $$(nproc) + 2)
+# one more than there are CPUs: tests of programs on a bus wait for half of their time
+WORKERS ?= $(shell expr $$(nproc) + 1)
 BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip --disable-pip-version-check install -qq
 MADE   := $(VENV)/.made
