@@ -111,7 +111,10 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
         coarse = replay_current(trace, model, steps)
     else:
         steps = REPLAY_STEPS
-    return Replay(coarse, compute_residuals(trace, coarse), steps, error, undecided, blind)
+    residuals = compute_residuals(trace, coarse)
+    if model.kind.correct is not None:
+        undecided = _extend_until_noise(undecided, np.array([residuals[s] / floor[s] for s in residuals if s in floor]))
+    return Replay(coarse, residuals, steps, error, undecided, blind)
 
 
 def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str, float]
@@ -258,10 +261,17 @@ def find_unpredictable_rows(problem: Problem, fit: Fit, floor: Mapping[str, floa
     if (compute_typical_rms(left[:, problem.trace.usable], 0.5) > NEAR_NOISE * levels[:, 0]).any():
         return none
     undecided = find_undecided_rows(replace(problem, also=()), fit, floor) | ~problem.trace.usable
-    is_off = find_large_windows(np.abs(np.nan_to_num(left)) / levels, RESIDUAL_HELD_OUT)
-    for first in range(WINDOW, len(undecided), WINDOW):
-        undecided[first:first + WINDOW] |= undecided[first - 1] & is_off[first:first + WINDOW]
+    undecided = _extend_until_noise(undecided, left / levels)
     return undecided if undecided.mean() <= HELD_OUT_UNDECIDED_SHARE else none
+
+
+def _extend_until_noise(undecided: Flags, ratios: Floats) -> Flags:
+    """The undecided rows, and the windows after them in which residuals over their floors, (s, n), are not noise."""
+    extended = undecided.copy()
+    is_off = find_large_windows(np.abs(np.nan_to_num(ratios)), RESIDUAL_HELD_OUT)
+    for first in range(WINDOW, len(extended), WINDOW):
+        extended[first:first + WINDOW] |= extended[first - 1] & is_off[first:first + WINDOW]
+    return extended
 
 
 def measure_decided_errors(problem: Problem, fit: Fit, floor: Mapping[str, float]) -> dict[str, float]:
