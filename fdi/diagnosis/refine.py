@@ -177,8 +177,8 @@ def _make_shape_unknowns(fault: Fault, model: Model) -> list[Free]:
 def _list_shapes(fault: Fault, model: Model) -> list[Free]:
     known = {e.name: e for e in model.kind.list_effects()}
     effect = known.get(fault.parameter.partition(".")[0])
-    if effect is None or effect.base or fault.parameter not in effect.fitted:
-        return []
+    if effect is None or effect.base or not effect.starts or fault.parameter not in effect.fitted:
+        return []  # without starts nothing is known of a phase or the like, which then keeps its value
     return [u for u in list_effect_unknowns(effect, model) if u.name not in fault.parameters]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from places import ROOT
 from refusals import catch_refusal
 from rig_command import rig
 
@@ -26,9 +27,11 @@ from fdi.diagnosis.faults import (
     list_fault_files,
     load_faults,
 )
+from fdi.diagnosis.refine import list_unknowns
 from fdi.estimation.fit import Free
 from fdi.estimation.unidentifiable import LogFree
 from plant.faults import Fault, place_fault
+from plant.model import load_model
 from plant.plants import find_plant
 
 GAP = {"title": "play", "parameter": "feedback_gap.gap", "range": [0.0, 5e-4], "acceptable": 4e-5, "maintenance": 9e-5}
@@ -145,3 +148,10 @@ def test_a_range_that_begins_at_the_nominal_size_holds_every_healthy_unit() -> N
     kind = find_plant("ema")
     declared, placed = kind.faults[0], choose_faults(None, kind)[0]
     assert declared.range[0] == placed.healthy > placed.range[0] and declared.range[1] == placed.range[1]
+
+
+def test_a_fault_may_be_an_effect_without_starts() -> None:
+    """Of a phase beside its size nothing is known then, so the size alone is free."""
+    model = load_model(str(ROOT / "plant" / "models" / "new_plant.py"))
+    fault = place_fault(Fault("drag", "drag", "dry_friction.torque", (0.0, 5.0), 0.5, 1.0, "ours"), model.kind)
+    assert list_unknowns(model.with_effects(["dry_friction"]), [fault])[0].name == "dry_friction.torque"
