@@ -129,7 +129,7 @@ class Bench:
                 if found is None or (found.unit, found.role) != (s.unit, s.role):
                     has = ", ".join(f"{each.word} ({each.unit})" for each in own.values())
                     raise InputError(self.name, s.word, f"a plant that has this signal, as {s.role} in {s.unit}; "
-                                                        f"{model} has {has}")
+                                                        f"{model} has {has}; another bench by --bench FILE")
         return replace(self, signals=signals, noise=noise)
 
     @property

@@ -55,7 +55,8 @@ class BringUp:
         is_first = not self.identities
         if is_first:
             self._identify_nodes()
-        parameters = job.model.values if job.controller != "external" else None
+        has_objects = job.controller != "external" and CONTROLLER in job.bench.nodes
+        parameters = job.model.values if has_objects else None
         if self.gains is None:
             self.gains = read_gains(self._master.read_parameters() if parameters is None else parameters)
         patient = not job.realtime and isinstance(self._stage.clock, WallClock)

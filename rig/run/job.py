@@ -25,10 +25,11 @@ from plant.effects import load_effects
 from plant.model import find_plant_of_model, find_quantity, parse_model
 from plant.parameters import parse_toml
 from plant.plant_files import read_named_plant
-from plant.plants import load_plant
-from plant.signals import Signals
+from plant.plants import find_plant, load_plant
+from plant.signals import EHA, Signals
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench, load_bench_from_files
+from rig.benches.plant_bench import is_plant_bench, make_plant_bench
 from rig.nodes.scenario import Scenario
 from rig.run.choices import CONTROLLERS, PACES, PLANTS
 from rig.sequences import Sequence, load_sequence
@@ -71,7 +72,8 @@ class Job:
         if self.plant != "external" and self.bench.has_plant_node and not speaks_as_shipped(self.bench):
             raise InputError("--plant", self.plant, "external: our own plant emulator does not speak as that of "
                                                     f"{self.bench.name!r}")
-        if self.controller != "external" and not speaks_as_shipped(self.bench):
+        if self.controller != "external" and not speaks_as_shipped(self.bench) and not (
+                self.controller == "builtin" and is_plant_bench(self.bench)):
             raise InputError("--controller", self.controller, "external: our own firmware does not speak as the device "
                                                               f"of {self.bench.name!r}")
         object.__setattr__(self, "sequence", self.sequence.at_rate(self.bench.rate))
@@ -300,6 +302,10 @@ def load_tested_plant(choice: JobChoice, *, is_trusted: bool = False, announce: 
     """The bench, and what models call the plant on it, which is loaded. Raises InputError."""
     if choice.model:  # first: a plant that the user names himself is trusted in the bench file as well
         load_plant_of_model(choice.model, is_trusted=is_trusted, announce=announce)
+    if choice.model and choice.bench is None:
+        kind = find_plant(find_plant_of_model(choice.model))
+        if kind.signals != EHA:
+            return make_plant_bench(kind, choice.model), kind.key
     bench = load_bench(choice.bench or "eha", is_trusted=is_trusted)
     return bench, find_plant_of_model(choice.model) if choice.model else bench.kind
 
@@ -352,7 +358,7 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     model = model.replace(sequence.model.overrides, sequence.name).replace(choice.changes)
     require_bench_cycle(model, bench, "--set")
     foreign = [name for name in model.list_changes() if name.startswith("controller.") and name != "controller.period"]
-    is_ours = speaks_as_shipped(bench)
+    is_ours = speaks_as_shipped(bench) or is_plant_bench(bench)
     controller = choice.controller or ("builtin" if is_ours else "external")
     plant = choice.plant or ("auto" if is_ours or not bench.has_plant_node else "external")
     if controller == "external" and foreign:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from plant import InputError, Model
 from rig.benches.frame_map import Role
+from rig.benches.plant_bench import is_plant_bench
 from rig.network.bus import open_can
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Node, Send
@@ -21,6 +22,7 @@ from rig.network.master import BusError, Master
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
+from rig.nodes.stand_in import StandIn
 from rig.run.job import Job
 from rig.sequences.faults import is_noticed_by_time
 
@@ -54,9 +56,13 @@ def open_participants(job: Job) -> Iterator[Participants]:
         if job.controller != "builtin" or job.plant == "external":
             raise InputError("--bus", job.bus, "a bus that an external node can be on, such as socketcan:can0")
         makers: list[Callable[[Send], Node]] = [Emulator, partial(Firmware, model=job.model)]
+        if not job.bench.has_plant_node:
+            makers = [partial(StandIn, bench=job.bench, model=job.model)]
         wire = EmbeddedWire(WallClock() if job.realtime else VirtualClock(), makers, job.period_ns)
         yield Participants(wire, NodeProcesses())
         return
+    if job.controller == "builtin" and is_plant_bench(job.bench):
+        raise InputError("--bus", job.bus, "embedded: the controller that the plant declares runs inside the rig")
     if job.controller == "c":
         require_firmware_bus(job.bus)
         from rig.firmware.build import build_controller  # here and below: other runs need no compiler

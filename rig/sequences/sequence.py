@@ -26,7 +26,7 @@ from plant.plant_check import MOST_FOLLOWING_ERROR
 from plant.plants import Plant, find_plant
 from plant.profile import Profile, build_profile, list_section_names, parse_columns
 from plant.quantity import Quantity
-from plant.segments import RATE, Array, Csv, Segment
+from plant.segments import RATE, Array, Csv, Hold, Segment
 from rig import tables
 from rig.benches.calibration import Decision
 from rig.sequences import checks, faults
@@ -270,13 +270,15 @@ def write_preflight(kind: Plant) -> str:
     """
     command = build_profile(kind.profile, rate=round(1.0 / kind.nominal["controller.period"])).command
     span = float(np.ptp(np.append(command, 0.0)))
-    name, last = json.dumps(kind.signals.controlled.name), list_section_names(kind.profile)[-1]
+    name, last = json.dumps(kind.signals.controlled.name), json.dumps(list_section_names(kind.profile)[-1])
+    rests = [f'  {{ name = "error at the end", kind = "max_error", window = {last}, high = {0.2 * span!r} }},'
+             ] if isinstance(kind.profile[-1], Hold) else []
     return "\n".join([
         f"title = {json.dumps('Preflight, ' + (kind.title or kind.name))}",
         'setup = [{ kind = "hold", time = 0.5 }]',
         'cleanup = [{ kind = "ramp", to = 0.0, time = 0.5 }, { kind = "hold", time = 0.2 }]', "checks = [",
         f'  {{ name = "following error", kind = "rms_error", high = {MOST_FOLLOWING_ERROR * span!r} }},',
-        f'  {{ name = "error at the end", kind = "max_error", window = {json.dumps(last)}, high = {0.2 * span!r} }},',
+        *rests,
         f'  {{ name = "far out", kind = "never_exceeds", signal = {name}, high = {1.5 * span!r} }},',
         '  { name = "no emergency", kind = "event_never", event = "EMCY" },', "]",
         f'guards = [{{ name = "runs away", signal = {name}, low = {-3.0 * span!r}, high = {3.0 * span!r} }}]', ""])
