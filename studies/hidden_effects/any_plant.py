@@ -167,7 +167,7 @@ def _format_truth(plant: str, case: Case) -> str:
     levels = {name: measure_levels(plant, kind.find_effect(name), values, command) for name, values in case.hidden}
     names = [*(s.name for s in kind.signals.outputs), "controller"]
     together = {name: max((each[name] for each in levels.values()), default=0.0) for name in names}
-    lines = [f"seed = {case.seed}", f'plant = "{plant}"', f'kind = "{case.kind}"',
+    lines = [f"seed = {case.seed}", f'model = "{plant}"', f'kind = "{case.kind}"',
              f"effects = {json.dumps([name for name, _ in case.hidden])}", f'signals = "{case.signals}"',
              f"colour = {case.colour:.6g}", "", "[base_ratio]", *_format_table(together)]
     for name, values in case.hidden:

@@ -111,16 +111,17 @@ CATALOGUE: dict[str, HiddenLaw] = {
     "quantisation": HiddenLaw(1e-6, 20e-6, _set_symbol("lsb"), "lsb"),
     "transport_delay": HiddenLaw(0.07, 3, _set_symbol("delay"), "delay"),
     "command_rate_limit": HiddenLaw(0.05, 0.3, _set_symbol("rate"), "rate"),
+    "structural_resonance": HiddenLaw(  # of 35 Hz, damping ratio 0.02
+        15, 60, lambda x, p: {"mass2": x, "spring2": x * (2 * np.pi * 35) ** 2, "damp2": 0.04 * x * 2 * np.pi * 35},
+        "mass2"),
 }
-"""The 33 effects of the catalogue (docs/physics.md)."""
+"""The effects of the catalogue (docs/physics.md)."""
 
 OUTSIDE: dict[str, HiddenLaw] = {
     "force periodic in position": HiddenLaw(300, 3000, _set_symbol("cog"), extra={"cog_l": (0.8e-3, 4e-3)}),
     "Coulomb friction that depends on position": HiddenLaw(0.3, 0.9, _set_symbol("rough"),
                                                            extra={"rough_l": (1e-3, 6e-3)}),
     "pilot pressure lag": HiddenLaw(0.3e-3, 3e-3, _set_symbol("pilot_tau")),
-    "second mass on a spring": HiddenLaw(
-        15, 60, lambda x, p: {"mass2": x, "spring2": x * (2 * np.pi * 35) ** 2, "damp2": 0.04 * x * 2 * np.pi * 35}),
     "square-law leakage": HiddenLaw(2e-9, 5e-8, _set_symbol("leak_root"), known_load=KNOWN_LOAD),
     "torque-motor gain that drifts": HiddenLaw(0.002, 0.02, _set_symbol("motor_drift"), signed=True),
     "cubic feedback spring": HiddenLaw(2e4, 1e6, _set_symbol("spring_cubic")),

@@ -76,7 +76,7 @@ def plan_batch(explain: str, seeds: Sequence[int], folder: Path, signals: str | 
 
     def is_valid(row: Row) -> bool:
         return bool(row["sources"] == sources and row["by"] == explain and row["signals"] == signals
-                    and row["truth"].get("plant", "eha") == plant)
+                    and row["truth"].get("model", "eha") == plant)
 
     def is_failed(row: Row) -> bool:
         return bool(row["answer"]["verdict"] == "CRASHED")

@@ -101,9 +101,11 @@ def plants(effect: hidden.Hidden) -> dict[str, float]:
     entry, changes = CATALOGUE[effect.name], effect.changes
     if entry.base:
         return {SYMBOLS[symbol]: value for symbol, value in changes.items() if symbol in SYMBOLS}
-    second = {"stribeck": ("stribeck.speed", "stribeck_v"), "supply_ripple": ("supply_ripple.frequency", "ripple_hz")}
-    more = {name: changes[symbol] for name, symbol in [second[effect.name]]} if effect.name in second else {}
-    return {entry.fitted[0]: effect.value} | more
+    more = {"stribeck": {"stribeck.speed": changes.get("stribeck_v", 0.0)},
+            "supply_ripple": {"supply_ripple.frequency": changes.get("ripple_hz", 0.0)},
+            "structural_resonance": {"structural_resonance.frequency": 35.0,
+                                     "structural_resonance.damping_ratio": 0.02}}
+    return {entry.fitted[0]: effect.value} | more.get(effect.name, {})
 
 
 def test_the_plants_effects_are_what_the_table_says_as_written_twice() -> None:
