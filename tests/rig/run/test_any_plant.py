@@ -103,6 +103,23 @@ def test_from_a_plant_file_to_its_hidden_fault(tmp_path: Path, monkeypatch: pyte
     assert (first.column("trim_angle") == second.column("trim_angle")).all()
 
 
+def test_a_plant_without_a_device_runs_with_its_own_controller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing but the plant file: run, repeat, and find what was hidden in the plant of the run."""
+    monkeypatch.chdir(tmp_path)
+    assert rig("new", "plant", "motor").status == 0
+    said = rig("run", "--model", "motor.py", "--set", "dry_friction.torque=0.3", "--json", "--out", "run")
+    assert (said.status, said.json["verdict"]) == (0, "PASS"), said
+    skipped = {each["name"] for each in said.json["not_applicable"]}
+    assert "same answers after a reset" in skipped  # and so not counted as passed
+    again = rig("run", "--from", "run", "--trust", "--out", "again")
+    assert again.status == 0, again
+    assert rig("diff", "run", "again", "--json").json["verdict"] == "SAME"
+    found = rig("explain", "run", "--trust", "--json").json
+    assert (found["verdict"], found["effects"]) == ("EXPLAINED", ["dry_friction"])
+    assert "expected embedded" in refuse("run", "--model", "motor.py", "--bus", spec("udp_multicast"))
+    assert "expected external" in refuse("run", "--model", "motor.py", "--controller", "c")
+
+
 @pytest.mark.parametrize(("old", "new", "line"), [
     ('trim_angle = {', 'ram_position = {', "inputs.ram_position: expected a signal of the bench and its plant: "
      "'case_rise', 'control_word', 'cycle', 'flags', 'gear_torque', 'hinge', 'mode', 'phase_amps'"),
