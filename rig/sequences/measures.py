@@ -20,6 +20,7 @@ from plant.errors import InputError
 from plant.run import Columns
 from plant.segments import RATE, Array
 from plant.signals import EHA, Signals
+from plant.units import UNITS
 from rig import tables
 from rig.benches.profiles import CIA408, ProfileWords, find_state
 from rig.sequences.signals import DERIVED
@@ -148,20 +149,9 @@ def find_crossing(signal: Array, rate: float, above: float | None, below: float 
     return float(in_a_row[0]) / rate
 
 
-SI_OF_UNIT: dict[str, tuple[str, float]] = {  # unit: (SI unit, how many of those it is)
-    "m": ("m", 1.0), "mm": ("m", 1e-3), "um": ("m", 1e-6),
-    "m/s": ("m/s", 1.0), "mm/s": ("m/s", 1e-3),
-    "s": ("s", 1.0), "ms": ("s", 1e-3),
-    "Pa": ("Pa", 1.0), "bar": ("Pa", 1e5), "MPa": ("Pa", 1e6),
-    "N": ("N", 1.0), "kN": ("N", 1e3),
-    "A": ("A", 1.0), "mA": ("A", 1e-3),
-    "%": ("%", 1.0), "deg": ("deg", 1.0), "1": ("1", 1.0),
-}
-
-
 def find_scale(unit: str, si: str) -> float:
     """How many of the SI unit `si` one `unit` is; InputError at the key `unit` if it measures something else."""
-    fitting = {name: scale for name, (base, scale) in SI_OF_UNIT.items() if base == si} | {si: 1.0}
+    fitting = {name: float(each.factor) for name, each in UNITS.items() if each.si == si} | {si: 1.0}
     if unit not in fitting:
         raise InputError("unit", "unit", tables.list_choices(unit, fitting))
     return fitting[unit]

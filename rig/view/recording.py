@@ -24,8 +24,8 @@ from fdi.thresholds import NOISE_BAND_RATIO, SIGNAL_ERROR_RATIO
 from fdi.trace.sections import Section
 from fdi.trace.trace import MAIN, Check, Floats, Trace
 from plant.signals import Signal, Signals
+from plant.units import UNITS
 from rig.network.node_objects import NAMES
-from rig.sequences.measures import SI_OF_UNIT
 from rig.view.viewer import ShownView, import_rerun
 
 TIMELINE = "run"
@@ -327,7 +327,7 @@ def _list_limits(origin: str, checks: tuple[Check, ...], layout: Plots) -> Itera
     for number, check in enumerate(checks):
         signal = "error" if check.kind == "max_error" else check.signal
         if check.kind in LIMITS_OF and signal in scales and not math.isnan(check.t0 + check.high):
-            level = check.high * SI_OF_UNIT.get(check.unit, ("", 1.0))[1] * scales[signal]
+            level = check.high * (float(UNITS[check.unit].factor) if check.unit in UNITS else 1.0) * scales[signal]
             for name, sign in (("high", 1.0), ("low", -1.0)):  # both kinds judge the size of the signal
                 yield Curve(f"limit_{number}_{name}", f"limit: {check.name}", LIMIT, np.array([check.t0, check.t1]),
                             np.full(2, sign * level))
