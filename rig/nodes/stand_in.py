@@ -6,6 +6,7 @@ from math import nan
 from plant import Model
 from plant.compile import interpret_function
 from plant.model import collect_bindings
+from plant.run import report_law_errors
 from rig.benches.bench import Bench
 from rig.benches.frame_map import Role, make_reader, make_writer
 from rig.network.frame import Frame, Send
@@ -15,7 +16,7 @@ class StandIn:
     """It answers the last frame of each cycle of the rig with the drive of the plant's law."""
 
     def __init__(self, send: Send, bench: Bench, model: Model) -> None:
-        self._send, self._record = send, model.build_record()[0]
+        self._send, self._model, self._record = send, model, model.build_record()[0]
         parts = collect_bindings(model.effects, model.plant)
         self._law = interpret_function(parts["control_plant"], parts)
         self._memory = model.kind.build_control_memory()
@@ -34,7 +35,8 @@ class StandIn:
         self._values |= self._readers[frame.cob_id](frame.data)
         if frame.cob_id == self._last:
             readings = tuple(self._values[word] for word in self._outputs)
-            drive, self._memory = self._law(self._memory, self._values[self._command], readings, self._record)
+            with report_law_errors(self._model):
+                drive, self._memory = self._law(self._memory, self._values[self._command], readings, self._record)
             self._send(self._answer.identifier, self._write({self._drive: drive}, 0, 0))
 
     def tick(self, t_ns: int) -> None:
