@@ -87,7 +87,8 @@ FAULTS = option("--faults", metavar="FILE|NAME",
                 help="faults to measure: a fault file, or a shipped list by name (default: those of the plant file, or "
                      "paper)")
 BENCH = option("--bench", metavar="FILE|NAME",
-               help="bench file: which controller is under test, and its frames (default: eha, the shipped one)")
+               help="bench file: which controller is under test, and its frames (default: eha, the shipped one; of "
+                    "another plant its own controller)")
 FORCE = option("--force", action="store_true", help="replace the file of --out if there is one")
 REQUIREMENTS = option("--requirements", metavar="FILE",
                       help="requirements to cover, .csv (id, text) or .reqif; an id that it lacks is refused")
