@@ -233,7 +233,9 @@ def test_nominal_is_an_integrator_and_unequal_areas_make_it_faster_backwards() -
 
 
 def test_the_bench_refuses_it() -> None:
-    assert "a model of eha" in refuse("run", "--model", "ehs")
+    """It declares no nominal test, with its own controller or another."""
+    assert "a sequence of your own" in refuse("run", "--model", "ehs")
+    assert "a sequence of your own" in refuse("run", "--model", "ehs", "--bench", "eha")
 
 
 @real

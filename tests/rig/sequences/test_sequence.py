@@ -222,8 +222,8 @@ CHECKS = [  # keys of a check, the key that cannot be used, and what was expecte
     ('kind = "max_error"', "", "a low, a high, or both"),
     ('kind = "max_error", low = 2.0, high = 1.0', ".high", "a number from low = 2 up, not 1"),
     ('kind = "max_error", high = 1, band = 2', ".band", "a key: 'high'"),
-    ('kind = "max_error", high = 1, unit = "bar"', ".unit", "'m', 'mm' or 'um', not 'bar'"),
-    ('kind = "never_exceeds", high = 1, signal = "p12", unit = "mm"', ".unit", "'MPa'"),
+    ('kind = "max_error", high = 1, unit = "bar"', ".unit", "'cm', 'inch', 'm', 'mil', 'mm', 'nm' or 'um', not 'bar'"),
+    ('kind = "never_exceeds", high = 1, signal = "p12", unit = "mm"', ".unit", "'GPa', 'MPa', 'Pa'"),
     ('kind = "max_error", high = 1, window = [2.0, 1.0]', ".window", "[t0, t1] with t0 < t1, not [2.0, 1.0]"),
     ('kind = "max_error", high = 1, window = [0.0, 1e306]', ".window", "a text or [a number from 0 to 1e+06 s, a"),
     ('kind = "max_error", high = 1, skip = -1.0', ".skip", "a number from 0 to 3600 s, not -1.0"),
@@ -242,7 +242,7 @@ BAD += [(HEAD + f'guards = [{{ name = "g", signal = "xj"{keys} }}]\n', f"mine.to
         for keys, key, said in (("", "", "a low, a high, or both"),
                                 (", low = 1, high = 1", "", "a low, a high, or both"),
                                 (", high = 1, cycles = 0", ".cycles", "a whole number from 1, not 0"),
-                                (', high = 1, unit = "bar"', ".unit", "'m', 'mm' or 'um', not 'bar'"))]
+                                (', high = 1, unit = "bar"', ".unit", "'cm', 'inch', 'm'"))]
 BAD += [(f"{HEAD}[{table}]\n{pair}\n", f"mine.toml:4: {table}.{pair.split()[0]}: expected {expected}")
         for table, pair, expected in (
             ("timing", 'overruns = "ignore"', "'abort' or 'count', not 'ignore'"),

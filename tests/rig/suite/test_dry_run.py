@@ -128,7 +128,7 @@ def test_jumps_are_no_speed() -> None:
 @pytest.mark.parametrize(("words", "line"), [
     (("nothing",), "expected a .toml file"), (("preflight", "--out", "x.png"), "FILE.html"),
     (("preflight", "--set", "jack.mas=1"), "did you mean mass"),
-    (("preflight", "--model", "servo", "--bench", "eha"), "current: expected a plant that has this signal"),
+    (("preflight", "--model", "servo"), "preflight: expected a sequence of your own: electrohydrostatic servo"),
     (("late.toml",), "late.toml:14: faults[0].start: expected a time within main's 0.35 s, not 9")])
 def test_bad_input_is_one_line(words: tuple[str, ...], line: str, tmp_path: Path) -> None:
     (tmp_path / "late.toml").write_text(f'{SHORT}faults = [{{ kind = "lost", frame = "drive", start = 9.0 }}]\n')
