@@ -90,7 +90,7 @@ def build_run_report(trace: Trace) -> Report:
         Section("Protocol", [_tabulate_checks(trace.protocol_checks, "protocol check", page),
                              _tabulate_skipped(trace)]),
         Section("Signals", [Figure(
-            "Command, ram position, following error, current, pressure difference and spool position over time. "
+            "Command, controlled signal, following error, drive and other measured signals over time. "
             "Shaded: ramps (blue) and dynamic sections (violet) of the command, injected faults (orange). The bars at "
             "the bottom are the windows of the checks, green for passed, red for failed and amber for CANNOT_TELL; a "
             "check whose window was not reached has no bar.", partial(draw_signals, trace))]),
