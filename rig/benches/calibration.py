@@ -76,7 +76,7 @@ def read_calibration(tables: Mapping[str, Mapping[str, Any]], place: Place,
         signals: of the plant.
 
     Raises:
-        InputError: a signal that no sensor measures, a date that is none, a u without its unit.
+        InputError: a signal that no sensor measures, a text that is no date, a u without its unit.
     """
     sensed = {word: s for s in signals if s.role in ("output", "load") for word in (s.alias, s.name) if word}
     decision: Decision = "simple"

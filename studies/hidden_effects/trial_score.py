@@ -10,7 +10,7 @@ from fdi.estimation.binomial import clopper_pearson_interval
 from fdi.report.numbers import NO_NUMBER, format_duration
 from fdi.report.report import Cell, Column, Item, Line, Report, Section, Table
 from plant.effects import Effect
-from plant.plants import find_plant
+from plant.plants import Plant, find_plant
 from rig.campaign.batch import BatchProgress
 
 Record = Mapping[str, Any]
@@ -77,8 +77,13 @@ def is_truth_covered(record: Record) -> bool | None:
 
 
 def _find_hidden_effect(record: Record) -> Effect:
-    truth = record["truth"]
-    return find_plant(truth.get("plant", "eha")).find_effect(truth["hidden"][0]["effect"])
+    return _find_plant(record).find_effect(record["truth"]["hidden"][0]["effect"])
+
+
+def _find_plant(record: Record) -> Plant:
+    """The plant of a case: `model` of its truth; the cases of the EHA, whose table `plant` has its symbols, name none.
+    """
+    return find_plant(record["truth"].get("model", "eha"))
 
 
 def measure_holdout_error(record: Record) -> float | None:
@@ -206,7 +211,7 @@ def _describe_failure(record: Record, against: Sequence[str]) -> dict[str, Any]:
 
 def summarise_trial(records: Sequence[Record]) -> dict[str, Any]:
     """All figures as JSON values: the rates over cases with all signals, and their counts by the measured signals."""
-    outputs = [s.name for s in find_plant(records[0]["truth"].get("plant", "eha")).signals.outputs]
+    outputs = [s.name for s in _find_plant(records[0]).signals.outputs]
     groups = [",".join(outputs[:count]) for count in range(len(outputs), 0, -1)]  # the rates are required of the first
     by_signals = {signals: [record for record in records if record["truth"]["signals"] == signals]
                   for signals in groups}

@@ -183,7 +183,8 @@ def record(seed: int, kind: str, effects: Sequence[str], verdict: str, named: Se
     shown = {"xj": floors, "xj_drift": 99.0, "p12": floors, "xs": 0.0, "controller": 0.0}
     each = [{"effect": name, "size": 1.0, "value": 20.0} | ({"ratio": shown} if len(effects) > 1 else {})
             for name in effects]
-    truth = {"kind": kind, "effects": list(effects), "signals": "xj,p12,xs", "base_ratio": shown, "hidden": each}
+    truth = {"kind": kind, "effects": list(effects), "signals": "xj,p12,xs", "base_ratio": shown, "hidden": each,
+             "plant": {"MJ": 101.0}}
     answer = {"verdict": verdict, "effects": list(named), "baseline": {"floor": {"xj": 1.0}}} | more
     return {"seed": seed, "truth": truth, "answer": answer, "seconds": 5.0 if seed else 30.0}
 
