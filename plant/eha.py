@@ -266,4 +266,5 @@ PLANT = Plant(
               "compute_compliance": (update_compliance, frozenset({"valve", "jack_drag"}))},
     values=load_nominal_values(),
     balances=True,
+    shared_starts=True,
 )

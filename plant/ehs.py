@@ -218,6 +218,7 @@ PLANT = Plant(
     variants={"compute_compliance": (update_compliance, frozenset())},
     values=NOMINAL,
     has=("quantisation",),
+    shared_starts=True,
     lacks=("constant_load", "aero_stiffness", "sensor_gain", "sensor_lag", "sensor_offset"),
     scatter={"pump.displacement": 0.1},
     tables=(Table(skip=60, separator=";", load=estimate_load, columns=PROCESSED_COLUMNS),

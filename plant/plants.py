@@ -125,6 +125,7 @@ class Plant:
     values: Mapping[str, float] = field(default_factory=dict, repr=False)  # nominal, in place of the types' defaults
     has: tuple[str, ...] = ()  # effects of the nominal model
     lacks: tuple[str, ...] = ()  # shared effects that cannot be
+    shared_starts: bool = False  # the starts of shared effects, which are those of the EHA, suit it
     scatter: Mapping[str, float] | None = None  # tolerances, a fraction, of parameters; None: as their types say
     balances: bool = False  # `plant.forced` balances flow and force of its jack, as measured signals have them
     solver_step: float = 1e-5  # s
@@ -137,7 +138,8 @@ class Plant:
     key: str = ""  # what a model calls it: its name, or the path of a user's file as it was named
     source: bytes = field(default=b"", repr=False)  # of a user's file
     foreign: Callable[[float], Program] | None = field(default=None, repr=False)  # runs it in place of its step
-    effects: Mapping[str, Effect] = field(default_factory=dict, repr=False)  # its own
+    # its own, and shared ones with starts of its own
+    effects: Mapping[str, Effect] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         parameters = self.parameters
@@ -202,8 +204,9 @@ class Plant:
 
     def list_effects(self) -> list[Effect]:
         """The effects it can have: those of the catalogue that suit it, then its own, which may have their names."""
-        shared = (e for e in CATALOGUE.list_all().values() if e.name not in self.effects)
-        return [*(e for e in shared if self.offers(e)), *self.effects.values()]
+        everything = CATALOGUE.list_all()
+        shared = (e for e in map(self.find_effect, everything) if self.offers(e))
+        return [*shared, *(e for name, e in self.effects.items() if name not in everything)]
 
     def list_groups(self, names: Iterable[str] | None = None) -> dict[str, type[Any]]:
         """The parameter groups of the plant and of the effects `names`, by default of all that it can have."""
@@ -220,7 +223,7 @@ class Plant:
 
     def replace_effect(self, e: Effect) -> None:
         """Put an effect with other start values in the place of the one of its name."""
-        if e.name in self.effects:
+        if e.name in self.effects or CATALOGUE[e.name].starts:
             cast("dict[str, Effect]", self.effects)[e.name] = e
         else:
             CATALOGUE[e.name] = e

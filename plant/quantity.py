@@ -56,7 +56,6 @@ _KNOWN_GROUPS: dict[type[Any], Mapping[str, Quantity]] = {}
 
 Metre = Annotated[float, Quantity("m")]
 MetrePerSecond = Annotated[float, Quantity("m/s")]
-Ampere = Annotated[float, Quantity("A")]
 Pascal = Annotated[float, Quantity("Pa")]
 Newton = Annotated[float, Quantity("N")]
 Second = Annotated[float, Quantity("s")]

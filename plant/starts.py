@@ -12,7 +12,7 @@ from plant.controller import compute_answers
 from plant.effects import Effect
 from plant.lanes import Lanes
 from plant.model import Model, build_bare_model
-from plant.plants import find_plant
+from plant.plants import Plant, find_plant
 from plant.quantity import Quantity
 from plant.run import report_law_errors, simulate
 
@@ -21,6 +21,7 @@ VISIBLE = (3.0, 30.0, 300.0)  # noise levels that starts are to show
 SHAPES = (1.0, 0.4, 2.5)  # times the usual value, for a parameter that does nothing alone
 DECADES = (-15, 13)  # where the size of a parameter without a hint is looked for
 ANCHOR = 2.0  # 1/s
+WITHOUT_SIZE = ("1", "s", "Hz", "rad")  # units of parameters that are alike in plants of any size
 PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3, "M": 1e6, "G": 1e9}
 _NUMBER = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER})\s*-\s*({_NUMBER})\s*([^\s,;:]*)")
@@ -34,7 +35,7 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None, plant
     nothing, sizes are looked for that change what the sensors see over `command` by 3, 30 and 300 times their noise.
 
     Args:
-        effect: with a law.
+        effect: any that the plant can have.
         command: (n,) demand, one a cycle.
         load: (n,) external load; none by default.
         plant: that has the effect.
@@ -45,10 +46,12 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None, plant
     Raises:
         InputError: a law that cannot be compiled and run.
     """
-    if effect.starts or effect.base or not effect.fitted:
+    if effect.starts or not effect.fitted:
         return effect.starts
-    usual = {name: effect.off[name] for name in effect.fitted}
-    sized = {name: sizes for name in usual if (sizes := _find_sizes(effect, name, command, load, plant))}
+    nominal = find_plant(plant).nominal
+    usual = {name: effect.off.get(name, nominal.get(name, 0.0)) for name in effect.fitted}
+    sized = {name: sizes for name, off in usual.items()
+             if (sizes := _find_sizes(effect, name, off, command, load, plant))}
     found = [usual | {name: size} for name, sizes in sized.items() for size in sizes]
     for name, value in usual.items():
         if name not in sized and (value or parse_hint(effect.parameters[name])):
@@ -58,6 +61,20 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None, plant
     return tuple(found)
 
 
+def lacks_starts(effect: Effect, kind: Plant) -> bool:
+    """Whether start values of an effect have to be found: it has none, or it has those of an actuator of another size.
+
+    The starts of shared effects are the EHA's: its null bias is some microamperes, that of a motor may be an ampere.
+    Fractions and times are alike in plants of any size.
+    """
+    if not effect.starts:
+        return bool(effect.fitted)
+    is_of_eha = effect.function is not None and effect.function.__module__.startswith("plant.effects.")
+    has_size = any(effect.parameters[name].unit not in WITHOUT_SIZE for name in effect.fitted)
+    return (is_of_eha and has_size and effect.port not in ("command", "reading")
+            and not kind.shared_starts and effect.name not in kind.effects)
+
+
 def ensure_starts(name: str, command: Array, load: Array | None = None, plant: str = "eha") -> Effect:
     """The effect of that name; its plant has the start values from now on (see `find_starts`).
 
@@ -65,14 +82,29 @@ def ensure_starts(name: str, command: Array, load: Array | None = None, plant: s
     """
     kind = find_plant(plant)
     effect = kind.find_effect(name)
-    if not effect.starts:
-        effect = replace(effect, starts=find_starts(effect, command, load, plant))
+    if lacks_starts(effect, kind):
+        find = _resize_starts if effect.starts else find_starts
+        effect = replace(effect, starts=find(effect, command, load, plant) or effect.starts)
         kind.replace_effect(effect)
     return effect
 
 
+def _resize_starts(effect: Effect, command: Array, load: Array | None, plant: str) -> tuple[Mapping[str, float], ...]:
+    """Starts of an effect that has those of another plant: sizes that this one shows, and what it shows of the others.
+
+    A deviation of the controlled signal, or of its demand, is at most a tenth of the largest demand.
+    """
+    unhinted = {name: q._replace(typical="") for name, q in effect.parameters.items()}  # typical of the other plant
+    found = find_starts(replace(effect, starts=(), parameters=unhinted), command, load, plant)
+    shown = compute_levels(compute_changes(effect, effect.starts, command, load, plant), plant).max(axis=1)
+    found += tuple(start for start, level in zip(effect.starts, shown, strict=True) if VISIBLE[0] <= level < np.inf)
+    unit, most = find_plant(plant).signals.controlled.unit, 0.1 * np.abs(command).max()
+    return tuple(start for start in found
+                 if all(abs(x) <= most for name, x in start.items() if effect.parameters[name].unit == unit))
+
+
 def compute_changes(effect: Effect, values: Sequence[Mapping[str, float]], command: Array,
-            load: Array | None = None, plant: str = "eha") -> Array:
+            load: Array | None = None, plant: str = "eha", anchor: float = ANCHOR) -> Array:
     """How an effect changes the signals of the nominal plant, driven by the same drive, without noise.
 
     An effect in the firmware changes no plant: then the first column is its drive over the loop's gain when it sees the
@@ -84,6 +116,7 @@ def compute_changes(effect: Effect, values: Sequence[Mapping[str, float]], comma
         command: (n,) demand that the nominal closed loop makes the drive from.
         load: (n,) external load.
         plant: whose signals they are.
+        anchor: 1/s, at which the plant is drawn to the position of the nominal one.
 
     Returns:
         (m, n, outputs): change of each output; of the EHA XJ m, P12 Pa, XS m.
@@ -99,7 +132,7 @@ def compute_changes(effect: Effect, values: Sequence[Mapping[str, float]], comma
     names = list(dict.fromkeys(name for row in values for name in row))
     rows = [[model[name] for name in names], *([row.get(name, model[name]) for name in names] for row in values)]
     with report_law_errors(model):
-        out = Lanes(model, names).replay(np.array(rows), getattr(run, signals.drive.name), force, outputs[:, 0], ANCHOR)
+        out = Lanes(model, names).replay(np.array(rows), getattr(run, signals.drive.name), force, outputs[:, 0], anchor)
     return out[1:] - out[:1]
 
 
@@ -128,9 +161,9 @@ def _compute_firmware_changes(model: Model, values: Sequence[Mapping[str, float]
     return (out[1:] - out[:1]) / model.values.get("controller.proportional_gain", 1.0)
 
 
-def _find_sizes(effect: Effect, name: str, command: Array, load: Array | None, plant: str) -> list[float]:
-    """Values of one parameter that can be seen with the others as usual; both signs where it may be negative."""
-    quantity, off = effect.parameters[name], effect.off[name]
+def _find_sizes(effect: Effect, name: str, off: float, command: Array, load: Array | None, plant: str) -> list[float]:
+    """Values of one parameter, on either side of its off value, that can be seen with the others as usual."""
+    quantity = effect.parameters[name]
 
     def find_highest_level(values: Array) -> Array:
         change = compute_changes(effect, [{name: float(x)} for x in values], command, load, plant)

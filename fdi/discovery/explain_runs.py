@@ -33,7 +33,7 @@ from plant.errors import InputError
 from plant.lanes import Lanes, compile_kernels, list_kernel_variants
 from plant.model import Model, find_quantity, list_searched_effects
 from plant.run import report_law_errors
-from plant.starts import ensure_starts
+from plant.starts import ensure_starts, lacks_starts
 
 PATTERN_VERDICTS = ("UNEXPLAINED", "PARTLY")  # after these the shape of the residual is reported
 
@@ -117,7 +117,7 @@ def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: 
     """
     runs.model.kind.require_equations()
     for name in [e.name for e in list_searched_effects(runs.model.plant)] if effects is None else effects:
-        if not runs.model.find_effect(name).starts and runs.model.find_effect(name).fitted:
+        if lacks_starts(runs.model.find_effect(name), runs.model.kind):
             progress(f"looking for sizes of {name}", 0.0)
             ensure_starts(name, runs.est.command, runs.est.load, runs.model.plant)
     if effects is None:

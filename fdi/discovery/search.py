@@ -39,7 +39,7 @@ from fdi.estimation.fit import (
 )
 from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, is_long, judge_on_all
 from fdi.estimation.noise import Noise
-from fdi.estimation.replay import measure_decided_errors
+from fdi.estimation.replay import leave_out_rest, measure_decided_errors
 from fdi.estimation.unidentifiable import finish_fit, list_powers, scale_together
 from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import (
@@ -132,9 +132,12 @@ class Search:
     def __init__(self, model: Model, trace: Trace, repeats: Sequence[Trace], effects: Iterable[str],
                  workers: int | None = None, holdout: Trace | None = None, whole: Sequence[Trace] = ()) -> None:
         self.workers = workers or count_threads()
-        self.holdout, self.whole = holdout, whole  # `whole`: what the runs were cut from, if they were
         self.sensors = {signal.name: noises.white_noise(_find_level(trace, signal, model))
                         for signal in trace.declared.outputs}
+        level = self.sensors[trace.declared.controlled.name].level
+        trace, *repeats = (leave_out_rest(run, model, level) for run in (trace, *repeats))
+        self.holdout = None if holdout is None else leave_out_rest(holdout, model, level)
+        self.whole = whole  # what the runs were cut from, if they were
         lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
         # RMS of rounding, where a signal comes in steps
         self.coarse = {trace.declared.controlled.name: lsb / np.sqrt(12.0)} if lsb else {}
@@ -302,17 +305,14 @@ class Search:
         errors = _measure_rms(own, signals)
         coarse = [self.coarse.get(s, 0.0) for s in signals]
         others = others or [p.compute_residuals(found.free, found.x[None])[0] for p in self.repeats]
-        floor = {s: float(np.hypot(n.level, c)) for s, n, c in zip(signals, self.noise, coarse, strict=True)}
         if not others:
+            floor = {s: float(np.hypot(n.level, c)) for s, n, c in zip(signals, self.noise, coarse, strict=True)}
             errors = measure_decided_errors(self.problem, found, floor)
             return Hypothesis(effects, found, errors, {s: errors[s] / floor[s] for s in signals})
         pairs = zip(self.repeats, others, strict=True)
         cost = float(np.mean([compute_misfit(p.whiten_residuals(r[None]))[0] for p, r in pairs]))
-        ratio = dict(zip(signals, measure_repeating(own, others, coarse), strict=True))
-        if self.model.kind.correct is not None and max(ratio.values()) > RESIDUAL_IS_NOISE:
-            # an observer's replay misses the same stops in each run of a command
-            decided = measure_decided_errors(self.problem, found, floor)
-            ratio = {s: min(x, decided[s] / floor[s]) for s, x in ratio.items()}
+        typical = own if self.model.kind.correct is None else _leave_out_worst(own)
+        ratio = dict(zip(signals, measure_repeating(typical, others, coarse), strict=True))
         return Hypothesis(effects, found, errors, ratio, cost, tuple(others))
 
     def make_unseen_problem(self, steps: int | None = None) -> Problem:
@@ -466,6 +466,13 @@ def measure_repeating(residual: Floats, others: Sequence[Floats], coarse: Sequen
     return ratios
 
 
+def _leave_out_worst(residuals: Floats, share: float = 0.1) -> Floats:
+    """Residuals (s, n) without each signal's worst blocks: in a slow motion a surface may also stop for an instant."""
+    sums = sum_blocks(np.nan_to_num(residuals))
+    kept = sums <= np.quantile(sums, 1.0 - share, axis=1, keepdims=True)
+    return np.where(np.repeat(kept, BLOCK, axis=1)[:, :residuals.shape[1]], residuals, np.nan)
+
+
 def _measure_rms(residuals: Floats, signals: Sequence[str]) -> dict[str, float]:
     return {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(signals, residuals, strict=True)}
 
@@ -522,7 +529,8 @@ def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: in
     frequencies.
     """
     first = [(name, start, along) for name in effects for along in ((False, True) if name in GOES_WITH else (False,))
-             for start in (*problem.model.find_effect(name).starts, *find_tones(problem, fit, name))]
+             for start in (*problem.model.find_effect(name).starts, *find_tones(problem, fit, name),
+                           *_start_at_fit(problem, fit, name))]
     best = _keep_best(simulate_starts(problem, fit, first, workers))
     for factors, count in zip(ZOOM, LOOKED_AT, strict=True):
         near = [(t.effect, start, t.along) for t in best[:count] for start in _list_starts_around(problem, t, factors)]
@@ -530,6 +538,14 @@ def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: in
     beside = [(t.effect, start, t.along) for t in best[:LOOKED_AT[-1]] for start in _list_lines_beside(problem, t)]
     best = _keep_best([*best, *simulate_starts(problem, fit, beside, workers)])
     return [_make_prospect(problem, fit, t) for t in best]
+
+
+def _start_at_fit(problem: Problem, fit: Fit, effect: str) -> list[Start]:
+    """A start of an effect of the reference model where the fit has its parameters: other starts may all be far off."""
+    entry = problem.model.find_effect(effect)
+    if not entry.base or problem.model.kind.shared_starts or not set(entry.fitted) <= set(fit.values):
+        return []
+    return [{name: fit.values[name] for name in entry.fitted}]
 
 
 def _make_prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:

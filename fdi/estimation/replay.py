@@ -18,6 +18,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from fdi.estimation.fit import (
     Fit,
@@ -249,6 +250,37 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
     return undecided
 
 
+def find_rest_rows(position: Floats, period: float, noise: float, window: float = 0.05,
+                   memory: float = 4.0 / ANCHOR_RATE) -> Flags:
+    """Rows, (n,), in which the controlled signal rests, and those in which a replay still remembers that.
+
+    Args:
+        position: the signal, (n,) SI, NaN where it was not measured.
+        period: s, of its rows.
+        noise: RMS of its sensor, SI.
+        window: s, the shortest rest; the reversal of a motion is none.
+        memory: s, until an anchored replay is back on the recording.
+    """
+    rows = 2 * round(0.5 * window / period) + 1
+    range_of_noise = 8.0  # RMS, hardly ever exceeded by so few samples of normal noise
+    x = hold_next(hold_last(position))
+    rests = maximum_filter1d(x, rows) - minimum_filter1d(x, rows) <= range_of_noise * noise
+    return extend_flags(maximum_filter1d(rests.astype(np.int8), rows) > 0, round(memory / period))
+
+
+def leave_out_rest(trace: Trace, model: Model, noise: float) -> Trace:
+    """A prepared run of a plant that is replayed by an observer, without the rows that hang on its stops.
+
+    At rest dry friction has any value up to its static level: whether a replay stays or slips hangs on less than a
+    sensor shows, and one that slips alone is off by many times the noise. Speed and friction of a motion are certain.
+    Without an observer, or where more than `HELD_OUT_UNDECIDED_SHARE` would be left out, the run is as it is.
+    """
+    if model.kind.correct is None:
+        return trace
+    moves = trace.usable & ~find_rest_rows(trace.controlled, trace.period, noise)
+    return trace.with_columns({}, usable=moves) if moves.mean() >= 1.0 - HELD_OUT_UNDECIDED_SHARE else trace
+
+
 def find_unpredictable_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) -> Flags:
     """Rows of the first run, (n,), that hang on a stop, and those after them until only noise is left again.
 
@@ -323,8 +355,10 @@ def answer_readings(model: Model, trace: Trace, command: Floats, controlled: Flo
     The other readings are those of the trace; NaN where the law needs one that was not measured.
     """
     others = [trace.column(name) for name in trace.output_names[1:]]
-    held = [x if np.isnan(x).all() else hold_last(x) for x in others]
-    return compute_answers(model, command, np.column_stack([controlled, *held]))
+    low, high = (compute_answers(model, command, np.column_stack(
+        [controlled, *(np.full(len(x), guess) if np.isnan(x).all() else hold_last(x) for x in others)]))
+        for guess in (-1e9, 1e9))  # so far apart that a limit of the drive does not make them alike
+    return np.where(low == high, low, np.nan)
 
 
 def find_controller_gain(model: Model, period: float) -> tuple[float, float]:

@@ -16,7 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.fit import list_relative_tolerances
+from fdi.estimation.fit import compute_typical_rms, list_relative_tolerances
+from fdi.estimation.replay import find_rest_rows
+from fdi.thresholds import ANCHOR_RATE, HEALTHY_TOLERANCES
 from plant import simulate
 from plant.effects import Effect, load_effects
 from plant.model import Model, build_bare_model, list_searched_effects
@@ -87,31 +89,59 @@ def sample_case(plant: str, seed: int) -> Case:
 
 def sample_size(plant: str, effect: Effect, command: Array, level: float, rng: np.random.Generator
                 ) -> dict[str, float]:
-    """One of the effect's starts, its first parameter so far from its off value that `level` noise floors show it."""
+    """One of the effect's starts, its first parameter so far from its off value that `level` noise floors show it.
+
+    It is at most as far off as the start that is furthest on that side, and further than in any healthy unit.
+    """
     kind = find_plant(plant)
     starts = ensure_starts(effect.name, command, None, plant).starts
     start, first = dict(starts[int(rng.integers(len(starts)))]), effect.fitted[0]
     off, q = effect.off.get(first, kind.nominal.get(first, 0.0)), effect.parameters[first]
-    sizes = (start[first] - off) * np.geomspace(1e-3, 1e3, 37)
-    sizes = sizes[[not q.refuses(off + x) for x in sizes]]
-    shown = np.array([max(measure_levels(plant, effect, start | {first: off + x}, command).values()) for x in sizes])
-    shown = np.nan_to_num(shown, nan=np.inf)
-    nearest = int(np.abs(np.log(np.clip(shown, 1e-9, 1e12) / level)).argmin())
-    return start | {first: off + float(sizes[nearest])}
+    side = np.sign(start[first] - off)
+    sizes = side * max(side * (each[first] - off) for each in starts) * np.geomspace(1e-3, 1.0, 37)
+    healthy = HEALTHY_TOLERANCES * kind.find_tolerance(first, q) * abs(off)
+    tried = [start | {first: off + float(x)} for x in sizes if abs(x) > healthy and not q.refuses(off + x)]
+    shown = np.array([max(levels.values()) for levels in measure_levels(plant, effect, tried, command)])
+    return tried[int(np.abs(np.log(np.clip(np.nan_to_num(shown, nan=np.inf), 1e-9, 1e12) / level)).argmin())]
 
 
-def measure_levels(plant: str, effect: Effect, values: Mapping[str, float], command: Array) -> dict[str, float]:
-    """RMS change over the noise by signal, of the nominal plant; "controller": of an effect in the firmware."""
-    change = compute_changes(effect, [values], command, None, plant)[0]
-    change = np.column_stack([change[LAG:, 0] - change[:-LAG, 0], change[LAG:, 1:]])
-    signals, nominal = find_plant(plant).signals.outputs, find_plant(plant).nominal
+def measure_levels(plant: str, effect: Effect, values: Sequence[Mapping[str, float]], command: Array
+                   ) -> list[dict[str, float]]:
+    """By signal, for each of `values`: the change that no healthy unit has, RMS of the typical blocks over the noise,
+    in a replay as fits have it; "controller": that of an effect in the firmware.
+
+    What tolerances change is a part of the residual that does not tell an effect, so it is left out. Nor do the rows
+    in which an observer's replay stops by chance; where an effect shows in these alone, it counts as not visible.
+    """
+    kind, names = find_plant(plant), [s.name for s in find_plant(plant).signals.outputs]
+    tolerances = list_relative_tolerances(build_bare_model(plant), kind.nominal)
+    units = [] if effect.firmware else [{n: (1.0 + t) * kind.nominal[n]} for n, t in tolerances.items() if t > 0.0]
+    change = compute_changes(effect, [*values, *units], command, None, plant, ANCHOR_RATE)
+    noise = np.array([kind.nominal[s.noise] for s in kind.signals.outputs])
+    noise[0] *= 2.0**0.5
+    change[:, LAG:, 0] -= change[:, :-LAG, 0].copy()  # the first rows are not judged
     with np.errstate(over="ignore", invalid="ignore"):  # sizes at which the simulation diverges are tried too
-        rms = np.sqrt(np.nanmean(np.square(change), axis=0))
-    levels = {s.name: float(x) / (nominal[s.noise] * (1.0 if i else 2**0.5))
-              for i, (s, x) in enumerate(zip(signals, rms, strict=True))}
-    if effect.firmware:
-        return dict.fromkeys(levels, 0.0) | {"controller": levels[signals[0].name]}
-    return levels | {"controller": 0.0}
+        change = change[:, find_judged_rows(plant, command)] / noise
+        own = change[len(values):].reshape(len(units), change[0].size)
+        found = []
+        for row in change[:len(values)]:
+            share = np.linalg.solve(own @ own.T + np.eye(len(units)), own @ row.ravel())
+            left = row - (np.clip(share, -HEALTHY_TOLERANCES, HEALTHY_TOLERANCES) @ own).reshape(row.shape)
+            levels = dict(zip(names, compute_typical_rms(left.T).tolist(), strict=True))
+            none = dict.fromkeys(names, 0.0) | {"controller": levels[names[0]]}
+            found.append(none if effect.firmware else levels | {"controller": 0.0})
+    return found
+
+
+def find_judged_rows(plant: str, command: Array) -> NDArray[np.bool_]:
+    """The rows of a command, (n,), in which a hidden effect has to show."""
+    kind, model = find_plant(plant), build_bare_model(plant)
+    rows = np.arange(len(command)) >= LAG
+    if kind.correct is None:
+        return rows
+    controlled = kind.signals.controlled
+    reading = getattr(simulate(model.replace({controlled.noise: 0.0}), command), controlled.name)
+    return rows & ~find_rest_rows(reading, kind.nominal["controller.period"], kind.nominal[controlled.noise])
 
 
 def make_command(plant: str) -> Array:
@@ -164,7 +194,7 @@ def write_case(plant: str, case: Case, folder: Path) -> None:
 
 def _format_truth(plant: str, case: Case) -> str:
     kind, command = find_plant(plant), make_command(plant)
-    levels = {name: measure_levels(plant, kind.find_effect(name), values, command) for name, values in case.hidden}
+    levels = {name: measure_levels(plant, kind.find_effect(name), [values], command)[0] for name, values in case.hidden}
     names = [*(s.name for s in kind.signals.outputs), "controller"]
     together = {name: max((each[name] for each in levels.values()), default=0.0) for name in names}
     lines = [f"seed = {case.seed}", f'model = "{plant}"', f'kind = "{case.kind}"',

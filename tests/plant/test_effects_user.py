@@ -16,6 +16,8 @@ from rig_command import answer, rig
 from plant import Actuator, InputError, Model, simulate
 from plant.effects import CATALOGUE, load_effects
 from plant.model import list_offered_effects
+from plant.plants import find_plant
+from plant.profile import build_profile
 from plant.selftest import check_effect
 from plant.starts import compute_changes, compute_levels, ensure_starts, find_starts
 
@@ -112,6 +114,19 @@ def test_an_effect_without_a_hint_starts_where_it_shows(file: Path, text: str, n
     shown = compute_levels(compute_changes(CATALOGUE[name], upwards, PREFLIGHT)).max(axis=1)
     assert shown == pytest.approx([3.0, 30.0, 300.0], rel=0.5)
     assert {start["cogging.length"] for start in starts} == {1e-3, 4e-4, 2.5e-3} if name == "cogging" else True
+
+
+@pytest.mark.parametrize("name", ["null_bias", "constant_load"])
+def test_a_shared_effect_starts_where_another_plant_shows_it(name: str) -> None:
+    """Microamperes are a null bias of a servovalve and not of a motor; the EHA keeps its own sizes."""
+    command = build_profile(find_plant("ema").profile).command
+    before = CATALOGUE[name].starts
+    found = ensure_starts(name, command, plant="ema")
+    shown = compute_levels(compute_changes(found, found.starts, command, plant="ema"), "ema").max(axis=1)
+    assert shown.min() > 1.0 and (shown < 10.0).any() and (shown > 100.0).any()
+    assert {next(iter(start.values())) > 0.0 for start in found.starts} == {True, False}
+    assert ensure_starts(name, command, plant="ema") is found and CATALOGUE[name].starts == before
+    assert ensure_starts(name, PREFLIGHT).starts == before
 
 
 def test_a_hint_spares_the_search(file: Path) -> None:

@@ -13,7 +13,7 @@ from noisy_traces import record_plant
 from fdi.discovery.search import Search
 from fdi.estimation.fit import Fit, Problem, evolve_population, list_all_unknowns
 from fdi.estimation.noise import white_noise
-from fdi.estimation.replay import find_undecided_rows, hold_inputs
+from fdi.estimation.replay import find_rest_rows, find_undecided_rows, hold_inputs
 from fdi.estimation.unidentifiable import (
     FLAPPER,
     JACK_PRESSURE,
@@ -162,3 +162,13 @@ def test_slips_on_soft_oil_are_undecided_and_a_step_is_not() -> None:
     soft = _find({"compressibility.coefficient": 1.0 / 4e8, "jack.static_friction": 1600.0}, ramp)
     assert soft.mean() > 0.2 and not soft[:200].any()
     assert not _find({}, np.repeat([0.0, 3e-3], [200, 800])).any()
+
+
+def test_a_rest_hangs_on_stops_and_a_reversal_does_not() -> None:
+    t = np.arange(0.0, 3.0, 1e-3)
+    x = np.where(t < 1.0, 0.0, 3e-3 * np.sin(2.0 * np.pi * np.clip(t - 1.0, 0.0, 1.5)))  # rests, two reversals, rests
+    noise = 1e-6 * np.random.default_rng(0).standard_normal(len(t))
+    x = x + noise
+    x[500:520] = np.nan
+    rest = find_rest_rows(x, 1e-3, 1e-6)
+    assert rest[:1150].all() and not rest[1300:2490].any() and rest[2550:].all()  # and until a replay has forgotten it
