@@ -175,6 +175,8 @@ def _find_sizes(effect: Effect, name: str, off: float, command: Array, load: Arr
     found: list[float] = []
     for sign in (1.0, -1.0):
         decades = off + sign * np.logspace(*DECADES, DECADES[1] - DECADES[0] + 1)
+        if effect.base and off:  # a stiffness that is lost is a fraction that nears 0
+            decades = off * (1.0 + np.logspace(-4.0, 3.0, 15)) ** sign
         decades = decades[[not quantity.refuses(x) for x in decades]]
         shown = find_highest_level(decades) if len(decades) else decades
         for level in VISIBLE:
@@ -184,7 +186,8 @@ def _find_sizes(effect: Effect, name: str, off: float, command: Array, load: Arr
             i = above[0]
             finer = off + sign * np.geomspace(abs(decades[max(i - 1, 0)] - off), abs(decades[i] - off), 9)
             distance = np.abs(np.log(np.clip(find_highest_level(finer), 1e-9, 1e9) / level))
-            found.append(float(finer[distance.argmin()]))
+            if distance.min() < np.log(10.0):  # further off the simulation diverges
+                found.append(float(finer[distance.argmin()]))
     return list(dict.fromkeys(found))
 
 

@@ -25,6 +25,7 @@ from plant.threads import map_in_threads
 
 HUM = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0, 400.0)  # Hz
 BLOCK = 100  # cycles
+FURTHEST = 1e15  # SI, of any signal
 
 
 class Free(NamedTuple):
@@ -110,6 +111,8 @@ class Problem:
         trace = self.trace if trace is None else trace
         out = self._lanes[key].replay(values, trace.drive, trace.load, trace.anchor, self.anchor, trace.parts,
                                       trace.chambers)
+        if not np.abs(out).max() < FURTHEST:  # a trial at which the simulation diverges
+            out = np.clip(np.nan_to_num(out, nan=FURTHEST), -FURTHEST, FURTHEST)
         return trace.pass_sensors(out).transpose(0, 2, 1)
 
     def compute_residuals(self, free: Sequence[Free], x: Floats) -> Floats:

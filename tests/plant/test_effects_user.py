@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -127,6 +128,14 @@ def test_a_shared_effect_starts_where_another_plant_shows_it(name: str) -> None:
     assert {next(iter(start.values())) > 0.0 for start in found.starts} == {True, False}
     assert ensure_starts(name, command, plant="ema") is found and CATALOGUE[name].starts == before
     assert ensure_starts(name, PREFLIGHT).starts == before
+
+
+@pytest.mark.parametrize("name", ["moving_mass", "torque_gain"])
+def test_an_effect_of_the_plants_own_parameters_starts_on_either_side_of_nominal(name: str) -> None:
+    command, kind = build_profile(find_plant("ema").profile).command, find_plant("ema")
+    effect = replace(kind.find_effect(name), starts=())
+    nominal = kind.nominal[effect.fitted[0]]
+    assert {start[effect.fitted[0]] > nominal for start in find_starts(effect, command, plant="ema")} == {True, False}
 
 
 def test_a_hint_spares_the_search(file: Path) -> None:
