@@ -459,7 +459,7 @@ def compute_firmware_residual(model: Model, trace: Trace) -> Floats:
 
 def _measure_rms(model: Model, traces: Sequence[Trace]) -> float:
     left = [compute_firmware_residual(model, r) for r in traces]
-    return float(np.sqrt(np.mean([np.nanmean(x**2) for x in left if not np.isnan(x).all()] or [0.0])))
+    return float(np.sqrt(np.mean([float(np.nanmean(x**2)) for x in left if not np.isnan(x).all()] or [0.0])))
 
 
 def _fit_size(model: Model, traces: Sequence[Trace], name: str, before: float, unit: float) -> Fingerprint:
