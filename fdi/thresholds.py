@@ -509,6 +509,11 @@ IDENTIFIABLE_SHARE = 0.2
 # command beyond its stroke, lowers it to 0.66 in a test; columns that are not Com and XJ are usually below.
 LEAST_SCALING_CORRELATION = 0.5
 
+# Correlation of a drive and a speed from which the guess takes their columns for those of an open loop.
+#
+# Half of what a drive without end stops and saturation would have: a ram waits at its stops.
+LEAST_SPEED_CORRELATION = 0.5
+
 # Noise of a reading's step over the noise of the nominal sensor, from which the guess writes the step into the map: a
 # smaller one changes the noise floor by less than 0.5 %.
 LEAST_QUANTUM_NOISE = 0.1

@@ -115,6 +115,11 @@ class Signals(tuple[Signal, ...]):
         return next(s for s in self if s.role == "drive")
 
     @property
+    def is_open_loop(self) -> bool:
+        """Whether the command is the drive, passed on, and not a demand for the controlled signal."""
+        return self.command.unit == self.drive.unit != self.controlled.unit
+
+    @property
     def load(self) -> Signal | None:
         """The external load, None if the plant has none."""
         return next((s for s in self if s.role == "load"), None)

@@ -230,7 +230,7 @@ class IdentificationRuns(NamedTuple):
     """What an identification works on."""
 
     model: Model  # at the cycle of the runs
-    fitted: tuple[Trace, ...]  # prepared, with the same outputs
+    fitted: tuple[Trace, ...]  # prepared
     held_out: tuple[Trace, ...]
     sources: tuple[Source, ...]  # of all of them, the held-out ones last
 
@@ -274,12 +274,12 @@ def prepare_runs(model: Model, ranges: Sequence[Range], traces: Sequence[Trace],
     for name in signals or ():
         if name not in outputs:
             raise InputError("--signals", name, f"some of {','.join(outputs)}")
-    shared = [s for s in outputs if all(s in t.signals for t in traces[:fitted]) and (signals is None or s in signals)]
-    if not shared:
-        raise InputError(sources[0].file, ", ".join(signals or outputs), "a signal that every run to fit has")
+    chosen = [s for s in outputs if any(s in t.signals for t in traces[:fitted]) and (signals is None or s in signals)]
+    if not chosen:
+        raise InputError(sources[0].file, ", ".join(signals or outputs), "a signal that a run to fit has")
     limits = {s.limit for s in model.kind.signals if s.limit}
     widest = replace(model, values={**model.values, **{r.name: r.high for r in ranges if r.name in limits}})
-    prepared = [_prepare(t, widest, [s for s in shared if s in t.signals] or shared, source)
+    prepared = [_prepare(t, widest, [s for s in chosen if s in t.signals] or chosen, source)
                 for t, source in zip(traces, sources, strict=True)]
     model = match_period(model, prepared[0], SAME_PERIOD)
     period = model["controller.period"]
@@ -559,7 +559,7 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
     Args:
         model: with the values of the data sheet.
         ranges: of the free parameters.
-        fitted: runs, prepared for replay, with the same outputs.
+        fitted: runs, prepared for replay, each with the outputs that were measured in it.
         held_out: runs that no fit sees, prepared.
         sources: of all of them, in this order.
         seed: of the scattered starts.
@@ -568,8 +568,9 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
     """
     runs = (*fitted, *held_out)
     notes = [f"{source.file}: {note}" for trace, source in zip(runs, sources, strict=True) for note in trace.notes]
-    floor = {s: float(np.median([f[s].value for f in (sensor_floors(t, model) for t in fitted)]))
-             for s in fitted[0].outputs}
+    floors = [sensor_floors(t, model) for t in fitted]
+    floor = {s: float(np.median([f[s].value for f in floors if s in f])) for s in fitted[0].output_names
+             if any(s in f for f in floors)}
     if not any(_moves(t) for t in fitted):
         controlled, least = model.kind.signals.controlled, MOVING_RAM * fitted[0].scale
         reason = (f"no run to fit moves the {controlled.called} by {least * controlled.shown_scale:g} "
@@ -625,9 +626,10 @@ def cut_long_runs(runs: Sequence[Trace], sources: Sequence[Source], model: Model
 
 
 def make_problem(model: Model, fitted: Sequence[Trace], floor: Mapping[str, float], workers: int) -> LogProblem:
-    """The runs to fit with white noise of the floor's size."""
-    noise = tuple(noises.white_noise(floor[s]) for s in fitted[0].outputs)
-    return LogProblem(silence_readings(model), fitted[0], noise, workers=workers, also=tuple(fitted[1:]))
+    """The runs to fit with white noise of the floor's size; a signal that a run lacks counts nothing in it."""
+    noise = tuple(noises.white_noise(level) for level in floor.values())
+    first, *others = (replace(t, outputs=tuple(floor)) for t in fitted)
+    return LogProblem(silence_readings(model), first, noise, workers=workers, also=tuple(others))
 
 
 def find_hidden(problem: LogProblem, fit: Fit, ranges: Mapping[str, Range]

@@ -156,7 +156,8 @@ def describe_verdict(a: Answer) -> str:
 def _describe_unexplained(a: Answer) -> str:
     if a.explanation.base.is_at_floor and not a.explanation.effects:
         return ("The output of the controller differs from the model's, and no effect of the catalogue explains the "
-                "difference.")
+                "difference." if a.explanation.marks.is_firmware_different else
+                "The model fits this run, but not the held-out run; this run does not show what is missing.")
     worst, signals = _find_worst_signal(a), find_signals(a)
     best = min(a.candidates, key=lambda c: c.ratio, default=None)
     return (f"No effect of the catalogue explains the residual: {signals.find(worst).symbol} error "

@@ -8,7 +8,7 @@ from fdi.report.numbers import choose_unit, count_nouns, format_digits, list_fir
 from fdi.report.report import Cell, Column, Line, Mood, Report, Section, tabulate
 from fdi.trace.importing.conversion import Imported, ImportedSignal
 from fdi.trace.importing.formats import Measurement
-from fdi.trace.importing.guess import GuessedMap
+from fdi.trace.importing.guess import GuessedMap, list_recorded
 
 MOST = 12  # channels that a note names; a recording may have hundreds
 
@@ -36,12 +36,12 @@ def build_import_report(imported: Imported, measurement: Measurement, out: Path)
                   sections=[Section("Signals", [table, *lines])], next_command=f"rig compare {out}")
 
 
-def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path) -> Report:
-    """Which column is taken for which signal."""
+def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path, model: str | None = None) -> Report:
+    """Which column is taken for which signal; `model`: of the plant, as the next command names it."""
     moods: dict[str, Mood] = {"sure": "good", "likely": "doubtful", "unsure": "bad"}
     chosen = guessed.chosen
     signals = guessed.signals
-    missing = [signals.find(name).symbol for name in signals.required if name not in chosen]
+    missing = [s.symbol for s in list_recorded(signals) if s.name in signals.required and s.name not in chosen]
     notes = [f"no column was found for {', '.join(missing)}: complete the map by hand"] if missing else []
     if guessed.left:
         notes.append(f"columns left out: {list_first([f'{name} ({why})' for name, why in guessed.left.items()], MOST)}")
@@ -52,7 +52,7 @@ def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path)
         caption="The map says why in comments. Check what is not sure.")
     return Report("import", str(measurement.path), notes=notes, sections=[Section("Guess", [table])],
                   sentence=f"{out}: first map of {measurement.path.name} ({measurement.format}); check it",
-                  next_command=f"rig import {measurement.path} --map {out}",
+                  next_command=f"rig import {measurement.path} --map {out}" + (f" --model {model}" if model else ""),
                   data={"map": str(out), "signals": {name: {"source": source, "confidence": confidence}
                                                      for name, (source, confidence) in guessed.chosen.items()}})
 

@@ -248,13 +248,15 @@ class Trace:
     def scale(self) -> float:
         """The size of the motion: lengths that are right for a ram, whose command is at most 1 m, are multiplied by it.
 
-        It is the largest command that the plant declares, else a hundred times the range of this one.
+        It is the largest command that the plant declares, else a hundred times the range of this one; in an open loop
+        those of the controlled signal.
         """
-        largest = self.declared.command.largest
-        if math.isfinite(largest):
-            return largest
-        span = float(np.nanmax(self.command) - np.nanmin(self.command)) if not np.isnan(self.command).all() else 0.0
-        return 100.0 * span or 1.0
+        d = self.declared
+        sized = d.controlled if d.is_open_loop else d.command
+        if math.isfinite(sized.largest):
+            return sized.largest
+        column = self.columns[sized.name]
+        return 1.0 if np.isnan(column).all() else 100.0 * float(np.nanmax(column) - np.nanmin(column)) or 1.0
 
     def mask_unusable(self, name: str) -> Floats:
         """A column, NaN where it is missing or its row cannot be used."""

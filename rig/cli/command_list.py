@@ -218,7 +218,7 @@ COMMANDS = {
         (option("runs", nargs="+", metavar="RUN", help=f"runs to fit, of any commands: {MEASURED_TRACE}"),
          option("--holdout", action="append", default=[], metavar="RUN",
                 help="a run that no fit sees: shows whether the model holds (repeatable)"),
-         option("--signals", metavar="NAME,..", help="outputs to use (default: all that every run to fit has)"),
+         option("--signals", metavar="NAME,..", help="outputs to use (default: all that a run to fit has)"),
          *MODEL)),
     "import": Command(
         "make a trace.mcap from a recording: CSV, MF4, MAT, Parquet, CAN log; --guess writes the map it needs",
@@ -234,7 +234,8 @@ COMMANDS = {
          option("--force", action="store_true", help="let --guess replace a map that exists"),
          option("--dbc", metavar="FILE", help="DBC that decodes the raw frames (default: the bench; with --map "
                                                      "the shipped eha.dbc)"),
-         BENCH, TRUST)),
+         BENCH, option("--model", metavar="FILE|NAME",
+                       help="whose signals were recorded: model file, plant file or model name (default eha)"), TRUST)),
     "list": Command(
         "list names that other commands take: parameters, signals, sequences, effects, checks, models, benches, faults",
         "Names come with unit, range and default.",

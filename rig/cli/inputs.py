@@ -12,7 +12,6 @@ from fdi import foreign_code
 from plant.effects import load_effects
 from plant.errors import InputError
 from plant.model import Model, load_model
-from plant.signals import Signals
 
 
 def parse_changes(pairs: Sequence[str]) -> dict[str, str]:
@@ -78,15 +77,15 @@ def load_chosen_model(args: argparse.Namespace) -> Model:
     return load_model(args.model or "eha").replace(parse_changes(args.set))
 
 
-def load_declared_signals(args: argparse.Namespace) -> Signals:
-    """The signals that a CSV may have: those of the plant of --model, or of the EHA.
+def load_declared_model(args: argparse.Namespace) -> Model:
+    """The model of --model, or the EHA: its plant declares the signals that a recording has.
 
     Raises:
         InputError: an invalid model, or code of it that --trust does not allow.
     """
     foreign_code.load_plant_of_model(args.model, is_trusted=args.trust)
     foreign_code.load_effects_of_model(args.model, is_trusted=args.trust)
-    return load_model(args.model or "eha").kind.signals
+    return load_model(args.model or "eha")
 
 
 def list_signals(args: argparse.Namespace) -> list[str] | None:

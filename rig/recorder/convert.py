@@ -75,9 +75,9 @@ def read_raw_frames(path: Path) -> Iterator[Frame]:
         yield Frame(t_ns, message.cob_id, message.data)
 
 
-def import_csv(source: Path, out: Path) -> int:
-    """Make a log with signals only from a CSV trace; -> cycles."""
-    return _write_own(Trace.read(source), source, out)
+def import_csv(source: Path, out: Path, signals: plant_signals.Signals = plant_signals.EHA) -> int:
+    """Make a log with signals only from a CSV trace with the columns of these `signals`; -> cycles."""
+    return _write_own(Trace.read(source, signals=signals), source, out)
 
 
 def import_own_table(source: Path, out: Path) -> int | None:

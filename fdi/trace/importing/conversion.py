@@ -181,7 +181,7 @@ def parse_map(text: str, path: Path, declared: Signals = EHA) -> ImportMap:
     top = _read_table(path, "", parse_toml(text, path), MAP)
     signals = {name: _parse_signal(path, name, table, declared) for name, table in top["signals"].items()}
     for name in declared.required:
-        if name not in signals:
+        if name not in signals and not (declared.is_open_loop and name == declared.command.name):
             needed = declared.find(name)
             raise InputError(path, f"signals.{name}", f"a table with the source of {needed.symbol}, {needed.quantity}")
     owner: dict[str, str] = {}
@@ -190,6 +190,8 @@ def parse_map(text: str, path: Path, declared: Signals = EHA) -> ImportMap:
         if other != name and signal.minus is None and signals[other].minus is None:
             raise InputError(path, f"signals.{name}.source",
                              f"a column of its own; signals.{other} has {signal.term.source!r} already")
+    # in an open loop the drive is the command
+    signals.setdefault(declared.command.name, replace(signals[declared.drive.name], name=declared.command.name))
     return ImportMap(path, text, declared, signals, _parse_time(path, "time", top["time"]),
                      **_read_table(path, "trace", top["trace"], ROWS), **_read_table(path, "file", top["file"], FILE))
 

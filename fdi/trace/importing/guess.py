@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION
+from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION, LEAST_SPEED_CORRELATION
 from fdi.trace.importing.formats import OTHER_UNITS, Channel, Measurement, split_unit
 from fdi.trace.sensor_dynamics import find_comb
 from fdi.trace.trace import Floats
@@ -161,7 +161,7 @@ def _has_word(name: str, words: str) -> str:
     """The first of the words that a name has, alone or (four letters and more) within another; "" for none."""
     plain = _simplify_name(name)
     for word in words.split("|"):
-        pattern = word if len(word.replace(" ?", "")) >= 4 else rf"(?<=[ 0-9]){word}(?=[ 0-9])"
+        pattern = word if len(word.replace(" ?", "")) >= 4 and word[-2:-1] != " " else rf"(?<=[ 0-9]){word}(?=[ 0-9])"
         found = re.search(pattern, plain)
         if found:
             return found[0]
@@ -248,7 +248,8 @@ def _guess_time_unit(said: str, x: Floats) -> str:
 def _assign(columns: Columns, signals: Signals) -> dict[str, Guess]:
     """Each signal's column: the pair of most points first."""
     rated = [(signal.name, guess) for column, x in columns.data.items() if float(np.ptp(x)) > 0.0
-             for signal in signals[1:] if (guess := _rate_column(signal, signals, column, columns)) is not None]
+             for signal in list_recorded(signals)
+             if (guess := _rate_column(signal, signals, column, columns)) is not None]
     found: dict[str, Guess] = {}
     for name, guess in sorted(rated, key=lambda pair: -pair[1].points):
         if name not in found and guess.source not in {g.source for g in found.values()}:
@@ -258,6 +259,11 @@ def _assign(columns: Columns, signals: Signals) -> dict[str, Guess]:
         if signal.unit == "Pa" and signal.name in found:
             _pair_chambers(found[signal.name], columns.data)
     return {name: found[name] for name in signals.names if name in found}
+
+
+def list_recorded(signals: Signals) -> list[Signal]:
+    """The signals that a recording may have a column for: in an open loop the command is the drive."""
+    return [s for s in signals[1:] if not (signals.is_open_loop and s.role == "command")]
 
 
 def _list_words(signal: Signal, signals: Signals) -> list[tuple[str, float]]:
@@ -325,28 +331,37 @@ def _pair_chambers(guess: Guess, data: Mapping[str, Floats]) -> None:
 def _guess_by_motion(found: dict[str, Guess], columns: Columns, signals: Signals) -> None:
     """Command and controlled signal where names say nothing: the two free columns that follow each other best.
 
-    The later one is the controlled signal.
+    The later one is the controlled signal. In an open loop the drive takes the place of the command, and the speed that
+    of the controlled signal.
     """
-    command, controlled = signals.command.name, signals.controlled.name
-    si = signals.controlled.unit
+    is_open, controlled = signals.is_open_loop, signals.controlled
+    first = signals.drive if is_open else signals.command
     data, taken = columns.data, {guess.source for guess in found.values()}
-    free = [c for c in data if c not in taken and (
-        columns.measures(c, si) or not columns.units[c] or columns.has_raw_unit(c, si))]
-    known = {name: found[name] for name in (command, controlled) if name in found}
-    firsts, seconds = ([known[name].source] if name in known else free
-                       for name in (command, controlled))
-    pairs = [(abs(correlate(data[a], data[b])), a, b) for a in firsts for b in seconds
-             if a != b and len(data[a]) == len(data[b])]
-    if len(known) == 2 or not pairs or max(pairs)[0] <= 0.9:
+    known = {s.name: found[s.name] for s in (first, controlled) if s.name in found}
+    firsts, seconds = ([known[s.name].source] if s.name in known else
+                       [c for c in data if c not in taken and (columns.measures(c, s.unit) or not columns.units[c]
+                                                               or columns.has_raw_unit(c, s.unit))]
+                       for s in (first, controlled))
+    pairs = [(abs((correlate_speed if is_open else correlate)(data[a], data[b])), a, b)
+             for a in firsts for b in seconds if a != b and len(data[a]) == len(data[b])]
+    if len(known) == 2 or not pairs or max(pairs)[0] <= (LEAST_SPEED_CORRELATION if is_open else 0.9):
         return
     r, a, b = max(pairs)
-    if not known and measure_lead(data[a], data[b]) < 0:
+    if not known and not is_open and measure_lead(data[a], data[b]) < 0:
         a, b = b, a
-    unit = next((guess.unit for guess in known.values()),
-                UNITS["mm"] if si == "m" else find_unit(si) or Unit(si, si, Fraction(1)))
-    for name, column, other, order in ((command, a, b, "first"), (controlled, b, a, "later")):
-        more = "" if known else f", and it comes {order}"
-        found.setdefault(name, Guess(column, unit, 1.5, [f"no name says so; correlation {r:.3f} with {other}{more}"]))
+    for signal, column, other, order in ((first, a, b, "first"), (controlled, b, a, "later")):
+        unit = next((guess.unit for guess in known.values() if guess.unit.si == signal.unit),
+                    UNITS["mm"] if signal.unit == "m" else
+                    find_unit(signal.unit) or Unit(signal.unit, signal.unit, Fraction(1)))
+        found.setdefault(signal.name, Guess(column, unit, 1.5, [
+            f"no name says so; correlation {r:.3f} {'of drive and speed ' if is_open else ''}with {other}"
+            + ("" if known else f", and it comes {order}")]))
+
+
+def correlate_speed(drive: Floats, x: Floats) -> float:
+    """Correlation of a drive, (n,), and the speed of `x`, (n,), over a hundredth of them: noise hides a shorter one."""
+    lag = max(1, len(x) // 100)
+    return correlate(np.convolve(drive, np.full(lag, 1.0 / lag), "valid")[:len(x) - lag], x[lag:] - x[:-lag])
 
 
 def correlate(a: Floats, b: Floats) -> float:
@@ -462,7 +477,7 @@ def _list_file_lines(measurement: Measurement) -> list[str]:
 def _list_signal_lines(signal: Signal, signals: Signals, guess: Guess | None, columns: Columns) -> list[str]:
     name, quantity = signal.name, f"{signal.symbol}, {signal.quantity}"
     if guess is None:
-        if name not in signals.required:
+        if name not in signals.required or signal not in list_recorded(signals):
             return []
         return [f"# [signals.{name}]  # {quantity}: no column found; every analysis needs it", '# source = ""',
                 f'# unit = "{signal.unit}"', ""]

@@ -12,9 +12,9 @@ from fdi.trace.importing.conversion import ImportMap, import_measurement, read_m
 from fdi.trace.importing.formats import Measurement, open_measurement
 from fdi.trace.importing.guess import guess_map
 from plant.errors import InputError
-from plant.parameters import load_nominal_values
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import give_answer
+from rig.cli.inputs import load_declared_model
 from rig.recorder.convert import RAW_SUFFIXES, import_csv, import_frames, import_own_table, open_can_log, write_imported
 
 
@@ -52,7 +52,7 @@ def import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
         cycles = import_frames(source, out, bench, Path(args.dbc) if args.dbc else None)
     elif source.name.endswith((".csv", ".csv.gz")):
         try:
-            cycles = import_csv(source, out)
+            cycles = import_csv(source, out, load_declared_model(args).kind.signals)
         except InputError as error:
             if "in the header" not in error.expected:
                 raise
@@ -69,9 +69,10 @@ def import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
 
 def import_by_map(args: argparse.Namespace, source: Path, out: Path) -> int:
     """Import the columns or frames that --map names."""
-    chosen = read_map(Path(args.map))
+    model = load_declared_model(args)
+    chosen = read_map(Path(args.map), model.kind.signals)
     measurement = open_source(args, source, chosen)
-    imported = import_measurement(measurement, chosen, load_nominal_values()["controller.period"])
+    imported = import_measurement(measurement, chosen, model["controller.period"])
     write_imported(imported.trace, chosen, out)
     return give_answer(build_import_report(imported, measurement, out), args)
 
@@ -79,9 +80,9 @@ def import_by_map(args: argparse.Namespace, source: Path, out: Path) -> int:
 def write_guess(args: argparse.Namespace, source: Path, out: Path) -> int:
     """Write the map that the names and values of the columns suggest."""
     measurement = open_source(args, source, None)
-    guessed = guess_map(measurement)
+    guessed = guess_map(measurement, load_declared_model(args).kind.signals)
     write_text(out, guessed.text)
-    return give_answer(build_guess_report(guessed, measurement, out), args)
+    return give_answer(build_guess_report(guessed, measurement, out, args.model), args)
 
 
 def open_source(args: argparse.Namespace, source: Path, chosen: ImportMap | None) -> Measurement:

@@ -20,7 +20,7 @@ from plant.model import Model
 from rig.cli.answer import give_answer, show_progress
 from rig.cli.commands.diff import read_and_compare_runs
 from rig.cli.discovery_inputs import load_known_model
-from rig.cli.inputs import list_signals, load_declared_signals
+from rig.cli.inputs import list_signals, load_declared_model
 from rig.interrupts import catch_signals
 from rig.view import viewer
 from rig.view.recording import Drawing, draw_comparison, draw_run, draw_runs, write_recording
@@ -107,10 +107,11 @@ def draw(args: argparse.Namespace, progress: Progress) -> Drawing:
         InputError: a trace, model or option that cannot be used.
     """
     if args.others:
-        return draw_runs(read_and_compare_runs([args.trace, *args.others], load_declared_signals(args), progress))
+        signals = load_declared_model(args).kind.signals
+        return draw_runs(read_and_compare_runs([args.trace, *args.others], signals, progress))
     progress("reading", 0.0)
     if not args.compare:
-        return draw_run(Trace.read(args.trace, all=True, signals=load_declared_signals(args)))
+        return draw_run(Trace.read(args.trace, all=True, signals=load_declared_model(args).kind.signals))
     model, before = load_models(args)
     trace, *repeats = (Trace.read(file, signals=model.kind.signals) for file in (args.trace, *args.repeat))
 
