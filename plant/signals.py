@@ -83,10 +83,7 @@ class Signals(tuple[Signal, ...]):
 
     def find(self, name: str) -> Signal:
         """The signal of that name. Raises KeyError."""
-        for signal in self:
-            if signal.name == name:
-                return signal
-        raise KeyError(name)
+        return {signal.name: signal for signal in self}[name]
 
     @property
     def names(self) -> tuple[str, ...]:
