@@ -39,7 +39,7 @@ from fdi.estimation.fit import (
 )
 from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, is_long, judge_on_all
 from fdi.estimation.noise import Noise
-from fdi.estimation.replay import leave_out_rest, measure_decided_errors
+from fdi.estimation.replay import find_undecided_rows, leave_out_rest, measure_decided_errors
 from fdi.estimation.unidentifiable import finish_fit, list_powers, scale_together
 from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import (
@@ -305,14 +305,17 @@ class Search:
         errors = _measure_rms(own, signals)
         coarse = [self.coarse.get(s, 0.0) for s in signals]
         others = others or [p.compute_residuals(found.free, found.x[None])[0] for p in self.repeats]
+        floor = {s: float(np.hypot(n.level, c)) for s, n, c in zip(signals, self.noise, coarse, strict=True)}
         if not others:
-            floor = {s: float(np.hypot(n.level, c)) for s, n, c in zip(signals, self.noise, coarse, strict=True)}
             errors = measure_decided_errors(self.problem, found, floor)
             return Hypothesis(effects, found, errors, {s: errors[s] / floor[s] for s in signals})
         pairs = zip(self.repeats, others, strict=True)
         cost = float(np.mean([compute_misfit(p.whiten_residuals(r[None]))[0] for p, r in pairs]))
-        typical = own if self.model.kind.correct is None else _leave_out_worst(own)
-        ratio = dict(zip(signals, measure_repeating(typical, others, coarse), strict=True))
+        ratio = dict(zip(signals, measure_repeating(own, others, coarse), strict=True))
+        if self.model.kind.correct is not None and max(ratio.values()) > RESIDUAL_IS_NOISE:
+            undecided = find_undecided_rows(replace(self.problem, also=(), _lanes={}), found, floor)
+            typical = _leave_out_worst(np.where(undecided, np.nan, own))
+            ratio = dict(zip(signals, measure_repeating(typical, others, coarse), strict=True))
         return Hypothesis(effects, found, errors, ratio, cost, tuple(others))
 
     def make_unseen_problem(self, steps: int | None = None) -> Problem:
@@ -466,8 +469,11 @@ def measure_repeating(residual: Floats, others: Sequence[Floats], coarse: Sequen
     return ratios
 
 
-def _leave_out_worst(residuals: Floats, share: float = 0.1) -> Floats:
-    """Residuals (s, n) without each signal's worst blocks: in a slow motion a surface may also stop for an instant."""
+def _leave_out_worst(residuals: Floats, share: float = 0.15) -> Floats:
+    """Residuals (s, n) without each signal's worst blocks, as many as `compute_typical_rms` leaves out.
+
+    A surface may stop for an instant in a slow motion.
+    """
     sums = sum_blocks(np.nan_to_num(residuals))
     kept = sums <= np.quantile(sums, 1.0 - share, axis=1, keepdims=True)
     return np.where(np.repeat(kept, BLOCK, axis=1)[:, :residuals.shape[1]], residuals, np.nan)
