@@ -88,6 +88,19 @@ def list_directions(effect: str, model: Model) -> list[Direction]:
     return list(found.values())
 
 
+def move_effect(model: Model, values: Mapping[str, float], way: Direction, size: float) -> dict[str, float]:
+    """The parameters of an effect, by name, whose first one has moved by `size` from its value in a model's `values`.
+
+    The others move along in proportion; those that say where an effect is have their starting values.
+    """
+    entry, at = model.find_effect(way.effect), {}
+    for name, start in way.start.items():
+        off = entry.off.get(name, model.nominal.get(name, 0.0))
+        moved = values[name] + (start - off) * size / way.reach
+        at[name] = start if entry.parameters[name].unit in WITHOUT_SIZE else moved
+    return at
+
+
 @dataclass
 class SimulatedRun(Problem):
     """A problem whose `run`, (s, n) SI, stands for the measurement, where something was measured."""
@@ -210,11 +223,7 @@ class VirtualTest:
         values = {**model.values, **self.fit.values}
         rows = []
         for way, size in zip(ways, sizes, strict=True):
-            entry, at = model.find_effect(way.effect), {}
-            for name, start in way.start.items():
-                off = entry.off.get(name, model.nominal.get(name, 0.0))
-                moved = values[name] + (start - off) * size / way.reach
-                at[name] = start if entry.parameters[name].unit in WITHOUT_SIZE else moved
+            at = move_effect(model, values, way, size)
             rows.append([at.get(name, values[name]) for name in names])
         return names, np.array(rows)
 

@@ -16,18 +16,24 @@ from fdi.discovery.laws.terms import describe_formula
 from fdi.discovery.residual_pattern import Pattern, find_smooth_rows
 from fdi.discovery.runs import Source
 from fdi.discovery.search import Hypothesis
+from fdi.discovery.sensitivity import NEEDED, RUNGS, TRIALS, Claim
 from fdi.discovery.update_model import ModelUpdate, Row
+from fdi.estimation.binomial import Share
 from fdi.estimation.fit import Value
 from fdi.report.compare_report import OTHER_ACTUATOR
 from fdi.report.drawing import (
     AFTER,
+    AMBER,
     BEFORE,
     GREEN,
     ORANGE,
+    RED,
+    Mark,
     Panel,
     area,
     axes,
     call,
+    dot,
     draw_panels,
     draw_residuals,
     instant,
@@ -60,7 +66,7 @@ WORD_MOODS: dict[str, Mood] = {"explains": "good", "equal": "doubtful", "part": 
 
 def build_explanation_report(a: Answer, title: str, model: str, sources: Sequence[Source], command: str = "",
                              next_command: str = "", pattern: Pattern | None = None, notes: Sequence[str] = (),
-                             files: Sequence[tuple[str, str]] = ()) -> Report:
+                             files: Sequence[tuple[str, str]] = (), claims: Sequence[Claim] = ()) -> Report:
     """The report of an explanation.
 
     Args:
@@ -73,6 +79,7 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
         pattern: shape of the residual, where it was looked for.
         notes: what a reader must know about the runs.
         files: (label, path) of what was written.
+        claims: of sizes that the search names, where they were measured.
     """
     e, page = a.explanation, Medium.PAGE
     trace, marks = e.search.problem.trace, e.marks
@@ -115,10 +122,11 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
             (Column("would reveal it"), lambda b: b.revealed_by),
             caption="Tolerances of a healthy unit make up for these effects, so this test says nothing about them.")],
             medium=page),
+        *([_list_claims(claims)] if claims else []),
         Section("Provenance", [Listing(command, medium=page)] if command else [])]
     facts = [("model", model), *list_sources(sources, bool(a.baseline["holdout"]))]
     return Report("explain", title, a.verdict, MOODS[a.verdict], describe_verdict(a), facts, notes, sections,
-                  next_command, files, collect_data(a, notes))
+                  next_command, files, collect_data(a, notes, claims))
 
 
 def find_signals(a: Answer) -> Signals:
@@ -294,8 +302,58 @@ def list_sources(sources: Sequence[Source], has_holdout: bool) -> list[tuple[str
     return [(role, source.file) for role, source in zip(roles, sources, strict=True)]
 
 
-def collect_data(a: Answer, notes: Sequence[str] = ()) -> dict[str, Any]:
-    """The answer of `rig explain --json`, with notes on the runs; SI units."""
+def _list_claims(claims: Sequence[Claim]) -> Section:
+    """From which size on each effect is named, and what smaller ones were taken for."""
+    return Section("Sizes that are named", [
+        tabulate(claims, (Column("effect"), lambda c: Cell(c.effect, "good" if c.named else "bad")),
+                 (Column("parameter", medium=Medium.PAGE), lambda c: Cell(name_parameter(c.parameter), "muted")),
+                 (Column("named from", align="right"), _describe_claim),
+                 (Column("named", align="right"), lambda c: _format_count(c.named)),
+                 (Column("interval", align="right"), lambda c: _format_share(c.named)),
+                 (Column("others taken for"), lambda c: list_first([f"{w} {n}" for w, n in c.taken_for.items()], 2)),
+                 caption="Each effect was hidden in this unit, at sizes a factor of two apart, in "
+                         f"{TRIALS} runs a size with other noise. Named from: the smallest change of its first "
+                         f"parameter that at least {NEEDED} of {TRIALS} runs named, and nothing else; the interval (95 "
+                         "%) is that of this share. Of smaller sizes nothing is claimed."),
+        Figure("Runs that name the effect and nothing else, of all at that size. Right: the largest usual size.",
+               partial(draw_claims, claims))])
+
+
+def _describe_claim(c: Claim) -> str:
+    if c.smallest is None:
+        return "no usual size"
+    return format_amount(c.smallest, c.unit)
+
+
+def _format_count(share: Share | None) -> str:
+    return f"{share.good} of {share.of}" if share else NO_NUMBER
+
+
+def _format_share(share: Share | None) -> str:
+    return f"{100 * share.low:.0f} .. {100 * share.high:.0f} %" if share else NO_NUMBER
+
+
+def draw_claims(claims: Sequence[Claim]) -> str:
+    """How often each effect was named, by its size over the largest usual one."""
+    marks: list[Mark] = [*name_rows([c.effect for c in claims])]
+    for y, c in enumerate(claims):
+        for size, named, of in c.counts:
+            x, colour = size / c.largest, choose_colour_of_share(named / of)
+            marks += [dot(x, y, colour, marker="s", ms=15, alpha=0.3),
+                      call("text", x, y, f"{named}/{of}", ha="center", va="center", fontsize=7)]
+    marks.append(axes(xscale="log", xlim=(0.5**RUNGS, 1.5), xlabel="size over the largest usual size"))
+    return draw_panels("claims", [[marks]], 0.8 + 0.27 * len(claims))
+
+
+def choose_colour_of_share(share: float) -> str:
+    """Green where a size is named often enough, red where it is named in less than half of the runs."""
+    if share >= NEEDED / TRIALS:
+        return GREEN
+    return AMBER if share > 0.5 else RED
+
+
+def collect_data(a: Answer, notes: Sequence[str] = (), claims: Sequence[Claim] = ()) -> dict[str, Any]:
+    """The answer of `rig explain --json`, with notes on the runs and claims of sizes; SI units."""
     e = a.explanation
     held = e.unseen.get(a.best.effects)
     has_ledger = len(e.effects) > 1 and e.verdict != "AMBIGUOUS"
@@ -308,7 +366,11 @@ def collect_data(a: Answer, notes: Sequence[str] = ()) -> dict[str, Any]:
         "law_search": None if a.law is None else _collect_law_data(a.law, a.law_effects),
         "excerpt": e.excerpt or None,
         "ledger": [{"effect": effect, "error": error, "holdout": holdout} for effect, error, holdout in a.ledger]
-        if has_ledger else None}
+        if has_ledger else None,
+        "sensitivity": [{"effect": c.effect, "parameter": c.parameter, "unit": c.unit, "smallest_named": c.smallest,
+                         "named": c.named._asdict() if c.named else None,
+                         "counts": [{"size": size, "named": named, "of": of} for size, named, of in c.counts],
+                         "taken_for": c.taken_for} for c in claims] or None}
     return {
         "verdict": e.verdict, "effects": e.effects, "candidates": candidates,
         "baseline": {**a.baseline, "ratio": e.base.ratio},

@@ -335,19 +335,18 @@ def summarise_contenders(times: Mapping[str, Times]) -> dict[str, Any]:
 
 
 def list_targets(tables: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[dict[str, Any]]:
-    """The ratios to cyclictest and to the responder in C, and the execution, with their limits; None: not measured."""
+    """The ratios to cyclictest and to the responder in C, and the execution, with their limits; None: not measured.
+
+    The benches of foreign controllers have the limits of the shipped one.
+    """
+    rows = [*(("lateness", name, CYCLICTEST, 1.2) for name in (COMPILED, *MAPPED) if name in tables["lateness"]),
+            *((quantity, COMPILED, IN_C, 1.3) for quantity in ("feedback_response", "valve_response"))]
     found: list[tuple[str, float | None, float, str]] = []
-    for quantity, rival, limit in (("lateness", CYCLICTEST, 1.2), ("feedback_response", IN_C, 1.3),
-                                   ("valve_response", IN_C, 1.3)):
+    for quantity, name, rival, limit in rows:
         for share in ("p50", "p99"):
-            own, other = (tables[quantity].get(name, {}).get(share) for name in (COMPILED, rival))
+            own, other = (tables[quantity].get(each, {}).get(share) for each in (name, rival))
             ratio = own / other if own is not None and other else None
-            found.append((f"{quantity.replace('_', ' ')} {share}, compiled / {rival}", ratio, limit, ""))
-    for name in MAPPED:
-        for share in ("p50", "p99"):
-            own, other = (tables["lateness"].get(each, {}).get(share) for each in (name, COMPILED))
-            if own is not None:
-                found.append((f"lateness {share}, {name} / compiled", own / other if other else None, 1.2, ""))
+            found.append((f"{quantity.replace('_', ' ')} {share}, {name} / {rival}", ratio, limit, ""))
     found += [(f"execution p99.9, {name}", tables["execution"][name].get("p99_9"), 100.0, "us")
               for name in (COMPILED, *MAPPED) if name in tables["execution"]]
     return [{"name": name, "value": value, "limit": limit, "unit": unit,

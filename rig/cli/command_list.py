@@ -185,7 +185,15 @@ COMMANDS = {
          option("--write-effect", metavar="FILE.py",
                 help="write the law of the residual as an effect to add; where no law holds, its shape, to edit (with "
                      "--out FILE.html a law that holds is written beside it, as FILE_law.py)"),
-         offer_page("explain.html"))),
+         offer_page("explain.html"),
+         Group("sizes that the search names", (
+             option("--sensitivity", action="store_true",
+                    help="hide each effect at several sizes in the unit that explains the runs, explain the simulated "
+                         "runs, and say from which size on it is named (an hour of computing for all effects; the "
+                         "same command resumes)"),
+             option("--hide", metavar="NAME,..", help="effects that --sensitivity hides (default: all)"),
+             option("--workers", metavar="N|ADDRESS",
+                    help="processes, or the address of a Dask scheduler, for --sensitivity (default: all cores)"))))),
     "export": Command(
         "write a trace in another format, .csv, .csv.gz (signals), .log, .blf, .asc, .trc (raw frames), or a model as "
         "an FMU",

@@ -43,8 +43,8 @@ def test_the_table_counts_by_effect_and_size() -> None:
     assert table[3] == "| `sensor_gain` | none | 0 of 0 | 0 of 0 |"
 
 
-def test_tolerances_make_up_for_a_clogged_filter_and_the_loop_for_an_offset() -> None:
-    """Were the tolerances of a healthy unit held, a clogging of 0.001 would show; a load shows by its pressure."""
+def test_tolerances_make_up_for_an_offset_of_any_usual_size_and_not_for_a_load() -> None:
+    """A load shows by its pressure; the loop moves the ram by what its transducer is off."""
     t = np.arange(4000) * 1e-3
     com = np.where(t < 2.0, 4e-3 * np.sign(np.sin(2 * np.pi * t)), 2e-3 * np.sin(2 * np.pi * 1.5 * t))
     model, effects = Model(), ("constant_load", "filter_clogging", "sensor_offset")
@@ -53,22 +53,13 @@ def test_tolerances_make_up_for_a_clogged_filter_and_the_loop_for_an_offset() ->
     problem = Problem(complete_model(model), trace, noise, bare=silence_readings(model), workers=2)
     fit = fit_unknowns(problem, list_all_unknowns(model), rounds=3)
     assert [(h.effect, h.usual) for h in find_hidden_effects(problem, fit, effects)] == [("sensor_offset", 2e-4)]
-    sizes = detectable_sizes.find_detectable_sizes(problem, fit, effects)
-    assert sizes["filter_clogging"] > 0.03 and sizes["sensor_offset"] == np.inf, sizes
-    alone = 10.0 * 2e4 / np.sqrt(4000.0) * model["jack.area"]  # N: gain 100 if nothing else could move
-    assert alone < sizes["constant_load"] < 20.0 * alone
-
-
-def test_a_failed_fit_to_a_small_size_makes_no_small_size_visible() -> None:
-    """What tolerances make up for at a size of 3 they make up for at 2."""
-    assert detectable_sizes.find_least_gains([(1.0, 2.0), (3.0, 40.0), (2.0, 500.0), (4.0, 900.0)]) == [
-        (1.0, 2.0), (2.0, 40.0), (3.0, 40.0), (4.0, 900.0)]
 
 
 @pytest.mark.slow
 def test_claims_hold(tmp_path: Path) -> None:
-    """About two minutes a case."""
-    rows = detectable_sizes.run_study(2 * len(detectable_sizes.EFFECTS), tmp_path)
+    """About an hour for each effect."""
+    effects = ("null_bias", "constant_load")
+    rows = detectable_sizes.run_study(4 * len(effects), tmp_path, effects=effects)
     large = [row["found"] for row in rows if row["factor"] > 1.0 and row["found"] is not None]
     small = [row["found"] for row in rows if row["factor"] < 1.0 and row["found"] is not None]
     assert sum(large) >= 0.9 * len(large) and sum(small) <= 0.5 * len(small)

@@ -2,12 +2,20 @@
 from __future__ import annotations
 
 import argparse
+import os
+from collections.abc import Sequence
+from pathlib import Path
 
 from fdi.discovery.explain_runs import Answer, explain_runs
-from fdi.discovery.runs import read_runs
+from fdi.discovery.runs import Runs, read_runs
+from fdi.discovery.sensitivity import Claim, describe_unit
+from fdi.progress import Progress
 from fdi.report.explain_report import build_explanation_report
-from rig.cli.answer import choose_file, choose_places, give_answer, show_progress
-from rig.cli.discovery_inputs import format_command_line, load_known_model
+from plant.errors import InputError
+from rig.campaign.batch import Workers
+from rig.campaign.sensitivity import measure_sensitivity
+from rig.cli.answer import Places, choose_file, choose_places, give_answer, show_progress
+from rig.cli.discovery_inputs import format_command_line, load_known_model, split_words
 from rig.cli.inputs import format_arguments, list_signals
 
 
@@ -15,7 +23,13 @@ def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 if nothing is missing, 1 otherwise."""
     places = choose_places(args, "explain.html", args.trace)
     choose_file(args.write_effect, (".py",), args.trace, "--write-effect")
-    model, _ = load_known_model(args)
+    workers = parse_workers(args.workers)
+    if not args.sensitivity and (args.hide or args.workers):
+        raise InputError("--hide" if args.hide else "--workers", args.hide or args.workers, "--sensitivity beside it")
+    model, known = load_known_model(args)
+    hidden = args.hide.split(",") if args.hide else []
+    if hidden:
+        split_words(hidden, args.trace, model.plant)  # refuses names that are no effects
     with show_progress(is_silent=args.json or args.quiet) as progress:
         progress("reading", 0.0)
         runs = read_runs(model, args.trace, args.repeat, args.holdout, list_signals(args))
@@ -23,9 +37,34 @@ def run_command(args: argparse.Namespace) -> int:
         answer, pattern = explain_runs(runs, args.seed, args.write_effect, progress, law_file)
         effect_file = args.write_effect or (str(law_file) if answer.law_effects else "")
         files = [*places.files, *([("effect", effect_file)] if effect_file else [])]
+        claims = _measure_claims(args, runs, answer, hidden, known.effect_files, workers, places, progress)
         report = build_explanation_report(answer, args.trace, args.model or "eha", runs.sources, format_command_line(),
-                                          choose_next_command(args, answer, effect_file), pattern, runs.notes, files)
+                                          choose_next_command(args, answer, effect_file), pattern, runs.notes, files,
+                                          claims)
     return give_answer(report, args, int(answer.verdict != "NOTHING_MISSING"), places)
+
+
+def parse_workers(text: str | None) -> Workers:
+    """What --workers names: a number of processes, or a Dask scheduler; all cores without it. Raises InputError."""
+    if text is None:
+        return Workers(len(os.sched_getaffinity(0)), single_threaded=True)
+    if "://" in text:
+        return Workers(scheduler=text, single_threaded=True)
+    if not text.isdecimal() or int(text) < 1:
+        raise InputError("--workers", text, "1 or more processes, or the address of a Dask scheduler such as "
+                                            "tcp://127.0.0.1:8786")
+    return Workers(int(text), single_threaded=True)
+
+
+def _measure_claims(args: argparse.Namespace, runs: Runs, answer: Answer, hidden: Sequence[str],
+                    effect_files: Sequence[str], workers: Workers, places: Places, progress: Progress) -> list[Claim]:
+    """What --sensitivity finds, with its rows in a file beside the page or in this folder; nothing without it."""
+    if not args.sensitivity:
+        return []
+    files = [str(Path(file).absolute()) for file in effect_files]
+    unit = describe_unit(runs, answer, hidden, files)
+    page = places.page or places.answer or Path("explain.html")
+    return measure_sensitivity(unit, answer, page.with_name(f"{page.stem}_sensitivity.jsonl"), workers, progress)
 
 
 def choose_next_command(args: argparse.Namespace, answer: Answer, effect_file: str = "") -> str:

@@ -1,0 +1,278 @@
+"""Which sizes of an effect `explain` names: proved by hiding effects in the user's own unit and explaining the runs.
+
+The unit has the parameters of the fit that explains the measured runs. It is simulated on their commands, with their
+noise and its colour, with an effect hidden in it, and the simulated runs go the way that measured ones go. A size
+counts if at least `NEEDED` of `TRIALS` runs with other noise name the effect, alone.
+
+Sizes are the largest usual one and halves of it, quarters and so on (the rungs of a ladder). An effect is tried first
+where a simulated gain says that it just shows (detectable.py), then at larger or smaller sizes, until one rung is named
+and the next smaller one is not. A rung on which that can no longer be reached is left at once.
+"""
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdi.discovery.detectable import Direction, VirtualTest, list_directions, move_effect
+from fdi.discovery.explain_runs import Answer, explain_runs
+from fdi.discovery.runs import Runs, collect_runs
+from fdi.estimation.binomial import Share, measure_share
+from fdi.estimation.fit import limit_friction_values
+from fdi.estimation.noise import Noise
+from fdi.thresholds import GAIN_DETECTED
+from fdi.trace.trace import Floats, Trace
+from plant.effects import load_effects
+from plant.errors import InputError
+from plant.lanes import Lanes
+from plant.model import Model
+from plant.plants import load_plant
+from plant.run import simulate
+
+TRIALS, NEEDED = 10, 9
+TRIALS_AT_ONCE = 4  # of a rung, before it is looked at again: most rungs that miss are decided by the first
+RUNGS = 8  # the smallest size is the largest over 2**7
+FINER = 2  # times the usual number of solver steps: a unit is no copy of the model that is fitted to it
+
+
+class Injection(NamedTuple):
+    """An effect to hide: at 2**-rung times its largest usual size, with the noise of one trial."""
+
+    number: int
+    effect: str
+    rung: int
+    trial: int
+
+
+class Play(NamedTuple):
+    """What a run plays: columns (n,); the drive counts where the plant has no controller of its own."""
+
+    command: Floats
+    load: Floats
+    drive: Floats
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit to hide effects in, and how its runs are explained. It travels to other processes."""
+
+    model: Model  # which explains: the user's, with the effects that were found
+    values: Mapping[str, float]  # of the unit, "group.field" to SI value: what was fitted
+    noise: Mapping[str, Noise]  # by measured signal
+    play: Play
+    repeats: int
+    holdout: Play | None
+    effects: tuple[str, ...]  # to hide
+    effect_files: tuple[str, ...] = ()
+    plant_file: str = ""
+
+
+class Claim(NamedTuple):
+    """What was counted of an effect. `named` is empty where not even the largest usual size is named often enough."""
+
+    effect: str
+    parameter: str
+    unit: str
+    largest: float  # usual size: distance from the off value, SI
+    smallest: float | None  # size that was named NEEDED times of TRIALS
+    named: Share | None
+    counts: Sequence[tuple[float, int, int]]  # (size, named, of) of each size that was tried, smallest first
+    taken_for: Mapping[str, int]  # what the others were taken for, with how often
+
+
+def describe_unit(runs: Runs, answer: Answer, effects: Sequence[str] = (), effect_files: Sequence[str] = ()) -> Unit:
+    """The unit behind measured runs that a model explains.
+
+    Args:
+        runs: the measured runs.
+        answer: the explanation of them.
+        effects: to hide; default: each that the search can name and has not named.
+        effect_files: with the user's own effects, for other processes.
+
+    Raises:
+        InputError: more than noise is left, sensors that filter or delay, or an effect that cannot be hidden.
+    """
+    e, best = answer.explanation, answer.best
+    if runs.est.sensors:
+        raise InputError("--sensitivity", ", ".join(runs.est.sensors), "sensors that neither filter nor delay")
+    if not best.is_at_floor:
+        raise InputError("--sensitivity", answer.verdict, "runs that the model explains; here more than noise is left, "
+                         "so no simulated run stands for a measured one (rig add first)")
+    offered = [name for name in e.search.effects if name not in best.effects]
+    for name in effects:
+        if name not in offered:
+            raise InputError("--hide", name, f"one of {', '.join(offered)}")
+    fitted = limit_friction_values(best.fit.values)
+    found = {p for name in best.effects for p in runs.model.find_effect(name).fitted if p in fitted}
+    problem = e.search.problem
+    kind = runs.model.kind
+    return Unit(runs.model.replace({name: fitted[name] for name in sorted(found)}, "fit"), fitted,
+                dict(zip(problem.trace.outputs, problem.noise, strict=True)), _read_play(runs.est), len(runs.repeats),
+                None if runs.holdout is None else _read_play(runs.holdout), tuple(effects or offered),
+                tuple(effect_files), str(kind.file or ""))
+
+
+def _read_play(trace: Trace) -> Play:
+    return Play(trace.command, trace.load, trace.drive)
+
+
+def find_first_rungs(answer: Answer, effects: Sequence[str]) -> dict[str, int]:
+    """The rung of each effect on which a simulated gain says that it shows; the largest size where none does.
+
+    It is one above the smallest that gains `GAIN_DETECTED`: a search wants more than a gain in a known place.
+    """
+    search = answer.explanation.search
+    ways = {name: list_directions(name, search.model)[:1] for name in effects}
+    tried = [(way, rung) for each in ways.values() for way in each for rung in range(RUNGS)]
+    gains = VirtualTest(search.problem, answer.best.fit).measure_gains(
+        [way for way, _ in tried], [way.most * 0.5**rung for way, rung in tried]) if tried else []
+    shown: dict[str, int] = dict.fromkeys(effects, 0)
+    for (way, rung), gain in zip(tried, gains, strict=True):
+        if gain > GAIN_DETECTED:
+            shown[way.effect] = max(shown[way.effect], rung - 1)
+    return shown
+
+
+def choose_way(model: Model, effect: str, trial: int) -> Direction:
+    """The sign of an effect in a trial: both in turn, where both are usual."""
+    ways = list_directions(effect, model)
+    return ways[trial % len(ways)]
+
+
+def measure_size(model: Model, effect: str, rung: int) -> float:
+    """The size of an effect on a rung, of the larger sign: the distance of its first parameter from the off value."""
+    return 0.5**rung * max(way.most for way in list_directions(effect, model))
+
+
+def hide_effect(unit: Unit, injection: Injection) -> Runs:
+    """The simulated runs of the unit with the effect in it, as `read_runs` would read them."""
+    way = choose_way(unit.model, injection.effect, injection.trial)
+    own = unit.model.replace(unit.values, "fit").with_effects([injection.effect])
+    changed = move_effect(own, own.values, way, way.most * 0.5**injection.rung)
+    hidden = own.replace(limit_friction_values({**own.values, **changed}), "hidden effect")
+    seeds = np.random.SeedSequence([injection.number]).spawn(2 + unit.repeats)
+    est, unseen, *repeats = (np.random.default_rng(seed) for seed in seeds)
+    runs = [_simulate_run(unit, hidden, unit.play, rng) for rng in (est, *repeats)]
+    holdout = None if unit.holdout is None else _simulate_run(unit, hidden, unit.holdout, unseen)
+    return collect_runs(unit.model, runs[0], runs[1:], holdout, list(unit.noise))
+
+
+def _simulate_run(unit: Unit, model: Model, play: Play, rng: np.random.Generator) -> Trace:
+    """One run of a unit: in closed loop, or driven as the measured one was, where the plant has no controller.
+
+    In closed loop the noise of the sensors is part of what the controller reads.
+    """
+    signals, n = model.kind.signals, len(play.command)
+    noise = {s.name: draw_noise(unit.noise[s.name], n, rng) for s in signals.outputs if s.name in unit.noise}
+    columns = {signals.command.name: play.command}
+    columns |= {} if signals.load is None else {signals.load.name: play.load}
+    if model.kind.controller:
+        drawn = rng.standard_normal((n, len(signals.outputs) + 1))
+        fed = [(i, s) for i, s in enumerate(signals.outputs) if s.noise and s.name in noise]
+        for i, signal in fed:
+            drawn[:, i] = noise.pop(signal.name) / unit.noise[signal.name].level
+        heard = model.replace({s.noise: unit.noise[s.name].level for _, s in fed}, "noise")
+        columns |= simulate(heard, play.command, play.load, steps=FINER * model.steps, drawn=drawn)._asdict()
+    else:
+        out = Lanes(model, (), FINER * model.steps, 1).replay(np.empty((1, 0)), play.drive, play.load)[0]
+        columns |= {signals.drive.name: play.drive} | {s.name: out[:, i] for i, s in enumerate(signals.outputs)}
+    for signal in signals.outputs:
+        is_read = signal.name in unit.noise or signal == signals.controlled
+        columns[signal.name] = columns[signal.name] + noise.get(signal.name, 0.0) if is_read else np.full(n, math.nan)
+    return Trace.from_columns(columns, model["controller.period"], {"source": f"simulated {rng.integers(2**32)}"},
+                              signals)
+
+
+def draw_noise(noise: Noise, n: int, rng: np.random.Generator) -> Floats:
+    """Noise, (n,), that its filter makes white: the autoregressive process with these innovations."""
+    from scipy.signal import lfilter  # here: it takes long to import
+
+    settling = 1000  # samples until the process has forgotten its start
+    drawn: Floats = lfilter([noise.innovation], noise.filter, rng.standard_normal(settling + n))[settling:]
+    return drawn
+
+
+def judge_injection(injection: Injection, unit: Unit) -> dict[str, Any]:
+    """Hide the effect, explain the runs, and say what was named."""
+    if unit.plant_file:
+        load_plant(Path(unit.plant_file), key=unit.model.plant)
+    for file in unit.effect_files:
+        load_effects(Path(file))
+    answer, _ = explain_runs(hide_effect(unit, injection))
+    named = list(answer.explanation.effects)
+    return {**injection._asdict(), "size": measure_size(unit.model, injection.effect, injection.rung),
+            "verdict": answer.verdict, "effects": named,
+            "is_named": answer.verdict == "EXPLAINED" and named == [injection.effect]}
+
+
+def choose_injections(unit: Unit, first: Mapping[str, int], rows: Iterable[Mapping[str, Any]]) -> list[Injection]:
+    """What to hide next: the trials of the rung under way, of each effect that is not decided; none at the end."""
+    counts, chosen = count_rungs(rows), list[Injection]()
+    offered = [entry.name for entry in unit.model.kind.list_effects()]
+    for effect in unit.effects:
+        rung = _find_open_rung(counts.get(effect, {}), first[effect])
+        if rung is not None:
+            _, of = counts.get(effect, {}).get(rung, (0, 0))
+            place = (offered.index(effect) * RUNGS + rung) * TRIALS
+            chosen += [Injection(place + trial, effect, rung, trial)
+                       for trial in range(of, min(of + TRIALS_AT_ONCE, TRIALS))]
+    return chosen
+
+
+def count_rungs(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[int, tuple[int, int]]]:
+    """(named, of) of each rung of each effect."""
+    counts: dict[str, dict[int, tuple[int, int]]] = {}
+    for row in rows:
+        own = counts.setdefault(row["effect"], {})
+        named, of = own.get(row["rung"], (0, 0))
+        own[row["rung"]] = named + row["is_named"], of + 1
+    return counts
+
+
+def _find_open_rung(counts: Mapping[int, tuple[int, int]], first: int) -> int | None:
+    """The rung of an effect that is under way; None when the smallest size that is named is known, or none is."""
+    rung = first
+    while 0 <= rung < RUNGS:
+        is_named = _judge_rung(counts, rung)
+        if is_named is None:
+            return rung
+        beside = rung + 1 if is_named else rung - 1
+        if _judge_rung(counts, beside) == (not is_named):
+            return None
+        rung = beside
+    return None
+
+
+def _judge_rung(counts: Mapping[int, tuple[int, int]], rung: int) -> bool | None:
+    """Whether a rung is named often enough; None while both is possible."""
+    named, of = counts.get(rung, (0, 0))
+    if of - named > TRIALS - NEEDED:
+        return False
+    return True if of == TRIALS else None
+
+
+def summarise_injections(unit: Unit, rows: Sequence[Mapping[str, Any]]) -> list[Claim]:
+    """The claim of each effect: the smallest size that was named often enough."""
+    counts, claims = count_rungs(rows), []
+    for effect in unit.effects:
+        entry, own = unit.model.find_effect(effect), counts.get(effect, {})
+        smallest = max((rung for rung in own if _judge_rung(own, rung)), default=None)
+        wrong = Counter(_describe_miss(row) for row in rows if row["effect"] == effect and not row["is_named"])
+        sizes = [(measure_size(unit.model, effect, rung), *own[rung]) for rung in sorted(own, reverse=True)]
+        claims.append(Claim(effect, entry.fitted[0], entry.parameters[entry.fitted[0]].unit,
+                            measure_size(unit.model, effect, 0),
+                            None if smallest is None else measure_size(unit.model, effect, smallest),
+                            None if smallest is None else measure_share(*own[smallest]), sizes,
+                            dict(wrong.most_common())))
+    return claims
+
+
+def _describe_miss(row: Mapping[str, Any]) -> str:
+    """What a run was taken for: a verdict, with the effects that it names."""
+    named = " and ".join(row["effects"])
+    return f"{named} ({row['verdict']})" if named else str(row["verdict"])
