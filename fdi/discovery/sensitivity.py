@@ -37,7 +37,7 @@ from plant.run import simulate
 TRIALS, NEEDED = 10, 9
 TRIALS_AT_ONCE = 4  # of a rung, before it is looked at again: most rungs that miss are decided by the first
 RUNGS = 8  # the smallest size is the largest over 2**7
-FINER = 2  # times the usual number of solver steps: a unit is no copy of the model that is fitted to it
+UNIT_STEPS = 2  # times the usual number of solver steps: a unit is no copy of the model that is fitted to it
 
 
 class Injection(NamedTuple):
@@ -177,9 +177,9 @@ def _simulate_run(unit: Unit, model: Model, play: Play, rng: np.random.Generator
         for i, signal in fed:
             drawn[:, i] = noise.pop(signal.name) / unit.noise[signal.name].level
         heard = model.replace({s.noise: unit.noise[s.name].level for _, s in fed}, "noise")
-        columns |= simulate(heard, play.command, play.load, steps=FINER * model.steps, drawn=drawn)._asdict()
+        columns |= simulate(heard, play.command, play.load, steps=UNIT_STEPS * model.steps, drawn=drawn)._asdict()
     else:
-        out = Lanes(model, (), FINER * model.steps, 1).replay(np.empty((1, 0)), play.drive, play.load)[0]
+        out = Lanes(model, (), UNIT_STEPS * model.steps, 1).replay(np.empty((1, 0)), play.drive, play.load)[0]
         columns |= {signals.drive.name: play.drive} | {s.name: out[:, i] for i, s in enumerate(signals.outputs)}
     for signal in signals.outputs:
         is_read = signal.name in unit.noise or signal == signals.controlled

@@ -147,7 +147,7 @@ def test_the_command_tells_claims_and_resumes(files: dict[str, Path], monkeypatc
     page = (tmp_path / "page.html").read_text()
     assert "Sizes that are named" in page and "coil_lag and sensor_gain (AMBIGUOUS)" in page
     made.clear()
-    assert "named from" in rig(*arguments).out and made == []
+    assert "Each effect was hidden in this unit" in rig(*arguments).out and made == []
 
 
 @pytest.mark.parametrize("words, expected", [
