@@ -124,6 +124,11 @@ GAIN_DOUBTFUL = 500.0
 # Difference below which two explanations are equally good: odds of 1000 to 1.
 GAIN_TIE = 14.0
 
+# Cosine between what two effects change, the tolerances taken out, from which they count as look-alikes. Of the pairs
+# of the shipped catalogue on preflight eight have more: coil lag and transport delay 0.98, a constant load and an
+# asymmetric friction 0.99, clogging and spool friction 0.73.
+LOOKS_ALIKE = 0.7
+
 # Expected gain of an effect below which no full fit is made.
 GAIN_WORTH_A_FIT = 20.0
 

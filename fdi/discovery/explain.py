@@ -18,7 +18,7 @@ the thresholds.
 | other valleys | two effects remove {FURTHER_EFFECT_SHARE:g} of the excess cost and still leave more than noise | fits the best two pairs again with a population |
 | number of effects | always | keeps the effects that gain more than {GAIN_SEEN:g}, of several only those whose removal costs more than {GAIN_CONVINCES:g} |
 | last fits | always | finishes the base and the best four with finer steps, on the repeats too; begins again those of the best two that leave a mean square above {WHITE_SQUARE_POOR:g} or have far tolerances |
-| rivals | the best one leaves only noise | begins the others that do so too from its tolerances |
+| rivals | the best one leaves only noise | begins the others that do so too, and effects whose signature has a cosine of {LOOKS_ALIKE:g} with its own, from its tolerances |
 | intervals | the base leaves only noise | drops effects whose 95 % interval holds the off value |
 | small gain | the gain is below {GAIN_DOUBTFUL:g} | fits the base again from there; drops a single effect that then gains at most {GAIN_SEEN:g} |
 | solver | half the step changes more than {SOLVER_ERROR_SHARE:g} floors | finishes again with 50 steps a cycle |
@@ -274,13 +274,13 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
                                        [(levels[0][0], rounds), *((h, 5) for h in close)])
     close = _sort_by_cost(close)
     close = _sort_by_cost([*search.map_parallel(search.begin_again, close[:2]), *close[2:]])
-    return _doubt_small_gain(search, base, _compare_rivals(search, close), depth)
+    return _doubt_small_gain(search, base, _compare_rivals(search, base, close), depth)
 
 
-def _compare_rivals(search: Search, close: list[Hypothesis]) -> list[Hypothesis]:
+def _compare_rivals(search: Search, base: Hypothesis, close: list[Hypothesis]) -> list[Hypothesis]:
     """The hypotheses, best first, after those that leave only noise have begun from the tolerances of the best.
 
-    Where another one is better then, the others get the same chance from there.
+    So do look-alikes of a single effect. Where another one is best then, the others get the same chance from there.
     """
     def begin(h: Hypothesis, best: Hypothesis) -> Hypothesis:
         return search.begin_beside(best, h) if h.is_at_floor and h is not best else h
@@ -288,8 +288,9 @@ def _compare_rivals(search: Search, close: list[Hypothesis]) -> list[Hypothesis]
     for _ in range(2):
         if not close or not close[0].is_at_floor:
             break
-        best = close[0]
-        close = _sort_by_cost(search.map_parallel(partial(begin, best=best), close))
+        best, known = close[0], {h.effects[0] for h in close if h.is_at_floor}
+        more = search.begin_look_alikes(base, best, known) if len(best.effects) == 1 else []
+        close = _drop_duplicates([*search.map_parallel(partial(begin, best=best), close), *more])
         if close[0] is best:
             break
     return close

@@ -46,6 +46,7 @@ from fdi.thresholds import (
     BLOCK_FITTED_SQUARE,
     GAIN_DOUBTFUL,
     GAIN_WORTH_A_FIT,
+    LOOKS_ALIKE,
     NULL_DRAWS,
     RESIDUAL_IS_NEAR_NOISE,
     RESIDUAL_IS_NOISE,
@@ -436,6 +437,33 @@ class Search:
         begun = fit_unknowns(self.problem, free, np.clip(x, *scaled_bounds(free)), rounds)
         again = self.finish_hypothesis(self.judge_fit(rival.effects, begun))
         return min(rival, again, key=lambda each: each.cost)
+
+    def begin_look_alikes(self, base: Hypothesis, best: Hypothesis, known: Iterable[str], rounds: int = 4
+                          ) -> list[Hypothesis]:
+        """The effects that change the signals almost as the best one does, from its tolerances, if noise is left then.
+
+        The search fits what promises most from the tolerances of the base. There a look-alike may miss a stop, and
+        fall far behind or not be fitted at all.
+
+        Args:
+            base: without any effect.
+            best: with one effect.
+            known: effects that need not be tried.
+        """
+        told = compute_sensitivity(self.problem, base.fit, self.effects)
+        own = [effect == best.effects[0] for effect in told.names]
+        alike = {effect for effect, cosines in zip(told.names, np.abs(told.gram), strict=True)
+                 if max(cosines[own], default=0.0) > LOOKS_ALIKE} - {best.effects[0], *known}
+        if not alike:
+            return []
+        bare = linearise(self.problem, base.fit.free, _place_base(base, best))
+
+        def begin(p: Prospect) -> Hypothesis:
+            return self.judge_fit((p.effect,), fit_unknowns(self.problem, p.free, p.x, rounds))
+
+        found = self.map_parallel(begin, scan_effects(self.problem, bare, sorted(alike), self.workers))
+        finished = self.map_parallel(self.finish_hypothesis, [h for h in found if h.is_near_floor])
+        return [h for h in finished if h.is_at_floor]
 
     def measure_solver_error(self, h: Hypothesis, floor: Mapping[str, float]) -> float:
         """What half the step changes in a replay, over the floor, in the worst signal."""
