@@ -311,12 +311,9 @@ GROUP_CORRELATION = 0.5
 # Prior standard deviation of a size that is fitted without a logarithm, in MidBands: it may be any.
 LINEAR_FAULT_SPREAD = 10.0
 
-# Half of the narrowest interval of such a size, in MidBands: stops of spool and ram that a replay makes or misses move
-# its best value by up to that, which the covariance at one point does not see.
-NARROWEST_LINEAR = 0.03
-
-# Share of the misfit by which a fault is missed that another fault in its place must take away to be fitted instead.
-RIVAL_SHARE = 0.8
+# Half of the narrowest interval of a size, in MidBands: stops of spool and ram that a replay makes or misses move its
+# best value by up to that, which the covariance at one point does not see.
+NARROWEST_SHARE = 0.03
 
 # Share of MidBand; a fit that ends above it is compared with one that starts from a healthy unit.
 FAULT_BLAMED_SHARE = 0.5

@@ -218,6 +218,10 @@ def place_fault(fault: Fault, kind: Any, where: object = "faults") -> Fault:
     if not WORD.fullmatch(fault.name):
         raise refuse("", "a name of small letters, digits and _")
     q = look_up("parameter", fault.parameter)
+    group = fault.parameter.partition(".")[0]
+    if group in ("controller", "sensors") or any(e.name == group and e.port in ("command", "reading")
+                                                 for e in kind.list_effects()):
+        raise refuse("parameter", f"a parameter that a replay of the measured drive shows; {fault.parameter} is none")
     if not q.unit:
         raise refuse("parameter", f"a parameter with a unit; {fault.parameter} is declared without one")
     if fault.unit not in ("", q.unit):

@@ -15,9 +15,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fdi.diagnosis.faults import Fault, Level, classify_size, load_faults
+from fdi.diagnosis.faults import Fault, Level, choose_faults, classify_size
 from fdi.estimation.binomial import Share, measure_share
-from plant.model import load_model
+from fdi.foreign_code import load_plant_of_model
+from plant.model import Model, load_model
 from rig.campaign.batch import Row, Workers
 from rig.campaign.judge import HEALTHY, OK, WORKS, Matrix, build_matrix, run_campaign
 from rig.campaign.summary import describe_progress
@@ -25,13 +26,13 @@ from rig.campaign.summary import describe_progress
 BEYOND = tuple(level.word for level in Level if level > Level.ACCEPTABLE)
 
 
-def list_cases(faults: Sequence[Fault], seeds: int, healthy: int) -> Matrix:
+def list_cases(model: Model, faults: Sequence[Fault], seeds: int, healthy: int, first: int = 0) -> Matrix:
     """A campaign of healthy units and of units with each fault at MidBand and at MaxBand."""
     cases: list[dict[str, Any]] = [{"seeds": healthy}]
     for fault in faults:
         limits = [fault.place_size(departure) for departure in fault.limits[1:]]
         cases.append({fault.name: limits, "seeds": seeds})
-    return build_matrix({"case": cases}, load_model(), WORKS["fdi"], "studies.wider_faults", faults)
+    return build_matrix({"first": first, "case": cases}, model, WORKS["fdi"], "studies.wider_faults", faults)
 
 
 def count_answers(rows: Iterable[Row], faults: Sequence[Fault]) -> dict[str, dict[str, Share]]:
@@ -79,14 +80,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the cases that the folder lacks, print the table; exit status 0."""
     parser = argparse.ArgumentParser(prog="python -m studies.wider_faults", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, help="where the results go, or the folder of an interrupted study")
-    parser.add_argument("--faults", default="wider", help="a fault file, or a shipped list (default: wider)")
+    parser.add_argument("--model", default="eha", help="the healthy plant: a shipped one, or a plant file")
+    parser.add_argument("--faults", help="a fault file, or a shipped list (default: the plant's own; of eha wider)")
     parser.add_argument("--seeds", type=int, default=2, help="units of each size (default 2)")
     parser.add_argument("--healthy", type=int, default=10, help="units without a fault (default 10)")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first unit (default 0)")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="processes")
     parser.add_argument("--most", type=int, help="stop after so many cases")
     args = parser.parse_args(arguments)
-    faults = load_faults(args.faults)
-    rows = run_campaign(list_cases(faults, args.seeds, args.healthy), args.folder, Workers(args.jobs), count=args.most,
+    load_plant_of_model(args.model, is_trusted=False)
+    model = load_model(args.model)
+    faults = choose_faults(args.faults or ("wider" if model.plant == "eha" else None), model.kind)
+    matrix = list_cases(model, faults, args.seeds, args.healthy, args.first)
+    rows = run_campaign(matrix, args.folder, Workers(args.jobs), count=args.most,
                         report_progress=lambda p: print(describe_progress(p), file=sys.stderr, flush=True))
     order = [HEALTHY, *(fault.name for fault in faults), "all"]
     shares = count_answers(rows, faults)

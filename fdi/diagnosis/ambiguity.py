@@ -7,23 +7,20 @@ is replaced by that of the profile likelihood within the bounds of all faults. W
 together: if no point with all of these faults acceptable is within the 95 % region, at least one of them is not, and
 they form a group.
 
-A fault that the posterior finds gone may still have a rival: another fault that in its place explains the recording as
-well. The posterior at one point does not see that where a law is curved, so the rival is fitted.
+The posterior is one at a point, so unknowns are what laws go with (gains by logarithms, clearance by its cube).
 """
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from fdi.diagnosis.faults import Estimate, Fault
-from fdi.diagnosis.refine import CountedProblem, Refinement, descend, place_value, set_sizes
-from fdi.estimation.fit import replay_fit, scaled_bounds
-from fdi.estimation.unidentifiable import start_fit
-from fdi.thresholds import GAIN_TIE, GROUP_CORRELATION, INTERVAL_95_SD, RIVAL_SHARE
+from fdi.diagnosis.refine import Refinement, place_value
+from fdi.estimation.fit import scaled_bounds
+from fdi.thresholds import GROUP_CORRELATION, INTERVAL_95_SD
 from fdi.trace.trace import Floats
 
 
@@ -123,75 +120,3 @@ def find_groups(found: Refinement, names: Sequence[str]) -> tuple[Group, ...]:
         if len(group) > 1 and distance > INTERVAL_95_SD:
             groups.append(Group(tuple(found.faults[i].name for i in sorted(group)), distance))
     return tuple(groups)
-
-
-def find_rivals(found: Refinement, gone: Sequence[str], sizes: int = 24, rounds: int = 8) -> tuple[Group, ...]:
-    """Groups of a fault that is not acceptable and the others that explain the recording as well in its place.
-
-    Args:
-        found: the fit of all faults together.
-        gone: the faults that are not acceptable.
-        sizes: of each rival that are tried, over its range.
-        rounds: of the fit of a rival.
-    """
-    groups = []
-    blamed = [fault for fault in found.faults if fault.name in gone]
-    most = replay_fit(_require_problem(found), found.fit, found.fit.x).cost + GAIN_TIE if blamed else np.inf
-    for fault in blamed:
-        rivals = [other for other in _list_candidates(found, fault, sizes)
-                  if _fit_in_place(found, fault, other, rounds) < most]
-        if rivals:
-            groups.append(Group((fault.name, *(other.fault.name for other in rivals)), 0.0))
-    return tuple(groups)
-
-
-class _Candidate(NamedTuple):
-    """Another fault in place of one, at the size that leaves least: scaled unknowns (p,), and that cost."""
-
-    fault: Fault
-    x: Floats
-    cost: float
-
-
-def _list_candidates(found: Refinement, fault: Fault, sizes: int) -> list[_Candidate]:
-    """The other faults that take away most of what is left where `fault` is missing, nothing else changed."""
-    problem, fit = _require_problem(found), found.fit
-    without = replace(fit, x=set_sizes(fit, fault, fault.healthy))
-    least, missing = (float(c) for c in problem.compute_costs(fit.free, np.array([fit.x, without.x])))
-    candidates = []
-    for other in (f for f in found.faults if f != fault):
-        ends, best = other.range, _Candidate(other, without.x, np.inf)
-        for _ in range(2):
-            tried = _spread_sizes(other, ends, sizes)
-            trials = np.array([set_sizes(without, other, size) for size in tried])
-            costs = problem.compute_costs(fit.free, trials)
-            k = int(np.argmin(costs))
-            best = min(best, _Candidate(other, trials[k], float(costs[k])), key=lambda c: c.cost)
-            ends = tried[max(k - 1, 0)], tried[min(k + 1, len(tried) - 1)]
-        if missing - best.cost > RIVAL_SHARE * (missing - least):
-            candidates.append(best)
-    return sorted(candidates, key=lambda c: c.cost)[:3]
-
-
-def _spread_sizes(fault: Fault, ends: tuple[float, float], count: int) -> list[float]:
-    """Sizes between two ends, more of them near a healthy unit."""
-    parts = np.linspace(0.0, 1.0, count) ** 3
-    sides = [fault.healthy + parts * (end - fault.healthy) for end in ends]
-    between = np.linspace(*ends, count)
-    is_inside = min(ends) <= fault.healthy <= max(ends)
-    return sorted(set(np.concatenate(sides if is_inside else [between]).tolist()))
-
-
-def _fit_in_place(found: Refinement, fault: Fault, rival: _Candidate, rounds: int) -> float:
-    """The cost of the fit without `fault`, begun at the rival's size."""
-    problem, own = _require_problem(found), set(fault.parameters)
-    kept = [k for k, f in enumerate(found.fit.free) if f.name not in own]
-    begun = start_fit([found.fit.free[k] for k in kept], rival.x[kept])
-    alone = replace(problem, model=problem.model.replace(fault.list_changes(fault.healthy)), _lanes={})
-    return descend(alone, begun, ((3.0, 4), (1.0, rounds))).cost
-
-
-def _require_problem(found: Refinement) -> CountedProblem:
-    if found.problem is None:
-        raise ValueError("a refinement that remembers its problem")
-    return found.problem

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi.diagnosis.ambiguity import Group, cut_intervals, find_groups, find_rivals
+from fdi.diagnosis.ambiguity import Group, cut_intervals, find_groups
 from fdi.diagnosis.bands import (
     Bands,
     BandVerdict,
@@ -154,9 +154,6 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         sizes |= cut_intervals(refinement, _name_undecided(levels), sizes)
         levels = _judge_sizes(sizes, refinement)
         groups = find_groups(refinement, _name_undecided(levels))
-    if refinement.is_explained and beside is None:
-        groups += find_rivals(refinement, [name for name, level in levels.items() if level])
-        levels |= {name: None for group in groups for name in group.names}
     if beside is not None:
         levels |= dict.fromkeys(beside.disputed)
     progress("done", 1.0)

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.comparison.jack import P12
-from fdi.diagnosis.faults import FAULTS, Estimate, Fault, Level, compute_severity, judge_size
+from fdi.diagnosis.faults import CLOGGING, FAULTS, Estimate, Fault, Level, compute_severity, judge_size
 from fdi.discovery.explain import find_marks
 from fdi.discovery.explain_runs import list_fitted_parameters
 from fdi.discovery.search import Prospect, scan_effects
@@ -39,22 +39,32 @@ from fdi.estimation.fit import (
     follow_population,
     list_all_unknowns,
     list_effect_unknowns,
+    replay_fit,
     scale_noise,
     scaled_bounds,
     silence_readings,
     span_all_rows,
 )
 from fdi.estimation.long_recordings import Excerpt, choose_excerpt, judge_on_all
-from fdi.estimation.replay import find_unpredictable_rows, is_friction, measure_decided_errors
+from fdi.estimation.replay import (
+    find_undecided_rows,
+    find_unpredictable_rows,
+    guess_anchor_noise,
+    is_friction,
+    measure_decided_errors,
+)
 from fdi.estimation.unidentifiable import (
     FLAPPER,
     ORIGINS,
+    POWERS,
     LogFree,
     LogFrictionRatio,
     LogOpenFilter,
     LogProblem,
+    PowerFree,
     descend_valley,
     find_flat_directions,
+    get_power,
     guess_covariance,
     linearise_across,
     list_directions_of_faults,
@@ -70,9 +80,10 @@ from fdi.thresholds import (
     GAIN_CONVINCES,
     GAIN_TIE,
     GAIN_WORTH_A_FIT,
+    HELD_OUT_UNDECIDED_SHARE,
     INTERVAL_95_SD,
     LINEAR_FAULT_SPREAD,
-    NARROWEST_LINEAR,
+    NARROWEST_SHARE,
     PRIORS_KNOW_MORE_MISFIT,
     RESIDUAL_HELD_OUT,
     RESIDUAL_HOPELESS,
@@ -82,7 +93,7 @@ from fdi.thresholds import (
     UNIT_TOLERANCE,
     WEIGHT_COUNTS,
 )
-from fdi.trace.trace import Floats, Trace
+from fdi.trace.trace import Flags, Floats, Trace
 from plant.effects import CATALOGUE
 from plant.model import Model, find_quantity, list_searched_effects
 from plant.starts import ensure_starts
@@ -91,9 +102,13 @@ from plant.threads import R, T, map_in_threads
 SMALLEST_SHARE = 0.01  # of the healthy size, bound of a fit by logarithms
 Sizes = tuple[float, ...]
 """One size for each fault, SI."""
+Way = tuple[Mapping[str, float], Mapping[str, float], Mapping[str, float]]
+"""Values of starts: shapes of effects, what does not follow a fault, bias and load; parameter to SI value."""
 # (factor on the noise, rounds): small stops of the ram count only once the fit is near
 NOISE_SCHEDULE = ((30.0, 4), (6.0, 4), (1.0, 8))
 FINE_STEPS = 20  # solver steps a cycle of the last fit
+POLISH = ((3.0, 4), (1.0, 12))
+RATIO_SPREAD = 0.03  # prior standard deviation of the logarithm of static over dynamic friction of the ram
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -136,7 +151,7 @@ def list_unknowns(model: Model, faults: Sequence[Fault] = FAULTS, fault_spread: 
     ratio: list[Free] = []
     if "jack.dynamic_friction" in taken and "jack.static_friction" not in taken:
         usual = math.log(get_positive(model, "jack.static_friction") / get_positive(model, "jack.dynamic_friction"))
-        ratio = [LogFrictionRatio("jack.static_friction", usual, 0.03, 1.0, 0.0, usual + 1.0, 0.3)]
+        ratio = [LogFrictionRatio("jack.static_friction", usual, RATIO_SPREAD, 1.0, 0.0, usual + 1.0, 0.3)]
         taken.add("jack.static_friction")
     tolerances = (take_logarithm(f) for f in list_all_unknowns(model) if f.name not in taken)
     return (*own, *suspects, *ratio, *tolerances)
@@ -152,6 +167,11 @@ def _make_fault_unknowns(fault: Fault, model: Model, spread: float) -> list[Free
     if ORIGINS.get(fault.parameter) == 1.0:
         return [LogOpenFilter(fault.parameter, math.log(1.0 - fault.healthy), UNIT_TOLERANCE, spread,
                               math.log(1.0 - high), math.log(1.0 - low), 1.0)]
+    if fault.parameter in POWERS:
+        power = POWERS[fault.parameter]
+        healthy, middle = fault.healthy**power, fault.place_size(fault.limits[1]) ** power
+        return [PowerFree(fault.parameter, healthy, abs(middle - healthy), LINEAR_FAULT_SPREAD, low**power, high**power,
+                          0.02)]
     if not _is_scaled(fault):
         healthy, middle, _ = fault.limits
         factors = {fault.parameter: 1.0, **fault.follow}
@@ -165,8 +185,16 @@ def _make_fault_unknowns(fault: Fault, model: Model, spread: float) -> list[Free
         by = 1.0 if find_quantity(name, plant=model.plant).unit == same else fault.follow[name]
         return math.log(by * least), math.log(by * high)
 
-    return [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, spread, *take_bounds(name), 1.0)
-            for name in fault.parameters]
+    # The ram stops a few times in a test, and its static friction alone makes or misses some of these stops: its ratio
+    # to the dynamic one is known. The spool stops in every cycle of stick-slip, and both of its frictions are free.
+    if fault.parameter == "jack.static_friction" and list(fault.follow) == ["jack.dynamic_friction"]:
+        dynamic, by = next(iter(fault.follow.items()))
+        led: list[Free] = [LogFrictionRatio(dynamic, math.log(by), RATIO_SPREAD, 1.0, -1.0, 0.0, 0.3)]
+    else:
+        led = [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, spread, *take_bounds(name), 1.0)
+               for name in fault.follow]
+    name = fault.parameter
+    return [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, spread, *take_bounds(name), 1.0), *led]
 
 
 def _make_shape_unknowns(fault: Fault, model: Model) -> list[Free]:
@@ -212,6 +240,8 @@ def make_start(free: Sequence[Free], faults: Sequence[Fault], sizes: Sequence[fl
         size = fault.range[0] if isinstance(own, LogOpenFilter) and size < fault.range[0] else size
         values[own.name] = place_value(own, size)
         for name, by in fault.follow.items():
+            if isinstance(known[name], LogFrictionRatio):
+                continue
             value = max(size, math.exp(own.low)) / (1.0 / by) if isinstance(own, LogFree) else by * size
             values[name] = place_value(known[name], min(value, (stays or {}).get(name, math.inf)))
     return np.array([(values.get(f.name, f.centre) - f.centre) / f.scale for f in free])
@@ -221,6 +251,8 @@ def place_value(f: Free, value: float) -> float:
     """The number of which the unknown `f` makes a parameter's value, within its bounds below."""
     if isinstance(f, LogOpenFilter):
         return max(math.log(1.0 - min(value, 1.0 - 1e-12)), f.low)
+    if isinstance(f, PowerFree):
+        return float(value ** POWERS[f.name])
     return math.log(max(value, math.exp(f.low))) if isinstance(f, LogFree) else value
 
 
@@ -246,11 +278,13 @@ def _list_ladder(fault: Fault) -> list[float]:
     """Sizes of a fault in coarse steps: by a factor where a healthy unit has some, else by parts of MidBand."""
     if _is_scaled(fault) and not fault.falls:
         return [x for x in fault.healthy * 1.4 ** np.arange(-1.0, 10.0) if x <= fault.range[1]]
-    healthy, middle, _ = fault.limits
+    healthy, middle, most = fault.limits
     ways = (-1.0, 1.0) if fault.both_ways else (1.0,)
     way = -1.0 if fault.falls else 1.0
-    sizes = [fault.healthy + way * side * part * (middle - healthy) for side in ways
-             for part in (0.0, 0.48, 0.96, 1.44, 1.92)]
+    parts = [0.0, 0.48, 0.96, 1.44, 1.92]
+    while parts[-1] < 1.3 * (most - healthy) / (middle - healthy):  # until well beyond MaxBand
+        parts.append(parts[-1] * 4.0 / 3.0)
+    sizes = [fault.healthy + way * side * part * (middle - healthy) for side in ways for part in parts]
     return [x for x in dict.fromkeys(sizes) if fault.range[0] <= x <= fault.range[1]]
 
 
@@ -283,7 +317,6 @@ class Refinement:
     method: str = "least squares"
     everywhere: Mapping[str, float] = field(default_factory=dict)  # of a long recording: typical error over noise
     worst: float = RESIDUAL_WORST  # error over noise that a few stops of the ram may leave
-    problem: CountedProblem | None = field(default=None, repr=False)  # that was fitted
 
     @property
     def correlation(self) -> float:
@@ -365,6 +398,8 @@ def refine_sizes(model: Model, trace: Trace, starts: Sequence[Sizes] | None = No
     stage = Stage(progress, "refinement", 0.3, 0.97, usual_rounds)
     problem = replace(make_problem(model, trace, floor, workers, faults), stage=stage)
     free = list_unknowns(problem.model, faults)
+    if problem.model.kind.correct is not None:
+        problem = _allow_observer_noise(problem, free)
     first = _fit_coarsely(problem, free, starts or list_coarse_starts(faults))
     problem = learn_left_noise(problem, first)
     last = first
@@ -377,13 +412,20 @@ def refine_sizes(model: Model, trace: Trace, starts: Sequence[Sizes] | None = No
         last = _fit_finely(problem, last)
     if len(faults) > 2:  # of fewer, the start from a healthy unit is the only one that lacks a fault
         last = _retry_without(problem, last)
+    if problem.faults != FAULTS:
+        last = polish_fit(problem, last)
+        problem = replace(problem, steps=problem.model.steps, _lanes={})
     return report_fit(last, problem, None if whole is trace else whole)
 
 
 def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequence[Sizes]) -> Fit:
     """A fit from the best start and, if that blames a fault, one from a healthy unit: whichever leaves less."""
-    alone = replace(problem, workers=1, _lanes={})
     begin = [choose_start(problem, free, starts)]
+    if problem.model.kind.correct is not None:  # what hangs on a stop there draws the fit to the wrong size
+        undecided = find_undecided_rows(problem, replay_fit(problem, start_fit(free, begin[0]), begin[0]),
+                                        list_floors(problem))
+        problem = _leave_out(problem, undecided)
+    alone = replace(problem, workers=1, _lanes={})
     healthy = make_healthy_start(problem, free)
     if _blames_a_fault(problem, free, begin[0]):
         begin.append(healthy)
@@ -394,11 +436,39 @@ def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequenc
     return best if is_noise_left(problem, best) else descend(problem, best, ((3.0, 4), (1.0, 8)))
 
 
+def _allow_observer_noise(problem: CountedProblem, free: Sequence[Free]) -> CountedProblem:
+    """The problem with what an observer makes of the controlled signal's noise in the other signals, of a healthy unit.
+
+    The observer takes that noise for a speed, and the replayed speed has it, too.
+    """
+    trace, floor, controlled = problem.trace, list_floors(problem), problem.trace.declared.controlled.name
+    x = make_healthy_start(problem, free)[None]
+    names, values = [f.name for f in free], problem.convert_unknowns(free, x)
+    for noise in guess_anchor_noise(trace, problem.model, floor):
+        shaken = replace(problem, trace=trace.with_columns({controlled: trace.controlled + noise}), _lanes={})
+        moved = compute_typical_rms((shaken.predict_outputs(names, values) - problem.predict_outputs(names, values))[0])
+        floor |= {s: math.hypot(floor[s], float(by)) for s, by in zip(trace.outputs, moved, strict=True)
+                  if s != controlled}
+    return replace(problem, noise=tuple(noises.white_noise(floor[s]) for s in trace.outputs), _lanes={})
+
+
 def _leave_out_stops(problem: CountedProblem, found: Fit) -> CountedProblem:
     """The problem without the rows that hang on a stop of the plant: what they say of its parameters is chance."""
-    floor = {s: n.level for s, n in zip(problem.trace.outputs, problem.noise, strict=True)}
-    usable = problem.trace.usable & ~find_unpredictable_rows(problem, found, floor)
-    return replace(problem, trace=replace(problem.trace, usable=usable), _lanes={})
+    whole, floor = replay_fit(problem, found, found.x), list_floors(problem)
+    slight = {name: math.sqrt(RESIDUAL_IS_NOISE**2 - 1.0) * level for name, level in floor.items()}
+    rows = find_undecided_rows(problem, whole, slight)  # less than the noise each, they add to the residual as well
+    large = find_unpredictable_rows(problem, whole, floor)
+    tried = (rows | large, rows, large if large.any() else find_undecided_rows(problem, whole, floor))
+    return _leave_out(problem, next((r for r in tried if r.mean() <= HELD_OUT_UNDECIDED_SHARE), rows & False))
+
+
+def _leave_out(problem: CountedProblem, rows: Flags) -> CountedProblem:
+    return replace(problem, trace=replace(problem.trace, usable=problem.trace.usable & ~rows), _lanes={})
+
+
+def list_floors(problem: Problem) -> dict[str, float]:
+    """RMS noise by signal, SI."""
+    return {s: n.level for s, n in zip(problem.trace.outputs, problem.noise, strict=True)}
 
 
 def _fit_finely(problem: CountedProblem, first: Fit) -> Fit:
@@ -439,28 +509,57 @@ def _restart_fit(problem: CountedProblem, found: Fit, parts: Sequence[float], ro
 
 
 def _retry_without(problem: CountedProblem, found: Fit, most: int = 2) -> Fit:
-    """The best of a fit and some that begin without one of the faults that it blames: one fault may stand for another.
+    """The best of a fit and some that begin without one of the causes that it blames: one may stand for another.
 
-    They begin at the same unit, and where the fault looks like parameters of the plant, with these in its place.
+    Without a fault they begin at the same unit, and where the fault looks like parameters of the plant, with these in
+    its place; without a suspect, such as a null bias, at a unit with the same faults and no other deviation.
     """
     fine = replace(problem, workers=1, steps=FINE_STEPS, _lanes={})
     alone = replace(problem, workers=1, _lanes={})
 
-    def fit_without(fault: Fault) -> Fit:
-        x = set_sizes(found, fault, fault.healthy)
-        starts = np.array([x, *(_move_instead(problem, found, fault, x))])
+    def fit_from(starts: Floats) -> Fit:
         best = starts[int(np.argmin(problem.compute_costs(found.free, starts)))]
         begun = descend(alone, start_fit(found.free, best), NOISE_SCHEDULE[1:])
         return descend_valley(fine, begun, 8, find_flat(alone, found.free, begun.x))
 
     for _ in range(most):
+        tried = []
         blamed = [fault for fault in problem.faults if _blames(fault, found)]
-        fits = map_in_threads(fit_without, blamed, problem.workers)
+        for fault in blamed:
+            x = set_sizes(found, fault, fault.healthy)
+            tried.append(np.array([x, *(_move_instead(problem, found, fault, x))]))
+        moved = {f.name for f, x in zip(found.free, found.x, strict=True) if abs(x) > 0.2}  # of what is typical
+        if moved & {s.parameter for s in list_suspects(problem.model, problem.faults)}:
+            tried += [_list_alone(problem, found, fault) for fault in blamed]
+        fits = map_in_threads(fit_from, tried, problem.workers)
         best = min(fits, key=lambda f: f.cost, default=found)
         if best.cost >= found.cost:
             break
         found = best
     return found
+
+
+def _list_alone(problem: CountedProblem, found: Fit, fault: Fault) -> Floats:
+    """Starts (m, p) at units without other deviations than the faults, one of them about as large as found."""
+    kept = [f.name in problem.fault_parameters for f in found.free]
+    home = replace(found, x=np.where(kept, found.x, 0.0))
+    size = found.values[fault.parameter]
+    return np.array([set_sizes(home, fault, fault.healthy + part * (size - fault.healthy))
+                     for part in np.linspace(0.6, 1.6, 16)])
+
+
+def polish_fit(problem: CountedProblem, found: Fit) -> Fit:
+    """The fit with the plant's own steps: coarser ones bias sizes that they resemble, such as a lag.
+
+    Slopes are those of coarser steps, at a fifth of the time, except for the covariance of the end.
+    """
+    exact, coarse = (replace(problem, steps=steps, _lanes={}) for steps in (problem.model.steps, FINE_STEPS))
+    flat = find_flat(problem, found.free, found.x)
+    for factor, rounds in POLISH:
+        begun = replace(found, covariance=guess_first_covariance(found.free))
+        found = descend_valley(scale_noise(exact, factor), begun, rounds, flat, problem.stage,
+                               scale_noise(coarse, factor))
+    return linearise_across(exact, found.free, found.x, found.covariance, flat)
 
 
 def _move_instead(problem: CountedProblem, found: Fit, fault: Fault, x: Floats) -> list[Floats]:
@@ -470,7 +569,7 @@ def _move_instead(problem: CountedProblem, found: Fit, fault: Fault, x: Floats) 
     for way in list_directions_of_faults(at):
         if next(iter(way)) == fault.parameter and way[fault.parameter]:
             part = (x[k] - found.x[k]) * found.free[k].scale / way[fault.parameter]
-            shift = np.array([way.get(f.name, 0.0) * part / f.scale for f in found.free])
+            shift = np.array([get_power(way, f) * part / f.scale for f in found.free])
             low, high = scaled_bounds(found.free)
             moved.append(np.clip(np.where(np.arange(len(x)) == k, x, found.x + shift), low, high))
     return moved
@@ -480,7 +579,7 @@ def set_sizes(found: Fit, fault: Fault, size: float) -> Floats:
     """Scaled unknowns (p,) of a fit with another size of one fault, within the bounds."""
     x, changes = found.x.copy(), fault.list_changes(size)
     for k, f in enumerate(found.free):
-        if f.name in changes:
+        if f.name in changes and not isinstance(f, LogFrictionRatio):
             x[k] = (min(max(place_value(f, changes[f.name]), f.low), f.high) - f.centre) / f.scale
     return x
 
@@ -543,18 +642,17 @@ def measure_ratios(problem: Problem, found: Fit) -> list[float]:
 def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence[Sizes]) -> Floats:
     """The start, (p,) scaled, with the smallest misfit, searched on ever finer grids around the best one."""
     loud = scale_noise(replace(problem, workers=1, _lanes={}), NOISE_SCHEDULE[0][0])
-    offsets, faults = estimate_offsets(problem), problem.faults
+    known_offsets, faults = estimate_offsets(problem), problem.faults
     usual = {name: problem.model[name] for fault in faults for name in fault.follow}
 
-    def try_starts(tried: Sequence[Sizes], way: tuple[Mapping[str, float], Mapping[str, float]]
-                   ) -> tuple[float, Sizes, Floats]:
-        shape, stays = way
+    def try_starts(tried: Sequence[Sizes], way: Way) -> tuple[float, Sizes, Floats]:
+        shape, stays, offsets = way
         x = np.array([make_start(free, faults, s, {**offsets, **shape}, stays) for s in tried])
         costs = compute_misfit(loud.compute_white_residuals(free, x))
         k = int(np.argmin(costs))
         return float(costs[k]), tried[k], x[k]
 
-    def search(way: tuple[Mapping[str, float], Mapping[str, float]]) -> tuple[float, Floats]:
+    def search(way: Way) -> tuple[float, Floats]:
         cost, best, x = try_starts(starts, way)
         # of the two faults that are furthest gone
         moved = sorted(sorted(range(len(faults)), key=lambda i: -compute_severity(faults[i], best[i]))[:2])
@@ -569,7 +667,9 @@ def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence
         return cost, x
 
     # dynamic friction goes with the static one, or has stayed what it was; phases and the like as in effects' starts
-    ways = product(_list_shape_starts(problem), ({}, usual) if usual else ({},))
+    # of the paper's two faults none shifts the null; another may, and then there is no bias
+    offsets: list[Mapping[str, float]] = [known_offsets, *([{}] if known_offsets and faults != FAULTS else [])]
+    ways = product(_list_shape_starts(problem), ({}, usual) if usual else ({},), offsets)
     return min(map_in_threads(search, ways, problem.workers), key=lambda each: each[0])[1]
 
 
@@ -631,30 +731,34 @@ def learn_left_noise(problem: CountedProblem, found: Fit) -> CountedProblem:
 
 def report_fit(last: Fit, problem: CountedProblem, whole: Trace | None = None) -> Refinement:
     """What a fit found, with the noise of its problem as the floor; judged on the `whole` recording if it is cut."""
-    outputs = problem.trace.outputs
-    floor = {s: n.level for s, n in zip(outputs, problem.noise, strict=True)}
+    floor = list_floors(problem)
     errors = measure_decided_errors(problem, last, floor)
     names = [f.name for f in last.free]
     places = [names.index(fault.parameter) for fault in problem.faults]
     spread = np.sqrt(np.diag(last.covariance))[places]
     correlations = last.covariance[np.ix_(places, places)] / np.outer(spread, spread)
-    sizes = {fault.name: estimate_parameter(last, fault.parameter, fault.interval_factor, _find_narrowest(last.free[k]))
+    sizes = {fault.name: estimate_parameter(last, fault.parameter, fault.interval_factor,
+                                            _find_narrowest(last.free[k], float(last.x[k]), fault))
              for fault, k in zip(problem.faults, places, strict=True)}
     suspects = list_suspects(problem.model, problem.faults)
     found = Refinement(problem.faults, sizes, correlations,
                        {s.parameter: estimate_parameter(last, s.parameter) for s in suspects}, last, errors, floor,
-                       sum(problem.counts), problem=replace(problem, _lanes={}))
+                       sum(problem.counts))
     if whole is None or whole is problem.trace:
         return found
     judged = judge_on_all(problem, [last], whole, FINE_STEPS)[0]
     return replace(found, errors=judged.errors, everywhere=judged.typical_ratio(found.floor))
 
 
-def _find_narrowest(f: Free) -> float:
-    """Half the narrowest interval of a fault's scaled unknown."""
-    if type(f) is Free:
-        return NARROWEST_LINEAR
-    return FRICTION_UNCERTAINTY / f.scale if is_friction(f.name) else 0.0
+def _find_narrowest(f: Free, x: float, fault: Fault) -> float:
+    """Half the narrowest interval of a fault's scaled unknown, at `x`."""
+    healthy, middle, _ = fault.limits
+    if is_friction(f.name):
+        return FRICTION_UNCERTAINTY / f.scale
+    if fault.parameter == CLOGGING.parameter:
+        return 0.0  # the tolerances of the pilot gains make it six times as wide
+    slope = 0.5 * abs(f.value(x + 1.0) - f.value(x - 1.0))
+    return NARROWEST_SHARE * (middle - healthy) / max(slope, 1e-3 * (middle - healthy))
 
 
 def estimate_parameter(found: Fit, name: str, factor: float = 1.0, least: float = 0.0) -> Estimate:

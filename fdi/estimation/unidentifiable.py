@@ -42,6 +42,7 @@ TRIED_SHARES = (1.0, -1.0, 0.3, -0.3)  # of TRIED
 # sensor shows of a position 1 + error.
 ORIGINS: Mapping[str, float] = {"filter.clogging": 1.0, "magnet_loss.share": 1.0, "coil_short.share": 1.0,
                                 "sensor_gain.error": -1.0}
+POWERS: Mapping[str, float] = {"land_clearance.clearance": 3.0}  # with which a parameter acts, if not in proportion
 # Powers with which parameters move together.
 FLAT: tuple[Mapping[str, float], ...] = (
     {"filter.clogging": 1.0, "pilot.flow_gain": -0.5, "pilot.pressure_gain": -1.0, "supply.pressure": -1.0},
@@ -115,7 +116,8 @@ def list_directions_of_faults(at: Mapping[str, float]) -> list[Mapping[str, floa
               "sensor_gain.error": 1.0 + at.get("sensor_gain.error", 0.0)}
     return [{"magnet_loss.share": 1.0, "torque_motor.gain": -1.0},
             {"coil_short.share": 1.0, "torque_motor.gain": -1.0},
-            {"land_clearance.clearance": clearance * leak["jack.leakage"] / most, "jack.leakage": -3.0 * flow / most},
+            {"land_clearance.clearance": 3.0 * clearance**3 * leak["jack.leakage"] / most,
+             "jack.leakage": -3.0 * flow / most},
             {name: power * linear.get(name, 1.0) for name, power in POSITION_SCALE.items()}]
 
 
@@ -252,7 +254,7 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
     said = [{**flat, **{name: power * at[name] for name, power in effects.items() if name in at}}
             for flat, effects in zip(list_powers(problem), FLAT_WITH_EFFECTS, strict=True)]
     every = [flat for flat in (*said, *others) if next(iter(flat)) in {f.name for f in free}]
-    ways = np.array([[_get_power(flat, f) / f.scale for f in free] for flat in every]).reshape(-1, len(free))
+    ways = np.array([[get_power(flat, f) / f.scale for f in free] for flat in every]).reshape(-1, len(free))
     if not len(ways):
         return ways.T
     shares = np.array(TRIED_SHARES)
@@ -264,10 +266,10 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
     return flat_ways[_find_independent(flat_ways)].T
 
 
-def _get_power(powers: Mapping[str, float], f: Free) -> float:
+def get_power(powers: Mapping[str, float], f: Free) -> float:
     """The power with which an unknown moves; a ratio of frictions only moves where its frictions move apart."""
     power = powers.get(f.name, 0.0)
-    return power - powers.get(f.dynamic_name, 0.0) if isinstance(f, LogFrictionRatio) else power
+    return power - powers.get(f.leader, 0.0) if isinstance(f, LogFrictionRatio) else power
 
 
 def _find_independent(ways: Floats) -> list[int]:
@@ -330,12 +332,16 @@ class LogFree(Free):
 
 
 class LogFrictionRatio(LogFree):
-    """Static friction by the logarithm of its ratio to the dynamic one of the same body, which comes before it."""
+    """Static friction by the logarithm of its ratio to the dynamic one of the same body, which comes before it.
+
+    Or the dynamic one by its ratio to the static one, which then comes before it.
+    """
 
     @property
-    def dynamic_name(self) -> str:
-        """The dynamic friction's name."""
-        return self.name.replace("static", "dynamic")
+    def leader(self) -> str:
+        """The other friction's name."""
+        is_static = "static" in self.name
+        return self.name.replace("static", "dynamic") if is_static else self.name.replace("dynamic", "static")
 
 
 class LogOpenFilter(Free):
@@ -344,6 +350,15 @@ class LogOpenFilter(Free):
     def value(self, x: float) -> float:
         """Kintas."""
         return 1.0 - math.exp(super().value(x))
+
+
+class PowerFree(Free):
+    """A parameter by its power in `POWERS`, with which its law goes: centre, scale and bounds are those of the power.
+    """
+
+    def value(self, x: float) -> float:
+        """The parameter in SI units."""
+        return float(super().value(x) ** (1.0 / POWERS[self.name]))
 
 
 def take_logarithm(f: Free) -> Free:
@@ -359,13 +374,13 @@ def compute_values(free: Sequence[Free], x: Floats) -> Floats:
     names = [f.name for f in free]
     for k, f in enumerate(free):
         if isinstance(f, LogFrictionRatio):
-            found[k] *= found[names.index(f.dynamic_name)]
+            found[k] *= found[names.index(f.leader)]
     return limit_dynamic_friction(names, found)
 
 
 @dataclass
 class LogProblem(Problem):
-    """A problem whose unknowns may be logarithms, the jack's static friction by its ratio to the dynamic one."""
+    """A problem whose unknowns may be logarithms, a friction by its ratio to the other one of the same body."""
 
     def convert_unknowns(self, free: Sequence[Free], x: Floats) -> Floats:
         return np.array([compute_values(free, row) for row in x])
@@ -451,14 +466,19 @@ def take_best_step(problem: Problem, fit: Fit) -> Fit:
                    white=white[k])
 
 
-def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats, stage: Stage = NO_STAGE) -> Fit:
+def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats, stage: Stage = NO_STAGE,
+                   slopes: Problem | None = None) -> Fit:
     """A fit after so many rounds of steps across the valley, then moved along it to where the priors want it.
 
-    `flat` (p, k) are the directions that the data do not see. `stage` takes a step with each round.
+    `flat` (p, k) are the directions that the data do not see. `stage` takes a step with each round. `slopes`: the same
+    problem with coarser steps, for the differences; default `problem` itself.
     """
     def linearise(fit: Fit) -> Fit:
-        return linearise_across(problem, fit.free, fit.x, fit.covariance, flat)
+        here = linearise_across(slopes or problem, fit.free, fit.x, fit.covariance, flat)
+        return here if slopes is None else replace(here, cost=fit.cost, misfit=fit.misfit, residuals=fit.residuals,
+                                                   white=fit.white)
 
+    begun = begun if slopes is None else replay_fit(problem, begun, begun.x)
     return replace(relax_along(take_steps(problem, begun, linearise, rounds, stage), flat), converged=True)
 
 

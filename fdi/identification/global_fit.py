@@ -49,7 +49,7 @@ def scale_values(free: Sequence[Free], values: Mapping[str, float]) -> Floats:
             continue
         value = values[f.name]
         if isinstance(f, LogFrictionRatio):
-            value = max(value / values[f.dynamic_name], 1.0)
+            value = max(value / values[f.leader], 1.0)
         place = math.log(value) if isinstance(f, LogFree) else value
         x[k] = (min(max(place, f.low), f.high) - f.centre) / f.scale
     return x

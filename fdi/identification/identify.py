@@ -461,7 +461,7 @@ def _compute_shares(free: Sequence[Free], information: Floats) -> dict[str, floa
         slope = np.zeros(len(free))
         slope[k] = f.scale
         if isinstance(f, LogFrictionRatio):
-            dynamic = names.index(f.dynamic_name)
+            dynamic = names.index(f.leader)
             slope[dynamic] = free[dynamic].scale
         spread = IDENTIFIED_INTERVAL_FACTOR * float(np.sqrt(slope @ covariance @ slope))
         shares[f.name] = INTERVAL_95_SD * float(np.hypot(spread, get_systematic_sd(f.name))) / (f.scale * f.prior)
@@ -658,10 +658,10 @@ def find_hidden(problem: LogProblem, fit: Fit, ranges: Mapping[str, Range]
             high = r.high if above else _find_edge(problem, fit, k, f.high)
             found[f.name] = (min(max(r.centre, low), high), low, high)
     for k, f in enumerate(fit.free):
-        if isinstance(f, LogFrictionRatio) and f.dynamic_name in found:  # it moved as well, and no signal changed
+        if isinstance(f, LogFrictionRatio) and f.leader in found:  # it moved as well, and no signal changed
             ratio = f.value(float(fit.x[k]))
             least, most = (ranges[f.name].low, ranges[f.name].high) if f.name in ranges else (0.0, math.inf)
-            value, low, high = (min(max(ratio * each, least), most) for each in found[f.dynamic_name])
+            value, low, high = (min(max(ratio * each, least), most) for each in found[f.leader])
             found[f.name] = value, low, high
     return found
 
@@ -748,7 +748,7 @@ def estimate_parameters(model: Model, ranges: Sequence[Range], fit: Fit,
             k = names.index(r.name)
             slopes[i, k] = free[k].scale
             if isinstance(f := free[k], LogFrictionRatio):
-                dynamic = names.index(f.dynamic_name)
+                dynamic = names.index(f.leader)
                 slopes[i, dynamic] = free[dynamic].scale
     covariance = slopes @ fit.covariance @ slopes.T
     spread = np.sqrt(np.diag(covariance))

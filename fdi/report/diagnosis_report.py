@@ -54,6 +54,7 @@ from fdi.report.drawing import (
 from fdi.report.numbers import (
     NO_NUMBER,
     attach_unit,
+    choose_unit,
     format_digits,
     format_interval,
     format_ratio,
@@ -243,13 +244,14 @@ def list_found_faults(answer: Mapping[str, Any]) -> list[FoundFault]:
     return found
 
 
-def format_limits_of_fault(fault: Fault) -> tuple[str, str]:
+def format_limits_of_fault(fault: Fault) -> tuple[str, ...]:
     """MidBand and MaxBand of a fault.
 
     >>> format_limits_of_fault(FRICTION)
     ('35 N', '70 N')
     """
-    return attach_unit(f"{fault.acceptable:g}", fault.unit), attach_unit(f"{fault.maintenance:g}", fault.unit)
+    return tuple(f"{size / scale:g} {unit}".rstrip() for size in (fault.acceptable, fault.maintenance)
+                 for scale, unit in [choose_unit(fault.unit, abs(size))])
 
 
 def describe_residual(d: Diagnosis) -> str:
@@ -392,7 +394,7 @@ def _show_bands(d: Diagnosis) -> list[Item]:
     judged, bands = d.band_verdict, d.bands
     if judged is None:
         return []
-    items: list[Item] = [Figure("Command and ram position. Shaded: times outside MidBand (amber) and MaxBand (red).",
+    items: list[Item] = [Figure("Command and position. Shaded: times outside MidBand (amber) and MaxBand (red).",
                                 partial(draw_overview, d.trace, judged))]
     if bands is not None:
         items += [Figure(
@@ -473,17 +475,18 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
     return [tabulate(
         found, (Column("precursor"), lambda name: found[name].words),
         (Column("measured", align="right"), lambda name: Cell(found[name].shown, is_strong=True)),
-        show_value("healthy", lambda p: p.healthy), show_value("healthy s.d.", lambda p: p.noise),
-        (Column("deviation", "s.d.", "right"), lambda name: Cell(
-            show_deviation(found[name].departure), "bad" if 4.0 < abs(found[name].departure) < math.inf else "")),
-        show_value(f"Kintas {CLOGGING.acceptable:g} adds", lambda p: p.clogging),
-        (number("in s.d."), lambda name: show_deviation(found[name].clogging_ratio)),
-        show_value(f"FSS {FRICTION.acceptable:g} N adds", lambda p: p.friction),
-        (number("in s.d."), lambda name: show_deviation(found[name].friction_ratio)),
-        caption="Deviation: measured minus healthy mean, in standard deviations of healthy units; red beyond 4."),
-        Figure("How far a fault at MidBand moves each precursor, in standard deviations of healthy units: longer bars "
-               "discriminate better; below the dotted line (3) a single test does not show the fault.",
-               partial(draw_precursor_shifts, found))]
+        *((show_value("healthy", lambda p: p.healthy), show_value("healthy s.d.", lambda p: p.noise),
+           (Column("deviation", "s.d.", "right"), lambda name: Cell(
+               show_deviation(found[name].departure), "bad" if 4.0 < abs(found[name].departure) < math.inf else "")),
+           show_value(f"Kintas {CLOGGING.acceptable:g} adds", lambda p: p.clogging),
+           (number("in s.d."), lambda name: show_deviation(found[name].clogging_ratio)),
+           show_value(f"FSS {FRICTION.acceptable:g} N adds", lambda p: p.friction),
+           (number("in s.d."), lambda name: show_deviation(found[name].friction_ratio))) if d.bands else ()),
+        caption="Deviation: measured minus healthy mean, in standard deviations of healthy units; red beyond 4."
+        if d.bands else "As measured; without bands there are no healthy units to compare with."),
+        *([Figure("How far a fault at MidBand moves each precursor, in standard deviations of healthy units: longer "
+                  "bars discriminate better; below the dotted line (3) a single test does not show the fault.",
+                  partial(draw_precursor_shifts, found))] if d.bands else [])]
 
 
 def collect_data(d: Diagnosis) -> dict[str, Any]:
@@ -549,7 +552,7 @@ def draw_overview(trace: Trace, judged: BandVerdict) -> str:
     limits = (float(trace.t[0]), float(trace.t[-1]) + trace.period)
     return draw_panels("overview", [[[
         line(trace.t, trace.command * MM, COMMAND, "Com, command", 2.2),
-        line(trace.t, trace.mask_unusable(trace.declared.controlled.name) * MM, BLUE, "XJ, ram"),
+        line(trace.t, trace.mask_unusable(trace.declared.controlled.name) * MM, BLUE, "XJ, position"),
         *_shade_events(judged.events, limits),
         axes(xlim=limits, ylabel="position [mm]", xlabel="time [s]"), legend(2)]]], 2.4)
 

@@ -24,31 +24,28 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from fdi.diagnosis.faults import FAULTS, Fault, Level
+from fdi.estimation.fit import list_relative_tolerances
 from fdi.output import write_text, write_whole
 from fdi.prognosis.unit_trend import list_traces
 from fdi.sources import hash_sources, import_function
+from fdi.thresholds import UNIT_TOLERANCE
 from fdi.trace.trace import Floats, Trace
 from plant import simulate
 from plant.errors import InputError, RigError
-from plant.model import Model, find_effect, find_quantity, parse_model
+from plant.model import Model, build_bare_model, find_effect, find_quantity, parse_model
 from plant.parameters import load_nominal_values, parse_toml, parse_value, read_toml
+from plant.plants import Plant, load_plant
 from plant.quantity import Quantity
-from plant.run import NOISES
-from plant.segments import RATE
 from plant.signals import EHA
 from plant.threads import count_threads
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, import_extra, read_rows, run_batch
 from rig.network.clock import WallClock
-from rig.sequences import load_sequence
-from rig.tables import Choice, Place, Range, build_dataclass
+from rig.sequences.nominal import load_nominal_test
+from rig.tables import Place, Range, build_dataclass
 
 OWN_SIMULATOR = "plant"
 HEALTHY = "healthy"
 Tolerance = Annotated[float, Range("1", low=0.0, high=0.2)]
-
-
-MEASURED = tuple(",".join(s.name for s in EHA.outputs[:count]) for count in range(len(EHA.outputs), 0, -1))
-"""Signals that may be measured in a campaign."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,9 +56,10 @@ class Settings:
     first: Annotated[int, Range("1", low=0)] = 0  # seed of the first
     tolerance: Tolerance | tuple[Tolerance, ...] = (0.015,)
     simulator: str = OWN_SIMULATOR  # plant.simulate in 10 us steps, or "module:function"
-    colour: Annotated[float, Range("1", low=0.0, high=0.99)] = 0.8  # correlation of xj's noise between cycles
-    hum: Annotated[float, Range("m", low=0.0, high=1e-3)] = 0.7e-6  # of the mains on the position sensor
-    signals: Annotated[str, Choice(lambda: MEASURED)] = MEASURED[0]  # measured
+    # of the controlled signal's noise: correlation from one cycle to the next, and the mains, in the signal's unit
+    colour: Annotated[float, Range("1", low=0.0, high=0.99)] = 0.8
+    hum: Annotated[float, Range("1", low=0.0)] = 0.0
+    signals: str = ""  # outputs that are measured
 
     def __post_init__(self) -> None:
         if self.tolerance == ():
@@ -111,21 +109,38 @@ def build_matrix(tables: Mapping[str, Any], model: Model, work: str, where: obje
     """The campaign that the tables of a matrix file describe.
 
     Raises:
-        InputError: an unknown key or effect, a value out of range, another plant than `eha`, or no case at all.
+        InputError: an unknown key or effect, a value out of range, a plant without a nominal test, or no case at all.
     """
-    place = Place(str(where))
-    given = {key: value for key, value in tables.items() if key != "case"}
+    place, outputs = Place(str(where)), [s.name for s in model.kind.signals.outputs]
+    measured = [",".join(outputs[:count]) for count in range(len(outputs), 0, -1)]
+    usual_hum = 0.35  # of the controlled signal's noise
+    given = {"hum": usual_hum * _find_noise(model), "signals": measured[0],
+             **{key: value for key, value in tables.items() if key != "case"}}
     settings = build_dataclass(Settings, given, place)
-    if model.plant != "eha":
-        raise InputError("--model", model.plant, "eha, whose preflight check this is")
-    if model["controller.period"] != 1 / RATE:
-        raise InputError("--set", "controller.period", f"{1 / RATE:g} s, the cycle of the preflight check")
+    if settings.signals not in measured:
+        raise InputError(where, "signals", f"one of {' or '.join(measured)}, not {settings.signals!r}")
+    load_nominal_test(model.kind, model["controller.period"])
     blocks = tables.get("case", [])
     if not isinstance(blocks, list) or not blocks or not all(isinstance(block, Mapping) for block in blocks):
         raise InputError(where, "case", "at least one [[case]] (an empty one is a healthy plant)")
     parsed = [_parse_block(block, given, model, place, faults) for block in blocks]
-    spec = {**settings.list_values(), "model": model.to_toml(), "work": work, **list_own_faults(faults), "case": parsed}
+    spec = {**settings.list_values(), **list_shared(model, work, faults), "case": parsed}
     return Matrix(spec, _expand_cases(spec))
+
+
+def list_shared(model: Model, work: str, faults: Sequence[Fault]) -> dict[str, Any]:
+    """What every worker needs, as JSON values: the model, with the path of a user's plant, judgement and faults.
+
+    The paper's faults are left out, as in all folders that have no others.
+    """
+    plant = {} if model.kind.file is None else {"plant_file": str(model.kind.file)}
+    faulty = {} if tuple(faults) == FAULTS else {"faults": [asdict(fault) for fault in faults]}
+    return {"model": model.to_toml(), **plant, "work": work, **faulty}
+
+
+def _find_noise(model: Model) -> float:
+    """RMS noise of the controlled signal, SI."""
+    return model.values.get(model.kind.signals.controlled.noise, 0.0)
 
 
 def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Model, place: Place,
@@ -154,11 +169,6 @@ def _find_size(name: str, model: Model, faults: Sequence[Fault]) -> Quantity:
     if not effect.fitted:
         raise InputError("", name, "an effect with a size; this one is noise of the bench")
     return effect.parameters[effect.fitted[0]]
-
-
-def list_own_faults(faults: Sequence[Fault]) -> dict[str, Any]:
-    """The faults as JSON values of a campaign; nothing for the paper's, which all folders without them have."""
-    return {} if tuple(faults) == FAULTS else {"faults": [asdict(fault) for fault in faults]}
 
 
 def restore_faults(spec: Mapping[str, Any]) -> tuple[Fault, ...]:
@@ -199,9 +209,7 @@ def build_trace_matrix(folder: str | Path, model: Model, work: str, faults: Sequ
     root = Path(folder).absolute()
     names = {path.relative_to(root).as_posix(): path for path in list_traces(root)}
     digests = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in names.items()}
-    spec = {"traces": str(root), "files": digests, "model": model.to_toml(), "work": work,
-            **list_own_faults(faults)}
-    return restore_matrix(spec)
+    return restore_matrix({"traces": str(root), "files": digests, **list_shared(model, work, faults)})
 
 
 def restore_matrix(spec: Mapping[str, Any]) -> Matrix:
@@ -238,11 +246,6 @@ def parse_faults(words: Sequence[str]) -> list[dict[str, Any]]:
 
 FLOORS = {s.name: load_nominal_values()[s.noise] for s in EHA.outputs}
 """RMS noise of the sensors: m, Pa, m."""
-SCATTERED_PARAMETERS = (
-    "torque_motor.gain", "flapper.inertia", "flapper.damping", "flapper.stiffness", "feedback_spring.stiffness",
-    "pilot.flow_gain", "pilot.pressure_gain", "valve.flow_gain", "valve.pressure_gain", "supply.pressure", "jack.area",
-    "jack.mass", "jack.damping", "jack.static_friction", "jack.dynamic_friction", "jack.leakage")
-"""The parameters with a tolerance, in the order in which they are drawn."""
 
 
 class Unit(NamedTuple):
@@ -252,29 +255,30 @@ class Unit(NamedTuple):
     scatter: Mapping[str, float]  # parameter "group.field" to the factor on its value
     sizes: Mapping[str, float]  # fault, or effect by its first parameter, to its size, SI
     command: Floats  # (n,) m
-    noise: Floats  # (n, NOISES), in units of the sensors' noise
+    noise: Floats  # (n, outputs + 1), in units of the sensors' noise
     faults: tuple[Fault, ...] = FAULTS
 
 
 Simulator = Callable[[Unit], Mapping[str, Floats]]
-"""From a unit to its columns com, cor, load, xj, p12, xs, (n,) each, SI."""
+"""From a unit to the columns of its signals, of the EHA com, cor, load, xj, p12, xs; (n,) each, SI."""
 
 
 def simulate_case(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
-    """The preflight check of a plant with the faults, scatter and noise of a case.
+    """The nominal test of a plant with the faults, scatter and noise of a case.
 
     Raises:
         InputError: values that contradict each other, no such simulator, or a fault or change that it does not have.
     """
-    command = np.round(load_sequence("preflight").main_profile().command, 12)
-    scatter, noise = sample_random_parts(case, len(command), spec["colour"], spec["hum"])
+    signals, period = model.kind.signals, model["controller.period"]
+    command = np.round(load_nominal_test(model.kind, period)[0], 12)
+    scatter, noise = sample_random_parts(case, len(command), spec["colour"], spec["hum"], model)
     simulator: Simulator = simulate_unit
     if spec["simulator"] != OWN_SIMULATOR:
         simulator = import_function(spec["simulator"], "--simulator", "a simulator of units")
     columns = simulator(Unit(model, scatter, case.sizes, command, noise, restore_faults(spec)))
-    measured = {EHA.command.name, EHA.drive.name, "load", *spec["signals"].split(",")}
-    return Trace.from_columns({name: columns[name] for name in columns if name in measured}, model["controller.period"],
-                              {"source": case.label, "seed": str(case.seed)})
+    measured = {signals.command.name, signals.drive.name, "load", *spec["signals"].split(",")}
+    return Trace.from_columns({name: columns[name] for name in columns if name in measured}, period,
+                              {"source": case.label, "seed": str(case.seed)}, signals)
 
 
 def simulate_unit(unit: Unit) -> dict[str, Floats]:
@@ -283,40 +287,55 @@ def simulate_unit(unit: Unit) -> dict[str, Floats]:
     return simulate(add_faults(model, unit.sizes, unit.faults), unit.command, drawn=unit.noise)._asdict()
 
 
-def sample_random_parts(case: Case, cycles: int, colour: float, hum: float) -> tuple[dict[str, float], Floats]:
+def sample_random_parts(case: Case, cycles: int, colour: float, hum: float, model: Model
+                        ) -> tuple[dict[str, float], Floats]:
     """Scatter and noise of a case, as `Unit` holds them.
 
     Another label gives other random numbers. Another tolerance gives the same, so that a unit is comparable with
     itself at another tolerance.
     """
+    scatter, rng = sample_scatter(case, model.kind)
+    level, period = _find_noise(model) or 1.0, model["controller.period"]
+    position = sample_coloured_noise(cycles, level, colour, hum, period, rng)
+    others = rng.standard_normal((cycles, len(model.kind.signals.outputs)))
+    return scatter, np.column_stack([position / level, others])
+
+
+def sample_scatter(case: Case, kind: Plant) -> tuple[dict[str, float], np.random.Generator]:
+    """Factors on the parameters of the unit of a case, and the source of its other random numbers."""
     rng = np.random.default_rng([case.seed, 11, zlib.crc32(case.label.encode())])
-    nominal = load_nominal_values()
-    scatter = {name: value / nominal[name] for name, value in sample_healthy_plant(case.tolerance, rng).items()}
-    position = sample_position_noise(cycles, colour, hum, rng)
-    return scatter, np.column_stack([position / FLOORS[EHA.controlled.name], rng.standard_normal((cycles, NOISES - 1))])
+    healthy = sample_healthy_plant(case.tolerance, rng, kind)
+    return {name: value / kind.nominal[name] for name, value in healthy.items()}, rng
 
 
-def sample_healthy_plant(spread: float, rng: np.random.Generator) -> dict[str, float]:
-    """The parameters of a healthy plant; `spread` is their relative standard deviation about nominal."""
-    nominal = load_nominal_values()
-    return {name: nominal[name] * (1 + spread * rng.standard_normal()) for name in SCATTERED_PARAMETERS}
+def sample_healthy_plant(spread: float, rng: np.random.Generator, kind: Plant) -> dict[str, float]:
+    """The parameters of a healthy plant that differ from unit to unit, SI.
+
+    `spread` is the standard deviation of most of them, relative; one with another tolerance differs by as much more.
+    """
+    tolerances = list_relative_tolerances(build_bare_model(kind.key), kind.nominal)
+    return {name: kind.nominal[name] * (1 + spread * (tolerance / UNIT_TOLERANCE) * rng.standard_normal())
+            for name, tolerance in tolerances.items()}
 
 
-def sample_position_noise(n: int, colour: float, hum: float, rng: np.random.Generator) -> Floats:
-    """Noise of the position sensor, (n,) m: first-order noise with the RMS of the noise floor, and hum of 50 Hz.
+def sample_coloured_noise(n: int, level: float, colour: float, hum: float, period: float, rng: np.random.Generator
+                          ) -> Floats:
+    """Noise of the sensor of the controlled signal, (n,), in its unit: first-order noise, and hum of 50 Hz.
 
     Args:
         n: number of cycles.
+        level: RMS of the first-order noise.
         colour: correlation from one cycle to the next.
-        hum: amplitude of the mains hum, m.
+        hum: amplitude of the mains hum.
+        period: of a cycle, s.
         rng: source of the random numbers.
     """
-    white = FLOORS[EHA.controlled.name] * rng.standard_normal(n)
+    white = level * rng.standard_normal(n)
     noise, last = np.empty(n), float(white[0])
     noise[0] = last
     for k, innovation in enumerate((np.sqrt(1 - colour**2) * white).tolist()[1:], start=1):
         noise[k] = last = colour * last + innovation
-    noise += hum * np.sin(2 * np.pi * 50.0 * (1 / RATE) * np.arange(n) + 1.0)
+    noise += hum * np.sin(2 * np.pi * 50.0 * period * np.arange(n) + 1.0)
     return noise
 
 
@@ -373,9 +392,12 @@ def describe_case(case: Case, spec: Mapping[str, Any]) -> Row:
            "seed": case.seed, "status": FAILED, "reason": ""}
     if case.trace:
         return row
-    values = _parse_healthy_model(spec).values
-    return row | {f"true_{fault.key}": case.sizes.get(fault.name, values.get(fault.parameter, fault.healthy))
-                  for fault in restore_faults(spec)}
+    model = _parse_healthy_model(spec)
+    scatter, _ = sample_scatter(case, model.kind)
+    usual = {name: factor * model[name] for name, factor in scatter.items()}
+    return row | {f"true_{fault.key}": case.sizes.get(
+        fault.name, usual.get(fault.parameter, model.values.get(fault.parameter, fault.healthy)))
+        for fault in restore_faults(spec)}
 
 
 def _load_judgement(spec: Mapping[str, Any]) -> Callable[..., Row]:
@@ -384,7 +406,15 @@ def _load_judgement(spec: Mapping[str, Any]) -> Callable[..., Row]:
 
 
 def _parse_healthy_model(spec: Mapping[str, Any]) -> Model:
-    return parse_model(tomllib.loads(spec["model"]), "campaign")
+    """The model; in a worker process the file of a user's plant is read first, and must be that of the campaign."""
+    tables = tomllib.loads(spec["model"])
+    if "plant_file" in spec:
+        path = Path(spec["plant_file"])
+        code = path.read_bytes() if path.is_file() else b""
+        if hashlib.sha256(code).hexdigest() != tables["plant_sha256"]:
+            raise RigError(f"{path} on {platform.node()} is not the plant file with which the campaign was started")
+        load_plant(path, code, tables["plant"])
+    return parse_model(tables, "campaign")
 
 
 def hash_campaign_sources() -> str:

@@ -161,8 +161,8 @@ def count_detections(rows: Sequence[Row], fault: Fault) -> list[Figures]:
     the bands alone.
     """
     healthy = [row for row in rows if row["label"] == HEALTHY and row["status"] == OK]
-    groups: dict[float, list[Row]] = {}
-    for row in healthy + select_single_fault(rows, fault):
+    groups = {find_usual_size(healthy, fault): healthy} if healthy else {}
+    for row in select_single_fault(rows, fault):
         groups.setdefault(true_size(row, fault), []).append(row)
     counted: dict[str, Callable[[Row], bool]] = {
         "detected": partial(is_detected, fault=fault),
@@ -171,6 +171,11 @@ def count_detections(rows: Sequence[Row], fault: Fault) -> list[Figures]:
         "bands": partial(is_detected, fault=fault, judged_by="band")}
     return [{"size": size, **{name: format_share(count_share(groups[size], is_good)) for name, is_good in
                               counted.items()}} for size in sorted(groups)]
+
+
+def find_usual_size(rows: Sequence[Row], fault: Fault) -> float:
+    """The median of the true sizes of a fault, SI: those of a parameter with a tolerance differ from unit to unit."""
+    return float(np.median([true_size(row, fault) for row in rows]))
 
 
 def count_levels(rows: Iterable[Row], fault: Fault, faults: Sequence[Fault] = FAULTS) -> dict[str, dict[str, int]]:
@@ -238,10 +243,11 @@ def _measure_error(label: str, rows: Sequence[Row], fault: Fault) -> Figures:
     most: 95 % of the errors are smaller; close: errors as small as required of the off-grid case, None for a healthy
     plant; covered: the 95 % interval contains the truth.
     """
-    size = true_size(rows[0], fault)
-    error = np.array([row[fault.key] for row in rows]) - size
+    size = find_usual_size(rows, fault)
+    error = np.array([row[fault.key] - true_size(row, fault) for row in rows])
     close = measure_share(int((abs(error) <= CLOSE.get(fault.name, 0.05) * abs(size)).sum()), len(error))
-    covered = count_share(rows, lambda row: row[f"{fault.key}_low"] <= size <= row[f"{fault.key}_high"])
+    covered = count_share(rows, lambda row: row[f"{fault.key}_low"] <= true_size(row, fault) <= row[f"{fault.key}_high"]
+                          )
     return {"label": label, "fault": fault.name, "symbol": fault.symbol, "truth": size,
             "cases": len(error), "bias": float(error.mean()),
             "rms": float(np.sqrt((error**2).mean())), "most": float(np.quantile(abs(error), 0.95)),

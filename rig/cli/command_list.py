@@ -104,10 +104,11 @@ COMMANDS = {
              option("--simulator", metavar="MODULE:FUNCTION",
                     help="function that simulates a unit (rig.campaign.judge.Unit) instead of the plant model"),
              option("--signals", metavar="NAME,..", help="outputs that are measured, such as xj,p12 (default: all)"),
-             option("--model", metavar="FILE|NAME", help="the healthy plant (default eha)"),
+             option("--model", metavar="FILE|NAME", help="the healthy plant: a model or plant file, or a shipped one "
+                                                         "(default eha)"),
              option("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
                     help="change a parameter of this plant (repeatable)"),
-             FAULTS,
+             FAULTS, TRUST,
              option("--work", default="fdi", metavar="MODULE:FUNCTION",
                     help="function that judges a case instead of rig fdi"))))),
     "check": Command(

@@ -183,7 +183,8 @@ def write_case(plant: str, case: Case, folder: Path) -> None:
         rng = np.random.default_rng([case.seed, 5, turn])
         command = sample_holdout_command(plant, rng) if name == "holdout" else make_command(plant)
         noise = rng.standard_normal((len(command), len(kind.signals.outputs) + 1))
-        noise[:, 0] = judge.sample_position_noise(len(command), case.colour, case.hum, rng) / judge.FLOORS["xj"]
+        level, period = judge.FLOORS["xj"], 1.0 / _get_rate("eha")
+        noise[:, 0] = judge.sample_coloured_noise(len(command), level, case.colour, case.hum, period, rng) / level
         run = simulate(truth, command, steps=STEPS, drawn=noise)
         names = ("t", *kind.signals.names)
         rows = np.column_stack([getattr(run, name) for name in names])

@@ -15,6 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from plant.plants import find_plant
+from plant.segments import RATE
 from rig.campaign import judge
 from rig.campaign.judge import FLOORS
 from studies.hidden_effects import command, hidden
@@ -82,7 +84,8 @@ def sample_case(seed: int, kind: str | None = None, effects: Sequence[str] = (),
 def sample_healthy_plant(spread: float, rng: np.random.Generator) -> dict[str, float]:
     """The parameters of a healthy plant, by symbol; `spread` is their relative standard deviation about nominal."""
     symbol_of = {name: symbol for symbol, name in SYMBOLS.items()}
-    return {symbol_of[name]: value for name, value in judge.sample_healthy_plant(spread, rng).items()}
+    healthy = judge.sample_healthy_plant(spread, rng, find_plant("eha"))
+    return {symbol_of[name]: value for name, value in healthy.items()}
 
 
 def _sample_level(rng: np.random.Generator) -> BenchLevel:
@@ -126,7 +129,7 @@ def measure_case(case: Case, name: str) -> Measured:
     rng = np.random.default_rng([case.seed, 5, turn])
     com = np.round(command.sample_holdout_command(rng) if name == "holdout" else command.preflight_command(), 12)
     n = len(com)
-    noise = {"xj": judge.sample_position_noise(n, case.level.colour, case.level.hum, rng)}
+    noise = {"xj": judge.sample_coloured_noise(n, FLOORS["xj"], case.level.colour, case.level.hum, 1 / RATE, rng)}
     noise |= {signal: FLOORS[signal] * rng.standard_normal(n) for signal in ("p12", "xs")}
     run = simulate_truth(com, list_changed_symbols(case), noise["xj"], command.known_load_profile(n, case.load))
     return Measured(run._replace(p12=run.p12 + noise["p12"], xs=run.xs + noise["xs"]), noise)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi.diagnosis.faults import choose_faults, load_faults
+from fdi.foreign_code import ForeignCode, load_plant_of_model, require_trust
 from fdi.output import write_text
 from plant import InputError, load_model
 from rig.campaign.batch import BatchProgress, Row, Workers
@@ -93,13 +94,19 @@ def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
         if found.spec["work"] not in (*WORKS.values(), work):  # a folder is data
             raise InputError(args.what, "work", f"--work {found.spec['work']} on the command line, to call that "
                                                 "function")
+        if "plant_file" in found.spec:
+            path = Path(found.spec["plant_file"])
+            code = [ForeignCode(str(path), path.read_bytes())] if path.is_file() else []
+            require_trust(args.what, code, is_trusted=args.trust)
         return found, Path(args.what)
+    load_plant_of_model(args.model, is_trusted=args.trust)
     model = load_model(args.model or "eha").replace(parse_changes(args.set))
+    faults = choose_faults(args.faults, model.kind)
     campaigns = Path("campaigns")
     if args.what and Path(args.what).is_dir():
         if changed or args.fault:
             raise InputError(args.what, "", "no faults or seeds: these are recorded traces")
-        return (build_trace_matrix(args.what, model, work, choose_faults(args.faults, model.kind)),
+        return (build_trace_matrix(args.what, model, work, faults),
                 Path(args.out or campaigns / Path(args.what).absolute().name))
     tables = read_matrix(args.what) if args.what else {}
     listed, more = tables.get("case", []), parse_faults(args.fault)
@@ -108,7 +115,6 @@ def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
         shipped = " or ".join(list_shipped_matrices())
         raise InputError("MATRIX.toml|FOLDER", "", f"a matrix file, the shipped matrix {shipped}, a folder of "
                                                    "traces, or --fault EFFECT=SIZE,..")
-    faults = choose_faults(args.faults, model.kind) if args.faults or model.plant == "eha" else ()
     return (build_matrix(tables, model, work, args.what or "--fault", faults),
             Path(args.out or campaigns / Path(args.what or "options").stem))
 

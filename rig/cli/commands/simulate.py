@@ -5,8 +5,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from fdi.output import require_new, require_writable
 from fdi.report.numbers import format_amount
 from fdi.report.report import Report
@@ -14,11 +12,11 @@ from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
 from plant.plant_check import find_divergence
 from plant.plants import Plant
-from plant.profile import build_profile, read_command, resample_on_cycles
-from plant.segments import RATE, Array, Points
-from plant.signals import EHA
+from plant.profile import build_profile, read_command
+from plant.segments import Points
 from rig.cli.answer import give_answer
 from rig.cli.inputs import load_chosen_model
+from rig.sequences.nominal import load_nominal_test
 
 SAMPLE_UNIT = {"jack.static_friction": 900.0, "jack.dynamic_friction": 600.0, "null_bias.current": 5e-5}
 SAMPLE_POINTS = ((0.0, 0.0), (0.5, 0.0), (0.501, 2e-3), (1.5, 2e-3), (3.0, -3e-3), (4.0, -3e-3), (4.001, -1e-3),
@@ -94,27 +92,4 @@ def load_command(file: str | None, period: float, kind: Plant) -> tuple[Any, Any
     """
     if file is not None:
         return (*read_command(file, period, kind.signals), file)
-    if kind.profile:
-        return build_profile(kind.profile, rate=1.0 / period).command, None, f"profile of {kind.name}"
-    if kind.signals.names != EHA.names:
-        raise InputError("--command", "", f"FILE with the columns t and {kind.signals.command.name}: {kind.name} "
-                                          "declares no profile")
-    try:
-        return (*sample_preflight(1.0 / period), "preflight")
-    except InputError:  # its segments are not whole cycles of this period
-        columns = sample_preflight(RATE)
-    t = np.arange(len(columns[0])) / RATE
-    command, force = (resample_on_cycles(t, column, period) for column in columns)
-    return command, force, "preflight"
-
-
-def sample_preflight(rate: float) -> tuple[Array, Array]:
-    """Demand, m, and load, N, of the main phase of preflight, `rate` values a second.
-
-    Raises:
-        InputError: its segments are not whole cycles.
-    """
-    from rig.sequences import load_sequence
-
-    sequence = load_sequence("preflight", rate)
-    return sequence.main_profile().command, sequence.load_profile()
+    return load_nominal_test(kind, period)

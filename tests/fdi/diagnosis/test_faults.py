@@ -14,6 +14,7 @@ from refusals import catch_refusal
 from rig_command import rig
 
 from fdi.diagnosis.ambiguity import cut_intervals, find_groups
+from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.faults import (
     CLOGGING,
     FAULTS,
@@ -27,12 +28,13 @@ from fdi.diagnosis.faults import (
     list_fault_files,
     load_faults,
 )
-from fdi.diagnosis.refine import list_unknowns
+from fdi.diagnosis.refine import list_coarse_starts, list_unknowns, make_start, place_value
 from fdi.estimation.fit import Free
-from fdi.estimation.unidentifiable import LogFree
+from fdi.estimation.unidentifiable import LogFree, LogFrictionRatio, PowerFree, compute_values
 from plant.faults import Fault, place_fault
 from plant.model import load_model
 from plant.plants import find_plant
+from rig.campaign.judge import build_matrix, simulate_case
 
 GAP = {"title": "play", "parameter": "feedback_gap.gap", "range": [0.0, 5e-4], "acceptable": 4e-5, "maintenance": 9e-5}
 EHA = find_plant("eha")
@@ -70,6 +72,8 @@ def test_the_papers_faults_are_a_file_with_the_limits_of_table_2() -> None:
     ({"acceptable": "much"}, ["acceptable", "a number"]),
     ({"follow": ["jack.mass"]}, ["follow", "table of factors"]),
     ({"follow": {"no.such": 1.0}}, ["follow", "plant eha"]),
+    ({"parameter": "controller.current_limit"}, ["parameter", "a replay of the measured drive shows"]),
+    ({"parameter": "quantisation.lsb"}, ["parameter", "a replay of the measured drive shows"]),
     ({"both_ways": 1}, ["both_ways", "true or false"])])
 def test_a_bad_fault_is_one_line_with_status_2(tmp_path: Path, keys: dict[str, Any], words: list[str]) -> None:
     file = write(tmp_path / "bad.toml", **keys)
@@ -155,3 +159,37 @@ def test_a_fault_may_be_an_effect_without_starts() -> None:
     model = load_model(str(ROOT / "plant" / "models" / "new_plant.py"))
     fault = place_fault(Fault("drag", "drag", "dry_friction.torque", (0.0, 5.0), 0.5, 1.0, "ours"), model.kind)
     assert list_unknowns(model.with_effects(["dry_friction"]), [fault])[0].name == "dry_friction.torque"
+
+
+def test_unknowns_are_what_laws_go_with() -> None:
+    """Leakage goes with the cube of a clearance; of the ram's frictions the ratio is known."""
+    faults = [f for f in load_faults("wider") if f.name in ("spool_clearance", "jack_friction")]
+    free = list_unknowns(load_model().with_effects(["land_clearance"]), faults)
+    known = {f.name: f for f in free}
+    clearance = known["land_clearance.clearance"]
+    assert isinstance(clearance, PowerFree) and isinstance(known["jack.dynamic_friction"], LogFrictionRatio)
+    x = (place_value(clearance, 3e-5) - clearance.centre) / clearance.scale
+    assert x == pytest.approx(1.0) and clearance.value(x) == pytest.approx(3e-5)
+    sizes = {"spool_clearance": 2e-5, "jack_friction": 1800.0}
+    start = make_start(free, faults, [sizes[f.name] for f in faults])
+    values = dict(zip(known, compute_values(free, start), strict=True))
+    jack = next(f for f in faults if f.name == "jack_friction")
+    assert values["jack.dynamic_friction"] == pytest.approx(jack.list_changes(1800.0)["jack.dynamic_friction"])
+    assert values["land_clearance.clearance"] == pytest.approx(2e-5)
+
+
+def test_fits_begin_beyond_every_limit() -> None:
+    for kind in ("eha", "ema"):
+        faults = load_faults("wider") if kind == "eha" else choose_faults(None, find_plant(kind))
+        starts = np.array(list_coarse_starts(faults))
+        for fault, tried in zip(faults, starts.T, strict=True):
+            assert max(map(fault.measure_departure, tried)) > fault.limits[2]
+
+
+def test_backlash_is_measured_although_rows_hang_on_its_impacts() -> None:
+    model = load_model("ema")
+    faults = choose_faults(None, model.kind)
+    drawn = build_matrix({"case": [{"backlash": 8e-5}], "seeds": 1}, model, "", "test", faults)
+    found = diagnose(simulate_case(drawn.cases[0], drawn.spec, model), model, faults=faults)
+    assert found.verdict == "MAINTENANCE" and found.ruling == "backlash"
+    assert found.sizes["backlash"].low < 8e-5 < found.sizes["backlash"].high

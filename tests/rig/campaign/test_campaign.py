@@ -201,8 +201,8 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
     (("--fault", "filter_clogging"), "--fault: filter_clogging: expected healthy"),
     (("--fault", "healthy", "--tolerance", "0.5"), "tolerance: expected a number from 0 to 0.2"),
     (("--fault", "healthy", "--seeds", "0"), "seeds: expected a whole number from 1"),
-    (("--fault", "healthy", "--model", "ehs"), "--model: ehs: expected eha"),
-    (("--fault", "healthy", "--set", "controller.period=2e-3"), "--set: controller.period: expected 0.001 s"),
+    (("--fault", "healthy", "--model", "ehs"), "--faults: expected a fault file: the plant ehs brings no faults"),
+    (("--fault", "healthy", "--signals", "xs"), "signals: expected one of xj,p12,xs or xj,p12 or xj, not 'xs'"),
     (("--fault", "healthy", "--jobs", "0"), "--jobs: expected a whole number from 1"),
     (("--fault", "healthy", "--work", "nothing:here"), "--work: nothing:here: expected module:function"),
     (("--fault", "healthy", "--work", ".:x"), "--work: .:x: expected module:function"),
@@ -249,7 +249,7 @@ def test_a_case_depends_on_its_own_seed_alone_and_hides_what_it_says() -> None:
     broken = judge.add_faults(Model(), {"spool_friction": 45.0, "jack_friction": 1600.0, "stribeck": 0.3})
     assert broken["spool.dynamic_friction"] == pytest.approx(30.0) and broken["jack.dynamic_friction"] == 1000.0
     assert broken[CATALOGUE["stribeck"].fitted[0]] == 0.3 and broken[CATALOGUE["stribeck"].fitted[1]] > 0
-    chance = [judge.sample_random_parts(case._replace(seed=seed), 4000, 0.8, 0.0) for seed in range(60)]
+    chance = [judge.sample_random_parts(case._replace(seed=seed), 4000, 0.8, 0.0, Model()) for seed in range(60)]
     noise = chance[0][1]
     assert np.std([scatter[SYMBOLS["GQ"]] for scatter, _ in chance]) == pytest.approx(0.015, rel=0.3)
     assert noise.std(0) == pytest.approx(np.ones(4), rel=0.1)
@@ -300,6 +300,24 @@ def test_rig_fdi_in_a_campaign_finds_both_faults_and_the_statistics_are_written(
     assert "off-grid FSS within 2 %" in shown and "1/1" in shown
     assert answer("campaign", tmp_path, "--summary") == said.json
     assert json.loads((tmp_path / "summary.json").read_text()) == said.json
+
+
+def test_a_plant_file_is_judged_by_worker_processes_and_resumed_only_with_trust(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    rig("new", "plant", "my_motor")
+    rig("campaign", "--model", "my_motor.py", "--fault", "healthy", "--seeds", 3, "--out", "two", "--jobs", 2,
+        "--most", 2)
+    found = rows(tmp_path / "two")
+    fault, = judge.restore_faults(judge.read_matrix_of_folder("two").spec)
+    assert [row["status"] for row in found] == ["ok", "ok"]
+    truth = {row[f"true_{fault.key}"] for row in found}
+    assert len(truth) == 2 and fault.healthy not in truth  # the parameter of the fault scatters as well
+    assert "expected --trust" in refuse("campaign", "two")
+    with Path("my_motor.py").open("a") as file:
+        file.write("# changed\n")
+    said = rig("campaign", "two", "--trust")
+    assert said.status == 2 and "is not the plant file with which the campaign was started" in said.err
 
 
 CLOGGING, FRICTION = "filter_clogging", "spool_friction"
