@@ -3,7 +3,8 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,14 +18,16 @@ from fdi.discovery.sensitivity import (
     judge_injection,
     summarise_injections,
 )
+from fdi.progress import Progress
 from fdi.sources import hash_sources
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
 from rig.network.clock import WallClock
 
-Report = Callable[[str, float], None]
+TYPICAL_RUNS = 8  # of an effect on one more rung: what is left is estimated with it
+CRASHED = "CRASHED"  # the verdict of a run whose workers died
 
 
-def measure_sensitivity(unit: Unit, answer: Answer, file: Path, workers: Workers, report_progress: Report
+def measure_sensitivity(unit: Unit, answer: Answer, file: Path, workers: Workers, report_progress: Progress
                         ) -> list[Claim]:
     """The claim of each effect to hide. Runs that have a row of the same unit in `file` are not made again.
 
@@ -49,7 +52,6 @@ def measure_sensitivity(unit: Unit, answer: Answer, file: Path, workers: Workers
 
     def show(finished: BatchProgress, is_open: int, before: int) -> None:
         made, decided = before + finished.done, len(unit.effects) - is_open
-        # of each effect that is not decided one more rung after this one, as a rule
         runs_left = finished.total - finished.done + TYPICAL_RUNS * is_open
         minutes = 1e-9 * clock.now() / made * runs_left / 60.0
         report_progress(f"{decided} of {len(unit.effects)} effects decided, {made} runs explained, about {minutes:.0f} "
@@ -66,13 +68,9 @@ def measure_sensitivity(unit: Unit, answer: Answer, file: Path, workers: Workers
             before += len(jobs)
 
 
-TYPICAL_RUNS = 8
-CRASHED = "CRASHED"
-
-
 def hash_unit(unit: Unit) -> str:
-    """What tells the rows of a unit from those of another, or of other code."""
-    return hash_sources("plant", "fdi")[:16] + hashlib.sha256(pickle.dumps(unit)).hexdigest()[:16]
+    """What tells the rows of a unit from those of another, or of other code, whichever effects are hidden."""
+    return hash_sources("plant", "fdi") + hashlib.sha256(pickle.dumps(replace(unit, effects=()))).hexdigest()[:16]
 
 
 def _make_row(job: Injection, unit: Unit, key: str) -> Row:

@@ -148,6 +148,8 @@ def test_the_command_tells_claims_and_resumes(files: dict[str, Path], monkeypatc
     assert "Sizes that are named" in page and "coil_lag and sensor_gain (AMBIGUOUS)" in page
     made.clear()
     assert "Each effect was hidden in this unit" in rig(*arguments).out and made == []
+    fewer = [word if word != "coil_lag,constant_load" else "coil_lag" for word in arguments]
+    assert [claim["effect"] for claim in rig(*fewer, "--json").json["sensitivity"]] == ["coil_lag"] and made == []
 
 
 @pytest.mark.parametrize("words, expected", [
