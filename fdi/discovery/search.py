@@ -463,7 +463,7 @@ class Search:
 
         found = self.map_parallel(begin, scan_effects(self.problem, bare, sorted(alike), self.workers))
         finished = self.map_parallel(self.finish_hypothesis, [h for h in found if h.is_near_floor])
-        return [h for h in finished if h.is_at_floor]
+        return self.map_parallel(self.begin_again, [h for h in finished if h.is_at_floor])
 
     def measure_solver_error(self, h: Hypothesis, floor: Mapping[str, float]) -> float:
         """What half the step changes in a replay, over the floor, in the worst signal."""
