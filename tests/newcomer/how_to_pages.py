@@ -79,6 +79,7 @@ NOT_PLAYED = {
     "rig campaign --fault healthy --fault filter_clogging=0.1,0.25,0.35 --seeds 50 --out mine": _HOURS,
 }
 NOT_PLAYED_SECTIONS = {("docs/commands.md", "Find the parameters"): _MINUTES,
+                       ("docs/explain.md", "Sizes that are named"): _MINUTES,
                        ("docs/commands.md", "Measure the software"): "measures for minutes to hours",
                        ("docs/bench.md", "Signals of the bench"): "needs a device on the bus; tests/rig/run plays it"}
 NOT_PLAYED_PAGES = {
