@@ -365,7 +365,10 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
     if there and all(h.is_far for h in there):
         return "PARTLY", (*prints, *there[0].effects)
     if best.is_at_floor and there and not firmware_left:
-        equal = [h for h in there if h.cost + h.repeat_cost < there[0].cost + there[0].repeat_cost + 2.0 * GAIN_TIE]
+        # named alone only with the gain with which an effect is named where the model is at the floor without it
+        equal = [h for h in there if h is there[0] or (
+            measure_gain(h, there[0]) < GAIN_CONVINCES
+            and not (base.is_at_floor and measure_gain(base, h) < GAIN_CONVINCES))]
         if len(equal) > 1:
             return "AMBIGUOUS", (*prints, *dict.fromkeys(e for h in equal for e in h.effects))
         return "EXPLAINED", (*prints, *there[0].effects)
