@@ -14,13 +14,14 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fdi.discovery.detectable import Direction, VirtualTest, list_directions, move_effect
-from fdi.discovery.explain_runs import Answer, explain_runs
+from fdi.discovery.explain_runs import Answer, explain_recording, prepare_effects
 from fdi.discovery.runs import Runs, collect_runs
 from fdi.estimation.binomial import Share, measure_share
 from fdi.estimation.fit import limit_friction_values
@@ -199,28 +200,37 @@ def draw_noise(noise: Noise, n: int, rng: np.random.Generator) -> Floats:
 
 def judge_injection(injection: Injection, unit: Unit) -> dict[str, Any]:
     """Hide the effect, explain the runs, and say what was named."""
-    if unit.plant_file:
-        load_plant(Path(unit.plant_file), key=unit.model.plant)
-    for file in unit.effect_files:
-        load_effects(Path(file))
-    answer, _ = explain_runs(hide_effect(unit, injection))
-    named = list(answer.explanation.effects)
+    _load_files(unit.plant_file, unit.model.plant, unit.effect_files)
+    runs = hide_effect(unit, injection)
+    prepare_effects(runs)
+    found = explain_recording(runs)
+    named = list(found.effects)
     return {**injection._asdict(), "size": measure_size(unit.model, injection.effect, injection.rung),
-            "verdict": answer.verdict, "effects": named,
-            "is_named": answer.verdict == "EXPLAINED" and named == [injection.effect]}
+            "verdict": found.verdict, "effects": named,
+            "is_named": found.verdict == "EXPLAINED" and named == [injection.effect]}
+
+
+@cache
+def _load_files(plant_file: str, plant: str, effect_files: tuple[str, ...]) -> None:
+    """Load the user's plant and effects, once in each process: what runs anew has to be compiled anew."""
+    if plant_file:
+        load_plant(Path(plant_file), key=plant)
+    for file in effect_files:
+        load_effects(Path(file))
 
 
 def choose_injections(unit: Unit, first: Mapping[str, int], rows: Iterable[Mapping[str, Any]]) -> list[Injection]:
     """What to hide next: the trials of the rung under way, of each effect that is not decided; none at the end."""
-    counts, chosen = count_rungs(rows), list[Injection]()
+    rows = list(rows)
+    counts, chosen, done = count_rungs(rows), list[Injection](), {row["number"] for row in rows}
     offered = [entry.name for entry in unit.model.kind.list_effects()]
     for effect in unit.effects:
         rung = _find_open_rung(counts.get(effect, {}), first[effect])
         if rung is not None:
-            _, of = counts.get(effect, {}).get(rung, (0, 0))
             place = (offered.index(effect) * RUNGS + rung) * TRIALS
-            chosen += [Injection(place + trial, effect, rung, trial)
-                       for trial in range(of, min(of + TRIALS_AT_ONCE, TRIALS))]
+            # an interrupted round may have left out any of its trials
+            left = [trial for trial in range(TRIALS) if place + trial not in done][:TRIALS_AT_ONCE]
+            chosen += [Injection(place + trial, effect, rung, trial) for trial in left]
     return chosen
 
 

@@ -126,6 +126,16 @@ def test_a_size_counts_with_one_miss_and_not_with_two(unit: Unit) -> None:
         assert (claim.smallest is not None) == (misses <= TRIALS - NEEDED)
 
 
+def test_trials_that_an_interrupted_round_left_out_are_made_up_for(unit: Unit) -> None:
+    """Workers end in any order: of the first four trials the second may be missing."""
+    one = Unit(**{**vars(unit), "effects": ("coil_lag",)})
+    whole = play_rounds(one, 0, lambda job: job.rung == 0)
+    rows = [row for row in whole if (row["rung"], row["trial"]) != (0, 1)]
+    (job,) = choose_injections(one, {"coil_lag": 0}, [row for row in rows if row["rung"] == 0])
+    assert (job.rung, job.trial) == (0, 1)
+    assert choose_injections(one, {"coil_lag": 0}, [*rows, answer(job, is_named=True)]) == []
+
+
 def test_the_command_tells_claims_and_resumes(files: dict[str, Path], monkeypatch: pytest.MonkeyPatch,
                                               tmp_path: Path) -> None:
     made: list[Injection] = []
