@@ -28,7 +28,7 @@ from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_
 from rig.campaign.sensitivity import measure_sensitivity
 from studies.hidden_effects import cases, hidden
 from studies.hidden_effects.hidden import Hidden
-from studies.hidden_effects.run_trial import run_rig_explain
+from studies.hidden_effects.rig_answer import run_rig_explain
 from studies.hidden_effects.truth import nominal_symbols
 
 EFFECTS = tuple(name for name in hidden.CATALOGUE

@@ -6,12 +6,10 @@ this one, which `rig explain` never loads.
 """
 from __future__ import annotations
 
-import gzip
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +25,7 @@ from plant.profile import build_profile
 from plant.segments import Hold, Ramp, Segment
 from plant.starts import compute_changes, ensure_starts
 from rig.campaign import judge
-from studies.hidden_effects.cases import KINDS
+from studies.hidden_effects.cases import KINDS, name_parameter, write_columns, write_truth
 
 Array = NDArray[np.float64]
 
@@ -176,40 +174,36 @@ def build_truth(plant: str, case: Case) -> Model:
 
 
 def write_case(plant: str, case: Case, folder: Path) -> None:
-    """Write the traces and truth.toml of a case into `folder`, which is made if it is missing."""
+    """Write the traces and truth.json of a case into `folder`, which is made if it is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     kind, truth = find_plant(plant), build_truth(plant, case)
+    outputs = [s.name for s in kind.signals.outputs]
     for turn, name in enumerate(NAMES):
         rng = np.random.default_rng([case.seed, 5, turn])
         command = sample_holdout_command(plant, rng) if name == "holdout" else make_command(plant)
-        noise = rng.standard_normal((len(command), len(kind.signals.outputs) + 1))
+        noise = rng.standard_normal((len(command), len(outputs) + 1))
         level, period = judge.FLOORS["xj"], 1.0 / _get_rate("eha")
         noise[:, 0] = judge.sample_coloured_noise(len(command), level, case.colour, case.hum, period, rng) / level
         run = simulate(truth, command, steps=STEPS, drawn=noise)
-        names = ("t", *kind.signals.names)
-        rows = np.column_stack([getattr(run, name) for name in names])
-        text = "\n".join([",".join(names), *(",".join(f"{x:.9g}" for x in row) for row in rows.tolist())])
-        (folder / f"{name}.csv.gz").write_bytes(gzip.compress(text.encode() + b"\n", compresslevel=4, mtime=0))
-    (folder / "truth.toml").write_text(_format_truth(plant, case), encoding="utf-8")
+        columns = {name: getattr(run, name) for name in ("t", *kind.signals.names)}
+        write_columns(folder / f"{name}.csv.gz", columns, case.signals, outputs)
+    write_truth(folder, _describe_case(plant, case), outputs)
 
 
-def _format_truth(plant: str, case: Case) -> str:
+def _describe_case(plant: str, case: Case) -> dict[str, Any]:
+    """As `studies.hidden_effects.cases.describe_case`; where the effects act is not measured."""
     kind, command = find_plant(plant), make_command(plant)
-    levels = {name: measure_levels(plant, kind.find_effect(name), [values], command)[0] for name, values in case.hidden}
-    names = [*(s.name for s in kind.signals.outputs), "controller"]
-    together = {name: max((each[name] for each in levels.values()), default=0.0) for name in names}
-    lines = [f"seed = {case.seed}", f'model = "{plant}"', f'kind = "{case.kind}"',
-             f"effects = {json.dumps([name for name, _ in case.hidden])}", f'signals = "{case.signals}"',
-             f"colour = {case.colour:.6g}", "", "[base_ratio]", *_format_table(together)]
+    effects: list[dict[str, Any]] = []
     for name, values in case.hidden:
         effect = kind.find_effect(name)
-        lines += ["", "[[hidden]]", f'effect = "{name}"', f"size = {values[effect.fitted[0]]:.8g}",
-                  f"value = {values[effect.fitted[0]]:.8g}", "[hidden.changes]",
-                  *_format_table({f'"{key}"': x for key, x in values.items()})]
-        if len(levels) > 1:
-            lines += ["[hidden.ratio]", *_format_table(levels[name])]
-    return "\n".join([*lines, "", "[scatter]", *_format_table({f'"{k}"': x for k, x in case.scatter.items()}), ""])
-
-
-def _format_table(values: Mapping[str, float]) -> Sequence[str]:
-    return [f"{key} = {value:.8g}" for key, value in values.items()]
+        parameter, unit = name_parameter(effect)
+        effects.append({"name": name, "parameter": parameter, "value": values[parameter], "unit": unit,
+                        "size": values[parameter], "symbols": values,
+                        "floors": measure_levels(plant, effect, [values], command)[0], "where": None})
+    signals = [*(s.name for s in kind.signals.outputs), "controller"]
+    together = {signal: max((e["floors"][signal] for e in effects), default=0.0) for signal in signals}
+    return {"case": f"{case.seed:05d}", "plant": plant, "kind": case.kind, "signals": case.signals, "effects": effects,
+            "floors": together, "where": None,
+            "holdout_noise": {s.name: kind.nominal[s.noise] for s in kind.signals.outputs},
+            "noise": {"colour": case.colour, "hum": case.hum},
+            "parameters": case.scatter}

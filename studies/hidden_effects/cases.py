@@ -1,20 +1,22 @@
-"""Cases of the blind trial: `python -m studies.hidden_effects.cases --out DIR --count N --seed S` writes traces.
+"""Cases of the blind trial, by their seed.
 
 A case is a folder with the traces est.csv.gz (the preflight command), repeat.csv.gz (the same command, other noise) and
-holdout.csv.gz (another command), and with truth.toml (the hidden effects). Everything follows from the seed.
+holdout.csv.gz (another command), and with truth.json (the hidden effects).
 """
 from __future__ import annotations
 
-import argparse
 import gzip
 import json
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.trace.sections import Section, find_sections
+from plant.effects import CATALOGUE, Effect
 from plant.plants import find_plant
 from plant.segments import RATE
 from rig.campaign import judge
@@ -29,6 +31,9 @@ KINDS = {"nothing": 0.20, "one": 0.50, "two": 0.12, "outside": 0.18}
 """What is hidden, with its probability: nothing, effects of the catalogue, or one outside the catalogue."""
 SIGNALS = {"xj": 0.25, "xj,p12": 0.25, "xj,p12,xs": 0.5}
 """The measured signals, with their probability."""
+OUTPUTS = ("xj", "p12", "xs")
+
+
 class BenchLevel(NamedTuple):
     """How far plant and bench are from ideal."""
 
@@ -135,23 +140,47 @@ def measure_case(case: Case, name: str) -> Measured:
     return Measured(run._replace(p12=run.p12 + noise["p12"], xs=run.xs + noise["xs"]), noise)
 
 
-def measure_effect_ratios(case: Case, measured: Measured, without: Iterable[str]) -> dict[str, float]:
-    """The RMS effect on each signal in noise floors: the trace against a replay of the plant `without` the effects.
+def measure_changes(case: Case, measured: Measured, without: Iterable[str]) -> dict[str, Array]:
+    """What effects change in a trace, (n,) each, in noise floors: the trace less noise, less a replay `without` them.
 
-    The replay is driven by the measured current. `xj_drift` is the whole difference in position, which drifts; `xj` is
-    its change over 20 cycles. `controller` is the difference between the controller's answer and the control law, in
-    units of what the position's noise floor does to the answer.
+    The replay is driven by the measured current.
     """
     run, noise = measured.trace, measured.noise
     bare = simulate_truth(run.com, list_changed_symbols(case, without), None, run.load, run.cor)
-    xj, lag = run.xj - noise["xj"] - bare.xj, 20
+    change = measure_floors({name: getattr(run, name) - noise[name] - getattr(bare, name) for name in OUTPUTS})
+    return change | {"cor": measure_law_error(run.com, run.xj, run.cor)}
+
+
+def measure_floors(differences: Mapping[str, Array], lag: int = 20) -> dict[str, Array]:
+    """Differences of two runs, SI, (n,) each, in noise floors.
+
+    That of the position is its change over `lag` cycles, because the position of a replay drifts with any difference.
+    """
+    floors = {name: x / FLOORS[name] for name, x in differences.items()}
+    xj = floors["xj"] / 2**0.5
+    return floors | {"xj": np.concatenate([np.zeros(lag), xj[lag:] - xj[:-lag]])}
+
+
+def measure_law_error(com: Array, xj: Array, cor: Array) -> Array:
+    """The controller's answer less the control law, (n,), in units of what the position's noise floor does to it."""
     p = nominal_symbols()
-    law = np.clip(p["GAP"] * (run.com - run.xj), -p["Imax"], p["Imax"])
-    return {"xj": _measure_rms(xj[lag:] - xj[:-lag]) / (FLOORS["xj"] * 2**0.5),
-            "xj_drift": _measure_rms(xj) / FLOORS["xj"],
-            "p12": _measure_rms(run.p12 - noise["p12"] - bare.p12) / FLOORS["p12"],
-            "xs": _measure_rms(run.xs - noise["xs"] - bare.xs) / FLOORS["xs"],
-            "controller": _measure_rms(run.cor - law) / (p["GAP"] * FLOORS["xj"])}
+    return (cor - np.clip(p["GAP"] * (com - xj), -p["Imax"], p["Imax"])) / (p["GAP"] * FLOORS["xj"])
+
+
+def describe_change(changes: Mapping[str, Array], command: Array) -> dict[str, Any]:
+    """The RMS of `changes` in noise floors, and the cells "signal/section" of the `command` where it is above 1.
+
+    The sections are those of `name_sections`.
+    """
+    sections = name_sections(command)
+    return {"floors": {signal: _measure_rms(x) for signal, x in changes.items()},
+            "where": [f"{signal}/{name}" for signal, x in changes.items() for name, rows in sections.items()
+                      if _measure_rms(x[rows.start:rows.stop]) > 1.0]}
+
+
+def name_sections(command: Array) -> dict[str, Section]:
+    """The sections of a command by name: s01, s02, .."""
+    return {f"s{number:02d}": section for number, section in enumerate(find_sections(command, 1 / RATE), start=1)}
 
 
 def _measure_rms(x: Array) -> float:
@@ -159,64 +188,68 @@ def _measure_rms(x: Array) -> float:
 
 
 def write_case(case: Case, folder: Path) -> None:
-    """Write the traces and truth.toml of a case into `folder`, which is made if it is missing."""
+    """Write the traces and truth.json of a case into `folder`, which is made if it is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("est", "repeat", "holdout"):
         measured = measure_case(case, name)
-        _write_trace(measured.trace, folder / f"{name}.csv.gz")
+        columns = {"t": np.arange(len(measured.trace.com)) / RATE, **measured.trace._asdict()}
+        write_columns(folder / f"{name}.csv.gz", columns, case.signals)
         if name == "est":
-            (folder / "truth.toml").write_text(_format_truth(case, measured), encoding="utf-8")
+            truth = describe_case(case, measured)
+        noise = {signal: _measure_rms(x) for signal, x in measured.noise.items()}
+    write_truth(folder, truth | {"holdout_noise": noise}, OUTPUTS)
 
 
-def _write_trace(run: Run, path: Path) -> None:
-    rows = np.column_stack([run.com, run.xj, run.cor, run.p12, run.xs, run.load]).tolist()
-    lines = [f"{k / 1000:.3f},%.9g,%.9g,%.9g,%.9g,%.9g,%.9g" % tuple(row) for k, row in enumerate(rows)]
-    text = "\n".join(["t,com,xj,cor,p12,xs,load", *lines, ""])
-    # without a time stamp: the same case gives the same bytes
-    path.write_bytes(gzip.compress(text.encode(), compresslevel=4, mtime=0))
+def write_columns(path: Path, columns: Mapping[str, Array], signals: str, outputs: Collection[str] = OUTPUTS) -> None:
+    """Write the columns of a trace, (n,) each, without those of the `outputs` that are not among the `signals`.
+
+    The file has no time stamp: the same case gives the same bytes.
+    """
+    names = [name for name in columns if name in signals.split(",") or name not in outputs]
+    rows = np.column_stack([columns[name] for name in names]).tolist()
+    lines = [",".join(names), *(",".join(f"{x:.9g}" for x in row) for row in rows), ""]
+    path.write_bytes(gzip.compress("\n".join(lines).encode(), compresslevel=4, mtime=0))
 
 
-def _format_truth(case: Case, est: Measured) -> str:
-    """The hidden effects and the plant of a case, as TOML."""
-    names = [effect.name for effect in case.effects]
-    lines = [f"seed = {case.seed}", f"kind = {json.dumps(case.kind)}", f"effects = {json.dumps(names)}",
-             f"signals = {json.dumps(case.signals)}", f"known_load = {case.load:.6g}", "", "[level]",
-             *(f"{key} = {value:.6g}" for key, value in case.level._asdict().items()), "", "[base_ratio]",
-             *_format_table(measure_effect_ratios(case, est, names))]
+def read_columns(path: Path) -> dict[str, Array]:
+    """The columns of a trace that `write_columns` wrote, (n,) each, SI."""
+    names = gzip.decompress(path.read_bytes()).partition(b"\n")[0].decode().split(",")
+    return dict(zip(names, np.loadtxt(path, delimiter=",", skiprows=1).T, strict=True))
+
+
+def describe_case(case: Case, est: Measured) -> dict[str, Any]:
+    """What is hidden in a case, and its unit, as JSON values."""
+    effects = []
     for effect in case.effects:
-        lines += ["", "[[hidden]]", f"effect = {json.dumps(effect.name)}", f"size = {effect.size:.6g}",
-                  f"value = {effect.value:.8g}", "[hidden.changes]", *_format_table(effect.changes)]
-        if len(case.effects) > 1:
-            lines += ["[hidden.ratio]", *_format_table(measure_effect_ratios(case, est, [effect.name]))]
-    return "\n".join([*lines, "", "[plant]", *_format_table(case.plant), ""])
+        shown = describe_change(measure_changes(case, est, [effect.name]), est.trace.com)
+        parameter, unit = name_parameter(CATALOGUE.get(effect.name))
+        effects.append({"name": effect.name, "parameter": parameter, "value": effect.value, "unit": unit,
+                        "size": effect.size, "symbols": effect.changes} | shown)
+    together = measure_changes(case, est, [effect.name for effect in case.effects])
+    return {"case": f"{case.seed:05d}", "plant": "eha", "kind": case.kind, "signals": case.signals, "effects": effects,
+            **describe_change(together, est.trace.com), "known_load": case.load, "noise": case.level._asdict(),
+            "parameters": case.plant}
 
 
-def _format_table(values: dict[str, float]) -> list[str]:
-    return [f"{key} = {value:.8g}" for key, value in values.items()]
+def name_parameter(effect: Effect | None) -> tuple[str, str]:
+    """The parameter that gives the size of an effect, and its unit; empty without an effect."""
+    return (effect.fitted[0], effect.parameters[effect.fitted[0]].unit) if effect else ("", "")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Write cases to a folder; see --help."""
-    parser = argparse.ArgumentParser(prog="python -m studies.hidden_effects.cases",
-                                     description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for the folders of the cases")
-    parser.add_argument("--count", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first case; each case uses the next seed")
-    parser.add_argument("--kind", choices=list(KINDS))
-    parser.add_argument("--effect", action="append", default=[], choices=[*hidden.CATALOGUE, *hidden.OUTSIDE],
-                        help="the hidden effect; give it twice to hide two")
-    parser.add_argument("--level", choices=list(LEVELS), help="scatter and noise of the bench (default: random)")
-    parser.add_argument("--signals", choices=list(SIGNALS), help="the measured signals (default: random)")
-    parser.add_argument("--sizes", type=float, nargs=2, default=(0.0, 1.0), metavar=("LOW", "HIGH"),
-                        help="fractions of the logarithmic range of sizes (default: 0 1)")
-    args = parser.parse_args(arguments)
-    for seed in range(args.seed, args.seed + args.count):
-        kind = args.kind or ("two" if len(args.effect) > 1 else None)
-        case = sample_case(seed, kind, args.effect, args.level, tuple(args.sizes), args.signals)
-        write_case(case, args.out / f"{seed:04d}")
-        print(f"{seed:04d} {case.kind}: {', '.join(f'{e.name} {e.size:.4g}' for e in case.effects)}", flush=True)
-    return 0
+def write_truth(folder: Path, truth: Mapping[str, Any], outputs: Collection[str]) -> None:
+    """Write truth.json: of the `outputs` only those that are measured, and eight digits of each number.
 
+    Every processor then writes the same bytes.
+    """
+    hidden_from_all = set(outputs) - set(truth["signals"].split(","))
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+    def shorten(x: Any) -> Any:
+        if isinstance(x, Mapping):
+            return {key: shorten(value) for key, value in x.items() if key not in hidden_from_all}
+        if isinstance(x, list | tuple):
+            return [shorten(value) for value in x if str(value).partition("/")[0] not in hidden_from_all]
+        if isinstance(x, float):
+            return float(f"{x:.8g}") if math.isfinite(x) else None
+        return x
+
+    (folder / "truth.json").write_text(json.dumps(shorten(truth), indent=1) + "\n", encoding="utf-8")

@@ -3,27 +3,18 @@ from __future__ import annotations
 
 import csv
 import gzip
-import io
 import json
-import tomllib
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from places import SHARED
-from rich.console import Console
 
-from fdi.report.terminal import print_report
 from fdi.trace.trace import Trace
-from plant import InputError, Model
+from plant import Model
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes
-from studies.hidden_effects import cases, command, hidden, trial_score
-from studies.hidden_effects.__main__ import main
-from studies.hidden_effects.run_trial import RIG_EXPLAIN, load_explain, run_trial
-from studies.hidden_effects.trial_score import build_trial_report, describe_progress
+from studies.hidden_effects import cases, command, hidden
 from studies.hidden_effects.truth import SYMBOLS, has_compiler, nominal_symbols, parameter_names, simulate_truth
 
 PRACTICE = SHARED / "practice"
@@ -131,15 +122,17 @@ def test_the_plants_effects_are_what_the_table_says_as_written_twice() -> None:
 
 
 def test_a_case_repeats_by_its_seed(tmp_path: Path) -> None:
-    case = cases.sample_case(11, level="bench")
-    assert str(case) == str(cases.sample_case(11, level="bench")) != str(cases.sample_case(12, level="bench"))
+    case = cases.sample_case(11, level="bench", signals="xj,p12,xs")
+    again = cases.sample_case(11, level="bench", signals="xj,p12,xs")
+    assert str(case) == str(again) != str(cases.sample_case(12, level="bench"))
     cases.write_case(case, tmp_path)
-    again, holdout = cases.measure_case(case, "holdout").trace, read(tmp_path / "holdout.csv.gz")
+    measured, holdout = cases.measure_case(case, "holdout").trace, read(tmp_path / "holdout.csv.gz")
     for name in ("com", "xj", "cor", "p12", "xs", "load"):
-        assert holdout[name] == pytest.approx(getattr(again, name), rel=1e-8), name
-    truth = tomllib.loads((tmp_path / "truth.toml").read_text())
-    assert truth["effects"] == [h["effect"] for h in truth["hidden"]] and truth["base_ratio"].keys() == {
-        "xj", "xj_drift", "p12", "xs", "controller"}
+        assert holdout[name] == pytest.approx(getattr(measured, name), rel=1e-8), name
+    truth = json.loads((tmp_path / "truth.json").read_text())
+    assert [e["name"] for e in truth["effects"]] == [e.name for e in case.effects]
+    assert truth["floors"].keys() == {"xj", "p12", "xs", "cor"}
+    assert cases.read_columns(tmp_path / "holdout.csv.gz")["xs"] == pytest.approx(measured.xs, rel=1e-8)
     est, repeat = (Trace.read(tmp_path / f"{name}.csv.gz") for name in ("est", "repeat"))
     assert len(est) == 13_500 and (est.com == repeat.com).all() and not (est.xj == repeat.xj).any()
 
@@ -173,121 +166,24 @@ def test_the_noise_of_a_bench_is_coloured_and_hums() -> None:
 
 def test_nothing_hidden_leaves_no_trace_of_an_effect() -> None:
     case = cases.sample_case(5, "nothing", level="bench")
-    ratios = cases.measure_effect_ratios(case, cases.measure_case(case, "est"), [])
-    assert max(ratios.values()) < 1e-6
+    est = cases.measure_case(case, "est")
+    shown = cases.describe_change(cases.measure_changes(case, est, []), est.trace.com)
+    assert max(shown["floors"].values()) < 1e-6 and shown["where"] == []
 
 
-def record(seed: int, kind: str, effects: Sequence[str], verdict: str, named: Sequence[str], floors: float = 9.0,
-           **more: Any) -> dict[str, Any]:
-    """A record as a trial writes it."""
-    shown = {"xj": floors, "xj_drift": 99.0, "p12": floors, "xs": 0.0, "controller": 0.0}
-    each = [{"effect": name, "size": 1.0, "value": 20.0} | ({"ratio": shown} if len(effects) > 1 else {})
-            for name in effects]
-    truth = {"kind": kind, "effects": list(effects), "signals": "xj,p12,xs", "base_ratio": shown, "hidden": each,
-             "plant": {"MJ": 101.0}}
-    answer = {"verdict": verdict, "effects": list(named), "baseline": {"floor": {"xj": 1.0}}} | more
-    return {"seed": seed, "truth": truth, "answer": answer, "seconds": 5.0 if seed else 30.0}
+def test_an_effect_is_located_where_it_acts() -> None:
+    """A limit of the current acts in the large steps alone; a limit of the demand in the controller alone."""
+    for name, signals in (("current_limit", {"xj", "p12", "xs"}), ("command_rate_limit", {"cor"})):
+        case = cases.sample_case(5, effects=[name], level="bench", sizes=(0.9, 0.9))
+        est = cases.measure_case(case, "est")
+        cells = cases.describe_change(cases.measure_changes(case, est, [name]), est.trace.com)["where"]
+        assert {cell.partition("/")[0] for cell in cells} == signals, name
+        assert {"s02", "s03"} <= {cell.partition("/")[2] for cell in cells}  # 5 mm
+        assert not {"s01", "s07", "s09", "s11"} & {cell.partition("/")[2] for cell in cells}  # holds
 
 
-def candidate(low: float, high: float, left: float) -> list[dict[str, Any]]:
-    return [{"effect": "spool_friction", "parameters": {"spool.static_friction": {"low": low, "high": high}},
-             "holdout": {"xj": left}}]
-
-
-RECORDS = [
-    record(0, "nothing", [], "NOTHING_MISSING", []),
-    record(1, "nothing", [], "EXPLAINED", ["coil_lag"]),
-    record(2, "one", ["spool_friction"], "EXPLAINED", ["spool_friction"], candidates=candidate(19, 21, 1.1)),
-    record(3, "one", ["spool_friction"], "AMBIGUOUS", ["coil_lag", "spool_friction"], candidates=candidate(21, 22, 2)),
-    record(4, "one", ["spool_friction"], "EXPLAINED", ["coil_lag"]),
-    record(5, "one", ["spool_friction"], "NOT_RESOLVABLE", [], floors=1.5),
-    record(6, "outside", ["periodic torque"], "UNEXPLAINED", []),
-    record(7, "outside", ["periodic torque"], "EXPLAINED", ["null_bias"], floors=1.0),
-    record(8, "two", ["null_bias", "coil_lag"], "EXPLAINED", ["coil_lag", "null_bias"]),
-    record(9, "two", ["null_bias", "coil_lag"], "PARTLY", ["null_bias"]),
-]
-
-
-def test_rates_count_what_they_say() -> None:
-    found = [(rate.good, rate.of, rate.bad) for rate in trial_score.count_rates(RECORDS)]
-    assert found == [(1, 2, (1,)), (2, 3, (4,)), (2, 3, (4,)), (1, 2, (3,)), (1, 2, (3,)), (1, 1, ()), (1, 2, (7,)),
-                     (1, 2, (9,)), (9, 10, (0,))]
-    assert trial_score.average_named_effects(RECORDS) == 1.5
-
-
-@pytest.mark.parametrize(("usual", "good"), [(25.0, 1), (15.0, 0)])
-def test_an_effect_that_is_said_to_be_hidden_at_its_size_is_admitted(usual: float, good: int) -> None:
-    blind = [{"effect": "constant_load", "parameter": "constant_load.force", "usual": usual}]
-    one = record(4, "one", ["constant_load"], "NOTHING_MISSING", [], blind_to=blind)
-    rates = {rate.name.strip(): rate.good for rate in trial_score.count_rates([one])}
-    assert rates["or listed as not detectable at its size"] == good
-    assert rates["one effect: the truth is named"] == 0
-
-
-def test_the_summary_tells_every_failure_and_is_json() -> None:
-    figures = json.loads(json.dumps(trial_score.summarise_trial(RECORDS)))
-    assert [f["seed"] for f in figures["failures"]] == [0, 1, 3, 4, 7, 9]
-    assert figures["rates"][0]["bad"] == [1] and figures["by_signals"]["xj"]["two effects: both named"] == [0, 0]
-    print_report(build_trial_report(figures), Console(file=(shown := io.StringIO()), width=200))
-    assert "one effect: the truth is named" in shown.getvalue() and "NOT met" in shown.getvalue()
-    assert figures["confusion"]["one: spool_friction"] == {
-        "EXPLAINED right": 1, "AMBIGUOUS right": 1, "EXPLAINED wrong": 1}
-    assert figures["confusion"]["outside: periodic torque (small)"] == {"EXPLAINED": 1}
-
-
-def knowing(est: Path, holdout: Path, repeats: Sequence[Path], signals: Sequence[str]) -> dict[str, Any]:
-    """An explanation that looks up the truth, and keeps a tally."""
-    assert holdout.exists() and repeats[0].exists() and signals[0] == "xj"
-    with (est.parent.parent / "tally").open("a") as tally:
-        tally.write(".")
-    truth = tomllib.loads((est.parent / "truth.toml").read_text())
-    if truth["kind"] == "outside":
-        raise ValueError("out of my depth")
-    return {"verdict": "EXPLAINED" if truth["effects"] else "NOTHING_MISSING", "effects": truth["effects"]}
-
-
-def test_a_trial_is_taken_up_where_it_was_left(tmp_path: Path) -> None:
-    told: list[str] = []
-    by = f"{__name__}:knowing"
-    seeds = [next(s for s in range(99) if cases.sample_case(s).kind == kind) for kind in ("one", "outside")]
-    run_trial(by, seeds[:1], tmp_path, processes=1)
-    with (tmp_path / "results.jsonl").open("a") as results:
-        results.write('{"seed": 3, "cut')  # a process that was killed
-    records = run_trial(by, seeds, tmp_path, processes=1, report_progress=lambda p: told.append(describe_progress(p)))
-    assert next(tmp_path.glob("cases-*/tally")).read_text() == ".."
-    assert [r["answer"]["verdict"] for r in records] == ["EXPLAINED", "CRASHED"]
-    assert "out of my depth" in records[1]["answer"]["error"]
-    assert len(told) == 1 and told[0].startswith("2/2")
-
-
-def test_a_folder_does_not_mix_choices_of_signals(tmp_path: Path) -> None:
-    by, seed = f"{__name__}:knowing", next(s for s in range(99) if cases.sample_case(s).signals == "xj")
-    for choices, done in ((None, 1), ("xj,p12,xs", 2), ("xj,p12,xs", 2), ("xj", 3)):
-        (row,) = run_trial(by, [seed], tmp_path, processes=1, signals=choices)
-        assert row["truth"]["signals"] == (choices or "xj")
-        assert sum(len(tally.read_text()) for tally in tmp_path.glob("cases-*/tally")) == done
-
-
-@pytest.mark.parametrize(("option", "value", "expected"), [
-    ("--signals", "xj,pressure", "studies.hidden_effects: --signals: xj,pressure: expected xj or xj,p12 or xj,p12,xs"),
-    ("--cases", "0", "studies.hidden_effects: --cases: 0: expected 1 or more"),
-    ("--jobs", "0", "studies.hidden_effects: --jobs: 0: expected 1 or more"),
-    ("--out", "trial.txt", "studies.hidden_effects: --out: trial.txt: expected FILE.json")])
-def test_bad_options_are_refused_in_one_line(
-        option: str, value: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([option, value, "--folder", str(tmp_path / "trial")]) == 2
-    assert capsys.readouterr().err == expected + "\n"
-    assert not (tmp_path / "trial").exists()
-
-
-def test_an_explanation_that_is_not_there_is_said_in_one_line() -> None:
-    assert callable(load_explain(RIG_EXPLAIN))
-    with pytest.raises(InputError, match="module:function"):
-        load_explain("studies.hidden_effects.nowhere:explain")
-
-
-@pytest.mark.slow
-def test_blind_trial(tmp_path: Path) -> None:
-    """200 cases through `rig explain`: an hour or two."""
-    missed = [rate for rate in trial_score.count_rates(run_trial(RIG_EXPLAIN, range(200), tmp_path)) if not rate.met]
-    assert missed == []
+def test_signals_that_are_not_measured_are_in_no_file(tmp_path: Path) -> None:
+    cases.write_case(cases.sample_case(5, effects=["current_limit"], signals="xj"), tmp_path)
+    assert cases.read_columns(tmp_path / "est.csv.gz").keys() == {"t", "com", "xj", "cor", "load"}
+    truth = json.loads((tmp_path / "truth.json").read_text())
+    assert truth["floors"].keys() == {"xj", "cor"} and "p12" not in str(truth["where"]) + str(truth["effects"])

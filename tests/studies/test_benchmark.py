@@ -1,0 +1,212 @@
+"""The benchmark of hidden effects: what is made, who answers, and what the scorer counts."""
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from scipy.stats import beta
+
+from studies.hidden_effects import cases, score
+from studies.hidden_effects.__main__ import main
+from studies.hidden_effects.benchmark import answer_benchmark, describe_progress, make_benchmark
+from studies.hidden_effects.truth import has_compiler
+
+compiled = pytest.mark.skipif(not has_compiler(), reason="no gcc: the trial's simulator cannot be built")
+SCRIPT = Path(score.__file__)
+
+
+def truth(kind: str, effects: Sequence[str] = (), floors: float = 9.0, where: Sequence[str] = ("xj/s02", "xs/s03"),
+          **more: Any) -> dict[str, Any]:
+    """A truth as the maker writes it."""
+    each = [{"name": name, "size": 1.0, "value": 20.0, "floors": {"xj": floors, "cor": 0.0}} for name in effects]
+    return {"kind": kind, "signals": "xj,p12,xs", "effects": each, "floors": {"xj": floors},
+            "where": list(where) if effects else [], "holdout_noise": {"xj": 2e-6}} | more
+
+
+def answer(verdict: str, *effects: str, **more: Any) -> dict[str, Any]:
+    return {"verdict": verdict, "effects": list(effects)} | more
+
+
+FRICTION = "spool_friction"
+PAIRS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "00000": (truth("nothing", floors=0.0), answer("nothing", seconds=30.0)),
+    "00001": (truth("nothing", floors=0.0), answer("explained", "coil_lag", seconds=5.0)),
+    "00002": (truth("one", [FRICTION]), answer("explained", FRICTION, holdout={"xj": 2.2e-6},
+                                               where=["xj/s02", "xj/s04"],
+                                               sizes={FRICTION: {"value": 20, "low": 19, "high": 21}})),
+    "00003": (truth("one", [FRICTION]), answer("ambiguous", "coil_lag", FRICTION, holdout={"xj": 4e-6},
+                                               sizes={FRICTION: {"value": 21, "low": 20.5, "high": 22}})),
+    "00004": (truth("one", [FRICTION]), answer("explained", "coil_lag", where=["xj/s02"])),
+    "00005": (truth("one", [FRICTION], floors=1.5), answer("nothing")),
+    "00006": (truth("outside", ["periodic torque"]), answer("unexplained")),
+    "00007": (truth("outside", ["periodic torque"], floors=1.0), answer("explained", "null_bias")),
+    "00008": (truth("two", ["null_bias", "coil_lag"]), answer("explained", "coil_lag", "null_bias")),
+    "00009": (truth("two", ["null_bias", "coil_lag"]), answer("partly", "null_bias")),
+    "00010": (truth("one", [FRICTION]), answer("ambiguous", "a", "b", "c", FRICTION)),
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A benchmark of invented cases, with invented answers."""
+    (tmp_path / "truth").mkdir()
+    for case, (hidden, _) in PAIRS.items():
+        (tmp_path / "truth" / f"{case}.json").write_text(json.dumps(hidden))
+    (tmp_path / "answers.json").write_text(json.dumps({"answers": {case: given for case, (_, given) in PAIRS.items()}}))
+    return tmp_path
+
+
+def run_script(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """The scorer as others run it: without site packages and without this project on the path."""
+    return subprocess.run([sys.executable, "-I", "-S", str(SCRIPT), *map(str, arguments)], capture_output=True,
+                          text=True, check=False)
+
+
+def test_the_scorer_needs_the_standard_library_alone() -> None:
+    tree = ast.parse(SCRIPT.read_text())
+    modules = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    modules |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert {module.partition(".")[0] for module in modules} <= sys.stdlib_module_names
+
+
+def test_rates_count_what_they_say(folder: Path) -> None:
+    scores = json.loads(run_script(folder, folder / "answers.json", "--json").stdout)
+    found = {rate["name"]: (rate["good"], rate["of"], rate["without"]) for rate in scores["rates"]}
+    assert found == {
+        "nothing: answered nothing": (1, 2, ["00001"]),
+        "nothing: an effect is named": (1, 2, ["00000"]),
+        "one: named": (2, 4, ["00004", "00010"]),
+        "one: named alone, explained": (1, 4, ["00003", "00004", "00010"]),
+        "one: wrong alone": (1, 4, ["00002", "00003", "00010"]),
+        "one, named: true size in interval": (1, 2, ["00003"]),
+        "one, named: held-out run at most 1.15 floors": (1, 2, ["00003"]),
+        "two: both named": (1, 2, ["00009"]),
+        "two: wrong alone": (0, 2, ["00008", "00009"]),
+        "two, named: true sizes in intervals": (0, 0, []),
+        "outside: unexplained or partly": (1, 1, []),
+        "outside, any size: not explained": (1, 2, ["00007"]),
+        "all: answered within 20 s": (1, 2, ["00000"])}
+    assert scores["names_on_average"] == 1.5 and scores["seconds"] == {"median": 30.0, "longest": 30.0}
+
+
+def test_precision_recall_and_f1_are_those_of_the_cells(folder: Path) -> None:
+    """Blamed are three cells, two of them rightly; of seven visible cases with two cells each."""
+    scores = json.loads(run_script(folder, folder / "answers.json", "--json").stdout)
+    where = scores["where"]["all"]
+    assert where["cases"] == 7
+    assert [where[name]["value"] for name in ("precision", "recall", "F1")] == pytest.approx([2 / 3, 2 / 14, 4 / 17])
+    assert where["F1"]["low"] < where["F1"]["value"] < where["F1"]["high"]
+    assert scores["where"]["xj"]["recall"]["value"] == pytest.approx(2 / 7)
+    assert scores["where"]["one"]["precision"]["value"] == pytest.approx(2 / 3)
+    assert scores["where"]["xs"] == {"cases": 7} and scores["where"]["outside"] == {"cases": 1}
+
+
+@pytest.mark.parametrize(("good", "of"), [(0, 5), (5, 5), (3, 7), (150, 200), (1, 1), (0, 0)])
+def test_intervals_are_those_of_clopper_and_pearson(good: int, of: int) -> None:
+    low = beta.ppf(0.025, good, of - good + 1) if good else 0.0
+    high = beta.ppf(0.975, good + 1, of - good) if good < of else 1.0
+    assert score.compute_interval(good, of) == pytest.approx((low, high), abs=1e-9)
+
+
+def test_an_answer_in_csv_counts_as_in_json(folder: Path) -> None:
+    rows = ["case,verdict,effects,sizes,where", *(
+        f"{case},{given['verdict']},{';'.join(given['effects'])},{'20 19 21' if case == '00002' else ''},"
+        f"{';'.join(given.get('where', []))}" for case, (_, given) in PAIRS.items())]
+    (folder / "answers.csv").write_text("\n".join(rows) + "\n")
+    by_file = [json.loads(run_script(folder, folder / f"answers.{kind}", "--json").stdout) for kind in ("csv", "json")]
+    assert by_file[0]["where"] == by_file[1]["where"]
+    named, covered = by_file[0]["rates"][2], by_file[0]["rates"][5]
+    assert named == by_file[1]["rates"][2] and (covered["good"], covered["of"]) == (1, 1)
+
+
+def test_the_text_says_rates_and_misses(folder: Path) -> None:
+    (folder / "answers.json").write_text(json.dumps({"00002": PAIRS["00002"][1]}))
+    shown = run_script(folder, folder / "answers.json").stdout
+    assert "1 of 11 cases answered" in shown and "one: named" in shown and "F1" in shown
+    assert "00004  spool_friction 1 (9.0 floors) -> failed" in shown
+
+
+@pytest.mark.parametrize(("text", "expected"), [
+    ("[", "expected a JSON file"),
+    ("{}", "expected an object with one entry per case"),
+    ('{"00002": {"verdict": "perhaps"}}', "case 00002: verdict: expected nothing, explained"),
+    ('{"00099": {"verdict": "nothing"}}', "case 00099: case: expected one of the benchmark"),
+    ('{"00002": {"verdict": "nothing", "effects": "coil_lag"}}', "case 00002: effects: expected a list"),
+    ('{"00002": {"verdict": "nothing", "sizes": {"a": {"low": "x"}}}}', "case 00002: sizes, holdout: expected finite"),
+])
+def test_bad_answers_are_refused_in_one_line(text: str, expected: str, folder: Path) -> None:
+    (folder / "answers.json").write_text(text)
+    done = run_script(folder, folder / "answers.json")
+    assert done.returncode == 2 and done.stdout == "" and len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith(f"score.py: {folder / 'answers.json'}: ") and expected in done.stderr
+
+
+def test_a_folder_without_truth_is_refused_in_one_line(tmp_path: Path) -> None:
+    done = run_script(tmp_path, tmp_path / "answers.json")
+    assert done.returncode == 2 and done.stderr == f"score.py: {tmp_path}: expected a folder with truth/CASE.json\n"
+
+
+def knowing(case: Path, plant: str, signals: str) -> dict[str, Any]:
+    """A method that looks up the truth, and keeps a tally."""
+    with (case.parent.parent / "tally").open("a") as tally:
+        tally.write(".")
+    hidden = json.loads((case.parent.parent / "truth" / f"{case.name}.json").read_text())
+    if hidden["kind"] == "outside":
+        raise ValueError("out of my depth")
+    names = [effect["name"] for effect in hidden["effects"]]
+    return {"verdict": "explained" if names else "nothing", "effects": names, "where": hidden["where"]}
+
+
+@compiled
+def test_a_benchmark_has_the_same_bytes_and_resumes(tmp_path: Path) -> None:
+    seeds = [next(s for s in range(99) if cases.sample_case(s).kind == kind) for kind in ("one", "outside")]
+    first, other, by = tmp_path / "first", tmp_path / "other", f"{__name__}:knowing"
+    make_benchmark(first, seeds[:1])
+    answer_benchmark(first, by)
+    make_benchmark(first, seeds)  # goes on
+    make_benchmark(other, seeds)
+    made = [sorted(path.relative_to(root) for path in root.rglob("*") if path.is_file() and "answers" not in path.name
+                   and path.name != "tally") for root in (first, other)]
+    assert made[0] == made[1] and len(made[0]) == 4 + 2 * 4
+    assert all((first / name).read_bytes() == (other / name).read_bytes() for name in made[0])
+    with next(first.glob("answers-*.jsonl")).open("a") as rows:
+        rows.write('{"case": 3, "cut')  # a process that was killed
+    told: list[str] = []
+    answers = json.loads(answer_benchmark(first, by, 1, lambda p: told.append(describe_progress(p))).read_text())
+    assert (first / "tally").read_text() == ".." and len(told) == 1 and told[0].startswith("2/2")
+    found = score.score_answers(score.read_truths(first), answers["answers"])
+    assert [answers["answers"][f"{seed:05d}"]["verdict"] for seed in seeds] == ["explained", "failed"]
+    assert found["answered"] == 2 and "out of my depth" in answers["answers"][f"{seeds[1]:05d}"]["error"]
+    described = json.loads((first / "benchmark.json").read_text())
+    assert len(described["catalogue"]) == 34 and described["sections"]["s02"]["command"] == "step to 5 mm"
+
+
+@compiled
+def test_the_command_makes_answers_and_scores(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    seed = next(s for s in range(99) if cases.sample_case(s).kind == "nothing")
+    made = ["--benchmark", str(tmp_path / "made")]
+    assert main([*made, "--cases", "1", "--seed", str(seed)]) == 0
+    assert main([*made, "--answer", f"{__name__}:knowing"]) == 0
+    assert "Every aim that was counted is reached." in capsys.readouterr().out
+    assert main([*made, "--cases", "1", "--signals", "xj"]) == 2
+    assert "or one with cases of the same plant, signals and simulator" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("options", "expected"), [
+    (["--signals", "xj,pressure"], "--signals: xj,pressure: expected xj or xj,p12 or xj,p12,xs or drawn"),
+    (["--cases", "0"], "--cases: 0: expected 1 or more"),
+    (["--workers", "0"], "--workers: 0: expected 1 or more"),
+    (["--answer", "explain"], "the folder of a benchmark, which --benchmark without --answer makes"),
+    (["--out", "trial.txt"], "--out: trial.txt: expected FILE.json")])
+def test_bad_options_are_refused_in_one_line(options: list[str], expected: str, tmp_path: Path,
+                                             capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*options, "--benchmark", str(tmp_path / "made")]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("studies.hidden_effects: ") and expected in said and said.count("\n") == 1
+    assert not (tmp_path / "made").exists()
