@@ -22,6 +22,7 @@ from fdi.estimation.fit import (
     compute_misfit,
     compute_weights,
     continue_fit,
+    cut_runs,
     fit_unknowns,
     follow_population,
     linearise,
@@ -53,7 +54,7 @@ from fdi.thresholds import (
     TOLERANCE_SQUARE_FAR,
     WHITE_SQUARE_POOR,
 )
-from fdi.trace.trace import Floats, Trace
+from fdi.trace.trace import Flags, Floats, Trace
 from plant.lanes import Part
 from plant.model import Model
 from plant.signals import Signal
@@ -146,7 +147,7 @@ class Search:
             self.sensors[s].innovation, self.coarse.get(s, 0.0)))) for s in trace.outputs)
         self.model, ready = model, complete_model(model)
         bare = silence_readings(model)
-        self.problem = Problem(ready, trace, self.noise, workers=1, bare=bare)
+        self.problem = Problem(ready, trace, self.noise, workers=self.workers, bare=bare)
         self.repeats = [Problem(ready, r, self.noise, bare=bare) for r in repeats]
         self.fine: Problem | None = None  # with the steps of last residuals
         self._left_unseen: dict[Hypothesis, Floats] = {}
@@ -476,8 +477,7 @@ class Search:
 
     def refine_steps(self, steps: int, finest: int = TRUEST) -> None:
         """Finer steps from here on, `finest` where only slopes do not ask for them; fits to the repeats as well."""
-        self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.trace for p in self.repeats),
-                               workers=self.workers)
+        self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.trace for p in self.repeats))
         self.fine = replace(self.problem, steps=finest, _lanes={})
         self.repeats = [replace(p, steps=finest, _lanes={}) for p in self.repeats]
 
@@ -709,15 +709,13 @@ def simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Star
     begun = [_move_along(fit, effect, start, ways) if along else fit.x for effect, start, along in starts]
     at = [problem.list_values(fit.free, x) | dict(start) for x, (_, start, _) in zip(begun, starts, strict=True)]
     rows = np.array([[values.get(n, problem.model.values[n]) for n in names] for values in at])
-    absorb_shift = _make_absorber(fit)
 
     def run_trials(part: NDArray[np.int64]) -> list[Trial]:
         white = problem.whiten_residuals(problem.subtract_measurements(problem.predict_outputs(names, rows[part])))
-        found = []
-        for i, r in zip(part, white, strict=True):
-            effect, start, goes_along = starts[i]
-            found.append(Trial(effect, start, *absorb_shift(r, start, begun[i]), goes_along))
-        return found
+        own = [starts[i] for i in part]
+        costs, x = absorb_shifts(fit, white, [start for _, start, _ in own], np.array([begun[i] for i in part]))
+        return [Trial(effect, start, float(cost), at, along)
+                for (effect, start, along), cost, at in zip(own, costs, x, strict=True)]
 
     parts = np.array_split(np.arange(len(rows)), min(len(rows), max(workers, -(-len(rows) // TOGETHER))))
     return [trial for several in map_together(run_trials, parts, workers) for trial in several]
@@ -733,32 +731,47 @@ def _move_along(fit: Fit, effect: str, start: Start, ways: Sequence[Mapping[str,
     return np.clip(x, low, high)
 
 
-def _make_absorber(fit: Fit) -> Callable[[Floats, Iterable[str], Floats], tuple[float, Floats]]:
-    """A function that lets a fit's unknowns take up what they can of a whitened residual.
+def absorb_shifts(fit: Fit, white: Floats, held: Sequence[Iterable[str]], begun: Floats) -> tuple[Floats, Floats]:
+    """A fit's unknowns take up what they can of whitened residuals: the costs that are left, and where they are then.
 
-    Of a residual (s, n), simulated at the unknowns `begun`, (p,), it gives the cost after they have shifted linearly,
-    but for those `held`, and where they are then.
+    They shift linearly, twice, as what can be fitted is known only after the first time; not at all where to stay is
+    better.
+
+    Args:
+        fit: with the Jacobian.
+        white: (m, s, n), each simulated at its own unknowns.
+        held: of each residual the unknowns that stay where they are.
+        begun: (m, p), the unknowns.
     """
-    low, high = scaled_bounds(fit.free)
-    whole, priors = fit.jacobian.reshape(len(fit.x), -1), weigh_priors(fit.free)
+    moves = np.array([[f.name not in names for f in fit.free] for names in held])
     thin = np.ascontiguousarray(fit.jacobian[:, :, ::SCAN_STRIDE])
+    x = np.array([_shift_unknowns(fit.free, thin, each[:, ::SCAN_STRIDE], start, move)
+                  for each, start, move in zip(white, begun, moves, strict=True)])
+    whole, priors = fit.jacobian.reshape(len(fit.x), -1), weigh_priors(fit.free)
+    costs, stayed = (compute_misfit(white) + (at * moves) ** 2 @ priors for at in (x, begun))
+    for few in cut_runs(white.shape):
+        left = white[few] + ((x[few] - begun[few]) @ whole).reshape(white[few].shape)
+        costs[few] += compute_misfit(left) - compute_misfit(white[few])
+    stays = stayed < costs
+    return np.where(stays, stayed, costs), np.where(stays[:, None], begun, x)
 
-    def absorb_shift(white: Floats, held: Iterable[str], begun: Floats) -> tuple[float, Floats]:
-        """Twice, as what can be fitted is known only after the first time; not at all where to stay is better."""
-        move = np.array([f.name not in held for f in fit.free])
-        prior = np.where(move, priors, 1e30)  # what is held does not move
-        flat, left, x = thin.reshape(len(begun), -1), white, begun
-        few = white[:, ::SCAN_STRIDE].reshape(-1)
-        for _ in range(2):
-            heavy = (SCAN_STRIDE * thin * compute_weights(left)[:, ::SCAN_STRIDE]).reshape(flat.shape)
-            hessian = heavy @ flat.T + np.diag(prior + 1e-9)
-            gradient = heavy @ few + priors * begun * move
-            x = np.where(move, np.clip(begun - cho_solve(cho_factor(hessian), gradient), low, high), begun)
-            left = white + ((x - begun) @ whole).reshape(white.shape)
-        costs = compute_misfit(np.array([left, white])) + [(at * move) ** 2 @ priors for at in (x, begun)]
-        return (float(costs[0]), x) if costs[0] <= costs[1] else (float(costs[1]), begun)
 
-    return absorb_shift
+def _shift_unknowns(free: Sequence[Free], thin: Floats, few: Floats, begun: Floats, move: Flags) -> Floats:
+    """Where unknowns, (p,), have moved from `begun`, of which `move` says which may.
+
+    `thin`, (p, s, k), is the Jacobian at every `SCAN_STRIDE`-th sample, and `few`, (s, k), the residual there.
+    """
+    low, high = scaled_bounds(free)
+    priors = weigh_priors(free)
+    prior = np.where(move, priors, 1e30)  # what is held does not move
+    flat, left, x = thin.reshape(len(begun), -1), few, begun
+    for _ in range(2):
+        heavy = (SCAN_STRIDE * thin * compute_weights(left, BLOCK // SCAN_STRIDE)).reshape(flat.shape)
+        hessian = heavy @ flat.T + np.diag(prior + 1e-9)
+        gradient = heavy @ few.reshape(-1) + priors * begun * move
+        x = np.where(move, np.clip(begun - cho_solve(cho_factor(hessian), gradient), low, high), begun)
+        left = few + ((x - begun) @ flat).reshape(few.shape)
+    return x
 
 
 NULL_STRIDE = 3

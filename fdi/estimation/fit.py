@@ -97,7 +97,8 @@ class Problem:
     def predict_outputs(self, names: Sequence[str], values: Floats) -> Floats:
         """Replays with the named parameters at `values` (m, p): (m, s, n) in SI units."""
         def predict_run(run: Trace) -> Floats:
-            return self.predict_signals(names, values, run)[:, run.output_columns]
+            every, columns = self.predict_signals(names, values, run), run.output_columns
+            return every if columns == list(range(every.shape[1])) else every[:, columns]
 
         runs = map_in_threads(predict_run, (self.trace, *self.also), self.workers)
         return np.concatenate(runs, axis=-1) if self.also else runs[0]
@@ -111,7 +112,7 @@ class Problem:
         trace = self.trace if trace is None else trace
         out = self._lanes[key].replay(values, trace.drive, trace.load, trace.anchor, self.anchor, trace.parts,
                                       trace.chambers)
-        if not np.abs(out).max() < FURTHEST:  # a trial at which the simulation diverges
+        if not (out.max() < FURTHEST and out.min() > -FURTHEST):  # a trial at which the simulation diverges
             out = np.clip(np.nan_to_num(out, nan=FURTHEST), -FURTHEST, FURTHEST)
         return trace.pass_sensors(out).transpose(0, 2, 1)
 
@@ -142,18 +143,23 @@ class Problem:
 
         Its slope is that of the prediction. What a report shows is the residual, measured minus model.
         """
-        parts, start = [], 0
+        residuals, start, period = np.empty(predicted.shape), 0, self.model.values["controller.period"]
         for trace in (self.trace, *self.also):
-            residuals = predicted[..., start:start + len(trace)] - trace.measurements
-            period = self.model.values["controller.period"]
-            pieces = trace.parts or _cut_rows(len(trace))
-            parts += [remove_mains(residuals[..., p.first:p.stop], period) for p in pieces]
+            for part in trace.parts or _cut_rows(len(trace)):
+                there = slice(start + part.first, start + part.stop)
+                measured = trace.measurements[:, part.first:part.stop]
+                for few in cut_runs(predicted.shape):
+                    residuals[few, :, there] = remove_mains(predicted[few, :, there] - measured, period)
             start += len(trace)
-        return np.concatenate(parts, axis=-1) if len(parts) > 1 else parts[0]
+        return residuals
 
     def whiten_residuals(self, residuals: Floats) -> Floats:
         """Residuals (m, s, n) as white noise of variance 1, if only noise is left; where nothing was measured, 0."""
-        return np.stack([n.whiten(residuals[:, i]) for i, n in enumerate(self.noise)], axis=1)
+        white = np.empty(residuals.shape)
+        for few in cut_runs(residuals.shape):
+            for i, noise in enumerate(self.noise):
+                white[few, i] = noise.whiten(residuals[few, i])
+        return white
 
 
 P = TypeVar("P", bound=Problem)
@@ -167,6 +173,12 @@ def scale_noise(problem: P, factor: float) -> P:
 def span_all_rows(trace: Trace) -> Part:
     """All rows of a trace as its only part."""
     return Part(0, len(trace), 0)
+
+
+def cut_runs(shape: Sequence[int], most: int = 200_000) -> list[slice]:
+    """The runs of an array (m, s, n) a few at a time, so that the processor's cache holds all that is made of them."""
+    few = max(1, most // (shape[1] * shape[2]))
+    return [slice(first, first + few) for first in range(0, shape[0], few)]
 
 
 def _cut_rows(rows: int, most: int = 60_000) -> list[Part]:
@@ -192,11 +204,12 @@ def mains_waves(n: int, period: float) -> Floats:
     return np.linalg.qr(np.column_stack([w(f * t) for f in lines for w in (np.sin, np.cos)]))[0]
 
 
-def sum_blocks(white: Floats) -> Floats:
-    """Sums of squares of whitened residuals (.., n) over blocks: (.., b)."""
+def sum_blocks(white: Floats, block: int = BLOCK) -> Floats:
+    """Sums of squares of whitened residuals (.., n) over blocks of so many: (.., b)."""
     n = white.shape[-1]
-    padded = np.concatenate([white, np.zeros((*white.shape[:-1], -n % BLOCK))], axis=-1)
-    cut = padded.reshape(*white.shape[:-1], -1, BLOCK)
+    if n % block:
+        white = np.concatenate([white, np.zeros((*white.shape[:-1], -n % block))], axis=-1)
+    cut = white.reshape(*white.shape[:-1], -1, block)
     sums: Floats = np.einsum("...i,...i->...", cut, cut)
     return sums
 
@@ -210,11 +223,14 @@ def compute_misfit(white: Floats) -> Floats:
     return total
 
 
-def compute_weights(white: Floats) -> Floats:
-    """Weights of the squares, (s, n), that give `compute_misfit` its slope at whitened residuals (s, n)."""
-    sums = sum_blocks(white)
-    each = np.minimum(1.0, BLOCK_FITTED_SQUARE * BLOCK / np.maximum(sums, 1e-300))
-    return np.repeat(each, BLOCK, axis=-1)[:, :white.shape[-1]]
+def compute_weights(white: Floats, block: int = BLOCK) -> Floats:
+    """Weights of the squares, (s, n), that give `compute_misfit` its slope at whitened residuals (s, n).
+
+    Of residuals at every so manieth cycle, `block` is the number of them in a block.
+    """
+    sums = sum_blocks(white, block)
+    each = np.minimum(1.0, BLOCK_FITTED_SQUARE * block / np.maximum(sums, 1e-300))
+    return np.repeat(each, block, axis=-1)[:, :white.shape[-1]]
 
 
 def compute_typical_rms(residuals: Floats, share: float = 0.85) -> Floats:
@@ -385,37 +401,58 @@ def continue_fit(problem: Problem, now: Fit, rounds: int = FIT_ROUNDS) -> Fit:
     for _ in range(rounds):
         gradient, hessian = form_normal_equations(now)
         trials = np.array([step_within_bounds(now, hessian, gradient, damping) for damping in DAMPINGS])
-        costs = problem.compute_costs(now.free, trials)
-        k = int(np.argmin(costs))
-        gained = now.cost - float(costs[k])
+        best = find_best_trial(problem, now, trials)
+        gained = now.cost - best.cost
         if gained < max(CONVERGED_GAIN, CONVERGED_SHARE * now.cost):
-            return replace(replay_fit(problem, now, trials[k]) if gained > 0.0 else now, converged=True)
-        now = linearise(problem, now.free, trials[k], _choose_widths(now.free, hessian))
+            return replace(best if gained > 0.0 else now, converged=True)
+        now = _differentiate(problem, best, _choose_widths(now.free, hessian))
     return now
 
 
-def linearise(problem: Problem, free: Sequence[Free], x: Floats, step: Floats | None = None) -> Fit:
-    """The model at `x` (p,) with its Jacobian by differences of `step`, away from a bound."""
-    free = tuple(free)
-    step = np.array([f.step for f in free]) if step is None else step
-    signs = np.array([-1.0 if f.centre + f.scale * (v + h) > f.high else 1.0
-                      for f, v, h in zip(free, x, step, strict=True)])
-    moved = np.vstack([x, x + np.diag(signs * step)])
-    residuals = problem.compute_residuals(free, moved)
+def find_best_trial(problem: Problem, fit: Fit, trials: Floats) -> Fit:
+    """The fit at the best of the trials (m, p); its Jacobian and covariance stay as they are."""
+    residuals = problem.compute_residuals(fit.free, trials)
     white = problem.whiten_residuals(residuals)
-    jacobian = (white[1:] - white[0]) / (signs * step)[:, None, None]
+    held = compute_misfit(white)
+    costs = held + trials**2 @ weigh_priors(fit.free)
+    k = int(np.argmin(costs))
+    return replace(fit, x=trials[k], cost=float(costs[k]), misfit=float(held[k]), residuals=residuals[k].copy(),
+                   white=white[k].copy())
+
+
+def linearise(problem: Problem, free: Sequence[Free], x: Floats) -> Fit:
+    """The model at `x` (p,) with its Jacobian by differences, away from a bound."""
+    moves = _choose_moves(free, x, np.array([f.step for f in free]))
+    residuals = problem.compute_residuals(free, np.vstack([x, x + np.diag(moves)]))
+    white = problem.whiten_residuals(residuals)
     held = float(compute_misfit(white[:1])[0])
-    covariance = _compute_covariance(free, jacobian, white[0])
-    return Fit(free, x, held + float(x**2 @ weigh_priors(free)), held, covariance, residuals[0], white[0], jacobian)
+    begun = Fit(tuple(free), x, held + float(x**2 @ weigh_priors(free)), held, np.empty((0, 0)), residuals[0].copy(),
+                white[0].copy(), white[1:])
+    return _take_differences(begun, white[1:], moves)
+
+
+def _differentiate(problem: Problem, fit: Fit, step: Floats) -> Fit:
+    """The fit with its Jacobian where it is, by differences of `step` (p,) from what it leaves there."""
+    moves = _choose_moves(fit.free, fit.x, step)
+    return _take_differences(fit, problem.compute_white_residuals(fit.free, fit.x + np.diag(moves)), moves)
+
+
+def _choose_moves(free: Sequence[Free], x: Floats, step: Floats) -> Floats:
+    """Differences of the unknowns, (p,), each away from its upper bound."""
+    is_high = np.array([f.centre + f.scale * (v + h) > f.high for f, v, h in zip(free, x, step, strict=True)])
+    return np.where(is_high, -step, step)
+
+
+def _take_differences(fit: Fit, moved: Floats, moves: Floats) -> Fit:
+    """The fit with its Jacobian and covariance from the whitened residuals (p, s, n), used up, after each move (p,)."""
+    moved -= fit.white
+    moved /= moves[:, None, None]
+    return replace(fit, jacobian=moved, covariance=_compute_covariance(fit.free, moved, fit.white))
 
 
 def replay_fit(problem: Problem, fit: Fit, x: Floats) -> Fit:
     """The fit at `x` (p,) with what `problem` leaves there; its Jacobian and covariance stay as they are."""
-    residuals = problem.compute_residuals(fit.free, x[None])
-    white = problem.whiten_residuals(residuals)
-    held = float(compute_misfit(white)[0])
-    return replace(fit, x=x, cost=held + float(x**2 @ weigh_priors(fit.free)), misfit=held, residuals=residuals[0],
-                   white=white[0])
+    return find_best_trial(problem, fit, x[None])
 
 
 def form_normal_equations(fit: Fit) -> tuple[Floats, Floats]:

@@ -10,6 +10,7 @@ its lines are measured in the quiet windows of each run and added.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from itertools import combinations
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ from fdi.thresholds import (
     REPEAT_FLOOR_RATIO,
 )
 from fdi.trace.trace import Flags, Floats, Trace, rms
+from plant.compile import Function, compile_function
 from plant.effects import combine_laws
 from plant.model import Model
 from plant.signals import Signals
@@ -253,23 +255,34 @@ class Noise(NamedTuple):
 
     def whiten(self, residual: Floats) -> Floats:
         """Residuals, (.., n), time last, as white noise of variance 1; NaN (nothing measured) gives 0."""
-        missing = np.isnan(residual)
-        x = np.where(missing, 0.0, residual)
-        white: Floats = x / self.innovation
-        if len(self.filter) > 1:
-            white = _apply_filter(self.filter / self.innovation, x)
-        if missing.any():
-            missing = _apply_filter(np.ones(len(self.filter)), missing.astype(float)) > 0.5
-            white = np.where(missing, 0.0, white)
-        return white
+        rows = np.ascontiguousarray(residual, float).reshape(-1, residual.shape[-1])
+        white = np.empty_like(rows)
+        _compile_filter()(rows, self.filter / self.innovation, white)
+        return white.reshape(residual.shape)
 
 
-def _apply_filter(weights: Floats, x: Floats) -> Floats:
-    """Weighted sums of each value, (.., n), and those before it, as scipy.signal.lfilter has them.
+@cache
+def _compile_filter() -> Function:
+    return compile_function(filter_rows)
 
-    Without it, as that takes longer to import than all else here together.
+
+def filter_rows(x: Floats, weights: Floats, out: Floats) -> None:
+    """Fill `out` (m, n) with weighted sums of each value of `x` (m, n) and those before it, 0 where one is missing.
+
+    Compiled, as the residuals of every trial of a fit pass it: `scipy.signal.lfilter` takes five times as long.
     """
-    return np.apply_along_axis(lambda row: np.convolve(weights, row)[:len(row)], -1, x)
+    n, tile = x.shape[1], 1024  # a tile stays in the fastest cache for all weights
+    for row in range(len(x)):
+        for first in range(0, n, tile):
+            sums = out[row, first:first + tile]
+            sums[:] = 0.0
+            for i in range(len(weights)):
+                begin = max(i - first, 0)
+                there = x[row, first + begin - i:n]
+                for t in range(len(sums) - begin):
+                    sums[begin + t] += weights[i] * there[t]
+            for t in range(len(sums)):
+                sums[t] = sums[t] if sums[t] == sums[t] else 0.0
 
 
 def white_noise(level: float) -> Noise:

@@ -24,6 +24,7 @@ from fdi.estimation.fit import (
     compute_misfit,
     compute_weights,
     cut_at_bounds,
+    find_best_trial,
     form_normal_equations,
     limit_dynamic_friction,
     replay_fit,
@@ -455,15 +456,8 @@ def take_best_step(problem: Problem, fit: Fit) -> Fit:
     """The best of some damped Gauss-Newton steps; the fit itself if none gains."""
     gradient, hessian = form_normal_equations(fit)
     trials = np.array([step_within_bounds(fit, hessian, gradient, damping) for damping in DAMPINGS])
-    residuals = problem.compute_residuals(fit.free, trials)
-    white = problem.whiten_residuals(residuals)
-    held = compute_misfit(white)
-    costs = held + np.einsum("ij,jk,ik->i", trials, np.diag(weigh_priors(fit.free)), trials)
-    k = int(np.argmin(costs))
-    if costs[k] >= fit.cost:
-        return fit
-    return replace(fit, x=trials[k], cost=float(costs[k]), misfit=float(held[k]), residuals=residuals[k],
-                   white=white[k])
+    best = find_best_trial(problem, fit, trials)
+    return best if best.cost < fit.cost else fit
 
 
 def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats, stage: Stage = NO_STAGE,
