@@ -7,7 +7,7 @@ the thresholds.
 | stage | acts if | what it does |
 |---|---|---|
 | marks | Cor differs by more than {FIRMWARE_DIFFERS:g} roundings, or all positions are multiples of one step | names the effect of the firmware or the converter |
-| base | always | fits the tolerances; learns the noise if at most {RESIDUAL_IS_NOISE:g} floors are left |
+| base | always | fits the tolerances; learns the noise if at most {RESIDUAL_IS_NOISE:g} floors are left, and fits again with a population if the mean square is then above {WHITE_SQUARE_POOR:g} |
 | first effect | always | fits the eight effects that promise to gain more than {GAIN_WORTH_A_FIT:g}, in stages, the best two to the end |
 | noise | the base leaves more than noise | learns the noise under the best first effect; fits the base and the best four again |
 | second effect | the first leaves more than noise and gains more than {GAIN_SEEN:g} | fits the four most promising effects beside each of the best two |
@@ -116,6 +116,8 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
     if base.is_at_floor:
         search.learn_noise(base)
         base = search.refit_hypothesis(base)
+        if base.is_poor:  # by a missed stop, beside which nothing else would be looked for
+            base = search.search_widely(base)
     return _conclude(search, _search_levels(search, base, progress), marks, progress)
 
 
