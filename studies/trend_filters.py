@@ -1,4 +1,4 @@
-"""Compare `rig trend` with two library filters on the same units: the table "Filters from libraries" in trend.md.
+"""Compare `rig trend` with two library filters on the same units.
 
     pip install progpy filterpy; OPENBLAS_NUM_THREADS=1 python -m studies.trend_filters [UNITS OF EACH LAW]
 
