@@ -51,6 +51,12 @@ def load_cylinder(**changes: float) -> Model:
     return model.replace({s.noise: 0.0 for s in model.kind.signals.outputs})
 
 
+def test_an_open_loop_has_no_following_error(tmp_path: Path) -> None:
+    """Volts minus metres would be a number without meaning."""
+    told = answer("simulate", "--model", PLANT, "--trust", "--out", tmp_path / "run.csv")
+    assert "rms_error" not in told and told["cycles"] > 0
+
+
 def test_steady_speed_and_pressures_are_those_of_four_orifices() -> None:
     """v = K w/AA root((pS - r pT - F/AA)/(1 + r^3)) out, r the ratio of the areas; from v both pressures follow."""
     model = load_cylinder(cylinder__friction=60.0, cylinder__damping=0.0, cylinder__stroke=2.0, valve__overlap=0.2)

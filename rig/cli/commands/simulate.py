@@ -51,12 +51,14 @@ def run_command(args: argparse.Namespace) -> int:
         write_mcap(trace, out)
     else:
         trace.write_csv(out)
-    error = columns[signals.command.name] - columns[signals.controlled.name]
+    summary: dict[str, Any] = {"trace": str(out), "cycles": len(com), "seconds": len(com) * period}
+    sentence = f"{out}: {summary['cycles']} cycles, {summary['seconds']:g} s"
     unit = signals.controlled.unit
-    summary: dict[str, Any] = {"trace": str(out), "cycles": len(com), "seconds": len(com) * period,
-                               "rms_error": float((error**2).mean() ** 0.5), "max_error": float(abs(error).max())}
-    sentence = (f"{out}: {summary['cycles']} cycles, {summary['seconds']:g} s; following error "
-                f"{format_amount(summary['rms_error'], unit)} RMS, {format_amount(summary['max_error'], unit)} at most")
+    if signals.command.unit == unit:  # the command of an open loop may be a voltage
+        error = columns[signals.command.name] - columns[signals.controlled.name]
+        summary |= {"rms_error": float((error**2).mean() ** 0.5), "max_error": float(abs(error).max())}
+        sentence += (f"; following error {format_amount(summary['rms_error'], unit)} RMS, "
+                     f"{format_amount(summary['max_error'], unit)} at most")
     return give_answer(Report("simulate", str(out), sentence=sentence, data=summary), args)
 
 
