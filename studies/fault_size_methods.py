@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,42 +26,41 @@ from fdi.diagnosis.refine import (
 from fdi.estimation.fit import compute_misfit
 from fdi.progress import Progress, ignore_progress
 from fdi.report.numbers import NO_NUMBER, format_digits
-from fdi.report.report import Column, Report, Section, Table, to_plain
+from fdi.report.report import Column, Report, Section, Table
 from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace, hold_last
 from plant.errors import InputError
 from plant.model import Model, load_model
 from rig.network.clock import WallClock
 from studies.command import report_progress, run_study_command
+from studies.hidden_effects.cases import measure_rms
 
 
 class Row(NamedTuple):
     """The result of one method; None for what the method does not give."""
 
     method: str
-    kintas: float | None
-    fss: float | None  # N
-    left: float | None  # RMS of the residual, in noise floors
-    error_kintas: float | None  # RMS on simulated units that were not used for training
-    error_fss: float | None  # N
-    right: dict[str, float] | None  # share of right levels on these units, by fault
-    levels: dict[str, str] | None
     simulations: int
-    seconds: float
+    kintas: float | None = None
+    fss: float | None = None  # N
+    left: float | None = None  # RMS of the residual, in noise floors
+    error_kintas: float | None = None  # RMS on simulated units that were not used for training
+    error_fss: float | None = None  # N
+    right: dict[str, float] | None = None  # share of right levels on these units, by fault
+    levels: dict[str, str] | None = None
+    seconds: float = 0.0
 
 
 def apply_optimisers(diagnosis: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
     """Least squares and the global optimisers, each started from the sizes of the RMS grid."""
-
     grid = diagnosis.grid
     start = (grid.merged.kintas, grid.merged.fss) if grid else (0.1, 15.0)
     for number, (name, method) in enumerate(METHODS.items()):
         progress(name, number / len(METHODS))
-        if is_available(name):
+        if name != "genetic" or is_installed("pygad"):
             found, seconds = measure_time(
                 partial(method, diagnosis.model, diagnosis.trace, start, diagnosis.floor, seed))
-            yield Row(found.method, found.kintas, found.fss, found.left, error_kintas=None, error_fss=None, right=None,
-                      levels=None, simulations=found.simulations, seconds=seconds)
+            yield found._replace(seconds=seconds)
 
 
 def apply_learners(diagnosis: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
@@ -69,18 +69,19 @@ def apply_learners(diagnosis: Diagnosis, seed: int, progress: Progress) -> Itera
     Raises:
         InputError: scikit-learn is not installed, or the trace shows no precursors.
     """
-
-    if not has_scikit_learn():
-        raise InputError("--comparators", "scikit-learn", "installed: pip install 'eha-rig[learn]'")
+    if not is_installed("sklearn"):
+        raise InputError("--learners", "scikit-learn", "installed: pip install 'eha-rig[learn]'")
     simulate = partial(simulate_lesson, diagnosis.trace, diagnosis.model, seed, progress)
     lesson, simulation_seconds = measure_time(simulate)
     for name, learner in LEARNERS.items():
         progress(name, 1.0)
         found, seconds = measure_time(partial(learner, lesson, seed))
-        yield Row(found.method, to_plain(found.kintas), to_plain(found.fss), left=None,
-                  error_kintas=to_plain(found.error_kintas), error_fss=to_plain(found.error_fss),
-                  right=found.right, levels={fault: level.word for fault, level in found.levels.items()},
-                  simulations=found.simulations, seconds=simulation_seconds + seconds)
+        yield found._replace(seconds=simulation_seconds + seconds)
+
+
+def is_installed(package: str) -> bool:
+    """Whether a package is there; pygad and sklearn come with `pip install 'eha-rig[learn]'`."""
+    return find_spec(package) is not None
 
 
 def measure_time(work: Callable[[], Any]) -> tuple[Any, float]:
@@ -115,17 +116,6 @@ def _format_known(x: float | None) -> str:
 Floats = NDArray[np.float64]
 
 
-class Attempt(NamedTuple):
-    """What one method found."""
-
-    method: str
-    kintas: float
-    fss: float  # N
-    left: float  # RMS residual over noise
-    simulations: int
-    intervals: bool  # whether the method gives intervals
-
-
 class Objective:
     """Misfit of a plant with (Kintas, ln FSS, FDS/FSS), nominal otherwise, and the box that is searched.
 
@@ -146,12 +136,12 @@ class Objective:
         cost: Floats = compute_misfit(self._compute_white_residuals(points))
         return cost
 
-    def report(self, method: str, point: Sequence[float]) -> Attempt:
+    def report(self, method: str, point: Sequence[float]) -> Row:
         """The answer at a point; evaluating it once more does not count as a simulation."""
         spent = sum(self.problem.counts)
         white = self._compute_white_residuals(np.asarray(point, float)[None])
         left = float(np.sqrt(np.mean(white**2)))
-        return Attempt(method, float(point[0]), math.exp(float(point[1])), left, spent, False)
+        return Row(method, spent, float(point[0]), math.exp(float(point[1])), left)
 
     def _compute_white_residuals(self, points: Floats) -> Floats:
         x = np.array([make_start(self.free, FAULTS, (k, math.exp(f))) for k, f, _ in points])
@@ -161,17 +151,17 @@ class Objective:
 
 
 def search_by_least_squares(model: Model, trace: Trace, start: tuple[float, float], floor: Mapping[str, float],
-                            seed: int) -> Attempt:
+                            seed: int) -> Row:
     """The default: every tolerance and suspect free, Gauss-Newton steps."""
     r = refine_sizes(model, trace, (start, *list_coarse_starts(FAULTS)), floor)
     left = float(np.sqrt(np.mean(np.square([*r.ratio.values()]))))
     kintas, fss = (r.sizes[fault.name].value for fault in FAULTS)
-    return Attempt("least squares", kintas, fss, left, r.simulations, True)
+    return Row("least squares", r.simulations, kintas, fss, left)
 
 
 def search_by_differential_evolution(model: Model, trace: Trace, start: tuple[float, float],
                                      floor: Mapping[str, float], seed: int, population: int = 24, generations: int = 15
-                                     ) -> Attempt:
+                                     ) -> Row:
     """scipy's differential evolution, a generation at a time in lanes."""
     from scipy.optimize import differential_evolution
 
@@ -183,7 +173,7 @@ def search_by_differential_evolution(model: Model, trace: Trace, start: tuple[fl
 
 
 def search_by_simulated_annealing(model: Model, trace: Trace, start: tuple[float, float], floor: Mapping[str, float],
-                                  seed: int, simulations: int = 250) -> Attempt:
+                                  seed: int, simulations: int = 250) -> Row:
     """scipy's dual annealing, one simulation after the other."""
     from scipy.optimize import dual_annealing
 
@@ -194,7 +184,7 @@ def search_by_simulated_annealing(model: Model, trace: Trace, start: tuple[float
 
 
 def search_by_genetic_algorithm(model: Model, trace: Trace, start: tuple[float, float], floor: Mapping[str, float],
-                                seed: int, population: int = 24, generations: int = 15) -> Attempt:
+                                seed: int, population: int = 24, generations: int = 15) -> Row:
     """A genetic algorithm (pygad), a generation at a time in lanes."""
     import pygad
 
@@ -211,34 +201,12 @@ def search_by_genetic_algorithm(model: Model, trace: Trace, start: tuple[float, 
     return objective.report("genetic", search.best_solution(search.last_generation_fitness)[0])
 
 
-METHODS: Mapping[str, Callable[..., Attempt]] = {
+METHODS: Mapping[str, Callable[..., Row]] = {
     "least squares": search_by_least_squares,
     "differential evolution": search_by_differential_evolution,
     "simulated annealing": search_by_simulated_annealing,
     "genetic": search_by_genetic_algorithm,
 }
-
-
-def is_available(method: str) -> bool:
-    """Whether the packages of a method are installed: pygad comes with `pip install 'eha-rig[learn]'`."""
-    from importlib.util import find_spec
-
-    return method != "genetic" or find_spec("pygad") is not None
-
-
-
-
-class LearnerAnswer(NamedTuple):
-    """A learner's answer on a trace, and its errors on units that it was not trained on."""
-
-    method: str
-    kintas: float  # NaN if the learner gives levels only
-    fss: float  # N
-    levels: dict[str, Level]
-    error_kintas: float  # RMS on held-out units
-    error_fss: float  # N
-    right: dict[str, float]  # share of the levels that are right, by fault
-    simulations: int
 
 
 class Lesson(NamedTuple):
@@ -249,13 +217,6 @@ class Lesson(NamedTuple):
     fss: Floats
     unseen: NDArray[np.bool_]
     own: Floats  # (1, k)
-
-
-def has_scikit_learn() -> bool:
-    """Whether scikit-learn is installed (pip install 'eha-rig[learn]')."""
-    from importlib.util import find_spec
-
-    return find_spec("sklearn") is not None
 
 
 def simulate_lesson(trace: Trace, model: Model, seed: int = 0, progress: Progress = ignore_progress,
@@ -297,7 +258,7 @@ def simulate_lesson(trace: Trace, model: Model, seed: int = 0, progress: Progres
     return Lesson(x[:-1], sizes[:, 0], sizes[:, 1], unseen, x[-1:])
 
 
-def train_neural_network(data: Lesson, seed: int = 0, neurons: tuple[int, ...] = (24, 12)) -> LearnerAnswer:
+def train_neural_network(data: Lesson, seed: int = 0, neurons: tuple[int, ...] = (24, 12)) -> Row:
     """A small multilayer perceptron on standardised precursors, trained on Kintas and ln FSS."""
     from sklearn.neural_network import MLPRegressor
 
@@ -315,12 +276,12 @@ def train_neural_network(data: Lesson, seed: int = 0, neurons: tuple[int, ...] =
     own_k, own_f = (float(v[0]) for v in predict(data.own))
     right = {CLOGGING.name: _count_right(CLOGGING, k, data.kintas[data.unseen]),
              FRICTION.name: _count_right(FRICTION, f, data.fss[data.unseen])}
-    levels = {CLOGGING.name: classify_size(CLOGGING, own_k), FRICTION.name: classify_size(FRICTION, own_f)}
-    return LearnerAnswer("neural network", own_k, own_f, levels, _compute_rms(k - data.kintas[data.unseen]),
-                  _compute_rms(f - data.fss[data.unseen]), right, len(data.x))
+    levels = {CLOGGING.name: classify_size(CLOGGING, own_k).word, FRICTION.name: classify_size(FRICTION, own_f).word}
+    return Row("neural network", len(data.x), own_k, own_f, None, measure_rms(k - data.kintas[data.unseen]),
+               measure_rms(f - data.fss[data.unseen]), right, levels)
 
 
-def train_logistic_regression(data: Lesson, seed: int = 0) -> LearnerAnswer:
+def train_logistic_regression(data: Lesson, seed: int = 0) -> Row:
     """Multinomial logistic regression on standardised precursors and their products, one for each fault's levels."""
     from sklearn.linear_model import LogisticRegression
     from sklearn.preprocessing import PolynomialFeatures, StandardScaler
@@ -332,9 +293,8 @@ def train_logistic_regression(data: Lesson, seed: int = 0) -> LearnerAnswer:
                                  LogisticRegression(C=1.0, max_iter=300, random_state=seed))
         learner.fit(data.x[~data.unseen], true[~data.unseen])
         right[fault.name] = float(np.mean(learner.predict(data.x[data.unseen]) == true[data.unseen]))
-        levels[fault.name] = Level(int(learner.predict(data.own)[0]))
-    unknown = float("nan")
-    return LearnerAnswer("logistic regression", unknown, unknown, levels, unknown, unknown, right, len(data.x))
+        levels[fault.name] = Level(int(learner.predict(data.own)[0])).word
+    return Row("logistic regression", len(data.x), right=right, levels=levels)
 
 
 LEARNERS = {"neural network": train_neural_network, "logistic regression": train_logistic_regression}
@@ -352,10 +312,6 @@ def _count_right(fault: Fault, predicted: Floats, true: Floats) -> float:
     """Share of units whose level is right."""
     right = [classify_size(fault, a) == classify_size(fault, b) for a, b in zip(predicted, true, strict=True)]
     return float(np.mean(right))
-
-
-def _compute_rms(x: Floats) -> float:
-    return float(np.sqrt(np.mean(x**2)))
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

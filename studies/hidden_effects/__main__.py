@@ -4,16 +4,14 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from fdi.report.numbers import NO_NUMBER
-from fdi.report.report import Cell, Column, Item, Line, Mood, Report, Section, Table
+from fdi.report.report import Listing, Report, Section
 from plant.errors import InputError
 from studies.command import make_row_progress, run_study_command
 from studies.hidden_effects.benchmark import METHODS, answer_benchmark, describe_progress, make_benchmark
-from studies.hidden_effects.score import describe_miss, read_answers, read_truths, score_answers
+from studies.hidden_effects.score import format_scores, read_answers, read_truths, score_answers
 
 AIMS = {"nothing: answered nothing": 0.99, "one: named": 0.97, "one, named: true size in interval": 0.93,
         "one, named: held-out run at most 1.15 floors": 0.90, "outside: unexplained or partly": 0.95,
@@ -62,28 +60,9 @@ def score_method(folder: Path, method: str, workers: int) -> tuple[Report, bool]
     answers = read_answers(file, truths)
     scores = score_answers(truths, answers)
     missed = [rate["name"] for rate in scores["rates"] if rate["of"] and rate["share"] < AIMS.get(rate["name"], 0.0)]
-    sentence = f"Aims not reached: {'; '.join(missed)}." if missed else "Every aim that was counted is reached."
-    misses = {case for rate in scores["rates"] if rate["name"] in AIMS for case in rate["without"]}
-    items: list[Item] = [Line(case, describe_miss(case, truths[case], answers[case])) for case in sorted(misses)]
-    return Report("bench", f"hidden effects by {method}", sentence=f"{scores['answered']} cases. {sentence}",
-                  sections=[Section("Rates", [_tabulate_rates(scores["rates"])]),
-                            Section("Cases against an aim", items)], data=scores), not missed
-
-
-def _tabulate_rates(rates: Sequence[Mapping[str, Any]]) -> Table:
-    columns = [Column("rate"), *(Column(title, align="right") for title in ("count", "share", "95 % interval", "aim"))]
-    rows: list[list[str | Cell]] = []
-    for rate in rates:
-        if rate["of"]:
-            aim = AIMS.get(rate["name"])
-            rows.append([rate["name"], f"{rate['good']}/{rate['of']}", f"{100 * rate['share']:.1f} %",
-                         f"{100 * rate['low']:.1f} .. {100 * rate['high']:.1f}",
-                         NO_NUMBER if aim is None else Cell(f"{100 * aim:.0f} %", _judge_share(rate["share"], aim))])
-    return Table(columns, rows, "Rates with their exact 95 % intervals, beside the aims of rig explain.")
-
-
-def _judge_share(share: float, aim: float) -> Mood:
-    return "good" if share >= aim else "bad"
+    sentence = f"Below the aim: {'; '.join(missed)}." if missed else "Every aim that was counted is reached."
+    return Report("bench", f"hidden effects by {method}", sentence=sentence, data=scores, sections=[
+        Section("Scores", [Listing(format_scores(scores, truths, answers))])]), not missed
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

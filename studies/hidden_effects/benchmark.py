@@ -29,7 +29,7 @@ from studies.hidden_effects.command import preflight_command
 from studies.hidden_effects.hidden import CATALOGUE
 
 HERE = Path(__file__).parent
-METHODS = {"explain": "rig_answer"}
+METHODS = {"explain": "rig_answer", "regression": "regression", "sindy": "sindy"}
 """Methods and the modules of this package with their `answer_case`."""
 CASE_SOURCES = tuple(f"studies/hidden_effects/{name}" for name in ("truth.c", "truth.py", "command.py", "hidden.py",
                                                               "cases.py", "any_plant.py", "outside_ema.py"))

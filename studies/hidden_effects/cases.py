@@ -32,6 +32,7 @@ KINDS = {"nothing": 0.20, "one": 0.50, "two": 0.12, "outside": 0.18}
 SIGNALS = {"xj": 0.25, "xj,p12": 0.25, "xj,p12,xs": 0.5}
 """The measured signals, with their probability."""
 OUTPUTS = ("xj", "p12", "xs")
+NO_STOP = 1.0  # m, travel of a ram that no replay reaches
 
 
 class BenchLevel(NamedTuple):
@@ -143,22 +144,24 @@ def measure_case(case: Case, name: str) -> Measured:
 def measure_changes(case: Case, measured: Measured, without: Iterable[str]) -> dict[str, Array]:
     """What effects change in a trace, (n,) each, in noise floors: the trace less noise, less a replay `without` them.
 
-    The replay is driven by the measured current.
+    The replay is driven by the measured current, and has no end stops: without a bias it would drift to one.
     """
     run, noise = measured.trace, measured.noise
-    bare = simulate_truth(run.com, list_changed_symbols(case, without), None, run.load, run.cor)
+    symbols = list_changed_symbols(case, without) | {"XJM": NO_STOP}
+    bare = simulate_truth(run.com, symbols, None, run.load, run.cor)
     change = measure_floors({name: getattr(run, name) - noise[name] - getattr(bare, name) for name in OUTPUTS})
     return change | {"cor": measure_law_error(run.com, run.xj, run.cor)}
 
 
 def measure_floors(differences: Mapping[str, Array], lag: int = 20) -> dict[str, Array]:
-    """Differences of two runs, SI, (n,) each, in noise floors.
+    """Differences of two runs, SI, (.., n) each, in noise floors.
 
     That of the position is its change over `lag` cycles, because the position of a replay drifts with any difference.
     """
     floors = {name: x / FLOORS[name] for name, x in differences.items()}
-    xj = floors["xj"] / 2**0.5
-    return floors | {"xj": np.concatenate([np.zeros(lag), xj[lag:] - xj[:-lag]])}
+    change = np.zeros_like(floors["xj"])
+    change[..., lag:] = (floors["xj"][..., lag:] - floors["xj"][..., :-lag]) / 2**0.5
+    return floors | {"xj": change}
 
 
 def measure_law_error(com: Array, xj: Array, cor: Array) -> Array:
@@ -173,9 +176,9 @@ def describe_change(changes: Mapping[str, Array], command: Array) -> dict[str, A
     The sections are those of `name_sections`.
     """
     sections = name_sections(command)
-    return {"floors": {signal: _measure_rms(x) for signal, x in changes.items()},
+    return {"floors": {signal: measure_rms(x) for signal, x in changes.items()},
             "where": [f"{signal}/{name}" for signal, x in changes.items() for name, rows in sections.items()
-                      if _measure_rms(x[rows.start:rows.stop]) > 1.0]}
+                      if measure_rms(x[rows.start:rows.stop]) > 1.0]}
 
 
 def name_sections(command: Array) -> dict[str, Section]:
@@ -183,7 +186,8 @@ def name_sections(command: Array) -> dict[str, Section]:
     return {f"s{number:02d}": section for number, section in enumerate(find_sections(command, 1 / RATE), start=1)}
 
 
-def _measure_rms(x: Array) -> float:
+def measure_rms(x: Array) -> float:
+    """The RMS of all elements."""
     return float(np.sqrt((x**2).mean()))
 
 
@@ -196,7 +200,7 @@ def write_case(case: Case, folder: Path) -> None:
         write_columns(folder / f"{name}.csv.gz", columns, case.signals)
         if name == "est":
             truth = describe_case(case, measured)
-        noise = {signal: _measure_rms(x) for signal, x in measured.noise.items()}
+        noise = {signal: measure_rms(x) for signal, x in measured.noise.items()}
     write_truth(folder, truth | {"holdout_noise": noise}, OUTPUTS)
 
 

@@ -15,6 +15,7 @@ from plant.lanes import Lanes
 from plant.model import build_bare_model
 from plant.plants import find_plant
 from studies.hidden_effects.cases import (
+    NO_STOP,
     OUTPUTS,
     Array,
     describe_change,
@@ -71,7 +72,7 @@ def locate_parameters(trace: Mapping[str, Array], values: Mapping[str, float]) -
     The nominal model is replayed with the measured current, with and without these `values`, "group.field" to SI.
     """
     groups = {name.partition(".")[0] for name in values}
-    model = build_bare_model("eha").with_effects(groups)
+    model = build_bare_model("eha").with_effects(groups).replace({"jack.travel": NO_STOP})
     rows = np.array([[model[name] for name in values], list(values.values())])
     without, present = Lanes(model, list(values)).replay(rows, trace["cor"], trace["load"])
     changes = measure_floors(dict(zip(OUTPUTS, (present - without).T, strict=True)))

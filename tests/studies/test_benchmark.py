@@ -14,7 +14,7 @@ from scipy.stats import beta
 
 from studies.hidden_effects import cases, score
 from studies.hidden_effects.__main__ import main
-from studies.hidden_effects.benchmark import answer_benchmark, describe_progress, make_benchmark
+from studies.hidden_effects.benchmark import answer_benchmark, describe_progress, load_method, make_benchmark
 from studies.hidden_effects.truth import has_compiler
 
 compiled = pytest.mark.skipif(not has_compiler(), reason="no gcc: the trial's simulator cannot be built")
@@ -193,7 +193,7 @@ def test_the_command_makes_answers_and_scores(tmp_path: Path, capsys: pytest.Cap
     made = ["--benchmark", str(tmp_path / "made")]
     assert main([*made, "--cases", "1", "--seed", str(seed)]) == 0
     assert main([*made, "--answer", f"{__name__}:knowing"]) == 0
-    assert "Every aim that was counted is reached." in capsys.readouterr().out
+    assert "Every aim that was counted is reached." in (shown := capsys.readouterr().out) and "1 of 1 cases" in shown
     assert main([*made, "--cases", "1", "--signals", "xj"]) == 2
     assert "or one with cases of the same plant, signals and simulator" in capsys.readouterr().err
 
@@ -210,3 +210,28 @@ def test_bad_options_are_refused_in_one_line(options: list[str], expected: str, 
     said = capsys.readouterr().err
     assert said.startswith("studies.hidden_effects: ") and expected in said and said.count("\n") == 1
     assert not (tmp_path / "made").exists()
+
+
+@compiled
+@pytest.mark.parametrize(("module", "effect", "known"), [
+    ("regression", "null_bias", True), ("sindy", "compressibility", True), ("sindy", "rod_backlash", False)])
+def test_other_methods_name_an_effect_that_they_can_express(module: str, effect: str, known: bool, tmp_path: Path
+                                                                 ) -> None:
+    if module == "sindy":
+        pytest.importorskip("pysindy")
+    case = cases.sample_case(5, effects=[effect], level="exact", sizes=(0.5, 0.5), signals="xj,p12,xs")
+    cases.write_case(case, tmp_path)
+    method = load_method(f"studies.hidden_effects.{module}:answer_case")
+    given, hidden = method(tmp_path, "eha", "xj,p12,xs"), json.loads((tmp_path / "truth.json").read_text())
+    assert (effect in given["effects"][:score.NAMES]) is known
+    read = read_through_file({"00005": given}, tmp_path)
+    if known:
+        assert read["sizes"][effect]["value"] == pytest.approx(hidden["effects"][0]["value"], rel=0.5)
+        assert set(hidden["where"]) & set(read["where"])
+
+
+def read_through_file(answers: dict[str, Any], folder: Path) -> Any:
+    """The answer of the only case, as the scorer reads it from a file."""
+    (folder / "answers.json").write_text(json.dumps(answers, allow_nan=False))
+    (given,) = score.read_answers(folder / "answers.json", answers).values()
+    return given
