@@ -31,6 +31,7 @@ from plant.threads import map_in_threads
 
 FITTED_STEPS, SIMULATED_STEPS = 10, 13  # a cycle: of the fit, and of the run that stands for the measurement
 REFIT_ROUNDS = 4
+MORE_MOTION = "a run with more motion"  # shows what a run at rest does not
 WITHOUT_SIZE = ("Hz", "rad")  # units of parameters that say where an effect is and not how large
 
 
@@ -68,7 +69,7 @@ def find_hidden_effects(problem: Problem, fit: Fit, effects: Iterable[str]) -> l
     ways = [way for name in effects for way in list_directions(name, problem.model)]
     won = VirtualTest(problem, fit).measure_gains(ways, [way.most for way in ways]) if ways else []
     usual = {way.effect: way.most for way, gained in zip(ways, won, strict=True) if gained < GAIN_DETECTED}
-    return [Blind(e.name, e.fitted[0], usual[e.name], e.parameters[e.fitted[0]].unit, e.revealed_by)
+    return [Blind(e.name, e.fitted[0], usual[e.name], e.parameters[e.fitted[0]].unit, e.revealed_by or MORE_MOTION)
             for e in map(problem.model.find_effect, usual)]
 
 

@@ -26,7 +26,7 @@ the thresholds.
 | held-out run | there is one | rejects an effect that leaves more than {RESIDUAL_HELD_OUT:g} floors in the typical block; up to {HELD_OUT_UNDECIDED_SHARE:g} of the run may be undecided |
 | verdict | always | see below |
 | wave | the verdict is PARTLY, and a wave along the stroke explains more | names no effect |
-| hidden effects | only noise is left | names those that would gain less than {GAIN_DETECTED:g} at any usual size |
+| hidden effects | only noise is left | names those that would gain less than {GAIN_DETECTED:g} at any usual size; nothing is missing only if they are at most half of all |
 | law | the verdict is PARTLY or UNEXPLAINED | looks for a law, and describes the residual |
 """  # noqa: E501
 from __future__ import annotations
@@ -50,6 +50,7 @@ from fdi.thresholds import (
     FIRMWARE_DIFFERS,
     FURTHER_EFFECT_SHARE,
     GAIN_CONVINCES,
+    GAIN_DETECTED,
     GAIN_DOUBTFUL,
     GAIN_SEEN,
     GAIN_TIE,
@@ -241,8 +242,12 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
     explained = close[0] if close and verdict == "EXPLAINED" else base
     blind = compute_sensitivity(search.problem, explained.fit, search.effects)
     progress("what this test cannot see", 0.94)
-    hard_to_see = [e for e in search.effects if search.model.find_effect(e).revealed_by and e not in named]
+    doubtful = [*blind.list_unseen_effects(GAIN_DETECTED),
+                *(e for e in search.effects if search.model.find_effect(e).revealed_by)]
+    hard_to_see = [e for e in dict.fromkeys(doubtful) if e not in named]
     hidden = find_hidden_effects(search.problem, explained.fit, hard_to_see if verdict in NOISE_LEFT else ())
+    if verdict == "NOTHING_MISSING" and 2 * len(hidden) > len(search.effects):
+        verdict = "NOT_RESOLVABLE"
     return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, marks, blind, search,
                        unseen, tuple(hidden))
 

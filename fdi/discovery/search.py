@@ -684,7 +684,8 @@ def _measure_prominence(spectra: Floats, width: int) -> Floats:
     out = np.empty_like(spectra)
     for first in range(0, spectra.shape[1], width):
         around = spectra[:, max(first - width, 0):first + 2 * width]
-        out[:, first:first + width] = spectra[:, first:first + width] / np.median(around, axis=1, keepdims=True)
+        middle = np.maximum(np.median(around, axis=1, keepdims=True), 1e-300)  # an effect may change nothing here
+        out[:, first:first + width] = spectra[:, first:first + width] / middle
     return out
 
 
@@ -782,6 +783,12 @@ class Sensitivity(NamedTuple):
 
     names: tuple[str, ...]  # the effect of each direction
     gram: Floats  # (d, d) cosines between directions
+    gains: Floats  # (d,), of each in -2 log likelihood, if it is there at the size it was tried at
+
+    def list_unseen_effects(self, gain: float) -> list[str]:
+        """The effects of which no direction would gain so much."""
+        seen = {name for name, own in zip(self.names, self.gains, strict=True) if own >= gain}
+        return [name for name in dict.fromkeys(self.names) if name not in seen]
 
 
 def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> Sensitivity:
@@ -789,7 +796,7 @@ def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> S
     starts = [(e.name, s) for e in map(problem.model.find_effect, effects) for s in e.starts
               if e.port not in ("command", "reading")]
     if not starts:
-        return Sensitivity((), np.empty((0, 0)))
+        return Sensitivity((), np.empty((0, 0)), np.empty(0))
     names = list(dict.fromkeys([*fit.values, *(n for _, s in starts for n in s)]))
     held = [fit.values.get(n, problem.model.values[n]) for n in names]
     rows = np.array([held, *([s.get(n, v) for n, v in zip(names, held, strict=True)] for _, s in starts)])
@@ -801,7 +808,7 @@ def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> S
     prior = np.diag([f.prior**-2 + 1e-9 for f in fit.free])
     left = thin - (thin @ own.T) @ np.linalg.solve(own @ own.T + prior, own)
     length = np.sqrt(np.maximum(np.einsum("ij,ij->i", left, left), 1e-300))
-    return Sensitivity(tuple(e for e, _ in starts), (left @ left.T) / np.outer(length, length))
+    return Sensitivity(tuple(e for e, _ in starts), (left @ left.T) / np.outer(length, length), length**2)
 
 
 def compute_p_value(s: Sensitivity, gain: float, parameters: int = 1, seed: int = 0) -> float:

@@ -143,6 +143,9 @@ def describe_verdict(a: Answer) -> str:
                        f"{_format(floor, s, signals)}" for s in error)
     if a.verdict == "NOTHING_MISSING":
         return f"Nothing is missing: the residual is noise ({floors})."
+    if a.verdict == "NOT_RESOLVABLE" and not a.explanation.effects:
+        return (f"The residual is noise ({floors}), but this run shows little: {len(a.blind)} of "
+                f"{len(a.explanation.search.effects)} effects would change nothing in it that the tolerances do not.")
     if a.verdict == "NOT_RESOLVABLE":
         c = a.candidates[0]
         return (f"The error is at the noise floor ({floors}). {c.effect} may be present ({_describe_sizes([c])}), but "

@@ -108,7 +108,7 @@ def test_independent_noise_of_any_colour_does_not_repeat_and_physics_does() -> N
 
 
 def test_the_p_value_is_that_of_the_best_of_all_candidates() -> None:
-    independent = Sensitivity(tuple("abcdefghij"), np.eye(10))
+    independent = Sensitivity(tuple("abcdefghij"), np.eye(10), np.ones(10))
     for gain in (4.0, 6.0, 9.0):
         exact = 1.0 - (1.0 - 0.5 * chi2.sf(gain, 1)) ** 10  # each on its own side only
         assert compute_p_value(independent, gain) == pytest.approx(exact, rel=0.3)

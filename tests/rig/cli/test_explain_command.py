@@ -149,6 +149,18 @@ def test_the_file_is_a_model_with_intervals_and_provenance(added: tuple[Said, Pa
     assert before.effects == () and before.values == Model().values
 
 
+def test_a_run_at_rest_shows_next_to_nothing(tmp_path: Path) -> None:
+    """Noise alone is left of it, also with a bias hidden: it does not say that nothing is missing."""
+    command = tmp_path / "rest.csv"
+    command.write_text("t,com\n0,0\n2,0\n")
+    run = tmp_path / "run.csv"
+    assert rig("simulate", "--command", command, "--set=null_bias.current=5e-5", "--out", run).status == 0
+    said = rig("explain", run, "--json", "--out", tmp_path / "page.html").json
+    assert (said["verdict"], said["effects"]) == ("NOT_RESOLVABLE", [])
+    blind = {b["effect"]: b["revealed_by"] for b in said["blind_to"]}
+    assert "motion" in blind["moving_mass"] and "gauge" in blind["filter_clogging"]
+
+
 def test_the_page_has_the_ledger(added: tuple[Said, Path]) -> None:
     page = Path(added[0].json["report"]).read_text()
     assert "null_bias added" in page and page.count("<svg") == 2 and "http" not in page.replace("http://www.w3.org", "")
