@@ -144,7 +144,7 @@ def answer_benchmark(folder: Path, method: str, processes: int = 1,
     plant = read_description(folder)["plant"]
     module = METHODS.get(method)
     name = f"studies.hidden_effects.{module}:answer_case" if module else method
-    load_method(name)
+    import_function(name, "--answer", "a method")
     more = (f"studies/hidden_effects/{module}.py",) if module else ()
     sources = hash_sources("plant", "fdi", *CASE_SOURCES, *more)
 
@@ -170,7 +170,7 @@ def answer_case(case: str, folder: Path, name: str, plant: str, sources: str) ->
     clock = WallClock()
     start = clock.now()
     try:
-        answer = load_method(name)(folder / "cases" / case, plant, signals)
+        answer = import_function(name, "--answer", "a method")(folder / "cases" / case, plant, signals)
     except Exception as error:
         answer = {"verdict": "failed", "error": f"{type(error).__name__}: {error}"}
     return make_row(case, sources, answer | {"seconds": (clock.now() - start) * 1e-9})
@@ -179,11 +179,6 @@ def answer_case(case: str, folder: Path, name: str, plant: str, sources: str) ->
 def make_row(case: str, sources: str, answer: dict[str, Any]) -> Row:
     """A line of answers-METHOD.jsonl."""
     return {"case": int(case), "sources": sources, "answer": answer}
-
-
-def load_method(name: str) -> Callable[..., dict[str, Any]]:
-    """The method "module:function". Raises InputError if there is none."""
-    return import_function(name, "--answer", "a method")
 
 
 def describe_progress(progress: BatchProgress) -> str:

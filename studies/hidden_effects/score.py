@@ -88,10 +88,10 @@ def _find_fault(answer: Any) -> str:
     sizes, holdout = answer.get("sizes") or {}, answer.get("holdout") or {}
     if not isinstance(sizes, dict) or not all(isinstance(size, dict) for size in sizes.values()):
         return "sizes: expected value, low and high by effect"
-    numbers = [x for size in sizes.values() for x in size.values()]
+    numbers = [answer.get("seconds"), *(x for size in sizes.values() for x in size.values())]
     numbers += list(holdout.values()) if isinstance(holdout, dict) else ["no object"]
     if not all(x is None or (isinstance(x, (int, float)) and math.isfinite(x)) for x in numbers):
-        return "sizes, holdout: expected finite numbers, or null"
+        return "sizes, holdout, seconds: expected finite numbers, or null"
     return ""
 
 
@@ -160,10 +160,6 @@ def _has_verdict(*verdicts: str) -> Callable[[Truth, Answer], bool]:
     return lambda truth, answer: answer["verdict"] in verdicts
 
 
-def _is_in_time(truth: Truth, answer: Answer) -> bool | None:
-    return answer["seconds"] <= LONGEST if answer.get("seconds") is not None else None
-
-
 def count_rates(pairs: Mapping[str, Pair]) -> list[Rate]:
     """The rates by kind."""
     kinds = {kind: {case: pair for case, pair in pairs.items() if pair[0]["kind"] == kind} for kind in KINDS}
@@ -182,7 +178,8 @@ def count_rates(pairs: Mapping[str, Pair]) -> list[Rate]:
         ("two, named: true sizes in intervals", seen["two"], is_size_covered),
         ("outside: unexplained or partly", seen["outside"], _has_verdict("unexplained", "partly")),
         ("outside, any size: not explained", kinds["outside"], lambda _, answer: answer["verdict"] != "explained"),
-        ("all: answered within 20 s", pairs, _is_in_time),
+        ("all: answered within 20 s", pairs,
+         lambda _, answer: answer["seconds"] <= LONGEST if answer.get("seconds") is not None else None),
     ]
     return [count_rate(*row) for row in table]
 

@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 from scipy.stats import beta
 
+from fdi.sources import import_function
 from studies.hidden_effects import cases, score
 from studies.hidden_effects.__main__ import main
-from studies.hidden_effects.benchmark import answer_benchmark, describe_progress, load_method, make_benchmark
+from studies.hidden_effects.benchmark import answer_benchmark, describe_progress, make_benchmark
 from studies.hidden_effects.truth import has_compiler
 
 compiled = pytest.mark.skipif(not has_compiler(), reason="no gcc: the trial's simulator cannot be built")
@@ -138,7 +139,7 @@ def test_the_text_says_rates_and_misses(folder: Path) -> None:
     ('{"00002": {"verdict": "perhaps"}}', "case 00002: verdict: expected nothing, explained"),
     ('{"00099": {"verdict": "nothing"}}', "case 00099: case: expected one of the benchmark"),
     ('{"00002": {"verdict": "nothing", "effects": "coil_lag"}}', "case 00002: effects: expected a list"),
-    ('{"00002": {"verdict": "nothing", "sizes": {"a": {"low": "x"}}}}', "case 00002: sizes, holdout: expected finite"),
+    ('{"00002": {"verdict": "nothing", "sizes": {"a": {"low": "x"}}}}', "sizes, holdout, seconds: expected finite"),
 ])
 def test_bad_answers_are_refused_in_one_line(text: str, expected: str, folder: Path) -> None:
     (folder / "answers.json").write_text(text)
@@ -221,7 +222,7 @@ def test_other_methods_name_an_effect_that_they_can_express(module: str, effect:
         pytest.importorskip("pysindy")
     case = cases.sample_case(5, effects=[effect], level="exact", sizes=(0.5, 0.5), signals="xj,p12,xs")
     cases.write_case(case, tmp_path)
-    method = load_method(f"studies.hidden_effects.{module}:answer_case")
+    method = import_function(f"studies.hidden_effects.{module}:answer_case", "", "")
     given, hidden = method(tmp_path, "eha", "xj,p12,xs"), json.loads((tmp_path / "truth.json").read_text())
     assert (effect in given["effects"][:score.NAMES]) is known
     read = read_through_file({"00005": given}, tmp_path)
