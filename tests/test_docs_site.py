@@ -24,8 +24,9 @@ from rig.sequences.sequence import SEGMENT_KINDS
 
 NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
 PAGES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").glob("*.md")}
-MADE = {f"docs/{NOTEBOOK.stem}.md", "ARCHITECTURE.md", "CHANGELOG.md", "studies/README.md",
-        *(path.relative_to(ROOT).as_posix() for path in (ROOT / "examples").rglob("README.md"))}
+MADE = {f"docs/{NOTEBOOK.stem}.md", "ARCHITECTURE.md", "CHANGELOG.md",
+        *(path.relative_to(ROOT).as_posix() for name in ("examples", "studies")
+          for path in (ROOT / name).rglob("README.md"))}
 
 
 @pytest.fixture(scope="module")

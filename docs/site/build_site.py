@@ -58,8 +58,8 @@ def write_source(source: Path, notebooks: Mapping[Path, Any]) -> None:
     shutil.copytree(ROOT / "docs", source / "docs", ignore=shutil.ignore_patterns("site", "*.py", "__pycache__"))
     for path, cells in notebooks.items():
         write_notebook_page(path, cells, source / "docs" / f"{path.stem}.md")
-    examples = [path.relative_to(ROOT) for path in (ROOT / "examples").rglob("README.md")]
-    for name in ("ARCHITECTURE.md", "CHANGELOG.md", "studies/README.md", *examples):
+    readmes = [path.relative_to(ROOT) for name in ("examples", "studies") for path in (ROOT / name).rglob("README.md")]
+    for name in ("ARCHITECTURE.md", "CHANGELOG.md", *readmes):
         (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, source / name)
     shutil.copy(ROOT / "README.md", source / "index.md")

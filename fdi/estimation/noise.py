@@ -269,7 +269,7 @@ def _compile_filter() -> Function:
 def filter_rows(x: Floats, weights: Floats, out: Floats) -> None:
     """Fill `out` (m, n) with weighted sums of each value of `x` (m, n) and those before it, 0 where one is missing.
 
-    Compiled, as the residuals of every trial of a fit pass it: `scipy.signal.lfilter` takes five times as long.
+    Compiled, as the residuals of every trial of a fit pass it: SciPy's lfilter takes five times as long.
     """
     n, tile = x.shape[1], 1024  # a tile stays in the fastest cache for all weights
     for row in range(len(x)):

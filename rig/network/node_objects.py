@@ -123,10 +123,10 @@ class CycleRecord(NamedTuple):
 def encode_cycle_record(record: CycleRecord) -> bytes:
     """The bytes of object 0x2212, little endian; empty without a cycle.
 
-    4 bytes `ECR1`; UNSIGNED32 number n of cycles; INTEGER64 `sync` of the first in ns; then a zlib stream of six columns
-    of n INTEGER32, each as four planes of n bytes, the lowest bytes first: the cycle number as the difference to the one
-    before (the first: itself); `sync` in us after that of the cycle before (the first: 0); `start`, `sent` and `done` in
-    us after `sync`; `flags`.
+    4 bytes ECR1; UNSIGNED32 number n of cycles; INTEGER64 `sync` of the first in ns; then a zlib stream of six
+    columns of n INTEGER32, each as four planes of n bytes, the lowest bytes first: the cycle number as the difference
+    to the one before (the first: itself); `sync` in us after that of the cycle before (the first: 0); `start`, `sent`
+    and `done` in us after `sync`; `flags`.
     """
     if not len(record.cycle):
         return b""
