@@ -215,18 +215,18 @@ def compute_interval(good: int, of: int, confidence: float = 0.95) -> tuple[floa
 def score_places(pairs: Mapping[str, Pair]) -> dict[str, Any]:
     """Precision, recall and F1 of the cells "signal/section" blamed, with 95 % intervals by bootstrap over the cases.
 
-    They are counted over the visible cases that have something hidden; an answer without `where` blames no cell.
+    They are counted over the cases with nothing hidden and the visible ones; an answer without `where` blames no cell.
     """
     cases = [(set(truth["where"]), set(answer.get("where") or [])) for truth, answer in pairs.values()
-             if truth["where"] and is_visible(truth)]
+             if truth["where"] is not None and (is_visible(truth) or not truth["effects"])]
     if not any(blamed for _, blamed in cases):
         return {"cases": len(cases)}
 
     def measure(sample: Sequence[tuple[set[str], set[str]]]) -> dict[str, float]:
         hits = sum(len(acts & blamed) for acts, blamed in sample)
         blamed, acts = sum(len(b) for _, b in sample), sum(len(a) for a, _ in sample)
-        return {"precision": hits / blamed if blamed else 0.0, "recall": hits / acts,
-                "F1": 2 * hits / (blamed + acts)}
+        return {"precision": hits / max(blamed, 1), "recall": hits / max(acts, 1),
+                "F1": 2 * hits / max(blamed + acts, 1)}
 
     draw = random.Random(0)
     samples = [measure(draw.choices(cases, k=len(cases))) for _ in range(RESAMPLES)]

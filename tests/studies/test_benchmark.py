@@ -37,7 +37,7 @@ def answer(verdict: str, *effects: str, **more: Any) -> dict[str, Any]:
 FRICTION = "spool_friction"
 PAIRS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "00000": (truth("nothing", floors=0.0), answer("nothing", seconds=30.0)),
-    "00001": (truth("nothing", floors=0.0), answer("explained", "coil_lag", seconds=5.0)),
+    "00001": (truth("nothing", floors=0.0), answer("explained", "coil_lag", seconds=5.0, where=["xj/s03"])),
     "00002": (truth("one", [FRICTION]), answer("explained", FRICTION, holdout={"xj": 2.2e-6},
                                                where=["xj/s02", "xj/s04"],
                                                sizes={FRICTION: {"value": 20, "low": 19, "high": 21}})),
@@ -97,15 +97,15 @@ def test_rates_count_what_they_say(folder: Path) -> None:
 
 
 def test_precision_recall_and_f1_are_those_of_the_cells(folder: Path) -> None:
-    """Blamed are three cells, two of them rightly; of seven visible cases with two cells each."""
+    """Blamed are four cells, two of them rightly; of seven visible cases with two cells each, and two with nothing."""
     scores = json.loads(run_script(folder, folder / "answers.json", "--json").stdout)
     where = scores["where"]["all"]
-    assert where["cases"] == 7
-    assert [where[name]["value"] for name in ("precision", "recall", "F1")] == pytest.approx([2 / 3, 2 / 14, 4 / 17])
+    assert where["cases"] == 9
+    assert [where[name]["value"] for name in ("precision", "recall", "F1")] == pytest.approx([2 / 4, 2 / 14, 4 / 18])
     assert where["F1"]["low"] < where["F1"]["value"] < where["F1"]["high"]
     assert scores["where"]["xj"]["recall"]["value"] == pytest.approx(2 / 7)
     assert scores["where"]["one"]["precision"]["value"] == pytest.approx(2 / 3)
-    assert scores["where"]["xs"] == {"cases": 7} and scores["where"]["outside"] == {"cases": 1}
+    assert scores["where"]["xs"] == {"cases": 9} and scores["where"]["outside"] == {"cases": 1}
 
 
 @pytest.mark.parametrize(("good", "of"), [(0, 5), (5, 5), (3, 7), (150, 200), (1, 1), (0, 0)])
