@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from plant.friction import soften
 from plant.kernels import correct_plant, measure_plant, move_plant, sense_plant, shift_memories
 from plant.state import Input, Memory
 
@@ -27,11 +28,14 @@ def rest_at_reading(s: Any, m: Memory, x: float, p: Any, steps: int) -> tuple[An
     return s, m
 
 
-def pull_plant(s: Any, m: Memory, share: float, measured: float, p: Any) -> tuple[Any, Memory]:
+def pull_plant(s: Any, m: Memory, share: float, measured: float, slack: float, p: Any) -> tuple[Any, Memory]:
     """The plant moved by this share of the way to the measured signal; as it is where none was measured.
 
     Positions that a sensor remembers move along. Else the noise of the measurement would push a ram through the play of
     its rod end, and the play would seem 1 um smaller than it is.
+
+    The measured signal of a coarse sensor says no more than that the true one is within `slack` of it, half a step. An
+    observer that took the rounding for motion would add it to every speed, the same in each repeat of a run.
     """
-    moved = share * (measured - measure_plant(s, p)[0]) if measured == measured else 0.0
+    moved = share * soften(measured - measure_plant(s, p)[0], slack) if measured == measured else 0.0
     return correct_plant(s, moved, p), shift_memories(m, moved)

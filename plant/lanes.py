@@ -162,7 +162,8 @@ class Lanes:
         self._own: dict[tuple[str, ...], KernelVariant] = {}
 
     def replay(self, values: Array, current: Array, load: Array, position: Array | None = None,
-               anchor: float = 0.0, parts: Sequence[Part] = (), chambers: Array | None = None) -> Array:
+               anchor: float = 0.0, parts: Sequence[Part] = (), chambers: Array | None = None,
+               slack: float = 0.0) -> Array:
         """The plant without its controller, driven by a measured current or motor speed.
 
         The position of a plant whose chamber pressures were measured follows from its flow alone: they are given as a
@@ -178,6 +179,8 @@ class Lanes:
             parts: pieces of a longer recording that the rows consist of: each begins anew; none: one piece.
             chambers: (n, 2) Pa, pressures of both chambers as they were read; None: the model's forces move the ram.
                 A plant without `measured_pressures` does not use them.
+            slack: how far the controlled signal may be off before an observer corrects the plant: half a step of a
+                coarse sensor. A plant without an observer is pulled wherever it is off.
 
         Returns:
             (m, n, outputs): the readings at each sample, without noise; `[..., i]` has contiguous rows. Of the EHA XJ
@@ -187,7 +190,7 @@ class Lanes:
             InputError: shapes that do not fit.
         """
         where = np.empty(0) if position is None else position
-        out = self._run(values, current, load, where, anchor, False, parts)
+        out = self._run(values, current, load, where, anchor, False, parts, slack)
         pressures = self.model.kind.measured_pressures
         if chambers is None or pressures is None:
             return out
@@ -216,7 +219,7 @@ class Lanes:
         return out
 
     def replay_in_turns(self, values: Array, current: Array, load: Array, position: Array | None = None,
-                        anchor: float = 0.0, rows: int = TURN) -> Iterator[tuple[int, Array]]:
+                        anchor: float = 0.0, rows: int = TURN, slack: float = 0.0) -> Iterator[tuple[int, Array]]:
         """The same replay, so many `rows` at a time: the first row of each piece, and its (m, k, 3).
 
         Memory does not grow with the recording. The numbers are those of `replay`, to the last bit.
@@ -226,9 +229,9 @@ class Lanes:
         """
         where = np.empty(0) if position is None else position
         if self.model.kind.foreign is not None:
-            yield 0, self.replay(values, current, load, position, anchor)
+            yield 0, self.replay(values, current, load, position, anchor, slack=slack)
             return
-        shares, inputs = self._prepare(values, current, load, where, anchor, False)
+        shares, inputs = self._prepare(values, current, load, where, anchor, False, slack)
         work = build_blocks(shares, len(values))
         for first in range(0, len(current), rows):
             stop = min(first + rows, len(current))
@@ -258,10 +261,10 @@ class Lanes:
         return self._run(values, com, load, np.empty(0), 0.0, True)
 
     def _run(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool,
-             parts: Sequence[Part] = ()) -> Array:
+             parts: Sequence[Part] = (), slack: float = 0.0) -> Array:
         if self.model.kind.foreign is not None:
             return run_foreign(self.model, self.names, values, driven, load, position, anchor, closed, parts)
-        shared, inputs = self._prepare(values, driven, load, position, anchor, closed)
+        shared, inputs = self._prepare(values, driven, load, position, anchor, closed, slack)
         batch = Batch(shared, inputs, tuple(parts), len(values), self._count_columns(closed))
         do_together(batch, make_runs, self.workers)
         return batch.out.transpose(0, 2, 1)
@@ -270,8 +273,8 @@ class Lanes:
         signals = self.model.kind.signals
         return len(signals.columns if closed else signals.outputs)
 
-    def _prepare(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool
-                 ) -> tuple[list[Share], tuple[Any, ...]]:
+    def _prepare(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool,
+                 slack: float = 0.0) -> tuple[list[Share], tuple[Any, ...]]:
         """The runs by their kernels, and the inputs of all.
 
         Raises:
@@ -283,10 +286,11 @@ class Lanes:
         if driven.ndim != 1 or load.shape != driven.shape or position.shape not in (driven.shape, (0,)):
             raise InputError("lanes", "load", "one number a cycle in each input, not shapes "
                              f"{driven.shape}, {load.shape} and {position.shape}")
+        slack = 0.0 if self.model.kind.correct is None else float(slack)
         shares = [Share(rung, self.names, values[members], members)
                   for rung, members in self._assign_runs(values, len(driven))]
         period = float(self.model["controller.period"])
-        return shares, (driven, load, position, float(anchor), closed, period, self.steps)
+        return shares, (driven, load, position, float(anchor), slack, closed, period, self.steps)
 
     def _assign_runs(self, values: Array, samples: int) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
         """The runs of each kernel: a run goes to the kernel with the fewest effects that has all its active ones.
@@ -382,7 +386,7 @@ class KernelVariant:
         none = np.empty(0)
         for run, buffer, rows in build_blocks([Share(self, (), np.zeros((1, 0)), np.zeros(1, np.int64))], 1):
             out = np.empty((2, len(self.model.kind.signals.outputs), 0))
-            run(buffer, none, none, none, 0.0, False, 1.0, 1, 0, 0, 0, 0, True, rows, out)
+            run(buffer, none, none, none, 0.0, 0.0, False, 1.0, 1, 0, 0, 0, 0, True, rows, out)
 
     def compile(self, width: int) -> tuple[Layout, Function]:
         """The kernel with so many lanes, and the layout of its buffer."""
@@ -480,8 +484,8 @@ def plan_layout(effects: tuple[str, ...], kind: Plant, width: int = NARROW) -> L
     return Layout(rebind_names(run_block, WIDTH=width), made, place, place + record.view(float).size)
 
 
-def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool, period: float, steps: int,
-              first: int, stop: int, origin: int, later: int, begins: bool, rows: Any, out: Any) -> None:
+def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, slack: float, closed: bool, period: float,
+              steps: int, first: int, stop: int, origin: int, later: int, begins: bool, rows: Any, out: Any) -> None:
     """Simulates a block of runs over the samples k = first..stop-1.
 
     Fills out[rows[lane], :, k - origin] = the readings at sample k, in closed loop the drive too.
@@ -492,6 +496,7 @@ def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, closed:
         load: (n,) external load.
         position: (n,) measured controlled signal; NaN where missing; or (0,).
         anchor: 1/s, how fast the plant is pulled to it.
+        slack: how far it may be off before the plant is pulled.
         closed: with the model's own controller.
         period: of a cycle, s.
         steps: steps a cycle.
@@ -520,7 +525,7 @@ def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, closed:
         if len(position):
             for lane in range(WIDTH):
                 s, m = state_at(a, lane)
-                keep_state(pull_plant(s, m, anchor * period, position[k], parameters_at(a, lane)), a, lane)
+                keep_state(pull_plant(s, m, anchor * period, position[k], slack, parameters_at(a, lane)), a, lane)
         for i in range(steps):
             # the loop that everything is for
             for lane in range(WIDTH):

@@ -33,6 +33,7 @@ from fdi.estimation.replay import (
     find_repeat,
     fit_scatter,
     has_controller_memory,
+    leave_out_rest,
     match_period,
     measure_drift,
     measure_misfit,
@@ -216,6 +217,7 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     trace = prepare_trace(trace, model, signals, source)
     model = match_period(model, trace)
     trace, found = _align_delays(trace, model, compare_controller(trace, model))
+    trace = leave_out_rest(trace, model)
     others = [find_repeat(trace, other, model, number) for number, other in enumerate(repeats, 1)]
     progress("solver", 1 / STAGES)
     noise = sensor_floors(trace, model)

@@ -14,7 +14,7 @@ the thresholds.
 | third effect | so does the second, which also removes {FURTHER_EFFECT_SHARE:g} of the excess cost, and leaves at most {ERROR_PARTLY_EXPLAINED:g} of the excess on the held-out run | the same |
 | finer steps | the best leaves at most {RESIDUAL_IS_NEAR_NOISE:g} floors | asks whether 20 steps a cycle leave only noise |
 | missed stops | that holds for the first effect, and the second gains at most {GAIN_SEEN:g} | fits the first again with a population; no second effect is missing |
-| more noise | the best leaves more than noise, or its tolerances have a mean square above {TOLERANCE_SQUARE_FAR:g} | searches again from a nominal unit with 30 and 6 times the noise |
+| more noise | the best leaves more than noise, or its tolerances are those of {TOLERANCES_FAR_SHARE:.2%} of healthy units | searches again from a nominal unit with 30 and 6 times the noise |
 | other valleys | two effects remove {FURTHER_EFFECT_SHARE:g} of the excess cost and still leave more than noise | fits the best two pairs again with a population |
 | number of effects | always | keeps the effects that gain more than {GAIN_SEEN:g}, of several only those whose removal costs more than {GAIN_CONVINCES:g} |
 | last fits | always | finishes the base and the best four with finer steps, on the repeats too; begins again those of the best two that leave a mean square above {WHITE_SQUARE_POOR:g} or have far tolerances |
@@ -41,8 +41,13 @@ import numpy as np
 from fdi.discovery.detectable import Blind, find_hidden_effects
 from fdi.discovery.residual_pattern import is_periodic_in_position
 from fdi.discovery.search import FINE, Hypothesis, Search, Sensitivity, compute_sensitivity
-from fdi.estimation.fit import compute_typical_rms
-from fdi.estimation.replay import answer_readings, find_controller_gain, find_undecided_rows
+from fdi.estimation.fit import compute_typical_rms, replay_fit
+from fdi.estimation.replay import (
+    answer_readings,
+    find_controller_gain,
+    find_undecided_rows,
+    find_unpredictable_rows,
+)
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (
     ERROR_PARTLY_EXPLAINED,
@@ -109,9 +114,7 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
     marks = find_marks(model, whole or [est, *repeats])
     candidates = [e.name for e in list_searched_effects(model.plant)
                   if e.port not in ("command", "reading") and e.starts]
-    search = Search(model, est, repeats, candidates, holdout=holdout, whole=whole)
-    if marks.step:
-        search.coarse = {est.declared.controlled.name: marks.rounding}
+    search = Search(model, est, repeats, candidates, holdout=holdout, whole=whole, rounding=marks.rounding)
     progress("fitting the tolerances", 0.03)
     base = search.fit_base()
     if base.is_at_floor:
@@ -119,7 +122,10 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
         base = search.refit_hypothesis(base)
         if base.is_poor:  # by a missed stop, beside which nothing else would be looked for
             base = search.search_widely(base)
-    return _conclude(search, _search_levels(search, base, progress), marks, progress)
+    levels = _search_levels(search, base, progress)
+    if not any(level[0].is_near_floor for level in levels) and search.leave_out_bounces(levels[0][0]):
+        levels = _search_levels(search, search.fit_base(), progress)
+    return _conclude(search, levels, marks, progress)
 
 
 def _search_levels(search: Search, base: Hypothesis, progress: Progress) -> list[list[Hypothesis]]:
@@ -277,10 +283,19 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
     # where no effect helps, the base is fitted until that is beyond doubt
     rounds = 2 if depth or levels[0][0].is_at_floor else LONG
     search.stage = Stage(progress, "last fits, with finer steps", 0.5, 0.93, rounds + 6 * len(close))
+    is_cut = search.leave_out_undecided(levels[depth][0])
     base, *close = search.map_parallel(lambda work: search.finish_hypothesis(*work),
                                        [(levels[0][0], rounds), *((h, 5) for h in close)])
     close = _sort_by_cost(close)
+    best = (close or [base])[0]
+    if search.leave_out_undecided(best) or is_cut:  # of the size that it has without these rows, further ones
+        search.learn_noise(best)
+        base, *close = search.map_parallel(partial(search.finish_hypothesis, rounds=2), [base, *close])
+        close = _sort_by_cost(close)
     close = _sort_by_cost([*search.map_parallel(search.begin_again, close[:2]), *close[2:]])
+    close = _sort_by_cost([*search.map_parallel(search.search_decided, close[:2]), *close[2:]])
+    if is_cut and close and search.leave_out_undecided(close[0]):
+        base, *close = search.map_parallel(partial(search.finish_hypothesis, rounds=2), [base, *close])
     return _doubt_small_gain(search, base, _compare_rivals(search, base, close), depth)
 
 
@@ -398,6 +413,8 @@ def _judge_unseen_run(search: Search, h: Hypothesis, floor: Mapping[str, float])
     if _is_noise(left, trace, floor):
         return HeldOut(True)
     undecided = find_undecided_rows(problem, h.fit, floor)
+    if search.model.kind.correct is not None:  # a bounce that was missed has consequences
+        undecided |= find_unpredictable_rows(problem, replay_fit(problem, h.fit, h.fit.x), floor) & trace.usable
     share = float(undecided.mean())
     if share == 0.0 or share > HELD_OUT_UNDECIDED_SHARE:
         return HeldOut(False)

@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri
 
 from fdi.estimation import noise as noises
 from fdi.estimation.fit import (
@@ -30,6 +30,7 @@ from fdi.estimation.fit import (
     list_effect_unknowns,
     name_sine,
     place_in_healthy_unit,
+    replay_fit,
     scale_noise,
     scaled_bounds,
     silence_readings,
@@ -47,17 +48,17 @@ from fdi.thresholds import (
     BLOCK_FITTED_SQUARE,
     GAIN_DOUBTFUL,
     GAIN_WORTH_A_FIT,
+    HELD_OUT_UNDECIDED_SHARE,
     LOOKS_ALIKE,
     NULL_DRAWS,
     RESIDUAL_IS_NEAR_NOISE,
     RESIDUAL_IS_NOISE,
-    TOLERANCE_SQUARE_FAR,
+    TOLERANCES_FAR_SHARE,
     WHITE_SQUARE_POOR,
 )
 from fdi.trace.trace import Flags, Floats, Trace
 from plant.lanes import Part
 from plant.model import Model
-from plant.signals import Signal
 from plant.threads import R, T, count_threads, map_together
 
 FITTED = 8  # effects of a scan that get a full fit
@@ -99,7 +100,7 @@ class Hypothesis:
     def is_far(self) -> bool:
         """True when few healthy units have such tolerances: it may have ended far off in a valley."""
         known = np.isfinite([f.prior for f in self.fit.free]).sum()
-        return bool(self.tolerance_cost > TOLERANCE_SQUARE_FAR * known)
+        return bool(self.tolerance_cost > chdtri(known, TOLERANCES_FAR_SHARE))
 
     @property
     def cost(self) -> float:
@@ -121,30 +122,25 @@ def choose_search_excerpt(model: Model, trace: Trace, effects: Iterable[str], pr
     return choose_excerpt(trace, complete_model(model), floor, changes, progress)
 
 
-def _find_level(trace: Trace, signal: Signal, model: Model) -> float:
-    """RMS of a sensor's white noise: the model's, or that of the data where the plant declares none."""
-    if signal.noise:
-        return model[signal.noise]
-    return max(noises.floor_from_data(trace.mask_unusable(signal.name)).value, signal.finest) or 1.0
-
-
 class Search:
     """The state of one search: the problem, its noise, every hypothesis tried."""
 
     def __init__(self, model: Model, trace: Trace, repeats: Sequence[Trace], effects: Iterable[str],
-                 workers: int | None = None, holdout: Trace | None = None, whole: Sequence[Trace] = ()) -> None:
+                 workers: int | None = None, holdout: Trace | None = None, whole: Sequence[Trace] = (),
+                 rounding: float = 0.0) -> None:
         self.workers = workers or count_threads()
-        self.sensors = {signal.name: noises.white_noise(_find_level(trace, signal, model))
+        self.sensors = {signal.name: noises.white_noise(noises.find_sensor_level(trace, signal, model))
                         for signal in trace.declared.outputs}
-        level = self.sensors[trace.declared.controlled.name].level
-        trace, *repeats = (leave_out_rest(run, model, level) for run in (trace, *repeats))
-        self.holdout = None if holdout is None else leave_out_rest(holdout, model, level)
+        trace, *repeats = (leave_out_rest(run, model) for run in (trace, *repeats))
+        self.holdout = None if holdout is None else leave_out_rest(holdout, model)
         self.whole = whole  # what the runs were cut from, if they were
         lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
+        rounding = max(rounding, float(lsb / np.sqrt(12.0)))
         # RMS of rounding, where a signal comes in steps
-        self.coarse = {trace.declared.controlled.name: lsb / np.sqrt(12.0)} if lsb else {}
-        self.noise = tuple(self.sensors[s]._replace(innovation=float(np.hypot(
-            self.sensors[s].innovation, self.coarse.get(s, 0.0)))) for s in trace.outputs)
+        self.coarse = {trace.declared.controlled.name: rounding} if rounding else {}
+        self.noise = tuple(self.sensors[s] for s in trace.outputs)
+        if lsb or model.kind.correct is not None:
+            self.noise = self._add_rounding(trace, self.noise)
         self.model, ready = model, complete_model(model)
         bare = silence_readings(model)
         self.problem = Problem(ready, trace, self.noise, workers=self.workers, bare=bare)
@@ -363,8 +359,16 @@ class Search:
     def learn_noise(self, best: Hypothesis) -> None:
         """Take the noise from what differs between the runs under the best hypothesis."""
         self.noise = tuple(learn_noise(best, self.problem.trace, self.noise))
+        if self.model.kind.correct is not None:
+            self.noise = self._add_rounding(self.problem.trace, self.noise)
         self.problem = replace(self.problem, noise=self.noise)
+        self.fine = None if self.fine is None else replace(self.fine, noise=self.noise)
         self.repeats = [replace(p, noise=self.noise) for p in self.repeats]
+
+    def _add_rounding(self, trace: Trace, found: Iterable[Noise]) -> tuple[Noise, ...]:
+        """The noise of each output with that of rounding, which repeats do not show, as they round alike."""
+        return tuple(n._replace(innovation=float(np.hypot(n.innovation, self.coarse.get(s, 0.0))))
+                     for s, n in zip(trace.outputs, found, strict=True))
 
     def match_noise(self, best: Hypothesis) -> None:
         """Take the noise for so large that 99 of 100 blocks of the best hypothesis count by their squares.
@@ -423,6 +427,61 @@ class Search:
         if other.cost > self.problem.compute_costs(h.fit.free, h.fit.x[None])[0] + GAIN_DOUBTFUL:
             return h
         again = self.finish_hypothesis(self.judge_fit(h.effects, other))
+        return min(h, again, key=lambda each: each.cost)
+
+    def leave_out_undecided(self, best: Hypothesis) -> bool:
+        """Leave out of all runs the rows that hang on a stop or an impact under the best hypothesis; whether any did.
+
+        Where a plant has an observer. Behind a backlash a motor bounces, and a thousandth of a friction decides the
+        next impact: there a replay at the true values is off by up to 80 noise floors, and a fit is drawn to a size at
+        which it happens to bounce like the measured motor. If few of the rows would remain, they stay as they are.
+        """
+        if self.model.kind.correct is None:
+            return False
+        alone = replace(self.fine or self.problem, also=(), _lanes={})
+        return self._leave_out(find_undecided_rows(alone, best.fit, self.estimate_floor(best)))
+
+    def leave_out_bounces(self, base: Hypothesis) -> bool:
+        """The same for the rows that would hang on an impact if one of the effects were there at its largest start.
+
+        Such rows cost an effect that makes the plant bounce as much as any other, and they draw the tolerances of the
+        base from where the scan would find it.
+        """
+        if self.model.kind.correct is None:
+            return False
+        floor, rows = self.estimate_floor(base), np.zeros(len(self.problem.trace), bool)
+        for entry in map(self.model.find_effect, self.effects):
+            start = max(entry.starts, key=lambda values: abs(values[entry.fitted[0]]))
+            changed = self.problem.model.replace(dict(start))
+            rows |= find_undecided_rows(replace(self.problem, model=changed, bare=None, _lanes={}), base.fit, floor)
+        return self._leave_out(rows)
+
+    def _leave_out(self, undecided: Flags) -> bool:
+        usable = self.problem.trace.usable
+        kept = float((usable & ~undecided).sum() / usable.sum())
+        if kept == 1.0 or kept < 1.0 - HELD_OUT_UNDECIDED_SHARE:
+            return False
+
+        def cut(problem: Problem) -> Problem:
+            runs = [run.with_columns({}, usable=run.usable & ~undecided[:len(run)])
+                    for run in (problem.trace, *problem.also)]
+            return replace(problem, trace=runs[0], also=tuple(runs[1:]), _lanes={})
+
+        self.problem, self.fine = cut(self.problem), None if self.fine is None else cut(self.fine)
+        self.repeats = [cut(problem) for problem in self.repeats]
+        return True
+
+    def search_decided(self, h: Hypothesis) -> Hypothesis:
+        """A last fit that leaves more than noise of the rows that hang on no stop, or where a population ends there.
+
+        A fit that began with all rows may be far off in size, and the way to the right one is rough.
+        """
+        if self.model.kind.correct is None or not h.is_poor:
+            return h
+        coarse = copy(self)
+        coarse.problem = replace(self.problem, steps=Problem.steps, also=(), workers=1, _lanes={})
+        begun = coarse.judge_fit(h.effects, replay_fit(coarse.problem, h.fit, h.fit.x))
+        again = self.finish_hypothesis(coarse.search_widely(begun))
         return min(h, again, key=lambda each: each.cost)
 
     def begin_beside(self, best: Hypothesis, rival: Hypothesis, rounds: int = 4) -> Hypothesis:

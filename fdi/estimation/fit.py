@@ -24,6 +24,7 @@ from plant.model import Model, find_quantity, list_offered_effects, list_searche
 from plant.threads import map_in_threads
 
 HUM = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0, 400.0)  # Hz
+HUM_MOST_SD = 8.0  # noise levels, of hum and noise together
 BLOCK = 100  # cycles
 FURTHEST = 1e15  # SI, of any signal
 
@@ -111,7 +112,7 @@ class Problem:
             self._lanes[key] = Lanes(self.bare if bare and self.bare else self.model, key, self.steps, self.workers)
         trace = self.trace if trace is None else trace
         out = self._lanes[key].replay(values, trace.drive, trace.load, trace.anchor, self.anchor, trace.parts,
-                                      trace.chambers)
+                                      trace.chambers, trace.slack)
         if not (out.max() < FURTHEST and out.min() > -FURTHEST):  # a trial at which the simulation diverges
             out = np.clip(np.nan_to_num(out, nan=FURTHEST), -FURTHEST, FURTHEST)
         return trace.pass_sensors(out).transpose(0, 2, 1)
@@ -143,13 +144,16 @@ class Problem:
 
         Its slope is that of the prediction. What a report shows is the residual, measured minus model.
         """
+        # an observer's replay that bounces otherwise than the measured motor is off by far more than any hum
+        is_observed = self.model.kind.correct is not None
+        most = HUM_MOST_SD * np.array([[n.level] for n in self.noise]) if is_observed else None
         residuals, start, period = np.empty(predicted.shape), 0, self.model.values["controller.period"]
         for trace in (self.trace, *self.also):
             for part in trace.parts or _cut_rows(len(trace)):
                 there = slice(start + part.first, start + part.stop)
                 measured = trace.measurements[:, part.first:part.stop]
                 for few in cut_runs(predicted.shape):
-                    residuals[few, :, there] = remove_mains(predicted[few, :, there] - measured, period)
+                    residuals[few, :, there] = remove_mains(predicted[few, :, there] - measured, period, most)
             start += len(trace)
         return residuals
 
@@ -186,10 +190,15 @@ def _cut_rows(rows: int, most: int = 60_000) -> list[Part]:
     return [Part(first, min(first + most, rows), 0) for first in range(0, rows, most)]
 
 
-def remove_mains(residuals: Floats, period: float) -> Floats:
-    """Residuals (.., n) without the steady lines of the mains."""
+def remove_mains(residuals: Floats, period: float, most: Floats | None = None) -> Floats:
+    """Residuals (.., n) without the steady lines of the mains.
+
+    What is larger than `most` counts as that: a piece with large residuals would put lines into all others.
+    """
     lines = mains_waves(residuals.shape[-1], period)
     complete = residuals if np.isfinite(residuals).all() else np.nan_to_num(residuals)
+    if most is not None:
+        complete = np.clip(complete, -most, most)
     return residuals - (complete @ lines) @ lines.T
 
 
@@ -573,8 +582,9 @@ def evolve_fit(problem: Problem, fit: Fit, spread: Floats, generations: int, see
     """The fit at the best trial of a population that begins at it with the covariance `spread` (p, p); its covariance
     is that of the last trials.
     """
+    size = min(64, 16 * -(-len(fit.x) // 4))  # whole blocks of lanes; few unknowns need few trials
     end = evolve_population(partial(problem.compute_costs, fit.free), fit.x, spread, *scaled_bounds(fit.free),
-                            generations, seed)
+                            generations, seed, size)
     return replace(fit, x=end.x, cost=end.cost, covariance=end.covariance)
 
 

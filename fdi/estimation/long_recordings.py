@@ -73,12 +73,13 @@ def replay_in_turns(lanes: Lanes, values: Floats, trace: Trace, position: Floats
         rows: of a turn.
     """
     if _is_driven_by_pressures(trace, lanes.model):
-        out = lanes.replay(values, trace.drive, trace.load, position, anchor, trace.parts, trace.chambers)
+        out = lanes.replay(values, trace.drive, trace.load, position, anchor, trace.parts, trace.chambers,
+                           trace.slack)
         whole = trace.pass_sensors(out)
         yield from ((first, whole[:, first:first + rows]) for first in range(0, len(trace), rows))
         return
     before = np.empty((len(values), 0, len(trace.output_names)))  # what a filtering sensor remembers
-    for first, out in lanes.replay_in_turns(values, trace.drive, trace.load, position, anchor, rows):
+    for first, out in lanes.replay_in_turns(values, trace.drive, trace.load, position, anchor, rows, trace.slack):
         if not trace.sensors:
             yield first, out
             continue

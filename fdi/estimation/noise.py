@@ -32,7 +32,7 @@ from fdi.trace.trace import Flags, Floats, Trace, rms
 from plant.compile import Function, compile_function
 from plant.effects import combine_laws
 from plant.model import Model
-from plant.signals import Signals
+from plant.signals import Signal, Signals
 from plant.state import Input
 
 WINDOW = 100  # samples; shorter than stick-slip events are apart, longer than two periods of hum
@@ -108,6 +108,13 @@ def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
         found = Floor(given, "model") if given > 0.0 and seen.value < NOISIER_THAN_MODEL * given else seen
         out[name] = found._replace(value=max(found.value, signal.finest), freedom=share)
     return out
+
+
+def find_sensor_level(trace: Trace, signal: Signal, model: Model) -> float:
+    """RMS of a sensor's white noise: the model's, or that of the data where the plant declares none."""
+    if signal.noise:
+        return model[signal.noise]
+    return max(floor_from_data(trace.mask_unusable(signal.name)).value, signal.finest) or 1.0
 
 
 def simulate_reading_noise(model: Model, controlled: Floats) -> float:

@@ -29,9 +29,10 @@ from fdi.estimation.fit import (
     silence_sensors,
 )
 from fdi.estimation.long_recordings import choose_excerpt, cut_excerpt, is_long, replay_in_turns
-from fdi.estimation.noise import WINDOW
+from fdi.estimation.noise import WINDOW, find_sensor_level
 from fdi.thresholds import (
     ANCHOR_RATE,
+    FINEST_COMB,
     FRICTION_UNCERTAINTY,
     HELD_OUT_UNDECIDED_SHARE,
     RESIDUAL_HELD_OUT,
@@ -42,6 +43,7 @@ from fdi.thresholds import (
     SCATTER_TOLERANCES,
     SOLVER_ERROR_SHARE,
 )
+from fdi.trace.sensor_dynamics import find_comb
 from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, hold_last, hold_next, rms
 from plant.controller import compute_answers
 from plant.errors import InputError
@@ -79,7 +81,7 @@ def replay_lanes(lanes: Lanes, values: Floats, trace: Trace, current: Floats | N
     """
     position = trace.unlagged if has_known_start(trace) else None
     driven = trace.drive if current is None else current
-    out = lanes.replay(values, driven, trace.load, position, anchor, trace.parts, trace.chambers)
+    out = lanes.replay(values, driven, trace.load, position, anchor, trace.parts, trace.chambers, trace.slack)
     return trace.pass_sensors(out)
 
 
@@ -186,7 +188,8 @@ def guess_anchor_noise(trace: Trace, model: Model, floor: Mapping[str, float]) -
 
     A plant with an observer of its own takes it for a speed, and so for a force. What hangs on that is undecided.
     """
-    size = floor.get(trace.declared.controlled.name, 0.0)
+    rounding = trace.slack / math.sqrt(3.0)  # RMS; within it the observer does nothing
+    size = math.sqrt(max(floor.get(trace.declared.controlled.name, 0.0) ** 2 - rounding**2, 0.0))
     if model.kind.correct is None or not size:
         return []
     return [size * np.random.default_rng(0).standard_normal(len(trace))]
@@ -268,17 +271,23 @@ def find_rest_rows(position: Floats, period: float, noise: float, window: float 
     return extend_flags(maximum_filter1d(rests.astype(np.int8), rows) > 0, round(memory / period))
 
 
-def leave_out_rest(trace: Trace, model: Model, noise: float) -> Trace:
+def leave_out_rest(trace: Trace, model: Model) -> Trace:
     """A prepared run of a plant that is replayed by an observer, without the rows that hang on its stops.
 
     At rest dry friction has any value up to its static level: whether a replay stays or slips hangs on less than a
     sensor shows, and one that slips alone is off by many times the noise. Speed and friction of a motion are certain.
-    Without an observer, or where more than `HELD_OUT_UNDECIDED_SHARE` would be left out, the run is as it is.
+    Without an observer, or where more than `HELD_OUT_UNDECIDED_SHARE` would be left out, the run is as it is. A note
+    says how much is not compared.
     """
     if model.kind.correct is None:
         return trace
+    noise = find_sensor_level(trace, trace.declared.controlled, model)
     moves = trace.usable & ~find_rest_rows(trace.controlled, trace.period, noise)
-    return trace.with_columns({}, usable=moves) if moves.mean() >= 1.0 - HELD_OUT_UNDECIDED_SHARE else trace
+    if moves.mean() < 1.0 - HELD_OUT_UNDECIDED_SHARE:
+        return trace
+    rests = float((trace.usable & ~moves).sum()) * trace.period
+    return trace.with_columns({}, usable=moves).with_notes(
+        *[f"{rests:.1f} s at rest are not compared: friction has any value there"] * (rests > 0.0))
 
 
 def find_unpredictable_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) -> Flags:
@@ -481,7 +490,8 @@ def hold_inputs(trace: Trace, outputs: Sequence[str] | None = None, source: obje
         InputError: too few rows, no command, controlled signal or drive, or a chosen signal that was not measured.
     """
     return trace.with_inputs(hold_last(trace.command), hold_last(trace.drive), hold_last(trace.load),
-                             incomplete=_find_incomplete(trace), outputs=_choose_outputs(trace, outputs, source))
+                             incomplete=_find_incomplete(trace), outputs=_choose_outputs(trace, outputs, source),
+                             slack=_find_slack(trace))
 
 
 def match_period(model: Model, trace: Trace, tolerance: float = 0.0) -> Model:
@@ -661,7 +671,13 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
         raise InputError(source, rows.declared.drive.name,
                          f"at least {FEWEST_ROWS} rows that can be replayed, not {int(usable.sum())}")
     return rows.with_inputs(_fill_demand(rows.command, 2e-4 * rows.scale), drive, hold_last(rows.load),
-                            usable=usable, filled=missing, notes=(*rows.notes, *notes))
+                            usable=usable, filled=missing, notes=(*rows.notes, *notes), slack=_find_slack(trace))
+
+
+def _find_slack(trace: Trace) -> float:
+    """Half the step of which all values of the controlled signal are multiples; 0 where there is no coarse one."""
+    comb = find_comb(trace.controlled, FINEST_COMB)
+    return 0.5 * comb.step if comb else 0.0
 
 
 def _fill_demand(com: Floats, step: float) -> Floats:

@@ -145,6 +145,7 @@ class Trace:
     attachments: Mapping[str, bytes] = field(default_factory=dict)  # enough to repeat the run
     sensors: Mapping[str, SensorDynamics] = field(default_factory=dict)  # by signal, of those that are not ideal
     parts: tuple[Part, ...] = ()  # pieces of a longer recording that the rows are; none: one piece
+    slack: float = 0.0  # half a step of the controlled signal, where a prepared trace holds it in coarse steps
 
     def __len__(self) -> int:
         return len(self.t)

@@ -56,7 +56,7 @@ def replay_drive(flat: Any, drive: Any, load: Any, position: Any, anchor: float,
         t = k * p.controller.period
         out[k], m = read_sensors(s, m, np.zeros(out.shape[1] + 1), t, p)
         if len(position):
-            s, m = pull_plant(s, m, anchor * p.controller.period, position[k], p)
+            s, m = pull_plant(s, m, anchor * p.controller.period, position[k], 0.0, p)
         s, m = step_cycle(s, m, drive[k - 1] if k else 0.0, load[k], 0.0, t, record, steps)
 
 
@@ -243,7 +243,7 @@ def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path))  # what comes from the cache cannot be read as assembly
     plan = plan_layout((), Model().kind)
     run = compile_function(plan.loop, plan.names)
-    run(np.zeros(plan.numbers * NARROW), CURRENT, FORCE, np.empty(0), 0.0, False, 1e-3, 10,
+    run(np.zeros(plan.numbers * NARROW), CURRENT, FORCE, np.empty(0), 0.0, 0.0, False, 1e-3, 10,
         0, len(CURRENT), 0, 0, True, np.arange(NARROW, dtype=np.uint64), np.empty((NARROW, 3, len(CURRENT))))
     (code,) = run.inspect_asm().values()
     loops = re.findall(r"^(\.LBB\w+):\n((?:\t.*\n)+?)\tj\w+\t\1$", code, re.MULTILINE)
@@ -293,7 +293,7 @@ def test_the_transducer_moves_along_where_the_ram_is_pulled() -> None:
     pull, show = (interpret_function(f, collect_bindings(model.effects)) for f in (pull_plant, show_start))
     p = model.build_record()[0]
     before, m = model.build_start()
-    after, m = pull(before, m, 0.5, before.sensed + 2e-5, p)
+    after, m = pull(before, m, 0.5, before.sensed + 2e-5, 0.0, p)
     after = show(after, m, p)
     moved = (after.jack_position - before.jack_position, after.sensed - before.sensed)
     assert moved == pytest.approx((1e-5, 1e-5))

@@ -11,9 +11,23 @@ import pytest
 from noisy_traces import record_plant
 
 from fdi.discovery.search import Search
-from fdi.estimation.fit import Fit, Problem, evolve_population, list_all_unknowns
+from fdi.estimation.fit import (
+    Fit,
+    Problem,
+    evolve_population,
+    linearise,
+    list_all_unknowns,
+    list_effect_unknowns,
+)
 from fdi.estimation.noise import white_noise
-from fdi.estimation.replay import find_rest_rows, find_undecided_rows, hold_inputs
+from fdi.estimation.replay import (
+    compute_residuals,
+    find_rest_rows,
+    find_undecided_rows,
+    hold_inputs,
+    leave_out_rest,
+    replay_current,
+)
 from fdi.estimation.unidentifiable import (
     FLAPPER,
     JACK_PRESSURE,
@@ -26,8 +40,10 @@ from fdi.estimation.unidentifiable import (
     find_tangents,
     invert_hessian,
 )
-from fdi.trace.trace import Floats, Trace
+from fdi.trace.trace import Floats, Trace, rms
 from plant import Model, load_model, simulate
+from plant.declare import Chirp, Hold, Ramp
+from plant.profile import build_profile
 
 
 @pytest.mark.parametrize("steep", [1e6, 1e15, 1e18])
@@ -164,6 +180,38 @@ def test_slips_on_soft_oil_are_undecided_and_a_step_is_not() -> None:
     assert not _find({}, np.repeat([0.0, 3e-3], [200, 800])).any()
 
 
+def _record_motor(changes: Mapping[str, float], step: float = 0.0) -> Trace:
+    """A ramp and a chirp of an `ema`, the position in steps; the motor's speed has its noise."""
+    unit = load_model("ema").replace(dict(changes))
+    command = build_profile([Hold(time=0.3), Ramp(to=0.01, time=1.0), Hold(time=0.3),
+                             Chirp(amplitude=1e-3, f0=1.0, f1=20.0, fade=20.0, time=2.0)], rate=1000.0).command
+    unit = unit.replace({"sensors.position_noise": 0.0} if step else {})
+    columns = simulate(unit, command, seed=3, steps=100)._asdict()
+    columns["position"] = step * np.round(columns["position"] / step) if step else columns["position"]
+    return hold_inputs(Trace.from_columns(columns, 1e-3, {}, unit.kind.signals))
+
+
+def test_an_observer_does_not_take_the_steps_of_a_position_for_motion() -> None:
+    trace = _record_motor({}, 2e-5)
+    assert trace.slack == pytest.approx(1e-5) and _record_motor({}).slack == 0.0
+    coarse, plain = (rms(compute_residuals(each, replay_current(each, load_model("ema")))["motor_speed"])
+                     for each in (trace, replace(trace, slack=0.0)))
+    assert coarse < 0.06 < plain  # rad/s; the sensor has 0.05
+
+
+def test_rows_in_which_a_motor_bounces_in_its_backlash_are_left_out_of_last_fits() -> None:
+    trace, model = _record_motor({"screw.backlash": 2e-4}), load_model("ema")
+    search = Search(model, trace, [], ["backlash"], 1)
+    usable = search.problem.trace.usable
+    free = (*list_all_unknowns(model), *list_effect_unknowns(model.find_effect("backlash"), model))
+    x = np.array([(2e-4 - f.centre) / f.scale if f.name == "screw.backlash" else 0.0 for f in free])
+    true = search.judge_fit(("backlash",), linearise(search.problem, free, x))
+    assert search.leave_out_undecided(true) and not usable[:300].any()  # at rest
+    kept = search.problem.trace.usable
+    assert kept[700:1200].all() and usable[-1000:].all() and kept[-1000:].mean() < 0.5
+    assert not Search(Model(), hold_inputs(record_plant({}, np.zeros(200))), [], [], 1).leave_out_undecided(true)
+
+
 def test_a_rest_hangs_on_stops_and_a_reversal_does_not() -> None:
     t = np.arange(0.0, 3.0, 1e-3)
     x = np.where(t < 1.0, 0.0, 3e-3 * np.sin(2.0 * np.pi * np.clip(t - 1.0, 0.0, 1.5)))  # rests, two reversals, rests
@@ -172,3 +220,11 @@ def test_a_rest_hangs_on_stops_and_a_reversal_does_not() -> None:
     x[500:520] = np.nan
     rest = find_rest_rows(x, 1e-3, 1e-6)
     assert rest[:1150].all() and not rest[1300:2490].any() and rest[2550:].all()  # and until a replay has forgotten it
+
+
+def test_rows_at_rest_are_left_out_where_a_plant_has_an_observer_and_a_note_says_so() -> None:
+    trace = _record_motor({})
+    moving = leave_out_rest(trace, load_model("ema"))
+    assert not moving.usable[:300].any() and moving.usable[700:1200].all() and "at rest" in moving.notes[-1]
+    ram = hold_inputs(record_plant({}, np.zeros(200)))
+    assert leave_out_rest(ram, Model()) is ram
