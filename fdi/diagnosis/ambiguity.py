@@ -4,8 +4,8 @@ Sizes are estimated together, with a common Gaussian posterior (the covariance o
 free). Two faults that change the signals alike have wide intervals each, although their sum is well known. Then the
 bounds of the one cut what the other may be: no size is below that of a new unit. So an interval that cannot be judged
 is replaced by that of the profile likelihood within the bounds of all faults. What still cannot be judged is tested
-together: if no point with all of these faults acceptable is within the 95 % region, at least one of them is not, and
-they form a group.
+together as one fault alone is: if no unit that is healthy in all of them is within the 95 % region, at least one of
+them has reached MidBand as far as the recording tells, and they form a group.
 
 The posterior is one at a point, so unknowns are what laws go with (gains by logarithms, clearance by its cube).
 """
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from fdi.diagnosis.faults import Estimate, Fault
+from fdi.diagnosis.faults import Estimate, Level
 from fdi.diagnosis.refine import Refinement, place_value
 from fdi.estimation.fit import scaled_bounds
 from fdi.thresholds import GROUP_CORRELATION, INTERVAL_95_SD
@@ -25,10 +25,10 @@ from fdi.trace.trace import Floats
 
 
 class Group(NamedTuple):
-    """Faults of which at least one is not acceptable."""
+    """Faults of which at least one has grown, and may have reached MidBand."""
 
     names: tuple[str, ...]
-    excluded: float  # distance from the nearest unit in which all of them are acceptable, standard deviations
+    excluded: float  # distance from the nearest unit in which all of them are healthy, standard deviations
 
 
 class _Region:
@@ -44,6 +44,7 @@ class _Region:
         values, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
         self.root = (axes / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T  # |root (x - x0)|: distance, s.d.
         self.spread = np.sqrt(np.diag(covariance))
+        self.alike = np.abs(covariance / np.outer(self.spread, self.spread)) > GROUP_CORRELATION
         self.low, self.high = scaled_bounds(self.free)
 
     def measure_distance(self, low: Floats, high: Floats) -> float:
@@ -73,28 +74,21 @@ class _Region:
         low[i] = high[i] = value
         return self.measure_distance(low, high)
 
-    def limit_to_acceptable(self, low: Floats, high: Floats, i: int) -> None:
-        """Narrow the limits, (f,), to acceptable sizes of fault `i`."""
+    def limit_to_healthy(self, low: Floats, high: Floats, i: int) -> None:
+        """Narrow the limits, (f,), to sizes of fault `i` that are no worse than a healthy unit's."""
         fault = self.faults[i]
-        sizes = _list_acceptable(fault)
+        best = fault.healthy if fault.both_ways else fault.range[fault.falls]
+        sizes = best, fault.healthy
         ends = sorted(min(max(place_value(self.free[i], size), self.low[i]), self.high[i]) for size in sizes)
         low[i], high[i] = ends
 
     def group_alike(self, members: Sequence[int]) -> list[list[int]]:
         """The members in groups of those whose sizes correlate."""
-        covariance = np.linalg.pinv(self.root.T @ self.root)
-        alike = np.abs(covariance / np.outer(self.spread, self.spread)) > GROUP_CORRELATION
         groups: list[list[int]] = []
         for i in members:
-            near = [g for g in groups if any(alike[i, j] for j in g)]
+            near = [g for g in groups if any(self.alike[i, j] for j in g)]
             groups = [g for g in groups if g not in near] + [[*(j for g in near for j in g), i]]
         return groups
-
-
-def _list_acceptable(fault: Fault) -> tuple[float, float]:
-    if fault.both_ways:
-        return fault.healthy - fault.acceptable, fault.healthy + fault.acceptable
-    return (fault.acceptable, fault.range[1]) if fault.falls else (fault.range[0], fault.acceptable)
 
 
 def cut_intervals(found: Refinement, names: Sequence[str], sizes: Mapping[str, Estimate]) -> dict[str, Estimate]:
@@ -108,15 +102,24 @@ def cut_intervals(found: Refinement, names: Sequence[str], sizes: Mapping[str, E
     return cut
 
 
-def find_groups(found: Refinement, names: Sequence[str]) -> tuple[Group, ...]:
-    """Groups among faults that cannot be judged one by one: at least one of each group is not acceptable."""
+def find_groups(found: Refinement, levels: Mapping[str, Level | None]) -> tuple[Group, ...]:
+    """Groups of faults that change the signals alike, of which no unit that is healthy in all of them fits.
+
+    Args:
+        found: the fit.
+        levels: of all faults by name. Each group has one that cannot be judged, None; one that is acceptable by itself
+            may stand for it.
+    """
     region = _Region(found)
     groups = []
-    for group in region.group_alike([i for i, fault in enumerate(found.faults) if fault.name in names]):
+    undecided, others = ([i for i, f in enumerate(found.faults) if levels[f.name] == level]
+                         for level in (None, Level.ACCEPTABLE))
+    for members in region.group_alike(undecided):
+        group = sorted([*members, *(j for j in others if region.alike[j, members].any())])
         low, high = region.low.copy(), region.high.copy()
         for i in group:
-            region.limit_to_acceptable(low, high, i)
+            region.limit_to_healthy(low, high, i)
         distance = region.measure_distance(low, high)
         if len(group) > 1 and distance > INTERVAL_95_SD:
-            groups.append(Group(tuple(found.faults[i].name for i in sorted(group)), distance))
+            groups.append(Group(tuple(found.faults[i].name for i in group), distance))
     return tuple(groups)

@@ -36,7 +36,7 @@ from fdi.diagnosis.refine import (
 from fdi.diagnosis.rms_grid import Grid, search_grid
 from fdi.estimation.long_recordings import cut_excerpt, is_long
 from fdi.estimation.noise import sensor_floors
-from fdi.estimation.replay import SAME_PERIOD, match_period, prepare_trace
+from fdi.estimation.replay import SAME_PERIOD, leave_out_rest, match_period, prepare_trace
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     MOVING_RAM,
@@ -61,7 +61,7 @@ class Diagnosis:
     levels: Mapping[str, Level | None]  # by fault; None: cannot be judged
     ruling: str | None  # the fault that is furthest gone; None if none is
     sizes: Mapping[str, Estimate]  # by fault, SI, as the levels are judged by them
-    groups: tuple[Group, ...]  # faults of which at least one is not acceptable, without telling which
+    groups: tuple[Group, ...]  # faults of which at least one has grown, without telling which
     refinement: Refinement
     grid: Grid | None  # None: the command has neither steps nor ramps
     precursors: Mapping[str, Precursor]
@@ -128,10 +128,11 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     precursors = measure_precursors(trace, bands)
     progress("grid", 0.05)
     floor = {name: f.value for name, f in sensor_floors(trace, model).items()}
-    fitted = trace
+    fitted = moving = leave_out_rest(trace, model)
+    notes += moving.notes[len(trace.notes):]
     if is_long(trace):
-        excerpt = choose_size_excerpt(model, trace, floor, progress, faults)
-        fitted = cut_excerpt(trace, excerpt)
+        excerpt = choose_size_excerpt(model, moving, floor, progress, faults)
+        fitted = cut_excerpt(moving, excerpt)
         notes.append(excerpt.describe(trace))
     grid = _search_grid(fitted, model, notes) if set(FAULTS) <= set(faults) else None
     if with_effects:
@@ -140,12 +141,12 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     pairs = [grid.merged[:2]] if grid else []
     pairs += [m.minimum[:2] for m in maps if m is not None]
     starts = [_complete_sizes(faults, pair) for pair in pairs]
-    refinement = refine_sizes(model, fitted, (*starts, *list_coarse_starts(faults)), floor, workers, trace,
+    refinement = refine_sizes(model, fitted, (*starts, *list_coarse_starts(faults)), floor, workers, moving,
                               ignore_progress if with_effects else progress, faults)
     sizes = _widen_intervals(refinement)
     beside = None
     if with_effects:
-        beside = find_effects_beside(model, fitted, refinement, floor, progress, workers, trace)
+        beside = find_effects_beside(model, fitted, refinement, floor, progress, workers, moving)
         refinement = beside.best.refinement
         sizes = dict(beside.sizes) if refinement.is_explained else _widen_intervals(refinement)
     levels = _judge_sizes(sizes, refinement)
@@ -153,7 +154,7 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     if refinement.is_explained and None in levels.values():
         sizes |= cut_intervals(refinement, _name_undecided(levels), sizes)
         levels = _judge_sizes(sizes, refinement)
-        groups = find_groups(refinement, _name_undecided(levels))
+        groups = find_groups(refinement, levels)
     if beside is not None:
         levels |= dict.fromkeys(beside.disputed)
     progress("done", 1.0)

@@ -107,7 +107,9 @@ Way = tuple[Mapping[str, float], Mapping[str, float], Mapping[str, float]]
 # (factor on the noise, rounds): small stops of the ram count only once the fit is near
 NOISE_SCHEDULE = ((30.0, 4), (6.0, 4), (1.0, 8))
 FINE_STEPS = 20  # solver steps a cycle of the last fit
-POLISH = ((3.0, 4), (1.0, 12))
+# The valley that many faults share is long, bent and rough: a fit stops in it until its steps begin anew as wide as
+# at first. Stopped too early, its sizes are off by several of its standard deviations.
+POLISH = ((3.0, 4), (1.0, 12), (1.0, 12), (1.0, 12))
 RATIO_SPREAD = 0.03  # prior standard deviation of the logarithm of static over dynamic friction of the ram
 
 

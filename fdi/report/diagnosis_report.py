@@ -189,7 +189,7 @@ def _describe_rest(d: Diagnosis, worst: Fault) -> str:
 def describe_group(d: Diagnosis, group: Group) -> str:
     """Faults that a trace does not tell apart, and what would."""
     titles = join_words((f.title for f in d.faults if f.name in group.names), "or")
-    return (f"At least one of these is not acceptable: {titles}. This trace does not tell which; "
+    return (f"At least one of these has grown, and may have reached MidBand: {titles}. This trace does not tell which; "
             f"{describe_separation(d, group)}.")
 
 

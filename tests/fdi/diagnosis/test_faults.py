@@ -127,14 +127,14 @@ def pair(x: float, total: float, each: float) -> Any:
     return SimpleNamespace(faults=(first, second), fit=fit)
 
 
-@pytest.mark.parametrize(("x", "total", "grouped"), [(0.0, 0.02, False), (0.2, 0.02, False), (0.35, 0.02, True),
+@pytest.mark.parametrize(("x", "total", "grouped"), [(0.0, 0.02, False), (0.2, 0.02, True), (0.35, 0.02, True),
                                                      (0.35, 0.5, False)])
 def test_faults_that_only_show_as_a_sum_are_a_group(x: float, total: float, grouped: bool) -> None:
-    """Each may be absent, but both acceptable, at most 0.25, need a sum of at most 0.5."""
+    """Each may be absent, but not both: then the sum would be 0."""
     found = pair(x, total, 5.0)
     wide = {name: Estimate(x, 0.0, 1.0) for name in "ab"}
     cut = cut_intervals(found, ["a", "b"], wide)
-    assert [group.names for group in find_groups(found, ["a", "b"])] == [("a", "b")] * grouped
+    assert [group.names for group in find_groups(found, dict.fromkeys("ab"))] == [("a", "b")] * grouped
     if x == 0.0:  # neither can be less than nothing, so neither can be much
         assert all(size.high < 0.08 for size in cut.values())
     if x == 0.35:
@@ -144,7 +144,8 @@ def test_faults_that_only_show_as_a_sum_are_a_group(x: float, total: float, grou
 def test_a_logarithm_keeps_its_bounds_in_a_group() -> None:
     found = pair(0.2, 0.02, 5.0)
     found.fit.free = (found.fit.free[0], LogFree("two.size", -1.6, 1.0, 1.0, -4.0, 0.0, 1.0))
-    assert find_groups(found, []) == ()
+    assert find_groups(found, dict.fromkeys("ab", Level.ACCEPTABLE)) == ()
+    assert [g.names for g in find_groups(found, {"a": None, "b": Level.ACCEPTABLE})] == [("a", "b")]
 
 
 def test_a_range_that_begins_at_the_nominal_size_holds_every_healthy_unit() -> None:
