@@ -63,24 +63,20 @@ COMMANDS = {
                      "to)"),
          option("--trace", metavar="TRACE", help="same as the positional TRACE"), *RUNS, *MODEL)),
     "bench": Command(
-        "measure the speed of the plant, the cycle in real time, the live screen, or the cost of long recordings",
+        "measure the speed of the plant, or the cycle in real time",
         "Without an argument: the speed of the plant, compared with C.",
-        (option("what", nargs="?", default="plant", choices=("plant", "realtime", "live", "recordings"),
+        (option("what", nargs="?", default="plant", choices=("plant", "realtime"),
                 help="plant: speed of the plant, compared with C (default); realtime: lateness and response of the "
-                     "cycle, compared with cyclictest and C; live: the same with and without rig run --live; "
-                     "recordings: CPU time and memory of compare, explain and fdi by length of the recording"),
+                     "cycle, compared with cyclictest and C"),
          option("--accuracy", action="store_true",
                 help="also the error of the default step size and of others, against 0.2 us (half a minute)"),
-         Group("rig bench realtime, rig bench live", (
+         Group("rig bench realtime", (
              option("--bus", default="auto", metavar="INTERFACE:CHANNEL",
                     help="socketcan:vcan0 or udp_multicast:GROUP (default: a UDP group of its own)"),
              option("--seconds", type=float, default=60.0, metavar="S",
                     help="time of measurement for each row of the table (default: 60)"),
              option("--blocks", type=int, default=6, metavar="N",
-                    help="alternating blocks into which this time is divided (default: 6)"))),
-         Group("rig bench recordings", (
-             option("--lengths", default="13.5,60,300,1800", metavar="S,S,..",
-                    help="lengths of the recordings, s (default: 13.5,60,300,1800)"),)))),
+                    help="alternating blocks into which this time is divided (default: 6)"))))),
     "campaign": Command(
         "judge a matrix of simulated faults, or a folder of traces, on all cores or a cluster",
         "results.parquet, summary.json and detection.svg go to the folder --out (default: campaigns/NAME).",

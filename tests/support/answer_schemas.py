@@ -16,7 +16,6 @@ from places import ROOT
 from referencing import Registry, Resource
 
 FOLDER = ROOT / "docs" / "schema"
-KINDS_OF_BENCH = ("realtime", "live", "recordings")
 
 
 def load_schemas() -> dict[str, dict[str, Any]]:
@@ -28,8 +27,7 @@ def name_schema(words: Sequence[str]) -> str:
     """The schema of the answer to a command line, given without "rig"."""
     command = words[0]
     if command == "bench":
-        kind = [word for word in words[1:2] if word in KINDS_OF_BENCH]
-        return "_".join(["bench", *kind]) + ".json"
+        return "bench_realtime.json" if "realtime" in words else "bench.json"
     if command == "check" and "--bench" in words[1:2] and set(words[3:]) <= {"--json"}:
         return "check_bench.json"  # without a sequence
     if command == "check" and words[1:2] and str(words[1]).endswith(".py"):

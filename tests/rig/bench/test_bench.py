@@ -9,35 +9,22 @@ from pathlib import Path
 import codec
 import numpy as np
 import pytest
-from answer_schemas import check_answer
 from bus_stations import gather, spec
 from physics_cases import PREFLIGHT
 from rig_command import answer, refuse, rig
 from vcan_host import kernel_has_vcan0
 
-from fdi.report.report import to_json
 from fdi.report.terminal import format_report
-from plant.errors import RigError
 from rig.bench import plant, realtime
-from rig.bench.plant import build_long_recordings_report, make_command, record_unit
 from rig.bench.realtime import (
-    AGAIN,
     COMPILED,
     CYCLICTEST,
     IN_C,
-    LIVE,
     PYTHON,
-    WITHOUT,
-    build_live_runs_report,
     build_realtime_report,
-    compare_contenders,
-    describe_ratios,
     parse_histogram,
-    play_run,
     run_c_responder,
-    run_in_terminal,
     summarise_contenders,
-    summarise_live_runs,
 )
 from rig.network.bus import open_can
 from rig.network.link import Link
@@ -75,78 +62,6 @@ def test_a_path_that_cannot_be_written_is_told_in_one_line(
         "step": None, "times_real_time": 1.0, "cycle": 1.0, "lockstep": 1.0, "run_process": 1.0, "help_process": 1.0})
     line = refuse("bench", "--out", tmp_path / "none" / "b.json", "--quiet")
     assert "--out" in line and "none/b.json: expected a file that can be written (No such file" in line
-
-
-def test_cost_of_recordings() -> None:
-    """The table names length, CPU time and memory of each command."""
-    costs = [{"command": "compare", "length": 1800.0, "cpu": 46.7, "memory": 1_350_000_000, "verdict": "WITHIN_FLOOR",
-              "interrupted": 0.4}]
-    report = build_long_recordings_report({"seed": 0, "cpus": 2, "costs": costs})
-    assert report.sentence == "1800 s of recording at 1 kHz take 1.35 GB at most."
-
-
-def test_recordings_repeat_by_their_seed() -> None:
-    """A recording is as long as asked for, holds what a bench measures, and is the same for the same seed."""
-    com = make_command(15.0, 3)
-    assert len(com) == 15_000
-    once, again = (record_unit(com[:2000], 3) for _ in range(2))
-    assert once.signals == ("com", "xj", "cor", "p12", "xs", "load")
-    assert (once.xs == again.xs).all()
-    assert (record_unit(com[:2000], 4).xs != once.xs).any()
-
-
-GROUP = f"udp_multicast:239.75.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
-
-
-def invent_block(rng: np.random.Generator, factor: float) -> dict[str, np.ndarray]:
-    """Times of 1000 cycles, whose blocks scatter by 5 %."""
-    scale = factor * float(np.exp(0.05 * rng.standard_normal()))
-    times = {name: scale * rng.gamma(4.0, 1e-5, 1000) for name in ("lateness", "response", "feedback_response")}
-    return {**times, "overrun": np.zeros(1000, bool)}
-
-
-def test_a_slower_run_is_found_and_noise_is_none() -> None:
-    rng = np.random.default_rng(1)
-    found = {WITHOUT: [invent_block(rng, 1.0) for _ in range(8)], AGAIN: [invent_block(rng, 1.0) for _ in range(8)],
-             LIVE: [invent_block(rng, 1.5) for _ in range(8)]}
-    figures = summarise_live_runs(found)
-    words = {(ratio["contender"], ratio["word"]) for ratio in figures["ratios"]}
-    assert words == {(AGAIN, "no difference found"), (LIVE, "slower")}
-    assert all(ratio["low"] < 1.5 < ratio["high"] for ratio in figures["ratios"] if ratio["contender"] == LIVE)
-    assert "lateness p99 slower with --live (1." in describe_ratios(figures["ratios"])
-    assert figures["cycles"] == {WITHOUT: 8000, AGAIN: 8000, LIVE: 8000}
-    figures |= {"bus": GROUP, "seconds": 8.0, "blocks": 8, "cpus": 2, "priority": 0, "missing": {},
-                "ended_early": {WITHOUT: 0, AGAIN: 0, LIVE: 1}}
-    text = format_report(build_live_runs_report(figures))
-    assert "no real-time priority" in text and "--live: 1" in text and "slower" in text
-    check_answer(["bench", "live"], json.loads(to_json(figures)))
-
-
-def test_few_blocks_and_missing_answers_are_not_known() -> None:
-    block = {"p50": 10.0, "p99": 20.0}
-    ratios = compare_contenders({name: {WITHOUT: [block] * 3, AGAIN: [block] * 3, LIVE: [{}] * 3}
-                                 for name in ("lateness", "response", "feedback_response")})
-    assert {ratio["word"] for ratio in ratios} == {"not known"}
-    assert [ratio["ratio"] for ratio in ratios if ratio["contender"] == AGAIN] == [1.0] * 6
-    assert "--blocks 4 or more" in describe_ratios(ratios)
-
-
-def test_a_run_is_shown_and_measured() -> None:
-    with pytest.raises(RigError, match=r"ended with status 2: rig run: .*--jobs"):
-        play_run(GROUP, 1.0, ("--jobs", "0"))
-    for _ in range(3):  # a busy machine may end a run before an answer came
-        times = play_run(GROUP, 1.0, ("--live",))
-        assert len(times["lateness"]) == len(times["feedback_response"]) == len(times["overrun"])
-        answered = np.isfinite(times["feedback_response"])
-        if answered.any():
-            assert times["feedback_response"][answered].min() > 0.0
-            return
-    pytest.skip("not measured: this machine ended three runs before an answer came")
-
-
-def test_the_terminal_is_one() -> None:
-    status, text = run_in_terminal(["sh", "-c", "stty size; test -t 2 && exit 5"])
-    assert (status, text.split()) == (5, ["40", "120"])
 
 
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
@@ -234,9 +149,7 @@ def test_the_command_measures_everybody(bus_kind: str) -> None:
 @pytest.mark.parametrize(("words", "says"), [
     (("realtime", "--bus", "virtual:x"), "--bus: virtual:x: expected socketcan:INTERFACE"),
     (("realtime", "--blocks", 0), "--blocks"), (("realtime", "--seconds", 0.1), "--seconds"),
-    (("realtime", "--seconds", "nan"), "--seconds"), (("live", "--bus", "virtual:x"), "--bus"),
-    (("live", "--blocks", 0), "--blocks"), (("live", "--seconds", 1), "--seconds"),
-    (("recordings", "--lengths", "60,x"), "--lengths"),
+    (("realtime", "--seconds", "nan"), "--seconds"),
 ])
 def test_bad_input_is_one_line(words: tuple[object, ...], says: str) -> None:
     assert says in refuse("bench", *words)
