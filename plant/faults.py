@@ -18,12 +18,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from plant.errors import InputError, show_value, suggest_name
+from plant.errors import InputError
 from plant.parameters import find_field, read_toml
+from plant.tables import Place, build_dataclass, decode_text, parse_table, read_file
 
 WORD = re.compile(r"[a-z][a-z0-9_]*")  # of a fault: a key of JSON and a column of a campaign
 
@@ -32,7 +33,7 @@ WORD = re.compile(r"[a-z][a-z0-9_]*")  # of a fault: a key of JSON and a column 
 class Fault:
     """A fault that `rig fdi` measures: a parameter, and the sizes at which it needs maintenance. All sizes are SI."""
 
-    name: str
+    name: str = field(metadata={"key": False})
     title: str  # what it is, for people
     parameter: str  # "group.field" of the plant or of an effect
     range: tuple[float, float]  # sizes that are possible
@@ -100,9 +101,6 @@ class Fault:
 
 
 SCATTER = 5.0  # tolerances, by which a healthy unit may be off its nominal size: a fit must be able to say so
-KEYS = {f.name: f for f in fields(Fault) if f.name != "name"}
-REQUIRED = ("title", "parameter", "range", "acceptable", "maintenance")
-NUMBERS = ("acceptable", "maintenance", "healthy", "interval_factor")
 
 
 def read_faults(path: Path, kind: Any) -> tuple[Fault, ...]:
@@ -111,14 +109,15 @@ def read_faults(path: Path, kind: Any) -> tuple[Fault, ...]:
     Raises:
         InputError: unreadable, not a fault file, or a fault that the plant cannot have; with file and key.
     """
-    tables = read_toml(path)
+    tables, place = parse_table(decode_text(read_file(path), path), str(path))
     for key in tables:
         if key != "faults":
-            raise InputError(path, key, "only tables [faults.NAME]")
+            raise place.at(key).refuse("only tables [faults.NAME]")
     found = tables.get("faults")
     if not isinstance(found, dict) or not found:
-        raise InputError(path, "", "at least one table [faults.NAME]")
-    return place_faults((_read_fault(path, name, table) for name, table in found.items()), kind, path)
+        raise place.refuse("at least one table [faults.NAME]")
+    return place_faults((_read_fault(name, table, place.at("faults", name)) for name, table in found.items()), kind,
+                        path)
 
 
 def is_fault_file(path: Path) -> bool:
@@ -129,49 +128,13 @@ def is_fault_file(path: Path) -> bool:
         return False
 
 
-def _read_fault(path: Path, name: str, table: object) -> Fault:
-    where = f"faults.{name}"
-    if not isinstance(table, dict):
-        raise InputError(path, where, "a table")
-    for key in table:
-        if key not in KEYS:
-            raise InputError(path, f"{where}.{key}", f"one of {', '.join(KEYS)}{suggest_name(key, KEYS)}")
-    for key in REQUIRED:
-        if key not in table:
-            raise InputError(path, where, f"also the key {key}")
-    values = dict(table)
-    for key, value in values.items():
-        is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        if key == "range":
-            ends = value if isinstance(value, list) else []
-            if len(ends) != 2 or not all(type(x) in (int, float) and math.isfinite(x) for x in ends):
-                raise InputError(path, f"{where}.range", f"[least, largest] in SI units, not {show_value(value)}")
-            values["range"] = float(ends[0]), float(ends[1])
-        elif key in NUMBERS:
-            if not is_number:
-                raise InputError(path, f"{where}.{key}", f"a number, not {show_value(value)}")
-            values[key] = float(value)
-        elif key == "both_ways":
-            if not isinstance(value, bool):
-                raise InputError(path, f"{where}.{key}", f"true or false, not {show_value(value)}")
-        elif key == "follow":
-            values[key] = _read_follow(path, f"{where}.{key}", value)
-        elif not isinstance(value, str):
-            raise InputError(path, f"{where}.{key}", f"a text, not {show_value(value)}")
-    return Fault(name, **values)
-
-
-def _read_follow(path: Path, where: str, value: object) -> dict[str, float]:
-    """Names of parameters, or a table of factors; TOML reads a name with a dot as a table in a table."""
-    if isinstance(value, list) and all(isinstance(name, str) for name in value):
-        return dict.fromkeys(value, math.nan)
-    if isinstance(value, dict):
-        flat = {f"{group}.{name}" if isinstance(part, dict) else group: factor for group, part in value.items()
-                for name, factor in (part.items() if isinstance(part, dict) else [("", part)])}
-        if all(type(factor) in (int, float) and math.isfinite(factor) for factor in flat.values()):
-            return {name: float(factor) for name, factor in flat.items()}
-    raise InputError(path, where, f'["group.field", ..] or {{ "group.field" = factor on the size }}, not '
-                                  f"{show_value(value)}")
+def _read_fault(name: str, table: object, place: Place) -> Fault:
+    """The fault of a table [faults.NAME]; its `follow` may be a list of names as well."""
+    names = table.get("follow") if isinstance(table, dict) else None
+    if not isinstance(table, dict) or not isinstance(names, list):
+        return build_dataclass(Fault, table, place, name=name)
+    fault = build_dataclass(Fault, {**table, "follow": {}}, place, name=name)
+    return replace(fault, follow=dict.fromkeys(map(str, names), math.nan))
 
 
 def place_faults(faults: Any, kind: Any, where: object = "faults") -> tuple[Fault, ...]:

@@ -16,6 +16,7 @@ from typing import Annotated, Any, NamedTuple, cast
 
 from plant.errors import InputError, show_value, suggest_name
 from plant.quantity import Quantity, list_quantities
+from plant.tables import decode_text, parse_table, read_file
 
 FILTER_LAWS = {"sqrt": 0.5, "linear": 1.0, "pressure": 0.0}
 """Exponent of (1 - Kintas) on the pilot flow gain; pressures scale with (1 - Kintas) in all three.
@@ -177,12 +178,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         InputError: unreadable, or not TOML (with the line).
     """
-    try:
-        return parse_toml(path.read_text(encoding="utf-8"), path)
-    except OSError as error:
-        raise InputError(path, "", f"a readable file ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputError(path, "", "text in UTF-8") from None
+    return parse_toml(decode_text(read_file(path), path), path)
 
 
 def parse_toml(text: str, where: object) -> dict[str, Any]:
@@ -191,12 +187,7 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
     Raises:
         InputError: not TOML (with the line), or nested too deeply.
     """
-    try:
-        return tomllib.loads(text)
-    except ValueError as error:  # also of a whole number of thousands of digits, with advice for Python
-        raise InputError(where, "", f"TOML ({str(error).partition('; use sys.')[0]})") from None
-    except RecursionError:
-        raise InputError(where, "", "TOML with fewer levels of brackets") from None
+    return parse_table(text, str(where))[0]
 
 
 def flatten_tables(where: object, tables: Mapping[str, Any], groups: Mapping[str, type[Any]]) -> dict[str, float]:

@@ -23,6 +23,9 @@ class Quantity(NamedTuple):
     typical: str = ""  # the range met in practice, for people
     tolerance: float = 0.0  # how far one unit differs from another, as a fraction (prior of a fit)
 
+    def __hash__(self) -> int:
+        return hash((*self[:6], *self.words, *self[7:]))  # a dict has none, and annotations must
+
     def refuses(self, value: float) -> bool:
         """True for a value outside the range, NaN or infinity."""
         return not (math.isfinite(value) and self.low <= value <= self.high and self.above < value < self.below)
@@ -36,11 +39,21 @@ class Quantity(NamedTuple):
         """
         if self.words:
             return "one of " + ", ".join(self.words)
-        unit = "" if self.unit == "1" else f" {self.unit}"
-        bounds = [(self.above, -math.inf, "above"), (self.low, -math.inf, "at least"),
-                  (self.below, math.inf, "below"), (self.high, math.inf, "at most")]
-        said = [f"{word} {bound:g}{unit}" for bound, open_end, word in bounds if bound != open_end]
-        return "a number " + " and ".join(said) if said else f"a finite number in {self.unit}"
+        bounds = self.bounds
+        return f"a number {bounds}" if bounds else f"a finite number in {self.unit}"
+
+    @property
+    def bounds(self) -> str:
+        """The range in words, "" for any number.
+
+        >>> Quantity("s", low=0.0, high=3600.0).bounds, Quantity("1", above=0.0, high=1.0).bounds
+        ('from 0 to 3600 s', 'above 0 and at most 1')
+        """
+        ends = {"from": self.low, "above": self.above, "at most": self.high, "below": self.below}
+        said = " and ".join(f"{word} {end if isinstance(end, int) else format(end, 'g')}"
+                            for word, end in ends.items() if math.isfinite(end))
+        said = said.replace(" and at most", " to") if self.low > -math.inf else said
+        return f"{said} {self.unit}" if said and self.unit != "1" else said
 
 
 def list_quantities(group: type[Any]) -> Mapping[str, Quantity]:

@@ -15,13 +15,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from rig.benches.bench import Bench
-from rig.benches.bus_load import list_loads
-from rig.benches.frame_map import describe_identifier
+from rig.benches.bench import Bench, describe_identifier
+from rig.benches.bench_report import list_loads
 from rig.network import bus, udp
+from rig.network.bus import Link, LinkWire
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
-from rig.network.link import Link, LinkWire
 from rig.run import priority
 
 Status = Literal["ok", "limited", "missing"]

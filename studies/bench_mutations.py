@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from plant.errors import InputError
-from rig.benches.bench import decode_device_text
+from rig.benches.bench import Role, decode_device_text, pack, unpack
 from rig.benches.bench_file import load_bench, load_bench_from_files
-from rig.benches.bus_load import list_loads
-from rig.benches.frame_map import Role, pack, unpack
+from rig.benches.bench_report import list_loads
 from rig.benches.guess import guess_can, guess_canopen
 from rig.benches.packing import make_layout
 

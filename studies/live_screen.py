@@ -28,7 +28,7 @@ from fdi.report.numbers import format_digits
 from fdi.report.report import Cell, Column, Line, Mood, Report, Section, Table, tabulate
 from fdi.trace.trace import Trace
 from plant.errors import RigError
-from rig.bench.realtime import (
+from rig.bench.benchmarks import (
     Times,
     choose_bus,
     compute_percentiles,

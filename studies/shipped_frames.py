@@ -3,8 +3,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from rig.benches.bench import pack, unpack
 from rig.benches.bench_file import load_bench
-from rig.benches.frame_map import pack, unpack
 
 _FRAMES = load_bench().frames
 _SPECS = {spec.identifier: spec for spec in _FRAMES.frames}

@@ -33,7 +33,6 @@ SINGLE_MAY_IMPORT = {
                      "fdi.identification", "fdi.diagnosis", "fdi.prognosis", "fdi.report"},
     "rig.interrupts": set(),
     "rig.junit": set(),
-    "rig.tables": set(),
     "rig.doctor": {"rig.benches", "rig.network", "rig.run"},
 }
 
@@ -86,7 +85,7 @@ CLOCK_MODULES = {"time", "datetime", "sched"}
 CLOCK_FILES = (
     "studies/",
     "rig/benches/calibration.py",  # reads dates; a run gives it the time
-    "rig/bench/realtime.py",  # waits for a node to boot
+    "rig/bench/benchmarks.py",  # waits for a node to boot
     "rig/network/", "rig/run/loop.py", "rig/run/priority.py", "rig/cli/commands/",
     "rig/view/live_",  # a screen has a rate
     "rig/recorder/",  # its thread must close a chunk in time

@@ -14,15 +14,24 @@ from fdi.foreign_code import ForeignCode, load_plant_of_model, require_trust
 from plant.errors import InputError
 from plant.model import find_plant_of_model, find_quantity
 from plant.plants import find_plant, is_known, is_loaded, load_plant
+from plant.quantity import Quantity
 from plant.signals import Signals
+from plant.tables import Place, build_dataclass, decode_text, list_choices, parse_table, read_file
 from plant.units import parse_quantity
 from rig.benches import canopen_map
 from rig.benches.bench import (
+    FD,
+    MOST_FRAMES,
     Bench,
     CanopenNode,
+    FrameMap,
+    FrameSpec,
+    Guard,
     Profile,
+    Role,
     SignalObject,
     decode_device_text,
+    describe_identifier,
     find_word,
     list_inputs,
     list_measured,
@@ -31,14 +40,12 @@ from rig.benches.bench import (
 from rig.benches.calibration import read_calibration
 from rig.benches.can_map import map_messages, read_database
 from rig.benches.checksums import CHECKSUMS, load_checksum
-from rig.benches.frame_map import FD, MOST_FRAMES, FrameMap, FrameSpec, Guard, Role, describe_identifier
 from rig.benches.layout import PHASES, DeviceFrame, Use, build_fields, compute_counts, list_phases
-from rig.tables import Place, Range, build_dataclass, decode_text, list_choices, parse_table, read_file
 
 ReadFile = Callable[[str], bytes]
-Byte = Annotated[int, Range("1", low=0, high=255)]
-EmcyCode = Annotated[int, Range("1", low=0, high=0xFFFF)]
-NodeId = Annotated[int, Range("1", low=1, high=127)]
+Byte = Annotated[int, Quantity("1", low=0, high=255)]
+EmcyCode = Annotated[int, Quantity("1", low=0, high=0xFFFF)]
+NodeId = Annotated[int, Quantity("1", low=1, high=127)]
 CYCLE_POSITION = 8  # mode of operation of CiA 402: cyclic synchronous position
 _CYCLES = Fraction(1, 10_000), Fraction(1, 10)  # s
 _PROFILE_OBJECTS: dict[str, dict[str, tuple[str, bool]]] = {  # signal -> object and whether the device receives it
@@ -67,7 +74,7 @@ class ControllerKeys(NodeKeys):
     protocol: Literal["canopen", "can"] = "canopen"
     dbc: str | None = None
     profile: Profile = "none"
-    mode: Annotated[int, Range("1", low=-128, high=127)] | None = None
+    mode: Annotated[int, Quantity("1", low=-128, high=127)] | None = None
     timeout: str | None = None
     parameters: Mapping[str, str] = field(default_factory=dict)
     values: Mapping[str, float] = field(default_factory=dict)
@@ -85,8 +92,8 @@ class BenchKeys:
     plant: str = "eha"
     plant_node: NodeKeys | None = None
     cycle: str = "1 ms"
-    bitrate: Annotated[int, Range("bit/s", low=10_000, high=1_000_000)] = 1_000_000
-    data_bitrate: Annotated[int, Range("bit/s", low=10_000, high=20_000_000)] | None = None
+    bitrate: Annotated[int, Quantity("bit/s", low=10_000, high=1_000_000)] = 1_000_000
+    data_bitrate: Annotated[int, Quantity("bit/s", low=10_000, high=20_000_000)] | None = None
     calibration: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -105,7 +112,7 @@ class ProtectionKeys:
     """The keys of a protected signal."""
 
     kind: str
-    data_id: Annotated[int, Range("1", low=0, high=0xFFFF)] | tuple[Byte, ...] | None = None
+    data_id: Annotated[int, Quantity("1", low=0, high=0xFFFF)] | tuple[Byte, ...] | None = None
 
 
 def load_bench(name_or_path: str = "eha", *, is_trusted: bool = False) -> Bench:

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from math import sqrt
 from typing import Annotated, Any, Literal, NamedTuple
 
+from plant.quantity import Quantity
 from plant.signals import Signals
+from plant.tables import Place, build_dataclass, list_choices
 from plant.units import parse_quantity
-from rig.tables import Place, Range, build_dataclass, list_choices
 
 Decision = Literal["simple", "guarded", "shared"]  # rule by which a value with an uncertainty passes a limit
 DECISIONS = ("simple", "guarded", "shared")
@@ -30,7 +31,7 @@ class SensorKeys:
     date: str
     expiry: str
     u: str
-    gain: Annotated[float, Range("1", low=0.0, below=1.0)] = 0.0  # relative standard uncertainty of the reading
+    gain: Annotated[float, Quantity("1", low=0.0, below=1.0)] = 0.0  # relative standard uncertainty of the reading
     noise: str | None = None  # standard deviation of one sample
 
 

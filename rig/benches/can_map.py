@@ -9,9 +9,9 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from plant.errors import InputError, suggest_name
-from rig.benches.frame_map import EXTENDED, FD, MOST_FRAMES, Field, Kind
+from plant.tables import list_choices
+from rig.benches.bench import EXTENDED, FD, MOST_FRAMES, Field, Kind
 from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
-from rig.tables import list_choices
 
 if TYPE_CHECKING:
     from cantools.database.can import Message, Signal

@@ -12,7 +12,7 @@ from canopen.objectdictionary import ODVariable, datatypes
 from canopen.objectdictionary.eds import import_eds
 
 from plant.errors import InputError
-from rig.benches.frame_map import EXTENDED, Field, Kind
+from rig.benches.bench import EXTENDED, Field, Kind
 from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 
 INVALID = 1 << 31  # in a COB-ID: the PDO is switched off

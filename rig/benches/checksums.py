@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from plant.errors import InputError
-from rig.benches.frame_map import Field, Guard, insert_bits
+from rig.benches.bench import Field, Guard, insert_bits
 
 UserChecksum = Callable[[bytes, int], int]
 

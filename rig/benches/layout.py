@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
+from plant.tables import Place, list_choices
 from plant.units import find_unit
-from rig.benches.frame_map import Field, Guard, Kind, encode_float, list_bits
-from rig.tables import Place, list_choices
+from rig.benches.bench import Field, Guard, Kind, encode_float, list_bits
 
 PHASES = ("setup", "main", "cleanup", "safe")
 _PLAIN = {"": Fraction(1), "-": Fraction(1), "1": Fraction(1), "%": Fraction(1, 100)}  # units of a plain number

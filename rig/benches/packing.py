@@ -2,7 +2,7 @@
 
 One block of memory, `Layout`, holds the tables, the values and one payload of at most 64 bytes. A loop writes `values`
 (doubles from VALUES on, one a channel), packs a frame into the payload and sends it; a frame that came is put into the
-payload and unpacked into `values`. Nothing is allocated. frame_map.py does the same in Python.
+payload and unpacked into `values`. Nothing is allocated. bench.py does the same in Python.
 """
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from plant.compile import ForeignCall, compile_function, keep_apart, raise_unbound
 from plant.errors import InputError
 from plant.machine_code import find_function_address
+from rig.benches.bench import Field, FrameSpec, Guard, Kind, Role
 from rig.benches.checksums import CHECKSUMS, find_user_checksum
-from rig.benches.frame_map import Field, FrameSpec, Guard, Kind, Role
 
 # Words of the layout: a scratch word, the payload, then counts and places of the tables
 _SCRATCH, PAYLOAD = 0, 8
@@ -201,7 +201,7 @@ def _find_next_byte(m: Layout, field: int, place: int) -> int:
 
 @keep_apart
 def _encode(m: Layout, field: int, value: float) -> int:
-    """The bits of a value: see `frame_map.Field.encode`."""
+    """The bits of a value: see `bench.Field.encode`."""
     words, doubles = m.words, m.doubles
     counts = (value - doubles[field + _OFFSET]) * doubles[field + _DENOMINATOR] / doubles[field + _NUMERATOR]
     if words[field + _KIND] == _FLOAT:
@@ -221,7 +221,7 @@ def _encode(m: Layout, field: int, value: float) -> int:
 
 @keep_apart
 def _decode(m: Layout, field: int, bits: int) -> float:
-    """The value of bits: see `frame_map.Field.decode`."""
+    """The value of bits: see `bench.Field.decode`."""
     words, doubles, length = m.words, m.doubles, m.words[field + _BITS]
     counts = 0.0
     if words[field + _KIND] == _FLOAT:

@@ -1,7 +1,7 @@
 """A bench for any plant without a device: a frame of plain CAN for each signal, and the plant's own controller on it.
 
 `rig run --model my_plant.py` takes it where no bench file is given and the shipped one has other signals.
-`rig.nodes.stand_in` plays the controller on the embedded bus.
+`rig.nodes.firmware` plays the controller on the embedded bus.
 """
 from __future__ import annotations
 

@@ -37,28 +37,28 @@ from plant.parameters import load_nominal_values, parse_toml, parse_value, read_
 from plant.plants import Plant, load_plant
 from plant.quantity import Quantity
 from plant.signals import EHA
+from plant.tables import Place, build_dataclass
 from plant.threads import count_threads
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, import_extra, read_rows, run_batch
 from rig.network.clock import WallClock
 from rig.sequences.nominal import load_nominal_test
-from rig.tables import Place, Range, build_dataclass
 
 OWN_SIMULATOR = "plant"
 HEALTHY = "healthy"
-Tolerance = Annotated[float, Range("1", low=0.0, high=0.2)]
+Tolerance = Annotated[float, Quantity("1", low=0.0, high=0.2)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """The keys above the first [[case]]; a case may override seeds and tolerance."""
 
-    seeds: Annotated[int, Range("1", low=1)] = 20  # runs of each size
-    first: Annotated[int, Range("1", low=0)] = 0  # seed of the first
+    seeds: Annotated[int, Quantity("1", low=1)] = 20  # runs of each size
+    first: Annotated[int, Quantity("1", low=0)] = 0  # seed of the first
     tolerance: Tolerance | tuple[Tolerance, ...] = (0.015,)
     simulator: str = OWN_SIMULATOR  # plant.simulate in 10 us steps, or "module:function"
     # of the controlled signal's noise: correlation from one cycle to the next, and the mains, in the signal's unit
-    colour: Annotated[float, Range("1", low=0.0, high=0.99)] = 0.8
-    hum: Annotated[float, Range("1", low=0.0)] = 0.0
+    colour: Annotated[float, Quantity("1", low=0.0, high=0.99)] = 0.8
+    hum: Annotated[float, Quantity("1", low=0.0)] = 0.0
     signals: str = ""  # outputs that are measured
 
     def __post_init__(self) -> None:

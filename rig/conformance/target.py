@@ -16,8 +16,8 @@ from canopen.objectdictionary import ODVariable, datatypes
 
 from fdi.report.numbers import count_nouns
 from plant.errors import InputError
+from rig.network.bus import Wire
 from rig.network.frame import Frame
-from rig.network.link import Wire
 from rig.network.node_objects import NmtCommand, NmtState
 
 Item = TypeVar("Item")

@@ -1,18 +1,68 @@
-"""What goes into a package: runs as they were written, their inputs from the logs, versions, machine, coverage."""
+"""What goes into a package: runs as they were written, inputs from their logs, a bill of materials, coverage."""
 from __future__ import annotations
 
 import json
+import platform
+import re
 from collections.abc import Iterable, Mapping
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from fdi.report.report import to_plain
 from fdi.trace.trace import Trace
 from plant.errors import InputError
-from rig.evidence.bill import build_bill
+from plant.tables import decode_text, read_file
 from rig.evidence.package import INDEX
 from rig.evidence.requirements import RUN, JudgedCheck, JudgedRun, Requirement
-from rig.tables import decode_text, read_file
+
+ROOT = "eha-rig"
+
+
+def build_bill(created: str) -> dict[str, Any]:
+    """The bill of this Python environment: the program, what it requires, and those of its extras that are installed.
+
+    `created`: time in UTC, ISO 8601.
+    """
+    found: dict[str, Distribution] = {}
+    needs: dict[str, list[str]] = {}
+    waiting = [ROOT]
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        try:
+            found[name] = distribution(name)
+        except PackageNotFoundError:  # of an extra that is not installed, or for another system
+            continue
+        needs[name] = sorted({_normalise(text) for text in found[name].requires or ()
+                              if name == ROOT or "extra ==" not in text})
+        waiting += needs[name]
+    components = {name: _describe(name, each) for name, each in sorted(found.items())}
+    own = {**components.pop(ROOT, {"name": ROOT, "bom-ref": ROOT}), "type": "application"}
+    python = {"type": "platform", "name": platform.python_implementation(), "version": platform.python_version(),
+              "bom-ref": "python"}
+    return {"bomFormat": "CycloneDX", "specVersion": "1.5", "version": 1,
+            "metadata": {"timestamp": created, "component": own}, "components": [python, *components.values()],
+            "dependencies": [{"ref": found_ref["bom-ref"],
+                              "dependsOn": [components[need]["bom-ref"] for need in needs[name] if need in components]}
+                             for name, found_ref in {ROOT: own, **components}.items() if name in needs]}
+
+
+def _normalise(requirement: str) -> str:
+    """The normal form of a package's name (PEP 503): "Python_CAN>=4" is python-can."""
+    return re.sub(r"[-_.]+", "-", re.split(r"[^\w.-]", requirement, maxsplit=1)[0]).lower()
+
+
+def _describe(name: str, package: Distribution) -> dict[str, Any]:
+    purl = f"pkg:pypi/{name}@{package.version}"
+    component = {"type": "library", "name": name, "version": package.version, "bom-ref": purl, "purl": purl}
+    said = package.metadata.json  # its license as an expression, or in words that may be all of its text
+    if "license_expression" in said:
+        return {**component, "licenses": [{"expression": said["license_expression"]}]}
+    named = str(said.get("license", "")).splitlines()
+    return {**component, "licenses": [{"license": {"name": named[0]}}]} if len(named) == 1 else component
+
 
 BILL = "sbom.cdx.json"
 _SETTINGS = ("sequence", "model", "bench", "seed", "bus", "pace", "controller", "plant", "started", "git.commit",

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 from fdi.report.report import Cell, Column, Medium, Mood, Table, tabulate
 from plant.errors import InputError, suggest_name
-from rig.tables import decode_text, read_file
+from plant.tables import decode_text, read_file
 
 RUN = "whole run"  # the name of what verifies a requirement of a case
 NO_VERDICT = ("ERROR", "NOT_RUN")  # cases without a run that was judged

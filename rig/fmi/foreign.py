@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.errors import InputError, RigError, suggest_name
+from plant.tables import Place
 from rig.fmi.host import Settings, Variable
-from rig.tables import Place
 
 Array = NDArray[np.float64]
 LONGEST_CALL = 20.0  # s, of one cycle or of starting: a unit that takes longer hangs

@@ -25,9 +25,9 @@ from plant.parameters import Controller, convert_group_unit
 from plant.plants import Plant, find_plant, keep_plant
 from plant.quantity import Quantity
 from plant.signals import EHA, Signal
+from plant.tables import Place, build_dataclass, decode_text, parse_table, read_file
 from plant.units import find_unit, parse_quantity
 from rig.fmi.foreign import Description, Port, Unit, find_variable, read_description
-from rig.tables import Place, build_dataclass, decode_text, parse_table, read_file
 
 _COLUMNS = EHA.aliases  # these keep their columns and meaning; other names are new signals
 

@@ -1,20 +1,32 @@
-"""Buses: the embedded one, that needs nothing from the machine, and python-can's, opened from one line of text."""
+"""Buses, opened from one line of text, and a node's or the rig's end of one.
+
+The embedded bus needs nothing from the machine. On python-can's a node is served in the caller's own thread, because
+python-can's notifier thread is ms late.
+"""
 from __future__ import annotations
 
+import errno
 import os
+import select
 import socket
+import struct
 import sys
+import time
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import can
+from can.interfaces.socketcan import SocketcanBus
 
 from plant.errors import InputError, RigError
+from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.network.can_interface import UdpBus
-from rig.network.frame import BIT_RATE_SWITCH, Frame, Node, Send
-from rig.network.udp import GROUP, is_group
+from rig.network.clock import Clock, WallClock
+from rig.network.frame import IDENTIFIER, Frame, Node, Send, find_cob_id, has_valid_length, make_message
+from rig.network.udp import GROUP, SO_RXQ_OVFL, SO_TIMESTAMPNS, is_group, set_receive_options
 
 BUS_VARIABLE = "EHA_RIG_BUS"  # environment: what `auto` takes
 BITRATE, _DATA_BITRATE = 1_000_000, 4_000_000  # bit/s; the second of CAN FD, in advice
@@ -72,7 +84,7 @@ class EmbeddedBus:
         queue, count = self._queue, 0
         while queue:
             others, cob_id, data = queue.popleft()
-            frame = Frame(t_ns, cob_id & ~BIT_RATE_SWITCH, data)
+            frame = Frame(t_ns, cob_id & ~SWITCHED, data)
             for receive in others:
                 receive(frame)
             count += 1
@@ -186,3 +198,337 @@ def parse_spec(spec: str, where: str) -> tuple[str, str]:
     if kind in can.VALID_INTERFACES and channel:
         return kind, channel
     raise InputError(where, spec, _SPECS)
+
+
+_CAN_FRAME, _CANFD_FRAME = struct.Struct("=IBxxx8s"), struct.Struct("=IBBxx64s")  # linux/can.h
+_SWITCHED = 1  # CANFD_BRS
+_TIMESPEC = struct.Struct("@qq")
+_REMOTE, _ERROR = 0x40000000, 0x20000000  # in the kernel's can_id
+_CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
+_ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(4)
+_FILTER = struct.Struct("=II")  # struct can_filter: identifier, mask
+_SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_JOIN_FILTERS = 101, 1, 6  # linux/can/raw.h
+_INVERTED = 0x20000000
+_QUEUE_FULL = (errno.ENOBUFS, errno.EAGAIN)
+
+
+class Link:
+    """Frames of one bus, with the times of `clock` (ns since the run began). The link owns the bus.
+
+    Counted, to be read at any time: `error_frames` of the controller; `overflows`, frames lost on the way in;
+    `dropped`, remote frames; `unsent`, frames the full transmit queue refused. On socketcan CAN FD frames come, and can
+    be sent, if the bus was opened with fd=True.
+    """
+
+    def __init__(self, bus: can.BusABC, clock: Callable[[], int]) -> None:
+        self.error_frames = self.dropped = self.unsent = 0
+        self._bus, self._clock = bus, clock
+        self._in_controller = self._in_kernel = 0  # where frames overflowed
+        self._latest = 0  # ns: a frame came no earlier than the one before, even if somebody has set the clock since
+        self._socket: socket.socket | None = None
+        self._left_out: frozenset[int] = frozenset()
+        self._foreign = 0  # bits of a COB-ID that a frame must not have
+        if isinstance(bus, SocketcanBus):
+            self._socket = bus.socket
+            set_receive_options(self._socket)
+
+    @property
+    def overflows(self) -> int:
+        return self._in_controller + self._in_kernel + int(getattr(self._bus, "overflows", 0))
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        """Put one frame on the bus. Raises RigError when the bus is gone, and for a length that such a frame lacks."""
+        if not has_valid_length(cob_id, len(data)):
+            raise RigError(f"frame 0x{cob_id & IDENTIFIER:03X}: {len(data)} bytes; a CAN frame has 0 to 8, a CAN FD "
+                           "frame also 12, 16, 20, 24, 32, 48 or 64")
+        identifier = cob_id & (EXTENDED | IDENTIFIER)
+        try:
+            if self._socket is None:
+                self._bus.send(make_message(cob_id, data))
+            elif cob_id & FD:
+                flags = _SWITCHED if cob_id & SWITCHED else 0
+                self._socket.send(_CANFD_FRAME.pack(identifier, len(data), flags, data), socket.MSG_DONTWAIT)
+            else:
+                self._socket.send(_CAN_FRAME.pack(identifier, len(data), data), socket.MSG_DONTWAIT)
+        except OSError as error:
+            if error.errno not in _QUEUE_FULL:
+                raise RigError(f"{self._bus.channel_info}: {error.strerror}") from error
+            self.unsent += 1
+        except can.CanError as error:
+            raise RigError(str(error)) from error
+
+    def poll(self, timeout: float = 0.0) -> list[Frame]:
+        """All frames waiting; if there are none, wait up to `timeout` seconds for the first.
+
+        On socketcan the kernel's time of reception counts, elsewhere the time of this call. Raises RigError when the
+        bus is gone.
+        """
+        try:
+            return self._poll_messages(timeout) if self._socket is None else self._poll_socket(self._socket, timeout)
+        except can.CanError as error:
+            raise RigError(str(error)) from error
+        except OSError as error:
+            raise RigError(f"{self._bus.channel_info}: {error.strerror}") from error
+
+    def leave_out(self, cob_ids: Collection[int]) -> None:
+        """Frames with these COB-IDs are no longer received (another socket does); an empty collection: all are."""
+        self._left_out = frozenset(cob_ids)
+        self._set_filters()
+
+    def select_nodes(self, most: int | None) -> None:
+        """Receive only the frames of CANopen nodes 0 to `most`, a power of two less one; None: all frames.
+
+        On socketcan the kernel drops the others, so that their number does not matter.
+        """
+        self._foreign = 0 if most is None else EXTENDED | 0x7F & ~most
+        self._set_filters()
+
+    def _set_filters(self) -> None:
+        if isinstance(self._bus, UdpBus):
+            self._bus.leave_out(sorted(self._left_out))
+        elif self._socket is not None:
+            exact = IDENTIFIER | EXTENDED | _REMOTE
+            filters = [_FILTER.pack(cob_id & ~FD | _INVERTED, exact) for cob_id in sorted(self._left_out)]
+            filters += [_FILTER.pack(0, self._foreign)] if self._foreign else []
+            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, int(bool(filters)))
+            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"".join(filters) or _FILTER.pack(0, 0))
+
+    def close(self) -> None:
+        """Give the bus back."""
+        self._bus.shutdown()
+
+    def _poll_messages(self, timeout: float) -> list[Frame]:
+        frames = []
+        for message in self._take_messages(timeout):
+            if message.is_error_frame:
+                self.error_frames += 1
+                continue
+            cob_id = find_cob_id(message) & ~SWITCHED
+            if message.is_remote_frame:
+                self.dropped += 1
+            elif not has_valid_length(cob_id, len(message.data)):
+                self.error_frames += 1
+            elif cob_id not in self._left_out and not cob_id & self._foreign:
+                frames.append(Frame(self._clock(), cob_id, bytes(message.data)))
+        return frames
+
+    def _take_messages(self, timeout: float) -> Iterator[can.Message]:
+        if isinstance(self._bus, UdpBus):
+            yield from self._bus.receive_waiting(timeout)
+            return
+        message = self._bus.recv(timeout)
+        while message is not None:
+            yield message
+            message = self._bus.recv(0)
+
+    def _poll_socket(self, raw: socket.socket, timeout: float) -> list[Frame]:
+        frames: list[Frame] = []
+        if timeout > 0 and not select.select([raw], [], [], timeout)[0]:
+            return frames
+        epoch = self._find_epoch()  # the kernel stamps with the wall clock
+        while True:
+            try:
+                data, ancillary, _, _ = raw.recvmsg(_CANFD_FRAME.size, _ANCILLARY, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                return frames
+            t_ns = self._clock()
+            for _, kind, value in ancillary:
+                if kind == SO_TIMESTAMPNS:
+                    seconds, ns = _TIMESPEC.unpack(value)
+                    t_ns = max(self._latest, min(t_ns, seconds * 1_000_000_000 + ns - epoch))
+                elif kind == SO_RXQ_OVFL:
+                    self._in_kernel = int.from_bytes(value, "little")
+            self._latest = t_ns
+            identifier, length, payload = int.from_bytes(data[:4], sys.byteorder), data[4], data[8:]
+            if identifier & _ERROR:
+                self.error_frames += 1
+                self._in_controller += bool(identifier & _CONTROLLER and payload[1] & _RX_OVERFLOW)
+            elif identifier & _REMOTE:
+                self.dropped += 1
+            else:
+                kind = FD if len(data) == _CANFD_FRAME.size else 0
+                frames.append(Frame(t_ns, identifier | kind, payload[:length]))
+
+    def _find_epoch(self) -> int:
+        """Wall clock minus the link's clock, ns. A thread that is interrupted between the two reads them again."""
+        epoch, shortest = 0, 1 << 62
+        for _ in range(3):
+            before = self._clock()
+            wall = time.time_ns()
+            taken = self._clock() - before
+            if taken < shortest:
+                epoch, shortest = wall - before - taken // 2, taken
+            if taken < 50_000:
+                break
+        return epoch
+
+
+MS = 1_000_000  # ns
+_PATIENCE = 5  # cycles without all answers, after which a wire waits less for them
+_STALL = 100 * MS  # twice the longest pause of the cycle in lockstep
+Done = Callable[[], bool]
+
+
+class Wire(ABC):
+    """What the master and the loop need of a bus."""
+
+    clock: Clock
+    send: Send
+    blind_ns = 0  # how long at most the frames that come in now have waited to be taken in
+    stalled_ns = 0  # how long in all frames were not taken in, pauses of the cycle left out
+
+    def __init__(self) -> None:
+        self.receive: Callable[[Frame], None] = lambda frame: None  # where incoming frames go; set by the master
+        self.is_node_gone: Done = lambda: False  # whether a node will not answer any more; set by the session
+
+    @abstractmethod
+    def wait(self, done: Done, seconds: float) -> bool:
+        """Let frames come in until `done()`; False when it took longer than `seconds`."""
+
+    @abstractmethod
+    def wait_for_answers(self, t_ns: int, done: Done) -> None:
+        """Lockstep: let the frames of the cycle at `t_ns` come in, until `done()` or nothing more can come."""
+
+    @abstractmethod
+    def run_until(self, t_ns: int) -> None:
+        """Real time: let frames come in until the clock says `t_ns`."""
+
+    def hear_all(self) -> None:  # noqa: B027 - a bus in memory has no others
+        """Let the frames of nodes that are not of the bench in, for the log; during bring-up they stay out."""
+
+    def close(self) -> None:  # noqa: B027 - nothing to give back
+        """Give the bus back."""
+
+
+class EmbeddedWire(Wire):
+    """All nodes in this process and thread. With a virtual clock a run repeats bit for bit."""
+
+    def __init__(self, clock: Clock, makers: Sequence[Callable[[Send], Node]], period_ns: int = MS) -> None:
+        super().__init__()
+        self.clock, self._period = clock, period_ns
+        self._bus = EmbeddedBus()
+        self.send = self._bus.attach(lambda frame: self.receive(frame))
+        self.nodes = [self._bus.add(make) for make in makers]
+
+    def deliver(self, t_ns: int) -> None:
+        """Deliver the frames that wait; no timer runs."""
+        self._bus.deliver(t_ns)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether no frame waits to be delivered."""
+        return self._bus.is_empty
+
+    def wait(self, done: Done, seconds: float) -> bool:
+        """See `Wire`; the time waited is the clock's."""
+        end = self.clock.now() + round(seconds * 1e9)
+        while True:
+            self._deliver(self.clock.now())
+            if done():
+                return True
+            if self.clock.now() >= end:
+                return False
+            self.clock.sleep_until(self.clock.now() + MS)
+
+    def wait_for_answers(self, t_ns: int, done: Done) -> None:
+        """See `Wire`; what is late by less than a cycle comes in too."""
+        self.clock.sleep_until(t_ns)
+        self._deliver(t_ns)
+        self._deliver(t_ns + self._period - 1)
+
+    def run_until(self, t_ns: int) -> None:
+        """See `Wire`."""
+        self._deliver(self.clock.now())
+        while self.clock.now() < t_ns:
+            self.clock.sleep_until(min(t_ns, self.clock.now() + MS))
+            self._deliver(self.clock.now())
+
+    def _deliver(self, t_ns: int) -> None:
+        """Deliver what is there, run the nodes' timers, deliver what came of them."""
+        self._bus.deliver(t_ns)
+        for node in self.nodes:
+            node.tick(t_ns)
+        self._bus.deliver(t_ns)
+
+
+class LinkWire(Wire):
+    """A bus between programs or machines. Waiting is in wall time, whatever the pace."""
+
+    def __init__(self, link: Link, clock: WallClock, grace: float = 0.2) -> None:
+        """`grace`: how late an answer may be in lockstep, s; a tenth of it after some cycles without all answers.
+
+        A node that is gone must not make clean-up last minutes.
+        """
+        super().__init__()
+        self.clock: WallClock = clock
+        self.link, self._grace = link, grace
+        self._missed = 0  # cycles in a row without all frames
+        self._looked_ns = clock.now()  # when the link was last seen to be empty
+        self.send: Send = link.send
+
+    def wait(self, done: Done, seconds: float) -> bool:
+        """See `Wire`. What has come when the time is over counts: this program may have stood still meanwhile."""
+        end = self.clock.now() + round(seconds * 1e9)
+        while not done():
+            left = end - self.clock.now()
+            self.poll(min(max(left, 0) * 1e-9, 0.05))
+            if left <= 0:
+                return done()
+        return True
+
+    def wait_for_answers(self, t_ns: int, done: Done) -> None:
+        """See `Wire`; a frame that does not come within the grace time is missing; after several, it waits less.
+
+        When a node is gone, a cycle takes its 1 ms, in which the other nodes can answer.
+        """
+        is_patient = self._missed < _PATIENCE
+        grace = self._grace if is_patient else 0.1 * self._grace
+        is_answered = not self.is_node_gone() and self.wait(lambda: done() or self.is_node_gone(), grace)
+        if self.is_node_gone():
+            self.wait(done, 1e-3)
+        self._missed = 0 if is_answered else self._missed + 1
+
+    def run_until(self, t_ns: int) -> None:
+        """See `Wire`."""
+        self.poll(0.0)
+        while (left := t_ns - self.clock.now()) > 0:
+            self.poll(left * 1e-9)
+
+    def hear_all(self) -> None:
+        """See `Wire`."""
+        self.link.select_nodes(None)
+
+    def close(self) -> None:
+        """See `Wire`."""
+        self.link.close()
+
+    @property
+    def grace_ns(self) -> int:
+        """How late an answer may be in lockstep, ns."""
+        return round(self._grace * 1e9)
+
+    def poll(self, timeout: float) -> None:
+        """Pass on the frames that are waiting; if there are none, wait up to `timeout` seconds for the first."""
+        begin = self.clock.now()
+        frames = self.link.poll(timeout)
+        end = self.clock.now()
+        self.blind_ns = begin - self._looked_ns + max(0, end - begin - round(timeout * 1e9))
+        self._looked_ns = end
+        if self.blind_ns > _STALL:
+            self.stalled_ns += self.blind_ns
+        for frame in frames:
+            self.receive(frame)
+
+
+def serve_node(node: Node, link: Link, clock: Clock, stop: Done) -> None:
+    """Run one node on a link until `stop()`, which is asked every millisecond: the whole of `rig node`."""
+    tick = clock.now() + MS
+    while True:
+        for frame in link.poll(max(0.0, (tick - clock.now()) * 1e-9)):
+            node.receive(frame)
+        now = clock.now()
+        if now >= tick:
+            if stop():
+                return
+            node.tick(now)
+            tick = max(tick + MS, now)

@@ -1,7 +1,7 @@
 """One CAN frame, as nodes see it: bytes and a time, never a socket or a clock.
 
 One integer, the COB-ID, says everywhere which frame it is: the identifier, with `EXTENDED` if it has 29 bits and with
-`FD_FRAME` if it is a CAN FD frame. 0x123, 0x123 | EXTENDED and 0x123 | FD_FRAME are three different frames. A plain
+`FD` if it is a CAN FD frame. 0x123, 0x123 | EXTENDED and 0x123 | FD are three different frames. A plain
 11-bit number is a classical frame.
 """
 from __future__ import annotations
@@ -9,16 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from rig.benches import frame_map
+from rig.benches.bench import EXTENDED, FD, SWITCHED
 
 if TYPE_CHECKING:
     import can
 
-EXTENDED = frame_map.EXTENDED  # in a COB-ID: the identifier has 29 bits, as CAN_EFF_FLAG in Linux's can_id
-FD_FRAME = frame_map.FD  # a CAN FD frame, of up to 64 bytes
-# A CAN FD frame whose data go at the higher bit rate. It is set to send such a frame, and stands in logs of others. A
-# bus leaves it out of the frames that it delivers: with it or without it, a frame is the same frame.
-BIT_RATE_SWITCH = frame_map.SWITCHED
 IDENTIFIER = 0x1FFFFFFF  # the bits of the identifier itself
 FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)  # bytes of the CAN FD frames that are longer than a classical frame
 
@@ -27,11 +22,11 @@ class Frame(NamedTuple):
     """A CAN data frame: classical or CAN FD, with an identifier of 11 or 29 bits."""
 
     t_ns: int  # ns since the run began; virtual in lockstep
-    cob_id: int  # with EXTENDED and FD_FRAME
+    cob_id: int  # with EXTENDED and FD
     data: bytes
 
 
-Send = Callable[[int, bytes], None]  # (COB-ID, data); also with BIT_RATE_SWITCH
+Send = Callable[[int, bytes], None]  # (COB-ID, data); also with SWITCHED
 
 
 class Node(Protocol):
@@ -46,7 +41,7 @@ class Node(Protocol):
 
 def has_valid_length(cob_id: int, length: int) -> bool:
     """Whether a frame of this kind can have `length` bytes: 0 to 8, in CAN FD also those of `FD_LENGTHS`."""
-    return 0 <= length <= 8 or (cob_id & FD_FRAME != 0 and length in FD_LENGTHS)
+    return 0 <= length <= 8 or (cob_id & FD != 0 and length in FD_LENGTHS)
 
 
 def make_message(cob_id: int, data: bytes, **options: Any) -> can.Message:
@@ -54,15 +49,15 @@ def make_message(cob_id: int, data: bytes, **options: Any) -> can.Message:
     import can  # here: who only reads logs need not load it
 
     return can.Message(arbitration_id=cob_id & IDENTIFIER, is_extended_id=bool(cob_id & EXTENDED),
-                       is_fd=bool(cob_id & FD_FRAME), bitrate_switch=bool(cob_id & BIT_RATE_SWITCH), data=data,
+                       is_fd=bool(cob_id & FD), bitrate_switch=bool(cob_id & SWITCHED), data=data,
                        **options)
 
 
 def find_cob_id(message: can.Message) -> int:
     """The COB-ID of a data frame of python-can, with its flags; not the error state indicator of CAN FD."""
     cob_id = message.arbitration_id
-    for flag, is_set in ((EXTENDED, message.is_extended_id), (FD_FRAME, message.is_fd),
-                         (BIT_RATE_SWITCH, message.bitrate_switch)):
+    for flag, is_set in ((EXTENDED, message.is_extended_id), (FD, message.is_fd),
+                         (SWITCHED, message.bitrate_switch)):
         if is_set:
             cob_id |= flag
     return cob_id

@@ -18,7 +18,7 @@ from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from plant.errors import InputError, RigError
-from rig.benches.bench import Bench
+from rig.benches.bench import Bench, Role
 from rig.benches.canopen_map import (
     INVALID,
     MAPPING,
@@ -28,10 +28,9 @@ from rig.benches.canopen_map import (
     read_dictionary,
     read_number,
 )
-from rig.benches.frame_map import Role
+from rig.network.bus import Wire
 from rig.network.frame import Frame
 from rig.network.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from rig.network.link import Wire
 from rig.network.node_objects import (
     CYCLE_RECORD,
     SCENARIO,

@@ -1,6 +1,6 @@
 """One CAN frame in, one CAN frame out, as compiled code: SocketCAN and the project's UDP bus, with kernel times.
 
-A COB-ID has the flags of frame.py: EXTENDED for an identifier of 29 bits, FD_FRAME for CAN FD.
+A COB-ID has the flags of frame.py: EXTENDED for an identifier of 29 bits, FD for CAN FD.
 
 A loop that must not be late is a plain function that calls `receive_frame` and `send_frame`, compiled as a whole by
 `plant.compile.compile_function`. It runs without the interpreter lock; it makes no Python object and allocates nothing.
@@ -48,9 +48,10 @@ from numpy.typing import NDArray
 
 from plant.compile import ForeignCall, keep_apart
 from plant.errors import InputError, RigError
+from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.network import udp
 from rig.network.bus import can_open, parse_spec, require_interface
-from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, IDENTIFIER, has_valid_length
+from rig.network.frame import IDENTIFIER, has_valid_length
 from rig.network.udp import GIVE, SO_RXQ_OVFL, SO_TIMESTAMPNS, TAKE, TURN_LIMIT_NS, Turn, set_receive_options
 
 # status of receive_frame
@@ -288,7 +289,7 @@ def _decode(port: Port, size: int) -> tuple[int, int, int, int]:
         return _OTHER, 0, 0, 0
     most = 8
     if size == _CANFD_SIZE:
-        cob_id, most = cob_id | FD_FRAME, 64
+        cob_id, most = cob_id | FD, 64
     length = min(_integer(port.octets[_FRAME_IN + 4]), most)
     data = _integer(port.words[PAYLOAD_IN // 8])
     if length < 8:
@@ -322,9 +323,9 @@ def _send_payload(port: Port, cob_id: int, length: int) -> int:
         return _send_datagram(port, cob_id, length)
     port.halves[_FRAME_OUT // 4] = cob_id & (EXTENDED | IDENTIFIER)
     port.halves[_FRAME_OUT // 4 + 1] = length
-    if not cob_id & FD_FRAME:
+    if not cob_id & FD:
         return _transmit(port, _FRAME_OUT, _CAN_SIZE)
-    if cob_id & BIT_RATE_SWITCH:
+    if cob_id & SWITCHED:
         port.octets[_FRAME_OUT + 5] = _CANFD_BRS
     return _transmit(port, _FRAME_OUT, _CANFD_SIZE)
 
@@ -395,9 +396,9 @@ def encode_datagram(port: Port, cob_id: int, length: int) -> tuple[int, int]:
     _memcpy(base + place, base + PAYLOAD_OUT, length)
     place += length
     _memcpy(base + place, base + _OUT + _OUT_SIZE - _TAIL, _TAIL)
-    if cob_id & FD_FRAME:
+    if cob_id & FD:
         octets[place + _FD_AT] = _TRUE
-        octets[place + _SWITCH_AT] += cob_id & BIT_RATE_SWITCH != 0
+        octets[place + _SWITCH_AT] += cob_id & SWITCHED != 0
     return start, _integer(place + _TAIL - start)
 
 
@@ -446,7 +447,7 @@ def decode_datagram(port: Port, size: int) -> tuple[int, int, int, int]:
     if flags & _EXTENDED:
         cob_id |= EXTENDED
     if flags & _FD:
-        cob_id |= FD_FRAME
+        cob_id |= FD
     if dlc != length or not has_valid_length(cob_id, length):
         return _ERROR_FRAME, 0, 0, 0
     port.words[PAYLOAD_IN // 8] = 0
@@ -513,7 +514,7 @@ class RawBus:
             with contextlib.ExitStack() as stack:
                 self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
                 stack.callback(os.close, self._wake)
-                is_fd = fd or any(cob_id & FD_FRAME for cob_id in cob_ids or ())
+                is_fd = fd or any(cob_id & FD for cob_id in cob_ids or ())
                 if kind == "socketcan":
                     self._rx = tx = _open_socketcan(channel, is_fd, stack)
                     words[_VECTOR // 8: _VECTOR // 8 + 2] = words.ctypes.data + _FRAME_IN, _CANFD_SIZE
@@ -612,7 +613,7 @@ class RawBus:
 
     def _allow(self, cob_ids: Sequence[int]) -> None:
         """One bit a COB-ID, for the frames that the kernel lets through; those beyond 11 bits are a list."""
-        listed = [cob_id & ~BIT_RATE_SWITCH for cob_id in cob_ids if cob_id > 0x7FF]
+        listed = [cob_id & ~SWITCHED for cob_id in cob_ids if cob_id > 0x7FF]
         if len(listed) > _LIST_SIZE // 8:
             raise RigError(f"{self.spec}: {len(listed)} frames to receive; at most {_LIST_SIZE // 8} are possible")
         allowed = np.zeros(0x800, np.uint8)

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from plant.errors import RigError
-from rig.network.frame import FD_FRAME
+from rig.benches.bench import FD
 
 GROUP, PORT = "239.74.163.2", 43113  # python-can's defaults
 _LOOPBACK = socket.inet_aton("127.0.0.1")
@@ -81,7 +81,7 @@ def attach_filter(rx: socket.socket, own_port: int, cob_ids: Collection[int], le
             taken = (equal, 0, len(body), first) if at else (at_least, len(body), 0, first)
             branches = [(load_byte, 0, 0, 8 + 35), taken, *body, *branches]
         program += branches
-        program += [step for cob_id in cob_ids for step in ((equal, 0, 1, cob_id & ~FD_FRAME), (give, 0, 0, listed))]
+        program += [step for cob_id in cob_ids for step in ((equal, 0, 1, cob_id & ~FD), (give, 0, 0, listed))]
         program.append((give, 0, 0, others))
     else:
         program.append((give, 0, 0, accept))

@@ -13,9 +13,8 @@ from typing import NamedTuple, cast
 from plant import load_model
 from plant.errors import InputError
 from plant.signals import Signals
-from rig.benches.bench import Bench, CanopenNode, Flags
+from rig.benches.bench import Bench, CanopenNode, Flags, FrameSpec
 from rig.benches.bench_file import load_bench
-from rig.benches.frame_map import FrameSpec
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
 from rig.network import heartbeat
 from rig.network.frame import Frame, Send

@@ -22,8 +22,7 @@ from plant.compile import ForeignCall, keep_apart
 from plant.machine_code import ADVANCE_CALL, READ_CALL
 from plant.run import find_direct_readings
 from plant.signals import Signals
-from rig.benches.bench import Flags
-from rig.benches.frame_map import FrameSpec, Role
+from rig.benches.bench import Flags, FrameSpec, Role
 from rig.benches.packing import (
     FRAME_WORDS,
     FRAMES_AT,

@@ -1,22 +1,23 @@
 """The reference firmware: a position loop in a CANopen device. With it the bench needs no external controller.
 
 It answers each feedback frame with a drive frame. The control word (CiA 408) lets current flow only in device mode
-ACTIVE without a fault; any fault is latched until it has gone and the control word's reset bit rises.
-"""
+ACTIVE without a fault; any fault is latched until it has gone and the control word's reset bit rises."""
 from __future__ import annotations
 
 import struct
-from math import isfinite
+from math import isfinite, nan
 from typing import cast
 
+from plant import Model
+from plant.compile import interpret_function
 from plant.controller import Loop, compute_current
-from plant.model import Model
-from plant.run import Demand
-from rig.benches.bench import SignalObject
+from plant.model import collect_bindings
+from plant.run import Demand, report_law_errors
+from rig.benches.bench import Bench, Role, SignalObject, make_reader, make_writer
 from rig.benches.bench_file import load_bench
 from rig.benches.profiles import Control, Status
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
-from rig.network.frame import Send
+from rig.network.frame import Frame, Send
 from rig.network.node_objects import CONTROLLER, GAINS, Gains
 
 # As plain integers: an operation on an IntFlag takes a microsecond, and there are five in each cycle.
@@ -153,3 +154,33 @@ class Firmware:
         od[self._answered] = od[self._cycle]
         self.device.transmit(1)
 
+
+class StandIn:
+    """It answers the last frame of each cycle of the rig with the drive of the plant's law."""
+
+    def __init__(self, send: Send, bench: Bench, model: Model) -> None:
+        self._send, self._model, self._record = send, model, model.build_record()[0]
+        parts = collect_bindings(model.effects, model.plant)
+        self._law = interpret_function(parts["control_plant"], parts)
+        self._memory = model.kind.build_control_memory()
+        self._readers = {spec.identifier: make_reader(spec) for spec in bench.frames.list_from(Role.RIG)}
+        self._last = tuple(self._readers)[-1]
+        self._answer, = bench.frames.list_from(Role.CONTROLLER)
+        self._write = make_writer(self._answer)
+        self._command, self._drive = bench.signals.command.word, bench.signals.drive.word
+        self._outputs = [s.word for s in bench.signals.outputs]
+        self._values = dict.fromkeys((self._command, *self._outputs), nan)
+
+    def receive(self, frame: Frame) -> None:
+        """See `rig.network.frame.Node`."""
+        if frame.cob_id not in self._readers:
+            return
+        self._values |= self._readers[frame.cob_id](frame.data)
+        if frame.cob_id == self._last:
+            readings = tuple(self._values[word] for word in self._outputs)
+            with report_law_errors(self._model):
+                drive, self._memory = self._law(self._memory, self._values[self._command], readings, self._record)
+            self._send(self._answer.identifier, self._write({self._drive: drive}, 0, 0))
+
+    def tick(self, t_ns: int) -> None:
+        """See `rig.network.frame.Node`; it has no clock of its own."""

@@ -22,9 +22,8 @@ from fdi.trace.sensor_dynamics import write_sensors
 from fdi.trace.trace import Trace, make_table_trace
 from plant import signals as plant_signals
 from plant.errors import InputError
-from rig.benches.bench import Bench
-from rig.benches.frame_map import EXTENDED, FrameSpec, Role, describe_identifier, make_reader
-from rig.network.frame import BIT_RATE_SWITCH, FD_FRAME, Frame, find_cob_id, make_message
+from rig.benches.bench import EXTENDED, FD, SWITCHED, Bench, FrameSpec, Role, describe_identifier, make_reader
+from rig.network.frame import Frame, find_cob_id, make_message
 from rig.network.node_objects import NmtState as State
 from rig.recorder.schema import Event, NmtState, Record, Signals, collect_provenance, make_row_record
 from rig.recorder.writer import Recorder
@@ -57,7 +56,7 @@ def export_trace(source: Path, out: Path, everything: bool = False) -> int:
     raw = list(read_raw_frames(path))
     if not raw:
         raise InputError(path, "/can", "at least one raw frame")
-    if out.suffix == ".trc" and any(frame.cob_id & FD_FRAME for frame in raw):
+    if out.suffix == ".trc" and any(frame.cob_id & FD for frame in raw):
         raise InputError(out, "--out", "a name that ends in .log, .blf or .asc: a .trc would lose the CAN FD frames")
     try:
         with write_whole(require_writable(out, "--out")) as part, can.Logger(part) as writer:
@@ -198,7 +197,7 @@ class _CycleBuilder:
 
     def feed(self, frame: Frame) -> Iterable[Record]:
         """Take a frame; -> what is to be recorded besides rows."""
-        cob_id, node = frame.cob_id & ~BIT_RATE_SWITCH, frame.cob_id & 0x7F
+        cob_id, node = frame.cob_id & ~SWITCHED, frame.cob_id & 0x7F
         spec = self._frames.find(cob_id, frame.data)
         if cob_id == self._frames.sync:
             self._open(frame.t_ns)

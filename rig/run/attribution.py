@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.segments import RATE, Array
-from rig.benches.bench import Bench, Flags
-from rig.benches.frame_map import Role
+from rig.benches.bench import Bench, Flags, Role
 from rig.network.master import StartTime
 from rig.network.node_objects import CONTROLLER, PLANT, RIG
 from rig.sequences.faults import DELAY, BusOff, Offset, Parameter, Plan, Schedule, Silent, Stuck

@@ -1,37 +1,243 @@
-"""Bring-up: the nodes are reset, identified, configured and started, and the probes before set-up are played."""
+"""Bring-up: the nodes are reset, identified, configured and started, and the probes before set-up are played.
+
+The probes are short plays before and after a sequence that show what its own cycles cannot. In a sequence the
+controller is disabled only where demand and position agree, so a firmware that ignores it sends next to no current
+there either. A probe asks for a position some way off (of the EHA 1 mm) while the controller is disabled, then steps
+the demand while it is enabled. It is played before set-up, on the healthy plant in its initial state. On CANopen it is
+played twice, each time after a reset, and the two must be answered alike; the reset that follows brings plant and
+controller back to the same state, so the rows of the sequence are those of a run without probes. Plain CAN has no
+reset: there it is played once, and the ram goes back to where it began. After clean-up the controller is disabled once
+more.
+
+The controller is made ready in cycles that do not count: CiA 402 is enabled step by step, then its own words say so.
+The run stands still meanwhile: neither its profiles nor its faults go on. In real time the last input is repeated until
+the next one, which waits for the answer to it.
+"""
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import isclose, nan
+from typing import NamedTuple
+
+import numpy as np
 
 from plant.errors import InputError
-from rig.benches.frame_map import Role
-from rig.benches.profiles import PROFILES, State
+from rig.benches.bench import Bench, Flags, Role
+from rig.benches.profiles import PROFILES, State, choose_control, find_state
+from rig.network.bus import EmbeddedWire
 from rig.network.clock import WallClock
-from rig.network.link import EmbeddedWire
 from rig.network.master import HEARTBEAT_LIMIT, PATIENT, Master
 from rig.network.node_objects import CONTROLLER, Gains, Identity, read_gains
 from rig.nodes.scenario import Scenario
 from rig.run.attribution import Mask, find_start_problem
-from rig.run.cyclic_values import BEFORE
-from rig.run.enabling import Enabling
 from rig.run.job import Job
-from rig.run.loop import History, Loop
+from rig.run.loop import AFTER, BEFORE, BEFORE_MAIN, CycleInput, History, Loop
 from rig.run.loops import open_loop
-from rig.run.probe import (
-    ATTEMPTS,
-    PROBES,
-    Step,
-    count_cycles,
-    find_disabled,
-    find_gap,
-    find_on_time,
-    has_no_answers,
-    list_first_steps,
-    list_inputs,
-    list_warm_up,
-)
 from rig.run.state import Journal, SafeState, Stage
+from rig.run.watch import PATIENCE, describe_silence
 from rig.sequences.faults import Plan, Schedule
+from rig.sequences.protocol import ProtocolLimits, Rows
+
+PROBES = 2  # before set-up, of a controller that can be reset
+ATTEMPTS = 5  # at each of them, in real time
+RETURN_TIME = 0.3  # s: until the ram is back, some time constants of a position loop
+_MISSED_LIMIT = 5  # cycles in a row without an answer: then the probe ends, because each costs a timeout
+
+
+class Step(NamedTuple):
+    """Some cycles with the same command; `demand` counts from where the plant is meant to be."""
+
+    control: int
+    demand: float
+    cycles: int
+    phase: int = BEFORE
+    begins_enabled: bool = False  # before it the controller is enabled, in cycles that do not count
+
+
+def list_warm_up(bench: Bench) -> tuple[Step, ...]:
+    """Real time: the first cycles may be late."""
+    words = PROFILES[bench.profile]
+    first = Step(find_disabled(bench), find_distance(bench), 30)
+    return (first,) if words.is_confirmed else (first, Step(words.reset, first.demand, 1))
+
+
+def find_distance(bench: Bench) -> float:
+    """From the position to the demand while the controller is disabled; 1 mm of the EHA."""
+    return 500.0 * bench.fineness
+
+
+def find_disabled(bench: Bench) -> int:
+    """The control word of a probe with which the controller is disabled."""
+    words = PROFILES[bench.profile]
+    return words.ladder[State.READY] if bench.profile == "none" and not bench.is_enabled("setup") else words.ladder[0]
+
+
+def list_last_steps(bench: Bench) -> tuple[Step, ...]:
+    """The probe after clean-up."""
+    return (Step(0, find_distance(bench), 8 + _count_release(bench), AFTER),)
+
+
+def list_first_steps(limits: ProtocolLimits, bench: Bench) -> tuple[Step, ...]:
+    """The steps of a probe before set-up, whose demand step may be answered as late as the limits say."""
+    distance = find_distance(bench)
+    step = 0.5 * distance  # the answer to it is far below the limit
+    active, off = PROFILES[bench.profile].ladder[State.ACTIVE], find_disabled(bench)
+    steps = []
+    if bench.profile != "none":
+        low, high = PROFILES[bench.profile].ladder[1:3]
+        steps = [Step(off, distance, 4), Step(low, distance, 2), Step(high, distance, 2)]
+    elif bench.enables:
+        steps = [Step(off, distance, 8)]
+    steps += [Step(active, 0.0, 3, BEFORE_MAIN, begins_enabled=True),
+              Step(active, step, 3 + round(limits.find_step_delay(bench) * bench.rate), BEFORE_MAIN)]
+    if not bench.nodes:
+        steps.append(Step(active, 0.0, round(RETURN_TIME * bench.rate), BEFORE_MAIN))
+    return (*steps, Step(off, distance, 8 + _count_release(bench)))
+
+
+def _count_release(bench: Bench) -> int:
+    """Cycles until a controller without a control word has switched its current off."""
+    return round(PROFILES["none"].delay * bench.rate) if bench.profile == "none" else 0
+
+
+def count_cycles(steps: tuple[Step, ...]) -> int:
+    """The length of a probe in cycles."""
+    return sum(step.cycles for step in steps)
+
+
+def list_inputs(step: Step, demand: float = 0.0) -> list[CycleInput]:
+    """The cycles of a step at the position `demand`, SI."""
+    return [CycleInput(step.phase, demand + step.demand, 0.0, step.control)] * step.cycles
+
+
+def has_no_answers(probe: History) -> bool:
+    """Whether the last cycles were all without a drive frame."""
+    last = probe.column(probe.signals.drive.name)[-_MISSED_LIMIT:]
+    return len(last) == _MISSED_LIMIT and bool(np.isnan(last).all())
+
+
+def find_gap(probe: History, on_time: Mask, cycles: int) -> str:
+    """Who left one of the last `cycles` of a probe without a frame: "bench", "controller", "" for nobody.
+
+    An answer that is missing where the bench was not `on_time`, (n,), is the bench's gap.
+    """
+    missing = np.isnan(probe.column(probe.signals.drive.name)[-cycles:])
+    if np.isnan(probe.column(probe.signals.controlled.name)[-cycles:]).any() or (missing & ~on_time[-cycles:]).any():
+        return "bench"
+    return "controller" if missing.any() else ""
+
+
+def read_rows(history: History, on_time: Mask) -> Rows:
+    """The rows of a history as the protocol checks see them."""
+    signals = history.signals
+    own = {"demand": signals.command.name, "position": signals.controlled.name, "drive": signals.drive.name}
+    return Rows(on_time=on_time, **{name: history.column(own.get(name, name)) for name in Rows._fields
+                                    if name != "on_time"})
+
+
+def find_on_time(history: History, faults: Schedule | None, realtime: bool, period: float, reach: int = 1) -> Mask:
+    """Cycles that the bench delivered: neither this SYNC nor the next was late, feedback came within half a cycle, and
+    no injected fault touched a frame of this cycle or of the `reach` before it."""
+    on_time: Mask = ~np.isnan(history.column(history.signals.controlled.name))
+    if realtime:
+        on_time &= history.column("feedback_response") <= 0.5 * period
+        late = history.column("lateness") > 0.1 * period
+        on_time &= ~late & ~np.append(late[1:], False)
+    if faults is not None:
+        on_time &= ~faults.find_disturbed(len(on_time), reach)
+    return on_time
+
+
+LIMIT = 5.0  # s: a controller that is not ready by then ends the run
+
+
+class Enabling:
+    """Gets the controller of a bench ready on a loop. `stop()` is True when the run is to end."""
+
+    def __init__(self, bench: Bench, loop: Loop, realtime: bool, stop: Callable[[], bool]) -> None:
+        self._bench, self._loop, self._realtime, self._stop = bench, loop, realtime, stop
+        self._words = PROFILES[bench.profile]
+        self._said: list[tuple[int, float, float]] = []  # control word, status word and current of the cycles
+        self._silent = 0  # cycles in a row for which the rig's own plant has had no drive frame
+
+    @property
+    def rows(self) -> Rows:
+        """What was sent and answered, for the protocol checks; the bench need not have been on time."""
+        control, status, current = np.array(self._said, float).reshape(-1, 3).T
+        zero = np.zeros(len(control))
+        return Rows(zero, zero, current, control, status, zero, zero, on_time=zero > 0)
+
+    def enable(self, demand: float) -> str:
+        """Climb to ACTIVE, with fault reset, holding `demand`, m; why that failed, or ""."""
+        if not self._words.is_confirmed:
+            return ""
+        control = 0
+
+        def step() -> CycleInput:
+            nonlocal control
+            control = choose_control(self._words, State.ACTIVE, self._find_state(), control, resets=True)
+            return CycleInput(0, demand, 0.0, control, is_counted=False)
+
+        for _ in range(2):  # the second shows whether the first was answered: a status word from before says nothing
+            self._play(step())
+        if self._play_until(lambda: self._find_state() == State.ACTIVE, step):
+            return ""
+        status = int(self._loop.outputs.get("status_word", 0))
+        return self._describe_silence() or (
+            f"the controller is not enabled after {LIMIT:g} s: status word 0x{status:04X}, "
+            f"{State(self._find_state()).name.lower().replace('_', ' ')}")
+
+    def await_ready(self, demand: float, control: int, main_control: int) -> str:
+        """Wait, at a `demand` in m, until the controller is ready; why it is not, or "".
+
+        A controller that is not ready at the end of set-up, with `control`, gets the values of main, with
+        `main_control`: it may say that it is ready as soon as it is enabled.
+        """
+        self._play(CycleInput(0, demand, 0.0, control, is_counted=False))
+        if self._play_until(self._is_ready, lambda: CycleInput(1, demand, 0.0, main_control, is_counted=False)):
+            return ""
+        said = ", ".join(f"{name} is {self._loop.outputs.get(name, 0.0):g}, not {value:g}"
+                         for name, value in self._bench.ready.items() if not self._has(name, value))
+        return self._describe_silence() or f"the controller is not ready after {LIMIT:g} s: {said}"
+
+    def _describe_silence(self) -> str:
+        return describe_silence(self._bench, self._silent) if self._silent else ""
+
+    def _play_until(self, is_done: Callable[[], bool], make_step: Callable[[], CycleInput]) -> bool:
+        """Play cycles until `is_done()`; False if that takes too long, True also when the run is to end."""
+        clock, left = WallClock(), round(LIMIT * 1e9 / self._bench.cycle_ns)
+        while not is_done():
+            left -= 1
+            is_over = clock.now() > LIMIT * 1e9 if self._realtime else self._silent >= PATIENCE
+            if left < 0 or is_over:
+                return False
+            self._play(make_step())
+            if self._stop():
+                return True
+        return True
+
+    def _play(self, step: CycleInput) -> None:
+        self._loop.cycle(step)
+        self._loop.wait_until_played(self._stop)
+        outputs = self._loop.outputs
+        current = nan if self._has_flag(Flags.DRIVE_MISSING) else outputs.get(self._bench.signals.drive.word, nan)
+        self._said.append((step.control, outputs.get("status_word", 0.0), current))
+        is_silent = self._has_flag(Flags.CURRENT_ZEROED) and not self._bench.has_plant_node
+        self._silent = self._silent + 1 if is_silent else 0
+
+    def _find_state(self) -> int:
+        if self._has_flag(Flags.DRIVE_MISSING):
+            return State.UNKNOWN
+        return find_state(self._words, int(self._loop.outputs.get("status_word", 0)))
+
+    def _has_flag(self, flag: Flags) -> bool:
+        return bool(int(self._loop.outputs.get("flags", 0)) & flag)
+
+    def _is_ready(self) -> bool:
+        return all(self._has(name, value) for name, value in self._bench.ready.items())
+
+    def _has(self, name: str, value: float) -> bool:
+        return isclose(self._loop.outputs.get(name, 0.0), value, rel_tol=1e-9, abs_tol=1e-12)
 
 
 class BringUp:

@@ -2,32 +2,231 @@
 
 Both give the same rows and frames. A cycle with a fault that begins, acts or ends, a frame that waits, or a node that
 is not well is played by `CycleLoop` and the nodes themselves. Timers, such as those of heartbeats, run in Python
-between the compiled cycles.
-"""
+between the compiled cycles."""
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping
-from functools import cache
+import os
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from math import ceil
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.controller import Loop
+from plant.compile import ForeignCall, compile_function, compute_fingerprint, find_cache_folder, interpret_function
+from plant.controller import Loop, compute_current
+from plant.machine_code import ADVANCE_CALL, StoredCode
+from plant.model import Model
+from plant.run import Actuator, LentPlant, sample_noise
 from plant.segments import Array
-from rig.benches.bench import Bench
-from rig.network.link import EmbeddedWire
+from plant.signals import Signals
+from rig.benches.bench import Bench, FrameSpec, Role
+from rig.benches.bench_file import load_bench
+from rig.benches.packing import PAYLOAD, VALUES_AT, Layout, list_frame_places, make_layout, pack_frame
+from rig.network.bus import EmbeddedWire
 from rig.network.master import Master
+from rig.network.node_objects import Gains, read_gains
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock
 from rig.recorder.schema import make_row_record
-from rig.run import embedded_cycle as ec
-from rig.run.cyclic_values import CycleInput
-from rig.run.loop import CycleLoop, CycleObserver, Seen
+from rig.run.loop import CycleInput, CycleLoop, CycleObserver, CyclicValues, Seen
 from rig.sequences.faults import Frames, Jitter, Parameter, Plan, Schedule
+
+# Words: cycles to play and played, the number of the first; of the plant its cycle, the address of its code, steps and
+# size of its parameters; address of the C library's clock (0: no times) and its answer; places of the frames
+ASKED, DONE, FIRST, PLANT_CYCLE, ADVANCE, STEPS, RECORD_SIZE, CLOCK, TIME, FRAMES_AT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 10
+SENSORS = 14  # transducers of the plant
+DEMAND, LOAD, READINGS, DRIVE_VALUE = range(15, 19)  # places among the values; the readings stand together
+SENSORS_AT = 20  # for each transducer: place of what it shows in the state, and of its noise among the parameters
+COMMAND, FEEDBACK, VALVE, DRIVE = range(4)  # frames, columns of the payloads
+# Reals: the controller's loop and gains, period, scratch; then the readings of a cycle, and for each signal with limits
+# (readings, demand, drive, load, error) its value, the lower and the upper limit
+LOOP, GAINS, PERIOD, _SCRATCH, _READ_AT = 0, 3, 8, 9, 12
+_LIMITED = 4  # signals with limits beside the readings
+SYNC_AT, PLANT_AT, DRIVE_AT, END_AT, BEGUN_AT = range(5)  # columns of the times
+
+MOST = 500  # cycles a call
+_call_advance, _call_clock = ForeignCall(ADVANCE_CALL), ForeignCall("iiq")
+_MONOTONIC = 1
+
+
+class Buffers(NamedTuple):
+    """What Python and the compiled loop share; of a call row i is its cycle i."""
+
+    words: NDArray[np.int64]
+    reals: NDArray[np.float64]
+    layout: Layout
+    inputs: NDArray[np.float64]  # (MOST, 3), SI: demand, load for the rig, load on the plant
+    noise: NDArray[np.float64]  # (MOST, transducers + 1)
+    values: NDArray[np.float64]  # (MOST, values of the bench), SI
+    payloads: NDArray[np.int64]  # (MOST, 4)
+    times: NDArray[np.int64]  # (MOST, 5), ns
+
+
+def play_quiet_cycles(b: Buffers, flat: NDArray[np.float64], live: NDArray[np.float64]) -> None:
+    """Play the cycles asked for, but none after one whose values are outside a guard, nor one of a plant that diverges.
+
+    `flat`: state of the plant; `live`: its parameters.
+    """
+    words, reals, m = b.words, b.reals, b.layout
+    at = m.words[VALUES_AT]
+    loop = Loop(reals[LOOP], reals[LOOP + 1], reals[LOOP + 2])
+    gains = Gains(reals[GAINS], reals[GAINS + 1], reals[GAINS + 2], reals[GAINS + 3], reals[GAINS + 4])
+    words[DONE], sensors = 0, words[SENSORS]
+    for i in range(words[ASKED]):
+        _note_time(b, i, BEGUN_AT)
+        is_finite = True
+        for j in range(sensors):
+            place = SENSORS_AT + 2 * j
+            reals[_READ_AT + j] = flat[words[place]] + live[words[place + 1]] * b.noise[i, j]
+            is_finite &= bool(np.isfinite(reals[_READ_AT + j]))
+        if _is_outside(b) or not is_finite:
+            break
+        in_force = m.doubles[at + words[DRIVE_VALUE]]  # what the controller answered to the cycle before
+        m.doubles[at + words[DEMAND]], m.doubles[at + words[LOAD]] = b.inputs[i, 0], b.inputs[i, 1]
+        _pack(b, i, COMMAND)
+        _note_time(b, i, SYNC_AT)
+        readings = at + words[READINGS]
+        for j in range(sensors):
+            m.doubles[readings + j] = reals[_READ_AT + j]
+        _pack(b, i, FEEDBACK)
+        _pack(b, i, VALVE)
+        _note_time(b, i, PLANT_AT)
+        m.doubles[at + words[DRIVE_VALUE]], loop = compute_current(
+            loop, m.doubles[at + words[DEMAND]], m.doubles[readings], gains)
+        _pack(b, i, DRIVE)
+        _note_time(b, i, DRIVE_AT)
+        _call_advance(words[ADVANCE], reals.ctypes.data + 8 * _SCRATCH, reals.ctypes.data + 8 * (_SCRATCH + 1),
+                      0, 0, len(flat), 8, flat.ctypes.data, len(flat), 8,
+                      in_force, b.inputs[i, 2], b.noise[i, sensors], (words[PLANT_CYCLE] + i) * reals[PERIOD],
+                      0, 0, 1, words[RECORD_SIZE], live.ctypes.data, 1, words[RECORD_SIZE], words[STEPS])
+        _note_time(b, i, END_AT)
+        for channel in range(b.values.shape[1]):
+            b.values[i, channel] = m.doubles[at + channel]
+        words[DONE] += 1
+    reals[LOOP], reals[LOOP + 1], reals[LOOP + 2] = loop.integral, loop.error, loop.cycles
+
+
+def _is_outside(b: Buffers) -> bool:
+    """Whether a value of the cycle before is outside the limits of the guards."""
+    words, reals, at = b.words, b.reals, b.layout.words[VALUES_AT]
+    sensors, first = words[SENSORS], _READ_AT + words[SENSORS]
+    for i in range(sensors):
+        reals[first + 3 * i] = b.layout.doubles[at + words[READINGS] + i]
+    rest = first + 3 * sensors
+    reals[rest] = b.layout.doubles[at + words[DEMAND]]
+    reals[rest + 3] = b.layout.doubles[at + words[DRIVE_VALUE]]
+    reals[rest + 6] = b.layout.doubles[at + words[LOAD]]
+    reals[rest + 9] = reals[rest] - reals[first]
+    for place in range(first, rest + 3 * _LIMITED, 3):
+        if not reals[place + 1] <= reals[place] <= reals[place + 2]:
+            return True
+    return False
+
+
+def _pack(b: Buffers, i: int, what: int) -> None:
+    """Pack a frame of cycle i; its values become what the receiver reads."""
+    pack_frame(b.layout, b.words[FRAMES_AT + what], b.words[FIRST] + i)
+    b.payloads[i, what] = b.layout.words[PAYLOAD]
+
+
+def _note_time(b: Buffers, i: int, column: int) -> None:
+    words = b.words
+    if words[CLOCK]:
+        _call_clock(words[CLOCK], _MONOTONIC, words.ctypes.data + 8 * TIME)
+        b.times[i, column] = words[TIME] * 1_000_000_000 + words[TIME + 1]
+
+
+# ---------------------------------------------------------------------------------------- made before the start
+
+
+def make_buffers(bench: Bench, names: Sequence[str], guards: Mapping[str, tuple[float, float]]) -> Buffers:
+    """Buffers for a bench whose values have these names. `guards`: limits by signal, SI."""
+    m = make_layout(bench.frames.list_of(Role.RIG), names, Role.RIG)
+    guarded, sensors = list_guarded(bench.signals), len(bench.signals.outputs)
+    first = _READ_AT + sensors
+    b = Buffers(np.zeros(SENSORS_AT + 2 * sensors, np.int64), np.zeros(first + 3 * len(guarded)), m,
+                np.zeros((MOST, 3)), np.zeros((MOST, sensors + 1)), np.zeros((MOST, len(names))),
+                np.zeros((MOST, 4), np.int64), np.zeros((MOST, 5), np.int64))
+    b.words[SENSORS] = sensors
+    places = dict(zip((each.identifier for each in bench.frames.list_of(Role.RIG)), list_frame_places(m), strict=True))
+    b.words[FRAMES_AT:FRAMES_AT + 4] = [places[each.identifier] for each in list_frames(bench)]
+    values = CyclicValues(bench)
+    b.words[DEMAND:DRIVE_VALUE + 1] = [names.index(name) for name in (values.command, values.load, values.readings[0],
+                                                                      values.drive)]
+    b.reals[first:].reshape(-1, 3)[:, 1:] = [guards.get(signal, (-np.inf, np.inf)) for signal in guarded]
+    return b
+
+
+def list_guarded(signals: Signals) -> tuple[str, ...]:
+    """What may have limits, in the order of the compiled code."""
+    load = "load" if signals.load is None else signals.load.name
+    return (*(s.name for s in signals.outputs), signals.command.name, signals.drive.name, load, "error")
+
+
+def list_frames(bench: Bench) -> list[FrameSpec]:
+    """The frames of a cycle in the order of the payloads; empty unless there is one of each kind, in each cycle."""
+    found = [each for role in ("command", "feedback", "valve_state", "drive")
+             for each in bench.frames.frames if role in each.roles]
+    known = {bench.signals.command.word, *(s.word for s in bench.signals.outputs), bench.signals.drive.word,
+             "control_word", "status_word", "flags", "cycle"}  # what our own nodes put into frames
+    is_plain = all(each.every == 1 and each.length == 8 and {one.name for one in each.fields} <= known
+                   for each in found)
+    return found if is_plain and len(bench.frames.frames) == len(set(found)) == len(found) == 4 else []
+
+
+def set_values(b: Buffers, values: Sequence[float]) -> None:
+    """The values of the cycle before, SI."""
+    at = b.layout.words[VALUES_AT]
+    b.layout.doubles[at:at + len(values)] = values
+
+
+def bind_code(b: Buffers, actuator: Actuator) -> Callable[[], object] | None:
+    """The compiled cycles on a plant; None for one whose readings need more than its state and noise."""
+    plant = _lend_plant(b, actuator)
+    return None if plant is None else load_code().bind((b, plant.flat, plant.live))
+
+
+def _lend_plant(b: Buffers, actuator: Actuator) -> LentPlant | None:
+    """A plant for the compiled code, which is told where its code, its parameters and its readings are."""
+    plant = actuator.lend()
+    if plant is None or len(plant.fields) != b.words[SENSORS]:
+        return None
+    b.words[ADVANCE], b.words[STEPS], b.words[RECORD_SIZE] = plant.advance, actuator.steps, 8 * len(plant.live)
+    b.words[SENSORS_AT:].reshape(-1, 2)[:] = np.column_stack((plant.fields, plant.levels))
+    b.reals[PERIOD] = actuator.model["controller.period"]
+    return plant
+
+
+def is_compiled() -> bool:
+    """Whether code is compiled in this process: not where a debugger wants plain Python."""
+    return not os.environ.get("NUMBA_DISABLE_JIT")
+
+
+def make_trial() -> tuple[Buffers, Any, Any]:
+    """Arguments of some cycles of the shipped bench, without times."""
+    bench, actuator = load_bench(), Actuator(Model())
+    actuator.warm()
+    b = make_buffers(bench, CyclicValues(bench).names, {})
+    plant = _lend_plant(b, actuator)
+    assert plant is not None
+    b.words[ASKED], b.inputs[:, 0], b.noise[:20] = 20, 1e-3, sample_noise(0, 20)
+    b.reals[GAINS:GAINS + len(Gains._fields)] = read_gains(actuator.model.values)
+    return b, plant.flat, plant.live
+
+
+@cache
+def load_code() -> StoredCode:
+    """The compiled cycles, for any plant: some seconds on a new machine."""
+    source = compute_fingerprint(interpret_function(play_quiet_cycles))
+    code = StoredCode(find_cache_folder() / source, partial(compile_function, play_quiet_cycles), "cycles")
+    code.warm(make_trial)
+    return code
+
 
 FRAMES = ("command", "sync", "feedback", "valve_state", "drive")  # that faults act on
 Limits = Mapping[str, tuple[float, float]]  # of signals, SI
@@ -45,9 +244,9 @@ class EmbeddedLoop(CycleLoop):
         assert isinstance(master.wire, EmbeddedWire)
         self._embedded = master.wire
         self._busy = find_busy_cycles(scenario.plan, faults)
-        self._buffers = ec.make_buffers(bench, self._values.names, guards)
-        self._buffers.words[ec.CLOCK] = find_clock()
-        self._frames, self._sync_id = ec.list_frames(bench), bench.frames.sync or 0
+        self._buffers = make_buffers(bench, self._values.names, guards)
+        self._buffers.words[CLOCK] = find_clock()
+        self._frames, self._sync_id = list_frames(bench), bench.frames.sync or 0
         self._lent: object = None  # the actuator that the compiled code works on
         self._run: Callable[[], object] | None = None
         self._roles = {role for answer in self._answers.values() for role in answer.roles}
@@ -57,7 +256,7 @@ class EmbeddedLoop(CycleLoop):
         emulator, firmware = self._embedded.nodes
         assert isinstance(emulator, Emulator)
         assert isinstance(firmware, Firmware)
-        most = self._count_quiet(emulator, firmware, control, min(len(demands), ec.MOST))
+        most = self._count_quiet(emulator, firmware, control, min(len(demands), MOST))
         run = self._bind(emulator) if most > 1 else None
         if run is None:
             return 0
@@ -65,18 +264,18 @@ class EmbeddedLoop(CycleLoop):
         b, k = self._buffers, self.k
         step = CycleInput(phase, 0.0, 0.0, control)
         self.outputs.update(zip(self._values.given[2:], self._values.list_given(step)[2:], strict=True))
-        ec.set_values(b, [self.outputs[name] for name in self._values.names])
-        b.words[ec.ASKED], b.words[ec.FIRST], b.words[ec.PLANT_CYCLE] = most, k, emulator.plant.actuator.cycle
-        b.reals[ec.LOOP:ec.GAINS], b.reals[ec.GAINS:ec.PERIOD] = firmware.loop, firmware.gains
+        set_values(b, [self.outputs[name] for name in self._values.names])
+        b.words[ASKED], b.words[FIRST], b.words[PLANT_CYCLE] = most, k, emulator.plant.actuator.cycle
+        b.reals[LOOP:GAINS], b.reals[GAINS:PERIOD] = firmware.loop, firmware.gains
         on_plant = emulator.plant.list_loads(k, most)
         b.inputs[:most, 0], b.inputs[:most, 1], b.inputs[:most, 2] = demands[:most], loads[:most], 0.0
         b.inputs[:len(on_plant), 2] = on_plant
         b.noise[:most] = emulator.plant.actuator.noise.look_ahead(most)
         run()
-        played = int(b.words[ec.DONE])
+        played = int(b.words[DONE])
         if played:
-            firmware.loop = Loop(*b.reals[ec.LOOP:ec.GAINS].tolist())
-            emulator.pass_quiet(played, int(b.payloads[played - 1, ec.DRIVE]).to_bytes(8, "little", signed=True))
+            firmware.loop = Loop(*b.reals[LOOP:GAINS].tolist())
+            emulator.pass_quiet(played, int(b.payloads[played - 1, DRIVE]).to_bytes(8, "little", signed=True))
             self._take_cycles(phase, control, played)
             self._run_timers(emulator, firmware)
         return played
@@ -94,13 +293,13 @@ class EmbeddedLoop(CycleLoop):
         """The compiled code on the plant of the emulator, which is another one after each reset."""
         actuator = emulator.plant.actuator
         if self._lent is not actuator:
-            self._lent, self._run = actuator, ec.bind_code(self._buffers, actuator)
+            self._lent, self._run = actuator, bind_code(self._buffers, actuator)
         return self._run
 
     def _take_cycles(self, phase: int, control: int, played: int) -> None:
         """Log the cycles that were played, all but the last, which is the cycle under way now."""
         b, names, first, signals = self._buffers, self._values.names, self.k, self._bench.signals
-        begun, sync, plant, drive = (b.times[:played, i] for i in (ec.BEGUN_AT, ec.SYNC_AT, ec.PLANT_AT, ec.DRIVE_AT))
+        begun, sync, plant, drive = (b.times[:played, i] for i in (BEGUN_AT, SYNC_AT, PLANT_AT, DRIVE_AT))
         values = dict(zip(names, b.values[:played].T.copy(), strict=True))
         fed, answered = (plant - sync) * 1e-9, (drive - sync) * 1e-9
         columns = {
@@ -166,4 +365,4 @@ def can_play_many(master: Master, bench: Bench) -> bool:
     """
     nodes = master.wire.nodes if isinstance(master.wire, EmbeddedWire) else []
     is_own = [type(node) for node in nodes] == [Emulator, Firmware]
-    return is_own and bool(ec.list_frames(bench)) and bench.frames.sync is not None and ec.is_compiled()
+    return is_own and bool(list_frames(bench)) and bench.frames.sync is not None and is_compiled()

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.compile import keep_apart
+from rig.benches.bench import FD
 from rig.benches.packing import (
     ACCEPTED,
     ALL_ROLES,
@@ -45,7 +46,6 @@ from rig.benches.packing import (
     pack_frame,
     unpack_frame,
 )
-from rig.network.frame import FD_FRAME
 from rig.network.raw_bus import (
     FRAME,
     PAYLOAD_IN,
@@ -361,7 +361,7 @@ def _send(port: Port, buffers: Buffers, m: Layout, identifier: int, length: int,
     for _ in range(count):
         if not (words[DRY] or words[FAILURE]):
             _record_frame(buffers, m, read_clock(port), identifier | length << 32 | 1 << 40)
-            if identifier & FD_FRAME:
+            if identifier & FD:
                 for i in range(64):
                     port.octets[PAYLOAD_OUT + i] = m.octets[8 * PAYLOAD + i]
                 words[FAILURE] = min(send_payload(port, identifier, length), 0)

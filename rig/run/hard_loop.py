@@ -23,10 +23,9 @@ from plant.compile import compile_function
 from plant.errors import RigError
 from plant.model import Model
 from rig.benches import packing
-from rig.benches.bench import Bench
-from rig.benches.frame_map import FD, Role
+from rig.benches.bench import FD, Bench, Role
+from rig.network.bus import LinkWire
 from rig.network.frame import Frame
-from rig.network.link import LinkWire
 from rig.network.master import Master
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
@@ -35,8 +34,7 @@ from rig.nodes.faulty_plant import DIVERGED
 from rig.nodes.scenario import Scenario
 from rig.recorder import Signals, Timing
 from rig.run import hard_cycle as hc
-from rig.run.cyclic_values import CycleInput, CyclicValues
-from rig.run.loop import CycleObserver, Loop
+from rig.run.loop import CycleInput, CycleObserver, CyclicValues, Loop
 from rig.run.priority import enter_loop_thread, list_cpus
 from rig.sequences.faults import CUT, DELAY, DOUBLE, DROP, NORMAL, Plan, Schedule
 

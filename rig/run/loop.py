@@ -4,34 +4,119 @@ SocketCAN and the UDP bus have a compiled one as well (hard_loop.py), which give
 
 Lockstep: the next cycle begins when this one's frames are in. Real time: it begins when it is due; due times are a
 fixed grid, and a cycle that is late by whole periods drops the due times it has missed (and counts them) instead of
-firing a burst. Either way the plant moves one period a SYNC, so a run that was late is late, not wrong.
-"""
+firing a burst. Either way the plant moves one period a SYNC, so a run that was late is late, not wrong."""
 from __future__ import annotations
 
 import heapq
 from abc import ABC, abstractmethod
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from math import isnan, nan
 from operator import attrgetter
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from plant import signals as plant_signals
 from plant.segments import Array
-from rig.benches.bench import Bench, Flags
-from rig.benches.frame_map import FrameSpec, Role, check_guards, make_reader, make_writer
+from rig.benches.bench import (
+    RIG_OUTPUTS,
+    SWITCHED,
+    Bench,
+    Flags,
+    FrameSpec,
+    Role,
+    check_guards,
+    make_reader,
+    make_writer,
+)
 from rig.network.clock import WallClock
-from rig.network.frame import BIT_RATE_SWITCH, Frame
+from rig.network.frame import Frame
 from rig.network.master import Master
 from rig.nodes.emulator import Emulator
 from rig.nodes.faulty_plant import FaultyPlant
 from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock, Signals, Timing
-from rig.run.cyclic_values import CycleInput, CyclicValues
+from rig.recorder.schema import make_row_record
 from rig.sequences.faults import DELAY, DROP, NORMAL, SENT_NORMALLY, Action, Schedule, apply_action
+
+# Numbers of phases: set-up, main, clean-up; then those of the probes, of which the log has the frames only
+BEFORE, AFTER, BEFORE_MAIN = 3, 4, 5
+_PHASES = ("setup", "main", "cleanup", "setup", "cleanup", "main")  # whose values are sent
+_NO_LOAD = "load"  # stands for the load of a plant that has none
+
+
+class CycleInput(NamedTuple):
+    """Inputs of one cycle."""
+
+    phase: int  # 0 set-up, 1 main, 2 clean-up; of the probes see above
+    demand: float  # SI, as the load
+    load: float  # on the plant, from the scenario
+    control: int  # control word; of a controller without one: 0 for the values of the safe state
+    is_counted: bool = True  # False: the controller is being enabled, the run has not begun and the plant rests
+
+
+class CyclicValues:
+    """The values of a bench by name, in one order: given by the rig, sent by it besides, received.
+
+    And the rows that these make: a column for each signal of the plant, whatever it is called.
+    """
+
+    def __init__(self, bench: Bench) -> None:
+        controller, signals = bench.nodes.get(Role.CONTROLLER), bench.signals
+        self._mode = 0.0 if controller is None else float(controller.mode or 0)
+        self._phases = bench.phases
+        self.command, self.drive = signals.command.word, signals.drive.word
+        self.load = _NO_LOAD if signals.load is None else signals.load.word
+        self.readings = tuple(s.word for s in signals.outputs)  # in the order of the transducers
+        self.given = (self.command, self.load, "control_word", "mode", *bench.phases)
+        read = (*self.readings, "flags")
+        self.sent = self.given if bench.has_plant_node else (*self.given, *read)
+        received = [name for name in (*read, self.drive, *RIG_OUTPUTS, *bench.ready)
+                    if name not in self.sent and name != "cycle"]
+        self.names = (*self.sent, *dict.fromkeys(received))
+        self.place = {name: i for i, name in enumerate(self.names)}
+        fed = {each.name for spec in bench.frames.frames if "feedback" in spec.roles for each in spec.fields}
+        role = {signals.drive.name: "drive", **{s.name: "feedback" if s.word in fed else "valve_state"
+                                                for s in signals.outputs}}
+        self._columns = [(s.name, s.word, role.get(s.name, "")) for s in signals[1:]]  # and the frame that brings each
+        self._given = [s.name for s in (signals.command, signals.load) if s is not None]
+        self._record: Any = make_row_record(signals)
+
+    def open_row(self, k: int, phase: int, demand: float, load: float, control: int) -> Signals:
+        """The row of cycle k before anything has come."""
+        row: Signals = self._record(k, phase, *(nan for _ in self._columns), control, 0, 0)
+        setattr(row, self._given[0], demand)
+        if len(self._given) > 1:
+            setattr(row, self._given[1], load)
+        return row
+
+    def fill_row(self, row: Signals, values: Mapping[str, float], came: Collection[str]) -> None:
+        """Put the values of the bench into a row that the frames of these roles have brought."""
+        for name, word, role in self._columns:
+            if role in came:
+                setattr(row, name, values[word])
+        if "valve_state" in came:
+            row.flags = int(values["flags"])
+        if "drive" in came:
+            row.status = int(values["status_word"])
+
+    def list_given(self, step: CycleInput) -> list[float]:
+        """The values that the rig gives in a cycle, SI; of fields of the device the physical value of its DBC."""
+        phase = _PHASES[step.phase] if step.control else "safe"
+        return [step.demand, step.load, float(step.control), self._mode,
+                *(find_phase_value(values, phase) for values in self._phases.values())]
+
+    def list_safe(self, control: int) -> list[float]:
+        """What replaces the given values in the safe state; NaN where nothing does."""
+        return [nan, nan, float(control), nan, *(find_phase_value(values, "safe") for values in self._phases.values())]
+
+
+def find_phase_value(values: Mapping[str, float], phase: str) -> float:
+    """The value of a field in a phase; in the safe state that of clean-up, if the bench file says nothing else."""
+    return float(values.get(phase, values.get("cleanup", 0.0)))
+
 
 _RESPONSES = {"feedback": "feedback_response", "valve_state": "valve_response", "drive": "response"}  # of the timing
 
@@ -307,7 +392,7 @@ class CycleLoop(Loop):
         """Late frames whose time has come; those of the controller are taken in now."""
         while self._held and self._held[0][0] < before_ns:
             _, _, identifier, data = heapq.heappop(self._held)
-            spec = self._bench.frames.find(identifier & ~BIT_RATE_SWITCH, data)
+            spec = self._bench.frames.find(identifier & ~SWITCHED, data)
             if spec in self._answers:
                 self._take_answer(self._answers[spec], data, self._wire.clock.now())
             else:

@@ -2,12 +2,10 @@
 from __future__ import annotations
 
 from rig.benches.bench import Bench
-from rig.network.bus import can_open
-from rig.network.link import LinkWire
+from rig.network.bus import LinkWire, can_open
 from rig.network.master import Master
 from rig.nodes.scenario import Scenario
-from rig.run import embedded_cycle
-from rig.run.embedded_loop import EmbeddedLoop, Limits, can_play_many
+from rig.run.embedded_loop import EmbeddedLoop, Limits, can_play_many, is_compiled, load_code
 from rig.run.job import Job
 from rig.run.loop import CycleLoop, CycleObserver, Loop
 from rig.sequences.faults import Schedule
@@ -19,8 +17,8 @@ def compile_loop(job: Job) -> None:
         from rig.run.hard_loop import compile_cycle  # here: on the embedded bus a run needs none of it
 
         compile_cycle(job.realtime)
-    elif job.controller == "builtin" and not job.realtime and embedded_cycle.is_compiled():
-        embedded_cycle.load_code()
+    elif job.controller == "builtin" and not job.realtime and is_compiled():
+        load_code()
 
 
 def open_loop(master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver, bus: str,

@@ -21,7 +21,7 @@ from plant.errors import InputError
 from plant.model import Model
 from plant.segments import Array
 from plant.signals import Signals
-from rig.benches.frame_map import Role
+from rig.benches.bench import Role
 from rig.network.node_objects import NAMES, PLANT, Identity
 from rig.run.attribution import Attribution, Cause, Trouble, count_most_in_a_row
 from rig.run.job import Job, find_differences

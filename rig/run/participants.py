@@ -12,17 +12,15 @@ from functools import partial
 from typing import NamedTuple
 
 from plant import InputError, Model
-from rig.benches.frame_map import Role
+from rig.benches.bench import Role
 from rig.benches.plant_bench import is_plant_bench
-from rig.network.bus import open_can
+from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, open_can
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Node, Send
-from rig.network.link import EmbeddedWire, Link, LinkWire, Wire
 from rig.network.master import BusError, Master
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
 from rig.nodes.emulator import Emulator
-from rig.nodes.firmware import Firmware
-from rig.nodes.stand_in import StandIn
+from rig.nodes.firmware import Firmware, StandIn
 from rig.run.job import Job
 from rig.sequences.faults import is_noticed_by_time
 

@@ -19,34 +19,32 @@ from fdi.progress import Progress
 from plant.pid import control_by_pid
 from plant.profile import Profile, build_profile
 from plant.segments import Array, Hold
-from rig.benches.frame_map import make_reader
+from rig.benches.bench import make_reader
 from rig.benches.profiles import PROFILES, State
+from rig.network.bus import EmbeddedWire
 from rig.network.frame import Frame
-from rig.network.link import EmbeddedWire
 from rig.network.master import HEARTBEAT, Master
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, CycleRecord, NmtState
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.attribution import Mask, find_injected
-from rig.run.bring_up import BringUp
-from rig.run.cyclic_values import AFTER, CycleInput
-from rig.run.embedded_cycle import MOST
-from rig.run.enabling import Enabling
-from rig.run.job import Job
-from rig.run.loop import History
-from rig.run.loops import open_loop
-from rig.run.participants import Participants, find_firmware_parameters
-from rig.run.probe import (
+from rig.run.bring_up import (
+    BringUp,
+    Enabling,
     count_cycles,
     list_first_steps,
     list_inputs,
     list_last_steps,
     read_rows,
 )
+from rig.run.embedded_loop import MOST
+from rig.run.job import Job
+from rig.run.loop import AFTER, CycleInput, History
+from rig.run.loops import open_loop
+from rig.run.participants import Participants, find_firmware_parameters
 from rig.run.state import Journal, SafeState, Stage
 from rig.run.watch import PATIENCE, NodeWatch, OverrunWatch
-from rig.sequences.checks import Guard, GuardWatch
+from rig.sequences.checks import DriveFrames, Guard, GuardWatch
 from rig.sequences.faults import Schedule
-from rig.sequences.measures import DriveFrames
 from rig.sequences.protocol import ProtocolRecord, Rows
 
 SETUP, MAIN, CLEANUP = 0, 1, 2

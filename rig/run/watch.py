@@ -7,8 +7,7 @@ from math import isnan
 
 from canopen.emcy import EmcyError
 
-from rig.benches.bench import Bench, Flags
-from rig.benches.frame_map import Role, describe_identifier
+from rig.benches.bench import Bench, Flags, Role, describe_identifier
 from rig.device.emcy import EmcyCode
 from rig.network.master import HEARTBEAT_LIMIT, Master
 from rig.network.node_objects import CONTROLLER, PLANT, RIG, NmtState

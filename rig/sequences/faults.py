@@ -15,6 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from plant import tables
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.model import Model, find_quantity
@@ -22,11 +23,8 @@ from plant.parameters import check_combinations, parse_value
 from plant.plants import find_plant
 from plant.quantity import Quantity
 from plant.segments import RATE, Second
-from rig import tables
-from rig.benches.bench import Bench
-from rig.benches.frame_map import Role
+from rig.benches.bench import Bench, Role
 from rig.sequences.signals import Sensed, name_signals_of
-from rig.tables import Range
 
 Table = NDArray[np.int64]
 FrameName = Literal["feedback", "valve_state", "drive", "command", "sync"]
@@ -35,9 +33,9 @@ BenchNode = Literal["rig", "plant"]
 LATEST_TIME = 1e6  # s, later than any run ends
 LARGEST_VALUE = 1e12  # SI; a sensor cannot be further off, and sums of two stay numbers
 MOST_FOREIGN = 1000  # frames a cycle; a bus of 1 Mbit/s carries 7
-Time = Annotated[float, Range("s", low=0.0, high=LATEST_TIME)]
-Size = Annotated[float, Range("SI units", low=-LARGEST_VALUE, high=LARGEST_VALUE)]
-Count = Annotated[int, Range("1", low=1, high=1_000_000_000)]
+Time = Annotated[float, Quantity("s", low=0.0, high=LATEST_TIME)]
+Size = Annotated[float, Quantity("SI units", low=-LARGEST_VALUE, high=LARGEST_VALUE)]
+Count = Annotated[int, Quantity("1", low=1, high=1_000_000_000)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +128,7 @@ class Frames(Fault):
     frame: FrameName | PdoName
     every: Count = 1
     count: Count | None = None
-    probability: Annotated[float, Range("1", above=0.0, high=1.0)] = 1.0
+    probability: Annotated[float, Quantity("1", above=0.0, high=1.0)] = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +145,7 @@ class Late(Frames):
 
     kind, code = "late", DELAY
     frame: PdoName
-    delay: Annotated[float, Range("s", above=0.0, high=1.0)]
+    delay: Annotated[float, Quantity("s", above=0.0, high=1.0)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +162,7 @@ class Corrupted(Frames):
 
     kind, code = "corrupted", CORRUPT
     frame: PdoName
-    bits: Annotated[int, Range("1", low=1, high=64)] = 1
+    bits: Annotated[int, Quantity("1", low=1, high=64)] = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +171,7 @@ class Short(Frames):
 
     kind, code = "short", CUT
     frame: PdoName
-    length: Annotated[int, Range("1", low=0, high=7)]
+    length: Annotated[int, Quantity("1", low=0, high=7)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +179,7 @@ class Jitter(Fault):
     """SYNC comes late by a random time, uniform between 0 and `size` seconds; due times stay where they are."""
 
     kind = "jitter"
-    size: Annotated[float, Range("s", above=0.0, below=0.1)]  # and below a cycle
+    size: Annotated[float, Quantity("s", above=0.0, below=0.1)]  # and below a cycle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,9 +190,9 @@ class Foreign(Fault):
     """
 
     kind = "foreign"
-    cob_id: Annotated[int, Range("1", low=1, high=0x7FF)] = 0x7E5
-    length: Annotated[int, Range("1", low=0, high=8)] = 8
-    frames: Annotated[int, Range("1", low=1, high=MOST_FOREIGN)] = 1  # in each of these cycles
+    cob_id: Annotated[int, Quantity("1", low=1, high=0x7FF)] = 0x7E5
+    length: Annotated[int, Quantity("1", low=0, high=8)] = 8
+    frames: Annotated[int, Quantity("1", low=1, high=MOST_FOREIGN)] = 1  # in each of these cycles
     every: Count = 1
 
 
@@ -283,7 +281,7 @@ class Plan:
     start: int = 0
     stop: int
     seed: int = 0
-    rate: Annotated[float, Range("1/s", low=1.0, high=1e6)] = RATE
+    rate: Annotated[float, Quantity("1/s", low=1.0, high=1e6)] = RATE
     plant: str = field(default="eha", metadata={"key": False})  # whose parameters and signals the faults change
 
     def find_cycles(self, fault: Fault) -> tuple[int, int]:

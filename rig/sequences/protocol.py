@@ -1,7 +1,7 @@
 """Protocol checks: what every controller must do on the bus, judged in every run whatever the sequence.
 
-They need the rows of the run, the rows of the probes (rig/run/probe.py), heartbeat and EMCY times. Pure functions: no
-bus, no clock. docs/sequences.md lists the checks and their default limits.
+They need the rows of the run and of the probes (rig/run/bring_up.py), heartbeat and EMCY times. Pure functions: no bus,
+no clock. docs/sequences.md lists the checks and their default limits.
 """
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.controller import Loop, compute_current
+from plant.quantity import Quantity
 from plant.segments import Array, Second
 from plant.signals import Signal
-from rig.benches.bench import Bench, Flags
+from rig.benches.bench import Bench, Flags, Role
 from rig.benches.bench_file import load_bench
 from rig.benches.canopen_map import name_object
-from rig.benches.frame_map import Role
 from rig.benches.profiles import (
     CIA402,
     CIA408,
@@ -31,9 +31,7 @@ from rig.benches.profiles import (
     list_reachable,
     list_transitions,
 )
-from rig.sequences.checks import CheckResult, SkippedCheck
-from rig.sequences.measures import map_words
-from rig.tables import Range
+from rig.sequences.checks import CheckResult, SkippedCheck, map_words
 
 Mask = NDArray[np.bool_]
 Whole = NDArray[np.int64]
@@ -42,7 +40,7 @@ NO_FRAME = "no drive frame came"
 HEARTBEAT = "heartbeat"  # the signal of those about heartbeats
 _LEVELS, _READY = CIA408.ladder[-1], 0x8  # of control and status word of CiA 408
 LONGEST_STEP_DELAY = 0.1  # s: the probe's step lasts as long
-UpToOneSecond = Annotated[float, Range("s", above=0.0, high=1.0)]
+UpToOneSecond = Annotated[float, Quantity("s", above=0.0, high=1.0)]
 _BEFORE_EMCY = 20  # cycles: a fault may show in the status word before its EMCY has been read
 
 
@@ -61,15 +59,15 @@ class ProtocolLimits:
     """
 
     status: UpToOneSecond | None = None
-    idle_current: Annotated[float, Range("A", low=0.0)] = 0.0
-    missing: Annotated[float, Range("1", low=0.0, high=1.0)] | None = None
+    idle_current: Annotated[float, Quantity("A", low=0.0)] = 0.0
+    missing: Annotated[float, Quantity("1", low=0.0, high=1.0)] | None = None
     response_p50: UpToOneSecond | None = None
     response_p99: UpToOneSecond | None = None
     response_max: UpToOneSecond | None = None
     heartbeat: UpToOneSecond = 0.01
-    gain: Annotated[float, Range("1", above=0.0, below=1.0)] = 0.1
-    step_delay: Annotated[float, Range("s", low=0.0, high=LONGEST_STEP_DELAY)] = 0.0
-    emcy: tuple[Annotated[int, Range("1", low=1, high=0xFFFF)], ...] = ()
+    gain: Annotated[float, Quantity("1", above=0.0, below=1.0)] = 0.1
+    step_delay: Annotated[float, Quantity("s", low=0.0, high=LONGEST_STEP_DELAY)] = 0.0
+    emcy: tuple[Annotated[int, Quantity("1", low=1, high=0xFFFF)], ...] = ()
     probe: bool = True
 
     def find_delay(self, words: ProfileWords, rate: float) -> float:

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from plant import segments
+from plant import segments, tables
 from plant.errors import InputError
 from plant.model import build_bare_model, find_quantity, load_model
 from plant.parameters import parse_value
@@ -27,21 +27,19 @@ from plant.plants import Plant, find_plant
 from plant.profile import Profile, build_profile, list_section_names, parse_columns
 from plant.quantity import Quantity
 from plant.segments import RATE, Array, Csv, Hold, Segment
-from rig import tables
+from plant.tables import Place
 from rig.benches.calibration import Decision
 from rig.sequences import checks, faults
-from rig.sequences.checks import Check, Guard, PythonCheck
+from rig.sequences.checks import MAIN, Check, Guard, PythonCheck
 from rig.sequences.faults import Fault, Parameter, Plan, find_contradiction
-from rig.sequences.measures import MAIN
 from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.python_parts import PythonSegment, Step, load_function, require_function_name, run_file
 from rig.sequences.signals import find_tested, name_signals_of
 from rig.sequences.timing import TimingPolicy
-from rig.tables import Place, Range
 
 PHASES = ("setup", "main", "cleanup", "load")
 PREFLIGHT = "preflight.toml"
-Unsigned32 = Annotated[int, Range("1", low=0, high=0xFFFFFFFF)]
+Unsigned32 = Annotated[int, Quantity("1", low=0, high=0xFFFFFFFF)]
 
 
 @dataclass(frozen=True, kw_only=True)

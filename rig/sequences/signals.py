@@ -10,7 +10,7 @@ from contextvars import ContextVar
 from typing import Annotated
 
 from plant.signals import EHA, Signals
-from rig.tables import Choice
+from plant.tables import Choice
 
 _TESTED: ContextVar[Signals] = ContextVar("_TESTED", default=EHA)
 DERIVED = ("error", "speed")  # command less controlled signal, and the speed of the latter, beside the plant's signals

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from math import ceil
 from typing import Annotated, Literal
 
+from plant.quantity import Quantity
 from plant.segments import LONGEST
-from rig.tables import Range
 
-InCycle = Annotated[float, Range("s", above=0.0, high=0.1)]
+InCycle = Annotated[float, Quantity("s", above=0.0, high=0.1)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,12 +21,12 @@ class TimingPolicy:
 
     overruns: Literal["count", "abort"] = "count"
     # overruns in a row; None: any number with "count", none with "abort"
-    tolerate: Annotated[int, Range("1", low=0, high=1_000_000)] | None = None
-    share: Annotated[float, Range("1", low=0.0, high=1.0)] = 1e-3  # of all cycles; more make the timing invalid
-    grace: Annotated[float, Range("s", low=0.0, high=LONGEST)] = 0.1  # overruns in it do not count
+    tolerate: Annotated[int, Quantity("1", low=0, high=1_000_000)] | None = None
+    share: Annotated[float, Quantity("1", low=0.0, high=1.0)] = 1e-3  # of all cycles; more make the timing invalid
+    grace: Annotated[float, Quantity("s", low=0.0, high=LONGEST)] = 0.1  # overruns in it do not count
     sync: InCycle | None = None  # SYNC after it was due; None: half a cycle
     feedback: InCycle | None = None  # from SYNC to the feedback frame; None: half a cycle
-    operational: Annotated[float, Range("s", above=0.0, high=60.0)] = 1.0  # from NMT start to OPERATIONAL
+    operational: Annotated[float, Quantity("s", above=0.0, high=60.0)] = 1.0  # from NMT start to OPERATIONAL
 
     @property
     def most_in_a_row(self) -> int | None:

@@ -17,9 +17,8 @@ import numpy as np
 from plant.run import Columns
 from plant.segments import Array
 from plant.signals import Signals
-from rig.benches.bench import Bench
+from rig.benches.bench import Bench, Kind
 from rig.benches.calibration import WIDTHS, Decision, SensorCalibration
-from rig.benches.frame_map import Kind
 
 COVERAGE = 2.0  # k: U = k u, about 95 %
 DRAWS = 200  # a sensitivity to 1 %, what noise does to 5 %

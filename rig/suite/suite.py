@@ -23,6 +23,8 @@ from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table
 from fdi.report.run_report import MOODS as RUN_MOODS
 from fdi.report.run_report import format_limits, format_uncertainty, format_value, write_run_page
 from plant.errors import InputError, RigError
+from plant.quantity import Quantity
+from plant.tables import build_dataclass, decode_text, parse_table, read_file
 from rig import junit
 from rig.campaign.batch import UNLIMITED, run_in_processes
 from rig.evidence.requirements import (
@@ -39,10 +41,9 @@ from rig.run.outcome import INTERRUPTED, Outcome, describe_faults, describe_find
 from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import run_job
 from rig.sequences.checks import CheckResult, SkippedCheck
-from rig.tables import Range, build_dataclass, decode_text, parse_table, read_file
 
 Value = float | str
-Seed = Annotated[int, Range("1", low=0)]
+Seed = Annotated[int, Quantity("1", low=0)]
 MOST_CASES = 10_000
 
 
@@ -58,7 +59,7 @@ class CaseEntry:
     seed: Seed | tuple[Seed, ...] = 0
     effects: tuple[str, ...] = ()
     requirement: str | tuple[str, ...] = ()
-    timeout: Annotated[float, Range("s", above=0.0, high=1e6)] | None = None
+    timeout: Annotated[float, Quantity("s", above=0.0, high=1e6)] | None = None
     fdi: bool = False
 
     def __post_init__(self) -> None:

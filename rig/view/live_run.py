@@ -16,8 +16,7 @@ from plant.signals import EHA, Signals
 from rig import recorder
 from rig.benches.bench import Bench
 from rig.sequences import Sequence
-from rig.sequences.checks import Check
-from rig.sequences.measures import MAIN, RunData
+from rig.sequences.checks import MAIN, Check, RunData
 
 PHASES = ("set-up", "main", "clean-up")
 _AFTER_RUN = ("shut_off", "recovers")  # kinds that need all drive frames

@@ -18,7 +18,7 @@ from fdi.progress import Progress, ignore_progress
 from plant import Model, simulate
 from plant.lanes import Lanes
 from plant.monitor import FAULTS, Cell, Monitor, compute_cells
-from rig.bench.realtime import FLAGS, build_library, measure_median_duration
+from rig.bench.benchmarks import FLAGS, build_library, measure_median_duration
 from studies.peers.rivals import Race, Replay, Rival, explain_missing, explain_missing_gcc, race_rivals, skip_rival
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from plant import Model
 from plant.eha import compute_coefficients
-from rig.bench.realtime import build_library
+from rig.bench.benchmarks import build_library
 from studies.peers.rivals import Replay
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fdi.progress import Progress, ignore_progress
 from plant import Model, simulate
 from plant.lanes import STEPS, Lanes
-from rig.bench.realtime import FLAGS, SAME_ROUNDING, measure_median_duration
+from rig.bench.benchmarks import FLAGS, SAME_ROUNDING, measure_median_duration
 from studies.peers.libraries import Task, make_c_replay, make_jax_replay, make_progpy_replay
 from studies.peers.rivals import Race, Replay, Rival, explain_missing, explain_missing_gcc, race_rivals, skip_rival
 

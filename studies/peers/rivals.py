@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bench.realtime import GET_GCC, find_gcc, measure_durations
+from rig.bench.benchmarks import GET_GCC, find_gcc, measure_durations
 
 Array = NDArray[np.float64]
 Replay = Callable[[], Array]

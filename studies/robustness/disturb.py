@@ -29,10 +29,9 @@ import numpy as np
 from fdi.trace.trace import Trace
 from plant.errors import RigError
 from rig.benches.bench import Flags
-from rig.network.bus import open_can
+from rig.network.bus import Link, open_can
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
-from rig.network.link import Link
 from rig.network.udp import PORT, find_key
 from rig.recorder.recover import recover_log
 from studies.shipped_frames import COMMAND, DRIVE, FEEDBACK, SYNC, VALVE_STATE, unpack_frame

@@ -12,10 +12,9 @@ from typing import NamedTuple
 from fdi.progress import Progress, ignore_progress
 from plant.model import load_model
 from rig.benches.profiles import Control, Status
-from rig.network.bus import EmbeddedBus
+from rig.network.bus import EmbeddedBus, EmbeddedWire
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame, Node, Send
-from rig.network.link import EmbeddedWire
 from rig.network.master import BusError
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware

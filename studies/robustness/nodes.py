@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rig.firmware.build import build_controller
-from rig.network.bus import open_can
+from rig.network.bus import Link, open_can
 from rig.network.clock import WallClock
-from rig.network.link import Link
 from studies.robustness.disturb import wait_until
 from studies.robustness.fuzz import PAGE
 

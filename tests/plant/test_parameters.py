@@ -30,33 +30,33 @@ def refusal(changes: dict[str, object]) -> str:
 
 
 @pytest.mark.parametrize(("name", "value", "said"), [
-    ("spool.static_friction", -1, "at least 0 N and at most 1e+06 N, not -1"),
-    ("jack.mass", 0, "at least 0.01 kg"),
-    ("supply.pressure", 1e-300, "at least 100000 Pa and at most 1e+08 Pa, not 1e-300"),
-    ("supply.pressure", 201, "at least 100000 Pa"),  # bar
-    ("controller.current_limit", 1e300, "at most 20 A"),
-    ("constant_load.force", -1e7, "at least -1e+06 N"),
+    ("spool.static_friction", -1, "from 0 to 1e+06 N, not -1"),
+    ("jack.mass", 0, "from 0.01 to"),
+    ("supply.pressure", 1e-300, "from 100000 to 1e+08 Pa, not 1e-300"),
+    ("supply.pressure", 201, "from 100000 to 1e+08 Pa"),  # bar
+    ("controller.current_limit", 1e300, "to 20 A"),
+    ("constant_load.force", -1e7, "from -1e+06 to"),
     ("filter.clogging", 1.0, "below 1, not 1"),
-    ("filter.clogging", -0.1, "at least 0"),
+    ("filter.clogging", -0.1, "from 0 "),
     ("filter.law", "cubic", "one of sqrt, linear, pressure, not 'cubic'"),
     ("filter.law", 0.7, "one of sqrt, linear, pressure, not 0.7"),
     ("valve.flow_gain", "plenty", "not 'plenty'"),
     ("valve.flow_gain", "nan", "not nan"),
     ("valve.flow_gain", float("nan"), "not nan"),
     ("valve.flow_gain", float("inf"), "not inf"),
-    ("null_bias.current", float("-inf"), "at least -20 A and at most 20 A, not -inf"),
+    ("null_bias.current", float("-inf"), "from -20 to 20 A, not -inf"),
     pytest.param("valve.flow_gain", 10**400, "not 1000", id="400 digits"),
     ("valve.flow_gain", [1 << 20000], "not a huge value"),
     ("valve.flow_gain", True, "not True"),
     ("valve.flow_gain", None, "not None"),
     ("valve.flow_gain", [0.3], r"not [0.3]"),
-    ("controller.period", 1e-6, "at least 0.0001 s"),
+    ("controller.period", 1e-6, "from 0.0001 to"),
     ("spool.static_fricton", 3, "did you mean static_friction?"),
     ("spol.static_friction", 3, "did you mean spool?"),
     ("nothing.at_all", 3, "a known group"),
     ("spool", 3, "spool"),
     ("", 3, "a known group"),
-    ("sensor_lag.time", 1.0, "at most 0.1 s"),
+    ("sensor_lag.time", 1.0, "to 0.1 s"),
 ])
 def test_refused_by_name(name: str, value: object, said: str) -> None:
     text = refusal({name: value})
@@ -161,7 +161,7 @@ def test_model_file_round_trip(tmp_path_factory: pytest.TempPathFactory, changes
 
 @pytest.mark.parametrize(("text", "said"), [
     ("[spool\n", "TOML"),
-    pytest.param(f"[spool]\nmass = {'9' * 5000}", "TOML (Exceeds the limit (4300 digits)", id="5000 digits"),
+    pytest.param(f"[spool]\nmass = {'9' * 5000}", "at most 4300 digits", id="5000 digits"),
     ("[spool]\nstatic_friction = nan", "spool.static_friction"),
     ("[spool]\nstatic_fricton = 3", "did you mean static_friction?"),
     ("[spol]\nstatic_friction = 3", "did you mean spool?"),

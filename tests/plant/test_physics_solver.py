@@ -18,7 +18,7 @@ from fdi.trace.trace import Trace
 from plant import Actuator, Model, simulate
 from plant.effects import load_effects
 from plant.segments import Chirp, Hold, Ramp, Sine
-from rig.bench.plant import measure_accuracy
+from rig.bench.benchmarks import measure_accuracy
 from rig.cli import main
 
 GENTLE = build_profile((Hold(time=0.05), Ramp(to=1e-3, time=1.0), Sine(amplitude=3e-3, frequency=1.0, time=1.0),

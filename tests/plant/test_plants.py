@@ -146,7 +146,7 @@ def test_its_own_effect_may_have_the_name_of_a_shared_one(tmp_path: Path) -> Non
     ("resistance: Annotated[float, Quantity(\"ohm\", \"R\", low=0.01, high=100, tolerance=0.05)] = 2.0",
      "resistance: float = 2.0", "motor.*Annotated"),
     ("tolerance=0.05)] = 2.0", "tolerance=0.05)]", "motor.resistance.*nominal value"),
-    ("tolerance=0.05)] = 2.0", "tolerance=0.05)] = 2000.0", "motor.resistance.*at most 100 ohm"),
+    ("tolerance=0.05)] = 2.0", "tolerance=0.05)] = 2000.0", "motor.resistance.*to 100 ohm"),
     ("tolerance=0.05)] = 2.0", 'tolerance=0.05)] = "2"', "motor.resistance.*nominal value"),
     ('Signal("angle", "theta", "rad"', 'Signal("angle", "theta", ""', "signal angle.*unit"),
     ("return s.angle, s.current", "return (s.angle,)", "measure.*2 numbers, angle, current"),

@@ -9,15 +9,15 @@ from typing import Any
 import pytest
 from physics_cases import PREFLIGHT
 
-from rig.bench import realtime
+from rig.bench import benchmarks
 from studies.peers import __main__ as command
 from studies.peers import grid_runs, many_runs, rivals
 
-needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {realtime.GET_GCC}")
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {benchmarks.GET_GCC}")
 
 
 def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(realtime.shutil, "which", lambda name: None)
+    monkeypatch.setattr(benchmarks.shutil, "which", lambda name: None)
     monkeypatch.setattr(rivals.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr(command, "compare_many_runs", partial(many_runs.compare_many_runs, rounds=1, cycles=300))
     monkeypatch.setattr(command, "compare_grid_runs", partial(grid_runs.compare_grid_runs, rounds=1))

@@ -8,9 +8,8 @@ from contextlib import ExitStack, contextmanager
 from itertools import count
 from typing import Protocol
 
-from rig.network.bus import EmbeddedBus, open_can
+from rig.network.bus import EmbeddedBus, Link, open_can
 from rig.network.frame import Frame
-from rig.network.link import Link
 
 _SERIAL = count()
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from plant import Model
 from plant.profile import build_profile
-from rig.bench.plant import FRICTIONLESS, QUIET
+from rig.bench.benchmarks import FRICTIONLESS, QUIET
 from rig.sequences.sequence import load_sequence
 
 PREFLIGHT = load_sequence("preflight").main_profile().command

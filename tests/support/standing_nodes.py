@@ -8,8 +8,7 @@ from collections.abc import Iterator
 
 from c_program import run_program
 
-from rig.network.bus import open_can
-from rig.network.link import Link
+from rig.network.bus import Link, open_can
 from rig.network.node_objects import NAMES
 
 

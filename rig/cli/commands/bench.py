@@ -1,4 +1,4 @@
-"""`rig bench`: the project's own benchmarks. Each loads what it measures, and nothing else."""
+"""`rig bench`: the project's own benchmarks."""
 from __future__ import annotations
 
 import argparse
@@ -20,7 +20,7 @@ def run_command(args: argparse.Namespace) -> int:
 
 def measure_plant(args: argparse.Namespace, progress: Progress) -> Report:
     """The speed of the plant; with --accuracy also the error of its step."""
-    from rig.bench.plant import build_plant_report, measure_accuracy, run_benchmarks
+    from rig.bench.benchmarks import build_plant_report, measure_accuracy, run_benchmarks
     from rig.sequences import load_sequence
 
     command = load_sequence("preflight").main_profile().command
@@ -33,7 +33,7 @@ def measure_plant(args: argparse.Namespace, progress: Progress) -> Report:
 
 def measure_cycle(args: argparse.Namespace, progress: Progress) -> Report:
     """The cycle in real time."""
-    from rig.bench.realtime import build_realtime_report, choose_bus, measure_realtime
+    from rig.bench.benchmarks import build_realtime_report, choose_bus, measure_realtime
 
     bus = choose_bus(args.bus, args.seconds, args.blocks, 0.5)
     return build_realtime_report(measure_realtime(bus, args.seconds, args.blocks, progress))

@@ -11,8 +11,7 @@ from plant.faults import is_fault_file
 from plant.model import load_model
 from plant.plant_check import check_behaviour
 from rig.benches.bench_file import load_bench
-from rig.benches.bench_report import build_bench_report, collect_data, tabulate_frames
-from rig.benches.bus_load import list_loads
+from rig.benches.bench_report import build_bench_report, collect_data, list_loads, tabulate_frames
 from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.commands.list import build_list_report, list_faults
 from rig.cli.inputs import load_chosen_model, parse_changes

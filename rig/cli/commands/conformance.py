@@ -8,14 +8,13 @@ from pathlib import Path
 
 from fdi.output import write_text
 from plant.errors import InputError, RigError
+from rig.benches.bench import Role
 from rig.benches.bench_file import load_bench
-from rig.benches.frame_map import Role
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, show_progress
 from rig.conformance.run_cases import build_conformance_report, choose_cases, run_cases, write_junit
 from rig.conformance.target import DataSheet, Options, Target
-from rig.network.bus import choose_bus, open_can
+from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, choose_bus, open_can
 from rig.network.clock import VirtualClock, WallClock
-from rig.network.link import EmbeddedWire, Link, LinkWire, Wire
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.run.participants import EMBEDDED_NAMES, NodeProcesses, make_node_command, require_firmware_bus

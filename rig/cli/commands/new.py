@@ -16,12 +16,12 @@ from plant.effects import load_effects
 from plant.errors import InputError
 from plant.faults import EXAMPLE, WORD
 from plant.plants import load_plant
+from plant.tables import read_file
 from rig.benches.bench import decode_device_text
 from rig.benches.bench_file import load_bench
 from rig.benches.guess import UNSURE, guess_can, guess_canopen
 from rig.cli.answer import give_answer
 from rig.sequences import load_sequence
-from rig.tables import read_file
 
 
 def run_command(args: argparse.Namespace) -> int:

@@ -15,10 +15,9 @@ from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, give_answer
 from rig.cli.inputs import load_chosen_model
 from rig.network import heartbeat
-from rig.network.bus import can_open, choose_bus, open_can
+from rig.network.bus import Link, can_open, choose_bus, open_can, serve_node
 from rig.network.clock import WallClock
 from rig.network.frame import Node
-from rig.network.link import Link, serve_node
 from rig.network.node_objects import CONTROLLER, PLANT, read_gains
 from rig.network.raw_bus import open_raw_bus
 from rig.nodes.emulator import Emulator, PlantPlace

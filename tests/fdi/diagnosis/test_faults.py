@@ -65,10 +65,10 @@ def test_the_papers_faults_are_a_file_with_the_limits_of_table_2() -> None:
     ({"acceptable": -1.0}, ["acceptable", "within the range"]),
     ({"range": [1e-5, 5e-4]}, ["range", "healthy size"]),
     ({"range": [-1.0, 1.0]}, ["range", "at least 0 m"]),
-    ({"range": [1.0]}, ["range", "[least, largest]"]),
+    ({"range": [1.0]}, ["range", "[a number, a number]"]),
     ({"unit": "mm"}, ["unit", "m, that of feedback_gap.gap"]),
-    ({"mantenance": 1.0}, ["mantenance", "did you mean maintenance?"]),
-    ({"title": None}, ["also the key title"]),
+    ({"mantenance": 1.0}, ["mantenance", "did you mean 'maintenance'?"]),
+    ({"title": None}, ["also the key 'title'"]),
     ({"acceptable": "much"}, ["acceptable", "a number"]),
     ({"follow": ["jack.mass"]}, ["follow", "table of factors"]),
     ({"follow": {"no.such": 1.0}}, ["follow", "plant eha"]),
@@ -78,12 +78,12 @@ def test_the_papers_faults_are_a_file_with_the_limits_of_table_2() -> None:
 def test_a_bad_fault_is_one_line_with_status_2(tmp_path: Path, keys: dict[str, Any], words: list[str]) -> None:
     file = write(tmp_path / "bad.toml", **keys)
     text = catch_refusal(load_faults, file)
-    assert "bad.toml: faults.play" in text and "\n" not in text and all(word in text for word in words), text
+    assert "bad.toml" in text and "faults.play" in text and "\n" not in text and all(word in text for word in words), text
 
 
 def test_bad_files_and_lists(tmp_path: Path) -> None:
     for content, word in (("", "at least one table"), ("[faults]\n", "at least one table"), ("x = 1\n", "only tables"),
-                          ("[faults.a]\n", "also the key title"), ("[faults\n", "TOML")):
+                          ("[faults.a]\n", "also the key 'title'"), ("[faults\n", "TOML")):
         (tmp_path / "bad.toml").write_text(content)
         assert word in catch_refusal(load_faults, tmp_path / "bad.toml")
     write(tmp_path / "two.toml").open("a").write((tmp_path / "two.toml").read_text().replace("play]", "other]"))

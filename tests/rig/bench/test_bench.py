@@ -15,8 +15,8 @@ from rig_command import answer, refuse, rig
 from vcan_host import kernel_has_vcan0
 
 from fdi.report.terminal import format_report
-from rig.bench import plant, realtime
-from rig.bench.realtime import (
+from rig.bench import benchmarks
+from rig.bench.benchmarks import (
     COMPILED,
     CYCLICTEST,
     IN_C,
@@ -26,24 +26,23 @@ from rig.bench.realtime import (
     run_c_responder,
     summarise_contenders,
 )
-from rig.network.bus import open_can
-from rig.network.link import Link
+from rig.network.bus import Link, open_can
 
-needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {realtime.GET_GCC}")
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {benchmarks.GET_GCC}")
 
 
 @needs_gcc
 def test_c_and_python_take_the_same_step() -> None:
-    cost = plant.compare_step_with_c(PREFLIGHT, rounds=3)
+    cost = benchmarks.compare_step_with_c(PREFLIGHT, rounds=3)
     assert cost is not None and cost["identical"] and cost["ratio"] > 0.0
     assert cost["difference"] < 1e-9  # m, with another rounding: no more than stick-slip makes of it
 
 
 def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """And the JSON answer has what was measured."""
-    monkeypatch.setattr(realtime.shutil, "which", lambda name: None)
+    monkeypatch.setattr(benchmarks.shutil, "which", lambda name: None)
     for name, value in (("bus_run_speed", 10.0), ("run_process_speed", 6.0), ("help_time", 0.1)):
-        monkeypatch.setattr(plant, f"measure_{name}", lambda value=value: value)
+        monkeypatch.setattr(benchmarks, f"measure_{name}", lambda value=value: value)
     words = " ".join(rig("bench").out.split())
     assert "C skipped: gcc is not installed; to get it: apt-get install gcc" in words
     told = answer("bench", "--out", tmp_path / "b.json")
@@ -52,13 +51,13 @@ def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
 
 
 def test_whole_processes_are_timed() -> None:
-    assert plant.measure_help_time(rounds=1) > 0
-    assert plant.measure_run_process_speed(rounds=1) > 0
+    assert benchmarks.measure_help_time(rounds=1) > 0
+    assert benchmarks.measure_run_process_speed(rounds=1) > 0
 
 
 def test_a_path_that_cannot_be_written_is_told_in_one_line(
         monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(plant, "run_benchmarks", lambda command, progress: {
+    monkeypatch.setattr(benchmarks, "run_benchmarks", lambda command, progress: {
         "step": None, "times_real_time": 1.0, "cycle": 1.0, "lockstep": 1.0, "run_process": 1.0, "help_process": 1.0})
     line = refuse("bench", "--out", tmp_path / "none" / "b.json", "--quiet")
     assert "--out" in line and "none/b.json: expected a file that can be written (No such file" in line
@@ -142,7 +141,7 @@ def test_the_command_measures_everybody(bus_kind: str) -> None:
     assert figures["times_us"]["feedback_response"].keys() == there
     for name in there:
         assert figures["cycles"][name] >= 400 and figures["lost"][name] < figures["cycles"][name]
-    if realtime.find_cyclictest():
+    if benchmarks.find_cyclictest():
         assert figures["times_us"]["lateness"][CYCLICTEST]["p50"] > 0
 
 

@@ -11,8 +11,8 @@ from places import ROOT
 
 from dbc import EDS
 from plant.errors import InputError
+from rig.benches.bench import Guard, Kind, Role, pack
 from rig.benches.bench_file import list_benches, load_bench, load_bench_from_files
-from rig.benches.frame_map import Guard, Kind, Role, pack
 
 EXAMPLES = sorted(ROOT.glob("examples/*/bench.toml"))
 

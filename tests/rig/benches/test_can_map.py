@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from plant.errors import InputError
+from rig.benches.bench import EXTENDED, FD, SWITCHED, FrameSpec, Kind, Role, extract_bits, pack, unpack
 from rig.benches.bench_file import load_bench_from_files
-from rig.benches.frame_map import EXTENDED, FD, SWITCHED, FrameSpec, Kind, Role, extract_bits, pack, unpack
 from rig.benches.packing import PAYLOAD, find_frame, list_frame_places, make_layout
 
 INPUTS = {"position_demand": ("mm", 1e-3), "ram_position": ("m", 1.0), "load_pressure": ("bar", 1e5),

@@ -13,9 +13,9 @@ from device_files import NODE, OBJECTS, RPDOS, TPDOS, Entry, Mapped, format_eds
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rig.benches.bench import EXTENDED, Kind, Role, extract_bits, pack, unpack
 from rig.benches.bench_file import load_bench_from_files
 from rig.benches.canopen_map import list_values, read_dictionary
-from rig.benches.frame_map import EXTENDED, Kind, Role, extract_bits, pack, unpack
 
 # data type of CiA 301: bits
 TYPES = {0x01: 1, 0x02: 8, 0x03: 16, 0x04: 32, 0x10: 24, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64, 0x05: 8, 0x06: 16,

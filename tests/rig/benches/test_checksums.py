@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from plant.errors import InputError
+from rig.benches.bench import Field, Guard
 from rig.benches.checksums import compute_checksum, compute_crc8, load_checksum
-from rig.benches.frame_map import Field, Guard
 
 # AUTOSAR SWS CRC Library, 7.2.1.2 and 7.2.1.3: data, CRC-8 (SAE J1850), CRC-8 with polynomial 0x2F
 PUBLISHED = """00000000 59 12; F20183 37 C2; 0FAA0055 79 C6; 00FF5511 B8 77; 332255AABBCCDDEEFF CB 11; 926B55 8C 33;

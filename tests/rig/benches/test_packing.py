@@ -1,4 +1,4 @@
-"""Compiled packing: the same bits as frame_map.py, which the other tests compare with cantools and canopen."""
+"""Compiled packing: the same bits as bench.py, which the other tests compare with cantools and canopen."""
 from __future__ import annotations
 
 import random
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plant.compile import compile_function
-from rig.benches.frame_map import Field, FrameSpec, Guard, Kind, Role, check_guards, pack, unpack
+from rig.benches.bench import Field, FrameSpec, Guard, Kind, Role, check_guards, pack, unpack
 from rig.benches.packing import (
     ACCEPTED,
     FRAMES_AT,

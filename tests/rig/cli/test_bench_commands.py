@@ -14,16 +14,14 @@ from rig_command import refuse, rig
 
 from plant.signals import EHA
 from rig import doctor
-from rig.benches.bench import list_inputs, list_outputs
+from rig.benches.bench import EXTENDED, FD, Role, list_inputs, list_outputs, pack
 from rig.benches.bench_file import ControllerKeys, NodeKeys, load_bench
-from rig.benches.bus_load import list_loads
+from rig.benches.bench_report import list_loads
 from rig.benches.checksums import CHECKSUMS
-from rig.benches.frame_map import EXTENDED, FD, Role, pack
 from rig.benches.guess import UNSURE
-from rig.network.bus import open_can
+from rig.network.bus import Link, open_can
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
-from rig.network.link import Link
 
 PAGE = (ROOT / "docs" / "bench.md").read_text()
 DRIVE, ECU = ROOT / "examples" / "cia402_drive", ROOT / "examples" / "can_ecu"

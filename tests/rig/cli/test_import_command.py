@@ -151,7 +151,7 @@ BAD = {
     "unknown signal": (MAP + "[signals.p21]\nsource = 'p12'", "signals.p21", "did you mean p12?"),
     "no current": (MAP.split("[signals.cor]")[0], "signals.cor: expected a table", "Cor"),
     "no time": (MAP.replace("[time]\nsource", "[trace]\nperiod"), "trace.period: expected a period above 0 s", "'t'"),
-    "not TOML": ("[time", "expected TOML (", ""),
+    "not TOML": ("[time", "expected TOML;", ""),
     "column that goes back": (MAP.replace('source = "t"', 'source = "com"'), "own.csv: com: expected times that grow",
                               "row 2"),
     "counter without rate": (MAP.replace('source = "t"', 'source = "t"\nbits = 16'), "time: expected source and rate",

@@ -16,9 +16,9 @@ from rig.conformance.run_cases import Outcome, choose_cases, run_cases
 from rig.conformance.target import DataSheet, Options, Target, Verdict
 from rig.device import NmtState, SdoAbort
 from rig.device.dictionary import INVALID
+from rig.network.bus import Done, EmbeddedWire
 from rig.network.clock import VirtualClock
 from rig.network.frame import Send
-from rig.network.link import Done, EmbeddedWire
 from rig.nodes.firmware import Firmware
 
 

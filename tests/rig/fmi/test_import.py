@@ -13,10 +13,10 @@ from rig_command import answer, refuse, rig
 from fdi.trace.trace import Trace
 from plant import RigError, load_model, simulate
 from plant.lanes import Lanes
+from plant.tables import Place
 from rig.fmi import foreign
 from rig.fmi.export import export_fmu
 from rig.fmi.foreign import Port, Unit, find_variable, read_description
-from rig.tables import Place
 
 pytest.importorskip("fmpy")
 from foreign_fmu import build_fmu

@@ -12,10 +12,10 @@ import pytest
 from bus_stations import gather, spec, stations
 
 from plant.errors import RigError
-from rig.network.bus import open_can
+from rig.benches.bench import EXTENDED, FD, SWITCHED
+from rig.network.bus import Link, open_can
 from rig.network.can_interface import UdpBus
-from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, Frame, find_cob_id
-from rig.network.link import Link
+from rig.network.frame import FD_LENGTHS, Frame, find_cob_id
 from rig.network.udp import PORT
 
 only_socketcan = pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
@@ -35,12 +35,12 @@ class TestEveryBus:
         identifiers = [cob_id | wide for cob_id in (0, 0x7F, 0x80, 0x182, 0x7FF) for wide in (0, EXTENDED)]
         identifiers += [EXTENDED | 0x800, EXTENDED | 0x18FEF1AB, EXTENDED | 0x1FFFFFFF]
         sent = [(cob_id, bytes(range(0xF0, 0xF0 + length))) for length in (0, 1, 8) for cob_id in identifiers]
-        sent += [(cob_id | FD_FRAME, data) for cob_id, data in sent]
-        sent += [(cob_id | FD_FRAME, bytes(range(length))) for length in FD_LENGTHS for cob_id in identifiers]
+        sent += [(cob_id | FD, data) for cob_id, data in sent]
+        sent += [(cob_id | FD, bytes(range(length))) for length in FD_LENGTHS for cob_id in identifiers]
         sent += [(n % 0x700, struct.pack("<I", n)) for n in range(150)]
         with stations(bus_kind, fd=True) as (sender, *others):
             for cob_id, data in sent:
-                sender.send(cob_id | BIT_RATE_SWITCH if cob_id & FD_FRAME else cob_id, data)
+                sender.send(cob_id | SWITCHED if cob_id & FD else cob_id, data)
             for station in others:
                 assert contents(gather(station, len(sent))) == sent
             assert sender.poll(0.02) == []
@@ -86,11 +86,11 @@ class TestLink:
     def test_frames_are_left_out_and_taken_again(self, bus_kind: str) -> None:
         """As another socket of the program receives them."""
         identifiers = (0x000, 0x07F, 0x080, 0x0FF, 0x182, 0x183, 0x202, 0x7FF, EXTENDED | 0x080, EXTENDED | 0x7F,
-                       EXTENDED | 0x18FEF1AB, EXTENDED | 0x18FEF2AB, FD_FRAME | 0x200, FD_FRAME | EXTENDED | 0x12345)
+                       EXTENDED | 0x18FEF1AB, EXTENDED | 0x18FEF2AB, FD | 0x200, FD | EXTENDED | 0x12345)
         with stations(bus_kind, 2, fd=True) as (sender, receiver):
             assert isinstance(receiver, Link)
-            for left_out in ((0x080, 0x182, 0x000), (), (0x7FF, 0x07F), (), (EXTENDED | 0x080, FD_FRAME | 0x200),
-                             (EXTENDED | 0x18FEF1AB, FD_FRAME | EXTENDED | 0x12345, 0x7F)):
+            for left_out in ((0x080, 0x182, 0x000), (), (0x7FF, 0x07F), (), (EXTENDED | 0x080, FD | 0x200),
+                             (EXTENDED | 0x18FEF1AB, FD | EXTENDED | 0x12345, 0x7F)):
                 receiver.leave_out(left_out)
                 for cob_id in (*identifiers, 0x123):
                     sender.send(cob_id, b"1")
@@ -138,7 +138,7 @@ class TestLink:
                     sent = can.Message(arbitration_id=0x123, is_extended_id=is_extended, data=data, **flags)
                     other.send(sent)
                     (frame,) = gather(link, 1)
-                    assert frame.cob_id == find_cob_id(sent) & ~BIT_RATE_SWITCH and frame.data == data
+                    assert frame.cob_id == find_cob_id(sent) & ~SWITCHED and frame.data == data
                     link.send(find_cob_id(sent), data)
                     heard = other.recv(60)
                     assert heard is not None
@@ -159,7 +159,7 @@ class TestLink:
     @links
     def test_a_length_that_no_such_frame_has_is_refused(self, bus_kind: str) -> None:
         with stations(bus_kind, 1, fd=True) as (station,):
-            for cob_id, length in ((0x80, 9), (EXTENDED, 12), (FD_FRAME | 0x80, 9), (FD_FRAME | 0x80, 65)):
+            for cob_id, length in ((0x80, 9), (EXTENDED, 12), (FD | 0x80, 9), (FD | 0x80, 65)):
                 with pytest.raises(RigError, match=f"{length} bytes; a CAN frame has 0 to 8"):
                     station.send(cob_id, bytes(length))
 

@@ -7,8 +7,8 @@ from typing import Any
 import can
 import pytest
 
-from rig.network import link as link_module
-from rig.network.link import Link
+from rig.network import bus as bus_module
+from rig.network.bus import Link
 
 HOUR = 3600 * 10**9  # ns
 SECOND = 10**9
@@ -40,7 +40,7 @@ class Kernel:
 def test_a_frame_is_never_from_the_future_nor_older_than_the_one_before(step: int,
                                                                        monkeypatch: pytest.MonkeyPatch) -> None:
     kernel = Kernel()
-    monkeypatch.setattr(link_module.time, "time_ns", lambda: kernel.wall)
+    monkeypatch.setattr(bus_module.time, "time_ns", lambda: kernel.wall)
     link = Link(can.Bus(interface="virtual", channel="clock steps"), lambda: kernel.monotonic)
     link._socket = kernel  # type: ignore[assignment]
     times, true = [], []

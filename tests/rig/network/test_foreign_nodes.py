@@ -14,12 +14,11 @@ import pytest
 from device_files import BENCH, OBJECTS, RPDOS, TPDOS, Entry, Mapped, format_eds, write_bench
 
 from plant import InputError
-from rig.benches.bench import Bench
+from rig.benches.bench import Bench, Role
 from rig.benches.bench_file import load_bench
-from rig.benches.frame_map import Role
+from rig.network.bus import EmbeddedWire
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame, Send
-from rig.network.link import EmbeddedWire
 from rig.network.master import BusError, Master
 from rig.network.node_objects import NmtState
 

@@ -21,18 +21,10 @@ from hypothesis import strategies as st
 
 from plant.compile import compile_function
 from plant.errors import InputError, RigError
+from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.network import raw_bus
 from rig.network.bus import can_open, open_can
-from rig.network.frame import (
-    BIT_RATE_SWITCH,
-    EXTENDED,
-    FD_FRAME,
-    FD_LENGTHS,
-    IDENTIFIER,
-    find_cob_id,
-    has_valid_length,
-    make_message,
-)
+from rig.network.frame import FD_LENGTHS, IDENTIFIER, find_cob_id, has_valid_length, make_message
 from rig.network.raw_bus import (
     FAILED,
     FRAME,
@@ -84,7 +76,7 @@ def other(where: str) -> Iterator[can.BusABC]:
 class TestFrames:
     def test_frames_go_to_and_fro_between_python_can_and_compiled_code(self, where: str) -> None:
         """Of all kinds and lengths; the payload of a frame up to 8 bytes is a number, that of every frame its bytes."""
-        kinds = [flags | wide for flags in (0, FD_FRAME, FD_FRAME | BIT_RATE_SWITCH) for wide in (0, EXTENDED)]
+        kinds = [flags | wide for flags in (0, FD, FD | SWITCHED) for wide in (0, EXTENDED)]
         cob_ids = [kind | number for kind in kinds for number in (0, 0x7F, 0x80, 0x182, 0x7FF)]
         cob_ids += [kind | number for kind in kinds if kind & EXTENDED for number in (0x800, 0x18FEF1AB, IDENTIFIER)]
         receive = function("receive_frame")
@@ -96,7 +88,7 @@ class TestFrames:
                     sent = make_message(cob_id, data)
                     other.send(sent)
                     status, t_ns, *rest = receive(bus.port, soon())
-                    assert (status, *rest) == (FRAME, cob_id & ~BIT_RATE_SWITCH, length, payload(data[:8]))
+                    assert (status, *rest) == (FRAME, cob_id & ~SWITCHED, length, payload(data[:8]))
                     assert bytes(bus.port.octets[PAYLOAD_IN: PAYLOAD_IN + length]) == data
                     assert 0 <= time.monotonic_ns() - t_ns < 60e9
                     bus.port.octets[PAYLOAD_OUT: PAYLOAD_OUT + length] = np.frombuffer(data, np.uint8)
@@ -110,7 +102,7 @@ class TestFrames:
 
     def test_only_the_kinds_asked_for_arrive(self, where: str) -> None:
         """One number is four identifiers: of 11 or 29 bits, classical or CAN FD."""
-        kinds = (0, EXTENDED, FD_FRAME, EXTENDED | FD_FRAME)
+        kinds = (0, EXTENDED, FD, EXTENDED | FD)
         with open_can(where, fd=True) as other:
             for wanted in kinds:
                 with open_raw_bus(where, [number | wanted for number in (0x12, 0xFF, 0x183)], fd=True) as bus:
@@ -119,13 +111,13 @@ class TestFrames:
                             other.send(make_message(number | kind, b"\1"))
                     assert receive_waiting(bus.port) == [number | wanted for number in (0x12, 0xFF, 0x183)]
                     bus.set_filter([EXTENDED | 0x12345678, 0x80])
-                    for number in (0x12, EXTENDED | 0x12345678, EXTENDED | 0x12345679, FD_FRAME | 0x80, 0x80):
+                    for number in (0x12, EXTENDED | 0x12345678, EXTENDED | 0x12345679, FD | 0x80, 0x80):
                         other.send(make_message(number, b""))
                     assert receive_waiting(bus.port) == [EXTENDED | 0x12345678, 0x80]
 
     def test_a_length_that_no_such_frame_has_fails(self, where: str) -> None:
         with open_raw_bus(where, (), fd=True) as bus:
-            for cob_id, length in ((0x80, 9), (EXTENDED | 0x80, 12), (FD_FRAME | 0x80, 9), (FD_FRAME | 0x80, 65)):
+            for cob_id, length in ((0x80, 9), (EXTENDED | 0x80, 12), (FD | 0x80, 9), (FD | 0x80, 65)):
                 status = function("send_payload")(bus.port, cob_id, length)
                 assert status == FAILED and "Invalid argument" in str(bus.explain_failure(status))
 
@@ -204,7 +196,7 @@ def read_by_python_can(data: bytes) -> tuple[int, ...]:
         return (1,)
     if message.is_remote_frame:
         return (2,)
-    cob_id, data = find_cob_id(message) & ~BIT_RATE_SWITCH, bytes(message.data)
+    cob_id, data = find_cob_id(message) & ~SWITCHED, bytes(message.data)
     if not has_valid_length(cob_id, len(data)):
         return (1,)
     return 0, cob_id, len(data), payload(data[:8]), data
@@ -247,8 +239,8 @@ class TestDatagrams:
 
     @given(st.integers(0, IDENTIFIER), st.binary(max_size=64), st.sets(st.sampled_from(range(3))))
     def test_packs_as_python_can_does(self, number: int, data: bytes, kinds: set[int]) -> None:
-        flags = sum((EXTENDED, FD_FRAME, BIT_RATE_SWITCH)[kind] for kind in kinds)
-        if not flags & FD_FRAME:
+        flags = sum((EXTENDED, FD, SWITCHED)[kind] for kind in kinds)
+        if not flags & FD:
             flags, data = flags & EXTENDED, data[:8]
         cob_id = flags | number & (IDENTIFIER if flags & EXTENDED else 0x7FF)
         PORT.octets[PAYLOAD_OUT: PAYLOAD_OUT + len(data)] = np.frombuffer(data, np.uint8)
@@ -286,7 +278,7 @@ class TestDatagrams:
             bits = fields.get("data") or b""
             cob_id = fields["arbitration_id"]
             cob_id |= EXTENDED if fields.get("is_extended_id", True) else 0
-            cob_id |= FD_FRAME if fields.get("is_fd") else 0
+            cob_id |= FD if fields.get("is_fd") else 0
             assert seen == (0, cob_id, len(bits), payload(bits[:8]), bits)
             assert fields["dlc"] == len(bits)
             assert not (fields.get("is_remote_frame") or fields.get("is_error_frame"))

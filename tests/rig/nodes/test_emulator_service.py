@@ -18,10 +18,9 @@ from plant import Model
 from plant.compile import compile_function
 from rig.benches.bench_file import load_bench
 from rig.device import NmtState
-from rig.network.bus import open_can
+from rig.network.bus import Link, open_can, serve_node
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
-from rig.network.link import Link, serve_node
 from rig.network.node_objects import decode_cycle_record
 from rig.network.raw_bus import make_closed_port, open_raw_bus
 from rig.nodes import emulator_cycle as ec

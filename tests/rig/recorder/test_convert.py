@@ -13,8 +13,9 @@ from synthetic_run import record_run
 import dbc
 from fdi.trace.trace import Trace
 from plant.errors import InputError
+from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.benches.bench_file import load_bench
-from rig.network.frame import BIT_RATE_SWITCH, EXTENDED, FD_FRAME, FD_LENGTHS, Frame, make_message
+from rig.network.frame import FD_LENGTHS, Frame, make_message
 from rig.recorder import Recorder
 from rig.recorder.convert import (
     RAW_SUFFIXES,
@@ -52,12 +53,12 @@ def test_raw_frames_there_and_back(log: Path, tmp_path: Path, suffix: str) -> No
 @pytest.mark.parametrize("suffix", RAW_SUFFIXES)
 def test_every_kind_of_frame_there_and_back(tmp_path: Path, suffix: str) -> None:
     """Classical and CAN FD, of 11 and of 29 bits, also with the same number: as python-can reads and writes them."""
-    kinds = [0, EXTENDED] if suffix == ".trc" else [0, EXTENDED, FD_FRAME, EXTENDED | FD_FRAME]
-    kinds += [kind | BIT_RATE_SWITCH for kind in kinds if kind & FD_FRAME]
+    kinds = [0, EXTENDED] if suffix == ".trc" else [0, EXTENDED, FD, EXTENDED | FD]
+    kinds += [kind | SWITCHED for kind in kinds if kind & FD]
     frames = [Frame(0, 0x080, b"")]
     for kind in kinds:
         for number in (0, 0x080, 0x7FF, 0x1FFFFFFF if kind & EXTENDED else 0x123):
-            for length in (0, 3, 8, *(FD_LENGTHS if kind & FD_FRAME else ())):
+            for length in (0, 3, 8, *(FD_LENGTHS if kind & FD else ())):
                 frames.append(Frame(len(frames) * 1_000_000, kind | number, bytes(range(0xF0 - length, 0xF0))))
     recorder = Recorder(tmp_path / "x.mcap", {}, {})
     for frame in frames:
@@ -76,7 +77,7 @@ def test_every_kind_of_frame_there_and_back(tmp_path: Path, suffix: str) -> None
 
 def test_fd_frames_do_not_go_into_a_trc(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "x.mcap", {}, {})
-    recorder.frame(Frame(0, FD_FRAME | 0x80, bytes(64)))
+    recorder.frame(Frame(0, FD | 0x80, bytes(64)))
     recorder.close()
     with pytest.raises(InputError, match=r"x\.trc: --out: expected a name that ends in \.log, \.blf or \.asc"):
         export_trace(tmp_path / "x.mcap", tmp_path / "x.trc")

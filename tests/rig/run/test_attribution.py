@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.benches.bench import Flags
+from rig.benches.bench import Flags, Role
 from rig.benches.bench_file import load_bench
-from rig.benches.frame_map import Role
 from rig.network.master import StartTime
 from rig.network.node_objects import CONTROLLER, PLANT, RIG, CycleRecord
 from rig.run.attribution import (

@@ -18,8 +18,7 @@ from python_devices import CanDevice, CanopenDevice, PythonDevice, RemappedDevic
 from fdi.progress import ignore_progress
 from fdi.trace.trace import Trace
 from plant import simulate
-from rig.benches.bench import Bench
-from rig.benches.frame_map import Role
+from rig.benches.bench import Bench, Role
 from rig.recorder.convert import export_trace, import_frames
 from rig.run import loops
 from rig.run.job import JobChoice, build_job

@@ -22,17 +22,16 @@ from numba.core.event import install_recorder
 from plant import Model
 from plant.errors import RigError
 from rig.benches.bench_file import load_bench
-from rig.network.bus import open_can
+from rig.network.bus import Link, LinkWire, open_can
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
-from rig.network.link import Link, LinkWire
 from rig.network.master import Master
 from rig.network.raw_bus import open_raw_bus
 from rig.network.udp import PORT, Turn
 from rig.nodes.scenario import Scenario
 from rig.recorder import Signals, Timing
-from rig.run.cyclic_values import CycleInput
 from rig.run.hard_loop import HardLoop, compile_cycle
+from rig.run.loop import CycleInput
 from rig.sequences.faults import (
     BusOff,
     Corrupted,

@@ -9,14 +9,13 @@ import pytest
 
 from plant import Model
 from rig.benches.bench_file import load_bench
+from rig.network.bus import Link, LinkWire
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame
-from rig.network.link import Link, LinkWire
 from rig.network.master import Master
 from rig.nodes.scenario import Scenario
 from rig.recorder import Signals, Timing
-from rig.run.cyclic_values import CycleInput
-from rig.run.loop import CycleLoop
+from rig.run.loop import CycleInput, CycleLoop
 from rig.sequences.faults import Fault, Late, Lost, Plan, Schedule, Silent
 
 MS = 1_000_000  # ns

@@ -12,9 +12,8 @@ from rig_command import finished, rig, started
 from standing_nodes import wait_for_node
 
 from rig.benches.bench_file import load_bench
-from rig.network.bus import open_can
+from rig.network.bus import Link, LinkWire, open_can
 from rig.network.clock import WallClock
-from rig.network.link import Link, LinkWire
 from rig.network.master import BusError, Master
 from rig.network.node_objects import CONTROLLER, PLANT
 from rig.run import participants

@@ -18,9 +18,9 @@ from fdi.trace.trace import Trace
 from rig.network.frame import Frame
 from rig.recorder import Signals, Timing
 from rig.run import participants
+from rig.run.bring_up import find_gap
 from rig.run.loop import History
 from rig.run.outcome import Outcome
-from rig.run.probe import find_gap
 
 HOLD = 'title = "Holds"\nmain = [{ kind = "hold", time = 0.4 }]\n'
 MOVE = """

@@ -26,9 +26,8 @@ from fdi.report.run_report import build_run_report
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import CLEANUP, Trace
 from plant import simulate
-from rig.network.bus import open_can
+from rig.network.bus import Link, open_can
 from rig.network.frame import Frame
-from rig.network.link import Link
 from rig.network.node_objects import CONTROLLER, PLANT
 from rig.run import runner
 from rig.run.session import Session

@@ -19,10 +19,10 @@ from fdi.report.run_report import build_run_report, write_run_page
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import CLEANUP, MAIN, SETUP, Trace
 from plant import Actuator, InputError, RigError
-from rig.benches.frame_map import Role
+from rig.benches.bench import Role
+from rig.network.bus import EmbeddedWire
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Frame, Send
-from rig.network.link import EmbeddedWire
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.recorder import RecorderError

@@ -12,9 +12,8 @@ import pytest
 from plant.profile import build_profile
 from plant.run import Columns
 from plant.segments import RATE, Array, Hold, Ramp, Segment, Sine, Step
-from rig.sequences import checks, measures
-from rig.sequences.checks import CheckResult, Guard, GuardWatch, evaluate_checks
-from rig.sequences.measures import NO_DRIVES, DriveFrames
+from rig.sequences import checks
+from rig.sequences.checks import NO_DRIVES, CheckResult, DriveFrames, Guard, GuardWatch, evaluate_checks
 from rig.sequences.protocol import (
     Heartbeat,
     ProtocolLimits,
@@ -150,8 +149,8 @@ def test_speed_of_a_ramp() -> None:
 
 
 def test_noise_through_the_median_is_what_its_docstring_says() -> None:
-    assert np.std(measures.filter_median(noise(100_000), RATE)) == pytest.approx(1.1e-6, abs=0.05e-6)
-    assert np.std(measures.compute_speed(noise(100_000), RATE)) == pytest.approx(0.14e-3, abs=0.01e-3)
+    assert np.std(checks.filter_median(noise(100_000), RATE)) == pytest.approx(1.1e-6, abs=0.05e-6)
+    assert np.std(checks.compute_speed(noise(100_000), RATE)) == pytest.approx(0.14e-3, abs=0.01e-3)
 
 
 def test_response_to_a_fault_by_event_and_by_signal() -> None:
@@ -249,7 +248,7 @@ def test_a_measure_that_raises_or_has_no_end_has_failed(raised: Exception | None
         return float("inf")
 
     run, sections = follower(Hold(time=0.1), Step(to=1e-3, time=0.9, name="step"))
-    monkeypatch.setattr(measures, "measure_overshoot", broken)
+    monkeypatch.setattr(checks, "measure_overshoot", broken)
     both = [check("overshoot", window="step", low=0.0, high=None), check("rise_time", window="step")]
     spoilt, sound = evaluate_checks(both, run, sections)
     assert (spoilt.passed, isnan(spoilt.value), spoilt.detail) == (False, True, said)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from refusals import catch_refusal
 
-from plant import load_model, simulate
+from plant import load_model, simulate, tables
 from plant.errors import InputError
-from rig import tables
 from rig.sequences.checks import CheckResult, evaluate_checks
 from rig.sequences.sequence import Sequence, load_sequence, parse_sequence
 
@@ -138,7 +137,7 @@ BAD = [  # text, then what the user reads
     (HEAD + 'faults = [{ kind = "parameter", parameter = "filter.cloging", value = 1, start = 0 }]\n',
      "mine.toml:3: faults[0].parameter: expected a field of filter"),
     (HEAD + 'faults = [{ kind = "parameter", parameter = "filter.clogging", value = 1.5, start = 0 }]\n',
-     "mine.toml:3: faults[0].value: expected a number at least 0 and below 1"),
+     "mine.toml:3: faults[0].value: expected a number from 0 and below 1"),
     (HEAD + 'faults = [\n{ kind = "parameter", parameter = "controller.period", value = 0.002, start = 0 }]\n',
      "mine.toml:4: faults[0].parameter: expected a parameter of the plant, not 'controller.period': the controller is "
      "the thing under test, no fault reaches into it"),

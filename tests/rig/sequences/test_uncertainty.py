@@ -22,7 +22,7 @@ from plant.segments import Array
 from rig.benches.bench_file import load_bench
 from rig.benches.calibration import SensorCalibration
 from rig.sequences import checks, uncertainty
-from rig.sequences.measures import RunData
+from rig.sequences.checks import RunData
 from rig.sequences.uncertainty import WIDTHS, Decision, Metrology, decide
 
 SIZE, FINE = 1e-3, 25  # m, of the step; instants of the true motion for each sample

@@ -1,7 +1,7 @@
 """Reads TOML text into frozen dataclasses. Errors name file and line, key, and what was expected there.
 
 The dataclass is the schema: its fields are the keys, its annotations the types (`Annotated[float, "s"]` adds the unit,
-`Annotated[float, Range("s", low=0)]` unit and range), its defaults say what may be left out. A base class whose
+`Annotated[float, Quantity("s", low=0)]` unit and range), its defaults say what may be left out. A base class whose
 kinds are told apart by the key `kind` is read by the table of kinds given for it. A field with metadata {"key": False}
 is the program's own, not a key; one with the name `kind` gets the kind.
 """
@@ -13,42 +13,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import MISSING, dataclass, field, fields
 from difflib import get_close_matches
-from math import inf, isfinite
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from plant.errors import InputError, show_value
+from plant.quantity import Quantity
 
 T = TypeVar("T")
 Kinds = Mapping[type, Mapping[str, type]]  # base class -> {kind: class with its keys}
-
-
-class Range(NamedTuple):
-    """Unit and range of a number of a file. `low` and `high` are allowed; `above` and `below` are not."""
-
-    unit: str
-    low: float = -inf
-    high: float = inf
-    above: float = -inf
-    below: float = inf
-
-    def refuses(self, value: float) -> bool:
-        """True for a value outside the range."""
-        return not (self.low <= value <= self.high and self.above < value < self.below)
-
-    @property
-    def expected(self) -> str:
-        """The range in words.
-
-        >>> Range("s", low=0.0, high=3600.0).expected, Range("1", above=0.0, high=1.0).expected
-        ('from 0 to 3600 s', 'above 0 and at most 1')
-        """
-        bounds = {"from": self.low, "above": self.above, "at most": self.high, "below": self.below}
-        said = [f"{word} {bound if isinstance(bound, int) else format(bound, 'g')}" for word, bound in bounds.items()
-                if isfinite(bound)]
-        text = " and ".join(said).replace(" and at most", " to") if "from" in said[0] else " and ".join(said)
-        return text if self.unit == "1" else f"{text} {self.unit}"
 
 
 class Choice(NamedTuple):
@@ -131,18 +104,21 @@ def parse_table(text: str, file: str) -> tuple[dict[str, Any], Place]:
         raise InputError(file, "", "TOML with fewer levels of brackets or parts of a key") from error
 
 
-def build_dataclass(cls: type[T], table: object, place: Place, kinds: Kinds | None = None) -> T:
-    """A `cls` from the table at `place`; raises InputError for a key or value it cannot be made from."""
+def build_dataclass(cls: type[T], table: object, place: Place, kinds: Kinds | None = None, **given: Any) -> T:
+    """A `cls` from the table at `place`; raises InputError for a key or value it cannot be made from.
+
+    `given`: fields that are no keys.
+    """
     kinds = kinds or {}
     if not isinstance(table, dict):
         raise place.refuse("a table")
-    pairs, made = dict(table), {}
+    pairs, made = dict(table), given
     if cls in kinds:
         kind = pairs.pop("kind", None)
         if not isinstance(kind, str) or kind not in kinds[cls]:
             raise (place.at("kind") if kind is not None else place).refuse(f"a kind: {list_choices(kind, kinds[cls])}")
         cls = kinds[cls][kind]
-        made = {f.name: kind for f in fields(cls) if f.name == "kind"}  # type: ignore[arg-type]
+        made |= {f.name: kind for f in fields(cls) if f.name == "kind"}  # type: ignore[arg-type]
     hints = get_type_hints(cls, include_extras=True)
     known = {f.name: f for f in fields(cls) if f.metadata.get("key", True)}  # type: ignore[arg-type]
     for key in pairs:
@@ -179,7 +155,7 @@ def _convert(value: Any, hint: Any, place: Place, kinds: Kinds) -> Any:
             raise place.refuse(list_choices(value, choice.list_names()))
         return name
     if bare in _SCALARS:
-        if _is_scalar(value, bare) and not any(isinstance(note, Range) and note.refuses(value) for note in notes):
+        if _is_scalar(value, bare) and not any(isinstance(note, Quantity) and note.refuses(value) for note in notes):
             return bare(value)
     elif bare is Any:
         return value
@@ -235,7 +211,7 @@ def describe_annotation(hint: Any) -> str:
         note = args[1]
         if isinstance(note, Choice):
             return note.expected
-        return f"{words} {note.expected}" if isinstance(note, Range) else f"{words} in {note}"
+        return f"{words} {note.bounds}" if isinstance(note, Quantity) else f"{words} in {note}"
     if origin is Literal:
         return list_choices(None, args)
     if origin in (Union, UnionType):
