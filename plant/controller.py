@@ -1,4 +1,5 @@
-"""The controller: effects on the demand, then the law of the plant's controller, alone over recorded columns too."""
+"""Parts of the loop alone, over recorded columns: effects on the demand and the law of the plant's controller; and the
+equations of a plant turned round, where it declares them so."""
 from __future__ import annotations
 
 from typing import Any
@@ -7,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.flat import unpack_state
-from plant.kernels import control_plant, get_readings, start_control
+from plant.kernels import control_plant, get_readings, invert_plant, start_control
 from plant.model import Model, build_kernel
 from plant.pid import Loop, compute_current
 from plant.ports import at_command
@@ -53,3 +54,25 @@ def compute_answers(model: Model, com: Array, readings: Array) -> Array:
     run = build_kernel(run_controller, model.effects, plant=model.plant)
     run(model.build_flat_state(), com, np.ascontiguousarray(readings), model.build_record(), out)
     return out
+
+
+def compute_needed_drive(model: Model, motion: Array, load: Array) -> Array:
+    """The drive that a motion needs, (n,), in its unit.
+
+    Args:
+        model: of a plant with `inverse`.
+        motion: (n, 3) controlled signal, its rate and the rate of that, SI.
+        load: (n,) external load.
+    """
+    out = np.empty(len(motion))
+    run = build_kernel(fill_needed_drive, model.effects, plant=model.plant)
+    run(model.build_start()[1], np.ascontiguousarray(motion), np.ascontiguousarray(load), model.build_record(), out)
+    return out
+
+
+def fill_needed_drive(m: Memory, motion: Any, load: Any, record: Any, out: Any) -> None:
+    """Fills out[k] with the drive at row k."""
+    p = record[0]
+    for k in range(len(motion)):
+        u = Input(0.0, load[k], 0.0, k * p.controller.period, 0.0, p.controller.period)
+        out[k], m = invert_plant(motion[k, 0], motion[k, 1], motion[k, 2], m, u, p)
