@@ -10,9 +10,8 @@ from typing import Any, get_type_hints
 from catalogue_pages import make_plain_table
 from markdown_text import MADE, escape_markup, make_table, quote_code
 
-from plant import Model
+from plant import Model, tables
 from plant.segments import Segment
-from rig import tables
 from rig.cli.commands import list as list_command
 from rig.sequences import faults
 from rig.sequences.checks import KEYS, KINDS, Check, Guard
