@@ -3,7 +3,6 @@
 A recording, a model file and a folder of results are data that people send to each other. What they contain must not
 run on the machine of the person who opens them. A file that the user names on the command line is his own choice.
 """
-from __future__ import annotations
 
 import hashlib
 import sys

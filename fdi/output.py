@@ -1,5 +1,4 @@
 """Where a result is to go: asked before long work is done, and before anything that lies there is lost; or written."""
-from __future__ import annotations
 
 import contextlib
 import os

@@ -1,5 +1,4 @@
 """How long work reports its progress: one kind of callable for every command, study and estimate."""
-from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import count

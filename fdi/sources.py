@@ -1,5 +1,4 @@
 """Code by name and by content: functions named by the user, and hashes of the code that a result depends on."""
-from __future__ import annotations
 
 import hashlib
 import importlib

@@ -1,5 +1,4 @@
 """How a simulated run is tied to a measured signal: it starts where the sensor shows it, and is pulled there."""
-from __future__ import annotations
 
 from typing import Any
 

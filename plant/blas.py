@@ -4,7 +4,6 @@ OpenBLAS, which NumPy and SciPy use, chooses its code by the CPU and splits its 
 cores. Both change the last bits. A fit over stick-slip amplifies them: measured, up to 0.6 of the width of an interval
 (docs/statistics.md). OpenBLAS reads its settings when it is loaded, so this comes before the first import of NumPy.
 """
-from __future__ import annotations
 
 import os
 from pathlib import Path

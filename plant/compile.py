@@ -5,7 +5,6 @@ it calls, replaces the port functions by the model's effects, and compiles all o
 that passes the state through memory costs as much as the step. The machine code is stored under a hash of all sources
 that went in, so a changed effect never meets stale code. numba's own cache looks at one file only.
 """
-from __future__ import annotations
 
 import atexit
 import contextlib

@@ -1,6 +1,5 @@
 """Parts of the loop alone, over recorded columns: effects on the demand and the law of the plant's controller; and the
 equations of a plant turned round, where it declares them so."""
-from __future__ import annotations
 
 from typing import Any
 

@@ -6,7 +6,6 @@ will be in mid step. That leaves 1/170 of the error of the plain implicit scheme
 
 Names in capitals in the comments are the paper's symbols; functions named `at_<port>` are bound to the model's effects.
 """
-from __future__ import annotations
 
 from math import sqrt
 from typing import Any, NamedTuple

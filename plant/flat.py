@@ -3,7 +3,6 @@
 The state of a model with effects nests their memories. The conversions are written out as plain assignments, so that
 compiled code moves numbers between registers and the buffer and nothing else.
 """
-from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any

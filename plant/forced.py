@@ -4,7 +4,6 @@ Flow: from the measured spool position and P12, the metering edges give the spee
 Force: at that speed, the force of the measured P12 must equal inertia, drag, loads and friction.
 Neither depends on the spool's friction, the pilot stage or the controller, so a fault there does not show.
 """
-from __future__ import annotations
 
 from typing import Any
 

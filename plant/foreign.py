@@ -2,7 +2,6 @@
 
 `Plant.foreign` gives the program for cycles of so many seconds.
 """
-from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache

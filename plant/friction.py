@@ -3,7 +3,6 @@
 Dry friction after Karnopp, without his velocity band (Borello): a body at rest stays at rest while the net force is
 within the static level; one that moves is resisted by the dynamic level and stops where its velocity would change sign.
 """
-from __future__ import annotations
 
 from math import inf
 

@@ -7,7 +7,6 @@ are those of fdlibm (sin, cos, log) and Cephes (tanh, atan). Errors against libm
 them): exp, log, atan 1, sin, cos, tanh 2, tan 3; angles up to 1e6 rad, beyond that a digit is lost a decade. What has
 no value is NaN or infinite instead of an exception.
 """
-from __future__ import annotations
 
 import math
 from math import inf, nan, sqrt

@@ -5,7 +5,6 @@ cheap ones 140 to 230 million. To compile one takes 5 s, to load it from the dis
 larger kernel has spent about 2 s on runs that it could have made, and loaded after a twentieth of that. Which of them
 makes a run changes no bit of it.
 """
-from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Hashable

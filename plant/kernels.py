@@ -3,7 +3,6 @@
 The functions that a plant's signals determine are written out as source text, since compiled code knows the number of
 readings, and which parameter is the noise of which.
 """
-from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any

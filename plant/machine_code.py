@@ -5,7 +5,6 @@ it has compiled is stored as an object file, and the next process links that wit
 not possible (code that calls something besides `sqrt`, a file that is damaged or of other versions), numba runs as
 before: the bits of the results are the same, because the code is.
 """
-from __future__ import annotations
 
 import contextlib
 import ctypes

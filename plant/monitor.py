@@ -8,7 +8,6 @@ cycle, so XS has a closed form: a straight line while the flapper is at its stop
 loop's Kv = KSF GQF1/(KF ASV). The ram lags behind it by MJ/(AJ^2 GP/GQ + CJ), 22 us. One step makes a cycle, where the
 reference model takes 20 to 100. Many runs are simulated side by side, as in `plant.lanes`.
 """
-from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache

@@ -4,7 +4,6 @@ The values are data (`plant/models/nominal.toml`); this file gives their meaning
 ranges are wide, about three orders of magnitude either way: a value outside is a mistake (a unit, an exponent), and for
 every value inside the simulation stays finite.
 """
-from __future__ import annotations
 
 import math
 import tomllib

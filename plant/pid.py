@@ -1,5 +1,4 @@
 """The law of the reference firmware: PID on the sensed error, limited. By default it is proportional only."""
-from __future__ import annotations
 
 from typing import Any, NamedTuple
 

@@ -2,7 +2,6 @@
 
 A package that reads such files adds its function, which makes a `plant.plants.Plant` of a path.
 """
-from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import import_module

@@ -3,7 +3,6 @@
 A plant's `step` and the functions beside it stand in place of placeholders in every kernel (`plant.compile` binds by
 name), so single runs, lanes, emulator and fits work with every plant.
 """
-from __future__ import annotations
 
 import dis
 import hashlib

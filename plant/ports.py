@@ -4,7 +4,6 @@ A step calls `at_<port>` at each place: `x, m = at_load(x, m, s, u, p)` gets the
 the state at the start of the step, the inputs and the parameters; it returns the signal and the memories. The functions
 here pass the signal unchanged; a model's kernels are compiled with its effects instead (`plant.compile`).
 """
-from __future__ import annotations
 
 from collections import namedtuple
 from collections.abc import Iterable, Sequence

@@ -1,5 +1,4 @@
 """Turns segments or a CSV file into a position demand: one value per cycle, and named sections."""
-from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence

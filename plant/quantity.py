@@ -3,7 +3,6 @@
 A parameter group is a NamedTuple whose fields are `Annotated[float, Quantity(...)]`. The unit lives in the type, where
 people, error messages, logs and tables all read the same one.
 """
-from __future__ import annotations
 
 import math
 from collections.abc import Mapping

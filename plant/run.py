@@ -1,5 +1,4 @@
 """Runs a model: one cycle at a time (`Actuator`), or over a whole command (`simulate`)."""
-from __future__ import annotations
 
 import re
 import traceback

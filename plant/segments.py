@@ -4,7 +4,6 @@ A segment starts from the demand that the one before it reached at its end (the 
 its last), so a list of them is continuous except where a step, a CSV file or a wave with given phases says otherwise.
 The same segments describe a load on the ram: read N for m. The waves are those of docs/physics.md.
 """
-from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field

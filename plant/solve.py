@@ -3,7 +3,6 @@
 Timing (physics of a synchronous bus): cycle k reads the sensors at t_k, the controller answers a drive, which acts on
 the plant from t_k+1 to t_k+2. Row k of a log holds demand, drive and readings of cycle k.
 """
-from __future__ import annotations
 
 from typing import Any
 

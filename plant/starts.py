@@ -1,5 +1,4 @@
 """Finds start values for fits and scans, for effects that name none, from how much an effect changes the signals."""
-from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence

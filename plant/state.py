@@ -1,5 +1,4 @@
 """What every step gets: its inputs; and two records that laws of hydraulic actuators exchange at their ports."""
-from __future__ import annotations
 
 from typing import Any, NamedTuple
 

@@ -3,7 +3,6 @@
 A kernel makes a block of runs in the time of one. Fits that go on side by side each ask for a few, so
 `map_together` has them wait for each other, and what they ask for is made in common blocks.
 """
-from __future__ import annotations
 
 import contextlib
 import os

@@ -1,5 +1,4 @@
 """Units of other programs and of people: what one of them is worth in SI, exactly."""
-from __future__ import annotations
 
 import re
 from collections.abc import Mapping

@@ -1,5 +1,4 @@
 """Limits on unpacking. A file says itself how much it unpacks to, and a file of 240 kB can say 6 GB."""
-from __future__ import annotations
 
 import zlib
 

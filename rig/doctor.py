@@ -1,5 +1,4 @@
 """What this machine can do: each finding says what was found, what it is used for, and how to get it."""
-from __future__ import annotations
 
 import contextlib
 import ctypes.util

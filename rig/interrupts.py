@@ -1,5 +1,4 @@
 """Ctrl-C and SIGTERM: a run is asked to stop, so that its clean-up can bring the machine to rest."""
-from __future__ import annotations
 
 import contextlib
 import signal

@@ -3,7 +3,6 @@
 The elements and their order are those of the schema of Jenkins (junit-10.xsd of its xUnit plugin) and of the older one
 that most other programs follow: a test case has neither properties nor elements of other names.
 """
-from __future__ import annotations
 
 import re
 from collections.abc import Sequence

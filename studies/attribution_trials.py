@@ -12,7 +12,6 @@ With `--mixed` the three processes are stopped alternately in one pace, each tim
 and the table has a line per process. A trial that came too late, after the run, is repeated. With `--stay` plant and
 controller are started once and stay for all trials.
 """
-from __future__ import annotations
 
 import argparse
 import json

@@ -1,5 +1,4 @@
 """Print the tables of the bands in docs/statistics.md, from units that the bands have not seen."""
-from __future__ import annotations
 
 import math
 

@@ -6,7 +6,6 @@ Damages the shipped bench and those of examples/ with their EDS and DBC: bytes, 
 Each is loaded, its frames are packed and unpacked, become the tables of the compiled loop and a share of the bus, and a
 first bench file is guessed from the damaged sheet.
 """
-from __future__ import annotations
 
 import random
 import re

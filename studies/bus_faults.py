@@ -4,7 +4,6 @@ A cell of the matrix is one run. It says when the fault first shows in the log (
 first reports trouble (detection), when the controller says zero current (reaction), how long clean-up takes to make it
 ACTIVE again (recovery), and how far the position was from that of the sound run.
 """
-from __future__ import annotations
 
 import argparse
 import tempfile

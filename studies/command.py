@@ -1,5 +1,4 @@
 """What the commands `python -m studies.NAME` share: options, progress on standard error, the answer."""
-from __future__ import annotations
 
 import argparse
 import sys

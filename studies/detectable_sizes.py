@@ -8,7 +8,6 @@ The units are those of the trial's simulator, with scatter, coloured noise and h
 The folder holds claims.jsonl, one row for each run that the claims rest on (hours for all effects), and sizes.jsonl,
 one for each case; an interrupted study resumes there.
 """
-from __future__ import annotations
 
 import argparse
 import math

@@ -1,5 +1,4 @@
 """Other methods for the fault sizes of a trace: what each one finds, its error, its simulations and its time."""
-from __future__ import annotations
 
 import argparse
 import math

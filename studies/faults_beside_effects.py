@@ -8,7 +8,6 @@ The units are those of the trial's simulator, with scatter, coloured noise and h
 The folder holds beside.jsonl, one row for each finished case; an interrupted study resumes there. Cases come in a
 random order, so that the first ones are a fair sample of all.
 """
-from __future__ import annotations
 
 import argparse
 import os

@@ -2,7 +2,6 @@
 
 The first campaign gives all tables, further ones their rates only.
 """
-from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence

@@ -4,7 +4,6 @@ Each trial draws an actuator about twice as large as the nominal one, fits two o
 counts the parameters whose 95 % interval holds the true value, and the error on the held-out run. A finished trial is a
 line of the file; an interrupted study resumes there.
 """
-from __future__ import annotations
 
 import argparse
 import json

@@ -1,5 +1,4 @@
 """The live screen: lateness and response of runs with and without `rig run --live`, in alternating blocks."""
-from __future__ import annotations
 
 import argparse
 import contextlib

@@ -1,5 +1,4 @@
 """Long recordings: CPU time and memory of `rig compare`, `explain` and `fdi` by length of the recording."""
-from __future__ import annotations
 
 import argparse
 import json

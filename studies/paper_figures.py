@@ -3,7 +3,6 @@
 Figs. 7 and 8: what either fault does to a step and to a slow ramp. Figs. 10 to 12: a trace in the bands, position on a
 step, position on a ramp, speed on a ramp. The RMS maps, figs. 14 and 15, are those of `rig fdi`.
 """
-from __future__ import annotations
 
 from collections.abc import Mapping
 

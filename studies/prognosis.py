@@ -1,5 +1,4 @@
 """The score of `rig trend`: `python -m studies.prognosis` follows simulated units of each growth law to their end."""
-from __future__ import annotations
 
 import argparse
 import os

@@ -5,7 +5,6 @@
 FOLDER holds exp_data_3_4.csv.gz and the other runs as the rig's logger wrote them (docs/real_data.md). Only 3_4 is
 fitted: the steps of the flow to its position, those of the forces to its pressure.
 """
-from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence

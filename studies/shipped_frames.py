@@ -1,5 +1,4 @@
 """The frames of the shipped bench: identifiers by role, and values into and out of payloads."""
-from __future__ import annotations
 
 from collections.abc import Mapping
 

@@ -5,7 +5,6 @@
 Both filters estimate the state (size x, rate a, curvature c) with x' = a + c x. They take each interval as the noise of
 its trace, and let a and c wander. Sizes are scaled to 1 at MaxBand, time to 100 days.
 """
-from __future__ import annotations
 
 import sys
 import time

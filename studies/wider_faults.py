@@ -6,7 +6,6 @@ Units have the scatter of the tolerances and are simulated as in `rig campaign`;
 interrupted study resumes. A unit with one fault is counted as: named alone, named in a group that the recording does
 not tell apart, or missed; and for every fault that it does not have, whether that was reported.
 """
-from __future__ import annotations
 
 import argparse
 import os

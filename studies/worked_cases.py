@@ -1,5 +1,4 @@
 """Make the figures and tables of worked_cases.md: python -m studies.worked_cases (six runs, one minute)."""
-from __future__ import annotations
 
 import subprocess
 import sys

@@ -1,5 +1,4 @@
 """Shared by all tests."""
-from __future__ import annotations
 
 import fcntl
 import os

@@ -2,7 +2,6 @@
 
 Every test that reads an answer with `rig_command.Said.json` checks it against its schema as well.
 """
-from __future__ import annotations
 
 import json
 import re

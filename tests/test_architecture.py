@@ -1,5 +1,4 @@
 """The house rules that a machine can check: direction of imports, public names, docstrings, leftovers, pins."""
-from __future__ import annotations
 
 import ast
 import fnmatch

@@ -1,5 +1,4 @@
 """The documentation is complete, its links have targets, and its examples work."""
-from __future__ import annotations
 
 import argparse
 import ast

@@ -1,5 +1,4 @@
 """The site of the docs: every page is in it, every link has a target, it needs no network, and its notebook runs."""
-from __future__ import annotations
 
 import importlib.util
 import json

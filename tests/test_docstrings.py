@@ -1,5 +1,4 @@
 """Docstrings and comments name only what exists: a name in backticks is defined in the project or used in that file."""
-from __future__ import annotations
 
 import ast
 import builtins

@@ -1,5 +1,4 @@
 """The programs of examples/ do what their page says."""
-from __future__ import annotations
 
 import subprocess
 import sys

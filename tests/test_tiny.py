@@ -1,5 +1,4 @@
 """The whole promise on one page: a bench that runs, logs, judges, repeats itself, feels faults, takes your effects."""
-from __future__ import annotations
 
 from pathlib import Path
 

@@ -1,5 +1,4 @@
 """Model against measurement: how large the error is beside what noise explains, where, when, and in which block."""
-from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence

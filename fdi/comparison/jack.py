@@ -2,7 +2,6 @@
 
 For a plant whose declaration says that `plant.forced` can balance it (`Plant.balances`).
 """
-from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence

@@ -7,7 +7,6 @@ cumulative periodogram with Bartlett's band, and the mean of the residual by spe
 Coloured sensor noise is no fault of a model: where repeats show its colour, residuals are whitened by it before they
 are called coloured.
 """
-from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,5 +1,4 @@
 """The report of `rig compare`: error of a model beside its noise floor, by signal, block, section and condition."""
-from __future__ import annotations
 
 import math
 from collections.abc import Sequence

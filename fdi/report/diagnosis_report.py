@@ -1,5 +1,4 @@
 """The report of a diagnosis: verdict, faults, response in its bands, RMS maps, precursors, provenance."""
-from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -1,5 +1,4 @@
 """The report of `rig diff`: runs side by side - signals, checks, timing, nodes and models."""
-from __future__ import annotations
 
 import math
 import re

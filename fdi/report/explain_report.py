@@ -1,5 +1,4 @@
 """The report of `rig explain`: the missing effect, the ranked candidates, what the test cannot detect."""
-from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,5 +1,4 @@
 """The report of `rig identify`: parameters with intervals, what the runs do not show, errors before and after."""
-from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial

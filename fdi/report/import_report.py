@@ -1,5 +1,4 @@
 """What `rig import` did with each signal, and what `rig import --guess` takes each column for."""
-from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path

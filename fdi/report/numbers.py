@@ -2,7 +2,6 @@
 
 Every printed estimate goes through here, so that it has the same digits and unit on the terminal and on a page.
 """
-from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence

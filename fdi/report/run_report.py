@@ -1,5 +1,4 @@
 """The report of a run: verdict, checks, signals over time, cycle timing, events, NMT states, provenance."""
-from __future__ import annotations
 
 import json
 import math

@@ -1,5 +1,4 @@
 """The terminal writer: verdict, tables and labelled lines, for a person at a console of 80 columns or more."""
-from __future__ import annotations
 
 import textwrap
 from collections.abc import Collection, Sequence

@@ -1,5 +1,4 @@
 """The report of a trend: growth of both fault sizes, the time left to each limit, the traces behind it."""
-from __future__ import annotations
 
 import math
 from dataclasses import asdict

@@ -1,5 +1,4 @@
 """CSV files of traces: SI units, one row per cycle, empty fields for missing samples; or a plant's own columns."""
-from __future__ import annotations
 
 import contextlib
 import csv

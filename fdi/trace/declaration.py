@@ -1,5 +1,4 @@
 """The declaration of a plant's signals in a log, so that the log can be read without the plant that was recorded."""
-from __future__ import annotations
 
 import json
 from collections.abc import Mapping

@@ -3,7 +3,6 @@
 Rows of numbers are read as whole columns through the index of each chunk. Other messages are found by a plain scan and
 read by protobuf's parser; the library's message iterator makes an object of every record first, which is slower.
 """
-from __future__ import annotations
 
 import contextlib
 import os

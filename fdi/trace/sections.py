@@ -1,5 +1,4 @@
 """What a command asks for, piece by piece: hold, step, ramp or dynamic (sine, chirp, noise), read from itself."""
-from __future__ import annotations
 
 from typing import NamedTuple
 

@@ -3,7 +3,6 @@
 A filtered measurement is compared with a filtered model. The filters are those of the recording's logger; a moving mean
 of n samples is kept as its length in seconds, because the rows of a trace need not be the logger's.
 """
-from __future__ import annotations
 
 import json
 import math

@@ -13,7 +13,6 @@ order of the catalogue. A law that remembers something also gets and returns its
 
 The effects of `base` are parameters of the reference model itself; they have no law of their own.
 """
-from __future__ import annotations
 
 import importlib
 import sys

@@ -1,5 +1,4 @@
 """Effects in the firmware: they show in its answer against what it was told and what it sensed, without any noise."""
-from __future__ import annotations
 
 from typing import Annotated, Any, NamedTuple
 

@@ -1,5 +1,4 @@
 """Effects on the way of the current, from the bus through driver, line and coil to the armature, in this order."""
-from __future__ import annotations
 
 from math import inf, pi, sin
 from typing import Annotated, Any, NamedTuple

@@ -1,5 +1,4 @@
 """Dry friction of the ram beyond one static and one dynamic level."""
-from __future__ import annotations
 
 from math import exp, sqrt
 from typing import Annotated, Any, NamedTuple

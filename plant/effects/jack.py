@@ -1,5 +1,4 @@
 """Forces on the ram. Positive external force acts against extension."""
-from __future__ import annotations
 
 from math import pi
 from typing import Annotated, Any, NamedTuple

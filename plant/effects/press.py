@@ -1,5 +1,4 @@
 """Loads of test stands that are no mere force."""
-from __future__ import annotations
 
 from typing import Annotated, Any, NamedTuple
 

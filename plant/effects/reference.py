@@ -1,5 +1,4 @@
 """The effects that the reference model has already: missing means that their parameter is off its nominal value."""
-from __future__ import annotations
 
 from plant.effects import register_base
 

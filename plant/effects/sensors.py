@@ -1,5 +1,4 @@
 """Effects of the position transducer, in the order of its signal path."""
-from __future__ import annotations
 
 from math import sqrt
 from typing import Annotated, Any, NamedTuple

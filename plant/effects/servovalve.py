@@ -1,5 +1,4 @@
 """Effects of the pilot stage and the spool."""
-from __future__ import annotations
 
 from typing import Annotated, Any, NamedTuple
 

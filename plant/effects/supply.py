@@ -1,5 +1,4 @@
 """Effects of the hydraulic supply and of its oil."""
-from __future__ import annotations
 
 from math import pi, sin
 from typing import Annotated, Any, NamedTuple

@@ -1,5 +1,4 @@
 """Effects between the metering edges and the piston: what pressure they leave across it at which speed."""
-from __future__ import annotations
 
 from math import exp, log, sqrt
 from typing import Annotated, Any, NamedTuple

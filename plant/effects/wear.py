@@ -8,7 +8,6 @@ Applied to an Electrohydraulic Servomechanism Affected by Multiple Failures", af
 Sorli, "A Prognostic Model for Electrohydraulic Servovalves", PHM 2009: friction of spool and jack, radial clearance of
 the spool, rounding of its lands' corners, torque of the first stage, contamination of the filter.
 """
-from __future__ import annotations
 
 from math import sqrt
 from typing import Annotated, Any, NamedTuple

@@ -2,7 +2,6 @@
 
 Rivals take turns in short rounds or blocks, so that a disturbance of the machine hits all of them.
 """
-from __future__ import annotations
 
 import contextlib
 import ctypes

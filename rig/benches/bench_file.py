@@ -1,5 +1,4 @@
 """Reads bench files: with the EDS, DCF or DBC that they name they become a `Bench`. docs/bench.md has the keys."""
-from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace

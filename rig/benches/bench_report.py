@@ -1,5 +1,4 @@
 """How much of the bus the frames of a bench take, each at its longest; as a report for terminal, page and JSON."""
-from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -4,7 +4,6 @@ A reading is true value x (1 + span error) + zero error + noise. Zero and span e
 is new in every sample. `u` is the standard uncertainty of the zero error, `gain` that of the span error.
 docs/uncertainty.md has the keys.
 """
-from __future__ import annotations
 
 import datetime
 from collections.abc import Mapping

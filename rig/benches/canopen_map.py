@@ -1,5 +1,4 @@
 """An EDS or DCF as frames of a CANopen device: its PDOs, as its mapping parameters say (CiA 301, 7.5.2.35 to 38)."""
-from __future__ import annotations
 
 import io
 import re

@@ -3,7 +3,6 @@
 Each gets the frame as bytes, with the bits of the checksum itself 0. The CRCs and profiles take the bytes other than
 the checksum's own one, in the order of the frame.
 """
-from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable

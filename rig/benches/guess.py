@@ -1,5 +1,4 @@
 """A first bench file from an EDS, DCF or DBC: names, units and access say what is likely; the rest is marked."""
-from __future__ import annotations
 
 import json
 import re

@@ -1,6 +1,5 @@
 """What an EDS or DBC says of a device's frames, what a bench file says each value is for, and both together as frames.
 """
-from __future__ import annotations
 
 import logging
 import math

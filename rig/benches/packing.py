@@ -4,7 +4,6 @@ One block of memory, `Layout`, holds the tables, the values and one payload of a
 (doubles from VALUES on, one a channel), packs a frame into the payload and sends it; a frame that came is put into the
 payload and unpacked into `values`. Nothing is allocated. bench.py does the same in Python.
 """
-from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -3,7 +3,6 @@
 `rig run --model my_plant.py` takes it where no bench file is given and the shipped one has other signals.
 `rig.nodes.firmware` plays the controller on the embedded bus.
 """
-from __future__ import annotations
 
 from pathlib import Path
 

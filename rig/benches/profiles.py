@@ -3,7 +3,6 @@
 Both enable in steps, up a ladder of states. A step up is asked for only when the status word has confirmed the one
 before; a step down may skip others. The functions take plain numbers, so that compiled loops can call them.
 """
-from __future__ import annotations
 
 from enum import IntEnum, IntFlag
 from typing import NamedTuple

@@ -6,7 +6,6 @@ A simulated unit is a healthy plant with scatter and faults of known size, measu
     finished.jsonl     one row per finished case (see `rig.campaign.batch`)
     results.parquet    all rows in the matrix's order; replaced as a whole
 """
-from __future__ import annotations
 
 import hashlib
 import itertools

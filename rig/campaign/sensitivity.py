@@ -1,5 +1,4 @@
 """`rig explain --sensitivity`: many simulated runs on many cores, in rounds, resumed where they were interrupted."""
-from __future__ import annotations
 
 import hashlib
 import pickle

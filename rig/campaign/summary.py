@@ -1,5 +1,4 @@
 """The statistics of a campaign (false alarms, detection by size, confusion, errors, coverage), and their report."""
-from __future__ import annotations
 
 import math
 from collections import Counter

@@ -2,7 +2,6 @@
 
 The module `rig.cli.commands.NAME` does the work of a command; its function `run_command` returns the exit status.
 """
-from __future__ import annotations
 
 import argparse
 import keyword

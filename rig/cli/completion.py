@@ -3,7 +3,6 @@
 The shell calls `rig` with the line typed so far in its environment. Without the package (extra "shell") nothing
 happens.
 """
-from __future__ import annotations
 
 import argparse
 import os

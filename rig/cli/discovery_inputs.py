@@ -1,5 +1,4 @@
 """What `rig compare`, `rig explain`, `rig add`, `rig remove` and `rig identify` take: a model with its past, runs."""
-from __future__ import annotations
 
 import argparse
 import shlex

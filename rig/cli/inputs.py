@@ -1,5 +1,4 @@
 """What the options of several commands stand for: the plant model, the effects of the user, the signals to use."""
-from __future__ import annotations
 
 import argparse
 import shlex

@@ -1,6 +1,5 @@
 # PYTHON_ARGCOMPLETE_OK
 """`rig COMMAND`: parse the command line, run the command, report errors in one line, return the exit status."""
-from __future__ import annotations
 
 import argparse
 import atexit

@@ -1,5 +1,4 @@
 """Options as data: what every command has in common, options that several commands share, and types of values."""
-from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence

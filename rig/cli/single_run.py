@@ -1,5 +1,4 @@
 """`rig run` with one sequence: its job, the run, its answer."""
-from __future__ import annotations
 
 import argparse
 import contextlib

@@ -1,5 +1,4 @@
 """`rig run` with several sequences or a suite file: all runs, one report."""
-from __future__ import annotations
 
 import argparse
 import os

@@ -1,5 +1,4 @@
 """Chapter 1: the EDS agrees with CiA 306, with CiA 301 and with itself. Nothing is sent."""
-from __future__ import annotations
 
 import re
 from itertools import combinations

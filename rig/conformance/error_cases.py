@@ -1,5 +1,4 @@
 """Chapter 5: SYNC, emergencies, error register and history, heartbeat producer and consumer, error behaviour."""
-from __future__ import annotations
 
 from functools import partial
 from itertools import pairwise

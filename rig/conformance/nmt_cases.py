@@ -1,5 +1,4 @@
 """Chapter 6, the NMT state machine, and 7, how long the node takes; CiA 301 sets few limits for that."""
-from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -1,5 +1,4 @@
 """Chapter 2: the object dictionary holds what the EDS says, and refuses what it must."""
-from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple

@@ -1,5 +1,4 @@
 """Chapter 4: PDOs: parameters, transmission types, COB-IDs, mapping, wrong lengths, and what a received one does."""
-from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -1,5 +1,4 @@
 """Runs the cases on a node one after the other: each begins with a reset of the communication and forgets the last."""
-from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,5 +1,4 @@
 """Chapter 3: the SDO server, frame by frame: transfers, toggle bits, aborts, lengths, malformed requests."""
-from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,5 +1,4 @@
 """An emulated CANopen device: the protocol services around one object dictionary, driven by frames and ticks alone."""
-from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,5 +1,4 @@
 """Object dictionary: the entries of an EDS (CiA 306) and their values in use."""
-from __future__ import annotations
 
 import logging
 import struct

@@ -1,5 +1,4 @@
 """EMCY producer (CiA 301, 7.2.7): emergency frames, error register 0x1001 and error history 0x1003."""
-from __future__ import annotations
 
 import struct
 from collections.abc import Callable

@@ -1,5 +1,4 @@
 """NMT slave (CiA 301, 7.3.2): the state machine and the error behaviour object 0x1029."""
-from __future__ import annotations
 
 from collections.abc import Callable
 

@@ -2,7 +2,6 @@
 
 The mapping is fixed (1600.., 1A00.. are const); COB-ID and transmission type (1400.., 1800..) may be changed by SDO.
 """
-from __future__ import annotations
 
 import struct
 from collections.abc import Callable

@@ -4,7 +4,6 @@ Block transfer is optional for a server; it is refused with "command specifier n
 Rejected alternative: canopen's SdoServer, which notices a read-only or absent object only after the last segment of
 a download, accepts any number of bytes against the size announced, and answers a stray first request with an exception.
 """
-from __future__ import annotations
 
 import struct
 from collections.abc import Callable

@@ -1,5 +1,4 @@
 """SYNC consumer (CiA 301, 7.2.5): what happens at a SYNC, and whether they still come (0x1006)."""
-from __future__ import annotations
 
 from collections.abc import Callable
 

@@ -1,5 +1,4 @@
 """What goes into a package: runs as they were written, inputs from their logs, a bill of materials, coverage."""
-from __future__ import annotations
 
 import json
 import platform

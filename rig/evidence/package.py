@@ -3,7 +3,6 @@
 The manifest has the format of sha256sum, so `sha256sum -c MANIFEST.sha256` checks a folder without this program. A zip
 is written without compression and without dates: the same files give the same bytes, and every byte can be verified.
 """
-from __future__ import annotations
 
 import contextlib
 import hashlib

@@ -1,5 +1,4 @@
 """Requirements: read from CSV or ReqIF, and traced to the checks and runs that verify them."""
-from __future__ import annotations
 
 import csv
 import io

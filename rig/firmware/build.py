@@ -5,7 +5,6 @@
 compiles the C files of a folder, with the object table of the EDS in it if there is one, and prints the program's path.
 Programs are kept under a hash of their sources and of the compiler.
 """
-from __future__ import annotations
 
 import hashlib
 import os

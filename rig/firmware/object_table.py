@@ -4,7 +4,6 @@
 
 does so for the reference firmware. A test compares its two files with the EDS, so they cannot differ from it unnoticed.
 """
-from __future__ import annotations
 
 import struct
 from pathlib import Path

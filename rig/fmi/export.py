@@ -3,7 +3,6 @@
 The equations are the machine code that numba compiled, linked with the interface in C of this folder. The code is
 emitted for every CPU of an architecture, not for this one alone; without fused multiply-add its bits are the same.
 """
-from __future__ import annotations
 
 import hashlib
 import math

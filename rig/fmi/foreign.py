@@ -1,5 +1,4 @@
 """A foreign unit as a plant: what its file says of it, and the process that runs it."""
-from __future__ import annotations
 
 import contextlib
 import re

@@ -3,7 +3,6 @@
 A unit is somebody else's machine code. If it crashes or hangs, only this process does. Requests are a name and its
 arguments, the first one `load`; answers are ("done", result) or ("failed", what went wrong). rig/fmi/foreign.py asks.
 """
-from __future__ import annotations
 
 import sys
 from collections.abc import Sequence

@@ -11,7 +11,6 @@
     [plant.parameters]                              # what --set and rig identify may change
     screw.stiffness = { variable = "k", range = [1e6, 1e9] }
 """
-from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping

@@ -1,5 +1,4 @@
 """One communication step of an exported unit, as a function for `plant.model.build_kernel`."""
-from __future__ import annotations
 
 from typing import Any
 

@@ -3,7 +3,6 @@
 The embedded bus needs nothing from the machine. On python-can's a node is served in the caller's own thread, because
 python-can's notifier thread is ms late.
 """
-from __future__ import annotations
 
 import errno
 import os

@@ -6,7 +6,6 @@
 pyproject.toml registers it in the group of entry points in which python-can looks for interfaces, "can.interface".
 python-can's own `udp_multicast` cannot take its place: it hears its own frames, and it needs a route for multicast.
 """
-from __future__ import annotations
 
 import contextlib
 import select

@@ -1,5 +1,4 @@
 """Time for the bench: a clock that is set (lockstep) and one that runs (real time)."""
-from __future__ import annotations
 
 import time
 from typing import Protocol

@@ -1,5 +1,4 @@
 """Heartbeat producer (0x1017) and consumer (0x1016), CiA 301, 7.2.8.3.2. The rig and the nodes have both."""
-from __future__ import annotations
 
 from collections.abc import Callable
 

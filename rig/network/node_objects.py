@@ -1,5 +1,4 @@
 """Participants of a run, and application objects of our own nodes, which the rig writes and the nodes obey."""
-from __future__ import annotations
 
 import struct
 import zlib

@@ -9,7 +9,6 @@ Time. In real time a late frame is late by the clock. In lockstep (0x1006 = 0) t
 delay counts in cycles, as on the embedded bus: a frame that is late by m cycles and a part is sent in cycle k + m,
 after the answer to that cycle has come.
 """
-from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -5,7 +5,6 @@ services, which keep the state that heartbeat, SDO and EMCY need. All that they 
 While the plant or the faults change (a scenario, an NMT reset) the loop is stopped; the frames that come meanwhile wait
 in its socket.
 """
-from __future__ import annotations
 
 import os
 import threading

@@ -1,5 +1,4 @@
 """The plant of a run, cycle by cycle: the actuator with the faults and the load of its scenario. No bus, no clock."""
-from __future__ import annotations
 
 from math import isfinite
 

@@ -2,7 +2,6 @@
 
 It answers each feedback frame with a drive frame. The control word (CiA 408) lets current flow only in device mode
 ACTIVE without a fault; any fault is latched until it has gone and the control word's reset bit rises."""
-from __future__ import annotations
 
 import struct
 from math import isfinite, nan

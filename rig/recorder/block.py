@@ -1,5 +1,4 @@
 """Cycles that were played together, as columns, and how they become the same bytes of a log as one by one."""
-from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields

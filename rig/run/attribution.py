@@ -8,7 +8,6 @@ A cycle is judged only if the bench was on time in it: its SYNC and the next one
 plant's feedback came within the limit. Cycles that follow a late one are not judged as far as its consequences reach:
 nodes that were stalled first work off the frames that waited, which takes at most as long as the stall did.
 """
-from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import NamedTuple

@@ -13,7 +13,6 @@ The controller is made ready in cycles that do not count: CiA 402 is enabled ste
 The run stands still meanwhile: neither its profiles nor its faults go on. In real time the last input is repeated until
 the next one, which waits for the answer to it.
 """
-from __future__ import annotations
 
 from collections.abc import Callable
 from math import isclose, nan

@@ -3,7 +3,6 @@
 Both give the same rows and frames. A cycle with a fault that begins, acts or ends, a frame that waits, or a node that
 is not well is played by `CycleLoop` and the nodes themselves. Timers, such as those of heartbeats, run in Python
 between the compiled cycles."""
-from __future__ import annotations
 
 import ctypes
 import os

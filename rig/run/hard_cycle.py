@@ -10,7 +10,6 @@ A frame whose values take effect with SYNC goes out before SYNC is due: on a rea
 loop moves it as the emulator does: what the controller answers to cycle k acts from cycle k+1. Times are those of
 CLOCK_MONOTONIC, ns.
 """
-from __future__ import annotations
 
 from typing import NamedTuple
 

@@ -7,7 +7,6 @@ EMCY use the wire's socket, in the main thread. The log gets the frames of both 
 
 The queue does not delay a reaction: `override_control` changes the control word of what is queued, `hold` discards it.
 """
-from __future__ import annotations
 
 import threading
 from bisect import bisect_right

@@ -1,5 +1,4 @@
 """A run as data: everything that determines its result, from the command line or from an earlier run's log."""
-from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping

@@ -5,7 +5,6 @@ SocketCAN and the UDP bus have a compiled one as well (hard_loop.py), which give
 Lockstep: the next cycle begins when this one's frames are in. Real time: it begins when it is due; due times are a
 fixed grid, and a cycle that is late by whole periods drops the due times it has missed (and counts them) instead of
 firing a burst. Either way the plant moves one period a SYNC, so a run that was late is late, not wrong."""
-from __future__ import annotations
 
 import heapq
 from abc import ABC, abstractmethod

@@ -1,5 +1,4 @@
 """Which cycle loop plays a run: the bus, the pace and the nodes decide."""
-from __future__ import annotations
 
 from rig.benches.bench import Bench
 from rig.network.bus import LinkWire, can_open

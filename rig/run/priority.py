@@ -1,5 +1,4 @@
 """Real-time rights for the thread that runs the loop, as far as the machine grants them."""
-from __future__ import annotations
 
 import contextlib
 import ctypes

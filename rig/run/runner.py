@@ -1,5 +1,4 @@
 """Runs one job: nodes and bus, log, session, checks, verdict.json."""
-from __future__ import annotations
 
 import contextlib
 import fcntl

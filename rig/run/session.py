@@ -7,7 +7,6 @@ every other sequence ends main.
 The parts: `Stage`, `Journal` and `SafeState` (state.py), `BringUp`, `NodeWatch`, and here `CycleLog` (the cycles that
 are complete) and `Session`, which plays the phases and announces and injects faults.
 """
-from __future__ import annotations
 
 from array import array
 from collections.abc import Callable

@@ -1,5 +1,4 @@
 """What is true of a run at the moment: its time and stage, the events it reports, and its safe state."""
-from __future__ import annotations
 
 import bisect
 from typing import NamedTuple

@@ -1,5 +1,4 @@
 """The watch of the nodes of a run: emergencies, heartbeats, states, processes that end, and silence."""
-from __future__ import annotations
 
 from collections.abc import Collection, Container, Mapping
 from itertools import filterfalse

@@ -1,5 +1,4 @@
 """The nominal test of a plant: the profile that it declares, or the main phase of preflight for the EHA's signals."""
-from __future__ import annotations
 
 import numpy as np
 

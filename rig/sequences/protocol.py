@@ -3,7 +3,6 @@
 They need the rows of the run and of the probes (rig/run/bring_up.py), heartbeat and EMCY times. Pure functions: no bus,
 no clock. docs/sequences.md lists the checks and their default limits.
 """
-from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

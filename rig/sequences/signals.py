@@ -2,7 +2,6 @@
 
 While a sequence is read, `name_signals_of` says which plant that is; without it, it is the EHA.
 """
-from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

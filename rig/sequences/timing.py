@@ -1,5 +1,4 @@
 """Time limits of a run, and what happens when the bench itself is late: the table [timing] of a sequence."""
-from __future__ import annotations
 
 from dataclasses import dataclass
 from math import ceil

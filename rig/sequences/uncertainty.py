@@ -5,7 +5,6 @@ medians and times of a signal have no useful derivative. Its standard uncertaint
 numbers differ by from the number itself, so that what the errors add to a maximum or an RMS counts too. A time that is
 read from samples is known to a cycle either way, a reading to half a count. docs/uncertainty.md derives it.
 """
-from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from math import hypot, inf, isnan, nan

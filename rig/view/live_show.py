@@ -8,7 +8,6 @@ The plan of the run comes on standard input, and a byte when the log is there. S
 rig runs: when it ends, however it ends, this program restores the terminal and ends too. It closes its standard output
 when it is ready.
 """
-from __future__ import annotations
 
 import contextlib
 import os

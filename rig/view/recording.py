@@ -1,5 +1,4 @@
 """What the viewer shows, as data: plots of curves, lanes of states, texts; of a log, of runs, of a comparison."""
-from __future__ import annotations
 
 import math
 import re

@@ -1,5 +1,4 @@
 """Running the rerun viewer: its window, or a picture without a display that is checked for errors and empty views."""
-from __future__ import annotations
 
 import contextlib
 import os

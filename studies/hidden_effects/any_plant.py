@@ -4,7 +4,6 @@ The truth is the plant's own equations in steps of 2 us, with parameters that sc
 coloured noise; the trial's simulator in C has the EHA alone. Effects outside the catalogue are laws of a file beside
 this one, which `rig explain` never loads.
 """
-from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,5 +1,4 @@
 """A simulator for `rig campaign --simulator studies.hidden_effects.campaign_simulator:simulate_unit`: truth.c."""
-from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray

@@ -3,7 +3,6 @@
 A case is a folder with the traces est.csv.gz (the preflight command), repeat.csv.gz (the same command, other noise) and
 holdout.csv.gz (another command), and with truth.json (the hidden effects).
 """
-from __future__ import annotations
 
 import gzip
 import json

@@ -1,5 +1,4 @@
 """Commands and known loads of the trial's traces: the preflight of docs/physics.md, and random held-out commands."""
-from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray

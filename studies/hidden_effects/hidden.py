@@ -3,7 +3,6 @@
 They are written from that table alone, in the symbols of truth.c. Sizes are drawn log-uniformly, from about the noise
 floor of the sensors to the large end of the typical range.
 """
-from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple

@@ -1,5 +1,4 @@
 """Peers: the speed of many runs at once and of the RMS grid beside C, jax and NASA ProgPy, in one process."""
-from __future__ import annotations
 
 from collections.abc import Sequence
 

@@ -3,7 +3,6 @@
 The work is one map of `fdi.diagnosis.rms_grid`: every cell over a whole preflight, drawn to the measured ram, and its
 RMS error.
 """
-from __future__ import annotations
 
 import ctypes
 import tempfile

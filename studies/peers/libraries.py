@@ -2,7 +2,6 @@
 
 Each rival gets the same runs, of the bare model from the same current, and returns its rows as `Lanes.replay` does.
 """
-from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping

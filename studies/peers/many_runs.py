@@ -1,5 +1,4 @@
 """Many runs at once, beside C, jax and ProgPy: the same runs of the same equations, in one process."""
-from __future__ import annotations
 
 import tempfile
 from pathlib import Path

@@ -1,5 +1,4 @@
 """What both comparisons share: compilers, optional libraries, and rivals measured in alternating rounds."""
-from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Mapping

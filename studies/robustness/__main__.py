@@ -1,5 +1,4 @@
 """Robustness: fuzz frames, killed processes, full disks, long operation; hours with the numbers of the page."""
-from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence

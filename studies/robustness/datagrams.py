@@ -1,5 +1,4 @@
 """Fuzz datagrams on the UDP bus, on which every program of the machine can send anything."""
-from __future__ import annotations
 
 import socket
 import tempfile

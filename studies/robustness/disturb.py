@@ -7,7 +7,6 @@ read or recovered; no process, semaphore or temporary file is left. A run whose 
 be ABORTED and name the end of that process. A stop of less than 1 s must not end the run; a node that was stopped for
 longer than 3 s must be named.
 """
-from __future__ import annotations
 
 import contextlib
 import json

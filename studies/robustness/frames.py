@@ -1,5 +1,4 @@
 """Fuzz frames: valid ones of the bench, mutations of them, and random ones. A seed gives the same frames again."""
-from __future__ import annotations
 
 from collections.abc import Iterator
 

@@ -1,5 +1,4 @@
 """Fuzz frames into each node of the bench: afterwards it answers as before, and its memory has not grown."""
-from __future__ import annotations
 
 import resource
 import tempfile

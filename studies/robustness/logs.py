@@ -1,5 +1,4 @@
 """Damaged and invented logs: each is read, reported on, repeated and recovered, or refused in one line."""
-from __future__ import annotations
 
 import struct
 import traceback

@@ -1,5 +1,4 @@
 """Nodes that stay for many runs, and what their processes hold."""
-from __future__ import annotations
 
 import contextlib
 import os

@@ -1,5 +1,4 @@
 """The whole study: fuzz frames and datagrams, disturbed runs, long operation."""
-from __future__ import annotations
 
 import os
 import tempfile

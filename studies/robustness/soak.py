@@ -1,5 +1,4 @@
 """Long work: run after run by one rig on nodes that stay, and nothing grows: memory, open files, threads."""
-from __future__ import annotations
 
 import tempfile
 from pathlib import Path

@@ -1,5 +1,4 @@
 """Shared by the tests of the controllers in examples/."""
-from __future__ import annotations
 
 import pytest
 from bus_stations import spec

@@ -1,5 +1,4 @@
 """The rig tests the controllers of examples/ by their bench files: the sound ones pass, and none of the faulty ones."""
-from __future__ import annotations
 
 import re
 from pathlib import Path

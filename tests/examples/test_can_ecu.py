@@ -1,5 +1,4 @@
 """The ECU of examples/, as cantools sees it: states, current, counters and checksums."""
-from __future__ import annotations
 
 import subprocess
 from collections.abc import Iterator

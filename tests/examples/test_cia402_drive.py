@@ -1,5 +1,4 @@
 """The CiA 402 drive of examples/, as canopen sees it: objects, power states, current, faults."""
-from __future__ import annotations
 
 import struct
 import subprocess

@@ -1,5 +1,4 @@
 """The servovalve and cylinder of examples/: closed forms, another cylinder, and the recordings of a real one."""
-from __future__ import annotations
 
 from math import pi, sqrt
 from pathlib import Path

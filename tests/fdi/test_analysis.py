@@ -1,5 +1,4 @@
 """The public Python interface: the lines of docs/python.md as they stand there, what results can do, and progress."""
-from __future__ import annotations
 
 import contextlib
 import io

@@ -1,5 +1,4 @@
 """What a newcomer gets wrong: 120 command lines and files, and what the one line of the answer has to name."""
-from __future__ import annotations
 
 from pathlib import Path
 from typing import NamedTuple

@@ -1,5 +1,4 @@
 """The command lines of the pages beside README and tutorial: files that a reader has, and lines that are not played."""
-from __future__ import annotations
 
 import re
 import subprocess

@@ -1,5 +1,4 @@
 """Ctrl-C in every long command: how soon it ends, with which exit status, and what it leaves behind."""
-from __future__ import annotations
 
 import contextlib
 import json

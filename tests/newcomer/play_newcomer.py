@@ -3,7 +3,6 @@
 `make newcomer` runs all of it and prints a table; `make newcomer ARGS=inputs` a part: shown, pages, inputs or
 interruptions. Exit status 1 if something is wrong. The quick parts are tests as well (test_newcomer.py).
 """
-from __future__ import annotations
 
 import argparse
 import os

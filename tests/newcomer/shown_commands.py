@@ -1,5 +1,4 @@
 """The command lines of README and tutorial, played in order in a fresh clone."""
-from __future__ import annotations
 
 import re
 import subprocess

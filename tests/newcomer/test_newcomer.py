@@ -1,5 +1,4 @@
 """The quick parts of what a newcomer does: bad inputs, the lines of the pages, Ctrl-C. `make newcomer` plays all."""
-from __future__ import annotations
 
 from pathlib import Path
 

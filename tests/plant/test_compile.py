@@ -1,5 +1,4 @@
 """Compiled code: kept on disk, never stale, prepared when it is worth it; ways to run the plant agree bit for bit."""
-from __future__ import annotations
 
 import json
 import os

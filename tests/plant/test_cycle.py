@@ -1,5 +1,4 @@
 """The cycle of a run: the plant takes the same steps of 10 us whatever it is."""
-from __future__ import annotations
 
 import numpy as np
 import pytest

@@ -1,5 +1,4 @@
 """What each effect does, from the current to the transducer and the firmware, against a closed form."""
-from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any

@@ -1,5 +1,4 @@
 """One suite for everything in the catalogue: what it says of itself, and what every law must keep to."""
-from __future__ import annotations
 
 import numpy as np
 import pytest

@@ -1,5 +1,4 @@
 """A user's own effects: found, compiled, tried, given starts; and told in one line what is wrong with them."""
-from __future__ import annotations
 
 import re
 from collections.abc import Iterator

@@ -1,5 +1,4 @@
 """The physics of the electromechanical actuator against closed forms, an independent solver and its own energy."""
-from __future__ import annotations
 
 from collections import namedtuple
 from functools import cache

@@ -1,5 +1,4 @@
 """Elementary functions and the firmware's law against the library and numbers worked out by hand."""
-from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator

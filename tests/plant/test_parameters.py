@@ -1,5 +1,4 @@
 """Parameters, model files and commands as data: what is refused and how it is said, and what comes back as it went."""
-from __future__ import annotations
 
 import gzip
 import tomllib

@@ -1,5 +1,4 @@
 """Every closed form of docs/physics.md on the plant itself; passive parts take energy and never give it."""
-from __future__ import annotations
 
 import numpy as np
 import pytest

@@ -1,5 +1,4 @@
 """The plant against independent solvers and the recordings of another simulator, and the error of its step."""
-from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping

@@ -1,5 +1,4 @@
 """The plant gives the same bits on every x86-64 CPU: commands, `simulate`, `Actuator`, lanes, and interpreted code."""
-from __future__ import annotations
 
 import os
 import subprocess

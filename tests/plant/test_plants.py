@@ -1,5 +1,4 @@
 """Every plant, shipped or a user's: one suite over what it declares; and what is wrong in a plant file, in one line."""
-from __future__ import annotations
 
 import re
 from collections.abc import Iterator

@@ -1,5 +1,4 @@
 """Pump-driven actuators: effects and the flow under measured pressures against closed forms, shipped models."""
-from __future__ import annotations
 
 from math import factorial
 from pathlib import Path

@@ -1,5 +1,4 @@
 """Work side by side: in order, in this thread where there is nothing to share, and an error is an error."""
-from __future__ import annotations
 
 import subprocess
 import sys

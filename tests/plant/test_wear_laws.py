@@ -1,5 +1,4 @@
 """Wear of the servovalve: each law against the closed form of its source."""
-from __future__ import annotations
 
 import numpy as np
 import pytest

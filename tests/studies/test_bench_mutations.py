@@ -1,5 +1,4 @@
 """A few of the damaged bench files, data sheets and DBCs of `studies.bench_mutations`."""
-from __future__ import annotations
 
 from collections import Counter
 

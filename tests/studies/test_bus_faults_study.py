@@ -1,5 +1,4 @@
 """The matrix of faults on the bus in small: two faults, all phases, and what the report says about them."""
-from __future__ import annotations
 
 import pytest
 

@@ -1,5 +1,4 @@
 """The law of a position controller, identified from what it was told, what it sensed and what it answered."""
-from __future__ import annotations
 
 import numpy as np
 import pytest

@@ -1,5 +1,4 @@
 """Sizes are hidden as they were claimed, and the study finds what it should."""
-from __future__ import annotations
 
 from pathlib import Path
 

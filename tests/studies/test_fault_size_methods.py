@@ -1,5 +1,4 @@
 """Other methods for the fault sizes: the optimisers improve on the grid, the learners know units they never saw."""
-from __future__ import annotations
 
 import pytest
 from noisy_traces import SHORT, record_plant

@@ -1,5 +1,4 @@
 """The live screen's cost is told from noise, and recordings of any length are made, measured and reported."""
-from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence

@@ -1,5 +1,4 @@
 """The paper's figures are drawn from whatever traces and grids there are, as SVG for a page."""
-from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from functools import cache

@@ -1,5 +1,4 @@
 """Peers make the same runs as this software, and a peer that is missing is named with its reason."""
-from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence

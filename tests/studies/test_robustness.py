@@ -1,5 +1,4 @@
 """The robustness study in small: the same code as `python -m studies.robustness`, with fewer frames and runs."""
-from __future__ import annotations
 
 import pytest
 from c_device import CFirmware

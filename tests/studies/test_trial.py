@@ -1,5 +1,4 @@
 """The blind trial: its simulator against an independent one, its cases, its counting."""
-from __future__ import annotations
 
 import csv
 import gzip

@@ -3,7 +3,6 @@
 The published schemas allow further keys, because a new version may add some. The check does not: a key that the schema
 lacks is an error here, so that the schemas stay complete.
 """
-from __future__ import annotations
 
 import json
 from collections.abc import Sequence

@@ -1,5 +1,4 @@
 """Jobs for the tests of the resumable runner. A job is a word or a number; what it does is said at each branch."""
-from __future__ import annotations
 
 import os
 import signal

@@ -1,5 +1,4 @@
 """Nodes with one defect each: what a conformance test must find. A defect is a patch of our own plant or controller."""
-from __future__ import annotations
 
 import heapq
 from collections.abc import Callable

@@ -2,7 +2,6 @@
 
 Without chromium `find_browser` is None; what needs it is skipped, or fails with EHA_RIG_REQUIRE_BROWSER=1.
 """
-from __future__ import annotations
 
 import json
 import os

@@ -1,5 +1,4 @@
 """Stations on one bus of any back end, with the same few calls: what the bus tests are written in."""
-from __future__ import annotations
 
 import os
 import time

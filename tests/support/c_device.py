@@ -2,7 +2,6 @@
 
 The stack takes any object dictionary, so the tests of `rig.device` run on it unchanged, with the EDS of any node.
 """
-from __future__ import annotations
 
 import ctypes
 import shutil

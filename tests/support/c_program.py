@@ -1,5 +1,4 @@
 """The C firmware as a program on a bus: sound, or with one of the faults of firmware/faulty.c."""
-from __future__ import annotations
 
 import contextlib
 import subprocess

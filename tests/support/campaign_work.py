@@ -1,5 +1,4 @@
 """Judgements for the tests of rig campaign: quick, or held up where the environment says."""
-from __future__ import annotations
 
 import os
 import time

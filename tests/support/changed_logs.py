@@ -1,5 +1,4 @@
 """Logs as an attacker or an accident would change them: valid containers with other contents."""
-from __future__ import annotations
 
 import struct
 import zlib

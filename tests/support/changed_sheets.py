@@ -1,5 +1,4 @@
 """Electronic data sheets that differ a little from that of node 3."""
-from __future__ import annotations
 
 from pathlib import Path
 

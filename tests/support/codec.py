@@ -5,7 +5,6 @@ out of range saturate, like the output of a transducer (INT32 at 1e-7 m covers +
 that);
 NaN has no raw value and raises ValueError: no invented number is sent.
 """
-from __future__ import annotations
 
 import struct
 from enum import IntFlag

@@ -1,5 +1,4 @@
 """A program: the answers of compare, add and fdi about a folder's traces, as JSON. For test_fits_on_other_cpus.py."""
-from __future__ import annotations
 
 import json
 import sys

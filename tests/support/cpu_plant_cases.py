@@ -1,5 +1,4 @@
 """A program: hashes of what the plant computes, one a case, as JSON. Run by test_plant_on_other_cpus.py."""
-from __future__ import annotations
 
 import hashlib
 import json

@@ -1,5 +1,4 @@
 """One device on an embedded bus, opposite a hand-made master: a test is a script of frames."""
-from __future__ import annotations
 
 from collections.abc import Callable
 from fnmatch import fnmatchcase

@@ -1,5 +1,4 @@
 """Data sheets and bench files of devices that do not exist."""
-from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

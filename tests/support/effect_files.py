@@ -1,5 +1,4 @@
 """Effect files as a user would write them, and a catalogue that forgets them after the test."""
-from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager

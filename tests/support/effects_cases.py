@@ -1,5 +1,4 @@
 """What the tests of effects share: plants that have the whole catalogue, so that one kernel serves all of them."""
-from __future__ import annotations
 
 import numpy as np
 from physics_cases import SILENT, SMOOTH

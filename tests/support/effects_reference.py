@@ -3,7 +3,6 @@
 Shares neither code nor scheme with plant/: the orifice law by bisection, compressible oil and LuGre's bristles as
 states of their own. The spool follows a given path.
 """
-from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any

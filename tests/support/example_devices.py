@@ -1,5 +1,4 @@
 """The controllers of examples/ as programs on a bus, and masters for them by independent libraries."""
-from __future__ import annotations
 
 import contextlib
 import queue

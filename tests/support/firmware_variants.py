@@ -2,7 +2,6 @@
 
 The layer works on frames alone, so a variant is a fault as seen on the bus and not one of a particular implementation.
 """
-from __future__ import annotations
 
 from collections.abc import Callable
 

@@ -1,5 +1,4 @@
 """Units of another tool, sound or with a fault: foreign_fmu.c compiled, and a description."""
-from __future__ import annotations
 
 import subprocess
 import zipfile

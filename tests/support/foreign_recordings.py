@@ -1,5 +1,4 @@
 """One run as other loggers write it: other names, units, rates, signs and formats."""
-from __future__ import annotations
 
 from pathlib import Path
 from typing import Any

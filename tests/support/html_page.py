@@ -1,5 +1,4 @@
 """What a page says: its text, tags, addresses and table cells; elements must be closed in order."""
-from __future__ import annotations
 
 from html.parser import HTMLParser
 

@@ -1,5 +1,4 @@
 """The elements and attributes of JUnit XML that both schemas of Jenkins allow, and their order."""
-from __future__ import annotations
 
 import re
 from pathlib import Path

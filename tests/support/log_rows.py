@@ -1,5 +1,4 @@
 """The rows of a run's log, byte for byte as they were written."""
-from __future__ import annotations
 
 from pathlib import Path
 

@@ -1,5 +1,4 @@
 """Files and folders of tests that `make quick` leaves out: each takes more than some 3 s."""
-from __future__ import annotations
 
 # Those of half a minute and more begin first: none is left to one worker at the end.
 LONGEST = (

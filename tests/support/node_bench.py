@@ -1,5 +1,4 @@
 """One bench node on an embedded bus, opposite a hand-made rest of the bench: a test is a script of frames."""
-from __future__ import annotations
 
 from collections.abc import Callable
 

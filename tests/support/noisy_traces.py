@@ -1,5 +1,4 @@
 """Traces for tests of the comparison: the plant in its loop, with noise of any colour and a faulty transducer."""
-from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache

@@ -2,7 +2,6 @@
 
 Each of the four looks at the CPU when it is loaded, so every setting needs a process of its own.
 """
-from __future__ import annotations
 
 import json
 import os

@@ -1,5 +1,4 @@
 """What the physics tests share: the preflight command, and plants without noise or friction."""
-from __future__ import annotations
 
 from plant import Model
 from plant.profile import build_profile

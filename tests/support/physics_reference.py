@@ -4,7 +4,6 @@
 solver (Radau) with the stops as events; `simulate_linear` the matrix exponential where nothing saturates. None of them
 shares code or scheme with plant/.
 """
-from __future__ import annotations
 
 from collections import namedtuple
 from collections.abc import Mapping

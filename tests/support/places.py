@@ -1,5 +1,4 @@
 """Where the project is, and where the shared material is when it lies beside the checkout."""
-from __future__ import annotations
 
 from pathlib import Path
 

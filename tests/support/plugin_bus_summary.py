@@ -5,7 +5,6 @@ User-Mode-Linux guest at hand, the socketcan tests are taken out here and run on
 vcan/test_vcan_guest.py; it records their number as the property `GUEST_TESTS`. A property travels from the worker that
 ran the test to the session that prints the summary.
 """
-from __future__ import annotations
 
 import os
 from collections import Counter

@@ -1,5 +1,4 @@
 """Controllers under test that are written with other libraries: canopen for the services, cantools for a DBC."""
-from __future__ import annotations
 
 import struct
 import threading

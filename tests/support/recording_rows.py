@@ -1,5 +1,4 @@
 """What a recording for the viewer holds."""
-from __future__ import annotations
 
 import math
 from pathlib import Path

@@ -1,5 +1,4 @@
 """What the code says about input that it must refuse."""
-from __future__ import annotations
 
 from collections.abc import Callable
 

@@ -1,5 +1,4 @@
 """Short measured runs for searches and fits: the plant with something hidden, at a tenth of the step of any fit."""
-from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path

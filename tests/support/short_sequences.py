@@ -1,5 +1,4 @@
 """Short sequences as text, and what it takes to play one in a test."""
-from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,5 +1,4 @@
 """Nodes that stay on a bus for the tests of a file, as on a real bench: starting them takes longer than a run."""
-from __future__ import annotations
 
 import contextlib
 import sys

@@ -1,5 +1,4 @@
 """A run to record without a bench: the plant over the preflight command (docs/physics.md), as frames and cycles."""
-from __future__ import annotations
 
 import math
 from collections.abc import Iterator

@@ -1,5 +1,4 @@
 """An independent reading of what was on the bus: candump's log through Wireshark's CANopen dissector."""
-from __future__ import annotations
 
 import re
 import subprocess

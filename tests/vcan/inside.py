@@ -7,7 +7,6 @@ Leaves in OUT: bus.xml (junit) from `bus`; run/, run.json, candump.log and one .
 and NAME.json of each of `examples`; minute/ and minute.json from `minute`. `compile` fills the cache of compiled code.
 It is meant for the host, which does it ten times as fast as its guest: both have the same files and the same CPU.
 """
-from __future__ import annotations
 
 import contextlib
 import json

@@ -1,5 +1,4 @@
 """guest.sh --check says why the guest does not work; the shim lets it boot where UML's register buffer is too small."""
-from __future__ import annotations
 
 import os
 import shutil

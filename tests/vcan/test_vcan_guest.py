@@ -3,7 +3,6 @@
 Runs on this kernel's vcan0 or else in a User-Mode-Linux guest, booted once for the whole file. Without either it is
 skipped, saying how to get it; with EHA_RIG_REQUIRE_VCAN=1 (as in CI) it fails instead.
 """
-from __future__ import annotations
 
 import json
 import shutil

@@ -1,5 +1,4 @@
 """Where a real CAN interface is to be had: this kernel's own vcan0, or a User-Mode-Linux guest with one."""
-from __future__ import annotations
 
 import functools
 import os

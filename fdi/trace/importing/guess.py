@@ -1,5 +1,4 @@
 """A first map of a recording, guessed from names, units and data; each choice with its reasons and how sure it is."""
-from __future__ import annotations
 
 import json
 import math

@@ -1,5 +1,4 @@
 """`rig add`: effects added to a model file and fitted; the error after each step, also on the held-out run."""
-from __future__ import annotations
 
 import argparse
 

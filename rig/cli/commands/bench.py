@@ -1,5 +1,4 @@
 """`rig bench`: the project's own benchmarks."""
-from __future__ import annotations
 
 import argparse
 from pathlib import Path

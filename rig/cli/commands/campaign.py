@@ -1,5 +1,4 @@
 """`rig campaign`: a matrix of faults, sizes, tolerances and seeds, or a folder of traces, judged on many cores."""
-from __future__ import annotations
 
 import argparse
 import json

@@ -1,5 +1,4 @@
 """`rig check`: a dry run of a sequence; the frames of a bench; a plant file over its nominal test; a fault file."""
-from __future__ import annotations
 
 import argparse
 from dataclasses import replace

@@ -1,5 +1,4 @@
 """`rig compare`: a model held against a measured trace."""
-from __future__ import annotations
 
 import argparse
 

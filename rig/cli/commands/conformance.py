@@ -1,5 +1,4 @@
 """`rig conformance`: test a CANopen node against CiA 301 and its EDS."""
-from __future__ import annotations
 
 import argparse
 import contextlib

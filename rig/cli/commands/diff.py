@@ -1,5 +1,4 @@
 """`rig diff`: two or more runs side by side."""
-from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence

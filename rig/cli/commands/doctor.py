@@ -1,5 +1,4 @@
 """`rig doctor`: what this machine can do, and how to get the rest."""
-from __future__ import annotations
 
 import argparse
 from collections import Counter

@@ -1,5 +1,4 @@
 """`rig effects`: the catalogue of physical effects, one effect in detail, and the self-test of an effect."""
-from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence

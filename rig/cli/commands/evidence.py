@@ -1,5 +1,4 @@
 """`rig evidence`: packs runs into a sealed folder or zip, and verifies one."""
-from __future__ import annotations
 
 import argparse
 from datetime import UTC, datetime

@@ -1,5 +1,4 @@
 """`rig explain`: which physical effect is missing from a model, with the evidence and the doubt."""
-from __future__ import annotations
 
 import argparse
 import os

@@ -1,5 +1,4 @@
 """`rig export`: signals as CSV, raw frames as CAN logs, a model as a functional mock-up unit."""
-from __future__ import annotations
 
 import argparse
 from pathlib import Path

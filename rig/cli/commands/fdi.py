@@ -1,5 +1,4 @@
 """`rig fdi`: how far faults have gone, from one captured test."""
-from __future__ import annotations
 
 import argparse
 from dataclasses import replace

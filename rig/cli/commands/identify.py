@@ -1,5 +1,4 @@
 """`rig identify`: the parameters of an actuator from its runs, with intervals, and what these runs do not show."""
-from __future__ import annotations
 
 import argparse
 import shlex

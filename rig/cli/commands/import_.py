@@ -1,5 +1,4 @@
 """`rig import`: a recording of any logger becomes a trace.mcap; `--guess` writes the first map of its columns."""
-from __future__ import annotations
 
 import argparse
 from pathlib import Path

@@ -1,5 +1,4 @@
 """`rig list`: the names that other commands take, with unit, range and default."""
-from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Mapping

@@ -1,5 +1,4 @@
 """`rig new`: a first file of your own, commented, to be completed."""
-from __future__ import annotations
 
 import argparse
 import os

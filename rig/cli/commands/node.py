@@ -1,5 +1,4 @@
 """`rig node`: one node of the bench on a bus, to face real hardware."""
-from __future__ import annotations
 
 import argparse
 import contextlib

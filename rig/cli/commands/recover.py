@@ -1,5 +1,4 @@
 """`rig recover`: brings back a log whose writer died."""
-from __future__ import annotations
 
 import argparse
 from dataclasses import asdict

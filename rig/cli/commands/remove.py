@@ -1,5 +1,4 @@
 """`rig remove`: an effect removed from a model file, and what that does to the error."""
-from __future__ import annotations
 
 import argparse
 from pathlib import Path

@@ -1,5 +1,4 @@
 """`rig report`: one offline HTML file about a trace."""
-from __future__ import annotations
 
 import argparse
 from pathlib import Path

@@ -1,5 +1,4 @@
 """`rig run`: play test sequences on the bench, log and judge them."""
-from __future__ import annotations
 
 import argparse
 

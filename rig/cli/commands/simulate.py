@@ -1,5 +1,4 @@
 """`rig simulate`: run a model on a command, without a bus, and write a trace."""
-from __future__ import annotations
 
 import argparse
 from pathlib import Path

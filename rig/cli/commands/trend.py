@@ -1,5 +1,4 @@
 """`rig trend`: how fault sizes grow from trace to trace, and the time left."""
-from __future__ import annotations
 
 import argparse
 from dataclasses import replace

@@ -1,5 +1,4 @@
 """`rig view`: a trace, a trace beside a model, or several traces, in the rerun viewer."""
-from __future__ import annotations
 
 import argparse
 import sys

@@ -1,5 +1,4 @@
 """The comparison as a whole: a perfect model is at the floor, and a fault is found in the block that has it."""
-from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache

@@ -1,5 +1,4 @@
 """`rig compare` on recordings of another simulator and of a real servo: right where the truth is known."""
-from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache

@@ -1,5 +1,4 @@
 """A real ball-screw drive that others have measured (EMPS): its published parameters leave the published errors."""
-from __future__ import annotations
 
 from pathlib import Path
 

@@ -1,5 +1,4 @@
 """Where an error is: sections, conditions, speed, and what a residual goes with, with errors put there."""
-from __future__ import annotations
 
 import re
 

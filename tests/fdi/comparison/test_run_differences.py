@@ -1,5 +1,4 @@
 """Runs side by side: what is subtracted, what is left out, and when two runs are the same."""
-from __future__ import annotations
 
 from dataclasses import replace
 

@@ -1,5 +1,4 @@
 """Filters of sensors are compared with a filtered model; how finely a column was recorded."""
-from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace

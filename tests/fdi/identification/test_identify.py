@@ -1,5 +1,4 @@
 """`rig identify`: an actuator of twice the size, what its runs do not show, and inputs that cannot be used."""
-from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,5 +1,4 @@
 """Trends: dates, laws, breaks, remaining life and its score, and the command."""
-from __future__ import annotations
 
 import json
 import math

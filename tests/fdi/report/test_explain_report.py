@@ -1,5 +1,4 @@
 """Reports of analyses: each verdict in a sentence, each error beside its floor, residuals as measured minus model."""
-from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache

@@ -1,5 +1,4 @@
 """Pages as a browser shows them: no overflow at any width, figures that can be zoomed and read, a print."""
-from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,5 +1,4 @@
 """The report: one file that needs nothing else and says what the trace says; close-ups of failed checks."""
-from __future__ import annotations
 
 import html
 import math

@@ -1,5 +1,4 @@
 """The three writers: one report with an item of every kind, as terminal text, as a page and as JSON."""
-from __future__ import annotations
 
 import json
 import math

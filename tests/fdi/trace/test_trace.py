@@ -1,5 +1,4 @@
 """Trace: the same columns whatever the file was; a clear line for what cannot be one, or would take gigabytes."""
-from __future__ import annotations
 
 import gzip
 import json

@@ -1,5 +1,4 @@
 """The benchmarks run, say what they measured, and say what they could not."""
-from __future__ import annotations
 
 import json
 import os

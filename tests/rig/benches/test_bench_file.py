@@ -1,5 +1,4 @@
 """Bench files: the shipped bench, the examples, what a log repeats, and one line for each mistake."""
-from __future__ import annotations
 
 from fractions import Fraction
 from pathlib import Path

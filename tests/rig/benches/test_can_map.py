@@ -1,5 +1,4 @@
 """A DBC as frames: bits and numbers are those of cantools, for any layout."""
-from __future__ import annotations
 
 import math
 from collections.abc import Iterator

@@ -1,5 +1,4 @@
 """An EDS or DCF as frames: bits are those of canopen's own PDO maps, for any mapping."""
-from __future__ import annotations
 
 import io
 import struct

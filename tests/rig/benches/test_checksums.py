@@ -1,5 +1,4 @@
 """Checksums: the tables of the standards, other people's code, and functions of users."""
-from __future__ import annotations
 
 import pytest
 from cantools.autosar.end_to_end import compute_profile2_crc

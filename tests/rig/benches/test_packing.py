@@ -1,5 +1,4 @@
 """Compiled packing: the same bits as bench.py, which the other tests compare with cantools and canopen."""
-from __future__ import annotations
 
 import random
 from fractions import Fraction

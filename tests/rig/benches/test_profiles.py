@@ -1,5 +1,4 @@
 """Control and status words of the profiles, against the tables of the canopen library."""
-from __future__ import annotations
 
 import pytest
 from canopen.profiles.p402 import State402

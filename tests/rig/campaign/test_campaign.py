@@ -1,5 +1,4 @@
 """rig campaign: the same rows by one process, by a cluster that loses a worker, and after a kill; its runner."""
-from __future__ import annotations
 
 import json
 import os

@@ -1,5 +1,4 @@
 """`rig check --bench`, `rig new bench`, `rig doctor --bench` and docs/bench.md."""
-from __future__ import annotations
 
 import re
 import shutil

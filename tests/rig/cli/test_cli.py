@@ -1,5 +1,4 @@
 """The command as scripts and people see it: help, one-line errors, exit statuses, JSON, signals, closed pipes."""
-from __future__ import annotations
 
 import os
 import pkgutil

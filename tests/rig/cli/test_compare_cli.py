@@ -1,5 +1,4 @@
 """`rig compare` and `rig diff` as typed: words, JSON, exit statuses, pages, and what they refuse in one line."""
-from __future__ import annotations
 
 import json
 import re

@@ -1,5 +1,4 @@
 """`rig explain`, `rig add` and `rig remove` on runs made with a tenth of their step: answers, pages, model files."""
-from __future__ import annotations
 
 import json
 import re

@@ -1,5 +1,4 @@
 """`rig fdi` as it is typed: verdict, table, JSON, exit statuses, other methods, and what it refuses in one line."""
-from __future__ import annotations
 
 import json
 import re

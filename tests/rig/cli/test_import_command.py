@@ -1,5 +1,4 @@
 """`rig import --map` and `--guess`: one run in several formats gives the same answer of `rig compare`."""
-from __future__ import annotations
 
 import sys
 import tomllib

@@ -1,5 +1,4 @@
 """`rig list`, `rig doctor` and the shell: every name that a command takes, and what this machine can do."""
-from __future__ import annotations
 
 import importlib.util
 import json

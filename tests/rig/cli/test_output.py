@@ -1,5 +1,4 @@
 """Results are whole or absent, and nothing that was there is lost; `rig simulate` takes the seconds it says."""
-from __future__ import annotations
 
 import importlib.util
 import resource

@@ -1,5 +1,4 @@
 """Data is not code: what a log or a model file brings along runs only with --trust, and after it was listed."""
-from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator

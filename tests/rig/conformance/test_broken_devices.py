@@ -1,5 +1,4 @@
 """Each defect of a device is found by the cases that are there for it, and by no others."""
-from __future__ import annotations
 
 from typing import Any
 

@@ -1,5 +1,4 @@
 """`rig conformance`: our nodes on the embedded bus and as processes on UDP; answers, files, exit status, bad input."""
-from __future__ import annotations
 
 import json
 from pathlib import Path

@@ -1,5 +1,4 @@
 """The tester: defects of data sheets, services our nodes lack, late or lied to, and leaving the node as it was."""
-from __future__ import annotations
 
 import random
 from pathlib import Path

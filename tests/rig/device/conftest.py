@@ -1,5 +1,4 @@
 """The tests of this folder run twice: on the slave core in Python and on that of the C firmware."""
-from __future__ import annotations
 
 import device_bench
 import pytest

@@ -1,5 +1,4 @@
 """The slave core against an independent implementation: the canopen library as master on the same embedded bus."""
-from __future__ import annotations
 
 import canopen
 import pytest

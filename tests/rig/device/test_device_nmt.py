@@ -1,5 +1,4 @@
 """NMT, heartbeat and its supervision, as far as the conformance test (tests/rig/conformance) does not see them."""
-from __future__ import annotations
 
 from pathlib import Path
 

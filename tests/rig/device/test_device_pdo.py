@@ -1,5 +1,4 @@
 """SYNC, PDOs and EMCY: latch order, transmission types, wrong lengths, error register and history."""
-from __future__ import annotations
 
 import struct
 from pathlib import Path

@@ -1,5 +1,4 @@
 """SDO server: the frames of CiA 301, 7.2.4.3, byte by byte, and every abort it knows."""
-from __future__ import annotations
 
 import random
 

@@ -1,5 +1,4 @@
 """Packages of runs: everything is in them, every changed byte is found; requirements from CSV and ReqIF are covered."""
-from __future__ import annotations
 
 import json
 import os

@@ -1,5 +1,4 @@
 """Devices of a user's own on the stack in C: compiled with the object table of their EDS, for any node number."""
-from __future__ import annotations
 
 import shutil
 from pathlib import Path

@@ -1,5 +1,4 @@
 """Runs with the C firmware on the project's UDP bus: it is built, started and gives the numbers of the built-in one."""
-from __future__ import annotations
 
 import os
 import shutil

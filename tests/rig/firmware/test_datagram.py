@@ -1,5 +1,4 @@
 """The datagrams of the C firmware's UDP port are python-can's: read what it packs, pack what it reads."""
-from __future__ import annotations
 
 import ctypes
 from typing import Any

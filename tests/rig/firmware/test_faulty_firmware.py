@@ -1,5 +1,4 @@
 """Each fault of a firmware is caught by the check that is meant for it, and a sound firmware by none."""
-from __future__ import annotations
 
 import os
 from collections.abc import Iterator

@@ -1,5 +1,4 @@
 """The firmware's object table is what the EDS of node 2 says."""
-from __future__ import annotations
 
 from rig.firmware.object_table import FOLDER, write_object_table
 

@@ -2,7 +2,6 @@
 
 The script is random: sound traffic, requests with random bits, frames of wrong length, foreign frames, pauses, resets.
 """
-from __future__ import annotations
 
 import random
 import struct

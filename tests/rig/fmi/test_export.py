@@ -1,5 +1,4 @@
 """Exported units: valid by FMPy, the bits of `rig simulate` in both versions, states, parameters, wrong calls."""
-from __future__ import annotations
 
 import ctypes
 import re

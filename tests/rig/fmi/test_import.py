@@ -1,5 +1,4 @@
 """Foreign units as plants: the exported EHA gives its own rows, others run, and bad ones end in a line."""
-from __future__ import annotations
 
 import json
 from pathlib import Path

@@ -1,5 +1,4 @@
 """One set of tests for every back end, then what is particular to each."""
-from __future__ import annotations
 
 import select
 import socket

@@ -1,5 +1,4 @@
 """`--bus` and EHA_RIG_BUS: what is taken, why, and what a bad one is told."""
-from __future__ import annotations
 
 import os
 import socket

@@ -1,5 +1,4 @@
 """The UDP bus as a python-can interface: programs that know nothing of this project join a run in one line."""
-from __future__ import annotations
 
 import subprocess
 import sys

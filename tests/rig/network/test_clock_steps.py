@@ -1,5 +1,4 @@
 """The clock is set while frames come: the kernel stamps with the wall clock, a run goes by the monotonic one."""
-from __future__ import annotations
 
 import struct
 from typing import Any

@@ -1,5 +1,4 @@
 """The emulator's record of its cycles survives the way through object 0x2212."""
-from __future__ import annotations
 
 import contextlib
 import zlib

@@ -1,5 +1,4 @@
 """DBC, object dictionaries and code say the same thing, signal by signal."""
-from __future__ import annotations
 
 import random
 import struct

@@ -2,7 +2,6 @@
 
 The device is canopen's local node, on the embedded bus with a virtual clock.
 """
-from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,5 +1,4 @@
 """The canopen library as master through both kinds of wire, and what it is kept from: malformed frames, strangers."""
-from __future__ import annotations
 
 import contextlib
 import threading

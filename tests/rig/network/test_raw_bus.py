@@ -1,5 +1,4 @@
 """Frames sent and received by compiled code, on UDP here and on SocketCAN where there is a vcan0."""
-from __future__ import annotations
 
 import os
 import socket

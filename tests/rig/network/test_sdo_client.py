@@ -1,5 +1,4 @@
 """The SDO client opposite a server that answers as a script says: every wrong confirmation ends in one clear line."""
-from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial

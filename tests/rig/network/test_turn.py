@@ -1,5 +1,4 @@
 """The turn to send on a group of the UDP bus: who holds it, and what is left when its programs end or are killed."""
-from __future__ import annotations
 
 import ctypes
 import signal

@@ -1,5 +1,4 @@
 """The plant emulator by scripts of frames: what acts when, what is counted, what goes wrong exactly when it is to."""
-from __future__ import annotations
 
 import json
 import zlib

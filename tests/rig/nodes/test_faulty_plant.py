@@ -1,5 +1,4 @@
 """The plant of a run with its faults and its load, as the emulator and the rig's own cycle move it."""
-from __future__ import annotations
 
 from plant import Model
 from rig.nodes.faulty_plant import FaultyPlant

@@ -1,7 +1,6 @@
 """The reference firmware by scripts of frames: when current flows, how a fault is taken back, and that its law is the
 one the model has. All tests run on the firmware in Python and on the one in C.
 """
-from __future__ import annotations
 
 import struct
 

@@ -1,5 +1,4 @@
 """Other formats, there and back."""
-from __future__ import annotations
 
 import shutil
 import subprocess

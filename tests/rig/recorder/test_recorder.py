@@ -1,5 +1,4 @@
 """The log as others read it: the mcap library and Google's protobuf, not this project's own reader."""
-from __future__ import annotations
 
 import shutil
 import struct

@@ -1,5 +1,4 @@
 """A log whose writer was killed comes back, up to the last half second."""
-from __future__ import annotations
 
 import os
 import re

@@ -1,5 +1,4 @@
 """Benches and runs of plants with signals of their own: an EMA with a drive, and a user's plant in one file."""
-from __future__ import annotations
 
 from pathlib import Path
 

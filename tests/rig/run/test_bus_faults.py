@@ -1,5 +1,4 @@
 """Faults on the bus from a sequence, in whole runs: what must change nothing changes nothing, the rest is noticed."""
-from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path

@@ -1,5 +1,4 @@
 """Benches with another cycle: the sequence keeps its seconds, the plant its physics, the log its cycle."""
-from __future__ import annotations
 
 import shutil
 from dataclasses import replace

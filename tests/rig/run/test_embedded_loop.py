@@ -1,5 +1,4 @@
 """Cycles that are played together as compiled code leave the same log as cycles that the nodes in Python play alone."""
-from __future__ import annotations
 
 from pathlib import Path
 from typing import Any

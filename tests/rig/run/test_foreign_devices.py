@@ -2,7 +2,6 @@
 
 Each is written with canopen or cantools, and each closes the same position loop, so each must move the ram alike.
 """
-from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator

@@ -3,7 +3,6 @@
 Any thread may stand still for half a second here: the machine is shared. So these tests ask for order and number and
 for what follows from what, and where an answer is needed they play on until it has come.
 """
-from __future__ import annotations
 
 import struct
 import threading

@@ -1,5 +1,4 @@
 """A run repeated from its log alone: the sequence with its files, the model, the user's effects, the seed."""
-from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace

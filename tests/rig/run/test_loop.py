@@ -1,5 +1,4 @@
 """The cycle against a clock and a bus that do as the script says: due times, overruns, lateness, late frames."""
-from __future__ import annotations
 
 from collections.abc import Callable
 from math import isnan

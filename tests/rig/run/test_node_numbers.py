@@ -1,5 +1,4 @@
 """A node number belongs to one node: a second one does not join the bus, and a run never starts one beside another."""
-from __future__ import annotations
 
 import os
 import sys

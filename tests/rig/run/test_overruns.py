@@ -1,5 +1,4 @@
 """The policy "abort": which cycles are overruns while a run is under way."""
-from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from math import nan

@@ -1,5 +1,4 @@
 """The page of a run: written by a second process, or here if that one is of no use."""
-from __future__ import annotations
 
 import os
 import signal

@@ -1,5 +1,4 @@
 """Real-time rights: taken where they are granted, given back, and taken for all threads of the process."""
-from __future__ import annotations
 
 import contextlib
 import ctypes

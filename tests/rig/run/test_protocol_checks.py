@@ -2,7 +2,6 @@
 
 The sequence has no checks of its own.
 """
-from __future__ import annotations
 
 from math import nan
 from pathlib import Path

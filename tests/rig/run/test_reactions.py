@@ -1,5 +1,4 @@
 """The shipped sequences of a reaction: the reference firmware passes, and a controller that does not react fails."""
-from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path

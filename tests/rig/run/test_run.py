@@ -1,5 +1,4 @@
 """Whole runs: the same bytes for the same seed, whatever the pace and the bus; and what a killed one leaves behind."""
-from __future__ import annotations
 
 import gc
 import os

@@ -1,5 +1,4 @@
 """The sequencer: phases in order, clean-up always, no current in the safe state, and what is told on the way."""
-from __future__ import annotations
 
 import json
 import threading

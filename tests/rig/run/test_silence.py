@@ -1,5 +1,4 @@
 """Nodes that have stopped sending: known by the time for which the rig listened, not by the time that passed."""
-from __future__ import annotations
 
 from collections.abc import Collection
 

@@ -1,5 +1,4 @@
 """The parts of a session without a bus: time and stage, journal, safe state."""
-from __future__ import annotations
 
 import pytest
 

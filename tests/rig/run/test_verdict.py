@@ -1,5 +1,4 @@
 """No false green: a run without checks is not judged, limits and faults are reported, and so is what is not nominal."""
-from __future__ import annotations
 
 import json
 from pathlib import Path

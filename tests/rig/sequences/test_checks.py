@@ -1,5 +1,4 @@
 """Checks against signals whose numbers are known in closed form; protocol checks blame no node for a late rig."""
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass

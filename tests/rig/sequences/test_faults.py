@@ -1,5 +1,4 @@
 """The fault schedule: what is wrong in which cycle, the same for the same seed, and cheap to ask."""
-from __future__ import annotations
 
 import json
 from pathlib import Path

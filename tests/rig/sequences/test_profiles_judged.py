@@ -1,5 +1,4 @@
 """Protocol checks on benches of other devices: CiA 402, plain CAN, and what does not apply to them."""
-from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path

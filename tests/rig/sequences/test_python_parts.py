@@ -1,5 +1,4 @@
 """A user's Python in a sequence: profile, check, steps; errors in it; code in a log runs only if it is trusted."""
-from __future__ import annotations
 
 import json
 import re

@@ -1,5 +1,4 @@
 """Sequences from TOML: what a good one says, what a bad one is told, and that the shipped ones do their work."""
-from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path

@@ -1,5 +1,4 @@
 """The uncertainty of checks covers what sensors and sampling do; decision rules; calibrations of a bench file."""
-from __future__ import annotations
 
 import datetime
 from collections.abc import Callable

@@ -1,5 +1,4 @@
 """`rig check`: the command of a sequence against the limits of the actuator, and the run it is predicted to make."""
-from __future__ import annotations
 
 import json
 from pathlib import Path

@@ -1,5 +1,4 @@
 """Suites: matrix, report, requirements, JUnit, diagnosis; a crash or a timeout of one case costs only that one."""
-from __future__ import annotations
 
 import json
 import re

@@ -1,5 +1,4 @@
 """The pytest plugin as a user's project sees it: a small project in a folder of its own, run by another pytest."""
-from __future__ import annotations
 
 import re
 import subprocess

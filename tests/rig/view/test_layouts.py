@@ -1,5 +1,4 @@
 """The layouts for Foxglove and PlotJuggler: every path is in the log of a real run, and every panel in the layout."""
-from __future__ import annotations
 
 import json
 import re

@@ -1,5 +1,4 @@
 """`rig run --live`: the log while it is written, the screen in a terminal and without one, and the viewer."""
-from __future__ import annotations
 
 import fcntl
 import importlib.util

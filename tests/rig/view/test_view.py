@@ -1,5 +1,4 @@
 """The viewer: the picture of a run, and recordings of `rig view --compare` and of several runs."""
-from __future__ import annotations
 
 import contextlib
 import http.client

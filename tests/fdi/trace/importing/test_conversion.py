@@ -1,5 +1,4 @@
 """Text tables, time bases, rates, gaps, delays and scales: what an import makes of them, and what a guess says."""
-from __future__ import annotations
 
 import math
 import re
