@@ -121,7 +121,7 @@ def measure_blocks(bus: str, seconds: float, blocks: int, contenders: Mapping[st
                    "priority": choose_priority()}
 
 
-def choose_bus(bus: str, seconds: float, blocks: int, least_block: float) -> str:
+def choose_bus(bus: str, seconds: float, blocks: int, least_block: float = 0.5) -> str:
     """The bus of a benchmark in real time: `bus`, or for "auto" a UDP group of this process's own.
 
     Raises:

@@ -34,5 +34,5 @@ def measure_cycle(args: argparse.Namespace, progress: Progress) -> Report:
     """The cycle in real time."""
     from rig.bench.benchmarks import build_realtime_report, choose_bus, measure_realtime
 
-    bus = choose_bus(args.bus, args.seconds, args.blocks, 0.5)
+    bus = choose_bus(args.bus, args.seconds, args.blocks)
     return build_realtime_report(measure_realtime(bus, args.seconds, args.blocks, progress))
