@@ -2,13 +2,7 @@
 from __future__ import annotations
 
 import math
-from math import exp, nan, sqrt
 from typing import NamedTuple
-
-import numpy as np
-from scipy.special import stdtrit
-
-from fdi.trace.trace import Floats
 
 
 class Share(NamedTuple):
@@ -42,25 +36,3 @@ def clopper_pearson_interval(good: int, of: int, confidence: float = 0.95) -> tu
     low = float(betaincinv(good, of - good + 1, tail)) if good > 0 else 0.0
     high = float(betaincinv(good + 1, of - good, 1.0 - tail)) if good < of else 1.0
     return low, high
-
-
-def estimate_geometric_mean(logs: Floats, risk: float, fewest: int) -> tuple[float, float, float]:
-    """The geometric mean of independent ratios and its interval by Student's t, NaN of fewer ratios than `fewest`.
-
-    Args:
-        logs: natural logarithms of the ratios, (n,); NaN: not measured.
-        risk: probability that the interval misses.
-        fewest: ratios for an interval, 2 or more.
-
-    >>> [round(x, 3) for x in estimate_geometric_mean(np.log([0.5, 1.0, 2.0]), 0.05, 2)]
-    [1.0, 0.179, 5.595]
-    """
-    known = logs[np.isfinite(logs)]
-    if not len(known):
-        return nan, nan, nan
-    mean = float(known.mean())
-    if len(known) < fewest:
-        return exp(mean), nan, nan
-    half = float(stdtrit(len(known) - 1, 1.0 - risk / 2) * known.std(ddof=1) / sqrt(len(known)))
-    with np.errstate(over="ignore"):  # of ratios that scatter widely nothing is known: up to infinity
-        return exp(mean), float(np.exp(mean - half)), float(np.exp(mean + half))
