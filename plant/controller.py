@@ -4,17 +4,16 @@ equations of a plant turned round, where it declares them so."""
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plant.flat import unpack_state
 from plant.kernels import control_plant, get_readings, invert_plant, start_control
 from plant.model import Model, build_kernel
 from plant.pid import Loop, compute_current
 from plant.ports import at_command
+from plant.segments import Array
 from plant.state import Input, Memory, Sampled
 
 __all__ = ["Loop", "compute_answers", "compute_current", "take_demand"]
-Array = NDArray[np.float64]
 
 
 def take_demand(com: float, m: Memory, sensed: float, t: float, p: Any) -> tuple[float, Memory]:

@@ -15,9 +15,10 @@ from plant.effects.valve import Compressibility
 from plant.eha import step_jack, update_compliance
 from plant.friction import clip
 from plant.parameters import GROUPS, convert_group_unit, read_shipped_model
-from plant.plants import Array, MeasuredPressures, Plant, Table, Term, base_effect
+from plant.plants import MeasuredPressures, Plant, Table, Term, base_effect
 from plant.ports import at_position, at_valve, port
 from plant.quantity import Metre, MetrePerSecond, Pascal, Quantity
+from plant.segments import Array
 from plant.signals import Signals
 from plant.state import Input, Line, Memory
 

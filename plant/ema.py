@@ -33,7 +33,8 @@ from plant.declare import (
     port,
     solve_sliding,
 )
-from plant.plants import Array, Table, Term
+from plant.plants import Table, Term
+from plant.segments import Array
 from plant.signals import Signals
 
 

@@ -8,16 +8,15 @@ Neither depends on the spool's friction, the pilot stage or the controller, so a
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plant.anchor import rest_at_reading
 from plant.eha import Coefficients, State, apply_oil, compute_coefficients, compute_metering_line, sense_ram
 from plant.flat import unpack_state
 from plant.model import Model, build_kernel
 from plant.ports import at_jack_drag, at_load
+from plant.segments import Array
 from plant.state import Drag, Input, Memory
 
-Array = NDArray[np.float64]
 STEPS, FINE = 5, 100  # a cycle: what was stiff is given here, only effects that remember want many
 
 

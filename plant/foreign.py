@@ -8,11 +8,9 @@ from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plant.pid import control_by_pid
-
-Array = NDArray[np.float64]
+from plant.segments import Array
 
 
 class Program(Protocol):

@@ -15,19 +15,17 @@ from math import ceil
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plant.compile import Function, compile_function, raise_unbound
 from plant.controller import Loop, compute_current
 from plant.errors import InputError
 from plant.flat import make_lane_packers
 from plant.friction import clip, soften
-from plant.lanes import Drive
+from plant.lanes import Array, Drive
 from plant.model import Model
 from plant.parameters import Controller
 from plant.threads import count_threads, map_in_threads
 
-Array = NDArray[np.float64]
 Reduction = Callable[[Array], Array]
 
 FAULTS = ("filter.clogging", "spool.static_friction")

@@ -19,9 +19,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, NamedTuple, cast
 
-import numpy as np
-from numpy.typing import NDArray
-
 from plant.compile import Function, find_called_functions, raise_unbound, rebind_names
 from plant.effects import CATALOGUE, Effect, build_base_effect, build_effect, combine_laws
 from plant.errors import InputError
@@ -43,14 +40,13 @@ from plant.ports import (
     port,
 )
 from plant.quantity import Quantity
-from plant.segments import Segment
+from plant.segments import Array, Segment
 from plant.signals import Signals
 from plant.state import Sampled
 
 __all__ = ["Fault", "MeasuredPressures", "Plant", "Table", "Term", "base_effect", "effect", "find_plant", "list_plants",
            "load_plant", "port"]
 
-Array = NDArray[np.float64]
 MODULES = {"eha": "plant.eha", "ehs": "plant.ehs", "ema": "plant.ema"}  # the shipped plants; read when first named
 CONTROL_AT = 2  # of an exported unit: behind the cycles of its plant and the answer of its controller
 OWN_EFFECTS = "__effects__"  # where a plant file keeps the effects that it declares

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plant.compile import compute_fingerprint, find_cache_folder, interpret_function
 from plant.controller import take_demand
@@ -21,11 +20,11 @@ from plant.kernels import write_reader
 from plant.machine_code import Call, StoredCode
 from plant.model import Model, build_kernel, collect_bindings
 from plant.plants import Plant, find_plant
+from plant.segments import Array
 from plant.signals import EHA, Signals
 from plant.solve import advance_flat_state, read_flat_sensors, run_closed_loop, step_cycle
 from plant.threads import run_beside
 
-Array = NDArray[np.float64]
 NOISES = len(EHA.outputs) + 1  # standard normal numbers a cycle of the EHA: position, pressure, spool, effects
 
 

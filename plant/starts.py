@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plant.controller import compute_answers
 from plant.effects import Effect
@@ -14,8 +13,8 @@ from plant.model import Model, build_bare_model
 from plant.plants import Plant, find_plant
 from plant.quantity import Quantity
 from plant.run import report_law_errors, simulate
+from plant.segments import Array
 
-Array = NDArray[np.float64]
 VISIBLE = (3.0, 30.0, 300.0)  # noise levels that starts are to show
 SHAPES = (1.0, 0.4, 2.5)  # times the usual value, for a parameter that does nothing alone
 DECADES = (-15, 13)  # where the size of a parameter without a hint is looked for

@@ -37,7 +37,7 @@ from rig.firmware.build import build_device
 from rig.network.bus import Link, LinkWire, can_open, open_can, serve_node
 from rig.network.clock import WallClock
 from rig.network.master import Master
-from rig.network.raw_bus import open_raw_bus
+from rig.network.raw_bus import RawBus
 from rig.nodes.emulator import Emulator
 from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
@@ -175,7 +175,7 @@ def build_responder(folder: Path) -> Path:
 def run_c_responder(bus: str) -> Iterator[None]:
     """Run the responder in C on a bus while the context lasts, on the CPU and with the priority of the emulator."""
     frames = load_bench().frames
-    with tempfile.TemporaryDirectory() as folder, open_raw_bus(bus, [frames.sync or 0]) as raw:
+    with tempfile.TemporaryDirectory() as folder, RawBus(bus, [frames.sync or 0]) as raw:
         receive, send, turn = raw.descriptors
         feedback, valve = (_pack(bus, frames.find_role(role).identifier) for role in ("feedback", "valve_state"))
         number = next(each for each in frames.find_role("valve_state").fields if each.name == "cycle")

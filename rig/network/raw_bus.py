@@ -5,7 +5,7 @@ A COB-ID has the flags of frame.py: EXTENDED for an identifier of 29 bits, FD fo
 A loop that must not be late is a plain function that calls `receive_frame` and `send_frame`, compiled as a whole by
 `plant.compile.compile_function`. It runs without the interpreter lock; it makes no Python object and allocates nothing.
 
-    with open_raw_bus("udp_multicast:239.0.0.1", (sync, drive)) as bus:   # COB-IDs; Python: opens, sets the filters
+    with RawBus("udp_multicast:239.0.0.1", (sync, drive)) as bus:   # COB-IDs; Python: opens, sets the filters
         run = compile_function(my_loop)
         run(bus.port, ...)                                                            # in a thread of its own
 
@@ -486,7 +486,9 @@ def _read_number(octets: NDArray[np.uint8], first: int, place: int, count: int) 
 
 
 class RawBus:
-    """A bus for compiled loops; `port` is what they get. Use it as a context, or close it.
+    """`socketcan:INTERFACE` or `udp_multicast[:GROUP]` for compiled loops, as a context or to be closed.
+
+    `port` is what the loops get.
 
     Counted, to be read at any time: `error_frames`; `overflows`, frames lost on the way in; `dropped`, remote frames,
     and frames of 29 bits and CAN FD frames that nobody asked for; `unsent`, frames the full transmit queue refused. On
@@ -630,11 +632,6 @@ def _open_socketcan(channel: str, is_fd: bool, stack: contextlib.ExitStack) -> s
     raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, int(is_fd))
     raw.bind((channel,))
     return raw
-
-
-def open_raw_bus(spec: str, cob_ids: Sequence[int] | None = None, fd: bool = False) -> RawBus:
-    """Open `socketcan:INTERFACE` or `udp_multicast[:GROUP]` for compiled loops; see `RawBus`."""
-    return RawBus(spec, cob_ids, fd)
 
 
 def _make_port() -> Port:

@@ -28,14 +28,14 @@ from rig.network.clock import WallClock
 from rig.network.master import HEARTBEAT_LIMIT, PATIENT, Master
 from rig.network.node_objects import CONTROLLER, Gains, Identity, read_gains
 from rig.nodes.scenario import Scenario
-from rig.run.attribution import Mask, find_start_problem
+from rig.run.attribution import find_start_problem
 from rig.run.job import Job
 from rig.run.loop import AFTER, BEFORE, BEFORE_MAIN, CycleInput, History, Loop
 from rig.run.loops import open_loop
 from rig.run.state import Journal, SafeState, Stage
 from rig.run.watch import PATIENCE, describe_silence
 from rig.sequences.faults import Plan, Schedule
-from rig.sequences.protocol import ProtocolLimits, Rows
+from rig.sequences.protocol import Mask, ProtocolLimits, Rows
 
 PROBES = 2  # before set-up, of a controller that can be reset
 ATTEMPTS = 5  # at each of them, in real time

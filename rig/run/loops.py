@@ -31,10 +31,10 @@ def open_loop(master: Master, bench: Bench, scenario: Scenario, faults: Schedule
     """
     is_compiled = bench.has_plant_node or scenario.model.kind.foreign is None  # or Python moves the plant
     if can_open(bus) and isinstance(master.wire, LinkWire) and is_compiled:
-        from rig.network.raw_bus import open_raw_bus  # here: on the embedded bus a run needs none of it
+        from rig.network.raw_bus import RawBus  # here: on the embedded bus a run needs none of it
         from rig.run.hard_loop import HardLoop
 
-        return HardLoop(master, bench, scenario, faults, log, open_raw_bus(bus, bench.frames.identifiers), realtime)
+        return HardLoop(master, bench, scenario, faults, log, RawBus(bus, bench.frames.identifiers), realtime)
     if guards is not None and not realtime and can_play_many(master, bench):
         return EmbeddedLoop(master, bench, scenario, faults, log, guards)
     return CycleLoop(master, bench, scenario, faults, log, realtime)

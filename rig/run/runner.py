@@ -19,7 +19,7 @@ from rig.network.clock import WallClock
 from rig.network.node_objects import CycleRecord
 from rig.recorder import Check, Observer, Recorder
 from rig.recorder.schema import collect_provenance, read_epoch_ns
-from rig.run.attribution import Attribution, CycleRecords, Mask, attribute, find_injected
+from rig.run.attribution import Attribution, CycleRecords, attribute, find_injected
 from rig.run.job import Job, find_differences
 from rig.run.loop import History
 from rig.run.loops import compile_loop
@@ -36,7 +36,7 @@ from rig.run.priority import (
 from rig.run.session import MAIN, Session
 from rig.sequences.checks import CheckResult, SkippedCheck, evaluate_checks, find_skipped
 from rig.sequences.faults import Schedule
-from rig.sequences.protocol import judge_protocol
+from rig.sequences.protocol import Mask, judge_protocol
 from rig.sequences.python_parts import StepRun
 from rig.sequences.uncertainty import NO_METROLOGY, Metrology, collect_metrology
 

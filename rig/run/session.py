@@ -25,7 +25,7 @@ from rig.network.frame import Frame
 from rig.network.master import HEARTBEAT, Master
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, CycleRecord, NmtState
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
-from rig.run.attribution import Mask, find_injected
+from rig.run.attribution import find_injected
 from rig.run.bring_up import (
     BringUp,
     Enabling,
@@ -44,7 +44,7 @@ from rig.run.state import Journal, SafeState, Stage
 from rig.run.watch import PATIENCE, NodeWatch, OverrunWatch
 from rig.sequences.checks import DriveFrames, Guard, GuardWatch
 from rig.sequences.faults import Schedule
-from rig.sequences.protocol import ProtocolRecord, Rows
+from rig.sequences.protocol import Mask, ProtocolRecord, Rows
 
 SETUP, MAIN, CLEANUP = 0, 1, 2
 PHASES = ("setup", "main", "cleanup")

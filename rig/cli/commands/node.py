@@ -18,7 +18,7 @@ from rig.network.bus import Link, can_open, choose_bus, open_can, serve_node
 from rig.network.clock import WallClock
 from rig.network.frame import Node
 from rig.network.node_objects import CONTROLLER, PLANT, read_gains
-from rig.network.raw_bus import open_raw_bus
+from rig.network.raw_bus import RawBus
 from rig.nodes.emulator import Emulator, PlantPlace
 from rig.nodes.emulator_service import EmulatorService, list_unheard
 from rig.nodes.firmware import Firmware
@@ -100,7 +100,7 @@ def make_node(args: argparse.Namespace, bench: Bench, link: Link, stack: context
     """
     if is_compiled:
         is_locked = stack.enter_context(lock_memory())
-        raw = stack.enter_context(open_raw_bus(choose_bus(args.bus)[0]))
+        raw = stack.enter_context(RawBus(choose_bus(args.bus)[0]))
         link.leave_out(list_unheard(bench))
         service = EmulatorService(link.send, raw, enter_loop_thread, choose_scenario(args), is_locked, bench)
         stack.callback(service.close)

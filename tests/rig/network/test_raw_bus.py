@@ -34,7 +34,7 @@ from rig.network.raw_bus import (
     TIMEOUT,
     WOKEN,
     Port,
-    open_raw_bus,
+    RawBus,
 )
 
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
@@ -79,7 +79,7 @@ class TestFrames:
         cob_ids = [kind | number for kind in kinds for number in (0, 0x7F, 0x80, 0x182, 0x7FF)]
         cob_ids += [kind | number for kind in kinds if kind & EXTENDED for number in (0x800, 0x18FEF1AB, IDENTIFIER)]
         receive = function("receive_frame")
-        with open_can(where, fd=True) as other, open_raw_bus(where, cob_ids) as bus:
+        with open_can(where, fd=True) as other, RawBus(where, cob_ids) as bus:
             receive(bus.port, 0)  # compiles it
             for length in (*range(9), *FD_LENGTHS):
                 data = bytes(range(0xF8 - length, 0xF8))
@@ -104,7 +104,7 @@ class TestFrames:
         kinds = (0, EXTENDED, FD, EXTENDED | FD)
         with open_can(where, fd=True) as other:
             for wanted in kinds:
-                with open_raw_bus(where, [number | wanted for number in (0x12, 0xFF, 0x183)], fd=True) as bus:
+                with RawBus(where, [number | wanted for number in (0x12, 0xFF, 0x183)], fd=True) as bus:
                     for kind in kinds:
                         for number in (0x12, 0x13, 0xFF, 0x182, 0x183):
                             other.send(make_message(number | kind, b"\1"))
@@ -115,14 +115,14 @@ class TestFrames:
                     assert receive_waiting(bus.port) == [EXTENDED | 0x12345678, 0x80]
 
     def test_a_length_that_no_such_frame_has_fails(self, where: str) -> None:
-        with open_raw_bus(where, (), fd=True) as bus:
+        with RawBus(where, (), fd=True) as bus:
             for cob_id, length in ((0x80, 9), (EXTENDED | 0x80, 12), (FD | 0x80, 9), (FD | 0x80, 65)):
                 status = function("send_payload")(bus.port, cob_id, length)
                 assert status == FAILED and "Invalid argument" in str(bus.explain_failure(status))
 
     def test_only_the_frames_asked_for_arrive_and_none_of_its_own(self, where: str, other: can.BusABC) -> None:
         wanted = [0x000, 0x050, 0x0FF, 0x183, 0x7FF]  # each length of an identifier in msgpack
-        with open_raw_bus(where, wanted) as bus, open_raw_bus(where) as python:
+        with RawBus(where, wanted) as bus, RawBus(where) as python:
             function("send_frame")(bus.port, 0x183, 0, 0)
             for cob_id in range(0x800):
                 other.send(can.Message(arbitration_id=cob_id, is_extended_id=False))
@@ -136,7 +136,7 @@ class TestFrames:
 
     def test_time_is_that_of_reception(self, where: str) -> None:
         receive, send = function("receive_frame"), function("send_frame")
-        with open_raw_bus(where) as bus, open_raw_bus(where) as sender:
+        with RawBus(where) as bus, RawBus(where) as sender:
             receive(bus.port, 0)
             before = time.monotonic_ns()
             send(sender.port, 0x80, 0, 0)
@@ -149,7 +149,7 @@ class TestFrames:
 
     def test_waits_until_its_deadline_or_until_it_is_woken(self, where: str) -> None:
         receive = function("receive_frame")
-        with open_raw_bus(where) as bus:
+        with RawBus(where) as bus:
             assert receive(bus.port, 0) == (TIMEOUT, 0, 0, 0, 0)
             end = soon(0.02)
             assert receive(bus.port, end)[0] == TIMEOUT
@@ -164,7 +164,7 @@ class TestFrames:
 
     def test_waits_in_the_call_that_receives(self, where: str, other: can.BusABC) -> None:
         await_frame = function("await_frame")
-        with open_raw_bus(where) as bus:
+        with RawBus(where) as bus:
             assert await_frame(bus.port) == (TIMEOUT, 0, 0, 0, 0)
             other.send(can.Message(arbitration_id=0x123, data=b"\x07", is_extended_id=False))
             status, t_ns, *rest = await_frame(bus.port)
@@ -177,7 +177,7 @@ class TestFrames:
 
     def test_a_lost_frame_is_counted(self, where: str) -> None:
         receive, send = function("receive_frame"), function("send_frame")
-        with open_raw_bus(where) as bus, open_raw_bus(where, ()) as sender:
+        with RawBus(where) as bus, RawBus(where, ()) as sender:
             with socket.socket(fileno=os.dup(bus.descriptors[0])) as same:
                 same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 100_000)  # bytes; it holds some hundred frames
             sent = sum(send(sender.port, 0x100, 0, 0) == SENT for _ in range(3_000))
@@ -291,8 +291,8 @@ class TestDatagrams:
 def test_everybody_hears_all_frames_in_one_order(where: str) -> None:
     receive, send = function("receive_frame"), function("send_frame")
     with ExitStack() as stack:
-        receivers = [stack.enter_context(open_raw_bus(where)) for _ in range(3)]
-        senders = [stack.enter_context(open_raw_bus(where, ())) for _ in range(4)]
+        receivers = [stack.enter_context(RawBus(where)) for _ in range(3)]
+        senders = [stack.enter_context(RawBus(where, ())) for _ in range(4)]
 
         def work(number: int) -> None:
             for k in range(300):
@@ -312,5 +312,5 @@ def test_other_buses_are_refused() -> None:
     for where in ("embedded", "virtual:x", "slcan:x"):
         assert not can_open(where)
         with pytest.raises(InputError):
-            open_raw_bus(where)
+            RawBus(where)
     assert can_open("udp_multicast") and can_open("socketcan:vcan0")

@@ -11,7 +11,7 @@ from bus_stations import spec
 
 from plant.compile import compile_function
 from rig.network.bus import open_can
-from rig.network.raw_bus import NO_TURN, SENT, open_raw_bus, send_frame
+from rig.network.raw_bus import NO_TURN, SENT, RawBus, send_frame
 from rig.network.udp import PORT, Turn
 from studies.robustness.disturb import has_semaphores
 
@@ -25,7 +25,7 @@ def find_group() -> str:
 def test_a_turn_that_is_held_is_one_line_and_ends_with_its_holder() -> None:
     group, send = find_group(), compile_function(send_frame)
     message = can.Message(arbitration_id=1, is_extended_id=False)
-    with open_raw_bus(f"udp_multicast:{group}") as bus, open_can(f"udp_multicast:{group}") as other:
+    with RawBus(f"udp_multicast:{group}") as bus, open_can(f"udp_multicast:{group}") as other:
         with subprocess.Popen([sys.executable, "-c", TAKE + "print('taken', flush=True); input()", group, str(PORT)],
                               stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
             assert holder.stdout is not None and holder.stdout.readline() == b"taken\n"

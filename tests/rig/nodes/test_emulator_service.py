@@ -22,7 +22,7 @@ from rig.network.bus import Link, open_can, serve_node
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
 from rig.network.node_objects import decode_cycle_record
-from rig.network.raw_bus import make_closed_port, open_raw_bus
+from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator import Emulator, PlantPlace
 from rig.nodes.emulator_service import EmulatorService, compile_loop, list_unheard
@@ -48,7 +48,7 @@ class BusDesk:
 
         def serve() -> None:
             clock = WallClock()
-            with open_raw_bus(self.where) as raw:
+            with RawBus(self.where) as raw:
                 link = Link(open_can(self.where), clock.now)
                 link.leave_out(list_unheard(load_bench()))
                 self.node = EmulatorService(link.send, raw, enter_loop_thread, self.scenario)
@@ -281,7 +281,7 @@ def test_a_wake_up_does_not_end_the_wait_for_a_drive(monkeypatch: pytest.MonkeyP
     where = spec("udp_multicast")
     await_drive = compile_function(ec._await_drive)
     await_drive(make_closed_port(), ec.make_memory(Model(), [], Schedule(Plan(stop=0)), frames=place.frames))
-    with open_raw_bus(where, [codec.DRIVE]) as raw:
+    with RawBus(where, [codec.DRIVE]) as raw:
         link = Link(open_can(where), lambda: 0)
         raw.wake()
         timer = threading.Timer(0.05, link.send, (codec.DRIVE, codec.pack_drive(0.0, 15, 7)))

@@ -25,7 +25,7 @@ from rig.network.bus import Link, LinkWire, open_can
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
 from rig.network.master import Master
-from rig.network.raw_bus import open_raw_bus
+from rig.network.raw_bus import RawBus
 from rig.network.udp import PORT, Turn
 from rig.nodes.scenario import Scenario
 from rig.recorder import Signals, Timing
@@ -116,7 +116,7 @@ class Bench:
         self.master.hooks.on_frame = self.frames.append
         schedule = Schedule(Plan(faults=faults, stop=1000))
         bench = replace(load_bench(), cycle_ns=PERIOD)
-        bus = open_raw_bus(where, bench.frames.identifiers)
+        bus = RawBus(where, bench.frames.identifiers)
         self.loop = HardLoop(self.master, bench, Scenario(Model(), Plan(stop=0)), schedule, self, bus, realtime, ahead)
         self._markers = 0
 
