@@ -154,9 +154,9 @@ BAD_INPUTS = [
     # models and effects
     bad("compare run.csv --model new_group.toml", "new_group.toml", "rocket"),
     bad("compare run.csv --model new_field.toml", "new_field.toml", "static_fricton", "static_friction"),
-    bad("compare run.csv --model negative.toml", "negative.toml", "spool.static_friction", "at least 0 N", "not -3"),
+    bad("compare run.csv --model negative.toml", "negative.toml", "spool.static_friction", "from 0 to", "not -3"),
     bad("compare run.csv --model word_value.toml", "word_value.toml", "spool.static_friction", "number"),
-    bad("compare run.csv --model broken.toml", "broken.toml", "line 1"),
+    bad("compare run.csv --model broken.toml", "broken.toml:1", "TOML"),
     bad("compare run.csv --effects absent.py", "absent.py", "does not exist"),
     bad("compare run.csv --effects no_colon.py", "no_colon.py", "line 1"),
     bad("compare run.csv --effects no_effect.py", "no_effect.py", "effect"),
