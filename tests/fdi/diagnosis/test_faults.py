@@ -64,7 +64,7 @@ def test_the_papers_faults_are_a_file_with_the_limits_of_table_2() -> None:
     ({"maintenance": 1.0}, ["maintenance", "within the range"]),
     ({"acceptable": -1.0}, ["acceptable", "within the range"]),
     ({"range": [1e-5, 5e-4]}, ["range", "healthy size"]),
-    ({"range": [-1.0, 1.0]}, ["range", "at least 0 m"]),
+    ({"range": [-1.0, 1.0]}, ["range", "from 0 to 1 m"]),
     ({"range": [1.0]}, ["range", "[a number, a number]"]),
     ({"unit": "mm"}, ["unit", "m, that of feedback_gap.gap"]),
     ({"mantenance": 1.0}, ["mantenance", "did you mean 'maintenance'?"]),

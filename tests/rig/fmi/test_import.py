@@ -102,7 +102,7 @@ def test_a_unit_of_another_tool_is_mapped_simulated_and_compared(folder: Path, v
     other = answer("compare", "run.csv", "--model", "slide.toml", "--set", "drive.gain=2.2", status=1)
     assert other["verdict"] == "MODEL_INCOMPLETE"
     assert "a plant with equations" in refuse("explain", "run.csv", "--model", "slide.toml")
-    assert "at most 10" in refuse("simulate", "--model", "slide.toml", "--set", "drive.gain=12")
+    assert "from 0.5 to 10" in refuse("simulate", "--model", "slide.toml", "--set", "drive.gain=12")
 
 
 def test_identify_finds_the_parameters_that_the_map_gives_a_range(folder: Path) -> None:
