@@ -17,7 +17,7 @@ the thresholds.
 | more noise | the best leaves more than noise, or its tolerances are those of {TOLERANCES_FAR_SHARE:.2%} of healthy units | searches again from a nominal unit with 30 and 6 times the noise |
 | other valleys | two effects remove {FURTHER_EFFECT_SHARE:g} of the excess cost and still leave more than noise | fits the best two pairs again with a population |
 | number of effects | always | keeps the effects that gain more than {GAIN_SEEN:g}, of several only those whose removal costs more than {GAIN_CONVINCES:g} |
-| last fits | always | finishes the base and the best four with finer steps, on the repeats too; begins again those of the best two that leave a mean square above {WHITE_SQUARE_POOR:g} or have far tolerances |
+| last fits | always | finishes the base and the best four with finer steps, on the repeats too; begins again those of the best two that leave a mean square above {WHITE_SQUARE_POOR:g} or have far tolerances; with a population these and the base, if they leave only noise and still such a mean square or far tolerances |
 | rivals | the best one leaves only noise | begins the others that do so too, and effects whose signature has a cosine of {LOOKS_ALIKE:g} with its own, from its tolerances |
 | intervals | the base leaves only noise | drops effects whose 95 % interval holds the off value |
 | small gain | the gain is below {GAIN_DOUBTFUL:g} | fits the base again from there; drops a single effect that then gains at most {GAIN_SEEN:g} |
@@ -293,7 +293,8 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
         base, *close = search.map_parallel(partial(search.finish_hypothesis, rounds=2), [base, *close])
         close = _sort_by_cost(close)
     close = _sort_by_cost([*search.map_parallel(search.begin_again, close[:2]), *close[2:]])
-    close = _sort_by_cost([*search.map_parallel(search.search_decided, close[:2]), *close[2:]])
+    base, *close = [*search.map_parallel(search.leave_valley, [base, *close[:2]]), *close[2:]]
+    close = _sort_by_cost(close)
     if is_cut and close and search.leave_out_undecided(close[0]):
         base, *close = search.map_parallel(partial(search.finish_hypothesis, rounds=2), [base, *close])
     return _doubt_small_gain(search, base, _compare_rivals(search, base, close), depth)

@@ -30,7 +30,6 @@ from fdi.estimation.fit import (
     list_effect_unknowns,
     name_sine,
     place_in_healthy_unit,
-    replay_fit,
     scale_noise,
     scaled_bounds,
     silence_readings,
@@ -254,11 +253,11 @@ class Search:
         free = h.fit.free
         has_prior = np.isfinite([f.prior for f in free])
         home = np.where(has_prior, 0.0, h.fit.x)
-
-        begun = fit_unknowns(scale_noise(self.problem, 100.0), free, home, 4)
+        coarse = replace(self.problem, steps=Problem.steps, also=(), _lanes={})  # enough for what leads to a valley
+        begun = fit_unknowns(scale_noise(coarse, 100.0), free, home, 4)
         width = np.where(has_prior, 0.5, 0.1 * np.maximum(np.abs(begun.x), 0.1))
         end = follow_population(
-            self.problem, begun, np.diag(width**2), VALLEY_STAGES, 0,
+            coarse, begun, np.diag(width**2), VALLEY_STAGES, 0,
             lambda problem, fit, rounds, factor: fit_unknowns(scale_noise(problem, factor), free, fit.x, rounds))
         other = self.judge_fit(h.effects, fit_unknowns(self.problem, free, end.x))
         return min(h, other, key=lambda each: each.cost + each.repeat_cost)
@@ -471,18 +470,17 @@ class Search:
         self.repeats = [cut(problem) for problem in self.repeats]
         return True
 
-    def search_decided(self, h: Hypothesis) -> Hypothesis:
-        """A last fit that leaves more than noise of the rows that hang on no stop, or where a population ends there.
+    def leave_valley(self, h: Hypothesis) -> Hypothesis:
+        """A last fit, or where a population ends, for one that is in a valley of its own and if that ends lower.
 
-        A fit that began with all rows may be far off in size, and the way to the right one is rough.
+        Such a fit leaves only noise, but more than was learned or far from a healthy unit: a stop that the base has
+        missed would be the gain of any effect. Beside an observer, which keeps residuals short, it may leave more than
+        noise: one that began with rows that hang on a stop may be far off in size.
         """
-        if self.model.kind.correct is None or not h.is_poor:
+        is_misled = h.is_poor or (h.is_far and h.is_at_floor)
+        if not is_misled or not (h.is_at_floor or self.model.kind.correct is not None):
             return h
-        coarse = copy(self)
-        coarse.problem = replace(self.problem, steps=Problem.steps, also=(), workers=1, _lanes={})
-        begun = coarse.judge_fit(h.effects, replay_fit(coarse.problem, h.fit, h.fit.x))
-        again = self.finish_hypothesis(coarse.search_widely(begun))
-        return min(h, again, key=lambda each: each.cost)
+        return min(h, self.finish_hypothesis(self.search_widely(h)), key=lambda each: each.cost)
 
     def begin_beside(self, best: Hypothesis, rival: Hypothesis, rounds: int = 4) -> Hypothesis:
         """A rival of the best hypothesis, or the same effects from the tolerances of the best if that ends lower.
