@@ -236,7 +236,7 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
     parents = [next((p for p in levels[i] if p.effects == close[0].effects[:i]), levels[i][0]) for i in range(1, depth)]
     base, *close = search.judge_on_all([base, *close], FINE)
     ledger = [base, *parents, *close[:1]]
-    told = [base, *close, *others[:3]]
+    told = [*ledger, *close[1:], *others[:3]]
     held = dict(zip((h.effects for h in told), search.measure_holdout(told), strict=True))
     unseen = {h.effects: _judge_unseen_run(search, h, floor) for h in close}
     holding = [h for h in close if unseen[h.effects].holds]
