@@ -21,8 +21,8 @@ NOISE_BAND_RATIO = 2.0
 # RMS residual over noise up to which only noise is left; what is above is physics that the model lacks.
 #
 # The solver's error at the 20 steps a cycle of the last fits is up to 0.5 um beside 2 um of noise (docs/statistics.md):
-# 3 %. The noise itself is known to 3 % from one repeat (docs/statistics.md). 317 of 320 fits of simulated units stayed
-# below (docs/statistics.md).
+# 3 %. The noise itself is known to 3 % from one repeat (docs/statistics.md). Of 320 fits of simulated units 317 stayed
+# below.
 RESIDUAL_IS_NOISE = 1.08
 
 # Share of the noise floor that the solver's error may reach: added in squares, a fifth makes 2 %.
