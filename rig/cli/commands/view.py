@@ -56,7 +56,8 @@ def show_in_browser(report: Report, rrd: Path, args: argparse.Namespace) -> int:
         give_answer(replace(report, sentence=f"{report.sentence}\n{address}  (Ctrl-C ends it)",
                             data={**report.data, "address": address}), args)
         sys.stdout.flush()
-        webbrowser.open(address)
+        if not is_to_stop():  # asked first: from here on Ctrl-C ends the viewer, also while the browser starts
+            webbrowser.open(address)
         while not is_to_stop() and server.poll() is None:
             time.sleep(0.1)
     return 0

@@ -209,7 +209,7 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
     (("--fault", "healthy", "--scheduler", "tcp://127.0.0.1:1"), "--scheduler: tcp://127.0.0.1:1: expected the addr"),
     (("--fault", "healthy", "--scheduler", "nowhere"), "--scheduler: nowhere: expected the address"),
     ((), "expected a matrix file, the shipped matrix statistics, a folder of traces, or --fault EFFECT=SIZE,.."),
-    (("nothing.toml",), "nothing.toml: expected a readable file"),
+    (("nothing.toml",), "nothing.toml: expected a file that can be read"),
 ])
 def test_bad_input_is_one_line(words: tuple[str, ...], complaint: str, tmp_path: Path,
                                monkeypatch: pytest.MonkeyPatch) -> None:
