@@ -390,7 +390,7 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
     if best.is_at_floor and there and not firmware_left:
         # named alone only with the gain with which an effect is named where the model is at the floor without it
         equal = [h for h in there if h is there[0] or (
-            measure_gain(h, there[0]) < GAIN_CONVINCES
+            not h.is_far and measure_gain(h, there[0]) < GAIN_CONVINCES
             and not (base.is_at_floor and measure_gain(base, h) < GAIN_CONVINCES))]
         if len(equal) > 1:
             return "AMBIGUOUS", (*prints, *dict.fromkeys(e for h in equal for e in h.effects))
