@@ -68,7 +68,10 @@ TRANSIENT = 20  # rows at either end, of the filter's transient
 def measure_drive_error(trace: Trace, model: Model) -> float | None:
     """Share of the drive, 0 to 1, that the inverse model leaves; None where the plant declares none or it cannot tell.
 
-    Drive k - 1 acts from row k to k + 1.
+    Defined as the users of the EMPS benchmark do (A. Janot, M. Gautier, M. Brunot, "Data Set and Reference Models of
+    EMPS", 2019): the controlled signal through a Butterworth filter of fourth order, forwards and backwards, rates by
+    central differences, both drives decimated by ten; |u - u_model| / |u|. At 1 kHz the filter ends at 100 Hz. Drive
+    k - 1 acts from row k to k + 1.
     """
     rows = len(trace) - 2 * TRANSIENT
     if model.kind.inverse is None or rows < 50 * DECIMATION or np.isnan(trace.controlled).any():

@@ -806,10 +806,11 @@ def absorb_shifts(fit: Fit, white: Floats, held: Sequence[Iterable[str]], begun:
     x = np.array([_shift_unknowns(fit.free, thin, each[:, ::SCAN_STRIDE], start, move)
                   for each, start, move in zip(white, begun, moves, strict=True)])
     whole, priors = fit.jacobian.reshape(len(fit.x), -1), weigh_priors(fit.free)
-    costs, stayed = (compute_misfit(white) + (at * moves) ** 2 @ priors for at in (x, begun))
+    costs = (x * moves) ** 2 @ priors
     for few in cut_runs(white.shape):
         left = white[few] + ((x[few] - begun[few]) @ whole).reshape(white[few].shape)
-        costs[few] += compute_misfit(left) - compute_misfit(white[few])
+        costs[few] += compute_misfit(left)
+    stayed = compute_misfit(white) + (begun * moves) ** 2 @ priors
     stays = stayed < costs
     return np.where(stays, stayed, costs), np.where(stays[:, None], begun, x)
 

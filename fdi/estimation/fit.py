@@ -235,7 +235,7 @@ def compute_misfit(white: Floats) -> Floats:
 def compute_weights(white: Floats, block: int = BLOCK) -> Floats:
     """Weights of the squares, (s, n), that give `compute_misfit` its slope at whitened residuals (s, n).
 
-    Of residuals at every so manieth cycle, `block` is the number of them in a block.
+    Of residuals at fewer samples, `block` is the number of them in a block.
     """
     sums = sum_blocks(white, block)
     each = np.minimum(1.0, BLOCK_FITTED_SQUARE * block / np.maximum(sums, 1e-300))
@@ -435,8 +435,9 @@ def linearise(problem: Problem, free: Sequence[Free], x: Floats) -> Fit:
     residuals = problem.compute_residuals(free, np.vstack([x, x + np.diag(moves)]))
     white = problem.whiten_residuals(residuals)
     held = float(compute_misfit(white[:1])[0])
-    begun = Fit(tuple(free), x, held + float(x**2 @ weigh_priors(free)), held, np.empty((0, 0)), residuals[0].copy(),
-                white[0].copy(), white[1:])
+    none = np.empty(0)  # Jacobian and covariance follow
+    begun = Fit(tuple(free), x, held + float(x**2 @ weigh_priors(free)), held, none, residuals[0].copy(),
+                white[0].copy(), none)
     return _take_differences(begun, white[1:], moves)
 
 

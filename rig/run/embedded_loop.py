@@ -2,7 +2,12 @@
 
 Both give the same rows and frames. A cycle with a fault that begins, acts or ends, a frame that waits, or a node that
 is not well is played by `CycleLoop` and the nodes themselves. Timers, such as those of heartbeats, run in Python
-between the compiled cycles."""
+between the compiled cycles.
+
+A cycle is quiet when nothing happens in it but its frames: all nodes are OPERATIONAL, the loop of the controller is
+closed, and no timer runs out. Its frames are packed from the tables of the bench (rig/benches/packing.py), and each
+value is what its receiver reads from its frame: rows and payloads are those of the nodes in Python to the last bit.
+"""
 
 import ctypes
 import os

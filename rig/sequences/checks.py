@@ -52,7 +52,12 @@ def bridge_gaps(signal: Array, name: str, allowed: float) -> Array:
 
 
 def filter_median(signal: Array, rate: float) -> Array:
-    """Centred moving median of the samples in MEDIAN_SPAN, the ends repeated."""
+    """Centred moving median of the samples in MEDIAN_SPAN, the ends repeated.
+
+    For where one noisy sample could decide, such as a peak. At 1000 samples a second it keeps steps and ramps as they
+    are, lowers a peak of angular frequency w by (w * 1 ms)^2 / 2 of its curve (0.7 % at 120 rad/s), and leaves 1.1 of
+    2 um RMS of noise. From 200 samples a second down there is no room for a median: one sample decides.
+    """
     half = int(MEDIAN_SPAN * rate / 2 + 1e-9)
     padded = np.pad(signal, half, mode="edge")
     filtered: Array = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1), axis=1)
