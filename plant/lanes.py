@@ -45,8 +45,8 @@ FEW = 6  # effects that a model may have and still get one kernel for all its ru
 FEW_COSTLY = 2  # costly effects that a kernel of their own may have
 ALL_OVER_FEW = 4.0  # time of a step with all effects over that of one with few costly ones
 WIDTH = 16  # lanes: this stands for a layout's own, which is put in its place
-# two of the widest registers, so that one computes while the other waits; for many runs of a short step, four
-NARROW, WIDE = 16, 32
+# one of the widest registers, or two, so that one computes while the other waits
+FEWEST, NARROW = 8, 16
 TURN = 20_000  # samples that a kernel makes in one call
 KERNEL_USE = KernelUse()  # of this process
 
@@ -137,14 +137,15 @@ def build_blocks(shares: Iterable[Share], idle: int) -> list[Block]:
     blocks = []
     for group in by_kernel.values():
         kernel, rows = group[0].kernel, np.concatenate([share.rows for share in group])
-        width = WIDE if len(rows) >= 2 * WIDE and not kernel.model.effects else NARROW
-        plan, run = kernel.compile(width)
-        lanes = np.concatenate([share.kernel.fill_lanes(plan, share.names, share.values) for share in group], axis=1)
-        for first in range(0, len(rows), width):
+        lanes = np.concatenate([share.kernel.fill_lanes(share.names, share.values) for share in group], axis=1)
+        first = 0
+        while first < len(rows):
+            width = next((w for w in kernel.widths if first + w >= len(rows)), kernel.widths[-1])
             used = np.minimum(np.arange(first, first + width), len(rows) - 1)
             places = np.where(np.arange(first, first + width) < len(rows), rows[used], idle)
             # unsigned: no test for counting from the end
-            blocks.append(Block(run, lanes[:, used].reshape(-1), places.astype(np.uint64)))
+            blocks.append(Block(kernel.compile(width), lanes[:, used].reshape(-1), places.astype(np.uint64)))
+            first += width
     return blocks
 
 
@@ -335,7 +336,7 @@ class Lanes:
             if not is_few or ALL_OVER_FEW * fewer <= _count_blocks(sizes[kind]):
                 continue
             own = self._find_own_kernel((*cheap, *(costly[i] for i in np.flatnonzero(kinds[kind]))))
-            if own.is_ready(NARROW * _count_blocks(sizes[kind]) * samples * self.steps):
+            if own.is_ready(FEWEST * _count_blocks(sizes[kind]) * samples * self.steps):
                 shared.append((own, members[chosen]))
                 is_left &= ~chosen
         if is_left.any():
@@ -367,11 +368,15 @@ class KernelVariant:
         self._names, self._laws = self.model.list_names(), model.kind.list_laws(effects)
         self._state: Array | None = None
         self._parameters = self.model.build_record().view(np.float64)[:, None]
+        # lanes of its blocks: a costly step keeps the processor busy with one register, a short one is half waiting
+        self.widths: tuple[int, ...] = (FEWEST, NARROW) if not effects else (NARROW,)
+        if not all(_is_cheap(model.find_effect(name)) for name in effects):
+            self.widths = (FEWEST,)
 
     def is_ready(self, steps: float) -> bool:
         """Whether the kernel can make so many steps of all lanes now: see `KernelUse.is_ready`."""
         def is_stored() -> bool:
-            plan = plan_layout(self.model.effects, self.model.kind, NARROW)
+            plan = plan_layout(self.model.effects, self.model.kind, self.widths[0])
             return is_function_stored(plan.loop, plan.names)
 
         return KERNEL_USE.is_ready(self.key, steps, is_stored, self.prepare)
@@ -384,16 +389,19 @@ class KernelVariant:
     def prepare(self) -> None:
         """Load or compile the kernel by a run of no samples."""
         none = np.empty(0)
-        for run, buffer, rows in build_blocks([Share(self, (), np.zeros((1, 0)), np.zeros(1, np.int64))], 1):
-            out = np.empty((2, len(self.model.kind.signals.outputs), 0))
-            run(buffer, none, none, none, 0.0, 0.0, False, 1.0, 1, 0, 0, 0, 0, True, rows, out)
+        for width in self.widths:
+            shares = [Share(self, (), np.zeros((width, 0)), np.arange(width))]
+            for run, buffer, rows in build_blocks(shares, width):
+                out = np.empty((width + 1, len(self.model.kind.signals.outputs), 0))
+                run(buffer, none, none, none, 0.0, 0.0, False, 1.0, 1, 0, 0, 0, 0, True, rows, out)
 
-    def compile(self, width: int) -> tuple[Layout, Function]:
-        """The kernel with so many lanes, and the layout of its buffer."""
-        return _compile_layout(self.model.effects, self._laws, self.model.kind, width)
+    def compile(self, width: int) -> Function:
+        """The kernel with so many lanes."""
+        return _compile_layout(self.model.effects, self._laws, self.model.kind, width)[1]
 
-    def fill_lanes(self, plan: Layout, names: Sequence[str], values: Array) -> Array:
+    def fill_lanes(self, names: Sequence[str], values: Array) -> Array:
         """The numbers of a lane for each run, (numbers, m), whose named parameters are `values` (m, p)."""
+        plan, _ = _compile_layout(self.model.effects, self._laws, self.model.kind, self.widths[0])
         if self._state is None:  # not sooner: it asks laws, which may be wrong
             self._state = self.model.build_flat_state()
         lanes = np.zeros((plan.numbers, len(values)))
@@ -406,7 +414,7 @@ class KernelVariant:
 
 
 def _count_blocks(runs: int) -> int:
-    return -(-int(runs) // NARROW)
+    return -(-int(runs) // FEWEST)
 
 
 def list_kernel_variants(model: Model) -> list[KernelVariant]:

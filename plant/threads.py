@@ -38,11 +38,14 @@ def _open_pool(workers: int) -> Iterator[ThreadPoolExecutor]:
 def map_in_threads(do: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
     """`do(item)` of each item, in order, in `workers` threads; a single item or one worker uses the calling thread.
 
-    So does a thread of `map_together`.
+    Of a thread of `map_together`, the threads take its place: what they ask for is made with what others ask for.
     """
     work = list(items)
-    if min(workers, len(work)) < 2 or _is_in_meeting():
+    if min(workers, len(work)) < 2:
         return [do(item) for item in work]
+    if _is_in_meeting():
+        meeting: _Meeting = _thread.meeting
+        return meeting.take_places(do, work)
     with _open_pool(min(workers, len(work))) as pool:
         return list(pool.map(do, work))
 
@@ -107,6 +110,33 @@ class _Meeting:
             self._tasks -= tasks
             self._change.notify_all()
 
+    def take_part(self, do: Callable[[T], R], work: Sequence[T]) -> list[R]:
+        """`do(item)` of each item, each in a thread that is one task."""
+        def do_item(item: T) -> R:
+            _thread.meeting = self
+            try:
+                return do(item)
+            finally:
+                _thread.meeting = None
+                self.end_task()
+
+        with _open_pool(min(len(work), MOST_TOGETHER)) as pool:
+            try:
+                return list(pool.map(do_item, work))
+            except BaseException:
+                self.end_task(len(work))  # nobody waits for a task that does not begin
+                raise
+
+    def take_places(self, do: Callable[[T], R], work: Sequence[T]) -> list[R]:
+        """The same from a thread of this meeting, which makes no request of its own meanwhile."""
+        with self._change:
+            self._tasks += len(work) - 1
+        try:
+            return self.take_part(do, work)
+        finally:
+            with self._change:
+                self._tasks += 1
+
 
 def map_together(do: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
     """`do(item)` of each item, in order, in threads of their own, whose calls of `do_together` wait for each other.
@@ -116,22 +146,7 @@ def map_together(do: Callable[[T], R], items: Iterable[T], workers: int) -> list
     work = list(items)
     if len(work) < 2 or _is_in_meeting():
         return [do(item) for item in work]
-    meeting = _Meeting(len(work), workers)
-
-    def do_item(item: T) -> R:
-        _thread.meeting = meeting
-        try:
-            return do(item)
-        finally:
-            _thread.meeting = None
-            meeting.end_task()
-
-    with _open_pool(min(len(work), MOST_TOGETHER)) as pool:
-        try:
-            return list(pool.map(do_item, work))
-        except BaseException:
-            meeting.end_task(len(work))  # nobody waits for a task that does not begin
-            raise
+    return _Meeting(len(work), workers).take_part(do, work)
 
 
 def do_together(work: Any, do: Callable[[Sequence[Any], int], None], workers: int) -> None:

@@ -9,7 +9,6 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtrc, chdtri
 
 from fdi.estimation import noise as noises
@@ -20,8 +19,8 @@ from fdi.estimation.fit import (
     Problem,
     complete_model,
     compute_misfit,
-    compute_weights,
     continue_fit,
+    cut_blocks,
     cut_runs,
     fit_unknowns,
     follow_population,
@@ -36,6 +35,7 @@ from fdi.estimation.fit import (
     span_all_rows,
     sum_blocks,
     turn_amplitudes_positive,
+    weigh_blocks,
     weigh_priors,
 )
 from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, is_long, judge_on_all
@@ -508,7 +508,9 @@ class Search:
             best: with one effect.
             known: effects that need not be tried.
         """
-        told = compute_sensitivity(self.problem, base.fit, self.effects)
+        coarse = replace(self.problem, steps=Problem.steps, also=(), _lanes={})  # enough for cosines
+        of_run = replace(base.fit, jacobian=base.fit.jacobian[:, :, :len(self.problem.trace)])
+        told = compute_sensitivity(coarse, of_run, self.effects)
         own = [effect == best.effects[0] for effect in told.names]
         alike = {effect for effect, cosines in zip(told.names, np.abs(told.gram), strict=True)
                  if max(cosines[own], default=0.0) > LOOKS_ALIKE} - {best.effects[0], *known}
@@ -687,7 +689,7 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     still = {**entry.starts[0], tone: max(1e-6, entry.parameters[tone].low), phase: 0.5 * np.pi}
     names = list(still)
     at = np.array([list(still.values()), [entry.off.get(n, still[n]) for n in names]])
-    white = problem.whiten_residuals(problem.subtract_measurements(problem.predict_outputs(names, at)))
+    white = problem.whiten_predictions(problem.predict_outputs(names, at))
     longest = _find_longest_piece(problem)
     rows = slice(longest.first, longest.stop)  # a line has one phase within a piece alone
     answer = (white[1] - white[0])[:, rows]
@@ -769,7 +771,7 @@ def simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Star
     rows = np.array([[values.get(n, problem.model.values[n]) for n in names] for values in at])
 
     def run_trials(part: NDArray[np.int64]) -> list[Trial]:
-        white = problem.whiten_residuals(problem.subtract_measurements(problem.predict_outputs(names, rows[part])))
+        white = problem.whiten_predictions(problem.predict_outputs(names, rows[part]))
         own = [starts[i] for i in part]
         costs, x = absorb_shifts(fit, white, [start for _, start, _ in own], np.array([begun[i] for i in part]))
         return [Trial(effect, start, float(cost), at, along)
@@ -802,9 +804,7 @@ def absorb_shifts(fit: Fit, white: Floats, held: Sequence[Iterable[str]], begun:
         begun: (m, p), the unknowns.
     """
     moves = np.array([[f.name not in names for f in fit.free] for names in held])
-    thin = np.ascontiguousarray(fit.jacobian[:, :, ::SCAN_STRIDE])
-    x = np.array([_shift_unknowns(fit.free, thin, each[:, ::SCAN_STRIDE], start, move)
-                  for each, start, move in zip(white, begun, moves, strict=True)])
+    x = _shift_unknowns(fit, white[:, :, ::SCAN_STRIDE], begun, moves)
     whole, priors = fit.jacobian.reshape(len(fit.x), -1), weigh_priors(fit.free)
     costs = (x * moves) ** 2 @ priors
     for few in cut_runs(white.shape):
@@ -815,21 +815,29 @@ def absorb_shifts(fit: Fit, white: Floats, held: Sequence[Iterable[str]], begun:
     return np.where(stays, stayed, costs), np.where(stays[:, None], begun, x)
 
 
-def _shift_unknowns(free: Sequence[Free], thin: Floats, few: Floats, begun: Floats, move: Flags) -> Floats:
-    """Where unknowns, (p,), have moved from `begun`, of which `move` says which may.
+def _shift_unknowns(fit: Fit, thin: Floats, begun: Floats, moves: Flags) -> Floats:
+    """Where unknowns have moved from `begun`, (m, p), of which `moves` says which may.
 
-    `thin`, (p, s, k), is the Jacobian at every `SCAN_STRIDE`-th sample, and `few`, (s, k), the residual there.
+    `thin`, (m, s, k), are the residuals at every `SCAN_STRIDE`-th sample. A weight belongs to a block, so a Hessian is
+    a weighted sum of those of the blocks, which all residuals have in common.
     """
-    low, high = scaled_bounds(free)
-    priors = weigh_priors(free)
-    prior = np.where(move, priors, 1e30)  # what is held does not move
-    flat, left, x = thin.reshape(len(begun), -1), few, begun
+    block, unknowns = BLOCK // SCAN_STRIDE, len(fit.x)
+    low, high = scaled_bounds(fit.free)
+    priors = weigh_priors(fit.free)
+    thin = np.ascontiguousarray(thin)
+    slopes = np.ascontiguousarray(fit.jacobian[:, :, ::SCAN_STRIDE])
+    flat = slopes.reshape(unknowns, -1)
+    of_block = cut_blocks(slopes, block).reshape(unknowns, -1, block).transpose(1, 0, 2)
+    squares = (of_block @ of_block.transpose(0, 2, 1)).reshape(len(of_block), -1)
+    held = np.eye(unknowns) * np.where(moves, priors + 1e-9, 1e30)[:, None]  # what is held does not move
+    left, x = thin, begun
     for _ in range(2):
-        heavy = (SCAN_STRIDE * thin * compute_weights(left, BLOCK // SCAN_STRIDE)).reshape(flat.shape)
-        hessian = heavy @ flat.T + np.diag(prior + 1e-9)
-        gradient = heavy @ few.reshape(-1) + priors * begun * move
-        x = np.where(move, np.clip(begun - cho_solve(cho_factor(hessian), gradient), low, high), begun)
-        left = few + ((x - begun) @ flat).reshape(few.shape)
+        weights = SCAN_STRIDE * weigh_blocks(left, block)
+        heavy = thin * np.repeat(weights, block, axis=-1)[..., :thin.shape[-1]]
+        hessian = (weights.reshape(len(thin), -1) @ squares).reshape(held.shape) + held
+        gradient = heavy.reshape(len(thin), -1) @ flat.T + priors * begun * moves
+        x = np.where(moves, np.clip(begun - np.linalg.solve(hessian, gradient[..., None])[..., 0], low, high), begun)
+        left = thin + ((x - begun) @ flat).reshape(thin.shape)
     return x
 
 
@@ -858,10 +866,10 @@ def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> S
     names = list(dict.fromkeys([*fit.values, *(n for _, s in starts for n in s)]))
     held = [fit.values.get(n, problem.model.values[n]) for n in names]
     rows = np.array([held, *([s.get(n, v) for n, v in zip(names, held, strict=True)] for _, s in starts)])
-    parts = np.array_split(rows, -(-len(rows) // 64))
-    residuals = (problem.subtract_measurements(problem.predict_outputs(names, part)) for part in parts)
-    white = np.concatenate([problem.whiten_residuals(r) for r in residuals])
-    thin = (white[1:] - white[0])[:, :, ::NULL_STRIDE].reshape(len(starts), -1) * np.sqrt(NULL_STRIDE)
+    parts = np.array_split(rows, -(-len(rows) // TOGETHER))
+    white = np.concatenate([problem.whiten_predictions(problem.predict_outputs(names, part))[:, :, ::NULL_STRIDE]
+                            for part in parts])
+    thin = (white[1:] - white[0]).reshape(len(starts), -1) * np.sqrt(NULL_STRIDE)
     own = fit.jacobian[:, :, ::NULL_STRIDE].reshape(len(fit.x), -1) * np.sqrt(NULL_STRIDE)
     prior = np.diag([f.prior**-2 + 1e-9 for f in fit.free])
     left = thin - (thin @ own.T) @ np.linalg.solve(own @ own.T + prior, own)

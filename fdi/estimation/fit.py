@@ -7,13 +7,13 @@ priors; its trials are replayed side by side in lanes.
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from fdi.estimation.noise import Noise
 from fdi.thresholds import ANCHOR_RATE, BLOCK_FITTED_SQUARE, CONVERGED_GAIN, CONVERGED_SHARE, HEALTHY_TOLERANCES
@@ -117,14 +117,24 @@ class Problem:
             out = np.clip(np.nan_to_num(out, nan=FURTHEST), -FURTHEST, FURTHEST)
         return trace.pass_sensors(out).transpose(0, 2, 1)
 
+    def predict_unknowns(self, free: Sequence[Free], x: Floats) -> Floats:
+        """Replays for scaled unknowns `x` (m, p): (m, s, n) in SI units."""
+        return self.predict_outputs([f.name for f in free], self.convert_unknowns(free, x))
+
     def compute_residuals(self, free: Sequence[Free], x: Floats) -> Floats:
         """Model minus measurement for scaled unknowns `x` (m, p): (m, s, n), SI units, NaN where not measured."""
-        names = [f.name for f in free]
-        return self.subtract_measurements(self.predict_outputs(names, self.convert_unknowns(free, x)))
+        return self.subtract_measurements(self.predict_unknowns(free, x))
 
     def compute_white_residuals(self, free: Sequence[Free], x: Floats) -> Floats:
         """The same, whitened: (m, s, n), 0 where not measured."""
-        return self.whiten_residuals(self.compute_residuals(free, x))
+        return self.whiten_predictions(self.predict_unknowns(free, x))
+
+    def whiten_predictions(self, predicted: Floats) -> Floats:
+        """Whitened residuals of predictions, (m, s, n), 0 where not measured."""
+        white = np.empty(predicted.shape)
+        for few in cut_runs(predicted.shape):
+            white[few] = self.whiten_residuals(self.subtract_measurements(predicted[few]))
+        return white
 
     def compute_costs(self, free: Sequence[Free], x: Floats) -> Floats:
         """-2 log likelihood with priors, (m,), of scaled unknowns `x` (m, p)."""
@@ -152,17 +162,15 @@ class Problem:
             for part in trace.parts or _cut_rows(len(trace)):
                 there = slice(start + part.first, start + part.stop)
                 measured = trace.measurements[:, part.first:part.stop]
-                for few in cut_runs(predicted.shape):
-                    residuals[few, :, there] = remove_mains(predicted[few, :, there] - measured, period, most)
+                residuals[..., there] = remove_mains(predicted[..., there] - measured, period, most)
             start += len(trace)
         return residuals
 
     def whiten_residuals(self, residuals: Floats) -> Floats:
         """Residuals (m, s, n) as white noise of variance 1, if only noise is left; where nothing was measured, 0."""
         white = np.empty(residuals.shape)
-        for few in cut_runs(residuals.shape):
-            for i, noise in enumerate(self.noise):
-                white[few, i] = noise.whiten(residuals[few, i])
+        for i, noise in enumerate(self.noise):
+            white[:, i] = noise.whiten(residuals[:, i])
         return white
 
 
@@ -179,7 +187,7 @@ def span_all_rows(trace: Trace) -> Part:
     return Part(0, len(trace), 0)
 
 
-def cut_runs(shape: Sequence[int], most: int = 200_000) -> list[slice]:
+def cut_runs(shape: Sequence[int], most: int = 120_000) -> list[slice]:
     """The runs of an array (m, s, n) a few at a time, so that the processor's cache holds all that is made of them."""
     few = max(1, most // (shape[1] * shape[2]))
     return [slice(first, first + few) for first in range(0, shape[0], few)]
@@ -195,30 +203,49 @@ def remove_mains(residuals: Floats, period: float, most: Floats | None = None) -
 
     What is larger than `most` counts as that: a piece with large residuals would put lines into all others.
     """
-    lines = mains_waves(residuals.shape[-1], period)
+    waves = find_mains_waves(residuals.shape[-1], period)
     complete = residuals if np.isfinite(residuals).all() else np.nan_to_num(residuals)
     if most is not None:
         complete = np.clip(complete, -most, most)
-    return residuals - (complete @ lines) @ lines.T
+    turn = len(waves)
+    whole = residuals.shape[-1] // turn * turn  # of all turns that are complete
+    cut = (*residuals.shape[:-1], -1, turn)
+    sums = complete[..., :whole].reshape(cut).sum(axis=-2)
+    sums[..., :residuals.shape[-1] - whole] += complete[..., whole:]
+    steady = ((sums.reshape(-1, turn) @ waves) @ waves.T).reshape(sums.shape)
+    left = np.empty_like(residuals)
+    left[..., :whole] = (residuals[..., :whole].reshape(cut) - steady[..., None, :]).reshape(*cut[:-2], -1)
+    left[..., whole:] = residuals[..., whole:] - steady[..., :residuals.shape[-1] - whole]
+    return left
 
 
 @cache
-def mains_waves(n: int, period: float) -> Floats:
-    """Orthonormal sines and cosines of the mains' lines over n samples, (n, k): what a steady hum looks like.
+def find_mains_waves(n: int, period: float) -> Floats:
+    """Sines and cosines of the mains' lines that are orthonormal over n samples: what a steady hum looks like.
 
-    A hum that starts with the test has the same phase in every run, so no repeat tells it from physics.
+    Only one turn of them, (turn, k), after which they all repeat, or all n samples where no such turn is whole. A hum
+    that starts with the test has the same phase in every run, so no repeat tells it from physics.
     """
     t = 2.0 * np.pi * period * np.arange(n)
-    lines = [f for f in HUM if f < 0.45 / period]
-    return np.linalg.qr(np.column_stack([w(f * t) for f in lines for w in (np.sin, np.cos)]))[0]
+    raw = np.array([w(f * t) for f in HUM if f < 0.45 / period for w in (np.sin, np.cos)]).reshape(-1, n).T
+    turn = 1.0 / (math.gcd(*map(int, HUM)) * period)
+    waves, triangle = np.linalg.qr(raw)
+    if turn < n and math.isclose(turn, round(turn), rel_tol=1e-9):
+        waves = np.linalg.solve(triangle.T, raw[:round(turn)].T).T
+    return np.asarray(waves, np.float64)
+
+
+def cut_blocks(white: Floats, block: int = BLOCK) -> Floats:
+    """Whitened residuals (.., n) in blocks of so many, (.., b, block), zeros at the end of the last."""
+    n = white.shape[-1]
+    if n % block:
+        white = np.concatenate([white, np.zeros((*white.shape[:-1], -n % block))], axis=-1)
+    return white.reshape(*white.shape[:-1], -1, block)
 
 
 def sum_blocks(white: Floats, block: int = BLOCK) -> Floats:
     """Sums of squares of whitened residuals (.., n) over blocks of so many: (.., b)."""
-    n = white.shape[-1]
-    if n % block:
-        white = np.concatenate([white, np.zeros((*white.shape[:-1], -n % block))], axis=-1)
-    cut = white.reshape(*white.shape[:-1], -1, block)
+    cut = cut_blocks(white, block)
     sums: Floats = np.einsum("...i,...i->...", cut, cut)
     return sums
 
@@ -232,14 +259,19 @@ def compute_misfit(white: Floats) -> Floats:
     return total
 
 
-def compute_weights(white: Floats, block: int = BLOCK) -> Floats:
-    """Weights of the squares, (s, n), that give `compute_misfit` its slope at whitened residuals (s, n).
+def weigh_blocks(white: Floats, block: int = BLOCK) -> Floats:
+    """Weights of the squares in each block, (.., b), that give `compute_misfit` its slope at residuals (.., n).
 
     Of residuals at fewer samples, `block` is the number of them in a block.
     """
     sums = sum_blocks(white, block)
-    each = np.minimum(1.0, BLOCK_FITTED_SQUARE * block / np.maximum(sums, 1e-300))
-    return np.repeat(each, block, axis=-1)[:, :white.shape[-1]]
+    each: Floats = np.minimum(1.0, BLOCK_FITTED_SQUARE * block / np.maximum(sums, 1e-300))
+    return each
+
+
+def compute_weights(white: Floats) -> Floats:
+    """The weights of `weigh_blocks` for each sample, (s, n), of whitened residuals (s, n)."""
+    return np.repeat(weigh_blocks(white), BLOCK, axis=-1)[:, :white.shape[-1]]
 
 
 def compute_typical_rms(residuals: Floats, share: float = 0.85) -> Floats:
@@ -402,42 +434,45 @@ class Value(NamedTuple):
 def fit_unknowns(problem: Problem, free: Sequence[Free], start: Floats | None = None, rounds: int = FIT_ROUNDS) -> Fit:
     """The most likely parameters near `start` (p,), scaled (default: the centres)."""
     x = np.zeros(len(free)) if start is None else np.array(start, float)
-    return continue_fit(problem, linearise(problem, free, x), rounds)
+    return continue_fit(problem, _begin_fit(problem, free, x), rounds)
 
 
 def continue_fit(problem: Problem, now: Fit, rounds: int = FIT_ROUNDS) -> Fit:
     """A fit after so many further rounds, or fewer if it converges."""
     for _ in range(rounds):
         gradient, hessian = form_normal_equations(now)
-        trials = np.array([step_within_bounds(now, hessian, gradient, damping) for damping in DAMPINGS])
-        best = find_best_trial(problem, now, trials)
+        best = find_best_trial(problem, now, step_within_bounds(now, hessian, gradient))
         gained = now.cost - best.cost
         if gained < max(CONVERGED_GAIN, CONVERGED_SHARE * now.cost):
-            return replace(best if gained > 0.0 else now, converged=True)
+            return replace(best if gained > 0.0 else now, converged=True, covariance=_invert(hessian))
         now = _differentiate(problem, best, _choose_widths(now.free, hessian))
-    return now
+    return _add_covariance(now)
 
 
 def find_best_trial(problem: Problem, fit: Fit, trials: Floats) -> Fit:
     """The fit at the best of the trials (m, p); its Jacobian and covariance stay as they are."""
-    residuals = problem.compute_residuals(fit.free, trials)
-    white = problem.whiten_residuals(residuals)
+    predicted = problem.predict_unknowns(fit.free, trials)
+    white = problem.whiten_predictions(predicted)
     held = compute_misfit(white)
     costs = held + trials**2 @ weigh_priors(fit.free)
     k = int(np.argmin(costs))
-    return replace(fit, x=trials[k], cost=float(costs[k]), misfit=float(held[k]), residuals=residuals[k].copy(),
-                   white=white[k].copy())
+    return replace(fit, x=trials[k], cost=float(costs[k]), misfit=float(held[k]),
+                   residuals=problem.subtract_measurements(predicted[k:k + 1])[0], white=white[k].copy())
 
 
 def linearise(problem: Problem, free: Sequence[Free], x: Floats) -> Fit:
-    """The model at `x` (p,) with its Jacobian by differences, away from a bound."""
+    """The model at `x` (p,) with its Jacobian by differences, away from a bound, and the covariance of that."""
+    return _add_covariance(_begin_fit(problem, free, x))
+
+
+def _begin_fit(problem: Problem, free: Sequence[Free], x: Floats) -> Fit:
     moves = _choose_moves(free, x, np.array([f.step for f in free]))
-    residuals = problem.compute_residuals(free, np.vstack([x, x + np.diag(moves)]))
-    white = problem.whiten_residuals(residuals)
+    predicted = problem.predict_unknowns(free, np.vstack([x, x + np.diag(moves)]))
+    white = problem.whiten_predictions(predicted)
     held = float(compute_misfit(white[:1])[0])
     none = np.empty(0)  # Jacobian and covariance follow
-    begun = Fit(tuple(free), x, held + float(x**2 @ weigh_priors(free)), held, none, residuals[0].copy(),
-                white[0].copy(), none)
+    begun = Fit(tuple(free), x, held + float(x**2 @ weigh_priors(free)), held, none,
+                problem.subtract_measurements(predicted[:1])[0], white[0].copy(), none)
     return _take_differences(begun, white[1:], moves)
 
 
@@ -454,10 +489,10 @@ def _choose_moves(free: Sequence[Free], x: Floats, step: Floats) -> Floats:
 
 
 def _take_differences(fit: Fit, moved: Floats, moves: Floats) -> Fit:
-    """The fit with its Jacobian and covariance from the whitened residuals (p, s, n), used up, after each move (p,)."""
+    """The fit with its Jacobian from the whitened residuals (p, s, n), used up, after each move (p,)."""
     moved -= fit.white
     moved /= moves[:, None, None]
-    return replace(fit, jacobian=moved, covariance=_compute_covariance(fit.free, moved, fit.white))
+    return replace(fit, jacobian=moved)
 
 
 def replay_fit(problem: Problem, fit: Fit, x: Floats) -> Fit:
@@ -467,16 +502,18 @@ def replay_fit(problem: Problem, fit: Fit, x: Floats) -> Fit:
 
 def form_normal_equations(fit: Fit) -> tuple[Floats, Floats]:
     """Gradient (p,) and Gauss-Newton Hessian (p, p) of half the cost."""
-    heavy = fit.jacobian * compute_weights(fit.white)
     prior = weigh_priors(fit.free)
     flat = fit.jacobian.reshape(len(fit.x), -1)
-    heavy = heavy.reshape(len(fit.x), -1)
+    heavy = flat * compute_weights(fit.white).reshape(-1)
     return heavy @ fit.white.reshape(-1) + prior * fit.x, heavy @ flat.T + np.diag(prior)
 
 
-def _compute_covariance(free: Sequence[Free], jacobian: Floats, white: Floats) -> Floats:
-    flat = (jacobian * np.sqrt(compute_weights(white))).reshape(len(free), -1)
-    return np.asarray(np.linalg.pinv(flat @ flat.T + np.diag(weigh_priors(free))), np.float64)
+def _add_covariance(fit: Fit) -> Fit:
+    return replace(fit, covariance=_invert(form_normal_equations(fit)[1]))
+
+
+def _invert(hessian: Floats) -> Floats:
+    return np.asarray(np.linalg.pinv(hessian), np.float64)
 
 
 def _choose_widths(free: Sequence[Free], hessian: Floats) -> Floats:
@@ -486,21 +523,21 @@ def _choose_widths(free: Sequence[Free], hessian: Floats) -> Floats:
     return np.clip(wanted, 0.01 * widest, widest)  # times the first width
 
 
-def step_within_bounds(fit: Fit, hessian: Floats, gradient: Floats, damping: float) -> Floats:
-    """A damped Gauss-Newton step within the bounds: what runs into one stays there, and the rest is solved again."""
+def step_within_bounds(fit: Fit, hessian: Floats, gradient: Floats, dampings: Sequence[float] = DAMPINGS) -> Floats:
+    """Damped Gauss-Newton steps within the bounds, (m, p): what runs into one stays there, the rest is solved again."""
     low, high = scaled_bounds(fit.free)
-    damped = hessian + np.diag(damping * np.diag(hessian) + 1e-12 * np.trace(hessian) + 1e-12)
-    x, open_ = fit.x.copy(), np.ones(len(fit.x), bool)
-    for _ in range(len(x)):
-        move = x - fit.x
-        right = -gradient[open_] - damped[np.ix_(open_, ~open_)] @ move[~open_]
-        x[open_] = fit.x[open_] + cho_solve(cho_factor(damped[np.ix_(open_, open_)]), right)
+    diagonal = np.outer(dampings, np.diag(hessian)) + 1e-12 * np.trace(hessian) + 1e-12
+    damped = hessian + diagonal[:, None, :] * np.eye(len(gradient))
+    x, open_ = np.tile(fit.x, (len(dampings), 1)), np.ones((len(dampings), len(fit.x)), bool)
+    for _ in fit.x:
+        held = np.where(open_, 0.0, x - fit.x)
+        own = np.where(open_[:, :, None] & open_[:, None, :], damped, ~open_[:, :, None] * np.eye(len(gradient)))
+        right = np.where(open_, -gradient - (damped @ held[:, :, None])[..., 0], held)
+        x = fit.x + np.linalg.solve(own, right[..., None])[..., 0]
         out = open_ & ((x < low) | (x > high))
         x = np.clip(x, low, high)
-        if not out.any():
-            break
         open_ &= ~out
-        if not open_.any():
+        if not out.any():
             break
     return x
 

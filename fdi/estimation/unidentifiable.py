@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.fit import (
-    DAMPINGS,
     Fit,
     Free,
     Problem,
@@ -455,8 +454,7 @@ def _find_principal(covariance: Floats) -> Floats:
 def take_best_step(problem: Problem, fit: Fit) -> Fit:
     """The best of some damped Gauss-Newton steps; the fit itself if none gains."""
     gradient, hessian = form_normal_equations(fit)
-    trials = np.array([step_within_bounds(fit, hessian, gradient, damping) for damping in DAMPINGS])
-    best = find_best_trial(problem, fit, trials)
+    best = find_best_trial(problem, fit, step_within_bounds(fit, hessian, gradient))
     return best if best.cost < fit.cost else fit
 
 
@@ -486,7 +484,8 @@ def linearise_across(problem: Problem, free: Sequence[Free], x: Floats, covarian
     moves = np.zeros((len(places), len(free)))
     moves[:, places] = wide.T
     moves = np.array([cut_at_bounds(free, x, way) for way in moves])
-    white = problem.whiten_residuals(residuals := problem.compute_residuals(free, np.vstack([x, x + moves])))
+    predicted = problem.predict_unknowns(free, np.vstack([x, x + moves]))
+    white, left = problem.whiten_predictions(predicted), problem.subtract_measurements(predicted[:1])[0]
     steep = np.asarray(np.linalg.pinv(moves[:, places]), np.float64) @ (white[1:] - white[0]).reshape(len(places), -1)
     jacobian = (inverse.T @ steep).reshape(len(free), *white[0].shape)
     prior = np.diag(weigh_priors(free))
@@ -494,7 +493,7 @@ def linearise_across(problem: Problem, free: Sequence[Free], x: Floats, covarian
     heavy = (jacobian * compute_weights(white[0])).reshape(len(free), -1)
     held = float(compute_misfit(white[:1])[0])
     covariance = invert_hessian(heavy @ flat_rows.T + prior)
-    return Fit(tuple(free), x, held + float(x @ prior @ x), held, covariance, residuals[0], white[0], jacobian)
+    return Fit(tuple(free), x, held + float(x @ prior @ x), held, covariance, left, white[0], jacobian)
 
 
 def invert_hessian(hessian: Floats) -> Floats:

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from threading import Timer
+from threading import Thread, Timer
 from typing import TYPE_CHECKING, NamedTuple
 
 from fdi.output import require_writable, write_text
@@ -59,13 +59,21 @@ def choose_places(args: argparse.Namespace, page_name: str, source: str) -> Plac
         InputError: a place that cannot be written, or a kind of file that the command does not make.
     """
     out = choose_file(args.out or None, (".html", ".json"), source, expected="FILE.html for a page, or FILE.json")
-    if out is not None and out.suffix == ".html":
-        return Places(page=out)
     page = None
-    if page_name and args.report:
+    if out is not None and out.suffix == ".html":
+        page, out = out, None
+    elif page_name and args.report:
         folder = Path(source) if Path(source).is_dir() else Path(source).parent
         page = choose_file(str(folder / page_name), (".html",), source, "--report")
+    if page is not None:  # while kernels compute, another core can load what draws the page: half a second
+        Thread(target=load_drawing, daemon=True).start()
     return Places(page, out)
+
+
+def load_drawing() -> None:
+    """Load what pages are drawn with, before one is."""
+    import matplotlib.backends.backend_svg
+    import matplotlib.figure  # noqa: F401
 
 
 def make_folder(path: Path) -> Path:

@@ -58,12 +58,14 @@ def find_recorded_plant(args: argparse.Namespace) -> str | None:
     Raises:
         InputError: the log brings a plant along that --trust does not allow.
     """
-    from rig.run.job import load_plant_of_log  # here: commands without a log need none of it
-
     given = [getattr(args, "trace", None), *(getattr(args, name, None) or [] for name in ("traces", "words"))]
     names = [name for each in given if each for name in ([each] if isinstance(each, str | Path) else each)]
     log = next((path for path in map(Path, names) if path.suffix == ".mcap" or (path / "trace.mcap").is_file()), None)
-    return None if log is None else load_plant_of_log(log, is_trusted=args.trust) or None
+    if log is None:
+        return None
+    from rig.run.job import load_plant_of_log  # here: commands without a log need none of it
+
+    return load_plant_of_log(log, is_trusted=args.trust) or None
 
 
 def load_chosen_model(args: argparse.Namespace) -> Model:

@@ -340,8 +340,8 @@ class _Worker:
                 mask = (piece % 2 == half).astype(float)
                 fitted = replace(t.fit, white=white * mask, jacobian=t.fit.jacobian * mask)
                 gradient, hessian = form_normal_equations(fitted)
-                x = step_within_bounds(fitted, hessian, gradient, 1e-3)
-                there = problem.compute_white_residuals(t.fit.free, x[None]) * (1.0 - mask)
+                x = step_within_bounds(fitted, hessian, gradient, (1e-3,))
+                there = problem.compute_white_residuals(t.fit.free, x) * (1.0 - mask)
                 total += float(compute_misfit(there)[0])
             return replace(t, unseen=total)
 
