@@ -30,6 +30,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--plant", default="eha", metavar="NAME|FILE", help="shipped plant, or a plant file (default: eha)")
     add("--signals", metavar="NAMES", help="measure these in every case, of the EHA xj or xj,p12 or xj,p12,xs "
                                            "(default: all); drawn: by the seed")
+    add("--small", action="store_true", help="hide in each case one effect that others look like, at 1 to 2 noise "
+                                             "floors (of the EHA)")
     add("--workers", type=int, default=1, metavar="N", help="cases at a time (default: 1, for reliable timings)")
 
 
@@ -42,11 +44,13 @@ def run_trial_command(args: argparse.Namespace) -> tuple[Report, bool]:
     for option, count in (("--cases", args.cases), ("--workers", args.workers)):
         if count < 1:
             raise InputError(option, str(count), "1 or more")
+    if args.small and args.plant != "eha":
+        raise InputError("--small", args.plant, "the plant eha, whose look-alikes are known")
     with tempfile.TemporaryDirectory() as temporary:
         folder, method = args.benchmark or Path(temporary), args.answer
         if method is None:
             make_benchmark(folder, range(args.seed, args.seed + args.cases), args.signals, args.plant, args.workers,
-                           lambda line: print(line, file=sys.stderr, flush=True))
+                           lambda line: print(line, file=sys.stderr, flush=True), args.small)
             if args.benchmark:
                 return Report("bench", "hidden-effects benchmark", sentence=f"The benchmark is in {folder}; --answer "
                               "answers it, its score.py scores answers.", data={"folder": str(folder)}), True

@@ -42,7 +42,8 @@ def name_plant(name: str) -> Plant:
 
 
 def make_benchmark(folder: Path, seeds: Sequence[int], signals: str | None = None, plant: str = "eha",
-                   processes: int = 1, report_progress: Callable[[str], None] = lambda _: None) -> None:
+                   processes: int = 1, report_progress: Callable[[str], None] = lambda _: None,
+                   small: bool = False) -> None:
     """Write the cases of `seeds` that the folder lacks, and what goes with them.
 
     Args:
@@ -52,6 +53,7 @@ def make_benchmark(folder: Path, seeds: Sequence[int], signals: str | None = Non
         plant: shipped, or a plant file; the cases of the EHA are made by the simulator in C.
         processes: cases at a time.
         report_progress: gets a line for each case.
+        small: hide one effect in each case of the EHA, one that others look like, at 1 to 2 noise floors.
 
     Raises:
         InputError: unknown signals or plant, no C compiler, or a folder that has other cases or cannot be written.
@@ -63,9 +65,10 @@ def make_benchmark(folder: Path, seeds: Sequence[int], signals: str | None = Non
         raise InputError("--signals", chosen, " or ".join([*known, DRAWN]))
     if plant == "eha":
         truth.parameter_names()  # compile the simulator before several processes need it
-    _write_description(folder, {"plant": plant, "signals": chosen, "made_by": hash_sources(*CASE_SOURCES)})
+    _write_description(folder, {"plant": plant, "signals": chosen, "small": small,
+                                "made_by": hash_sources(*CASE_SOURCES)})
     missing = [seed for seed in seeds if not (folder / "cases" / f"{seed:05d}").exists()]
-    clock, work = WallClock(), partial(make_case, folder=folder, signals=chosen, plant=plant)
+    clock, work = WallClock(), partial(make_case, folder=folder, signals=chosen, plant=plant, small=small)
     for done, (seed, _) in enumerate(run_jobs(work, missing, Workers(processes), _raise_failure), start=1):
         left = clock.now() * 1e-9 / done * (len(missing) - done)
         report_progress(f"case {seed:05d} made, {done}/{len(missing)}, {format_duration(left)} left")
@@ -75,7 +78,7 @@ def _raise_failure(seed: int, reason: str) -> None:
     raise RigError(f"case {seed:05d} could not be made: {reason}")
 
 
-def _write_description(folder: Path, made: dict[str, str]) -> None:
+def _write_description(folder: Path, made: dict[str, Any]) -> None:
     """Write benchmark.json and the files that do not depend on the cases. Raises InputError for another benchmark."""
     file = folder / "benchmark.json"
     if file.exists() and not made.items() <= read_description(folder).items():
@@ -113,13 +116,14 @@ def read_description(folder: Path) -> dict[str, Any]:
     return found
 
 
-def make_case(seed: int, folder: Path, signals: str, plant: str) -> None:
+def make_case(seed: int, folder: Path, signals: str, plant: str, small: bool = False) -> None:
     """Write the traces and the truth of a seed."""
     target = folder / "cases" / f"{seed:05d}"
     part = target.with_name(target.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
     if plant == "eha":
-        cases.write_case(cases.sample_case(seed, signals=None if signals == DRAWN else signals), part)
+        sample = cases.sample_small_case if small else cases.sample_case
+        cases.write_case(sample(seed, signals=None if signals == DRAWN else signals), part)
     else:
         name_plant(plant)
         case = any_plant.sample_case(plant, seed)

@@ -31,6 +31,8 @@ KINDS = {"nothing": 0.20, "one": 0.50, "two": 0.12, "outside": 0.18}
 SIGNALS = {"xj": 0.25, "xj,p12": 0.25, "xj,p12,xs": 0.5}
 """The measured signals, with their probability."""
 OUTPUTS = ("xj", "p12", "xs")
+LOOK_ALIKE = ("coil_lag", "transport_delay", "filter_clogging", "spool_friction", "viscous_drag", "supply_droop")
+"""Effects that are taken for each other, or for a tolerance, while they are small."""
 NO_STOP = 1.0  # m, travel of a ram that no replay reaches
 
 
@@ -84,6 +86,20 @@ def sample_case(seed: int, kind: str | None = None, effects: Sequence[str] = (),
     is_loaded = rng.random() < 0.1 and bench.scatter > 0  # one in ten of the cases that do not need a known load
     random_load = float(rng.uniform(2000, 8000)) if is_loaded else 0.0
     return Case(seed, kind, drawn, signals or random_signals, bench, plant, load or random_load)
+
+
+def sample_small_case(seed: int, signals: str | None = None) -> Case:
+    """A case of one of the effects that others look like, so large that 1 to 2 noise floors show it at best."""
+    rng = np.random.default_rng([seed, 7])
+    name, wanted = str(rng.choice(LOOK_ALIKE)), float(rng.uniform(1.0, 2.0))
+    low, high = -2.0, 1.0  # of the logarithmic range of sizes, which begins at about 2 floors
+    for _ in range(7):
+        middle = 0.5 * (low + high)
+        case = sample_case(seed, effects=[name], sizes=(middle, middle), signals=signals)
+        changes = measure_changes(case, measure_case(case, "est"), [name])
+        shown = max(measure_rms(changes[signal]) for signal in case.signals.split(","))
+        low, high = (middle, high) if shown < wanted else (low, middle)
+    return case
 
 
 def sample_healthy_plant(spread: float, rng: np.random.Generator) -> dict[str, float]:

@@ -165,12 +165,15 @@ def count_rates(pairs: Mapping[str, Pair]) -> list[Rate]:
     kinds = {kind: {case: pair for case, pair in pairs.items() if pair[0]["kind"] == kind} for kind in KINDS}
     seen = {kind: {case: pair for case, pair in group.items() if is_visible(pair[0])} for kind, group in kinds.items()}
     right = {case: pair for case, pair in seen["one"].items() if is_named(*pair)}
+    small = {case: pair for case, pair in kinds["one"].items() if case not in seen["one"]}
     table: list[tuple[str, Mapping[str, Pair], Callable[[Truth, Answer], bool | None]]] = [
         ("nothing: answered nothing", kinds["nothing"], _has_verdict("nothing")),
         ("nothing: an effect is named", kinds["nothing"], is_wrong_alone),
         ("one: named", seen["one"], is_named),
         ("one: named alone, explained", seen["one"], is_named_alone),
         ("one: wrong alone", seen["one"], is_wrong_alone),
+        ("one, below 2 floors: named", small, is_named),
+        ("one, below 2 floors: wrong alone", small, is_wrong_alone),
         ("one, named: true size in interval", right, is_size_covered),
         ("one, named: held-out run at most 1.15 floors", right, is_holdout_predicted),
         ("two: both named", seen["two"], is_named),
