@@ -89,17 +89,19 @@ def sample_case(seed: int, kind: str | None = None, effects: Sequence[str] = (),
 
 
 def sample_small_case(seed: int, signals: str | None = None) -> Case:
-    """A case of one of the effects that others look like, so large that 1 to 2 noise floors show it at best."""
+    """A case of one of the effects that others look like, of a size that 1 to 2 noise floors show at best."""
     rng = np.random.default_rng([seed, 7])
-    name, wanted = str(rng.choice(LOOK_ALIKE)), float(rng.uniform(1.0, 2.0))
-    low, high = -2.0, 1.0  # of the logarithmic range of sizes, which begins at about 2 floors
-    for _ in range(7):
-        middle = 0.5 * (low + high)
-        case = sample_case(seed, effects=[name], sizes=(middle, middle), signals=signals)
-        changes = measure_changes(case, measure_case(case, "est"), [name])
-        shown = max(measure_rms(changes[signal]) for signal in case.signals.split(","))
-        low, high = (middle, high) if shown < wanted else (low, middle)
-    return case
+    while True:
+        name, wanted = str(rng.choice(LOOK_ALIKE)), float(rng.uniform(1.1, 1.9))
+        low, high = -2.0, 1.0  # of the logarithmic range of sizes, which begins at about 2 floors
+        for _ in range(10):  # friction that just holds a spool shows by more than 2 floors at once: another effect then
+            middle = 0.5 * (low + high)
+            case = sample_case(seed, effects=[name], sizes=(middle, middle), signals=signals)
+            changes = measure_changes(case, measure_case(case, "est"), [name])
+            shown = max(measure_rms(changes[signal]) for signal in case.signals.split(","))
+            if abs(shown - wanted) < 0.1:
+                return case
+            low, high = (middle, high) if shown < wanted else (low, middle)
 
 
 def sample_healthy_plant(spread: float, rng: np.random.Generator) -> dict[str, float]:
