@@ -51,6 +51,7 @@ from fdi.estimation.replay import (
     find_unpredictable_rows,
     guess_anchor_noise,
     is_friction,
+    leave_out_rows,
     measure_decided_errors,
 )
 from fdi.estimation.unidentifiable import (
@@ -80,7 +81,6 @@ from fdi.thresholds import (
     GAIN_CONVINCES,
     GAIN_TIE,
     GAIN_WORTH_A_FIT,
-    HELD_OUT_UNDECIDED_SHARE,
     INTERVAL_95_SD,
     LINEAR_FAULT_SPREAD,
     NARROWEST_SHARE,
@@ -93,7 +93,7 @@ from fdi.thresholds import (
     UNIT_TOLERANCE,
     WEIGHT_COUNTS,
 )
-from fdi.trace.trace import Flags, Floats, Trace
+from fdi.trace.trace import Floats, Trace
 from plant.effects import CATALOGUE
 from plant.model import Model, find_quantity, list_searched_effects
 from plant.starts import ensure_starts
@@ -334,8 +334,7 @@ class Refinement:
     @property
     def is_explained(self) -> bool:
         """Whether only noise is left, except for a few stops of the ram that the model makes or misses."""
-        left = self.fit.residuals
-        usual = compute_typical_rms(left[:, ~np.isnan(left).all(axis=0)])
+        usual = compute_typical_rms(self.fit.residuals)
         near = all(min(float(t), self.errors[name]) <= RESIDUAL_IS_NOISE * self.floor[name]
                    for t, name in zip(usual, self.floor, strict=True))
         near &= all(ratio <= RESIDUAL_HELD_OUT for ratio in self.everywhere.values())
@@ -426,7 +425,7 @@ def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequenc
     if problem.model.kind.correct is not None:  # what hangs on a stop there draws the fit to the wrong size
         undecided = find_undecided_rows(problem, replay_fit(problem, start_fit(free, begin[0]), begin[0]),
                                         list_floors(problem))
-        problem = _leave_out(problem, undecided)
+        problem = replace(problem, trace=leave_out_rows(problem.trace, undecided), _lanes={})
     alone = replace(problem, workers=1, _lanes={})
     healthy = make_healthy_start(problem, free)
     if _blames_a_fault(problem, free, begin[0]):
@@ -461,11 +460,8 @@ def _leave_out_stops(problem: CountedProblem, found: Fit) -> CountedProblem:
     rows = find_undecided_rows(problem, whole, slight)  # less than the noise each, they add to the residual as well
     large = find_unpredictable_rows(problem, whole, floor)
     tried = (rows | large, rows, large if large.any() else find_undecided_rows(problem, whole, floor))
-    return _leave_out(problem, next((r for r in tried if r.mean() <= HELD_OUT_UNDECIDED_SHARE), rows & False))
-
-
-def _leave_out(problem: CountedProblem, rows: Flags) -> CountedProblem:
-    return replace(problem, trace=replace(problem.trace, usable=problem.trace.usable & ~rows), _lanes={})
+    cut = (leave_out_rows(problem.trace, rows) for rows in tried)
+    return replace(problem, trace=next((run for run in cut if run is not problem.trace), problem.trace), _lanes={})
 
 
 def list_floors(problem: Problem) -> dict[str, float]:

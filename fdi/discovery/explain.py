@@ -41,7 +41,7 @@ import numpy as np
 from fdi.discovery.detectable import Blind, find_hidden_effects
 from fdi.discovery.residual_pattern import is_periodic_in_position
 from fdi.discovery.search import FINE, Hypothesis, Search, Sensitivity, compute_sensitivity
-from fdi.estimation.fit import compute_typical_rms, replay_fit
+from fdi.estimation.fit import Problem, compute_typical_rms, replay_fit
 from fdi.estimation.replay import (
     answer_readings,
     find_controller_gain,
@@ -62,6 +62,7 @@ from fdi.thresholds import (
     HELD_OUT_UNDECIDED_SHARE,
     INTERVAL_95_SD,
     RESIDUAL_HELD_OUT,
+    RESIDUAL_WORST,
     SOLVER_ERROR_SHARE,
 )
 from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
@@ -234,7 +235,7 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
     tried = [] if len(levels) == 1 else levels[depth or -1]
     others = [h for h in tried if h.effects not in [c.effects for c in close]]
     parents = [next((p for p in levels[i] if p.effects == close[0].effects[:i]), levels[i][0]) for i in range(1, depth)]
-    base, *close = search.judge_on_all([base, *close], FINE)
+    base, *close = (judge_left_out_rows(search, h, floor) for h in search.judge_on_all([base, *close], FINE))
     ledger = [base, *parents, *close[:1]]
     told = [*ledger, *close[1:], *others[:3]]
     held = dict(zip((h.effects for h in told), search.measure_holdout(told), strict=True))
@@ -410,22 +411,46 @@ def _judge_unseen_run(search: Search, h: Hypothesis, floor: Mapping[str, float])
     """Whether noise alone is left of the held-out run; if not of all of it, of what does not hang on a small stop."""
     if search.holdout is None:
         return HeldOut(True)
-    (problem, (left,)), trace = search.replay_holdout([h]), search.holdout
-    if _is_noise(left, trace, floor):
+    problem, (left,) = search.replay_holdout([h])
+    return _judge_run(problem, left, h, floor)
+
+
+def judge_left_out_rows(search: Search, h: Hypothesis, floor: Mapping[str, float]) -> Hypothesis:
+    """The hypothesis; where it fails in rows that the search left out for others, with what it leaves there.
+
+    Behind a backlash rows hang on an impact; where there is none, the same rows may show that something is missing.
+    """
+    if search.model.kind.correct is None:
+        return h
+    problem = search.make_problem(search.run)
+    judged = _judge_run(problem, problem.compute_residuals(h.fit.free, h.fit.x[None])[0], h, floor)
+    if judged.holds:
+        return h
+    return replace(h, ratio={s: max(x, judged.decided.get(s, 0.0) / floor[s]) for s, x in h.ratio.items()})
+
+
+def _judge_run(problem: Problem, left: Floats, h: Hypothesis, floor: Mapping[str, float]) -> HeldOut:
+    """Whether noise alone is `left`, (s, n), of a run under a hypothesis, or of the rows that hang on no stop."""
+    trace, has_observer = problem.trace, problem.model.kind.correct is not None
+    if _is_noise(left, trace, floor, has_observer):
         return HeldOut(True)
     undecided = find_undecided_rows(problem, h.fit, floor)
-    if search.model.kind.correct is not None:  # a bounce that was missed has consequences
+    if has_observer:  # a bounce that was missed has consequences
         undecided |= find_unpredictable_rows(problem, replay_fit(problem, h.fit, h.fit.x), floor) & trace.usable
     share = float(undecided.mean())
-    if share == 0.0 or share > HELD_OUT_UNDECIDED_SHARE:
+    if share > HELD_OUT_UNDECIDED_SHARE or (share == 0.0 and not has_observer):
         return HeldOut(False)
     kept = left[:, ~undecided]
-    rms = np.sqrt(np.nanmean(kept**2, axis=1))
-    return HeldOut(_is_noise(kept, trace, floor), share, dict(zip(trace.outputs, rms.tolist(), strict=True)))
+    rms = dict(zip(trace.outputs, np.sqrt(np.nanmean(kept**2, axis=1)).tolist(), strict=True))
+    return HeldOut(_is_noise(kept, trace, floor, has_observer), share, rms)
 
 
-def _is_noise(left: Floats, trace: Trace, floor: Mapping[str, float]) -> bool:
-    return all(e <= RESIDUAL_HELD_OUT * floor[s] for s, e in zip(trace.outputs, compute_typical_rms(left), strict=True))
+def _is_noise(left: Floats, trace: Trace, floor: Mapping[str, float], has_observer: bool) -> bool:
+    """Whether the typical block is noise; an observer forgets missed stops, so the others must not be far off either.
+    """
+    typical, rms = compute_typical_rms(left), np.sqrt(np.nanmean(left**2, axis=1))
+    return all(e <= RESIDUAL_HELD_OUT * floor[s] and (r <= RESIDUAL_WORST * floor[s] or not has_observer)
+               for s, e, r in zip(trace.outputs, typical, rms, strict=True))
 
 
 BUS_CURRENT, BUS_POSITION = 1e-8, 1e-7  # A, m: what one count on the bus is worth (docs/bus.md)

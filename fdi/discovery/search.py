@@ -40,14 +40,13 @@ from fdi.estimation.fit import (
 )
 from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, is_long, judge_on_all
 from fdi.estimation.noise import Noise
-from fdi.estimation.replay import find_undecided_rows, leave_out_rest, measure_decided_errors
+from fdi.estimation.replay import find_undecided_rows, leave_out_rest, leave_out_rows, measure_decided_errors
 from fdi.estimation.unidentifiable import finish_fit, list_powers, scale_together
 from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import (
     BLOCK_FITTED_SQUARE,
     GAIN_DOUBTFUL,
     GAIN_WORTH_A_FIT,
-    HELD_OUT_UNDECIDED_SHARE,
     LOOKS_ALIKE,
     NULL_DRAWS,
     RESIDUAL_IS_NEAR_NOISE,
@@ -131,6 +130,7 @@ class Search:
         self.sensors = {signal.name: noises.white_noise(noises.find_sensor_level(trace, signal, model))
                         for signal in trace.declared.outputs}
         trace, *repeats = (leave_out_rest(run, model) for run in (trace, *repeats))
+        self.run = trace  # with the rows that the search may leave out
         self.holdout = None if holdout is None else leave_out_rest(holdout, model)
         self.whole = whole  # what the runs were cut from, if they were
         lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
@@ -315,15 +315,15 @@ class Search:
             ratio = dict(zip(signals, measure_repeating(typical, others, coarse), strict=True))
         return Hypothesis(effects, found, errors, ratio, cost, tuple(others))
 
-    def make_unseen_problem(self, steps: int | None = None) -> Problem:
-        """The held-out run in place of the search's own."""
-        assert self.holdout is not None
-        return replace(self.problem, trace=self.holdout, steps=steps or self.problem.steps, also=(), _lanes={})
+    def make_problem(self, trace: Trace, steps: int | None = None) -> Problem:
+        """Another run in place of the search's own; by default with the steps of a replay that decides."""
+        steps = steps or (FINE if is_long(trace) else TRUEST)
+        return replace(self.problem, trace=trace, steps=steps, also=(), _lanes={})
 
     def replay_holdout(self, hypotheses: Sequence[Hypothesis]) -> tuple[Problem, list[Floats]]:
         """The held-out run, and what each hypothesis leaves of it, (s, n) SI; none is replayed twice."""
         assert self.holdout is not None
-        problem = self.make_unseen_problem(FINE if is_long(self.holdout) else TRUEST)
+        problem = self.make_problem(self.holdout)
         new = [h for h in dict.fromkeys(hypotheses) if h not in self._left_unseen]
         left = map_together(lambda h: problem.compute_residuals(h.fit.free, h.fit.x[None])[0], new, self.workers)
         self._left_unseen.update(zip(new, left, strict=True))
@@ -456,14 +456,11 @@ class Search:
         return self._leave_out(rows)
 
     def _leave_out(self, undecided: Flags) -> bool:
-        usable = self.problem.trace.usable
-        kept = float((usable & ~undecided).sum() / usable.sum())
-        if kept == 1.0 or kept < 1.0 - HELD_OUT_UNDECIDED_SHARE:
+        if leave_out_rows(self.problem.trace, undecided) is self.problem.trace:
             return False
 
         def cut(problem: Problem) -> Problem:
-            runs = [run.with_columns({}, usable=run.usable & ~undecided[:len(run)])
-                    for run in (problem.trace, *problem.also)]
+            runs = [leave_out_rows(run, undecided[:len(run)]) for run in (problem.trace, *problem.also)]
             return replace(problem, trace=runs[0], also=tuple(runs[1:]), _lanes={})
 
         self.problem, self.fine = cut(self.problem), None if self.fine is None else cut(self.fine)
@@ -575,8 +572,9 @@ def _leave_out_worst(residuals: Floats, share: float = 0.15) -> Floats:
 
     A surface may stop for an instant in a slow motion.
     """
-    sums = sum_blocks(np.nan_to_num(residuals))
-    kept = sums <= np.quantile(sums, 1.0 - share, axis=1, keepdims=True)
+    counts = sum_blocks((~np.isnan(residuals)).astype(float))
+    squares = np.where(counts > 0.0, sum_blocks(np.nan_to_num(residuals)) / np.maximum(counts, 1.0), np.nan)
+    kept = squares <= np.nanquantile(squares, 1.0 - share, axis=1, keepdims=True)
     return np.where(np.repeat(kept, BLOCK, axis=1)[:, :residuals.shape[1]], residuals, np.nan)
 
 

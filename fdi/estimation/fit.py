@@ -275,11 +275,16 @@ def compute_weights(white: Floats) -> Floats:
 
 
 def compute_typical_rms(residuals: Floats, share: float = 0.85) -> Floats:
-    """RMS of residuals (s, n) without the worst blocks: a stop of the ram that is made or missed by a hair is luck."""
-    squares = np.sort(sum_blocks(np.nan_to_num(residuals)), axis=-1)
-    kept = squares[:, :max(1, round(share * squares.shape[1]))]
-    rms: Floats = np.sqrt(kept.mean(axis=1) / BLOCK)
-    return rms
+    """RMS of residuals (s, n) without the worst blocks: a stop of the ram that is made or missed by a hair is luck.
+
+    Samples that are missing are left out, and do not fill blocks; 0 where all are.
+    """
+    typical = np.zeros(len(residuals))
+    for i, row in enumerate(residuals):
+        squares = np.sort(sum_blocks(row[~np.isnan(row)]))
+        if len(squares):
+            typical[i] = np.sqrt(squares[:max(1, round(share * len(squares)))].mean() / BLOCK)
+    return typical
 
 
 UNREPLAYED = ("command", "reading")  # ports that a replay from the measured current does not pass

@@ -116,7 +116,11 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
         steps = REPLAY_STEPS
     residuals = compute_residuals(trace, coarse)
     if model.kind.correct is not None:
-        undecided = _extend_until_noise(undecided, np.array([residuals[s] / floor[s] for s in residuals if s in floor]))
+        names = list(filter(is_friction, model.values))
+        slid = replay_lanes(Lanes(silence_sensors(model), names, REPLAY_STEPS), np.zeros((1, len(names))), trace)[0]
+        reach = {name: slid[:, i] - coarse[name] for i, name in enumerate(trace.output_names)}
+        undecided = extend_until_noise(undecided, *(np.array([x[s] / floor[s] for s in residuals if s in floor])
+                                                     for x in (residuals, reach)))
     return Replay(coarse, residuals, steps, error, undecided, blind)
 
 
@@ -214,11 +218,15 @@ def vary_frictions(names: Sequence[str], values: Mapping[str, float]) -> Floats:
 
 def find_large_windows(moved: Floats, floor: float, window: int = WINDOW) -> Flags:
     """Rows of windows in which one of the runs (m, n) is moved by more than the floor, RMS."""
-    n = moved.shape[1]
-    starts = np.arange(0, n, window)
-    sizes = np.diff(np.append(starts, n))
-    power = np.add.reduceat(moved**2, starts, axis=1).max(axis=0, initial=0.0) / sizes
-    return np.repeat(power > floor**2, sizes)
+    large: Flags = measure_window_power(moved, window).max(axis=0, initial=0.0) > floor**2
+    return large
+
+
+def measure_window_power(x: Floats, window: int = WINDOW) -> Floats:
+    """Mean square of each row's window in signals (m, n): (m, n)."""
+    starts = np.arange(0, x.shape[1], window)
+    sizes = np.diff(np.append(starts, x.shape[1]))
+    return np.repeat(np.add.reduceat(x**2, starts, axis=1) / sizes, sizes, axis=1)
 
 
 def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) -> Flags:
@@ -276,18 +284,26 @@ def leave_out_rest(trace: Trace, model: Model) -> Trace:
 
     At rest dry friction has any value up to its static level: whether a replay stays or slips hangs on less than a
     sensor shows, and one that slips alone is off by many times the noise. Speed and friction of a motion are certain.
-    Without an observer, or where more than `HELD_OUT_UNDECIDED_SHARE` would be left out, the run is as it is. A note
-    says how much is not compared.
+    Without an observer, or where too little would remain, the run is as it is. A note says how much is not compared.
     """
     if model.kind.correct is None:
         return trace
     noise = find_sensor_level(trace, trace.declared.controlled, model)
-    moves = trace.usable & ~find_rest_rows(trace.controlled, trace.period, noise)
-    if moves.mean() < 1.0 - HELD_OUT_UNDECIDED_SHARE:
+    moving = leave_out_rows(trace, find_rest_rows(trace.controlled, trace.period, noise))
+    if moving is trace:
         return trace
-    rests = float((trace.usable & ~moves).sum()) * trace.period
-    return trace.with_columns({}, usable=moves).with_notes(
-        *[f"{rests:.1f} s at rest are not compared: friction has any value there"] * (rests > 0.0))
+    rests = float((trace.usable & ~moving.usable).sum()) * trace.period
+    return moving.with_notes(f"{rests:.1f} s at rest are not compared: friction has any value there")
+
+
+def leave_out_rows(trace: Trace, rows: Flags) -> Trace:
+    """A prepared run without some of its rows, (n,).
+
+    As it is where there are none to leave out, or where more than `HELD_OUT_UNDECIDED_SHARE` would be.
+    """
+    kept = trace.usable & ~rows
+    share = float(kept.sum() / trace.usable.sum())
+    return trace if share == 1.0 or share < 1.0 - HELD_OUT_UNDECIDED_SHARE else trace.with_columns({}, usable=kept)
 
 
 def find_unpredictable_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) -> Flags:
@@ -301,15 +317,29 @@ def find_unpredictable_rows(problem: Problem, fit: Fit, floor: Mapping[str, floa
     none = np.zeros(left.shape[1], bool)
     if (compute_typical_rms(left[:, problem.trace.usable], 0.5) > NEAR_NOISE * levels[:, 0]).any():
         return none
-    undecided = find_undecided_rows(replace(problem, also=()), fit, floor) | ~problem.trace.usable
-    undecided = _extend_until_noise(undecided, left / levels)
+    alone = replace(problem, also=(), _lanes={})
+    undecided = find_undecided_rows(alone, fit, floor) | ~problem.trace.usable
+    values = {**problem.model.values, **fit.values}
+    frictions, reach = list(filter(is_friction, values)), None
+    if frictions and problem.model.kind.correct is not None:
+        moved = list(dict.fromkeys([*(f.name for f in fit.free), *frictions]))
+        rows = np.array([[values[n] for n in moved], [0.0 if is_friction(n) else values[n] for n in moved]])
+        reach = np.diff(alone.predict_outputs(moved, rows), axis=0)[0] / levels
+    undecided = extend_until_noise(undecided, left / levels, reach)
     return undecided if undecided.mean() <= HELD_OUT_UNDECIDED_SHARE else none
 
 
-def _extend_until_noise(undecided: Flags, ratios: Floats) -> Flags:
-    """The undecided rows, and the windows after them in which residuals over their floors, (s, n), are not noise."""
+def extend_until_noise(undecided: Flags, ratios: Floats, reach: Floats | None = None) -> Flags:
+    """The undecided rows, and the windows after them in which residuals over their floors, (s, n), are not noise.
+
+    `reach`, (s, n), is what all friction of the plant does, over the floors. A replay that slides where the plant
+    sticks, or the reverse, is off by no more: a larger residual is physics that is missing, and ends the extension.
+    """
     extended = undecided.copy()
-    is_off = find_large_windows(np.abs(np.nan_to_num(ratios)), RESIDUAL_HELD_OUT)
+    power = measure_window_power(np.nan_to_num(ratios))
+    is_off: Flags = power.max(axis=0) > RESIDUAL_HELD_OUT**2
+    if reach is not None:
+        is_off &= (power <= np.maximum(measure_window_power(reach), RESIDUAL_HELD_OUT**2)).all(axis=0)
     for first in range(WINDOW, len(extended), WINDOW):
         extended[first:first + WINDOW] |= extended[first - 1] & is_off[first:first + WINDOW]
     return extended

@@ -139,7 +139,8 @@ def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, flo
         progress: called with each stage and the share done.
     """
     progress("which states the residual follows", 0.85)
-    unseen = search.make_unseen_problem() if search.holdout is not None else None
+    held, steps = search.holdout, search.problem.steps
+    unseen = search.make_problem(held, steps) if held is not None else None
     balances, states = compute_balances(search.problem, base, floor)
     there = compute_balances(unseen, base, floor) if unseen is not None else None
     missing = tuple(describe_balance(b, states, there) for b in balances)
@@ -209,7 +210,8 @@ def _measure_holdout(search: Search, h: Hypothesis) -> dict[str, float]:
     """RMS residual of the typical block of the held-out run, SI; {} without one."""
     if search.holdout is None:
         return {}
-    left = search.make_unseen_problem().compute_residuals(h.fit.free, h.fit.x[None])[0]
+    problem = search.make_problem(search.holdout, search.problem.steps)
+    left = problem.compute_residuals(h.fit.free, h.fit.x[None])[0]
     return dict(zip(search.holdout.outputs, compute_typical_rms(left).tolist(), strict=True))
 
 

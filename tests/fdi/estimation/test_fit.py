@@ -10,18 +10,21 @@ import numpy as np
 import pytest
 from noisy_traces import record_plant
 
+from fdi.discovery.explain import judge_left_out_rows
 from fdi.discovery.search import Search
 from fdi.estimation.fit import (
     Fit,
     Problem,
+    compute_typical_rms,
     evolve_population,
     linearise,
     list_all_unknowns,
     list_effect_unknowns,
 )
-from fdi.estimation.noise import white_noise
+from fdi.estimation.noise import WINDOW, white_noise
 from fdi.estimation.replay import (
     compute_residuals,
+    extend_until_noise,
     find_rest_rows,
     find_undecided_rows,
     hold_inputs,
@@ -210,6 +213,38 @@ def test_rows_in_which_a_motor_bounces_in_its_backlash_are_left_out_of_last_fits
     kept = search.problem.trace.usable
     assert kept[700:1200].all() and usable[-1000:].all() and kept[-1000:].mean() < 0.5
     assert not Search(Model(), hold_inputs(record_plant({}, np.zeros(200))), [], [], 1).leave_out_undecided(true)
+
+
+def test_what_is_missing_in_rows_that_a_search_left_out_is_no_noise() -> None:
+    """A larger mass, and a search that keeps nothing but the ramp: what it left out may hang on an impact or not."""
+    model, ramp = load_model("ema"), slice(700, 1250)
+    for changes, is_noise in (({}, True), ({"surface.mass": 260.0}, False)):
+        search = Search(model, _record_motor(changes), [], [], 1)
+        usable = np.zeros(len(search.run), bool)
+        usable[ramp] = True
+        search.problem = replace(search.problem, trace=search.run.with_columns({}, usable=usable), _lanes={})
+        base = search.judge_fit((), linearise(search.problem, list_all_unknowns(model), np.zeros(4)))
+        assert base.is_at_floor
+        assert judge_left_out_rows(search, base, search.estimate_floor(base)).is_at_floor == is_noise
+
+
+def test_an_extension_ends_where_friction_cannot_have_made_the_residual() -> None:
+    n = 10 * WINDOW
+    undecided = np.arange(n) < WINDOW
+    ratios, reach = np.full((1, n), 3.0), np.full((1, n), 5.0)
+    ratios[:, 8 * WINDOW:] = 1.0
+    assert extend_until_noise(undecided, ratios).mean() == 0.8
+    assert extend_until_noise(undecided, ratios, reach).mean() == 0.8
+    ratios[:, 4 * WINDOW:6 * WINDOW] = 7.0
+    assert extend_until_noise(undecided, ratios, reach).mean() == 0.4
+
+
+def test_missing_samples_do_not_make_the_typical_block_smaller() -> None:
+    residuals = np.random.default_rng(0).standard_normal((2, 4000))
+    there = compute_typical_rms(residuals[:, :2000])
+    residuals[:, 2000:] = np.nan
+    assert compute_typical_rms(residuals).tolist() == there.tolist()
+    assert compute_typical_rms(np.full((1, 300), np.nan)).tolist() == [0.0]
 
 
 def test_a_rest_hangs_on_stops_and_a_reversal_does_not() -> None:
