@@ -23,6 +23,7 @@ the thresholds.
 | small gain | the gain is below {GAIN_DOUBTFUL:g} | fits the base again from there; drops a single effect that then gains at most {GAIN_SEEN:g} |
 | solver | half the step changes more than {SOLVER_ERROR_SHARE:g} floors | finishes again with 50 steps a cycle |
 | whole recording | only an excerpt was fitted | judges on all rows |
+| left-out rows | the replay has an observer | judges on all rows that hang on no stop, as on a held-out run; all together may leave {RESIDUAL_WORST:g} floors there |
 | held-out run | there is one | rejects an effect that leaves more than {RESIDUAL_HELD_OUT:g} floors in the typical block; up to {HELD_OUT_UNDECIDED_SHARE:g} of the run may be undecided |
 | verdict | always | see below |
 | wave | the verdict is PARTLY, and a wave along the stroke explains more | names no effect |
@@ -40,7 +41,7 @@ import numpy as np
 
 from fdi.discovery.detectable import Blind, find_hidden_effects
 from fdi.discovery.residual_pattern import is_periodic_in_position
-from fdi.discovery.search import FINE, Hypothesis, Search, Sensitivity, compute_sensitivity
+from fdi.discovery.search import FINE, TRUEST, Hypothesis, Search, Sensitivity, compute_sensitivity
 from fdi.estimation.fit import Problem, compute_typical_rms, replay_fit
 from fdi.estimation.replay import (
     answer_readings,
@@ -396,15 +397,16 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
         if len(equal) > 1:
             return "AMBIGUOUS", (*prints, *dict.fromkeys(e for h in equal for e in h.effects))
         return "EXPLAINED", (*prints, *there[0].effects)
-    better = min(_measure_excess(best, floor), 1e9) < ERROR_PARTLY_EXPLAINED * _measure_excess(base, floor)
+    left, before = (measure_excess(h.errors, floor) for h in (best, base))
+    better = min(left, 1e18) < ERROR_PARTLY_EXPLAINED**2 * before
     if better and part:
         return "PARTLY", (*prints, *best.effects)
     return ("PARTLY" if prints else "UNEXPLAINED"), prints
 
 
-def _measure_excess(h: Hypothesis, floor: Mapping[str, float]) -> float:
-    """How far above the floor what is left is, in all signals together."""
-    return float(np.sqrt(np.mean([max((e / floor[s]) ** 2 - 1.0, 0.0) for s, e in h.errors.items()])))
+def measure_excess(errors: Mapping[str, float], floor: Mapping[str, float]) -> float:
+    """Squared error above the squared floor, summed over the signals, in squared floors."""
+    return float(sum(max((e / floor[s]) ** 2 - 1.0, 0.0) for s, e in errors.items()))
 
 
 def _judge_unseen_run(search: Search, h: Hypothesis, floor: Mapping[str, float]) -> HeldOut:
@@ -422,35 +424,35 @@ def judge_left_out_rows(search: Search, h: Hypothesis, floor: Mapping[str, float
     """
     if search.model.kind.correct is None:
         return h
-    problem = search.make_problem(search.run)
+    problem = search.make_problem(search.run, TRUEST)
     judged = _judge_run(problem, problem.compute_residuals(h.fit.free, h.fit.x[None])[0], h, floor)
-    if judged.holds:
-        return h
-    return replace(h, ratio={s: max(x, judged.decided.get(s, 0.0) / floor[s]) for s, x in h.ratio.items()})
+    return h if judged.holds else replace(h, ratio={s: max(x, judged.decided.get(s, 0.0) / floor[s])
+                                                    for s, x in h.ratio.items()})
 
 
 def _judge_run(problem: Problem, left: Floats, h: Hypothesis, floor: Mapping[str, float]) -> HeldOut:
     """Whether noise alone is `left`, (s, n), of a run under a hypothesis, or of the rows that hang on no stop."""
-    trace, has_observer = problem.trace, problem.model.kind.correct is not None
-    if _is_noise(left, trace, floor, has_observer):
+    if _is_noise(left, problem, floor):
         return HeldOut(True)
     undecided = find_undecided_rows(problem, h.fit, floor)
-    if has_observer:  # a bounce that was missed has consequences
-        undecided |= find_unpredictable_rows(problem, replay_fit(problem, h.fit, h.fit.x), floor) & trace.usable
-    share = float(undecided.mean())
-    if share > HELD_OUT_UNDECIDED_SHARE or (share == 0.0 and not has_observer):
+    if problem.model.kind.correct is not None:  # a bounce that was missed has consequences
+        undecided |= find_unpredictable_rows(problem, replay_fit(problem, h.fit, h.fit.x), floor) & problem.trace.usable
+    elif not undecided.any():
         return HeldOut(False)
-    kept = left[:, ~undecided]
-    rms = dict(zip(trace.outputs, np.sqrt(np.nanmean(kept**2, axis=1)).tolist(), strict=True))
-    return HeldOut(_is_noise(kept, trace, floor, has_observer), share, rms)
+    share, kept = float(undecided.mean()), left[:, ~undecided]
+    if share > HELD_OUT_UNDECIDED_SHARE:
+        return HeldOut(False)
+    rms = np.sqrt(np.nanmean(kept**2, axis=1)).tolist()
+    return HeldOut(_is_noise(kept, problem, floor), share, dict(zip(problem.trace.outputs, rms, strict=True)))
 
 
-def _is_noise(left: Floats, trace: Trace, floor: Mapping[str, float], has_observer: bool) -> bool:
-    """Whether the typical block is noise; an observer forgets missed stops, so the others must not be far off either.
+def _is_noise(left: Floats, problem: Problem, floor: Mapping[str, float]) -> bool:
+    """Whether the typical block is noise; an observer forgets a missed stop, so the others may not be far off either.
     """
-    typical, rms = compute_typical_rms(left), np.sqrt(np.nanmean(left**2, axis=1))
-    return all(e <= RESIDUAL_HELD_OUT * floor[s] and (r <= RESIDUAL_WORST * floor[s] or not has_observer)
-               for s, e, r in zip(trace.outputs, typical, rms, strict=True))
+    levels = np.array([floor[s] for s in problem.trace.outputs])
+    worst = np.inf if problem.model.kind.correct is None else RESIDUAL_WORST
+    return bool((compute_typical_rms(left) <= RESIDUAL_HELD_OUT * levels).all()
+                and (np.sqrt(np.nanmean(left**2, axis=1)) <= worst * levels).all())
 
 
 BUS_CURRENT, BUS_POSITION = 1e-8, 1e-7  # A, m: what one count on the bus is worth (docs/bus.md)

@@ -132,7 +132,7 @@ class Search:
         trace, *repeats = (leave_out_rest(run, model) for run in (trace, *repeats))
         self.run = trace  # with the rows that the search may leave out
         self.holdout = None if holdout is None else leave_out_rest(holdout, model)
-        self.whole = whole  # what the runs were cut from, if they were
+        self.whole = [leave_out_rest(run, model) for run in whole]  # what the runs were cut from, if they were
         lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
         rounding = max(rounding, float(lsb / np.sqrt(12.0)))
         # RMS of rounding, where a signal comes in steps
@@ -315,15 +315,14 @@ class Search:
             ratio = dict(zip(signals, measure_repeating(typical, others, coarse), strict=True))
         return Hypothesis(effects, found, errors, ratio, cost, tuple(others))
 
-    def make_problem(self, trace: Trace, steps: int | None = None) -> Problem:
-        """Another run in place of the search's own; by default with the steps of a replay that decides."""
-        steps = steps or (FINE if is_long(trace) else TRUEST)
+    def make_problem(self, trace: Trace, steps: int) -> Problem:
+        """Another run in place of the search's own, with so many steps a cycle."""
         return replace(self.problem, trace=trace, steps=steps, also=(), _lanes={})
 
     def replay_holdout(self, hypotheses: Sequence[Hypothesis]) -> tuple[Problem, list[Floats]]:
         """The held-out run, and what each hypothesis leaves of it, (s, n) SI; none is replayed twice."""
         assert self.holdout is not None
-        problem = self.make_problem(self.holdout)
+        problem = self.make_problem(self.holdout, FINE if is_long(self.holdout) else TRUEST)
         new = [h for h in dict.fromkeys(hypotheses) if h not in self._left_unseen]
         left = map_together(lambda h: problem.compute_residuals(h.fit.free, h.fit.x[None])[0], new, self.workers)
         self._left_unseen.update(zip(new, left, strict=True))
@@ -568,13 +567,12 @@ def measure_repeating(residual: Floats, others: Sequence[Floats], coarse: Sequen
 
 
 def _leave_out_worst(residuals: Floats, share: float = 0.15) -> Floats:
-    """Residuals (s, n) without each signal's worst blocks, as many as `compute_typical_rms` leaves out.
+    """Residuals (s, n) without each signal's worst blocks, a share of all of them.
 
     A surface may stop for an instant in a slow motion.
     """
-    counts = sum_blocks((~np.isnan(residuals)).astype(float))
-    squares = np.where(counts > 0.0, sum_blocks(np.nan_to_num(residuals)) / np.maximum(counts, 1.0), np.nan)
-    kept = squares <= np.nanquantile(squares, 1.0 - share, axis=1, keepdims=True)
+    sums = sum_blocks(np.nan_to_num(residuals))
+    kept = sums <= np.quantile(sums, 1.0 - share, axis=1, keepdims=True)
     return np.where(np.repeat(kept, BLOCK, axis=1)[:, :residuals.shape[1]], residuals, np.nan)
 
 

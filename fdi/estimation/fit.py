@@ -279,12 +279,10 @@ def compute_typical_rms(residuals: Floats, share: float = 0.85) -> Floats:
 
     Samples that are missing are left out, and do not fill blocks; 0 where all are.
     """
-    typical = np.zeros(len(residuals))
-    for i, row in enumerate(residuals):
-        squares = np.sort(sum_blocks(row[~np.isnan(row)]))
-        if len(squares):
-            typical[i] = np.sqrt(squares[:max(1, round(share * len(squares)))].mean() / BLOCK)
-    return typical
+    squares = [np.sort(sum_blocks(row[~np.isnan(row)])) for row in residuals]
+    means = [each[:max(1, round(share * len(each)))].mean() if len(each) else 0.0 for each in squares]
+    rms: Floats = np.sqrt(np.array(means) / BLOCK)
+    return rms
 
 
 UNREPLAYED = ("command", "reading")  # ports that a replay from the measured current does not pass

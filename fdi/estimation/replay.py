@@ -116,11 +116,7 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
         steps = REPLAY_STEPS
     residuals = compute_residuals(trace, coarse)
     if model.kind.correct is not None:
-        names = list(filter(is_friction, model.values))
-        slid = replay_lanes(Lanes(silence_sensors(model), names, REPLAY_STEPS), np.zeros((1, len(names))), trace)[0]
-        reach = {name: slid[:, i] - coarse[name] for i, name in enumerate(trace.output_names)}
-        undecided = extend_until_noise(undecided, *(np.array([x[s] / floor[s] for s in residuals if s in floor])
-                                                     for x in (residuals, reach)))
+        undecided = extend_until_noise(undecided, np.array([residuals[s] / floor[s] for s in residuals if s in floor]))
     return Replay(coarse, residuals, steps, error, undecided, blind)
 
 
@@ -147,9 +143,9 @@ def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str,
         found[:, rows] = runs[0].T
         for i, signal in enumerate(outputs):
             if signal.name in floor:
-                moved = np.abs(runs[1:, :, i] - runs[:1, :, i])
-                large = find_large_windows(moved, max(floor[signal.name], signal.slight))
-                undecided[rows] |= large & ~np.isnan(trace.mask_unusable(signal.name)[rows])
+                power_moved = measure_window_power(runs[1:, :, i] - runs[:1, :, i]).max(axis=0, initial=0.0)
+                undecided[rows] |= ((power_moved > max(floor[signal.name], signal.slight) ** 2)
+                                    & ~np.isnan(trace.mask_unusable(signal.name)[rows]))
         guessed = (runs[len(values):len(values) + len(currents)] - runs[:1])[:, ~undecided[rows]]
         power, count = power + (guessed**2).sum(axis=(0, 1)), count + guessed.shape[0] * guessed.shape[1]
     blind = {name: math.sqrt(float(power[i]) / count) if count else 0.0 for i, name in enumerate(trace.output_names)}
@@ -216,12 +212,6 @@ def vary_frictions(names: Sequence[str], values: Mapping[str, float]) -> Floats:
     return limit_dynamic_friction(names, np.concatenate([base[None], base * (1 + shifts), base * (1 - shifts)]))
 
 
-def find_large_windows(moved: Floats, floor: float, window: int = WINDOW) -> Flags:
-    """Rows of windows in which one of the runs (m, n) is moved by more than the floor, RMS."""
-    large: Flags = measure_window_power(moved, window).max(axis=0, initial=0.0) > floor**2
-    return large
-
-
 def measure_window_power(x: Floats, window: int = WINDOW) -> Floats:
     """Mean square of each row's window in signals (m, n): (m, n)."""
     starts = np.arange(0, x.shape[1], window)
@@ -252,12 +242,10 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
         if noisy:
             shifted = replace(problem, trace=noisy[0], also=tuple(noisy[1:]))
             runs = np.concatenate([runs, shifted.predict_outputs(names, tried[:1])])
-    changes = np.abs(runs[1:] - runs[0])
-    undecided = np.zeros(runs.shape[2], bool)
-    for i, signal in enumerate(problem.trace.outputs):
-        slight = problem.trace.declared.find(signal).slight
-        large = find_large_windows(changes[:, i], max(floor[signal], slight))
-        undecided |= large & ~np.isnan(problem.trace.measurements[i])
+    changes = measure_window_power((runs[1:] - runs[0]).reshape(-1, runs.shape[2])).reshape(-1, *runs.shape[1:])
+    least = np.array([[max(floor[s], problem.trace.declared.find(s).slight)] for s in problem.trace.outputs])
+    is_large = changes.max(axis=0, initial=0.0) > least**2
+    undecided: Flags = (is_large & ~np.isnan(problem.trace.measurements)).any(axis=0)
     return undecided
 
 
@@ -317,14 +305,12 @@ def find_unpredictable_rows(problem: Problem, fit: Fit, floor: Mapping[str, floa
     none = np.zeros(left.shape[1], bool)
     if (compute_typical_rms(left[:, problem.trace.usable], 0.5) > NEAR_NOISE * levels[:, 0]).any():
         return none
-    alone = replace(problem, also=(), _lanes={})
+    alone, reach = replace(problem, also=()), None
     undecided = find_undecided_rows(alone, fit, floor) | ~problem.trace.usable
-    values = {**problem.model.values, **fit.values}
-    frictions, reach = list(filter(is_friction, values)), None
-    if frictions and problem.model.kind.correct is not None:
-        moved = list(dict.fromkeys([*(f.name for f in fit.free), *frictions]))
-        rows = np.array([[values[n] for n in moved], [0.0 if is_friction(n) else values[n] for n in moved]])
-        reach = np.diff(alone.predict_outputs(moved, rows), axis=0)[0] / levels
+    if problem.model.kind.correct is not None and any(map(is_friction, problem.model.values)):
+        values = {name: x for name, x in problem.model.values.items() if is_friction(name)} | fit.values
+        rows = np.array([[x * keep if is_friction(n) else x for n, x in values.items()] for keep in (1.0, 0.0)])
+        reach = np.diff(alone.predict_outputs(list(values), rows), axis=0)[0] / levels
     undecided = extend_until_noise(undecided, left / levels, reach)
     return undecided if undecided.mean() <= HELD_OUT_UNDECIDED_SHARE else none
 

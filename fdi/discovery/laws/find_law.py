@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.explain import Explanation
+from fdi.discovery.explain import Explanation, measure_excess
 from fdi.discovery.laws.terms import LIBRARY, PARTS, TERMS, Term, find_states, name_parameter, registered_library
 from fdi.discovery.residual_pattern import ACCELERATION_WINDOW, CREEP, EDGE, Balance, States, compute_balances
 from fdi.discovery.search import Hypothesis, Search, simulate_starts
@@ -139,8 +139,7 @@ def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, flo
         progress: called with each stage and the share done.
     """
     progress("which states the residual follows", 0.85)
-    held, steps = search.holdout, search.problem.steps
-    unseen = search.make_problem(held, steps) if held is not None else None
+    unseen = None if search.holdout is None else search.make_problem(search.holdout, search.problem.steps)
     balances, states = compute_balances(search.problem, base, floor)
     there = compute_balances(unseen, base, floor) if unseen is not None else None
     missing = tuple(describe_balance(b, states, there) for b in balances)
@@ -210,14 +209,8 @@ def _measure_holdout(search: Search, h: Hypothesis) -> dict[str, float]:
     """RMS residual of the typical block of the held-out run, SI; {} without one."""
     if search.holdout is None:
         return {}
-    problem = search.make_problem(search.holdout, search.problem.steps)
-    left = problem.compute_residuals(h.fit.free, h.fit.x[None])[0]
+    left = search.make_problem(search.holdout, search.problem.steps).compute_residuals(h.fit.free, h.fit.x[None])[0]
     return dict(zip(search.holdout.outputs, compute_typical_rms(left).tolist(), strict=True))
-
-
-def measure_excess(errors: Mapping[str, float], floor: Mapping[str, float]) -> float:
-    """Squared error above the squared floor, summed over the signals, in squared floors."""
-    return float(sum(max((e / floor[s]) ** 2 - 1.0, 0.0) for s, e in errors.items()))
 
 
 class _Ranked(NamedTuple):
