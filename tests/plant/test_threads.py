@@ -72,6 +72,27 @@ def test_requests_of_side_by_side_tasks_are_met_together_until_each_has_ended() 
     assert map_together(make_requests, [2], 2) == [2] and met == [[(0, 2)], [(1, 2)]]  # nobody to wait for
 
 
+def test_requests_of_threads_within_tasks_are_met_together_too() -> None:
+    """Each task asks for two pieces of work at once, and goes on alone."""
+    met: list[list[str]] = []
+
+    def do(requests: Sequence[str], workers: int) -> None:
+        met.append(sorted(requests))
+
+    def make_requests(task: str) -> list[str]:
+        def ask(part: str) -> str:
+            do_together(task + part, do, 2)
+            return part
+
+        answers = map_in_threads(ask, "12", 2)
+        do_together(task, do, 2)
+        return answers
+
+    assert map_together(make_requests, "ab", 2) == [["1", "2"]] * 2
+    assert met[0] == ["a1", "a2", "b1", "b2"]
+    assert sorted(sum(met[1:], [])) == ["a", "b"]  # whoever comes back first may be alone
+
+
 @pytest.mark.parametrize("fails_in_task", [True, False])
 def test_no_task_waits_for_one_that_failed(fails_in_task: bool) -> None:
     def do(requests: Sequence[int], workers: int) -> None:
