@@ -291,8 +291,6 @@ UNIT_TOLERANCE = 0.015
 
 # RMS residual over noise, over all blocks, that a few stops of the ram at the wrong moment may leave.
 #
-# In `rig explain` of a plant with an observer also that of the rows that hang on no stop: of an `ema`, true
-# explanations left at most 2.0 there, wrong ones 64 and more.
 # The typical block (`RESIDUAL_IS_NOISE`) decides; this limit catches a misfit in the 15 % of blocks it leaves out. A
 # fit with other effects has been begun elsewhere too and must do better (`FITTED_RUN_WORST`).
 RESIDUAL_WORST = 5.0

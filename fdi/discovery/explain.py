@@ -23,7 +23,7 @@ the thresholds.
 | small gain | the gain is below {GAIN_DOUBTFUL:g} | fits the base again from there; drops a single effect that then gains at most {GAIN_SEEN:g} |
 | solver | half the step changes more than {SOLVER_ERROR_SHARE:g} floors | finishes again with 50 steps a cycle |
 | whole recording | only an excerpt was fitted | judges on all rows |
-| left-out rows | the replay has an observer | judges on all rows that hang on no stop, as on a held-out run; all together may leave {RESIDUAL_WORST:g} floors there |
+| left-out rows | the replay has an observer | judges on all rows that hang on no stop, as on a held-out run |
 | held-out run | there is one | rejects an effect that leaves more than {RESIDUAL_HELD_OUT:g} floors in the typical block; up to {HELD_OUT_UNDECIDED_SHARE:g} of the run may be undecided |
 | verdict | always | see below |
 | wave | the verdict is PARTLY, and a wave along the stroke explains more | names no effect |
@@ -63,7 +63,6 @@ from fdi.thresholds import (
     HELD_OUT_UNDECIDED_SHARE,
     INTERVAL_95_SD,
     RESIDUAL_HELD_OUT,
-    RESIDUAL_WORST,
     SOLVER_ERROR_SHARE,
 )
 from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
@@ -432,7 +431,7 @@ def judge_left_out_rows(search: Search, h: Hypothesis, floor: Mapping[str, float
 
 def _judge_run(problem: Problem, left: Floats, h: Hypothesis, floor: Mapping[str, float]) -> HeldOut:
     """Whether noise alone is `left`, (s, n), of a run under a hypothesis, or of the rows that hang on no stop."""
-    if _is_noise(left, problem, floor):
+    if _is_noise(left, problem.trace, floor):
         return HeldOut(True)
     undecided = find_undecided_rows(problem, h.fit, floor)
     if problem.model.kind.correct is not None:  # a bounce that was missed has consequences
@@ -443,16 +442,11 @@ def _judge_run(problem: Problem, left: Floats, h: Hypothesis, floor: Mapping[str
     if share > HELD_OUT_UNDECIDED_SHARE:
         return HeldOut(False)
     rms = np.sqrt(np.nanmean(kept**2, axis=1)).tolist()
-    return HeldOut(_is_noise(kept, problem, floor), share, dict(zip(problem.trace.outputs, rms, strict=True)))
+    return HeldOut(_is_noise(kept, problem.trace, floor), share, dict(zip(problem.trace.outputs, rms, strict=True)))
 
 
-def _is_noise(left: Floats, problem: Problem, floor: Mapping[str, float]) -> bool:
-    """Whether the typical block is noise; an observer forgets a missed stop, so the others may not be far off either.
-    """
-    levels = np.array([floor[s] for s in problem.trace.outputs])
-    worst = np.inf if problem.model.kind.correct is None else RESIDUAL_WORST
-    return bool((compute_typical_rms(left) <= RESIDUAL_HELD_OUT * levels).all()
-                and (np.sqrt(np.nanmean(left**2, axis=1)) <= worst * levels).all())
+def _is_noise(left: Floats, trace: Trace, floor: Mapping[str, float]) -> bool:
+    return all(e <= RESIDUAL_HELD_OUT * floor[s] for s, e in zip(trace.outputs, compute_typical_rms(left), strict=True))
 
 
 BUS_CURRENT, BUS_POSITION = 1e-8, 1e-7  # A, m: what one count on the bus is worth (docs/bus.md)
