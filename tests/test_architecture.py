@@ -102,7 +102,7 @@ PUBLIC = {
     },
     "rig.sequences": {"Sequence", "load_sequence"},
     "rig.recorder": {
-        "U32", "CanFrame", "Check", "CycleBlock", "Event", "NmtState", "Observer", "Record", "Recorder",
+        "U32", "CanFrame", "CycleBlock", "Event", "NmtState", "Observer", "Record", "Recorder",
         "RecorderError", "Signals", "Timing",
     },
     "dbc": {"DBC", "EDS"},

@@ -15,7 +15,8 @@ import numpy as np
 
 from fdi.estimation.noise import floor_from_data
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
-from fdi.trace.trace import Check, Flags, Floats, Trace, rms
+from fdi.trace.check_result import CheckResult
+from fdi.trace.trace import Flags, Floats, Trace, rms
 from plant.errors import InputError
 from plant.signals import Signal
 
@@ -297,11 +298,11 @@ class MatchedCheck:
     """
 
     name: str
-    results: tuple[Check | None, ...]
+    results: tuple[CheckResult | None, ...]
     is_changed: bool
 
     @property
-    def first(self) -> Check:
+    def first(self) -> CheckResult:
         """The result of the first run that has the check."""
         return next(check for check in self.results if check is not None)
 
@@ -314,7 +315,7 @@ class MatchedCheck:
                    for check in known)
 
 
-def match_checks(checks_of_runs: Sequence[Sequence[Check]]) -> list[MatchedCheck]:
+def match_checks(checks_of_runs: Sequence[Sequence[CheckResult]]) -> list[MatchedCheck]:
     """The checks of each run, matched by name, in the order in which they first appear.
 
     Checks of one name in one run are told apart by their order.
@@ -326,8 +327,8 @@ def match_checks(checks_of_runs: Sequence[Sequence[Check]]) -> list[MatchedCheck
                               for table in tables if table}) > 1) for key in keys]
 
 
-def _number_checks(checks: Sequence[Check]) -> dict[tuple[str, int], Check]:
-    out: dict[tuple[str, int], Check] = {}
+def _number_checks(checks: Sequence[CheckResult]) -> dict[tuple[str, int], CheckResult]:
+    out: dict[tuple[str, int], CheckResult] = {}
     count: dict[str, int] = {}
     for check in checks:
         out[check.name, count.setdefault(check.name, 0)] = check

@@ -40,7 +40,8 @@ from fdi.report.numbers import (
 from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Report, Section, Table
 from fdi.report.run_report import format_limits, read_verdict
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
-from fdi.trace.trace import Check, Trace
+from fdi.trace.check_result import CheckResult
+from fdi.trace.trace import Trace
 
 Facts = dict[str, list[str]]  # the text of each run
 
@@ -152,13 +153,13 @@ def _tabulate_checks(found: RunDifferences, checks: Sequence[MatchedCheck], medi
     return Table(columns, rows, caption, medium=medium)
 
 
-def _show_value(check: Check | None) -> Cell | str:
+def _show_value(check: CheckResult | None) -> Cell | str:
     if check is None:
         return Cell("-", "muted")
     return Cell("not measurable", "muted") if math.isnan(check.value) else f"{check.value:.4g}"
 
 
-def _join_verdicts(results: Sequence[Check | None]) -> Cell:
+def _join_verdicts(results: Sequence[CheckResult | None]) -> Cell:
     words = ["-" if check is None else check.verdict.replace("PASS", "pass") for check in results]
     text = " -> ".join(words) if len(set(words)) > 1 else words[0]
     if "FAIL" in words:

@@ -53,8 +53,10 @@ from fdi.report.report import (
     tabulate,
     write_html,
 )
-from fdi.trace.trace import Check, Event, Floats, Trace
+from fdi.trace.check_result import CheckResult, compute_speed, filter_median
+from fdi.trace.trace import Event, Floats, Trace
 from plant.signals import EHA, Signals
+from plant.units import UNITS
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",
                           "NOT_JUDGED": "doubtful", "CANNOT_TELL": "doubtful"}
@@ -180,7 +182,7 @@ def _list_notes(trace: Trace, most: int = 5) -> list[str]:
     return notes
 
 
-def _tabulate_checks(checks: Sequence[Check], heading: str, remark: Medium) -> Table:
+def _tabulate_checks(checks: Sequence[CheckResult], heading: str, remark: Medium) -> Table:
     """The checks of a sequence, or the protocol checks, which judge the whole run."""
     page = Medium.PAGE
     is_windowed, is_uncertain = heading == "check", any(check.uncertainty < math.inf for check in checks)
@@ -221,7 +223,7 @@ def _show_failed_checks(trace: Trace, most: int = 12) -> list[Item]:
     return items
 
 
-def _name_measure(check: Check) -> str:
+def _name_measure(check: CheckResult) -> str:
     """What a check measures: "steady error of xj", "largest size of cor", "number of EMCY events"."""
     if check.kind in ("event_occurs", "event_never"):
         return f"number of {check.signal} events" if check.signal else "number of events"
@@ -254,7 +256,7 @@ def format_limits(low: float, high: float) -> str:
     return f">= {low:g}" if math.isnan(high) else f"{low:g} .. {high:g}"
 
 
-def _format_window(check: Check) -> str:
+def _format_window(check: CheckResult) -> str:
     if math.isnan(check.t0):
         return "not reached" if math.isnan(check.value) else "whole run"
     return f"{check.t0:.3f} – {check.t1:.3f} s"
@@ -425,8 +427,7 @@ def _draw_checks(trace: Trace) -> Panel:
     return [*panel, call("barh", rows, widths, left=lefts, height=0.7, color=colours)]
 
 
-UNIT_SIZES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "m/s": 1.0, "mm/s": 1e-3, "Pa": 1.0, "bar": 1e5, "MPa": 1e6, "N": 1.0,
-              "kN": 1e3, "A": 1.0, "mA": 1e-3, "s": 1.0, "ms": 1e-3}
+UNIT_SIZES = {name: float(unit.factor) for name, unit in UNITS.items()}
 BOTH = (1.0, -1.0)  # sides of zero
 
 
@@ -434,7 +435,7 @@ class _View(NamedTuple):
     """The rows of a check, which its close-up shows."""
 
     trace: Trace
-    check: Check
+    check: CheckResult
     rows: slice
 
     @property
@@ -448,7 +449,7 @@ class _View(NamedTuple):
         if name in trace.columns:
             return trace.column(name)[self.rows]
         if name == "speed":
-            return _compute_speed(trace.controlled, trace.period)[self.rows]
+            return compute_speed(trace.controlled, 1.0 / trace.period)[self.rows]
         return (trace.command - trace.controlled)[self.rows]
 
     @property
@@ -485,10 +486,10 @@ class _View(NamedTuple):
     def compute_share(self) -> Floats:
         """How much of the step the plant has done, %; filtered as the checks do it."""
         before, size = self.step
-        return 100.0 * (_filter_median(self.controlled, self.trace.period) - before) / size
+        return 100.0 * (filter_median(self.controlled, 1.0 / self.trace.period) - before) / size
 
 
-def draw_failed_check(trace: Trace, check: Check, salt: str = "check") -> str:
+def draw_failed_check(trace: Trace, check: CheckResult, salt: str = "check") -> str:
     """The window of a check with its limits and what was measured; "" for a check without window or signal.
 
     `salt` keeps the ids of the figure apart from those of other figures of the page.
@@ -552,7 +553,7 @@ def _draw_size(view: _View) -> Panel:
     check, is_error = view.check, view.check.kind != "never_exceeds"
     name = "error" if is_error else check.signal
     values = view.read(name) / UNIT_SIZES.get(check.unit, 1.0)
-    filtered = _filter_median(values, view.trace.period) if is_error else values
+    filtered = filter_median(values, 1.0 / view.trace.period) if is_error else values
     middle = 0.0
     sides: tuple[float, ...] = BOTH
     if check.kind == "break_away":
@@ -636,7 +637,7 @@ def _draw_times(view: _View, start: float) -> list[Mark]:
             axes(xlim=(view.t[0], min(float(view.t[-1]), start + 3.0 * longest)))]
 
 
-def _to_seconds(check: Check, value: float) -> float:
+def _to_seconds(check: CheckResult, value: float) -> float:
     return value * UNIT_SIZES.get(check.unit, 1.0)
 
 
@@ -647,7 +648,7 @@ def _draw_sides(size: float, colour: str, label: str, sides: Sequence[float], mi
             for side in sides if not math.isnan(size)]
 
 
-def _draw_limits(check: Check, sides: Sequence[float] = (1.0,), middle: float = 0.0) -> list[Mark]:
+def _draw_limits(check: CheckResult, sides: Sequence[float] = (1.0,), middle: float = 0.0) -> list[Mark]:
     return [mark for limit, word in ((check.low, "least"), (check.high, "most"))
             for mark in _draw_sides(limit, AMBER, attach_unit(f"{word} {limit:g}", check.unit), sides, middle, "--")]
 
@@ -656,24 +657,10 @@ def _write_in_legend(text: str) -> Mark:
     return line([], [], INK, text, ls="")
 
 
-def _name_value(check: Check) -> str:
+def _name_value(check: CheckResult) -> str:
     if math.isnan(check.value):
         return "not measurable"
     return attach_unit(f"measured {check.value:.4g}", check.unit)
-
-
-def _filter_median(signal: Floats, period: float, span: float = 5e-3) -> Floats:
-    """Centred moving median over `span` s, the ends repeated, as the checks take it (docs/sequences.md)."""
-    half = int(span / period / 2 + 1e-9)
-    padded = np.pad(signal, half, mode="edge")
-    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1), axis=1)
-
-
-def _compute_speed(position: Floats, period: float, span: float = 20e-3) -> Floats:
-    """Difference over `span` s, one-sided at the ends, m/s, as the checks take it."""
-    rows, half = np.arange(len(position)), max(1, round(span / period / 2))
-    ahead, behind = np.minimum(rows + half, len(rows) - 1), np.maximum(rows - half, 0)
-    return (position[ahead] - position[behind]) / (period * (ahead - behind))
 
 
 STEP_DRAWERS = (_draw_overshoot, _draw_rise_time, _draw_settling_time)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.trace.check_result import CheckResult
 from fdi.trace.csv_table import read_csv, write_csv
 from fdi.trace.declaration import DECLARATION, read_declaration
 from fdi.trace.mcap_log import Log, open_log
@@ -59,40 +60,6 @@ class Nmt(NamedTuple):
     name: str
 
 
-class Check(NamedTuple):
-    """A judged measurement; NaN limits and window ends mean none."""
-
-    name: str
-    kind: str  # overshoot, settling_time, ...
-    signal: str
-    value: float
-    unit: str
-    low: float
-    high: float
-    passed: bool
-    t0: float  # s
-    t1: float  # s
-    detail: str
-    requirement: str = ""  # ids of the requirements that it verifies, with commas between them
-    after: float = math.nan  # s, from which the time of a reaction counts
-    above: float = math.nan  # level that a signal has to pass, SI
-    below: float = math.nan
-    uncertainty: float = math.nan  # U (k = 2) of the value
-    cannot_tell: bool = False  # the decision rule leaves the verdict open
-
-    @property
-    def verdict(self) -> str:
-        """PASS, FAIL or CANNOT_TELL."""
-        if self.cannot_tell:
-            return "CANNOT_TELL"
-        return "PASS" if self.passed else "FAIL"
-
-    @property
-    def is_protocol(self) -> bool:
-        """Whether it is one of the protocol checks, which every run makes."""
-        return self.kind == "protocol"
-
-
 class Timing(NamedTuple):
     """When each cycle ran: columns of shape (cycles,), wall-clock seconds."""
 
@@ -106,7 +73,7 @@ class Timing(NamedTuple):
     execution: Floats
 
 
-R = TypeVar("R", Event, Nmt, Check)
+R = TypeVar("R", Event, Nmt, CheckResult)
 _NONE = np.empty(0)
 NO_TIMING = Timing(_NONE, _NONE, _NONE, _NONE, np.empty(0, bool), _NONE, _NONE, _NONE)
 
@@ -139,7 +106,7 @@ class Trace:
     provenance: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # what reading had to leave out
     events: tuple[Event, ...] = ()
-    checks: tuple[Check, ...] = ()
+    checks: tuple[CheckResult, ...] = ()
     nmt: tuple[Nmt, ...] = ()
     timing: Timing = NO_TIMING
     attachments: Mapping[str, bytes] = field(default_factory=dict)  # enough to repeat the run
@@ -151,12 +118,12 @@ class Trace:
         return len(self.t)
 
     @property
-    def sequence_checks(self) -> tuple[Check, ...]:
+    def sequence_checks(self) -> tuple[CheckResult, ...]:
         """The checks of the sequence, each over a window of the run."""
         return tuple(check for check in self.checks if not check.is_protocol)
 
     @property
-    def protocol_checks(self) -> tuple[Check, ...]:
+    def protocol_checks(self) -> tuple[CheckResult, ...]:
         """The checks that every run makes of the controller's behaviour on the bus."""
         return tuple(check for check in self.checks if check.is_protocol)
 
@@ -438,7 +405,7 @@ def _from_log(log: Log, everything: bool, declared: Signals) -> Trace:
                        timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
                        events=tuple(_list_records(log, "/events", Event, rest, seconds)),
                        nmt=tuple(_list_records(log, "/nmt", Nmt, rest, seconds)),
-                       checks=tuple(_list_records(log, "/checks", Check, rest, seconds)))
+                       checks=tuple(_list_records(log, "/checks", CheckResult, rest, seconds)))
 
 
 def _list_records(log: Log, topic: str, kind: type[R], rest: Mapping[str, Messages],
@@ -452,14 +419,14 @@ def _list_records(log: Log, topic: str, kind: type[R], rest: Mapping[str, Messag
     """
     fields = get_type_hints(kind)
     for time_ns, message in rest[topic]:
-        values: list[Any] = []
+        values: dict[str, Any] = {}
         for name, expected in fields.items():
-            absent = kind._field_defaults.get(name)  # logs of earlier versions lack a field that has a default
+            absent = getattr(kind, name, None)  # logs of earlier versions lack a field that has a default
             value = seconds(time_ns) if name == "t" else getattr(message, name, absent)
             if not isinstance(value, str | int | float) or isinstance(value, str) != (expected is str):
                 raise InputError(log.path, f"{topic}.{name}", f"a field of this name with a {expected.__name__}")
-            values.append(escape_control_characters(value) if isinstance(value, str) else value)
-        yield kind(*values)
+            values[name] = escape_control_characters(value) if isinstance(value, str) else value
+        yield kind(**values)
 
 
 def _require_numbers(log: Log, topic: str, columns: Mapping[str, NDArray[Any]], names: Iterable[str]) -> None:

@@ -1,7 +1,7 @@
 """The log: MCAP with protobuf channels, written off the loop's thread, salvaged after a crash."""
 from rig.recorder.block import CycleBlock
-from rig.recorder.schema import U32, CanFrame, Check, Event, NmtState, Record, Signals, Timing
+from rig.recorder.schema import U32, CanFrame, Event, NmtState, Record, Signals, Timing
 from rig.recorder.writer import Observer, Recorder, RecorderError
 
-__all__ = ["U32", "CanFrame", "Check", "CycleBlock", "Event", "NmtState", "Observer", "Record", "Recorder",
+__all__ = ["U32", "CanFrame", "CycleBlock", "Event", "NmtState", "Observer", "Record", "Recorder",
            "RecorderError", "Signals", "Timing"]

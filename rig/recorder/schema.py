@@ -4,7 +4,7 @@ Fields of fixed width come first and are packed in one precompiled `struct` call
 text and bytes follow. That is about 1 us a record against 5 us with protobuf's Python objects, and the log shares the
 interpreter lock with the loop. Zeros are written out, which proto3 allows; a test reads it with Google's library.
 """
-# ruff: noqa: RUF009 (`_describe_field` is a field specifier, as dataclasses.field is)
+# ruff: noqa: RUF009 (`describe_field` is a field specifier, as dataclasses.field is)
 from __future__ import annotations
 
 import math
@@ -25,6 +25,7 @@ from typing import Annotated, Any, cast, get_type_hints
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Fd
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
+from fdi.trace.check_result import CheckResult, describe_field
 from plant import signals as plant_signals
 from plant.errors import InputError
 
@@ -41,49 +42,45 @@ _HEAD = "<BQHIQQ"  # MCAP message record: opcode, length, channel, sequence, log
 _MESSAGE = 0x05
 
 
-def _describe_field(text: str, unit: str = "", **kw: Any) -> Any:
-    return field(metadata={"unit": unit, "doc": text}, **kw)
-
-
 @dataclass(slots=True)
 class CanFrame:
     """A raw CAN frame; its time is the log time."""
 
-    cob_id: U32 = _describe_field("identifier; bit 31: extended, 30: FD, 29: BRS")
-    data: bytes = _describe_field("0-64 bytes")
+    cob_id: U32 = describe_field("identifier; bit 31: extended, 30: FD, 29: BRS")
+    data: bytes = describe_field("0-64 bytes")
 
 
 @dataclass(slots=True)
 class Signals:
     """One cycle, decoded: row k holds Com_k, XJ_k as sensed and Cor_k, the answer to sample k. NaN: no sample."""
 
-    cycle: U32 = _describe_field("cycles since the run began, not wrapped as on the bus")
-    phase: U32 = _describe_field("0 set-up, 1 main, 2 clean-up")
-    com: float = _describe_field("position demand", "m")
-    xj: float = _describe_field("ram position as sensed", "m")
-    cor: float = _describe_field("current demand of the controller", "A")
-    p12: float = _describe_field("differential pressure as sensed", "Pa")
-    xs: float = _describe_field("spool position as sensed", "m")
-    load: float = _describe_field("known external force on the ram, positive against extension", "N")
-    control: U32 = _describe_field("control word, CiA 408 object 0x6040")
-    status: U32 = _describe_field("status word, CiA 408 object 0x6041")
-    flags: U32 = _describe_field("flags of the plant node")
+    cycle: U32 = describe_field("cycles since the run began, not wrapped as on the bus")
+    phase: U32 = describe_field("0 set-up, 1 main, 2 clean-up")
+    com: float = describe_field("position demand", "m")
+    xj: float = describe_field("ram position as sensed", "m")
+    cor: float = describe_field("current demand of the controller", "A")
+    p12: float = describe_field("differential pressure as sensed", "Pa")
+    xs: float = describe_field("spool position as sensed", "m")
+    load: float = describe_field("known external force on the ram, positive against extension", "N")
+    control: U32 = describe_field("control word, CiA 408 object 0x6040")
+    status: U32 = describe_field("status word, CiA 408 object 0x6041")
+    flags: U32 = describe_field("flags of the plant node")
 
 
 @dataclass(slots=True)
 class Timing:
     """When one cycle ran; all times are on the wall clock, also in lockstep."""
 
-    cycle: U32 = _describe_field("as in /signals")
-    overrun: bool = _describe_field("the cycle was skipped or ended after the next one was due")
-    lateness: float = _describe_field("SYNC sent this long after it was due", "s")
-    response: float = _describe_field("from SYNC to the controller's drive frame; NaN: none came", "s")
-    work: float = _describe_field("from SYNC to the last of the cycle's answers; NaN: one is missing", "s")
-    feedback_response: float = _describe_field("from SYNC to the plant's feedback frame; NaN: none came", "s",
+    cycle: U32 = describe_field("as in /signals")
+    overrun: bool = describe_field("the cycle was skipped or ended after the next one was due")
+    lateness: float = describe_field("SYNC sent this long after it was due", "s")
+    response: float = describe_field("from SYNC to the controller's drive frame; NaN: none came", "s")
+    work: float = describe_field("from SYNC to the last of the cycle's answers; NaN: one is missing", "s")
+    feedback_response: float = describe_field("from SYNC to the plant's feedback frame; NaN: none came", "s",
                                                default=math.nan)
-    valve_response: float = _describe_field("from SYNC to the plant's valve state; NaN: none came", "s",
+    valve_response: float = describe_field("from SYNC to the plant's valve state; NaN: none came", "s",
                                             default=math.nan)
-    execution: float = _describe_field("time the rig's own code took in the cycle, without waiting", "s",
+    execution: float = describe_field("time the rig's own code took in the cycle, without waiting", "s",
                                        default=math.nan)
 
 
@@ -91,43 +88,18 @@ class Timing:
 class Event:
     """A single event: phase change, fault on or off, EMCY, safe state, operator."""
 
-    level: str = _describe_field("INFO, WARN or ERROR")
-    kind: str = _describe_field("one word: phase, segment, fault, emcy, safe_state, abort, ...")
-    text: str = _describe_field("for people")
+    level: str = describe_field("INFO, WARN or ERROR")
+    kind: str = describe_field("one word: phase, segment, fault, emcy, safe_state, abort, ...")
+    text: str = describe_field("for people")
 
 
 @dataclass(slots=True)
 class NmtState:
     """A node's NMT state changed, as seen by the master (CiA 301 heartbeat codes)."""
 
-    node: U32 = _describe_field("node number")
-    code: U32 = _describe_field("0 boot-up, 4 stopped, 5 operational, 127 pre-operational")
-    name: str = _describe_field("the same in words")
-
-
-@dataclass(slots=True, kw_only=True)
-class Check:
-    """One judged measurement."""
-
-    value: float = _describe_field("measured, in `unit`")
-    low: float = _describe_field("lower limit; NaN: none", default=math.nan)
-    high: float = _describe_field("upper limit; NaN: none", default=math.nan)
-    passed: bool = _describe_field("verdict")
-    t0: float = _describe_field("start of the window, from the start of the main phase; NaN: not a window", "s",
-                                default=math.nan)
-    t1: float = _describe_field("end of the window", "s", default=math.nan)
-    after: float = _describe_field("when the time of a reaction begins, from the start of the main phase; NaN: none",
-                                   "s", default=math.nan)
-    above: float = _describe_field("level that a signal has to pass, SI; NaN: none", default=math.nan)
-    below: float = _describe_field("level that a signal has to pass downwards, SI; NaN: none", default=math.nan)
-    uncertainty: float = _describe_field("expanded uncertainty (k = 2) of the value; NaN: not known", default=math.nan)
-    cannot_tell: bool = _describe_field("the decision rule leaves the verdict open", default=False)
-    name: str = _describe_field("as in the sequence")
-    kind: str = _describe_field("what was measured: overshoot, settling, never_exceeds, ...", default="")
-    signal: str = _describe_field("what was looked at")
-    unit: str = _describe_field("of value, low and high")
-    detail: str = _describe_field("why, in words", default="")
-    requirement: str = _describe_field("ids of the requirements that it verifies, with commas between them", default="")
+    node: U32 = describe_field("node number")
+    code: U32 = describe_field("0 boot-up, 4 stopped, 5 operational, 127 pre-operational")
+    name: str = describe_field("the same in words")
 
 
 @cache
@@ -147,7 +119,7 @@ def make_row_record(declared: plant_signals.Signals) -> type[Signals]:
     def keep(names: tuple[str, ...]) -> list[tuple[str, Any, Any]]:
         return [(name, hints[name], field(metadata=dict(kept[name].metadata))) for name in names]
 
-    own = [(s.name, float, _describe_field(s.quantity, s.unit)) for s in declared[1:]]
+    own = [(s.name, float, describe_field(s.quantity, s.unit)) for s in declared[1:]]
     made: Any = make_dataclass("Signals", [*keep(first), *own, *keep(last)], slots=True, namespace={"__doc__":
                                "One cycle, decoded: row k holds the command, the sensed outputs and the drive, the "
                                "answer to sample k. NaN: no sample."})
@@ -155,9 +127,9 @@ def make_row_record(declared: plant_signals.Signals) -> type[Signals]:
     return cast("type[Signals]", made)
 
 
-Record = Signals | Timing | Event | NmtState | Check
+Record = Signals | Timing | Event | NmtState | CheckResult
 TOPICS: dict[str, type] = {"/can": CanFrame, "/signals": Signals, "/timing": Timing, "/events": Event, "/nmt": NmtState,
-                           "/checks": Check}
+                           "/checks": CheckResult}
 CHANNELS: dict[type, int] = {record: number for number, record in enumerate(TOPICS.values(), 1)}
 
 

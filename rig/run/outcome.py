@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from fdi.output import write_text
 from fdi.progress import Progress
 from fdi.report.report import to_plain
-from fdi.trace.trace import Trace
+from fdi.trace.check_result import CheckResult
+from fdi.trace.trace import Event, Trace
 from plant.errors import InputError
 from plant.model import Model
 from plant.segments import Array
@@ -26,8 +27,7 @@ from rig.network.node_objects import NAMES, PLANT, Identity
 from rig.run.attribution import Attribution, Cause, Trouble, count_most_in_a_row
 from rig.run.job import Job, find_differences
 from rig.run.loop import History, Loop
-from rig.run.state import SessionEvent
-from rig.sequences.checks import CheckResult, SkippedCheck
+from rig.sequences.checks import SkippedCheck
 from rig.sequences.protocol import HEARTBEAT
 from rig.sequences.uncertainty import NO_METROLOGY, Metrology
 
@@ -42,7 +42,7 @@ class Outcome:
     job: Job
     folder: Path
     checks: Sequence[CheckResult]
-    events: Sequence[SessionEvent]
+    events: Sequence[Event]
     aborted: str  # why main ended early, or ""
     safe: bool  # the safe state was entered
     interrupted: bool
@@ -244,7 +244,7 @@ class Outcome:
         write_text(self.folder / "verdict.json", json.dumps(self.to_json(), indent=1) + "\n")
 
 
-def select_events(events: Sequence[SessionEvent], most: int = 200) -> tuple[list[SessionEvent], dict[str, int]]:
+def select_events(events: Sequence[Event], most: int = 200) -> tuple[list[Event], dict[str, int]]:
     """The first `most` events of each kind, in order, and how many of each kind are omitted; the log has them all."""
     counts: Counter[str] = Counter()
     selected = []

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fdi.progress import Progress
+from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
 from plant import Actuator, InputError
 from plant.run import make_columns_type
@@ -17,7 +18,7 @@ from plant.segments import Array
 from rig.benches.bench import Flags
 from rig.network.clock import WallClock
 from rig.network.node_objects import CycleRecord
-from rig.recorder import Check, Observer, Recorder
+from rig.recorder import Observer, Recorder
 from rig.recorder.schema import collect_provenance, read_epoch_ns
 from rig.run.attribution import Attribution, CycleRecords, attribute, find_injected
 from rig.run.job import Job, find_differences
@@ -34,7 +35,7 @@ from rig.run.priority import (
     suspend_garbage_collection,
 )
 from rig.run.session import MAIN, Session
-from rig.sequences.checks import CheckResult, SkippedCheck, evaluate_checks, find_skipped
+from rig.sequences.checks import SkippedCheck, evaluate_checks, find_skipped
 from rig.sequences.faults import Schedule
 from rig.sequences.protocol import Mask, judge_protocol
 from rig.sequences.python_parts import StepRun
@@ -121,7 +122,7 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     progress("checks", 0.0)
     checks, skipped = judge_run(job, session, attribution.judged, metrology)
     for check in checks:
-        recorder.put(session.stage.now(), _make_check_record(check))
+        recorder.put(session.stage.now(), check)
     diagnosis = diagnose(make_main_trace(job, folder, history)) if diagnose and not session.safety.interrupted else {}
     safety, log, starter = session.safety, session.log, session.starter
     outcome = Outcome(
@@ -247,8 +248,3 @@ def _count_lost_frames(history: History) -> dict[str, int]:
             "plant_drive_late": int((flags & Flags.DRIVE_LATE != 0).sum())}
 
 
-def _make_check_record(check: CheckResult) -> Check:
-    return Check(name=check.name, kind=check.kind, signal=check.signal, value=check.value, unit=check.unit,
-                 low=check.low, high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, after=check.after,
-                 above=check.above, below=check.below, detail=check.detail, requirement=", ".join(check.requirement),
-                 uncertainty=check.uncertainty, cannot_tell=check.cannot_tell)

@@ -1,25 +1,17 @@
 """What is true of a run at the moment: its time and stage, the events it reports, and its safe state."""
 
 import bisect
-from typing import NamedTuple
 
+from fdi.trace.trace import Event
 from rig.network.clock import Clock
-from rig.recorder import Event, Recorder
+from rig.recorder import Event as EventRecord
+from rig.recorder import Recorder
 from rig.run.attribution import Trouble
 from rig.run.loop import Loop
 
 _ENDS_BRING_UP = ("bring_up", "late")  # troubles that a run cannot go on with
 _ENDS_RUN = ("process", *_ENDS_BRING_UP)  # whatever the sequence tests, it needs its nodes
 _MOST_TROUBLES = 1000  # they say enough for the attribution
-
-
-class SessionEvent(NamedTuple):
-    """An event of the run; `t` in s of main."""
-
-    t: float
-    level: str
-    kind: str
-    text: str
 
 
 class Stage:
@@ -55,12 +47,12 @@ class Journal:
 
     def __init__(self, stage: Stage, recorder: Recorder) -> None:
         self.recorder, self._stage = recorder, stage
-        self.events: list[SessionEvent] = []
+        self.events: list[Event] = []
         self._agenda: list[tuple[int, str, str, str]] = []  # events of queued cycles: cycle, level, kind, text
 
     def log(self, level: str, kind: str, text: str) -> None:
         """Record an event now."""
-        self._record(self._stage.now(), SessionEvent(self._stage.find_time(), level, kind, text))
+        self._record(self._stage.now(), Event(self._stage.find_time(), level, kind, text))
 
     def announce(self, level: str, kind: str, text: str) -> None:
         """Record an event of the next cycle that is given to the loop, when that cycle is played."""
@@ -74,15 +66,15 @@ class Journal:
         """Record the announced events up to a cycle that is complete."""
         while self._agenda and self._agenda[0][0] <= cycle:
             due, *words = self._agenda.pop(0)
-            self._record(t_ns, SessionEvent(self._stage.find_time(due), *words))
+            self._record(t_ns, Event(self._stage.find_time(due), *words))
 
     def drop_unplayed(self) -> None:
         """Forget the announced events of cycles that are not queued any more."""
         self._agenda = [event for event in self._agenda if event[0] < self._stage.playing.queued]
 
-    def _record(self, t_ns: int, event: SessionEvent) -> None:
+    def _record(self, t_ns: int, event: Event) -> None:
         bisect.insort(self.events, event, key=lambda other: other.t)
-        self.recorder.put(t_ns, Event(event.level, event.kind, event.text))
+        self.recorder.put(t_ns, EventRecord(event.level, event.kind, event.text))
 
 
 class SafeState:

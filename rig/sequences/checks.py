@@ -15,6 +15,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.trace.check_result import CheckResult, compute_speed, filter_median
 from plant import tables
 from plant.errors import InputError
 from plant.quantity import Quantity
@@ -28,9 +29,6 @@ from rig.sequences.faults import Time
 from rig.sequences.python_parts import Argument, UserFunction, describe_value, require_function_name
 from rig.sequences.signals import DERIVED, Controlled, Guarded, Measured, find_controlled, find_tested, find_unit
 from rig.sequences.uncertainty import NO_METROLOGY, Metrology, compute_expanded_uncertainty, decide
-
-MEDIAN_SPAN = 5e-3  # s
-SPEED_SPAN = 20e-3  # s between the two samples of a speed: 2 um rms of position noise become 0.14 mm/s rms
 
 
 class NotMeasurable(Exception):
@@ -49,29 +47,6 @@ def bridge_gaps(signal: Array, name: str, allowed: float) -> Array:
         return signal
     rows = np.arange(len(signal))
     return np.interp(rows, rows[~missing], signal[~missing])
-
-
-def filter_median(signal: Array, rate: float) -> Array:
-    """Centred moving median of the samples in MEDIAN_SPAN, the ends repeated.
-
-    For where one noisy sample could decide, such as a peak. At 1000 samples a second it keeps steps and ramps as they
-    are, lowers a peak of angular frequency w by (w * 1 ms)^2 / 2 of its curve (0.7 % at 120 rad/s), and leaves 1.1 of
-    2 um RMS of noise. From 200 samples a second down there is no room for a median: one sample decides.
-    """
-    half = int(MEDIAN_SPAN * rate / 2 + 1e-9)
-    padded = np.pad(signal, half, mode="edge")
-    filtered: Array = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1), axis=1)
-    return filtered
-
-
-def compute_speed(position: Array, rate: float) -> Array:
-    """Central difference over SPEED_SPAN, one cycle to each side at least, one-sided at the ends, m/s."""
-    rows, half = np.arange(len(position)), max(1, round(SPEED_SPAN * rate / 2))
-    ahead, behind = np.minimum(rows + half, len(rows) - 1), np.maximum(rows - half, 0)
-    if len(rows) < 2:
-        raise NotMeasurable("one sample has no speed")
-    difference: Array = (position[ahead] - position[behind]) * rate / (ahead - behind)
-    return difference
 
 
 def measure_step_size(com: Array, before: float, smallest: float = 20e-6) -> float:
@@ -237,6 +212,8 @@ class RunData:
         if name == "error" and name not in self.signals.names:
             return self.read_signal(command, span) - self.read_signal(controlled, span)
         if name == "speed" and name not in self.signals.names:
+            if span.stop - span.start < 2:
+                raise NotMeasurable("one sample has no speed")
             return compute_speed(self.read_signal(controlled, span), self.rate)
         if not hasattr(self.trace, name):
             raise NotMeasurable(f"the plant has no signal {name}")
@@ -265,39 +242,6 @@ class RunData:
 LEFT_OPERATIONAL = "controller left OPERATIONAL:"  # words of the event
 InSI = Annotated[float, "SI units"]
 InUnit = Annotated[float, "the check's unit"]
-
-
-class CheckResult(NamedTuple):
-    """One line of the table. `value`, `low` and `high` are in `unit`; NaN: not measurable, no such limit."""
-
-    name: str
-    kind: str
-    signal: str
-    value: float
-    unit: str
-    low: float
-    high: float
-    passed: bool
-    t0: float  # s, the window
-    t1: float
-    detail: str
-    requirement: tuple[str, ...] = ()  # ids of the requirements that the check verifies
-    after: float = nan  # s of main, from which a time is measured; NaN: the check measures none
-    above: float = nan  # level that a signal has to pass, SI
-    below: float = nan
-    uncertainty: float = nan  # U (k = 2) of the value; NaN: not known, or not asked for
-    cannot_tell: bool = False  # the decision rule leaves it open; then it has not passed either
-
-    @property
-    def verdict(self) -> str:
-        """PASS, FAIL or CANNOT_TELL."""
-        if self.cannot_tell:
-            return "CANNOT_TELL"
-        return "PASS" if self.passed else "FAIL"
-
-    def collect_data(self) -> dict[str, Any]:
-        """All of it by name, for an answer in JSON."""
-        return {**self._asdict(), "verdict": self.verdict}
 
 
 class SkippedCheck(NamedTuple):
@@ -376,8 +320,11 @@ class Check:
             detail = "; ".join(filter(None, (detail, problem)))
         low, high = (nan if limit is None else limit for limit in (self.low, self.high))
         passed = decide(value, low, high, uncertainty, run.metrology.decision)
-        return CheckResult(self.name, self.kind, self.about, value, self.shown_unit, low, high, passed is True, t0, t1,
-                           detail, self.requirements, *self._find_reference(run), uncertainty, passed is None)
+        after, above, below = self._find_reference(run)
+        return CheckResult(name=self.name, kind=self.kind, signal=self.about, value=value, unit=self.shown_unit,
+                           low=low, high=high, passed=passed is True, t0=t0, t1=t1, detail=detail, after=after,
+                           above=above, below=below, requirement=", ".join(self.requirements), uncertainty=uncertainty,
+                           cannot_tell=passed is None)
 
     def _measure(self, run: RunData, span: slice) -> float:
         """The number, in the unit of the limits. Raises NotMeasurable."""

@@ -12,6 +12,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.trace.check_result import PROTOCOL, CheckResult
 from plant.controller import Loop, compute_current
 from plant.quantity import Quantity
 from plant.segments import Array, Second
@@ -30,11 +31,10 @@ from rig.benches.profiles import (
     list_reachable,
     list_transitions,
 )
-from rig.sequences.checks import CheckResult, SkippedCheck, map_words
+from rig.sequences.checks import SkippedCheck, map_words
 
 Mask = NDArray[np.bool_]
 Whole = NDArray[np.int64]
-KIND = "protocol"  # of the check results
 NO_FRAME = "no drive frame came"
 HEARTBEAT = "heartbeat"  # the signal of those about heartbeats
 _LEVELS, _READY = CIA408.ladder[-1], 0x8  # of control and status word of CiA 408
@@ -179,7 +179,8 @@ def _make_result(name: str, signal: str, value: float, unit: str, low: float = n
                  detail: str = "") -> CheckResult:
     slack = 1e-9  # of the limit: a value in mA is a multiple of a count in A
     passed = isfinite(value) and not (value < low * (1 - slack) or value > high * (1 + slack))  # no NaN limit is passed
-    return CheckResult(name, KIND, signal, value, unit, low, high, passed, nan, nan, detail)
+    return CheckResult(name=name, kind=PROTOCOL, signal=signal, value=value, unit=unit, low=low, high=high,
+                       passed=passed, detail=detail)
 
 
 def _judge_current(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:

@@ -28,6 +28,7 @@ from fdi.report.drawing import (
 from fdi.report.numbers import count_nouns, format_amount
 from fdi.report.report import Cell, Column, Figure, Line, Medium, Report, Section, Table, tabulate, to_plain
 from fdi.report.run_report import format_limits
+from fdi.trace.check_result import CheckResult
 from plant import Model, simulate
 from plant.model import find_quantity
 from plant.plants import Plant
@@ -36,7 +37,7 @@ from plant.segments import Array
 from plant.signals import Signals
 from rig.run.job import Job, find_differences
 from rig.run.outcome import LimitReached, find_limits
-from rig.sequences.checks import CheckResult, Guard, evaluate_checks
+from rig.sequences.checks import Guard, evaluate_checks
 from rig.sequences.faults import (
     Corrupted,
     Fault,

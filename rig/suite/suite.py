@@ -22,6 +22,7 @@ from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table, tabulate, to_plain
 from fdi.report.run_report import MOODS as RUN_MOODS
 from fdi.report.run_report import format_limits, format_uncertainty, format_value, write_run_page
+from fdi.trace.check_result import CheckResult
 from plant.errors import InputError, RigError
 from plant.quantity import Quantity
 from plant.tables import build_dataclass, decode_text, parse_table, read_file
@@ -40,7 +41,7 @@ from rig.run.job import JobChoice, build_job, find_differences, load_tested_sequ
 from rig.run.outcome import INTERRUPTED, Outcome, describe_faults, describe_finding, diagnose_servovalve, has_fault
 from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import run_job
-from rig.sequences.checks import CheckResult, SkippedCheck
+from rig.sequences.checks import SkippedCheck
 
 Value = float | str
 Seed = Annotated[int, Quantity("1", low=0)]
@@ -526,7 +527,7 @@ def _make_check_test(check: CheckResult, result: CaseResult, classname: str) -> 
     measured += f" ({check.detail})" if check.detail else ""
     window = "" if check.t0 != check.t0 else f"; window {check.t0:.3f} to {check.t1:.3f} s"
     test = junit.TestCase(check.name, classname, output="\n".join(
-        filter(None, (measured + window, _name_requirements(check.requirement)))))
+        filter(None, (measured + window, _name_requirements(check.requirements)))))
     if check.passed:
         return test
     if check.cannot_tell or result.verdict in ("INVALID_TIMING", *NO_VERDICT):

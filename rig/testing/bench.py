@@ -23,15 +23,14 @@ from fdi.report.run_report import (
     format_uncertainty,
     write_run_page,
 )
-from fdi.trace.trace import Trace
+from fdi.trace.check_result import CheckResult
+from fdi.trace.trace import Event, Trace
 from plant.errors import InputError
 from plant.plants import find_plant
 from plant.segments import RATE
 from rig.run.job import JobChoice, build_job, load_tested_plant
 from rig.run.outcome import Outcome
 from rig.run.runner import run_job
-from rig.run.state import SessionEvent
-from rig.sequences.checks import CheckResult
 from rig.sequences.sequence import Sequence as TestSequence
 from rig.sequences.sequence import load_sequence, parse_sequence
 
@@ -63,7 +62,7 @@ class BenchRun:
         return {check.name: check for check in self.outcome.checks}
 
     @property
-    def events(self) -> Sequence[SessionEvent]:
+    def events(self) -> Sequence[Event]:
         """What happened, in order."""
         return self.outcome.events
 
@@ -130,7 +129,7 @@ def describe_failure(check: CheckResult) -> str:
     parts += [f"limits {format_limits(check.low, check.high)}{unit}"]
     parts += [f"{check.t0:.3f} to {check.t1:.3f} s"] if check.t0 == check.t0 else []
     parts += [check.detail] if check.detail else []
-    parts += [f"requirement {', '.join(check.requirement)}"] if check.requirement else []
+    parts += [f"requirement {check.requirement}"] if check.requirement else []
     return f"{check.name}: {', '.join(parts)}"
 
 

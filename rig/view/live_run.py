@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.trace.check_result import CheckResult
 from plant.run import make_columns_type
 from plant.signals import EHA, Signals
 from rig import recorder
@@ -84,11 +85,9 @@ class CheckState(NamedTuple):
     detail: str = ""
 
     @classmethod
-    def read(cls, check: recorder.Check) -> CheckState:
+    def read(cls, check: CheckResult) -> CheckState:
         """What the run itself says of a check at its end."""
-        word = "PASS" if check.passed else "FAIL"
-        word = "CANNOT_TELL" if check.cannot_tell else word
-        return cls(check.name, word, check.value, check.unit, True, check.detail)
+        return cls(check.name, check.verdict, check.value, check.unit, True, check.detail)
 
     @property
     def is_judged(self) -> bool:
@@ -132,7 +131,7 @@ class LiveRun:
             self._add_row(t_ns, record)
         elif isinstance(record, recorder.NmtState):
             self.states[record.node] = record.name
-        elif isinstance(record, recorder.Check):
+        elif isinstance(record, CheckResult):
             self.checks[record.name] = CheckState.read(record)
         else:
             self.events.append(Event(self._find_time(t_ns), record.level, record.kind, record.text, t_ns))

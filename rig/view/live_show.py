@@ -33,9 +33,10 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from fdi.trace.check_result import CheckResult
 from fdi.trace.mcap_log import scan_messages, unpack_chunk
 from plant.signals import EHA, Signals
-from rig.recorder import CanFrame, Check, Event, NmtState, Record
+from rig.recorder import CanFrame, Event, NmtState, Record
 from rig.recorder.writer import MAGIC, list_channels, list_topics
 from rig.view.live_run import CheckState, LivePlan, LiveRun
 from rig.view.recording import (
@@ -353,7 +354,7 @@ class LiveView:
     def _send_record(self, record: Record, t: float) -> None:
         if isinstance(record, NmtState):
             self._send_state(name_node_lane(record.node, self._plan.nodes.get(record.node)), t, record.name)
-        elif isinstance(record, Check):
+        elif isinstance(record, CheckResult):
             state = CheckState.read(record)
             self._send_check(state, t)
             self._recording.send_text(LogText(

@@ -20,8 +20,9 @@ from fdi.report.report import Report
 from fdi.report.run_report import read_verdict
 from fdi.report.terminal import format_report
 from fdi.thresholds import NOISE_BAND_RATIO, SIGNAL_ERROR_RATIO
+from fdi.trace.check_result import CheckResult
 from fdi.trace.sections import Section
-from fdi.trace.trace import MAIN, Check, Floats, Trace
+from fdi.trace.trace import MAIN, Floats, Trace
 from plant.signals import Signal, Signals
 from plant.units import UNITS
 from rig.network.node_objects import NAMES
@@ -320,7 +321,7 @@ def draw_signals(columns: Mapping[str, tuple[Floats, Floats]], layout: Plots) ->
     return [plot for plot in plots if plot.curves]
 
 
-def _list_limits(origin: str, checks: tuple[Check, ...], layout: Plots) -> Iterator[Curve]:
+def _list_limits(origin: str, checks: tuple[CheckResult, ...], layout: Plots) -> Iterator[Curve]:
     """Limits of a plotted signal as red lines over the check's window."""
     scales = {line.signal: line.scale for (own, _), lines in layout.items() for line in lines if own == origin}
     for number, check in enumerate(checks):
@@ -391,7 +392,7 @@ def read_fault_event(text: str) -> tuple[str, str] | None:
     return (label, "active" if word == "begins" else "") if word in ("begins", "ends") else None
 
 
-def _make_check_lane(check: Check, trace: Trace) -> Lane:
+def _make_check_lane(check: CheckResult, trace: Trace) -> Lane:
     """A lane with the window of a check, failed checks first; grey is a window that the run did not reach.
 
     Verdict and value stand beside the window, on its longer side, because a window may be too short for a number; in
@@ -422,7 +423,7 @@ def _describe_section(section: Section, command: Signal) -> str:
     return section.kind if section.kind == "dynamic" else f"{section.kind} {section.last * scale:.3g} {unit}"
 
 
-def _describe_measurement(check: Check) -> str:
+def _describe_measurement(check: CheckResult) -> str:
     limits = " and ".join(f"{sign} {limit:.4g}" for sign, limit in (("≥", check.low), ("≤", check.high))
                           if not math.isnan(limit))
     return describe_value(check.value, check.unit) + (f" (limit {limits})" if limits else "")

@@ -7,9 +7,10 @@ from pathlib import Path
 import codec
 import numpy as np
 
+from fdi.trace.check_result import CheckResult
 from plant import load_model, simulate
 from rig.network.frame import Frame
-from rig.recorder import Check, Event, NmtState, Recorder, Signals, Timing
+from rig.recorder import Event, NmtState, Recorder, Signals, Timing
 
 ATTACHMENTS = {"sequence.toml": ("application/toml", b"title = 'synthetic'\n"),
                "model.toml": ("application/toml", b"name = 'eha'\n"),
@@ -77,12 +78,12 @@ def record_run(path: Path, seed: int = 1, settings: dict[str, float] | None = No
 
 
 CHECKS = [
-    Check(name="overshoot of the 5 mm step", kind="overshoot", signal="xj", value=2.4, unit="%", high=5.0, passed=True,
-          t0=0.5, t1=1.5),
-    Check(name="settling of the 1 mm step", kind="settling_time", signal="xj", value=61.0, unit="ms", high=80.0,
-          passed=True, t0=2.5, t1=3.25),
-    Check(name="ramp error", kind="ramp_error", signal="error", value=9.1e-6, unit="m", low=2e-6, high=8e-6,
-          passed=False, t0=4.5, t1=6.0, detail="mean of com - xj over the slope"),
-    Check(name="pressure", kind="never_exceeds", signal="p12", value=0.61, unit="MPa", low=-1.0, high=1.0, passed=True,
-          t0=0.0, t1=13.5),
+    CheckResult(name="overshoot of the 5 mm step", kind="overshoot", signal="xj", value=2.4, unit="%", high=5.0,
+                passed=True, t0=0.5, t1=1.5),
+    CheckResult(name="settling of the 1 mm step", kind="settling_time", signal="xj", value=61.0, unit="ms", high=80.0,
+                passed=True, t0=2.5, t1=3.25),
+    CheckResult(name="ramp error", kind="ramp_error", signal="error", value=9.1e-6, unit="m", low=2e-6, high=8e-6,
+                passed=False, t0=4.5, t1=6.0, detail="mean of com - xj over the slope"),
+    CheckResult(name="pressure", kind="never_exceeds", signal="p12", value=0.61, unit="MPa", low=-1.0, high=1.0,
+                passed=True, t0=0.0, t1=13.5),
 ]

@@ -16,11 +16,13 @@ from fdi.comparison.run_differences import (
 from fdi.report.diff_report import build_diff_report
 from fdi.report.report import render_html
 from fdi.report.terminal import format_report
-from fdi.trace.trace import Check, Trace
+from fdi.trace.check_result import CheckResult
+from fdi.trace.trace import Trace
 
 ROWS = 4000
 NOISE = 2e-6  # m rms
-LIMITED = Check("overshoot", "overshoot", "xj", 7.0, "%", float("nan"), 11.0, True, 0.5, 1.5, "")
+LIMITED = CheckResult(name="overshoot", kind="overshoot", signal="xj", value=7.0, unit="%", high=11.0, passed=True,
+                      t0=0.5, t1=1.5)
 
 
 def make_run(seed: int = 0, period: float = 1e-3, start: float = 0.0, bump: float = 0.0, rows: int = ROWS) -> Trace:
@@ -99,7 +101,7 @@ def test_missing_samples_signals_and_units_are_left_out() -> None:
 
 
 def test_checks_are_matched_by_name_and_changes_are_marked() -> None:
-    failed, limits, new = (LIMITED._replace(**keys) for keys in (
+    failed, limits, new = (replace(LIMITED, **keys) for keys in (
         {"value": 13.0, "passed": False}, {"high": 12.0}, {"name": "rise time"}))
     for runs, changed, other_limits in (
             ([[LIMITED], [failed]], [True], [False]), ([[LIMITED], [LIMITED, new]], [False, True], [False, False]),
@@ -110,7 +112,7 @@ def test_checks_are_matched_by_name_and_changes_are_marked() -> None:
 
 
 def test_a_changed_check_makes_runs_different() -> None:
-    first, second = (replace(make_run(0), checks=(LIMITED._replace(passed=passed),)) for passed in (True, False))
+    first, second = (replace(make_run(0), checks=(replace(LIMITED, passed=passed),)) for passed in (True, False))
     found, *_ = compare_two(second, first)
     assert found.verdict == "DIFFERENT" and compare_two(first, first)[0].verdict == "SAME"
     text = format_report(build_diff_report(found), 80)

@@ -10,7 +10,8 @@ from PIL import Image  # comes with matplotlib
 
 from fdi.report.report import Column, Report, Section, Table, render_html
 from fdi.report.run_report import build_run_report
-from fdi.trace.trace import Check, Trace
+from fdi.trace.check_result import CheckResult
+from fdi.trace.trace import Trace
 
 pytestmark = needs_browser
 
@@ -45,8 +46,10 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     t = np.arange(3000) / 1000
     com = np.where(t < 0.5, 0.0, 5e-3)
     xj = np.where(t < 0.5, 0.0, 5e-3 * (1.0 - np.exp(-40 * (t - 0.5))))
-    failed = Check("settling time of the step", "settling_time", "xj", 100.0, "ms", float("nan"), 80.0, False, 0.5, 1.5,
-                   "0 of 1000 samples missing, and a remark that is long enough to need several lines on a phone")
+    failed = CheckResult(
+        name="settling time of the step", kind="settling_time", signal="xj", value=100.0, unit="ms", high=80.0,
+        passed=False, t0=0.5, t1=1.5,
+        detail="0 of 1000 samples missing, and a remark that is long enough to need several lines on a phone")
     trace = Trace.from_columns({"com": com, "xj": xj, "cor": 4.0 * (com - xj)}, 1e-3, {"node2.name": "x" * 200})
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(render_html(build_run_report(replace(trace, checks=(failed,) * 3))), encoding="utf-8")

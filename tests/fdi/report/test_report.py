@@ -18,8 +18,8 @@ from synthetic_run import record_run
 from fdi.report import drawing, run_report
 from fdi.report.report import render_html
 from fdi.report.run_report import build_run_report, read_verdict, write_run_page
-from fdi.trace.trace import Check, Event, Trace
-from rig.recorder import Check as CheckRecord
+from fdi.trace.check_result import CheckResult
+from fdi.trace.trace import Event, Trace
 from rig.recorder import Recorder, Signals, Timing
 from rig.recorder.recover import recover_log
 
@@ -64,7 +64,7 @@ def test_it_says_what_the_trace_says(page: str) -> None:
 def test_text_of_the_trace_is_no_html(log: Path) -> None:
     trace, nasty = Trace.read(log, all=True), "<script>alert(1)</script>"
     assert "<script>" not in render_run(replace(
-        trace, checks=(trace.checks[0]._replace(name=nasty, detail=nasty),),
+        trace, checks=(replace(trace.checks[0], name=nasty, detail=nasty),),
         provenance={"sequence": nasty, "source": nasty}, attachments={nasty: nasty.encode()}))
 
 
@@ -95,7 +95,7 @@ def test_a_real_run_has_a_report(preflight: Path) -> None:
 
 def test_a_failed_run_names_its_checks(log: Path) -> None:
     trace = Trace.read(log)
-    bad = tuple(trace.checks[0]._replace(name=f"c{i}", passed=False) for i in range(6))
+    bad = tuple(replace(trace.checks[0], name=f"c{i}", passed=False) for i in range(6))
     for checks, verdict in ((trace.checks, ("FAIL", "1 of 4 checks failed: ramp error")),
                             (bad, ("FAIL", "6 of 6 checks failed: c0, c1, c2, c3 and 2 more")),
                             ((), ("NOT_JUDGED", "")), (trace.checks[:1], ("PASS", ""))):
@@ -136,7 +136,7 @@ def test_the_shortest_runs_draw_without_a_warning(tmp_path: Path, phases: list[i
     recorder = Recorder(tmp_path / "trace.mcap", {}, {"period": "0.001"})
     for k, phase in enumerate(phases):
         recorder.cycle(k * 1_000_000, Signals(k, phase, 0, 0, 0, 0, 0, 0, 0, 0, 0), Timing(k, False, *timing))
-    recorder.put(0, CheckRecord(name="x", signal="xj", unit="m", value=0.0, passed=True, t0=0.0, t1=0.0))
+    recorder.put(0, CheckResult(name="x", signal="xj", unit="m", value=0.0, passed=True, t0=0.0, t1=0.0))
     recorder.close()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -180,11 +180,12 @@ def make_trace() -> Trace:
 
 
 def make_check(kind: str, value: float, unit: str, high: float, window: tuple[float, float], signal: str = "xj",
-               low: float = NAN) -> Check:
-    return Check(kind, kind, signal, value, unit, low, high, False, *window, "")
+               low: float = NAN) -> CheckResult:
+    return CheckResult(name=kind, kind=kind, signal=signal, value=value, unit=unit, low=low, high=high, passed=False,
+                       t0=window[0], t1=window[1])
 
 
-def draw(check: Check) -> Any:
+def draw(check: CheckResult) -> Any:
     """Axes of the close-up of a check."""
     return vars(run_report.draw_failed_check(make_trace(), check))["figure"].axes[0]
 
@@ -236,7 +237,7 @@ def test_largest_size_and_its_place() -> None:
     (12.0, [0.5, 0.505, 0.512], "measured 12 ms"), (NAN, [0.5, 0.505], "not measurable")])
 def test_a_reaction_stands_between_its_begin_and_its_limit(kind: str, signal: str, value: float, places: list[float],
                                                            label: str) -> None:
-    ax = draw(make_check(kind, value, "ms", 5.0, (0.2, 1.5), signal)._replace(after=0.5, above=4e-3))
+    ax = draw(replace(make_check(kind, value, "ms", 5.0, (0.2, 1.5), signal), after=0.5, above=4e-3))
     assert list_places(ax, "x") == pytest.approx(places) and list_places(ax, "y") == [4.0]
     assert 0.45 < ax.get_xlim()[0] < 0.5 and 0.52 < ax.get_xlim()[1] < 0.6  # of a window of 1.3 s
     assert ax.get_ylabel() == ("xj [mm]" if signal == "xj" else "cor [mA]")

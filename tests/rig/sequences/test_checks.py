@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fdi.trace.check_result import CheckResult, compute_speed, filter_median
 from plant.profile import build_profile
 from plant.run import Columns
 from plant.segments import RATE, Array, Hold, Ramp, Segment, Sine, Step
 from rig.sequences import checks
-from rig.sequences.checks import NO_DRIVES, CheckResult, DriveFrames, Guard, GuardWatch, evaluate_checks
+from rig.sequences.checks import NO_DRIVES, DriveFrames, Guard, GuardWatch, evaluate_checks
 from rig.sequences.protocol import (
     Heartbeat,
     ProtocolLimits,
@@ -148,8 +149,8 @@ def test_speed_of_a_ramp() -> None:
 
 
 def test_noise_through_the_median_is_what_its_docstring_says() -> None:
-    assert np.std(checks.filter_median(noise(100_000), RATE)) == pytest.approx(1.1e-6, abs=0.05e-6)
-    assert np.std(checks.compute_speed(noise(100_000), RATE)) == pytest.approx(0.14e-3, abs=0.01e-3)
+    assert np.std(filter_median(noise(100_000), RATE)) == pytest.approx(1.1e-6, abs=0.05e-6)
+    assert np.std(compute_speed(noise(100_000), RATE)) == pytest.approx(0.14e-3, abs=0.01e-3)
 
 
 def test_response_to_a_fault_by_event_and_by_signal() -> None:

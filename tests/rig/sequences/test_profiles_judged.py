@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fdi.trace.check_result import CheckResult
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
-from rig.sequences.checks import CheckResult
 from rig.sequences.protocol import ProtocolLimits, ProtocolRecord, Rows, judge_protocol
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from refusals import catch_refusal
 
+from fdi.trace.check_result import CheckResult
 from plant import load_model, simulate, tables
 from plant.errors import InputError
-from rig.sequences.checks import CheckResult, evaluate_checks
+from rig.sequences.checks import evaluate_checks
 from rig.sequences.sequence import Sequence, load_sequence, parse_sequence
 
 SHIPPED = sorted(Path(entry.name).stem for entry in files("rig.sequences").iterdir() if entry.name.endswith(".toml"))

@@ -14,6 +14,7 @@ from short_sequences import SHORT, job, play
 
 from fdi.report.run_report import build_run_report
 from fdi.report.terminal import format_report
+from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.run import Columns
@@ -86,7 +87,7 @@ def test_a_mean_has_the_uncertainty_of_its_sensor_whatever_the_distribution(dist
 
 
 def test_without_a_calibration_the_uncertainty_is_unknown_and_exact_numbers_have_none() -> None:
-    def judge(kind: str, **keys: Any) -> checks.CheckResult:
+    def judge(kind: str, **keys: Any) -> CheckResult:
         run = RunData(make_columns(np.zeros(100), 0.0), metrology=Metrology("guarded"))
         return checks.KEYS[kind](**{"kind": kind, "name": kind, "high": 1.0, **keys}).judge(run)
 

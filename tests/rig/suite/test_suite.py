@@ -11,11 +11,11 @@ from junit_schema import read_valid_junit
 from rig_command import Said, answer, finished, refuse, rig, started
 from short_sequences import SHORT
 
+from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
 from rig.cli.inputs import is_suite_file
 from rig.evidence.requirements import Evidence, JudgedCheck, trace_requirements
 from rig.run.job import JobChoice
-from rig.sequences.checks import CheckResult
 from rig.suite.suite import (
     Case,
     CaseResult,
@@ -214,7 +214,8 @@ def test_ctrl_c_writes_what_is_done(tmp_path: Path) -> None:
 
 def make_result(verdict: str, *passed: bool, fdi: dict[str, str] | None = None) -> CaseResult:
     """A result of a case with checks "a", "b", .. that verify R-1; diagnosed if `fdi` is given."""
-    checks = tuple(CheckResult(name, "max_error", "xj", 1.0, "m", 0.0, 2.0, is_passed, 0.0, 1.0, "", ("R-1",))
+    checks = tuple(CheckResult(name=name, kind="max_error", signal="xj", value=1.0, unit="m", low=0.0, high=2.0,
+                               passed=is_passed, t0=0.0, t1=1.0, requirement="R-1")
                    for name, is_passed in zip("abc", passed, strict=False))
     planned = tuple(JudgedCheck(check.name, ("R-1",)) for check in checks)
     case = Case("case", JobChoice(is_diagnosed=bool(fdi)), 1.0, ("R-2",), Path("case"), planned)

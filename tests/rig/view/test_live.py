@@ -24,9 +24,10 @@ from refusals import catch_refusal
 from rig_command import finished, grown, nodes_on, refuse, rig, started
 from synthetic_run import build_cycles, record_run
 
+from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
 from rig.benches.bench_file import load_bench
-from rig.recorder import Check, Event, NmtState, Record, Recorder, Signals, Timing
+from rig.recorder import Event, NmtState, Record, Recorder, Signals, Timing
 from rig.sequences import load_sequence
 from rig.view.live_process import find_viewer_place, show_live
 from rig.view.live_run import LiveRun, find_named_node, make_live_plan
@@ -52,7 +53,7 @@ def test_every_record_arrives_once_and_in_order_while_the_log_grows(tmp_path: Pa
     assert list(map(repr, written)) == [repr(record) for _, record in found if isinstance(record, Signals | Timing)]
     trace = Trace.read(moved, all=True)
     assert [record.text for _, record in found if isinstance(record, Event)] == [event.text for event in trace.events]
-    assert {type(record) for _, record in found} == {Signals, Timing, Event, NmtState, Check}
+    assert {type(record) for _, record in found} == {Signals, Timing, Event, NmtState, CheckResult}
 
 
 def test_what_is_written_is_there_soon(tmp_path: Path) -> None:
@@ -171,7 +172,7 @@ def test_screen_fits(preflight: Path, size: tuple[int, int]) -> None:
     before = draw_screen(run, *size, silence=0.0).plain
     add(run, records[:6000])
     run.add(0, Event("ERROR", "process", "node 3 plant: its process was ended by SIGKILL"))
-    run.add(0, Check(name="no emergency", passed=False, value=2.0, unit="1", signal=""))
+    run.add(0, CheckResult(name="no emergency", passed=False, value=2.0, unit="1", signal=""))
     text = draw_screen(run, *size, silence=1.2).plain
     lines = text.split("\n")
     assert len(lines) <= size[1] and max(map(len, lines)) <= size[0]
@@ -198,7 +199,7 @@ def test_dead_node() -> None:
         assert (3 in run.troubles) == (level == "ERROR")
     assert run.read_last("lateness", 10).tolist() == [] and isnan(run.t)
     assert "bring-up" in describe_line(run)
-    run.add(0, Check(value=1.0, passed=True, name="slip speed", signal="xj", unit="mm/s"))  # ends the waiting
+    run.add(0, CheckResult(value=1.0, passed=True, name="slip speed", signal="xj", unit="mm/s"))  # ends the waiting
     assert (run.checks["slip speed"].word, run.checks["slip speed"].is_final) == ("PASS", True)
 
 
