@@ -15,6 +15,7 @@ from plant.errors import InputError, escape_control_characters
 from plant.parameters import read_toml
 from plant.plant_files import read_model_tables
 from plant.plants import load_plant
+from plant.tables import read_file
 
 Announce = Callable[[str], None]
 
@@ -71,7 +72,7 @@ def load_effects_of_model(model: str | Path | None, given: Sequence[Path] = (), 
         InputError: there are such files and the user does not trust them, or one of them cannot be used.
     """
     found = [path for path in find_effect_files(model, given) if not _is_loaded(path)]
-    codes = [ForeignCode(str(path), _read(path)) for path in found]
+    codes = [ForeignCode(str(path), read_file(path)) for path in found]
     require_trust(model, codes, is_trusted=is_trusted, announce=announce)
     for path, code in zip(found, codes, strict=True):
         load_effects(path, code.content)
@@ -97,7 +98,7 @@ def load_plant_of_model(model: str | Path | None, *, is_trusted: bool,
         places = [place for place in (path.parent / named, Path(named)) if place.is_file()]
         if not places:
             raise InputError(path, "plant", f"a file that exists, not {named!r}")
-        code = ForeignCode(str(places[0]), _read(places[0]))
+        code = ForeignCode(str(places[0]), read_file(places[0]))
         require_trust(path, [code], is_trusted=is_trusted, announce=announce)
         load_plant(places[0], code.content)
 
@@ -121,13 +122,6 @@ def find_effect_files(model: str | Path | None, given: Sequence[Path] = ()) -> l
 def _is_loaded(path: Path) -> bool:
     """Whether the effects of the catalogue include some of this file, as it is now or was before."""
     return any(effect.file == path.absolute() for effect in CATALOGUE.list_all().values())
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"a readable file ({error.strerror})") from error
 
 
 def require_different_names(files: Sequence[Path]) -> None:

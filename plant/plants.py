@@ -10,7 +10,6 @@ import importlib
 import inspect
 import re
 import sys
-import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -43,6 +42,8 @@ from plant.quantity import Quantity
 from plant.segments import Array, Segment
 from plant.signals import Signals
 from plant.state import Sampled
+from plant.tables import read_file
+from plant.user_code import run_file
 
 __all__ = ["Fault", "MeasuredPressures", "Plant", "Table", "Term", "base_effect", "effect", "find_plant", "list_plants",
            "load_plant", "port"]
@@ -426,25 +427,11 @@ def load_plant(path: Path, source: bytes | None = None, key: str = "") -> Plant:
     key, path = key or str(path), path.absolute()
     if not path.is_file() and source is None:
         raise InputError(path, "", "a Python file that declares a plant; it does not exist")
-    try:
-        code = path.read_bytes() if source is None else source
-    except OSError as error:
-        raise InputError(path, "", f"a readable file ({error.strerror})") from error
-    digest = hashlib.sha256(code).hexdigest()
+    code = read_file(path) if source is None else source
     known = _LOADED.get(key)
     if known is not None and (known.file, known.source) == (path, code):
         return known
-    module = ModuleType(f"plant_of_{path.stem}_{digest[:8]}")
-    module.__file__ = str(path)
-    sys.modules[module.__name__] = module  # where annotations written as text, and types, are looked up
-    try:
-        exec(compile(code, path, "exec", dont_inherit=True), module.__dict__)
-    except SyntaxError as error:
-        raise InputError(f"{path}:{error.lineno}", "", f"Python ({error.msg})") from error
-    except Exception as error:
-        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
-        raise InputError(f"{path}:{lines[-1]}" if lines else path, "",
-                         f"a file that Python can run ({type(error).__name__}: {error})") from error
+    module = run_file(path, code)
     plant = replace(find_declared_plant(module, path.stem, path, key), source=code)
     before, _LOADED[key] = known, plant
     try:

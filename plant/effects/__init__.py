@@ -15,11 +15,9 @@ The effects of `base` are parameters of the reference model itself; they have no
 """
 
 import importlib
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from plant.compile import Function
@@ -28,6 +26,8 @@ from plant.parameters import GROUPS
 from plant.ports import PORTS, chain_laws
 from plant.quantity import Quantity, list_quantities
 from plant.state import Memory
+from plant.tables import read_file
+from plant.user_code import run_file
 
 __all__ = ["CATALOGUE", "Effect", "Law", "combine_laws", "effect", "load_effects", "register_base"]
 
@@ -191,14 +191,7 @@ def load_effects(path: Path, source: bytes | None = None) -> list[str]:
     path = path.absolute()  # as the code of its functions will say where it comes from
     if not path.is_file():
         raise InputError(path, "", "a Python file with effects; it does not exist")
-    module = ModuleType(f"effects_of_{path.stem}")
-    module.__file__ = str(path)
-    sys.modules[module.__name__] = module  # where annotations written as text are looked up
-    try:  # not by an import: its .pyc cannot tell two edits within a second apart
-        code = path.read_bytes() if source is None else source
-        exec(compile(code, path, "exec", dont_inherit=True), module.__dict__)
-    except Exception as error:
-        raise InputError(path, "", f"a file that Python can run ({type(error).__name__}: {error})") from error
+    run_file(path, read_file(path) if source is None else source)
     new = [name for name, entry in CATALOGUE.items() if entry.file == path]
     if not new:
         raise InputError(path, "", "at least one function marked @effect(...)")

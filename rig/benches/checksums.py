@@ -7,10 +7,11 @@ the checksum's own one, in the order of the frame.
 import hashlib
 from collections.abc import Callable
 from functools import cache
-from types import ModuleType
+from pathlib import Path
 from typing import NamedTuple
 
 from plant.errors import InputError
+from plant.user_code import run_file
 from rig.benches.bench import Field, Guard, insert_bits
 
 UserChecksum = Callable[[bytes, int], int]
@@ -100,11 +101,7 @@ def load_checksum(name: str, source: bytes, function: str) -> str:
     """
     known = f"{name}:{function}#{hashlib.sha256(source).hexdigest()[:8]}"
     if known not in _USERS:
-        module = ModuleType(f"checksum_of_{name}")
-        try:
-            exec(compile(source, name, "exec", dont_inherit=True), module.__dict__)
-        except Exception as error:
-            raise InputError(name, "", f"a file that Python can run ({type(error).__name__}: {error})") from error
+        module = run_file(Path(name), source)
         for place, value in vars(module).items():  # tables: compiled code takes constants alone
             if isinstance(value, list | bytearray):
                 vars(module)[place] = bytes(value) if isinstance(value, bytearray) else tuple(value)

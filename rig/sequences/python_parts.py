@@ -4,8 +4,6 @@ from __future__ import annotations
 import contextlib
 import inspect
 import re
-import sys
-import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +14,7 @@ import numpy as np
 
 from plant.errors import InputError
 from plant.segments import Array, Timed, require
+from plant.user_code import explain_errors
 
 Argument = float | str | bool
 _OWN = {"key": False}  # a field that the program fills in
@@ -120,7 +119,7 @@ class UserFunction:
         Raises:
             InputError: it raised an exception or ended the program; the error names file and line.
         """
-        with _explain_errors(self.file, self.name):
+        with explain_errors(self.file, self.name):
             return self.function(*values, **arguments)
 
 
@@ -142,34 +141,3 @@ def load_function(module: ModuleType, name: str, given: int, arguments: Mapping[
             raise InputError(f"{file}:{line}", name, f"a function of {given} value{'s' if given > 1 else ''}{named} "
                                                      f"({error})") from error
     return UserFunction(file, name, function)
-
-
-def run_file(path: Path, source: bytes) -> ModuleType:
-    """Run a user's file as a module of its own.
-
-    Raises:
-        InputError: it is not Python, or raises an exception; the error names the line.
-    """
-    module = ModuleType(f"steps_of_{path.stem}")
-    module.__file__ = str(path)
-    sys.modules[module.__name__] = module  # where dataclasses look up their annotations
-    with _explain_errors(str(path), ""):
-        exec(compile(source, str(path), "exec", dont_inherit=True), module.__dict__)
-    return module
-
-
-@contextlib.contextmanager
-def _explain_errors(file: str, name: str) -> Any:
-    """Turn an exception of a user's code into bad input, with the last line of the file that it came through."""
-    try:
-        with contextlib.redirect_stdout(sys.stderr):  # standard output may be one JSON object
-            yield
-    except InputError:
-        raise
-    except (Exception, SystemExit) as error:
-        if isinstance(error, SyntaxError) and error.filename == file:
-            raise InputError(f"{file}:{error.lineno}", name, f"Python ({error.msg})") from error
-        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-        text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        raise InputError(f"{file}:{lines[-1]}" if lines else file, name,
-                         f"code that runs without an exception, not {text}") from error

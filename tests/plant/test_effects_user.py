@@ -76,14 +76,14 @@ def test_the_users_effect_with_memory(file: Path) -> None:
 
 
 @pytest.mark.parametrize(("text", "said"), [
-    ("effect(", "a file that Python can run"),
-    ("import no_such_module", "a file that Python can run"),
+    ("effect(", ":1: expected Python ("),
+    ("import no_such_module", ":1: expected code that runs without an exception, not ModuleNotFoundError"),
     ("x = 1 / 0", "ZeroDivisionError"),
     ("x = 1", "at least one function marked @effect"),
     (COGGING.replace('"load"', '"laod"'), "no port 'laod'"),
     (COGGING.replace('Quantity("N")] = 0.0', 'Quantity("N")]'), "needs a default"),
     (COGGING.replace("def cogging", "def null_bias"), "the name is taken"),
-    (HEAD + "raise ValueError('two\\nlines')", "a file that Python can run"),
+    (HEAD + "raise ValueError('two\\nlines')", "ValueError: two"),
 ])
 def test_a_bad_file_is_refused_in_one_line(file: Path, text: str, said: str) -> None:
     assert "a Python file with effects" in catch_refusal(load_effects, file)  # there is none yet
