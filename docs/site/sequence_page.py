@@ -13,11 +13,12 @@ from markdown_text import MADE, escape_markup, make_table, quote_code
 from plant import Model, tables
 from plant.segments import Segment
 from rig.cli.commands import list as list_command
+from rig.network.node_objects import Identity
 from rig.sequences import faults
 from rig.sequences.checks import KEYS, KINDS, Check, Guard
 from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.python_parts import Step
-from rig.sequences.sequence import SEGMENT_KINDS, RequiredFirmware, Sequence
+from rig.sequences.sequence import SEGMENT_KINDS, Sequence
 from rig.sequences.timing import TimingPolicy
 
 
@@ -39,7 +40,7 @@ def write_sequence_page() -> list[str]:
             lines += ["", f"Unit: {measured.unit or 'of the signal'}."] if measured and name != "python" else []
             lines += describe_keys(kind, without=common)
     for title, cls in (("Guards", Guard), ("Steps in Python", Step), ("Limits of the protocol checks", ProtocolLimits),
-                       ("Timing", TimingPolicy), ("Firmware", RequiredFirmware)):
+                       ("Timing", TimingPolicy), ("Firmware", Identity)):
         lines += [f"## {title}", "", describe_class(cls), *describe_keys(cls)]
     return lines
 

@@ -1,15 +1,18 @@
 """Participants of a run, and application objects of our own nodes, which the rig writes and the nodes obey."""
+from __future__ import annotations
 
 import struct
 import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plant.errors import InputError
+from plant.quantity import Quantity
 from rig.benches.bench import Role
 
 RIG, CONTROLLER, PLANT = Role.RIG, Role.CONTROLLER, Role.PLANT  # of the shipped bench they are the node-IDs as well
@@ -53,26 +56,45 @@ class NmtCommand(IntEnum):
     RESET_COMMUNICATION = 130
 
 
-class Identity(NamedTuple):
-    """The identity of a node; None for an object that it does not have."""
+Unsigned32 = Annotated[int, Quantity("1", low=0, high=0xFFFFFFFF)]
 
-    device_type: int | None = None  # 0x1000
+
+@dataclass(frozen=True, kw_only=True)
+class Identity:
+    """What a node says about itself, or has to say. None: it has no such object, or that is not compared."""
+
+    device_type: Unsigned32 | None = None  # 0x1000
     name: str | None = None  # 0x1008, manufacturer device name
     hardware: str | None = None  # 0x1009, manufacturer hardware version
     software: str | None = None  # 0x100A, manufacturer software version
-    vendor: int | None = None  # 0x1018 sub 1, vendor-ID
-    product: int | None = None  # 0x1018 sub 2, product code
-    revision: int | None = None  # 0x1018 sub 3, revision number
-    serial: int | None = None  # 0x1018 sub 4, serial number
+    vendor: Unsigned32 | None = None  # 0x1018 sub 1, vendor-ID
+    product: Unsigned32 | None = None  # 0x1018 sub 2, product code
+    revision: Unsigned32 | None = None  # 0x1018 sub 3, revision number
+    serial: Unsigned32 | None = None  # 0x1018 sub 4, serial number
+
+    @property
+    def known(self) -> dict[str, int | str]:
+        """What is known."""
+        return {key: value for key, value in vars(self).items() if value is not None}
 
     def __str__(self) -> str:
-        """The objects that the node has, in one line."""
-        words = []
-        for key, value in self._asdict().items():
-            if value is not None:
-                label = key.replace("_", " ")
-                words.append(f"{label} 0x{value:08X}" if isinstance(value, int) else f"{label} {value!r}")
+        """What is known, in one line."""
+        words = (f"{key.replace('_', ' ')} {_show_object(value)}" for key, value in self.known.items())
         return ", ".join(words) or "no identity objects"
+
+    def find_difference(self, found: Identity) -> tuple[str, str]:
+        """The first key that another identity must have alike and has not, and how, in words; two empty texts for none.
+        """
+        for key, required in self.known.items():
+            if (said := getattr(found, key)) != required:
+                return key, f"{_show_object(required)}, but the controller has {_show_object(said)}"
+        return "", ""
+
+
+def _show_object(value: int | str | None) -> str:
+    if value is None:
+        return "no such object"
+    return f"0x{value:08X}" if isinstance(value, int) else repr(value)
 
 
 _OBJECTS = {"device_type": (0x1000, 0), "name": (0x1008, 0), "hardware": (0x1009, 0), "software": (0x100A, 0),

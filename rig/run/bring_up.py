@@ -361,12 +361,11 @@ class BringUp:
             identity = self._master.read_identity(role)
             self.identities[role] = identity
             self._journal.log("INFO", "identity", f"{bench.describe_node(role)}: {identity}")
-            known = {key: str(value) for key, value in identity._asdict().items() if value is not None}
-            self._journal.recorder.metadata(f"node{bench.find_number(role)}", known)
+            self._journal.recorder.metadata(f"node{bench.find_number(role)}",
+                                            {key: str(value) for key, value in identity.known.items()})
         for role in self.identities:
             self._master.require_identity(role)
-        identity = self.identities.get(CONTROLLER, Identity())
-        key, difference = sequence.firmware.find_difference(identity._asdict())
+        key, difference = sequence.firmware.find_difference(self.identities.get(CONTROLLER, Identity()))
         if difference:
             raise InputError(sequence.name, f"firmware.{key}", difference)
 

@@ -199,7 +199,7 @@ class Outcome:
                     name: each.to_json(self.started_ns) for name, each in self.metrology.calibration.items()},
                 "limits": [limit._asdict() for limit in self.limits],
                 "nodes": {str(self.job.bench.find_number(role)): {
-                    "name": NAMES[role], "identity": self.identities[role]._asdict(),
+                    "name": NAMES[role], "identity": vars(self.identities[role]),
                     "operational_ms": round(1e3 * self.start_times[role], 1) if role in self.start_times else None}
                     for role in sorted(self.identities)},
                 "events": [to_plain(event._asdict()) for event in events], "events_omitted": omitted,

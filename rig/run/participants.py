@@ -9,7 +9,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
 
 from plant import InputError, Model
 from rig.benches.bench import Role
@@ -29,16 +28,11 @@ FRAME_TIMEOUT = 2.0  # s: in lockstep a frame may be this late, for the machine 
 LOST_FRAME_TIMEOUT = 0.2  # s: the same where frames are to be lost, so that the run comes to an end
 
 
-class Participants(NamedTuple):
-    """The rig's end of the bus, and the nodes that the rig started as processes of their own."""
-
-    wire: Wire
-    processes: NodeProcesses
-
-
 @contextlib.contextmanager
-def open_participants(job: Job) -> Iterator[Participants]:
+def open_participants(job: Job) -> Iterator[tuple[Wire, NodeProcesses]]:
     """Open the bus and start the nodes of this job on it: inside this process, or as processes of their own.
+
+    Yields the rig's end of the bus, and the processes.
 
     Raises:
         InputError: an external node on a bus that no other program can reach, or an external firmware together with
@@ -57,7 +51,7 @@ def open_participants(job: Job) -> Iterator[Participants]:
         if not job.bench.has_plant_node:
             makers = [partial(StandIn, bench=job.bench, model=job.model)]
         wire = EmbeddedWire(WallClock() if job.realtime else VirtualClock(), makers, job.period_ns)
-        yield Participants(wire, NodeProcesses())
+        yield wire, NodeProcesses()
         return
     if job.controller == "builtin" and is_plant_bench(job.bench):
         raise InputError("--bus", job.bus, "embedded: the controller that the plant declares runs inside the rig")
@@ -75,7 +69,7 @@ def open_participants(job: Job) -> Iterator[Participants]:
     processes = NodeProcesses()
     try:
         _start_missing_nodes(job, Master(link_wire, clock.now, False, job.bench), processes)
-        yield Participants(link_wire, processes)
+        yield link_wire, processes
     finally:
         processes.stop()
         link_wire.close()

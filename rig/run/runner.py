@@ -69,11 +69,11 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
     with lock_folder(folder):
         try:
             _play_steps(job, folder, "before", "")
-            with open_participants(job) as participants:
+            with open_participants(job) as (wire, processes):
                 prepare()
-                epoch_ns = read_epoch_ns() - participants.wire.clock.now()
+                epoch_ns = read_epoch_ns() - wire.clock.now()
                 with (open_recorder(job, folder, epoch_ns, observer) as recorder,
-                      contextlib.closing(Session(job, participants, recorder, progress, stop)) as session):
+                      contextlib.closing(Session(job, wire, processes, recorder, progress, stop)) as session):
                     outcome = play_job(job, folder, session, recorder, progress, diagnose)
                 outcome.save()
         except BaseException:

@@ -20,7 +20,7 @@ from plant.profile import Profile, build_profile
 from plant.segments import Array, Hold
 from rig.benches.bench import make_reader
 from rig.benches.profiles import PROFILES, State
-from rig.network.bus import EmbeddedWire
+from rig.network.bus import EmbeddedWire, Wire
 from rig.network.frame import Frame
 from rig.network.master import HEARTBEAT, Master
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, CycleRecord, NmtState
@@ -39,7 +39,7 @@ from rig.run.embedded_loop import MOST
 from rig.run.job import Job
 from rig.run.loop import AFTER, CycleInput, History
 from rig.run.loops import open_loop
-from rig.run.participants import Participants, find_firmware_parameters
+from rig.run.participants import NodeProcesses, find_firmware_parameters
 from rig.run.state import Journal, SafeState, Stage
 from rig.run.watch import PATIENCE, NodeWatch, OverrunWatch
 from rig.sequences.checks import DriveFrames, Guard, GuardWatch
@@ -132,9 +132,8 @@ class CycleLog:
 class Session:
     """Runs a job's sequence on a bus. `stop()`, called every cycle, is True when the operator wants to end."""
 
-    def __init__(self, job: Job, participants: Participants, recorder: Recorder, progress: Progress,
+    def __init__(self, job: Job, wire: Wire, processes: NodeProcesses, recorder: Recorder, progress: Progress,
                  stop: Callable[[], bool]) -> None:
-        wire, self._processes = participants
         self.job, self._progress, self._stop = job, progress, stop
         self._setup, self._main = job.sequence.setup_profile(), job.sequence.main_profile()  # now, not between cycles
         self.scenario = job.scenario
@@ -147,7 +146,7 @@ class Session:
         self.safety = SafeState(self.stage, self.journal, job.sequence.ends == "safe_state")
         self._master = Master(wire, self.stage.now, job.realtime, job.bench)
         patience = round(job.sequence.timing.operational * plan.rate) if job.realtime else PATIENCE
-        self.nodes = NodeWatch(self.stage, self.journal, self.safety, self._master, self._processes, job.bench,
+        self.nodes = NodeWatch(self.stage, self.journal, self.safety, self._master, processes, job.bench,
                                looks_for_silence=not job.realtime and not self._is_embedded, patience=patience)
         injected = find_injected(plan, self._faults, plan.stop)
         self._overruns = OverrunWatch(job.sequence.timing, job.period_ns * 1e-9,

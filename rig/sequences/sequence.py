@@ -10,11 +10,11 @@ import json
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -28,46 +28,20 @@ from plant.profile import Profile, build_profile, list_section_names, parse_colu
 from plant.quantity import Quantity
 from plant.segments import RATE, Array, Csv, Hold, Segment
 from plant.tables import Place
+from plant.user_code import run_file
 from rig.benches.calibration import Decision
+from rig.network.node_objects import Identity
 from rig.sequences import checks, faults
 from rig.sequences.checks import MAIN, Check, Guard, PythonCheck
 from rig.sequences.faults import Fault, Parameter, Plan, find_contradiction
 from rig.sequences.protocol import ProtocolLimits
-from rig.sequences.python_parts import PythonSegment, Step, load_function, require_function_name, run_file
+from rig.sequences.python_parts import PythonSegment, Step, load_function, require_function_name
 from rig.sequences.signals import find_tested, name_signals_of
 from rig.sequences.timing import TimingPolicy
 
 PHASES = ("setup", "main", "cleanup", "load")
 PREFLIGHT = "preflight.toml"
-Unsigned32 = Annotated[int, Quantity("1", low=0, high=0xFFFFFFFF)]
 
-
-@dataclass(frozen=True, kw_only=True)
-class RequiredFirmware:
-    """What the controller must say about itself; a key that is left out is not compared."""
-
-    device_type: Unsigned32 | None = None  # 0x1000
-    name: str | None = None  # 0x1008
-    hardware: str | None = None  # 0x1009
-    software: str | None = None  # 0x100A
-    vendor: Unsigned32 | None = None  # 0x1018 sub 1
-    product: Unsigned32 | None = None  # 0x1018 sub 2
-    revision: Unsigned32 | None = None  # 0x1018 sub 3
-    serial: Unsigned32 | None = None  # 0x1018 sub 4
-
-    def find_difference(self, identity: Mapping[str, object]) -> tuple[str, str]:
-        """The first key in which a controller's identity differs and how, in words; two empty texts if none does."""
-        for key, required in asdict(self).items():
-            found = identity.get(key)
-            if required is not None and found != required:
-                return key, f"{_format(required)}, but the controller has {_format(found)}"
-        return "", ""
-
-
-def _format(value: object) -> str:
-    if value is None:
-        return "no such object"
-    return f"0x{value:08X}" if isinstance(value, int) else repr(value)
 
 
 ReadFile = Callable[[str], bytes]
@@ -109,7 +83,7 @@ class Sequence:
     model: ModelChoice = ModelChoice()
     protocol: ProtocolLimits = field(default_factory=ProtocolLimits)
     timing: TimingPolicy = field(default_factory=TimingPolicy)
-    firmware: RequiredFirmware = field(default_factory=RequiredFirmware)
+    firmware: Identity = field(default_factory=Identity)  # what the controller must say about itself
     name: str = field(default="", metadata=_OWN)  # the file's, without folders
     source: str = field(default="", metadata=_OWN, repr=False)
     files: Mapping[str, bytes] = field(default_factory=dict, metadata=_OWN, repr=False)  # CSV and Python files, by name

@@ -18,7 +18,7 @@ from rig.network.master import BusError
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.run.job import Job
-from rig.run.participants import NodeProcesses, Participants
+from rig.run.participants import NodeProcesses
 from rig.run.runner import attribute_run, judge_run, open_recorder
 from rig.run.session import Session
 from rig.sequences.sequence import parse_sequence
@@ -185,8 +185,8 @@ def _play(job: Job, folder: Path, strangers: Sequence[Callable[[Send], Node]] = 
     try:
         with open_recorder(job, folder) as recorder:
             makers: list[Callable[[Send], Node]] = [Emulator, Firmware, *strangers]
-            participants = Participants(EmbeddedWire(VirtualClock(), makers), NodeProcesses())
-            session = Session(job, participants, recorder, ignore_progress, lambda: False)
+            session = Session(job, EmbeddedWire(VirtualClock(), makers), NodeProcesses(), recorder,
+                              ignore_progress, lambda: False)
             session.bring_up()
             session.run_phases()
             checks, _ = judge_run(job, session, attribute_run(job, session).judged)

@@ -27,7 +27,7 @@ from rig.nodes.firmware import Firmware
 from rig.recorder import RecorderError
 from rig.run import participants, runner
 from rig.run.job import Job
-from rig.run.participants import NodeProcesses, Participants
+from rig.run.participants import NodeProcesses
 from rig.run.session import Session
 from rig.sequences.sequence import parse_sequence
 
@@ -148,7 +148,7 @@ def play_in_parts(one: Job, folder: Path, wire: EmbeddedWire, processes: NodePro
                   between: Callable[[Session], object] = lambda session: None) -> Session:
     """Bring a session up, let something happen, and play its phases."""
     with runner.open_recorder(one, folder) as recorder:
-        session = Session(one, Participants(wire, processes), recorder, ignore_progress, lambda: False)
+        session = Session(one, wire, processes, recorder, ignore_progress, lambda: False)
         session.bring_up()
         between(session)
         session.run_phases()

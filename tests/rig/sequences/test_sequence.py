@@ -11,6 +11,7 @@ from refusals import catch_refusal
 from fdi.trace.check_result import CheckResult
 from plant import load_model, simulate, tables
 from plant.errors import InputError
+from rig.network.node_objects import Identity
 from rig.sequences.checks import evaluate_checks
 from rig.sequences.sequence import Sequence, load_sequence, parse_sequence
 
@@ -312,9 +313,9 @@ def test_timing_and_firmware_are_tables_of_the_sequence() -> None:
                             '[firmware]\nproduct = 2\nsoftware = "1.0"\n')
     assert (sequence.timing.most_in_a_row, sequence.timing.share) == (3, 0.01)
     for identity, difference in (
-            ({"product": 2, "software": "1.0", "vendor": 9}, ("", "")),
-            ({"product": 2, "software": "1.1"}, ("software", "'1.0', but the controller has '1.1'")),
-            ({"software": "1.0"}, ("product", "0x00000002, but the controller has no such object"))):
+            (Identity(product=2, software="1.0", vendor=9), ("", "")),
+            (Identity(product=2, software="1.1"), ("software", "'1.0', but the controller has '1.1'")),
+            (Identity(software="1.0"), ("product", "0x00000002, but the controller has no such object"))):
         assert sequence.firmware.find_difference(identity) == difference
 
 
