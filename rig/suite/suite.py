@@ -430,7 +430,7 @@ def _tabulate_failures(results: Sequence[CaseResult], folder: Path) -> list[Tabl
         (Column("U", align="right"), lambda row: format_uncertainty(row[1].uncertainty)),
         (Column("limits", align="right"), lambda row: format_limits(row[1].low, row[1].high)),
         (Column("unit"), lambda row: "" if row[1].unit == "1" else row[1].unit),
-        (Column("requirement"), lambda row: ", ".join(row[1].requirement)), terminal_rows=30)]
+        (Column("requirement"), lambda row: row[1].requirement), terminal_rows=30)]
 
 
 def _tabulate_faults(results: Sequence[CaseResult], folder: Path) -> list[Table]:
