@@ -45,7 +45,7 @@ def rig_bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]
         properties.append(("rig_run", f"{run.verdict} {run.folder}"))
         for check in run.checks.values():
             properties += [("requirement", f"{requirement} {check.verdict} {check.name}")
-                           for requirement in check.requirement]
+                           for requirement in check.requirements]
 
 
 @pytest.hookimpl(wrapper=True)

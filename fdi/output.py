@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from plant.errors import InputError
+from plant.errors import InputError, report_system_error
 
 
 def require_writable(out: str | Path, field: str, *, source: str | Path | None = None) -> Path:
@@ -17,11 +17,8 @@ def require_writable(out: str | Path, field: str, *, source: str | Path | None =
     there = path.exists()
     if there and source is not None and Path(source).exists() and path.samefile(source):
         raise InputError(path, field, "another file than the one that is read")
-    try:
-        with path.open("ab"):
-            pass
-    except OSError as error:
-        raise InputError(path, field, f"a place that can be written ({error.strerror})") from error
+    with report_system_error(path, field, "a place that can be written"):
+        path.open("ab").close()
     if not there:
         path.unlink()
     return path
@@ -33,11 +30,8 @@ def write_text(path: str | Path, text: str, option: str = "--out") -> None:
     Raises:
         InputError: a path that cannot be written.
     """
-    try:
-        with write_whole(path) as part:
-            part.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(option, str(path), f"a file that can be written ({error.strerror})") from error
+    with report_system_error(option, str(path), "a file that can be written"), write_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def replace_text(path: str | Path, text: str) -> Path | None:

@@ -1,7 +1,8 @@
 """Errors that the user can correct, each shown as one line; and the hint at a similar name."""
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 class RigError(Exception):
@@ -24,6 +25,15 @@ class InputError(RigError):
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
         """As a worker process hands it on."""
         return type(self), (self.where, self.field, self.expected)
+
+
+@contextmanager
+def report_system_error(where: object, field: str, expected: str) -> Iterator[None]:
+    """Turn what the system refuses within into bad input, with the system's own words."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(where, field, f"{expected} ({error.strerror or error})") from error
 
 
 def escape_control_characters(text: str) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from plant.errors import InputError
 from plant.segments import LONGEST, RATE, Array, Segment, require
 from plant.signals import EHA, Signals
+from plant.tables import read_file
 from plant.unpacking import UnpackingError, unpack_gzip
 
 SLACK = 0.01  # of a cycle: a time within it of a row is that row's
@@ -78,11 +79,7 @@ def read_command(path: str | Path, period: float = 1 / RATE, signals: Signals = 
     Raises:
         InputError: the file, the line and what was expected there.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"a CSV file that can be read ({error.strerror})") from error
-    columns = parse_columns(data, path, period, signals)
+    columns = parse_columns(read_file(Path(path)), path, period, signals)
     if "com" not in columns:
         raise InputError(path, "line 1", f"a header with the columns t and {signals.command.name}")
     return Command(columns["com"], columns.get("load"))

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from plant.errors import InputError, show_value
+from plant.errors import InputError, report_system_error, show_value
 from plant.quantity import Quantity
 
 T = TypeVar("T")
@@ -76,10 +76,8 @@ def _join_keys(path: str, keys: Iterable[str | int]) -> str:
 
 def read_file(path: Path) -> bytes:
     """The content of a file; raises InputError if it cannot be read."""
-    try:
+    with report_system_error(path, "", "a file that can be read"):
         return path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"a file that can be read ({error.strerror})") from error
 
 
 def decode_text(data: bytes, name: object) -> str:

@@ -38,7 +38,7 @@ from fdi.report.numbers import (
     list_first,
 )
 from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Report, Section, Table
-from fdi.report.run_report import format_limits, read_verdict
+from fdi.report.run_report import read_verdict
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
@@ -147,16 +147,16 @@ def _tabulate_checks(found: RunDifferences, checks: Sequence[MatchedCheck], medi
                *(Column(label, align="right") for label in labels), Column(" -> ".join(labels)), Column("")]
     rows: list[list[Cell | str]] = [
         [check.name,
-         "differ" if check.has_other_limits else format_limits(check.first.low, check.first.high),
-         "" if check.first.unit == "1" else check.first.unit, *map(_show_value, check.results),
+         "differ" if check.has_other_limits else check.first.shown_limits,
+         check.first.unit_behind.strip(), *map(_show_value, check.results),
          _join_verdicts(check.results), Cell("changed", "bad", True) if check.is_changed else ""] for check in checks]
     return Table(columns, rows, caption, medium=medium)
 
 
-def _show_value(check: CheckResult | None) -> Cell | str:
+def _show_value(check: CheckResult | None) -> Cell:
     if check is None:
         return Cell("-", "muted")
-    return Cell("not measurable", "muted") if math.isnan(check.value) else f"{check.value:.4g}"
+    return Cell(check.shown_value, "muted" if math.isnan(check.value) else "")
 
 
 def _join_verdicts(results: Sequence[CheckResult | None]) -> Cell:

@@ -37,7 +37,7 @@ from fdi.report.drawing import (
     shade,
     spans,
 )
-from fdi.report.numbers import attach_unit, choose_unit, list_first
+from fdi.report.numbers import choose_unit, list_first
 from fdi.report.report import (
     Cell,
     Column,
@@ -190,11 +190,10 @@ def _tabulate_checks(checks: Sequence[CheckResult], heading: str, remark: Medium
         (True, Column(heading), lambda check: check.name),
         (is_windowed, Column("kind", medium=page), lambda check: Cell(_name_measure(check), "muted")),
         (True, Column(""), lambda check: Cell(check.verdict.replace("PASS", "pass"), MOODS[check.verdict])),
-        (True, Column("measured", align="right"), lambda check: Cell(format_value(check.value), is_strong=True)),
-        (is_uncertain, Column("U", align="right"),
-         lambda check: format_uncertainty(check.uncertainty)),
-        (True, Column("limits", align="right"), lambda check: format_limits(check.low, check.high)),
-        (True, Column("unit"), lambda check: "" if check.unit == "1" else check.unit),
+        (True, Column("measured", align="right"), lambda check: Cell(check.shown_value, is_strong=True)),
+        (is_uncertain, Column("U", align="right"), lambda check: check.shown_uncertainty),
+        (True, Column("limits", align="right"), lambda check: check.shown_limits),
+        (True, Column("unit"), lambda check: check.unit_behind.strip()),
         (is_windowed, Column("window", medium=page), lambda check: Cell(_format_window(check), "muted")),
         (any(check.requirement for check in checks), Column("requirement"), lambda check: check.requirement),
         (any(check.detail for check in checks), Column("remark", medium=remark),
@@ -215,11 +214,10 @@ def _show_failed_checks(trace: Trace, most: int = 12) -> list[Item]:
     failed = [check for check in trace.sequence_checks if check.verdict == "FAIL" and not math.isnan(check.t0)]
     items: list[Item] = []
     for number, check in enumerate(failed[:most]):
-        measured = f"{attach_unit(format_value(check.value), check.unit)} measured"
-        items.append(Figure(f"{check.name}: {_name_measure(check)}, "
-                            f"{check.detail if math.isnan(check.value) else measured}, limit "
-                            f"{attach_unit(format_limits(check.low, check.high), check.unit)}. Dashed: limits; red: "
-                            "what was measured.", partial(draw_failed_check, trace, check, f"check{number}")))
+        measured = check.detail if math.isnan(check.value) else f"{check.measured} measured"
+        items.append(Figure(f"{check.name}: {_name_measure(check)}, {measured}, limit "
+                            f"{check.shown_limits}{check.unit_behind}. Dashed: limits; red: what was measured.",
+                            partial(draw_failed_check, trace, check, f"check{number}")))
     return items
 
 
@@ -229,31 +227,6 @@ def _name_measure(check: CheckResult) -> str:
         return f"number of {check.signal} events" if check.signal else "number of events"
     quantity = {"never_exceeds": "largest size", "response_within": "response time"}.get(check.kind)
     return " of ".join(word for word in (quantity or check.kind.replace("_", " "), check.signal) if word)
-
-
-def format_value(value: float) -> str:
-    """What a check measured."""
-    return "not measurable" if math.isnan(value) else f"{value:.4g}"
-
-
-def format_uncertainty(uncertainty: float) -> str:
-    """U with two digits; nothing for an unknown one.
-
-    >>> format_uncertainty(0.4334), format_uncertainty(0.0), format_uncertainty(float("nan"))
-    ('0.43', '0', '')
-    """
-    return f"{uncertainty:.2g}" if uncertainty < math.inf else ""
-
-
-def format_limits(low: float, high: float) -> str:
-    """The limits of a check.
-
-    >>> format_limits(float("nan"), 5.0), format_limits(1.0, 2.0), format_limits(1.0, float("nan"))
-    ('<= 5', '1 .. 2', '>= 1')
-    """
-    if math.isnan(low):
-        return f"<= {high:g}"
-    return f">= {low:g}" if math.isnan(high) else f"{low:g} .. {high:g}"
 
 
 def _format_window(check: CheckResult) -> str:
@@ -650,7 +623,7 @@ def _draw_sides(size: float, colour: str, label: str, sides: Sequence[float], mi
 
 def _draw_limits(check: CheckResult, sides: Sequence[float] = (1.0,), middle: float = 0.0) -> list[Mark]:
     return [mark for limit, word in ((check.low, "least"), (check.high, "most"))
-            for mark in _draw_sides(limit, AMBER, attach_unit(f"{word} {limit:g}", check.unit), sides, middle, "--")]
+            for mark in _draw_sides(limit, AMBER, f"{word} {limit:g}{check.unit_behind}", sides, middle, "--")]
 
 
 def _write_in_legend(text: str) -> Mark:
@@ -658,9 +631,7 @@ def _write_in_legend(text: str) -> Mark:
 
 
 def _name_value(check: CheckResult) -> str:
-    if math.isnan(check.value):
-        return "not measurable"
-    return attach_unit(f"measured {check.value:.4g}", check.unit)
+    return check.measured if math.isnan(check.value) else f"measured {check.measured}"
 
 
 STEP_DRAWERS = (_draw_overshoot, _draw_rise_time, _draw_settling_time)

@@ -58,6 +58,47 @@ class CheckResult:
         """The ids of the requirements that it verifies."""
         return self.requirement.split(", ") if self.requirement else []
 
+    @property
+    def unit_behind(self) -> str:
+        """The unit as it follows a number: " mm", "" for a number without one."""
+        return "" if self.unit in ("", "1") else f" {self.unit}"
+
+    @property
+    def shown_value(self) -> str:
+        """What was measured, without its unit.
+
+        >>> CheckResult(value=7.44213, passed=True, name="", signal="", unit="%").shown_value
+        '7.442'
+        """
+        return "not measurable" if math.isnan(self.value) else f"{self.value:.4g}"
+
+    @property
+    def measured(self) -> str:
+        """What was measured, with its unit."""
+        return self.shown_value if math.isnan(self.value) else self.shown_value + self.unit_behind
+
+    @property
+    def shown_limits(self) -> str:
+        """The limits, without their unit.
+
+        >>> [CheckResult(value=1.0, passed=True, name="", signal="", unit="1", low=low, high=high).shown_limits
+        ...  for low, high in ((math.nan, 5.0), (1.0, 2.0), (1.0, math.nan))]
+        ['<= 5', '1 .. 2', '>= 1']
+        """
+        if math.isnan(self.low):
+            return f"<= {self.high:g}"
+        return f">= {self.low:g}" if math.isnan(self.high) else f"{self.low:g} .. {self.high:g}"
+
+    @property
+    def shown_uncertainty(self) -> str:
+        """U with two digits; nothing for an unknown one."""
+        return f"{self.uncertainty:.2g}" if self.uncertainty < math.inf else ""
+
+    def describe(self) -> str:
+        """Value, U and limits in words."""
+        uncertain = f", U {self.shown_uncertainty}{self.unit_behind}" if self.shown_uncertainty else ""
+        return f"measured {self.measured}{uncertain}, limits {self.shown_limits}{self.unit_behind}"
+
     def collect_data(self) -> dict[str, Any]:
         """All of it by name, for an answer in JSON."""
         return {**vars(self), "requirement": self.requirements, "verdict": self.verdict}

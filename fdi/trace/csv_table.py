@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.output import write_whole
-from plant.errors import InputError
+from plant.errors import InputError, report_system_error
 from plant.plants import Plant, Table, Term, find_plant, list_plants
 from plant.signals import Signals
 from plant.unpacking import UnpackingError, limit_unpacked_size
@@ -89,11 +89,8 @@ def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
             for row in zip(*(columns[name].tolist() for name in names), strict=True))
     text = "\n".join([",".join(names), *rows]) + "\n"
     raw = text.encode()
-    try:
-        with write_whole(path) as part:
-            part.write_bytes(gzip.compress(raw, mtime=0) if path.suffix == ".gz" else raw)
-    except OSError as error:
-        raise InputError(path, "", f"a place that can be written ({error.strerror})") from error
+    with report_system_error(path, "", "a place that can be written"), write_whole(path) as part:
+        part.write_bytes(gzip.compress(raw, mtime=0) if path.suffix == ".gz" else raw)
 
 
 def open_text(path: Path, encoding: str = "utf-8-sig") -> io.TextIOBase:

@@ -22,7 +22,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from plant.errors import InputError, RigError
+from plant.errors import InputError, RigError, report_system_error
 from rig.interrupts import ignore_interrupts
 from rig.network.clock import WallClock
 
@@ -222,11 +222,9 @@ class RowFile(contextlib.AbstractContextManager["RowFile"]):
     """
 
     def __init__(self, path: Path) -> None:
-        try:
+        with report_system_error(path.parent, "", "a folder that can be written"):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("a+", encoding="utf-8")
-        except OSError as error:
-            raise InputError(path.parent, "", f"a folder that can be written ({error.strerror})") from error
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:

@@ -30,7 +30,7 @@ from fdi.sources import hash_sources, import_function
 from fdi.thresholds import UNIT_TOLERANCE
 from fdi.trace.trace import Floats, Trace
 from plant import simulate
-from plant.errors import InputError, RigError
+from plant.errors import InputError, RigError, report_system_error
 from plant.model import Model, build_bare_model, find_effect, find_quantity, parse_model
 from plant.parameters import load_nominal_values, parse_toml, parse_value, read_toml
 from plant.plants import Plant, load_plant
@@ -521,7 +521,7 @@ def open_campaign(path: str | Path, matrix: Matrix, sources: str) -> RowFile:
     """
     folder = Path(path)
     expected = json.loads(json.dumps({"matrix": matrix.spec, "code": sources}))
-    try:
+    with report_system_error(path, "", "a folder that can be written"):
         folder.mkdir(parents=True, exist_ok=True)
         if is_campaign_folder(folder):
             present = _read_campaign(folder)
@@ -536,8 +536,6 @@ def open_campaign(path: str | Path, matrix: Matrix, sources: str) -> RowFile:
             raise InputError(path, "--out", "an empty folder, or one of this campaign")
         else:
             write_text(folder / MATRIX, json.dumps(expected, indent=1) + "\n")
-    except OSError as error:
-        raise InputError(path, "", f"a folder that can be written ({error.strerror})") from error
     return RowFile(folder / ROWS)
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from fdi.output import require_writable, write_text
 from fdi.progress import Progress, ignore_progress
-from plant.errors import InputError
+from plant.errors import InputError, report_system_error
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -82,10 +82,8 @@ def make_folder(path: Path) -> Path:
     Raises:
         InputError: it cannot be made.
     """
-    try:
+    with report_system_error("--out", str(path), "a folder that can be written"):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError("--out", str(path), f"a folder that can be written ({error.strerror})") from error
     return path
 
 

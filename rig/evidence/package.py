@@ -20,7 +20,7 @@ from typing import IO, NamedTuple
 
 from fdi.output import write_whole
 from fdi.progress import Progress
-from plant.errors import InputError, show_value
+from plant.errors import InputError, report_system_error, show_value
 
 MANIFEST, INDEX = "MANIFEST.sha256", "evidence.json"
 Files = Mapping[str, Callable[[], IO[bytes]]]  # name -> opens its content
@@ -97,7 +97,7 @@ def write_package(contents: Mapping[str, bytes | Path], out: Path, key: str, pro
     if key:
         file, signature = _sign(manifest, key)
         files[file] = partial(open_content, signature)
-    try:
+    with report_system_error("--out", str(out), "a place that can be written"):
         if out.suffix == ".zip":
             with write_whole(out) as part, part.open("wb") as handle:
                 _write_zip(files, handle.write)
@@ -107,8 +107,6 @@ def write_package(contents: Mapping[str, bytes | Path], out: Path, key: str, pro
                 (out / name).parent.mkdir(parents=True, exist_ok=True)
                 with open_file() as source, (out / name).open("xb") as target:
                     shutil.copyfileobj(source, target)
-    except OSError as error:
-        raise InputError("--out", str(out), f"a place that can be written ({error.strerror or error})") from error
     return hashlib.sha256(manifest).hexdigest()
 
 

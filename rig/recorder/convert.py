@@ -21,8 +21,20 @@ from fdi.trace.mcap_log import open_log
 from fdi.trace.sensor_dynamics import write_sensors
 from fdi.trace.trace import Trace, make_table_trace
 from plant import signals as plant_signals
-from plant.errors import InputError
-from rig.benches.bench import EXTENDED, FD, SWITCHED, Bench, FrameSpec, Role, describe_identifier, make_reader
+from plant.errors import InputError, report_system_error
+from plant.tables import read_file
+from rig.benches.bench import (
+    EXTENDED,
+    FD,
+    SWITCHED,
+    Bench,
+    FrameSpec,
+    Role,
+    decode_device_text,
+    describe_identifier,
+    make_reader,
+)
+from rig.benches.can_map import read_database
 from rig.network.frame import Frame, find_cob_id, make_message
 from rig.network.node_objects import NmtState as State
 from rig.recorder.schema import Event, NmtState, Record, Signals, collect_provenance, make_row_record
@@ -58,13 +70,11 @@ def export_trace(source: Path, out: Path, everything: bool = False) -> int:
         raise InputError(path, "/can", "at least one raw frame")
     if out.suffix == ".trc" and any(frame.cob_id & FD for frame in raw):
         raise InputError(out, "--out", "a name that ends in .log, .blf or .asc: a .trc would lose the CAN FD frames")
-    try:
-        with write_whole(require_writable(out, "--out")) as part, can.Logger(part) as writer:
-            for frame in raw:
-                writer(make_message(frame.cob_id, frame.data, timestamp=frame.t_ns / 1e9,
-                                    channel="can0" if out.suffix == ".log" else 0))
-    except OSError as error:
-        raise InputError(out, "--out", f"a place that can be written ({error.strerror})") from error
+    with (report_system_error(out, "--out", "a place that can be written"),
+          write_whole(require_writable(out, "--out")) as part, can.Logger(part) as writer):
+        for frame in raw:
+            writer(make_message(frame.cob_id, frame.data, timestamp=frame.t_ns / 1e9,
+                                channel="can0" if out.suffix == ".log" else 0))
     return len(raw)
 
 
@@ -286,16 +296,8 @@ def _load_messages(dbc: Path) -> dict[tuple[int, bool], Any]:
     Raises:
         InputError: it cannot be read.
     """
-    import cantools
-
-    try:
-        base = cantools.database.load_file(str(dbc))
-    except OSError as error:
-        raise InputError(dbc, "--dbc", f"a readable file ({error.strerror})") from error
-    except (cantools.Error, ValueError) as error:
-        reason = [*str(error).splitlines(), type(error).__name__][0]
-        raise InputError(dbc, "--dbc", f"a DBC file ({reason})") from error
-    return {(m.frame_id, m.is_extended_frame): m for m in getattr(base, "messages", ())}
+    base = read_database(str(dbc), decode_device_text(read_file(dbc)))
+    return {(m.frame_id, m.is_extended_frame): m for m in base.messages}
 
 
 def _find_readers(bench: Bench, dbc: Path | None) -> Readers:

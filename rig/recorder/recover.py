@@ -15,7 +15,7 @@ from mcap.stream_reader import StreamReader
 
 from fdi.output import require_writable
 from fdi.trace.mcap_log import BoundedFile, read_declarations, scan_messages, unpack_chunk
-from plant.errors import InputError
+from plant.errors import InputError, report_system_error
 from plant.unpacking import UnpackingError, limit_unpacked_size
 from rig.recorder.writer import McapFile
 
@@ -48,10 +48,8 @@ def recover_log(path: Path, out: Path) -> Salvage:
 
     Raises InputError when `path` cannot be read or holds nothing sound, and when `out` cannot be written.
     """
-    try:
+    with report_system_error(path, "", "a file that can be read"):
         source = path.open("rb")
-    except OSError as error:
-        raise InputError(path, "", f"a readable file ({error.strerror})") from error
     with source:
         damage = _Damage()
         records = _list_intact_records(BoundedFile(source), damage)
@@ -59,10 +57,8 @@ def recover_log(path: Path, out: Path) -> Salvage:
         if first is None:
             reason = damage.reason or "it is empty"
             raise InputError(path, "", f"an MCAP log with at least one intact record ({reason})")
-        try:
+        with report_system_error(out, "--out", "a place that can be written"):
             return _write_salvage(chain([first], records), damage, require_writable(out, "--out", source=path))
-        except OSError as error:
-            raise InputError(out, "--out", f"a place that can be written ({error.strerror})") from error
 
 
 @dataclass

@@ -21,6 +21,7 @@ from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import Trace
 from plant import InputError, Model, load_model
 from plant.effects import load_effects
+from plant.errors import report_system_error
 from plant.model import find_plant_of_model, find_quantity, parse_model
 from plant.parameters import parse_toml
 from plant.plant_files import read_named_plant
@@ -267,14 +268,12 @@ def _store_code(codes: list[ForeignCode]) -> tuple[Path, ...]:
     digest = hashlib.sha256(repr([(code.name, code.content) for code in codes]).encode()).hexdigest()
     files = []
     for code in codes:
-        try:
+        with report_system_error(code.name, "", "room for its code in the cache folder"):
             folder = make_private_folder(find_cache_folder() / f"effects-{digest}")
             file = folder / code.name.partition("/")[2]
             if not file.is_file() or file.read_bytes() != code.content:
                 with write_whole(file) as part:
                     part.write_bytes(code.content)
-        except OSError as error:
-            raise InputError(code.name, "", f"room for its code in the cache folder ({error.strerror})") from error
         files.append(file)
     return tuple(files)
 

@@ -13,6 +13,7 @@ from fdi.progress import Progress
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
 from plant import Actuator, InputError
+from plant.errors import report_system_error
 from plant.run import make_columns_type
 from plant.segments import Array
 from rig.benches.bench import Flags
@@ -209,11 +210,9 @@ def lock_folder(folder: Path) -> Iterator[None]:
     Raises:
         InputError: the folder cannot be created or written, or another run is writing there.
     """
-    try:
+    with report_system_error("--out", str(folder), "a folder that can be written"):
         folder.mkdir(parents=True, exist_ok=True)
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise InputError("--out", str(folder), f"a folder that can be written ({error.strerror})") from error
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield

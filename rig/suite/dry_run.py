@@ -27,7 +27,6 @@ from fdi.report.drawing import (
 )
 from fdi.report.numbers import count_nouns, format_amount
 from fdi.report.report import Cell, Column, Figure, Line, Medium, Report, Section, Table, tabulate, to_plain
-from fdi.report.run_report import format_limits
 from fdi.trace.check_result import CheckResult
 from plant import Model, simulate
 from plant.model import find_quantity
@@ -419,8 +418,8 @@ def _tabulate_checks(checks: Sequence[CheckResult]) -> list[Table]:
         (Column("check"), lambda check: check.name),
         (Column("window", "s"), lambda check: "-" if math.isnan(check.t0) else f"{check.t0:.3f} .. {check.t1:.3f}"),
         (Column("predicted", align="right"), show_value),
-        (Column("limits", align="right"), lambda check: format_limits(check.low, check.high)),
-        (Column("unit"), lambda check: "" if check.unit == "1" else check.unit),
+        (Column("limits", align="right"), lambda check: check.shown_limits),
+        (Column("unit"), lambda check: check.unit_behind.strip()),
         (Column("remark"), lambda check: check.detail))]
 
 

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from math import inf
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, NamedTuple
@@ -21,7 +20,7 @@ from fdi.progress import ignore_progress
 from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table, tabulate, to_plain
 from fdi.report.run_report import MOODS as RUN_MOODS
-from fdi.report.run_report import format_limits, format_uncertainty, format_value, write_run_page
+from fdi.report.run_report import write_run_page
 from fdi.trace.check_result import CheckResult
 from plant.errors import InputError, RigError
 from plant.quantity import Quantity
@@ -426,10 +425,10 @@ def _tabulate_failures(results: Sequence[CaseResult], folder: Path) -> list[Tabl
         (Column("case"), lambda row: Cell(row[0].case.name, link=_link(row[0], folder))),
         (Column("check"), lambda row: row[1].name),
         (Column("verdict"), lambda row: Cell(row[1].verdict, "bad" if row[0].verdict == "FAIL" else "doubtful")),
-        (Column("measured", align="right"), lambda row: format_value(row[1].value)),
-        (Column("U", align="right"), lambda row: format_uncertainty(row[1].uncertainty)),
-        (Column("limits", align="right"), lambda row: format_limits(row[1].low, row[1].high)),
-        (Column("unit"), lambda row: "" if row[1].unit == "1" else row[1].unit),
+        (Column("measured", align="right"), lambda row: row[1].shown_value),
+        (Column("U", align="right"), lambda row: row[1].shown_uncertainty),
+        (Column("limits", align="right"), lambda row: row[1].shown_limits),
+        (Column("unit"), lambda row: row[1].unit_behind.strip()),
         (Column("requirement"), lambda row: row[1].requirement), terminal_rows=30)]
 
 
@@ -520,11 +519,7 @@ def _make_run_test(result: CaseResult, classname: str) -> junit.TestCase:
 
 
 def _make_check_test(check: CheckResult, result: CaseResult, classname: str) -> junit.TestCase:
-    unit = "" if check.unit == "1" else f" {check.unit}"
-    uncertain = f", U {format_uncertainty(check.uncertainty)}{unit}" if check.uncertainty < inf else ""
-    measured = f"measured {format_value(check.value)}{unit}{uncertain}"
-    measured += f", limits {format_limits(check.low, check.high)}{unit}"
-    measured += f" ({check.detail})" if check.detail else ""
+    measured = check.describe() + (f" ({check.detail})" if check.detail else "")
     window = "" if check.t0 != check.t0 else f"; window {check.t0:.3f} to {check.t1:.3f} s"
     test = junit.TestCase(check.name, classname, output="\n".join(
         filter(None, (measured + window, _name_requirements(check.requirements)))))

@@ -7,7 +7,6 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,6 @@ from fdi.progress import ignore_progress
 from fdi.report.run_report import (
     draw_failed_check,
     draw_signals,
-    format_limits,
-    format_uncertainty,
     write_run_page,
 )
 from fdi.trace.check_result import CheckResult
@@ -122,15 +119,9 @@ class BenchRun:
 
 def describe_failure(check: CheckResult) -> str:
     """A failed check in one line: name, measured value, limits, window, requirement."""
-    unit = "" if check.unit == "1" else f" {check.unit}"
-    value = "not measurable" if check.value != check.value else f"{check.value:.4g}{unit}"
-    parts = [f"measured {value}"]
-    parts += [f"U {format_uncertainty(check.uncertainty)}{unit}"] if check.uncertainty < inf else []
-    parts += [f"limits {format_limits(check.low, check.high)}{unit}"]
-    parts += [f"{check.t0:.3f} to {check.t1:.3f} s"] if check.t0 == check.t0 else []
-    parts += [check.detail] if check.detail else []
-    parts += [f"requirement {check.requirement}"] if check.requirement else []
-    return f"{check.name}: {', '.join(parts)}"
+    window = f"{check.t0:.3f} to {check.t1:.3f} s" if check.t0 == check.t0 else ""
+    requirement = f"requirement {check.requirement}" if check.requirement else ""
+    return f"{check.name}: {', '.join(filter(None, (check.describe(), window, check.detail, requirement)))}"
 
 
 @dataclass

@@ -79,15 +79,8 @@ class CheckState(NamedTuple):
 
     name: str
     word: str
-    value: float = nan
-    unit: str = ""
+    result: CheckResult | None = None  # so far
     is_final: bool = False  # said by the run itself
-    detail: str = ""
-
-    @classmethod
-    def read(cls, check: CheckResult) -> CheckState:
-        """What the run itself says of a check at its end."""
-        return cls(check.name, check.verdict, check.value, check.unit, True, check.detail)
 
     @property
     def is_judged(self) -> bool:
@@ -97,8 +90,7 @@ class CheckState(NamedTuple):
     @property
     def measured(self) -> str:
         """Value and unit behind a space; empty for none."""
-        unit = "" if self.unit in ("", "1") else f" {self.unit}"
-        return "" if isnan(self.value) else f" {self.value:.4g}{unit}"
+        return "" if self.result is None or isnan(self.result.value) else f" {self.result.measured}"
 
 
 class LiveRun:
@@ -132,7 +124,7 @@ class LiveRun:
         elif isinstance(record, recorder.NmtState):
             self.states[record.node] = record.name
         elif isinstance(record, CheckResult):
-            self.checks[record.name] = CheckState.read(record)
+            self.checks[record.name] = CheckState(record.name, record.verdict, record, True)
         else:
             self.events.append(Event(self._find_time(t_ns), record.level, record.kind, record.text, t_ns))
             node = find_named_node(record.kind, record.text, self.plan.nodes)
@@ -212,7 +204,7 @@ class LiveRun:
                 result = check.judge(data)
                 is_early = rows < stop and (result.passed or isnan(result.value))
                 word = "measures" if is_early else "PASS" if result.passed else "FAIL"
-                state = CheckState(check.name, word, result.value, result.unit, detail=result.detail)
+                state = CheckState(check.name, word, result)
             self.checks[check.name] = state
 
 

@@ -355,10 +355,10 @@ class LiveView:
         if isinstance(record, NmtState):
             self._send_state(name_node_lane(record.node, self._plan.nodes.get(record.node)), t, record.name)
         elif isinstance(record, CheckResult):
-            state = CheckState.read(record)
+            state = CheckState(record.name, record.verdict, record, True)
             self._send_check(state, t)
             self._recording.send_text(LogText(
-                "log/checks", t, f"{state.word} {state.name}:{state.measured} {state.detail}".rstrip(),
+                "log/checks", t, f"{state.word} {state.name}:{state.measured} {record.detail}".rstrip(),
                 "INFO" if record.passed else "ERROR"))
         elif isinstance(record, Event):
             text = f"{t:8.3f} s  {record.kind}: {record.text}"

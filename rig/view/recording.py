@@ -407,7 +407,7 @@ def _make_check_lane(check: CheckResult, trace: Trace) -> Lane:
     word, colour = check.verdict, NEUTRAL if unreached else VERDICTS[check.verdict]
     text = f"{word} {_describe_measurement(check)}"
     if math.isnan(check.value) and check.detail:
-        text = f"{word} {describe_value(check.value, check.unit)}: {check.detail}"
+        text = f"{word} {check.measured}: {check.detail}"
     path = f"check/{'pass' if check.passed else word}/{check.name}"
     if stop - start > max(start - first, last - stop):
         return Lane(path, [(start, text), (stop, "")], {text: colour})
@@ -426,18 +426,7 @@ def _describe_section(section: Section, command: Signal) -> str:
 def _describe_measurement(check: CheckResult) -> str:
     limits = " and ".join(f"{sign} {limit:.4g}" for sign, limit in (("≥", check.low), ("≤", check.high))
                           if not math.isnan(limit))
-    return describe_value(check.value, check.unit) + (f" (limit {limits})" if limits else "")
-
-
-def describe_value(value: float, unit: str) -> str:
-    """What a check measured.
-
-    >>> describe_value(7.44213, "%"), describe_value(math.nan, "um")
-    ('7.442 %', 'not measured')
-    """
-    if math.isnan(value):
-        return "not measured"
-    return f"{value:.4g}" + ("" if unit in ("", "1") else f" {unit}")
+    return check.measured + (f" (limit {limits})" if limits else "")
 
 
 def _list_texts(trace: Trace) -> list[LogText]:

@@ -340,8 +340,9 @@ def test_a_bad_file_is_refused_with_its_line(tmp_path: Path, text: str, message:
 
 def test_what_is_no_csv_at_all_is_refused(tmp_path: Path) -> None:
     (tmp_path / "c.csv").write_bytes(b"\x1f\x8bnot gzip")
-    for path in (tmp_path / "c.csv", tmp_path / "absent.csv", tmp_path):
-        assert "CSV" in catch_refusal(read_command, path)
+    assert "CSV" in catch_refusal(read_command, tmp_path / "c.csv")
+    for path in (tmp_path / "absent.csv", tmp_path):
+        assert "a file that can be read" in catch_refusal(read_command, path)
 
 
 @pytest.mark.parametrize(("make", "key", "expected"), [

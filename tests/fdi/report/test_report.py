@@ -249,13 +249,15 @@ def test_every_kind_survives_a_value_that_could_not_be_measured(kind: str) -> No
     unit = {"overshoot": "%", "amplitude_ratio": "1", "phase_lag": "deg"}.get(kind, "ms" if "time" in kind else "um")
     check = make_check(kind, NAN, unit, 5.0, (0.5, 1.5))
     assert run_report.draw_failed_check(make_trace(), check).startswith("<svg")
-    for other in (check._replace(t0=NAN, t1=NAN), check._replace(kind="event_never"), check._replace(t0=50.0, t1=51.0)):
+    for other in (replace(check, t0=NAN, t1=NAN), replace(check, kind="event_never"),
+                      replace(check, t0=50.0, t1=51.0)):
         assert not run_report.draw_failed_check(make_trace(), other)
 
 
 def test_a_page_shows_each_failed_check_once() -> None:
     failed = make_check("overshoot", 12.0, "%", 11.0, (0.5, 1.5))
-    trace = replace(make_trace(), checks=(failed, failed._replace(name="fine", passed=True), failed._replace(name="b")))
+    trace = replace(make_trace(), checks=(failed, replace(failed, name="fine", passed=True),
+                                        replace(failed, name="b")))
     page = render_html(build_run_report(trace))
     assert "Failed checks" in page and page.count("Dashed: limits; red") == 2 and page.count("<script") == 1
     assert "Failed checks" not in render_html(build_run_report(replace(trace, checks=())))

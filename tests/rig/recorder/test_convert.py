@@ -134,7 +134,7 @@ FILES = {"x.csv": b"t,com,xj,cor\n0,0,0,0\n0.001,0,0,0\n", "bad.log": b"hello\n"
     ("export {log} --out x.xlsx", "ends in .csv"), ("export x.csv --out x.blf", "raw frames"),
     ("export x.mcap --out x.blf", "at least one raw frame"), ("import bad.log", "CAN frames as .log"),
     ("import bad.blf", "CAN frames as .blf"), ("import silent.log", "SYNC"),
-    ("import silent.log --dbc bad.dbc", "a DBC file"), ("import silent.log --dbc other.dbc", "frame 0x202")])
+    ("import silent.log --dbc bad.dbc", "expected a DBC ("), ("import silent.log --dbc other.dbc", "frame 0x202")])
 def test_refusals(log: Path, words: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name, content in FILES.items():

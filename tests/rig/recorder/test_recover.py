@@ -120,7 +120,7 @@ def test_refusals(whole: Path, tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("t,com,xj,cor\n")
     with pytest.raises(InputError, match="MCAP log"):
         recover_log(tmp_path / "text.mcap", tmp_path / "out.mcap")
-    with pytest.raises(InputError, match="readable file"):
+    with pytest.raises(InputError, match="a file that can be read"):
         recover_log(tmp_path / "none.mcap", tmp_path / "out.mcap")
     with pytest.raises(InputError, match="another file"):
         recover_log(whole, whole)

@@ -122,7 +122,8 @@ def test_checks_turn_when_their_window_is_over(preflight: Path) -> None:
     assert seen["overshoot, 5 mm"] == seen["position"] == ["waits", "measures", "PASS"]
     for name, state in run.checks.items():
         assert state.word == ("PASS" if final[name].passed else "FAIL"), name
-        np.testing.assert_allclose(state.value, final[name].value, rtol=1e-9, err_msg=name)
+        assert state.result is not None
+        np.testing.assert_allclose(state.result.value, final[name].value, rtol=1e-9, err_msg=name)
 
 
 def test_a_limit_that_is_passed_fails_at_once(preflight: Path) -> None:
@@ -130,7 +131,7 @@ def test_a_limit_that_is_passed_fails_at_once(preflight: Path) -> None:
     t_ns, signals = records[4000]
     records[4000] = t_ns, replace(signals, xj=7e-3)  # type: ignore[call-arg]  # the limit is 6 mm for all of main
     add(run, records[:8000])
-    assert run.checks["position"].word == "FAIL" and run.checks["position"].value == pytest.approx(7.0)
+    assert (run.checks["position"].word, run.checks["position"].measured) == ("FAIL", " 7 mm")
     assert run.checks["pressure, unloaded"].word == "measures"
     assert run.read_rows_from(0).shape == (4000, len(run.plan.columns)) and run.read_last("xj", 2000)[0] == 7e-3
 
@@ -161,8 +162,8 @@ def test_events_stand_at_their_cycle(begin_ns: int, tmp_path: Path) -> None:
         run.add(t_ns, Timing(cycle, False, 0.0, 0.0, 0.0))
     run.judge_checks()
     assert [event.t for event in run.events] == [-0.02, 0.0, 0.0, 0.1] and run.t == 0.199
-    assert [(state.word, state.value) for state in run.checks.values()] == [
-        ("PASS", 1.0), ("FAIL", 1.0), ("PASS", 0.0), ("PASS", 1.0)]
+    assert [(state.word, state.measured) for state in run.checks.values()] == [
+        ("PASS", " 1"), ("FAIL", " 1"), ("PASS", " 0 s"), ("PASS", " 1")]
 
 
 @pytest.mark.parametrize("size", [(80, 24), (60, 20), (200, 60)])
