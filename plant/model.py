@@ -28,11 +28,6 @@ SHIPPED_MODELS = ("servo", "emps")  # plant/models/NAME.toml, beside the nominal
 STEP = 1e-5  # s, of the solver; its error is measured in the docs
 
 
-def find_parameter_groups(effects: Iterable[str] | None = None, plant: str = "eha") -> dict[str, type[Any]]:
-    """The parameter groups of a plant and of `effects` (default: all effects of the catalogue that suit the plant)."""
-    return plants.find_plant(plant).list_groups(effects)
-
-
 def list_offered_effects(plant: str = "eha") -> list[Effect]:
     """The effects of the catalogue that suit a plant."""
     return plants.find_plant(plant).list_effects()
@@ -52,7 +47,7 @@ def find_quantity(name: str, where: object = "--set", plant: str = "eha") -> Qua
     own = {e.name: e.fitted for e in list_offered_effects(plant) if e.base}.get(name.partition(".")[0])
     if own and name not in own:
         raise InputError(where, name, f"{' or '.join(own)}: the parameter that this effect is in this plant")
-    return find_field(where, name, find_parameter_groups(plant=plant))
+    return find_field(where, name, plants.find_plant(plant).list_groups())
 
 
 @dataclass(frozen=True)
@@ -147,7 +142,7 @@ class Model:
         return [f"{group}.{f}" for group, cls in self._find_groups().items() for f in cls._fields]
 
     def _find_groups(self) -> dict[str, type[Any]]:
-        return find_parameter_groups(self.effects, self.plant)
+        return self.kind.list_groups(self.effects)
 
     def build_record(self) -> NDArray[Any]:
         """The values as a record array of one row, fields group.field; compiled code reads it in each step."""
@@ -252,8 +247,8 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
         raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown[0]!r}{hint}")
     if not isinstance(design, Mapping):
         raise InputError(where, "design", "tables [design.GROUP] of nominal values")
-    values = flatten_tables(where, tables, find_parameter_groups(plant=plant))
-    usual = flatten_tables(where, design, find_parameter_groups((), plant))
+    values = flatten_tables(where, tables, plants.find_plant(plant).list_groups())
+    usual = flatten_tables(where, design, plants.find_plant(plant).list_groups(()))
     bare = build_bare_model(plant, name)
     sized = replace(bare, values={**bare.values, **usual}, design=usual)
     check_combinations(where, sized.values)
@@ -305,8 +300,3 @@ def _build_kernel(function: Function, effects: tuple[str, ...], laws: tuple[Any,
                   ) -> Function:
     # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
     return (compile_function if fast else interpret_function)(function, kind.bind_functions(effects))
-
-
-def collect_bindings(effects: tuple[str, ...], plant: str = "eha") -> dict[str, Function]:
-    """The functions that take the place of the placeholders in the kernels of a plant with `effects`."""
-    return plants.find_plant(plant).bind_functions(effects)

@@ -18,7 +18,7 @@ from plant.flat import make_packers
 from plant.foreign import run_foreign_loop
 from plant.kernels import write_reader
 from plant.machine_code import Call, StoredCode
-from plant.model import Model, build_kernel, collect_bindings
+from plant.model import Model, build_kernel
 from plant.plants import Plant, find_plant
 from plant.segments import Array
 from plant.signals import EHA, Signals
@@ -322,6 +322,6 @@ def load_stored_advance(effects: tuple[str, ...], plant: str = "eha") -> StoredC
 @cache
 def _load_stored_advance(effects: tuple[str, ...], laws: tuple[Any, ...], kind: Plant) -> StoredCode:
     # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
-    source = compute_fingerprint(interpret_function(advance_flat_state, collect_bindings(effects, kind.key)))
+    source = compute_fingerprint(interpret_function(advance_flat_state, kind.bind_functions(effects)))
     compile_code = partial(build_kernel, advance_flat_state, effects, True, kind.key)
     return StoredCode(find_cache_folder() / source, compile_code)

@@ -21,8 +21,7 @@ from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import Trace
 from plant import load_model
 from rig.run.job import Job
-from rig.run.outcome import Outcome
-from rig.run.runner import run_job
+from rig.run.runner import Outcome, run_job
 from rig.sequences.sequence import parse_sequence
 from studies.command import report_progress, run_study_command
 

@@ -78,7 +78,7 @@ from fdi.thresholds import BAND_NEAREST_LIMIT_SD
 from fdi.trace.sections import Section as CommandSection
 from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace
-from plant.model import Model, find_quantity, list_offered_effects
+from plant.model import Model, find_quantity
 
 LEVEL_NAMES = {Level.ACCEPTABLE: "acceptable", Level.MAINTENANCE: "maintenance", Level.NON_NOMINAL: "non-nominal",
                None: "cannot be judged"}
@@ -195,7 +195,7 @@ def describe_group(d: Diagnosis, group: Group) -> str:
 def describe_separation(d: Diagnosis, group: Group) -> str:
     """What would tell the faults of a group apart: signals that were not measured, or another test."""
     unmeasured = [s.symbol for s in d.model.kind.signals.outputs if s.name not in d.trace.outputs]
-    owners = [e for e in list_offered_effects(d.model.plant) for f in d.faults
+    owners = [e for e in d.model.kind.list_effects() for f in d.faults
               if f.name in group.names and f.parameter in e.fitted and e.revealed_by]
     ways = [f"a recording with {join_words(unmeasured)}"] if unmeasured else []
     ways += [f"{e.name}: {e.revealed_by}" for e in owners]

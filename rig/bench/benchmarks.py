@@ -44,7 +44,6 @@ from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.hard_loop import compile_cycle
 from rig.run.loop import CycleInput, CycleLoop, History, Loop
 from rig.run.loops import open_loop
-from rig.run.outcome import INTERRUPTED
 from rig.run.priority import (
     LOOP_PRIORITY,
     list_cpus,
@@ -53,6 +52,7 @@ from rig.run.priority import (
     raise_priority,
     suspend_garbage_collection,
 )
+from rig.run.runner import INTERRUPTED
 from rig.sequences import load_sequence
 from rig.sequences.faults import Plan, Schedule
 

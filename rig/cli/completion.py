@@ -38,9 +38,10 @@ def build_completion_parser(line: str) -> argparse.ArgumentParser:
 
 def complete_parameter(prefix: str, **_: Any) -> Iterable[str]:
     """Parameters for --set, with the equals sign."""
-    from plant.model import find_parameter_groups
+    from plant.plants import find_plant
 
-    names = (f"{group}.{field}=" for group, fields in find_parameter_groups().items() for field in fields._fields)
+    groups = find_plant("eha").list_groups()
+    names = (f"{group}.{field}=" for group, fields in groups.items() for field in fields._fields)
     return [name for name in names if name.startswith(prefix)]
 
 
@@ -62,9 +63,9 @@ def complete_sequence(prefix: str, **_: Any) -> Iterable[str]:
 
 def complete_effect(prefix: str, **_: Any) -> Iterable[str]:
     """Effects of the catalogue; the traces and model files that follow them."""
-    from plant.model import list_offered_effects
+    from plant.plants import find_plant
 
-    names = [e.name for e in list_offered_effects() if e.name.startswith(prefix)]
+    names = [e.name for e in find_plant("eha").list_effects() if e.name.startswith(prefix)]
     return names + _list_files(prefix, (".mcap", ".csv", ".csv.gz", ".toml"))
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from fdi.discovery.update_model import Provenance, load_model_file
 from plant.errors import InputError, suggest_name
-from plant.model import Model, list_offered_effects, load_model
+from plant.model import Model, load_model
+from plant.plants import find_plant
 from rig.cli.answer import choose_file
 from rig.cli.inputs import load_chosen_effects, parse_changes
 
@@ -33,7 +34,7 @@ def split_words(words: Sequence[str], trace: str | None, plant: str) -> tuple[li
     Raises:
         InputError: a word that is neither an effect nor a trace; it offers the nearest effect.
     """
-    effects, known = [], [e.name for e in list_offered_effects(plant)]
+    effects, known = [], [e.name for e in find_plant(plant).list_effects()]
     for word in words:
         is_file = word.endswith((".csv", ".csv.gz", ".mcap")) or Path(word).exists()
         if word in known:

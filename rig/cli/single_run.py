@@ -23,10 +23,9 @@ from rig.network.bus import choose_bus
 from rig.network.clock import WallClock
 from rig.recorder import Event, Observer, Record
 from rig.run.job import Job, JobChoice, build_job, find_differences, read_job, replace_settings
-from rig.run.outcome import Outcome, diagnose_servovalve
 from rig.run.page_writer import PageWriter
 from rig.run.participants import EMBEDDED_NAMES
-from rig.run.runner import run_job
+from rig.run.runner import Outcome, diagnose_servovalve, run_job
 from rig.view.live_process import ViewerPlace, find_viewer_place, show_live
 from rig.view.live_run import find_named_node, make_live_plan
 

@@ -10,7 +10,6 @@ from typing import cast
 from plant import Model
 from plant.compile import interpret_function
 from plant.controller import Loop, compute_current
-from plant.model import collect_bindings
 from plant.run import Demand, report_law_errors
 from rig.benches.bench import Bench, Role, SignalObject, make_reader, make_writer
 from rig.benches.bench_file import load_bench
@@ -159,7 +158,7 @@ class StandIn:
 
     def __init__(self, send: Send, bench: Bench, model: Model) -> None:
         self._send, self._model, self._record = send, model, model.build_record()[0]
-        parts = collect_bindings(model.effects, model.plant)
+        parts = model.kind.bind_functions(model.effects)
         self._law = interpret_function(parts["control_plant"], parts)
         self._memory = model.kind.build_control_memory()
         self._readers = {spec.identifier: make_reader(spec) for spec in bench.frames.list_from(Role.RIG)}

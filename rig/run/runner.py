@@ -1,31 +1,41 @@
-"""Runs one job: nodes and bus, log, session, checks, verdict.json."""
+"""Runs one job (nodes and bus, log, session, checks), and its outcome: verdict, checks, timing, verdict.json."""
+from __future__ import annotations
 
 import contextlib
 import fcntl
+import json
 import os
-from collections.abc import Callable, Iterator
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import isnan
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from fdi.output import write_text
 from fdi.progress import Progress
+from fdi.report.report import to_plain
 from fdi.trace.check_result import CheckResult
-from fdi.trace.trace import Trace
-from plant import Actuator, InputError
-from plant.errors import report_system_error
+from fdi.trace.trace import Event, Trace
+from plant import Actuator
+from plant.errors import InputError, report_system_error
+from plant.model import Model
 from plant.run import make_columns_type
 from plant.segments import Array
-from rig.benches.bench import Flags
+from plant.signals import Signals
+from rig.benches.bench import Flags, Role
 from rig.network.clock import WallClock
-from rig.network.node_objects import CycleRecord
+from rig.network.node_objects import NAMES, PLANT, CycleRecord, Identity
 from rig.recorder import Observer, Recorder
 from rig.recorder.schema import collect_provenance, read_epoch_ns
-from rig.run.attribution import Attribution, CycleRecords, attribute, find_injected
+from rig.run.attribution import Attribution, Cause, CycleRecords, Trouble, attribute, count_most_in_a_row, find_injected
 from rig.run.job import Job, find_differences
-from rig.run.loop import History
+from rig.run.loop import History, Loop
 from rig.run.loops import compile_loop
-from rig.run.outcome import Outcome, describe_faults, find_limits, summarise_timing
 from rig.run.participants import open_participants
 from rig.run.priority import (
     LOOP_PRIORITY,
@@ -38,9 +48,343 @@ from rig.run.priority import (
 from rig.run.session import MAIN, Session
 from rig.sequences.checks import SkippedCheck, evaluate_checks, find_skipped
 from rig.sequences.faults import Schedule
-from rig.sequences.protocol import Mask, judge_protocol
+from rig.sequences.protocol import HEARTBEAT, Mask, judge_protocol
 from rig.sequences.python_parts import StepRun
 from rig.sequences.uncertainty import NO_METROLOGY, Metrology, collect_metrology
+
+STATUS_OF_VERDICT = {"PASS": 0, "NOT_JUDGED": 0, "FAIL": 1, "CANNOT_TELL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """A finished run."""
+
+    job: Job
+    folder: Path
+    checks: Sequence[CheckResult]
+    events: Sequence[Event]
+    aborted: str  # why main ended early, or ""
+    safe: bool  # the safe state was entered
+    interrupted: bool
+    timing: dict[str, Any]
+    counters: dict[str, int]
+    speed: float  # multiple of real time, of the cycles alone
+    attribution: Attribution
+    due_ns: Sequence[int]  # log time of each cycle
+    start_times: Mapping[Role, float]  # s from NMT start to OPERATIONAL
+    identities: Mapping[Role, Identity]
+    skipped: Sequence[SkippedCheck] = ()  # they do not apply to the bench
+    limits: Sequence[LimitReached] = ()  # of travel and current, that the run reached
+    fdi: dict[str, Any] = field(default_factory=dict)  # diagnosis of `rig fdi`, if it was requested
+    metrology: Metrology = NO_METROLOGY
+    started_ns: int = 0  # since 1970
+
+    @property
+    def verdict(self) -> str:
+        """PASS, FAIL, CANNOT_TELL, INVALID_TIMING, ABORTED or NOT_JUDGED.
+
+        If the bench itself was late, the controller is not judged. Without checks in the sequence nothing says what
+        the actuator should have done: then the protocol checks can fail a run, but not pass it.
+        """
+        if self.timing_problem and not self.interrupted:
+            return "INVALID_TIMING"
+        if self.aborted:
+            return "ABORTED"
+        if self.failures:
+            return "FAIL"
+        if self._list_checks("CANNOT_TELL"):
+            return "CANNOT_TELL"
+        # Whether anything says what the actuator should do: a check, the end of the sequence, or `rig fdi`.
+        sequence = self.job.sequence
+        is_judged = sequence.checks or sequence.ends == "safe_state" or self.fdi.get("verdict") == "ACCEPTABLE"
+        return "PASS" if is_judged else "NOT_JUDGED"
+
+    @property
+    def failures(self) -> list[str]:
+        """The checks that failed, an end other than the one the sequence requires, and the faults found."""
+        failed = [check.name for check in self._list_checks("FAIL")]
+        if self.job.sequence.ends == "safe_state" and not self.safe:
+            failed.append("the run did not end in the safe state")
+        if has_fault(self.fdi):
+            failed.append(f"rig fdi: {self.fdi['sentence'].rstrip('.')}")
+        return failed
+
+    def _list_checks(self, verdict: str) -> list[CheckResult]:
+        return [check for check in self.checks if check.verdict == verdict]
+
+    @property
+    def timing_problem(self) -> str:
+        """Why the bench itself was too late to judge the controller; empty if it was not."""
+        cause = self.attribution.cause
+        if cause is not None and cause.is_lateness:
+            return self.describe_cause()
+        if cause is not None and cause.is_gone and self.aborted:
+            return ""  # a dead node is no matter of timing
+        if self.job.realtime and (problem := self._find_excess()):
+            return problem
+        if self.aborted or not self.failures:
+            return ""
+        failed = self._list_checks("FAIL")
+        is_fault_found = has_fault(self.fdi)
+        is_affected = (len(failed) + is_fault_found == len(self.failures) and all(map(self._is_affected, failed))
+                       and (not is_fault_found or bool(self.attribution.affected.any())))
+        if self.attribution.by_bench or is_affected:
+            return (f"the bench was late, and the checks that failed depend on it: {'; '.join(self.failures)}; "
+                    f"{self._describe_first_lateness()}")
+        return ""
+
+    def _find_excess(self) -> str:
+        """Whether there were more overruns than the sequence accepts, up to the first cause of trouble; in words."""
+        policy, overruns = self.job.sequence.timing, self.attribution.overruns.copy()
+        overruns[:round(policy.grace * self.job.bench.rate)] = 0
+        if self.attribution.cause is not None and self.aborted:
+            overruns = overruns[:self.attribution.cause.cycle]
+        total, most, cycles = int(overruns.sum()), policy.most_in_a_row, self.timing["cycles"]
+        if self.job.max_overruns < 1 and total > self.job.max_overruns * cycles:
+            # a run that skipped periods has more overruns than cycles
+            found = f"{total} overruns in {cycles} cycles, more than {100 * self.job.max_overruns:g} %:"
+        elif most is not None and (in_a_row := count_most_in_a_row(overruns)) > most:
+            found = f"{in_a_row} overruns in a row, {most} are accepted:"
+        else:
+            return ""
+        return (f"the bench itself was late: {found} the controller cannot be judged; "
+                f"{self._describe_first_lateness()}")
+
+    def _is_affected(self, check: CheckResult) -> bool:
+        """Whether a check saw rows that lateness of the bench changed, or the heartbeats of a bench that was late."""
+        if check.signal == HEARTBEAT:
+            return self._is_plant_off
+        first, last = (0.0 if isnan(t) else t for t in (check.t0, check.t1))
+        start, rate = self.job.scenario.plan.start, self.job.bench.rate
+        rows = slice(start + round(first * rate), start + round(last * rate) if last > first else None)
+        return bool(self.attribution.affected[rows].any())
+
+    @property
+    def _is_plant_off(self) -> bool:
+        """Whether the heartbeat period of the plant, a part of the bench, is wrong: then others' prove nothing."""
+        return any(check.signal == HEARTBEAT and check.name.endswith(NAMES[PLANT]) and not check.passed
+                   for check in self.checks)
+
+    def _describe_first_lateness(self) -> str:
+        first = min(self.attribution.disturbances, key=lambda found: found.first, default=None)
+        if first is None:
+            return "the plant's own heartbeat was not on time" if self._is_plant_off else ""
+        return f"first t = {self.find_time(first.first):.3f} s: {first.text}"
+
+    def find_time(self, cycle: int) -> float:
+        """The time of a cycle, s of main."""
+        return (cycle - self.job.scenario.plan.start) / self.job.bench.rate
+
+    def describe_cause(self) -> str:
+        """The first cause with its time, and what followed from it; empty if there was no trouble."""
+        cause = self.attribution.cause
+        if cause is None:
+            return ""
+        if cause.text == self.aborted and not self.attribution.consequences:
+            return self.aborted
+        then = [f"{trouble.text} at {self.find_time(self._find_cycle(trouble)):.3f} s"
+                for trouble in self.attribution.consequences[:4]]
+        text = f"t = {self.find_time(cause.cycle):.3f} s: {cause.text}"
+        return f"{text}; then: {', '.join(then)}" if then else text
+
+    def _find_cycle(self, trouble: Trouble) -> int:
+        return max(bisect_right(self.due_ns, trouble.t_ns) - 1, 0)
+
+    @property
+    def why(self) -> str:
+        """The reason of a verdict other than PASS, in words, and the calibrations that do not hold."""
+        passed = sum(check.passed for check in self.checks)
+        words = {"NOT_JUDGED": f"the sequence has no checks; {passed} protocol checks passed",
+                 "FAIL": "; ".join(self.failures), "INVALID_TIMING": self.timing_problem,
+                 "CANNOT_TELL": "too uncertain for a verdict: " + "; ".join(
+                     check.name for check in self._list_checks("CANNOT_TELL")),
+                 "ABORTED": self.describe_cause() or self.aborted}
+        reason, problems = words.get(self.verdict, ""), list(self.metrology.problems.values())
+        return "; ".join([reason or "every check passed", *problems] if problems else [reason])
+
+    @property
+    def status(self) -> int:
+        """Exit status of `rig run`."""
+        return INTERRUPTED if self.interrupted else STATUS_OF_VERDICT[self.verdict]
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of `rig run --json` and verdict.json; null for NaN and infinity."""
+        events, omitted = select_events(self.events)
+        return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.why,
+                "checks": [to_plain(check.collect_data()) for check in self.checks],
+                "not_applicable": [check._asdict() for check in self.skipped],
+                "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
+                **self._attribution_to_json(), "differences": find_differences(self.job).to_json(),
+                "decision": self.metrology.decision, "calibration": {
+                    name: each.to_json(self.started_ns) for name, each in self.metrology.calibration.items()},
+                "limits": [limit._asdict() for limit in self.limits],
+                "nodes": {str(self.job.bench.find_number(role)): {
+                    "name": NAMES[role], "identity": vars(self.identities[role]),
+                    "operational_ms": round(1e3 * self.start_times[role], 1) if role in self.start_times else None}
+                    for role in sorted(self.identities)},
+                "events": [to_plain(event._asdict()) for event in events], "events_omitted": omitted,
+                "run": self.job.list_settings(), "fdi": self.fdi}
+
+    def _attribution_to_json(self) -> dict[str, Any]:
+        found = self.attribution
+        cause = None if found.cause is None else {
+            "source": self._name_source(found.cause), "kind": found.cause.kind, "t": self.find_time(found.cause.cycle),
+            "cycle": found.cause.cycle, "text": found.cause.text, "evidence": list(found.cause.evidence)}
+        consequences = [{"t": self.find_time(self._find_cycle(trouble)), "source": self._name_node(trouble.node),
+                         "kind": trouble.kind, "text": trouble.text} for trouble in found.consequences]
+        cycles = len(found.judged)
+        judged = {"cycles": cycles, "judged": int(found.judged.sum()), "invalid": found.invalid,
+                  "overruns": int(found.overruns.sum()),
+                  "lateness": [{"t": self.find_time(each.first), "cycle": each.first, "last": each.last,
+                                "source": self._name_node(each.source), "text": each.text}
+                               for each in found.disturbances[:100]]}
+        return {"cause": cause, "consequences": consequences[:100], "judged": judged}
+
+    def _name_source(self, cause: Cause) -> str:
+        """Who a cause names: a node, "sequence" for a fault of the sequence, "bench", else the kind of the trouble."""
+        if cause.kind == "injected":
+            return "sequence"
+        if cause.is_lateness and cause.source == 0:
+            return "bench"
+        return self._name_node(cause.source) or cause.kind
+
+    def _name_node(self, number: int) -> str:
+        return self.job.bench.describe_node(Role(number)) if number else ""
+
+    def describe_attribution(self) -> dict[str, str]:
+        """First cause and consequences as they stand in the log; evidence and consequences are JSON."""
+        found = self._attribution_to_json()
+        cause = found["cause"] or {}
+        return {"t": f"{cause.get('t', 0.0):.3f}", "source": str(cause.get("source", "")),
+                "text": str(cause.get("text", "")), "evidence": json.dumps(cause.get("evidence", [])),
+                "consequences": json.dumps(found["consequences"])}
+
+    def save(self) -> None:
+        """Write verdict.json."""
+        write_text(self.folder / "verdict.json", json.dumps(self.to_json(), indent=1) + "\n")
+
+
+def select_events(events: Sequence[Event], most: int = 200) -> tuple[list[Event], dict[str, int]]:
+    """The first `most` events of each kind, in order, and how many of each kind are omitted; the log has them all."""
+    counts: Counter[str] = Counter()
+    selected = []
+    for event in events:
+        counts[event.kind] += 1
+        if counts[event.kind] <= most:
+            selected.append(event)
+    return selected, {kind: count - most for kind, count in counts.items() if count > most}
+
+
+def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str, reason: str = "") -> dict[str, Any]:
+    """Percentiles of lateness, response and execution in us, as `rig run --json` gives them.
+
+    `kind`: "lockstep", "hard real time" (the cycle is compiled code) or "soft real time" (the cycle is Python).
+    `reason`: which cycles are Python in real time, and why.
+    """
+    return {"kind": kind, "reason": reason, "cycles": len(history), "overruns": loop.overruns,
+            "underruns": loop.underruns, "scheduler": scheduler,
+            "execution_us": _compute_percentiles(history.column("execution")),
+            "lateness_us": _compute_percentiles(history.column("lateness")),
+            "response_us": _compute_percentiles(history.column("response"))}
+
+
+def _compute_percentiles(seconds: Array) -> dict[str, float | None]:
+    """Percentiles of the values that are not missing, in us."""
+    values = seconds[~np.isnan(seconds)] * 1e6
+    if not len(values):
+        return dict.fromkeys(("p50", "p99", "p99_9", "max"))
+    p50, p99, p99_9 = np.percentile(values, (50, 99, 99.9))
+    return {"p50": round(p50, 1), "p99": round(p99, 1), "p99_9": round(p99_9, 1), "max": round(float(values.max()), 1)}
+
+
+NEAR_A_STOP = 5.0  # standard deviations of the sensor's noise from a stop within which a reading is at it
+
+
+class LimitReached(NamedTuple):
+    """A limit that a run reached."""
+
+    parameter: str  # of the model: the limit
+    signal: str
+    limit: float  # SI; reached on either side of zero
+    t: float  # s of main, when it was reached first
+    seconds: float  # how long the signal was there, in all
+
+    def describe(self, signals: Signals) -> str:
+        """The limit in words, such as "ram at its stop (40 mm) for 120 ms, first at t = 1.250 s"."""
+        signal = signals.find(self.signal)
+        words = f"{signal.phrase} at its {'limit' if signal.role == 'drive' else 'stop'}"
+        shown = signals.controlled if signal.unit == signals.controlled.unit else signal
+        return (f"{words} ({shown.shown_scale * self.limit:.3g} {shown.shown_unit}) for "
+                f"{1e3 * self.seconds:.0f} ms, first at t = {self.t:.3f} s")
+
+
+def find_limits(column: Callable[[str], NDArray[np.float64]], model: Model, zero: int) -> tuple[LimitReached, ...]:
+    """The limits that the signals of a run reached.
+
+    Args:
+        column: gives a signal of all cycles, SI; NaN for missing samples.
+        model: its travels, current limit, cycle and sensor noise.
+        zero: the cycle in which main starts.
+    """
+    signals = model.kind.signals
+    ways = [s for s in signals.outputs if s.unit == signals.controlled.unit]
+    period, found = model["controller.period"], []
+    for signal in (*ways, signals.drive):
+        limit = model.values.get(signal.limit)
+        if limit is None:  # the plant declares none
+            continue
+        margin = NEAR_A_STOP * model.values.get(signal.noise, 0.0)
+        if signal.role == "drive":
+            margin = 2.5e-6 * limit  # two counts of the drive frame
+        rows = np.flatnonzero(np.abs(column(signal.name)) >= limit - margin)
+        if len(rows):
+            found.append(LimitReached(signal.limit, signal.name, limit, (int(rows[0]) - zero) * period,
+                                      len(rows) * period))
+    return tuple(found)
+
+
+FDI_FAILS = ("MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE")  # verdicts of rig fdi that fail a run
+
+
+def diagnose_servovalve(trace: Trace, progress: Progress, workers: int = 2) -> dict[str, Any]:
+    """The answer of `rig fdi --json` on the main phase of a run, against the nominal unit.
+
+    A phase that cannot be judged, for example a short one, gives CANNOT_TELL with the reason. `workers`: threads.
+    """
+    from fdi.diagnosis.diagnosis import diagnose  # here: loads the compiler, which other runs do not need
+    from fdi.report.diagnosis_report import collect_data
+    from fdi.report.report import to_plain
+
+    try:
+        diagnosis = diagnose(trace, progress=progress, source=trace.provenance["source"], workers=workers)
+    except InputError as error:
+        return {"verdict": "CANNOT_TELL", "sentence": f"not judged: {error}"}
+    return dict(to_plain(collect_data(diagnosis)))
+
+
+def has_fault(answer: Mapping[str, Any]) -> bool:
+    """Whether a diagnosis found a fault of the servovalve beyond acceptable, or another deviation."""
+    return answer.get("verdict") in FDI_FAILS
+
+
+def describe_faults(answer: Mapping[str, Any], *levels: str) -> str:
+    """Level and size of both faults with its interval, in words; with `levels` only of faults at one of these.
+
+    "" if there is none, or the trace could not be judged.
+    """
+    if not answer.get("level"):
+        return ""
+    from fdi.report.diagnosis_report import list_found_faults
+
+    return "; ".join(f"{found.name} {found.level}, {found.size}" for found in list_found_faults(answer)
+                     if not levels or found.level in levels)
+
+
+def describe_finding(answer: Mapping[str, Any]) -> str:
+    """What a diagnosis found beyond acceptable, in a few words: the faults with their sizes, else its verdict."""
+    return f"rig fdi: {describe_faults(answer, 'maintenance', 'non-nominal') or answer['verdict']}"
+
 
 Diagnose = Callable[[Trace], dict[str, Any]]
 
@@ -245,5 +589,3 @@ def _count_lost_frames(history: History) -> dict[str, int]:
             "no_drive": int(np.isnan(history.column(history.signals.drive.name)).sum()),
             "plant_drive_missing": int((flags & Flags.DRIVE_MISSING != 0).sum()),
             "plant_drive_late": int((flags & Flags.DRIVE_LATE != 0).sum())}
-
-

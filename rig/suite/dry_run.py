@@ -35,7 +35,7 @@ from plant.run import Columns, make_columns_type
 from plant.segments import Array
 from plant.signals import Signals
 from rig.run.job import Job, find_differences
-from rig.run.outcome import LimitReached, find_limits
+from rig.run.runner import LimitReached, find_limits
 from rig.sequences.checks import Guard, evaluate_checks
 from rig.sequences.faults import (
     Corrupted,

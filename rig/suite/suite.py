@@ -37,9 +37,16 @@ from rig.evidence.requirements import (
 )
 from rig.network.clock import WallClock
 from rig.run.job import JobChoice, build_job, find_differences, load_tested_sequence
-from rig.run.outcome import INTERRUPTED, Outcome, describe_faults, describe_finding, diagnose_servovalve, has_fault
 from rig.run.participants import EMBEDDED_NAMES
-from rig.run.runner import run_job
+from rig.run.runner import (
+    INTERRUPTED,
+    Outcome,
+    describe_faults,
+    describe_finding,
+    diagnose_servovalve,
+    has_fault,
+    run_job,
+)
 from rig.sequences.checks import SkippedCheck
 
 Value = float | str

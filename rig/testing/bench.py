@@ -26,8 +26,7 @@ from plant.errors import InputError
 from plant.plants import find_plant
 from plant.segments import RATE
 from rig.run.job import JobChoice, build_job, load_tested_plant
-from rig.run.outcome import Outcome
-from rig.run.runner import run_job
+from rig.run.runner import Outcome, run_job
 from rig.sequences.sequence import Sequence as TestSequence
 from rig.sequences.sequence import load_sequence, parse_sequence
 

@@ -22,7 +22,7 @@ from plant.effects.supply import Drawn, supply_droop
 from plant.eha import State, compute_coefficients, compute_metering_line, step_actuator
 from plant.eha import step_jack as ram
 from plant.flat import unpack_state
-from plant.model import collect_bindings
+from plant.plants import find_plant
 from plant.state import Input, Line
 from rig.benches.profiles import Control
 
@@ -201,7 +201,7 @@ def test_implicit_effects_against_an_explicit_integration(changes: dict[str, flo
                        22e3 * np.sin(6 * np.pi * t))
     every = round(h / fine)
     ours = np.empty((2, len(paths[h][0])))
-    run = compile_function(_moved, collect_bindings(model.effects))
+    run = compile_function(_moved, model.kind.bind_functions(model.effects))
     run(model.build_flat_state(), *paths[h], model.build_record(), h, ours)
     error = ours - simulate_jack(model.values, *paths[fine], fine)[:, every - 1::every]
     assert (np.sqrt((error**2).mean(axis=1)) * [1e6, 1e-5] < [um, bar]).all()
@@ -215,7 +215,7 @@ def test_compressibility_resonates_where_it_should_and_the_step_damps_nothing(h:
     out = np.empty((2, round(0.05 / h)))
     start = model.build_flat_state()
     start[State._fields.index("jack_speed")] = 0.01
-    run = compile_function(_moved, collect_bindings(model.effects))
+    run = compile_function(_moved, model.kind.bind_functions(model.effects))
     run(start, *np.zeros((2, out.shape[1])), model.build_record(), h, out)
     matrix = np.array([[-v["jack.damping"] / v["jack.mass"], v["jack.area"] / v["jack.mass"]],
                        [-v["jack.area"] / stored, -(v["valve.flow_gain"] / v["valve.pressure_gain"]
@@ -400,7 +400,7 @@ def test_friction_only_takes_energy(v: float, rise: float, speed: float, asymmet
                                                "presliding.deflection": deflection})
     p, (s, m) = model.build_record()[0], model.build_start()
     k, u, s = compute_coefficients(p, H), Input(h=H), s._replace(jack_speed=v)
-    moved = interpret_function(step_actuator, collect_bindings(names))
+    moved = interpret_function(step_actuator, find_plant("eha").bind_functions(names))
     stiffness = 800.0 / deflection if deflection else 0.0
     last = np.inf
     for _ in range(60):
@@ -433,7 +433,7 @@ def test_a_mass_on_the_ram_has_the_antiresonance_and_the_resonance_of_two_masses
     mass, f, ratio, push, h = 60.0, 60.0, 0.03, 500.0, 4e-5
     model = SMOOTH.replace({"structural_resonance.mass": mass, "structural_resonance.frequency": f,
                             "structural_resonance.damping_ratio": ratio})
-    p, moved = model.build_record()[0], interpret_function(ram, collect_bindings(["structural_resonance"]))
+    p, moved = model.build_record()[0], interpret_function(ram, model.kind.bind_functions(model.effects))
     k, resonance = compute_coefficients(p, h), f * np.sqrt(1.0 + mass / p.jack.mass)
     k = k._replace(jack_coupled=k.jack_free)  # as the oil has no part in it
     sizes = []

@@ -21,7 +21,6 @@ from plant.effects import CATALOGUE, load_effects
 from plant.flat import unpack_state
 from plant.kernel_use import KernelUse
 from plant.lanes import FEWEST, NARROW, Lanes, Part, compile_kernels, list_kernel_variants, plan_layout
-from plant.model import collect_bindings
 from plant.monitor import FAULTS, Cell, Monitor, Motion, compute_cells, step_monitor
 from plant.solve import read_sensors, step_cycle
 from plant.threads import map_together
@@ -64,7 +63,7 @@ def one_run(model: Model, current: np.ndarray, load: np.ndarray, position: np.nd
             anchor: float = 0.0, steps: int = 10) -> np.ndarray:
     """The same in plain Python, one run, (n, outputs)."""
     out = np.empty((len(current), len(model.kind.signals.outputs)))
-    run = interpret_function(replay_drive, collect_bindings(model.effects, model.plant))
+    run = interpret_function(replay_drive, model.kind.bind_functions(model.effects))
     position = np.empty(0) if position is None else position
     run(model.build_flat_state(), current, load, position, anchor, model.build_record(), steps, out)
     return out
@@ -292,7 +291,7 @@ def test_an_anchored_replay_does_not_pull_the_ram_through_the_play_of_its_rod() 
 def test_the_transducer_moves_along_where_the_ram_is_pulled() -> None:
     """With play, a lag and an elastic mount before the transducer: an anchored run shows the pull at once and whole."""
     model = Model().replace({"rod_backlash.width": 4e-5, "sensor_lag.time": 3e-3, "mount_compliance.compliance": 1e-9})
-    pull, show = (interpret_function(f, collect_bindings(model.effects)) for f in (pull_plant, show_start))
+    pull, show = (interpret_function(f, model.kind.bind_functions(model.effects)) for f in (pull_plant, show_start))
     p = model.build_record()[0]
     before, m = model.build_start()
     after, m = pull(before, m, 0.5, before.sensed + 2e-5, 0.0, p)

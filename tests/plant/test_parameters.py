@@ -15,8 +15,9 @@ from refusals import catch_refusal
 
 import plant
 from plant import Actuator, InputError, Model, load_model, simulate
-from plant.model import find_parameter_groups, find_quantity
+from plant.model import find_quantity
 from plant.parameters import GROUPS, load_nominal_values
+from plant.plants import find_plant
 from plant.profile import build_profile, parse_columns, read_command, resample_on_cycles
 from plant.quantity import Quantity, list_quantities
 from plant.segments import KINDS, Chirp, Csv, Hold, Multisine, Points, Ramp, Segment, Sine, Step
@@ -112,7 +113,7 @@ def test_words_numbers_and_texts_are_accepted_and_give_a_new_model() -> None:
 
 
 def test_every_parameter_says_what_it_is() -> None:
-    for group, cls in find_parameter_groups().items():
+    for group, cls in find_plant("eha").list_groups().items():
         assert cls.__doc__, group
         for name, quantity in list_quantities(cls).items():
             assert isinstance(quantity, Quantity) and quantity.unit, f"{group}.{name}"

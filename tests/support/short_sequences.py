@@ -9,8 +9,7 @@ from fdi.progress import ignore_progress
 from plant import load_model
 from rig.network import master
 from rig.run.job import Job
-from rig.run.outcome import Outcome
-from rig.run.runner import run_job
+from rig.run.runner import Outcome, run_job
 from rig.sequences.sequence import parse_sequence
 
 SHORT = """

@@ -8,7 +8,7 @@ from typing import Any
 from fdi.report.numbers import format_digits
 from fdi.report.report import Cell, Column, Item, Line, Paragraph, Report, Section, Table
 from plant.effects import Effect
-from plant.model import find_effect, list_offered_effects, load_model
+from plant.model import find_effect, load_model
 from plant.plants import find_plant, load_plant
 from plant.profile import build_profile
 from plant.selftest import Report as SelfTest
@@ -25,7 +25,7 @@ def run_command(args: argparse.Namespace) -> int:
         load_plant(Path(args.model))
     load_user_effects(args.effects)
     plant = load_model(args.model).plant
-    chosen = [find_effect(args.name, plant)] if args.name else list_offered_effects(plant)
+    chosen = [find_effect(args.name, plant)] if args.name else find_plant(plant).list_effects()
     own = {file.absolute() for file in args.effects}
     tested = chosen if args.test or (args.name and chosen[0].file in own) else []
     tests = {e.name: test_effect(e, plant) for e in tested}

@@ -11,9 +11,7 @@ from plant.errors import InputError
 from plant.model import (
     SHIPPED_MODELS,
     Model,
-    find_parameter_groups,
     find_quantity,
-    list_offered_effects,
     load_model,
 )
 from plant.plants import list_plants
@@ -52,9 +50,9 @@ def _format(value: Any) -> str:
 
 def list_parameters(model: Model) -> Rows:
     """Every parameter that --set takes: of the model, and of the effects that it does not have yet."""
-    off = {name: value for e in list_offered_effects(model.plant) for name, value in e.off.items()}
+    off = {name: value for e in model.kind.list_effects() for name, value in e.off.items()}
     rows = []
-    for group, fields_ in find_parameter_groups(plant=model.plant).items():
+    for group, fields_ in model.kind.list_groups().items():
         for name in (f"{group}.{field}" for field in fields_._fields):
             quantity = find_quantity(name, plant=model.plant)
             default = model.values.get(name, off.get(name))
@@ -94,7 +92,7 @@ def list_sequences(model: Model) -> Rows:
 def list_effects(model: Model) -> Rows:
     """The catalogue, the user's own effects included."""
     rows = []
-    for e in list_offered_effects(model.plant):
+    for e in model.kind.list_effects():
         parameters = [f"{name} [{q.unit}], {_describe_range(q)}, " + (
             f"off at {e.off[name]:g}" if name in e.off else f"nominal {model.kind.nominal.get(name, 0.0):g}")
             for name, q in e.parameters.items()]

@@ -15,7 +15,7 @@ from standing_nodes import stand_nodes
 from rig.firmware.build import FOLDER, build_controller, build_program
 from rig.network.node_objects import PLANT
 from rig.run import participants
-from rig.run.outcome import Outcome
+from rig.run.runner import Outcome
 
 CAUGHT_BY = {
     "late_frame": "drive frames of another cycle",

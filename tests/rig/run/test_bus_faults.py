@@ -9,7 +9,7 @@ from short_sequences import SHORT, job, play
 
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import CLEANUP, MAIN, Trace
-from rig.run.outcome import Outcome
+from rig.run.runner import Outcome
 
 SIGNALS = ("com", "xj", "cor", "p12", "xs")
 SAFE = SHORT + 'ends = "safe_state"\n'

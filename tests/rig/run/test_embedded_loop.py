@@ -14,7 +14,7 @@ from plant.run import NoiseStream
 from plant.segments import Array
 from rig.run import loops
 from rig.run.embedded_loop import EmbeddedLoop, find_busy_cycles
-from rig.run.outcome import Outcome
+from rig.run.runner import Outcome
 from rig.sequences.faults import Late, Noise, Parameter, Plan, Schedule
 
 LOADED = SHORT.replace("main = [", 'load = [{ kind = "ramp", to = 1500, time = 0.3 }]\nmain = [')

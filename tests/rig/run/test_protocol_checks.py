@@ -19,7 +19,7 @@ from rig.recorder import Signals, Timing
 from rig.run import participants
 from rig.run.bring_up import find_gap
 from rig.run.loop import History
-from rig.run.outcome import Outcome
+from rig.run.runner import Outcome
 
 HOLD = 'title = "Holds"\nmain = [{ kind = "hold", time = 0.4 }]\n'
 MOVE = """

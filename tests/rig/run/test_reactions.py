@@ -12,7 +12,7 @@ from rig.network.frame import Frame
 from rig.network.node_objects import GAINS
 from rig.nodes import firmware
 from rig.run import participants
-from rig.run.outcome import Outcome
+from rig.run.runner import Outcome
 from rig.sequences import load_sequence
 
 LOSSES = ("lost_command", "lost_feedback", "lost_sync", "lost_heartbeat")

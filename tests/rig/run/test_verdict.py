@@ -13,8 +13,7 @@ from fdi.report.run_report import build_run_report
 from fdi.report.terminal import format_report
 from fdi.trace.trace import Trace
 from plant import load_model
-from rig.run.outcome import Outcome, find_limits
-from rig.run.runner import run_job
+from rig.run.runner import Outcome, find_limits, run_job
 
 UNCHECKED = SHORT.partition("checks = [")[0]
 TO_THE_STOP = """
