@@ -110,7 +110,7 @@ def measure_blocks(bus: str, seconds: float, blocks: int, contenders: Mapping[st
     """
     if not can_open(bus):
         raise InputError("--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP]")
-    compile_cycle(realtime=True)
+    compile_cycle()
     names, found = list(contenders), {name: list[Times]() for name in contenders}
     for block in range(blocks):
         turn = block % len(names)  # nobody is always the first

@@ -460,7 +460,7 @@ class LinkWire(Wire):
         """
         super().__init__()
         self.clock: WallClock = clock
-        self.link, self._grace = link, grace
+        self.link, self.grace = link, grace
         self._missed = 0  # cycles in a row without all frames
         self._looked_ns = clock.now()  # when the link was last seen to be empty
         self.send: Send = link.send
@@ -481,7 +481,7 @@ class LinkWire(Wire):
         When a node is gone, a cycle takes its 1 ms, in which the other nodes can answer.
         """
         is_patient = self._missed < _PATIENCE
-        grace = self._grace if is_patient else 0.1 * self._grace
+        grace = self.grace if is_patient else 0.1 * self.grace
         is_answered = not self.is_node_gone() and self.wait(lambda: done() or self.is_node_gone(), grace)
         if self.is_node_gone():
             self.wait(done, 1e-3)
@@ -500,11 +500,6 @@ class LinkWire(Wire):
     def close(self) -> None:
         """See `Wire`."""
         self.link.close()
-
-    @property
-    def grace_ns(self) -> int:
-        """How late an answer may be in lockstep, ns."""
-        return round(self._grace * 1e9)
 
     def poll(self, timeout: float) -> None:
         """Pass on the frames that are waiting; if there are none, wait up to `timeout` seconds for the first."""

@@ -218,6 +218,10 @@ class Master:
         self._beat.tick(now, self._state)
         self._watch.tick(now)
 
+    def count_emergencies(self, role: Role) -> int:
+        """How many EMCYs of a node have come."""
+        return len(self._nodes[role].emcy.log)
+
     def find_due(self) -> int:
         """When `tick` has something to do, ns."""
         return min(self._beat.due, self._watch.find_due())

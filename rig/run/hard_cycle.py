@@ -1,9 +1,9 @@
 """The rig's cycle as compiled code: due time, frames, SYNC, collecting the answers. No Python object, no allocation.
 
-`play_cycles_in_real_time` runs in a thread of its own without the interpreter lock until the queue is empty and the
-end is asked for; `play_cycle_in_lockstep` plays one cycle a call. They share their memory, `Buffers`, with Python
-(hard_loop.py): Python writes the inputs of the cycles ahead and reads rows and frames behind. Which frames there are
-and what lies where in them is data too: `Layout` (rig/benches/packing.py).
+`play_cycles` runs in a thread of its own without the interpreter lock until the queue is empty and the end is asked
+for. It shares its memory, `Buffers`, with Python (hard_loop.py): Python writes the inputs of the cycles ahead and reads
+rows and frames behind. Which frames there are and what lies where in them is data too: `Layout`
+(rig/benches/packing.py).
 
 A frame whose values take effect with SYNC goes out before SYNC is due: on a real bus a frame of 8 bytes takes 135 us at
 1 Mbit/s and would delay the SYNC behind it. The others follow the SYNC. Where the plant is no node of its own, this
@@ -50,7 +50,6 @@ from rig.network.raw_bus import (
     PAYLOAD_IN,
     PAYLOAD_OUT,
     Port,
-    await_frame,
     read_clock,
     receive_frame,
     send_frame,
@@ -73,25 +72,21 @@ from rig.nodes.emulator_cycle import (
 )
 from rig.sequences.faults import DELAY, DOUBLE, DROP, change_frame
 
-DONE, WAITING = 0, 1  # what `play_cycle_in_lockstep` returns
-
 # Words that Python writes; the cycle sets CANCEL back
-(PERIOD, LEAD, SPIN, SPINS_ALWAYS, GRACE, TAIL, CANCEL, OVERRIDE_LIMIT, FINISH, DRY, FRAMES_READ, ROWS_READ,
- MAY_IDLE_AT, SYNC_ID, MOVES_PLANT, MISSED_LIMIT, SLACK, DRIVEN, SENT_CHANNELS, SENSED_AT, DRIVE_VALUE_AT,
- FLAGS_AT) = range(22)
+(PERIOD, LEAD, SPIN, SPINS_ALWAYS, TAIL, CANCEL, OVERRIDE_LIMIT, FINISH, DRY, FRAMES_READ, ROWS_READ, MAY_IDLE_AT,
+ SYNC_ID, MOVES_PLANT, MISSED_LIMIT, SLACK, DRIVEN, SENT_CHANNELS, SENSED_AT, DRIVE_VALUE_AT, FLAGS_AT) = range(21)
 # Words that the cycle writes; DUE is set by Python before the start. FAILURE is the status of a bus that failed
 (DUE, HEAD, CYCLES, OVERRUNS, UNDERRUNS, ROWS, FRAMES_DONE, COMPLETE_UNTIL, FAILURE, DIVERGED) = range(24, 34)
 # Words of the cycle alone; from COUNTED on the input under way, column by column
-(OPEN, SYNC_AT, CAME, AWAITED, STAGE, ANSWER_LIMIT, MISSED, HELD, FRAMES_WRITTEN, AWAKE_SINCE, WORKED, POSITION,
- IS_HELD, IS_UNDERRUN, ROW_CYCLE, IS_LATE, DRIVES_MISSED, HAS_BEGUN, COUNTED, COMMAND_CODE, COMMAND_ARGUMENT,
- SYNC_CODE, SYNC_ARGUMENT, DEAF, PLANT_FRAMES_LEFT, DRIVES_LEFT) = range(40, 66)
-PLAYED, IS_UNSURE = 66, 67  # cycles so far; whether a frame may come that is not sure to come
-WORDS = 72
+(OPEN, SYNC_AT, CAME, AWAITED, HELD, FRAMES_WRITTEN, AWAKE_SINCE, WORKED, POSITION, IS_HELD, IS_UNDERRUN, ROW_CYCLE,
+ IS_LATE, DRIVES_MISSED, HAS_BEGUN, COUNTED, COMMAND_CODE, COMMAND_ARGUMENT, SYNC_CODE, SYNC_ARGUMENT,
+ DEAF) = range(40, 61)
+PLAYED = 61  # cycles so far
+WORDS = 64
 # Columns of an input: whether the cycle counts (before the run the controller is enabled in cycles that do not, and
 # the plant stays where it is); code and argument of the faults of command and SYNC (change_frame); whether the rig
-# receives nothing, by a fault; in lockstep how many frames of the plant and how many drives are to be awaited (0:
-# until each answer has come)
-INPUT_COLUMNS = DRIVES_LEFT + 1 - COUNTED
+# receives nothing, by a fault
+INPUT_COLUMNS = DEAF + 1 - COUNTED
 # Columns of a row
 (CYCLE, INPUT, INPUT_HELD, IS_COUNTED, DUE_AT, LATENESS, OVERRUN, ANSWERS, FEEDBACK_AT, VALVE_AT, DRIVE_AT,
  COMPLETE_AT, EXECUTION) = range(13)
@@ -101,10 +96,6 @@ TIME, FRAME_HEAD, DATA = range(3)
 # Columns of a frame that waits: when it is due, its place in the layout, its length and 8 words of payload
 _HELD_DUE, _HELD_PLACE, _HELD_LENGTH, _HELD_DATA = range(4)
 HELD_COLUMNS = _HELD_DATA + 8
-
-_LONG_WAIT = 20_000_000  # ns: answers that may take this long are awaited to 20 ms, with fewer system calls
-_SECOND_ANSWER_LIMIT = 80_000_000  # ns
-_PATIENCE = 5  # cycles in a row without all answers: a node that is gone must not make clean-up last minutes
 
 
 class Buffers(NamedTuple):
@@ -129,7 +120,7 @@ def make_buffers(ahead: int, rows: int, frames: int, held: int, driven: int, cha
                    np.full((held, HELD_COLUMNS), 0, np.int64))
 
 
-def play_cycles_in_real_time(port: Port, buffers: Buffers, m: Layout, plant: Memory) -> None:
+def play_cycles(port: Port, buffers: Buffers, m: Layout, plant: Memory) -> None:
     """Play the queue at its due times until FINISH, or until the bus fails (FAILURE).
 
     Due times are a fixed grid. A SYNC that is late by whole periods drops the due times it has missed, and counts them.
@@ -152,59 +143,9 @@ def play_cycles_in_real_time(port: Port, buffers: Buffers, m: Layout, plant: Mem
         _begin_cycle(port, buffers, m, plant, read_clock(port) - words[DUE])
 
 
-def play_cycle_in_lockstep(port: Port, buffers: Buffers, m: Layout, plant: Memory, until_ns: int) -> int:
-    """Play one cycle: DONE when its answers are in, the time for them has passed or the bus has failed (FAILURE);
-    WAITING at `until_ns`, to be called again.
-    """
-    words = buffers.words
-    if words[STAGE] == DONE:
-        _begin_work(port, words)
-        _take_input(buffers)
-        _send_frames(port, buffers, m, plant, True)
-        _begin_cycle(port, buffers, m, plant, 0)
-        grace = words[GRACE] if words[MISSED] < _PATIENCE else words[GRACE] // 10
-        if not words[AWAITED]:  # what may come is given the time of a cycle
-            grace = words[PERIOD]
-        words[ANSWER_LIMIT] = words[SYNC_AT] + grace
-        words[STAGE] = WAITING
-        _end_work(port, words)
-    while not words[FAILURE] and not _is_answered(words):
-        if words[ANSWER_LIMIT] - words[SYNC_AT] >= _LONG_WAIT:
-            frame = await_frame(port)
-        else:
-            frame = receive_frame(port, min(words[ANSWER_LIMIT], until_ns))
-        _accept_frame(port, buffers, m, plant, frame)
-        if frame[0] != FRAME:
-            if read_clock(port) >= _find_answer_limit(words):
-                break
-            return WAITING
-    words[MISSED] = 0 if _is_complete(words) else words[MISSED] + 1
-    _receive_waiting(port, buffers, m, plant)
-    while words[HELD] > 0 and buffers.held[0, _HELD_DUE] < words[DUE]:
-        _release_first_held(port, buffers, m)
-    _close_row(port, buffers, m)
-    words[STAGE] = DONE
-    return DONE
-
-
 def _is_complete(words: NDArray[np.int64]) -> bool:
     """Whether each answer that is sure to come has come."""
     return bool(words[CAME] & words[AWAITED] == words[AWAITED])
-
-
-def _is_answered(words: NDArray[np.int64]) -> bool:
-    """Lockstep: whether there is nothing left to wait for."""
-    if not words[AWAITED] and words[IS_UNSURE]:
-        return False
-    return _is_complete(words) and words[PLANT_FRAMES_LEFT] <= 0 and words[DRIVES_LEFT] <= 0
-
-
-def _find_answer_limit(words: NDArray[np.int64]) -> int:
-    """How long to wait; not long if only a second drive frame is missing: not every controller answers twice."""
-    limit = int(words[ANSWER_LIMIT])
-    if words[AWAITED] and _is_complete(words) and words[PLANT_FRAMES_LEFT] <= 0:
-        limit = min(limit, int(words[SYNC_AT]) + _SECOND_ANSWER_LIMIT)
-    return limit
 
 
 def _take_input(buffers: Buffers) -> bool:
@@ -415,11 +356,10 @@ def _open_row(buffers: Buffers, m: Layout, late: int) -> None:
 def _expect_answers(buffers: Buffers, m: Layout) -> None:
     """Which answers are sure to come in this cycle, and which values of earlier frames still count."""
     words = buffers.words
-    words[CAME], words[AWAITED], words[IS_LATE], words[IS_UNSURE] = 0, 0, 0, 0
+    words[CAME], words[AWAITED], words[IS_LATE] = 0, 0, 0
     if words[MOVES_PLANT]:
         words[CAME] = FEEDBACK | VALVE
     if words[SYNC_CODE] == DROP and words[SYNC_ID] >= 0:
-        words[IS_UNSURE] = 1
         return
     for number in range(m.words[FRAMES]):
         at = FRAMES_AT + FRAME_WORDS * number
@@ -431,8 +371,6 @@ def _expect_answers(buffers: Buffers, m: Layout) -> None:
             words[CAME] |= m.words[at + ROLES]
         elif m.words[at + IS_ANSWER] and age >= m.words[at + EVERY]:
             words[AWAITED] |= m.words[at + ROLES] & ~ALL_ROLES
-        if not m.words[at + IS_ANSWER] or m.words[at + LAST_CYCLE] < 0:
-            words[IS_UNSURE] = 1
     words[HAS_BEGUN] += 1
 
 
@@ -496,13 +434,10 @@ def _accept_frame(port: Port, buffers: Buffers, m: Layout, plant: Memory,
     at = find_frame(m, identifier)
     if at < 0 or m.words[at + IS_MINE] or not words[OPEN]:
         return
-    is_drive = m.words[at + ROLES] & DRIVE != 0
-    words[DRIVES_LEFT if is_drive else PLANT_FRAMES_LEFT] -= 1
-    if is_drive and words[MOVES_PLANT]:
+    if m.words[at + ROLES] & DRIVE and words[MOVES_PLANT]:
         code, argument = find_drive_action(plant, words[ROW_CYCLE])
         if code == DELAY:
-            _hold_frame(buffers, m, at, t_ns + argument if words[LEAD] else words[DUE] - words[PERIOD] + argument,
-                        length)
+            _hold_frame(buffers, m, at, t_ns + argument, length)
         if code in (DELAY, DROP):
             return
         length, m.words[PAYLOAD] = change_frame(code, argument, length, m.words[PAYLOAD])

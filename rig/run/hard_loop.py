@@ -1,9 +1,9 @@
 """The hard cycle loop: the rig's cycle runs compiled, on a socket of its own; the rest of the rig stays in Python.
 
-It takes the place of `CycleLoop` on SocketCAN and the UDP bus, in both paces. In real time a thread without the
-interpreter lock plays a queue of inputs, which Python fills about a second ahead: the command profile is known. In
-lockstep Python calls the same compiled code once a cycle. PDOs and SYNC use the loop's socket; NMT, SDO, heartbeats and
-EMCY use the wire's socket, in the main thread. The log gets the frames of both in the order of their times.
+It takes the place of `CycleLoop` on SocketCAN and the UDP bus in real time. A thread without the interpreter lock plays
+a queue of inputs, which Python fills about a second ahead: the command profile is known. PDOs and SYNC use the loop's
+socket; NMT, SDO, heartbeats and EMCY use the wire's socket, in the main thread. The log gets the frames of both in the
+order of their times.
 
 The queue does not delay a reaction: `override_control` changes the control word of what is queued, `hold` discards it.
 """
@@ -31,24 +31,24 @@ from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator_service import compile_plant
 from rig.nodes.faulty_plant import DIVERGED
 from rig.nodes.scenario import Scenario
-from rig.recorder import Signals, Timing
+from rig.recorder import Timing
 from rig.run import hard_cycle as hc
-from rig.run.loop import CycleInput, CycleObserver, CyclicValues, Loop
+from rig.run.loop import CycleInput, CycleObserver, CyclicValues, Loop, set_rig_faults
 from rig.run.priority import enter_loop_thread, list_cpus
-from rig.sequences.faults import CUT, DELAY, DOUBLE, DROP, NORMAL, Plan, Schedule
+from rig.sequences.faults import Plan, Schedule
 
 _US = 1000  # ns
 
 
 @cache
-def compile_cycle(realtime: bool) -> Any:
-    """Compile the cycle of a pace: some seconds on a new machine, half a second afterwards."""
-    play = compile_function(hc.play_cycles_in_real_time if realtime else hc.play_cycle_in_lockstep)
+def compile_cycle() -> Any:
+    """Compile the cycle: some seconds on a new machine, half a second afterwards."""
+    play = compile_function(hc.play_cycles)
     buffers = hc.make_buffers(1, 1, 1, 1, 1, 1, is_fd=False)
     buffers.words[hc.PERIOD], buffers.words[hc.SYNC_ID] = 1, 0x080
     plant = ec.make_memory(Model(), [], Schedule(Plan(stop=0)))
     # fails at once, on a bus that is not there
-    play(make_closed_port(), buffers, packing.make_layout((), (), Role.RIG), plant, *() if realtime else (0,))
+    play(make_closed_port(), buffers, packing.make_layout((), (), Role.RIG), plant)
     return play
 
 
@@ -79,46 +79,38 @@ class HardLoop(Loop):
     kind = "hard"
 
     def __init__(self, master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver,
-                 bus: RawBus, realtime: bool, ahead: int = 1000) -> None:
-        """`ahead`: cycles that Python queues in real time; a stall of Python up to that length does no harm."""
+                 bus: RawBus, ahead: int = 1000) -> None:
+        """`ahead`: cycles that Python queues; a stall of Python up to that length does no harm."""
         wire = master.wire
         assert isinstance(wire, LinkWire)
         self._master, self._wire, self._bus, self._bench = master, wire, bus, bench
-        self._faults, self._log, self._period, self._realtime = faults, log, bench.cycle_ns, realtime
-        self._ahead = ahead if realtime else 1
+        self._faults, self._log, self._period, self._ahead = faults, log, bench.cycle_ns, ahead
         self._origin = wire.clock.origin_ns
         self._values = CyclicValues(bench)
         self._plant = _LoopPlant(bench, scenario)
-        bus.use_kernel_times(realtime)
-        self._play = compile_cycle(realtime)
+        self._play = compile_cycle()
         channels, is_fd = len(self._values.names), any(each.identifier & FD for each in bench.frames.frames)
         self._buffers = hc.make_buffers(ahead, 8 * ahead, 64 * ahead, 1100, len(self._values.given), channels, is_fd)
         self._words = self._buffers.words
         self._inputs = [CycleInput(0, 0.0, 0.0, 0)] * (9 * ahead)  # of all rows that are not yet logged, and the queue
         self._thread: threading.Thread | None = None
         self._idle_phase = 0
-        self._pending: tuple[int, Signals, Timing] | None = None  # lockstep: a row that the next cycle hands out
-        self._k = 0
         self._frames: list[tuple[int, Frame]] = []  # of both sockets, until everything before them is known
         self._came_at: int | None = None  # wall time of the service frame under way
         self._last_t_ns = 0
-        self._reported = False  # an EMCY of the plant has come in this cycle
-        self._plant_emcy = 0x080 + bench.nodes[Role.PLANT].node if bench.has_plant_node else None
         self._ours = [bench.frames.sync, *(each.identifier for each in bench.frames.list_from(Role.RIG))]
         self.outputs = dict.fromkeys(self._values.names, 0.0)
         self._write_frame, master.hooks.on_frame = master.hooks.on_frame, self._keep_frame
         self._receive, wire.receive = wire.receive, self._receive_service
         wire.link.leave_out(bench.frames.identifiers)  # those that the rig sends itself may come from a second rig
         self._warm_up()
-        # lockstep: time of the cycle under way or to come
-        self._t_ns = max(wire.clock.now(), master.played_until) + self._period
 
     # ------------------------------------------------------------------------------------ what the session sees
 
     @property
     def k(self) -> int:
         """See `Loop`."""
-        return int(self._words[hc.CYCLES]) if self._realtime else self._k
+        return int(self._words[hc.CYCLES])
 
     @property
     def queued(self) -> int:
@@ -142,14 +134,11 @@ class HardLoop(Loop):
 
     def now(self) -> int:
         """See `Loop`."""
-        return self._wire.clock.now() if self._realtime else self._t_ns
+        return self._wire.clock.now()
 
     def cycle(self, step: CycleInput) -> None:
-        """Queue one cycle; in lockstep, run it. Complete cycles go to the log."""
+        """Queue one cycle. Complete cycles go to the log."""
         self._push(step)
-        if not self._realtime:
-            self._run_one()
-            return
         if self._thread is None:
             self._words[hc.DUE] = self._origin + self._wire.clock.now() + 20 * self._period
             self._thread = threading.Thread(target=self._run_thread, name="cycle", daemon=True)
@@ -158,12 +147,12 @@ class HardLoop(Loop):
             self.serve()
 
     def serve(self) -> None:
-        """Real time: receive what the other nodes send and log the cycles that are complete; takes up to a period."""
+        """Receive what the other nodes send and log the cycles that are complete; takes up to a period."""
         near = self.waiting <= 2  # the end of the queue: the next input must come within a period
         self._wire.poll(self._period * (0.1e-9 if near else 1e-9))
         self._drain()
         self._plant.draw_noise()
-        self._set_rig_faults(self.k)
+        set_rig_faults(self._master, self._faults, self.k)
         self._master.tick()
         self._require_bus()
 
@@ -188,7 +177,7 @@ class HardLoop(Loop):
         self._words[hc.CANCEL] = self._is_running()
         while self._is_running() and self._words[hc.CANCEL]:
             self.serve()
-        if not self._is_running():  # in lockstep the cycle may have ended with an error before it took its input
+        if not self._is_running():  # nobody will take what is queued
             self._words[hc.TAIL] = self._words[hc.HEAD]
         return self._inputs[self._words[hc.POSITION] % len(self._inputs)].demand if self.k else 0.0
 
@@ -199,7 +188,6 @@ class HardLoop(Loop):
             self.serve()
         self._require_bus()
         self._drain()
-        self._log_pending()
 
     def close(self) -> None:
         """End the thread at the end of its cycle and give the bus back."""
@@ -207,7 +195,6 @@ class HardLoop(Loop):
         if self._thread is not None:
             self._thread.join()
         self._bus.close()
-        self._master.played_until = 0 if self._realtime else self._t_ns
         self._wire.link.leave_out(())
         try:
             self._drain()
@@ -220,60 +207,13 @@ class HardLoop(Loop):
     def _push(self, step: CycleInput) -> None:
         k = self.queued
         command, sync = self._faults.find_action("command", k), self._faults.find_action("sync", k)
-        if not self._realtime and sync.code == DELAY:
-            sync = NORMAL  # a cycle has no fixed length
         position = int(self._words[hc.TAIL])
         self._inputs[position % len(self._inputs)] = step
         queue = self._buffers.inputs
         self._buffers.settings[position % len(queue)] = self._values.list_given(step)
         queue[position % len(queue)] = (
-            step.is_counted, *command, *sync, self._faults.is_bus_off("rig", k), *self._count_repeated_frames(k))
+            step.is_counted, *command, *sync, self._faults.is_bus_off("rig", k))
         self._words[hc.TAIL] = position + 1
-
-    def _count_repeated_frames(self, k: int) -> tuple[int, int]:
-        """How many frames of the plant and of the controller come in a cycle in which a fault doubles some.
-
-        Zeros where none is doubled. Lockstep waits for all of them, for feedback of the cycle before would count as
-        that of the next one.
-        """
-        is_second = self._faults.find_action("sync", k).code == DOUBLE
-        cycles = (k, k + 1) if is_second else (k,)  # the second answer is under the faults of the cycle to come
-        feedback, valve = ([self._faults.find_action(name, each) for each in cycles]
-                           for name in ("feedback", "valve_state"))
-        if self._realtime or not (is_second or any(each[0].code == DOUBLE for each in (feedback, valve))):
-            return 0, 0
-        copies = {DROP: 0, DELAY: 0, DOUBLE: 2}
-        answered = sum(copies.get(action.code, 1) for action in feedback if action.code != CUT)
-        return sum(copies.get(action.code, 1) for action in feedback + valve), answered
-
-    def _run_one(self) -> None:
-        """Lockstep: one cycle, with the services meanwhile, so that Ctrl-C and EMCYs are not kept waiting."""
-        self._log_pending()
-        self._set_rig_faults(self._k)
-        self._reported = False
-        while self._play_until(self._origin + self._wire.clock.now() + 50_000 * _US):
-            self._serve_lockstep()
-        self._serve_lockstep()
-        self._require_bus()
-        is_cut = [self._faults.find_action("drive", k).code == CUT for k in (self._k - 1, self._k)]
-        if is_cut == [False, True]:  # the first drive frame that a fault cuts: the plant reports it, beside its cycle
-            self._wire.wait(lambda: self._reported or self._wire.is_node_gone(), self._wire.grace_ns * 1e-9)
-        self._drain()
-        self._master.tick()
-        self._k = int(self._words[hc.CYCLES])
-        self._t_ns += self._period
-
-    def _play_until(self, t_ns: int) -> bool:
-        """Lockstep: play the cycle under way, at most until then; whether it is not over."""
-        return bool(self._play(self._bus.port, self._buffers, self._layout, self._plant.memory, t_ns))
-
-    def _serve_lockstep(self) -> None:
-        self._wire.poll(0.0)
-        self._plant.draw_noise()
-        if self._wire.is_node_gone():  # it will not answer; the others can within a period
-            limit = self._origin + self._wire.clock.now() + self._period
-            self._words[hc.ANSWER_LIMIT] = min(self._words[hc.ANSWER_LIMIT], limit)
-            self._words[hc.GRACE] = self._period
 
     def _run_thread(self) -> None:
         with enter_loop_thread(from_last=1) as self.scheduler:
@@ -294,15 +234,12 @@ class HardLoop(Loop):
         """Play some cycles without sending, then set the cycle's times: code and memory are in place at the start."""
         words, period = self._words, self._period
         self._prepare_cycle()
-        words[hc.DRY], words[hc.GRACE] = 1, 0
+        words[hc.DRY] = 1
         for _ in range(10):
             self._push(CycleInput(0, 0.0, 0.0, 0, is_counted=False))
             words[hc.DUE] = self._origin + self._wire.clock.now() + period
-            if not self._realtime:
-                self._play_until(words[hc.DUE])
         words[hc.FINISH] = 1
-        if self._realtime:
-            self._play(self._bus.port, self._buffers, self._layout, self._plant.memory)
+        self._play(self._bus.port, self._buffers, self._layout, self._plant.memory)
         words[:] = 0
         self._prepare_cycle()
 
@@ -310,25 +247,18 @@ class HardLoop(Loop):
         """The words of a cycle that has not begun, and the tables of its frames."""
         words, bench, place = self._words, self._bench, self._values.place
         self._layout = packing.make_layout(bench.frames.list_of(Role.RIG), self._values.names, Role.RIG)
-        words[hc.PERIOD], words[hc.GRACE], words[hc.MAY_IDLE_AT] = self._period, self._wire.grace_ns, -1
-        words[hc.SPINS_ALWAYS] = len(list_cpus()) > 1
-        if self._realtime:
-            words[hc.LEAD], words[hc.SPIN] = min(200 * _US, self._period // 4), min(80 * _US, self._period // 8)
+        words[hc.PERIOD], words[hc.MAY_IDLE_AT], words[hc.SPINS_ALWAYS] = self._period, -1, len(list_cpus()) > 1
+        words[hc.LEAD], words[hc.SPIN] = min(200 * _US, self._period // 4), min(80 * _US, self._period // 8)
         sync = bench.frames.sync
         words[hc.SYNC_ID] = -1 if sync is None else sync
         words[hc.MOVES_PLANT], words[hc.MISSED_LIMIT] = not bench.has_plant_node, bench.most_missed
         # without a SYNC the controller has its own clock: its frame may slip from one cycle of the rig to the next
-        words[hc.SLACK] = sync is None and self._realtime
+        words[hc.SLACK] = sync is None
         words[hc.DRIVEN], words[hc.SENT_CHANNELS] = len(self._values.given), len(self._values.sent)
         words[hc.SENSED_AT], words[hc.DRIVE_VALUE_AT] = place[self._values.readings[0]], place[self._values.drive]
         words[hc.FLAGS_AT] = place["flags"]
 
     # ------------------------------------------------------------------------------------ from the cycle
-
-    def _set_rig_faults(self, k: int) -> None:
-        """The faults of the rig itself that do not concern the cycle: its heartbeat, and what else it hears."""
-        self._master.silent = not self._faults.is_heartbeat_alive("rig", k)
-        self._master.is_deaf = self._faults.is_bus_off("rig", k)
 
     def _drain(self) -> None:
         """Log the cycles and frames that are complete."""
@@ -340,7 +270,7 @@ class HardLoop(Loop):
             raw = b"".join([(word & 0xFFFFFFFFFFFFFFFF).to_bytes(8, "little") for word in data])
             self._take_frame(t_ns - self._origin, head & 0xFFFFFFFF, raw[:head >> 32 & 0xFF], bool(head >> 40))
         words[hc.FRAMES_READ] = last
-        self._release_frames(until - self._origin if self._realtime else 2**63)
+        self._release_frames(until - self._origin)
         first, last = int(words[hc.ROWS_READ]), int(words[hc.ROWS])
         values = _read_ring(buffers.values, first, last)
         for row, said in zip(_read_ring(buffers.rows, first, last), values, strict=True):
@@ -352,11 +282,10 @@ class HardLoop(Loop):
         if cob_id in self._ours and not is_sent:
             self._receive_service(frame)  # the master reports a second rig
         else:
-            self._frames.append((t_ns, frame if self._realtime else Frame(self._t_ns, cob_id, data)))
+            self._frames.append((t_ns, frame))
 
     def _receive_service(self, frame: Frame) -> None:
         self._came_at = frame.t_ns
-        self._reported |= frame.cob_id == self._plant_emcy
         try:
             self._receive(frame)
         finally:
@@ -388,21 +317,12 @@ class HardLoop(Loop):
                                         int(said["control_word"]))
         self._values.fill_row(signals, said, roles)
         timing = Timing(
-            row[hc.CYCLE], bool(row[hc.OVERRUN]), row[hc.LATENESS] * 1e-9 if self._realtime else 0.0,
+            row[hc.CYCLE], bool(row[hc.OVERRUN]), row[hc.LATENESS] * 1e-9,
             row[hc.DRIVE_AT] * 1e-9 if "drive" in roles else nan,
             row[hc.COMPLETE_AT] * 1e-9 if row[hc.COMPLETE_AT] else nan,
             row[hc.FEEDBACK_AT] * 1e-9 if "feedback" in roles else nan,
             row[hc.VALVE_AT] * 1e-9 if "valve_state" in roles else nan, row[hc.EXECUTION] * 1e-9)
-        if self._realtime:
-            self._log.cycle(row[hc.DUE_AT] - self._origin, signals, timing)
-        else:
-            self._pending = self._t_ns, signals, timing
-
-    def _log_pending(self) -> None:
-        """Lockstep: the next cycle hands a row out, as in `CycleLoop`, so that guards act in the same cycle."""
-        if self._pending is not None:
-            pending, self._pending = self._pending, None
-            self._log.cycle(*pending)
+        self._log.cycle(row[hc.DUE_AT] - self._origin, signals, timing)
 
 
 def _read_ring(ring: np.ndarray, first: int, last: int) -> list[list[Any]]:

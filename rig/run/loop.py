@@ -1,6 +1,6 @@
 """The cycle of the bench: command, SYNC, answers, row. This loop is Python, for every bus and both paces.
 
-SocketCAN and the UDP bus have a compiled one as well (hard_loop.py), which gives the same rows.
+In real time SocketCAN and the UDP bus have a compiled one (hard_loop.py), which gives the same rows.
 
 Lockstep: the next cycle begins when this one's frames are in. Real time: it begins when it is due; due times are a
 fixed grid, and a cycle that is late by whole periods drops the due times it has missed (and counts them) instead of
@@ -30,6 +30,7 @@ from rig.benches.bench import (
     make_reader,
     make_writer,
 )
+from rig.network.bus import LinkWire
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
 from rig.network.master import Master
@@ -38,7 +39,17 @@ from rig.nodes.faulty_plant import FaultyPlant
 from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock, Signals, Timing
 from rig.recorder.schema import make_row_record
-from rig.sequences.faults import DELAY, DROP, NORMAL, SENT_NORMALLY, Action, Schedule, apply_action
+from rig.sequences.faults import (
+    CUT,
+    DELAY,
+    DOUBLE,
+    DROP,
+    NORMAL,
+    SENT_NORMALLY,
+    Action,
+    Schedule,
+    apply_action,
+)
 
 # Numbers of phases: set-up, main, clean-up; then those of the probes, of which the log has the frames only
 BEFORE, AFTER, BEFORE_MAIN = 3, 4, 5
@@ -217,6 +228,8 @@ class Seen:
 
     came: set[str] = field(default_factory=set)  # roles of the frames
     awaited: set[FrameSpec] = field(default_factory=set)  # frames that are sure to come, and have not
+    plant_left: int = 0  # of the frames that come in a cycle in which a fault doubles some: of the plant
+    drives_left: int = 0  # and of the controller
     is_late: bool = False  # a drive frame has come that answers an earlier cycle
 
 
@@ -229,6 +242,7 @@ class CycleLoop(Loop):
     def __init__(self, master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver,
                  realtime: bool) -> None:
         self._master, self._wire = master, master.wire
+        self._link = None if realtime or not isinstance(master.wire, LinkWire) else master.wire  # lockstep of programs
         self._faults, self._log, self._period, self._realtime = faults, log, bench.cycle_ns, realtime
         self._values, self._bench = CyclicValues(bench), bench
         self._mine = [(each, make_writer(each), make_reader(each)) for each in bench.frames.list_from(Role.RIG)]
@@ -275,8 +289,8 @@ class CycleLoop(Loop):
             self._read_plant(self._plant, k)
         is_overrun = 2 * lateness > self._period  # it leaves the controller too little of the cycle to answer in
         timing = Timing(k, is_overrun, lateness * 1e-9, nan, nan)
-        master.silent = not self._faults.is_heartbeat_alive("rig", k)
-        master.is_deaf = self._faults.is_bus_off("rig", k)
+        set_rig_faults(master, self._faults, k)
+        reported = master.count_emergencies(Role.PLANT) if self._bench.has_plant_node else 0
         self._send_frames(is_before_sync=True)
         delay = self._send_sync()
         if self._plant is not None:
@@ -293,6 +307,7 @@ class CycleLoop(Loop):
         timing.execution = (self._wall.now() - began) * 1e-9
         if not self._realtime:
             self._wait_for_answers(delay)
+            self._wait_for_report(reported)
             self._release_held(self._t_ns + self._period)
         master.tick()
         for emulator in self._emulators:
@@ -402,6 +417,8 @@ class CycleLoop(Loop):
     def _expect_answers(self, is_synced: bool) -> None:
         """Which answers are sure to come in this cycle, and which values of earlier frames still count."""
         self._seen = Seen()
+        if self._link is not None:
+            self._seen.plant_left, self._seen.drives_left = self._count_repeated_frames(self.k)
         if self._plant is not None:
             self._seen.came |= {"feedback", "valve_state"}
         if not is_synced:
@@ -418,11 +435,41 @@ class CycleLoop(Loop):
 
     def _wait_for_answers(self, delay: int | None) -> None:
         """Lockstep: let the answers come in; what is not sure to come is given the time of a cycle."""
+        seen = self._seen
         is_unsure = any(answer.last < 0 or not spec.is_answer for spec, answer in self._answers.items())
-        if delay is None or (is_unsure and not self._seen.awaited):
+        if delay is None or (is_unsure and not seen.awaited):
             self._wire.run_until(self._wire.clock.now() + self._period)
-        elif self._seen.awaited:
-            self._wire.wait_for_answers(self._t_ns + delay, lambda: not self._seen.awaited)
+        elif seen.awaited:
+            self._wire.wait_for_answers(self._t_ns + delay, lambda: not seen.awaited and seen.plant_left <= 0)
+            if seen.drives_left > 0 and not seen.awaited:  # not every controller answers twice
+                self._wire.wait(lambda: seen.drives_left <= 0, _SECOND_ANSWER)
+
+    def _count_repeated_frames(self, k: int) -> tuple[int, int]:
+        """How many frames of the plant and of the controller come in a cycle in which a fault doubles some.
+
+        Zeros where none is doubled. Lockstep between programs waits for all of them, for feedback of the cycle before
+        would count as that of the next one.
+        """
+        is_second = self._faults.find_action("sync", k).code == DOUBLE
+        cycles = (k, k + 1) if is_second else (k,)  # the second answer is under the faults of the cycle to come
+        feedback, valve = ([self._faults.find_action(name, each) for each in cycles]
+                           for name in ("feedback", "valve_state"))
+        if not (is_second or any(each[0].code == DOUBLE for each in (feedback, valve))):
+            return 0, 0
+        copies = {DROP: 0, DELAY: 0, DOUBLE: 2}
+        answered = sum(copies.get(action.code, 1) for action in feedback if action.code != CUT)
+        return sum(copies.get(action.code, 1) for action in feedback + valve), answered
+
+    def _wait_for_report(self, reported: int) -> None:
+        """Lockstep between programs: the first drive frame that a fault cuts is reported by the plant in its own time.
+
+        `reported`: EMCYs of the plant before this cycle.
+        """
+        master, link = self._master, self._link
+        if link is None or not self._bench.has_plant_node:
+            return
+        if [self._faults.find_action("drive", k).code == CUT for k in (self.k - 1, self.k)] == [False, True]:
+            link.wait(lambda: master.count_emergencies(Role.PLANT) > reported or link.is_node_gone(), link.grace)
 
     def _receive_answer(self, frame: Frame) -> None:
         """A frame of the controller, or of the plant, has come."""
@@ -430,6 +477,10 @@ class CycleLoop(Loop):
         if self._open is None or spec not in self._answers:
             return
         answer = self._answers[spec]
+        if "drive" in answer.roles:
+            self._seen.drives_left -= 1
+        else:
+            self._seen.plant_left -= 1
         if self._plant is None or "drive" not in answer.roles:
             self._take_answer(answer, frame.data, frame.t_ns)
             return
@@ -480,7 +531,14 @@ class CycleLoop(Loop):
         self._log.cycle(t_ns, row, timing)
 
 
+def set_rig_faults(master: Master, faults: Schedule, k: int) -> None:
+    """The faults of the rig itself that do not concern the cycle: its heartbeat, and what else it hears."""
+    master.silent = not faults.is_heartbeat_alive("rig", k)
+    master.is_deaf = faults.is_bus_off("rig", k)
+
+
 _OF_PLANT = frozenset({"feedback", "valve_state"})
+_SECOND_ANSWER = 0.08  # s: how long the second drive frame of a cycle is waited for
 _TIMES = ("lateness", "response", "feedback_response", "valve_response", "execution")
 
 

@@ -54,8 +54,7 @@ def compile_all(out: Path) -> int:
     compile_function(raw_bus.receive_frame)(port, 0)
     compile_function(raw_bus.await_frame)(port)
     compile_function(raw_bus.send_frame)(port, 0x80, 0, 0)
-    for realtime in (False, True):
-        compile_cycle(realtime)
+    compile_cycle()
     compile_loop()
     compile_plant(Model())
     Actuator(Model()).warm()

@@ -1,4 +1,4 @@
-"""The compiled cycle on a real bus, against nodes that answer as the script says.
+"""The cycle on a real bus, compiled in real time and Python in lockstep, against nodes that answer as the script says.
 
 Any thread may stand still for half a second here: the machine is shared. So these tests ask for order and number and
 for what follows from what, and where an answer is needed they play on until it has come.
@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import groupby, pairwise
 from math import isnan
+from typing import Any
 
 import codec
 import pytest
@@ -29,8 +30,9 @@ from rig.network.raw_bus import RawBus
 from rig.network.udp import PORT, Turn
 from rig.nodes.scenario import Scenario
 from rig.recorder import Signals, Timing
+from rig.run import hard_loop, loop
 from rig.run.hard_loop import HardLoop, compile_cycle
-from rig.run.loop import CycleInput
+from rig.run.loop import CycleInput, CycleLoop
 from rig.sequences.faults import (
     BusOff,
     Corrupted,
@@ -101,7 +103,7 @@ class Nodes(threading.Thread):
 
 
 class Bench:
-    """A hard loop on a bus with nodes, and a log of all it says."""
+    """A loop on a bus with nodes, and a log of all it says."""
 
     def __init__(self, where: str, realtime: bool, faults: tuple[Fault, ...], ahead: int) -> None:
         clock = WallClock()
@@ -116,8 +118,9 @@ class Bench:
         self.master.hooks.on_frame = self.frames.append
         schedule = Schedule(Plan(faults=faults, stop=1000))
         bench = replace(load_bench(), cycle_ns=PERIOD)
-        bus = RawBus(where, bench.frames.identifiers)
-        self.loop = HardLoop(self.master, bench, Scenario(Model(), Plan(stop=0)), schedule, self, bus, realtime, ahead)
+        parts = self.master, bench, Scenario(Model(), Plan(stop=0)), schedule, self
+        self.loop: Any = HardLoop(*parts, RawBus(where, bench.frames.identifiers), ahead) if realtime else CycleLoop(
+            *parts, realtime=False)
         self._markers = 0
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
@@ -228,7 +231,7 @@ def test_rows_and_log(bus_kind: str, realtime: bool) -> None:
         drives = one.logged(codec.DRIVE)
         assert drives == [codec.pack_drive(k * 1e-8, 15, k) for k in range(len(drives))]
         compile_cycle.cache_clear()
-        compile_cycle(realtime)
+        compile_cycle()
         assert compiled.buffer  # the listener hears
 
 
@@ -292,13 +295,13 @@ def test_the_rigs_heartbeat_can_be_dropped(bus_kind: str, realtime: bool, monkey
     """It is off in the cycles of the fault and in no other; the nodes hear those that are in the log."""
     with bench(bus_kind, realtime, Silent(node="rig", start=0.1, end=0.13)) as one:
         asked: list[tuple[int, bool]] = []  # cycle by whose faults the rig goes, and whether its heartbeat is off
-        set_faults = one.loop._set_rig_faults
+        set_faults = loop.set_rig_faults
 
-        def note_faults(k: int) -> None:
-            set_faults(k)
+        def note_faults(master: Master, faults: Schedule, k: int) -> None:
+            set_faults(master, faults, k)
             asked.append((k, one.master.silent))
 
-        monkeypatch.setattr(one.loop, "_set_rig_faults", note_faults)
+        monkeypatch.setattr(hard_loop if realtime else loop, "set_rig_faults", note_faults)
         one.master._beat.configure(1, one.wire.clock.now())
         one.play(*range(160))
         one.loop.finish()
@@ -404,6 +407,15 @@ def test_nodes_that_are_gone_do_not_hold_up_lockstep_for_long(bus_kind: str) -> 
         one.loop.finish()
         answers = [row.xj for row in one.rows if not isnan(row.xj)]
         assert answers and 24.5e-6 < answers[0] < (played - 0.5) * 1e-6
+
+
+@raw_kinds
+def test_lockstep_waits_for_the_answer_to_a_second_sync(bus_kind: str) -> None:
+    """Else its feedback, which has no number, would be that of the next cycle."""
+    with bench(bus_kind, False, Duplicated(frame="sync", start=0.002, end=0.003)) as one:
+        one.play(*range(4))
+        one.loop.finish()
+    assert [round(row.xj * 1e6) for row in one.rows] == [0, 1, 2, 4]
 
 
 @raw_kinds
