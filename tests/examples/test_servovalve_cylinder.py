@@ -105,12 +105,15 @@ def test_motion_is_that_of_an_independent_solver() -> None:
 
 @pytest.fixture(scope="module")
 def press(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the model of another cylinder, and a run of it with dry friction."""
+    """A folder with the model of another cylinder, and a short run of it with dry friction: both ways, three speeds."""
     place = tmp_path_factory.mktemp("press")
     (place / "cylinder.py").write_bytes(PLANT.read_bytes())
     (place / "press.toml").write_text(OTHER)
+    volts = np.repeat([0.0, 3.0, 0.0, -3.0, 1.0, -2.0, 0.0], [100, 600, 200, 500, 300, 600, 100])
+    np.savetxt(place / "command.csv", np.column_stack([np.arange(len(volts)) * 1e-3, volts]), delimiter=",",
+               header="t,demand", comments="")
     rig("simulate", "--model", place / "press.toml", "--trust", "--set", "cylinder.friction=400",
-        "--out", place / "run.csv", "--quiet")
+        "--command", place / "command.csv", "--out", place / "run.csv", "--quiet")
     return place
 
 
