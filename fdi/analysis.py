@@ -352,13 +352,14 @@ def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eh
 
 
 def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Path | None = None,
-             trust: bool = False) -> DiagnosisResult:
-    """Judge filter clogging and spool friction: levels, sizes with 95 % intervals, other deviations.
+             faults: str | Path | None = None, trust: bool = False) -> DiagnosisResult:
+    """Judge faults: levels, sizes with 95 % intervals, other deviations.
 
     Args:
         trace: a run of any command, or its file.
         model: the healthy unit: a `Model`, a model file, or "eha".
         bands: a file of `rig fdi --learn-bands`; default: the bands that come with the software.
+        faults: a fault file, or a shipped list; default: those of the plant file, or clogging and spool friction.
         trust: whether effect files that a model file names may run; each is listed first, with its SHA-256.
 
     Raises:
@@ -366,12 +367,14 @@ def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Pat
     """
     from fdi.diagnosis.bands import load_bands
     from fdi.diagnosis.diagnosis import diagnose as diagnose_trace
+    from fdi.diagnosis.faults import choose_faults
     from fdi.report.diagnosis_report import build_diagnosis_report
 
     own_model = _load_model(model, trust)
-    measured, known_bands = _load_trace(trace, own_model), None if bands is None else load_bands(bands)
-    diagnosis = diagnose_trace(measured, own_model, known_bands,
-                               source=measured.provenance.get("source", "trace"))
+    known_bands = None if bands is None else load_bands(bands, own_model.kind)
+    measured, own_faults = _load_trace(trace, own_model), choose_faults(faults, own_model.kind)
+    diagnosis = diagnose_trace(measured, own_model, known_bands, source=measured.provenance.get("source", "trace"),
+                               faults=own_faults)
     return DiagnosisResult(build_diagnosis_report(diagnosis), diagnosis)
 
 

@@ -254,8 +254,9 @@ SECTION_MEASURED_SHARE = 0.8
 # Largest share of a trace's positions that may be missing and interpolated, for precursors and for learning bands.
 POSITION_MISSING_SHARE = 0.02
 
-# Known load, N, up to which bands of an unloaded ram hold: 100 N move the ram by 0.6 um, a third of the noise.
-BAND_LARGEST_LOAD = 100.0
+# Known load, in parts of the largest one of the plant, up to which bands of an unloaded plant hold: of the EHA 100 N,
+# which move the ram by 0.6 um, a third of the noise.
+BAND_LARGEST_LOAD = 1e-4
 
 # Difference, m, up to which two demands are the same: 20 counts of the bus, the least step that a section can have.
 SAME_COMMAND_POSITION = 2e-6
@@ -272,8 +273,8 @@ SAME_COMMAND_RATE = 0.002
 # is a dynamic friction of half the static one.
 FAST_SLIP_RATIO = 1.5
 
-# Spool friction over the healthy one above which a note names friction as the reason why clogging is not judged.
-FRICTION_HIDES_CLOGGING_RATIO = 2.0
+# Friction over the healthy one above which a note names it as the reason why a fault is not judged at the steps.
+FRICTION_HIDES_RATIO = 2.0
 
 # Healthy traces that bands of a fleet need at least; bands of 5, 8 and 12 traces find 58, 94 and 96 % of 96 units with
 # Kintas 0.25 (docs/statistics.md).

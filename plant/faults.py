@@ -45,9 +45,12 @@ class Fault:
     healthy: float = math.nan  # size of a healthy unit; default the nominal value of the parameter
     follow: Mapping[str, float] = field(default_factory=dict, hash=False)  # factors on the size; NaN: as nominal
     both_ways: bool = False  # the limits are distances from the healthy size, above and below it
+    axis: tuple[float, float] = (math.nan, math.nan)  # of the RMS maps; default a healthy unit to beyond MaxBand
     interval_factor: float = 1.0  # on the 95 % interval of a fit, where simulations show that it is too narrow
 
     def __post_init__(self) -> None:
+        for key in ("range", "axis"):  # JSON has lists
+            object.__setattr__(self, key, tuple(getattr(self, key)))
         if not isinstance(self.follow, Mapping):  # names alone
             object.__setattr__(self, "follow", dict.fromkeys(self.follow, math.nan))
 
@@ -192,13 +195,21 @@ def place_fault(fault: Fault, kind: Any, where: object = "faults") -> Fault:
     usual = {name: _find_usual(name, kind) for name in fault.parameters}
     if usual[fault.parameter] == 0.0 and any(map(math.isnan, fault.follow.values())):
         raise refuse("follow", f"a table of factors: {fault.parameter} is 0 in a healthy unit")
-    for name in fault.follow:
-        look_up("follow", name)
     follow = {name: usual[name] / usual[fault.parameter] if math.isnan(factor) else factor
               for name, factor in fault.follow.items()}
     placed = replace(fault, unit=q.unit, symbol=fault.symbol or q.symbol or fault.name, follow=follow,
                      healthy=usual[fault.parameter] if math.isnan(fault.healthy) else fault.healthy)
     _check_limits(placed, q, refuse)
+    for name, factor in follow.items():
+        led = look_up("follow", name)
+        if any(led.refuses(factor * size) for size in fault.range):
+            raise refuse("follow", f"factors that make values of {name}, {led.expected}, over the whole range, not "
+                                   f"{factor:g}")
+    if math.isnan(placed.axis[0]):
+        beyond = 10.0 / 7.0 * (placed.maintenance - (0.0 if placed.both_ways else placed.healthy))
+        ends = placed.healthy - beyond if placed.both_ways else placed.healthy, placed.healthy + beyond
+        low, high = (min(max(end, placed.range[0]), placed.range[1]) for end in sorted(ends))
+        placed = replace(placed, axis=(low, high))
     scatter = SCATTER * kind.find_tolerance(placed.parameter, q) * abs(placed.healthy)
     ends = placed.healthy - scatter, placed.healthy + scatter  # a range may begin at the nominal size
     low, high = (end if q.refuses(wider) else wider for end, wider in zip(placed.range, ends, strict=True))
@@ -228,6 +239,8 @@ def _check_limits(f: Fault, q: Any, refuse: Any) -> None:
     if not (healthy < f.acceptable < f.maintenance or (healthy > f.acceptable > f.maintenance and not f.both_ways)):
         raise refuse("acceptable", f"a size between that of a healthy unit, {healthy:g}, and maintenance, "
                                    f"{f.maintenance:g} {f.unit}, not {f.acceptable:g}")
+    if not (math.isnan(f.axis[0]) or low <= f.axis[0] < f.axis[1] <= high):
+        raise refuse("axis", f"[least, largest] within the range {low:g} .. {high:g} {f.unit}, not {list(f.axis)}")
     if not 0.1 <= f.interval_factor <= 10.0:
         raise refuse("interval_factor", f"a factor from 0.1 to 10, not {f.interval_factor:g}")
 
@@ -246,5 +259,6 @@ source = "3 and 7 % of the spool's half stroke"     # where the limits come from
 # symbol = "gap"                                    # of the size, in tables and as its key in JSON
 # healthy = 0                                       # size of a new unit; default: the nominal value of the parameter
 # both_ways = true                                  # the limits are distances from the healthy size, either way
+# axis = [0, 1.3e-4]                                # of the RMS maps; default: from a new unit to beyond MaxBand
 # follow = ["group.field"]                          # grow in proportion; or a table, {{ "group.field" = factor }}
 """

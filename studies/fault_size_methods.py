@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.diagnosis.bands import UnitKind, compute_features, simulate_units
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Fault, Level, classify_size
+from fdi.diagnosis.make_bands import UnitKind, simulate_units
+from fdi.diagnosis.precursors import compute_features
 from fdi.diagnosis.refine import (
     CountedProblem,
     list_coarse_starts,
@@ -52,8 +53,7 @@ class Row(NamedTuple):
 
 def apply_optimisers(diagnosis: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
     """Least squares and the global optimisers, each started from the sizes of the RMS grid."""
-    grid = diagnosis.grid
-    start = (grid.merged.kintas, grid.merged.fss) if grid else (0.1, 15.0)
+    start = diagnosis.grids[0].merged.sizes if diagnosis.grids else (0.1, 15.0)
     for number, (name, method) in enumerate(METHODS.items()):
         progress(name, number / len(METHODS))
         if name != "genetic" or is_installed("pygad"):
@@ -247,7 +247,8 @@ def simulate_lesson(trace: Trace, model: Model, seed: int = 0, progress: Progres
     tables = []
     for number, (k, f) in enumerate(pairs):
         progress("simulating faults to learn from", number / len(pairs))
-        made = simulate_units(model, com, trace.load, UnitKind(f"{k:g}, {f:g} N", k, f), units, seed + number)
+        made = simulate_units(model, com, trace.load, UnitKind(
+            f"{k:g}, {f:g} N", CLOGGING.list_changes(k) | FRICTION.list_changes(f)), units, seed + number)
         shown = compute_features(com, made, trace.period, parts)
         tables.append(np.column_stack([shown[name] for name in own]))
     x = np.vstack([*tables, np.array([[own[name][0] for name in own]])])

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi.diagnosis.bands import sample_sensor_noise
+from fdi.diagnosis.make_bands import sample_sensor_noise
 from fdi.estimation.fit import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
 from fdi.report.report import Column, Report, Section, tabulate

@@ -4,7 +4,7 @@ Figs. 7 and 8: what either fault does to a step and to a slow ramp. Figs. 10 to 
 step, position on a ramp, speed on a ramp. The RMS maps, figs. 14 and 15, are those of `rig fdi`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib import rc_context
@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from fdi.diagnosis.bands import Bands, Excursion, StepBand
+from fdi.diagnosis.bands import Bands, Excursion, StepBand, place_sections
 from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, thin_line, to_svg
 from fdi.trace.sections import Section
 from fdi.trace.trace import Trace
@@ -70,14 +70,15 @@ def draw_ramps(traces: Mapping[str, Trace], number: int = 0) -> str:
         return to_svg(figure, "ramps")
 
 
-def draw_bands(excursions: list[Excursion], friction: float, bands: Bands, trace: Trace, kind: str, signal: str) -> str:
+def draw_bands(excursions: list[Excursion], shown: Mapping[str, Sequence[float]], bands: Bands, trace: Trace, kind: str,
+               signal: str) -> str:
     """Figs. 10 (step, position), 11 (ramp, position) and 12 (ramp, speed): a trace in the bands.
 
     A step is drawn with the healthy response and its limits, a ramp as its departure from the healthy centre.
 
     Args:
         excursions: of the trace, from `fdi.diagnosis.bands.find_excursions`; positive is towards the fault.
-        friction: N, of the spool as the ramps show it, from `find_excursions` too.
+        shown: frictions that the ramps show, from `find_excursions` too.
         bands: the bands that the trace left.
         trace: the trace of the excursions.
         kind: of the sections, "step" or "ramp".
@@ -95,7 +96,7 @@ def draw_bands(excursions: list[Excursion], friction: float, bands: Bands, trace
         for ax, e in zip(axes, chosen, strict=True):
             if kind == "step":
                 band = _find_step_band(bands, trace, e)
-                _draw_step_in_band(ax, trace, e, band, band.compute_centre(friction, bands.friction)[0])
+                _draw_step_in_band(ax, trace, e, band, band.compute_centres(shown, bands)[0][0])
             else:
                 _draw_ramp_in_band(ax, trace, e)
             size = (e.section.last - e.section.first) * 1e3
@@ -108,9 +109,8 @@ def draw_bands(excursions: list[Excursion], friction: float, bands: Bands, trace
 
 def _find_step_band(bands: Bands, trace: Trace, e: Excursion) -> StepBand:
     """The band of the step that an excursion belongs to."""
-    own = [s for s in trace.sections() if s.kind in ("step", "ramp")]
-    known = [i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")]
-    return next(step for step in bands.steps if step.section == known[own.index(e.section)])
+    return next(step for place in [place_sections(bands, trace.sections())] for step in bands.steps
+                if place[step.section] == e.section)
 
 
 def _draw_step_in_band(ax: Axes, trace: Trace, e: Excursion, band: StepBand, centre: Floats) -> None:
@@ -119,7 +119,7 @@ def _draw_step_in_band(ax: Axes, trace: Trace, e: Excursion, band: StepBand, cen
     t, x = (trace.t[rows] - trace.t[e.section.start]) * 1e3, trace.xj[rows] * 1e3
     held = np.isfinite(e.departure)
     healthy = np.interp(t * 1e-3, band.t, centre) * 1e3
-    side = np.sign(np.interp(t * 1e-3, band.t, band.middle)) * 1e3
+    side = np.sign(np.interp(t * 1e-3, band.t, band.middle[e.fault])) * 1e3
     ax.plot(t, healthy, color=GREEN, lw=1.0, label="healthy")
     ax.plot(t, x, color=INK, lw=1.0, label="measured")
     for limit, colour, label in ((e.middle, AMBER, "MidBand"), (e.most, RED, "MaxBand")):

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from fdi import Trace
-from fdi.diagnosis.bands import choose_bands, find_excursions
+from fdi.diagnosis.bands import find_excursions
+from fdi.diagnosis.make_bands import choose_bands
 from fdi.diagnosis.rms_grid import search_grid
 from fdi.report.diagnosis_report import draw_maps
 from fdi.report.drawing import shorten_svg
@@ -36,9 +37,9 @@ def format_minima(name: str, drive: str, trace: Trace) -> str:
     """Minima of the three maps and centre of gravity as a row of the table."""
     g = search_grid(trace, drive=drive)
     assert g.step and g.ramp
-    cells = [f"{p.kintas:.3f}, {p.fss:.1f} N ({p.rms * 1e6:.1f} um)" for p in (
+    cells = [f"{p.sizes[0]:.3f}, {p.sizes[1]:.1f} N ({p.rms * 1e6:.1f} um)" for p in (
         g.step.minimum, g.ramp.minimum, g.joint.minimum, g.best)]
-    return f"| {name} | {drive} | {' | '.join(cells)} | {g.merged.kintas:.3f}, {g.merged.fss:.1f} N | " \
+    return f"| {name} | {drive} | {' | '.join(cells)} | {g.merged.sizes[0]:.3f}, {g.merged.sizes[1]:.1f} N | " \
            f"{g.merged.weight:.2f} |"
 
 
@@ -53,7 +54,7 @@ def format_scatter(kintas: float, fss: float, command: np.ndarray) -> str:
         unit = unit.replace({"filter.clogging": kintas, "spool.static_friction": fss,
                              "spool.dynamic_friction": fss / 1.5})
         g = search_grid(Trace.from_columns(simulate(unit, command, seed=seed)._asdict(), 1e-3, {}))
-        found.append([*g.merged[:2], *g.joint.minimum[:2], *g.best[:2]])
+        found.append([*g.merged.sizes, *g.joint.minimum.sizes, *g.best.sizes])
     off = np.array(found) - [kintas, fss, kintas, fss, kintas, fss]
     mean, sd = off.mean(0), off.std(0, ddof=1)
     cells = [f"{mean[i]:+.3f} ± {sd[i]:.3f}, {mean[i + 1]:+.1f} ± {sd[i + 1]:.1f} N" for i in (0, 2, 4)]
@@ -77,9 +78,9 @@ def main() -> None:
     save("8", figures.draw_ramps({"healthy": healthy} | stiff))
     case = cases["14"]
     bands = choose_bands(case.com, case.load, case.period, None, lambda *_: None)
-    found, friction, _ = find_excursions(case.com, case.xj, case.period, bands, case.sections())
+    found, shown, _ = find_excursions(case.com, case.xj, case.period, bands, case.sections())
     for number, kind, signal in (("10", "step", "position"), ("11", "ramp", "position"), ("12", "ramp", "speed")):
-        save(number, figures.draw_bands(found, friction, bands, case, kind, signal))
+        save(number, figures.draw_bands(found, shown, bands, case, kind, signal))
     for number, trace in cases.items():
         save(number, draw_maps(search_grid(trace), CASES[number]))
         for drive in ("current", "command"):

@@ -156,7 +156,8 @@ def test_the_answers_of_small_commands(preflight: Path, tmp_path: Path, monkeypa
 def test_the_answer_of_a_diagnosis(preflight: Path) -> None:
     answer = rig("fdi", preflight, "--json").json
     assert answer["events"] == []
-    event = {"band": "most", "signal": "speed", "section": "step", "t_in": 0.0, "t_out": 0.1, "excess": 1e-3}
+    event = {"band": "most", "fault": "spool_friction", "signal": "speed", "section": "step", "t_in": 0.0,
+             "t_out": 0.1, "excess": 1e-3}
     explanation = {"effects": ["null_bias"], "probability": 1.0, "parameters": {}, "ratio": {"xj": 1.0},
                    "level": answer["level"], **{key: answer["refined"][key] for key in ("kintas", "fss")}}
     beside = {"effects": [], "explained": True, "ambiguous": False, "disputed": [], "marks": {},

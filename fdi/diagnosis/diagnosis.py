@@ -4,6 +4,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -12,21 +13,26 @@ from fdi.diagnosis.bands import (
     Bands,
     BandVerdict,
     Event,
-    Precursor,
     describe_other_model,
     is_loaded,
-    is_nominal_plant,
     judge_trace,
     list_design,
     load_default_bands,
     matches_command,
-    measure_precursors,
 )
-from fdi.diagnosis.faults import FAULTS, Estimate, Fault, Level, choose_faults, find_ruling_fault, judge_size
+from fdi.diagnosis.faults import (
+    Estimate,
+    Fault,
+    Level,
+    choose_faults,
+    compute_severity,
+    find_ruling_fault,
+    judge_size,
+)
+from fdi.diagnosis.precursors import Precursor, measure_precursors
 from fdi.diagnosis.refine import (
     Beside,
     Refinement,
-    Sizes,
     choose_size_excerpt,
     find_effects_beside,
     get_positive,
@@ -63,7 +69,7 @@ class Diagnosis:
     sizes: Mapping[str, Estimate]  # by fault, SI, as the levels are judged by them
     groups: tuple[Group, ...]  # faults of which at least one has grown, without telling which
     refinement: Refinement
-    grid: Grid | None  # None: the command has neither steps nor ramps
+    grids: tuple[Grid, ...]  # of pairs of faults; none where the command has neither steps nor ramps
     precursors: Mapping[str, Precursor]
     band_verdict: BandVerdict | None  # None: there are no bands of this command
     others: Mapping[str, Estimate]  # suspects outside the healthy range, by parameter, SI
@@ -110,22 +116,12 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
                                                f"{controlled.unit} or more: at rest it shows no fault")
     notes = list(trace.notes)
     progress("bands", 0.03)
-    if not set(FAULTS) <= set(faults):
-        if bands is not None:
-            names = " and ".join(fault.name for fault in FAULTS)
-            raise InputError("--bands", "", f"none: bands judge {names}, which are not both among these faults")
-        notes.append("no bands: the software's own are of the paper's faults")
-    elif bands is None:
-        bands = _find_own_bands(trace, model, notes)
-    elif other := describe_other_model(bands, model):
-        design = ", ".join(f"{name} = {value:g}" for name, value in list_design(model).items())
-        raise InputError("--bands", f"made for {other}", f"bands of the model of this diagnosis, {model.name}"
-                         + (f" with {design}" if design else "") + "; rig fdi --learn-bands makes them")
+    bands = _find_own_bands(trace, model, faults, notes) if bands is None else _require_bands_of(bands, model, faults)
     band_verdict = None
     if bands is not None:
         band_verdict = judge_trace(trace, bands)
         notes += band_verdict.notes
-    precursors = measure_precursors(trace, bands)
+    precursors = measure_precursors(trace, bands.precursors if bands is not None else None)
     progress("grid", 0.05)
     floor = {name: f.value for name, f in sensor_floors(trace, model).items()}
     fitted = moving = leave_out_rest(trace, model)
@@ -134,13 +130,10 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         excerpt = choose_size_excerpt(model, moving, floor, progress, faults)
         fitted = cut_excerpt(moving, excerpt)
         notes.append(excerpt.describe(trace))
-    grid = _search_grid(fitted, model, notes) if set(FAULTS) <= set(faults) else None
+    grids = _search_grids(fitted, model, [faults] if len(faults) == 2 else [], notes)
     if with_effects:
         progress("refinement", 0.07)
-    maps = (grid.joint, grid.step, grid.ramp) if grid else ()
-    pairs = [grid.merged[:2]] if grid else []
-    pairs += [m.minimum[:2] for m in maps if m is not None]
-    starts = [_complete_sizes(faults, pair) for pair in pairs]
+    starts = [start for grid in grids for start in grid.starts]
     refinement = refine_sizes(model, fitted, (*starts, *list_coarse_starts(faults)), floor, workers, moving,
                               ignore_progress if with_effects else progress, faults)
     sizes = _widen_intervals(refinement)
@@ -157,10 +150,13 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         groups = find_groups(refinement, levels)
     if beside is not None:
         levels |= dict.fromkeys(beside.disputed)
+    if len(faults) > 2:
+        progress("grid", 0.98)
+        grids = _search_grids(fitted, model, _choose_pairs(faults, sizes, levels), notes)
     progress("done", 1.0)
     return Diagnosis(source=source, faults=faults, levels=levels, groups=groups,
                      verdict=_decide_verdict(levels, groups, refinement.is_explained),
-                     ruling=find_ruling_fault(faults, sizes, levels), sizes=sizes, refinement=refinement, grid=grid,
+                     ruling=find_ruling_fault(faults, sizes, levels), sizes=sizes, refinement=refinement, grids=grids,
                      precursors=precursors, band_verdict=band_verdict, others=_find_unhealthy(refinement, model),
                      trace=trace, model=model, floor=floor, bands=bands, notes=tuple(notes), beside=beside)
 
@@ -169,18 +165,38 @@ def _name_undecided(levels: Mapping[str, Level | None]) -> list[str]:
     return [name for name, level in levels.items() if level is None]
 
 
-def _complete_sizes(faults: Sequence[Fault], pair: Sizes) -> Sizes:
-    """One size for each fault from the pair of the grid; the others as in a healthy unit."""
-    known = dict(zip((fault.name for fault in FAULTS), pair, strict=True))
-    return tuple(known.get(fault.name, fault.healthy) for fault in faults)
+def _choose_pairs(faults: Sequence[Fault], sizes: Mapping[str, Estimate], levels: Mapping[str, Level | None],
+                  most: int = 3) -> list[tuple[Fault, Fault]]:
+    """The pairs of faults to draw maps of: of those that are not acceptable, and of the two that are furthest gone."""
+    ranked = sorted(faults, key=lambda f: (levels[f.name] == Level.ACCEPTABLE, -compute_severity(
+        f, sizes[f.name].value)))
+    gone = sum(levels[f.name] != Level.ACCEPTABLE for f in faults)
+    chosen = [f for f in faults if f in ranked[:min(max(gone, 2), most)]]
+    return list(combinations(chosen, 2))
 
 
-def _find_own_bands(trace: Trace, model: Model, notes: list[str]) -> Bands | None:
+def _require_bands_of(bands: Bands, model: Model, faults: Sequence[Fault]) -> Bands:
+    """Bands of another unit, or of none of these faults, are refused."""
+    if not any(own.is_of(fault) for own in bands.faults for fault in faults):
+        names = ", ".join(own.name for own in bands.faults)
+        raise InputError("--bands", f"of {names}", "bands of one of these faults with the same limits; rig fdi "
+                                                   "--learn-bands --faults FILE makes them")
+    if other := describe_other_model(bands, model):
+        design = ", ".join(f"{name} = {value:g}" for name, value in list_design(model, bands.faults).items())
+        raise InputError("--bands", f"made for {other}", f"bands of the model of this diagnosis, {model.name}"
+                         + (f" with {design}" if design else "") + "; rig fdi --learn-bands makes them")
+    return bands
+
+
+def _find_own_bands(trace: Trace, model: Model, faults: Sequence[Fault], notes: list[str]) -> Bands | None:
     """The bands that come with the software if they fit; a note if they do not."""
     own = load_default_bands()
     for fits, reason in (
-            (is_nominal_plant(model), "the software's own are of the nominal unit; rig fdi --learn-bands makes others"),
-            (not is_loaded(trace.load), "the ram is loaded, and the software's own are of a free one"),
+            (model.kind.name == own.kind.name and all(any(known.is_of(f) for f in faults) for known in own.faults),
+             "the software's own are of the paper's faults; rig fdi --learn-bands makes others"),
+            (not describe_other_model(own, model),
+             "the software's own are of the nominal unit; rig fdi --learn-bands makes others"),
+            (not is_loaded(trace.load, model.kind), "the plant is loaded, and the software's own are of a free one"),
             (matches_command(own, trace.command, trace.period),
              "the software's own are of the preflight command, this is another")):
         if not fits:
@@ -189,16 +205,15 @@ def _find_own_bands(trace: Trace, model: Model, notes: list[str]) -> Bands | Non
     return own
 
 
-def _search_grid(trace: Trace, model: Model, notes: list[str]) -> Grid | None:
-    kinds = {s.kind for s in trace.sections()}
-    if not kinds & {"step", "ramp"}:
+def _search_grids(trace: Trace, model: Model, pairs: Sequence[Sequence[Fault]], notes: list[str]) -> tuple[Grid, ...]:
+    if pairs and not {s.kind for s in trace.sections()} & {"step", "ramp"}:
         notes.append("no RMS grid: the command has neither steps nor ramps")
-        return None
+        return ()
     try:
-        return search_grid(trace, model)
+        return tuple(search_grid(trace, model, pair) for pair in pairs)
     except InputError as error:  # sections that a gap has emptied
         notes.append(f"no RMS grid: {error.expected}")
-        return None
+        return ()
 
 
 def _judge_sizes(sizes: Mapping[str, Estimate], refinement: Refinement) -> dict[str, Level | None]:

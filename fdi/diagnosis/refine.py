@@ -64,6 +64,7 @@ from fdi.estimation.unidentifiable import (
     LogProblem,
     PowerFree,
     descend_valley,
+    estimate_smooth_covariance,
     find_flat_directions,
     get_power,
     guess_covariance,
@@ -549,7 +550,7 @@ def _list_alone(problem: CountedProblem, found: Fit, fault: Fault) -> Floats:
 def polish_fit(problem: CountedProblem, found: Fit) -> Fit:
     """The fit with the plant's own steps: coarser ones bias sizes that they resemble, such as a lag.
 
-    Slopes are those of coarser steps, at a fifth of the time, except for the covariance of the end.
+    Slopes are those of coarser steps, at a fifth of the time.
     """
     exact, coarse = (replace(problem, steps=steps, _lanes={}) for steps in (problem.model.steps, FINE_STEPS))
     flat = find_flat(problem, found.free, found.x)
@@ -557,7 +558,7 @@ def polish_fit(problem: CountedProblem, found: Fit) -> Fit:
         begun = replace(found, covariance=guess_first_covariance(found.free))
         found = descend_valley(scale_noise(exact, factor), begun, rounds, flat, problem.stage,
                                scale_noise(coarse, factor))
-    return linearise_across(exact, found.free, found.x, found.covariance, flat)
+    return replace(found, covariance=estimate_smooth_covariance(coarse, found, flat))
 
 
 def _move_instead(problem: CountedProblem, found: Fit, fault: Fault, x: Floats) -> list[Floats]:

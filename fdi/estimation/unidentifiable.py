@@ -391,6 +391,8 @@ class LogProblem(Problem):
 
 PATIENCE = 3  # rounds without a gain, in which the covariance still grows to what it is
 DIRECTION_WIDTH_SD = 3.0  # of a difference, standard deviations
+SMOOTH_WIDTHS = (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0)  # of differences that are compared, standard deviations
+SMOOTH_PASSES = 4  # in which the covariance settles
 WIDEST_VARIANCE, NARROWEST_VARIANCE = 25.0, 1e-14  # variances of scaled unknowns, within which a direction is taken
 
 
@@ -474,16 +476,50 @@ def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats, stag
     return replace(relax_along(take_steps(problem, begun, linearise, rounds, stage), flat), converged=True)
 
 
-def linearise_across(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, flat: Floats) -> Fit:
-    """The model at `x` (p,), its Jacobian by differences across the valley, along principal directions there."""
+def list_moves_across(free: Sequence[Free], covariance: Floats, flat: Floats, width: float
+                      ) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """Places (k,) of the unknowns across the valley, the inverse (k, p) of their coordinates, and moves (k, p) of
+    `width` standard deviations along the principal directions there.
+    """
     places = choose_across(free, flat)
     basis = np.column_stack([np.eye(len(free))[:, places], flat])
     inverse = np.linalg.inv(basis)[:len(places)]  # of the coordinates across by all unknowns
     variances, vectors = np.linalg.eigh(inverse @ covariance @ inverse.T)
-    wide = DIRECTION_WIDTH_SD * vectors * np.sqrt(np.clip(variances, 1e-12, 9.0))
     moves = np.zeros((len(places), len(free)))
-    moves[:, places] = wide.T
-    moves = np.array([cut_at_bounds(free, x, way) for way in moves])
+    moves[:, places] = (width * vectors * np.sqrt(np.clip(variances, 1e-12, 9.0))).T
+    return places, inverse, moves
+
+
+def estimate_smooth_covariance(problem: Problem, found: Fit, flat: Floats) -> Floats:
+    """The covariance (p, p) of a fit by the slopes that the model has where it is smooth.
+
+    A stop of the ram that comes or goes within a difference makes it jump, and the jump is no slope: taken for one, it
+    makes directions known that are not, and intervals too narrow. So differences are taken at several widths, either
+    way, and each principal direction counts with the least of its slopes. The directions follow the covariance.
+    """
+    free, x, covariance = found.free, found.x, found.covariance
+    low, high = scaled_bounds(free)
+    weights = np.broadcast_to(compute_weights(found.white), found.white.shape).reshape(-1)
+    prior = np.diag(weigh_priors(free))
+    for _ in range(SMOOTH_PASSES):
+        places, inverse, ways = list_moves_across(free, covariance, flat, 1.0)
+        moves = np.clip(x + np.multiply.outer(SMOOTH_WIDTHS, ways), low, high) - x
+        white = problem.compute_white_residuals(free, np.vstack([x, x + moves.reshape(-1, len(x))]))
+        shifts = (white[1:] - white[0]).reshape(*moves.shape[:2], -1)
+        length = np.linalg.norm(moves, axis=2) / np.linalg.norm(ways, axis=1)
+        is_long = length > 0.5 * min(map(abs, SMOOTH_WIDTHS))  # others a bound has cut off
+        slopes = np.where(is_long, (weights * shifts**2).sum(axis=2) / np.maximum(length, 1e-9) ** 2, np.inf)
+        least = slopes.argmin(axis=0), np.arange(len(ways))
+        steep = np.asarray(np.linalg.pinv(moves[least][:, places]), np.float64) @ shifts[least]
+        jacobian = inverse.T @ steep
+        covariance = invert_hessian((jacobian * weights) @ jacobian.T + prior)
+    return covariance
+
+
+def linearise_across(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, flat: Floats) -> Fit:
+    """The model at `x` (p,), its Jacobian by differences across the valley, along principal directions there."""
+    places, inverse, ways = list_moves_across(free, covariance, flat, DIRECTION_WIDTH_SD)
+    moves = np.array([cut_at_bounds(free, x, way) for way in ways])
     predicted = problem.predict_unknowns(free, np.vstack([x, x + moves]))
     white, left = problem.whiten_predictions(predicted), problem.subtract_measurements(predicted[:1])[0]
     steep = np.asarray(np.linalg.pinv(moves[:, places]), np.float64) @ (white[1:] - white[0]).reshape(len(places), -1)

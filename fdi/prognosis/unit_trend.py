@@ -62,7 +62,7 @@ def read_points(path: Path, faults: Sequence[Fault] | None = None) -> Gathered:
     """
     try:
         answer = json.loads(path.read_text(encoding="utf-8"))
-        own = tuple(Fault(**{**table, "range": tuple(table["range"])}) for table in answer.get("faults", ()))
+        own = tuple(Fault(**table) for table in answer.get("faults", ()))
         faults = tuple(faults or own or FAULTS)
         points = tuple(Point(str(p["trace"]), float(p["t"]), {
             f.name: Estimate(*(float(p[f.key][name]) for name in Estimate._fields)) for f in faults},

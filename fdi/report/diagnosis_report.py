@@ -9,13 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi.diagnosis.ambiguity import Group
-from fdi.diagnosis.bands import (
-    Bands,
-    BandVerdict,
-    Event,
+from fdi.diagnosis.bands import BandFault, Bands, BandVerdict, Event, RampBand, StepBand, place_sections
+from fdi.diagnosis.diagnosis import Diagnosis
+from fdi.diagnosis.faults import FAULTS, Estimate, Fault, Level, compute_severity
+from fdi.diagnosis.precursors import (
     Precursor,
-    RampBand,
-    StepBand,
     compute_half_range,
     compute_speed,
     find_lasting_peak,
@@ -23,10 +21,8 @@ from fdi.diagnosis.bands import (
     read_columns,
     select_ramp_rows,
 )
-from fdi.diagnosis.diagnosis import Diagnosis
-from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Fault, Level, compute_severity
 from fdi.diagnosis.refine import Beside, Explanation
-from fdi.diagnosis.rms_grid import LOWER_CORNER, UPPER_CORNER, Grid, Map
+from fdi.diagnosis.rms_grid import Grid, Map, Merged, Point, find_corners
 from fdi.report.drawing import (
     BLUE,
     COMMAND,
@@ -54,6 +50,7 @@ from fdi.report.numbers import (
     NO_NUMBER,
     attach_unit,
     choose_unit,
+    format_amount,
     format_digits,
     format_interval,
     format_ratio,
@@ -79,6 +76,7 @@ from fdi.trace.sections import Section as CommandSection
 from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace
 from plant.model import Model, find_quantity
+from plant.signals import Signal
 
 LEVEL_NAMES = {Level.ACCEPTABLE: "acceptable", Level.MAINTENANCE: "maintenance", Level.NON_NOMINAL: "non-nominal",
                None: "cannot be judged"}
@@ -105,7 +103,7 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
         Section("Faults", [_tabulate_faults(d), Figure(
             "Each estimate of the sizes over the three levels: green acceptable, amber maintenance, red "
             "non-nominal. Circle: fit with its 95 % interval; diamonds: the other methods.",
-            partial(draw_sizes, d.faults, d.sizes, d.grid, d.band_verdict))]),
+            partial(draw_sizes, d.faults, d.sizes, d.grids, d.band_verdict))]),
         Section("Other effects", _show_effects(d)),
         Section("Response in its bands", _show_bands(d)),
         Section("Events", _tabulate_events(d)),
@@ -125,11 +123,11 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
 
 def build_bands_report(made: Mapping[str, Any]) -> Report:
     """Report on bands that `rig fdi --learn-bands` wrote."""
-    judged = join_words(fault.title for fault in FAULTS if fault.name in made["judges"])
+    judged = join_words(name.replace("_", " ") for name in made["judges"])
     return Report(
         command="fdi", title=str(made["bands"]), files=[("bands", str(made["bands"]))],
         sentence=f"The bands judge {judged}." if judged else
-        "The bands judge neither fault: the responses of both are within the scatter of healthy units.",
+        "The bands judge none of the faults: their responses are within the scatter of healthy units.",
         sections=[Section("Provenance", [Line(label, str(text)) for label, text in made["provenance"].items()])],
         data=made)
 
@@ -262,15 +260,16 @@ def describe_residual(d: Diagnosis) -> str:
 
 def describe_overruled_bands(d: Diagnosis) -> list[str]:
     """A sentence for each fault that the fit judges better than the bands do: which result to trust, and why."""
-    sentences = []
+    by_bands = d.band_verdict.levels if d.band_verdict else {}
+    alike: dict[tuple[Level, Level], list[str]] = {}
     for fault in d.faults:
-        by_bands = d.band_verdict.levels.get(fault.name) if d.band_verdict else None
-        level = d.levels[fault.name]
-        if by_bands is not None and level is not None and by_bands > level:
-            cause = f", with {_list_others(d)}" if d.others else ""
-            sentences.append(f"The bands call {fault.title} {LEVEL_NAMES[by_bands]}; the fit, which models "
-                             f"the whole plant, finds it {LEVEL_NAMES[level]}{cause}. Trust the fit.")
-    return sentences
+        found, level = by_bands.get(fault.name), d.levels[fault.name]
+        if found is not None and level is not None and found > level:
+            alike.setdefault((found, level), []).append(fault.title)
+    cause = f", with {_list_others(d)}" if d.others else ""
+    return [f"The bands call {join_words(titles)} {LEVEL_NAMES[found]}; the fit, which models the whole plant, finds "
+            f"{'it' if len(titles) == 1 else 'them'} {LEVEL_NAMES[level]}{cause}. Trust the fit."
+            for (found, level), titles in alike.items()]
 
 
 def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
@@ -278,29 +277,28 @@ def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
 
     `far`: cells of the grid outside the interval of the fit.
     """
-    sentences: list[str] = []
-    g = d.grid
-    if g is None:
-        return sentences
-    for fault, axis in zip(FAULTS, (g.kintas, g.fss), strict=True):
-        size, found = d.sizes[fault.name], float(getattr(g.merged, fault.key))
-        outside = max(size.low - found, found - size.high)
-        if outside <= far * float(axis[1] - axis[0]):
-            continue
-        parts = [f"{words} {format_digits(float(getattr(part.minimum, fault.key)))}"
-                 for words, part in (("steps", g.step), ("ramps", g.ramp)) if part is not None]
-        at = f"{fault.symbol} {attach_unit(format_digits(found), fault.unit)}"
-        sentence = (f"The grid gives {at} (minima: {', '.join(parts)}), the fit {format_size(fault, size)}: the grid "
-                    "matches the position alone with a plant that has only these two faults")
-        if d.others:
-            sentence += f", here with {_list_others(d)}"
-        left = d.refinement.errors.get(d.trace.declared.controlled.name)
-        if left is not None:
-            sentence += (f"; its best cell leaves {1e6 * g.joint.minimum.rms:.3g} um of the position, the fit "
-                         f"{1e6 * left:.3g} um")
-        trust = "Trust the fit" if d.refinement.is_explained else "The fit does not explain the trace either"
-        sentences.append(f"{sentence}. {trust}.")
-    return sentences
+    sentences: dict[str, str] = {}
+    controlled = d.trace.declared.controlled.name
+    for g in d.grids:
+        for fault, axis in zip(g.faults, g.axes, strict=True):
+            size, found = d.sizes[fault.name], g.find_size(fault, g.merged)
+            outside = max(size.low - found, found - size.high)
+            if outside <= far * float(axis[1] - axis[0]):
+                continue
+            parts = [f"{words} {format_digits(g.find_size(fault, part.minimum))}"
+                     for words, part in (("steps", g.step), ("ramps", g.ramp)) if part is not None]
+            at = f"{fault.symbol} {attach_unit(format_digits(found), fault.unit)}"
+            sentence = (f"The grid gives {at} (minima: {', '.join(parts)}), the fit {format_size(fault, size)}: the "
+                        "grid matches the position alone with a plant that has only these two faults")
+            if d.others:
+                sentence += f", here with {_list_others(d)}"
+            left = d.refinement.errors.get(controlled)
+            if left is not None:
+                sentence += (f"; its best cell leaves {format_amount(g.joint.minimum.rms, g.unit)} of the position, "
+                             f"the fit {format_amount(left, g.unit)}")
+            trust = "Trust the fit" if d.refinement.is_explained else "The fit does not explain the trace either"
+            sentences.setdefault(fault.name, f"{sentence}. {trust}.")
+    return list(sentences.values())
 
 
 def _list_others(d: Diagnosis) -> str:
@@ -333,9 +331,8 @@ def _tabulate_faults(d: Diagnosis) -> Table:
     by_bands = d.band_verdict.levels if d.band_verdict else {}
 
     def show_grid(fault: Fault) -> str:
-        if d.grid is None or fault not in FAULTS:
-            return NO_NUMBER
-        return attach_unit(format_digits(float(getattr(d.grid.merged, fault.key))), fault.unit)
+        grid = next((g for g in d.grids if fault in g.faults), None)
+        return NO_NUMBER if grid is None else format_amount(grid.find_size(fault, grid.merged), fault.unit)
 
     def show_bands(fault: Fault) -> Cell:
         level = by_bands.get(fault.name)
@@ -396,13 +393,32 @@ def _show_bands(d: Diagnosis) -> list[Item]:
     items: list[Item] = [Figure("Command and position. Shaded: times outside MidBand (amber) and MaxBand (red).",
                                 partial(draw_overview, d.trace, judged))]
     if bands is not None:
-        items += [Figure(
-            "Steps judge filter clogging: measured position less that of a healthy unit with the friction that the "
-            "ramps show. Green: scatter of healthy units; amber and red: limits, drawn where clogging is "
-            "distinguishable from healthy scatter.", partial(draw_steps, d.trace, bands, judged)), Figure(
-            "Ramps judge spool friction: following error (top) and speed beyond the demand (bottom). Green: scatter of "
-            "healthy units; amber and red: limits.", partial(draw_ramps, d.trace, bands, judged))]
+        at_steps, at_ramps = (_choose_drawn_fault(d, bands, judged, kind) for kind in ("step", "ramp"))
+        if at_steps is not None:
+            allowed = " with the friction that the ramps show" if judged.shown else ""
+            items.append(Figure(
+                f"Steps judge {_title(d, at_steps)}: measured position less that of a healthy unit{allowed}. Green: "
+                "scatter of healthy units; amber and red: limits, drawn where the fault is distinguishable from it.",
+                partial(draw_steps, d.trace, bands, judged, at_steps)))
+        if at_ramps is not None:
+            items.append(Figure(
+                f"Ramps judge {_title(d, at_ramps)}: following error (top) and speed beyond the demand (bottom). "
+                "Green: scatter of healthy units; amber and red: limits.",
+                partial(draw_ramps, d.trace, bands, judged, at_ramps)))
     return items
+
+
+def _choose_drawn_fault(d: Diagnosis, bands: Bands, judged: BandVerdict, kind: str) -> BandFault | None:
+    """Of the faults that sections of a kind judge, the one that is furthest in its bands."""
+    drawn = {name for s in bands.steps for name in s.middle}
+    if kind == "ramp":
+        drawn = {r.fault for r in bands.ramps if math.isfinite(r.position.middle)}
+    own = [fault for fault in bands.faults if fault.name in drawn]
+    return max(own, key=lambda f: (f.name in d.levels, judged.severity.get(f.name, -1.0)), default=None)
+
+
+def _title(d: Diagnosis, fault: BandFault) -> str:
+    return next((f.title for f in d.faults if f.name == fault.name), fault.name.replace("_", " "))
 
 
 def _tabulate_events(d: Diagnosis) -> list[Item]:
@@ -411,30 +427,34 @@ def _tabulate_events(d: Diagnosis) -> list[Item]:
     if not d.events:
         return [Paragraph("None: the response stays within MidBand.", medium=Medium.PAGE)]
 
+    unit = d.trace.declared.controlled.unit
+    titles = {f.name: f.title for f in d.faults}
+
     def show_furthest(group: Sequence[Event]) -> str:
-        scale, unit = (1e6, "um") if group[0].signal == "position" else (1e3, "mm/s")
-        return f"{max(abs(event.excess) for event in group) * scale:.3g} {unit}"
+        furthest = max(abs(event.excess) for event in group)
+        return format_amount(furthest, unit if group[0].signal == "position" else f"{unit}/s")
 
     return [tabulate(
         _group_events(d.events), (Column("band"), lambda group: BAND_NAMES[group[0].band]),
+        (Column("fault"), lambda group: titles.get(group[0].fault, group[0].fault.replace("_", " "))),
         (Column("signal"), lambda group: group[0].signal), (Column("section"), lambda group: group[0].section),
         (Column("events", align="right"), lambda group: str(len(group))),
         (Column("first begins", "s", "right"), lambda group: f"{group[0].t_in:.3f}"),
         (Column("last ends", "s", "right"), lambda group: f"{group[-1].t_out:.3f}"),
         (Column("time outside", "ms", "right"), lambda group: f"{1e3 * sum(e.t_out - e.t_in for e in group):.0f}"),
         (Column("furthest", align="right", medium=Medium.PAGE), show_furthest),
-        caption="Times outside a band, by band, signal and section of the command. rig fdi --json lists every event "
-                "with its distance from the band.", terminal_rows=10)]
+        caption="Times outside a band, by band, fault, signal and section of the command. rig fdi --json lists every "
+                "event with its distance from the band.", terminal_rows=10)]
 
 
 def _group_events(events: Sequence[Event], apart: float = 0.5) -> list[list[Event]]:
-    """Events of one band, signal and section together; one that is more than `apart` s later starts a new group.
+    """Events of one band, fault, signal and section together; one that is more than `apart` s later starts a new group.
 
     A command may have several sections of the same name.
     """
     groups: list[list[Event]] = []
     for event in events:
-        own = next((group for group in reversed(groups) if group[-1][:3] == event[:3]), None)
+        own = next((group for group in reversed(groups) if group[-1][:4] == event[:4]), None)
         if own is None or event.t_in - own[-1].t_out > apart:
             groups.append([event])
         else:
@@ -443,20 +463,24 @@ def _group_events(events: Sequence[Event], apart: float = 0.5) -> list[list[Even
 
 
 def _show_maps(d: Diagnosis) -> list[Item]:
-    grid = d.grid
-    if grid is None:
-        return []
+    return [item for grid in d.grids for item in _show_maps_of_pair(grid)]
+
+
+def _show_maps_of_pair(grid: Grid) -> list[Item]:
     found = (("steps, A", grid.step), ("ramps, B", grid.ramp), ("both, C", grid.joint))
-    rows = [[name, f"{m.minimum.kintas:.3f}", f"{m.minimum.fss:.3g}", f"{m.minimum.rms * 1e6:.2f}"]
-            for name, m in found if m]
-    rows.append([f"centre of gravity, G ({100 * grid.merged.weight:.0f} % of A)", f"{grid.merged.kintas:.3f}",
-                 f"{grid.merged.fss:.3g}", ""])
-    columns = [Column("minimum"), Column("Kintas", align="right"), Column("FSS", "N", "right"),
-               Column("RMS", "um", "right")]
-    return [Figure("RMS difference between the measured position and that of the monitor model, for every pair of "
-                   "fault sizes (logarithmic colour scale). The minima A (steps) and B (ramps) are merged into G; "
-                   "dashed: the first bisector.", partial(draw_maps, grid)),
-            Table(columns, rows, "Where each map has its minimum.", is_list=True)]
+    points: list[tuple[str, Point | Merged]] = [(name, m.minimum) for name, m in found if m]
+    points.append((f"centre of gravity, G ({100 * grid.merged.weight:.0f} % of A)", grid.merged))
+    first, second = grid.faults
+    return [Figure(f"{first.title.capitalize()} and {second.title}: RMS difference between the measured position and "
+                   "that of a plant with these two faults alone, for every pair of sizes (logarithmic colours). The "
+                   "minima A (steps) and B (ramps) are merged into G; dashed: the first bisector.",
+                   partial(draw_maps, grid)),
+            tabulate(points, (Column("minimum"), lambda point: point[0]),
+                     *((Column(fault.symbol, align="right"), lambda point, fault=fault: format_amount(
+                         grid.find_size(fault, point[1]), fault.unit)) for fault in grid.faults),
+                     (Column("RMS", align="right"), lambda point: format_amount(point[1].rms, grid.unit)
+                      if isinstance(point[1], Point) else ""),
+                     caption="Where each map has its minimum.", is_list=True)]
 
 
 def _show_precursors(d: Diagnosis) -> list[Item]:
@@ -468,8 +492,18 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
 
     found, number = d.precursors, partial(Column, unit="", align="right", medium=Medium.PAGE)
 
-    def show_value(title: str, find_value: Callable[[Precursor], float]) -> tuple[Column, Callable[[str], str]]:
+    def show_value(title: str, find_value: Callable[[Precursor], float]) -> tuple[Column, Callable[[str], Cell | str]]:
         return number(title), lambda name: format_precursor(find_value(found[name]), name, found[name].unit)
+
+    def show_fault(fault: BandFault) -> list[tuple[Column, Callable[[str], Cell | str]]]:
+        title = f"{_name_limit(fault)} adds"
+
+        def ratio(name: str) -> Cell | str:
+            return show_deviation(found[name].compute_ratio(fault.name))
+
+        if d.bands and len(d.bands.faults) > 2:  # of many faults there is no room for both
+            return [(number(title, unit="s.d."), ratio)]
+        return [show_value(title, lambda p: p.adds.get(fault.name, math.nan)), (number("in s.d."), ratio)]
 
     return [tabulate(
         found, (Column("precursor"), lambda name: found[name].words),
@@ -477,20 +511,23 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
         *((show_value("healthy", lambda p: p.healthy), show_value("healthy s.d.", lambda p: p.noise),
            (Column("deviation", "s.d.", "right"), lambda name: Cell(
                show_deviation(found[name].departure), "bad" if 4.0 < abs(found[name].departure) < math.inf else "")),
-           show_value(f"Kintas {CLOGGING.acceptable:g} adds", lambda p: p.clogging),
-           (number("in s.d."), lambda name: show_deviation(found[name].clogging_ratio)),
-           show_value(f"FSS {FRICTION.acceptable:g} N adds", lambda p: p.friction),
-           (number("in s.d."), lambda name: show_deviation(found[name].friction_ratio))) if d.bands else ()),
+           *(column for fault in d.bands.faults for column in show_fault(fault))) if d.bands else ()),
         caption="Deviation: measured minus healthy mean, in standard deviations of healthy units; red beyond 4."
         if d.bands else "As measured; without bands there are no healthy units to compare with."),
         *([Figure("How far a fault at MidBand moves each precursor, in standard deviations of healthy units: longer "
                   "bars discriminate better; below the dotted line (3) a single test does not show the fault.",
-                  partial(draw_precursor_shifts, found))] if d.bands else [])]
+                  partial(draw_precursor_shifts, found, d.bands.faults))] if d.bands else [])]
+
+
+def _name_limit(fault: BandFault | Fault) -> str:
+    """MidBand of a fault: "FSS 35 N"."""
+    scale, unit = choose_unit(fault.unit, abs(fault.acceptable))
+    return f"{fault.symbol} {fault.acceptable / scale:g} {unit}".rstrip()
 
 
 def collect_data(d: Diagnosis) -> dict[str, Any]:
     """The answer of `rig fdi --json`; SI units."""
-    g, r = d.grid, d.refinement
+    r = d.refinement
     return {
         "verdict": d.verdict, "sentence": describe_verdict(d),
         "level": {name: level.word if level is not None else None for name, level in d.levels.items()},
@@ -502,10 +539,8 @@ def collect_data(d: Diagnosis) -> dict[str, Any]:
         "bands": {"level": {name: level.word for name, level in d.band_verdict.levels.items()},
                   "ruling": d.band_verdict.ruling} if d.band_verdict else None,
         "precursors": {name: p._asdict() for name, p in d.precursors.items()},
-        "grid": None if g is None else {
-            **{name: None if found is None else found.minimum._asdict()
-               for name, found in (("step", g.step), ("ramp", g.ramp), ("joint", g.joint))},
-            "merged": g.merged._asdict(), "simulations": g.simulations},
+        "grid": _collect_grid(d.grids[0]) if d.grids else None,
+        "grids": [{"faults": [f.name for f in g.faults], **_collect_grid(g)} for g in d.grids],
         "refined": {**{f.key: d.sizes[f.name]._asdict() for f in d.faults},
                     "correlation": r.correlation, "method": r.method, "simulations": r.simulations,
                     "reached": r.is_explained},
@@ -514,6 +549,16 @@ def collect_data(d: Diagnosis) -> dict[str, Any]:
         "notes": list(d.notes),
         **({"with_effects": _collect_beside(d)} if d.beside is not None else {}),
     }
+
+
+def _collect_grid(g: Grid) -> dict[str, Any]:
+    def collect(point: Point | Merged) -> dict[str, Any]:
+        sizes = dict(zip((f.key for f in g.faults), point.sizes, strict=True))
+        return sizes | {key: x for key, x in point._asdict().items() if key != "sizes"}
+
+    maps = (("step", g.step), ("ramp", g.ramp), ("joint", g.joint))
+    return {**{name: None if found is None else collect(found.minimum) for name, found in maps},
+            "merged": collect(g.merged), "simulations": g.simulations}
 
 
 def _collect_faults(faults: Sequence[Fault]) -> dict[str, dict[str, Any]]:
@@ -543,84 +588,102 @@ def _collect_beside(d: Diagnosis) -> dict[str, Any]:
 
 SHADES = {"middle": ORANGE, "most": RED}
 MAP_CONTOURS = 7
-UM, MM, MS = 1e6, 1e3, 1e3
+MS = 1e3
+
+
+class _Axes(NamedTuple):
+    """Units of the axes of a controlled signal, each with how many of it make one SI unit."""
+
+    signal: tuple[str, float]
+    small: tuple[str, float]  # of its departures
+    speed: tuple[str, float]
+
+
+def _choose_axes(signal: Signal) -> _Axes:
+    if signal.unit == "m":
+        return _Axes(("mm", 1e3), ("um", 1e6), ("mm/s", 1e3))
+    return _Axes((signal.unit, 1.0), (signal.unit, 1.0), (f"{signal.unit}/s", 1.0))
 
 
 def draw_overview(trace: Trace, judged: BandVerdict) -> str:
     """Command and position of the whole trace, times outside the bands shaded."""
     limits = (float(trace.t[0]), float(trace.t[-1]) + trace.period)
+    command, controlled = trace.declared.command, trace.declared.controlled
+    unit, scale = _choose_axes(controlled).signal
     return draw_panels("overview", [[[
-        line(trace.t, trace.command * MM, COMMAND, "Com, command", 2.2),
-        line(trace.t, trace.mask_unusable(trace.declared.controlled.name) * MM, BLUE, "XJ, position"),
+        line(trace.t, trace.command * scale, COMMAND, f"{command.symbol}, command", 2.2),
+        line(trace.t, trace.mask_unusable(controlled.name) * scale, BLUE, f"{controlled.symbol}, measured"),
         *_shade_events(judged.events, limits),
-        axes(xlim=limits, ylabel="position [mm]", xlabel="time [s]"), legend(2)]]], 2.4)
+        axes(xlim=limits, ylabel=f"{controlled.symbol} [{unit}]", xlabel="time [s]"), legend(2)]]], 2.4)
 
 
-def draw_steps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
-    """Each judged step: position less the healthy response, healthy units' scatter, limits, and events."""
-    if not bands.steps:
-        return ""
+def draw_steps(trace: Trace, bands: Bands, judged: BandVerdict, fault: BandFault) -> str:
+    """Each step as it judges a fault: position less the healthy response, scatter of healthy units, limits, events."""
     place = _find_sections(trace, bands)
-    panels: list[Panel] = [_draw_step(trace, bands, step, place[step.section], judged) for step in bands.steps]
+    panels: list[Panel] = [_draw_step(trace, bands, step, place[step.section], judged, fault)
+                           for step in bands.steps if fault.name in step.middle]
     across = min(2, len(panels))
     panels += [[]] * (-len(panels) % across)
     rows = [panels[i:i + across] for i in range(0, len(panels), across)]
     return draw_panels("steps", rows, 2.5 * len(rows), common_legend=True)
 
 
-def _draw_step(trace: Trace, bands: Bands, step: StepBand, s: CommandSection, judged: BandVerdict) -> Panel:
-    t, begin, side = step.t * MS, float(trace.t[s.start]), np.sign(step.middle)
-    centre, spread = step.compute_centre(judged.friction, bands.friction)
-    middle, most, there = bands.compute_margins(step, spread)
+def _draw_step(trace: Trace, bands: Bands, step: StepBand, s: CommandSection, judged: BandVerdict, fault: BandFault
+               ) -> Panel:
+    controlled = trace.declared.controlled
+    (unit, scale), (small, factor), _ = _choose_axes(controlled)
+    t, begin, side = step.t * MS, float(trace.t[s.start]), np.sign(step.middle[fault.name])
+    centre, spread = step.compute_centres(judged.shown, bands)[0]
+    middle, most, there = step.compute_margins(fault, spread)
     rows = np.minimum(s.start + np.rint(step.t / trace.period).astype(int), s.stop - 1)
-    healthy = BAND_NEAREST_LIMIT_SD * spread * UM
+    healthy = BAND_NEAREST_LIMIT_SD * spread * factor
+    events = [e for e in judged.events if e.fault == fault.name]
     return [area(t, -healthy, healthy, GREEN, "healthy", 0.15),
-            *(line(t, np.where(there, side * limit, np.nan) * UM, colour, label, 1.6)
+            *(line(t, np.where(there, side * limit, np.nan) * factor, colour, label, 1.6)
               for limit, colour, label in ((middle, ORANGE, "MidBand"), (most, RED, "MaxBand"))),
-            line(t, (trace.mask_unusable(trace.declared.controlled.name)[rows] - centre) * UM, INK, "measured"),
-            *_shade_events(judged.events, (0.0, float(t[-1])), "position", MS, begin),
-            axes(xlim=(0.0, float(t[-1])), title=f"step of {(s.last - s.first) * MM:+.3g} mm at {begin:.4g} s",
-                 xlabel="time from the step [ms]", ylabel="off the healthy\nresponse [um]")]
+            line(t, (trace.mask_unusable(controlled.name)[rows] - centre) * factor, INK, "measured"),
+            *_shade_events(events, (0.0, float(t[-1])), "position", MS, begin),
+            axes(xlim=(0.0, float(t[-1])), title=f"step of {(s.last - s.first) * scale:+.3g} {unit} at {begin:.4g} s",
+                 xlabel="time from the step [ms]", ylabel=f"off the healthy\nresponse [{small}]")]
 
 
-def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
-    """Each judged ramp: following error and speed within their limits, and events."""
-    if not bands.ramps:
-        return ""
+def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict, fault: BandFault) -> str:
+    """Each ramp as it judges a fault: following error and speed within their limits, and events."""
     place = _find_sections(trace, bands)
-    pairs = [_draw_ramp(trace, ramp, place[ramp.section], judged, number == 0)
-             for number, ramp in enumerate(bands.ramps)]
+    own = [ramp for ramp in bands.ramps if ramp.fault == fault.name]
+    pairs = [_draw_ramp(trace, ramp, place[ramp.section], judged, number == 0) for number, ramp in enumerate(own)]
     return draw_panels("ramps", list(zip(*pairs, strict=True)), 4.6, common_legend=True, sharex="col", sharey="row")
 
 
 def _draw_ramp(trace: Trace, ramp: RampBand, s: CommandSection, judged: BandVerdict, is_first: bool) -> list[Panel]:
     rows, way = select_ramp_rows(s, trace.period), np.sign(s.rate)
     x = trace.mask_unusable(trace.declared.controlled.name)
+    _, (small, factor), (speed, speed_factor) = _choose_axes(trace.declared.controlled)
+    events = [e for e in judged.events if e.fault == ramp.fault]
     error = way * (trace.command[rows] - x[rows])
     fast = way * compute_speed(x, trace.period)[rows] - abs(s.rate)
     scale = ramp.compute_scale(float(compute_half_range(error)), float(find_lasting_peak(fast)))
     limits = (float(trace.t[rows.start]), float(trace.t[rows.stop - 1]))
-    above = axes(title=f"ramp at {s.rate * MM:+.3g} mm/s, judged from {limits[0]:.4g} s",
-                 ylabel="error [um]" if is_first else "")
-    below = axes(xlabel="time [s]", ylabel="speed beyond the\ndemand's [mm/s]" if is_first else "")
+    above = axes(title=f"ramp at {s.rate * speed_factor:+.3g} {speed}, judged from {limits[0]:.4g} s",
+                 ylabel=f"error [{small}]" if is_first else "")
+    below = axes(xlabel="time [s]", ylabel=f"speed beyond the\ndemand's [{speed}]" if is_first else "")
     panels: list[Panel] = []
-    for values, width, unit, nearer, name, labels in ((error, ramp.position, UM, 1 / scale, "position", above),
-                                                      (fast, ramp.speed, MM, 1.0, "speed", below)):
+    for values, width, unit, nearer, name, labels in (
+            (error, ramp.position, factor, 1 / scale, "position", above),
+            (fast, ramp.speed, speed_factor, 1.0, "speed", below)):
         middle, healthy = width.centre * unit, width.healthy * unit
         panels.append([
             band(middle - healthy, middle + healthy, GREEN, "healthy", 0.15),
             *(mark for limit, colour, label in ((width.middle, ORANGE, "MidBand"), (width.most, RED, "MaxBand"))
               if np.isfinite(limit) for mark in levels(nearer * limit * unit, colour, label, 1.2, middle=middle)),
-            line(trace.t[rows], values * unit, INK, "measured", 0.8), *_shade_events(judged.events, limits, name),
+            line(trace.t[rows], values * unit, INK, "measured", 0.8), *_shade_events(events, limits, name),
             axes(xlim=limits), labels])
     return panels
 
 
 def _find_sections(trace: Trace, bands: Bands) -> dict[int, CommandSection]:
     """The trace's sections by their number in the bands."""
-    com = read_columns(trace)[0]
-    own = [s for s in find_sections(com, trace.period) if s.kind in ("step", "ramp")]
-    return dict(zip([i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")], own, strict=True))
+    return place_sections(bands, find_sections(read_columns(trace)[0], trace.period, bands.scale))
 
 
 def _shade_events(events: Sequence[Event], limits: tuple[float, float], signal: str = "", unit: float = 1.0,
@@ -631,17 +694,18 @@ def _shade_events(events: Sequence[Event], limits: tuple[float, float], signal: 
                   alpha=0.18, lw=0, zorder=-1) for shown, colour in SHADES.items()]
 
 
-def draw_sizes(faults: Sequence[Fault], sizes: Mapping[str, Estimate], grid: Grid | None,
-               judged: BandVerdict | None) -> str:
+def draw_sizes(faults: Sequence[Fault], sizes: Mapping[str, Estimate], grids: Sequence[Grid] = (),
+               judged: BandVerdict | None = None) -> str:
     """The faults' sizes: refined with its interval, grid, and what the ramps show, over the three levels."""
-    points = () if grid is None else (
-        ("grid, merged", grid.merged), ("grid, steps", grid.step and grid.step.minimum),
-        ("grid, ramps", grid.ramp and grid.ramp.minimum))
     panels = []
     for fault in faults:
-        found = [(label, float(getattr(point, fault.key))) for label, point in points if point and fault in FAULTS]
-        if judged is not None and fault == FRICTION:
-            found.append(("bands, ramps", judged.friction))
+        found = []
+        for grid in [g for g in grids if fault in g.faults][:1]:
+            points = (("grid, merged", grid.merged), ("grid, steps", grid.step and grid.step.minimum),
+                      ("grid, ramps", grid.ramp and grid.ramp.minimum))
+            found += [(label, grid.find_size(fault, point)) for label, point in points if point]
+        if judged is not None and fault.name in judged.shown:
+            found.append(("bands, ramps", judged.shown[fault.name][0]))
         panels.append(_draw_sizes_of_fault(fault, sizes[fault.name], found))
     panels += [[]] * (-len(panels) % 2)
     return draw_panels("estimates", [panels[i:i + 2] for i in range(0, len(panels), 2)], 1.9 * ((len(panels) + 1) // 2))
@@ -663,28 +727,28 @@ def _draw_sizes_of_fault(fault: Fault, fit: Estimate, found: Sequence[tuple[str,
     return [*shades, call("errorbar", fit.value, 0, xerr=interval, color=INK, capsize=3, marker="o", ms=6),
             *(dot(size, row, INK, marker="D", ms=4) for row, (_, size) in enumerate(found, 1)),
             *name_rows(["refined", *(label for label, _ in found)]),
-            axes(xlim=(limits[0], limits[-1]), xlabel=fault.symbol + (f" [{fault.unit}]" if fault.unit != "1" else ""))]
+            axes(xlim=(limits[0], limits[-1]), xlabel=_name_axis(fault))]
 
 
 def _place_size(fault: Fault, departure: float, way: float) -> float:
     return 2.0 * fault.healthy - fault.place_size(departure) if way < 0.0 else fault.place_size(departure)
 
 
-def draw_precursor_shifts(found: Mapping[str, Precursor]) -> str:
-    """How many healthy standard deviations Table 2's lesser faults move each precursor by; "" without bands."""
-    known = [p for p in found.values() if math.isfinite(p.clogging_ratio) and math.isfinite(p.friction_ratio)]
+def draw_precursor_shifts(found: Mapping[str, Precursor], faults: Sequence[BandFault | Fault]) -> str:
+    """How many healthy standard deviations each fault at MidBand moves each precursor by; "" without bands."""
+    known = [p for p in found.values() if all(math.isfinite(p.compute_ratio(fault.name)) for fault in faults)]
     if not known:
         return ""
-    rows = np.arange(len(known))
+    rows, height = np.arange(len(known)), 0.8 / len(faults)
+    bars = [call("barh", rows + (i - 0.5 * (len(faults) - 1)) * height,
+                 [abs(p.compute_ratio(fault.name)) for p in known], height=0.95 * height,
+                 label=_name_limit(fault), **({"color": (BLUE, ORANGE)[i]} if len(faults) <= 2 else {}))
+            for i, fault in enumerate(faults)]
     return draw_panels("telling", [[[
-        call("barh", rows - 0.2, [abs(p.clogging_ratio) for p in known], height=0.38, color=BLUE,
-             label=f"Kintas {CLOGGING.acceptable:g}"),
-        call("barh", rows + 0.2, [abs(p.friction_ratio) for p in known], height=0.38, color=ORANGE,
-             label=f"FSS {FRICTION.acceptable:g} N"),
-        instant(3.0, INK, width=0.8, style=":"), *name_rows([p.words for p in known]), call("set_xscale", "log"),
-        call("set_xlim", left=0.1), legend(2),
+        *bars, instant(3.0, INK, width=0.8, style=":"), *name_rows([p.words for p in known]),
+        call("set_xscale", "log"), call("set_xlim", left=0.1), legend(2),
         axes(xlabel="shift / healthy standard deviation [1] (dotted: 3, below it one test does not show the fault)")]]],
-        0.8 + 0.3 * len(known))
+        0.8 + (0.3 if len(faults) <= 2 else 0.15 * len(faults)) * len(known))
 
 
 def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
@@ -692,29 +756,50 @@ def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
 
     Args:
         grid: from `fdi.diagnosis.rms_grid.search_grid`.
-        truth: the faults' sizes (Kintas, FSS in N), where they are known.
+        truth: the sizes of both faults, where they are known.
     """
     maps = (("step sections", grid.step, "A"), ("ramp sections", grid.ramp, "B"), ("both", grid.joint, "C"))
-    panels = [[*_draw_map(grid, m, letter), axes(title=f"{name}: {m.minimum.rms * 1e6:.1f} um at {letter}"),
-               *([dot(*truth, "white", "injected", marker="X", ms=9, mec=INK, mew=0.8)] if truth else [])]
+    panels = [[*_draw_map(grid, m, letter),
+               axes(title=f"{name}: {format_amount(m.minimum.rms, grid.unit)} at {letter}"),
+               *([dot(*_scale_sizes(grid, truth), "white", "injected", marker="X", ms=9, mec=INK, mew=0.8)]
+                 if truth else [])]
               for name, m, letter in maps if m]
-    panels[-1].append(dot(grid.best.kintas, grid.best.fss, "#ffd33d", "between cells", marker="*", ms=9, mec=INK))
+    panels[-1].append(dot(*_scale_sizes(grid, grid.best.sizes), "#ffd33d", "between cells", marker="*", ms=9, mec=INK))
     if grid.step and grid.ramp:
-        kintas, fss = zip(LOWER_CORNER, UPPER_CORNER, strict=True)
+        corners = np.array([_scale_sizes(grid, [fault.place_size(x) for fault, x in
+                                                zip(grid.faults, corner, strict=True)])
+                            for corner in find_corners(grid.faults)])
         for panel in panels[:2]:
-            panel += [line(kintas, fss, "white", width=0.8, ls="--"),
-                      dot(grid.merged.kintas, grid.merged.fss, "#ffd33d", "G", marker="D", ms=5, mec=INK)]
-    panels[0].append(axes(ylabel="FSS [N]"))
+            panel += [line(corners[:, 0], corners[:, 1], "white", width=0.8, ls="--"),
+                      dot(*_scale_sizes(grid, grid.merged.sizes), "#ffd33d", "G", marker="D", ms=5, mec=INK)]
+    panels[0].append(axes(ylabel=_name_map_axis(grid.faults[1])))
     below = legend(3, loc="upper center", bbox_to_anchor=(0.5, -0.16))
     return draw_panels("maps", [[[*panel, below] for panel in panels]], 3.5, 3.7 * len(panels), sharey=True)
 
 
 def _draw_map(grid: Grid, m: Map, letter: str) -> list[Mark]:
     """One map as an image of its logarithm, with contours and its minimum."""
-    half_k, half_f = (0.5 * float(axis[1] - axis[0]) if len(axis) > 1 else 0.5 for axis in (grid.kintas, grid.fss))
-    box = (grid.kintas[0] - half_k, grid.kintas[-1] + half_k, grid.fss[0] - half_f, grid.fss[-1] + half_f)
-    size: Any = np.log10(m.rms.T * 1e6)
-    contours = call("contour", grid.kintas, grid.fss, size, MAP_CONTOURS, colors="white", linewidths=0.4, alpha=0.6)
-    return [call("imshow", size, origin="lower", extent=box, aspect="auto", cmap="viridis", interpolation="none"),
-            *([contours] if min(size.shape) > 1 else []), call("grid", False), axes(xlabel="Kintas"),
-            dot(m.minimum.kintas, m.minimum.fss, RED, letter, mec="white")]
+    sides = [axis / choose_unit(fault.unit, fault.limits[2])[0]
+             for fault, axis in zip(grid.faults, grid.axes, strict=True)]
+    across, up = ((side[0] - 0.5 * (side[1] - side[0]), side[-1] + 0.5 * (side[1] - side[0])) for side in sides)
+    size: Any = np.log10(m.rms.T)
+    return [call("imshow", size, origin="lower", extent=(*across, *up), aspect="auto", cmap="viridis",
+                 interpolation="none"),
+            call("contour", *sides, size, MAP_CONTOURS, colors="white", linewidths=0.4, alpha=0.6),
+            call("grid", False), axes(xlabel=_name_map_axis(grid.faults[0]), xlim=across, ylim=up),
+            dot(*_scale_sizes(grid, m.minimum.sizes), RED, letter, mec="white")]
+
+
+def _scale_sizes(grid: Grid, sizes: Sequence[float]) -> tuple[float, float]:
+    """A pair of sizes in the units of the axes of a map."""
+    x, y = (size / choose_unit(fault.unit, fault.limits[2])[0] for fault, size in zip(grid.faults, sizes, strict=True))
+    return x, y
+
+
+def _name_map_axis(fault: Fault) -> str:
+    unit = choose_unit(fault.unit, fault.limits[2])[1]
+    return fault.symbol + (f" [{unit}]" if unit else "")
+
+
+def _name_axis(fault: Fault) -> str:
+    return fault.symbol + (f" [{fault.unit}]" if fault.unit != "1" else "")

@@ -20,7 +20,7 @@ from fdi.trace.sections import Section, find_sections
 from fdi.trace.sensor_dynamics import SensorDynamics, read_sensors
 from plant import signals as plant_signals
 from plant.errors import InputError, escape_control_characters
-from plant.signals import Signals
+from plant.signals import Signal, Signals
 
 if TYPE_CHECKING:
     from plant.lanes import Part  # a bench that reads its own log does not load the compiler
@@ -219,12 +219,8 @@ class Trace:
         It is the largest command that the plant declares, else a hundred times the range of this one; in an open loop
         those of the controlled signal.
         """
-        d = self.declared
-        sized = d.controlled if d.is_open_loop else d.command
-        if math.isfinite(sized.largest):
-            return sized.largest
-        column = self.columns[sized.name]
-        return 1.0 if np.isnan(column).all() else 100.0 * float(np.nanmax(column) - np.nanmin(column)) or 1.0
+        sized = self.declared.controlled if self.declared.is_open_loop else self.declared.command
+        return measure_scale(sized, self.columns[sized.name])
 
     def mask_unusable(self, name: str) -> Floats:
         """A column, NaN where it is missing or its row cannot be used."""
@@ -480,6 +476,13 @@ def _select_timing(columns: Mapping[str, NDArray[Any]], cycles: NDArray[np.int64
 
 
 # Single columns, shape (n,): missing samples are NaN.
+
+
+def measure_scale(signal: Signal, column: Floats) -> float:
+    """The size of the motion of a signal with this column, (n,): see `Trace.scale`."""
+    if math.isfinite(signal.largest):
+        return signal.largest
+    return 1.0 if np.isnan(column).all() else 100.0 * float(np.nanmax(column) - np.nanmin(column)) or 1.0
 
 
 def hold_last(x: Floats) -> Floats:

@@ -172,7 +172,7 @@ def _find_size(name: str, model: Model, faults: Sequence[Fault]) -> Quantity:
 
 def restore_faults(spec: Mapping[str, Any]) -> tuple[Fault, ...]:
     """The faults of a campaign."""
-    return tuple(Fault(**{**table, "range": tuple(table["range"])}) for table in spec.get("faults", ())) or FAULTS
+    return tuple(Fault(**table) for table in spec.get("faults", ())) or FAULTS
 
 
 def _expand_cases(spec: Mapping[str, Any]) -> tuple[Case, ...]:
@@ -444,8 +444,8 @@ def judge_by_fdi(trace: Trace, model: Model, faults: Sequence[Fault] = FAULTS) -
         levels, by = found.band_verdict.levels, found.band_verdict.severity
         row |= {f"band_{fault.name}": _format_level(levels.get(fault.name)) for fault in faults}
         row |= {f"severity_{fault.name}": by[fault.name] for fault in faults if fault.name in by}
-    if found.grid is not None:
-        row |= {"grid_kintas": found.grid.merged.kintas, "grid_fss": found.grid.merged.fss}
+    for grid in found.grids[:1]:
+        row |= {f"grid_{fault.key}": grid.find_size(fault, grid.merged) for fault in grid.faults}
     if found.groups:
         row["groups"] = [list(group.names) for group in found.groups]
     return row | {

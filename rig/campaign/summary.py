@@ -168,8 +168,9 @@ def count_detections(rows: Sequence[Row], fault: Fault) -> list[Figures]:
         "most": partial(is_detected, fault=fault, level=Level.NON_NOMINAL),
         "ruling": lambda row: row.get("ruling") == fault.name,
         "bands": partial(is_detected, fault=fault, judged_by="band")}
-    return [{"size": size, **{name: format_share(count_share(groups[size], is_good)) for name, is_good in
-                              counted.items()}} for size in sorted(groups)]
+    in_bands = {size: [row for row in rows if f"band_{fault.name}" in row] for size, rows in groups.items()}
+    return [{"size": size, **{name: format_share(count_share((in_bands if name == "bands" else groups)[size], is_good))
+                              for name, is_good in counted.items()}} for size in sorted(groups)]
 
 
 def find_usual_size(rows: Sequence[Row], fault: Fault) -> float:

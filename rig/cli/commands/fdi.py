@@ -4,9 +4,10 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from fdi.diagnosis.bands import load_bands, make_bands_file
+from fdi.diagnosis.bands import load_bands
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import choose_faults
+from fdi.diagnosis.make_bands import make_bands_file
 from fdi.report.diagnosis_report import build_bands_report, build_diagnosis_report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -26,7 +27,7 @@ def run_command(args: argparse.Namespace) -> int:
     places = choose_places(args, "", args.trace)
     model = load_chosen_model(args)
     with show_progress(is_silent=args.json or args.quiet) as progress:
-        bands = None if args.bands is None else load_bands(Path(args.bands))
+        bands = None if args.bands is None else load_bands(Path(args.bands), model.kind)
         faults = choose_faults(args.faults, model.kind)
         trace = Trace.read(args.trace, signals=model.kind.signals)
         found = diagnose(trace, model, bands, progress, args.trace, with_effects=args.with_effects,
@@ -42,9 +43,10 @@ def learn_bands(args: argparse.Namespace) -> int:
     if not args.out or Path(args.out).suffix != ".toml":
         raise InputError("--out", str(args.out or ""), "FILE.toml, where the bands go")
     model = load_chosen_model(args)
+    faults = choose_faults(args.faults, model.kind)
     com, _, name = load_command(args.command_file, model["controller.period"], model.kind)
     with show_progress(is_silent=args.json or args.quiet) as progress:
-        made = make_bands_file(args.learn_bands, args.out, model, com, name, args.seed, progress)
+        made = make_bands_file(args.learn_bands, args.out, model, com, name, args.seed, progress, faults)
     return give_answer(build_bands_report(made), args)
 
 

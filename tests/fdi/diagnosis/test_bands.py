@@ -15,35 +15,42 @@ from noisy_traces import record_plant
 from refusals import catch_refusal
 from rig_command import answer, refuse, rig
 
-from fdi.diagnosis import bands as learn_bands
+from fdi.diagnosis import make_bands
 from fdi.diagnosis.bands import (
-    MEANINGS,
     Bands,
     BandVerdict,
-    Precursor,
-    UnitKind,
-    choose_bands,
-    compute_features,
     describe_other_model,
-    find_kind,
-    find_stays,
     format_bands,
-    format_precursor,
     judge_position,
     judge_trace,
     list_design,
     load_bands,
     load_default_bands,
-    make_bands_by_simulation,
     matches_command,
-    measure_precursors,
     parse_bands,
-    sample_sensor_noise,
-    simulate_units,
-    smooth_spikes,
 )
 from fdi.diagnosis.diagnosis import diagnose
-from fdi.diagnosis.faults import FAULTS, Estimate, Level
+from fdi.diagnosis.faults import CLOGGING as CLOGGED
+from fdi.diagnosis.faults import FAULTS, Estimate, Level, load_faults
+from fdi.diagnosis.faults import FRICTION as RUBBING
+from fdi.diagnosis.make_bands import (
+    UnitKind,
+    choose_bands,
+    learn_bands,
+    make_bands_by_simulation,
+    sample_sensor_noise,
+    simulate_units,
+)
+from fdi.diagnosis.precursors import (
+    MEANINGS,
+    Precursor,
+    compute_features,
+    find_kind,
+    find_stays,
+    format_precursor,
+    measure_precursors,
+    smooth_spikes,
+)
 from fdi.report.diagnosis_report import draw_precursor_shifts, draw_sizes
 from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
@@ -70,8 +77,15 @@ def parts() -> list[Section]:
 @cache
 def units(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5, count: int = 16) -> np.ndarray:
     com = command()
-    kind = UnitKind("", clogging, friction, sliding)
+    kind = make_kind(clogging, friction, sliding)
     return simulate_units(load_model(), com, np.zeros_like(com), kind, count, seed=4321)
+
+
+def make_kind(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5) -> UnitKind:
+    """Units with these faults, NaN for none."""
+    clogged = {} if math.isnan(clogging) else CLOGGED.list_changes(clogging)
+    rubbing = {RUBBING.parameter: friction, "spool.dynamic_friction": sliding * friction}
+    return UnitKind("", clogged | ({} if math.isnan(friction) else rubbing))
 
 
 def judged(x: np.ndarray, bands: Bands | None = None) -> BandVerdict:
@@ -118,7 +132,7 @@ def test_dynamic_friction_of_its_own() -> None:
     """FSS alone raised, FDS healthy: the level is by FSS, and it is said that the spool slips faster than that."""
     found = [judged(x) for x in units(friction=50.0, sliding=3.333 / 50)]
     assert set(levels(found, FRICTION)) == {Level.MAINTENANCE} and all("slips faster" in j.notes[0] for j in found)
-    assert 45.0 < float(np.median([j.friction for j in found])) < 55.0
+    assert 45.0 < float(np.median([j.shown[FRICTION][0] for j in found])) < 55.0
 
 
 def test_spikes_do_not_count() -> None:
@@ -177,7 +191,7 @@ def test_bands_of_another_command_are_refused() -> None:
     for words, call in (
             ("the command of the bands, preflight (4 steps, 2 ramps)", partial(judge_position, other, other)),
             ("has 2 sections", partial(judge_position, com[:2000], com[:2000])),
-            ("unloaded ram", partial(judge_position, com, units()[0], load=np.full(len(com), 5e3)))):
+            ("unloaded plant", partial(judge_position, com, units()[0], load=np.full(len(com), 5e3)))):
         assert words in catch_refusal(call, period=1e-3, bands=bands)
     assert "steps or slow ramps" in catch_refusal(make_bands_by_simulation, load_model(), nothing, nothing, 1e-3)
     assert [matches_command(bands, each, 1e-3) for each in (com, other)] == [True, False]
@@ -196,17 +210,34 @@ def test_any_command() -> None:
     """Bands by simulation of a command that nobody has seen before judge as those of the preflight do."""
     com = profile(SHORT).command
     made = short_bands()
-    assert made.judges == (True, True)
-    for kind, ruling in ((UnitKind("", 0.4), CLOGGING), (UnitKind("", friction=60.0), FRICTION), (UnitKind(""), None)):
+    assert all(map(made.shows, made.faults))
+    for kind, ruling in ((make_kind(0.4), CLOGGING), (make_kind(friction=60.0), FRICTION), (make_kind(), None)):
         x = simulate_units(load_model(), com, np.zeros_like(com), kind, 16, seed=99)
         assert {judge_position(com, row, 1e-3, made).ruling for row in x} == {ruling}
+
+
+def test_faults_of_a_list_of_ones_own() -> None:
+    """Any faults have bands: where none is a friction, ramps judge as well; a unit with one of them leaves its band."""
+    backlash = next(fault for fault in load_faults("wider") if fault.name == "feedback_backlash")
+    com = profile(SHORT).command
+    made = make_bands_by_simulation(load_model(), com, np.zeros_like(com), 1e-3, 48, 32, seed=1, faults=[backlash])
+    again = parse_bands(format_bands(made), "")
+    assert {ramp.fault for ramp in again.ramps} == {backlash.name} and again.shows(again.faults[0])
+    ready = load_model().with_effects(["feedback_gap"])
+    for size, least, most in ((0.0, 0, 0), (1.5 * backlash.maintenance, 2, 2)):
+        x = simulate_units(ready, com, np.zeros_like(com), UnitKind("", backlash.list_changes(size)), 16, seed=99)
+        found = [judge_position(com, row, 1e-3, again).levels[backlash.name] for row in x]
+        assert least <= min(found) and max(found) <= most
+    noise = make_bands.sample_sensor_noise(np.random.default_rng(1), load_model(), len(com))
+    found = measure_precursors(trace(com + noise, com), again.precursors)
+    assert set(found["break_away"].adds) == {backlash.name}
 
 
 def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
     """A healthy unit under 5 kN is not blamed: where no bands fit, they are made with the load."""
     com = profile(SHORT).command
     force = np.full(len(com), 5e3)
-    monkeypatch.setattr(learn_bands, "make_bands_by_simulation", lambda *a, **k: short_bands(5e3))
+    monkeypatch.setattr(make_bands, "make_bands_by_simulation", lambda *a, **k: short_bands(5e3))
     bands = choose_bands(com, force, 1e-3)
     run = simulate(load_model(), com, force, seed=3)
     j = judge_trace(Trace.from_columns(run._asdict(), 1e-3, {}), bands)
@@ -232,8 +263,9 @@ def test_the_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("old", "new", "word"), [
     ("period_ms = 1\n", "period_ms = 0\n", "a file of bands"),
-    ("friction_N = [5.0, ", "friction_N = [500.0, ", "rising"),
-    ("friction_N = [5.0, ", "friction_N = [", "of other lengths"),
+    ("amounts = [5.0, ", "amounts = [500.0, ", "rising"),
+    ("amounts = [5.0, ", "amounts = [", "of other lengths"),
+    ('plant = "eha"', 'plant = "ema"', "bands of the plant eha"),
     ("[[ramp]]\nsection = ", "[[ramp]]\nsection = 9", "not a ramp of the command"),
     ("", "[bands", "TOML"), ("", "x = 1\n", "bands"), ("", "[bands]\nperiod_ms = 1\n", "key")])
 def test_a_wrong_file_is_refused(old: str, new: str, word: str, tmp_path: Path) -> None:
@@ -255,19 +287,12 @@ def test_bands_remember_their_model_through_a_file() -> None:
     made = parse_bands(format_bands(make_bands_by_simulation(model, com, np.zeros_like(com), 1e-3, 8, 8)), "file")
     same = {"filter.clogging": 0.2, "spool.static_friction": 20.0, "spool.dynamic_friction": 10.0,
             "sensors.position_noise": 5e-6}
-    assert list_design(Model().replace(same)) == {} and list_design(model.replace(same)) == OTHER
+    assert [list_design(x.replace(same), FAULTS) for x in (Model(), model)] == [{}, OTHER]
     assert describe_other_model(made, model) == describe_other_model(made, model.replace(same)) == ""
     for other in (Model(), model.replace({"jack.mass": 151.0})):
         assert describe_other_model(made, other) == "the model eha with jack.mass = 150.0"
     line = catch_refusal(diagnose, record_plant(com=RAMP_AND_SINE, seed=1), model, load_default_bands())
     assert re.search(r"--bands: made for the model eha with all parameters nominal.*mass = 150", line)
-
-
-def test_bands_of_an_earlier_version_are_known_by_the_name_of_their_model() -> None:
-    facts = {key: text for key, text in load_default_bands().provenance.items() if key != "parameters"}
-    for name, words in (("eha", ""), ("fleet", "the model fleet")):
-        old = replace(load_default_bands(), provenance={**facts, "model": name})
-        assert describe_other_model(old, Model()) == words
 
 
 def trace(x: np.ndarray, com: np.ndarray | None = None) -> Trace:
@@ -283,15 +308,15 @@ def test_a_fleet_of_its_own() -> None:
     def fleet(kind: UnitKind, count: int, seed: int) -> list[Trace]:
         return [trace(x) for x in simulate_units(model, com, np.zeros_like(com), kind, count, seed)]
 
-    sound = fleet(UnitKind(""), 32, 7)
+    sound = fleet(make_kind(), 32, 7)
     strange = [judge_trace(t, load_default_bands()) for t in sound]
     assert np.mean([j.severity[CLOGGING] for j in strange]) > 0.3
-    own = learn_bands.learn_bands(sound)
+    own = learn_bands(sound)
     assert own.provenance["made"].startswith("from 32 healthy traces")
-    fresh = [judge_trace(t, own) for t in fleet(UnitKind(""), 16, 8)]
+    fresh = [judge_trace(t, own) for t in fleet(make_kind(), 16, 8)]
     assert [j.events for j in fresh] == [()] * 16
     assert np.mean([j.severity[CLOGGING] for j in fresh]) < 0.2
-    assert {judge_trace(t, own).ruling for t in fleet(UnitKind("", 0.4), 8, 9)} == {CLOGGING}
+    assert {judge_trace(t, own).ruling for t in fleet(make_kind(0.4), 8, 9)} == {CLOGGING}
     assert own.precursors["overshoot_5mm"]["healthy"] != load_default_bands().precursors["overshoot_5mm"]["healthy"]
 
 
@@ -302,8 +327,8 @@ def test_a_fleet_that_cannot_be_learned_from() -> None:
     other[500:1500], holed[3000:4000] = 4e-3, np.nan
     for traces, reason in ((own[:3], "at least 5"), ([*own, trace(units()[7], other)], "odd.csv: com"),
                            ([*own, trace(holed)], "missing")):
-        assert reason in catch_refusal(learn_bands.learn_bands, traces, names=[*"abcdef", "odd.csv"][:len(traces)])
-    doubtful = learn_bands.learn_bands([*own, trace(units(0.5)[0])], names=[*"abcdef", "clogged.csv"])
+        assert reason in catch_refusal(learn_bands, traces, names=[*"abcdef", "odd.csv"][:len(traces)])
+    doubtful = learn_bands([*own, trace(units(0.5)[0])], names=[*"abcdef", "clogged.csv"])
     assert doubtful.provenance["doubtful"].endswith(": clogged.csv")
 
 
@@ -414,7 +439,7 @@ def test_closed_forms_of_the_plant() -> None:
 def test_each_fault_where_it_shows() -> None:
     """Clogging in overshoot and settling, friction in break-away and slips; neither in the other's best sign."""
     faults = (0.0, 5.0), (0.35, 5.0), (0.0, 35.0)
-    healthy, clogged, stuck = (measure_precursors(run(*f), load_default_bands()) for f in faults)
+    healthy, clogged, stuck = (measure_precursors(run(*f), load_default_bands().precursors) for f in faults)
     assert all(abs(p.departure) < 4.5 for p in healthy.values() if math.isfinite(p.departure))
     assert clogged["settling_time_1mm"].departure > 5 and clogged["overshoot_5mm"].departure > 2
     assert stuck["break_away"].departure > 100 and stuck["slip_speed"].departure > 20
@@ -423,11 +448,12 @@ def test_each_fault_where_it_shows() -> None:
 
 def test_the_table_tells_what_tells() -> None:
     """Break-away is worth a hundred scatters of friction, the mean ramp error hardly three; fresh units say so."""
-    table = measure_precursors(run(), load_default_bands())
-    assert table["break_away"].friction_ratio > 100 and abs(table["mean_ramp_error"].friction_ratio) < 4
-    assert abs(table["mean_ramp_error"].clogging_ratio) < 1 < abs(table["settling_time_5mm"].clogging_ratio)
+    table = measure_precursors(run(), load_default_bands().precursors)
+    drag, settling = table["mean_ramp_error"], table["settling_time_5mm"]
+    assert table["break_away"].compute_ratio(FRICTION) > 100 and abs(drag.compute_ratio(FRICTION)) < 4
+    assert abs(drag.compute_ratio(CLOGGING)) < 1 < abs(settling.compute_ratio(CLOGGING))
     com = command()
-    x = simulate_units(load_model(), com, np.zeros_like(com), UnitKind(""), 64, seed=77)
+    x = simulate_units(load_model(), com, np.zeros_like(com), make_kind(), 64, seed=77)
     fresh = compute_features(com, x, MS, find_sections(com))
     for name in ("overshoot_5mm", "break_away", "mean_ramp_error", "speed_ripple"):
         assert float(fresh[name].mean()) == pytest.approx(table[name].healthy, abs=0.5 * table[name].noise)
@@ -456,7 +482,7 @@ def test_what_a_command_does_not_show() -> None:
 
 def test_words_and_units() -> None:
     """Every precursor has a name that a person reads, and a unit; JSON can carry them."""
-    found = measure_precursors(run(), load_default_bands())
+    found = measure_precursors(run(), load_default_bands().precursors)
     assert {find_kind(name) for name in found} == set(MEANINGS)
     assert found["overshoot_5mm"].words == "first overshoot, 5 mm"
     assert {p.unit for p in found.values()} == {"%", "s", "m", "m/s", "Hz"}
@@ -480,5 +506,5 @@ def test_the_page(tmp_path: Path) -> None:
 def test_pictures_without_bands() -> None:
     """Sizes can be drawn without grid and bands; precursors without a table are not."""
     sizes = {CLOGGING: Estimate(0.9, 0.8, 0.97), FRICTION: Estimate(150.0, 140.0, 170.0)}
-    assert draw_sizes(FAULTS, sizes, None, None).startswith("<svg")
-    assert draw_precursor_shifts(measure_precursors(run())) == ""
+    assert draw_sizes(FAULTS, sizes).startswith("<svg")
+    assert draw_precursor_shifts(measure_precursors(run()), FAULTS) == ""

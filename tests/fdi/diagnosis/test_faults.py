@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from places import ROOT
 from refusals import catch_refusal
-from rig_command import rig
+from rig_command import refuse, rig
 
 from fdi.diagnosis.ambiguity import cut_intervals, find_groups
 from fdi.diagnosis.diagnosis import diagnose
@@ -72,6 +73,8 @@ def test_the_papers_faults_are_a_file_with_the_limits_of_table_2() -> None:
     ({"acceptable": "much"}, ["acceptable", "a number"]),
     ({"follow": ["jack.mass"]}, ["follow", "table of factors"]),
     ({"follow": {"no.such": 1.0}}, ["follow", "plant eha"]),
+    ({"follow": {"jack.mass": -1.0}}, ["follow", "values of jack.mass", "not -1"]),
+    ({"axis": [1e-4, 0.0]}, ["axis", "within the range"]), ({"axis": [0.0, 1e-3]}, ["axis", "within the range"]),
     ({"parameter": "controller.current_limit"}, ["parameter", "a replay of the measured drive shows"]),
     ({"parameter": "quantisation.lsb"}, ["parameter", "a replay of the measured drive shows"]),
     ({"both_ways": 1}, ["both_ways", "true or false"])])
@@ -194,3 +197,51 @@ def test_backlash_is_measured_although_rows_hang_on_its_impacts() -> None:
     found = diagnose(simulate_case(drawn.cases[0], drawn.spec, model), model, faults=faults)
     assert found.verdict == "MAINTENANCE" and found.ruling == "backlash"
     assert found.sizes["backlash"].low < 8e-5 < found.sizes["backlash"].high
+
+
+def test_a_plant_and_faults_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`rig fdi`, `rig campaign` and `rig trend` with both; bands and maps speak of this plant and of no other."""
+    monkeypatch.chdir(tmp_path)
+    assert rig("new", "plant", "motor").status == 0
+    Path("faults.toml").write_text("""
+[faults.bearing]
+title = "friction of the bearings"
+parameter = "dry_friction.torque"
+range = [0, 20]
+acceptable = 0.3
+maintenance = 0.8
+
+[faults.winding]
+title = "rise of the winding's resistance"
+parameter = "motor.resistance"
+range = [2, 4]
+acceptable = 2.3
+maintenance = 3.5
+
+[faults.magnet]
+title = "weak magnets"
+parameter = "motor.torque_constant"
+range = [0.02, 0.05]
+acceptable = 0.045
+maintenance = 0.04
+""")
+    own = ["--model", "motor.py", "--trust", "--faults", "faults.toml"]
+    Path("unit").mkdir()
+    for month in range(1, 4):
+        rig("simulate", *own[:3], "--set", f"dry_friction.torque={0.4 * month}", "--seed", month, "--out",
+            f"unit/2026-{month:02}-01.csv")
+    made = rig("fdi", "--learn-bands", *own, "--out", "bands.toml", "--json").json
+    assert made["judges"] == ["bearing"]
+    found = rig("fdi", "unit/2026-03-01.csv", *own, "--bands", "bands.toml", "--json").json
+    assert (found["ruling"], found["bands"]["ruling"]) == ("bearing", "bearing")
+    assert found["events"] and {event["section"] for event in found["events"]} == {"step to 0.5 rad"}
+    assert [set(grid["faults"]) for grid in found["grids"]] and "bearing" in found["grids"][0]["faults"]
+    page = tmp_path / "page.html"
+    rig("fdi", "unit/2026-03-01.csv", *own, "--bands", "bands.toml", "--out", page)
+    assert not re.search(r"\b(ram|jack|spool|valve|servo|XJ|XS|Kintas|FSS)\b", re.sub("<[^>]*>", " ", page.read_text()))
+    assert "--bands: of bearing" in refuse("fdi", "unit/2026-03-01.csv", *own[:3], "--bands", "bands.toml")
+    trend = rig("trend", "unit", *own, "--json").json
+    assert [fault["name"] for fault in trend["faults"]] == ["bearing", "winding", "magnet"]
+    cases = ["--fault", "healthy", "--fault", "bearing=1", "--seeds", "1", "--jobs", "1", "--out", "campaign"]
+    counted = rig("campaign", *own, *cases, "--json").json
+    assert counted["status"] == {"ok": 2} and counted["faults"] == trend["faults"]

@@ -12,11 +12,11 @@ from refusals import catch_refusal
 from rig_command import rig
 
 from fdi import Trace
-from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
+from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, load_faults
 from fdi.diagnosis.rms_grid import (
-    FSS_AXIS,
-    KINTAS_AXIS,
+    Grid,
     Map,
+    Merged,
     Point,
     measure_bisector_distance,
     merge_minima,
@@ -50,7 +50,7 @@ def trace(kintas: float, fss: float, ratio: float = 2.0 / 3.0, scatter: int = 0)
 
 def is_near(point: Any, kintas: float, fss: float, within: tuple[float, float] = (0.051, 4.5)) -> bool:
     """Whether a point of the grid is that close to the faults."""
-    return abs(point.kintas - kintas) <= within[0] and abs(point.fss - fss) <= within[1]
+    return abs(point.sizes[0] - kintas) <= within[0] and abs(point.sizes[1] - fss) <= within[1]
 
 
 def of(columns: object) -> Trace:
@@ -58,7 +58,7 @@ def of(columns: object) -> Trace:
 
 
 def map_of(kintas: float, fss: float) -> Map:
-    return Map(np.zeros((1, 1)), Point(kintas, fss, 1e-5))
+    return Map(np.zeros((1, 1)), Point((kintas, fss), 1e-5))
 
 
 def test_maps_are_rms_of_the_monitor() -> None:
@@ -67,14 +67,14 @@ def test_maps_are_rms_of_the_monitor() -> None:
     grid = search_grid(measured, sliding=(1.0,))
     row, column = 7, 5
     c = read_cycles(measured, Model())[0]
-    run = Monitor(Model()).replay(np.array([[KINTAS_AXIS[row], FSS_AXIS[column]]]), c.cor, c.xj, 20.0)[0, 0]
+    run = Monitor(Model()).replay(np.array([[grid.axes[0][row], grid.axes[1][column]]]), c.cor, c.xj, 20.0)[0, 0]
     steps, ramps = np.r_[500:4001], np.r_[4001:6001, 6501:8501]  # the sections of the preflight
     of_steps, of_ramps = (np.var((c.xj - run)[rows]) for rows in (steps, ramps))
     both = (len(steps) * of_steps + len(ramps) * of_ramps) / (len(steps) + len(ramps))
     for made, variance in ((grid.step, of_steps), (grid.ramp, of_ramps), (grid.joint, both)):
         assert made.rms[row, column] == pytest.approx(np.sqrt(variance), rel=1e-9) and made.rms.shape == (21, 21)
         where = np.argwhere(made.rms == made.rms.min())[0]
-        assert made.minimum == (KINTAS_AXIS[where[0]], FSS_AXIS[where[1]], made.rms.min())
+        assert made.minimum == ((grid.axes[0][where[0]], grid.axes[1][where[1]]), made.rms.min())
     assert grid.simulations == 441 + 21 * 13
 
 
@@ -104,14 +104,14 @@ def test_friction_that_is_static_alone() -> None:
     """`--set spool.static_friction=70` leaves FDS as it was; the grid finds FSS, as it tries how the spool slides."""
     measured = trace(0.0, 70.0, ratio=10.0 / 3.0 / 70.0)
     found, paper = search_grid(measured), search_grid(measured, sliding=(1.0,))
-    assert found.joint.minimum.fss == pytest.approx(70.0, abs=9.0) and found.sliding < 0.1
+    assert found.joint.minimum.sizes[1] == pytest.approx(70.0, abs=9.0) and found.sliding < 0.1
     assert found.joint.minimum.rms < 0.9 * paper.joint.minimum.rms
 
 
 def test_closed_loop_misleads() -> None:
     """With spool friction the loop oscillates in a phase of its own; the calmest monitor wins."""
     looped, driven = (search_grid(trace(0.17, 45.0), drive=drive) for drive in ("command", "current"))
-    assert looped.joint.minimum.fss < 10.0
+    assert looped.joint.minimum.sizes[1] < 10.0
     assert looped.joint.minimum.rms > 4.0 * driven.joint.minimum.rms
 
 
@@ -123,8 +123,8 @@ def test_a_command_with_one_kind_of_section(which: str) -> None:
     there, absent = (grid.step, grid.ramp) if which == "step" else (grid.ramp, grid.step)
     assert there is not None and absent is None
     np.testing.assert_allclose(there.rms, grid.joint.rms, rtol=1e-12)
-    assert grid.merged[:2] == there.minimum[:2] and grid.merged.weight == float(which == "step")
-    assert there.minimum.fss == pytest.approx(40.0, abs=18.0)
+    assert grid.merged.sizes == there.minimum.sizes and grid.merged.weight == float(which == "step")
+    assert there.minimum.sizes[1] == pytest.approx(40.0, abs=18.0)
 
 
 @pytest.mark.parametrize(("kintas", "fss"), [(0.0, 5.0), (0.25, 30.0)])
@@ -143,7 +143,7 @@ def test_gaps_are_left_out() -> None:
     holes = {name: whole.column(name).copy() for name in ("com", "xj", "cor", "p12", "xs", "load")}
     holes["xj"][700:760], holes["cor"][2000:2002] = np.nan, np.nan
     grid = search_grid(Trace.from_columns(holes, 1e-3, {}))
-    assert not np.isnan(grid.joint.rms).any() and grid.joint.minimum.fss == pytest.approx(30.0, abs=9.0)
+    assert not np.isnan(grid.joint.rms).any() and grid.joint.minimum.sizes[1] == pytest.approx(30.0, abs=9.0)
 
 
 def test_refusals() -> None:
@@ -158,33 +158,50 @@ def test_refusals() -> None:
     (0.15, 70.0, -1.0), (0.15, 35.0, -1.0), (0.0, 5.0, -1.0),  # left edge and beyond
     (0.30, 35.0, 0.5), (0.20, 35.0, -0.5)])
 def test_first_bisector(kintas: float, fss: float, distance: float) -> None:
-    assert measure_bisector_distance(kintas, fss) == pytest.approx(distance, abs=1e-12)
+    assert measure_bisector_distance((kintas, fss), FAULTS) == pytest.approx(distance, abs=1e-12)
 
 
 def test_centre_of_gravity() -> None:
-    merged = merge_minima(map_of(0.34, 30.0), map_of(0.26, 40.0))  # their middle is (0.30, 35): 3/4 for the steps
+    def merge(step: Map | None, ramp: Map | None) -> tuple[float, ...]:
+        found = merge_minima(step, ramp, FAULTS)
+        return (*found.sizes, found.weight, found.distance)
+
+    merged = merge(map_of(0.34, 30.0), map_of(0.26, 40.0))  # their middle is (0.30, 35): 3/4 for the steps
     assert merged == pytest.approx((0.75 * 0.34 + 0.25 * 0.26, 0.75 * 30.0 + 0.25 * 40.0, 0.75, 0.5))
-    assert merge_minima(map_of(0.4, 20.0), map_of(0.36, 60.0))[:3] == pytest.approx((0.4, 20.0, 1.0))
-    assert merge_minima(map_of(0.1, 20.0), map_of(0.0, 60.0))[:3] == pytest.approx((0.0, 60.0, 0.0))
-    assert merge_minima(None, map_of(0.3, 20.0)) == (0.3, 20.0, 0.0, -1.0)
+    assert merge(map_of(0.4, 20.0), map_of(0.36, 60.0))[:3] == pytest.approx((0.4, 20.0, 1.0))
+    assert merge(map_of(0.1, 20.0), map_of(0.0, 60.0))[:3] == pytest.approx((0.0, 60.0, 0.0))
+    assert merge(None, map_of(0.3, 20.0)) == (0.3, 20.0, 0.0, -1.0)
+
+
+def test_any_pair_of_faults() -> None:
+    """Of faults without a monitor the plant itself makes the maps; the pair that is there is found."""
+    faults = {fault.name: fault for fault in load_faults("wider")}
+    pair = faults["feedback_backlash"], faults["jack_friction"]
+    com = build_profile([Hold(time=0.1), Step(to=2e-3, time=0.3), Ramp(to=2.5e-3, time=0.8)]).command
+    changes = pair[0].list_changes(6e-5) | pair[1].list_changes(1600.0)
+    grid = search_grid(of(simulate(Model().replace(changes), com)), faults=pair)
+    cells = [axis[1] - axis[0] for axis in grid.axes]
+    assert [abs(x - y) <= 2.0 * cell for x, y, cell in zip(grid.best.sizes, (6e-5, 1600.0), cells, strict=True)]
+    assert grid.joint.rms.shape == (21, 21) and (grid.sliding, grid.unit) == (1.0, "m")
 
 
 def diagnosis(kintas: float, explained: bool = True, others: dict[str, Estimate] | None = None) -> Any:
-    def point(value: float) -> Any:
-        return SimpleNamespace(minimum=SimpleNamespace(kintas=value, fss=5.0, rms=54e-6))
+    def point(value: float) -> Map:
+        return Map(np.zeros((1, 1)), Point((value, 5.0), 54e-6))
 
-    grid = SimpleNamespace(kintas=np.linspace(0.0, 0.5, 21), fss=np.linspace(0.0, 90.0, 21), step=point(2 * kintas),
-                           ramp=point(0.0), joint=point(kintas), merged=SimpleNamespace(kintas=kintas, fss=5.0))
+    axes = np.linspace(0.0, 0.5, 21), np.linspace(0.0, 90.0, 21)
+    grid = Grid(FAULTS, axes, point(2 * kintas), point(0.0), point(kintas), Merged((kintas, 5.0), 0.5, 0.0),
+                Point((kintas, 5.0), 54e-6), 1.0, "current", 441, "m")
     sizes = {CLOGGING.name: Estimate(0.001, 0.0, 0.02), FRICTION.name: Estimate(5.0, 4.0, 6.0)}
     refinement = SimpleNamespace(errors={"xj": 2e-6}, is_explained=explained)
-    return cast(Any, SimpleNamespace(grid=grid, sizes=sizes, others=others or {}, refinement=refinement,
+    return cast(Any, SimpleNamespace(grids=(grid,), sizes=sizes, others=others or {}, refinement=refinement,
                                      trace=SimpleNamespace(declared=EHA)))
 
 
 def test_a_grid_that_contradicts_the_fit_says_why() -> None:
     (text,) = explain_grid(diagnosis(0.175, others={"null_bias.current": Estimate(2.4e-4, 2.3e-4, 2.5e-4)}))
     assert text.startswith("The grid gives Kintas 0.175 (minima: steps 0.350, ramps 0), the fit 0.001 (0 .. 0.020)")
-    assert "null bias 0.24 mA" in text and "leaves 54 um of the position, the fit 2 um. Trust the fit." in text
+    assert "null bias 0.24 mA" in text and "leaves 54.0 um of the position, the fit 2.00 um. Trust the fit." in text
     (text,) = explain_grid(diagnosis(0.175, explained=False))
     assert text.endswith("The fit does not explain the trace either.")
     assert explain_grid(diagnosis(0.05)) == []  # it agrees

@@ -1,0 +1,305 @@
+"""Precursors: single numbers of a response that a fault changes, each beside its scatter over healthy units.
+
+The mean error on a slow ramp is the classic sign of friction, but it does not depend on friction while the plant slides
+(docs/physics.md); the signal-to-noise ratios show which precursors are worth looking at. Each precursor is a mean over
+the sections of its kind. Noise of the position decides none of them: peaks are taken from running medians, ranges are
+between percentiles, and a reversal counts when it passes a quarter of the usual range.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.thresholds import BAND_EVENT_SAMPLES, POSITION_MISSING_SHARE
+from fdi.trace.sections import Section, find_sections
+from fdi.trace.trace import Flags, Floats, Trace, hold_last
+
+STEP_JUDGED_FROM = 0.004  # s; the command has to come through a cycle of the bus and the pilot stage
+STEP_JUDGED_UNTIL = 0.1  # s after a step at least; later the EHA only sticks and slips, which ramps show better
+
+
+def find_stays(beyond: Flags, lasting: int = BAND_EVENT_SAMPLES) -> list[tuple[int, int]]:
+    """Where a flag (n,) is up for `lasting` rows in a row, until it is down for as many: first and last row of each.
+
+    One or two samples are no event; a single sample back inside does not end one.
+    """
+    edges = np.flatnonzero(np.diff(beyond.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    found: list[tuple[int, int]] = []
+    for first, stop in edges.tolist():
+        if found and first - found[-1][1] <= lasting:
+            found[-1] = (found[-1][0], stop - 1)
+        elif stop - first >= lasting:
+            found.append((first, stop - 1))
+    return found
+
+
+def find_lasting_peak(x: Floats, lasting: int = BAND_EVENT_SAMPLES) -> Floats:
+    """The highest level that x (.., n), time last, keeps for `lasting` rows in a row; NaN is below all levels."""
+    known = np.where(np.isnan(x), -np.inf, x)
+    windows = np.lib.stride_tricks.sliding_window_view(known, lasting, axis=-1)
+    out: Floats = windows.min(axis=-1).max(axis=-1)
+    return out
+
+
+def compute_speed(x: Floats, period: float, span: float = 0.02) -> Floats:
+    """Speed, m/s, of a position (.., n) m, time last: difference over `span` s; NaN at the ends and beside gaps.
+
+    Over 20 ms, 2 um of noise become 0.14 mm/s. A spike of one sample becomes two of one sample each, so it does not
+    last either.
+    """
+    half = max(1, round(span / period / 2))
+    out = np.full(np.shape(x), np.nan)
+    out[..., half:-half] = (x[..., 2 * half:] - x[..., :-2 * half]) / (2 * half * period)
+    return out
+
+
+def compute_half_range(error: Floats) -> Floats:
+    """Half the range of a following error (.., n) m, time last, from its 1st to its 99th percentile."""
+    low, high = np.nanpercentile(error, (1, 99), axis=-1)
+    half: Floats = (high - low) / 2
+    return half
+
+
+def select_ramp_rows(s: Section, period: float, settling: float = 0.2) -> slice:
+    """The rows of a ramp that are judged: from `settling` s after its start, when the plant follows."""
+    return slice(s.start + round(settling / period), s.stop)
+
+
+def read_columns(source: Trace) -> tuple[Floats, Floats, Floats, float, float]:
+    """Command without holes, position with NaN where it cannot be used, load, period and first time of a trace."""
+    position = source.mask_unusable(source.declared.controlled.name)
+    return hold_last(source.command), position, source.load, source.period, float(source.t[0])
+
+
+class Meaning(NamedTuple):
+    """What a precursor is called, its unit, and how many of them make one SI unit."""
+
+    words: str
+    unit: str
+    scale: float
+
+
+MEANINGS = {
+    "overshoot": Meaning("first overshoot", "%", 1.0),
+    "undershoot": Meaning("undershoot after the overshoot", "%", 1.0),
+    "rise_time": Meaning("rise from 10 to 90 %", "ms", 1e3),
+    "peak_time": Meaning("time of the first peak", "ms", 1e3),
+    "settling_time": Meaning("settling within 5 %", "ms", 1e3),
+    "rest_error": Meaning("error at rest, RMS", "um", 1e6),
+    "mean_ramp_error": Meaning("mean error on the ramp", "um", 1e6),
+    "ramp_asymmetry": Meaning("ramp error out less in, half", "um", 1e6),
+    "break_away": Meaning("error at break-away", "um", 1e6),
+    "stick_slip_amplitude": Meaning("stick-slip amplitude", "um", 1e6),
+    "stick_slip_frequency": Meaning("stick-slip frequency", "Hz", 1.0),
+    "speed_ripple": Meaning("speed ripple, s.d.", "mm/s", 1e3),
+    "slip_speed": Meaning("fastest slip", "mm/s", 1e3),
+    "stuck_share": Meaning("share of the ramp at rest", "%", 100.0),
+    "tracking_error": Meaning("RMS error in motion", "um", 1e6),
+}
+OF_STEPS = ("overshoot", "undershoot", "rise_time", "peak_time", "settling_time")
+
+
+class Precursor(NamedTuple):
+    """One number, SI or %, NaN where the trace does not show it; the rest is NaN without bands."""
+
+    value: float
+    unit: str  # "m", "s", "m/s", "Hz", "%" or "1"
+    words: str
+    shown: str  # the value in the unit that people use
+    healthy: float  # mean of healthy units
+    noise: float  # standard deviation of healthy units
+    adds: Mapping[str, float]  # by fault: what one at MidBand adds
+
+    @property
+    def departure(self) -> float:
+        """Distance from the healthy mean, in healthy standard deviations."""
+        return (self.value - self.healthy) / self._scatter
+
+    def compute_ratio(self, fault: str) -> float:
+        """Signal to noise: what that fault at MidBand adds, in healthy standard deviations; NaN where not known."""
+        return self.adds.get(fault, math.nan) / self._scatter
+
+    @property
+    def _scatter(self) -> float:
+        return self.noise if self.noise > 0.0 else math.nan
+
+
+def measure_precursors(source: Trace, known: Mapping[str, Mapping[str, float]] | None = None) -> dict[str, Precursor]:
+    """The precursors of a trace by name; empty where too much of the position is missing.
+
+    Args:
+        source: the trace.
+        known: `Bands.precursors`: of healthy units and by fault.
+    """
+    com, xj, _, period, _ = read_columns(source)
+    missing = np.isnan(xj)
+    if missing.mean() > POSITION_MISSING_SHARE:
+        return {}
+    rows = np.arange(len(xj))
+    whole = np.interp(rows, rows[~missing], xj[~missing])
+    unit, scale = source.declared.controlled.unit, source.scale
+    found = compute_features(com, whole[None], period, find_sections(com, period, scale), unit, scale)
+    return {name: _make_precursor(name, float(values[0]), unit, (known or {}).get(name, {}))
+            for name, values in found.items()}
+
+
+def _make_precursor(name: str, value: float, unit: str, known: Mapping[str, float]) -> Precursor:
+    kind, of_size = MEANINGS[find_kind(name)], _choose_size_unit(unit)[0]
+    size = f", {name.rpartition('_')[2].removesuffix(of_size)} {of_size}" if find_kind(name) in OF_STEPS else ""
+    si_unit = {"ms": "s", "um": unit, "mm/s": f"{unit}/s"}.get(kind.unit, kind.unit)
+    adds = {fault: by for fault, by in known.items() if fault not in ("healthy", "noise")}
+    return Precursor(value, si_unit, kind.words + size, format_precursor(value, name, si_unit),
+                     known.get("healthy", math.nan), known.get("noise", math.nan), adds)
+
+
+def format_precursor(value: float, name: str, si_unit: str = "m") -> str:
+    """A value of a precursor in the unit that people use; `si_unit` is its own, of a signal other than a position.
+
+    >>> format_precursor(1.912e-05, "break_away"), format_precursor(7.41, "overshoot_5mm")
+    ('19.1 um', '7.41 %')
+    >>> format_precursor(1.8e-4, "rest_error", "rad")
+    '0.00018 rad'
+    """
+    _, unit, scale = MEANINGS[find_kind(name)]
+    if unit in ("um", "mm/s") and si_unit not in ("m", "m/s"):
+        unit, scale = si_unit, 1.0
+    return f"{value * scale:.3g} {unit}" if math.isfinite(value) else "-"
+
+
+def _choose_size_unit(unit: str) -> tuple[str, float]:
+    """The unit of the size of a step, and how many of them make one `unit`."""
+    return ("mm", 1e3) if unit == "m" else (unit, 1.0)
+
+
+def find_kind(name: str) -> str:
+    """The key into MEANINGS: a precursor's name without the step's size."""
+    return name if name in MEANINGS else name.rpartition("_")[0]
+
+
+def compute_features(com: Floats, x: Floats, period: float, parts: Sequence[Section], unit: str = "m",
+                     scale: float = 1.0, least_step: float = 2e-4) -> dict[str, Floats]:
+    """Values of all precursors for runs `x` (m, n) of a command (n,) in `unit`, by name as in MEANINGS, (m,) each.
+
+    Precursors of steps carry the step's size in their name, such as overshoot_5mm; a step below `least_step`, by the
+    `scale` of `Trace.scale`, shows little but noise and friction and is left out. Precursors that the command cannot
+    show are missing; those that a run does not show (an oscillation that never settles) are NaN.
+    """
+    out: dict[str, list[Floats]] = {}
+    ramps: dict[float, list[Floats]] = {1.0: [], -1.0: []}
+    for s in parts:
+        rows = slice(s.start, s.stop)
+        if s.kind == "step" and abs(s.last - s.first) >= least_step * scale:
+            of_size, factor = _choose_size_unit(unit)
+            size = f"{factor * abs(s.last - s.first):.3g}{of_size}"
+            for word, values in measure_step(x[:, rows], s, period):
+                out.setdefault(word if word == "rest_error" else f"{word}_{size}", []).append(values)
+        elif is_slow_ramp(s, period, scale):
+            for word, values in _measure_ramp_response(com, x, period, s):
+                out.setdefault(word, []).append(values)
+            ramps[float(np.sign(s.rate))].append(out["mean_ramp_error"][-1])
+        elif s.kind == "dynamic":
+            error = com[rows] - x[:, rows]
+            out.setdefault("tracking_error", []).append(np.sqrt(np.nanmean(error**2, axis=1)))
+    if ramps[1.0] and ramps[-1.0]:
+        out["ramp_asymmetry"] = [(np.mean(ramps[1.0], axis=0) - np.mean(ramps[-1.0], axis=0)) / 2]
+    order = {word: i for i, word in enumerate(MEANINGS)}
+    return {word: np.mean(out[word], axis=0) for word in sorted(out, key=lambda w: (order[find_kind(w)], w))}
+
+
+def is_slow_ramp(s: Section, period: float, scale: float = 1.0, fastest: float = 5e-3, lasting: float = 0.5) -> bool:
+    """Whether a section is a ramp that shows friction: below `fastest` m/s by the `scale` of `Trace.scale`, and several
+    slips (`lasting` s) long.
+    """
+    if s.kind != "ramp" or abs(s.rate) >= fastest * scale:
+        return False
+    return bool(s.stop - select_ramp_rows(s, period).start > lasting / period)
+
+
+def measure_step(x: Floats, s: Section, period: float, settling_band: float = 0.05, settled_for: float = 0.05,
+                 at_rest_after: float = 0.25) -> Iterator[tuple[str, Floats]]:
+    """Response of (m, rows) to one step.
+
+    A run has settled once it stays within `settling_band` of the step for `settled_for` s, as an oscillation passes
+    through the band now and then. `at_rest_after` s after the step it should be at rest.
+    """
+    y = (smooth_spikes(x) - s.first) / (s.last - s.first)  # as a fraction of the step
+    rows, horizon = y.shape[1], min(y.shape[1], round(STEP_JUDGED_UNTIL / period))
+    if np.median(y[:, :horizon].max(axis=1)) < 0.9:  # a slow plant
+        horizon = rows
+    peak = np.argmax(y[:, :horizon], axis=1)
+    yield "overshoot", 100 * (y[np.arange(len(y)), peak] - 1)
+    later = np.arange(horizon) > peak[:, None]
+    lowest = np.where(later, y[:, :horizon], np.inf).min(axis=1)
+    yield "undershoot", np.where(np.isfinite(lowest), 100 * (1 - lowest), np.nan)
+    yield "rise_time", period * (_find_crossing(y, 0.9) - _find_crossing(y, 0.1))
+    yield "peak_time", period * _find_vertex(y, peak)
+    outside = np.abs(y - 1) > settling_band
+    last = rows - 1 - np.argmax(outside[:, ::-1], axis=1)
+    needed = settled_for / period if rows > 2 * settled_for / period else 1
+    is_settled = rows - 1 - last >= needed
+    yield "settling_time", np.where(is_settled, (last + 1) * period, np.nan)
+    resting = round(at_rest_after / period)
+    if resting < rows:
+        yield "rest_error", np.sqrt(np.nanmean((x[:, resting:] - s.last)**2, axis=1))
+
+
+def _measure_ramp_response(com: Floats, x: Floats, period: float, s: Section, stuck_below: float = 0.3
+                  ) -> Iterator[tuple[str, Floats]]:
+    """Response to a slow ramp; the plant sticks while it is slower than `stuck_below` of the ramp's rate."""
+    rows = select_ramp_rows(s, period)
+    error = np.sign(s.rate) * (com[rows] - x[:, rows])
+    velocity = np.sign(s.rate) * compute_speed(x[:, s.start:s.stop], period)[:, rows.start - s.start:]
+    yield "mean_ramp_error", np.nanmean(error, axis=1)
+    half = compute_half_range(error)
+    yield "break_away", half
+    amplitude, frequency = _measure_oscillation(smooth_spikes(error), half, period)
+    yield "stick_slip_amplitude", amplitude
+    yield "stick_slip_frequency", frequency
+    yield "speed_ripple", np.nanstd(velocity, axis=1)
+    yield "slip_speed", np.nanpercentile(velocity, 99.5, axis=1)
+    yield "stuck_share", np.nanmean(velocity < stuck_below * abs(s.rate), axis=1)
+
+
+def _measure_oscillation(error: Floats, half: Floats, period: float) -> tuple[Floats, Floats]:
+    """Amplitude, m (RMS about the mean times sqrt 2), and frequency, Hz (turns with a hysteresis of `half`/2)."""
+    centred = error - np.nanmean(error, axis=1, keepdims=True)
+    side = np.where(np.abs(centred) > half[:, None] / 2, np.sign(centred), 0.0)
+    last = np.maximum.accumulate(np.where(side != 0.0, np.arange(side.shape[1]), 0), axis=1)
+    latest_side = np.take_along_axis(side, last, axis=1)
+    turns = ((latest_side[:, 1:] * latest_side[:, :-1]) < 0).sum(axis=1) / 2
+    return np.sqrt(2 * np.nanmean(centred**2, axis=1)), turns / (side.shape[1] * period)
+
+
+def smooth_spikes(x: Floats, samples: int = 5) -> Floats:
+    """Running median over `samples`, the ends repeated: (m, n) in and out; a single spike leaves no trace."""
+    half = samples // 2
+    padded = np.pad(x, ((0, 0), (half, half)), mode="edge")
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, samples, axis=1), axis=2)
+
+
+def _find_crossing(y: Floats, level: float) -> Floats:
+    """Row, between samples, at which each run first passes a level; NaN if it never does."""
+    beyond = y >= level
+    k = np.argmax(beyond, axis=1)
+    before = np.maximum(k - 1, 0)
+    lines = np.arange(len(y))
+    low, high = y[lines, before], y[lines, k]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        part = np.where(high > low, (level - low) / (high - low), 0.0)
+    return np.where(beyond.any(axis=1), before + part, np.nan)
+
+
+def _find_vertex(y: Floats, peak: NDArray[np.int64]) -> Floats:
+    """Row of each run's peak between samples: of the parabola through the five samples around it, by least squares."""
+    k = np.clip(peak, 2, y.shape[1] - 3)
+    near = y[np.arange(len(y))[:, None], k[:, None] + np.arange(-2, 3)]
+    slope = near @ np.array([-2.0, -1.0, 0.0, 1.0, 2.0]) / 10
+    bend = near @ np.array([2.0, -1.0, -2.0, -1.0, 2.0]) / 7
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = np.where(bend < 0, -slope / bend, 0.0)
+    row: Floats = k + np.clip(shift, -2.0, 2.0)
+    return row
