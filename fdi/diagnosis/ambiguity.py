@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from fdi.diagnosis.faults import Estimate, Level
+from fdi.diagnosis.faults import Estimate, Level, widen_for_many
 from fdi.diagnosis.refine import Refinement, place_value
 from fdi.estimation.fit import scaled_bounds
 from fdi.thresholds import GROUP_CORRELATION, INTERVAL_95_SD
@@ -120,6 +120,6 @@ def find_groups(found: Refinement, levels: Mapping[str, Level | None]) -> tuple[
         for i in group:
             region.limit_to_healthy(low, high, i)
         distance = region.measure_distance(low, high)
-        if len(group) > 1 and distance > INTERVAL_95_SD:
+        if len(group) > 1 and distance > INTERVAL_95_SD * widen_for_many(len(found.faults)):
             groups.append(Group(tuple(found.faults[i].name for i in group), distance))
     return tuple(groups)

@@ -218,7 +218,7 @@ def _search_grids(trace: Trace, model: Model, pairs: Sequence[Sequence[Fault]], 
 
 def _judge_sizes(sizes: Mapping[str, Estimate], refinement: Refinement) -> dict[str, Level | None]:
     """Level of each fault; where physics is missing in the fit, a fault is acceptable at most, or cannot be judged."""
-    levels = {f.name: judge_size(f, sizes[f.name]) for f in refinement.faults}
+    levels = {f.name: judge_size(f, sizes[f.name], len(refinement.faults)) for f in refinement.faults}
     if refinement.is_explained:
         return levels
     is_known = max(refinement.ratio.values()) <= RESIDUAL_JUDGES_NOTHING

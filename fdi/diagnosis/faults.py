@@ -13,9 +13,10 @@ from enum import IntEnum
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from statistics import NormalDist
 from typing import NamedTuple
 
-from fdi.thresholds import ACCEPTABLE_INTERVAL_FACTOR
+from fdi.thresholds import ACCEPTABLE_INTERVAL_FACTOR, INTERVAL_95_SD
 from plant.errors import InputError
 from plant.faults import Fault, place_faults, read_faults
 from plant.plants import Plant, find_plant
@@ -89,8 +90,10 @@ def choose_faults(source: str | Path | None, kind: Plant) -> tuple[Fault, ...]:
 FAULTS = CLOGGING, FRICTION = load_faults()  # the paper's
 
 
-def judge_size(fault: Fault, size: Estimate) -> Level | None:
+def judge_size(fault: Fault, size: Estimate, tested: int = 1) -> Level | None:
     """The level of a fault of that size; None if the interval holds both a healthy unit and MidBand.
+
+    Of many faults `tested` at once the healthy size has to lie outside a wider interval: see `widen_for_many`.
 
     >>> judge_size(CLOGGING, Estimate(0.02, 0.0, 0.07)).word, judge_size(CLOGGING, Estimate(0.23, 0.18, 0.28)).word
     ('acceptable', 'maintenance')
@@ -99,11 +102,23 @@ def judge_size(fault: Fault, size: Estimate) -> Level | None:
     healthy, middle, most = fault.limits
     if value + ACCEPTABLE_INTERVAL_FACTOR * (high - value) < middle:
         return Level.ACCEPTABLE
-    if low <= healthy:
+    more = widen_for_many(tested) - 1.0
+    sure = Estimate(size.value, size.low - more * (size.value - size.low), size.high + more * (size.high - size.value))
+    if measure_departures(fault, sure).low <= healthy:
         return None
     if high >= most and low > middle:
         return Level.NON_NOMINAL
     return Level.MAINTENANCE
+
+
+def widen_for_many(tested: int) -> float:
+    """By how much a 95 % interval is widened where so many faults are tested at once, that 95 % of all units without a
+    fault have none outside (Bonferroni). Two are judged as one is, which their rates are counted with.
+
+    >>> widen_for_many(2), round(widen_for_many(11), 2)
+    (1.0, 1.45)
+    """
+    return NormalDist().inv_cdf(1.0 - 0.025 / tested) / INTERVAL_95_SD if tested > 2 else 1.0
 
 
 def measure_departures(fault: Fault, size: Estimate) -> Estimate:

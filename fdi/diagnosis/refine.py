@@ -1089,7 +1089,8 @@ class Explanation:
     @property
     def levels(self) -> dict[str, Level | None]:
         """Levels that this explanation alone would give, by fault."""
-        return {fault.name: judge_size(fault, self.sizes[fault.name]) for fault in self.refinement.faults}
+        faults = self.refinement.faults
+        return {fault.name: judge_size(fault, self.sizes[fault.name], len(faults)) for fault in faults}
 
 
 @dataclass(frozen=True, eq=False)

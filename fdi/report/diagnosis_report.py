@@ -213,7 +213,7 @@ def describe_correlation(d: Diagnosis) -> str:
 def format_size(fault: Fault, size: Estimate) -> str:
     """A fault size with its 95 % interval, in the fault's unit.
 
-    >>> format_size(FRICTION, Estimate(45.01, 42.02, 48.2))
+    >>> format_size(FAULTS[1], Estimate(45.01, 42.02, 48.2))
     '45 N (42 .. 48)'
     """
     return format_interval(size.value, size.low, size.high, fault.unit)
@@ -244,7 +244,7 @@ def list_found_faults(answer: Mapping[str, Any]) -> list[FoundFault]:
 def format_limits_of_fault(fault: Fault) -> tuple[str, ...]:
     """MidBand and MaxBand of a fault.
 
-    >>> format_limits_of_fault(FRICTION)
+    >>> format_limits_of_fault(FAULTS[1])
     ('35 N', '70 N')
     """
     return tuple(f"{size / scale:g} {unit}".rstrip() for size in (fault.acceptable, fault.maintenance)
@@ -436,7 +436,8 @@ def _tabulate_events(d: Diagnosis) -> list[Item]:
 
     return [tabulate(
         _group_events(d.events), (Column("band"), lambda group: BAND_NAMES[group[0].band]),
-        (Column("fault"), lambda group: titles.get(group[0].fault, group[0].fault.replace("_", " "))),
+        (Column("fault", medium=Medium.PAGE if len(d.faults) <= 2 else Medium.BOTH),
+         lambda group: titles.get(group[0].fault, group[0].fault.replace("_", " "))),
         (Column("signal"), lambda group: group[0].signal), (Column("section"), lambda group: group[0].section),
         (Column("events", align="right"), lambda group: str(len(group))),
         (Column("first begins", "s", "right"), lambda group: f"{group[0].t_in:.3f}"),
