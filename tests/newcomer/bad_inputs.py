@@ -158,7 +158,7 @@ BAD_INPUTS = [
     bad("compare run.csv --model word_value.toml", "word_value.toml", "spool.static_friction", "number"),
     bad("compare run.csv --model broken.toml", "broken.toml:1", "TOML"),
     bad("compare run.csv --effects absent.py", "absent.py", "does not exist"),
-    bad("compare run.csv --effects no_colon.py", "no_colon.py", "line 1"),
+    bad("compare run.csv --effects no_colon.py", "no_colon.py:1:"),
     bad("compare run.csv --effects no_effect.py", "no_effect.py", "effect"),
     # recordings
     bad("compare absent.csv", "absent.csv", "does not exist"),

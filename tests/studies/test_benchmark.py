@@ -85,6 +85,8 @@ def test_rates_count_what_they_say(folder: Path) -> None:
         "one: named": (2, 4, ["00004", "00010"]),
         "one: named alone, explained": (1, 4, ["00003", "00004", "00010"]),
         "one: wrong alone": (1, 4, ["00002", "00003", "00010"]),
+        "one, below 2 floors: named": (0, 1, ["00005"]),
+        "one, below 2 floors: wrong alone": (0, 1, ["00005"]),
         "one, named: true size in interval": (1, 2, ["00003"]),
         "one, named: held-out run at most 1.15 floors": (1, 2, ["00003"]),
         "two: both named": (1, 2, ["00009"]),
@@ -122,8 +124,9 @@ def test_an_answer_in_csv_counts_as_in_json(folder: Path) -> None:
     (folder / "answers.csv").write_text("\n".join(rows) + "\n")
     by_file = [json.loads(run_script(folder, folder / f"answers.{kind}", "--json").stdout) for kind in ("csv", "json")]
     assert by_file[0]["where"] == by_file[1]["where"]
-    named, covered = by_file[0]["rates"][2], by_file[0]["rates"][5]
-    assert named == by_file[1]["rates"][2] and (covered["good"], covered["of"]) == (1, 1)
+    first, second = ({rate["name"]: rate for rate in scores["rates"]} for scores in by_file)
+    covered = first["one, named: true size in interval"]
+    assert first["one: named"] == second["one: named"] and (covered["good"], covered["of"]) == (1, 1)
 
 
 def test_the_text_says_rates_and_misses(folder: Path) -> None:

@@ -39,7 +39,9 @@ def test_main_phase_of_a_log(run: Path) -> None:
     assert trace.attachments["sequence.toml"] == ATTACHMENTS["sequence.toml"][1]
     assert [(e.t, e.kind) for e in trace.events] == [(-0.3, "phase"), (0, "phase"), (6, "fault"), (13.5, "phase")]
     assert (trace.nmt[-1].node, trace.nmt[-1].name) == (3, "operational")
-    assert trace.checks[2][:5] == ("ramp error", "ramp_error", "error", 9.1e-6, "m") and not trace.checks[2].passed
+    ramp = trace.checks[2]
+    assert (ramp.name, ramp.kind, ramp.signal) == ("ramp error", "ramp_error", "error")
+    assert (ramp.value, ramp.unit, ramp.passed) == (9.1e-6, "m", False)
     assert np.isnan(trace.checks[0].low) and len(trace.timing.t) == 13_500 and trace.timing.t[0] == 0
     assert [s.kind for s in trace.sections()] == KINDS
 
