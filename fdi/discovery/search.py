@@ -253,7 +253,7 @@ class Search:
         free = h.fit.free
         has_prior = np.isfinite([f.prior for f in free])
         home = np.where(has_prior, 0.0, h.fit.x)
-        coarse = replace(self.problem, steps=Problem.steps, also=(), _lanes={})  # enough for what leads to a valley
+        coarse = self.make_problem(self.problem.trace, Problem.steps)  # enough for what leads to a valley
         begun = fit_unknowns(scale_noise(coarse, 100.0), free, home, 4)
         width = np.where(has_prior, 0.5, 0.1 * np.maximum(np.abs(begun.x), 0.1))
         end = follow_population(
@@ -316,7 +316,7 @@ class Search:
         return Hypothesis(effects, found, errors, ratio, cost, tuple(others))
 
     def make_problem(self, trace: Trace, steps: int) -> Problem:
-        """Another run in place of the search's own, with so many steps a cycle."""
+        """One run, with so many steps a cycle, in place of all that the search fits."""
         return replace(self.problem, trace=trace, steps=steps, also=(), _lanes={})
 
     def replay_holdout(self, hypotheses: Sequence[Hypothesis]) -> tuple[Problem, list[Floats]]:
@@ -504,7 +504,7 @@ class Search:
             best: with one effect.
             known: effects that need not be tried.
         """
-        coarse = replace(self.problem, steps=Problem.steps, also=(), _lanes={})  # enough for cosines
+        coarse = self.make_problem(self.problem.trace, Problem.steps)  # enough for cosines
         of_run = replace(base.fit, jacobian=base.fit.jacobian[:, :, :len(self.problem.trace)])
         told = compute_sensitivity(coarse, of_run, self.effects)
         own = [effect == best.effects[0] for effect in told.names]
@@ -523,8 +523,7 @@ class Search:
 
     def measure_solver_error(self, h: Hypothesis, floor: Mapping[str, float]) -> float:
         """What half the step changes in a replay, over the floor, in the worst signal."""
-        halved = replace(self.problem, steps=2 * self.problem.steps, also=(), _lanes={})
-        coarse = replace(self.problem, also=(), _lanes={})
+        coarse, halved = (self.make_problem(self.problem.trace, n * self.problem.steps) for n in (1, 2))
         x = h.fit.x[None]
         change = (halved.compute_residuals(h.fit.free, x) - coarse.compute_residuals(h.fit.free, x))[0]
         typical = np.sqrt([np.nanmean(np.minimum(c**2, np.nanpercentile(c**2, 98.0))) for c in change])

@@ -499,7 +499,7 @@ def estimate_smooth_covariance(problem: Problem, found: Fit, flat: Floats) -> Fl
     """
     free, x, covariance = found.free, found.x, found.covariance
     low, high = scaled_bounds(free)
-    weights = np.broadcast_to(compute_weights(found.white), found.white.shape).reshape(-1)
+    weights = compute_weights(found.white).reshape(-1)
     prior = np.diag(weigh_priors(free))
     for _ in range(SMOOTH_PASSES):
         places, inverse, ways = list_moves_across(free, covariance, flat, 1.0)
