@@ -64,9 +64,13 @@ def write_constant(name: str, value: Any) -> Function:
     return _write(name, "", [f"return {shown}"], Kind=type(value))[name]
 
 
-def write_mover(state: type[Any], names: Sequence[str]) -> Function:
-    """`(s, distance, p)`: the state with the fields `names` moved. Written out, as compiled code knows no _replace."""
-    fields = ", ".join(f"s.{f} + distance" if f in names else f"s.{f}" for f in state._fields)
+def write_mover(state: type[Any], names: Sequence[str], factor: float = 1.0) -> Function:
+    """`(s, distance, p)`: the state with the fields `names` moved by `factor` times the distance.
+
+    Written out, as compiled code knows no _replace.
+    """
+    moved = "distance" if factor == 1.0 else f"{factor!r} * distance"
+    fields = ", ".join(f"s.{f} + {moved}" if f in names else f"s.{f}" for f in state._fields)
     return _write("move_plant", "s, distance, p", [f"return State({fields})"], State=state)["move_plant"]
 
 

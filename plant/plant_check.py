@@ -59,6 +59,14 @@ def check_declaration(plant: Plant, where: object) -> None:
         require(e.base or e.name not in plant.parameters, f"effect {e.name}", "a name that no parameter group has")
         require(set(e.fitted) <= (known if e.base else set(e.parameters)), f"effect {e.name}",
                 f"parameters that exist, not {', '.join(e.fitted)}")
+        if e.function is not None:
+            from plant.plants import find_fields_of
+
+            groups = {*plant.parameters, e.name}
+            unknown = sorted(f for f in find_fields_of(e.function, list(inspect.signature(e.function).parameters)[-1])
+                             if f not in groups)
+            require(not unknown, f"effect {e.name}", f"p.{e.name}.FIELD for its own parameters, or a group of the "
+                    f"plant ({', '.join(plant.parameters)}), not p.{', p.'.join(unknown)}")
     known |= {name for e in plant.list_effects() for name in e.parameters}
     for fault in plant.faults:
         require(isinstance(fault, Fault), "faults", "values Fault(...)")
@@ -103,6 +111,12 @@ def _check_readings(plant: Plant, require: Callable[[bool, str, str], None]) -> 
         raise InputError(*_find_place(error, plant), f"code that runs ({type(error).__name__}: {error})") from error
     require(isinstance(y, tuple) and len(y) == len(names) and all(isinstance(x, float | int) for x in y), "measure",
             f"a tuple of {len(names)} numbers, {', '.join(names)}, not {y!r}")
+    try:
+        share = plant.find_share_moved(plant.move)
+    except Exception as error:
+        raise InputError(*_find_place(error, plant), f"code that runs ({type(error).__name__}: {error})") from error
+    require(share == 0.0 or 0.5 <= share <= 2.0, "moves", f"a move of {names[0]} by the distance in "
+            f"{plant.signals.controlled.unit}, not by {share:.3g} times that")
     is_right = isinstance(after, tuple) and len(after) == 2 and isinstance(after[0], plant.state)
     require(is_right, field, "the new State and the memories, return State(...), m")
 

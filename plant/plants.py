@@ -18,6 +18,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, NamedTuple, cast
 
+import numpy as np
+
 from plant.compile import Function, find_called_functions, raise_unbound, rebind_names
 from plant.effects import CATALOGUE, Effect, build_base_effect, build_effect, combine_laws
 from plant.errors import InputError
@@ -263,15 +265,37 @@ class Plant:
         return bound | {name: f for name, (f, ports) in self.variants.items() if not ports or ports & acting_at}
 
     @cached_property
+    def move(self) -> Function:
+        """(s, distance, p): the state with the controlled signal `distance` further.
+
+        Fields that are named may be in another unit than the signal, such as rad and deg.
+        """
+        if callable(self.moves):
+            return self.moves
+        share = self.find_share_moved(write_mover(self.state, self.moves))
+        return write_mover(self.state, self.moves, 1.0 if share == 0.0 or 0.5 <= share <= 2.0 else 1.0 / share)
+
+    def find_share_moved(self, move: Function) -> float:
+        """How far a move changes the reading of the controlled signal, over the distance; 0 where that follows later.
+
+        The distance is a tenth of the largest demand of the nominal test, from rest.
+        """
+        from plant.model import build_bare_model
+        from plant.profile import build_profile
+
+        start, p = self.state(), build_bare_model(self.key).build_record()[0]
+        distance = 0.1 * (float(np.abs(build_profile(self.profile).command).max()) if self.profile else 0.0) or 1e-3
+        return float(self.measure(move(start, distance, p), p)[0] - self.measure(start, p)[0]) / distance
+
+    @cached_property
     def _functions(self) -> dict[str, Function]:
         """What does not depend on effects."""
         step = self.step
         if len(inspect.signature(step).parameters) == 4:
             step = rebind_names(_step_without_coefficients, step=step)
-        moves = self.moves if callable(self.moves) else write_mover(self.state, self.moves)
         store, load = make_packers(self.build_control_memory(), CONTROL_AT)
         return {"step_plant": step, "store_control": store, "load_control": load,
-                "measure_plant": self.measure, "move_plant": moves, "correct_plant": self.correct or moves,
+                "measure_plant": self.measure, "move_plant": self.move, "correct_plant": self.correct or self.move,
                 "invert_plant": self.inverse or raise_unbound,
                 "sense_plant": self.sense or _sense_nothing, "control_plant": self.control or control_by_pid,
                 "start_control": write_constant("start_control", self.build_control_memory()),
@@ -459,7 +483,8 @@ def find_declared_plant(module: ModuleType, name: str, file: Path | None = None,
     plant = vars(module).get("PLANT")
     if not isinstance(plant, Plant):
         raise InputError(file or name, "PLANT", "PLANT = Plant(...)")
-    own = {name: replace(e, plant=plant.name or name) for name, e in vars(module).get(OWN_EFFECTS, {}).items()}
-    made = replace(plant, name=plant.name or name, file=file, effects=own, key=key or name)
+    title = plant.name or name
+    own = {e.name: replace(e, plant=title) for e in vars(module).get(OWN_EFFECTS, {}).values()}
+    made = replace(plant, name=title, file=file, effects=own, key=key or name)
     PORTS.update({name: port for name, port in made.ports.items() if name not in PORTS})
     return made

@@ -137,6 +137,7 @@ def test_its_own_effect_may_have_the_name_of_a_shared_one(tmp_path: Path) -> Non
     file.write_text(TEXT.replace("dry_friction", "stribeck"))
     own = load_model(file)
     assert own.find_effect("stribeck").parameters.keys() == {"stribeck.torque"}
+    assert own.replace({"stribeck.torque": 0.4}).effects == ("stribeck",)
     assert load_model("eha").find_effect("stribeck").parameters.keys() == {"stribeck.rise", "stribeck.speed"}
 
 
@@ -153,6 +154,9 @@ def test_its_own_effect_may_have_the_name_of_a_shared_one(tmp_path: Path) -> Non
     ('@effect("friction"', '@effect("fricton"', "effect dry_friction.*voltage, load, friction"),
     ('"motor.resistance", (2.0', '"motor.resistence", (2.0', "fault winding.*motor.resistance"),
     ("moves=(\"angle\",)", "moves=(\"angel\",)", "moves.*angle"),
+    ("moves=(\"angle\",)", "moves=lambda s, d, p: State(s.current, s.speed, s.angle - d)",
+     "moves.*angle.* rad, not by -1"),
+    ("x + p.dry_friction.torque", "x + p.friction.torque", "effect dry_friction.*p.dry_friction.FIELD.*not p.friction"),
     ('"drive"),', '"output"),', "expected one signal of role drive"),
     ("period: Annotated", "cycle: Annotated", "controller.*period|period"),
     ("return State(current, speed", "return Stat(current, speed", r"\.py:\d+.*Stat"),
@@ -167,6 +171,13 @@ def test_a_wrong_plant_file_is_refused_in_one_line(old: str, new: str, message: 
     file.write_text(TEXT.replace(old, new, 1))
     said = catch_refusal(load_plant, file)
     assert re.search(message, said) and "\n" not in said and str(file) in said
+
+
+def test_the_signal_may_be_in_another_unit_than_the_state_that_moves(tmp_path: Path) -> None:
+    file = tmp_path / "degrees.py"
+    file.write_text(TEXT.replace("return s.angle, s", "return 50.0 * s.angle, s"))
+    kind = load_plant(file)
+    assert kind.find_share_moved(kind.move) == pytest.approx(1.0)
 
 
 def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -> None:
