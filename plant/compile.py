@@ -19,6 +19,7 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import takewhile
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple, TypeVar
@@ -379,3 +380,13 @@ def _describe_constant(value: Any) -> str:
     if fields and isinstance(value, type):  # numba's cache finds the type by its name: a user's renamed file is another
         return f"{value.__module__}.{value.__qualname__}{fields}"
     return repr(value)
+
+
+@cache
+def find_fields_of(function: Any, argument: str, depth: int = 1) -> frozenset[str]:
+    """The fields of an argument that a function names, as x in s.x; with `depth` 2 also "group.field" in p.group.field.
+    """
+    code = list(dis.get_instructions(getattr(function, "py_func", function)))
+    chains = ([step.argval for step in takewhile(lambda step: step.opname == "LOAD_ATTR", code[k + 1:k + 1 + depth])]
+              for k, load in enumerate(code) if load.opname == "LOAD_FAST" and load.argval == argument)
+    return frozenset(".".join(chain) for chain in chains if chain)

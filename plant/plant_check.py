@@ -3,16 +3,17 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
-from math import isfinite
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from plant.compile import find_fields_of
 from plant.errors import InputError, suggest_name
 from plant.faults import Fault
 from plant.quantity import Quantity, list_quantities
 from plant.segments import Segment
+from plant.user_code import explain_errors
 
 if TYPE_CHECKING:
     from plant.model import Model
@@ -36,11 +37,11 @@ def check_declaration(plant: Plant, where: object) -> None:
     for signal in plant.signals:
         require(isinstance(signal.unit, str) and bool(signal.unit), f"signal {signal.name}", 'a unit, "1" for none')
     _check_parameters(plant, require)
-    is_tuple = isinstance(plant.state, type) and hasattr(plant.state, "_fields")
-    require(is_tuple, "state", "a NamedTuple of floats, class State(NamedTuple)")
+    require(isinstance(plant.state, type) and hasattr(plant.state, "_fields"), "state",
+            "a NamedTuple of floats, class State(NamedTuple)")
     for name in plant.state._fields:
-        default = plant.state._field_defaults.get(name)
-        require(isinstance(default, float | int), f"State.{name}", "a number as default, the plant at rest")
+        require(isinstance(plant.state._field_defaults.get(name), float | int), f"State.{name}",
+                "a number as default, the plant at rest")
     for name, counts in ARGUMENTS.items():
         function = getattr(plant, name)
         if name == "moves" and not callable(function):
@@ -59,14 +60,9 @@ def check_declaration(plant: Plant, where: object) -> None:
         require(e.base or e.name not in plant.parameters, f"effect {e.name}", "a name that no parameter group has")
         require(set(e.fitted) <= (known if e.base else set(e.parameters)), f"effect {e.name}",
                 f"parameters that exist, not {', '.join(e.fitted)}")
-        if e.function is not None:
-            from plant.plants import find_fields_of
-
-            groups = {*plant.parameters, e.name}
-            unknown = sorted(f for f in find_fields_of(e.function, list(inspect.signature(e.function).parameters)[-1])
-                             if f not in groups)
-            require(not unknown, f"effect {e.name}", f"p.{e.name}.FIELD for its own parameters, or a group of the "
-                    f"plant ({', '.join(plant.parameters)}), not p.{', p.'.join(unknown)}")
+        unknown = sorted(find_fields_of(e.function, "p") - {*plant.parameters, e.name}) if e.function else []
+        require(not unknown, f"effect {e.name}", f"p.{e.name}.FIELD for its own parameters, or a group of the plant "
+                f"({', '.join(plant.parameters)}), not p.{', p.'.join(unknown)}")
     known |= {name for e in plant.list_effects() for name in e.parameters}
     for fault in plant.faults:
         require(isinstance(fault, Fault), "faults", "values Fault(...)")
@@ -99,36 +95,19 @@ def _check_readings(plant: Plant, require: Callable[[bool, str, str], None]) -> 
     from plant.solve import step_cycle
 
     names = [s.name for s in plant.signals.outputs]
-    model = build_bare_model(plant.key)
-    record = model.build_record()
-    try:
+    record = build_bare_model(plant.key).build_record()
+    with explain_errors(str(plant.file), "measure"):
         y = plant.measure(plant.state(), record[0])
-        field, after = "step", build_kernel(step_cycle, (), False, plant.key)(
-            *plant.build_start(()), 0.0, 0.0, 0.0, 0.0, record, 1)
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(*_find_place(error, plant), f"code that runs ({type(error).__name__}: {error})") from error
+    with explain_errors(str(plant.file), "step"):
+        after = build_kernel(step_cycle, (), False, plant.key)(*plant.build_start(()), 0.0, 0.0, 0.0, 0.0, record, 1)
     require(isinstance(y, tuple) and len(y) == len(names) and all(isinstance(x, float | int) for x in y), "measure",
             f"a tuple of {len(names)} numbers, {', '.join(names)}, not {y!r}")
-    try:
+    require(isinstance(after, tuple) and len(after) == 2 and isinstance(after[0], plant.state), "step",
+            "the new State and the memories, return State(...), m")
+    with explain_errors(str(plant.file), "moves"):
         share = plant.find_share_moved(plant.move)
-    except Exception as error:
-        raise InputError(*_find_place(error, plant), f"code that runs ({type(error).__name__}: {error})") from error
     require(share == 0.0 or 0.5 <= share <= 2.0, "moves", f"a move of {names[0]} by the distance in "
             f"{plant.signals.controlled.unit}, not by {share:.3g} times that")
-    is_right = isinstance(after, tuple) and len(after) == 2 and isinstance(after[0], plant.state)
-    require(is_right, field, "the new State and the memories, return State(...), m")
-
-
-def _find_place(error: Exception, plant: Plant) -> tuple[str, str]:
-    """File with line, and the function, where the plant's own code went wrong."""
-    trace, place, function = error.__traceback__, str(plant.file), "step"
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == str(plant.file):
-            place, function = f"{plant.file}:{trace.tb_lineno}", trace.tb_frame.f_code.co_name
-        trace = trace.tb_next
-    return place, function
 
 
 # ---------------------------------------------------------------------------------------------------- behaviour
@@ -172,8 +151,7 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
         return
     silent = [s.name for s in kind.signals.outputs if np.ptp(once[s.name]) == 0.0]
     yield Finding("signals", not silent, f"{', '.join(silent)} never change" if silent else "every output changes")
-    few = min(len(command), 300)
-    compiled, plain = run(20, few), run(20, few, fast=False)
+    compiled, plain = run(20, 300), run(20, 300, fast=False)
     same = all(np.array_equal(compiled[name], plain[name]) for name in compiled)
     yield Finding("compiled code", same, "the bits of plain Python" if same else "differs from plain Python")
     finer = run(2 * model.steps)
@@ -194,5 +172,4 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
 
 def rms(x: NDArray[np.float64]) -> float:
     """Root mean square; infinite for what is not finite."""
-    value = float(np.sqrt(np.mean(x * x)))
-    return value if isfinite(value) else np.inf
+    return float(np.nan_to_num(np.sqrt(np.mean(x * x)), nan=np.inf, posinf=np.inf))

@@ -4,7 +4,6 @@ A plant's `step` and the functions beside it stand in place of placeholders in e
 name), so single runs, lanes, emulator and fits work with every plant.
 """
 
-import dis
 import hashlib
 import importlib
 import inspect
@@ -13,14 +12,13 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from itertools import takewhile
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, NamedTuple, cast
 
 import numpy as np
 
-from plant.compile import Function, find_called_functions, raise_unbound, rebind_names
+from plant.compile import Function, find_called_functions, find_fields_of, raise_unbound, rebind_names
 from plant.effects import CATALOGUE, Effect, build_base_effect, build_effect, combine_laws
 from plant.errors import InputError
 from plant.faults import Fault
@@ -40,6 +38,7 @@ from plant.ports import (
     make_memory_type,
     port,
 )
+from plant.profile import build_profile
 from plant.quantity import Quantity
 from plant.segments import Array, Segment
 from plant.signals import Signals
@@ -281,7 +280,6 @@ class Plant:
         The distance is a tenth of the largest demand of the nominal test, from rest.
         """
         from plant.model import build_bare_model
-        from plant.profile import build_profile
 
         start, p = self.state(), build_bare_model(self.key).build_record()[0]
         distance = 0.1 * (float(np.abs(build_profile(self.profile).command).max()) if self.profile else 0.0) or 1e-3
@@ -337,16 +335,6 @@ def _sense_nothing(s: Any, m: Any, u: Any, p: Any) -> Any:
 
 
 step: Function = _step_without_coefficients  # bound for a plant whose step needs no coefficients
-
-
-@cache
-def find_fields_of(function: Any, argument: str, depth: int = 1) -> frozenset[str]:
-    """The fields of an argument that a function names, as x in s.x; with `depth` 2 also "group.field" in p.group.field.
-    """
-    code = list(dis.get_instructions(getattr(function, "py_func", function)))
-    chains = ([step.argval for step in takewhile(lambda step: step.opname == "LOAD_ATTR", code[k + 1:k + 1 + depth])]
-              for k, load in enumerate(code) if load.opname == "LOAD_FAST" and load.argval == argument)
-    return frozenset(".".join(chain) for chain in chains if chain)
 
 
 _LOADED: dict[str, Plant] = {}  # users' plants, by the path that they were named by
