@@ -8,7 +8,7 @@ the thresholds.
 |---|---|---|
 | marks | Cor differs by more than {FIRMWARE_DIFFERS:g} roundings, or all positions are multiples of one step | names the effect of the firmware or the converter |
 | base | always | fits the tolerances; learns the noise if at most {RESIDUAL_IS_NOISE:g} floors are left, and fits again with a population if the mean square is then above {WHITE_SQUARE_POOR:g} |
-| first effect | always | fits the eight effects that promise to gain more than {GAIN_WORTH_A_FIT:g}, in stages, the best two to the end |
+| first effect | always | fits the eight effects that promise to gain more than {GAIN_WORTH_A_FIT:g}, in stages, the best two to the end; the base again from there, if the best gains more than {GAIN_SEEN:g} |
 | noise | the base leaves more than noise | learns the noise under the best first effect; fits the base and the best four again |
 | second effect | the first leaves more than noise and gains more than {GAIN_SEEN:g} | fits the four most promising effects beside each of the best two |
 | third effect | so does the second, which also removes {FURTHER_EFFECT_SHARE:g} of the excess cost, and leaves at most {ERROR_PARTLY_EXPLAINED:g} of the excess on the held-out run | the same |
@@ -18,9 +18,10 @@ the thresholds.
 | other valleys | two effects remove {FURTHER_EFFECT_SHARE:g} of the excess cost and still leave more than noise | fits the best two pairs again with a population |
 | number of effects | always | keeps the effects that gain more than {GAIN_SEEN:g}, of several only those whose removal costs more than {GAIN_CONVINCES:g} |
 | last fits | always | finishes the base and the best four with finer steps, on the repeats too; begins again those of the best two that leave a mean square above {WHITE_SQUARE_POOR:g} or have far tolerances; with a population these and the base, if they leave only noise and still such a mean square or far tolerances |
-| rivals | the best one leaves only noise | begins the others that do so too, and effects whose signature has a cosine of {LOOKS_ALIKE:g} with its own, from its tolerances |
 | intervals | the base leaves only noise | drops effects whose 95 % interval holds the off value |
-| small gain | the gain is below {GAIN_DOUBTFUL:g} | fits the base again from there; drops a single effect that then gains at most {GAIN_SEEN:g} |
+| small gain | the gain is below {GAIN_DOUBTFUL:g} | fits the base again from there; a single effect that then gains at most {GAIN_SEEN:g} begins again from the base |
+| rivals | the best one leaves only noise | begins the others that do so too, and effects whose signature has a cosine of {LOOKS_ALIKE:g} with its own, from its tolerances |
+| small gain, again | the same | drops such an effect |
 | solver | half the step changes more than {SOLVER_ERROR_SHARE:g} floors | finishes again with 50 steps a cycle |
 | whole recording | only an excerpt was fitted | judges on all rows |
 | left-out rows | the replay has an observer | judges on all rows that hang on no stop, as on a held-out run |
@@ -42,7 +43,7 @@ import numpy as np
 from fdi.discovery.detectable import Blind, find_hidden_effects
 from fdi.discovery.residual_pattern import is_periodic_in_position
 from fdi.discovery.search import FINE, TRUEST, Hypothesis, Search, Sensitivity, compute_sensitivity
-from fdi.estimation.fit import Problem, compute_typical_rms, replay_fit
+from fdi.estimation.fit import Problem, compute_typical_rms, fit_unknowns, replay_fit
 from fdi.estimation.replay import (
     answer_readings,
     find_controller_gain,
@@ -149,6 +150,7 @@ def _search_levels(search: Search, base: Hypothesis, progress: Progress) -> list
             search.learn_noise(tried[0])
             base, *best = search.map_parallel(search.refit_hypothesis, [base, *tried[:4]])
             tried = sorted(best, key=lambda h: h.cost) + tried[4:]
+        if count == 1 and measure_gain(base, tried[0]) > GAIN_SEEN:  # more than what tolerances alone gain
             levels[0] = [search.refit_base(base, tried[0])]
         done = search.reaches_floor(tried[0])
         if not done and count == 2 and levels[1][0].is_near_floor and measure_gain(levels[1][0], tried[0]) <= GAIN_SEEN:
@@ -298,6 +300,11 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
     close = _sort_by_cost(close)
     if is_cut and close and search.leave_out_undecided(close[0]):
         base, *close = search.map_parallel(partial(search.finish_hypothesis, rounds=2), [base, *close])
+    known = [h.effects[0] for h in close]
+    base, close = _doubt_small_gain(search, base, close, depth)
+    if known and not close:  # an effect may yet do more from where the base is now than by its own fit
+        near = fit_unknowns(search.problem, base.fit.free, base.fit.x, 4)
+        close = _sort_by_cost(search.begin_effects(near, known))
     return _doubt_small_gain(search, base, _compare_rivals(search, base, close), depth)
 
 
@@ -330,8 +337,9 @@ def _doubt_small_gain(search: Search, base: Hypothesis, close: list[Hypothesis],
         close = [h for h in close if shows_effect(search.model, h)]
     if not close or measure_gain(base, close[0]) >= GAIN_DOUBTFUL:
         return base, close
-    base = search.finish_hypothesis(search.refit_base(base, close[0]), LONG)
-    base = search.leave_out_effects(base, close[0])
+    if measure_gain(base, close[0]) > GAIN_SEEN:
+        base = search.finish_hypothesis(search.refit_base(base, close[0]), LONG)
+        base = search.leave_out_effects(base, close[0])
     return base, [] if depth == 1 and measure_gain(base, close[0]) <= GAIN_SEEN else close
 
 

@@ -46,6 +46,7 @@ from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import (
     BLOCK_FITTED_SQUARE,
     GAIN_DOUBTFUL,
+    GAIN_SEEN,
     GAIN_WORTH_A_FIT,
     LOOKS_ALIKE,
     NULL_DRAWS,
@@ -212,8 +213,8 @@ class Search:
         for rounds, kept in RACE:
             fits.sort(key=lambda each: each[1].cost)
             fits[:kept] = self.map_parallel(partial(self._continue_begun_fit, rounds), fits[:kept])
-        done = self.map_parallel(lambda each: self.judge_fit((*start.effects, each[0]), each[1]), fits)
-        ranked = sorted(done, key=lambda h: h.cost)
+        ranked = sorted(self.map_parallel(lambda each: self.judge_fit((*start.effects, each[0]), each[1]), fits),
+                        key=lambda h: h.cost)
         if ranked and not ranked[0].is_at_floor:
             x = ranked[0].fit.x
             has_prior = np.array([np.isfinite(f.prior) for f in ranked[0].fit.free])
@@ -242,8 +243,7 @@ class Search:
 
         fits = sorted(self.map_parallel(begin_eased, starts), key=lambda each: each[1].cost)
         fits = self.map_parallel(partial(self._continue_begun_fit, 9), fits[:3])
-        done = [self.judge_fit((*start.effects, effect), fit) for effect, fit in fits]
-        return sorted(done, key=lambda h: h.cost)
+        return sorted((self.judge_fit((*start.effects, effect), fit) for effect, fit in fits), key=lambda h: h.cost)
 
     def search_widely(self, h: Hypothesis) -> Hypothesis:
         """A hypothesis, or where a population ends that begins at a unit with its effects and no other deviation.
@@ -492,8 +492,7 @@ class Search:
         again = self.finish_hypothesis(self.judge_fit(rival.effects, begun))
         return min(rival, again, key=lambda each: each.cost)
 
-    def begin_look_alikes(self, base: Hypothesis, best: Hypothesis, known: Iterable[str], rounds: int = 4
-                          ) -> list[Hypothesis]:
+    def begin_look_alikes(self, base: Hypothesis, best: Hypothesis, known: Iterable[str]) -> list[Hypothesis]:
         """The effects that change the signals almost as the best one does, from its tolerances, if noise is left then.
 
         The search fits what promises most from the tolerances of the base. There a look-alike may miss a stop, and
@@ -512,13 +511,17 @@ class Search:
                  if max(cosines[own], default=0.0) > LOOKS_ALIKE} - {best.effects[0], *known}
         if not alike:
             return []
-        bare = linearise(self.problem, base.fit.free, _place_base(base, best))
+        return self.begin_effects(linearise(self.problem, base.fit.free, _place_base(base, best)), sorted(alike))
 
+    def begin_effects(self, base: Fit, effects: Sequence[str], rounds: int = 4) -> list[Hypothesis]:
+        """Those of the effects, each alone, that gain over a base and leave only noise, taken to the end."""
         def begin(p: Prospect) -> Hypothesis:
             return self.judge_fit((p.effect,), fit_unknowns(self.problem, p.free, p.x, rounds))
 
-        found = self.map_parallel(begin, scan_effects(self.problem, bare, sorted(alike), self.workers))
-        finished = self.map_parallel(self.finish_hypothesis, [h for h in found if h.is_near_floor])
+        prospects = scan_effects(self.problem, base, effects, self.workers)
+        found = self.map_parallel(begin, [p for p in prospects if p.cost < base.cost - GAIN_WORTH_A_FIT])
+        worth = [h for h in found if h.is_near_floor and h.cost < base.cost - GAIN_SEEN]
+        finished = self.map_parallel(self.finish_hypothesis, worth)
         return self.map_parallel(self.begin_again, [h for h in finished if h.is_at_floor])
 
     def measure_solver_error(self, h: Hypothesis, floor: Mapping[str, float]) -> float:
