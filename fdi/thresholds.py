@@ -320,6 +320,9 @@ NARROWEST_SHARE = 0.03
 # Share of MidBand; a fit that ends above it is compared with one that starts from a healthy unit.
 FAULT_BLAMED_SHARE = 0.5
 
+# Share of units without a fault in which one of a list of more than two may be reported.
+ABSENT_FAULT_SHARE = 0.01
+
 # Factor on the upper half of the interval that must stay below MidBand for a fault to be acceptable.
 #
 # A missed fault costs more than an early look. 1.1 times 1.96 standard deviations is 98.4 % on this side: a fault
@@ -333,6 +336,10 @@ SUSPECT_INTERVAL_FACTOR = 2.0
 
 # Tolerances (`UNIT_TOLERANCE`) within which a suspect counts as healthy.
 SUSPECT_HEALTHY_TOLERANCES = 4.0
+
+# Cosine between what a fault and a suspect change, from which one may stand for the other: a blocked nozzle and a null
+# bias have 1.00.
+SUSPECT_COSINE = 0.95
 
 # Null bias, A, and load, N, below which a suspect is not named: 0.2 % of the largest current, 0.3 um of droop.
 SUSPECT_SMALLEST = {"null_bias.current": 1.6e-5, "constant_load.force": 50.0}

@@ -4,7 +4,7 @@ import numpy as np
 
 from fdi.diagnosis.bands import judge_position, load_default_bands
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Level
-from fdi.diagnosis.make_bands import UnitKind, simulate_units
+from fdi.diagnosis.make_bands import simulate_units
 from fdi.diagnosis.precursors import format_precursor
 from fdi.trace.sections import find_sections
 from plant import load_model
@@ -24,7 +24,7 @@ def main() -> None:
     com = load_sequence("preflight").main_profile().command
     parts, bands, model = find_sections(com), load_default_bands(), load_model()
     for name, changes, count, seed in UNITS:
-        x = simulate_units(model, com, np.zeros_like(com), UnitKind(name, changes), count, seed)
+        x = simulate_units(model, com, np.zeros_like(com), changes, count, seed)
         found = [judge_position(com, row, 1e-3, bands, parts=parts) for row in x]
         shares = [100 * np.mean([j.levels.get(f.name, Level.ACCEPTABLE) >= level for j in found])
                   for f in FAULTS for level in (Level.MAINTENANCE, Level.NON_NOMINAL)]

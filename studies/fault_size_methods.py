@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Fault, Level, classify_size
-from fdi.diagnosis.make_bands import UnitKind, simulate_units
+from fdi.diagnosis.make_bands import simulate_units
 from fdi.diagnosis.precursors import compute_features
 from fdi.diagnosis.refine import (
     CountedProblem,
@@ -247,8 +247,8 @@ def simulate_lesson(trace: Trace, model: Model, seed: int = 0, progress: Progres
     tables = []
     for number, (k, f) in enumerate(pairs):
         progress("simulating faults to learn from", number / len(pairs))
-        made = simulate_units(model, com, trace.load, UnitKind(
-            f"{k:g}, {f:g} N", CLOGGING.list_changes(k) | FRICTION.list_changes(f)), units, seed + number)
+        made = simulate_units(model, com, trace.load, CLOGGING.list_changes(k) | FRICTION.list_changes(f), units,
+                              seed + number)
         shown = compute_features(com, made, trace.period, parts)
         tables.append(np.column_stack([shown[name] for name in own]))
     x = np.vstack([*tables, np.array([[own[name][0] for name in own]])])

@@ -11,16 +11,18 @@ The posterior is one at a point, so unknowns are what laws go with (gains by log
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import lsq_linear
+from scipy.special import chdtrc, chdtri
 
 from fdi.diagnosis.faults import Estimate, Level, widen_for_many
 from fdi.diagnosis.refine import Refinement, place_value
 from fdi.estimation.fit import scaled_bounds
-from fdi.thresholds import GROUP_CORRELATION, INTERVAL_95_SD
+from fdi.thresholds import GROUP_CORRELATION, INTERVAL_95_SD, SUSPECT_HEALTHY_TOLERANCES
 from fdi.trace.trace import Floats
 
 
@@ -74,13 +76,15 @@ class _Region:
         low[i] = high[i] = value
         return self.measure_distance(low, high)
 
-    def limit_to_healthy(self, low: Floats, high: Floats, i: int) -> None:
-        """Narrow the limits, (f,), to sizes of fault `i` that are no worse than a healthy unit's."""
+    def limit_to_healthy(self, low: Floats, high: Floats, i: int, tolerance: float) -> None:
+        """Narrow the limits, (f,), to sizes of fault `i` that are no worse than a healthy unit's, which may be off its
+        nominal size by some of these relative tolerances.
+        """
         fault = self.faults[i]
-        best = fault.healthy if fault.both_ways else fault.range[fault.falls]
-        sizes = best, fault.healthy
-        ends = sorted(min(max(place_value(self.free[i], size), self.low[i]), self.high[i]) for size in sizes)
-        low[i], high[i] = ends
+        sizes = [fault.healthy * (1.0 + way * SUSPECT_HEALTHY_TOLERANCES * tolerance) for way in (-1.0, 1.0)]
+        if not fault.both_ways:
+            sizes[fault.falls] = fault.range[fault.falls]
+        low[i], high[i] = sorted(min(max(place_value(self.free[i], x), self.low[i]), self.high[i]) for x in sizes)
 
     def group_alike(self, members: Sequence[int]) -> list[list[int]]:
         """The members in groups of those whose sizes correlate."""
@@ -102,13 +106,15 @@ def cut_intervals(found: Refinement, names: Sequence[str], sizes: Mapping[str, E
     return cut
 
 
-def find_groups(found: Refinement, levels: Mapping[str, Level | None]) -> tuple[Group, ...]:
+def find_groups(found: Refinement, levels: Mapping[str, Level | None], tolerances: Mapping[str, float] | None = None
+                ) -> tuple[Group, ...]:
     """Groups of faults that change the signals alike, of which no unit that is healthy in all of them fits.
 
     Args:
         found: the fit.
         levels: of all faults by name. Each group has one that cannot be judged, None; one that is acceptable by itself
             may stand for it.
+        tolerances: relative ones of parameters that differ from one healthy unit to the next.
     """
     region = _Region(found)
     groups = []
@@ -118,8 +124,16 @@ def find_groups(found: Refinement, levels: Mapping[str, Level | None]) -> tuple[
         group = sorted([*members, *(j for j in others if region.alike[j, members].any())])
         low, high = region.low.copy(), region.high.copy()
         for i in group:
-            region.limit_to_healthy(low, high, i)
+            region.limit_to_healthy(low, high, i, (tolerances or {}).get(found.faults[i].parameter, 0.0))
         distance = region.measure_distance(low, high)
-        if len(group) > 1 and distance > INTERVAL_95_SD * widen_for_many(len(found.faults)):
+        if len(group) > 1 and distance > _exclude_all(len(group), len(found.faults)):
             groups.append(Group(tuple(found.faults[i].name for i in group), distance))
     return tuple(groups)
+
+
+def _exclude_all(together: int, tested: int) -> float:
+    """Distance, standard deviations, from which on so many sizes together are not healthy: chi-squared of as many
+    degrees of freedom, at the level at which one of more than two faults is judged.
+    """
+    limit = INTERVAL_95_SD * widen_for_many(tested)
+    return math.sqrt(chdtri(together, chdtrc(1, limit**2))) if tested > 2 else limit

@@ -51,6 +51,7 @@ from plant.errors import InputError
 from plant.model import Model
 from plant.parameters import parse_toml
 from plant.plants import Plant, find_plant
+from plant.tables import decode_text, read_file
 
 LEVELS = {"middle": Level.MAINTENANCE, "most": Level.NON_NOMINAL}  # of a signal that has left this band
 
@@ -504,12 +505,7 @@ def load_bands(path: str | Path, kind: Plant | None = None) -> Bands:
     Raises:
         InputError: a file that cannot be read, that holds no bands, or those of another plant.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text in UTF-8"
-        raise InputError(path, "--bands", f"a readable file of bands ({reason})") from error
-    return parse_bands(text, path, kind)
+    return parse_bands(decode_text(read_file(Path(path)), path), path, kind)
 
 
 def format_bands(bands: Bands) -> str:

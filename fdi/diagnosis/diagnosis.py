@@ -40,6 +40,7 @@ from fdi.diagnosis.refine import (
     refine_sizes,
 )
 from fdi.diagnosis.rms_grid import Grid, search_grid
+from fdi.estimation.fit import list_relative_tolerances
 from fdi.estimation.long_recordings import cut_excerpt, is_long
 from fdi.estimation.noise import sensor_floors
 from fdi.estimation.replay import SAME_PERIOD, leave_out_rest, match_period, prepare_trace
@@ -145,9 +146,9 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     levels = _judge_sizes(sizes, refinement)
     groups: tuple[Group, ...] = ()
     if refinement.is_explained and None in levels.values():
-        sizes |= cut_intervals(refinement, _name_undecided(levels), sizes)
+        sizes |= cut_intervals(refinement, [name for name, level in levels.items() if level is None], sizes)
         levels = _judge_sizes(sizes, refinement)
-        groups = find_groups(refinement, levels)
+        groups = find_groups(refinement, levels, list_relative_tolerances(model, [f.parameter for f in faults]))
     if beside is not None:
         levels |= dict.fromkeys(beside.disputed)
     if len(faults) > 2:
@@ -159,10 +160,6 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
                      ruling=find_ruling_fault(faults, sizes, levels), sizes=sizes, refinement=refinement, grids=grids,
                      precursors=precursors, band_verdict=band_verdict, others=_find_unhealthy(refinement, model),
                      trace=trace, model=model, floor=floor, bands=bands, notes=tuple(notes), beside=beside)
-
-
-def _name_undecided(levels: Mapping[str, Level | None]) -> list[str]:
-    return [name for name, level in levels.items() if level is None]
 
 
 def _choose_pairs(faults: Sequence[Fault], sizes: Mapping[str, Estimate], levels: Mapping[str, Level | None],
@@ -243,13 +240,12 @@ def _widen_intervals(found: Refinement) -> dict[str, Estimate]:
 def _decide_verdict(levels: Mapping[str, Level | None], groups: Sequence[Group], is_explained: bool) -> str:
     if not is_explained:
         return "SOMETHING_ELSE"
-    known = [found for found in levels.values() if found is not None]
-    worst = max(known, default=Level.ACCEPTABLE)
+    worst = max((level for level in levels.values() if level is not None), default=Level.ACCEPTABLE)
     if worst > Level.ACCEPTABLE:
         return worst.name
     if groups:
         return "AMBIGUOUS"
-    return "ACCEPTABLE" if len(known) == len(levels) else "CANNOT_TELL"
+    return "CANNOT_TELL" if None in levels.values() else "ACCEPTABLE"
 
 
 def _is_unhealthy(name: str, e: Estimate, model: Model) -> bool:

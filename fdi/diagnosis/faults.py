@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import NormalDist
 from typing import NamedTuple
 
-from fdi.thresholds import ACCEPTABLE_INTERVAL_FACTOR, INTERVAL_95_SD
+from fdi.thresholds import ABSENT_FAULT_SHARE, ACCEPTABLE_INTERVAL_FACTOR, INTERVAL_95_SD
 from plant.errors import InputError
 from plant.faults import Fault, place_faults, read_faults
 from plant.plants import Plant, find_plant
@@ -112,13 +112,14 @@ def judge_size(fault: Fault, size: Estimate, tested: int = 1) -> Level | None:
 
 
 def widen_for_many(tested: int) -> float:
-    """By how much a 95 % interval is widened where so many faults are tested at once, that 95 % of all units without a
-    fault have none outside (Bonferroni). Two are judged as one is, which their rates are counted with.
+    """By how much a 95 % interval is widened where so many faults are tested at once, that no more than
+    `ABSENT_FAULT_SHARE` of the units without a fault have one outside (Bonferroni). Two are judged as one is, which
+    their rates are counted with.
 
     >>> widen_for_many(2), round(widen_for_many(11), 2)
-    (1.0, 1.45)
+    (1.0, 1.69)
     """
-    return NormalDist().inv_cdf(1.0 - 0.025 / tested) / INTERVAL_95_SD if tested > 2 else 1.0
+    return NormalDist().inv_cdf(1.0 - 0.5 * ABSENT_FAULT_SHARE / tested) / INTERVAL_95_SD if tested > 2 else 1.0
 
 
 def measure_departures(fault: Fault, size: Estimate) -> Estimate:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -159,7 +159,7 @@ def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: fl
     ready = model.with_effects(name.partition(".")[0] for fault in faults for name in fault.parameters)
 
     def draw(words: str, changes: Mapping[str, float], number: int = faulty) -> Floats:
-        return simulate_units(ready, com, load, UnitKind(words, changes), number, seed, steps, progress)
+        return simulate_units(ready, com, load, changes, number, seed, steps, progress, words)
 
     def draw_fault(fault: Fault, size: float, share: float = 1.0) -> Floats:
         changes = {key: value * (1.0 if key == fault.parameter else share)
@@ -441,23 +441,17 @@ class _Fleet:
 # Simulated units
 # ---------------------------------------------------------------------------------------------------------------------
 
-class UnitKind(NamedTuple):
-    """Which units to draw."""
-
-    name: str
-    changes: Mapping[str, float]  # parameters that all of them have, SI, in place of those of the model
-
-
-def simulate_units(model: Model, com: Floats, load: Floats, kind: UnitKind, count: int, seed: int, steps: int = 20,
-                   progress: Progress = ignore_progress) -> Floats:
+def simulate_units(model: Model, com: Floats, load: Floats, changes: Mapping[str, float], count: int, seed: int,
+                   steps: int = 20, progress: Progress = ignore_progress, name: str = "") -> Floats:
     """Sensed position, (count, n), of units over a command (n,) with a known load (n,).
 
+    All of them have the parameters `changes`, SI, in place of those of the model; `name` is what progress calls them.
     The same seed gives the same units, whatever their faults. The solver takes `steps` a cycle; docs/statistics.md says
     what that leaves out. Every other block of units moved before its test and came to rest wherever friction left it;
     the others start at rest at null, as a model does.
     """
     tolerance = list_tolerance_sizes(model)
-    names = list(dict.fromkeys([*tolerance, *kind.changes]))
+    names = list(dict.fromkeys([*tolerance, *changes]))
     lanes = Lanes(model, names, steps, workers=1)
     moving, resting = (round(seconds / model["controller.period"]) for seconds in (0.5, 0.3))
     t = np.arange(moving) / moving
@@ -470,14 +464,14 @@ def simulate_units(model: Model, com: Floats, load: Floats, kind: UnitKind, coun
         rng = np.random.default_rng([seed, first])
         before = com[0] + lead_in if com[0] != 0.0 or first // NARROW % 2 else com[:0]
         noise = sample_sensor_noise(rng, model, len(before) + len(com))
-        units = _sample_parameters(rng, model, tolerance, names, kind)[:members.stop - first]
+        units = _sample_parameters(rng, model, tolerance, names, changes)[:members.stop - first]
         asked, force = np.r_[before, com] - noise, np.r_[np.full(len(before), load[0]), load]
         out[members] = (lanes.closed_loop(units, asked, force)[..., 0] + noise)[:, len(before):]
 
     starts = range(0, count, NARROW)
     with ThreadPoolExecutor(count_threads()) as pool:
         for done, _ in enumerate(pool.map(simulate_block, starts)):
-            progress(f"simulating units, {kind.name}", (done + 1) / len(starts))
+            progress(f"simulating units, {name}", (done + 1) / len(starts))
     return out
 
 
@@ -505,11 +499,11 @@ def sample_sensor_noise(rng: np.random.Generator, model: Model, cycles: int, mos
 
 
 def _sample_parameters(rng: np.random.Generator, model: Model, tolerance: Mapping[str, float], names: list[str],
-                       kind: UnitKind) -> Floats:
+                       changes: Mapping[str, float]) -> Floats:
     """Parameters of a block of units, (NARROW, len(names))."""
     table = np.tile([model[name] for name in names], (NARROW, 1))
     for name, size in tolerance.items():
         table[:, names.index(name)] += size * rng.standard_normal(NARROW)
-    for name, value in kind.changes.items():
+    for name, value in changes.items():
         table[:, names.index(name)] = value
     return limit_dynamic_friction(names, table)

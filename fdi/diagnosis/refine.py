@@ -36,6 +36,7 @@ from fdi.estimation.fit import (
     complete_model,
     compute_misfit,
     compute_typical_rms,
+    compute_weights,
     follow_population,
     list_all_unknowns,
     list_effect_unknowns,
@@ -91,6 +92,7 @@ from fdi.thresholds import (
     RESIDUAL_HOPELESS_VALVE,
     RESIDUAL_IS_NOISE,
     RESIDUAL_WORST,
+    SUSPECT_COSINE,
     UNIT_TOLERANCE,
     WEIGHT_COUNTS,
 )
@@ -317,7 +319,6 @@ class Refinement:
     errors: Mapping[str, float]  # RMS residual by signal, SI
     floor: Mapping[str, float]  # RMS noise by signal, SI
     simulations: int
-    method: str = "least squares"
     everywhere: Mapping[str, float] = field(default_factory=dict)  # of a long recording: typical error over noise
     worst: float = RESIDUAL_WORST  # error over noise that a few stops of the ram may leave
 
@@ -396,8 +397,7 @@ def refine_sizes(model: Model, trace: Trace, starts: Sequence[Sizes] | None = No
         progress: called with the stage and the share of a diagnosis that is done.
         faults: what to estimate.
     """
-    usual_rounds = 44  # from two starts; a fit that is restarted takes twice as many
-    stage = Stage(progress, "refinement", 0.3, 0.97, usual_rounds)
+    stage = Stage(progress, "refinement", 0.3, 0.97, 44)  # rounds from two starts; one begun again takes twice as many
     problem = replace(make_problem(model, trace, floor, workers, faults), stage=stage)
     free = list_unknowns(problem.model, faults)
     if problem.model.kind.correct is not None:
@@ -493,11 +493,7 @@ def _restart_fit(problem: CountedProblem, found: Fit, parts: Sequence[float], ro
     `parts` of that line lie between the fit, 0, and the other unit, 1. Stops of the ram make ridges: tolerances that
     lie behind one of them are found from the other side, or never.
     """
-    free = found.free
-    home = make_healthy_start(problem, free)
-    kept = [f.name in problem.fault_parameters for f in free]
-    home[kept] = found.x[kept]
-    alone = replace(problem, workers=1, _lanes={})
+    free, home, alone = found.free, place_home(problem, found), replace(problem, workers=1, _lanes={})
 
     def fit_from(part: float) -> Fit:
         begun = descend(alone, start_fit(free, found.x + part * (home - found.x)), NOISE_SCHEDULE)
@@ -511,7 +507,8 @@ def _retry_without(problem: CountedProblem, found: Fit, most: int = 2) -> Fit:
     """The best of a fit and some that begin without one of the causes that it blames: one may stand for another.
 
     Without a fault they begin at the same unit, and where the fault looks like parameters of the plant, with these in
-    its place; without a suspect, such as a null bias, at a unit with the same faults and no other deviation.
+    its place; without a suspect, such as a null bias, at a unit with the same faults and no other deviation, and a
+    fault that looks like the suspect in its place.
     """
     fine = replace(problem, workers=1, steps=FINE_STEPS, _lanes={})
     alone = replace(problem, workers=1, _lanes={})
@@ -521,15 +518,25 @@ def _retry_without(problem: CountedProblem, found: Fit, most: int = 2) -> Fit:
         begun = descend(alone, start_fit(found.free, best), NOISE_SCHEDULE[1:])
         return descend_valley(fine, begun, 8, find_flat(alone, found.free, begun.x))
 
+    suspects = [s.parameter for s in list_suspects(problem.model, problem.faults)]
+    names = [f.name for f in found.free]
     for _ in range(most):
+        alike = find_alike(found, [fault.parameter for fault in problem.faults], suspects)
+        ways = [*list_directions_of_faults(problem.list_values(found.free, found.x)), *alike]
+        sizes = {fault: found.values[fault.parameter] for fault in problem.faults if _blames(fault, found)}
         tried = []
-        blamed = [fault for fault in problem.faults if _blames(fault, found)]
-        for fault in blamed:
-            x = set_sizes(found, fault, fault.healthy)
-            tried.append(np.array([x, *(_move_instead(problem, found, fault, x))]))
-        moved = {f.name for f, x in zip(found.free, found.x, strict=True) if abs(x) > 0.2}  # of what is typical
-        if moved & {s.parameter for s in list_suspects(problem.model, problem.faults)}:
-            tried += [_list_alone(problem, found, fault) for fault in blamed]
+        for name, x in ((fault.parameter, set_sizes(found, fault, fault.healthy)) for fault in sizes):
+            own = [way for way in ways if next(iter(way)) == name and way[name]]
+            tried.append(np.array([x, *(slide_along(found, way, name, x[names.index(name)]) for way in own)]))
+        far = 0.2  # of what is typical
+        moved = [name for name, x in zip(names, found.x, strict=True) if name in suspects and abs(x) > far]
+        for fault, way in product(problem.faults, alike):
+            name, suspect = way
+            if name == fault.parameter and suspect in moved:
+                k = names.index(name)
+                sizes[fault] = found.free[k].value(float(slide_along(found, way, suspect, 0.0)[k]))
+        if moved:
+            tried += [_list_alone(problem, found, fault, size) for fault, size in sizes.items()]
         fits = map_in_threads(fit_from, tried, problem.workers)
         best = min(fits, key=lambda f: f.cost, default=found)
         if best.cost >= found.cost:
@@ -538,13 +545,36 @@ def _retry_without(problem: CountedProblem, found: Fit, most: int = 2) -> Fit:
     return found
 
 
-def _list_alone(problem: CountedProblem, found: Fit, fault: Fault) -> Floats:
-    """Starts (m, p) at units without other deviations than the faults, one of them about as large as found."""
-    kept = [f.name in problem.fault_parameters for f in found.free]
-    home = replace(found, x=np.where(kept, found.x, 0.0))
-    size = found.values[fault.parameter]
+def find_alike(found: Fit, faults: Sequence[str], suspects: Sequence[str]) -> list[Mapping[str, float]]:
+    """Directions along which a suspect looks like a fault, both by parameter; the fault is named first.
+
+    A blocked nozzle shifts the null as a bias does; only where the flapper meets its stops do they differ, and a fit
+    may end anywhere between the two.
+    """
+    names, slopes = [f.name for f in found.free], found.jacobian.reshape(len(found.free), -1)
+    products = (slopes * compute_weights(found.white).reshape(-1)) @ slopes.T
+    lengths, scales = np.sqrt(np.diag(products)), [f.scale for f in found.free]
+    pairs = [(names.index(fault), names.index(suspect)) for fault, suspect in product(faults, suspects)]
+    return [{names[k]: scales[k], names[j]: -scales[j] * products[k, k] / products[j, k]} for k, j in pairs
+            if abs(products[j, k]) > SUSPECT_COSINE * lengths[j] * lengths[k]]
+
+
+def slide_along(found: Fit, way: Mapping[str, float], name: str, to: float) -> Floats:
+    """Scaled unknowns (p,) of a fit moved along a direction, within the bounds, until the unknown `name` is at `to`."""
+    k = [f.name for f in found.free].index(name)
+    part = (to - found.x[k]) * found.free[k].scale / way[name]
+    shift = np.array([get_power(way, f) * part / f.scale for f in found.free])
+    return np.clip(np.where(np.arange(len(shift)) == k, to, found.x + shift), *scaled_bounds(found.free))
+
+
+def _list_alone(problem: CountedProblem, found: Fit, fault: Fault, size: float) -> Floats:
+    """Starts (m, p) at units without other deviations than this fault, of about that size, SI, or all the faults."""
+    every = [f.name in problem.fault_parameters for f in found.free]
+    own = [f.name in fault.parameters for f in found.free]
+    healthy = make_start(found.free, problem.faults, [each.healthy for each in problem.faults])
+    homes = [replace(found, x=np.where(kept, found.x, healthy)) for kept in (every, own)]
     return np.array([set_sizes(home, fault, fault.healthy + part * (size - fault.healthy))
-                     for part in np.linspace(0.6, 1.6, 16)])
+                     for home in homes for part in np.linspace(0.6, 1.6, 16)])
 
 
 def polish_fit(problem: CountedProblem, found: Fit) -> Fit:
@@ -559,19 +589,6 @@ def polish_fit(problem: CountedProblem, found: Fit) -> Fit:
         found = descend_valley(scale_noise(exact, factor), begun, rounds, flat, problem.stage,
                                scale_noise(coarse, factor))
     return replace(found, covariance=estimate_smooth_covariance(coarse, found, flat))
-
-
-def _move_instead(problem: CountedProblem, found: Fit, fault: Fault, x: Floats) -> list[Floats]:
-    """Starts (p,) at which parameters that look like a fault have moved by as much as its size has gone back."""
-    at, names = problem.list_values(found.free, found.x), [f.name for f in found.free]
-    k, moved = names.index(fault.parameter), []
-    for way in list_directions_of_faults(at):
-        if next(iter(way)) == fault.parameter and way[fault.parameter]:
-            part = (x[k] - found.x[k]) * found.free[k].scale / way[fault.parameter]
-            shift = np.array([get_power(way, f) * part / f.scale for f in found.free])
-            low, high = scaled_bounds(found.free)
-            moved.append(np.clip(np.where(np.arange(len(x)) == k, x, found.x + shift), low, high))
-    return moved
 
 
 def set_sizes(found: Fit, fault: Fault, size: float) -> Floats:
@@ -626,6 +643,12 @@ def _blames_a_fault(problem: CountedProblem, free: Sequence[Free], x: Floats) ->
 def make_healthy_start(problem: CountedProblem, free: Sequence[Free]) -> Floats:
     """Scaled unknowns, (p,), of a unit without faults, with the bias and the load that the means show."""
     return make_start(free, problem.faults, [fault.healthy for fault in problem.faults], estimate_offsets(problem))
+
+
+def place_home(problem: CountedProblem, fit: Fit) -> Floats:
+    """Scaled unknowns, (p,), of a unit with a fit's faults and effects and no other deviation."""
+    kept = [f.name in problem.fault_parameters or not np.isfinite(f.prior) for f in fit.free]
+    return np.where(kept, fit.x, make_healthy_start(problem, fit.free))
 
 
 def is_noise_left(problem: Problem, found: Fit) -> bool:
@@ -983,7 +1006,7 @@ class JointSearch:
             return descend(problem, fit, ((factor, rounds),), self.alone)
 
         coarse = replace(self.alone, steps=steps)
-        home = self._place_home(fit)
+        home = place_home(self.problem, fit)
         begun = descend_coarsely(coarse, replace(fit, x=home), 3, POPULATION_STAGES[0][0])
         width = 0.1  # of a population's first trials along a friction of ram or spool, of its logarithm
         frictions = np.array([width / f.scale if f.name.endswith("_friction") and f.name.startswith(("jack.", "spool."))
@@ -1020,15 +1043,8 @@ class JointSearch:
 
     def restart(self, fit: Fit, part: float) -> Fit:
         """The fit from a point on the line to a unit with these faults and effects and no other deviation."""
-        begun = start_fit(fit.free, fit.x + part * (self._place_home(fit) - fit.x))
+        begun = start_fit(fit.free, fit.x + part * (place_home(self.problem, fit) - fit.x))
         return self.descend(begun, ((6.0, 4), (1.0, 8)))
-
-    def _place_home(self, fit: Fit) -> Floats:
-        """Scaled unknowns, (p,), of a unit with a fit's faults and effects and no other deviation."""
-        home = make_healthy_start(self.problem, fit.free)
-        kept = [f.name in self.problem.fault_parameters or not np.isfinite(f.prior) for f in fit.free]
-        home[kept] = fit.x[kept]
-        return home
 
     @property
     def alone(self) -> CountedProblem:
@@ -1082,15 +1098,10 @@ class Explanation:
     weight: float = 1.0  # probability among all explanations
 
     @property
-    def sizes(self) -> dict[str, Estimate]:
-        """The faults, by name."""
-        return dict(self.refinement.sizes)
-
-    @property
     def levels(self) -> dict[str, Level | None]:
         """Levels that this explanation alone would give, by fault."""
-        faults = self.refinement.faults
-        return {fault.name: judge_size(fault, self.sizes[fault.name], len(faults)) for fault in faults}
+        faults, sizes = self.refinement.faults, self.refinement.sizes
+        return {fault.name: judge_size(fault, sizes[fault.name], len(faults)) for fault in faults}
 
 
 @dataclass(frozen=True, eq=False)
@@ -1136,7 +1147,8 @@ def average_explanations(found: Sequence[Explanation], marks: Mapping[str, Mappi
     total = sum(weight for weight, _ in counted)
     kept = tuple(Explanation(e.effects, e.parameters, e.refinement, weight / total) for weight, e in counted)
     faults = kept[0].refinement.faults
-    sizes = {f.name: mix_estimates([e.sizes[f.name] for e in kept], [e.weight for e in kept]) for f in faults}
+    weights = [e.weight for e in kept]
+    sizes = {f.name: mix_estimates([e.refinement.sizes[f.name] for e in kept], weights) for f in faults}
     return Beside(kept, sizes, marks or {}, tuple(f.name for f in faults if _is_disputed(f, kept)))
 
 
@@ -1183,7 +1195,7 @@ def mix_estimates(estimates: Sequence[Estimate], weights: Sequence[float]) -> Es
 def _is_disputed(fault: Fault, explanations: Sequence[Explanation]) -> bool:
     """Whether explanations that contradict each other in the size give different levels."""
     def contradict(first: Explanation, second: Explanation) -> bool:
-        a, b = first.sizes[fault.name], second.sizes[fault.name]
+        a, b = first.refinement.sizes[fault.name], second.refinement.sizes[fault.name]
         return not b.low <= a.value <= b.high and not a.low <= b.value <= a.high
 
     return any(contradict(first, second) and first.levels[fault.name] != second.levels[fault.name]

@@ -111,7 +111,7 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
         Section("Precursors", _show_precursors(d)),
         Section("Fit", [
             Line("residual", describe_residual(d)),
-            Line("fit", f"{d.refinement.method}, {d.refinement.simulations} simulations; "
+            Line("fit", f"least squares, {d.refinement.simulations} simulations; "
                         f"{describe_correlation(d)}"),
             *(Line("deviation", describe_deviation(name, size)) for name, size in d.others.items())]),
         Section("Provenance of the bands", [tabulate(
@@ -367,7 +367,7 @@ def _show_effects(d: Diagnosis) -> list[Item]:
         rows.append([
             name_explanation(e), f"{100 * e.weight:.0f}", _format_parameters(e.parameters, d.model) or NO_NUMBER,
             *(cell for f, level in levels for cell in (
-                format_size(f, e.sizes[f.name]), Cell(LEVEL_NAMES[level], LEVEL_MOODS[level]))),
+                format_size(f, e.refinement.sizes[f.name]), Cell(LEVEL_NAMES[level], LEVEL_MOODS[level]))),
             format_ratio(max(e.refinement.ratio.values()))])
     caption = ("Explanations that fit the trace about equally well; the sizes above are averaged over them." if
                b.is_ambiguous else "What the search found beside the faults, fitted together with them.")
@@ -543,7 +543,7 @@ def collect_data(d: Diagnosis) -> dict[str, Any]:
         "grid": _collect_grid(d.grids[0]) if d.grids else None,
         "grids": [{"faults": [f.name for f in g.faults], **_collect_grid(g)} for g in d.grids],
         "refined": {**{f.key: d.sizes[f.name]._asdict() for f in d.faults},
-                    "correlation": r.correlation, "method": r.method, "simulations": r.simulations,
+                    "correlation": r.correlation, "method": "least squares", "simulations": r.simulations,
                     "reached": r.is_explained},
         "signals": {s: {"error": r.errors[s], "floor": r.floor[s], "ratio": r.ratio[s]} for s in r.errors},
         "others": {name: {**e._asdict(), "unhealthy": name in d.others} for name, e in r.others.items()},
@@ -580,7 +580,7 @@ def _collect_beside(d: Diagnosis) -> dict[str, Any]:
             {"effects": list(e.effects), "probability": e.weight,
              "parameters": {name: {**v._asdict(), "unit": find_quantity(name, plant=d.model.plant).unit}
                             for name, v in e.parameters.items()},
-             **{f.key: e.sizes[f.name]._asdict() for f in d.faults},
+             **{f.key: e.refinement.sizes[f.name]._asdict() for f in d.faults},
              "level": {name: level.word if level is not None and e.refinement.is_explained else None
                        for name, level in e.levels.items()},
              "ratio": dict(e.refinement.ratio)} for e in b.explanations],

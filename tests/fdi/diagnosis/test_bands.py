@@ -34,7 +34,6 @@ from fdi.diagnosis.faults import CLOGGING as CLOGGED
 from fdi.diagnosis.faults import FAULTS, Estimate, Level, load_faults
 from fdi.diagnosis.faults import FRICTION as RUBBING
 from fdi.diagnosis.make_bands import (
-    UnitKind,
     choose_bands,
     learn_bands,
     make_bands_by_simulation,
@@ -81,11 +80,11 @@ def units(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5
     return simulate_units(load_model(), com, np.zeros_like(com), kind, count, seed=4321)
 
 
-def make_kind(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5) -> UnitKind:
+def make_kind(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5) -> dict[str, float]:
     """Units with these faults, NaN for none."""
     clogged = {} if math.isnan(clogging) else CLOGGED.list_changes(clogging)
     rubbing = {RUBBING.parameter: friction, "spool.dynamic_friction": sliding * friction}
-    return UnitKind("", clogged | ({} if math.isnan(friction) else rubbing))
+    return clogged | ({} if math.isnan(friction) else rubbing)
 
 
 def judged(x: np.ndarray, bands: Bands | None = None) -> BandVerdict:
@@ -225,7 +224,7 @@ def test_faults_of_a_list_of_ones_own() -> None:
     assert {ramp.fault for ramp in again.ramps} == {backlash.name} and again.shows(again.faults[0])
     ready = load_model().with_effects(["feedback_gap"])
     for size, least, most in ((0.0, 0, 0), (1.5 * backlash.maintenance, 2, 2)):
-        x = simulate_units(ready, com, np.zeros_like(com), UnitKind("", backlash.list_changes(size)), 16, seed=99)
+        x = simulate_units(ready, com, np.zeros_like(com), backlash.list_changes(size), 16, seed=99)
         found = [judge_position(com, row, 1e-3, again).levels[backlash.name] for row in x]
         assert least <= min(found) and max(found) <= most
     noise = make_bands.sample_sensor_noise(np.random.default_rng(1), load_model(), len(com))
@@ -274,7 +273,7 @@ def test_a_wrong_file_is_refused(old: str, new: str, word: str, tmp_path: Path) 
     assert old in content
     (tmp_path / "b.toml").write_text(content.replace(old, new) if old else new)
     assert word in catch_refusal(load_bands, tmp_path / "b.toml")
-    assert "a readable file" in catch_refusal(load_bands, tmp_path / "none.toml")
+    assert "a file that can be read" in catch_refusal(load_bands, tmp_path / "none.toml")
 
 
 OTHER = {"jack.mass": 150.0}
@@ -305,7 +304,7 @@ def test_a_fleet_of_its_own() -> None:
     model = load_model().replace({"pilot.flow_gain": 0.069 * 0.88})
     com = command()
 
-    def fleet(kind: UnitKind, count: int, seed: int) -> list[Trace]:
+    def fleet(kind: dict[str, float], count: int, seed: int) -> list[Trace]:
         return [trace(x) for x in simulate_units(model, com, np.zeros_like(com), kind, count, seed)]
 
     sound = fleet(make_kind(), 32, 7)

@@ -29,7 +29,14 @@ from fdi.diagnosis.faults import (
     list_fault_files,
     load_faults,
 )
-from fdi.diagnosis.refine import list_coarse_starts, list_unknowns, make_start, place_value
+from fdi.diagnosis.refine import (
+    find_alike,
+    list_coarse_starts,
+    list_unknowns,
+    make_start,
+    place_value,
+    slide_along,
+)
 from fdi.estimation.fit import Free
 from fdi.estimation.unidentifiable import LogFree, LogFrictionRatio, PowerFree, compute_values
 from plant.faults import Fault, place_fault
@@ -120,6 +127,12 @@ def test_levels_of_faults_that_fall_or_go_both_ways(fault: Fault, size: Estimate
     assert fault.turn_up().limits == pytest.approx(fault.limits)
 
 
+def test_a_size_that_one_of_many_tests_finds_by_chance_is_no_fault() -> None:
+    by_chance = Estimate(-0.062, -0.101, -0.023)  # 3.1 standard deviations
+    assert judge_size(DRIFT, by_chance) == Level.MAINTENANCE and judge_size(DRIFT, by_chance, tested=11) is None
+    assert judge_size(DRIFT, Estimate(-0.1, -0.14, -0.06), tested=11) == Level.MAINTENANCE
+
+
 def pair(x: float, total: float, each: float) -> Any:
     """A posterior of two linear sizes: their sum is known to `total` s.d., their difference to `each`."""
     first = replace(CLOGGING, name="a", parameter="one.size", range=(0.0, 1.0))
@@ -144,11 +157,48 @@ def test_faults_that_only_show_as_a_sum_are_a_group(x: float, total: float, grou
         assert all(size.low == 0.0 for size in cut.values())
 
 
+def test_of_many_faults_two_together_have_to_be_further_off_than_one() -> None:
+    found = pair(0.2, 0.08, 5.0)  # both absent: 3.5 standard deviations
+    assert find_groups(found, dict.fromkeys("ab"))
+    third = tuple(replace(CLOGGING, name=name, parameter=f"{name}.size", range=(0.0, 1.0)) for name in "cd")
+    found.faults += third
+    found.fit.free += tuple(Free(f.parameter, 0.0, 1.0, 10.0, 0.0, 1.0, 0.02) for f in third)
+    found.fit.x, wide = np.append(found.fit.x, (0.0, 0.0)), np.eye(4)
+    wide[:2, :2] = found.fit.covariance
+    found.fit.covariance = wide
+    levels = {"a": None, "b": None, "c": Level.ACCEPTABLE, "d": Level.ACCEPTABLE}
+    assert find_groups(found, levels)
+    found.fit.covariance = wide * np.where(np.outer((1, 1, 0, 0), (1, 1, 0, 0)), 1.1**2, 1.0)  # 3.2
+    assert not find_groups(found, levels)
+
+
+def test_a_fault_and_a_suspect_that_look_alike_change_places() -> None:
+    """One of the bias's unknown shifts the signals as half of the fault's does."""
+    rng = np.random.default_rng(0)
+    free = (Free("one.size", 0.0, 0.1, 10.0, 0.0, 1.0, 0.02), Free("null_bias.current", 0.0, 1.0, 1.0, -9.0, 9.0, 0.02),
+            Free("constant_load.force", 0.0, 1.0, 1.0, -9.0, 9.0, 0.02))
+    shift, other = rng.standard_normal((2, 1, 400))
+    fit: Any = SimpleNamespace(free=free, x=np.array([1.0, 2.0, 0.0]), white=np.ones((1, 400)),
+                               jacobian=np.array([2.0 * shift, shift, other]))
+    [way] = find_alike(fit, ["one.size"], ["null_bias.current", "constant_load.force"])
+    assert list(way) == ["one.size", "null_bias.current"]
+    assert slide_along(fit, way, "null_bias.current", 0.0) == pytest.approx([2.0, 0.0, 0.0])
+    assert slide_along(fit, way, "one.size", 0.0) == pytest.approx([0.0, 4.0, 0.0])
+
+
 def test_a_logarithm_keeps_its_bounds_in_a_group() -> None:
     found = pair(0.2, 0.02, 5.0)
     found.fit.free = (found.fit.free[0], LogFree("two.size", -1.6, 1.0, 1.0, -4.0, 0.0, 1.0))
     assert find_groups(found, dict.fromkeys("ab", Level.ACCEPTABLE)) == ()
     assert [g.names for g in find_groups(found, {"a": None, "b": Level.ACCEPTABLE})] == [("a", "b")]
+
+
+def test_a_healthy_unit_within_its_tolerances_is_in_no_group() -> None:
+    found = pair(0.215, 0.01, 5.0)
+    found.faults = tuple(replace(fault, healthy=0.2) for fault in found.faults)
+    levels = dict.fromkeys("ab")
+    assert find_groups(found, levels) and find_groups(found, levels, {"one.size": 0.001})
+    assert not find_groups(found, levels, {"one.size": 0.015, "two.size": 0.015})
 
 
 def test_a_range_that_begins_at_the_nominal_size_holds_every_healthy_unit() -> None:
