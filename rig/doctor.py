@@ -18,8 +18,7 @@ from rig.benches.bench import Bench, describe_identifier
 from rig.benches.bench_report import list_loads
 from rig.network import bus, udp
 from rig.network.bus import Link, LinkWire
-from rig.network.clock import WallClock
-from rig.network.frame import Frame
+from rig.network.frame import Frame, WallClock
 from rig.run import priority
 
 Status = Literal["ok", "limited", "missing"]

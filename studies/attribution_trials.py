@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rig.network.bus import Link, open_can
-from studies.robustness.nodes import start_nodes
+from studies.robustness.disturb import start_nodes
 from studies.shipped_frames import COMMAND, DRIVE, FEEDBACK, SYNC, VALVE_STATE, unpack_frame
 
 SEQUENCE = """

@@ -18,8 +18,7 @@ from rig.sequences import faults
 from rig.sequences.checks import KEYS, KINDS, Check, Guard
 from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.python_parts import Step
-from rig.sequences.sequence import SEGMENT_KINDS, Sequence
-from rig.sequences.timing import TimingPolicy
+from rig.sequences.sequence import SEGMENT_KINDS, Sequence, TimingPolicy
 
 
 def write_sequence_page() -> list[str]:

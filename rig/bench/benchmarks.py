@@ -35,15 +35,15 @@ from rig.benches.bench import Role
 from rig.benches.bench_file import load_bench
 from rig.firmware.build import build_device
 from rig.network.bus import Link, LinkWire, can_open, open_can, serve_node
-from rig.network.clock import WallClock
+from rig.network.frame import WallClock
 from rig.network.master import Master
 from rig.network.raw_bus import RawBus
 from rig.nodes.emulator import Emulator
 from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
+from rig.run.bring_up import open_loop
 from rig.run.hard_loop import compile_cycle
 from rig.run.loop import CycleInput, CycleLoop, History, Loop
-from rig.run.loops import open_loop
 from rig.run.priority import (
     LOOP_PRIORITY,
     list_cpus,

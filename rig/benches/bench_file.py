@@ -1,4 +1,8 @@
-"""Reads bench files: with the EDS, DCF or DBC that they name they become a `Bench`. docs/bench.md has the keys."""
+"""Reads bench files: with the EDS, DCF or DBC that they name they become a `Bench`. docs/bench.md has the keys.
+
+A plant without a device has a bench of its own: a frame of plain CAN for each signal, and the plant's own controller on
+it. `rig run --model my_plant.py` takes it where no bench file is given and the shipped one has other signals.
+"""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -12,9 +16,9 @@ from dbc import EDS
 from fdi.foreign_code import ForeignCode, load_plant_of_model, require_trust
 from plant.errors import InputError
 from plant.model import find_plant_of_model, find_quantity
-from plant.plants import find_plant, is_known, is_loaded, load_plant
+from plant.plants import Plant, find_plant, is_known, is_loaded, load_plant
 from plant.quantity import Quantity
-from plant.signals import Signals
+from plant.signals import Signal, Signals
 from plant.tables import Place, build_dataclass, decode_text, list_choices, parse_table, read_file
 from plant.units import parse_quantity
 from rig.benches import canopen_map
@@ -564,3 +568,47 @@ def _check_identifiers(bench: Bench, place: Place) -> None:
         if taken.setdefault(identifier, message) != message:
             raise place.at("controller").refuse(f"each identifier once; {spec.name} and {taken[identifier]} have "
                                                 f"{describe_identifier(identifier)}")
+
+
+_PLANT_BENCH, _PLANT_DBC = "plant_bench.toml", "plant_bench.dbc"
+_FIRST_IDENTIFIER, _DRIVE_IDENTIFIER = 0x101, 0x201
+
+
+def make_plant_bench(plant: Plant, model: str) -> Bench:
+    """The bench for a plant: its command and readings go to the controller, its drive comes back, as 64-bit numbers.
+
+    Args:
+        plant: as declared.
+        model: that has it; the folder of its file is left out.
+    """
+    return load_bench_from_files({_PLANT_BENCH: _write_plant_bench(plant, Path(model).name).encode(),
+                                  _PLANT_DBC: _write_plant_dbc(plant).encode()}, plant.signals)
+
+
+def is_plant_bench(bench: Bench) -> bool:
+    """Whether the plant's own controller can be the controller of this bench."""
+    return next(iter(bench.files), "") == _PLANT_BENCH
+
+
+def _write_plant_bench(plant: Plant, model: str) -> str:
+    sent = [f"{s.word} = {_write_plant_place(s)}" for s in (plant.signals.command, *plant.signals.outputs)]
+    return "\n".join([f'name = "{plant.title}, with its own controller"', f"plant = {model!r}", "", "[controller]",
+                      'protocol = "can"', f'dbc = "{_PLANT_DBC}"', "", "[controller.inputs]", *sent, "",
+                      "[controller.outputs]",
+                      f"{plant.signals.drive.word} = {_write_plant_place(plant.signals.drive)}", ""])
+
+
+def _write_plant_place(signal: Signal) -> str:
+    count = "" if signal.unit == "1" else f', count = "1 {signal.unit}"'
+    return f'{{ signal = "{signal.word}.{signal.word}"{count} }}'
+
+
+def _write_plant_dbc(plant: Plant) -> str:
+    given = (plant.signals.command, *plant.signals.outputs)
+    frames = [*enumerate(given, _FIRST_IDENTIFIER), (_DRIVE_IDENTIFIER, plant.signals.drive)]
+    lines = ['VERSION ""', "NS_ :", "BS_:", "BU_: Rig Controller", ""]
+    for identifier, signal in frames:
+        sender, receiver = ("Rig", "Controller") if signal in given else ("Controller", "Rig")
+        lines += [f"BO_ {identifier} {signal.word}: 8 {sender}",
+                  f' SG_ {signal.word} : 0|64@1- (1,0) [0|0] "{signal.unit}" {receiver}', ""]
+    return "\n".join([*lines, *(f"SIG_VALTYPE_ {identifier} {signal.word} : 2;" for identifier, signal in frames), ""])

@@ -24,7 +24,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from plant.errors import InputError, RigError, report_system_error
 from rig.interrupts import ignore_interrupts
-from rig.network.clock import WallClock
+from rig.network.frame import WallClock
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

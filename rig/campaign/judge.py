@@ -39,8 +39,8 @@ from plant.signals import EHA
 from plant.tables import Place, build_dataclass
 from plant.threads import count_threads
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, import_extra, read_rows, run_batch
-from rig.network.clock import WallClock
-from rig.sequences.nominal import load_nominal_test
+from rig.network.frame import WallClock
+from rig.sequences.sequence import load_nominal_test
 
 OWN_SIMULATOR = "plant"
 HEALTHY = "healthy"

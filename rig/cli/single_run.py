@@ -20,7 +20,7 @@ from rig.cli.command_list import LIVE_ON_TERMINAL
 from rig.cli.inputs import is_suite_file, parse_changes
 from rig.interrupts import catch_signals
 from rig.network.bus import choose_bus
-from rig.network.clock import WallClock
+from rig.network.frame import WallClock
 from rig.recorder import Event, Observer, Record
 from rig.run.job import Job, JobChoice, build_job, find_differences, read_job, replace_settings
 from rig.run.page_writer import PageWriter

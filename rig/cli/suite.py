@@ -17,7 +17,7 @@ from rig.cli.inputs import is_suite_file
 from rig.cli.single_run import build_choice, choose_bus_of_run, make_new_folder
 from rig.evidence.requirements import read_requirements, require_listed
 from rig.interrupts import catch_signals
-from rig.network.clock import WallClock
+from rig.network.frame import WallClock
 from rig.run.job import JobChoice
 from rig.run.participants import EMBEDDED_NAMES
 from rig.suite.suite import (

@@ -23,8 +23,17 @@ from can.interfaces.socketcan import SocketcanBus
 from plant.errors import InputError, RigError
 from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.network.can_interface import UdpBus
-from rig.network.clock import Clock, WallClock
-from rig.network.frame import IDENTIFIER, Frame, Node, Send, find_cob_id, has_valid_length, make_message
+from rig.network.frame import (
+    IDENTIFIER,
+    Clock,
+    Frame,
+    Node,
+    Send,
+    WallClock,
+    find_cob_id,
+    has_valid_length,
+    make_message,
+)
 from rig.network.udp import GROUP, SO_RXQ_OVFL, SO_TIMESTAMPNS, is_group, set_receive_options
 
 BUS_VARIABLE = "EHA_RIG_BUS"  # environment: what `auto` takes

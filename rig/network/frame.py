@@ -1,4 +1,4 @@
-"""One CAN frame, as nodes see it: bytes and a time, never a socket or a clock.
+"""One CAN frame, as nodes see it: bytes and a time, never a socket or a clock; and the clocks that give the time.
 
 One integer, the COB-ID, says everywhere which frame it is: the identifier, with `EXTENDED` if it has 29 bits and with
 `FD` if it is a CAN FD frame. 0x123, 0x123 | EXTENDED and 0x123 | FD are three different frames. A plain
@@ -6,6 +6,7 @@ One integer, the COB-ID, says everywhere which frame it is: the identifier, with
 """
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -61,3 +62,45 @@ def find_cob_id(message: can.Message) -> int:
         if is_set:
             cob_id |= flag
     return cob_id
+
+
+class Clock(Protocol):
+    """Time since the run began, ns."""
+
+    def now(self) -> int:
+        """The time now, ns."""
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Return at `t_ns`; at once if that has passed."""
+
+
+class VirtualClock:
+    """Simulated time: `sleep_until` jumps to its end at once, so a run repeats bit for bit and never waits."""
+
+    def __init__(self) -> None:
+        self._t_ns = 0
+
+    def now(self) -> int:
+        """The time last jumped to, ns."""
+        return self._t_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Jump to `t_ns`; never back."""
+        self._t_ns = max(self._t_ns, t_ns)
+
+
+class WallClock:
+    """The machine's monotonic clock; 0 when it is created. `origin_ns` is that moment on CLOCK_MONOTONIC."""
+
+    def __init__(self) -> None:
+        self.origin_ns = time.monotonic_ns()
+
+    def now(self) -> int:
+        """Time since the clock was created, ns."""
+        return time.monotonic_ns() - self.origin_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Sleep until `t_ns`. CPython sleeps to an absolute deadline, so a long run does not drift."""
+        left = t_ns - self.now()
+        if left > 0:
+            time.sleep(left * 1e-9)

@@ -19,8 +19,7 @@ from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbor
 from rig.network import heartbeat
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import COUNTERS, PLANT, SCENARIO
-from rig.nodes.faulty_plant import FaultyPlant
-from rig.nodes.scenario import Scenario
+from rig.nodes.scenario import FaultyPlant, Scenario
 from rig.sequences.faults import DELAY, DOUBLE, Plan, apply_action
 
 _NO_FLAGS = Flags(0)  # made once: an operation on an IntFlag takes a microsecond

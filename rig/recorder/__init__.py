@@ -1,7 +1,6 @@
 """The log: MCAP with protobuf channels, written off the loop's thread, salvaged after a crash."""
-from rig.recorder.block import CycleBlock
 from rig.recorder.schema import U32, CanFrame, Event, NmtState, Record, Signals, Timing
-from rig.recorder.writer import Observer, Recorder, RecorderError
+from rig.recorder.writer import CycleBlock, Observer, Recorder, RecorderError
 
 __all__ = ["U32", "CanFrame", "CycleBlock", "Event", "NmtState", "Observer", "Record", "Recorder",
            "RecorderError", "Signals", "Timing"]

@@ -21,7 +21,7 @@ from rig.network.master import StartTime
 from rig.network.node_objects import CONTROLLER, PLANT, RIG
 from rig.sequences.faults import DELAY, BusOff, Offset, Parameter, Plan, Schedule, Silent, Stuck
 from rig.sequences.protocol import Mask
-from rig.sequences.timing import TimingPolicy
+from rig.sequences.sequence import TimingPolicy
 
 NO_DRIVE = "drive"  # kind of a trouble: the rig, which moves the plant, gets no drive frames
 _NO_DRIVE = int(Flags.DRIVE_MISSING | Flags.DRIVE_LATE)

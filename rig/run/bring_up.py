@@ -1,4 +1,4 @@
-"""Bring-up: the nodes are reset, identified, configured and started, and the probes before set-up are played.
+"""Bring-up: the cycle loop is chosen, the nodes are reset, identified, configured and started, the probes are played.
 
 The probes are short plays before and after a sequence that show what its own cycles cannot. In a sequence the
 controller is disabled only where demand and position agree, so a firmware that ignores it sends next to no current
@@ -23,19 +23,50 @@ import numpy as np
 from plant.errors import InputError
 from rig.benches.bench import Bench, Flags, Role
 from rig.benches.profiles import PROFILES, State, choose_control, find_state
-from rig.network.bus import EmbeddedWire
-from rig.network.clock import WallClock
+from rig.network.bus import EmbeddedWire, LinkWire, can_open
+from rig.network.frame import WallClock
 from rig.network.master import HEARTBEAT_LIMIT, PATIENT, Master
 from rig.network.node_objects import CONTROLLER, Gains, Identity, read_gains
 from rig.nodes.scenario import Scenario
 from rig.run.attribution import find_start_problem
+from rig.run.embedded_loop import EmbeddedLoop, Limits, can_play_many, is_compiled, load_code
 from rig.run.job import Job
-from rig.run.loop import AFTER, BEFORE, BEFORE_MAIN, CycleInput, History, Loop
-from rig.run.loops import open_loop
+from rig.run.loop import AFTER, BEFORE, BEFORE_MAIN, CycleInput, CycleLoop, CycleObserver, History, Loop
 from rig.run.state import Journal, SafeState, Stage
 from rig.run.watch import PATIENCE, describe_silence
 from rig.sequences.faults import Plan, Schedule
 from rig.sequences.protocol import Mask, ProtocolLimits, Rows
+
+
+def compile_loop(job: Job) -> None:
+    """Compile the cycle of a job, before any node is started: some seconds on a new machine."""
+    if job.realtime and can_open(job.bus):
+        from rig.run.hard_loop import compile_cycle  # here: in lockstep a run needs none of it
+
+        compile_cycle()
+    elif job.controller == "builtin" and not job.realtime and is_compiled():
+        load_code()
+
+
+def open_loop(master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver, bus: str,
+              realtime: bool, guards: Limits | None = None) -> Loop:
+    """The cycle loop for a bus: in real time the hard one where compiled code can use the bus, else one in Python.
+
+    With `guards`, limits of signals, cycles of a run may be played together.
+
+    Raises:
+        RigError: the bus cannot be opened.
+    """
+    is_compiled = bench.has_plant_node or scenario.model.kind.foreign is None  # or Python moves the plant
+    if realtime and can_open(bus) and isinstance(master.wire, LinkWire) and is_compiled:
+        from rig.network.raw_bus import RawBus  # here: in lockstep a run needs none of it
+        from rig.run.hard_loop import HardLoop
+
+        return HardLoop(master, bench, scenario, faults, log, RawBus(bus, bench.frames.identifiers))
+    if guards is not None and not realtime and can_play_many(master, bench):
+        return EmbeddedLoop(master, bench, scenario, faults, log, guards)
+    return CycleLoop(master, bench, scenario, faults, log, realtime)
+
 
 PROBES = 2  # before set-up, of a controller that can be reset
 ATTEMPTS = 5  # at each of them, in real time

@@ -29,8 +29,7 @@ from rig.network.master import Master
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator_service import compile_plant
-from rig.nodes.faulty_plant import DIVERGED
-from rig.nodes.scenario import Scenario
+from rig.nodes.scenario import DIVERGED, Scenario
 from rig.recorder import Timing
 from rig.run import hard_cycle as hc
 from rig.run.loop import CycleInput, CycleObserver, CyclicValues, Loop, set_rig_faults

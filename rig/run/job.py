@@ -28,8 +28,7 @@ from plant.plant_files import read_named_plant
 from plant.plants import find_plant, load_plant
 from plant.signals import EHA, Signals
 from rig.benches.bench import Bench
-from rig.benches.bench_file import load_bench, load_bench_from_files
-from rig.benches.plant_bench import is_plant_bench, make_plant_bench
+from rig.benches.bench_file import is_plant_bench, load_bench, load_bench_from_files, make_plant_bench
 from rig.nodes.scenario import Scenario
 from rig.run.choices import CONTROLLERS, PACES, PLANTS
 from rig.sequences import Sequence, load_sequence

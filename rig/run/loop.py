@@ -31,12 +31,10 @@ from rig.benches.bench import (
     make_writer,
 )
 from rig.network.bus import LinkWire
-from rig.network.clock import WallClock
-from rig.network.frame import Frame
+from rig.network.frame import Frame, WallClock
 from rig.network.master import Master
 from rig.nodes.emulator import Emulator
-from rig.nodes.faulty_plant import FaultyPlant
-from rig.nodes.scenario import Scenario
+from rig.nodes.scenario import FaultyPlant, Scenario
 from rig.recorder import CycleBlock, Signals, Timing
 from rig.recorder.schema import make_row_record
 from rig.sequences.faults import (

@@ -12,10 +12,9 @@ from functools import partial
 
 from plant import InputError, Model
 from rig.benches.bench import Role
-from rig.benches.plant_bench import is_plant_bench
+from rig.benches.bench_file import is_plant_bench
 from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, open_can
-from rig.network.clock import VirtualClock, WallClock
-from rig.network.frame import Node, Send
+from rig.network.frame import Node, Send, VirtualClock, WallClock
 from rig.network.master import BusError, Master
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
 from rig.nodes.emulator import Emulator

@@ -28,14 +28,14 @@ from plant.run import make_columns_type
 from plant.segments import Array
 from plant.signals import Signals
 from rig.benches.bench import Flags, Role
-from rig.network.clock import WallClock
+from rig.network.frame import WallClock
 from rig.network.node_objects import NAMES, PLANT, CycleRecord, Identity
 from rig.recorder import Observer, Recorder
 from rig.recorder.schema import collect_provenance, read_epoch_ns
 from rig.run.attribution import Attribution, Cause, CycleRecords, Trouble, attribute, count_most_in_a_row, find_injected
+from rig.run.bring_up import compile_loop
 from rig.run.job import Job, find_differences
 from rig.run.loop import History, Loop
-from rig.run.loops import compile_loop
 from rig.run.participants import open_participants
 from rig.run.priority import (
     LOOP_PRIORITY,

@@ -33,12 +33,12 @@ from rig.run.bring_up import (
     list_first_steps,
     list_inputs,
     list_last_steps,
+    open_loop,
     read_rows,
 )
 from rig.run.embedded_loop import MOST
 from rig.run.job import Job
 from rig.run.loop import AFTER, CycleInput, History
-from rig.run.loops import open_loop
 from rig.run.participants import NodeProcesses, find_firmware_parameters
 from rig.run.state import Journal, SafeState, Stage
 from rig.run.watch import PATIENCE, NodeWatch, OverrunWatch

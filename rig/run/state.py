@@ -3,7 +3,7 @@
 import bisect
 
 from fdi.trace.trace import Event
-from rig.network.clock import Clock
+from rig.network.frame import Clock
 from rig.recorder import Event as EventRecord
 from rig.recorder import Recorder
 from rig.run.attribution import Trouble

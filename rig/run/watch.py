@@ -16,7 +16,7 @@ from rig.run.attribution import NO_DRIVE
 from rig.run.participants import FRAME_TIMEOUT, NodeProcesses, describe_exit
 from rig.run.state import Journal, SafeState, Stage
 from rig.sequences.protocol import Emergency, Heartbeat
-from rig.sequences.timing import TimingPolicy
+from rig.sequences.sequence import TimingPolicy
 
 PATIENCE = 5  # cycles in lockstep, of which each may wait long, until the first drive frame must have come
 

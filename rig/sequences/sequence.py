@@ -2,7 +2,8 @@
 
 A sequence is a TOML file (rig/sequences/ has examples): set-up, main and clean-up as lists of segments, the load on the
 ram, faults, checks and guards. Times of loads, faults and checks count from the start of main. All times are in s; the
-bench of a run says how many cycles a second has.
+bench of a run says how many cycles a second has. The table [timing] says how late the bench itself may be. The nominal
+test of a plant is the profile that it declares, or the main phase of preflight.
 """
 from __future__ import annotations
 
@@ -12,9 +13,10 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
+from math import ceil
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -24,9 +26,10 @@ from plant.model import build_bare_model, find_quantity, load_model
 from plant.parameters import parse_value
 from plant.plant_check import MOST_FOLLOWING_ERROR
 from plant.plants import Plant, find_plant
-from plant.profile import Profile, build_profile, list_section_names, parse_columns
+from plant.profile import Profile, build_profile, list_section_names, parse_columns, resample_on_cycles
 from plant.quantity import Quantity
-from plant.segments import RATE, Array, Csv, Hold, Segment
+from plant.segments import LONGEST, RATE, Array, Csv, Hold, Segment
+from plant.signals import EHA
 from plant.tables import Place
 from plant.user_code import run_file
 from rig.benches.calibration import Decision
@@ -37,7 +40,49 @@ from rig.sequences.faults import Fault, Parameter, Plan, find_contradiction
 from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.python_parts import PythonSegment, Step, load_function, require_function_name
 from rig.sequences.signals import find_tested, name_signals_of
-from rig.sequences.timing import TimingPolicy
+
+InCycle = Annotated[float, Quantity("s", above=0.0, high=0.1)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimingPolicy:
+    """Limits in s. An overrun is a cycle in which the bench was late: SYNC beyond `sync`, feedback beyond `feedback`.
+
+    A cycle that begins whole periods late counts as that many overruns. `overruns` says what they lead to: "count"
+    plays the sequence to its end and judges its timing then, "abort" ends main when more than `tolerate` come in a row.
+    """
+
+    overruns: Literal["count", "abort"] = "count"
+    # overruns in a row; None: any number with "count", none with "abort"
+    tolerate: Annotated[int, Quantity("1", low=0, high=1_000_000)] | None = None
+    share: Annotated[float, Quantity("1", low=0.0, high=1.0)] = 1e-3  # of all cycles; more make the timing invalid
+    grace: Annotated[float, Quantity("s", low=0.0, high=LONGEST)] = 0.1  # overruns in it do not count
+    sync: InCycle | None = None  # SYNC after it was due; None: half a cycle
+    feedback: InCycle | None = None  # from SYNC to the feedback frame; None: half a cycle
+    operational: Annotated[float, Quantity("s", above=0.0, high=60.0)] = 1.0  # from NMT start to OPERATIONAL
+
+    @property
+    def most_in_a_row(self) -> int | None:
+        """Overruns in a row that are accepted; None: any number."""
+        return 0 if self.tolerate is None and self.overruns == "abort" else self.tolerate
+
+    def find_limits(self, period: float) -> tuple[float, float]:
+        """The limits of SYNC and of feedback, s, where a cycle is `period` s long."""
+        sync, feedback = (0.5 * period if limit is None else limit for limit in (self.sync, self.feedback))
+        return sync, feedback
+
+    def choose_sync_period(self, period: float, in_a_row: int = 10) -> int:
+        """The communication cycle period to write to the nodes in real time (0x1006), us; a cycle is `period` s long.
+
+        CiA 301 does not say when SYNC counts as lost. CANopenNode says so 1.5 periods after the last one. With the true
+        period it would report every SYNC that is half a cycle late, which is an error of the bench and not of the bus.
+        So 1.5 times the value is at least the longest pause that the sequence accepts: its overruns in a row (or
+        `in_a_row`, if more) and one more SYNC that is late by its limit.
+        """
+        periods_tolerated = 1.5  # after so many times 0x1006 without a SYNC some CANopen stacks call SYNC lost
+        pause = (max(self.most_in_a_row or 0, in_a_row) + 1) * period + self.find_limits(period)[0]
+        return round(1e6 * period) * ceil(pause / periods_tolerated / period)
+
 
 PHASES = ("setup", "main", "cleanup", "load")
 PREFLIGHT = "preflight.toml"
@@ -410,3 +455,29 @@ def _check_checks(sequence: Sequence, place: Place) -> None:
             raise place.at(i, "frequency").refuse(f"below half the rate of {sequence.rate:g} Hz, not {frequency:g}")
         if isinstance(after, str) and labels[after] != 1:
             raise place.at(i, "after").refuse(f"a time or one fault: {tables.list_choices(after, labels)}")
+
+
+def load_nominal_test(kind: Plant, period: float) -> tuple[Array, Array | None, str]:
+    """Demand and load of every cycle of `period` s, (n,) each, and the name of the test; a load of None is none.
+
+    Raises:
+        InputError: the plant declares no test.
+    """
+    if kind.profile:
+        return build_profile(kind.profile, rate=1.0 / period).command, None, f"profile of {kind.name}"
+    if kind.signals.names != EHA.names:
+        raise InputError("--command", "", f"FILE with the columns t and {kind.signals.command.name}: {kind.name} "
+                                          "declares no profile")
+    try:
+        return (*_sample_preflight(1.0 / period), "preflight")
+    except InputError:  # its segments are not whole cycles of this period
+        columns = _sample_preflight(RATE)
+    t = np.arange(len(columns[0])) / RATE
+    command, force = (resample_on_cycles(t, column, period) for column in columns)
+    return command, force, "preflight"
+
+
+def _sample_preflight(rate: float) -> tuple[Array, Array]:
+    """Demand, m, and load, N, `rate` values a second. Raises InputError if its segments are not whole cycles."""
+    sequence = load_sequence("preflight", rate)
+    return sequence.main_profile().command, sequence.load_profile()

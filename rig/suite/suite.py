@@ -35,7 +35,7 @@ from rig.evidence.requirements import (
     tabulate_requirements,
     trace_requirements,
 )
-from rig.network.clock import WallClock
+from rig.network.frame import WallClock
 from rig.run.job import JobChoice, build_job, find_differences, load_tested_sequence
 from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import (

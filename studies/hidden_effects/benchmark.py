@@ -23,7 +23,7 @@ from plant.plants import Plant, find_plant, load_plant
 from plant.segments import RATE
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch, run_jobs
 from rig.campaign.judge import FLOORS
-from rig.network.clock import WallClock
+from rig.network.frame import WallClock
 from studies.hidden_effects import any_plant, cases, truth
 from studies.hidden_effects.command import preflight_command
 from studies.hidden_effects.hidden import CATALOGUE

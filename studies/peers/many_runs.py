@@ -1,19 +1,186 @@
 """Many runs at once, beside C, jax and ProgPy: the same runs of the same equations, in one process."""
 
+import ctypes
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi.progress import Progress, ignore_progress
 from plant import Model, simulate
+from plant.eha import compute_coefficients
 from plant.lanes import STEPS, Lanes
-from rig.bench.benchmarks import FLAGS, SAME_ROUNDING, measure_median_duration
-from studies.peers.libraries import Task, make_c_replay, make_jax_replay, make_progpy_replay
+from rig.bench.benchmarks import FLAGS, SAME_ROUNDING, build_library, measure_median_duration
 from studies.peers.rivals import Race, Replay, Rival, explain_missing, explain_missing_gcc, race_rivals, skip_rival
 
 Array = NDArray[np.float64]
+
+
+class Task(NamedTuple):
+    """Runs of the bare model: `values` (m, len(names)) of the parameters `names`, over `current` and `load` (n,)."""
+
+    model: Model
+    names: tuple[str, ...]
+    values: Array
+    current: Array
+    load: Array
+    steps: int
+
+    @property
+    def parameters(self) -> dict[str, dict[str, Array]]:
+        """Group to field to the values of the runs, (m,)."""
+        changed = dict(zip(self.names, self.values.T, strict=True))
+        groups: dict[str, dict[str, Array]] = {}
+        for name, value in self.model.values.items():
+            group, _, field = name.partition(".")
+            groups.setdefault(group, {})[field] = changed.get(name, np.full(len(self.values), value))
+        return groups
+
+    @property
+    def h(self) -> float:
+        """Length of a step, s."""
+        return float(self.model["controller.period"]) / self.steps
+
+
+def make_c_replay(task: Task, function: str, flags: tuple[str, ...], target: Path) -> Replay:
+    """A function of lanes.c: "replay_each" or "replay_lanes"."""
+    library = build_library("lanes.c", flags, target, "studies.peers")
+    records = np.repeat(task.model.build_record(), len(task.values))
+    numbers = records.view(np.float64).reshape(len(records), -1)
+    for column, name in enumerate(task.names):
+        numbers[:, task.model.list_names().index(name)] = task.values[:, column]
+    n = len(task.current)
+    out = np.empty((len(records), 3, n))
+    pointers = [np.ctypeslib.as_ctypes(a.reshape(-1)) for a in (numbers, task.current, task.load, out)]
+
+    def run() -> Array:
+        models, current, load, rows = pointers
+        getattr(library, function)(models, len(records), current, load, ctypes.c_long(n), task.steps, rows)
+        return out.transpose(0, 2, 1)
+
+    return run
+
+
+def make_jax_replay(task: Task) -> Replay:
+    """jax: one run as two nested scans, compiled, vmap over the runs. Unrolling the steps is slower."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    h, numbers = task.h, jax.numpy
+
+    def replay_run(parameters: Any, current: Any, load: Any) -> Any:
+        p = _make_namespaces(parameters)
+        k = compute_coefficients(p, h)
+
+        def cycle(s: Any, held: Any) -> Any:
+            def forward(s: Any, _: None) -> tuple[Any, None]:
+                return step_bare_model(numbers, s, held[0], held[1], p, k, h), None
+
+            after, _ = jax.lax.scan(forward, s, None, task.steps)
+            return after, numbers.stack([s[4], s[6], s[2]])
+
+        return jax.lax.scan(cycle, (numbers.zeros(()),) * 7, (current, load))[1]
+
+    compiled = jax.jit(jax.vmap(replay_run, (0, None, None)))
+    acting = np.r_[0.0, task.current[:-1]]
+    return lambda: np.asarray(compiled(task.parameters, acting, task.load))
+
+
+def make_progpy_replay(task: Task) -> Replay:
+    """NASA ProgPy: the step as a ProgPy model, vectorised over the runs, simulated by `simulate_to`."""
+    period = float(task.model["controller.period"])
+    plant, acting = _define_progpy_plant(task), np.r_[0.0, task.current[:-1]]
+
+    def inputs(t: float, x: Any = None) -> Any:
+        row = min(int(t / period), len(acting) - 1)
+        return plant.InputContainer({"current": acting[row], "load": task.load[row]})
+
+    # half a step early: ProgPy adds its steps up, and saves the first state past a time
+    times = [(row - 0.5 / task.steps) * period for row in range(1, len(acting))]
+
+    def run() -> Array:
+        rows = plant.simulate_to(times[-1], inputs, dt=task.h, save_pts=times).outputs
+        columns = [[np.ravel(rows[k][name]) for k in range(len(acting))] for name in plant.outputs]
+        return np.array(columns).transpose(2, 1, 0)
+
+    return run
+
+
+def _define_progpy_plant(task: Task) -> Any:
+    from progpy import PrognosticsModel
+
+    p, h, names = _make_namespaces(task.parameters), task.h, ["xf", "vf", "xs", "vs", "xj", "vj", "p12"]
+    k = compute_coefficients(p, h)
+
+    class Plant(PrognosticsModel):  # type: ignore[misc]
+        """The reference model without its controller."""
+
+        is_vectorized = True
+        inputs, states, outputs = ["current", "load"], names, ["xj", "p12", "xs"]
+        events: list[str] = []  # noqa: RUF012  (the library's own way)
+
+        def initialize(self, u: Any = None, z: Any = None) -> Any:
+            return self.StateContainer({name: np.zeros(len(task.values)) for name in names})
+
+        def next_state(self, x: Any, u: Any, dt: float) -> Any:
+            after = step_bare_model(np, [x[name] for name in names], u["current"], u["load"], p, k, h)
+            return self.StateContainer(dict(zip(names, after, strict=True)))
+
+        def output(self, x: Any) -> Any:
+            return self.OutputContainer({name: x[name] for name in self.outputs})
+
+    return Plant(process_noise=0, measurement_noise=0)
+
+
+def _make_namespaces(groups: Mapping[str, Mapping[str, Any]]) -> Any:
+    """The groups as objects with attributes, as `plant.eha` reads its parameters."""
+    return SimpleNamespace(**{group: SimpleNamespace(**fields) for group, fields in groups.items()})
+
+
+def step_bare_model(xp: Any, s: Any, current: Any, load: Any, p: Any, k: Any, h: float) -> tuple[Any, ...]:
+    """`plant.eha.step_actuator` of the bare model on arrays of the library `xp`: XF, XF', XS, XS', XJ, XJ', P12."""
+    xf, vf, xs, vs, xj, vj, _ = s
+    torque = p.torque_motor.gain * current - p.flapper.stiffness * xf - p.feedback_spring.stiffness * (
+        xs + 0.5 * h * vs)
+    xf, vf = _travel(xp, xf, vf, k.flapper_keep * vf + k.flapper_push * torque, h, p.flapper.travel)
+    dry = h * xp.where(vs == 0.0, p.spool.static_friction, p.spool.dynamic_friction)
+    v = _slide(xp, vs, p.spool.mass * vs, k.spool_push, k.pilot_gain * xf, k.pilot_slope, k.pilot_limit, dry,
+               k.spool_free, k.spool_coupled)
+    xs, vs = _travel(xp, xs, vs, v, h, p.spool.travel)
+    line = k.valve_gain * xs
+    dry = h * xp.where(vj == 0.0, p.jack.static_friction, p.jack.dynamic_friction)
+    v = _slide(xp, vj, p.jack.mass * vj - h * load, h * p.jack.area, line, k.valve_slope, k.valve_limit, dry,
+               k.jack_free, k.jack_coupled)
+    xj, vj = _travel(xp, xj, vj, v, h, p.jack.travel)
+    return xf, vf, xs, vs, xj, vj, _clip(xp, line - k.valve_slope * vj, k.valve_limit)
+
+
+def _clip(xp: Any, x: Any, limit: Any) -> Any:
+    return xp.maximum(xp.minimum(x, limit), -limit)
+
+
+def _soften(xp: Any, x: Any, band: Any) -> Any:
+    return x - _clip(xp, x, band)
+
+
+def _slide(xp: Any, v0: Any, impulse: Any, push: Any, line: Any, slope: Any, limit: Any, dry: Any, free: Any,
+           coupled: Any) -> Any:
+    v = _soften(xp, coupled * impulse + coupled * push * line, coupled * dry)
+    wanted = line - slope * v
+    held = _clip(xp, wanted, limit)
+    v = xp.where(held == wanted, v, _soften(xp, impulse + push * held, dry) * free)
+    return xp.minimum(xp.maximum(v, xp.where(v0 > 0.0, 0.0, -xp.inf)), xp.where(v0 < 0.0, 0.0, xp.inf))
+
+
+def _travel(xp: Any, x0: Any, v0: Any, v: Any, h: float, limit: Any) -> tuple[Any, Any]:
+    x = (x0 + 0.5 * h * v0) + 0.5 * h * v
+    return _clip(xp, x, limit), xp.where(xp.abs(x) <= limit, v, 0.0)
+
+
 OURS = "ours, one thread"
 NAMES = ("spool.static_friction", "jack.damping")
 

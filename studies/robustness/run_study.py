@@ -1,24 +1,178 @@
 """The whole study: fuzz frames and datagrams, disturbed runs, long operation."""
 
 import os
+import socket
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from can import Message
+from can.interfaces.udp_multicast.utils import pack_message
 
 from fdi.progress import Progress, ignore_progress
 from fdi.report.report import Cell, Column, Item, Line, Paragraph, Report, Section, Table
+from plant.errors import RigError
 from plant.model import load_model
+from rig.network.frame import WallClock
+from rig.network.master import BusError
+from rig.network.udp import PORT, open_sender
 from rig.run.job import Job
 from rig.run.runner import run_job
 from rig.sequences.sequence import parse_sequence
-from studies.robustness.datagrams import fuzz_datagrams
-from studies.robustness.disturb import ACTIONS, PROCESSES, SEQUENCE, Trial, disturb_run
-from studies.robustness.fuzz import fuzz_node, fuzz_rig
+from studies.robustness.disturb import (
+    ACTIONS,
+    PROCESSES,
+    SEQUENCE,
+    Trial,
+    Usage,
+    disturb_run,
+    find_processes,
+    has_semaphores,
+    read_usage,
+    start_nodes,
+    wait_until,
+)
+from studies.robustness.fuzz import fuzz_node, fuzz_rig, invent_frames
 from studies.robustness.logs import LogCount, fuzz_logs
-from studies.robustness.soak import soak_bench
+
+_NESTED, _HUGE = b"\x91" * 2000, b"\xdd\xff\xff\xff\xff"  # msgpack: arrays in arrays; an array of 4 billion
+
+
+class DatagramCount(NamedTuple):
+    """What came of the datagrams."""
+
+    datagrams: int
+    verdict: str  # of a run on the same nodes afterwards
+    growth: dict[str, int]  # bytes of memory, by process
+    problems: tuple[str, ...]
+
+
+def fuzz_datagrams(count: int, seed: int, group: str, controller: str = "builtin",
+                   progress: Progress = ignore_progress) -> DatagramCount:
+    """Send fuzz datagrams to the nodes of a UDP bus; afterwards a run on these nodes passes.
+
+    A third are random bytes, a third frames with changed bytes, a third fuzz frames in proper datagrams.
+
+    Raises:
+        RigError: the nodes do not start.
+    """
+    rng, problems = np.random.default_rng(seed), []
+    verdict, growth = "", {}
+    with (tempfile.TemporaryDirectory(prefix="eha-rig-study-") as place,
+          start_nodes(f"udp_multicast:{group}", controller) as nodes):
+        own = {name: number for name, number in nodes.items() if name != "rig"}
+        try:
+            _play(group, Path(place))
+            before = read_usage(own)
+            with open_sender() as sender:
+                for number, frame in enumerate(invent_frames(count, seed)):
+                    message = Message(arbitration_id=frame.cob_id, data=frame.data, is_extended_id=False)
+                    _send(sender, _change(rng, pack_message(message)), group)
+                    if number % 1000 == 0:
+                        progress("datagrams", number / count)
+            verdict = _play(group, Path(place))
+            after = read_usage(own)
+            growth = {name: after[name].memory - before[name].memory for name in own}
+        except (RigError, OSError) as error:  # OSError: a node has ended, its /proc entry is gone
+            problems.append(f"{type(error).__name__}: {error}")
+    if has_semaphores(group):
+        problems.append("semaphores are left")
+    return DatagramCount(count, verdict, growth, tuple(problems))
+
+
+def _change(rng: np.random.Generator, datagram: bytes) -> bytes:
+    kind = rng.random()
+    if kind < 1.0 / 3.0:
+        return datagram
+    if kind < 2.0 / 3.0:
+        changed = bytearray(datagram)
+        for _ in range(int(rng.integers(1, 6))):
+            changed[int(rng.integers(len(changed)))] = int(rng.integers(256))
+        return bytes(changed[:int(rng.integers(len(changed) + 1))] if rng.random() < 0.3 else changed)
+    if kind < 0.68:
+        return (_NESTED, _HUGE)[int(rng.integers(2))] + rng.bytes(int(rng.integers(60_000)))
+    return rng.bytes(int(rng.integers(100)))
+
+
+def _send(sender: socket.socket, datagram: bytes, group: str) -> None:
+    sender.sendto(datagram, (group, PORT))
+
+
+def _play(group: str, folder: Path) -> str:
+    job = Job(sequence=parse_sequence(SEQUENCE, "s.toml", lambda name: b""), model=load_model(),
+              bus=f"udp_multicast:{group}", controller="external", plant="external")
+    return run_job(job, folder / "run", ignore_progress, lambda: False).verdict
+
+
+NO_ANSWER = "no answer"
+SETTLE = 5.0  # s
+
+
+class Soak(NamedTuple):
+    """A soak: usage of each process after the first tenth of the time and at the end."""
+
+    minutes: float
+    runs: int
+    cycles: int
+    verdicts: dict[str, int]
+    start: dict[str, Usage]
+    end: dict[str, Usage]
+    problems: tuple[str, ...]
+
+    def find_growth(self, memory: int = 8 << 20) -> list[str]:
+        """What has grown: memory by more than `memory` bytes, or any file or thread."""
+        grown = []
+        for name, before in self.start.items():
+            after = self.end[name]
+            for what, most in (("memory", memory), ("files", 0), ("threads", 0)):
+                more = getattr(after, what) - getattr(before, what)
+                if more > most:
+                    grown.append(f"{name}: {what} +{more}")
+        return grown
+
+
+def soak_bench(minutes: float, group: str, pace: str = "lockstep", controller: str = "builtin",
+               progress: Progress = ignore_progress) -> Soak:
+    """Play a sequence of 3.2 s again and again on a UDP bus, with nodes that stay, for so many minutes.
+
+    Raises:
+        RigError: the nodes do not start.
+    """
+    clock = WallClock()
+    sequence = parse_sequence(SEQUENCE, "soak.toml", lambda name: b"")
+    bus = f"udp_multicast:{group}"
+    job = Job(sequence=sequence, model=load_model(), bus=bus, pace=pace, controller="external", plant="external",
+              max_overruns=1.0)
+    verdicts: dict[str, int] = {}
+    runs = cycles = 0
+    start: dict[str, Usage] = {}
+    problems = []
+    with tempfile.TemporaryDirectory(prefix="eha-rig-soak-") as place, start_nodes(bus, controller) as nodes:
+        while clock.now() < minutes * 60e9 or runs < 3:
+            try:
+                outcome = run_job(job, Path(place) / "run", ignore_progress, lambda: False)
+                verdict, cycles = outcome.verdict, cycles + outcome.timing["cycles"]
+            except BusError:  # a busy machine: the nodes did not answer in time
+                verdict = NO_ANSWER
+            runs, verdicts[verdict] = runs + 1, verdicts.get(verdict, 0) + 1
+            if not start and runs >= 2 and clock.now() > minutes * 6e9:  # the first runs load what stays loaded
+                start = read_usage(nodes)
+            progress("soak", min(1.0, clock.now() / (minutes * 60e9)))
+
+        def read_end() -> Soak:
+            return Soak(minutes, runs, cycles, verdicts, start, read_usage(nodes), ())
+
+        wait_until(lambda: not read_end().find_growth(), SETTLE)  # a thread of the last run may still be ending
+        soak = read_end()
+    if verdicts.get(NO_ANSWER, 0) > 0.1 * runs:
+        problems.append(f"in {verdicts[NO_ANSWER]} of {runs} runs the nodes did not answer in time")
+    if find_processes(group):
+        problems.append("processes are left")
+    if has_semaphores(group):
+        problems.append("semaphores are left")
+    return soak._replace(problems=tuple(problems))
 
 
 def run_study(frames: int, trials: int, minutes: float, seed: int, controller: str,

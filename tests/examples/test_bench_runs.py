@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 from bus_stations import spec
 from example_devices import DRIVE, ECU, PATIENT, run_device
-from rig_command import Said, rig
-from short_sequences import SHORT, SLOW_START
+from rig_command import SHORT, SLOW_START, Said, rig
 
 IN_TIME = """
 [protocol]

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import NamedTuple
 
-from short_sequences import SHORT
+from rig_command import SHORT
 
 from fdi.trace.trace import Trace
 from plant import Model, simulate

@@ -6,12 +6,9 @@ from c_device import CFirmware
 from rig.network.frame import Frame, Send
 from rig.nodes.firmware import Firmware
 from studies.robustness import fuzz
-from studies.robustness.disturb import disturb_run, find_processes, has_semaphores, judge_verdict
-from studies.robustness.frames import invent_frames
-from studies.robustness.fuzz import fuzz_node
-from studies.robustness.nodes import Usage
-from studies.robustness.run_study import build_robustness_report, run_study
-from studies.robustness.soak import Soak
+from studies.robustness.disturb import Usage, disturb_run, find_processes, has_semaphores, judge_verdict
+from studies.robustness.fuzz import fuzz_node, invent_frames
+from studies.robustness.run_study import Soak, build_robustness_report, run_study
 
 
 def test_a_seed_gives_the_same_frames_again() -> None:

@@ -11,8 +11,7 @@ from rig.conformance.run_cases import Outcome, choose_cases, run_cases
 from rig.conformance.target import DataSheet, Options, Target, Verdict
 from rig.device import Device
 from rig.network.bus import EmbeddedWire
-from rig.network.clock import VirtualClock
-from rig.network.frame import Frame, Send
+from rig.network.frame import Frame, Send, VirtualClock
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 

@@ -1,4 +1,7 @@
-"""The `rig` command in a test: in this process (fast), or as a user's process that can be interrupted and killed."""
+"""The `rig` command in a test: in this process (fast), or as a user's process that can be interrupted and killed; and
+short sequences that are played without it.
+"""
+
 from __future__ import annotations
 
 import contextlib
@@ -8,13 +11,20 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pytest
 from answer_schemas import check_answer
 
+from fdi.progress import ignore_progress
+from plant import load_model
 from rig.cli.main import main
+from rig.network import master
+from rig.run.job import Job
+from rig.run.runner import Outcome, run_job
+from rig.sequences.sequence import parse_sequence
 
 
 class _Said(NamedTuple):
@@ -114,3 +124,54 @@ def gone(where: str, timeout: float = 60.0) -> bool:
     while nodes_on(where) and time.monotonic() < end:
         time.sleep(0.05)
     return not nodes_on(where)
+
+
+SHORT = """
+title = "A short one"
+setup = [{ kind = "hold", time = 0.05 }]
+main = [
+  { name = "rest", kind = "hold", time = 0.05 },
+  { name = "step", kind = "step", to = 1e-3, time = 0.2 },
+  { name = "back", kind = "ramp", to = 0.0, time = 0.1 },
+]
+cleanup = [{ kind = "ramp", to = 0.0, time = 0.05 }]
+checks = [
+  { name = "overshoot", kind = "overshoot", window = "step", high = 30.0 },
+  { name = "no emergency", kind = "event_never", event = "EMCY" },
+]
+"""
+
+SLOW_START = "\n[timing]\noperational = 20\n"  # s
+
+
+def never() -> bool:
+    """Nobody stops the run."""
+    return False
+
+
+def job(text: str = SHORT, seed: int = 0, set_: dict[str, float] | None = None, **settings: object) -> Job:
+    """A job of a sequence's text. On a bus between programs the nodes have 20 s to start: the machine may be busy."""
+    if "bus" in settings and "[timing]" not in text:
+        text += SLOW_START
+    sequence = parse_sequence(text, "short.toml", lambda name: b"")
+    model = load_model(sequence.model.name).replace(dict(sequence.model.overrides)).replace(set_ or {})
+    return Job(sequence=sequence, model=model, seed=seed, **settings)  # type: ignore[arg-type]
+
+
+def play(one: Job, folder: Path, stop: Callable[[], bool] = never) -> Outcome:
+    """Run a job; its results lie in `folder`. On a bus between programs a boot-up may take 20 s."""
+    with pytest.MonkeyPatch.context() as patch:
+        if one.bus != "embedded":
+            patch.setattr(master, "BOOT_TIMEOUT", 20.0)
+        return run_job(one, folder, ignore_progress, stop)
+
+
+def stop_after(questions: int) -> Callable[[], bool]:
+    """An operator who presses Ctrl-C after the run has asked for it so often, each time cycles are over."""
+    asked = iter(range(10**9))
+    return lambda: next(asked) >= questions
+
+
+def kinds(outcome: Outcome) -> list[tuple[str, str]]:
+    """Kind and text of the events, in order."""
+    return [(event.kind, event.text) for event in outcome.events]

@@ -13,7 +13,7 @@ from rig.cli.answer import Places, choose_file, give_answer, make_folder, show_p
 from rig.conformance.run_cases import build_conformance_report, choose_cases, run_cases, write_junit
 from rig.conformance.target import DataSheet, Options, Target
 from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, choose_bus, open_can
-from rig.network.clock import VirtualClock, WallClock
+from rig.network.frame import VirtualClock, WallClock
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.run.participants import EMBEDDED_NAMES, NodeProcesses, make_node_command, require_firmware_bus

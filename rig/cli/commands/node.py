@@ -15,8 +15,7 @@ from rig.cli.answer import Places, give_answer
 from rig.cli.inputs import load_chosen_model
 from rig.network import heartbeat
 from rig.network.bus import Link, can_open, choose_bus, open_can, serve_node
-from rig.network.clock import WallClock
-from rig.network.frame import Node
+from rig.network.frame import Node, WallClock
 from rig.network.node_objects import CONTROLLER, PLANT, read_gains
 from rig.network.raw_bus import RawBus
 from rig.nodes.emulator import Emulator, PlantPlace

@@ -15,7 +15,7 @@ from plant.profile import build_profile, read_command
 from plant.segments import Points
 from rig.cli.answer import give_answer
 from rig.cli.inputs import load_chosen_model
-from rig.sequences.nominal import load_nominal_test
+from rig.sequences.sequence import load_nominal_test
 
 SAMPLE_UNIT = {"jack.static_friction": 900.0, "jack.dynamic_friction": 600.0, "null_bias.current": 5e-5}
 SAMPLE_POINTS = ((0.0, 0.0), (0.5, 0.0), (0.501, 2e-3), (1.5, 2e-3), (3.0, -3e-3), (4.0, -3e-3), (4.001, -1e-3),

@@ -19,8 +19,7 @@ from rig.benches.bench_report import list_loads
 from rig.benches.checksums import CHECKSUMS
 from rig.benches.guess import UNSURE
 from rig.network.bus import Link, open_can
-from rig.network.clock import WallClock
-from rig.network.frame import Frame
+from rig.network.frame import Frame, WallClock
 
 PAGE = (ROOT / "docs" / "bench.md").read_text()
 DRIVE, ECU = ROOT / "examples" / "cia402_drive", ROOT / "examples" / "can_ecu"

@@ -9,8 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from rig_command import answer, finished, grown, refuse, rig, started
-from short_sequences import SHORT
+from rig_command import SHORT, answer, finished, grown, refuse, rig, started
 
 from fdi.trace.trace import CLEANUP, Trace
 from rig.cli import commands

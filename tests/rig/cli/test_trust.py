@@ -8,8 +8,7 @@ import pytest
 from changed_logs import change_log
 from effect_files import HEAD, restored_catalogue
 from refusals import catch_refusal
-from rig_command import refuse, rig
-from short_sequences import SHORT, job, play
+from rig_command import SHORT, job, play, refuse, rig
 
 import fdi
 from fdi.trace.trace import Trace

@@ -14,7 +14,7 @@ from dbc import EDS
 from rig.conformance.run_cases import CASES, Outcome, Result, choose_cases, run_cases, write_junit
 from rig.conformance.target import CHAPTERS, DataSheet, Options, Target, Verdict
 from rig.network.bus import EmbeddedWire
-from rig.network.clock import VirtualClock
+from rig.network.frame import VirtualClock
 
 _CONTROLLER = {"2.10", "4.5", "4.13", "4.17", "5.14"}
 NOT_FOR_OUR_NODES = {"plant": {"4.5", "4.13", "4.17", "5.14", "6.12"}, "controller": _CONTROLLER, "c": _CONTROLLER}

@@ -16,8 +16,7 @@ from rig.conformance.target import DataSheet, Options, Target, Verdict
 from rig.device import NmtState, SdoAbort
 from rig.device.dictionary import INVALID
 from rig.network.bus import Done, EmbeddedWire
-from rig.network.clock import VirtualClock
-from rig.network.frame import Send
+from rig.network.frame import Send, VirtualClock
 from rig.nodes.firmware import Firmware
 
 

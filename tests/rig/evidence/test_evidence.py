@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rig_command import answer, refuse, rig
-from short_sequences import SHORT
+from rig_command import SHORT, answer, refuse, rig
 
 from plant.errors import InputError
 from rig.evidence.package import verify_package, write_package

@@ -1,19 +1,25 @@
-"""Runs with the C firmware on the project's UDP bus: it is built, started and gives the numbers of the built-in one."""
+"""Runs with the C firmware: it gives the numbers of the built-in one, and each fault built into it is caught."""
 
 import os
 import shutil
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from bus_stations import spec
 from c_device import STRICT, skip_without_compiler
+from c_program import SANITIZERS, build_faulty, run_program
 from log_rows import describe_first_difference
-from rig_command import nodes_on, rig
-from short_sequences import job, play
+from plugin_bus_summary import require_bus_kind
+from rig_command import SHORT, job, nodes_on, play, rig
+from standing_nodes import stand_nodes
 
 from plant.errors import InputError, RigError
 from rig.firmware.build import FOLDER, build_controller, build_program
+from rig.network.node_objects import PLANT
+from rig.run import participants
+from rig.run.runner import Outcome
 
 
 def test_preflight_rows_are_byte_for_byte_those_of_the_builtin_controller(tmp_path: Path, preflight: Path) -> None:
@@ -77,3 +83,107 @@ def test_the_program_says_what_it_needs(words: list[str]) -> None:
     skip_without_compiler()
     done = subprocess.run([build_controller(), *words], capture_output=True, text=True, timeout=20)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
+
+
+CAUGHT_BY = {
+    "late_frame": "drive frames of another cycle",
+    "late_current": "delay of the answer to a step",
+    "stale_cycle": "drive frames of another cycle",
+    "frozen_output": "current follows the error",
+    "sign_error": "delay of the answer to a step",
+    "gain_high": "gain against 0x2110",
+    "gain_low": "gain against 0x2110",
+    "missed_cycles": "drive frames missing or late",
+    "ignores_control": "no current unless ACTIVE",
+    "wrong_status": "status word follows the control word",
+    "missing_ready": "status word follows the control word",
+    "no_heartbeat": "heartbeat period, controller",
+    "nan_current": "current within its limit",
+    "saturated_current": "current within its limit",
+    "leaks_state": "same answers after a reset",
+}
+
+# What a bus can change: frames and times. On a CAN interface the other faults are no others than on UDP.
+CASES = [*(("udp_multicast", fault) for fault in CAUGHT_BY),
+         *(("socketcan", fault) for fault in ("late_frame", "missed_cycles", "no_heartbeat"))]
+only_udp = pytest.mark.parametrize("bus_kind_with_plant", ["udp_multicast"], indirect=True)
+
+LOSES_FRAMES = ("late_frame", "stale_cycle", "missed_cycles")
+# A heartbeat takes 100 ms of wall time, in which lockstep runs through hundreds of cycles; in the guest through twenty.
+LONG = SHORT.replace('"rest", kind = "hold", time = 0.05',
+                     f'"rest", kind = "hold", time = {0.3 if "EHA_RIG_GUEST" in os.environ else 3.0}')
+
+
+@pytest.fixture(scope="module")
+def bus_kind_with_plant(request: pytest.FixtureRequest) -> Iterator[str]:
+    """A bus between programs with a plant that stays on it, as on a real bench."""
+    skip_without_compiler()
+    where = spec(require_bus_kind(request.param))
+    with stand_nodes(where, PLANT):
+        yield where
+
+
+def play_short(folder: Path, where: str, fault: str, seed: int = 1) -> Outcome:
+    """A short run in lockstep against the firmware that is on the bus."""
+    text = LONG if fault == "no_heartbeat" else SHORT
+    limit = {"slow_start": 1, "no_heartbeat": 1}.get(fault, 20)  # s; a busy machine may need long
+    text += f"[timing]\noperational = {limit}\n"
+    return play(job(text, seed=seed, controller="external", plant="external", bus=where), folder)
+
+
+def list_failed(outcome: Outcome) -> list[str]:
+    """Names of the checks that did not pass."""
+    return [check.name for check in outcome.checks if not check.passed]
+
+
+# with the scope of the module the plant stays from test to test
+@pytest.mark.parametrize(("bus_kind_with_plant", "fault"), CASES, indirect=["bus_kind_with_plant"], scope="module")
+def test_each_fault_is_caught_by_its_check(
+    tmp_path: Path, fault: str, bus_kind_with_plant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if fault in LOSES_FRAMES:
+        monkeypatch.setattr(participants, "FRAME_TIMEOUT", 0.1)  # s: it is spent in each cycle without an answer
+    with run_program(build_faulty(), fault, bus_kind_with_plant):
+        outcome = play_short(tmp_path, bus_kind_with_plant, fault)
+    assert outcome.status == 1
+    assert CAUGHT_BY[fault] in list_failed(outcome)
+
+
+@only_udp
+def test_a_firmware_that_is_slow_to_start_is_caught(tmp_path: Path, bus_kind_with_plant: str) -> None:
+    """It needs 1.5 s from NMT start to OPERATIONAL."""
+    with run_program(build_faulty(), "slow_start", bus_kind_with_plant):
+        outcome = play_short(tmp_path, bus_kind_with_plant, "slow_start")
+    assert (outcome.verdict, outcome.status) == ("ABORTED", 1)
+    assert "node 2 controller must be OPERATIONAL within 1 s of NMT start" in outcome.aborted
+
+
+@only_udp
+def test_a_sound_firmware_with_an_integral_part_passes(tmp_path: Path, bus_kind_with_plant: str) -> None:
+    """It is the firmware of "leaks_state" without the leak."""
+    with run_program(build_faulty(), "integral", bus_kind_with_plant):
+        outcome = play_short(tmp_path, bus_kind_with_plant, "integral")
+    assert (outcome.verdict, list_failed(outcome)) == ("PASS", [])
+
+
+@only_udp
+def test_ten_runs_against_one_sound_firmware_pass(tmp_path: Path, bus_kind_with_plant: str) -> None:
+    """Without one false alarm, and without a restart of the firmware in between."""
+    with run_program(build_controller(), bus_kind_with_plant):
+        for seed in range(10):
+            outcome = play_short(tmp_path, bus_kind_with_plant, "none", seed)
+            assert (seed, outcome.verdict, list_failed(outcome)) == (seed, "PASS", [])
+            assert set(outcome.counters.values()) == {0}
+
+
+def test_a_run_under_the_sanitizers_passes(tmp_path: Path) -> None:
+    """The whole program with its port; the first wrong access to memory would end it.
+
+    Not in the guest, whose kernel has no room for the sanitizer's shadow memory.
+    """
+    skip_without_compiler()
+    where = spec("udp_multicast")
+    program = build_program("controller", sorted(FOLDER.glob("*.c")), (*STRICT, *SANITIZERS))
+    with run_program(program, where):
+        outcome = play(job(f"{SHORT}[timing]\noperational = 20\n", seed=1, controller="external", bus=where), tmp_path)
+    assert (outcome.verdict, list_failed(outcome)) == ("PASS", [])

@@ -11,8 +11,7 @@ import can
 import pytest
 from bus_stations import spec
 from places import ROOT
-from rig_command import rig
-from short_sequences import SHORT, SLOW_START
+from rig_command import SHORT, SLOW_START, rig
 
 from rig.network.bus import open_can
 from rig.network.can_interface import UdpBus

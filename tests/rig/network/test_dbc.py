@@ -19,7 +19,7 @@ from dbc import DBC, EDS
 from rig.conformance.run_cases import choose_cases, run_cases
 from rig.conformance.target import DataSheet, Target, Verdict
 from rig.network.bus import EmbeddedWire
-from rig.network.clock import VirtualClock
+from rig.network.frame import VirtualClock
 
 FRAMES = (codec.COMMAND, codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE)
 NODES = {1: "Rig", 2: "Controller", 3: "Plant"}

@@ -16,8 +16,7 @@ from plant import InputError
 from rig.benches.bench import Bench, Role
 from rig.benches.bench_file import load_bench
 from rig.network.bus import EmbeddedWire
-from rig.network.clock import VirtualClock
-from rig.network.frame import Frame, Send
+from rig.network.frame import Frame, Send, VirtualClock
 from rig.network.master import BusError, Master
 from rig.network.node_objects import NmtState
 

@@ -11,8 +11,7 @@ from bus_stations import spec
 from plant import Model
 from rig.benches.bench_file import load_bench
 from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, open_can, serve_node
-from rig.network.clock import VirtualClock, WallClock
-from rig.network.frame import Frame
+from rig.network.frame import Frame, VirtualClock, WallClock
 from rig.network.master import BusError, Master
 from rig.network.node_objects import CONTROLLER, PLANT
 from rig.nodes.emulator import Emulator

@@ -8,8 +8,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from rig.benches.bench_file import load_bench
 from rig.network.bus import EmbeddedWire
-from rig.network.clock import VirtualClock
-from rig.network.frame import Frame, Send
+from rig.network.frame import Frame, Send, VirtualClock
 from rig.network.master import CheckedSdoClient, ConfirmationError, Master, repeat_transfer
 from rig.network.node_objects import PLANT
 

@@ -13,7 +13,7 @@ from plant import Actuator, Model
 from rig.benches.bench import Flags
 from rig.device import Abort, NmtState
 from rig.network.node_objects import COUNTERS
-from rig.nodes.scenario import Scenario
+from rig.nodes.scenario import FaultyPlant, Scenario
 from rig.sequences.faults import (
     BusOff,
     Corrupted,
@@ -314,3 +314,17 @@ def test_duplicated_short_and_corrupted_frames() -> None:
     wrong = int.from_bytes(found[7], "little") ^ int.from_bytes(sound[6], "little")
     assert wrong.bit_count() == 1 and found[:2] + found[3:7] + found[8:9] == sound[:6] + sound[7:8]
     assert desk.emergencies()[:1] == [0x8210] and counters(desk) == (1, 0)
+
+
+def test_the_transducers_say_the_same_when_they_are_asked_again() -> None:
+    """While the controller is being enabled the cycle does not go on: no noise is drawn for it twice."""
+    faults = (Noise(signal="p12", start=0.003, value=1e5), Stuck(signal="xj", start=0.005))
+    scenario = Scenario(Model(), Plan(faults=faults, stop=20), seed=3)
+    once, often = FaultyPlant(scenario), FaultyPlant(scenario)
+    for k in range(20):
+        said = once.read(k)
+        assert [often.read(k) for _ in range(1 + k % 3)] == [said] * (1 + k % 3)
+        for each in (once, often):
+            each.drive = 1e-3
+            each.move(k)
+    assert once.actuator.state == often.actuator.state

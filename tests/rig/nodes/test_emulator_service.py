@@ -19,8 +19,7 @@ from plant.compile import compile_function
 from rig.benches.bench_file import load_bench
 from rig.device import NmtState
 from rig.network.bus import Link, open_can, serve_node
-from rig.network.clock import WallClock
-from rig.network.frame import Frame
+from rig.network.frame import Frame, WallClock
 from rig.network.node_objects import decode_cycle_record
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec

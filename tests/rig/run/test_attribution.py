@@ -23,7 +23,7 @@ from rig.run.attribution import (
 )
 from rig.run.runner import select_plant_delays
 from rig.sequences.faults import Fault, Late, Lost, Offset, Plan, Schedule, Silent
-from rig.sequences.timing import TimingPolicy
+from rig.sequences.sequence import TimingPolicy
 
 MS = 1_000_000  # ns
 N = 1000

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from short_sequences import SHORT, job, play
+from rig_command import SHORT, job, play
 
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import CLEANUP, MAIN, Trace

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig_command import refuse, rig
-from short_sequences import SHORT, job, play
+from rig_command import SHORT, job, play, refuse, rig
 
 import dbc
 from fdi.trace.trace import Trace

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import other_cpus
 import pytest
-from short_sequences import SHORT, job, play
+from rig_command import SHORT, job, play
 
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import Trace
 from plant.run import NoiseStream
 from plant.segments import Array
-from rig.run import loops
+from rig.run import bring_up
 from rig.run.embedded_loop import EmbeddedLoop, find_busy_cycles
 from rig.run.runner import Outcome
 from rig.sequences.faults import Late, Noise, Parameter, Plan, Schedule
@@ -50,7 +50,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def play_both(monkeypatch: pytest.MonkeyPatch, folder: Path, *given: Any, **settings: Any) -> Outcome:
     """Play a job as it is and with every cycle in Python; the logs and verdicts must be the same."""
     together = play(job(*given, **settings), folder / "together")
-    monkeypatch.setattr(loops, "can_play_many", lambda master, bench: False)
+    monkeypatch.setattr(bring_up, "can_play_many", lambda master, bench: False)
     alone = play(job(*given, **settings), folder / "alone")
     assert read_log(folder / "together") == read_log(folder / "alone")
     assert (together.verdict, together.aborted, together.checks) == (alone.verdict, alone.aborted, alone.checks)
@@ -115,7 +115,7 @@ def test_python_plays_the_cycles_in_which_a_fault_begins_acts_or_ends() -> None:
 RUN = """
 import hashlib, json
 from pathlib import Path
-from short_sequences import job, play
+from rig_command import job, play
 from fdi.trace.mcap_log import open_log
 play(job(seed=3), Path("run"))
 log = open_log(Path("run/trace.mcap"))

@@ -19,7 +19,7 @@ from fdi.trace.trace import Trace
 from plant import simulate
 from rig.benches.bench import Bench, Role
 from rig.recorder.convert import export_trace, import_frames
-from rig.run import loops
+from rig.run import bring_up
 from rig.run.job import JobChoice, build_job
 from rig.run.runner import run_job
 
@@ -181,7 +181,7 @@ def test_a_foreign_controller_closes_the_loop(start: object, bus_kind: str, is_c
                                               monkeypatch: pytest.MonkeyPatch) -> None:
     """The ram moves as a simulation of the same law does, whatever frames carry demand, position and current."""
     if not is_compiled:  # as on a bus that only python-can knows
-        monkeypatch.setattr(loops, "can_open", lambda spec: False)
+        monkeypatch.setattr(bring_up, "can_open", lambda spec: False)
     where = spec(bus_kind)
     device = start(tmp_path, where)  # type: ignore[operator]
     (tmp_path / "steps.toml").write_text(SEQUENCE)

@@ -23,8 +23,7 @@ from plant import Model
 from plant.errors import RigError
 from rig.benches.bench_file import load_bench
 from rig.network.bus import Link, LinkWire, open_can
-from rig.network.clock import WallClock
-from rig.network.frame import Frame
+from rig.network.frame import Frame, WallClock
 from rig.network.master import Master
 from rig.network.raw_bus import RawBus
 from rig.network.udp import PORT, Turn

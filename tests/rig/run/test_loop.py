@@ -9,8 +9,7 @@ import pytest
 from plant import Model
 from rig.benches.bench_file import load_bench
 from rig.network.bus import Link, LinkWire
-from rig.network.clock import VirtualClock
-from rig.network.frame import Frame
+from rig.network.frame import Frame, VirtualClock
 from rig.network.master import Master
 from rig.nodes.scenario import Scenario
 from rig.recorder import Signals, Timing

@@ -10,7 +10,7 @@ import firmware_variants as variants
 import numpy as np
 import pytest
 from firmware_variants import Variant
-from short_sequences import job, play
+from rig_command import job, play
 
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Trace

@@ -6,7 +6,7 @@ from pathlib import Path
 import firmware_variants as variants
 import pytest
 from firmware_variants import Variant
-from short_sequences import job, play
+from rig_command import job, play
 
 from rig.network.frame import Frame
 from rig.network.node_objects import GAINS

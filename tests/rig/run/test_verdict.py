@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig_command import rig
-from short_sequences import SHORT, job, play
+from rig_command import SHORT, job, play, rig
 
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.report.run_report import build_run_report

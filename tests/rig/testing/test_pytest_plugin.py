@@ -9,8 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from rig_command import rig
-from short_sequences import SHORT
+from rig_command import SHORT, rig
 
 from plant.errors import InputError
 from rig.testing.bench import Bench, build_sequence, write_toml
