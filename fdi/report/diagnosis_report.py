@@ -107,7 +107,7 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
         Section("Other effects", _show_effects(d)),
         Section("Response in its bands", _show_bands(d)),
         Section("Events", _tabulate_events(d)),
-        Section("RMS maps", _show_maps(d), medium=page),
+        Section("RMS maps", [item for grid in d.grids for item in _show_maps(grid)], medium=page),
         Section("Precursors", _show_precursors(d)),
         Section("Fit", [
             Line("residual", describe_residual(d)),
@@ -357,23 +357,26 @@ def _show_effects(d: Diagnosis) -> list[Item]:
     b = d.beside
     if b is None:
         return []
-    columns = [Column("beside the faults"), Column("probability", "%", "right"), Column("size (95 % interval)"),
-               *(column for fault in d.faults for column in (Column(fault.symbol, align="right"),
-                                                           Column("level"))),
-               Column("residual / noise", align="right", medium=Medium.PAGE)]
-    rows: list[list[Cell | str]] = []
-    for e in b.explanations:
-        levels = [(f, e.levels[f.name] if d.refinement.is_explained else None) for f in d.faults]
-        rows.append([
-            name_explanation(e), f"{100 * e.weight:.0f}", _format_parameters(e.parameters, d.model) or NO_NUMBER,
-            *(cell for f, level in levels for cell in (
-                format_size(f, e.refinement.sizes[f.name]), Cell(LEVEL_NAMES[level], LEVEL_MOODS[level]))),
-            format_ratio(max(e.refinement.ratio.values()))])
+
+    def show_fault(fault: Fault) -> tuple[tuple[Column, Callable[[Explanation], Cell | str]], ...]:
+        def show_level(e: Explanation) -> Cell:
+            level = e.levels[fault.name] if d.refinement.is_explained else None
+            return Cell(LEVEL_NAMES[level], LEVEL_MOODS[level])
+
+        return ((Column(fault.symbol, align="right"), lambda e: format_size(fault, e.refinement.sizes[fault.name])),
+                (Column("level"), show_level))
+
     caption = ("Explanations that fit the trace about equally well; the sizes above are averaged over them." if
                b.is_ambiguous else "What the search found beside the faults, fitted together with them.")
     if not b.is_explained:
         caption = "The best that the search found; it leaves more than noise, so no level follows from it."
-    return [Table(columns, rows, caption),
+    return [tabulate(
+        b.explanations, (Column("beside the faults"), name_explanation),
+        (Column("probability", "%", "right"), lambda e: f"{100 * e.weight:.0f}"),
+        (Column("size (95 % interval)"), lambda e: _format_parameters(e.parameters, d.model) or NO_NUMBER),
+        *(column for fault in d.faults for column in show_fault(fault)),
+        (Column("residual / noise", align="right", medium=Medium.PAGE),
+         lambda e: format_ratio(max(e.refinement.ratio.values()))), caption=caption),
             *(Line(effect, f"{_format_parameters(own, d.model)}, read off without noise")
               for effect, own in b.marks.items()),
             *(Paragraph(f"The level of {fault.title} depends on which of these is right: cannot be judged.")
@@ -388,24 +391,19 @@ def _format_parameters(sizes: Mapping[str, Any], model: Model) -> str:
 
 def _show_bands(d: Diagnosis) -> list[Item]:
     judged, bands = d.band_verdict, d.bands
-    if judged is None:
+    if judged is None or bands is None:
         return []
-    items: list[Item] = [Figure("Command and position. Shaded: times outside MidBand (amber) and MaxBand (red).",
-                                partial(draw_overview, d.trace, judged))]
-    if bands is not None:
-        at_steps, at_ramps = (_choose_drawn_fault(d, bands, judged, kind) for kind in ("step", "ramp"))
-        if at_steps is not None:
-            allowed = " with the friction that the ramps show" if judged.shown else ""
-            items.append(Figure(
-                f"Steps judge {_title(d, at_steps)}: measured position less that of a healthy unit{allowed}. Green: "
-                "scatter of healthy units; amber and red: limits, drawn where the fault is distinguishable from it.",
-                partial(draw_steps, d.trace, bands, judged, at_steps)))
-        if at_ramps is not None:
-            items.append(Figure(
-                f"Ramps judge {_title(d, at_ramps)}: following error (top) and speed beyond the demand (bottom). "
-                "Green: scatter of healthy units; amber and red: limits.",
-                partial(draw_ramps, d.trace, bands, judged, at_ramps)))
-    return items
+    at_steps, at_ramps = (_choose_drawn_fault(d, bands, judged, kind) for kind in ("step", "ramp"))
+    allowed = " with the friction that the ramps show" if judged.shown else ""
+    return [Figure("Command and position. Shaded: times outside MidBand (amber) and MaxBand (red).",
+                   partial(draw_overview, d.trace, judged)),
+            *([Figure(f"Steps judge {_title(d, at_steps.name)}: measured position less that of a healthy unit{allowed}."
+                      " Green: scatter of healthy units; amber and red: limits, drawn where the fault is "
+                      "distinguishable from it.", partial(draw_steps, d.trace, bands, judged, at_steps))]
+              if at_steps else []),
+            *([Figure(f"Ramps judge {_title(d, at_ramps.name)}: following error (top) and speed beyond the demand "
+                      "(bottom). Green: scatter of healthy units; amber and red: limits.",
+                      partial(draw_ramps, d.trace, bands, judged, at_ramps))] if at_ramps else [])]
 
 
 def _choose_drawn_fault(d: Diagnosis, bands: Bands, judged: BandVerdict, kind: str) -> BandFault | None:
@@ -417,8 +415,8 @@ def _choose_drawn_fault(d: Diagnosis, bands: Bands, judged: BandVerdict, kind: s
     return max(own, key=lambda f: (f.name in d.levels, judged.severity.get(f.name, -1.0)), default=None)
 
 
-def _title(d: Diagnosis, fault: BandFault) -> str:
-    return next((f.title for f in d.faults if f.name == fault.name), fault.name.replace("_", " "))
+def _title(d: Diagnosis, fault: str) -> str:
+    return next((f.title for f in d.faults if f.name == fault), fault.replace("_", " "))
 
 
 def _tabulate_events(d: Diagnosis) -> list[Item]:
@@ -428,7 +426,6 @@ def _tabulate_events(d: Diagnosis) -> list[Item]:
         return [Paragraph("None: the response stays within MidBand.", medium=Medium.PAGE)]
 
     unit = d.trace.declared.controlled.unit
-    titles = {f.name: f.title for f in d.faults}
 
     def show_furthest(group: Sequence[Event]) -> str:
         furthest = max(abs(event.excess) for event in group)
@@ -437,7 +434,7 @@ def _tabulate_events(d: Diagnosis) -> list[Item]:
     return [tabulate(
         _group_events(d.events), (Column("band"), lambda group: BAND_NAMES[group[0].band]),
         (Column("fault", medium=Medium.PAGE if len(d.faults) <= 2 else Medium.BOTH),
-         lambda group: titles.get(group[0].fault, group[0].fault.replace("_", " "))),
+         lambda group: _title(d, group[0].fault)),
         (Column("signal"), lambda group: group[0].signal), (Column("section"), lambda group: group[0].section),
         (Column("events", align="right"), lambda group: str(len(group))),
         (Column("first begins", "s", "right"), lambda group: f"{group[0].t_in:.3f}"),
@@ -463,11 +460,7 @@ def _group_events(events: Sequence[Event], apart: float = 0.5) -> list[list[Even
     return groups
 
 
-def _show_maps(d: Diagnosis) -> list[Item]:
-    return [item for grid in d.grids for item in _show_maps_of_pair(grid)]
-
-
-def _show_maps_of_pair(grid: Grid) -> list[Item]:
+def _show_maps(grid: Grid) -> list[Item]:
     found = (("steps, A", grid.step), ("ramps, B", grid.ramp), ("both, C", grid.joint))
     points: list[tuple[str, Point | Merged]] = [(name, m.minimum) for name, m in found if m]
     points.append((f"centre of gravity, G ({100 * grid.merged.weight:.0f} % of A)", grid.merged))
@@ -548,7 +541,7 @@ def collect_data(d: Diagnosis) -> dict[str, Any]:
         "signals": {s: {"error": r.errors[s], "floor": r.floor[s], "ratio": r.ratio[s]} for s in r.errors},
         "others": {name: {**e._asdict(), "unhealthy": name in d.others} for name, e in r.others.items()},
         "notes": list(d.notes),
-        **({"with_effects": _collect_beside(d)} if d.beside is not None else {}),
+        **({"with_effects": _collect_beside(d, d.beside)} if d.beside is not None else {}),
     }
 
 
@@ -567,11 +560,8 @@ def _collect_faults(faults: Sequence[Fault]) -> dict[str, dict[str, Any]]:
     return {fault.name: {key: getattr(fault, key) for key in keys} for fault in faults}
 
 
-def _collect_beside(d: Diagnosis) -> dict[str, Any]:
+def _collect_beside(d: Diagnosis, b: Beside) -> dict[str, Any]:
     """What was searched and found beside the faults; SI units."""
-    b = d.beside
-    if b is None:
-        return {}
     return {
         "effects": list(b.effects), "explained": b.is_explained, "ambiguous": b.is_ambiguous,
         "disputed": list(b.disputed),
@@ -592,25 +582,19 @@ MAP_CONTOURS = 7
 MS = 1e3
 
 
-class _Axes(NamedTuple):
-    """Units of the axes of a controlled signal, each with how many of it make one SI unit."""
-
-    signal: tuple[str, float]
-    small: tuple[str, float]  # of its departures
-    speed: tuple[str, float]
-
-
-def _choose_axes(signal: Signal) -> _Axes:
+def _choose_axes(signal: Signal) -> tuple[tuple[str, float], ...]:
+    """Units of the axes of a controlled signal, of its departures and its speed; each with how many make one SI unit.
+    """
     if signal.unit == "m":
-        return _Axes(("mm", 1e3), ("um", 1e6), ("mm/s", 1e3))
-    return _Axes((signal.unit, 1.0), (signal.unit, 1.0), (f"{signal.unit}/s", 1.0))
+        return ("mm", 1e3), ("um", 1e6), ("mm/s", 1e3)
+    return (signal.unit, 1.0), (signal.unit, 1.0), (f"{signal.unit}/s", 1.0)
 
 
 def draw_overview(trace: Trace, judged: BandVerdict) -> str:
     """Command and position of the whole trace, times outside the bands shaded."""
     limits = (float(trace.t[0]), float(trace.t[-1]) + trace.period)
     command, controlled = trace.declared.command, trace.declared.controlled
-    unit, scale = _choose_axes(controlled).signal
+    unit, scale = _choose_axes(controlled)[0]
     return draw_panels("overview", [[[
         line(trace.t, trace.command * scale, COMMAND, f"{command.symbol}, command", 2.2),
         line(trace.t, trace.mask_unusable(controlled.name) * scale, BLUE, f"{controlled.symbol}, measured"),
