@@ -1,5 +1,4 @@
 """The physics of the electrohydraulic actuator: no I/O, no clock, no CAN."""
-from __future__ import annotations
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

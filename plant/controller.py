@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from plant.flat import unpack_state
-from plant.kernels import control_plant, get_readings, invert_plant, start_control
+from plant.kernels import control_plant, get_readings, invert_plant, start_control, unpack_state
 from plant.model import Model, build_kernel
 from plant.pid import Loop, compute_current
 from plant.ports import at_command

@@ -11,7 +11,7 @@ import numpy as np
 
 from plant.anchor import rest_at_reading
 from plant.eha import Coefficients, State, apply_oil, compute_coefficients, compute_metering_line, sense_ram
-from plant.flat import unpack_state
+from plant.kernels import unpack_state
 from plant.model import Model, build_kernel
 from plant.ports import at_jack_drag, at_load
 from plant.segments import Array

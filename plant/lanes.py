@@ -29,10 +29,17 @@ from plant.compile import (
 from plant.controller import take_demand
 from plant.effects import Effect
 from plant.errors import InputError
-from plant.flat import make_lane_packers
 from plant.foreign import run_foreign
 from plant.kernel_use import KernelUse
-from plant.kernels import compute_plant_coefficients, control_plant, keep_answer, keep_sample, measure_plant, step_plant
+from plant.kernels import (
+    compute_plant_coefficients,
+    control_plant,
+    keep_answer,
+    keep_sample,
+    make_lane_packers,
+    measure_plant,
+    step_plant,
+)
 from plant.model import Model, build_bare_model
 from plant.plants import MeasuredPressures, Plant
 from plant.solve import read_controlled

@@ -18,7 +18,7 @@ from plant.anchor import show_start
 from plant.compile import Function, compile_function, interpret_function
 from plant.effects import Effect
 from plant.errors import InputError, suggest_name
-from plant.flat import list_state_values
+from plant.kernels import list_state_values
 from plant.parameters import check_combinations, find_field, flatten_tables, parse_value
 from plant.plant_files import READERS, read_model_tables, read_named_plant
 from plant.plants import Plant

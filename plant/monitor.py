@@ -19,8 +19,8 @@ import numpy as np
 from plant.compile import Function, compile_function, raise_unbound
 from plant.controller import Loop, compute_current
 from plant.errors import InputError
-from plant.flat import make_lane_packers
 from plant.friction import clip, soften
+from plant.kernels import make_lane_packers
 from plant.lanes import Array, Drive
 from plant.model import Model
 from plant.parameters import Controller

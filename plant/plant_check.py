@@ -12,7 +12,7 @@ from plant.compile import find_fields_of
 from plant.errors import InputError, suggest_name
 from plant.faults import Fault
 from plant.quantity import Quantity, list_quantities
-from plant.segments import Segment
+from plant.segments import Segment, build_profile
 from plant.user_code import explain_errors
 
 if TYPE_CHECKING:
@@ -132,7 +132,6 @@ def find_divergence(model: Model, columns: Mapping[str, NDArray[np.float64]]) ->
 
 def check_behaviour(model: Model) -> Iterator[Finding]:
     """The checks of a plant over its nominal test, one after the other."""
-    from plant.profile import build_profile
     from plant.run import simulate
     from plant.selftest import check_effect
 

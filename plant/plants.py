@@ -22,9 +22,8 @@ from plant.compile import Function, find_called_functions, find_fields_of, raise
 from plant.effects import CATALOGUE, Effect, build_base_effect, build_effect, combine_laws
 from plant.errors import InputError
 from plant.faults import Fault
-from plant.flat import make_packers
 from plant.foreign import Program
-from plant.kernels import write_constant, write_mover, write_signal_functions
+from plant.kernels import make_packers, write_constant, write_mover, write_signal_functions
 from plant.pid import Loop, control_by_pid
 from plant.plant_check import check_declaration
 from plant.ports import (
@@ -38,9 +37,8 @@ from plant.ports import (
     make_memory_type,
     port,
 )
-from plant.profile import build_profile
 from plant.quantity import Quantity
-from plant.segments import Array, Segment
+from plant.segments import Array, Segment, build_profile
 from plant.signals import Signals
 from plant.state import Sampled
 from plant.tables import read_file

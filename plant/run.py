@@ -14,9 +14,8 @@ import numpy as np
 from plant.compile import compute_fingerprint, find_cache_folder, interpret_function
 from plant.controller import take_demand
 from plant.errors import InputError, RigError
-from plant.flat import make_packers
 from plant.foreign import run_foreign_loop
-from plant.kernels import write_reader
+from plant.kernels import make_packers, write_reader
 from plant.machine_code import Call, StoredCode
 from plant.model import Model, build_kernel
 from plant.plants import Plant, find_plant

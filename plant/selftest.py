@@ -1,5 +1,4 @@
 """Tests that every effect must pass, also a user's own, on a command: `rig effects NAME --test` shows the result."""
-from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import NamedTuple

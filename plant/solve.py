@@ -7,16 +7,17 @@ the plant from t_k+1 to t_k+2. Row k of a log holds demand, drive and readings o
 from typing import Any
 
 from plant.controller import take_demand
-from plant.flat import pack_state, unpack_state
 from plant.kernels import (
     add_noise,
     compute_plant_coefficients,
     control_plant,
     keep_row,
     measure_plant,
+    pack_state,
     replace_first,
     start_control,
     step_plant,
+    unpack_state,
 )
 from plant.ports import at_reading
 from plant.state import Input, Memory

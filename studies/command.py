@@ -9,7 +9,7 @@ from fdi.report.report import Report
 from plant.errors import RigError
 from rig.campaign.batch import BatchProgress
 from rig.cli.answer import Places, choose_file, give_answer
-from rig.cli.options import parse_whole_number
+from rig.cli.command_list import parse_whole_number
 
 
 def run_study_command(name: str, text: str | None, arguments: Sequence[str] | None,

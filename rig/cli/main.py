@@ -15,8 +15,7 @@ from typing import Any, NoReturn
 
 from plant.errors import RigError, escape_control_characters
 from rig.cli.answer import discard_output
-from rig.cli.command_list import COMMANDS, find_work
-from rig.cli.options import OF_EVERY_COMMAND, add_options
+from rig.cli.command_list import COMMANDS, OF_EVERY_COMMAND, add_options, find_work
 
 FIRST_STEPS = """\
 rig tests the controller of an electrohydraulic actuator and analyses its recordings. To begin:

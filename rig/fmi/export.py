@@ -25,7 +25,7 @@ import numpy as np
 from fdi.output import write_whole
 from plant.compile import read_normal_tables
 from plant.errors import InputError, RigError
-from plant.flat import list_state_values
+from plant.kernels import list_state_values
 from plant.machine_code import emit_object
 from plant.model import STEP, Model, build_kernel, find_quantity
 from plant.run import report_law_errors

@@ -4,8 +4,15 @@ from typing import Any
 
 from plant.anchor import show_start
 from plant.controller import take_demand
-from plant.flat import pack_state, unpack_state
-from plant.kernels import control_plant, load_control, load_readings, store_control, store_readings
+from plant.kernels import (
+    control_plant,
+    load_control,
+    load_readings,
+    pack_state,
+    store_control,
+    store_readings,
+    unpack_state,
+)
 from plant.solve import read_sensors, step_cycle
 
 CYCLES, ANSWER, CONTROL = 0, 1, 2  # of `loop`: cycles of the plant, -1: not started; answer, memory of the controller

@@ -5,7 +5,6 @@ text and bytes follow. That is about 1 us a record against 5 us with protobuf's 
 interpreter lock with the loop. Zeros are written out, which proto3 allows; a test reads it with Google's library.
 """
 # ruff: noqa: RUF009 (`describe_field` is a field specifier, as dataclasses.field is)
-from __future__ import annotations
 
 import math
 import os

@@ -16,8 +16,7 @@ import numpy as np
 
 from fdi.progress import Progress
 from plant.pid import control_by_pid
-from plant.profile import Profile, build_profile
-from plant.segments import Array, Hold
+from plant.segments import Array, Hold, Profile, build_profile
 from rig.benches.bench import make_reader
 from rig.benches.profiles import PROFILES, State
 from rig.network.bus import EmbeddedWire, Wire

@@ -26,9 +26,20 @@ from plant.model import build_bare_model, find_quantity, load_model
 from plant.parameters import parse_value
 from plant.plant_check import MOST_FOLLOWING_ERROR
 from plant.plants import Plant, find_plant
-from plant.profile import Profile, build_profile, list_section_names, parse_columns, resample_on_cycles
 from plant.quantity import Quantity
-from plant.segments import LONGEST, RATE, Array, Csv, Hold, Segment
+from plant.segments import (
+    LONGEST,
+    RATE,
+    Array,
+    Csv,
+    Hold,
+    Profile,
+    Segment,
+    build_profile,
+    list_section_names,
+    parse_columns,
+    resample_on_cycles,
+)
 from plant.signals import EHA
 from plant.tables import Place
 from plant.user_code import run_file

@@ -1,5 +1,4 @@
 """What is known of a run while it runs: signals of main, states of the nodes, checks as far as they can be judged."""
-from __future__ import annotations
 
 import pickle
 from collections import deque

@@ -1,5 +1,4 @@
 """Hidden effects: a blind trial of `rig explain` on traces of a simulator in C, or a benchmark for other methods."""
-from __future__ import annotations
 
 import argparse
 import sys

@@ -20,8 +20,7 @@ from plant import simulate
 from plant.effects import Effect, load_effects
 from plant.model import Model, build_bare_model, list_searched_effects
 from plant.plants import find_plant
-from plant.profile import build_profile
-from plant.segments import Hold, Ramp, Segment
+from plant.segments import Hold, Ramp, Segment, build_profile
 from plant.starts import compute_changes, ensure_starts
 from rig.campaign import judge
 from studies.hidden_effects.cases import KINDS, name_parameter, write_columns, write_truth

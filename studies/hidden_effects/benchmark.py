@@ -5,7 +5,6 @@
 Answers are made case by case, and kept in answers-METHOD.jsonl beside the hash of the code that made them; there an
 interrupted method resumes. answers-METHOD.json is for the scorer.
 """
-from __future__ import annotations
 
 import json
 import shutil

@@ -5,7 +5,6 @@ explained by the sensitivities to the parameters that scatter, each with a prior
 effects, which forward selection adds while BIC falls, and the error on the held-out run as well. A sensitivity is a
 finite difference at the smallest starting size of an effect. (G. Schwarz, Annals of Statistics 6 (1978) 461-464.)
 """
-from __future__ import annotations
 
 import math
 from pathlib import Path

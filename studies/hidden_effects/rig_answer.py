@@ -1,5 +1,4 @@
 """The answer of `rig explain` to a case of the blind trial."""
-from __future__ import annotations
 
 import json
 import os

@@ -15,11 +15,10 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import how_to_pages
+import shown_commands
 from bad_inputs import BAD_INPUTS, find_faults, write_bad_files
 from interruption import LONG_COMMANDS, MOMENTS, interrupt_command
 from places import ROOT
-from shown_commands import NOT_PLAYED, play_page
 
 Row = tuple[str, str, str, str]  # what, status, time, result
 
@@ -62,16 +61,16 @@ def play_shown(folder: Path) -> Iterator[Row]:
         shutil.copytree(ROOT / "docs", clone / "docs")
     shutil.copy(ROOT / "rig/sequences/preflight.toml", clone / "my_test.toml")
     for page in ("README.md", "docs/tutorial.md"):
-        for played in play_page((ROOT / page).read_text(), clone, make_environment()):
+        for played in shown_commands.play_page((ROOT / page).read_text(), clone, make_environment()):
             status = "-" if played.status is None else str(played.status)
-            result = "; ".join(played.faults) or ("not run" if played.line in NOT_PLAYED else "ok")
+            result = "; ".join(played.faults) or ("not run" if played.line in shown_commands.DONE_BY_CI else "ok")
             yield f"{page}: `{played.line}`", status, f"{played.seconds:.1f} s", result
 
 
 def play_pages(folder: Path) -> Iterator[Row]:
     """The lines of the other pages, each section in a folder with the files that it needs."""
-    for part in how_to_pages.PARTS:
-        for played in how_to_pages.play_part(part, folder, make_environment()):
+    for part in shown_commands.PARTS:
+        for played in shown_commands.play_part(part, folder, make_environment()):
             status = "-" if played.status is None else str(played.status)
             result = "; ".join(played.faults) or ("ok" if played.status is not None else "not run")
             yield f"{part.page}: `{played.line}`", status, f"{played.seconds:.1f} s", result

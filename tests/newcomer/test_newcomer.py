@@ -4,21 +4,25 @@ from pathlib import Path
 
 import pytest
 from bad_inputs import BAD_INPUTS, BadInput, find_faults, write_bad_files
-from how_to_pages import (
+from interruption import LONG_COMMANDS, find_damage, interrupt_command, judge_end, judge_time
+from places import ROOT
+from play_newcomer import make_environment
+from rig_command import rig
+from shown_commands import (
+    NEEDS_HARDWARE,
     NOT_PLAYED,
     NOT_PLAYED_PAGES,
     NOT_PLAYED_SECTIONS,
     PARTS,
     Part,
+    Step,
     find_section,
+    judge_line,
     list_command_lines,
+    list_steps,
+    play_page,
     play_part,
 )
-from interruption import LONG_COMMANDS, find_damage, interrupt_command, judge_end, judge_time
-from places import ROOT
-from play_newcomer import make_environment
-from rig_command import rig
-from shown_commands import NEEDS_HARDWARE, Step, judge_line, list_steps, play_page
 
 from plant.effects import CATALOGUE
 from rig.cli.command_list import COMMANDS

@@ -21,7 +21,7 @@ from plant.effects.sensors import Lag, Recoil, mount_compliance, sensor_lag
 from plant.effects.supply import Drawn, supply_droop
 from plant.eha import State, compute_coefficients, compute_metering_line, step_actuator
 from plant.eha import step_jack as ram
-from plant.flat import unpack_state
+from plant.kernels import unpack_state
 from plant.plants import find_plant
 from plant.state import Input, Line
 from rig.benches.profiles import Control

@@ -17,7 +17,7 @@ from plant import Actuator, InputError, Model, simulate
 from plant.effects import CATALOGUE, load_effects
 from plant.model import list_offered_effects
 from plant.plants import find_plant
-from plant.profile import build_profile
+from plant.segments import build_profile
 from plant.selftest import check_effect
 from plant.starts import compute_changes, compute_levels, ensure_starts, find_starts
 

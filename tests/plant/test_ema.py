@@ -16,7 +16,7 @@ from plant import ema, simulate
 from plant.compile import compile_function
 from plant.ema import compute_coefficients, step
 from plant.model import load_model
-from plant.profile import build_profile
+from plant.segments import build_profile
 
 Array = NDArray[np.float64]
 GROUPS = ema.PLANT.parameters

@@ -1,5 +1,4 @@
 """Runs side by side, and the monitor: the bits of one run after the other, closed forms, and wide registers."""
-from __future__ import annotations
 
 import re
 from math import copysign, exp, pi, sqrt
@@ -18,8 +17,8 @@ from plant import lanes as lanes_module
 from plant.anchor import pull_plant, rest_at_reading, show_start
 from plant.compile import compile_function, interpret_function
 from plant.effects import CATALOGUE, load_effects
-from plant.flat import unpack_state
 from plant.kernel_use import KernelUse
+from plant.kernels import unpack_state
 from plant.lanes import FEWEST, NARROW, Lanes, Part, compile_kernels, list_kernel_variants, plan_layout
 from plant.monitor import FAULTS, Cell, Monitor, Motion, compute_cells, step_monitor
 from plant.solve import read_sensors, step_cycle

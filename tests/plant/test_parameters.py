@@ -18,9 +18,23 @@ from plant import Actuator, InputError, Model, load_model, simulate
 from plant.model import find_quantity
 from plant.parameters import GROUPS, load_nominal_values
 from plant.plants import find_plant
-from plant.profile import build_profile, parse_columns, read_command, resample_on_cycles
 from plant.quantity import Quantity, list_quantities
-from plant.segments import KINDS, Chirp, Csv, Hold, Multisine, Points, Ramp, Segment, Sine, Step
+from plant.segments import (
+    KINDS,
+    Chirp,
+    Csv,
+    Hold,
+    Multisine,
+    Points,
+    Ramp,
+    Segment,
+    Sine,
+    Step,
+    build_profile,
+    parse_columns,
+    read_command,
+    resample_on_cycles,
+)
 
 NAMES = list(load_nominal_values())
 

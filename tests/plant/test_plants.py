@@ -12,11 +12,11 @@ from refusals import catch_refusal
 from rig_command import rig
 
 from plant import Model, load_model, simulate
-from plant.flat import list_state_values, make_packers
+from plant.kernels import list_state_values, make_packers
 from plant.lanes import Lanes
 from plant.plant_check import MOST_STEP_ERROR, check_behaviour, rms
 from plant.plants import list_plants, load_plant
-from plant.profile import build_profile
+from plant.segments import build_profile
 
 EXAMPLE = ROOT / "plant" / "models" / "new_plant.py"
 TEXT = EXAMPLE.read_text()

@@ -1,5 +1,4 @@
 """The benchmark of hidden effects: what is made, who answers, and what the scorer counts."""
-from __future__ import annotations
 
 import ast
 import json

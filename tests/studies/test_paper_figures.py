@@ -10,8 +10,7 @@ from fdi.diagnosis.make_bands import choose_bands
 from fdi.diagnosis.rms_grid import search_grid
 from fdi.report.diagnosis_report import draw_maps
 from plant import Model, simulate
-from plant.profile import build_profile
-from plant.segments import Chirp, Hold, Step
+from plant.segments import Chirp, Hold, Step, build_profile
 from rig.sequences import load_sequence
 from studies import paper_figures as figures
 

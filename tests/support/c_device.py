@@ -1,12 +1,15 @@
 """The C firmware in this process: its CANopen stack and its controller behind the interfaces of the Python ones.
 
-The stack takes any object dictionary, so the tests of `rig.device` run on it unchanged, with the EDS of any node.
+The stack takes any object dictionary, so the tests of `rig.device` run on it unchanged, with the EDS of any node. The
+firmware also runs as a program, with faults built in or under the sanitizers.
 """
 
+import contextlib
 import ctypes
 import shutil
 import struct
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -248,3 +251,24 @@ class CFirmware(_Stack):
         self.device = _View(self, 2, Dictionary(EDS[2], 2))
         for sub, value in enumerate(gains or (), 1):
             self.device.write(GAINS, sub, value)
+
+
+SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+
+
+def build_faulty(*flags: str) -> Path:
+    """The program with faults, every warning an error."""
+    sources = [path for path in sorted(FOLDER.glob("*.c")) if path.name != "main.c"]
+    return build_program("faulty", [*sources, SUPPORT / "faulty.c"], (*STRICT, *flags))
+
+
+@contextlib.contextmanager
+def run_program(*words: str | Path) -> Iterator[subprocess.Popen[str]]:
+    """A program beside the test; it is terminated at the end, and must then end with status 0."""
+    program = subprocess.Popen(list(map(str, words)), stderr=subprocess.PIPE, text=True)
+    try:
+        yield program
+    finally:
+        program.terminate()
+        _, errors = program.communicate(timeout=120)
+    assert (program.returncode, errors) == (0, "")

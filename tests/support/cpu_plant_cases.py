@@ -9,8 +9,7 @@ from physics_cases import PREFLIGHT
 from plant import Actuator, Model, functions, simulate
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes
-from plant.profile import build_profile
-from plant.segments import Chirp, Multisine, Points, Ramp, Sine
+from plant.segments import Chirp, Multisine, Points, Ramp, Sine, build_profile
 
 SHORT = PREFLIGHT[3800:4400]  # a ramp: the ram sticks and slips
 SWING = 3e-3 * functions.sin_of_turns(np.arange(600) / 200.0)

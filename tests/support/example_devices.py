@@ -12,8 +12,7 @@ import can
 import canopen
 import cantools
 import pytest
-from c_device import skip_without_compiler
-from c_program import run_program
+from c_device import run_program, skip_without_compiler
 from canopen.profiles.p402 import BaseNode402, State402
 from places import ROOT
 

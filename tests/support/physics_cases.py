@@ -1,7 +1,7 @@
 """What the physics tests share: the preflight command, and plants without noise or friction."""
 
 from plant import Model
-from plant.profile import build_profile
+from plant.segments import build_profile
 from rig.bench.benchmarks import FRICTIONLESS, QUIET
 from rig.sequences.sequence import load_sequence
 

@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Iterator
 
-from c_program import run_program
+from c_device import run_program
 
 from rig.network.bus import Link, open_can
 from rig.network.node_objects import NAMES

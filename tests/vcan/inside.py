@@ -36,7 +36,7 @@ RIG = Path(sys.executable).with_name("rig")
 
 def compile_all(out: Path) -> int:
     """Compile what the other parts use: cycles, plant, functions of the raw bus, C programs. Always 0."""
-    from c_program import build_faulty
+    from c_device import build_faulty
     from example_devices import DRIVE, ECU
 
     from plant import Actuator, Model

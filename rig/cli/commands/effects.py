@@ -10,7 +10,7 @@ from fdi.report.report import Cell, Column, Item, Line, Paragraph, Report, Secti
 from plant.effects import Effect
 from plant.model import find_effect, load_model
 from plant.plants import find_plant, load_plant
-from plant.profile import build_profile
+from plant.segments import build_profile
 from plant.selftest import Report as SelfTest
 from plant.selftest import check_effect
 from rig.cli.answer import Places, give_answer

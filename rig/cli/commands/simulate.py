@@ -11,8 +11,7 @@ from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
 from plant.plant_check import find_divergence
 from plant.plants import Plant
-from plant.profile import build_profile, read_command
-from plant.segments import Points
+from plant.segments import Points, build_profile, read_command
 from rig.cli.answer import give_answer
 from rig.cli.inputs import load_chosen_model
 from rig.sequences.sequence import load_nominal_test

@@ -55,8 +55,8 @@ from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
 from plant import Model, load_model, simulate
-from plant.profile import build_profile as profile
 from plant.segments import Hold, Ramp, Step
+from plant.segments import build_profile as profile
 from rig.sequences import load_sequence
 
 CLOGGING, FRICTION = "filter_clogging", "spool_friction"

@@ -26,8 +26,7 @@ from fdi.estimation.replay import read_cycles
 from fdi.report.diagnosis_report import explain_grid
 from plant import Model, simulate
 from plant.monitor import Monitor
-from plant.profile import build_profile
-from plant.segments import Chirp, Hold, Ramp, Step
+from plant.segments import Chirp, Hold, Ramp, Step, build_profile
 from plant.signals import EHA
 from rig.sequences import load_sequence
 

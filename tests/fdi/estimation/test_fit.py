@@ -46,7 +46,7 @@ from fdi.estimation.unidentifiable import (
 from fdi.trace.trace import Floats, Trace, rms
 from plant import Model, load_model, simulate
 from plant.declare import Chirp, Hold, Ramp
-from plant.profile import build_profile
+from plant.segments import build_profile
 
 
 @pytest.mark.parametrize("steep", [1e6, 1e15, 1e18])

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from broken_devices import Break, examine, keep_values_over_reset, list_cases, nothing, send_instead, skip_checks, wrap
-from changed_sheets import change_sheet, describe_variable
+from device_bench import change_sheet, describe_variable
 from refusals import catch_refusal
 
 from dbc import EDS

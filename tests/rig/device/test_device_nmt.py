@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import pytest
-from changed_sheets import change_sheet, describe_variable
-from device_bench import Rack
+from device_bench import Rack, change_sheet, describe_variable
 
 from rig.device import EmcyCode, NmtCommand, NmtState
 

@@ -4,8 +4,7 @@ import struct
 from pathlib import Path
 
 import pytest
-from changed_sheets import change_sheet
-from device_bench import Rack
+from device_bench import Rack, change_sheet
 
 from dbc import EDS
 from plant.errors import InputError

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 from bus_stations import spec
-from c_device import STRICT, skip_without_compiler
-from c_program import SANITIZERS, build_faulty, run_program
+from c_device import SANITIZERS, STRICT, build_faulty, run_program, skip_without_compiler
 from log_rows import describe_first_difference
 from plugin_bus_summary import require_bus_kind
 from rig_command import SHORT, job, nodes_on, play, rig

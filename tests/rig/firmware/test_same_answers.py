@@ -9,8 +9,7 @@ import subprocess
 from collections.abc import Iterator
 
 import pytest
-from c_device import STRICT, SUPPORT, skip_without_compiler
-from c_program import SANITIZERS
+from c_device import SANITIZERS, STRICT, SUPPORT, skip_without_compiler
 
 from rig.firmware.build import FOLDER, build_program
 from rig.network.frame import Frame

@@ -19,9 +19,8 @@ from fdi.report.terminal import format_report
 from fdi.trace.check_result import CheckResult, compute_speed, filter_median
 from fdi.trace.trace import Trace
 from plant.errors import InputError
-from plant.profile import build_profile
 from plant.run import Columns
-from plant.segments import RATE, Array, Hold, Ramp, Segment, Sine, Step
+from plant.segments import RATE, Array, Hold, Ramp, Segment, Sine, Step, build_profile
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.benches.calibration import SensorCalibration
