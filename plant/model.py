@@ -25,7 +25,6 @@ from plant.plants import Plant
 from plant.quantity import Quantity
 
 SHIPPED_MODELS = ("servo", "emps")  # plant/models/NAME.toml, beside the nominal values of the plants
-STEP = 1e-5  # s, of the solver; its error is measured in the docs
 
 
 def list_offered_effects(plant: str = "eha") -> list[Effect]:
@@ -74,7 +73,7 @@ class Model:
     @property
     def steps(self) -> int:
         """Steps of the solver in a cycle of the controller."""
-        return max(1, round(self["controller.period"] / STEP))
+        return max(1, round(self["controller.period"] / self.kind.solver_step))
 
     @property
     def kind(self) -> Plant:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from plant.plants import Plant
 
 MOST_STEP_ERROR = 0.01  # RMS change of an output with half the step, over its range in the nominal test
+MOST_STRAY = 0.5  # of the distance to which a replay at rest is pulled; a spring may hold it back
 MOST_FOLLOWING_ERROR = 0.5  # RMS, over the range of the command
 ARGUMENTS = {"step": (4, 5), "measure": (2,), "control": (4,), "coefficients": (2,), "sense": (4,), "moves": (3,)}
 
@@ -132,6 +133,7 @@ def find_divergence(model: Model, columns: Mapping[str, NDArray[np.float64]]) ->
 
 def check_behaviour(model: Model) -> Iterator[Finding]:
     """The checks of a plant over its nominal test, one after the other."""
+    from plant.lanes import Lanes
     from plant.run import simulate
     from plant.selftest import check_effect
 
@@ -160,6 +162,12 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
     if worst:
         yield Finding("step", errors[worst] < MOST_STEP_ERROR, f"half the step changes {worst} by "
                       f"{100 * errors[worst]:.2g} % of its range (limit {100 * MOST_STEP_ERROR:g} %)")
+    there = np.full(min(len(command), 200), 0.1 * np.ptp(once[kind.signals.controlled.name]))
+    pulled = Lanes(quiet, ()).replay(np.empty((1, 0)), 0.0 * there, 0.0 * there, there, 200.0)[0, -1, 0]
+    kept = abs(pulled - there[0]) <= MOST_STRAY * there[0]
+    yield Finding("moves", kept, "a replay is pulled to the recorded signal" if kept else
+                  f"pulled to {there[0]:.3g} {kind.signals.controlled.unit}, a replay is at {pulled:.3g}: "
+                  "every field of the state has to move along, a motor's angle by the gear ratio")
     error = rms(once[kind.signals.command.name] - once[kind.signals.controlled.name]) / max(np.ptp(command), 1e-300)
     yield Finding("control", error < MOST_FOLLOWING_ERROR, f"following error {100 * error:.2g} % of the command's "
                   f"range (limit {100 * MOST_FOLLOWING_ERROR:g} %)")

@@ -152,8 +152,10 @@ def find_compile_error(error: Exception) -> InputError | None:
               if not file.startswith(own) and "site-packages" not in file]
     if not places:
         return None
-    said = next((line.strip() for line in text.splitlines()
-                 if line.strip() and not line.startswith(("Failed in", "During"))), "")
+    call = re.search(r">>> (.+)", text)  # of a function that it does not know for such arguments
+    lines = (line.strip() for line in text.splitlines())
+    said = f"not {call[1]}, see docs/effects.md" if call else next(
+        (line for line in lines if line and not line.startswith(("Failed in", "During"))), "")
     return InputError(f"{places[0][0]}:{places[0][1]}", "", f"Python that can be compiled ({said})")
 
 

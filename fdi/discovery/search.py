@@ -802,6 +802,8 @@ def absorb_shifts(fit: Fit, white: Floats, held: Sequence[Iterable[str]], begun:
         begun: (m, p), the unknowns.
     """
     moves = np.array([[f.name not in names for f in fit.free] for names in held])
+    if not fit.free:  # a plant without tolerances
+        return compute_misfit(white), begun
     x = _shift_unknowns(fit, white[:, :, ::SCAN_STRIDE], begun, moves)
     whole, priors = fit.jacobian.reshape(len(fit.x), -1), weigh_priors(fit.free)
     costs = (x * moves) ** 2 @ priors
@@ -868,7 +870,7 @@ def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> S
     white = np.concatenate([problem.whiten_predictions(problem.predict_outputs(names, part))[:, :, ::NULL_STRIDE]
                             for part in parts])
     thin = (white[1:] - white[0]).reshape(len(starts), -1) * np.sqrt(NULL_STRIDE)
-    own = fit.jacobian[:, :, ::NULL_STRIDE].reshape(len(fit.x), -1) * np.sqrt(NULL_STRIDE)
+    own = fit.jacobian[:, :, ::NULL_STRIDE].reshape(len(fit.x), thin.shape[1]) * np.sqrt(NULL_STRIDE)
     prior = np.diag([f.prior**-2 + 1e-9 for f in fit.free])
     left = thin - (thin @ own.T) @ np.linalg.solve(own @ own.T + prior, own)
     length = np.sqrt(np.maximum(np.einsum("ij,ij->i", left, left), 1e-300))

@@ -20,7 +20,10 @@ from fdi.thresholds import ANCHOR_RATE, BLOCK_FITTED_SQUARE, CONVERGED_GAIN, CON
 from fdi.trace.trace import Floats, Trace
 from plant.effects import Effect
 from plant.lanes import Lanes, Part
-from plant.model import Model, find_quantity, list_offered_effects, list_searched_effects
+from plant.model import Model, build_bare_model, find_quantity, list_offered_effects, list_searched_effects
+from plant.plants import Plant
+from plant.run import simulate
+from plant.segments import build_profile
 from plant.threads import map_in_threads
 
 HUM = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0, 400.0)  # Hz
@@ -78,6 +81,24 @@ def limit_friction_values(values: Mapping[str, float]) -> dict[str, float]:
     return {**values, **dict(zip(names, limited.tolist(), strict=True))}
 
 
+@cache
+def find_fewest_steps(kind: Plant) -> int:
+    """Steps a cycle with which fits may begin: the fewest that change a replay of the plant's nominal test by less than
+    the noise of each sensor, of 10, 20 and 50 against 200. Of a plant without such a test they are 10.
+    """
+    if not kind.profile or kind.foreign is not None:
+        return 10
+    model = silence_sensors(build_bare_model(kind.key))
+    run = simulate(model, build_profile(kind.profile, rate=round(1.0 / model["controller.period"])).command)
+    noise = np.array([kind.nominal.get(s.noise, 0.0) for s in kind.signals.outputs])
+    drive, read = (getattr(run, s.name) for s in (kind.signals.drive, kind.signals.controlled))
+    finest, *others = (Lanes(model, (), n).replay(np.empty((1, 0)), drive, np.zeros(len(drive)), read, ANCHOR_RATE)[0]
+                       for n in (200, 10, 20, 50))
+    with np.errstate(all="ignore"):  # too few steps may let it diverge
+        changes = [np.sqrt(((out - finest) ** 2).mean(axis=0))[noise > 0.0] / noise[noise > 0.0] for out in others]
+    return next((n for n, change in zip((10, 20, 50), changes, strict=True) if (change < 1.0).all()), 100)
+
+
 @dataclass
 class Problem:
     """A model, the whole catalogue ready in it at off values, and runs to hold it against.
@@ -88,7 +109,7 @@ class Problem:
     model: Model  # with every effect that may be tried
     trace: Trace
     noise: tuple[Noise, ...]  # of each signal
-    steps: int = 10  # a cycle, 100 us: differs from 10 us by less than the sensors' noise; last fits use more
+    steps: int = 10  # a cycle, at least `find_fewest_steps`; last fits use more
     anchor: float = ANCHOR_RATE
     workers: int = 1
     bare: Model | None = None  # the same without the effects at off values: five times as fast where it will do
@@ -109,7 +130,8 @@ class Problem:
         key = tuple(names)
         if key not in self._lanes:
             bare = self.bare is not None and set(key) <= set(self.bare.values)
-            self._lanes[key] = Lanes(self.bare if bare and self.bare else self.model, key, self.steps, self.workers)
+            self._lanes[key] = Lanes(self.bare if bare and self.bare else self.model, key,
+                                     max(self.steps, find_fewest_steps(self.model.kind)), self.workers)
         trace = self.trace if trace is None else trace
         out = self._lanes[key].replay(values, trace.drive, trace.load, trace.anchor, self.anchor, trace.parts,
                                       trace.chambers, trace.slack)
@@ -506,7 +528,7 @@ def replay_fit(problem: Problem, fit: Fit, x: Floats) -> Fit:
 def form_normal_equations(fit: Fit) -> tuple[Floats, Floats]:
     """Gradient (p,) and Gauss-Newton Hessian (p, p) of half the cost."""
     prior = weigh_priors(fit.free)
-    flat = fit.jacobian.reshape(len(fit.x), -1)
+    flat = fit.jacobian.reshape(len(fit.x), fit.white.size)
     heavy = flat * compute_weights(fit.white).reshape(-1)
     return heavy @ fit.white.reshape(-1) + prior * fit.x, heavy @ flat.T + np.diag(prior)
 
@@ -623,6 +645,8 @@ def evolve_fit(problem: Problem, fit: Fit, spread: Floats, generations: int, see
     """The fit at the best trial of a population that begins at it with the covariance `spread` (p, p); its covariance
     is that of the last trials.
     """
+    if not fit.free:  # a plant without tolerances
+        return fit
     size = min(64, 16 * -(-len(fit.x) // 4))  # whole blocks of lanes; few unknowns need few trials
     end = evolve_population(partial(problem.compute_costs, fit.free), fit.x, spread, *scaled_bounds(fit.free),
                             generations, seed, size)

@@ -403,6 +403,8 @@ def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | No
     `slopes`: the same problem with coarser steps, for the differences; default `problem` itself. `stage` takes a step
     with each round.
     """
+    if not fit.free:  # a plant without tolerances
+        return replace(replay_fit(problem, fit, fit.x), converged=True)
     slopes = slopes or problem
     now = relax_fit(problem, fit, find_tangents(slopes, fit.free, fit.x)[0])
     if now is fit:  # its residuals may be those of other steps, another noise or another place

@@ -27,7 +27,7 @@ from plant.compile import read_normal_tables
 from plant.errors import InputError, RigError
 from plant.kernels import list_state_values
 from plant.machine_code import emit_object
-from plant.model import STEP, Model, build_kernel, find_quantity
+from plant.model import Model, build_kernel, find_quantity
 from plant.run import report_law_errors
 from rig.firmware.build import find_compiler
 from rig.fmi.unit_cycle import INPUTS, advance_unit
@@ -210,7 +210,7 @@ def write_tables(model: Model, variables: Sequence[Variable], seed: int) -> str:
               "OUTPUTS": outputs[0],
               "OUTPUT_COUNT": len(outputs), "PARAMETERS": parameters[0],
               "PARAMETER_COUNT": len(parameters), "PERIOD": period, "SEED_AT": len(variables),
-              "CLOSED_AT": len(variables) + 1, "SEED": seed, "SOLVER_STEP": STEP.hex(),
+              "CLOSED_AT": len(variables) + 1, "SEED": seed, "SOLVER_STEP": model.kind.solver_step.hex(),
               "ZIGGURAT_R": normal.r.hex(), "ZIGGURAT_INVERSE_R": normal.inverse_r.hex()}
     tables = {
         "VARIABLE_TABLE": [f'{{"{v.name}", {v.role}, '

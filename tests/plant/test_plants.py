@@ -128,7 +128,7 @@ def test_the_written_example_passes_its_checks(tmp_path: Path) -> None:
     file = tmp_path / "my_motor.py"
     assert rig("new", "plant", "my_motor", "--out", file).status == 0
     said = rig("check", file, "--json")
-    assert said.status == 0 and said.json["verdict"] == "SOUND" and len(said.json["checks"]) == 6
+    assert said.status == 0 and said.json["verdict"] == "SOUND" and len(said.json["checks"]) == 7
     assert rig("new", "plant", "my_motor", "--out", file).status == 2  # it replaces nothing
 
 
@@ -178,6 +178,36 @@ def test_the_signal_may_be_in_another_unit_than_the_state_that_moves(tmp_path: P
     file.write_text(TEXT.replace("return s.angle, s", "return 50.0 * s.angle, s"))
     kind = load_plant(file)
     assert kind.find_share_moved(kind.move) == pytest.approx(1.0)
+
+
+def test_fields_that_do_not_move_along_fail_the_check(tmp_path: Path) -> None:
+    """A motor's angle and the angle of the wheel behind a stiff shaft, moved by the same angle in spite of the gear."""
+    file = tmp_path / "shaft.py"
+    file.write_text(TEXT.replace("    angle: float = 0.0", "    angle: float = 0.0\n    motor: float = 0.0").replace(
+        "- load)", "- load - 2e3 * (s.angle - s.motor / ratio))").replace(
+        "(s.speed + speed))", "(s.speed + speed), s.motor + h * ratio * speed)").replace(
+        '("angle",)', '("angle", "motor")'))
+    found = {f.check: f.passed for f in check_behaviour(load_model(file))}
+    assert not found["moves"] and found["finite"]
+
+
+def test_the_solver_step_of_a_plant_is_used(tmp_path: Path) -> None:
+    file = tmp_path / "fine.py"
+    file.write_text(TEXT.replace("control=control,", "control=control, solver_step=2e-6,"))
+    assert load_model(file).steps == 500
+
+
+def test_a_stiff_plant_without_tolerances_is_explained(tmp_path: Path) -> None:
+    """An explicit current diverges in ten steps a cycle, with which the search begins; and no unit is off nominal."""
+    text = re.sub(r", tolerance=[\d.]+", "", TEXT).replace("] = 2e-3", "] = 6e-5").replace(
+        "* s.speed)) / (inductance + h * p.motor.resistance)",
+        "* s.speed - p.motor.resistance * s.current)) / inductance")
+    file, run = tmp_path / "stiff.py", tmp_path / "run.csv"
+    file.write_text(text)
+    for torque, verdict in ((0.0, "NOTHING_MISSING"), (0.4, "EXPLAINED")):
+        rig("simulate", "--model", file, "--set", f"dry_friction.torque={torque}", "--out", run, "--force")
+        found = rig("explain", run, "--model", file, "--json").json
+        assert (found["verdict"], found["effects"]) == (verdict, ["dry_friction"] if torque else [])
 
 
 def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -> None:
