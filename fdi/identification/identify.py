@@ -290,7 +290,7 @@ def prepare_runs(model: Model, ranges: Sequence[Range], traces: Sequence[Trace],
 
 
 def _prepare(trace: Trace, model: Model, outputs: Sequence[str], source: Source) -> Trace:
-    if not model.kind.controller:
+    if not model.kind.controller and model.kind.foreign is None:
         return hold_inputs(trace, outputs, source.file)
     try:
         return prepare_trace(trace, model, outputs, source.file)
@@ -714,7 +714,8 @@ def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress
     size = np.sqrt(np.nanmean(fit.residuals**2, axis=1))
     level = np.array([n.level for n in fine.noise])
     if (size <= RESIDUAL_HELD_OUT * level).all():
-        learnt = tuple(noises.fit_noise(r) for r in fit.residuals)
+        learnt = tuple(noises.fit_noise(r) if s > 0.0 else old  # a signal that the model gives exactly tells none
+                       for r, s, old in zip(fit.residuals, size, fine.noise, strict=True))
         fine = replace(fine, noise=learnt, _lanes={})
         fit = descend(fine, fit, 5)
     return fine, fit

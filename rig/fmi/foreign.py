@@ -79,11 +79,11 @@ def read_description(path: Path) -> Description:
     libraries = [f"binaries/{folder}/{unit.modelIdentifier}{fmpy.sharedLibraryExtension}" for folder in folders]
     library = next((name for name in libraries if name in names), None)
     if library is None:
-        there = sorted({name.split("/")[1] for name in names if name.startswith("binaries/") and name.count("/") > 1})
+        there = sorted(name for name in names if name.startswith("binaries/") and not name.endswith("/"))
         offered = f"only {', '.join(there)}" if there else "none"
         if any(name.startswith("sources/") for name in names):
             offered += f" and source code: python -m fmpy compile {path.name}"
-        raise InputError(path, "binaries", f"a library for {folders[-1]}; it has {offered}")
+        raise InputError(path, "binaries", f"a library {libraries[-1]}; it has {offered}")
     variables = {v.name: v for v in found.modelVariables}
     step = unit.fixedInternalStepSize
     return Description(path, library, variables, version, None if step is None else float(step))

@@ -4,6 +4,8 @@ A unit is somebody else's machine code. If it crashes or hangs, only this proces
 arguments, the first one `load`; answers are ("done", result) or ("failed", what went wrong). rig/fmi/foreign.py asks.
 """
 
+import contextlib
+import ctypes
 import sys
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
@@ -26,6 +28,16 @@ def _group(variables: Sequence[Variable]) -> Groups:
         places.append(i)
         references.append(reference)
     return groups
+
+
+class Library(ctypes.CDLL):
+    """A library that may lack functions of the interface that nobody calls: FMPy looks for all of them."""
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            return lambda *arguments: 3  # the status fmiError
 
 
 class Host:
@@ -54,14 +66,18 @@ class Host:
         if self._start is not None and self._settings == settings:
             getattr(self._unit, self._set_state)(self._start)
             return self._read()
-        self._instantiate()
+        if self._unit is not None and self._description.coSimulation.canBeInstantiatedOnlyOncePerProcess:
+            self._unit.reset()
+        else:
+            self._instantiate()
         if self._version == "2":
             self._unit.setupExperiment(startTime=0.0)
         self.change(settings)
         self._unit.enterInitializationMode()
         self._unit.exitInitializationMode()
         if self._description.coSimulation.canGetAndSetFMUstate:
-            self._start, self._settings = getattr(self._unit, self._get_state)(), settings
+            with contextlib.suppress(Exception):  # FMPy's; without a state to go back to, each run starts anew
+                self._start, self._settings = getattr(self._unit, self._get_state)(), settings
         return self._read()
 
     def change(self, settings: Settings) -> None:
@@ -88,11 +104,16 @@ class Host:
         """When and how a call failed, with the last message of the unit."""
         said = f"; its message: {self.said}" if self.said else ""
         tool = "; it needs the tool that made it" if self._description.coSimulation.needsExecutionTool else ""
+        usual = self._description.defaultExperiment
+        if self._k == 0 and usual is not None and usual.stepSize:
+            tool += f"; the steps that it suggests are of {usual.stepSize} s, controller.period"
         return f"{str(error).rstrip('.')} at {self._k * self._cycle:.6g} s{said}{tool}"
 
     def _instantiate(self) -> None:
+        from fmpy import fmi1  # the base of all versions
         from fmpy.simulation import instantiate_fmu
 
+        fmi1.cdll = ctypes.LibraryLoader(Library)
         if self._unit is not None:
             if self._start is not None:
                 getattr(self._unit, self._free_state)(self._start)

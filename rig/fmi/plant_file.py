@@ -98,10 +98,11 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str) 
     types: dict[str, Any] = {
         group: NamedTuple(group.title().replace("_", ""), list(fields.items()))
         for group, fields in groups.items()}
-    is_usual = drive.unit == usual.unit
+    is_usual = drive.name == usual.signals.drive.name
     types["controller"] = Controller if is_usual else convert_group_unit(Controller, usual.unit, drive.unit, inf)
     values |= {name: value for name, value in usual.nominal.items()
                if name == "controller.period" or (is_usual and name.startswith("controller."))}
+    values.setdefault("controller.current_limit", 1e9)  # of a drive in another unit none is known
     state = make_state_type(tuple(signal.name for signal, _ in shown))
     columns = (command, first, drive, *(s for s, _ in shown[1:]), *(s for s, _ in given[1:]))
     return keep_plant(Plant(
@@ -156,24 +157,25 @@ def _map_signal(about: Description, name: str, entry: Entry, place: Place, causa
     eha = {s.name: s for s in find_plant("eha").signals}
     signal = eha.get(_COLUMNS.get(name, name))
     worth, unit = _find_worth(about, entry, "" if signal is None else signal.unit, place)
-    noise = float(parse_quantity(entry.noise, unit, place, "noise")) if entry.noise else ""
+    port = Port(name, find_variable(about, entry.variable, (causality,), place), worth)
+    noise = _parse(entry.noise, unit, place.at("noise")) if entry.noise else ""
     if signal is None:
         role = (entry.role or "drive") if causality == "input" else "output"
         signal = Signal(name, name, unit, name.replace("_", " "), role)
-    return signal._replace(noise=noise, limit="", role="output" if causality == "output" else signal.role), Port(
-        signal.name, find_variable(about, entry.variable, (causality,), place), worth)
+    return signal._replace(noise=noise, limit="", role="output" if causality == "output" else signal.role
+                           ), port._replace(name=signal.name)
 
 
 def _find_worth(about: Description, entry: Entry, unit: str, place: Place) -> tuple[float, str]:
     """What one of a variable is worth, and the SI unit; `unit` is that of the signal, "" if it has none of its own."""
-    stated = getattr(about.variables.get(entry.variable), "unit", None) or ""
+    stated = _find_attribute(about, entry.variable, "unit") or ""
     if entry.count is not None:
         number, _, named = entry.count.partition(" ")
         known = find_unit(named)
         si = unit or (known.si if known else named or "1")
         if not unit and known is None:
-            return float(parse_quantity(number, "", place, "count")), si
-        return float(parse_quantity(entry.count, si, place, "count")), si
+            return _parse(number, "", place.at("count")), si
+        return _parse(entry.count, si, place.at("count")), si
     known = find_unit(stated)
     if known is not None and unit in ("", known.si):
         return float(known.factor), known.si
@@ -189,9 +191,23 @@ def _map_parameter(about: Description, name: str, entry: Entry, place: Place) ->
     port = Port(name, find_variable(about, entry.variable, ("parameter",), place))
     worth, unit = _find_worth(about, entry, "", place)
     variable = about.variables[entry.variable]
-    low, high = entry.range or (_read_number(variable.min, -inf), _read_number(variable.max, inf))
+    low, high = entry.range or tuple(worth * _read_number(_find_attribute(about, entry.variable, name), far)
+                                     for name, far in (("min", -inf), ("max", inf)))
     quantity = Quantity(unit, low=low, high=high)
     return port._replace(worth=worth), quantity, worth * _read_number(variable.start, 0.0)
+
+
+def _parse(text: str, unit: str, place: Place) -> float:
+    """A number with a unit, in `unit`. Raises InputError with the line of its place."""
+    with place.locate():
+        return float(parse_quantity(text, unit, place.file, place.keys))
+
+
+def _find_attribute(about: Description, name: str, attribute: str) -> Any:
+    """An attribute of a variable, else of its type; None if neither has it."""
+    variable = about.variables.get(name)
+    own = getattr(variable, attribute, None)
+    return getattr(getattr(variable, "declaredType", None), attribute, None) if own is None else own
 
 
 def _read_number(text: Any, default: float) -> float:

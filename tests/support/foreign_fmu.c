@@ -23,6 +23,11 @@ static Slide *create(void *environment, void (*logger)(void)) {
     return s;
 }
 
+static int reset(Slide *s) {
+    s->u = s->load = s->x = s->v = 0.0, s->k = 2.0, s->d = 5.0, s->steps = s->is_big = 0;
+    return 0;
+}
+
 static double *find(Slide *s, uint32_t reference) {
     double *const places[] = {NULL, &s->u, &s->load, &s->x, &s->k, &s->d};
     return reference >= 1 && reference <= 5 ? places[reference] : NULL;
@@ -62,7 +67,7 @@ void fmi3FreeInstance(Slide *s) { free(s); }
 int fmi3EnterInitializationMode(Slide *s, bool a, double b, double c, bool d, double e) { return 0; }
 int fmi3ExitInitializationMode(Slide *s) { return 0; }
 int fmi3Terminate(Slide *s) { return 0; }
-int fmi3Reset(Slide *s) { return 0; }
+int fmi3Reset(Slide *s) { return reset(s); }
 int fmi3GetFloat64(Slide *s, const uint32_t *r, size_t n, double *v, size_t nv) {
     for (size_t i = 0; i < n; i++) v[i] = *find(s, r[i]);
     return 0;
@@ -93,7 +98,7 @@ int fmi2SetupExperiment(Slide *s, int a, double b, double c, int d, double e) { 
 int fmi2EnterInitializationMode(Slide *s) { return 0; }
 int fmi2ExitInitializationMode(Slide *s) { return 0; }
 int fmi2Terminate(Slide *s) { return 0; }
-int fmi2Reset(Slide *s) { return 0; }
+int fmi2Reset(Slide *s) { return reset(s); }
 int fmi2GetReal(Slide *s, const uint32_t *r, size_t n, double *v) {
     for (size_t i = 0; i < n; i++) v[i] = *find(s, r[i]);
     return 0;

@@ -14,7 +14,8 @@ _VARIABLES = (("u", "input", "continuous"), ("F", "input", "continuous"), ("slid
 
 
 def build_fmu(path: Path, version: str = "3", does: str = "NOTHING", at: int = -1, unit: str = "",
-              platform: str = "", kind: str = "CoSimulation", fmi: str = "", sources: bool = False) -> Path:
+              platform: str = "", kind: str = "CoSimulation", fmi: str = "", sources: bool = False,
+              stubs: bool = True) -> Path:
     """Write a unit to `path`.
 
     Args:
@@ -27,14 +28,15 @@ def build_fmu(path: Path, version: str = "3", does: str = "NOTHING", at: int = -
         kind: the interface that it offers.
         fmi: version that the description claims.
         sources: leave out the library; there is source code instead.
+        stubs: all functions of the interface are there, also those that nobody calls.
     """
     library = path.with_suffix(".so")
     flags = [f"-DDOES={does}", f"-DSTEP_THAT={at}", *(["-DFMI3"] if version == "3" else [])]
     known = {"2": fmpy.fmi2.FMU2Slave, "3": fmpy.fmi3.FMU3Slave}[version]
-    stubs = path.with_suffix(".c")  # FMPy wants every function of the interface
-    stubs.write_text("".join(f"int {name}(void) {{ return 3; }}\n" for name in dir(known)
-                             if name.startswith(f"fmi{version}") and f"{name}(" not in SOURCE.read_text()))
-    subprocess.run(["cc", "-shared", "-fPIC", "-w", "-o", library, *flags, SOURCE, stubs], check=True)
+    others = path.with_suffix(".c")
+    others.write_text("".join(f"int {name}(void) {{ return 3; }}\n" for name in dir(known)
+                              if stubs and name.startswith(f"fmi{version}") and f"{name}(" not in SOURCE.read_text()))
+    subprocess.run(["cc", "-shared", "-fPIC", "-w", "-o", library, *flags, SOURCE, others], check=True)
     scalars = ""
     for i, (name, causality, variability) in enumerate(_VARIABLES, 1):
         start = "" if causality == "output" else ' start="0"'

@@ -137,7 +137,7 @@ def test_a_unit_that_breaks_ends_the_run_with_a_verdict_and_a_readable_log(
 
 
 REFUSED = {
-    "another platform": ({"platform": "win64"}, "it has only win64"),
+    "another platform": ({"platform": "win64"}, "slide.so; it has only binaries/win64/slide.so"),
     "source code": ({"sources": True}, "it has none and source code: python -m fmpy compile slide.fmu"),
     "version": ({"fmi": "1.0"}, "fmiVersion: expected 2.0 or 3.0, not 1.0"),
     "model exchange": ({"kind": "ModelExchange"}, "an FMU for co-simulation; this one is for model exchange only"),
@@ -161,6 +161,7 @@ MAPS = {  # replaced in SLIDE
     "no variable": ('"slide.x"', '"slide.y"', "a variable of slide.fmu, not 'slide.y'; did you mean slide.x?"),
     "wrong way": ('variable = "u"', 'variable = "slide.x"', "a variable that is input; slide.x is output"),
     "unit": ('count = "1 mm"', 'count = "1 bar"', "not 'bar'"),
+    "noise": ('noise = "1 um"', 'noise = "1 bar"', "plant.outputs.ram_position.noise: expected one of m,"),
     "key": ("[plant.inputs]", "[plant.input]", "plant.input: expected one of file, seed, inputs, outputs, parameters"),
     "two drives": ('load_force = {', 'torque = {', "one signal that drives the plant"),
     "no dot": ('drive.damping = "d"', 'damping = "d"', "GROUP.NAME = VARIABLE"),
@@ -173,6 +174,20 @@ def test_a_wrong_map_is_refused_with_its_line(folder: Path, name: str) -> None:
     old, new, expected = MAPS[name]
     Path("slide.toml").write_text(SLIDE.replace(old, new))
     assert expected in refuse("simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
+
+
+@pytest.mark.parametrize("version", ["2", "3"])
+def test_a_unit_may_lack_functions_that_nobody_calls_and_may_exist_once(folder: Path, version: str) -> None:
+    """FMPy looks for all functions of the interface; a unit that may exist once is reset between runs."""
+    build_fmu(Path("slide.fmu"), version, unit='canBeInstantiatedOnlyOncePerProcess="true"', stubs=False)
+    answer("simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
+    assert answer("compare", "run.csv", "--model", "slide.toml")["verdict"] == "WITHIN_FLOOR"
+
+
+def test_a_drive_of_its_own_has_no_limit_of_the_shipped_actuator(folder: Path) -> None:
+    build_fmu(Path("slide.fmu"))
+    Path("own.toml").write_text(SLIDE.replace("current =", "torque =").replace("1 mA", "1 N m"))
+    assert load_model("own.toml")["controller.current_limit"] > 1e6
 
 
 def test_without_a_map_the_answer_lists_the_variables(folder: Path) -> None:
