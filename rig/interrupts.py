@@ -1,10 +1,13 @@
 """Ctrl-C and SIGTERM: a run is asked to stop, so that its clean-up can bring the machine to rest."""
 
 import contextlib
+import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import Any
 
 
 @contextlib.contextmanager
@@ -18,6 +21,19 @@ def ignore_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def repeat_lost_interrupts() -> None:
+    """Ctrl-C comes once more where Python ignores exceptions, as in the locks of imports: a command would go on."""
+    report = sys.unraisablehook
+
+    def hear(lost: Any) -> None:
+        if issubclass(lost.exc_type, KeyboardInterrupt):  # later: an exception in here is ignored as well
+            threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
+        else:
+            report(lost)
+
+    sys.unraisablehook = hear
 
 
 @contextlib.contextmanager

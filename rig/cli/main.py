@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 from plant.errors import RigError, escape_control_characters
 from rig.cli.answer import discard_output
 from rig.cli.command_list import COMMANDS, OF_EVERY_COMMAND, add_options, find_work
+from rig.interrupts import repeat_lost_interrupts
 
 FIRST_STEPS = """\
 rig tests the controller of an electrohydraulic actuator and analyses its recordings. To begin:
@@ -82,6 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     gc.set_threshold(50_000)  # 0.05 s less: most objects are made while modules load, and stay
     leave_out_reader(sys.argv[1:])
     keep_memory()
+    repeat_lost_interrupts()
     known: list[int] = []
     atexit.register(leave_quickly, known)
     known.append(run_command_line(sys.argv[1:]))

@@ -130,6 +130,24 @@ def test_a_second_ctrl_c_ends_it_and_the_log_is_closed_all_the_same(tmp_path: Pa
     assert Trace.read(tmp_path / "out", all=True).events[-1].text == "end"
 
 
+def test_ctrl_c_is_not_lost_where_python_ignores_exceptions() -> None:
+    """As in the locks of imports, in which a command spends much of its first second."""
+    program = """if True:
+        import os, signal, time
+        from rig.interrupts import repeat_lost_interrupts
+        class Lock:
+            def __del__(self):
+                os.kill(os.getpid(), signal.SIGINT)
+        repeat_lost_interrupts()
+        try:
+            Lock()
+            time.sleep(60.0)
+        except KeyboardInterrupt:
+            print("heard")"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=50.0, check=False)
+    assert (done.stdout, done.stderr) == ("heard\n", "")
+
+
 def test_runs_without_a_folder_get_new_ones(short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     traces = [rig("run", short, "--json").json["trace"] for _ in range(2)]

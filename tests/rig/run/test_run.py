@@ -361,15 +361,24 @@ def test_a_node_that_dies_is_named_and_the_run_ends(tmp_path: Path, name: str, s
 
 @pytest.mark.parametrize("pace", ["lockstep", "realtime"])
 def test_ctrl_c_at_a_terminal_reaches_the_rig_alone(tmp_path: Path, pace: str) -> None:
-    """A terminal interrupts all its processes; clean-up needs the plant."""
-    where = spec("udp_multicast")
-    (tmp_path / "long.toml").write_text(LONG)
-    process = started("run", tmp_path / "long.toml", "--bus", where, "--out", tmp_path, "--quiet", "--pace", pace,
-                      "--max-overruns", 1, start_new_session=True)
-    await_main(where, process)  # on a new machine the cycle is compiled first
-    os.killpg(process.pid, signal.SIGINT)
-    assert finished(process).status == 130 and gone(where)
-    trace = Trace.read(tmp_path, all=True)
+    """A terminal interrupts all its processes; clean-up needs the plant. Where the machine stands still, bring-up takes
+    so many cycles that it is interrupted instead: then once more.
+    """
+    where, (folder, *others) = spec("udp_multicast"), [tmp_path / str(number) for number in range(5)]
+    while True:
+        folder.mkdir()
+        (folder / "long.toml").write_text(LONG)
+        process = started("run", folder / "long.toml", "--bus", where, "--out", folder, "--quiet", "--pace", pace,
+                          "--max-overruns", 1, start_new_session=True)
+        await_main(where, process)  # on a new machine the cycle is compiled first
+        os.killpg(process.pid, signal.SIGINT)
+        assert finished(process).status == 130 and gone(where)
+        if messages(folder):
+            break
+        if not others:
+            pytest.skip("not measured: this machine stood still in each of five runs")
+        folder, *others = others
+    trace = Trace.read(folder, all=True)
     cleanup = int((trace.phase == CLEANUP).sum())
     if pace == "lockstep":
         assert cleanup == 50 and not np.isnan(trace.xj).any()
