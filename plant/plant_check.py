@@ -107,7 +107,7 @@ def _check_readings(plant: Plant, require: Callable[[bool, str, str], None]) -> 
             "the new State and the memories, return State(...), m")
     with explain_errors(str(plant.file), "moves"):
         share = plant.find_share_moved(plant.move)
-    require(share == 0.0 or 0.5 <= share <= 2.0, "moves", f"a move of {names[0]} by the distance in "
+    require(share == 1.0, "moves", f"a move of {names[0]} by the distance in "
             f"{plant.signals.controlled.unit}, not by {share:.3g} times that")
 
 

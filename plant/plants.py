@@ -269,11 +269,11 @@ class Plant:
         """
         if callable(self.moves):
             return self.moves
-        share = self.find_share_moved(write_mover(self.state, self.moves))
-        return write_mover(self.state, self.moves, 1.0 if share == 0.0 or 0.5 <= share <= 2.0 else 1.0 / share)
+        return write_mover(self.state, self.moves, 1.0 / self.find_share_moved(write_mover(self.state, self.moves)))
 
     def find_share_moved(self, move: Function) -> float:
-        """How far a move changes the reading of the controlled signal, over the distance; 0 where that follows later.
+        """How far a move changes the reading of the controlled signal, over the distance; 1 for whatever is within a
+        factor of two of it, as in a bent linkage, and where the reading follows later.
 
         The distance is a tenth of the largest demand of the nominal test, from rest.
         """
@@ -281,7 +281,8 @@ class Plant:
 
         start, p = self.state(), build_bare_model(self.key).build_record()[0]
         distance = 0.1 * (float(np.abs(build_profile(self.profile).command).max()) if self.profile else 0.0) or 1e-3
-        return float(self.measure(move(start, distance, p), p)[0] - self.measure(start, p)[0]) / distance
+        share = float(self.measure(move(start, distance, p), p)[0] - self.measure(start, p)[0]) / distance
+        return 1.0 if share == 0.0 or 0.5 <= share <= 2.0 else share
 
     @cached_property
     def _functions(self) -> dict[str, Function]:
