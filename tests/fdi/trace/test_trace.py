@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from changed_logs import write_bomb
 from mcap.writer import CompressionType, IndexType, Writer
+from places import SUPPORT
 from refusals import catch_refusal
+from rig_command import Said
 from synthetic_run import ATTACHMENTS, build_command, record_run
 
 from fdi.trace.mcap_log import Log, open_log
@@ -242,28 +244,39 @@ def test_a_log_of_an_earlier_version_has_no_feedback_times(tmp_path: Path, monke
 MEMORY = 1 << 30  # bytes of address space: the program itself takes a third of it
 
 
-def rig_with_little_memory(*words: object) -> subprocess.CompletedProcess[str]:
-    """The command in a process that may not have more than MEMORY."""
+PLAYED = """
+import json, sys
+from rig_command import rig
+print(json.dumps([rig(*words) for words in json.load(sys.stdin)]))
+"""
+
+
+def rig_with_little_memory(*commands: tuple[object, ...]) -> list[Said]:
+    """Commands, one after the other, in a process that may not have more than MEMORY."""
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
 
-    return subprocess.run([sys.executable, "-m", "rig.cli.main", *map(str, words)], preexec_fn=limit, text=True,
-                          capture_output=True, timeout=120, env={"OPENBLAS_NUM_THREADS": "1", "PATH": "/usr/bin:/bin"})
+    done = subprocess.run([sys.executable, "-c", PLAYED], preexec_fn=limit, text=True, capture_output=True, timeout=120,
+                          input=json.dumps(commands, default=str),
+                          env={"OPENBLAS_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "PYTHONPATH": str(SUPPORT)})
+    assert done.returncode == 0, (commands, done)
+    return [Said(*said, words) for said, words in zip(json.loads(done.stdout), commands, strict=True)]
 
 
-def refused(said: subprocess.CompletedProcess[str]) -> bool:
-    """Whether a command reported bad input in one line."""
-    return said.returncode == 2 and said.stderr.count("\n") == 1 and not said.stdout and "Memory" not in said.stderr
+def assert_refused(*commands: tuple[object, ...]) -> None:
+    """Each of the commands reports bad input in one line."""
+    for said in rig_with_little_memory(*commands):
+        assert (said.status, said.err.count("\n"), said.out) == (2, 1, ""), said.words
+        assert "Memory" not in said.err
 
 
 @pytest.mark.parametrize("kind", ["attachment", "record", "one chunk", "lying chunk", "many chunks",
                                   "one chunk indexed often"])
 def test_a_small_log_does_not_take_gigabytes(kind: str, tmp_path: Path) -> None:
     log = write_bomb(tmp_path / "trace.mcap", kind)
-    for words in (("report", log), ("export", log, "--out", tmp_path / "x.log")):  # messages by topic, and one by one
-        assert refused(said := rig_with_little_memory(*words)), (words, said)
-    said = rig_with_little_memory("recover", log)  # keeps what is sound, if there is anything
-    assert said.returncode in (0, 2) and "Traceback" not in said.stderr, said
+    assert_refused(("report", log), ("export", log, "--out", tmp_path / "x.log"))  # messages by topic, and one by one
+    said, = rig_with_little_memory(("recover", log))  # keeps what is sound, if there is anything
+    assert said.status in (0, 2), said
 
 
 def test_a_packed_table_does_not_take_gigabytes(tmp_path: Path) -> None:
@@ -273,8 +286,7 @@ def test_a_packed_table_does_not_take_gigabytes(tmp_path: Path) -> None:
     long_table.write_bytes(gzip.compress(b"t,com,xj,cor\n" + row))
     for table in (long_line, long_table):
         assert table.stat().st_size < 1_000_000
-        assert refused(said := rig_with_little_memory("report", table)), said
-        assert refused(said := rig_with_little_memory("simulate", "--command", table)), said
+        assert_refused(("report", table), ("simulate", "--command", table))
 
 
 def test_numbers_of_cycles_do_not_take_gigabytes(tmp_path: Path) -> None:
@@ -289,10 +301,9 @@ def test_brackets_do_not_end_the_program(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text(f"title = {deep}")
     (tmp_path / "keys.toml").write_text("title" + ".a" * 5_000 + " = 1")
     (tmp_path / "a.json").write_text(json.dumps({"points": 0}).replace("0", "[" * 200_000 + "]" * 200_000))
-    for words in (("simulate", "--model", "m.toml"), ("run", "s.toml"), ("run", "keys.toml"), ("trend", "a.json"),
-                  ("fdi", "t.csv", "--bands", "m.toml"), ("campaign", "m.toml")):
-        said = rig_with_little_memory(*(tmp_path / word if "." in word else word for word in words))
-        assert refused(said), (words, said)
+    assert_refused(*(tuple(tmp_path / word if "." in word else word for word in words) for words in (
+        ("simulate", "--model", "m.toml"), ("run", "s.toml"), ("run", "keys.toml"), ("trend", "a.json"),
+        ("fdi", "t.csv", "--bands", "m.toml"), ("campaign", "m.toml"))))
 
 
 def test_gzip_is_unpacked_up_to_its_limit() -> None:
