@@ -18,7 +18,7 @@ from synthetic_run import ATTACHMENTS, METADATA, build_cycles, record_run
 from fdi.trace.mcap_log import open_log
 from plant.errors import InputError
 from rig.network.frame import Frame
-from rig.recorder import U32, CanFrame, Event, NmtState, Recorder, RecorderError, Signals, Timing
+from rig.recorder import U32, CanFrame, Event, NmtState, Recorder, RecorderError
 from rig.recorder.schema import TOPICS, encode_schema, make_packer
 
 VALUES: dict[Any, st.SearchStrategy[Any]] = {
@@ -80,25 +80,6 @@ def test_chunks_are_closed_in_time_behind_attachments_and_metadata(log: Path) ->
     first = min(c.chunk_start_offset for c in summary.chunk_indexes)
     assert all(a.offset < first for a in summary.attachment_indexes)
     assert min(m.offset for m in summary.metadata_indexes) < first
-
-
-def test_cost_of_a_cycle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Processor time of both threads for 6 frames, signals and timing, told; and what they take on the disk."""
-    run = [(k * 1_000_000, [Frame(k * 1_000_000, 0x183, k.to_bytes(8, "little"))] * 6,
-            Signals(k, 1, k * 1e-7, 1.1e-3, 4e-3, 1e6, k * 1e-9, 0.0, 7, 15, 0), Timing(k, False, 1e-5, 2e-4, 3e-4))
-           for k in range(5000)]
-    recorder = Recorder(tmp_path / "trace.mcap", {}, {})
-    start = time.process_time()
-    for t_ns, frames, signals, timing in run:
-        for frame in frames:
-            recorder.frame(frame)
-        recorder.cycle(t_ns, signals, timing)
-    recorder.close()
-    cost = (time.process_time() - start) / 5000
-    with capsys.disabled():
-        size = (tmp_path / "trace.mcap").stat().st_size
-        print(f"\nlog: {cost * 1e6:.0f} us a cycle of 8 messages, {size / 40_000:.0f} bytes a message")
-    assert size / 40_000 < 40.0
 
 
 def _until_it_fails(recorder: Recorder) -> RecorderError:

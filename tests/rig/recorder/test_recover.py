@@ -1,74 +1,14 @@
 """A log whose writer was killed comes back, up to the last half second."""
 
-import os
-import re
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from places import ROOT, SUPPORT
-from synthetic_run import ATTACHMENTS, METADATA, record_run
+from synthetic_run import record_run
 
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from rig.recorder.recover import recover_log
-
-WRITER = """
-import sys, time
-from pathlib import Path
-from synthetic_run import ATTACHMENTS, METADATA, build_cycles
-from rig.recorder import Recorder
-run = list(build_cycles())
-recorder = Recorder(Path(sys.argv[1]), ATTACHMENTS, METADATA)
-start = time.monotonic_ns()
-for t_ns, frames, signals, timing in run:
-    time.sleep(max(0.0, (start + t_ns - time.monotonic_ns()) * 1e-9))
-    for frame in frames:
-        recorder.frame(frame)
-    recorder.cycle(t_ns, signals, timing)
-    print(t_ns, flush=True)
-"""
-
-
-def test_kill_9_in_mid_run_loses_at_most_half_a_second(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A writer that itself stood still just then loses more: the best of five counts."""
-    for attempt in range(5):
-        (tmp_path / str(attempt)).mkdir()
-        lost = lose_end(tmp_path / str(attempt), capsys)
-        if lost <= 0.5:
-            return
-    pytest.fail(f"{lost:.3f} s lost")
-
-
-def lose_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> float:
-    """Kill a writer in mid run and recover its log; how much was lost, s."""
-    broken, out = tmp_path / "trace.mcap", tmp_path / "recovered.mcap"
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(SUPPORT), *sys.path])}
-    with (tmp_path / "times").open("w") as times:
-        process = subprocess.Popen([sys.executable, "-c", WRITER, str(broken)], stdout=times, env=env)
-        deadline = time.monotonic() + 120
-        while (tmp_path / "times").stat().st_size < 25_000 and time.monotonic() < deadline:
-            time.sleep(0.05)  # some 2.3 s into the run
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-    reached = int((tmp_path / "times").read_text().rsplit("\n", 2)[-2])
-    with pytest.raises(InputError, match="rig recover"):
-        Trace.read(broken)
-    salvage = recover_log(broken, out)
-    trace = Trace.read(out, all=True)
-    lost = reached * 1e-9 - (trace.t[-1] - trace.t[0])
-    with capsys.disabled():
-        print(f"\nkill -9 after {reached * 1e-9:.2f} s: {lost:.3f} s lost")
-    assert reached > 2_000_000_000 and lost > -0.002
-    assert not salvage.complete and salvage.cycles == len(trace) and not trace.gaps
-    assert trace.attachments == {name: data for name, (_, data) in ATTACHMENTS.items()}
-    assert METADATA.items() <= dict(trace.provenance).items()
-    assert re.search(r"kept \d+ messages, .* lost \d+ bytes", str(salvage))
-    return float(lost)
 
 
 @pytest.fixture(scope="module")
@@ -124,10 +64,3 @@ def test_refusals(whole: Path, tmp_path: Path) -> None:
         recover_log(tmp_path / "none.mcap", tmp_path / "out.mcap")
     with pytest.raises(InputError, match="another file"):
         recover_log(whole, whole)
-
-
-def test_a_message_record_is_taken_apart_in_one_place() -> None:
-    root = ROOT
-    readers = [path for folder in ("fdi", "rig/recorder") for path in (root / folder).rglob("*.py")
-               if "unpack_from" in path.read_text()]
-    assert [path.relative_to(root).as_posix() for path in readers] == ["fdi/trace/mcap_log.py"]
