@@ -2,6 +2,7 @@
 
 import os
 import pkgutil
+import re
 import signal
 import subprocess
 import sys
@@ -38,18 +39,20 @@ def test_the_command_list_agrees_with_the_modules() -> None:
     assert list(COMMANDS) == sorted(COMMANDS)
 
 
-@pytest.mark.parametrize("command", ["", *COMMANDS])
-def test_help_imports_no_heavy_package(command: str) -> None:
+def test_help_imports_no_heavy_package() -> None:
     """Help is quick because neither the plant nor any library is imported for it."""
-    source = ("import sys; from rig.cli.main import run_command_line\n"
-              "try: run_command_line(sys.argv[1:])\n"
-              "finally: print(*{name.partition('.')[0] for name in sys.modules})")
-    done = subprocess.run([sys.executable, "-c", source, *([command] if command else []), "--help"],
-                          capture_output=True, text=True)
-    *text, last = done.stdout.splitlines()
-    packages = set(last.split())
-    assert "rig" in packages and (done.returncode, done.stderr) == (0, "") and len(text) > 4
-    assert not command or {"--json", "--out", "--quiet"} <= set(" ".join(text).replace(",", " ").split())
+    source = ("import contextlib, sys; from rig.cli.main import run_command_line\n"
+              "for words in ([], *([name] for name in sys.argv[1:])):\n"
+              "    with contextlib.suppress(SystemExit): run_command_line([*words, '--help'])\n"
+              "    print('', *{name.partition('.')[0] for name in sys.modules}, sep='\\0')")
+    done = subprocess.run([sys.executable, "-c", source, *COMMANDS], capture_output=True, text=True, check=True)
+    *pages, last = re.split(r"\0.*\n", done.stdout)
+    assert (len(pages), last, done.stderr) == (1 + len(COMMANDS), "", "")
+    for number, page in enumerate(pages):
+        assert len(page.splitlines()) > 4
+        assert not number or {"--json", "--out", "--quiet"} <= set(page.replace(",", " ").split())
+    packages = set(done.stdout.splitlines()[-1].split("\0"))
+    assert "rig" in packages
     assert packages.isdisjoint({"numpy", "numba", "scipy", "matplotlib", "can", "canopen", "mcap", "rich", "google"})
 
 
@@ -58,7 +61,8 @@ def test_results_stay_where_no_run_comes_about(short: Path, tmp_path: Path) -> N
     folder = tmp_path / "done"
     assert rig("run", short, "--out", folder, "--quiet").status == 0
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert rig("run", short, "--out", folder, "--bus", "udp_multicast:239.74.9.9", "--plant", "external").status == 2
+    alone = ("--bus", "udp_multicast:239.74.9.9", "--plant", "external")
+    assert "node 3 plant does not answer" in refuse("run", short, "--out", folder, *alone)
     assert "overwritten" in refuse("run", "--from", folder / "trace.mcap", "--out", folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
@@ -69,12 +73,6 @@ def test_a_run_that_passes(short: Path, tmp_path: Path) -> None:
     assert told.keys() >= RUN_KEYS and told["timing"].keys() >= TIMING_KEYS
     assert told["timing"]["response_us"].keys() == {"p50", "p99", "p99_9", "max"}
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["report.html", "trace.mcap", "verdict.json"]
-
-
-def test_a_run_that_fails(short: Path, tmp_path: Path) -> None:
-    told = answer("run", short, "--out", tmp_path / "out", "--set", "filter.clogging=0.9", status=1)
-    assert told["verdict"] == "FAIL"
-    assert [check["name"] for check in told["checks"] if not check["passed"]] == ["overshoot"]
 
 
 def test_brackets_in_names_are_brackets(tmp_path: Path) -> None:

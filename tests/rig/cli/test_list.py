@@ -86,8 +86,6 @@ def test_names_that_options_take(kind: str, begin: str, names: list[str], tmp_pa
 @pytest.mark.skipif(importlib.util.find_spec("argcomplete") is None, reason="no argcomplete (extra shell)")
 @pytest.mark.parametrize(("line", "expected"), [
     ("rig con", {"conformance"}), ("rig run --set filter.c", {"filter.clogging="}),
-    ("rig run pref", {"preflight", "preflight_ema"}),
-    ("rig run --model eh", {"eha", "ehs"}), ("rig list para", {"parameters"}),
     ("rig compare --rep", {"--repeat", "--report"})])
 def test_the_answer_to_the_shell(line: str, expected: set[str], tmp_path: Path) -> None:
     answer = tmp_path / "answer"

@@ -71,7 +71,8 @@ def test_impossible_places(sources: dict[str, Path], tmp_path: Path, command: st
 @pytest.mark.parametrize(("words", "out"), [
     (["view", "{log}", "--save", "{out}"], "log"), (["view", "{log}", "--headless", "--screenshot", "{out}"], "log"),
     (["report", "{log}", "--out", "{out}"], "log"), (["report", "{csv}", "--out", "{out}"], "csv"),
-    (["export", "{csv}", "--out", "{out}"], "csv"), (["recover", "{log}", "--out", "{out}"], "log")])
+    (["export", "{csv}", "--out", "{out}"], "csv"), (["recover", "{log}", "--out", "{out}"], "log"),
+    (["simulate", "--command", "{command}", "--out", "{out}"], "command")])
 def test_the_source_is_not_written_over(sources: dict[str, Path], words: list[str], out: str) -> None:
     assert "expected another file than the one that is read" in _refused(words, sources, sources[out])
 
@@ -171,20 +172,6 @@ def test_a_ramp_and_a_step_keep_their_seconds(period: float, tmp_path: Path) -> 
     speed = np.polyfit(run["t"][late & (run["t"] < 0.3)], run["xj"][late & (run["t"] < 0.3)], 1)[0]
     assert speed == pytest.approx(5e-3, rel=0.02)
     assert run["xj"][-1] == pytest.approx(2.5e-3, abs=50e-6)
-
-
-def test_rows_at_the_models_period_are_the_command(tmp_path: Path) -> None:
-    com = np.random.default_rng(0).standard_normal(50) * 1e-3
-    t = np.arange(50) * 0.002
-    run = simulated(tmp_path, "--command", written(tmp_path, t, com, 1e5 * com), "--set=controller.period=0.002")
-    assert (run["com"] == com).all() and run["t"] == pytest.approx(t)
-
-
-def test_the_command_file_is_never_overwritten(tmp_path: Path) -> None:
-    file = written(tmp_path, np.arange(50) / 1000, np.zeros(50), np.zeros(50))
-    before = file.read_text()
-    assert "another file than the one that is read" in refuse("simulate", "--command", file, "--out", file)
-    assert file.read_text() == before
 
 
 @pytest.mark.parametrize(("period", "every"), [(0.001, 1), (0.002, 2), (0.01, 10)])
