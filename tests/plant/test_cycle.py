@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from plant import Actuator, Model, simulate
-from plant.run import Columns
+from plant import Actuator, Model
 from plant.segments import Array
 
 QUIET = Model().replace({f"sensors.{name}_noise": 0.0 for name in ("position", "pressure", "spool")})
@@ -28,22 +27,3 @@ def test_a_current_moves_the_plant_as_the_same_current_held_on_the_usual_cycle(p
     slow = play(longer, current, load)
     fast = play(shorter, np.repeat(current, every), np.repeat(load, every))
     assert slow == fast[::every]
-
-
-def simulate_ramp(period: float) -> Columns:
-    """The closed loop on a smooth command, every 10 ms."""
-    t = np.arange(round(0.6 / period)) * period
-    gain = 0.25 * QUIET["controller.proportional_gain"]  # with all of it the loop is unstable at 10 ms
-    model = QUIET.replace({"controller.period": period, "controller.proportional_gain": gain})
-    run = simulate(model, 1e-3 * np.sin(2 * np.pi * 2.0 * t))
-    return Columns(*(column[::round(10e-3 / period)] for column in run))
-
-
-def test_the_closed_loop_differs_by_its_sampling_alone() -> None:
-    """The delay of one cycle and a half grows with the cycle, and so does the difference to a fast controller."""
-    usual, errors = simulate_ramp(1e-3), []
-    for period in CYCLES:
-        slow = simulate_ramp(period)
-        np.testing.assert_allclose(slow.com, usual.com, atol=1e-15)
-        errors.append(float(np.abs(slow.xj - usual.xj).max()))
-    assert errors[0] < errors[1] < errors[2] < errors[3] < 0.1e-3, errors

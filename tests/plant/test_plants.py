@@ -12,7 +12,6 @@ from refusals import catch_refusal
 from rig_command import rig
 
 from plant import Model, load_model, simulate
-from plant.kernels import list_state_values, make_packers
 from plant.lanes import Lanes
 from plant.plant_check import MOST_STEP_ERROR, check_behaviour, rms
 from plant.plants import list_plants, load_plant
@@ -84,17 +83,6 @@ def test_half_the_step_changes_little(model: Model) -> None:
         a, b = getattr(once, s.name), getattr(finer, s.name)
         noise = model.values.get(s.noise, 0.0)
         assert rms(a - b) <= MOST_STEP_ERROR * max(np.ptp(a), noise), s.name
-
-
-def test_states_are_packed_and_unpacked(model: Model) -> None:
-    every = model.with_effects(e.name for e in model.kind.list_effects())
-    start = every.kind.build_start(every.effects)
-    pack, unpack = make_packers(start)
-    array = np.zeros(len(list_state_values(start)))
-    pack(start, array)
-    assert array.tolist() == list_state_values(start) and list_state_values(unpack(array)) == array.tolist()
-    counted = array + np.arange(len(array))
-    assert list_state_values(unpack(counted)) == counted.tolist()
 
 
 def test_effects_at_their_off_values_change_nothing(model: Model) -> None:

@@ -22,7 +22,7 @@ from fdi.comparison.residuals import (
     map_deviation,
     name_shape,
 )
-from fdi.estimation.replay import differentiate, read_cycles
+from fdi.estimation.replay import read_cycles
 from fdi.trace.trace import Trace
 from plant import Model
 
@@ -41,20 +41,6 @@ def m(c: Trace) -> Motion:
 
 def squares(seed: int, rows: int, extra: np.ndarray) -> np.ndarray:
     return sample_noise(seed, rows)[:, 0] ** 2 / LEVELS[0] ** 2 + extra
-
-
-def test_derivatives_of_a_parabola() -> None:
-    k = np.arange(100.0)
-    x = 3.0 + 2.0 * k + 0.5 * k**2
-    assert differentiate(x, 21, 1)[20:80] == pytest.approx(2.0 + k[20:80])
-    assert differentiate(x, 21, 2)[20:80] == pytest.approx(np.ones(60))
-
-
-def test_motion_of_the_ram(c: Trace, m: Motion) -> None:
-    sine = (c.t > 9.1) & (c.t < 9.4)
-    assert m.v[sine] == pytest.approx(2 * np.pi * 3e-3 * np.cos(2 * np.pi * (c.t[sine] - 9.0 - 0.009)), abs=1.5e-3)
-    assert np.isinf(m.reversed_for[:400]).all()
-    assert m.reversed_for[9300] < 0.1  # just behind the sine's first crest
 
 
 @pytest.mark.parametrize(("chosen", "words"), [
