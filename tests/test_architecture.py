@@ -118,9 +118,14 @@ def tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text(), name(path))
 
 
+@cache
+def nodes(path: Path) -> list[ast.AST]:
+    return list(ast.walk(tree(path)))
+
+
 def imported(path: Path) -> Iterator[str]:
     """Absolute names of all modules that a file imports, wherever in the file."""
-    for node in ast.walk(tree(path)):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -169,7 +174,7 @@ def test_folders_import_only_lower_ones() -> None:
 
 def count_statements(path: Path) -> int:
     """Statements of a file's syntax tree, docstrings not counted."""
-    return sum(isinstance(node, ast.stmt) and not is_docstring(node) for node in ast.walk(tree(path)))
+    return sum(isinstance(node, ast.stmt) and not is_docstring(node) for node in nodes(path))
 
 
 def is_docstring(node: ast.stmt) -> bool:
@@ -188,7 +193,7 @@ def test_each_folder_keeps_its_budget() -> None:
 def test_private_names_stay_in_their_module() -> None:
     """What another module needs is public there, and has a docstring."""
     for path in MODULES:
-        found = [alias.name for node in ast.walk(tree(path)) if isinstance(node, ast.ImportFrom) for alias in node.names
+        found = [alias.name for node in nodes(path) if isinstance(node, ast.ImportFrom) for alias in node.names
                  if alias.name.startswith("_")]
         assert found == [], name(path)
 
@@ -280,7 +285,7 @@ def list_changing_fields(class_: ast.ClassDef) -> set[str]:
 def test_no_type_has_more_than_fifteen_fields_that_change() -> None:
     """Who has to keep more in mind cannot follow it."""
     for path in MODULES:
-        classes = [node for node in ast.walk(tree(path)) if isinstance(node, ast.ClassDef)]
+        classes = [node for node in nodes(path) if isinstance(node, ast.ClassDef)]
         assert {each.name: found for each in classes if len(found := list_changing_fields(each)) > 15} == {}, name(path)
 
 

@@ -21,14 +21,19 @@ LIBRARIES = {*sys.stdlib_module_names, "numpy", "scipy", "can", "canopen", "mcap
 FOREIGN = {*LIBRARIES, "resid", "array_split", "udp_multicast", "_asdict", "ro", "wo"}  # the last two: EDS
 
 
-def list_definitions(tree: ast.Module) -> Iterator[str]:
+@cache
+def list_nodes(source: str) -> list[ast.AST]:
+    """All nodes of the syntax tree of a file."""
+    return list(ast.walk(ast.parse(source)))
+
+
+def list_definitions(source: str) -> Iterator[str]:
     """Functions and classes, and the names that a module or a class assigns."""
-    for node in ast.walk(tree):
+    for node in list_nodes(source):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield node.name
-    for scope in ast.walk(tree):
-        if isinstance(scope, ast.Module | ast.ClassDef):
-            for statement in scope.body:
+        if isinstance(node, ast.Module | ast.ClassDef):
+            for statement in node.body:
                 if isinstance(statement, ast.Assign | ast.AnnAssign):
                     yield from (part.id for part in ast.walk(statement)
                                 if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store))
@@ -37,23 +42,23 @@ def list_definitions(tree: ast.Module) -> Iterator[str]:
 @cache
 def list_known_names() -> set[str]:
     """What Python, other programs and the project define, and the names of the project's files and folders."""
-    defined = {name for path in FILES for name in list_definitions(ast.parse(path.read_text()))}
+    defined = {name for path in FILES for name in list_definitions(path.read_text())}
     parts = {part for path in FILES for part in path.relative_to(ROOT).with_suffix("").parts}
     return {*dir(builtins), *keyword.kwlist} | FOREIGN | defined | parts
 
 
-def find_docstrings(tree: ast.Module) -> Iterator[ast.Constant]:
-    for node in ast.walk(tree):
+def find_docstrings(source: str) -> Iterator[ast.Constant]:
+    for node in list_nodes(source):
         if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module) and ast.get_docstring(node) is not None:
             first = node.body[0]
             assert isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant)
             yield first.value
 
 
-def list_words(tree: ast.Module) -> Iterator[str]:
+def list_words(source: str) -> Iterator[str]:
     """Names that the code of a file uses, and the words of its texts, which may be keys of files and messages."""
-    docstrings = set(find_docstrings(tree))
-    for node in ast.walk(tree):
+    docstrings = set(find_docstrings(source))
+    for node in list_nodes(source):
         if isinstance(node, ast.Name):
             yield node.id
         elif isinstance(node, ast.Attribute):
@@ -68,11 +73,10 @@ def list_words(tree: ast.Module) -> Iterator[str]:
 
 def find_unknown_names(source: str) -> list[str]:
     """Names in backticks in the docstrings and comments of a file that nothing defines or uses."""
-    tree = ast.parse(source)
-    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
-    texts = [str(node.value) for node in find_docstrings(tree)]
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline) if re.search("#.*`", source) else ()
+    texts = [str(node.value) for node in find_docstrings(source)]
     texts += [token.string for token in tokens if token.type == tokenize.COMMENT]
-    known = list_known_names() | set(list_words(tree))
+    known = list_known_names() | set(list_words(source))
     return [name for text in texts for name in NAME.findall(text) if not set(filter(None, name.split("."))) <= known]
 
 
