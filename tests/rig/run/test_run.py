@@ -11,6 +11,7 @@ import sys
 import time
 import weakref
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
@@ -320,9 +321,9 @@ def test_a_killed_run_loses_half_a_second_at_most(tmp_path: Path) -> None:
     assert min(lost) <= 500
 
 
-@pytest.mark.parametrize("is_external", [False, True])
-@pytest.mark.parametrize(("name", "source", "row"), [("controller", "node 2 controller", "cor"),
-                                                    ("plant", "node 3 plant", "xj")])
+@pytest.mark.parametrize(("name", "source", "row", "is_external"), [
+    ("controller", "node 2 controller", "cor", False),  # a plant of the rig's own that dies: test_live.py
+    ("controller", "node 2 controller", "cor", True), ("plant", "node 3 plant", "xj", True)])
 def test_a_node_that_dies_is_named_and_the_run_ends(tmp_path: Path, name: str, source: str, row: str,
                                                     is_external: bool) -> None:
     """In lockstep every cycle without answers would wait; the sequence has a minute to go, and wants the safe state.
@@ -386,12 +387,6 @@ def test_ctrl_c_at_a_terminal_reaches_the_rig_alone(tmp_path: Path, pace: str) -
         assert cleanup >= 50  # and what was held while the queue was discarded
 
 
-def test_an_external_node_that_does_not_answer(tmp_path: Path) -> None:
-    said = rig("run", "--bus", spec("udp_multicast"), "--controller", "external", "--plant", "external", "--out",
-               tmp_path)
-    assert said.status == 2 and "node 3 plant does not answer" in said.err
-
-
 def test_nodes_that_were_there_before_are_taken_and_left_alone(tmp_path: Path, reference: np.ndarray) -> None:
     """`rig node` twice, and a run that finds them."""
     where = spec("udp_multicast")
@@ -432,79 +427,44 @@ def test_the_memory_of_a_run_is_free_when_it_ends(
         gc.enable()
 
 
-@pytest.fixture
-def where() -> str:
-    """A bus of this test's own."""
-    return spec("udp_multicast")
-
-
-@pytest.fixture
-def plant(where: str) -> Iterator[None]:
-    """A plant emulator that somebody has started on it."""
-    process = started("node", "plant", "--bus", where)
-    try:
-        wait_for_node(where, PLANT)
-        yield
-        assert process.poll() is None
-    finally:
-        process.kill()
-        finished(process)
-
-
-@pytest.fixture
-def master(where: str) -> Iterator[Master]:
-    """The rig's end of the bus."""
+@contextmanager
+def open_master(where: str) -> Iterator[Master]:
+    """The rig's end of a bus."""
     clock = WallClock()
     wire = LinkWire(Link(open_can(where), clock.now), clock, 2.0)
     yield Master(wire, clock.now, False, load_bench())
     wire.close()
 
 
-def start_plant(where: str) -> NodeProcesses:
-    """The rig's own plant, about to load."""
-    processes = NodeProcesses()
-    words = ["node", "plant", "--bus", where, "--quiet", "--parent", str(os.getpid())]
-    processes.start(PLANT, [sys.executable, "-m", "rig.cli.main", *words], announces=True)
-    return processes
-
-
-@pytest.mark.usefixtures("plant")
-def test_a_second_node_of_a_number_does_not_start(where: str) -> None:
-    said = rig("node", "plant", "--bus", where)
+def test_a_second_node_of_a_number_does_not_start(bus_with_nodes: str) -> None:
+    said = rig("node", "plant", "--bus", bus_with_nodes)
     assert (said.status, said.err.count("\n")) == (2, 1)
-    assert f"{where}: a node 3 (plant) is on this bus already; stop it before you start another one" in said.err
+    assert f"{bus_with_nodes}: a node 3 (plant) is on this bus already; stop it before you start another" in said.err
 
 
-def test_our_own_plant_is_waited_for_until_it_is_on_the_bus(where: str, master: Master) -> None:
-    processes = start_plant(where)
-    try:
-        assert not participants.is_replaced(master, PLANT, processes)
-        assert not processes.find_ended()
-    finally:
-        processes.stop()
-
-
-@pytest.mark.usefixtures("plant")
-def test_a_plant_that_came_first_is_used_in_place_of_ours(where: str, master: Master) -> None:
+def test_a_plant_that_came_first_is_used_in_place_of_ours(bus_with_nodes: str) -> None:
     """On a slow machine a plant that the operator starts together with the run answers after the run has looked."""
-    processes = start_plant(where)
+    processes = NodeProcesses()
+    words = ["node", "plant", "--bus", bus_with_nodes, "--quiet", "--parent", str(os.getpid())]
+    processes.start(PLANT, [sys.executable, "-m", "rig.cli.main", *words], announces=True)
     try:
-        assert participants.is_replaced(master, PLANT, processes)
-        assert not processes.find_ended()  # its end is no trouble of the run
-        assert master.is_present(PLANT, 5.0)
+        with open_master(bus_with_nodes) as master:
+            assert participants.is_replaced(master, PLANT, processes)
+            assert not processes.find_ended()  # its end is no trouble of the run
+            assert master.is_present(PLANT, 5.0)
     finally:
         processes.stop()
 
 
-@pytest.mark.usefixtures("plant")
-def test_a_run_that_asks_for_its_own_plant_refuses_another_one(where: str, tmp_path: Path) -> None:
-    said = rig("run", "--bus", where, "--plant", "builtin", "--out", tmp_path)
+def test_a_run_that_asks_for_its_own_plant_refuses_another_one(bus_with_nodes: str, tmp_path: Path) -> None:
+    said = rig("run", "--bus", bus_with_nodes, "--plant", "builtin", "--out", tmp_path)
     assert said.status == 2
-    assert f"a node 3 plant is on {where} already: stop it, or say --plant external" in said.err
+    assert f"a node 3 plant is on {bus_with_nodes} already: stop it, or say --plant external" in said.err
 
 
-def test_a_node_of_ours_that_ends_is_no_node(where: str, master: Master) -> None:
+def test_a_node_of_ours_that_ends_is_no_node() -> None:
     processes = NodeProcesses()
     processes.start(CONTROLLER, [sys.executable, "-c", "raise SystemExit(2)"], announces=True)
-    with pytest.raises(BusError, match=r"our own controller did not start"):
+    with (open_master(spec("udp_multicast")) as master,
+          pytest.raises(BusError, match=r"our own controller did not start")):
         participants.is_replaced(master, CONTROLLER, processes)

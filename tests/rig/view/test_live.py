@@ -2,6 +2,7 @@
 
 import fcntl
 import importlib.util
+import json
 import math
 import os
 import pty
@@ -21,7 +22,7 @@ import numpy as np
 import pytest
 from recording_rows import read_recording
 from refusals import catch_refusal
-from rig_command import finished, grown, nodes_on, refuse, rig, started
+from rig_command import finished, gone, grown, nodes_on, refuse, rig, started
 from synthetic_run import build_cycles, record_run
 
 from fdi.trace.check_result import CheckResult
@@ -249,15 +250,6 @@ def require_restored(text: str) -> None:
                                                                         ("\x1b[?25l", "\x1b[?25h")))
 
 
-def test_screen_of_a_run(tmp_path: Path) -> None:
-    text, status = run_in_terminal(["--live", "--out", str(tmp_path / "run")])
-    frames = split_frames(text)
-    require_restored(text)
-    assert status == 0 and "PASS  Every check passed." in frames[-1] and "lockstep" in frames[-1]
-    assert text.index("\x1b[?1049l") < text.index("Every check passed")
-    assert any("Position [mm]" in frame for frame in frames[1:])
-
-
 def test_screen_follows_the_run_and_ctrl_c_restores_the_terminal(tmp_path: Path) -> None:
     """A run that lasts until all of it was seen, however slowly the screen is drawn."""
     sequence = tmp_path / "watched.toml"
@@ -281,7 +273,7 @@ def test_screen_follows_the_run_and_ctrl_c_restores_the_terminal(tmp_path: Path)
 
     text, status = run_in_terminal([str(sequence), "--live", "--out", str(tmp_path / "run")], look)
     require_restored(text)
-    assert (tmp_path / "run" / "verdict.json").exists()
+    assert text.index("\x1b[?1049l") < text.index("ABORTED") and (tmp_path / "run" / "verdict.json").exists()
     assert stopped and status == 130, {name: sorted(each)[:2] for name, each in seen.items()}
     assert "overshoot" in seen["passed"] and "position" in seen["measures"] and "position" not in seen["passed"]
 
@@ -308,7 +300,9 @@ def test_dead_node_is_announced_before_the_run_ends(tmp_path: Path) -> None:
     assert run.stderr.readline() == "rig run: node 3 plant: its process was ended by SIGKILL\n"
     assert run.poll() is None  # its report is still to come
     said = finished(run)
-    assert "ABORTED" in said.out and said.status == 1
+    cause = json.loads((tmp_path / "run" / "verdict.json").read_text())["cause"]
+    assert "ABORTED" in said.out and said.status == 1 and "SIGKILL" in cause["text"]
+    assert (cause["source"], cause["kind"]) == ("node 3 plant", "stopped") and gone(group)
 
 
 @pytest.mark.parametrize(("words", "line"), [
