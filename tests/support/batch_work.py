@@ -11,11 +11,6 @@ from plant.errors import InputError
 from plant.threads import count_threads
 
 
-def square(job: int) -> int:
-    """A pure function of the job."""
-    return job**2
-
-
 def square_of_deadly_job(job: tuple[int, str]) -> tuple[int, int]:
     """The square and the number of this process. The job's process dies first, if a file is named and not there yet.
 

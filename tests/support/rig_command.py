@@ -118,6 +118,14 @@ def nodes_on(where: str) -> list[int]:
     return found
 
 
+def is_running(pid: int) -> bool:
+    """Whether a process runs; one that has ended and that nobody has waited for does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 def gone(where: str, timeout: float = 60.0) -> bool:
     """Whether no node is left on that bus, within `timeout` s."""
     end = time.monotonic() + timeout

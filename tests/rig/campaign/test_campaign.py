@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from places import SUPPORT
 from refusals import catch_refusal
-from rig_command import answer, finished, grown, refuse, rig, started
+from rig_command import answer, finished, grown, is_running, refuse, rig, started
 
 from fdi.estimation.binomial import measure_share
 from fdi.report.terminal import format_report
@@ -27,7 +27,7 @@ from plant import InputError, Model, RigError
 from plant.effects import CATALOGUE
 from rig.campaign import batch, judge
 from rig.campaign import summary as campaign_summary
-from rig.campaign.batch import Batch, BatchProgress, RowFile, Workers, read_rows, run_batch, run_in_processes, run_jobs
+from rig.campaign.batch import BatchProgress, RowFile, Workers, run_in_processes, run_jobs
 from rig.campaign.judge import plan_batch, run_campaign
 from rig.campaign.summary import build_campaign_report
 from studies.hidden_effects.truth import SYMBOLS, has_compiler
@@ -379,13 +379,6 @@ def fail_test(job: object, reason: str) -> Any:
     raise AssertionError(f"{job}: {reason}")
 
 
-@pytest.mark.parametrize("workers", [Workers(), Workers(2), Workers(9)])
-def test_every_job_gives_its_result_once_wherever_it_is_done(workers: Workers) -> None:
-    jobs = list(range(5))
-    assert sorted(run_jobs(batch_work.square, jobs, workers, fail_test)) == [(job, job**2) for job in jobs]
-    assert list(run_jobs(batch_work.square, [], workers, fail_test)) == []
-
-
 def test_a_worker_that_dies_is_replaced_and_its_job_is_tried_again_until_it_has_failed(tmp_path: Path) -> None:
     jobs = [(0, ""), (1, str(tmp_path / "died")), (2, ""), (3, "always")]
     results = dict(run_in_processes(batch_work.square_of_deadly_job, jobs, 2, lambda job, reason: (-1, reason)))
@@ -413,14 +406,6 @@ def test_workers_are_limited_to_one_thread_on_demand(single_threaded: bool, thre
     assert results == {1: threads, 2: threads} and os.environ["OMP_NUM_THREADS"] == "5"
 
 
-def is_alive(pid: int) -> bool:
-    """Whether a process runs; one that has ended and waits for its parent does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0] != "Z"
-    except OSError:
-        return False
-
-
 @pytest.mark.parametrize("work", ["run_sleeping_process", "run_process_without_signals"])
 def test_an_interruption_ends_the_workers_and_the_processes_they_started(work: str, tmp_path: Path) -> None:
     command = [sys.executable, str(Path(batch_work.__file__)), work, str(tmp_path)]
@@ -430,11 +415,11 @@ def test_an_interruption_ends_the_workers_and_the_processes_they_started(work: s
         assert time.monotonic() < end and process.poll() is None
         time.sleep(0.05)
     pids = [int(word) for word in (tmp_path / "pids").read_text().split()]
-    assert all(is_alive(pid) for pid in pids)
+    assert all(is_running(pid) for pid in pids)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=300)
     assert (out, err) == ("interrupted\n", "")
-    assert not any(is_alive(pid) for pid in pids)
+    assert not any(is_running(pid) for pid in pids)
 
 
 def test_a_signal_that_is_lost_in_a_job_comes_again(tmp_path: Path) -> None:
@@ -447,30 +432,3 @@ def test_a_signal_that_is_lost_in_a_job_comes_again(tmp_path: Path) -> None:
         time.sleep(0.05)
     results.close()  # type: ignore[attr-defined]
     assert (tmp_path / "a").read_text() == (tmp_path / "b").read_text() == "lost, ended by 143"
-
-
-def make_batch(numbers: range, version: int = 1) -> Batch:
-    """Squares; a row counts for its version alone, and the square of 3 has failed."""
-    return Batch(jobs={number: number for number in numbers},
-                 work=lambda number: {"number": number, "square": number**2, "version": version}, key="number",
-                 describe_failure=fail_test, is_valid=lambda row: row["version"] == version,
-                 is_failed=lambda row: row["number"] == 3)
-
-
-def test_finished_jobs_are_not_done_again_and_rows_of_another_version_do_not_count(tmp_path: Path) -> None:
-    seen: list[BatchProgress] = []
-    path = tmp_path / "new" / "rows.jsonl"
-    with RowFile(path) as file:
-        run_batch(make_batch(range(2)), file, Workers(), seen.append)
-    with path.open("a") as out:
-        out.write('{"number": 2, "squ')  # as a kill in the middle of a write leaves it
-    with RowFile(path) as file:
-        rows = run_batch(make_batch(range(5)), file, Workers(), seen.append)
-    assert [row["square"] for row in rows.values()] == [0, 1, 4, 9, 16]
-    assert [(p.done, p.total, p.failed) for p in seen] == [(1, 2, 0), (2, 2, 0), (3, 5, 0), (4, 5, 1), (5, 5, 1)]
-    assert seen[-1].left == 0.0 and seen[-1].row == rows[4]
-    assert list(rows.values()) == read_rows(path)
-    assert len(path.read_text().splitlines()) == 6  # five rows and the truncated line, which stays as it is
-    with RowFile(path) as file:
-        run_batch(make_batch(range(3), version=2), file, Workers(), seen.append)
-    assert [(p.done, p.total) for p in seen[5:]] == [(1, 3), (2, 3), (3, 3)]
