@@ -7,7 +7,6 @@ NaN has no raw value and raises ValueError: no invented number is sent.
 """
 
 import struct
-from enum import IntFlag
 from typing import NamedTuple
 
 SYNC = 0x080
@@ -45,26 +44,6 @@ SIGNALS = (
     Signal(DRIVE, "status_word", 32, 16, False, 1, ""),
     Signal(DRIVE, "cycle", 48, 16, False, 1, ""),
 )
-
-
-class Control(IntFlag):
-    """Control word 0x6040 of CiA 408: all three level bits set = device mode active."""
-
-    DISABLE = 0x1  # D: 1 = not disabled
-    HOLD = 0x2  # H: 1 = hold released
-    MODE = 0x4  # M: 1 = device mode active, the loop is closed
-    RESET = 0x8  # R: a rising edge acknowledges a fault
-    ACTIVE = DISABLE | HOLD | MODE
-
-
-class Status(IntFlag):
-    """Status word 0x6041 of CiA 408: the level bits echo what is in force."""
-
-    DISABLE = 0x1
-    HOLD = 0x2
-    MODE = 0x4
-    READY = 0x8  # R: no fault
-    ACTIVE = DISABLE | HOLD | MODE | READY
 
 
 class Command(NamedTuple):
@@ -112,64 +91,24 @@ def _saturate(counts: float) -> int:
 
 # Counts per unit are whole numbers in binary while 1e-7 is not: multiply to encode and divide to decode, so that a raw
 # value decodes to the double nearest to its decimal (50000 -> 0.005) and survives the way there and back.
-def raw_position(metres: float) -> int:
-    """Counts of a position in m."""
-    return _saturate(metres * 1e7)
-
-
-def raw_pressure(pascals: float) -> int:
-    """Counts of a pressure in Pa."""
-    return _saturate(pascals / 10.0)
-
-
-def raw_spool(metres: float) -> int:
-    """Counts of a spool position in m."""
-    return _saturate(metres * 1e9)
-
-
-def raw_current(amperes: float) -> int:
-    """Counts of a current in A."""
-    return _saturate(amperes * 1e8)
-
-
-def position(raw: int) -> float:
-    """Metres of a position in counts."""
-    return raw / 1e7
-
-
-def pressure(raw: int) -> float:
-    """Pascals of a pressure in counts."""
-    return raw * 10.0
-
-
-def spool(raw: int) -> float:
-    """Metres of a spool position in counts."""
-    return raw / 1e9
-
-
-def current(raw: int) -> float:
-    """Amperes of a current in counts."""
-    return raw / 1e8
-
-
 def pack_command(position_demand: float, control: int, cycle: int) -> bytes:
     """Frame 0x202. `cycle` is taken modulo 2**16."""
-    return _LEVEL_WORDS.pack(raw_position(position_demand), control, cycle & 0xFFFF)
+    return _LEVEL_WORDS.pack(_saturate(position_demand * 1e7), control, cycle & 0xFFFF)
 
 
 def pack_feedback(ram_position: float, load_pressure: float) -> bytes:
     """Frame 0x183."""
-    return _LEVELS.pack(raw_position(ram_position), raw_pressure(load_pressure))
+    return _LEVELS.pack(_saturate(ram_position * 1e7), _saturate(load_pressure / 10.0))
 
 
 def pack_valve_state(spool_position: float, flags: int, cycle: int) -> bytes:
     """Frame 0x283. `cycle` is taken modulo 2**16."""
-    return _LEVEL_WORDS.pack(raw_spool(spool_position), flags, cycle & 0xFFFF)
+    return _LEVEL_WORDS.pack(_saturate(spool_position * 1e9), flags, cycle & 0xFFFF)
 
 
 def pack_drive(coil_current: float, status: int, cycle: int) -> bytes:
     """Frame 0x182. `cycle` is taken modulo 2**16."""
-    return _LEVEL_WORDS.pack(raw_current(coil_current), status, cycle & 0xFFFF)
+    return _LEVEL_WORDS.pack(_saturate(coil_current * 1e8), status, cycle & 0xFFFF)
 
 
 def unpack_command(data: bytes) -> Command:

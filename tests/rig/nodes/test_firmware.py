@@ -79,9 +79,9 @@ def test_the_law_is_the_models() -> None:
     for k in range(60):
         demand, position = 5e-3 * (k >= 10), 1e-4 * k
         drive = desk.cycle(ACTIVE, demand, position)
-        heard = codec.position(codec.raw_position(demand)), codec.position(codec.raw_position(position))
+        heard = [codec.unpack_feedback(codec.pack_feedback(metres, 0.0)).position for metres in (demand, position)]
         current, loop = compute_current(loop, *heard, GIVEN)
-        assert drive is not None and drive.current == codec.current(codec.raw_current(current))
+        assert drive is not None and drive == codec.unpack_drive(codec.pack_drive(current, drive.status, k))
 
 
 def test_the_integral_part_starts_anew_with_each_activation() -> None:
