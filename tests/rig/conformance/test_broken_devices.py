@@ -10,7 +10,6 @@ from broken_devices import (
     hear_instead,
     keep_values_over_reset,
     list_cases,
-    nothing,
     send_instead,
     skip_checks,
     wrap,
@@ -213,9 +212,3 @@ def test_reset_node_that_restores_no_application_object_is_found() -> None:
     """The plant has no such object that can be written, the controller has."""
     patch = wrap("od.restore", lambda device, old, first, last: old(first, min(last, 0x1FFF)))
     assert list_cases(examine(patch, 2)) == ["6.12"]
-
-
-@pytest.mark.parametrize("node", [2, 3])
-def test_without_a_defect_nothing_fails(node: int) -> None:
-    outcome = examine(nothing, node)
-    assert (list_cases(outcome), outcome.notes, outcome.verdict) == ([], [], "PASS")
