@@ -35,15 +35,6 @@ def test_every_case_has_the_same_bits_on_every_cpu(hashes: dict[str, dict[str, s
         assert cases == here, cpu
 
 
-def test_interpreted_is_compiled(hashes: dict[str, dict[str, str]]) -> None:
-    """The first cycles of the two agree."""
-    import cpu_plant_cases as cases
-
-    model = cases.activate_effects(cases.SOME)
-    fast, plain = cases.run_actuator(model, True), cases.run_actuator(model, False)
-    assert (fast[:len(plain)] == plain).all()
-
-
 def test_the_settings_reach_the_libraries(tmp_path: Path) -> None:
     """Without them nothing above would be tested: the machine code, and NumPy's and the C library's own exp, change."""
     program = tmp_path / "seen.py"
