@@ -13,7 +13,7 @@ from rig_command import Said, answer, refuse, rig
 from short_runs import HIDDEN, build_command, list_trace_arguments, write_measured_runs
 
 from fdi.discovery import update_model
-from fdi.estimation.fit import Value, list_active_effects, list_active_unknowns, list_all_unknowns
+from fdi.estimation.fit import Value
 from plant import Model, load_model
 from plant.effects import CATALOGUE
 
@@ -94,18 +94,6 @@ def test_a_users_effect_is_ranked_with_the_others(tmp_path: Path, monkeypatch: p
     assert (found["effects"], found["verdict"]) == (["own_spring"], "EXPLAINED")
     stiffness = found["candidates"][0]["parameters"]["own_spring.stiffness"]
     assert stiffness["low"] < 4e5 < stiffness["high"]
-
-
-def test_effects_of_a_model_are_free_from_where_they_are() -> None:
-    model = Model().replace({"null_bias.current": 1e-4, "spool.static_friction": 45.0, "spool.dynamic_friction": 30.0,
-                             "jack.mass": 101.0, "command_rate_limit.rate": 0.1})
-    assert set(list_active_effects(model)) == {"spool_friction", "null_bias", "command_rate_limit"}
-    own = {f.name: f for f in list_active_unknowns(model)}
-    assert set(own) == {"null_bias.current", "spool.static_friction", "spool.dynamic_friction"}
-    assert own["null_bias.current"].centre == 1e-4 and np.isinf(own["null_bias.current"].prior)
-    names = [f.name for f in list_all_unknowns(model)]
-    assert len(names) == len(set(names)) and {"jack.mass", "null_bias.current"} <= set(names)
-    assert not list_active_effects(Model()) and not list_active_unknowns(Model().with_effects(["null_bias"]))
 
 
 SHARED = SHARED / "practice"

@@ -19,7 +19,7 @@ from rig.sequences.sequence import parse_sequence
 from rig.suite.dry_run import make_dry_run
 from rig.testing.bench import Bench
 
-CYCLES = ("0.5", "1", "2", "5", "10")  # ms
+CYCLES = ("0.5", "2", "10")  # ms
 GAIN = 0.25 * Model()["controller.proportional_gain"]  # with all of it the loop is unstable at 10 ms
 PREFLIGHT = load_sequence("preflight")
 

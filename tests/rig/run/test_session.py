@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from effect_files import restored_catalogue
 from rig_command import SHORT, job, kinds, play, rig, stop_after
 
 from fdi.progress import ignore_progress
@@ -463,10 +464,8 @@ SIGNALS = ("com", "xj", "cor", "p12", "xs", "load")
 @pytest.fixture(autouse=True)
 def catalogue() -> Iterator[None]:
     """Each test has the shipped effects only, as a new process does."""
-    before = dict(CATALOGUE)
-    yield
-    CATALOGUE.clear()
-    CATALOGUE.update(before)
+    with restored_catalogue():
+        yield
 
 
 def same(a: Path, b: Path) -> bool:

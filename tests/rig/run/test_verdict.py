@@ -84,20 +84,6 @@ def test_without_checks_only_an_acceptable_diagnosis_is_a_pass(tmp_path: Path) -
     assert verdicts == ["PASS", "NOT_JUDGED"]
 
 
-def test_the_diagnosis_of_a_run_is_that_of_its_log(tmp_path: Path) -> None:
-    traces: list[Trace] = []
-
-    def keep(trace: Trace) -> dict[str, object]:
-        traces.append(trace)
-        return diagnosis("ACCEPTABLE")
-
-    run_job(job(SHORT), tmp_path, lambda stage, share: None, lambda: False, diagnose=keep)
-    logged = Trace.read(tmp_path)
-    for name in ("t", "com", "xj", "cor", "p12", "xs", "load"):
-        np.testing.assert_array_equal(traces[0].column(name), logged.column(name))
-    assert (traces[0].period, traces[0].provenance["seed"]) == (logged.period, logged.provenance["seed"])
-
-
 def test_a_clogged_filter_fails_a_run_with_fdi(tmp_path: Path) -> None:
     answer = rig("run", "--fdi", "--set", "filter.clogging=0.28", "--seed", "1", "--out", str(tmp_path / "run"))
     assert answer.status == 1
