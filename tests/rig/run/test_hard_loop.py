@@ -48,6 +48,7 @@ from rig.sequences.faults import (
 
 PERIOD = 10_000_000  # ns: ten times the bench's, because the nodes of this test are Python on a busy machine
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
+# what the bus is does not matter to these
 only_udp = pytest.mark.parametrize("bus_kind", ["udp_multicast"], indirect=True)
 
 
@@ -234,7 +235,7 @@ def test_rows_and_log(bus_kind: str, realtime: bool) -> None:
         assert compiled.buffer  # the listener hears
 
 
-@raw_kinds
+@only_udp
 @paces
 def test_commands_lost_and_late(bus_kind: str, realtime: bool) -> None:
     """A late command is sent before the first SYNC that is due after it."""
@@ -288,7 +289,7 @@ def test_commands_and_syncs_changed_by_faults(bus_kind: str) -> None:
             assert isnan(xj) or late
 
 
-@raw_kinds
+@only_udp
 @paces
 def test_the_rigs_heartbeat_can_be_dropped(bus_kind: str, realtime: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is off in the cycles of the fault and in no other; the nodes hear those that are in the log."""
@@ -310,7 +311,7 @@ def test_the_rigs_heartbeat_can_be_dropped(bus_kind: str, realtime: bool, monkey
         assert sum(frame.cob_id == 0x701 for frame in one.nodes.heard) == len(one.logged(0x701)) > 0
 
 
-@raw_kinds
+@only_udp
 def test_an_empty_queue_holds_the_last_demand(bus_kind: str) -> None:
     """And each such cycle counts as an overrun: the bench left its sequence."""
     with bench(bus_kind, True, ahead=10) as one:
@@ -323,7 +324,7 @@ def test_an_empty_queue_holds_the_last_demand(bus_kind: str) -> None:
         assert {row.control for row in one.rows} == {7}
 
 
-@raw_kinds
+@only_udp
 def test_waiting_for_the_end_of_the_queue_is_no_underrun(bus_kind: str) -> None:
     """Neither is the hold behind it."""
     with bench(bus_kind, True) as one:
@@ -343,7 +344,7 @@ def test_waiting_for_the_end_of_the_queue_is_no_underrun(bus_kind: str) -> None:
         assert set(phases[:10]) == {1} and set(phases[held:]) == {2}
 
 
-@raw_kinds
+@only_udp
 def test_the_control_word_is_overridden_and_hold_discards_what_is_queued(bus_kind: str) -> None:
     """An abort: no current from the next cycle on, and clean-up begins where the demand was."""
     with bench(bus_kind, True, ahead=500) as one:
@@ -390,7 +391,7 @@ def test_a_late_cycle_drops_due_times_and_counts_them(bus_kind: str) -> None:
         assert len(sent) == len(one.rows)
 
 
-@raw_kinds
+@only_udp
 def test_nodes_that_are_gone_do_not_hold_up_lockstep_for_long(bus_kind: str) -> None:
     """Five cycles wait for half a second, the others for a tenth of that."""
     with bench(bus_kind, False) as one:
@@ -408,7 +409,7 @@ def test_nodes_that_are_gone_do_not_hold_up_lockstep_for_long(bus_kind: str) -> 
         assert answers and 24.5e-6 < answers[0] < (played - 0.5) * 1e-6
 
 
-@raw_kinds
+@only_udp
 def test_lockstep_waits_for_the_answer_to_a_second_sync(bus_kind: str) -> None:
     """Else its feedback, which has no number, would be that of the next cycle."""
     with bench(bus_kind, False, Duplicated(frame="sync", start=0.002, end=0.003)) as one:
