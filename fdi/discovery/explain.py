@@ -49,6 +49,7 @@ from fdi.estimation.replay import (
     find_controller_gain,
     find_undecided_rows,
     find_unpredictable_rows,
+    has_controller_memory,
 )
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (
@@ -529,9 +530,14 @@ def measure_firmware_resolution(model: Model, trace: Trace) -> float:
 
 
 def compute_firmware_residual(model: Model, trace: Trace) -> Floats:
-    """Cor of the model's controller on the measured com and XJ, minus the measured Cor: (n,) A, NaN where missing."""
+    """Cor of the model's controller on the measured com and XJ, minus the measured Cor: (n,) A, NaN where missing.
+
+    It is missing as well where the controller remembers what came before the recording, or what was lost of it.
+    """
     own = replace(model, effects=tuple(e for e in model.effects if model.find_effect(e).firmware))
     answers = answer_readings(own, trace, trace.command, hold_last(trace.anchor))
+    if has_controller_memory(model) and not trace.usable.all():
+        answers[int(np.argmin(trace.usable)):] = np.nan
     return answers - np.where(trace.incomplete, np.nan, trace.drive)
 
 

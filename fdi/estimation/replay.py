@@ -466,9 +466,6 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
     return Scatter(error, ratio, moved, max(ratio.values()) < RESIDUAL_IS_SCATTER)
 
 
-# Of a run, in which the plant still follows the drive of set-up, which is not in the recording. Those of the EHA, which
-# follows over hundreds of rows, are judged.
-SETTLING_ROWS = 10
 FEWEST_ROWS = 200  # of a recording; fewer cannot tell anything
 PERIODS = (1e-4, 0.1)  # s, shortest and longest of a controller: the bounds of `controller.period`
 SAME_PERIOD = 0.01  # of a period: two periods that differ by less are the same
@@ -537,6 +534,8 @@ def read_cycles(trace: Trace, model: Model, outputs: Sequence[str] | None = None
     """
     chosen = _choose_outputs(trace, outputs, source)
     _check_signals(trace, model, chosen, source)
+    if trace.declared.names != EHA.names:  # an EHA, which has followed its drive for hundreds of rows, begins with main
+        trace = trace.join_lead()
     rows = _take_rows(trace, chosen)
     ratio = trace.period / model["controller.period"]
     rows_in_cycle, cycles_in_row = round(1 / ratio), round(ratio)
@@ -609,8 +608,8 @@ def _take_rows(trace: Trace, chosen: Sequence[str]) -> Trace:
     nothing = np.full(len(trace), np.nan)
     # the controller's block and the anchor of a replay need the controlled signal, chosen or not
     left_out = {name: nothing for name in trace.output_names[1:] if name not in chosen}
-    return trace.with_columns(left_out, usable=np.ones(len(trace), bool), filled=np.zeros(len(trace), bool),
-                              incomplete=_find_incomplete(trace), outputs=tuple(chosen),
+    return trace.with_columns(left_out, filled=np.zeros(len(trace), bool), incomplete=_find_incomplete(trace),
+                              outputs=tuple(chosen),
                               notes=(*trace.notes, *notes))
 
 
@@ -644,7 +643,8 @@ def _spread_rows(trace: Trace, cycles: int) -> Trace:
     for name, column in columns.items():
         column[::cycles] = trace.columns[name]
     return replace(trace, columns=columns, t=np.round(trace.t[0] + period * np.arange(n), 9), period=period,
-                   phase=np.repeat(trace.phase, cycles)[:n], usable=np.ones(n, bool), filled=np.zeros(n, bool),
+                   phase=np.repeat(trace.phase, cycles)[:n], usable=np.repeat(trace.usable, cycles)[:n],
+                   filled=np.zeros(n, bool),
                    incomplete=np.isnan(columns[trace.declared.controlled.name]))
 
 
@@ -681,8 +681,6 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
         notes.append(f"the {rows.declared.controlled.phrase} already moves in the first row: the first "
                      f"{start * rows.period:g} s are not judged")
         usable[:start] = False
-    if "pace" in rows.provenance and rows.declared.names != EHA.names:  # a run: main begins behind set-up
-        usable[:SETTLING_ROWS] = False
     if usable.sum() < FEWEST_ROWS:
         raise InputError(source, rows.declared.drive.name,
                          f"at least {FEWEST_ROWS} rows that can be replayed, not {int(usable.sum())}")

@@ -9,7 +9,7 @@ import numpy as np
 
 from fdi.comparison.compare import Comparison, SignalError
 from fdi.comparison.residuals import Depends, ResidualTests, map_deviation
-from fdi.estimation.replay import find_controller_gain
+from fdi.estimation.replay import find_controller_gain, has_controller_memory
 from fdi.report.drawing import (
     BLUE,
     COMMAND,
@@ -215,7 +215,8 @@ def _describe_controller(c: Comparison) -> str:
     if lags:
         path += f" (from {' and '.join(lags)})"
     if not math.isfinite(a.error):
-        return f"{path}: its law needs readings that are not known"
+        remembers = has_controller_memory(c.model) and not c.trace.usable.all()
+        return f"{path}: its law {'remembers what is not in the log' if remembers else 'needs unknown readings'}"
     if a.ratio <= CONTROLLER_ERROR_RATIO:
         return f"{path}: equal to the last digit"
     factor, shown = (1e6, "uA") if d.drive.unit == "A" else (1.0, d.drive.unit)

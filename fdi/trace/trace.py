@@ -113,6 +113,7 @@ class Trace:
     sensors: Mapping[str, SensorDynamics] = field(default_factory=dict)  # by signal, of those that are not ideal
     parts: tuple[Part, ...] = ()  # pieces of a longer recording that the rows are; none: one piece
     slack: float = 0.0  # half a step of the controlled signal, where a prepared trace holds it in coarse steps
+    lead: Mapping[str, Floats] = field(default_factory=dict)  # columns of the set-up before, where only main was read
 
     def __len__(self) -> int:
         return len(self.t)
@@ -196,13 +197,27 @@ class Trace:
         kept: dict[str, Any] = {name: getattr(self, name)[rows] for name in PER_ROW}
         chambers = None if self.chambers is None else self.chambers[rows]
         columns = {name: column[rows] for name, column in self.columns.items()}
-        return replace(self, **{**kept, "columns": columns, "chambers": chambers, **fields})
+        return replace(self, **{**kept, "columns": columns, "chambers": chambers, "lead": {}, **fields})
 
     def with_columns(self, columns: Mapping[str, Floats], **fields: Any) -> Trace:
         """The same trace with other columns for these signals, and other `fields`. Raises KeyError."""
         if unknown := columns.keys() - self.columns.keys():
             raise KeyError(unknown.pop())
         return replace(self, columns={**self.columns, **columns}, **fields)
+
+    def join_lead(self) -> Trace:
+        """The trace from the start of its set-up on, whose rows are not usable: there the plant rests."""
+        if not self.lead:
+            return self
+        rows = len(self.lead[self.declared.command.name])
+        before, unusable = self.t[0] + self.period * np.arange(-rows, 0), np.zeros(rows, bool)
+        columns = {name: np.concatenate([self.lead[name], column]) for name, column in self.columns.items()}
+        drive = columns[self.declared.drive.name]
+        drive[:rows] = hold_last(np.append(0.0, drive[:rows]))[1:]  # as a plant does that misses it
+        return replace(self, t=np.concatenate([np.round(before, 9), self.t]), columns=columns, lead={},
+                       phase=np.concatenate([np.full(rows, SETUP), self.phase]),
+                       usable=np.concatenate([unusable, self.usable]), filled=np.concatenate([unusable, self.filled]),
+                       incomplete=np.concatenate([unusable, self.incomplete]))
 
     def with_inputs(self, command: Floats | None = None, drive: Floats | None = None, load: Floats | None = None,
                     **fields: Any) -> Trace:
@@ -386,9 +401,13 @@ def _from_log(log: Log, everything: bool, declared: Signals) -> Trace:
     first = main[0] if len(main) else 0
     kept = slice(None) if everything else slice(main[0], main[-1] + 1)
     seconds = _make_clock(table[:, 0], (cycle - cycle[first]) * period, table[first, 0])
-    rows = cycle[kept] - cycle[kept][0]
+    rows, lead = cycle[kept] - cycle[kept][0], dict[str, Floats]()
     grid = _spread_rows(log.path, rows, {name: table[kept, 3 + i] for i, name in enumerate(names)}
                         | {"phase": phase[kept].astype(float)})
+    if first and not everything:
+        before = _spread_rows(log.path, cycle[:first + 1] - cycle[0],
+                              {name: table[:first + 1, 3 + i] for i, name in enumerate(names)})
+        lead = {name: column[:-1] for name, column in before.items()}
     filled = hold_last(grid.pop("phase"))
     grid["t"] = np.round((np.arange(len(filled)) + (cycle[kept][0] - cycle[first])) * period, 9)
     more = {f"{name}.{key}": value for name, record in log.metadata.items() if name not in ("run", DECLARATION)
@@ -397,7 +416,7 @@ def _from_log(log: Log, everything: bool, declared: Signals) -> Trace:
     return _make_trace(grid, declared, period, rows, phase=filled.astype(int),
                        provenance={"source": log.path.name, **said},
                        units=list_units(declared) | log.read_units("/signals"), attachments=log.attachments,
-                       notes=tuple(notes), sensors=read_sensors(log.path, run),
+                       notes=tuple(notes), sensors=read_sensors(log.path, run), lead=lead,
                        timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
                        events=tuple(_list_records(log, "/events", Event, rest, seconds)),
                        nmt=tuple(_list_records(log, "/nmt", Nmt, rest, seconds)),

@@ -480,9 +480,12 @@ class Bench:
     @property
     def fineness(self) -> float:
         """What differences of the controlled signal are measured by: noise of its sensor, or a part of a demand count.
+
+        A demand in floating point has no such count.
         """
         word = self.signals.command.word
-        counts = [float(abs(each.count)) for spec in self.frames.frames for each in spec.fields if each.name == word]
+        counts = [float(abs(each.count)) for spec in self.frames.frames for each in spec.fields
+                  if each.name == word and each.kind is not Kind.FLOAT]
         return max(self.noise or 2e-6, 0.2 * max(counts, default=0.0))
 
     def replace_signals(self, signals: Signals, noise: float, model: str) -> Bench:
@@ -542,6 +545,11 @@ class Bench:
         """Fields of `phases` that enable the controller: 0 in set-up or clean-up, and not in main."""
         return tuple(name for name, values in self.phases.items()
                      if values.get("main") and 0 in (values.get("setup"), values.get("cleanup"), values.get("safe")))
+
+    @property
+    def can_disable(self) -> bool:
+        """Whether a control word or a field of `phases` switches the controller off."""
+        return self.profile != "none" or bool(self.enables)
 
     def is_enabled(self, phase: str) -> bool:
         """Whether the fields that enable the controller do so in a phase: "setup", "main" or "cleanup"."""

@@ -73,7 +73,8 @@ TRUST = option("--trust", action="store_true",
                help="run the code that a log, model or bench file brings along; it is listed first, with its hash")
 PLANT = (
     option("--model", metavar="FILE|NAME",
-           help="model file, or a shipped model: eha (default), ehs (pump-driven servo), servo (the same, a real one)"),
+           help="file of a model, plant or FMU, or a shipped model: eha (default), ehs (pump-driven servo), servo (the "
+                "same, a real one), ema (electromechanical), emps (the same, a real one)"),
     option("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
            help="change a parameter of the model or of an effect, SI units (repeatable)"),
     option("--effects", action="append", default=[], type=Path, metavar="FILE.py",

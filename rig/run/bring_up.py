@@ -7,7 +7,7 @@ the demand while it is enabled. It is played before set-up, on the healthy plant
 played twice, each time after a reset, and the two must be answered alike; the reset that follows brings plant and
 controller back to the same state, so the rows of the sequence are those of a run without probes. Plain CAN has no
 reset: there it is played once, and the ram goes back to where it began. After clean-up the controller is disabled once
-more.
+more. A controller that nothing disables is asked for nothing in these steps: it would obey, and its integral remember.
 
 The controller is made ready in cycles that do not count: CiA 402 is enabled step by step, then its own words say so.
 The run stands still meanwhile: neither its profiles nor its faults go on. In real time the last input is repeated until
@@ -71,6 +71,7 @@ def open_loop(master: Master, bench: Bench, scenario: Scenario, faults: Schedule
 PROBES = 2  # before set-up, of a controller that can be reset
 ATTEMPTS = 5  # at each of them, in real time
 RETURN_TIME = 0.3  # s: until the ram is back, some time constants of a position loop
+RETURN_TIME_OBEYING = 1.0  # s: the same for a controller that nothing disables, and whose integral settles by itself
 _MISSED_LIMIT = 5  # cycles in a row without an answer: then the probe ends, because each costs a timeout
 
 
@@ -87,7 +88,7 @@ class Step(NamedTuple):
 def list_warm_up(bench: Bench) -> tuple[Step, ...]:
     """Real time: the first cycles may be late."""
     words = PROFILES[bench.profile]
-    first = Step(find_disabled(bench), find_distance(bench), 30)
+    first = Step(find_disabled(bench), find_distance(bench) if bench.can_disable else 0.0, 30)
     return (first,) if words.is_confirmed else (first, Step(words.reset, first.demand, 1))
 
 
@@ -104,7 +105,7 @@ def find_disabled(bench: Bench) -> int:
 
 def list_last_steps(bench: Bench) -> tuple[Step, ...]:
     """The probe after clean-up."""
-    return (Step(0, find_distance(bench), 8 + _count_release(bench), AFTER),)
+    return (Step(0, find_distance(bench), 8 + _count_release(bench), AFTER),) if bench.can_disable else ()
 
 
 def list_first_steps(limits: ProtocolLimits, bench: Bench) -> tuple[Step, ...]:
@@ -121,8 +122,9 @@ def list_first_steps(limits: ProtocolLimits, bench: Bench) -> tuple[Step, ...]:
     steps += [Step(active, 0.0, 3, BEFORE_MAIN, begins_enabled=True),
               Step(active, step, 3 + round(limits.find_step_delay(bench) * bench.rate), BEFORE_MAIN)]
     if not bench.nodes:
-        steps.append(Step(active, 0.0, round(RETURN_TIME * bench.rate), BEFORE_MAIN))
-    return (*steps, Step(off, distance, 8 + _count_release(bench)))
+        time = RETURN_TIME if bench.can_disable else RETURN_TIME_OBEYING
+        steps.append(Step(active, 0.0, round(time * bench.rate), BEFORE_MAIN))
+    return (*steps, Step(off, distance, 8 + _count_release(bench))) if bench.can_disable else tuple(steps)
 
 
 def _count_release(bench: Bench) -> int:

@@ -333,6 +333,8 @@ def _begin_cycle(port: Port, buffers: Buffers, m: Layout, plant: Memory, late: i
     _open_row(buffers, m, late)
     words[OVERRUNS] += max(lost, buffers.rows[words[ROWS] % len(buffers.rows), OVERRUN])
     if words[MOVES_PLANT] and words[COUNTED] and not words[DIVERGED]:
+        if words[CYCLES] == 0:  # the plant rests until the run begins: no answer from before drives it
+            plant.reals[IN_FORCE] = 0.0
         advance_plant(plant, words[CYCLES])
     words[CYCLES] += words[COUNTED]
     words[PLAYED] += 1

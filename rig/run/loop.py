@@ -301,6 +301,8 @@ class CycleLoop(Loop):
             self._values.fill_row(row, self.outputs, _OF_PLANT)
             timing.feedback_response = timing.valve_response = 0.0
             if step.is_counted and not self.problem:
+                if k == 0:  # the plant rests until the run begins: no answer from before drives it
+                    self._plant.drive = 0.0
                 self._plant.move(k)
         timing.execution = (self._wall.now() - began) * 1e-9
         if not self._realtime:

@@ -2,13 +2,18 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from bus_stations import spec
 from example_devices import DRIVE, PATIENT, run_device
 from places import ROOT
 from rig_command import Said, refuse, rig
 
+from fdi.discovery.explain import compute_firmware_residual
+from fdi.estimation.fit import silence_sensors
+from fdi.estimation.replay import prepare_trace, replay_current
 from fdi.trace.trace import Trace
+from plant.model import Model, load_model
 
 PLANT = ROOT / "tests" / "support" / "trim_jack.py"
 BENCH = """
@@ -116,6 +121,25 @@ def test_a_plant_without_a_device_runs_with_its_own_controller(tmp_path: Path, m
     assert (found["verdict"], found["effects"]) == ("EXPLAINED", ["dry_friction"])
     assert "expected embedded" in refuse("run", "--model", "motor.py", "--bus", spec("udp_multicast"))
     assert "expected external" in refuse("run", "--model", "motor.py", "--controller", "c")
+
+
+def test_a_replay_of_a_run_begins_with_its_set_up(tmp_path: Path) -> None:
+    """There the plant rests, so it is known; bring-up leaves nothing in the integral of a law that nothing disables."""
+    (tmp_path / "short.toml").write_text(SHORT)
+    silent = [f"--set=sensors.{name}_noise=0" for name in ("position", "motor_speed", "current")]
+    assert rig("run", tmp_path / "short.toml", "--model", "ema", *silent, "--out", tmp_path / "run").status == 0
+    trace, ema = Trace.read(tmp_path / "run"), silence_sensors(load_model("ema"))
+    assert trace.t[0] == 0.0 and len(trace.lead["demand"]) == 50
+    assert np.abs(trace.lead["current_demand"]).max() < 0.05  # A; the noise of its sensor is 0.02
+    ready = prepare_trace(trace, ema)
+    assert ready.t[0] == -0.05 and ready.usable.sum() == len(trace) and not has_known_controller(ema, ready)
+    for name, column in replay_current(ready, ema, ema.steps, anchor=0.0).items():
+        assert np.abs(column - ready.column(name)).max() <= 1e-9 * np.abs(ready.column(name)).max()
+
+
+def has_known_controller(model: Model, trace: Trace) -> bool:
+    """Whether the answers of its law can be told: not where it remembers what came before the log."""
+    return not np.isnan(compute_firmware_residual(model, trace)).all()
 
 
 @pytest.mark.parametrize(("old", "new", "line"), [
