@@ -97,7 +97,8 @@ POSITION_SCALE: Mapping[str, float] = {
     "sensor_gain.error": 1.0, "jack.area": 1.0, "jack.mass": 2.0, "jack.damping": 2.0, "jack.static_friction": 1.0,
     "jack.dynamic_friction": 1.0, "constant_load.force": 1.0, "aero_stiffness.stiffness": 2.0,
     "mount_compliance.compliance": -2.0, "mount_compliance.mass": 2.0, "structural_resonance.mass": 2.0,
-    "rod_backlash.width": -1.0, "stribeck.speed": -1.0, "presliding.deflection": -1.0}
+    "rod_backlash.width": -1.0, "stribeck.speed": -1.0, "presliding.deflection": -1.0,
+    "presliding.speed": -1.0}
 
 
 BALANCED = {"valve.pressure_gain", "valve.flow_gain", "jack.leakage"}  # a plant without them has other directions

@@ -43,9 +43,10 @@ def friction_asymmetry(x: Drag, s: Any, u: Any, p: Any) -> Drag:
 
 
 class Presliding(NamedTuple):
-    """Deflection of the bristles at the static level, z = FSJ/s0."""
+    """Deflection of the bristles at the static level, z = FSJ/s0, and the speed over which that level is lost."""
 
     deflection: Annotated[float, Quantity("m", low=0, high=1e-2, typical="5-100 um")] = 0.0
+    speed: Annotated[float, Quantity("m/s", low=0, high=10, typical="1-50 mm/s; 0: at once")] = 0.0
 
 
 class Bristle(NamedTuple):
@@ -55,8 +56,9 @@ class Bristle(NamedTuple):
     kept: float = 0.0
 
 
-@effect("jack_drag", Presliding, memory=Bristle, starts=(5e-6, 2e-5, 1e-4),
-        law="LuGre: z' = XJ' - s0 |XJ'| z/FDJ, F = s0 z + s1 z', s0 = FSJ/deflection, s1 = 0.02 sqrt(s0 MJ)",
+@effect("jack_drag", Presliding, memory=Bristle, starts=((5e-6, 1e-3), (2e-5, 1e-3), (1e-4, 1e-3), (2e-5, 1e-2)),
+        law="LuGre: z' = XJ' - s0 |XJ'| z/g, F = s0 z + s1 z', g = FDJ + (FSJ - FDJ) exp(-(XJ'/speed)^2), "
+            "s0 = FSJ/deflection, s1 = 0.02 sqrt(s0 MJ)",
         symptoms="P12-position spring loop at each reversal, no true stop",
         source="LuGre: Canudas de Wit, Olsson, Astrom and Lischinsky 1995")
 def presliding(x: Drag, m: Bristle, s: Any, u: Any, p: Any) -> tuple[Drag, Bristle]:
@@ -70,8 +72,11 @@ def presliding(x: Drag, m: Bristle, s: Any, u: Any, p: Any) -> tuple[Drag, Brist
     on = full > 0.0
     s0 = x.static / (full if on else 1.0)
     s1 = 0.02 * sqrt(s0 * p.jack.mass)
-    whole = x.dynamic + u.h * s0 * abs(s.jack_speed)
-    kept = x.dynamic / (whole if whole > 0.0 else 1.0)
+    fast = p.presliding.speed
+    v = s.jack_speed / (fast if fast > 0.0 else 1.0)
+    level = x.dynamic + ((x.static - x.dynamic) * exp(-v * v) if fast > 0.0 else 0.0)
+    whole = level + u.h * s0 * abs(s.jack_speed)
+    kept = level / (whole if whole > 0.0 else 1.0)
     rate = s1 / u.h
     force = z * (s0 * kept - rate * (1.0 - kept))
     damping = (s0 * u.h + s1) * kept

@@ -186,7 +186,7 @@ IMPLICIT = ("compressibility", "orifice_root", "presliding")
     FRICTIONLESS | {"orifice_root.share": 1.0}, FRICTIONLESS | {"orifice_root.share": 0.4},
     FRICTIONLESS | {"compressibility.coefficient": 1e-9}, FRICTIONLESS | {"compressibility.coefficient": 1e-11},
     FRICTIONLESS | {"compressibility.coefficient": 1e-9, "orifice_root.share": 1.0},
-    {"presliding.deflection": 5e-6}, {"presliding.deflection": 1e-4},
+    {"presliding.deflection": 5e-6}, {"presliding.deflection": 1e-4, "presliding.speed": 2e-3},
     {"presliding.deflection": 2e-5, "compressibility.coefficient": 1e-9, "orifice_root.share": 1.0},
 ], ids=lambda c: ", ".join(f"{k} {v:g}" for k, v in c.items() if v))
 @pytest.mark.parametrize(("h", "um", "bar"), [(1e-5, 0.3, 0.05), (5e-5, 1.5, 0.25)])
@@ -250,6 +250,9 @@ def list_steady_cases() -> Iterator[Any]:
         current = speed * AREA / model["valve.flow_gain"] / measure_spool(model, 1.0)
         yield pytest.param(model, np.full(400, current), 0.0,
                            lambda v: 500.0 + 0.5 * 800.0 * np.exp(-(v / 0.01) ** 2), id=f"stribeck {speed:g}")
+        model = QUIET_SPOOL.replace({"presliding.deflection": 2e-5, "presliding.speed": 0.01})
+        yield pytest.param(model, np.full(400, current), 0.0,
+                           lambda v: 500.0 + 300.0 * np.exp(-(v / 0.01) ** 2), id=f"bristles {speed:g}")
     for deflection in (5e-6, 2e-5, 1e-4):
         yield pytest.param(QUIET_SPOOL.replace({"presliding.deflection": deflection}), STEADY, 0.0, lambda v: 500.0,
                            id=f"presliding {deflection:g}")
@@ -397,7 +400,7 @@ def test_friction_only_takes_energy(v: float, rise: float, speed: float, asymmet
     names = ("stribeck", "friction_asymmetry", "presliding")
     model = WHOLE.with_effects(names).replace({"stribeck.rise": abs(rise), "stribeck.speed": speed,
                                                "friction_asymmetry.asymmetry": 0.0 if deflection else asymmetry,
-                                               "presliding.deflection": deflection})
+                                               "presliding.deflection": deflection, "presliding.speed": speed - 1e-3})
     p, (s, m) = model.build_record()[0], model.build_start()
     k, u, s = compute_coefficients(p, H), Input(h=H), s._replace(jack_speed=v)
     moved = interpret_function(step_actuator, find_plant("eha").bind_functions(names))

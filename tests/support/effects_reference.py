@@ -40,7 +40,7 @@ def _rigid(spool: float, flow: float, p: Any) -> float:
 
 @numba.njit
 def _run(p: Any, spool: Any, load: Any, h: float, out: Any) -> None:
-    # p: GQ, GP, AJ, CLK, PSR, MJ, CJ, V/4B, share of the root, FDJ, s0, s1
+    # p: GQ, GP, AJ, CLK, PSR, MJ, CJ, V/4B, share of the root, FDJ, s0, s1, FSJ - FDJ, speed of the bristles
     x = v = z = pressure = 0.0
     for i in range(len(spool)):
         if p[7] > 0.0:
@@ -48,7 +48,8 @@ def _run(p: Any, spool: Any, load: Any, h: float, out: Any) -> None:
             pressure = min(max(pressure, -p[4]), p[4])
         else:
             pressure = _rigid(spool[i], p[2] * v, p)
-        bristle = v - p[10] * abs(v) * z / p[9] if p[9] > 0.0 else 0.0
+        level = p[9] + (p[12] * np.exp(-(v / p[13])**2) if p[13] > 0.0 else 0.0)
+        bristle = v - p[10] * abs(v) * z / level if level > 0.0 else 0.0
         v += h / p[5] * (p[2] * pressure - p[6] * v - load[i] - p[10] * z - p[11] * bristle)
         z += h * bristle
         x += h * v
@@ -63,7 +64,8 @@ def simulate_jack(values: Mapping[str, float], spool: Any, load: Any, h: float) 
     s0 = v["jack.static_friction"] / z if z > 0.0 else 0.0
     p = np.array([v["valve.flow_gain"], v["valve.pressure_gain"], v["jack.area"], v["jack.leakage"],
                   v["supply.pressure"], v["jack.mass"], v["jack.damping"], stored, v["orifice_root.share"],
-                  v["jack.dynamic_friction"] if z > 0.0 else 0.0, s0, 0.02 * np.sqrt(s0 * v["jack.mass"])])
+                  v["jack.dynamic_friction"] if z > 0.0 else 0.0, s0, 0.02 * np.sqrt(s0 * v["jack.mass"]),
+                  v["jack.static_friction"] - v["jack.dynamic_friction"], v["presliding.speed"] if z > 0.0 else 0.0])
     out = np.empty((2, len(spool)))
     _run(p, spool, load, h, out)
     return out

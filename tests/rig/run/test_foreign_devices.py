@@ -227,7 +227,7 @@ class Mute(CanDevice):
 
 
 @pytest.mark.parametrize(("answers", "said"), [
-    (0, "controller: no frame Drive (0x18F00005) for 5 cycles"), (400, "controller stopped answering"),
+    (0, "controller: no frame Drive (0x18F00005) for 5 cycles"), (1080, "controller stopped answering"),
 ])
 def test_a_controller_that_sends_no_frames_ends_the_run_with_a_line_that_names_them(answers: int, said: str,
                                                                                    tmp_path: Path) -> None:
