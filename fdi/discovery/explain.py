@@ -245,7 +245,8 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
     unseen = {h.effects: _judge_unseen_run(search, h, floor) for h in close}
     holding = [h for h in close if unseen[h.effects].holds]
     part = bool(close) and _improves(search, base, close[0])
-    verdict, named = decide_verdict(base, close, holding, part, marks, floor)
+    costs = search.measure_unseen_costs([base, *close])
+    verdict, named = decide_verdict(base, close, holding, part, marks, floor, costs)
     if verdict == "PARTLY" and close and is_periodic_in_position(search, base, close[0]):
         named = tuple(f.effect for f in marks.prints)
         verdict = "PARTLY" if named else "UNEXPLAINED"
@@ -371,7 +372,8 @@ def _prune_level(search: Search, levels: list[list[Hypothesis]], depth: int) -> 
 
 
 def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hypothesis], part: bool,
-                   marks: Marks, floor: Mapping[str, float]) -> tuple[str, tuple[str, ...]]:
+                   marks: Marks, floor: Mapping[str, float], unseen: Sequence[float] = ()
+                   ) -> tuple[str, tuple[str, ...]]:
     """The verdict and the effects it names.
 
     Args:
@@ -381,7 +383,9 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
         part: whether the best one leaves less of that run than the base does.
         marks: what the controller's output and the position show exactly.
         floor: of each signal, SI.
+        unseen: costs of the base and of the best ones on the held-out run, where there is one.
     """
+    costs = dict(zip([h.effects for h in (base, *close)], unseen or [0.0] * (1 + len(close)), strict=True))
     prints = tuple(f.effect for f in marks.prints)
     firmware_left = marks.is_firmware_different and not any(p.is_firmware for p in marks.prints)
     if not close:
@@ -391,16 +395,18 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
             return "UNEXPLAINED", prints
         return ("EXPLAINED" if prints else "NOTHING_MISSING"), prints
     best = close[0]
-    least = measure_gain(base, best)
-    if base.is_at_floor and least < GAIN_CONVINCES:
-        return ("NOT_RESOLVABLE", tuple(best.effects)) if not prints else ("EXPLAINED", prints)
     there = [h for h in holding if h.is_at_floor]
+    # where the base leaves only noise: single stops that a fit has met by chance are missed elsewhere
+    sure = [h for h in there if not (unseen and base.is_at_floor) or costs[()] - costs[h.effects] > GAIN_SEEN]
+    if base.is_at_floor and (measure_gain(base, best) < GAIN_CONVINCES or (there and not sure)):
+        return ("NOT_RESOLVABLE", tuple(best.effects)) if not prints else ("EXPLAINED", prints)
+    there = sure
     if there and all(h.is_far for h in there):
         return "PARTLY", (*prints, *there[0].effects)
     if best.is_at_floor and there and not firmware_left:
         # named alone only with the gain with which an effect is named where the model is at the floor without it
         equal = [h for h in there if h is there[0] or (
-            not h.is_far and measure_gain(h, there[0]) < GAIN_CONVINCES
+            not h.is_far and not _is_better(there[0], h, costs)
             and not (base.is_at_floor and measure_gain(base, h) < GAIN_CONVINCES))]
         if len(equal) > 1:
             return "AMBIGUOUS", (*prints, *dict.fromkeys(e for h in equal for e in h.effects))
@@ -410,6 +416,12 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
     if better and part:
         return "PARTLY", (*prints, *best.effects)
     return ("PARTLY" if prints else "UNEXPLAINED"), prints
+
+
+def _is_better(h: Hypothesis, other: Hypothesis, unseen: Mapping[tuple[str, ...], float]) -> bool:
+    """Whether one hypothesis explains more than another: its own runs, and these and the held-out run together."""
+    gain = measure_gain(other, h)
+    return gain >= GAIN_TIE and gain + unseen[other.effects] - unseen[h.effects] >= GAIN_CONVINCES
 
 
 def measure_excess(errors: Mapping[str, float], floor: Mapping[str, float]) -> float:

@@ -334,6 +334,13 @@ class Search:
             return [{} for _ in hypotheses]
         return [_measure_rms(left, self.holdout.outputs) for left in self.replay_holdout(hypotheses)[1]]
 
+    def measure_unseen_costs(self, hypotheses: Sequence[Hypothesis]) -> list[float]:
+        """Robust sums of squares of what is left of the run that no fit saw; [] without one."""
+        if self.holdout is None:
+            return []
+        problem, left = self.replay_holdout(hypotheses)
+        return [float(compute_misfit(problem.whiten_residuals(each[None]))[0]) for each in left]
+
     def judge_on_all(self, hypotheses: Sequence[Hypothesis], steps: int) -> list[Hypothesis]:
         """The hypotheses with their errors on all of the recordings that the runs were cut from.
 
