@@ -4,7 +4,7 @@
 LONGEST = (
     "vcan/", "rig/view/", "fdi/diagnosis/test_refine.py", "fdi/identification/", "fdi/discovery/test_discovery.py",
     "fdi/comparison/test_compare.py", "studies/", "rig/campaign/", "rig/run/", "examples/", "plant/test_lanes.py",
-    "plant/test_plant_on_other_cpus.py", "test_docs_site.py",
+    "plant/test_plant_on_other_cpus.py", "test_docs_site.py", "test_examples.py",
 )
 LONG_TESTS = (
     "examples/",
