@@ -179,23 +179,11 @@ def test_compiled_cycles_in_lockstep_are_those_in_python(bus_with_nodes: str, na
     """The same rows and the same events in the same cycles, whatever the faults, also where the run is aborted.
 
     A heartbeat that stops is not among them: in lockstep between processes nobody watches heartbeats. The rows of the
-    preflight are compared in test_c_run.py.
+    preflight are compared in test_c_run.py, on a CAN interface in test_vcan_guest.py.
     """
-    require_equal_runs(bus_with_nodes, name, tmp_path)
-
-
-@pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
-def test_so_they_are_on_a_can_interface(bus_kind: str, tmp_path: Path) -> None:
-    where = spec(bus_kind)
-    with stand_nodes(where, PLANT, CONTROLLER):
-        require_equal_runs(where, "lost frames", tmp_path)
-
-
-def require_equal_runs(where: str, name: str, tmp_path: Path) -> None:
-    """Play a sequence on the embedded bus and on `where`, whose nodes stand there; compare verdict, rows and events."""
     text = TEXTS.get(name) or load_sequence(name).source
     here = play(job(text, seed=3), tmp_path / "a")
-    there = play(job(text, seed=3, bus=where, controller="external", plant="external"), tmp_path / "b")
+    there = play(job(text, seed=3, bus=bus_with_nodes, controller="external", plant="external"), tmp_path / "b")
     assert there.timing["kind"] == "lockstep" and (there.verdict, there.aborted) == (here.verdict, here.aborted)
     fields = ("cycle", "phase", "com", "xj", "cor", "p12", "xs", "load", "control", "status", "flags")
     rows = [table(tmp_path / folder, fields) for folder in "ab"]
