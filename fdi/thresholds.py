@@ -6,7 +6,6 @@ uses them; physical limits and the sizes of the faults (Table 2 of the paper) st
 
 "Noise" in a ratio is the noise floor of the signal: the RMS that the sensors alone would leave of the residual.
 """
-from __future__ import annotations
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Intervals and residuals, everywhere

@@ -9,7 +9,6 @@ them has reached MidBand as far as the recording tells, and they form a group.
 
 The posterior is one at a point, so unknowns are what laws go with (gains by logarithms, clearance by its cube).
 """
-from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence

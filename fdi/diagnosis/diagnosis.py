@@ -1,5 +1,4 @@
 """The diagnosis of one captured test: bands, precursors, RMS grid, refined sizes, levels, and what else is wrong."""
-from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence

@@ -6,7 +6,6 @@ size, for MidBand) is excluded. A fault is acceptable only if MidBand lies clear
 98 % of all tests, as long as the interval excludes a healthy unit. An interval that holds both the healthy size and
 MidBand cannot be judged.
 """
-from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum

@@ -1,5 +1,4 @@
 """Bands by simulating units of a model on a command, or from a fleet's own healthy traces."""
-from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence

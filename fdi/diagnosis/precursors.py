@@ -5,7 +5,6 @@ The mean error on a slow ramp is the classic sign of friction, but it does not d
 the sections of its kind. Noise of the position decides none of them: peaks are taken from running medians, ranges are
 between percentiles, and a reversal counts when it passes a quarter of the usual range.
 """
-from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence

@@ -7,7 +7,6 @@ as in the paper, the maps of this plant are useless: with spool friction the loo
 phase, and a monitor that does not oscillate at all is nearer to the trace than the right one (`drive="command"` shows
 it). Clogging and spool friction have the paper's monitor, which is much faster; all other pairs take the plant itself.
 """
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass

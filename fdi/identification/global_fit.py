@@ -5,7 +5,6 @@ things find the right one. Starts are scattered about the regressions' values. T
 size at first, so that small stops count late. And before each stage every unknown is tried on a grid with the others
 held: runs side by side cost little, and a grid steps over ridges at which slopes point the wrong way.
 """
-from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
