@@ -102,8 +102,7 @@ class Result:
             known_titles = f"one of {', '.join(self.figures)}" if figures else "a result with figures"
             raise InputError("plot", title or "", known_titles)
         for figure in chosen:
-            svg = figure.draw()
-            if svg:
+            if svg := figure.draw():
                 return Plot(svg, figure.caption)
         raise InputError("plot", title or "", "a figure for which the trace has data")
 

@@ -158,8 +158,7 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
     finer = run(2 * model.steps)
     errors = {s.name: rms(finer[s.name] - once[s.name]) / max(np.ptp(once[s.name]), 1e-300)
               for s in kind.signals.outputs if s.name not in silent}
-    worst = max(errors, key=lambda name: errors[name], default="")
-    if worst:
+    if worst := max(errors, key=lambda name: errors[name], default=""):
         yield Finding("step", errors[worst] < MOST_STEP_ERROR, f"half the step changes {worst} by "
                       f"{100 * errors[worst]:.2g} % of its range (limit {100 * MOST_STEP_ERROR:g} %)")
     there = np.full(min(len(command), 200), 0.1 * np.ptp(once[kind.signals.controlled.name]))

@@ -295,8 +295,7 @@ class Actuator:
     def _bind_advance(self) -> Call:
         if self._code is not None:
             return self._code.bind((self._flat,), 4, (self._record, self.steps))
-        program = self._program
-        if program is not None:
+        if (program := self._program) is not None:
             return lambda drive, load, noise, t: np.copyto(self._flat, program.step(drive, load))
         run = build_kernel(advance_flat_state, self.model.effects, fast=False, plant=self.model.plant)
         return lambda drive, load, noise, t: run(self._flat, drive, load, noise, t, self._record, self.steps)

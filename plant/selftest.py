@@ -65,9 +65,9 @@ def _find_faults(effect: Effect, starts: tuple[Mapping[str, float], ...], comman
         faults.append("at its off value it changes the plant")
     if not starts:
         faults.append("no size of it changes anything on this command")
-    for start in (*starts, *list_extremes(effect)):
-        if not np.isfinite(np.array(simulate(off.replace(start), command, load))).all():
-            faults.append(f"with {_format_values(start)} the plant has no number any more")
+    faults += [f"with {_format_values(start)} the plant has no number any more"
+               for start in (*starts, *list_extremes(effect))
+               if not np.isfinite(np.array(simulate(off.replace(start), command, load))).all()]
     if starts and not faults:
         model, said = off.replace(starts[-1]), _format_values(starts[-1])
         if not _are_equal(*(simulate(model, command, load) for _ in range(2))):

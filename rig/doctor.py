@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from importlib import metadata
@@ -245,7 +246,7 @@ def examine_rights() -> list[Finding]:
     is_preempt_rt = _read_text("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in platform.version()
     kernel = f"{platform.release()}, {'PREEMPT_RT' if is_preempt_rt else 'not PREEMPT_RT'}, {os.cpu_count()} CPUs"
     is_fifo, locked = bool(priority.run_under_fifo(lambda: True)), priority.read_memory_lock_limit()
-    resolution = priority.read_clock_resolution_ns()
+    resolution = time.clock_getres(time.CLOCK_MONOTONIC) * 1e9  # ns
     source = _read_text("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "unknown source"
     return [
         _grade("real time", "kernel", is_preempt_rt, kernel, "bounds the worst lateness",
@@ -264,8 +265,7 @@ def measure_timers(seconds: float) -> Iterator[Finding]:
     """Lateness of a 1 kHz timer, measured now: as an ordinary process, and under SCHED_FIFO where that is allowed."""
     ordinary = priority.measure_timer_lateness(seconds)
     yield _make_timer_finding("timer at 1 kHz", ordinary, "what --pace realtime can expect here")
-    fifo = priority.run_under_fifo(lambda: priority.measure_timer_lateness(seconds))
-    if fifo is not None:
+    if (fifo := priority.run_under_fifo(lambda: priority.measure_timer_lateness(seconds))) is not None:
         yield _make_timer_finding("timer under FIFO", fifo, "the same with real-time priority")
 
 

@@ -168,8 +168,7 @@ def find_lags(trace: Trace, limit: float, most_rows: int = 60_000) -> tuple[int,
             left, right = gram[np.ix_(pick, pick)], gram[pick, -1]
             gains = np.linalg.lstsq(left, right, rcond=None)[0]
             misfit = float(target - gains @ right)
-            nearer = abs(LAGS[a]) + abs(LAGS[b])
-            if misfit < best[0] * (1 - 1e-9) - 1e-30 * nearer:
+            if misfit < best[0] * (1 - 1e-9) - 1e-30 * (abs(LAGS[a]) + abs(LAGS[b])):
                 best = (misfit, LAGS[a], LAGS[b], float(gains[0]))
     return best[1], best[2], best[3]
 
@@ -343,8 +342,7 @@ def _list_blocks_above(ratios: Mapping[str, float | None], table: Mapping[str, S
 def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place], ratios: Mapping[str, float | None],
                     replay: Replay, period: float, doubtful: str) -> tuple[str, str]:
     """The verdict, and why it cannot tell; `doubtful` says why the repeats are no measure of the noise."""
-    coarse = [s.name for s in table.values() if s.solver_error > SOLVER_HIDES_RATIO * s.floor.value]
-    if coarse:
+    if coarse := [s.name for s in table.values() if s.solver_error > SOLVER_HIDES_RATIO * s.floor.value]:
         return "CANNOT_TELL", f"the solver's own error in {', '.join(coarse)} is as large as the floor"
     above = [s for s in table.values() if s.ratio > s.limit]
     least = min((s.floor.freedom for s in table.values()), default=1.0)

@@ -96,8 +96,7 @@ def locate_error(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Plac
     for section in trace.sections():
         rows = slice(section.start, section.stop)
         inside = z2[rows]
-        there = ~np.isnan(inside)
-        if total <= 0.0 or there.sum() * trace.period < shortest:
+        if total <= 0.0 or (~np.isnan(inside)).sum() * trace.period < shortest:
             continue
         chosen = np.zeros(len(z2), bool)
         chosen[rows] = True

@@ -60,8 +60,7 @@ class SignalDifference:
     @property
     def ratio(self) -> float:
         """RMS difference over what the noise of both runs leaves; 1 for two runs that differ only by noise."""
-        expected = math.hypot(*self.noise)
-        if expected > 0.0:
+        if (expected := math.hypot(*self.noise)) > 0.0:
             return self.rms / expected
         return 0.0 if self.rms == 0.0 else float("inf")
 
@@ -180,8 +179,7 @@ def _subtract(reference: Run, other: Run) -> RunPair:
         if not np.nan_to_num(first).any() and not np.nan_to_num(second).any():
             continue  # no load in either run
         difference = np.where(agrees, second - first, np.nan)
-        known = ~np.isnan(difference)
-        if not known.any():
+        if not (~np.isnan(difference)).any():
             left_out[name] = "no row with equal commands in which both runs have it"
             continue
         differences[name] = difference

@@ -210,8 +210,7 @@ def require_same_command(bands: Bands, found: Sequence[Section], period: float, 
     Raises:
         InputError: the first difference.
     """
-    difference = find_difference(bands, found, period)
-    if difference:
+    if difference := find_difference(bands, found, period):
         kinds = [s.kind for s in bands.sections]
         name = " ".join([bands.provenance.get("command", ""), f"({kinds.count('step')} steps,"]).strip()
         raise InputError(where, bands.kind.signals.command.name,
@@ -515,11 +514,9 @@ def format_bands(bands: Bands) -> str:
     lines = [HEADER.format(first=MS_PER_S * STEP_JUDGED_FROM, coarse=KNOT_CYCLES), "[bands]",
              *(f"{key} = {value:g}" for key, value in head.items()), "", "[provenance]",
              *(f"{key} = {json.dumps(value)}" for key, value in bands.provenance.items()), "",
-             "# kind, rows from and to, demand before and at the end in counts, rate in counts/s", "sections = ["]
-    for s in bands.sections:
-        numbers = _round_values((s.first / count, s.last / count, s.rate / count), 2)
-        lines.append(f"  {json.dumps([s.kind, s.start, s.stop, *numbers])},")
-    lines.append("]")
+             "# kind, rows from and to, demand before and at the end in counts, rate in counts/s", "sections = [",
+             *(f"  {json.dumps([*s[:3], *_round_values(np.array(s[3:]) / count, 2)])},"
+               for s in bands.sections), "]"]
     for fault in bands.faults:
         lines += ["", f"[faults.{fault.name}]",
                   *(f"{key} = {json.dumps(getattr(fault, key))}" for key in BandFault._fields[1:6]),
@@ -572,8 +569,7 @@ def parse_bands(content: str, where: object, kind: Plant | None = None) -> Bands
         raise InputError(where, str(error.args[0]), "a file of bands, which has this key") from error
     except (TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         raise InputError(where, "", f"a file of bands as rig fdi --learn-bands writes it ({error})") from error
-    own = found.provenance.get("plant", "eha")
-    if own != kind.name:
+    if (own := found.provenance.get("plant", "eha")) != kind.name:
         raise InputError(where, "plant", f"bands of the plant {kind.name}, not of {own}")
     return found
 

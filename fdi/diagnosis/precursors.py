@@ -241,8 +241,7 @@ def measure_step(x: Floats, s: Section, period: float, settling_band: float = 0.
     needed = settled_for / period if rows > 2 * settled_for / period else 1
     is_settled = rows - 1 - last >= needed
     yield "settling_time", np.where(is_settled, (last + 1) * period, np.nan)
-    resting = round(at_rest_after / period)
-    if resting < rows:
+    if (resting := round(at_rest_after / period)) < rows:
         yield "rest_error", np.sqrt(np.nanmean((x[:, resting:] - s.last)**2, axis=1))
 
 

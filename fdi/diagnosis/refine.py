@@ -270,12 +270,10 @@ def list_coarse_starts(faults: Sequence[Fault]) -> list[Sizes]:
     if len(faults) <= 2:
         return list(product(*ladders))
     healthy = tuple(fault.healthy for fault in faults)
-    found = [healthy]
-    for i, ladder in enumerate(ladders):
-        found += [(*healthy[:i], size, *healthy[i + 1:]) for size in ladder]
+    found = [healthy, *((*healthy[:i], size, *healthy[i + 1:]) for i, ladder in enumerate(ladders) for size in ladder)]
     for i, j in combinations(range(len(faults)), 2):
-        for a, b in product(_pick_two(ladders[i]), _pick_two(ladders[j])):
-            found.append((*healthy[:i], a, *healthy[i + 1:j], b, *healthy[j + 1:]))
+        found += [(*healthy[:i], a, *healthy[i + 1:j], b, *healthy[j + 1:])
+                  for a, b in product(_pick_two(ladders[i]), _pick_two(ladders[j]))]
     return found
 
 
@@ -883,8 +881,7 @@ class JointSearch:
             parents = sorted(tried, key=_get_cost)[:4]
             self.progress(f"fitting {', '.join(_describe(effects) for effects, _ in parents)} further", 0.3 * count)
             deep = sorted(self.deepen(parents), key=_get_cost)
-            before = min(found, key=_get_cost)
-            if count > 1 and not _takes_fair_share(before[1], deep[0][1]):
+            if count > 1 and not _takes_fair_share(min(found, key=_get_cost)[1], deep[0][1]):
                 break
             found += deep
             if is_noise_left(self.problem, deep[0][1]):

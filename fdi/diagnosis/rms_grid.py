@@ -169,10 +169,8 @@ class _Runs(NamedTuple):
         rows = [[x for fault, size in zip(self.faults, pair, strict=True) for x in fault.list_changes(size).values()]
                 for pair in values.tolist()]
         lanes = Lanes(model, names, workers=self.workers)
-        if self.drive == "command":
-            out = lanes.closed_loop(np.array(rows), self.trace.command, self.trace.load)
-        else:
-            out = replay_lanes(lanes, np.array(rows), self.trace)
+        out = (lanes.closed_loop(np.array(rows), self.trace.command, self.trace.load) if self.drive == "command" else
+               replay_lanes(lanes, np.array(rows), self.trace))
         return self.reduce_runs(out.transpose(0, 2, 1))
 
     def reduce_runs(self, runs: Floats) -> Floats:

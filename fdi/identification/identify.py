@@ -712,8 +712,7 @@ def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress
     progress("last rounds", 0.9)
     fit = polish_fit(fine, fit, seed)
     size = np.sqrt(np.nanmean(fit.residuals**2, axis=1))
-    level = np.array([n.level for n in fine.noise])
-    if (size <= RESIDUAL_HELD_OUT * level).all():
+    if (size <= RESIDUAL_HELD_OUT * np.array([n.level for n in fine.noise])).all():
         learnt = tuple(noises.fit_noise(r) if s > 0.0 else old  # a signal that the model gives exactly tells none
                        for r, s, old in zip(fit.residuals, size, fine.noise, strict=True))
         fine = replace(fine, noise=learnt, _lanes={})
@@ -881,8 +880,7 @@ def _mark_unseen(text: str, unseen: Mapping[str, str]) -> str:
     for line in text.splitlines():
         if line.startswith("["):
             group = line.strip("[]").removeprefix("design.")
-        name = f"{group}.{line.partition(' = ')[0]}"
-        if name in unseen:
+        if (name := f"{group}.{line.partition(' = ')[0]}") in unseen:
             line += f"{',' if '#' in line else '  #'} not identifiable from the runs, {unseen[name]}"
         lines.append(line)
     return "\n".join(lines) + "\n"

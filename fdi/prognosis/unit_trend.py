@@ -189,8 +189,7 @@ def read_start_time(file: Path, model: Model, again: bool = False, faults: Seque
     Raises:
         InputError: a file that is not a trace.
     """
-    found = _read_answer(_find_answer_file(file, model, faults), again)
-    if found is not None:
+    if (found := _read_answer(_find_answer_file(file, model, faults), again)) is not None:
         return str(found["started"])
     return Trace.read(file, signals=model.kind.signals).provenance.get("started", "")
 
@@ -257,8 +256,7 @@ def parse_date(text: str) -> float:
     (1.0, 1.0, nan)
     """
     text, late = text.strip().removesuffix("Z"), 0.0
-    offset = _OFFSET.search(text)
-    if offset:
+    if offset := _OFFSET.search(text):
         late = float(f"{offset[2]}1") * (int(offset[3]) * 60 + int(offset[4])) / 1440
         text = text[:offset.start(2)]
     try:

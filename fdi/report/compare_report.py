@@ -211,8 +211,7 @@ def _describe_controller(c: Comparison) -> str:
     if not c.model.kind.controller:
         return f"{path}: the firmware is not known"
     late = ((d.command.symbol, a.com_lag), (d.controlled.symbol, a.xj_lag))
-    lags = [f"{symbol} {count_nouns(lag, 'cycle')} earlier" for symbol, lag in late if lag > 0]
-    if lags:
+    if lags := [f"{symbol} {count_nouns(lag, 'cycle')} earlier" for symbol, lag in late if lag > 0]:
         path += f" (from {' and '.join(lags)})"
     if not math.isfinite(a.error):
         remembers = has_controller_memory(c.model) and not c.trace.usable.all()
@@ -308,8 +307,7 @@ def _describe_residual(signal: Signal, d: ResidualTests, strong: float = 0.15, l
     if d.memory > long_memory * d.noise_memory:
         found.append(f"keeps its sign for {1e3 * d.memory:.0f} ms (noise: {1e3 * d.noise_memory:.0f} ms), "
                      f"half of its power is below {d.half_power:.2g} Hz")
-    followed = [f for f in d.follows if abs(f.correlation) > max(strong, 2 * f.bound)]
-    if followed:
+    if followed := [f for f in d.follows if abs(f.correlation) > max(strong, 2 * f.bound)]:
         f = max(followed, key=lambda f: abs(f.correlation))
         found.append(f"follows {f.input} by {1e3 * f.lag:.3g} ms (correlation {f.correlation:.2f})")
     if d.depends and d.depends[0].share > DEPENDENCE_SHARE:

@@ -282,8 +282,7 @@ def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
     for g in d.grids:
         for fault, axis in zip(g.faults, g.axes, strict=True):
             size, found = d.sizes[fault.name], g.find_size(fault, g.merged)
-            outside = max(size.low - found, found - size.high)
-            if outside <= far * float(axis[1] - axis[0]):
+            if max(size.low - found, found - size.high) <= far * float(axis[1] - axis[0]):
                 continue
             parts = [f"{words} {format_digits(g.find_size(fault, part.minimum))}"
                      for words, part in (("steps", g.step), ("ramps", g.ramp)) if part is not None]
@@ -292,8 +291,7 @@ def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
                         "grid matches the position alone with a plant that has only these two faults")
             if d.others:
                 sentence += f", here with {_list_others(d)}"
-            left = d.refinement.errors.get(controlled)
-            if left is not None:
+            if (left := d.refinement.errors.get(controlled)) is not None:
                 sentence += (f"; its best cell leaves {format_amount(g.joint.minimum.rms, g.unit)} of the position, "
                              f"the fit {format_amount(left, g.unit)}")
             trust = "Trust the fit" if d.refinement.is_explained else "The fit does not explain the trace either"

@@ -260,14 +260,15 @@ def _collect_facts(traces: Sequence[Trace]) -> dict[str, Facts]:
         "timing": {"kind of timing": "timing.kind"}}
     facts = {heading: {name: [trace.provenance.get(key, "") for trace in traces] for name, key in own.items()}
              for heading, own in keys.items()}
-    for name, start in (("sequence file", "sequence/"), ("effect files", "effects/"), ("model file", "model.toml")):
-        facts["model"][name] = [", ".join(f"{file.rpartition('/')[2]} (CRC {zlib.crc32(data):08x})"
-                                          for file, data in sorted(trace.attachments.items()) if file.startswith(start))
-                                for trace in traces]
-    for words, field in (("SYNC lateness", "lateness"), ("controller's response", "response"),
-                         ("bench's own work", "work")):
-        facts["timing"][f"{words}, p50 / p99 / max"] = [_format_percentiles(getattr(trace.timing, field))
-                                                        for trace in traces]
+    facts["model"] |= {name: [", ".join(f"{file.rpartition('/')[2]} (CRC {zlib.crc32(data):08x})"
+                                        for file, data in sorted(trace.attachments.items()) if file.startswith(start))
+                              for trace in traces]
+                       for name, start in (("sequence file", "sequence/"), ("effect files", "effects/"),
+                                           ("model file", "model.toml"))}
+    facts["timing"] |= {f"{words}, p50 / p99 / max": [_format_percentiles(getattr(trace.timing, field))
+                                                      for trace in traces]
+                        for words, field in (("SYNC lateness", "lateness"), ("controller's response", "response"),
+                                             ("bench's own work", "work"))}
     facts["timing"]["overruns"] = [f"{int(trace.timing.overrun.sum())} of {len(trace.timing.t)}"
                                    if len(trace.timing.t) else "" for trace in traces]
     return facts

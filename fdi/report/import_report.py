@@ -63,8 +63,7 @@ def _list_notes(imported: Imported, measurement: Measurement) -> list[str]:
     if signals.load and signals.load.name not in known:
         notes.append(f"no {signals.load.symbol}: it is taken as 0; a load that did act is then a force that the model "
                      "lacks")
-    unused = [name for name in measurement.units if name not in imported.used]
-    if unused:
+    if unused := [name for name in measurement.units if name not in imported.used]:
         notes.append(f"not in the map, not imported: {list_first(unused, MOST)}")
     return notes
 

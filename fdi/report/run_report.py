@@ -171,11 +171,9 @@ def _list_notes(trace: Trace, most: int = 5) -> list[str]:
     load = trace.declared.load  # which is known or not, never sampled
     for name in (name for name in trace.signals if load is None or name != load.name):
         names_of_count.setdefault(int(np.isnan(trace.column(name)).sum()), []).append(name)
-    parts = [f"{count} of {', '.join(names)}" for count, names in names_of_count.items() if count]
-    if parts:
+    if parts := [f"{count} of {', '.join(names)}" for count, names in names_of_count.items() if count]:
         notes.append(f"missing samples (red on the page): {'; '.join(parts)} (of {len(trace)})")
-    limits = [text for name, text in sorted(trace.provenance.items()) if name.startswith("limits.")]
-    if limits:
+    if limits := [text for name, text in sorted(trace.provenance.items()) if name.startswith("limits.")]:
         notes.append(f"limits reached: {'; '.join(limits)}")
     if "recovered.reason" in trace.provenance:
         notes.append(f"this log was salvaged after its writer died: {trace.provenance['recovered.reason']}")

@@ -42,8 +42,7 @@ def read_csv(path: Path, signals: Signals) -> CsvColumns:
         def list_names(separator: str) -> set[str]:
             return {name.strip() for name in next(csv.reader([header], delimiter=separator), [])}
 
-        found = find_own_table(list_names)
-        if found is not None:
+        if (found := find_own_table(list_names)) is not None:
             plant, table = found
             rows = csv.reader(chain([header], stream), delimiter=table.separator)
             sources, notes = _parse_rows(path, rows, tuple(sorted(table.sources)), ())

@@ -92,8 +92,7 @@ class Log:
             InputError: messages that are not protobuf or do not fit their schema, and chunks that are damaged.
         """
         with _report_damage(self.path, topic):
-            columns = self._read_rows(topic)
-            if columns is not None:
+            if (columns := self._read_rows(topic)) is not None:
                 return columns
             messages = [(time_ns, message) for _, time_ns, message in self.read_messages(topic)]
             if not messages:
@@ -194,8 +193,7 @@ def _check_sizes(path: Path, summary: Summary, size: int) -> None:
     Raises:
         InputError: it names the declared size.
     """
-    stored = sum(index.data_size for index in summary.attachment_indexes)
-    if stored > size:
+    if (stored := sum(index.data_size for index in summary.attachment_indexes)) > size:
         raise InputError(path, "attachments", f"at most the {size} bytes of the file, not {stored}")
     unpacked, most = sum(index.uncompressed_size for index in summary.chunk_indexes), limit_unpacked_size(size)
     if unpacked > most:

@@ -368,8 +368,8 @@ def _make_trace(grid: Mapping[str, Floats], signals: Signals, period: float, row
     columns = {name: grid.get(name, np.full(len(t), math.nan)) for name in signals.names}
     if "pa" in grid and "pb" in grid:
         more["chambers"] = np.column_stack([grid["pa"], grid["pb"]])
-    fields = {"phase": np.full(len(t), MAIN), "units": list_units(signals), **more}
-    fields |= {"usable": np.ones(len(t), bool), "filled": np.zeros(len(t), bool), "incomplete": np.zeros(len(t), bool)}
+    fields = {"phase": np.full(len(t), MAIN), "units": list_units(signals), **more, "usable": np.ones(len(t), bool),
+              "filled": np.zeros(len(t), bool), "incomplete": np.zeros(len(t), bool)}
     gaps = tuple(Gap(float(t[a]), float(t[b]), int(b - a - 1)) for a, b in pairwise(rows) if b - a > 1)
     return Trace(t=t, declared=signals, columns=columns, period=period, gaps=gaps, **fields)
 

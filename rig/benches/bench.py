@@ -154,9 +154,7 @@ def encode_float(value: float, length: int) -> int:
 
 def decode_float(bits: int, length: int) -> float:
     """The number that 32 or 64 bits stand for."""
-    code = "<d" if length == 64 else "<f"
-    value: float = struct.unpack(code, bits.to_bytes(length // 8, "little"))[0]
-    return value
+    return float(struct.unpack("<d" if length == 64 else "<f", bits.to_bytes(length // 8, "little"))[0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,11 +201,7 @@ def make_writer(spec: FrameSpec) -> Writer:
     if code is None:
         return lambda values, cycle, count: pack(spec, {**values, "cycle": cycle}, count)
     write, fields = struct.Struct(code.upper().replace("F", "I").replace("D", "Q")).pack, spec.fields
-
-    def pack_bytes(values: Mapping[str, float], cycle: int, count: int) -> bytes:
-        return write(*[_choose_bits(each, values, cycle) for each in fields])
-
-    return pack_bytes
+    return lambda values, cycle, count: write(*[_choose_bits(each, values, cycle) for each in fields])
 
 
 def _choose_bits(each: Field, values: Mapping[str, float], cycle: int) -> int:
@@ -240,10 +234,9 @@ def check_guards(spec: FrameSpec, data: bytes, last: int) -> tuple[str, int]:
     counter = next((each for each in spec.fields if each.guard is Guard.COUNTER), None)
     number = -1 if counter is None else extract_bits(counter, data)
     for each in spec.fields:
-        if each.guard is Guard.CHECKSUM:
-            expected = compute_checksum(each, insert_bits(each, data, 0), max(number, 0))
-            if extract_bits(each, data) != expected:
-                return "checksum", last
+        if each.guard is Guard.CHECKSUM and (
+                extract_bits(each, data) != compute_checksum(each, insert_bits(each, data, 0), max(number, 0))):
+            return "checksum", last
     if counter is None or last < 0 or number == (last + 1) % counter.modulus:
         return "", number
     return "repeated" if number == last else "jump", number
@@ -256,12 +249,8 @@ def make_reader(spec: FrameSpec) -> Callable[[bytes], dict[str, float]]:
         return lambda data: unpack(spec, data)
     rows = [(each.name, each.count.numerator, each.count.denominator, float(each.offset)) for each in spec.fields]
     read = struct.Struct(code).unpack
-
-    def unpack_bytes(data: bytes) -> dict[str, float]:
-        return {name: counts * high / low + offset
-                for counts, (name, high, low, offset) in zip(read(data), rows, strict=True)}
-
-    return unpack_bytes
+    return lambda data: {name: counts * high / low + offset
+                         for counts, (name, high, low, offset) in zip(read(data), rows, strict=True)}
 
 
 def locate_bits(each: Field, length: int) -> tuple[str, int]:
@@ -313,8 +302,7 @@ class FrameMap:
 
     def list_of(self, role: Role) -> tuple[FrameSpec, ...]:
         """The frames that a participant sends, in their order, and then those that it receives."""
-        others = tuple(each for each in self.frames if each.sender is not role)
-        return self.list_from(role) + others
+        return self.list_from(role) + tuple(each for each in self.frames if each.sender is not role)
 
     def find(self, identifier: int, data: bytes) -> FrameSpec | None:
         """The frame with this identifier and, if it is multiplexed, with the selectors of `data`; None: not mapped."""
@@ -340,8 +328,7 @@ def list_bits(each: Field) -> list[int]:
 def extract_bits(each: Field, data: bytes) -> int:
     """The bits of a field."""
     order, shift = locate_bits(each, len(data))
-    whole = int.from_bytes(data, order)  # type: ignore[arg-type]  # "little" or "big"
-    return whole >> shift & (1 << each.length) - 1
+    return int.from_bytes(data, order) >> shift & (1 << each.length) - 1  # type: ignore[arg-type]  # little or big
 
 
 def insert_bits(each: Field, data: bytes, bits: int) -> bytes:

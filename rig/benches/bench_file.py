@@ -220,9 +220,8 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, signals
         reader.plant, reader.kind = _find_plant(reader, folder, is_trusted=is_trusted)
         signals = find_plant(reader.kind).signals
     cycle_ns = _read_time(keys.cycle, reader.place.at("cycle"), *_CYCLES)
-    timeout_ns = None
-    if keys.controller.timeout is not None:
-        timeout_ns = _read_time(keys.controller.timeout, place.at("timeout"), Fraction(cycle_ns, 10**9), Fraction(10))
+    timeout_ns = None if keys.controller.timeout is None else _read_time(
+        keys.controller.timeout, place.at("timeout"), Fraction(cycle_ns, 10**9), Fraction(10))
     is_canopen = keys.controller.protocol == "canopen"
     uses = _list_uses(keys.controller, place, signals, is_canopen=is_canopen)
     uses = _add_states(reader, uses, keys.controller, place, is_canopen=is_canopen)
@@ -314,8 +313,7 @@ def _list_uses(keys: NodeKeys, place: Place, signals: Signals, *, is_canopen: bo
             said = build_dataclass(SignalKeys, {word if key == "" else key: text for key, text in entry.items()}, own)
             name = said.object if is_canopen else said.signal
             if name is None or (said.signal if is_canopen else said.object) is not None:
-                example = '"0x607A"' if is_canopen else '"MESSAGE.SIGNAL"'
-                raise own.refuse(f"a table with {word} = {example}")
+                raise own.refuse(f"a table with {word} = " + ('"0x607A"' if is_canopen else '"MESSAGE.SIGNAL"'))
             numbers = {}
             for key, text in (("count", said.count), ("offset", said.offset)):
                 if text is not None:
@@ -370,7 +368,8 @@ def _add_states(reader: _Reader, uses: dict[str, Use], keys: ControllerKeys, pla
         _add_use(uses, name, use, is_canopen=is_canopen)
     for name, entry in _group_keys(keys.protection, dots).items():
         own = place.at("protection", name)
-        said = build_dataclass(ProtectionKeys, {key or "kind": _undo_tuple(value) for key, value in entry.items()}, own)
+        said = build_dataclass(ProtectionKeys, {key or "kind": list(value) if isinstance(value, tuple) else value
+                                                for key, value in entry.items()}, own)
         use = Use(place=own, is_received=None, guard=Guard.COUNTER)
         if said.kind != "counter":
             use = replace(use, guard=Guard.CHECKSUM, checksum=reader.find_checksum(said.kind, own))
@@ -379,10 +378,6 @@ def _add_states(reader: _Reader, uses: dict[str, Use], keys: ControllerKeys, pla
             raise own.at("data_id").refuse("a checksum with it")
         _add_use(uses, name, use, is_canopen=is_canopen)
     return uses
-
-
-def _undo_tuple(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _set_data_id(use: Use, data_id: int | tuple[int, ...] | None) -> Use:
@@ -435,11 +430,9 @@ def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use
                        emcy=keys.emcy)
     if isinstance(keys, ControllerKeys):
         uses = _add_profile(uses, dictionary, keys, place)
-        mode = keys.mode
-        if keys.profile != "cia402" and mode is not None:
+        if keys.profile != "cia402" and keys.mode is not None:
             raise place.at("mode").refuse('profile = "cia402" with it')
-        if keys.profile == "cia402" and mode is None:
-            mode = CYCLE_POSITION
+        mode = CYCLE_POSITION if keys.profile == "cia402" and keys.mode is None else keys.mode
         node = replace(node, profile=keys.profile, mode=mode, settings=tuple(_list_settings(
             reader.kind, dictionary, keys.parameters, place.at("parameters"))),
             values=(*node.values, *_list_values(dictionary, keys.values, place.at("values"))))

@@ -27,8 +27,7 @@ def read_database(name: str, text: str) -> Any:
     Raises:
         InputError: not a DBC.
     """
-    huge = _HUGE.search(text)
-    if huge is not None:  # cantools would work on it for hours
+    if (huge := _HUGE.search(text)) is not None:  # cantools would work on it for hours
         raise InputError(name, "", f"a DBC with lengths of CAN frames, not {huge[0].strip()[:100]!r}")
     import cantools  # here: a CANopen bench has no DBC, and to load it takes 20 ms
 
@@ -95,8 +94,7 @@ def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns:
     chosen = [signal for signal in message.signals if f"{message.name}.{signal.name}" in uses]
     pages = list(islice(_list_pages(message, chosen, is_received=True in ways), MOST_FRAMES + 1))
     for selector in sorted({selector for page in pages for selector in page}):
-        own = f"{message.name}.{selector}"
-        if own in uses:
+        if (own := f"{message.name}.{selector}") in uses:
             raise uses[own].place.refuse(f"signals with no other use; {own} is the multiplexer of used ones")
     for page in pages:
         on_page = [replace(slots[signal.name], start=page[signal.name], is_selector=True) if signal.name in page else

@@ -100,10 +100,8 @@ def find_variable(dictionary: Any, index: int, sub: int) -> ODVariable | None:
     item = dictionary.get(index)
     if item is None or isinstance(item, ODVariable):
         return item if not sub else None
-    if sub not in item.subindices and read_number(dictionary, index, 0) is None:
-        found: ODVariable | None = item.get(sub)  # of a compact array, which lists no elements
-    else:
-        found = item.subindices.get(sub)
+    is_compact = sub not in item.subindices and read_number(dictionary, index, 0) is None  # it lists no elements
+    found: ODVariable | None = (item if is_compact else item.subindices).get(sub)
     return found
 
 
@@ -165,8 +163,7 @@ def map_pdos(name: str, dictionary: Any, node: int, uses: Mapping[str, Use]) -> 
     awaited = {key for key, use in uses.items() if use.is_needed} - synchronous  # only this PDO brings them
     frames = []
     for pdo, keys in on:
-        own = {key for key in keys if key in uses and uses[key].is_received in (pdo.is_received, None)}
-        if own:
+        if own := {key for key in keys if key in uses and uses[key].is_received in (pdo.is_received, None)}:
             is_answer = 1 <= pdo.kind <= 240 or (pdo.kind in _EVENT and not awaited.isdisjoint(own))
             frames.append(_map_pdo(name, dictionary, pdo, own, is_answer=is_answer))
     return frames
@@ -265,10 +262,7 @@ def list_values(dictionary: Any) -> tuple[tuple[int, int, bytes], ...]:
                 given[variable.index, variable.subindex] = variable.encode_raw(variable.value)
             except (TypeError, ValueError, UnicodeError):
                 continue  # a value that does not fit its type cannot be written either
-    ordered = []
-    for (index, sub), data in given.items():
-        if not RPDO <= index < TPDO + 2 * MAPPING:
-            ordered.append((index, sub, data))
+    ordered = [(index, sub, data) for (index, sub), data in given.items() if not RPDO <= index < TPDO + 2 * MAPPING]
     for parameter in sorted({index & ~MAPPING for index, _ in given if RPDO <= index < TPDO + 2 * MAPPING}):
         mapping = {sub: data for (index, sub), data in given.items() if index == parameter + MAPPING}
         own = {sub: data for (index, sub), data in given.items() if index == parameter and sub}

@@ -111,8 +111,7 @@ def guess_can(title: str, file: str, text: str) -> str:
     candidates = {message.name: [Candidate(f"{message.name}.{signal.name}", f"{message.name} {signal.name}",
                                            signal.unit or "")
                                  for signal in message.signals if not signal.is_multiplexer] for message in messages}
-    every = [each for own in candidates.values() for each in own]
-    current = _assign(every, ("current",)).get("current")
+    current = _assign([each for own in candidates.values() for each in own], ("current",)).get("current")
     senders = {message.name: set(message.senders) for message in messages}
     device = senders.get(current[0].key.partition(".")[0], set()) if current else set()
     sent = [message for message in messages if device and senders[message.name] & device]

@@ -176,5 +176,4 @@ def compute_counts(slot: Slot, value: float | str, place: Place) -> float:
 def list_phases(slot: Slot, use: Use) -> dict[str, Any]:
     """The counts of a value in each phase; in the safe state as in clean-up, else as the device starts."""
     given = {phase: compute_counts(slot, value, use.place.at(phase)) for phase, value in use.values.items()}
-    usual = dict.fromkeys(PHASES, slot.start) | {"safe": given.get("cleanup", slot.start)}
-    return usual | given
+    return dict.fromkeys(PHASES, slot.start) | {"safe": given.get("cleanup", slot.start)} | given

@@ -161,8 +161,7 @@ def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Mod
 
 def _find_size(name: str, model: Model, faults: Sequence[Fault]) -> Quantity:
     """What the size of a fault, or of an effect by its first parameter, is. Raises InputError."""
-    own = next((fault for fault in faults if fault.name == name), None)
-    if own is not None:
+    if (own := next((fault for fault in faults if fault.name == name), None)) is not None:
         return find_quantity(own.parameter, plant=model.plant)
     effect = find_effect(name, model.plant)
     if not effect.fitted:
@@ -495,13 +494,10 @@ def run_campaign(matrix: Matrix, folder: str | Path, workers: Workers,
 def plan_batch(matrix: Matrix, sources: str, count: int | None = None, redo_failed: bool = False) -> Batch:
     """The first `count` cases of a matrix as a batch; `sources` is the hash of the code that may judge them."""
     shared = {key: value for key, value in matrix.spec.items() if key not in ("case", "files")}
-
-    def describe_failure(case: Case, reason: str) -> Row:
-        return describe_case(case, shared) | {"reason": reason}
-
     return Batch(jobs={case.number: case for case in matrix.cases[:count]},
                  work=partial(judge_case, spec=shared, expected_sources=sources), key="case",
-                 describe_failure=describe_failure, is_failed=_has_failed,
+                 describe_failure=lambda case, reason: describe_case(case, shared) | {"reason": reason},
+                 is_failed=_has_failed,
                  is_valid=lambda row: not (redo_failed and _has_failed(row)))
 
 
@@ -525,9 +521,8 @@ def open_campaign(path: str | Path, matrix: Matrix, sources: str) -> RowFile:
         folder.mkdir(parents=True, exist_ok=True)
         if is_campaign_folder(folder):
             present = _read_campaign(folder)
-            changed = [key for key in {**present["matrix"], **expected["matrix"]}
-                       if present["matrix"].get(key) != expected["matrix"].get(key)]
-            if changed:
+            if changed := [key for key in {**present["matrix"], **expected["matrix"]}
+                           if present["matrix"].get(key) != expected["matrix"].get(key)]:
                 raise InputError(path, "--out", "a folder of this matrix, or a new one; it differs in "
                                                 f"{', '.join(changed)}")
             if present["code"] != sources:

@@ -225,8 +225,7 @@ def measure_errors(rows: Sequence[Row], faults: Sequence[Fault] = FAULTS) -> lis
         group = [row for row in rows
                  if row["label"] == label and row["status"] == OK and not has_other_fault(row, faults)]
         for fault in faults:
-            estimated = [row for row in group if math.isfinite(_measure_width(row, fault))]
-            if estimated:
+            if estimated := [row for row in group if math.isfinite(_measure_width(row, fault))]:
                 errors.append(_measure_error(label, estimated, fault))
     return errors
 
@@ -371,16 +370,12 @@ def _tabulate_errors(errors: Sequence[Mapping[str, Any]], faults: Sequence[Fault
 
 
 def _tabulate_traces(traces: Sequence[Mapping[str, Any]], faults: Sequence[Fault]) -> list[Item]:
-    if not traces:
-        return []
     columns = [Column("trace"), *(Column(fault.name) for fault in faults), Column("ruling"),
                *(Column(fault.symbol, align="right") for fault in faults)]
-    rows = []
-    for trace in traces:
-        levels = [trace[f"level_{fault.name}"] or trace["status"] for fault in faults]
-        sizes = [trace[fault.key] for fault in faults]
-        rows.append([trace["label"], *levels, trace["ruling"] or NO_NUMBER,
-                     *(format_digits(math.nan if size is None else size) for size in sizes)])
+    rows = [[trace["label"], *(trace[f"level_{fault.name}"] or trace["status"] for fault in faults),
+             trace["ruling"] or NO_NUMBER,
+             *(format_digits(math.nan if trace[fault.key] is None else trace[fault.key]) for fault in faults)]
+            for trace in traces]
     return [Table(columns, rows, "Levels, ruling fault and fault sizes of each recorded trace.")]
 
 

@@ -112,8 +112,7 @@ def keep_memory() -> None:
     the time of an explain, and a tenth of its memory, as each thread has pieces of its own.
     """
     trim_threshold, mmap_threshold, most_arenas = -1, -3, -8  # M_.. of malloc.h
-    choose = getattr(ctypes.CDLL(None), "mallopt", None)
-    if choose is not None:
+    if (choose := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         for option, value in ((trim_threshold, 2**31 - 1), (mmap_threshold, 2**30), (most_arenas, 2)):
             choose(option, value)
 

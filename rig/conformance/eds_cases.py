@@ -75,8 +75,7 @@ def check_lists(t: Target) -> str:
     for name, permitted in LISTS.items():
         keys = t.sheet.text.options(name) if t.sheet.text.has_section(name) else []
         entries = [read_number(t, name, key) for key in keys if key.isdigit()]
-        count = read_number(t, name, "SupportedObjects")
-        if count != len(entries):
+        if (count := read_number(t, name, "SupportedObjects")) != len(entries):
             problems.append(f"{name} says {count} and lists {len(entries)}")
         problems += [f"0x{index:04X} in {name}" for index in entries if index not in permitted]
         listed += entries
@@ -101,12 +100,10 @@ def check_subindices(t: Target, index: int) -> None:
     require(stated == len(subs), f"0x{index:04X} says SubNumber {stated} and has {len(subs)}")
     require(0 in subs, f"0x{index:04X} has no sub 0")
     highest = t.sheet.default(index)
-    if index == HISTORY or variables[0].is_mapping:  # their sub 0 counts what is in use
-        is_right = highest is None or highest <= subs[-1]
-    else:
-        is_right = highest == subs[-1]
-    is_right &= variables[0].data_type == UNSIGNED8
-    require(is_right, f"0x{index:04X}:0 is {highest}, the highest sub-index is {subs[-1]}")
+    counts_used = index == HISTORY or variables[0].is_mapping  # sub 0 counts what is in use
+    is_right = highest == subs[-1] or (counts_used and (highest is None or highest <= subs[-1]))
+    require(is_right and variables[0].data_type == UNSIGNED8,
+            f"0x{index:04X}:0 is {highest}, the highest sub-index is {subs[-1]}")
 
 
 def check_types(t: Target) -> str:

@@ -83,16 +83,6 @@ def check_ignored(t: Target, state: NmtState, make_frames: Callable[[Target], li
     return name_state(state)
 
 
-def make_foreign_commands(t: Target) -> list[bytes]:
-    """All commands, to a node-ID that nobody on the bus has."""
-    return [bytes((command, t.find_free_node())) for command in NmtCommand]
-
-
-def make_malformed_commands(t: Target) -> list[bytes]:
-    """Commands 0, 3 and 127; one byte; none."""
-    return [*(bytes((command, t.node)) for command in (0, 3, 127)), b"\1", b"\x81", b""]
-
-
 def check_sdo_by_state(t: Target, state: NmtState) -> str:
     """The device type is read."""
     t.beat()
@@ -234,8 +224,7 @@ def check_first_request(t: Target) -> str:
 
 def check_heartbeat_jitter(t: Target) -> str:
     """Thirty periods. CiA 301 gives no limit; consumers allow half a period at least."""
-    errors = [abs(period - 50.0) for period in measure_periods(t, 50, 30)]
-    return f"off by {require_times(t, errors, 1.0, 10.0)}"
+    return f"off by {require_times(t, [abs(period - 50.0) for period in measure_periods(t, 50, 30)], 1.0, 10.0)}"
 
 
 def check_sync_response(t: Target) -> str:
@@ -294,11 +283,14 @@ CASES = (
          check_transitions),
     Case("6.5", "commands to all nodes", "7.2.8.3.1", "node-ID 0 addresses the node too", check_broadcast),
     Case("6.6", "commands to other nodes", "7.2.8.3.1", "ignored in each state",
-         for_each(lambda t: COMMANDS, partial(check_ignored, make_frames=make_foreign_commands,
-                                              what="5 commands to another node"), text="5 commands ignored in {}")),
+         for_each(lambda t: COMMANDS, partial(
+             check_ignored, make_frames=lambda t: [bytes((command, t.find_free_node())) for command in NmtCommand],
+             what="5 commands to another node"), text="5 commands ignored in {}")),
     Case("6.7", "malformed commands", "7.2.8.3.1", "unknown commands and frames of another length are ignored",
-         for_each(lambda t: COMMANDS, partial(check_ignored, make_frames=make_malformed_commands,
-                                              what="6 malformed commands"), text="6 frames ignored in {}")),
+         for_each(lambda t: COMMANDS, partial(
+             check_ignored, what="6 malformed commands",
+             make_frames=lambda t: [*(bytes((command, t.node)) for command in (0, 3, 127)), b"\1", b"\x81", b""]),
+             text="6 frames ignored in {}")),
     Case("6.8", "SDO by state", "7.3.2.3, table 39", "in PRE-OPERATIONAL and OPERATIONAL, not in STOPPED",
          for_each(lambda t: COMMANDS, check_sdo_by_state)),
     Case("6.9", "PDO by state", "7.3.2.3, table 39", "sent and received in OPERATIONAL only",

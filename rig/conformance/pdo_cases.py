@@ -45,11 +45,6 @@ def check_parameters(t: Target, pdo: Pdo) -> str:
     return f"{pdo.name} {'off' if word & INVALID else f'0x{word & 0x7FF:03X}'} type {kind}"
 
 
-def check_mapping(t: Target, pdo: Pdo) -> str:
-    """As the node itself has it, beside the EDS."""
-    return describe_mapping(t, pdo, read_mapping(t, pdo))
-
-
 def describe_mapping(t: Target, pdo: Pdo, words: Sequence[int]) -> str:
     """The length of a mapping. Raises Problem for objects that the EDS does not have, or with another length."""
     for word in words:
@@ -115,11 +110,6 @@ def check_reserved_types(t: Target, pdo: Pdo) -> str:
     return pdo.name
 
 
-def check_fixed_while_valid(t: Target, pdo: Pdo) -> str:
-    """Bits 0 to 29 may only be changed while bit 31 says that the PDO is off."""
-    return f"{pdo.name} {require_fixed(t, (pdo.parameter, 1))}"
-
-
 def check_restricted(t: Target, pdo: Pdo) -> str:
     """The PDO is switched off first, so that nothing else can be the reason."""
     require_unrestricted(t, (pdo.parameter, 1))
@@ -156,9 +146,8 @@ def check_switching(t: Target, pdo: Pdo, phases: Sequence[tuple[str, str, bool]]
                     f"{pdo.name} is {action}, its {name} COB-ID is {'not used' if is_expected else 'used'}")
         if not pdo.is_sent:
             send_values(t, pdo, values)
-    used = [f"{action} 0x{cob_ids[name]:03X} {'used' if is_expected else 'silent'}"
-            for action, name, is_expected in phases]
-    return f"{pdo.name} {', '.join(used)}"
+    return f"{pdo.name} " + ", ".join(f"{action} 0x{cob_ids[name]:03X} {'used' if is_expected else 'silent'}"
+                                      for action, name, is_expected in phases)
 
 
 def works_as(t: Target, pdo: Pdo, values: list[bytes], cob_id: int, is_expected: bool) -> bool:
@@ -378,8 +367,7 @@ def require_unrestricted(t: Target, key: tuple[int, int]) -> None:
         for can_id in RESTRICTED_ENDS:
             if is_switchable:
                 require_abort(t.try_download(*key, word | INVALID), (0,), "it cannot be switched off")
-            code = t.try_download(*key, base | can_id)
-            if code != VALUE:
+            if (code := t.try_download(*key, base | can_id)) != VALUE:
                 accepted.append(f"0x{can_id:03X} {format_abort(code)}")
     require(not accepted, f"{t.variable(*key).label}: {join_labels(accepted)}")
 
@@ -402,9 +390,8 @@ def count_bytes(t: Target, pdo: Pdo) -> int:
 def set_type(t: Target, pdo: Pdo, *kinds: int) -> bool:
     """Give a PDO the first of these transmission types that it takes; whether it has one now."""
     for kind in kinds:
-        if t.read(pdo.parameter, 2) == kind:
-            return True
-        if t.sheet.is_writable(pdo.parameter, 2) and not t.try_download(pdo.parameter, 2, kind):
+        if t.read(pdo.parameter, 2) == kind or (
+                t.sheet.is_writable(pdo.parameter, 2) and not t.try_download(pdo.parameter, 2, kind)):
             return True
     return False
 
@@ -423,7 +410,7 @@ CASES = (
          "sub 0 is 2 or more; COB-ID and transmission type can be read",
          for_each(lambda t: t.sheet.pdos, check_parameters)),
     Case("4.2", "mapping", "7.5.2.36, 7.5.2.38", "mapped objects exist with that length; at most 64 bits",
-         for_each(lambda t: t.sheet.pdos, check_mapping)),
+         for_each(lambda t: t.sheet.pdos, lambda t, pdo: describe_mapping(t, pdo, read_mapping(t, pdo)))),
     Case("4.3", "synchronous transmission", "7.2.2.2, 7.5.2.37",
          "type 1, 2 and 3: one frame at every, every second and every third SYNC, as long as its mapping",
          for_each(list_sent, check_cyclic)),
@@ -435,7 +422,7 @@ CASES = (
          for_each(lambda t: t.sheet.pdos, check_reserved_types, text="refused by {}")),
     Case("4.7", "COB-ID of a valid PDO", "7.5.2.35, 7.5.2.37",
          "it cannot be changed: an abort, and the old one stays in force",
-         for_each(list_changeable, check_fixed_while_valid)),
+         for_each(list_changeable, lambda t, pdo: f"{pdo.name} {require_fixed(t, (pdo.parameter, 1))}")),
     Case("4.8", "restricted COB-IDs", "7.3.5, table 40", "each is refused with 0x06090030, at both ends of every range",
          for_each(list_changeable, check_restricted, text=f"{len(RESTRICTED_ENDS)} identifiers refused by {{}}")),
     Case("4.9", "29-bit COB-IDs", "7.5.2.35, 7.5.2.37", "supported, or refused with 0x06090030",

@@ -199,8 +199,7 @@ def _make_test_case(result: Result, node: int) -> junit.TestCase:
 
 
 def _describe(outcome: Outcome) -> str:
-    failed = [result.case.number for result in outcome.results if result.verdict is Verdict.FAIL]
-    if failed:
+    if failed := [result.case.number for result in outcome.results if result.verdict is Verdict.FAIL]:
         return f"{count_nouns(len(failed), 'test')} failed: {', '.join(failed)}."
     if outcome.is_disturbed:
         return "No test failed, but this machine was too late to measure some times; repeat it on a quiet machine."

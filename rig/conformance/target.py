@@ -444,8 +444,8 @@ class Target:
 
     def find_free_identifier(self) -> int:
         """An identifier that a PDO may use and nobody does, as far as was heard. Raises Refusal, Problem."""
-        used = {frame.cob_id for frame in self.frames}
-        used |= {self.read(pdo.parameter, 1) & 0x7FF for pdo in self.sheet.pdos}
+        used = {*(frame.cob_id for frame in self.frames),
+                *(self.read(pdo.parameter, 1) & 0x7FF for pdo in self.sheet.pdos)}
         return next(each for each in range(0x57E, 0x480, -1) if each not in used)
 
 

@@ -63,8 +63,7 @@ class Device:
 
     def receive(self, frame: Frame) -> None:
         """A frame of another node arrived."""
-        handler = self._handlers.get(frame.cob_id)
-        if handler is not None:
+        if (handler := self._handlers.get(frame.cob_id)) is not None:
             self.t_ns = frame.t_ns
             handler(frame)
 

@@ -92,8 +92,7 @@ class Dictionary:
         size, entry = self.find_size(index, sub), self.find(index, sub)
         if not entry.code:
             return data
-        excess = len(data) - size
-        if excess:
+        if excess := len(data) - size:
             raise SdoAbort(Abort.TOO_LONG if excess > 0 else Abort.TOO_SHORT)
         value: int | float = struct.unpack("<" + entry.code, data)[0]
         if entry.high is not None and value > entry.high:

@@ -39,20 +39,20 @@ _LARGEST = sys.float_info.max
 
 
 class Platform(NamedTuple):
-    """A kind of machine: its names in FMI 3 and FMI 2, in LLVM, and programs that compile C for it."""
+    """A kind of machine: its names in FMI 3 and FMI 2, in LLVM, and the program that compiles C for it."""
 
     name: str
     old_name: str
     triple: str
     suffix: str
-    compilers: tuple[str, ...]
+    compiler: str
     flags: tuple[str, ...] = ("-fPIC",)
 
 
 PLATFORMS = (
-    Platform("x86_64-linux", "linux64", "x86_64-unknown-linux-gnu", ".so", ("x86_64-linux-gnu-gcc",)),
-    Platform("aarch64-linux", "aarch64-linux", "aarch64-unknown-linux-gnu", ".so", ("aarch64-linux-gnu-gcc",)),
-    Platform("x86_64-windows", "win64", "x86_64-w64-windows-gnu", ".dll", ("x86_64-w64-mingw32-gcc",),
+    Platform("x86_64-linux", "linux64", "x86_64-unknown-linux-gnu", ".so", "x86_64-linux-gnu-gcc"),
+    Platform("aarch64-linux", "aarch64-linux", "aarch64-unknown-linux-gnu", ".so", "aarch64-linux-gnu-gcc"),
+    Platform("x86_64-windows", "win64", "x86_64-w64-windows-gnu", ".dll", "x86_64-w64-mingw32-gcc",
              ("-static-libgcc",)),
 )
 
@@ -139,12 +139,9 @@ def find_platforms() -> list[tuple[Platform, str]]:
     here = [machine for machine in PLATFORMS if machine.name == own]
     if not here:
         raise InputError("--fmu", own, f"a machine that is one of {', '.join(m.name for m in PLATFORMS)}")
-    found = [(here[0], find_compiler("--fmu", "to link the FMU with"))]
-    for machine in PLATFORMS:
-        compilers = [path for path in map(shutil.which, machine.compilers) if path]
-        if machine.name != own and compilers:
-            found.append((machine, compilers[0]))
-    return found
+    others = ((machine, shutil.which(machine.compiler)) for machine in PLATFORMS if machine.name != own)
+    return [(here[0], find_compiler("--fmu", "to link the FMU with")),
+            *((machine, compiler) for machine, compiler in others if compiler)]
 
 
 def _compile_cycle(model: Model) -> Any:

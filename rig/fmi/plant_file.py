@@ -105,9 +105,10 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str) 
     values.setdefault("controller.current_limit", 1e9)  # of a drive in another unit none is known
     state = make_state_type(tuple(signal.name for signal, _ in shown))
     columns = (command, first, drive, *(s for s, _ in shown[1:]), *(s for s, _ in given[1:]))
+    # the unit keeps its step to itself; its state is what it has shown
     return keep_plant(Plant(
-        signals=cast(Any, columns), parameters=types, state=state, step=_stay, measure=_show_state, moves=(),
-        title=f"FMU {file.name}", name=file.stem, values=values, file=file, key=key,
+        signals=cast(Any, columns), parameters=types, state=state, step=lambda s, m, u, p: (s, m),
+        measure=lambda s, p: s, moves=(), title=f"FMU {file.name}", name=file.stem, values=values, file=file, key=key,
         foreign=partial(Unit, about, [port for _, port in given], [port for _, port in shown], ports)))
 
 
@@ -116,16 +117,6 @@ def make_state_type(names: tuple[str, ...]) -> type[Any]:
     made: Any = NamedTuple("Held", [(name, float) for name in names])  # type: ignore[misc]
     made.__new__.__defaults__ = (0.0,) * len(names)
     return cast("type[Any]", made)
-
-
-def _stay(s: Any, m: Any, u: Any, p: Any) -> Any:
-    """Stands for the step, which the unit keeps to itself."""
-    return s, m
-
-
-def _show_state(s: Any, p: Any) -> Any:
-    """The readings, which are the state."""
-    return s
 
 
 def _list_entries(table: object, place: Place, prefix: str = "") -> Iterator[tuple[str, tuple[Entry, Place]]]:
@@ -145,9 +136,8 @@ def _list_entries(table: object, place: Place, prefix: str = "") -> Iterator[tup
 def _guess_entries(about: Description, table: str, place: Place) -> Entries:
     """Variables that have the names of signals of the EHA; as parameters those with one dot in their name."""
     signals = {**{name: name for name in find_plant("eha").signals.names}, **_COLUMNS}
-    kinds = {"inputs": "input", "outputs": "output", "parameters": "parameter"}
     return {name: (Entry(name), place) for name, v in about.variables.items()
-            if v.causality == kinds[table] and v.type in ("Real", "Float64")
+            if v.causality == table.removesuffix("s") and v.type in ("Real", "Float64")
             and (re.fullmatch(r"(?!controller\b)\w+\.\w+", name) if table == "parameters" else
                  signals.get(name) in _COLUMNS.values() and signals.get(name) != "com")}
 

@@ -187,8 +187,7 @@ def explain_socketcan_problem(interface: str, fd: bool = False) -> str:
 
 def require_interface(interface: str, fd: bool = False) -> None:
     """Raise RigError unless this kernel CAN interface can be used; `fd`: for CAN FD."""
-    problem = explain_socketcan_problem(interface, fd)
-    if problem:
+    if problem := explain_socketcan_problem(interface, fd):
         raise RigError(f"socketcan:{interface}: {problem}")
 
 
@@ -529,8 +528,7 @@ def serve_node(node: Node, link: Link, clock: Clock, stop: Done) -> None:
     while True:
         for frame in link.poll(max(0.0, (tick - clock.now()) * 1e-9)):
             node.receive(frame)
-        now = clock.now()
-        if now >= tick:
+        if (now := clock.now()) >= tick:
             if stop():
                 return
             node.tick(now)

@@ -65,8 +65,7 @@ class UdpBus(can.BusABC):
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         while select.select([self._rx], [], [], timeout)[0]:
             with contextlib.suppress(BlockingIOError):  # another thread was quicker
-                message = self._take_message()
-                if message is not None:
+                if (message := self._take_message()) is not None:
                     return message, False
             timeout = 0.0  # what is behind our own frame has come already; recv() waits again if nothing has
         return None, False
@@ -81,8 +80,7 @@ class UdpBus(can.BusABC):
             return messages
         with contextlib.suppress(BlockingIOError):
             while True:
-                message = self._take_message()
-                if message is not None:
+                if (message := self._take_message()) is not None:
                     messages.append(message)
         return messages
 

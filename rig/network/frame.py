@@ -56,12 +56,8 @@ def make_message(cob_id: int, data: bytes, **options: Any) -> can.Message:
 
 def find_cob_id(message: can.Message) -> int:
     """The COB-ID of a data frame of python-can, with its flags; not the error state indicator of CAN FD."""
-    cob_id = message.arbitration_id
-    for flag, is_set in ((EXTENDED, message.is_extended_id), (FD, message.is_fd),
-                         (SWITCHED, message.bitrate_switch)):
-        if is_set:
-            cob_id |= flag
-    return cob_id
+    return message.arbitration_id | (
+        EXTENDED * message.is_extended_id | FD * message.is_fd | SWITCHED * message.bitrate_switch)
 
 
 class Clock(Protocol):
@@ -101,6 +97,5 @@ class WallClock:
 
     def sleep_until(self, t_ns: int) -> None:
         """Sleep until `t_ns`. CPython sleeps to an absolute deadline, so a long run does not drift."""
-        left = t_ns - self.now()
-        if left > 0:
+        if (left := t_ns - self.now()) > 0:
             time.sleep(left * 1e-9)

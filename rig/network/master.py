@@ -195,8 +195,7 @@ class Master:
         if not self._stamped and frame.t_ns != (now := self._now()):
             frame = Frame(now, frame.cob_id, frame.data)
         self.hooks.on_frame(frame)
-        cyclic = self.hooks.on_cyclic.get(frame.cob_id)
-        if cyclic is not None:
+        if (cyclic := self.hooks.on_cyclic.get(frame.cob_id)) is not None:
             cyclic(frame)
             return
         if frame.cob_id in self._ours and frame.cob_id not in self._rivals:
@@ -242,8 +241,7 @@ class Master:
         for role in self._nodes:
             self._command_node(role, NmtCommand.RESET_COMMUNICATION)
         self.wire.wait(lambda: self._booted >= self._nodes.keys(), BOOT_TIMEOUT)
-        silent = [self._bench.describe_node(role) for role in sorted(self._nodes) if role not in self._booted]
-        if silent:
+        if silent := [self._bench.describe_node(role) for role in sorted(self._nodes) if role not in self._booted]:
             raise BusError(f"no boot-up from {' and '.join(silent)} within {BOOT_TIMEOUT:g} s of an NMT reset")
 
     def _empty_receive_buffer(self) -> None:
@@ -557,8 +555,7 @@ def list_pdo_objects(dictionary: Any, node: int) -> Iterator[ExpectedObject]:
         yield ExpectedObject(pdo.parameter, 1, pdo.cob_id, not_remote)
         for index, subs in ((pdo.parameter, (2, 3, 5)), (pdo.parameter + MAPPING, range(len(pdo.entries) + 1))):
             for sub in subs:
-                value = read_number(dictionary, index, sub)
-                if value is not None:
+                if (value := read_number(dictionary, index, sub)) is not None:
                     yield ExpectedObject(index, sub, value)
 
 

@@ -596,10 +596,10 @@ class RawBus:
         self._allow(cob_ids)
         try:
             if is_socketcan:
-                filters = []
-                for cob_id in cob_ids:  # the kernel is fast with masks that have just the bits of such an identifier
-                    mask = EXTENDED | _RTR | (IDENTIFIER if cob_id & EXTENDED else 0x7FF)
-                    filters.append(struct.pack("=II", cob_id & (EXTENDED | IDENTIFIER), mask))
+                # the kernel is fast with masks that have just the bits of such an identifier
+                filters = [struct.pack("=II", cob_id & (EXTENDED | IDENTIFIER),
+                                       EXTENDED | _RTR | (IDENTIFIER if cob_id & EXTENDED else 0x7FF))
+                           for cob_id in cob_ids]
                 self._rx.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"".join(filters))
             else:
                 udp.attach_filter(self._rx, socket.ntohs(int(self.port.words[_OWN])), cob_ids)
@@ -643,11 +643,9 @@ def _make_port() -> Port:
     words[_MESSAGE // 8: _MESSAGE // 8 + 7] = base + _SENDER, 0, base + _VECTOR, 1, base + _CONTROL, _CONTROL_SIZE, 0
     words[_VECTOR // 8: _VECTOR // 8 + 2] = base + _IN, _IN_SIZE
     words[_LIMIT // 8: _LIMIT // 8 + 2] = TURN_LIMIT_NS // 1_000_000_000, TURN_LIMIT_NS % 1_000_000_000
-    for place, operations in ((_TAKE, TAKE), (_GIVE, GIVE)):
-        octets = operations.view(np.uint8)
-        port.octets[place: place + octets.size] = octets
-    for place, example in ((_OUT, _EXAMPLE), (_WIDE_OUT, _WIDE_EXAMPLE)):  # for `encode_datagram` to fill in
-        port.octets[place: place + len(example)] = np.frombuffer(example, np.uint8)
+    for place, data in ((_TAKE, TAKE.tobytes()), (_GIVE, GIVE.tobytes()),
+                        (_OUT, _EXAMPLE), (_WIDE_OUT, _WIDE_EXAMPLE)):  # the last two for `encode_datagram` to fill in
+        port.octets[place: place + len(data)] = np.frombuffer(data, np.uint8)
     port.octets[_OUT + _OUT_SIZE - _TAIL: _OUT + _OUT_SIZE] = np.frombuffer(_EXAMPLE[-_TAIL:], np.uint8)
     return port
 

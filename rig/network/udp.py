@@ -162,8 +162,7 @@ class Turn:
             RigError: another program held it for longer than `limit_ns`, or the set was removed.
         """
         limit = np.array([limit_ns // 1_000_000_000, limit_ns % 1_000_000_000], np.int64)
-        number = self._operate(TAKE, limit)
-        if number:
+        if number := self._operate(TAKE, limit):
             raise self.explain_failure(number, limit_ns)
 
     def give(self) -> None:
@@ -225,8 +224,7 @@ class Turn:
         time = None if limit is None else limit.ctypes.data
         while self._library.semtimedop(where, ctypes.c_void_p(operations.ctypes.data), ctypes.c_size_t(len(operations)),
                                        ctypes.c_void_p(time)):
-            number = ctypes.get_errno()
-            if number != errno.EINTR:
+            if (number := ctypes.get_errno()) != errno.EINTR:
                 return number
         return 0
 

@@ -169,12 +169,9 @@ class Emulator:
 
     def _pass_cycle(self) -> None:
         """A cycle of which the node heard no SYNC: the current stays, and is zeroed after three."""
-        k = self._cycle
-        if self.device.state is not NmtState.OPERATIONAL:
-            self._cycle += 1
-            return
-        self._miss(1)
-        self.plant.pass_unread(k)
+        if self.device.state is NmtState.OPERATIONAL:
+            self._miss(1)
+            self.plant.pass_unread(self._cycle)
         self._cycle += 1
 
     def _answer_again(self) -> None:
@@ -207,8 +204,7 @@ class Emulator:
 
     def _transmit(self, cob_id: int, data: bytes) -> None:
         """Send a frame unless a fault drops or delays it."""
-        name = self._names.get(cob_id)
-        if name is not None:
+        if (name := self._names.get(cob_id)) is not None:
             action = self._faults.find_action(name, self._cycle)
             if action.code == DELAY:
                 heapq.heappush(self._held, (self.device.t_ns + action.argument, self._cycle, cob_id, data))

@@ -120,8 +120,7 @@ class EmulatorService:
             RigError: the loop's bus is gone.
         """
         self._book_events()
-        last = int(self._memory.words[ec.LAST_SYNC])
-        if last != self._last_sync:
+        if (last := int(self._memory.words[ec.LAST_SYNC])) != self._last_sync:
             self._last_sync = last
             self.device.sync.notice(t_ns)
         self.device.tick(t_ns)
@@ -129,16 +128,12 @@ class EmulatorService:
         self._share_settings()
         self._watch_loop()
 
-    def close(self) -> None:
-        """Stop the loop."""
-        self._halt()
-
     # -- the loop's thread
 
     @contextmanager
     def _stop_loop(self) -> Iterator[None]:
         """Stop the loop, and start it again with what has been set meanwhile."""
-        self._halt()
+        self.close()
         try:
             yield
         finally:
@@ -152,7 +147,8 @@ class EmulatorService:
             self._kind |= _PINNED * (len(os.sched_getaffinity(0)) == 1)
             self._run(self._bus.port, self._memory)
 
-    def _halt(self) -> None:
+    def close(self) -> None:
+        """Stop the loop."""
         if self._thread is None:
             return
         self._memory.words[ec.STOP] = 1
@@ -266,10 +262,8 @@ class EmulatorService:
                           strict=False))
         for places, cycle in ((node.outputs, ec.FRAME_CYCLE), (node.inputs, ec.ANSWERED)):
             for signal, (key, field) in places.items():
-                if signal == "cycle":
-                    od[key] = field.wrap_number(int(shared[cycle]))
-                else:
-                    od[key] = field.compute_counts(values.get(signal, 0.0))
+                od[key] = (field.wrap_number(int(shared[cycle])) if signal == "cycle" else
+                           field.compute_counts(values.get(signal, 0.0)))
         longest = (shared[word] // 1000 for word in (ec.LONGEST_WAKE, ec.LONGEST_RESPONSE, ec.LONGEST_CYCLE))
         counts = (shared[ec.MISSING], shared[ec.LATE], shared[ec.RECORDED], shared[ec.UNSENT], self._bus.overflows,
                   *longest, self._kind)

@@ -108,8 +108,9 @@ def import_own_table(source: Path, out: Path) -> int | None:
 
 
 def _write_own(trace: Trace, source: Path, out: Path) -> int:
-    own = {key: trace.provenance[key] for key in ("plant",) if key in trace.provenance}
-    write_mcap(trace, out, collect_provenance(imported=source.name, period=trace.period, pace="imported", **own))
+    write_mcap(trace, out, collect_provenance(
+        imported=source.name, period=trace.period, pace="imported",
+        **{key: value for key, value in trace.provenance.items() if key == "plant"}))
     return len(trace)
 
 
@@ -216,12 +217,11 @@ class _CycleBuilder:
                 where = describe_identifier(cob_id)
                 return [Event("WARN", "frame", f"{where}: {len(frame.data)} bytes instead of {spec.length}")]
             self._take(frame.t_ns, spec, self._readers[spec](frame.data[:spec.length]))
-        elif not self._is_canopen:
-            pass
-        elif 0x700 < cob_id < 0x780 and len(frame.data) == 1 and self._nmt.get(node) != frame.data[0]:
+        elif (self._is_canopen and 0x700 < cob_id < 0x780 and len(frame.data) == 1
+              and self._nmt.get(node) != frame.data[0]):
             state = self._nmt[node] = frame.data[0]
             return [NmtState(node, state, _STATES.get(state, f"state {state}"))]
-        elif 0x080 < cob_id < 0x100 and len(frame.data) == 8:
+        elif self._is_canopen and 0x080 < cob_id < 0x100 and len(frame.data) == 8:
             code = int.from_bytes(frame.data[:2], "little")
             return [Event("ERROR" if code else "INFO", "emcy", f"node {node}: 0x{code:04X}")]
         return []
@@ -256,8 +256,7 @@ class _CycleBuilder:
     def _fill(self, row: Signals, values: Mapping[str, float]) -> None:
         """Put the values of a frame into a row."""
         for name, value in values.items():
-            column = self._columns.get(name)
-            if column is not None:
+            if (column := self._columns.get(name)) is not None:
                 setattr(row, column, round(value) if name in _WORDS else value)
 
 
@@ -296,8 +295,8 @@ def _load_messages(dbc: Path) -> dict[tuple[int, bool], Any]:
     Raises:
         InputError: it cannot be read.
     """
-    base = read_database(str(dbc), decode_device_text(read_file(dbc)))
-    return {(m.frame_id, m.is_extended_frame): m for m in base.messages}
+    return {(m.frame_id, m.is_extended_frame): m
+            for m in read_database(str(dbc), decode_device_text(read_file(dbc))).messages}
 
 
 def _find_readers(bench: Bench, dbc: Path | None) -> Readers:

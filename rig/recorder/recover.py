@@ -108,8 +108,7 @@ def _write_salvage(records: Iterable[McapRecord | bytes], damage: _Damage, out: 
         elif isinstance(record, bytes):
             if not file.channels:
                 file.declare(read_declarations(record))
-            index = _index_messages(record)
-            if index:
+            if index := _index_messages(record):
                 file.write_chunk(record, index)
         else:
             file.declare([record])

@@ -13,11 +13,11 @@ import threading
 import time
 import zlib
 from array import array
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from datetime import UTC, datetime
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -72,10 +72,9 @@ class CycleBlock(NamedTuple):
 
     def list_frames(self, cob_id: int) -> list[Frame]:
         """The frames with this COB-ID."""
-        times = self.t_ns.tolist()
         return [Frame(t_ns, cob_id, data.to_bytes(8, "little", signed=True))
                 for known, payload in self.frames if known == cob_id and payload is not None
-                for t_ns, data in zip(times, payload.tolist(), strict=True)]
+                for t_ns, data in zip(self.t_ns.tolist(), payload.tolist(), strict=True)]
 
     def make_row(self, i: int) -> tuple[Signals, Timing]:
         """A cycle as records."""
@@ -151,6 +150,7 @@ DRAIN_EVERY = 0.01  # s
 MOST_BLOCKS = 300  # waiting, of up to 500 cycles
 QUEUE_LIMIT = 2_000_000  # items; a disk that hangs must not eat the memory
 LIBRARY = "eha-rig"
+_make_index = partial(array, "Q")
 
 
 class Observer(NamedTuple):
@@ -219,7 +219,7 @@ class Recorder:
         self._parts: list[bytes] = []
         self._size = 0
         self._first_ns = 0
-        self._index: dict[int, array[int]] = {}
+        self._index: dict[int, array[int]] = defaultdict(_make_index)
         self._closed_at = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
@@ -315,10 +315,7 @@ class Recorder:
 
     def _add(self, t_ns: int, channel: int, raw: bytes) -> None:
         self._make_room(t_ns, t_ns)
-        try:
-            self._index[channel].extend((t_ns, self._size))
-        except KeyError:
-            self._index[channel] = array("Q", (t_ns, self._size))
+        self._index[channel].extend((t_ns, self._size))
         self._parts.append(raw)
         self._size += len(raw)
 
@@ -328,7 +325,7 @@ class Recorder:
         for channel, pairs in index.items():
             if len(pairs):
                 pairs[1::2] += np.uint64(self._size)
-                self._index.setdefault(channel, array("Q")).frombytes(pairs.tobytes())
+                self._index[channel].frombytes(pairs.tobytes())
         self._parts.append(raw)
         self._size += len(raw)
         if self._observer is not None and self._observer.sees_rows:
@@ -348,7 +345,7 @@ class Recorder:
             raise OSError(0, "the file was deleted while it was being written")
         if self._parts:
             self._file.write_chunk(b"".join(self._parts), self._index)
-            self._parts, self._size, self._index = [], 0, {}
+            self._parts, self._size, self._index = [], 0, defaultdict(_make_index)
 
 
 def _describe_failure(path: Path, error: OSError) -> RecorderError:

@@ -226,7 +226,8 @@ class Enabling:
         `main_control`: it may say that it is ready as soon as it is enabled.
         """
         self._play(CycleInput(0, demand, 0.0, control, is_counted=False))
-        if self._play_until(self._is_ready, lambda: CycleInput(1, demand, 0.0, main_control, is_counted=False)):
+        if self._play_until(lambda: all(self._has(name, value) for name, value in self._bench.ready.items()),
+                            lambda: CycleInput(1, demand, 0.0, main_control, is_counted=False)):
             return ""
         said = ", ".join(f"{name} is {self._loop.outputs.get(name, 0.0):g}, not {value:g}"
                          for name, value in self._bench.ready.items() if not self._has(name, value))
@@ -264,9 +265,6 @@ class Enabling:
 
     def _has_flag(self, flag: Flags) -> bool:
         return bool(int(self._loop.outputs.get("flags", 0)) & flag)
-
-    def _is_ready(self) -> bool:
-        return all(self._has(name, value) for name, value in self._bench.ready.items())
 
     def _has(self, name: str, value: float) -> bool:
         return isclose(self._loop.outputs.get(name, 0.0), value, rel_tol=1e-9, abs_tol=1e-12)

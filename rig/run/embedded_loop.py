@@ -183,18 +183,6 @@ def list_frames(bench: Bench) -> list[FrameSpec]:
     return found if is_plain and len(bench.frames.frames) == len(set(found)) == len(found) == 4 else []
 
 
-def set_values(b: Buffers, values: Sequence[float]) -> None:
-    """The values of the cycle before, SI."""
-    at = b.layout.words[VALUES_AT]
-    b.layout.doubles[at:at + len(values)] = values
-
-
-def bind_code(b: Buffers, actuator: Actuator) -> Callable[[], object] | None:
-    """The compiled cycles on a plant; None for one whose readings need more than its state and noise."""
-    plant = _lend_plant(b, actuator)
-    return None if plant is None else load_code().bind((b, plant.flat, plant.live))
-
-
 def _lend_plant(b: Buffers, actuator: Actuator) -> LentPlant | None:
     """A plant for the compiled code, which is told where its code, its parameters and its readings are."""
     plant = actuator.lend()
@@ -249,7 +237,8 @@ class EmbeddedLoop(CycleLoop):
         self._embedded = master.wire
         self._busy = find_busy_cycles(scenario.plan, faults)
         self._buffers = make_buffers(bench, self._values.names, guards)
-        self._buffers.words[CLOCK] = find_clock()
+        # address of that of the C library
+        self._buffers.words[CLOCK] = ctypes.cast(ctypes.CDLL(None).clock_gettime, ctypes.c_void_p).value or 0
         self._frames, self._sync_id = list_frames(bench), bench.frames.sync or 0
         self._lent: object = None  # the actuator that the compiled code works on
         self._run: Callable[[], object] | None = None
@@ -268,7 +257,8 @@ class EmbeddedLoop(CycleLoop):
         b, k = self._buffers, self.k
         step = CycleInput(phase, 0.0, 0.0, control)
         self.outputs.update(zip(self._values.given[2:], self._values.list_given(step)[2:], strict=True))
-        set_values(b, [self.outputs[name] for name in self._values.names])
+        at = b.layout.words[VALUES_AT]  # of the cycle before, SI
+        b.layout.doubles[at:at + len(self._values.names)] = [self.outputs[name] for name in self._values.names]
         b.words[ASKED], b.words[FIRST], b.words[PLANT_CYCLE] = most, k, emulator.plant.actuator.cycle
         b.reals[LOOP:GAINS], b.reals[GAINS:PERIOD] = firmware.loop, firmware.gains
         on_plant = emulator.plant.list_loads(k, most)
@@ -297,7 +287,8 @@ class EmbeddedLoop(CycleLoop):
         """The compiled code on the plant of the emulator, which is another one after each reset."""
         actuator = emulator.plant.actuator
         if self._lent is not actuator:
-            self._lent, self._run = actuator, bind_code(self._buffers, actuator)
+            self._lent, plant = actuator, _lend_plant(self._buffers, actuator)
+            self._run = None if plant is None else load_code().bind((self._buffers, plant.flat, plant.live))
         return self._run
 
     def _take_cycles(self, phase: int, control: int, played: int) -> None:
@@ -339,12 +330,6 @@ class EmbeddedLoop(CycleLoop):
         self.k += 1
         self._t_ns += self._period
         self._embedded.deliver(self._t_ns)  # the heartbeat of the rig
-
-
-@cache
-def find_clock() -> int:
-    """Address of clock_gettime of the C library."""
-    return ctypes.cast(ctypes.CDLL(None).clock_gettime, ctypes.c_void_p).value or 0
 
 
 def find_busy_cycles(plan: Plan, schedule: Schedule) -> NDArray[np.int64]:

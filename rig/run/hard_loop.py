@@ -147,8 +147,8 @@ class HardLoop(Loop):
 
     def serve(self) -> None:
         """Receive what the other nodes send and log the cycles that are complete; takes up to a period."""
-        near = self.waiting <= 2  # the end of the queue: the next input must come within a period
-        self._wire.poll(self._period * (0.1e-9 if near else 1e-9))
+        # at the end of the queue the next input must come within a period
+        self._wire.poll(self._period * (0.1e-9 if self.waiting <= 2 else 1e-9))
         self._drain()
         self._plant.draw_noise()
         set_rig_faults(self._master, self._faults, self.k)
@@ -310,8 +310,7 @@ class HardLoop(Loop):
             return
         step = self._inputs[row[hc.INPUT] % len(self._inputs)]
         phase = self._idle_phase if row[hc.INPUT_HELD] and self._idle_phase else step.phase
-        came = row[hc.ANSWERS]
-        roles = {role for role, bit in packing.BITS.items() if came & bit}
+        roles = {role for role, bit in packing.BITS.items() if row[hc.ANSWERS] & bit}
         signals = self._values.open_row(row[hc.CYCLE], phase, said[self._values.command], step.load,
                                         int(said["control_word"]))
         self._values.fill_row(signals, said, roles)

@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from itertools import count
 from math import isnan, nan
 from operator import attrgetter
 from typing import Any, NamedTuple, Protocol
@@ -260,7 +261,7 @@ class CycleLoop(Loop):
         self._t_ns = max(self._wire.clock.now(), master.played_until) + self._period
         self._sync = 0
         self._held: list[tuple[int, int, int, bytes]] = []  # late frames: due, order, identifier, payload
-        self._order = 0
+        self._order = count()
         master.hooks.on_cyclic.update({each.identifier: self._receive_answer for each in self._answers})
 
     def now(self) -> int:
@@ -399,8 +400,7 @@ class CycleLoop(Loop):
         return action
 
     def _hold(self, due: int, identifier: int, data: bytes) -> None:
-        self._order += 1
-        heapq.heappush(self._held, (due, self._order, identifier, data))
+        heapq.heappush(self._held, (due, next(self._order), identifier, data))
 
     def _release_held(self, before_ns: int) -> None:
         """Late frames whose time has come; those of the controller are taken in now."""
@@ -510,15 +510,12 @@ class CycleLoop(Loop):
         self._seen.came |= answer.roles
         self._seen.awaited.discard(answer.spec)
         if is_first:
-            since = self._since_sync(t_ns)
+            # by its time of reception; in lockstep, where that is virtual, to now
+            since = ((t_ns if self._realtime else self._wall.now()) - self._sync) * 1e-9
             for role in answer.roles & _RESPONSES.keys():
                 setattr(timing, _RESPONSES[role], since)
             if not self._seen.awaited and isnan(timing.work):
                 timing.work = since
-
-    def _since_sync(self, t_ns: int) -> float:
-        """Seconds from SYNC to a frame, by its time of reception; in lockstep, where that is virtual, to now."""
-        return ((t_ns if self._realtime else self._wall.now()) - self._sync) * 1e-9
 
     def _close(self) -> None:
         """The cycle under way is over: the next SYNC is due."""

@@ -233,8 +233,7 @@ class Outcome:
             "cycle": found.cause.cycle, "text": found.cause.text, "evidence": list(found.cause.evidence)}
         consequences = [{"t": self.find_time(self._find_cycle(trouble)), "source": self._name_node(trouble.node),
                          "kind": trouble.kind, "text": trouble.text} for trouble in found.consequences]
-        cycles = len(found.judged)
-        judged = {"cycles": cycles, "judged": int(found.judged.sum()), "invalid": found.invalid,
+        judged = {"cycles": len(found.judged), "judged": int(found.judged.sum()), "invalid": found.invalid,
                   "overruns": int(found.overruns.sum()),
                   "lateness": [{"t": self.find_time(each.first), "cycle": each.first, "last": each.last,
                                 "source": self._name_node(each.source), "text": each.text}
@@ -456,8 +455,8 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
         scheduled = loop.scheduler or name_scheduler()
     spent = stopwatch.now() * 1e-9
     kind = f"{loop.kind} real time" if job.realtime else "lockstep"
-    why = f"the cycles run in Python, because compiled code cannot use the bus {job.bus}"
-    reason = why if kind == "soft real time" else ""
+    reason = (f"the cycles run in Python, because compiled code cannot use the bus {job.bus}"
+              if kind == "soft real time" else "")
     recorder.metadata("nodes", {str(number): name for number, name in job.bench.list_participants().items()})
     recorder.metadata("timing", {"kind": kind, "reason": reason})
     history = session.log.history
@@ -576,10 +575,8 @@ def open_recorder(job: Job, folder: Path, epoch_ns: int = 0, observer: Observer 
         (folder / name).unlink(missing_ok=True)
     recorder = Recorder(folder / "trace.mcap", job.build_attachments(), collect_provenance(**job.list_settings()),
                         epoch_ns, observer, job.model.kind.signals)
-    try:
+    with contextlib.closing(recorder):
         yield recorder
-    finally:
-        recorder.close()
 
 
 def _count_lost_frames(history: History) -> dict[str, int]:

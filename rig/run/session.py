@@ -189,8 +189,7 @@ class Session:
         self._master.wire.hear_all()
         self.stage.loop = open_loop(self._master, self.job.bench, self.scenario, self._faults, self.log, self.job.bus,
                                     self.job.realtime, self.log.guarded)
-        first = Enabling(self.job.bench, self.stage.loop, self.job.realtime, self._must_end)
-        self._enablings.append((0, first))
+        self._enablings.append((0, Enabling(self.job.bench, self.stage.loop, self.job.realtime, self._must_end)))
         self.nodes.begin()
         self.stage.begun_ns, self.stage.is_playing = self.stage.clock.now(), True
         self._stalled_ns = self._master.wire.stalled_ns

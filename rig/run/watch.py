@@ -139,8 +139,7 @@ class NodeWatch:
 
     def is_node_gone(self) -> bool:
         """Whether a node will not answer any more; looks every 20 ms."""
-        now = self._stage.clock.now()
-        if now >= self._next_look:
+        if (now := self._stage.clock.now()) >= self._next_look:
             self._next_look = now + 20_000_000
             self.note_ended_processes()
             if self._stage.is_playing and self._looks:
@@ -223,9 +222,8 @@ class OverrunWatch:
 
     def add(self, timing: Timing) -> None:
         """Take in a complete cycle."""
-        if self._most is None or self.problem or timing.cycle * self._period < self._grace:
-            return
-        if timing.cycle in self._injected:
+        if (self._most is None or self.problem or timing.cycle * self._period < self._grace
+                or timing.cycle in self._injected):
             return
         is_fed = timing.feedback_response <= self._latest_feedback and not isnan(timing.valve_response)
         is_late = timing.lateness > self._latest_sync or not is_fed

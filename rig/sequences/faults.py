@@ -559,6 +559,5 @@ def find_contradiction(plan: Plan, model: Model) -> tuple[int, str] | None:
 
 def require_sensible(plan: Plan, model: Model) -> None:
     """Refuse faults whose parameters contradict each other or the model's own; raises InputError with the fault."""
-    found = find_contradiction(plan, model)
-    if found is not None:
+    if (found := find_contradiction(plan, model)) is not None:
         raise InputError("faults", plan.faults[found[0]].label, found[1])

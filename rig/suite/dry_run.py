@@ -112,13 +112,13 @@ class DryRun(NamedTuple):
     @property
     def problems(self) -> list[str]:
         """What violates a limit, in words; empty if the sequence can run."""
-        found = [f"{each.name} {each.describe(each.value)} beyond {each.describe(each.limit)} ({each.parameter}) in "
-                 f"{each.section!r}, t = {each.t:.3f} s"
-                 for each in self.demands if each.limit is not None and each.is_violated]
         signals = self.job.model.kind.signals
-        found += [each.describe(signals) for each in self.limits if each.signal == signals.controlled.name]
-        found += [f"guard {trip.name!r} violated at t = {trip.t:.3f} s" for trip in self.trips]
-        return found + [f"check {check.name!r}: {check.detail}" for check in self.checks if check.value != check.value]
+        return [*(f"{each.name} {each.describe(each.value)} beyond {each.describe(each.limit)} ({each.parameter}) in "
+                  f"{each.section!r}, t = {each.t:.3f} s"
+                  for each in self.demands if each.limit is not None and each.is_violated),
+                *(each.describe(signals) for each in self.limits if each.signal == signals.controlled.name),
+                *(f"guard {trip.name!r} violated at t = {trip.t:.3f} s" for trip in self.trips),
+                *(f"check {check.name!r}: {check.detail}" for check in self.checks if check.value != check.value)]
 
 
 def make_dry_run(job: Job) -> DryRun:
@@ -187,14 +187,13 @@ def measure_demands(command: Array, load: Array, t: Array, sections: Sequence[tu
         return Demand(name, float(np.abs(values[row])), unit, shown, float(t[row]), section, limits.get(parameter),
                       parameter)
 
-    found = [find(moved, command, unit, shown, signals.controlled.limit), find("step", jumps, unit, shown, ""),
-             # from the row before, which may be another section's
-             find("speed", speed, f"{unit}/s", (f"{shown[0]}/s", shown[1]), "no-load speed", back=1),
-             find("acceleration", acceleration, f"{unit}/s2", (f"{unit}/s2", 1.0), "")]
-    if signals.load is not None:
-        found.append(find("load", load, signals.load.unit, (signals.load.shown_unit, signals.load.shown_scale),
-                          "stall force"))
-    return found
+    return [find(moved, command, unit, shown, signals.controlled.limit), find("step", jumps, unit, shown, ""),
+            # from the row before, which may be another section's
+            find("speed", speed, f"{unit}/s", (f"{shown[0]}/s", shown[1]), "no-load speed", back=1),
+            find("acceleration", acceleration, f"{unit}/s2", (f"{unit}/s2", 1.0), ""),
+            *([] if signals.load is None else [
+                find("load", load, signals.load.unit, (signals.load.shown_unit, signals.load.shown_scale),
+                     "stall force")])]
 
 
 def split_jumps(command: Array, starts: Sequence[int], rate: float) -> tuple[Array, Array]:
@@ -321,9 +320,9 @@ def build_dry_run_report(dry: DryRun, files: Sequence[tuple[str, str]] = ()) -> 
     parts = [f"{name} {seconds:g} s" for name, seconds in dry.durations.items() if seconds]
     duration = f"{sum(dry.durations.values()):g} s: {', '.join(parts)}"
     facts = [("model", dry.job.model.name), ("differs from nominal", data["differences"]),
-             ("checks", str(len(sequence.checks))), ("guards", str(len(sequence.guards)))]
-    facts += [("steps in Python", ", ".join(f"{step.python} {step.when}" for step in sequence.steps))] if (
-        sequence.steps) else []
+             ("checks", str(len(sequence.checks))), ("guards", str(len(sequence.guards))),
+             *([("steps in Python", ", ".join(f"{step.python} {step.when}" for step in sequence.steps))]
+               if sequence.steps else [])]
     coloured = " Orange: the faults of the sequence." if dry.faults else ""
     picture = Figure("Position and speed of the command; position, following error and current of the predicted run of "
                      "a healthy actuator. Steps have no speed. Red: limits of the actuator. The bars are the windows "
@@ -341,18 +340,14 @@ def build_dry_run_report(dry: DryRun, files: Sequence[tuple[str, str]] = ()) -> 
 
 
 def _list_notes(dry: DryRun) -> list[str]:
-    notes = []
-    if dry.job.sequence.faults:
-        notes.append("the prediction is without the faults of the sequence")
     length, half_a_cycle = dry.durations["main"], 0.5 / dry.job.sequence.rate
-    notes += [f"fault {fault.label!r} ends with main at {length:g} s, not at {fault.end:g} s"
-              for fault in dry.job.sequence.faults if fault.end is not None and fault.end > length + half_a_cycle]
-    if dry.not_predicted:
-        notes.append(f"not predicted, because they judge events: {', '.join(dry.not_predicted)}")
-    failing = [check.name for check in dry.checks if not check.passed and check.value == check.value]
-    if failing:
-        notes.append(f"these checks would fail on the predicted run: {', '.join(failing)}")
-    return notes
+    lists = {"not predicted, because they judge events": dry.not_predicted,
+             "these checks would fail on the predicted run": [
+                 check.name for check in dry.checks if not check.passed and check.value == check.value]}
+    return [*(["the prediction is without the faults of the sequence"] if dry.job.sequence.faults else []),
+            *(f"fault {fault.label!r} ends with main at {length:g} s, not at {fault.end:g} s"
+              for fault in dry.job.sequence.faults if fault.end is not None and fault.end > length + half_a_cycle),
+            *(f"{words}: {', '.join(names)}" for words, names in lists.items() if names)]
 
 
 def _tabulate_demands(demands: Sequence[Demand]) -> list[Table]:
@@ -389,12 +384,10 @@ def describe_prediction(dry: DryRun) -> list[tuple[str, str]]:
     text = f"largest {scale * largest:.3g} {unit}" + (f" of {scale * limit:.3g} {unit}" if limit else "")
     main = (dry.t >= 0.0) & (dry.t < dry.durations["main"])
     scale, unit = signals.controlled.shown_scale, signals.controlled.shown_unit
-    lines = [(drive.phrase, text),
-             ("error", f"largest {scale * np.abs(error[main]).max():.4g} {unit}, RMS "
-                       f"{scale * math.sqrt(float(np.mean(error[main] ** 2))):.4g} {unit} in main")]
-    if dry.limits:
-        lines.append(("reaches", "; ".join(each.describe(dry.job.model.kind.signals) for each in dry.limits)))
-    return lines
+    return [(drive.phrase, text),
+            ("error", f"largest {scale * np.abs(error[main]).max():.4g} {unit}, RMS "
+                      f"{scale * math.sqrt(float(np.mean(error[main] ** 2))):.4g} {unit} in main"),
+            *([("reaches", "; ".join(each.describe(signals) for each in dry.limits))] if dry.limits else [])]
 
 
 def find_drive_limit(dry: DryRun) -> float | None:

@@ -148,12 +148,12 @@ def _vary(entry: CaseEntry, folder: Path, base: JobChoice) -> Iterator[Case]:
     effects = (*base.effects, *(folder / name for name in entry.effects))
     for sequence, model, bench, seed, *chosen in itertools.product(sequences, models, benches, seeds, *values.values()):
         changes: dict[str, Value] = dict(zip(values, chosen, strict=True))
-        words = [entry.name or Path(sequence).stem]
-        words += [Path(sequence).stem] if entry.name and len(sequences) > 1 else []
-        words += [Path(file).stem for file, files in ((model, models), (bench, benches))
-                  if file is not None and len(files) > 1]
-        words += [f"{name}={_show(value)}" for name, value in changes.items() if len(values[name]) > 1]
-        words += [f"seed {seed}"] if len(seeds) > 1 else []
+        words = [entry.name or Path(sequence).stem,
+                 *([Path(sequence).stem] if entry.name and len(sequences) > 1 else []),
+                 *(Path(file).stem for file, files in ((model, models), (bench, benches))
+                   if file is not None and len(files) > 1),
+                 *(f"{name}={_show(value)}" for name, value in changes.items() if len(values[name]) > 1),
+                 *([f"seed {seed}"] if len(seeds) > 1 else [])]
         choice = base._replace(sequence=_find_beside(folder, sequence), changes=changes, seed=seed, effects=effects,
                                model=None if model is None else _find_beside(folder, model),
                                bench=base.bench if bench is None else _find_beside(folder, bench),
@@ -202,8 +202,6 @@ def _as_tuple(value: object) -> tuple[Any, ...]:
 
 def _show(value: Value) -> str:
     return f"{value:g}" if isinstance(value, float) else value
-
-
 
 
 class CaseResult(NamedTuple):
@@ -375,9 +373,9 @@ def build_suite_report(suite: Suite, results: Sequence[CaseResult], seconds: flo
     verdict = find_verdict(results)
     verdicts = [each.verdict for each in requirements]
     facts = [("cases", count_verdicts([result.verdict for result in results])),
-             ("wall-clock time", f"{seconds:.1f} s, {processes} at a time")]
-    facts += [("suite file", suite.source)] if suite.source else []
-    facts += [("requirements", count_verdicts(verdicts))] if requirements else []
+             ("wall-clock time", f"{seconds:.1f} s, {processes} at a time"),
+             *([("suite file", suite.source)] if suite.source else []),
+             *([("requirements", count_verdicts(verdicts))] if requirements else [])]
     missing = [each.id for each in requirements if each.verdict == "NOT_COVERED"]
     return Report(
         command="run", title=suite.title, verdict=verdict, mood=MOODS[verdict], sentence=_describe(results),
@@ -466,16 +464,14 @@ def _tabulate_faults(results: Sequence[CaseResult], folder: Path) -> list[Table]
 def collect_data(suite: Suite, results: Sequence[CaseResult], requirements: Sequence[Requirement], seconds: float,
                  processes: int) -> dict[str, Any]:
     """The JSON answer of a suite."""
-    cases = []
-    for result in results:
-        choice = result.case.choice
-        cases.append({
-            "name": result.case.name, "verdict": result.verdict, "why": result.why, "seconds": round(result.seconds, 3),
-            "folder": str(result.case.folder), "sequence": choice.sequence, "model": choice.model,
-            "bench": choice.bench, "set": dict(choice.changes), "seed": choice.seed,
-            "requirement": list(result.case.requirement),
-            "differences": result.differences, "checks": [to_plain(check.collect_data()) for check in result.checks],
-            "not_applicable": [check._asdict() for check in result.skipped], "fdi": dict(result.fdi)})
+    cases = [{
+        "name": result.case.name, "verdict": result.verdict, "why": result.why, "seconds": round(result.seconds, 3),
+        "folder": str(result.case.folder), "sequence": result.case.choice.sequence, "model": result.case.choice.model,
+        "bench": result.case.choice.bench, "set": dict(result.case.choice.changes), "seed": result.case.choice.seed,
+        "requirement": list(result.case.requirement),
+        "differences": result.differences, "checks": [to_plain(check.collect_data()) for check in result.checks],
+        "not_applicable": [check._asdict() for check in result.skipped], "fdi": dict(result.fdi)}
+        for result in results]
     return {"verdict": find_verdict(results), "title": suite.title, "cases": cases,
             "counts": dict(Counter(result.verdict for result in results)), "seconds": round(seconds, 3),
             "jobs": processes,
@@ -500,15 +496,15 @@ def _make_suite(title: str, result: CaseResult) -> junit.TestSuite:
     case = result.case
     classname = ".".join(text.replace(".", "_") for text in (title, case.name))
     properties = [("folder", str(case.folder)), ("sequence", case.choice.sequence), ("seed", str(case.choice.seed)),
-                  ("verdict", result.verdict), ("differs from nominal", result.differences)]
-    properties += [("model", case.choice.model)] if case.choice.model else []
-    properties += [("requirement", f"{name}: whole run") for name in case.requirement]
-    properties += [("requirement", f"{name}: {check.name}") for check in case.checks for name in check.requirement]
-    tests = [_make_run_test(result, classname), *(_make_check_test(check, result, classname)
-                                                   for check in result.checks)]
-    tests += [junit.TestCase(check.name, classname, problem="skipped", message=f"not applicable: {check.reason}")
-              for check in result.skipped]
-    tests += [_make_diagnosis_test(result, classname)] if result.fdi else []
+                  ("verdict", result.verdict), ("differs from nominal", result.differences),
+                  *([("model", case.choice.model)] if case.choice.model else []),
+                  *(("requirement", f"{name}: whole run") for name in case.requirement),
+                  *(("requirement", f"{name}: {check.name}") for check in case.checks for name in check.requirement)]
+    tests = [_make_run_test(result, classname),
+             *(_make_check_test(check, result, classname) for check in result.checks),
+             *(junit.TestCase(check.name, classname, problem="skipped", message=f"not applicable: {check.reason}")
+               for check in result.skipped),
+             *([_make_diagnosis_test(result, classname)] if result.fdi else [])]
     return junit.TestSuite(case.name, tests, properties, result.seconds)
 
 

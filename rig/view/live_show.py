@@ -165,15 +165,9 @@ def _draw_title(run: LiveRun, width: int) -> Text:
 
 
 def _draw_nodes(run: LiveRun, silence: float) -> list[Text]:
-    lines = []
-    for node, name in run.plan.nodes.items():
-        line = Text(f"{name:<18}")
-        state = run.states[node]
-        if node in run.troubles:
-            line.append(f"DEAD: {run.troubles[node]}", style="bold white on red")
-        else:
-            line.append(state, style=_NODE_STYLES.get(state, "dim"))
-        lines.append(line)
+    said = {node: (state, _NODE_STYLES.get(state, "dim")) for node, state in run.states.items()}
+    said |= {node: (f"DEAD: {trouble}", "bold white on red") for node, trouble in run.troubles.items()}
+    lines = [Text.assemble(f"{name:<18}", said[node]) for node, name in run.plan.nodes.items()]
     if silence >= 1.0 and run.cycles and not run.is_over:
         lines[0].append(f"   no new cycle in the log for {silence:.1f} s", style="yellow")
     return lines
@@ -192,20 +186,15 @@ def _draw_checks(run: LiveRun, count: int) -> list[Text]:
     if len(shown) > count - 1:  # the newest of those that passed
         keep = done[len(done) - max(min(room - 1, len(done)), 0):]
         shown = [state for state in shown if state.word != "PASS" or state in keep]
-    return [title, *(_draw_check(state) for state in shown[:count - 1])]
-
-
-def _draw_check(state: CheckState) -> Text:
-    return Text.assemble((f"{state.word:<8} ", _STYLES[state.word]), state.name, (state.measured, "bold"))
+    return [title, *(Text.assemble((f"{state.word:<8} ", _STYLES[state.word]), state.name, (state.measured, "bold"))
+                     for state in shown[:count - 1])]
 
 
 def _draw_timing(run: LiveRun) -> list[Text]:
     response = run.read_last("response", round(2 * run.plan.rate))
-    lines = [Text("Timing, last 2 s", style="bold"), Text(_describe_lateness(run)),
-             Text(f"response {_describe_spread(response)}"), Text(f"overruns {run.overruns}")]
-    if run.overruns:
-        lines[3].stylize("yellow")
-    return lines
+    return [Text("Timing, last 2 s", style="bold"), Text(_describe_lateness(run)),
+            Text(f"response {_describe_spread(response)}"),
+            Text(f"overruns {run.overruns}", style="yellow" if run.overruns else "")]
 
 
 def _describe_lateness(run: LiveRun) -> str:
@@ -256,13 +245,9 @@ def draw_plot(lines: dict[str, NDArray[np.float64]], width: int, height: int, sm
             bits[row, column] |= bit
             colours[row, column] = colour
     labels = {0: high, height // 2: (low + high) / 2, height - 1: low}
-    drawn = []
-    for row in range(height):
-        text = Text(f"{labels[row]:7.2f} " if row in labels else " " * 8, style="dim")
-        for column in range(columns):
-            text.append(chr(0x2800 + bits[row, column]), style=colours[row, column] or None)
-        drawn.append(text)
-    return drawn
+    return [Text.assemble(f"{labels[row]:7.2f} " if row in labels else " " * 8,
+                          *((chr(0x2800 + bits[row, column]), colours[row, column]) for column in range(columns)),
+                          style="dim") for row in range(height)]
 
 
 def _list_dots(values: NDArray[np.float64], low: float, high: float, across: int, down: int
@@ -409,8 +394,7 @@ def follow_run(log: Path, run: LiveRun) -> Batches:
 def show_on_terminal(log: Path, plan: LivePlan) -> None:
     """Show a run on standard error until it is over: as a screen, or without a terminal as a line every 2 s."""
     console, run = Console(stderr=True, highlight=False), LiveRun(plan)
-    obstacle = find_obstacle(console)
-    if obstacle:
+    if obstacle := find_obstacle(console):
         print(f"live: {obstacle}: a line every 2 s instead of the screen", file=sys.stderr, flush=True)
         print_lines(log, run)
         return

@@ -108,10 +108,9 @@ class Recording:
 
     def declare_lane(self, lane: Lane) -> None:
         """Set the colours of a lane, and what is shown in place of its states."""
-        values = [*lane.colours]
-        if values:
+        if lane.colours:
             self._stream.log(make_lane_path(lane.path), self._rr.StateConfiguration(
-                values=values, labels=[lane.labels.get(value, value) for value in values],
+                values=[*lane.colours], labels=[lane.labels.get(value, value) for value in lane.colours],
                 colors=np.array([*lane.colours.values()], np.uint32)), static=True)
 
     def send_values(self, path: str, t: Floats, values: Floats) -> None:
@@ -292,12 +291,12 @@ def draw_run(trace: Trace) -> Drawing:
              for plot in draw_signals(list_columns(trace), layout)]
     facts = "\n".join(f"- {key}: {value}" for key, value in trace.provenance.items())
     log = _list_texts(trace)
-    shown = [ShownView(plot.title, tuple(curve.colour for curve in plot.curves if curve.colour != LIMIT))
-             for plot in plots]
     lanes = {PASS, *SECTIONS.values(), *STATES.values(), *VERDICTS.values()}
-    shown.append(ShownView(LANES, tuple(lanes), is_lanes=True))
-    shown += [ShownView(TEXTS, LEVEL_COLOURS, 40)] if log else []  # one level in the list of events has some 60
-    shown.append(ShownView(LIMITS, (LIMIT,), 0))
+    shown = [*(ShownView(plot.title, tuple(curve.colour for curve in plot.curves if curve.colour != LIMIT))
+               for plot in plots),
+             ShownView(LANES, tuple(lanes), is_lanes=True),
+             *([ShownView(TEXTS, LEVEL_COLOURS, 40)] if log else []),  # one level in the list of events has some 60
+             ShownView(LIMITS, (LIMIT,), 0)]
     name = trace.provenance.get("sequence", trace.provenance.get("source", "trace"))
     return Drawing(name, plots, LANES, [*_list_lanes(trace)], ("Provenance", facts), shown, log)
 
@@ -455,9 +454,9 @@ def draw_runs(found: RunDifferences) -> Drawing:
     plots: list[Plot] = []
     for name, (size, unit) in choose_difference_units(found).items():
         signal = found.runs[0].trace.declared.find(name)
-        plots.append(Plot(name, label_signal(signal), _draw_signal(found, name, signal.shown_scale)))
-        plots.append(Plot(f"difference_{name}", f"{signal.symbol} minus that of A [{unit}]",
-                          _draw_difference(found, name, 1.0 / size)))
+        plots += [Plot(name, label_signal(signal), _draw_signal(found, name, signal.shown_scale)),
+                  Plot(f"difference_{name}", f"{signal.symbol} minus that of A [{unit}]",
+                       _draw_difference(found, name, 1.0 / size))]
     # a run has one colour in all plots, so they are counted together
     colours = {curve.colour for plot in plots for curve in plot.curves} - {NOISE, REFERENCE}
     lanes = {PASS, NEUTRAL, *SECTIONS.values(), *VERDICTS.values()}
@@ -524,8 +523,8 @@ def draw_comparison(c: Comparison, before: Comparison | None) -> Drawing:
     plots = [draw(name, [(word, found) for word, found in models if name in found.signals])
              for name in c.signals for draw in (_draw_replay, _draw_residual)]
     own = {*MODELS, *RESIDUALS}
-    shown = [ShownView(plot.title, tuple({curve.colour for curve in plot.curves} & own)) for plot in plots]
-    shown.append(ShownView(COMMAND_AND_ERROR, (PASS, FAIL, *SECTIONS.values()), is_lanes=True))
+    shown = [*(ShownView(plot.title, tuple({curve.colour for curve in plot.curves} & own)) for plot in plots),
+             ShownView(COMMAND_AND_ERROR, (PASS, FAIL, *SECTIONS.values()), is_lanes=True)]
     lanes = [make_command_lane(c.trace, "run", 0.0), *(_make_error_lane(word, found) for word, found in models),
              *_list_left_out(c)]
     text = format_document(build_comparison_report(c))
@@ -540,13 +539,12 @@ def _draw_replay(name: str, models: Sequence[tuple[str, Comparison]]) -> Plot:
     trace = models[-1][1].trace
     signal, scale = trace.declared.find(name), trace.declared.find(name).shown_scale
     colour = MODELS[trace.output_names.index(name) % len(MODELS)]
-    curves = [Curve("1_measured", f"{signal.symbol} measured", COMMAND, trace.t,
-                    trace.mask_unusable(name) * scale, 4.0)]
     model = f"model, from the {trace.declared.drive.called}"
-    curves += [Curve(f"{number}_{word}", "before the change" if word == "before" else model,
-                     BEFORE if word == "before" else colour, found.trace.t, found.replay.model[name] * scale)
-               for number, (word, found) in enumerate(models, 2)]
-    return Plot(name, label_signal(signal), curves)
+    return Plot(name, label_signal(signal), [
+        Curve("1_measured", f"{signal.symbol} measured", COMMAND, trace.t, trace.mask_unusable(name) * scale, 4.0),
+        *(Curve(f"{number}_{word}", "before the change" if word == "before" else model,
+                BEFORE if word == "before" else colour, found.trace.t, found.replay.model[name] * scale)
+          for number, (word, found) in enumerate(models, 2))])
 
 
 def _draw_residual(name: str, models: Sequence[tuple[str, Comparison]]) -> Plot:
@@ -554,13 +552,13 @@ def _draw_residual(name: str, models: Sequence[tuple[str, Comparison]]) -> Plot:
     last = models[-1][1]
     signal, colour = last.signals[name].signal, RESIDUALS[last.trace.output_names.index(name) % len(RESIDUALS)]
     unit, scale = choose_drawn_unit(signal, max(found.signals[name].error for _, found in models))
-    curves = [Curve(f"{number}_{word}", "before the change" if word == "before" else "residual",
-                    BEFORE if word == "before" else colour, found.trace.t,
-                    found.replay.residual[name] * scale) for number, (word, found) in enumerate(models, 1)]
     floor = NOISE_BAND_RATIO * last.signals[name].floor.value * scale
-    curves += [Curve(f"3_floor_{side}", f"noise floor, {NOISE_BAND_RATIO:g} SD", FLOOR, last.trace.t[[0, -1]],
-                     np.full(2, sign * floor)) for side, sign in (("high", 1.0), ("low", -1.0))]
-    return Plot(f"residual_{name}", f"Residual of {signal.symbol}, measured minus model [{unit}]", curves)
+    return Plot(f"residual_{name}", f"Residual of {signal.symbol}, measured minus model [{unit}]", [
+        *(Curve(f"{number}_{word}", "before the change" if word == "before" else "residual",
+                BEFORE if word == "before" else colour, found.trace.t, found.replay.residual[name] * scale)
+          for number, (word, found) in enumerate(models, 1)),
+        *(Curve(f"3_floor_{side}", f"noise floor, {NOISE_BAND_RATIO:g} SD", FLOOR, last.trace.t[[0, -1]],
+                np.full(2, sign * floor)) for side, sign in (("high", 1.0), ("low", -1.0)))])
 
 
 def _list_left_out(c: Comparison) -> Iterator[Lane]:

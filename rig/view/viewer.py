@@ -119,8 +119,7 @@ def find_free_port() -> int:
     """A port of 127.0.0.1 that nothing uses."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+        return int(probe.getsockname()[1])
 
 
 def take_screenshot(shown: Sequence[ShownView], rrd: Path, image: Path, patience: float = 60.0) -> dict[str, int]:
@@ -144,11 +143,9 @@ def take_screenshot(shown: Sequence[ShownView], rrd: Path, image: Path, patience
             raise ViewerError(f"the viewer does not draw: {error}; its last line: {last.strip()}") from error
         finally:
             kill_viewer(viewer)
-    wrong = [f"{view.name}: {report.summary}" for view in views for report in view.reports]
-    if wrong:
+    if wrong := [f"{view.name}: {report.summary}" for view in views for report in view.reports]:
         raise ViewerError(f"views with errors: {'; '.join(wrong)}")
-    empty = _list_empty_views(shown, pixels)
-    if empty:
+    if empty := _list_empty_views(shown, pixels):
         raise ViewerError(f"{image}: empty views: {', '.join(empty)}")
     return pixels
 

@@ -116,13 +116,12 @@ def guess_map(measurement: Measurement, signals: Signals = EHA) -> GuessedMap:
     _scale_position(found, columns, signals)
     _find_signs(found, columns, signals)
     _find_steps(found, columns, signals)
-    chosen = {"time": (time_source or "its own times", time_confidence)}
-    chosen |= {name: (guess.source, guess.confidence) for name, guess in found.items()}
+    chosen = {"time": (time_source or "its own times", time_confidence),
+              **{name: (guess.source, guess.confidence) for name, guess in found.items()}}
     lines = [f"# First map of {measurement.path.name} ({measurement.format}), guessed: check every line.",
              f"# Then: rig import {measurement.path.name} --map THIS_FILE", "", *_list_file_lines(measurement),
-             *time_lines, ""]
-    for signal in signals[1:]:
-        lines += _list_signal_lines(signal, signals, found.get(signal.name), columns)
+             *time_lines, "", *(line for signal in signals[1:]
+                                for line in _list_signal_lines(signal, signals, found.get(signal.name), columns))]
     used = {column for guess in found.values() for column in (guess.source, guess.minus)} | {time_source}
     left = {name: _describe_left(name, columns, found, signals) for name in measurement.units if name not in used}
     if left:
@@ -161,8 +160,7 @@ def _has_word(name: str, words: str) -> str:
     plain = _simplify_name(name)
     for word in words.split("|"):
         pattern = word if len(word.replace(" ?", "")) >= 4 and word[-2:-1] != " " else rf"(?<=[ 0-9]){word}(?=[ 0-9])"
-        found = re.search(pattern, plain)
-        if found:
+        if found := re.search(pattern, plain):
             return found[0]
     return ""
 
@@ -284,8 +282,7 @@ def _rate_column(signal: Signal, signals: Signals, column: str, columns: Columns
         return None
     guess = Guess(column, unit or find_unit(si) or Unit(si, si, Fraction(1)))
     for words, worth in _list_words(signal, signals):
-        word = _has_word(column, words)
-        if word:
+        if word := _has_word(column, words):
             guess.note(worth, f"its name has {word!r}")
     if not guess.points:
         return None

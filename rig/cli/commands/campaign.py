@@ -58,8 +58,7 @@ def give_summary(rows: Sequence[Row], folder: Path, args: argparse.Namespace) ->
         write_statistics(figures, folder)
         names = sorted(file.name for file in folder.iterdir() if file.suffix in (".parquet", ".json", ".svg"))
         report = replace(report, files=[("results", f"{folder}/ {', '.join(names)}")])
-        left = len(read_matrix_of_folder(folder).cases) - len(rows)
-        if left:
+        if left := len(read_matrix_of_folder(folder).cases) - len(rows):
             report = replace(report, sentence=f"{report.sentence} {left} cases are left.",
                              next_command=f"rig campaign {shlex.quote(str(folder))}")
     is_missed = any(rate["met"] is False for part in figures["tolerances"] for rate in part["rates"])

@@ -58,8 +58,8 @@ def build_effects_report(chosen: Sequence[Effect], plant: str, tests: Mapping[st
     if is_detailed:
         law = ((chosen[0].function.__doc__ if chosen[0].function else "") or "").partition("\n")[0]
         title, sentence = chosen[0].name, ": ".join(filter(None, (chosen[0].name, law)))
-    sections = [Section("", _list_properties(chosen[0], rows[0], plant) if is_detailed else _tabulate_effects(chosen))]
-    sections += [Section(f"self-test of {name}", _show_test(test, plant)) for name, test in tests.items()]
+    sections = [Section("", _list_properties(chosen[0], rows[0], plant) if is_detailed else _tabulate_effects(chosen)),
+                *(Section(f"self-test of {name}", _show_test(test, plant)) for name, test in tests.items())]
     return Report("effects", title, sentence=sentence, sections=sections, data={"effects": rows})
 
 

@@ -37,8 +37,7 @@ def run_command(args: argparse.Namespace) -> int:
         raise InputError("--out", str(out), "a file .csv, .csv.gz or .mcap")
     require_new(require_writable(out, "--out", source=args.command_file), is_forced=args.force)
     columns = simulate(model, com, load, args.seed, args.steps)._asdict()
-    diverged = find_divergence(model, columns)
-    if diverged:
+    if diverged := find_divergence(model, columns):
         raise InputError(args.model or "--set", "", f"a plant that stays finite; {diverged} (rig simulate --steps "
                                                     "takes shorter steps)")
     trace = Trace.from_columns(columns, period, {"model": model.name, "seed": str(args.seed), "command": name,
