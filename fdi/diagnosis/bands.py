@@ -435,8 +435,8 @@ def _is_lost(x: Floats, s: Section, bands: Bands, notes: list[str]) -> bool:
     lost = float(np.isnan(x).mean()) if len(x) else 1.0
     too_much = lost > 1.0 - SECTION_MEASURED_SHARE
     if too_much:
-        section = describe_section(s, unit=bands.unit)
-        notes.append(f"{section} is not judged: {100 * lost:.0f} % of its position is missing")
+        notes.append(f"{describe_section(s, unit=bands.unit)} is not judged: {100 * lost:.0f} % of its position is "
+                     "missing")
     return too_much
 
 
@@ -509,7 +509,7 @@ def load_bands(path: str | Path, kind: Plant | None = None) -> Bands:
 
 def format_bands(bands: Bands) -> str:
     """Bands as TOML."""
-    count = _choose_count(bands)
+    count = float(f"1e{math.floor(math.log10(bands.scale)) - 6}")  # about a millionth of the largest command
     head = {"period_ms": bands.period * MS_PER_S, "scale": bands.scale, "count": count}
     lines = [HEADER.format(first=MS_PER_S * STEP_JUDGED_FROM, coarse=KNOT_CYCLES), "[bands]",
              *(f"{key} = {value:g}" for key, value in head.items()), "", "[provenance]",
@@ -539,21 +539,14 @@ def format_bands(bands: Bands) -> str:
                 lines += [f"{key}.{name} = [", *rows, "]"]
     for ramp in bands.ramps:
         lines += ["", "[[ramp]]", f"section = {ramp.section}", f"fault = {json.dumps(ramp.fault)}",
-                  f"position = {_format_width(ramp.position, count)}",
-                  f"speed = {_format_width(ramp.speed, SPEED_COUNT * count)}"]
+                  f"position = {_format_numbers(ramp.position._asdict(), count)}",
+                  f"speed = {_format_numbers(ramp.speed._asdict(), SPEED_COUNT * count)}"]
         if len(ramp.half_range):
             lines += [f"half_range = {_format_list(ramp.half_range / count, 2)}", f"slip = {ramp.slip:.4g}",
                       f"ease = {ramp.ease:.4g}"]
-    lines += ["", "[precursors]"]
-    for name, numbers_of in bands.precursors.items():
-        pairs = ", ".join(f"{key} = {_format_number(value)}" for key, value in numbers_of.items())
-        lines.append(f"{name if BARE.fullmatch(name) else json.dumps(name)} = {{ {pairs} }}")
+    lines += ["", "[precursors]", *(f"{name if BARE.fullmatch(name) else json.dumps(name)} = {_format_numbers(own)}"
+                                    for name, own in bands.precursors.items())]
     return "\n".join(lines) + "\n"
-
-
-def _choose_count(bands: Bands) -> float:
-    """What a count is worth: a power of ten, about a millionth of the largest command."""
-    return float(f"1e{math.floor(math.log10(bands.scale)) - 6}")
 
 
 def parse_bands(content: str, where: object, kind: Plant | None = None) -> Bands:
@@ -643,11 +636,8 @@ def _format_list(values: Iterable[float], places: int) -> str:
     return json.dumps(_round_values(values, places))
 
 
-def _format_width(width: Width, count: float) -> str:
-    pairs = ", ".join(f"{word} = {_format_number(value / count)}" for word, value in width._asdict().items())
-    return f"{{ {pairs} }}"
-
-
-def _format_number(value: float) -> str:
-    """A number as TOML writes it, NaN and infinity included."""
-    return f"{value:.5g}" if math.isfinite(value) else str(value)
+def _format_numbers(numbers: Mapping[str, float], count: float = 1.0) -> str:
+    """A table in one line, in counts of so much; as TOML writes numbers, NaN and infinity included."""
+    parts = {key: value / count for key, value in numbers.items()}
+    pairs = (f"{key} = {f'{x:.5g}' if math.isfinite(x) else x}" for key, x in parts.items())
+    return f"{{ {', '.join(pairs)} }}"

@@ -182,7 +182,7 @@ def _make_fault_unknowns(fault: Fault, model: Model, spread: float) -> list[Free
         factors = {fault.parameter: 1.0, **fault.follow}
         return [Free(name, by * fault.healthy, abs(by) * (middle - healthy), LINEAR_FAULT_SPREAD,
                      min(by * low, by * high), max(by * low, by * high), 0.02) for name, by in factors.items()
-                ] + _make_shape_unknowns(fault, model)
+                ] + [u._replace(prior=2.0) for u in _list_shapes(fault, model)]
     least = max(low, SMALLEST_SHARE * fault.healthy)
     same = find_quantity(fault.parameter, plant=model.plant).unit
 
@@ -202,14 +202,9 @@ def _make_fault_unknowns(fault: Fault, model: Model, spread: float) -> list[Free
     return [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, spread, *take_bounds(name), 1.0), *led]
 
 
-def _make_shape_unknowns(fault: Fault, model: Model) -> list[Free]:
-    """What a fit of the fault's effect frees beside its size, such as a phase, known to be of its starts' size."""
-    return [u._replace(prior=2.0) for u in _list_shapes(fault, model)]
-
-
 def _list_shapes(fault: Fault, model: Model) -> list[Free]:
-    known = {e.name: e for e in model.kind.list_effects()}
-    effect = known.get(fault.parameter.partition(".")[0])
+    """What a fit of the fault's effect frees beside its size, such as a phase, known to be of its starts' size."""
+    effect = {e.name: e for e in model.kind.list_effects()}.get(fault.parameter.partition(".")[0])
     if effect is None or effect.base or not effect.starts or fault.parameter not in effect.fitted:
         return []  # without starts nothing is known of a phase or the like, which then keeps its value
     return [u for u in list_effect_unknowns(effect, model) if u.name not in fault.parameters]
@@ -364,8 +359,8 @@ def make_problem(model: Model, trace: Trace, floor: Mapping[str, float] | None =
     """The model with faults and suspects ready in it, and the run to compare it with; `floor` RMS noise by signal, SI.
     """
     level = {name: floor[name] if floor else model[trace.declared.find(name).noise] for name in trace.outputs}
-    own = [s.effect for s in list_suspects(model, faults) if not model.find_effect(s.effect).base]
-    own += [name.partition(".")[0] for fault in faults for name in fault.parameters]
+    own = [*(s.effect for s in list_suspects(model, faults) if not model.find_effect(s.effect).base),
+           *(name.partition(".")[0] for fault in faults for name in fault.parameters)]
     ready = silence_readings(model).with_effects(own)
     noise = tuple(noises.white_noise(level[name]) for name in trace.outputs)
     return CountedProblem(ready, trace, noise, workers=workers, faults=tuple(faults))
@@ -742,11 +737,9 @@ def find_hopeless_ratio(trace: Trace, name: str) -> float:
 
 def learn_left_noise(problem: CountedProblem, found: Fit) -> CountedProblem:
     """The problem with the noise that a fit leaves, signal by signal, where only noise is left."""
-    learnt = []
-    for old, r in zip(problem.noise, found.residuals, strict=True):
-        is_noise = float(np.sqrt(np.nanmean(r**2))) <= RESIDUAL_IS_NOISE * old.level
-        learnt.append(noises.fit_noise(r) if is_noise else old)
-    return replace(problem, noise=tuple(learnt), _lanes={})
+    return replace(problem, noise=tuple(
+        noises.fit_noise(r) if float(np.sqrt(np.nanmean(r**2))) <= RESIDUAL_IS_NOISE * old.level else old
+        for old, r in zip(problem.noise, found.residuals, strict=True)), _lanes={})
 
 
 def report_fit(last: Fit, problem: CountedProblem, whole: Trace | None = None) -> Refinement:
@@ -760,9 +753,9 @@ def report_fit(last: Fit, problem: CountedProblem, whole: Trace | None = None) -
     sizes = {fault.name: estimate_parameter(last, fault.parameter, fault.interval_factor,
                                             _find_narrowest(last.free[k], float(last.x[k]), fault))
              for fault, k in zip(problem.faults, places, strict=True)}
-    suspects = list_suspects(problem.model, problem.faults)
     found = Refinement(problem.faults, sizes, correlations,
-                       {s.parameter: estimate_parameter(last, s.parameter) for s in suspects}, last, errors, floor,
+                       {s.parameter: estimate_parameter(last, s.parameter)
+                        for s in list_suspects(problem.model, problem.faults)}, last, errors, floor,
                        sum(problem.counts))
     if whole is None or whole is problem.trace:
         return found
@@ -787,8 +780,7 @@ def estimate_parameter(found: Fit, name: str, factor: float = 1.0, least: float 
     `least`: of the scaled unknown, half the narrowest interval.
     """
     i = [f.name for f in found.free].index(name)
-    half = factor * INTERVAL_95_SD * float(np.sqrt(found.covariance[i, i]))
-    half = max(half, least)
+    half = max(factor * INTERVAL_95_SD * float(np.sqrt(found.covariance[i, i])), least)
     low, high = sorted(found.free[i].value(float(found.x[i]) + way * half) for way in (-1.0, 1.0))
     return Estimate(found.free[i].value(float(found.x[i])), low, high)
 
@@ -813,8 +805,7 @@ def find_effects_beside(model: Model, trace: Trace, alone: Refinement, floor: Ma
         ensure_starts(name, trace.command, trace.load, model.plant)  # where the file of a user's plant gives none
     search = JointSearch(problem, list_other_effects(model, faults), progress)
     fits = search.find_explanations(alone.fit)
-    explanations = [_explain(effects, fit, search.problem, whole) for effects, fit in fits]
-    return average_explanations(explanations, marks)
+    return average_explanations([_explain(effects, fit, search.problem, whole) for effects, fit in fits], marks)
 
 
 def list_other_effects(model: Model, faults: Sequence[Fault] = FAULTS) -> list[str]:
@@ -868,9 +859,7 @@ class JointSearch:
         Fits are compared only when they have gone equally far: one that has just begun has the cost of the stops that
         it still misses, and a rival that has been fitted to the end beats it although it is wrong.
         """
-        free = self.list_unknowns()
-        begun = self.descend(replace(alone, free=free), ((1.0, 2),))
-        parents: list[Named] = [((), begun)]
+        parents: list[Named] = [((), self.descend(replace(alone, free=self.list_unknowns()), ((1.0, 2),)))]
         found = self.deepen(parents)
         for count in range(1, most_effects + 1):
             self.progress(f"looking for effect {count} beside the faults", 0.3 * count - 0.1)
@@ -907,8 +896,7 @@ class JointSearch:
         return self.map_alone(begin_again, deep)
 
     def _refine_steps(self) -> JointSearch:
-        problem = replace(self.problem, steps=FINE_STEPS, _lanes={})
-        return JointSearch(problem, self.effects, self.progress)
+        return JointSearch(replace(self.problem, steps=FINE_STEPS, _lanes={}), self.effects, self.progress)
 
     def add_effects(self, parent: Named, count: int, is_enough: bool) -> list[Named]:
         """The parent with one more effect each: the promising ones fitted; `is_enough`: the faults leave noise only."""
@@ -927,10 +915,8 @@ class JointSearch:
         worth = mixed[:most if count == 1 else 5]
         if not worth:
             return []
-        named = ", ".join(dict.fromkeys(p.effect for p in worth))
-        self.progress(f"fitting {named}", 0.3 * count - 0.05)
-        begun = self.map_alone(self._begin_fit, worth)
-        begun = sorted(begun, key=lambda f: f.cost)[:4]
+        self.progress(f"fitting {', '.join(dict.fromkeys(p.effect for p in worth))}", 0.3 * count - 0.05)
+        begun = sorted(self.map_alone(self._begin_fit, worth), key=lambda f: f.cost)[:4]
         fits = self.map_alone(lambda f: self.descend(f, ((3.0, 3), (1.0, 6))), begun)
         best: dict[str, Named] = {}
         for each in sorted(fits, key=lambda f: f.cost):
@@ -964,8 +950,7 @@ class JointSearch:
         near = 60.0 * GAIN_TIE  # such fits are not done: beginning again has gained a few hundred
         close = [each for each in ranked if each[1].cost < ranked[0][1].cost + near][:4]
         self.progress(f"last fits, {', '.join(_describe(effects) for effects, _ in close)}", 0.75)
-        fine = self._refine_steps()
-        self.problem = learn_left_noise(fine.problem, ranked[0][1])
+        self.problem = learn_left_noise(self._refine_steps().problem, ranked[0][1])
         done = self.map_alone(lambda each: (each[0], self.descend(each[1], ((1.0, 8),))), close)
         best = min(done, key=_get_cost)
         if len(best[0]) > 1:

@@ -337,8 +337,7 @@ def _move(model: Model, levels: Sequence[tuple[float, float]], scale: float, spe
 def _measure_stroke(model: Model) -> float:
     """How far the plant goes either way: its declared limit, else what the largest command has to a ram's stroke."""
     command = model.kind.signals.command
-    usual = 0.04 * (command.largest if math.isfinite(command.largest) else 1.0)
-    return model.values.get(command.limit, usual)
+    return model.values.get(command.limit, 0.04 * (command.largest if math.isfinite(command.largest) else 1.0))
 
 
 def _build_steps(model: Model) -> Floats:
@@ -436,8 +435,8 @@ def _simulate(model: Model, com: Floats, load: Floats, outputs: Sequence[str]) -
     """The closed loop on a command, as a recording without noise."""
     out = Lanes(silence_readings(model), (), STEPS).closed_loop(np.empty((1, 0)), com, load)[0]
     d = model.kind.signals
-    columns = {d.command.name: com, **{s.name: x for s, x in zip(d.columns, out.T, strict=True)}}
-    columns |= {d.load.name: load} if d.load else {}
+    columns = {d.command.name: com, **{s.name: x for s, x in zip(d.columns, out.T, strict=True)},
+               **({d.load.name: load} if d.load else {})}
     return hold_inputs(Trace.from_columns(columns, model["controller.period"], {}, d), tuple(outputs))
 
 
@@ -455,17 +454,22 @@ def _measure_information(problem: LogProblem, free: Sequence[Free], x: Floats) -
 def _compute_shares(free: Sequence[Free], information: Floats) -> dict[str, float]:
     """Of half its range, the half width of each parameter's interval."""
     covariance = np.linalg.pinv(information)
-    names = [f.name for f in free]
     shares = {}
     for k, f in enumerate(free):
-        slope = np.zeros(len(free))
-        slope[k] = f.scale
-        if isinstance(f, LogFrictionRatio):
-            dynamic = names.index(f.leader)
-            slope[dynamic] = free[dynamic].scale
+        slope = _find_slope(free, k)
         spread = IDENTIFIED_INTERVAL_FACTOR * float(np.sqrt(slope @ covariance @ slope))
         shares[f.name] = INTERVAL_95_SD * float(np.hypot(spread, get_systematic_sd(f.name))) / (f.scale * f.prior)
     return shares
+
+
+def _find_slope(free: Sequence[Free], k: int) -> Floats:
+    """Of the logarithm of parameter k, or of its value, by the scaled unknowns, (p,)."""
+    slope = np.zeros(len(free))
+    slope[k] = free[k].scale
+    if isinstance(f := free[k], LogFrictionRatio):
+        dynamic = [each.name for each in free].index(f.leader)
+        slope[dynamic] = free[dynamic].scale
+    return slope
 
 
 LAST_STEPS = 50  # solver steps a cycle, of the last rounds
@@ -580,8 +584,8 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
     free = list_unknowns(model, tuple(ranges))
     progress("regressions", 0.02)
     names = frozenset(f.name for f in free)
-    begun = estimate_by_regressions(fitted, model, frozenset(model.values) - names)
-    begun = {name: value for name, value in begun.items() if name in names}
+    regressed = estimate_by_regressions(fitted, model, frozenset(model.values) - names)
+    begun = {name: value for name, value in regressed.items() if name in names}
     first = replace(model, values=limit_friction_values({**model.values, **begun}))
     parts, remarks = cut_long_runs(fitted, sources, first, floor)
     problem = make_problem(model, parts, floor, workers or count_threads())
@@ -742,14 +746,8 @@ def estimate_parameters(model: Model, ranges: Sequence[Range], fit: Fit,
     free = fit.free
     names = [f.name for f in free]
     values = dict(zip(names, compute_values(free, fit.x).tolist(), strict=True))
-    slopes = np.zeros((len(ranges), len(free)))  # of the logarithm, or of the value, by scaled unknowns
-    for i, r in enumerate(ranges):
-        if r.name in names:
-            k = names.index(r.name)
-            slopes[i, k] = free[k].scale
-            if isinstance(f := free[k], LogFrictionRatio):
-                dynamic = names.index(f.leader)
-                slopes[i, dynamic] = free[dynamic].scale
+    slopes = np.array([_find_slope(free, names.index(r.name)) if r.name in names else np.zeros(len(free))
+                       for r in ranges])
     covariance = slopes @ fit.covariance @ slopes.T
     spread = np.sqrt(np.diag(covariance))
     found = []
@@ -994,8 +992,7 @@ def _estimate_spool(runs: Sequence[Trace], model: Model) -> dict[str, float]:
     if float(np.nanmax(np.abs(every))) > 0.98 * model["spool.travel"] or _dwells(every, limit):
         found["spool.travel"] = limit
     speeds = [np.abs(differentiate(_fill(x), 5, 1)) / t.period for t, x in zip(runs, spool, strict=True)]
-    highest = _find_limit(np.concatenate(speeds))
-    found["pilot.flow_gain"] = highest * model["spool.end_area"] / model["flapper.travel"]
+    found["pilot.flow_gain"] = _find_limit(np.concatenate(speeds)) * model["spool.end_area"] / model["flapper.travel"]
     return found
 
 

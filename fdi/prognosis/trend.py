@@ -450,8 +450,7 @@ def _sample_paths(found: Cleaned, posterior: Posterior, own: UnitError) -> Paths
     at = len(found.data.u) - 1
     tight = found.data._replace(loose=tuple(row for row in found.data.loose if row != at))
     third = TREND_PATHS // 3
-    jumped = fit_growth(tight._replace(steps=(*tight.steps, at)))
-    posteriors = posterior, jumped, fit_growth(tight)
+    posteriors = posterior, fit_growth(tight._replace(steps=(*tight.steps, at))), fit_growth(tight)
     three = [sample_paths(p, own, i, third) for i, p in enumerate(posteriors)]
     return Paths(np.concatenate([p.sizes for p in three]), np.concatenate([p.rate for p in three]))
 
@@ -464,10 +463,9 @@ def _summarise_draws(draws: Floats) -> Estimate:
 def _make_forecast(fault: Fault, unit: float, paths: Paths, start: float, span: float) -> Curve:
     """The sizes up to when most paths have reached MaxBand, at most twice the time seen so far."""
     until = float(np.quantile(find_first_passage(paths, 1.0), 0.5, method="nearest"))
-    ahead = AHEAD
-    shown = np.flatnonzero(ahead <= min(max(1.5 * until, 0.3), 2.0))
+    shown = np.flatnonzero(min(max(1.5 * until, 0.3), 2.0) >= AHEAD)
     low, middle, high = fault.healthy + unit * np.quantile(paths.sizes[:, shown], [0.025, 0.5, 0.975], axis=0)
-    return Curve(start + span * ahead[shown], low, middle, high)
+    return Curve(start + span * AHEAD[shown], low, middle, high)
 
 
 class Break(NamedTuple):
@@ -514,10 +512,8 @@ def _cut_before(data: Scaled, at: int) -> Scaled:
 def _find_strongest_break(data: Scaled) -> tuple[str, int, float] | None:
     """Kind, row and size of the break with the most evidence; None if that is not enough."""
     n = len(data.u)
-    spikes = np.eye(n)
-    jumps = np.tril(np.ones((n, n)))[:, 1:-1]  # from row j on; the first is no jump, at the last one cannot tell
-    v = np.column_stack([spikes, jumps])
-    gain, size = _compute_gains(data, v)
+    # spikes; and jumps from row j on, of which the first is none, and at the last one cannot tell
+    gain, size = _compute_gains(data, np.column_stack([np.eye(n), np.tril(np.ones((n, n)))[:, 1:-1]]))
     gain = gain + np.log(BREAK_PRIOR / np.repeat([n, max(n - 2, 1)], [n, n - 2]))
     gain[n - 1] += np.log(LAST_OUTLIER_PRIOR / BREAK_PRIOR * n)
     gain[[*data.loose, *(n + row - 1 for row in data.steps if row < n - 1)]] = -np.inf  # known already
@@ -561,5 +557,4 @@ def _compute_evidence(y: Floats, g: Floats, v: Floats, usual: Floats) -> tuple[F
     rest = gy[:, None] - gv * (vy / vv)
     both = (0.5 * vy ** 2 / vv - 0.5 * np.log(vv * STEP_PRIOR_SD ** 2)
             + compute_rise_evidence(rest / left, left ** -0.5, usual[:, None]))
-    rise = np.maximum(rest / left, 0.0)
-    return alone, both, (vy - gv * rise) / vv
+    return alone, both, (vy - gv * np.maximum(rest / left, 0.0)) / vv

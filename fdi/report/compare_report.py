@@ -126,8 +126,7 @@ def _error_and_floor(s: SignalError) -> str:
 def _describe_blocks(c: Comparison) -> str:
     """Which blocks disagree with the measurement, the worst first, and which fit."""
     if not c.named:
-        is_short = len(c.signals) == 1
-        return "P12 or XS would show in which block" if is_short else "no single block stands out"
+        return "P12 or XS would show in which block" if len(c.signals) == 1 else "no single block stands out"
     names = list(c.named)
     if c.blocks["jack"] is not None and c.blocks["jack"] == c.blocks["sensor"] and "jack" in names:
         names[names.index("jack")] = "jack or the sensor"
@@ -420,8 +419,8 @@ def draw_deviation_map(c: Comparison) -> str:
 
 def draw_whiteness(c: Comparison) -> str:
     """One row per signal: autocorrelation, cumulative periodogram, cross-correlation with the current."""
-    drive = c.trace.declared.drive.symbol
-    return draw_panels("whiteness", [_draw_tests(d, c.trace.period, c.signals[name].signal.symbol, drive)
+    return draw_panels("whiteness", [_draw_tests(d, c.trace.period, c.signals[name].signal.symbol,
+                                                 c.trace.declared.drive.symbol)
                                      for name, d in c.diagnoses.items()], 2.4 * len(c.diagnoses))
 
 

@@ -193,10 +193,9 @@ def describe_group(d: Diagnosis, group: Group) -> str:
 def describe_separation(d: Diagnosis, group: Group) -> str:
     """What would tell the faults of a group apart: signals that were not measured, or another test."""
     unmeasured = [s.symbol for s in d.model.kind.signals.outputs if s.name not in d.trace.outputs]
-    owners = [e for e in d.model.kind.list_effects() for f in d.faults
-              if f.name in group.names and f.parameter in e.fitted and e.revealed_by]
-    ways = [f"a recording with {join_words(unmeasured)}"] if unmeasured else []
-    ways += [f"{e.name}: {e.revealed_by}" for e in owners]
+    ways = [*([f"a recording with {join_words(unmeasured)}"] if unmeasured else []),
+            *(f"{e.name}: {e.revealed_by}" for e in d.model.kind.list_effects() for f in d.faults
+              if f.name in group.names and f.parameter in e.fitted and e.revealed_by)]
     return f"to find out, try {'; '.join(ways)}" if ways else "another test, or an inspection, has to"
 
 
@@ -235,9 +234,9 @@ def list_found_faults(answer: Mapping[str, Any]) -> list[FoundFault]:
     found = []
     for name, fault in (answer.get("faults") or _collect_faults(FAULTS)).items():
         size = Estimate(**{key: math.nan if x is None else x for key, x in answer["refined"][fault["key"]].items()})
-        level = words.get(answer["level"][name], LEVEL_NAMES[None])
-        shown = format_interval(size.value, size.low, size.high, fault["unit"])
-        found.append(FoundFault(fault["title"], level, f"{fault['symbol']} {shown}"))
+        found.append(FoundFault(
+            fault["title"], words.get(answer["level"][name], LEVEL_NAMES[None]),
+            f"{fault['symbol']} {format_interval(size.value, size.low, size.high, fault['unit'])}"))
     return found
 
 
@@ -710,7 +709,7 @@ def _draw_sizes_of_fault(fault: Fault, fit: Estimate, found: Sequence[tuple[str,
     return [*shades, call("errorbar", fit.value, 0, xerr=interval, color=INK, capsize=3, marker="o", ms=6),
             *(dot(size, row, INK, marker="D", ms=4) for row, (_, size) in enumerate(found, 1)),
             *name_rows(["refined", *(label for label, _ in found)]),
-            axes(xlim=(limits[0], limits[-1]), xlabel=_name_axis(fault))]
+            axes(xlim=(limits[0], limits[-1]), xlabel=fault.symbol + (f" [{fault.unit}]" if fault.unit != "1" else ""))]
 
 
 def _place_size(fault: Fault, departure: float, way: float) -> float:
@@ -782,7 +781,3 @@ def _scale_sizes(grid: Grid, sizes: Sequence[float]) -> tuple[float, float]:
 def _name_map_axis(fault: Fault) -> str:
     unit = choose_unit(fault.unit, fault.limits[2])[1]
     return fault.symbol + (f" [{unit}]" if unit else "")
-
-
-def _name_axis(fault: Fault) -> str:
-    return fault.symbol + (f" [{fault.unit}]" if fault.unit != "1" else "")

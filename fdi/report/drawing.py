@@ -286,6 +286,8 @@ def to_svg(figure: Figure, salt: str) -> Drawing:
     drawing = Drawing(f'<svg data-axes="{notes}"{text[text.index("<svg") + 4:]}')
     drawing.figure = figure
     return drawing
+
+
 def save_drawing(drawing: Drawing, path: Path, option: str) -> None:
     """Write a figure: .svg as a page shows it; .png, .pdf and what else matplotlib writes.
 

@@ -17,7 +17,6 @@ from fdi.discovery.runs import Source
 from fdi.discovery.search import Hypothesis
 from fdi.discovery.sensitivity import NEEDED, RUNGS, TRIALS, Claim
 from fdi.discovery.update_model import ModelUpdate, Row
-from fdi.estimation.binomial import Share
 from fdi.estimation.fit import Value
 from fdi.report.compare_report import OTHER_ACTUATOR
 from fdi.report.drawing import (
@@ -309,9 +308,12 @@ def _list_claims(claims: Sequence[Claim]) -> Section:
     return Section("Sizes that are named", [
         tabulate(claims, (Column("effect"), lambda c: Cell(c.effect, "good" if c.named else "bad")),
                  (Column("parameter", medium=Medium.PAGE), lambda c: Cell(name_parameter(c.parameter), "muted")),
-                 (Column("named from", align="right"), _describe_claim),
-                 (Column("named", align="right"), lambda c: _format_count(c.named)),
-                 (Column("interval", align="right"), lambda c: _format_share(c.named)),
+                 (Column("named from", align="right"),
+                  lambda c: "no usual size" if c.smallest is None else format_amount(c.smallest, c.unit)),
+                 (Column("named", align="right"),
+                  lambda c: f"{c.named.good} of {c.named.of}" if c.named else NO_NUMBER),
+                 (Column("interval", align="right"),
+                  lambda c: f"{100 * c.named.low:.0f} .. {100 * c.named.high:.0f} %" if c.named else NO_NUMBER),
                  (Column("others taken for"), lambda c: list_first([f"{w} {n}" for w, n in c.taken_for.items()], 2)),
                  caption="Each effect was hidden in this unit, at sizes a factor of two apart, in "
                          f"{TRIALS} runs a size with other noise. Named from: the smallest change of its first "
@@ -319,20 +321,6 @@ def _list_claims(claims: Sequence[Claim]) -> Section:
                          "%) is that of this share. Of smaller sizes nothing is claimed."),
         Figure("Runs that name the effect and nothing else, of all at that size. Right: the largest usual size.",
                partial(draw_claims, claims))])
-
-
-def _describe_claim(c: Claim) -> str:
-    if c.smallest is None:
-        return "no usual size"
-    return format_amount(c.smallest, c.unit)
-
-
-def _format_count(share: Share | None) -> str:
-    return f"{share.good} of {share.of}" if share else NO_NUMBER
-
-
-def _format_share(share: Share | None) -> str:
-    return f"{100 * share.low:.0f} .. {100 * share.high:.0f} %" if share else NO_NUMBER
 
 
 def draw_claims(claims: Sequence[Claim]) -> str:
@@ -392,10 +380,9 @@ AXES = {"position": (1e3, "mm"), "speed": (1e3, "mm/s"), "pressure": (1e-5, "bar
 def draw_change(trace: Trace, before: Hypothesis, after: Hypothesis | None, floor: BySignal,
                 name_of_after: str = "with the missing effect") -> str:
     """The residual, measured minus model, of each signal over time, without and with the effects, below the command."""
-    models = [("model as it was", BEFORE, before.fit.residuals[:, :len(trace)])]
-    if after is not None:
-        models.append((name_of_after, AFTER, after.fit.residuals[:, :len(trace)]))
-    return draw_residuals("left", trace, models, floor)
+    return draw_residuals("left", trace, [
+        ("model as it was", BEFORE, before.fit.residuals[:, :len(trace)]),
+        *([] if after is None else [(name_of_after, AFTER, after.fit.residuals[:, :len(trace)])])], floor)
 
 
 def draw_ranking(candidates: Sequence[Candidate], floor: BySignal, most: int = 12) -> str:
@@ -521,11 +508,11 @@ def _tabulate_law_errors(found: LawSearch, law: Law) -> Table:
 
 def _list_errors(found: LawSearch, law: Law) -> list[tuple[str, BySignal, BySignal]]:
     """(model, RMS errors on the fitted run, on the held-out run) without, with the catalogue's best, with the law."""
-    rows = [("as it was", found.base.errors, found.holdout.get("base", {}))]
-    if found.catalogue is not None:
-        rows.append((f"with {' + '.join(found.catalogue.effects)}", found.catalogue.errors,
-                     found.holdout.get("catalogue", {})))
-    return [*rows, ("with the law", law.hypothesis.errors, law.holdout), ("noise floor", found.floor, found.floor)]
+    best = found.catalogue
+    return [("as it was", found.base.errors, found.holdout.get("base", {})),
+            *([] if best is None else [(f"with {' + '.join(best.effects)}", best.errors,
+                                        found.holdout.get("catalogue", {}))]),
+            ("with the law", law.hypothesis.errors, law.holdout), ("noise floor", found.floor, found.floor)]
 
 
 def _tabulate_dependences(missing: Sequence[Missing]) -> Table:

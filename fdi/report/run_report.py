@@ -163,21 +163,19 @@ def _show_diagnosis(trace: Trace) -> list[Item]:
 def _list_notes(trace: Trace, most: int = 5) -> list[str]:
     """What a reader must know before trusting the plots: of missing cycles the first `most` gaps, missing samples."""
     rest = trace.gaps[most:]
-    notes = [*trace.notes,
-             *(f"{gap.cycles} cycles missing between {gap.t0:.3f} and {gap.t1:.3f} s" for gap in trace.gaps[:most])]
-    if rest:
-        notes.append(f"and {sum(gap.cycles for gap in rest)} cycles in {len(rest)} more gaps")
     names_of_count: dict[int, list[str]] = {}
     load = trace.declared.load  # which is known or not, never sampled
     for name in (name for name in trace.signals if load is None or name != load.name):
         names_of_count.setdefault(int(np.isnan(trace.column(name)).sum()), []).append(name)
-    if parts := [f"{count} of {', '.join(names)}" for count, names in names_of_count.items() if count]:
-        notes.append(f"missing samples (red on the page): {'; '.join(parts)} (of {len(trace)})")
-    if limits := [text for name, text in sorted(trace.provenance.items()) if name.startswith("limits.")]:
-        notes.append(f"limits reached: {'; '.join(limits)}")
-    if "recovered.reason" in trace.provenance:
-        notes.append(f"this log was salvaged after its writer died: {trace.provenance['recovered.reason']}")
-    return notes
+    parts = [f"{count} of {', '.join(names)}" for count, names in names_of_count.items() if count]
+    limits = [text for name, text in sorted(trace.provenance.items()) if name.startswith("limits.")]
+    recovered = trace.provenance.get("recovered.reason")
+    return [*trace.notes,
+            *(f"{gap.cycles} cycles missing between {gap.t0:.3f} and {gap.t1:.3f} s" for gap in trace.gaps[:most]),
+            *([f"and {sum(gap.cycles for gap in rest)} cycles in {len(rest)} more gaps"] if rest else []),
+            *([f"missing samples (red on the page): {'; '.join(parts)} (of {len(trace)})"] if parts else []),
+            *([f"limits reached: {'; '.join(limits)}"] if limits else []),
+            *([] if recovered is None else [f"this log was salvaged after its writer died: {recovered}"])]
 
 
 def _tabulate_checks(checks: Sequence[CheckResult], heading: str, remark: Medium) -> Table:
@@ -210,13 +208,11 @@ def _tabulate_skipped(trace: Trace) -> Table:
 def _show_failed_checks(trace: Trace, most: int = 12) -> list[Item]:
     """A close-up of each of the first `most` failed checks that have a window and a signal."""
     failed = [check for check in trace.sequence_checks if check.verdict == "FAIL" and not math.isnan(check.t0)]
-    items: list[Item] = []
-    for number, check in enumerate(failed[:most]):
-        measured = check.detail if math.isnan(check.value) else f"{check.measured} measured"
-        items.append(Figure(f"{check.name}: {_name_measure(check)}, {measured}, limit "
-                            f"{check.shown_limits}{check.unit_behind}. Dashed: limits; red: what was measured.",
-                            partial(draw_failed_check, trace, check, f"check{number}")))
-    return items
+    return [Figure(f"{check.name}: {_name_measure(check)}, "
+                   f"{check.detail if math.isnan(check.value) else f'{check.measured} measured'}, limit "
+                   f"{check.shown_limits}{check.unit_behind}. Dashed: limits; red: what was measured.",
+                   partial(draw_failed_check, trace, check, f"check{number}"))
+            for number, check in enumerate(failed[:most])]
 
 
 def _name_measure(check: CheckResult) -> str:

@@ -151,7 +151,8 @@ class Trace:
         if path.suffix == ".mcap":
             return _from_log(open_log(path), all, signals)
         if path.name.endswith((".csv", ".csv.gz")):
-            return _from_csv(path, signals)
+            columns, notes, plant, signals = read_csv(path, signals)
+            return make_table_trace(path, columns, signals, notes, plant.name if plant else "")
         raise InputError(path, "", "a trace: .mcap, .csv, .csv.gz or the folder of a run")
 
     @classmethod
@@ -323,11 +324,6 @@ def list_units(signals: Signals) -> dict[str, str]:
     return {s.name: s.unit for s in signals}
 
 
-def _from_csv(path: Path, signals: Signals) -> Trace:
-    columns, notes, plant, signals = read_csv(path, signals)
-    return make_table_trace(path, columns, signals, notes, plant.name if plant else "")
-
-
 def make_table_trace(path: Path, columns: dict[str, Floats], signals: Signals, notes: tuple[str, ...] = (),
                      plant: str = "") -> Trace:
     """The trace of the columns of a file, t among them, (rows,); `plant`: whose rig wrote it in its own columns.
@@ -457,8 +453,7 @@ def _require_numbers(log: Log, topic: str, columns: Mapping[str, NDArray[Any]], 
 
 def _find_period(log: Log, run: Mapping[str, str], t: Floats, cycle: NDArray[np.int64]) -> float:
     """The run's own figure, else the median over the cycles, to the microsecond."""
-    usual = round(float(np.median(np.diff(t) / np.diff(cycle))), 6) if len(t) > 1 else 1e-3
-    said = run.get("period", usual)
+    said = run.get("period", round(float(np.median(np.diff(t) / np.diff(cycle))), 6) if len(t) > 1 else 1e-3)
     try:
         period = float(said)
     except ValueError:

@@ -101,8 +101,7 @@ def format_arguments(args: argparse.Namespace) -> str:
         values = getattr(args, name, None) or []
         words += [word for value in (values if isinstance(values, list) else [values])
                   for word in (f"--{name}", str(value))]
-    words += ["--trust"] if args.trust else []
-    return shlex.join(words)
+    return shlex.join([*words, *(["--trust"] if args.trust else [])])
 
 
 def list_shipped_sequences() -> list[str]:

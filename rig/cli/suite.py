@@ -54,8 +54,8 @@ def run_suite(args: argparse.Namespace) -> int:
     clock = WallClock()
     with catch_signals():  # Ctrl-C and SIGTERM both break it off
         results, is_interrupted = run_cases(suite.cases, processes, show, 5.0 if base.bus == "embedded" else 30.0)
-    files = [("results", f"{folder}/ suite.html, suite.json, a folder for each case")]
-    files += [("JUnit", str(junit))] if junit else []
+    files = [("results", f"{folder}/ suite.html, suite.json, a folder for each case"),
+             *([("JUnit", str(junit))] if junit else [])]
     report = build_suite_report(suite, results, 1e-9 * clock.now(), processes, folder, files)
     status = give_answer(report, args, find_status(results, is_interrupted=is_interrupted),
                          Places(folder / "suite.html", folder / "suite.json"))

@@ -5,8 +5,6 @@ real time it would compete with the loop: there the run begins when the process 
 (`wait_until_loaded`). On one CPU there is nothing to gain: then the page is written here. It is written here as well if
 the second process cannot start or fails: a run that was measured never lacks its page, and an error is raised here.
 """
-from __future__ import annotations
-
 import contextlib
 import gc
 import json
@@ -15,10 +13,9 @@ import select
 import subprocess
 import sys
 from pathlib import Path
-from types import TracebackType
 
 
-class PageWriter:
+class PageWriter(contextlib.AbstractContextManager["PageWriter"]):
     """A context for one page, `start_page` and `finish_page`; whatever happens, no process is left behind."""
 
     def __init__(self) -> None:
@@ -27,11 +24,7 @@ class PageWriter:
             with contextlib.suppress(OSError):  # the system refuses a process
                 self._process = _start_process()
 
-    def __enter__(self) -> PageWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

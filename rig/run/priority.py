@@ -195,6 +195,11 @@ def run_under_fifo(function: Callable[[], R], priority: int = 1) -> R | None:
         return pool.submit(lambda: function() if _set_fifo(0, priority) else None).result()  # 0: this thread only
 
 
+def read_clock_resolution_ns() -> float:
+    """Resolution of the monotonic clock, ns."""
+    return time.clock_getres(time.CLOCK_MONOTONIC) * 1e9
+
+
 def read_memory_lock_limit() -> int:
     """Bytes that may be locked in memory; -1 means no limit (also for root, who is exempt)."""
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)

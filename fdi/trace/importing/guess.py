@@ -118,14 +118,14 @@ def guess_map(measurement: Measurement, signals: Signals = EHA) -> GuessedMap:
     _find_steps(found, columns, signals)
     chosen = {"time": (time_source or "its own times", time_confidence),
               **{name: (guess.source, guess.confidence) for name, guess in found.items()}}
+    used = {column for guess in found.values() for column in (guess.source, guess.minus)} | {time_source}
+    left = {name: _describe_left(name, columns, found, signals) for name in measurement.units if name not in used}
     lines = [f"# First map of {measurement.path.name} ({measurement.format}), guessed: check every line.",
              f"# Then: rig import {measurement.path.name} --map THIS_FILE", "", *_list_file_lines(measurement),
              *time_lines, "", *(line for signal in signals[1:]
-                                for line in _list_signal_lines(signal, signals, found.get(signal.name), columns))]
-    used = {column for guess in found.values() for column in (guess.source, guess.minus)} | {time_source}
-    left = {name: _describe_left(name, columns, found, signals) for name in measurement.units if name not in used}
-    if left:
-        lines += ["# Columns that were left out:", *(f"#   {name} ({why})" for name, why in left.items())]
+                                for line in _list_signal_lines(signal, signals, found.get(signal.name), columns)),
+             *(["# Columns that were left out:"] if left else []),
+             *(f"#   {name} ({why})" for name, why in left.items())]
     return GuessedMap("\n".join(lines) + "\n", chosen, left, signals)
 
 
@@ -269,9 +269,7 @@ def _list_words(signal: Signal, signals: Signals) -> list[tuple[str, float]]:
     first, *others = WORDS.get(by_role.get(signal, signal.unit), ()) or ((None, 0.0),)
     own = "|".join(dict.fromkeys(re.escape(word.strip()) for word in map(_simplify_name, (signal.name, signal.symbol))
                                  if word.strip()))
-    if first[0] is None:
-        return [(own, OWN_WORD)]
-    return [(f"{own}|{first[0]}", first[1]), *others]
+    return [(own, OWN_WORD) if first[0] is None else (f"{own}|{first[0]}", first[1]), *others]
 
 
 def _rate_column(signal: Signal, signals: Signals, column: str, columns: Columns) -> Guess | None:
@@ -465,9 +463,8 @@ def _list_file_lines(measurement: Measurement) -> list[str]:
     layout = measurement.layout
     if layout is None:
         return []
-    lines = ["[file]  # how the text is written", f"separator = {_quote(layout.separator)}",
-             f"decimal = {_quote(layout.decimal)}"]
-    return [*lines, *([f"header = {layout.name_line}"] if layout.name_line else []), ""]
+    return ["[file]  # how the text is written", f"separator = {_quote(layout.separator)}",
+            f"decimal = {_quote(layout.decimal)}", *([f"header = {layout.name_line}"] if layout.name_line else []), ""]
 
 
 def _list_signal_lines(signal: Signal, signals: Signals, guess: Guess | None, columns: Columns) -> list[str]:
@@ -478,19 +475,14 @@ def _list_signal_lines(signal: Signal, signals: Signals, guess: Guess | None, co
         return [f"# [signals.{name}]  # {quantity}: no column found; every analysis needs it", '# source = ""',
                 f'# unit = "{signal.unit}"', ""]
     unit = guess.unit.name
-    lines = [f"[signals.{name}]  # {quantity}; {guess.confidence}: {'; '.join(guess.reasons)}",
-             f"source = {_quote(guess.source)}", f'unit = "{unit}"']
-    if guess.minus:
-        lines.append(f"minus = {_quote(guess.minus)}")
-    if guess.sign < 0:
-        lines.append("sign = -1")
-    if columns.has_raw_unit(guess.source, signal.unit):
-        scale, offset = (f"{1.0 if guess.scale is None else guess.scale:g}", f"{guess.offset:g}")
-        lines.append(f"scale = {scale}  # {unit} for each {columns.units[guess.source]}: put in the true one")
-        lines.append(f"offset = {offset}  # {unit}")
-    if guess.quantum:
-        lines.append(f"sensor = {{quantum = {guess.quantum:g}}}  # {unit}: all readings are multiples of this step")
-    return [*lines, ""]
+    return [f"[signals.{name}]  # {quantity}; {guess.confidence}: {'; '.join(guess.reasons)}",
+            f"source = {_quote(guess.source)}", f'unit = "{unit}"',
+            *([f"minus = {_quote(guess.minus)}"] if guess.minus else []), *(["sign = -1"] if guess.sign < 0 else []),
+            *([f"scale = {1.0 if guess.scale is None else guess.scale:g}  # {unit} for each "
+               f"{columns.units[guess.source]}: put in the true one", f"offset = {guess.offset:g}  # {unit}"]
+              if columns.has_raw_unit(guess.source, signal.unit) else []),
+            *([f"sensor = {{quantum = {guess.quantum:g}}}  # {unit}: all readings are multiples of this step"]
+              if guess.quantum else []), ""]
 
 
 def _describe_left(column: str, columns: Columns, found: Mapping[str, Guess], signals: Signals) -> str:
