@@ -312,9 +312,7 @@ def _align_delays(trace: Trace, model: Model, found: ControllerBlock) -> tuple[T
 
 
 def _describe_cycles(n: int) -> str:
-    cycles = "cycle" if abs(n) == 1 else "cycles"
-    direction = "later" if n > 0 else "earlier"
-    return f"{abs(n)} {cycles} {direction}"
+    return f"{abs(n)} {'cycle' if abs(n) == 1 else 'cycles'} {'later' if n > 0 else 'earlier'}"
 
 
 def _judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],

@@ -58,9 +58,8 @@ def compute_balance(trace: Trace, model: Model, replayed: Columns) -> Balance:
     gain = float(np.sum(dx[there] * way[there])) / power if power > 0.0 else 0.0
     # without a measured spool the flow is the servovalve's, and the forces take their speed from the position
     known = speed * (1 + max(-0.2, min(gain, 0.2))) if XS in trace.outputs else seen
-    force = np.full(len(trace), np.nan)
-    if P12 in trace.outputs:
-        force = _compute_force_residual(trace, model, p12, xj, known)
+    is_known = P12 in trace.outputs
+    force = _compute_force_residual(trace, model, p12, xj, known) if is_known else np.full(len(trace), np.nan)
     force[bad] = np.nan
     return Balance(way, force, gain, speed, sensed)
 

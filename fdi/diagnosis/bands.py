@@ -352,9 +352,8 @@ def _explain_no_level(fault: BandFault, found: list[Excursion], shown: Mapping[s
         return "no section of the trace shows it"
     hiding = [f"{amounts[0]:.3g} {friction.unit}" for friction in map(bands.find, shown) for amounts in
               [shown[friction.name]] if amounts[0] > FRICTION_HIDES_RATIO * float(friction.amounts[0])]
-    if hiding and not len(fault.amounts):
-        return f"{hiding[0]} of friction hide it"
-    return "a fault at MidBand is within the scatter of healthy units"
+    return (f"{hiding[0]} of friction hide it" if hiding and not len(fault.amounts) else
+            "a fault at MidBand is within the scatter of healthy units")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -600,8 +599,7 @@ def _read_step(step: Mapping[str, Any], period: float, faults: Mapping[str, Band
         knots = np.array(values, float) / per_unit
         if knots.shape != ((count, len(coarse)) if count else coarse.shape) or step["section"] not in parts:
             raise ValueError(f"step of section {step['section']}: not a step of the command, or lists of other lengths")
-        fine: Floats = np.apply_along_axis(lambda each: np.interp(rows, coarse, each), -1, knots)
-        return fine
+        return np.apply_along_axis(lambda each: np.interp(rows, coarse, each), -1, knots)
 
     spread = read_knots(step["spread"])
     frictions = {}

@@ -105,9 +105,7 @@ def judge_size(fault: Fault, size: Estimate, tested: int = 1) -> Level | None:
     sure = Estimate(size.value, size.low - more * (size.value - size.low), size.high + more * (size.high - size.value))
     if measure_departures(fault, sure).low <= healthy:
         return None
-    if high >= most and low > middle:
-        return Level.NON_NOMINAL
-    return Level.MAINTENANCE
+    return Level.NON_NOMINAL if high >= most and low > middle else Level.MAINTENANCE
 
 
 def widen_for_many(tested: int) -> float:
@@ -138,9 +136,7 @@ def classify_size(fault: Fault, value: float) -> Level:
 def compute_severity(fault: Fault, value: float) -> float:
     """How far a fault has gone: 0 healthy, 1 at MidBand, 2 at MaxBand, straight lines between and beyond."""
     size, (healthy, middle, most) = fault.measure_departure(value), fault.limits
-    if size <= middle:
-        return (size - healthy) / (middle - healthy)
-    return 1.0 + (size - middle) / (most - middle)
+    return (size - healthy) / (middle - healthy) if size <= middle else 1.0 + (size - middle) / (most - middle)
 
 
 def find_ruling_fault(faults: Sequence[Fault], sizes: Mapping[str, Estimate], levels: Mapping[str, Level | None]

@@ -240,10 +240,9 @@ def make_start(free: Sequence[Free], faults: Sequence[Fault], sizes: Sequence[fl
         size = fault.range[0] if isinstance(own, LogOpenFilter) and size < fault.range[0] else size
         values[own.name] = place_value(own, size)
         for name, by in fault.follow.items():
-            if isinstance(known[name], LogFrictionRatio):
-                continue
-            value = max(size, math.exp(own.low)) / (1.0 / by) if isinstance(own, LogFree) else by * size
-            values[name] = place_value(known[name], min(value, (stays or {}).get(name, math.inf)))
+            if not isinstance(known[name], LogFrictionRatio):
+                value = max(size, math.exp(own.low)) / (1.0 / by) if isinstance(own, LogFree) else by * size
+                values[name] = place_value(known[name], min(value, (stays or {}).get(name, math.inf)))
     return np.array([(values.get(f.name, f.centre) - f.centre) / f.scale for f in free])
 
 

@@ -46,9 +46,8 @@ def scale_values(free: Sequence[Free], values: Mapping[str, float]) -> Floats:
     for k, f in enumerate(free):
         if f.name not in values:
             continue
-        value = values[f.name]
-        if isinstance(f, LogFrictionRatio):
-            value = max(value / values[f.leader], 1.0)
+        known = values[f.name]
+        value = max(known / values[f.leader], 1.0) if isinstance(f, LogFrictionRatio) else known
         place = math.log(value) if isinstance(f, LogFree) else value
         x[k] = (min(max(place, f.low), f.high) - f.centre) / f.scale
     return x

@@ -358,9 +358,8 @@ def _build_sweep(model: Model) -> Floats:
 
 def _build_stops(model: Model) -> Floats:
     stroke = _measure_stroke(model)
-    speed = 5.0 * stroke
-    if {"valve.flow_gain", "spool.travel", "jack.area"} <= model.values.keys():  # with the spool a fifth open
-        speed = 0.2 * model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"]
+    has_spool = {"valve.flow_gain", "spool.travel", "jack.area"} <= model.values.keys()  # then a fifth open
+    speed = 0.2 * model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"] if has_spool else 5.0 * stroke
     return _move(model, ((0.0, 0.3), (1.0, 0.8), (-1.0, 0.8), (0.0, 0.3)), 1.1 * stroke, speed)
 
 
@@ -517,9 +516,8 @@ class RunError(NamedTuple):
     @property
     def decided_ratio(self) -> float:
         """The same without the rows that no model can predict, if enough others are left."""
-        if self.undecided > HELD_OUT_UNDECIDED_SHARE:
-            return self.ratio
-        return max(self.decided[s] / self.floor[s] for s in self.decided)
+        is_left = self.undecided <= HELD_OUT_UNDECIDED_SHARE
+        return max(self.decided[s] / self.floor[s] for s in self.decided) if is_left else self.ratio
 
 
 class Correlation(NamedTuple):

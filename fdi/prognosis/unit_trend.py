@@ -176,10 +176,9 @@ def _choose_axis(folder: Path, rows: Mapping[Path, Row], wanted: str | None) -> 
         if not without[axis]:
             return axis
     missing = wanted or "date"
-    expected = f"a line in {folder / TABLE} with a column {missing}"
-    if missing == "date":
-        expected = ("a start time in the log, an ISO date in the name of file or folder (2026-01-31), or a line in "
-                    f"{folder / TABLE} (file,date)")
+    expected = f"a line in {folder / TABLE} with a column {missing}" if missing != "date" else (
+        "a start time in the log, an ISO date in the name of file or folder (2026-01-31), or a line in "
+        f"{folder / TABLE} (file,date)")
     raise InputError(without[missing][0], missing, expected)
 
 

@@ -199,9 +199,8 @@ def describe_block(c: Comparison, name: str) -> str:
     if name == "jack" and len(measured) == 1:
         return f"{measured[0]} to the ram: {'flow' if measured == ['XS'] else 'forces'}"
     flow, force = c.parts["flow"], c.parts["force"]
-    if name == "jack" and flow is not None and force is not None:
-        return f"{path}: flow {format_ratio(flow)}, forces {format_ratio(force)}"
-    return path
+    return path if name != "jack" or flow is None or force is None else (
+        f"{path}: flow {format_ratio(flow)}, forces {format_ratio(force)}")
 
 
 def _describe_controller(c: Comparison) -> str:

@@ -405,9 +405,8 @@ def _show_bands(d: Diagnosis) -> list[Item]:
 
 def _choose_drawn_fault(d: Diagnosis, bands: Bands, judged: BandVerdict, kind: str) -> BandFault | None:
     """Of the faults that sections of a kind judge, the one that is furthest in its bands."""
-    drawn = {name for s in bands.steps for name in s.middle}
-    if kind == "ramp":
-        drawn = {r.fault for r in bands.ramps if math.isfinite(r.position.middle)}
+    drawn = ({r.fault for r in bands.ramps if math.isfinite(r.position.middle)} if kind == "ramp" else
+             {name for s in bands.steps for name in s.middle})
     own = [fault for fault in bands.faults if fault.name in drawn]
     return max(own, key=lambda f: (f.name in d.levels, judged.severity.get(f.name, -1.0)), default=None)
 

@@ -90,9 +90,8 @@ def _tabulate_runs(found: RunDifferences) -> Table:
                Column("every", "ms", "right"), Column("same command"), Column("offset", "s", "right")]
     rows: list[list[Cell | str]] = []
     for run, pair in zip(found.runs, [None, *found.pairs], strict=True):
-        agreement: list[Cell | str] = ["", ""]
-        if pair is not None:
-            agreement = ["yes" if pair.has_same_command else Cell("no", "bad"), f"{pair.offset:.6g}"]
+        agreement = ["", ""] if pair is None else [
+            "yes" if pair.has_same_command else Cell("no", "bad"), f"{pair.offset:.6g}"]
         rows.append([run.label, run.source, read_verdict(run.trace).word, f"{len(run.trace) * run.trace.period:.3f}",
                      f"{1e3 * run.trace.period:g}", *agreement])
     return Table(columns, rows, "Offset: time of A minus time of the run in the same cycle.")

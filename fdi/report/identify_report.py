@@ -78,11 +78,9 @@ def describe_identification(found: Identification) -> str:
     chosen = (found.holdouts or found.errors)[0]  # the error of its worst signal
     name = max(chosen.before, key=lambda name: chosen.before[name] / chosen.floor[name])
     s = found.model.kind.signals.find(name)
-    count = f"{len(seen)} of {len(found.estimates)} free parameters are identified"
-    if found.verdict == "IDENTIFIED":
-        count = f"All {len(seen)} free parameters are identified"
+    count = f"All {len(seen)}" if found.verdict == "IDENTIFIED" else f"{len(seen)} of {len(found.estimates)}"
     but = f" But {found.reason}." if found.verdict == "PARTLY" and len(seen) == len(found.estimates) else ""
-    return (f"{count}: {'held-out run, ' if chosen.is_held_out else ''}{s.symbol} error "
+    return (f"{count} free parameters are identified: {'held-out run, ' if chosen.is_held_out else ''}{s.symbol} error "
             f"{format_signal(chosen.before[name], s)} -> {format_signal(chosen.after[name], s)}, noise floor "
             f"{format_signal(chosen.floor[name], s)}.{but}")
 

@@ -249,9 +249,8 @@ def _draw_chart(trend: Trend, unit: UnitTrend, future_share: float = 0.35) -> st
     cells = np.full((HEIGHT, WIDTH), " ")
     names = {find_row(trend.fault.acceptable): "MidBand", find_row(trend.fault.maintenance): "MaxBand"}
     cells[list(names)] = "-"
-    for curve, shaded_from in ((trend.past, WIDTH), (trend.future, find_column(end) + 1)):
-        if curve is None:
-            continue
+    curves = ((trend.past, WIDTH), (trend.future, find_column(end) + 1))
+    for curve, shaded_from in ((curve, begin) for curve, begin in curves if curve is not None):
         columns = find_column(curve.t)
         for x in range(max(columns[0], 0), min(columns[-1], WIDTH - 1) + 1):
             low, middle, high = (find_row(np.interp(x, columns, y)) for y in (curve.low, curve.middle, curve.high))

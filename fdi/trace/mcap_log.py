@@ -291,15 +291,13 @@ def read_declarations(raw: bytes) -> list[Schema | Channel]:
     Raises struct.error or EndOfFile for a chunk that ends within a record.
     """
     found: list[Schema | Channel] = []
-    at = 0
-    while at < len(raw):
+    for at in _list_records(raw):
         opcode, length = _RECORD.unpack_from(raw, at)
         body = ReadDataStream(BytesIO(raw[at + 9:at + 9 + length]))
         if opcode == Opcode.SCHEMA:
             found.append(Schema.read(body))
         elif opcode == Opcode.CHANNEL:
             found.append(Channel.read(body))
-        at += 9 + length
     return found
 
 

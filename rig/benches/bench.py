@@ -79,9 +79,8 @@ class Field:
     @cached_property
     def range(self) -> tuple[int, int]:
         """Smallest and largest counts of an integer."""
-        if self.kind is Kind.SIGNED:
-            return -(1 << self.length - 1), (1 << self.length - 1) - 1
-        return 0, (1 << self.length) - 1
+        half = 1 << self.length - 1
+        return (-half, half - 1) if self.kind is Kind.SIGNED else (0, 2 * half - 1)
 
     @property
     def modulus(self) -> int:
@@ -94,9 +93,8 @@ class Field:
         Raises:
             ValueError: NaN for an integer: no invented number is sent.
         """
-        if self.kind is Kind.FLOAT:
-            return encode_float(self.compute_counts(value), self.length)
-        return int(self.compute_counts(value)) & (1 << self.length) - 1
+        counts = self.compute_counts(value)
+        return encode_float(counts, self.length) if self.kind is Kind.FLOAT else int(counts) & (1 << self.length) - 1
 
     def compute_counts(self, value: float) -> float:
         """What the device's object holds for a value: limited and rounded to a whole number unless it is a float.
@@ -207,9 +205,7 @@ def make_writer(spec: FrameSpec) -> Writer:
 def _choose_bits(each: Field, values: Mapping[str, float], cycle: int) -> int:
     if each.fixed is not None:
         return each.fixed
-    if each.name == "cycle":
-        return each.wrap_number(cycle)
-    return each.encode(values.get(each.name, 0.0))
+    return each.wrap_number(cycle) if each.name == "cycle" else each.encode(values.get(each.name, 0.0))
 
 
 def _find_code(spec: FrameSpec) -> str | None:
@@ -256,9 +252,8 @@ def make_reader(spec: FrameSpec) -> Callable[[bytes], dict[str, float]]:
 def locate_bits(each: Field, length: int) -> tuple[str, int]:
     """Byte order of the integer to which a frame of `length` bytes is taken, and by how much a field is shifted in it.
     """
-    if not each.is_big_endian:
-        return "little", each.lowest
-    return "big", 8 * (length - 1 - each.lowest // 8) + each.lowest % 8
+    return ("big", 8 * (length - 1 - each.lowest // 8) + each.lowest % 8) if each.is_big_endian else (
+        "little", each.lowest)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -94,9 +94,8 @@ def build_bench_report(bench: Bench, files: Sequence[tuple[str, str]] = ()) -> R
     loads = list_loads(bench)
     load, rate = sum(each.share for each in loads), f"{bench.bitrate / 1000:g} kbit/s"
     is_possible = load <= 1
-    sentence = f"The frames take at most {100 * load:.0f} % of the bus at {rate}."
-    if not is_possible:
-        sentence = f"The frames need {100 * load:.0f} % of the bus at {rate}; a longer cycle or a higher bit rate."
+    sentence = (f"The frames take at most {100 * load:.0f} % of the bus at {rate}." if is_possible else
+                f"The frames need {100 * load:.0f} % of the bus at {rate}; a longer cycle or a higher bit rate.")
     nodes = [bench.describe_node(role) for role in (Role.CONTROLLER, Role.PLANT) if role in bench.nodes]
     facts = [("protocol", "CANopen" if bench.nodes else "CAN"), *([("nodes", ", ".join(nodes))] if nodes else []),
              ("profile", bench.profile), ("plant", bench.plant), ("cycle", f"{bench.cycle_ns / 1e6:g} ms")]

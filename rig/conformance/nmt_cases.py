@@ -265,9 +265,8 @@ def require_times(t: Target, times: Sequence[float], share: float, limit: float)
         return sorted(times)[round(part * (len(times) - 1))]
 
     limit += 1e3 * t.options.tolerance
-    text = f"p50 {find(0.5):.2f}, p99 {find(0.99):.2f}, max {max(times):.2f} ms"
-    if len(times) < 10:
-        text = f"{', '.join(f'{each:.1f}' for each in times)} ms"
+    text = (f"{', '.join(f'{each:.1f}' for each in times)} ms" if len(times) < 10 else
+            f"p50 {find(0.5):.2f}, p99 {find(0.99):.2f}, max {max(times):.2f} ms")
     require(find(share) <= limit, f"{text}, limit {limit:.1f} ms")
     return text
 

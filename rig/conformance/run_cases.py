@@ -132,9 +132,7 @@ def _restore(target: Target, snapshot: dict[Variable, bytes]) -> list[str]:
     _reset(target)
     after = _read_all(target)
     notes = []
-    for variable, before in snapshot.items():
-        if after.get(variable) == before:
-            continue
+    for variable, before in ((known, data) for known, data in snapshot.items() if after.get(known) != data):
         try:
             target.download(*variable.key, before)
             done = "it was set back"

@@ -370,9 +370,7 @@ class Target:
         try:
             yield
         finally:
-            for key, data in before.items():
-                if self.upload(*key) == data:
-                    continue
+            for key, data in ((key, data) for key, data in before.items() if self.upload(*key) != data):
                 if self.variable(*key).has_valid_bit:
                     self.try_download(*key, int.from_bytes(data, "little") | INVALID)
                 self.download(*key, data)

@@ -33,7 +33,6 @@ from rig.firmware.build import find_compiler
 from rig.fmi.unit_cycle import INPUTS, advance_unit
 
 FOLDER = Path(__file__).parent
-VERSIONS = ("2", "3")
 _FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-s", "-w")
 _LARGEST = sys.float_info.max
 

@@ -319,9 +319,7 @@ class Master:
         for role in sorted(self._nodes):
             settings = ((0x1006, 0, sync_period_us), (0x1016, 1, self._bench.rig_node << 16 | limit_ms),
                         (0x1017, 0, quick_heartbeat))
-            for index, sub, value in settings:
-                if not self._is_writable(role, index, sub):
-                    continue
+            for index, sub, value in (each for each in settings if self._is_writable(role, *each[:2])):
                 self._keep(role, index, sub)
                 try:
                     self._set(role, index, sub, value)
@@ -340,9 +338,8 @@ class Master:
 
     def _find_heartbeat(self, role: Role) -> int:
         """Period of a node's heartbeat, ms: ours if it can be set, else that of the data sheet; 0: it has none."""
-        if self._is_writable(role, 0x1017, 0):
-            return HEARTBEAT
-        return read_number(self._nodes[role].object_dictionary, 0x1017, 0) or 0
+        given = read_number(self._nodes[role].object_dictionary, 0x1017, 0) or 0
+        return HEARTBEAT if self._is_writable(role, 0x1017, 0) else given
 
     def _write_values(self, role: Role) -> None:
         """Write the values of a DCF. Raises InputError for one that the device refuses."""
@@ -399,11 +396,9 @@ class Master:
         Otherwise a node that stays on the bus would go on watching a rig that has left. Returns the failures in words.
         """
         failures = []
-        for (role, index, sub), data in self._before.items():
-            if role in gone:
-                continue
+        for role, index, sub in (key for key in self._before if key[0] not in gone):
             try:
-                self._nodes[role].sdo.download(index, sub, data)
+                self._nodes[role].sdo.download(index, sub, self._before[role, index, sub])
             except (SdoAbortedError, SdoCommunicationError, ConfirmationError) as error:
                 failures.append(f"{self._bench.describe_node(role)}: {name_object(index, sub)} was not set back "
                                 f"({error})")
@@ -549,9 +544,7 @@ def list_identity(dictionary: Any) -> Iterator[ExpectedObject]:
 def list_pdo_objects(dictionary: Any, node: int) -> Iterator[ExpectedObject]:
     """COB-ID, transmission type, inhibit time, event timer and mapping of the PDOs that a data sheet switches on."""
     not_remote = 0xFFFF_FFFF ^ 1 << 30  # whether a PDO may be requested does not matter
-    for pdo in list_pdos(dictionary, node):
-        if pdo.cob_id & INVALID:
-            continue
+    for pdo in (pdo for pdo in list_pdos(dictionary, node) if not pdo.cob_id & INVALID):
         yield ExpectedObject(pdo.parameter, 1, pdo.cob_id, not_remote)
         for index, subs in ((pdo.parameter, (2, 3, 5)), (pdo.parameter + MAPPING, range(len(pdo.entries) + 1))):
             for sub in subs:

@@ -212,10 +212,9 @@ class Turn:
             return
         for line in lines:
             _, identifier, _, count, owner = map(int, line.split()[:5])
-            is_ours = count == _SEMAPHORES and owner == os.geteuid()
-            if not is_ours or self._library.semctl(identifier, _MARK, _GET_VALUE) != _MARK_VALUE:
-                continue
-            if self._operate(_CLAIM_UNUSED, identifier=identifier) == 0:
+            if (count == _SEMAPHORES and owner == os.geteuid()
+                    and self._library.semctl(identifier, _MARK, _GET_VALUE) == _MARK_VALUE
+                    and self._operate(_CLAIM_UNUSED, identifier=identifier) == 0):
                 self._library.semctl(identifier, 0, _REMOVE)
 
     def _operate(self, operations: np.ndarray, limit: np.ndarray | None = None, identifier: int = -1) -> int:

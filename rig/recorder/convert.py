@@ -176,9 +176,8 @@ def import_frames(source: Path, out: Path, bench: Bench, dbc: Path | None = None
         begin = f"{cycles.begin.name} frame" if sync is None else f"SYNC frame (0x{sync:03X})"
         raise InputError(source, "", f"at least one {begin}")
     spans = np.sort(np.diff(starts))
-    period = bench.cycle_ns / 1e9
-    if len(spans) and not 0.9 < spans[len(spans) // 2] / bench.cycle_ns < 1.1:  # it ran at another speed
-        period = round(float(spans[len(spans) // 2]) / 1e9, 4)
+    middle = float(spans[len(spans) // 2]) if len(spans) else bench.cycle_ns
+    period = bench.cycle_ns / 1e9 if 0.9 < middle / bench.cycle_ns < 1.1 else round(middle / 1e9, 4)  # another speed
     items = sorted([*items, *cycles.rows], key=lambda item: item[0])
     decoding = {} if dbc is None else {dbc.name: dbc.read_bytes()}
     _write_log(out, {name: ("text/plain", data) for name, data in {**bench.files, **decoding}.items()},

@@ -241,10 +241,11 @@ def _describe_disturbance(records: CycleRecords, late: LateCycles, first: int, l
     """A disturbance with its reach: three cycles, and as long again as it lasted."""
     span = slice(first, last + 1)
     skipped = int(np.floor(np.nan_to_num(records.lateness[span]) / records.period).sum())
-    source, text = PLANT, _describe_plant(records, late, span)
     # The rig is named if its SYNC was late first: a stalled rig also takes the plant's frames in late.
-    if late.sync[first] or (late.sync[span].any() and not late.stalled[span].any() and late.feedback[span].sum() < 2):
-        source, text = RIG, f"the rig sent SYNC {1e3 * float(np.nanmax(records.lateness[span])):.1f} ms late"
+    is_rig = late.sync[first] or (
+        late.sync[span].any() and not late.stalled[span].any() and late.feedback[span].sum() < 2)
+    source, text = (RIG, f"the rig sent SYNC {1e3 * float(np.nanmax(records.lateness[span])):.1f} ms late") if (
+        is_rig) else (PLANT, _describe_plant(records, late, span))
     return Disturbance(first, last, last + 3 + (last - first + 1) + skipped, source, text)
 
 

@@ -259,9 +259,8 @@ class Enabling:
         self._silent = self._silent + 1 if is_silent else 0
 
     def _find_state(self) -> int:
-        if self._has_flag(Flags.DRIVE_MISSING):
-            return State.UNKNOWN
-        return find_state(self._words, int(self._loop.outputs.get("status_word", 0)))
+        word = int(self._loop.outputs.get("status_word", 0))
+        return State.UNKNOWN if self._has_flag(Flags.DRIVE_MISSING) else find_state(self._words, word)
 
     def _has_flag(self, flag: Flags) -> bool:
         return bool(int(self._loop.outputs.get("flags", 0)) & flag)

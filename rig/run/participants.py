@@ -46,9 +46,9 @@ def open_participants(job: Job) -> Iterator[tuple[Wire, NodeProcesses]]:
     if job.bus.partition(":")[0] in EMBEDDED_NAMES:
         if job.controller != "builtin" or job.plant == "external":
             raise InputError("--bus", job.bus, "a bus that an external node can be on, such as socketcan:can0")
-        makers: list[Callable[[Send], Node]] = [Emulator, partial(Firmware, model=job.model)]
-        if not job.bench.has_plant_node:
-            makers = [partial(StandIn, bench=job.bench, model=job.model)]
+        makers: list[Callable[[Send], Node]] = (
+            [Emulator, partial(Firmware, model=job.model)] if job.bench.has_plant_node else
+            [partial(StandIn, bench=job.bench, model=job.model)])
         wire = EmbeddedWire(WallClock() if job.realtime else VirtualClock(), makers, job.period_ns)
         yield wire, NodeProcesses()
         return

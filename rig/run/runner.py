@@ -333,9 +333,8 @@ def find_limits(column: Callable[[str], NDArray[np.float64]], model: Model, zero
         limit = model.values.get(signal.limit)
         if limit is None:  # the plant declares none
             continue
-        margin = NEAR_A_STOP * model.values.get(signal.noise, 0.0)
-        if signal.role == "drive":
-            margin = 2.5e-6 * limit  # two counts of the drive frame
+        two_counts = 2.5e-6 * limit  # of the drive frame
+        margin = two_counts if signal.role == "drive" else NEAR_A_STOP * model.values.get(signal.noise, 0.0)
         rows = np.flatnonzero(np.abs(column(signal.name)) >= limit - margin)
         if len(rows):
             found.append(LimitReached(signal.limit, signal.name, limit, (int(rows[0]) - zero) * period,

@@ -87,9 +87,9 @@ class NodeWatch:
         is_first = self.last_answers[CONTROLLER] < 0
         if self._missed != (self._patience if is_first else 1):
             return
-        what = describe_silence(self._bench, self._missed)
-        if not is_first:  # in the words of a plant that is a node, which says so by EMCY
-            what = f"plant 0x{EmcyCode.RPDO_TIMEOUT:04X} {describe_missing(self._bench, self._bench.most_missed)}"
+        # else in the words of a plant that is a node, which says so by EMCY
+        what = describe_silence(self._bench, self._missed) if is_first else (
+            f"plant 0x{EmcyCode.RPDO_TIMEOUT:04X} {describe_missing(self._bench, self._bench.most_missed)}")
         self._safety.handle("bring_up" if is_first else NO_DRIVE, what, CONTROLLER)
         if CONTROLLER not in self._master.watched or (self._looks and self._safety.aborted):
             self.gone.setdefault(CONTROLLER, "it sends no frames")

@@ -146,8 +146,7 @@ MAIN = "main"  # the window that is all of the main phase
 def map_words(values: NDArray[Any], find: Callable[[int], int]) -> NDArray[np.int64]:
     """What `find` gives for each of some words, most of which are equal."""
     known, places = np.unique(values.astype(int), return_inverse=True)
-    found: NDArray[np.int64] = np.array([find(word) for word in known.tolist()], np.int64)[places]
-    return found
+    return np.array([find(word) for word in known.tolist()], np.int64)[places]
 
 
 class DriveFrames(NamedTuple):

@@ -158,7 +158,6 @@ class ProtocolRecord:
             parts = [np.insert(whole, cycle, part) for whole, part in zip(parts, rows, strict=True)]
         return Rows(*parts)
 
-
     @property
     def words(self) -> ProfileWords:
         """Control word and status word of the controller."""
@@ -288,8 +287,7 @@ def measure_delays(rows: Rows) -> Whole:
     due = {state * len(State) + word for state, word in list_transitions()}
     k = np.arange(len(pairs))
     begin = np.maximum.accumulate(np.where(np.diff(pairs, prepend=-1) != 0, k, 0))  # of the run of this pair
-    found: Whole = np.where(np.isin(pairs, list(due)), k - begin, 0)[~np.isnan(rows.drive)]
-    return found
+    return np.where(np.isin(pairs, list(due)), k - begin, 0)[~np.isnan(rows.drive)]
 
 
 def measure_status_ages(rows: Rows, faulty: Mask | None = None) -> Whole:
@@ -311,15 +309,13 @@ def measure_status_ages(rows: Rows, faulty: Mask | None = None) -> Whole:
                                                         strict=True)):
             last[wanted] = k
             ages[k] = 0 if is_like else k - last.get(said, -1)
-    found: Whole = ages[answered]
-    return found
+    return ages[answered]
 
 
 def find_expected_status(control: Whole) -> Whole:
     """The status word of a sound controller: ready, and the levels of the control word, which build on each other."""
     levels = control & _LEVELS
-    expected: Whole = np.where(levels & (levels + 1) == 0, levels, 0) | _READY
-    return expected
+    return np.where(levels & (levels + 1) == 0, levels, 0) | _READY
 
 
 def _find_faulty(record: ProtocolRecord) -> Mask:
@@ -417,8 +413,7 @@ def _judge_probes(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
 
 
 def _find_active(rows: Rows, words: ProfileWords) -> Whole:
-    active: Whole = np.flatnonzero(map_words(rows.control, lambda word: find_wanted(words, word)) == State.ACTIVE)
-    return active
+    return np.flatnonzero(map_words(rows.control, lambda word: find_wanted(words, word)) == State.ACTIVE)
 
 
 def measure_step_delay(probe: Rows, rate: float, words: ProfileWords = CIA408) -> tuple[float, str]:

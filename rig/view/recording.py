@@ -404,9 +404,8 @@ def _make_check_lane(check: CheckResult, trace: Trace) -> Lane:
         main = trace.t[trace.phase == MAIN]
         start, stop = (float(main[0]), float(main[-1]) + trace.period) if len(main) else (first, last)
     word, colour = check.verdict, NEUTRAL if unreached else VERDICTS[check.verdict]
-    text = f"{word} {_describe_measurement(check)}"
-    if math.isnan(check.value) and check.detail:
-        text = f"{word} {check.measured}: {check.detail}"
+    is_unknown = math.isnan(check.value) and check.detail
+    text = f"{word} {f'{check.measured}: {check.detail}' if is_unknown else _describe_measurement(check)}"
     path = f"check/{'pass' if check.passed else word}/{check.name}"
     if stop - start > max(start - first, last - stop):
         return Lane(path, [(start, text), (stop, "")], {text: colour})

@@ -467,9 +467,7 @@ def _measure_cycle(own: Samples, cycle: float) -> float:
     rows = float(np.rint(np.diff(own.t) / own.period).sum())
     mean = float(own.t[-1] - own.t[0]) / rows
     ratio = max(1, round(nominal / mean)) if mean < nominal else 1
-    if abs(mean * ratio / nominal - 1.0) * rows / ratio < SLIP:
-        return nominal
-    return round(mean * ratio, 9)
+    return nominal if abs(mean * ratio / nominal - 1.0) * rows / ratio < SLIP else round(mean * ratio, 9)
 
 
 def _make_rows(chosen: ImportMap, samples: Mapping[str, Samples], period: float) -> Floats:

@@ -41,9 +41,8 @@ def open_measurement(path: Path, separator: str | None = None, decimal: str | No
         raise InputError(path, "", f"a file that ends in {', '.join(SUFFIXES)}")
     if suffix != ".mcap" and not path.is_file():
         raise InputError(path, "", "a readable file" + ("" if path.exists() else "; it does not exist"))
-    if suffix in TEXT_SUFFIXES:
-        return open_text_table(path, separator, decimal, name_line)
-    return READERS[suffix](path)
+    return (open_text_table(path, separator, decimal, name_line) if suffix in TEXT_SUFFIXES else
+            READERS[suffix](path))
 
 
 def _import_reader(name: str, path: Path) -> ModuleType:

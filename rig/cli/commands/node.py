@@ -105,9 +105,8 @@ def make_node(args: argparse.Namespace, bench: Bench, link: Link, stack: context
         stack.callback(service.close)
         return service
     scenario = choose_scenario(args)
-    if args.node == "plant":
-        return Emulator(link.send, scenario, bench)
-    return Firmware(link.send, read_gains(scenario.model.values), scenario.model)
+    return (Emulator(link.send, scenario, bench) if args.node == "plant" else
+            Firmware(link.send, read_gains(scenario.model.values), scenario.model))
 
 
 def choose_scenario(args: argparse.Namespace) -> Scenario:

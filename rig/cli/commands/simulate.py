@@ -89,6 +89,4 @@ def load_command(file: str | None, period: float, kind: Plant) -> tuple[Any, Any
     Raises:
         InputError: a file that cannot be read, or none for a plant that declares no test.
     """
-    if file is not None:
-        return (*read_command(file, period, kind.signals), file)
-    return load_nominal_test(kind, period)
+    return load_nominal_test(kind, period) if file is None else (*read_command(file, period, kind.signals), file)
