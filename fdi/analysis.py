@@ -309,8 +309,7 @@ def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPa
     effects = [effect] if isinstance(effect, str) else list(effect)
     own_model, known = _load_model_file(model, trust)
     runs = _collect_runs(update_model.remove_all_effects(own_model, known), trace, repeats, holdout, signals)
-    command = f"fdi.add_effect({', '.join(map(repr, effects))})"
-    update = add_effects(effects, runs, own_model, known, command)
+    update = add_effects(effects, runs, own_model, known, f"fdi.add_effect({', '.join(map(repr, effects))})")
     return ModelResult(build_model_report(update), update)
 
 

@@ -65,8 +65,7 @@ def read_requirements() -> dict[str, list[str]]:
     for line in metadata.requires("eha-rig") or []:
         requirement, _, marker = line.partition(";")
         name = requirement.strip().split("<")[0].split(">")[0].split("=")[0].split("!")[0].split("[")[0].strip()
-        extra = marker.partition("==")[2].strip().strip("\"'")
-        named.setdefault(extra, []).append(name)
+        named.setdefault(marker.partition("==")[2].strip().strip("\"'"), []).append(name)
     return named
 
 

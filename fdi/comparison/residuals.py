@@ -81,8 +81,7 @@ def describe_motion(trace: Trace, model: Columns) -> Motion:
 
 def combine_residuals(residual: Columns, floor: Mapping[str, float]) -> Floats:
     """Squared error over squared floor, mean of the signals, (n,); 1 on average where only noise is left."""
-    parts = [(residual[name] / floor[name]) ** 2 for name in residual if floor.get(name, 0.0) > 0.0]
-    stack = np.array(parts)
+    stack = np.array([(residual[name] / floor[name]) ** 2 for name in residual if floor.get(name, 0.0) > 0.0])
     there = ~np.isnan(stack)
     total = np.where(there, stack, 0.0).sum(axis=0)
     return np.where(there.any(axis=0), total / np.maximum(there.sum(axis=0), 1), np.nan)
@@ -280,15 +279,13 @@ def correlate(x: Floats, y: Floats, first: int, last: int) -> Floats:
             sums += _correlate_piece(padded[k:k + piece + last - first], y[k:k + piece], last - first)
         return sums
     n = len(x) + len(y)
-    whole = np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)
-    return whole[np.arange(first, last + 1) % n]
+    return np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)[np.arange(first, last + 1) % n]
 
 
 def _correlate_piece(x: Floats, y: Floats, last: int) -> Floats:
     """Sums of x_{k + lag} y_k for lags 0..last."""
     n = 1 << int(len(x) + last).bit_length()
-    whole = np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)
-    return whole[:last + 1]
+    return np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)[:last + 1]
 
 
 def cumulate_periodogram(x: Floats, period: float) -> tuple[Floats, Floats, float, float]:

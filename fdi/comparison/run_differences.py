@@ -216,8 +216,7 @@ def find_offset(a: Trace, b: Trace) -> float:
     """
     best, most = 0.0, -1
     for offset in _propose_offsets(a, b):
-        rows = _share_rows(a, b, offset)
-        count = int(_find_common_rows(rows).sum())
+        count = int(_find_common_rows(_share_rows(a, b, offset)).sum())
         if count > 1.002 * most:  # the first of equals: the later ones are less natural
             best, most = offset, count
         if count > 0.998 * min(len(a) * a.period, len(b) * b.period) / max(a.period, b.period):

@@ -167,8 +167,7 @@ def _choose_pairs(faults: Sequence[Fault], sizes: Mapping[str, Estimate], levels
     ranked = sorted(faults, key=lambda f: (levels[f.name] == Level.ACCEPTABLE, -compute_severity(
         f, sizes[f.name].value)))
     gone = sum(levels[f.name] != Level.ACCEPTABLE for f in faults)
-    chosen = [f for f in faults if f in ranked[:min(max(gone, 2), most)]]
-    return list(combinations(chosen, 2))
+    return list(combinations([f for f in faults if f in ranked[:min(max(gone, 2), most)]], 2))
 
 
 def _require_bands_of(bands: Bands, model: Model, faults: Sequence[Fault]) -> Bands:

@@ -374,8 +374,7 @@ def _align_trace(base: Bands, trace: Trace, name: str) -> tuple[Floats, Floats]:
     parts = find_sections(com, period, base.scale)
     require_same_command(base, parts, period, name)
     own, usual = (next(s.start for s in p if s.kind in ("step", "ramp")) for p in (parts, base.sections))
-    n = base.sections[-1].stop
-    at = np.clip(np.arange(n) + own - usual, 0, len(xj) - 1)
+    at = np.clip(np.arange(base.sections[-1].stop) + own - usual, 0, len(xj) - 1)
     rows = np.arange(len(xj))
     return com[at], np.interp(rows, rows[~missing], xj[~missing])[at]
 

@@ -38,8 +38,7 @@ def find_stays(beyond: Flags, lasting: int = BAND_EVENT_SAMPLES) -> list[tuple[i
 
 def find_lasting_peak(x: Floats, lasting: int = BAND_EVENT_SAMPLES) -> Floats:
     """The highest level that x (.., n), time last, keeps for `lasting` rows in a row; NaN is below all levels."""
-    known = np.where(np.isnan(x), -np.inf, x)
-    windows = np.lib.stride_tricks.sliding_window_view(known, lasting, axis=-1)
+    windows = np.lib.stride_tricks.sliding_window_view(np.where(np.isnan(x), -np.inf, x), lasting, axis=-1)
     out: Floats = windows.min(axis=-1).max(axis=-1)
     return out
 
@@ -231,8 +230,7 @@ def measure_step(x: Floats, s: Section, period: float, settling_band: float = 0.
         horizon = rows
     peak = np.argmax(y[:, :horizon], axis=1)
     yield "overshoot", 100 * (y[np.arange(len(y)), peak] - 1)
-    later = np.arange(horizon) > peak[:, None]
-    lowest = np.where(later, y[:, :horizon], np.inf).min(axis=1)
+    lowest = np.where(np.arange(horizon) > peak[:, None], y[:, :horizon], np.inf).min(axis=1)
     yield "undershoot", np.where(np.isfinite(lowest), 100 * (1 - lowest), np.nan)
     yield "rise_time", period * (_find_crossing(y, 0.9) - _find_crossing(y, 0.1))
     yield "peak_time", period * _find_vertex(y, peak)

@@ -529,8 +529,7 @@ def _retry_without(problem: CountedProblem, found: Fit, most: int = 2) -> Fit:
                 sizes[fault] = found.free[k].value(float(slide_along(found, way, suspect, 0.0)[k]))
         if moved:
             tried += [_list_alone(problem, found, fault, size) for fault, size in sizes.items()]
-        fits = map_in_threads(fit_from, tried, problem.workers)
-        best = min(fits, key=lambda f: f.cost, default=found)
+        best = min(map_in_threads(fit_from, tried, problem.workers), key=lambda f: f.cost, default=found)
         if best.cost >= found.cost:
             break
         found = best
@@ -593,8 +592,7 @@ def set_sizes(found: Fit, fault: Fault, size: float) -> Floats:
 
 
 def _blames(fault: Fault, found: Fit) -> bool:
-    size = found.values[fault.parameter]
-    return fault.measure_departure(size) > FAULT_BLAMED_SHARE * fault.limits[1]
+    return fault.measure_departure(found.values[fault.parameter]) > FAULT_BLAMED_SHARE * fault.limits[1]
 
 
 def descend(problem: CountedProblem, found: Fit, schedule: Sequence[tuple[float, int]],

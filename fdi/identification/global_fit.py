@@ -61,8 +61,7 @@ def sample_starts(free: Sequence[Free], begin: Floats, known: frozenset[str], se
     is known of them.
     """
     spread = np.array([(0.1 / f.scale if f.name in known else 0.4) * is_wide(f) for f in free])
-    rng = np.random.default_rng(seed)
-    scattered = begin + spread * rng.standard_normal((count, len(free)))
+    scattered = begin + spread * np.random.default_rng(seed).standard_normal((count, len(free)))
     low, high = scaled_bounds(free)
     return np.clip(np.vstack([begin, np.zeros(len(free)), scattered]), low, high)
 

@@ -409,8 +409,7 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: LogProblem, 
         part = np.arange(len(com)) / len(com)
         force = _measure_push(model) * experiment.is_loaded
         load = force * (((part > 0.2) & (part < 0.45)).astype(float) - ((part >= 0.45) & (part < 0.7)))
-        trace = _simulate(model, com, load, problem.trace.outputs)
-        run = replace(present, trace=trace, also=(), _lanes={})
+        run = replace(present, trace=_simulate(model, com, load, problem.trace.outputs), also=(), _lanes={})
         found[experiment.name] = known + _measure_information(run, free, x)
     what = {e.name: e.what for e in EXPERIMENTS}
     outputs = model.kind.signals.outputs

@@ -326,7 +326,5 @@ def _read_cell(where: str, axis: str, text: str) -> float:
 def find_row(table: Mapping[str, Row], name: str) -> Row | None:
     """The table's row of a trace by its path in the folder, POSIX; its folder, file name or stem will do, too."""
     path = Path(name)
-    for key in (name, str(path.parent), path.name, path.name.partition(".")[0]):
-        if key in table:
-            return table[key]
-    return None
+    keys = (name, str(path.parent), path.name, path.name.partition(".")[0])
+    return next((table[key] for key in keys if key in table), None)

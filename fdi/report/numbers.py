@@ -59,8 +59,7 @@ def _digits_of_interval(half: float, largest: float, most: int) -> int:
         return 2
     if half == 0.0:
         return most
-    wanted = 1 + math.floor(math.log10(largest)) - math.floor(math.log10(half))
-    return min(max(wanted, 2), most)
+    return min(max(1 + math.floor(math.log10(largest)) - math.floor(math.log10(half)), 2), most)
 
 
 def format_ratio(ratio: float) -> str:

@@ -440,8 +440,7 @@ class _View(NamedTuple):
         d = self.trace.declared
         if name in self.trace.columns:
             return d.find(name).shown_unit
-        fine = choose_unit(d.controlled.unit, 0.0)[1]
-        return {"error": fine, "speed": f"{d.controlled.shown_unit}/s"}[name]
+        return {"error": choose_unit(d.controlled.unit, 0.0)[1], "speed": f"{d.controlled.shown_unit}/s"}[name]
 
     @property
     def step(self) -> tuple[float, float]:
@@ -466,10 +465,8 @@ def draw_failed_check(trace: Trace, check: CheckResult, salt: str = "check") -> 
         return ""
     first, stop = np.searchsorted(trace.t, [check.t0 - 0.5 * trace.period, check.t1 - 0.5 * trace.period])
     view = _View(trace, check, slice(int(first), int(stop)))
-    if stop - first < 2:
-        return ""
-    if draw is not _draw_reaction and check.signal and (
-            check.signal not in view.known or np.isnan(view.read(check.signal)).all()):
+    if stop - first < 2 or (draw is not _draw_reaction and check.signal and (
+            check.signal not in view.known or np.isnan(view.read(check.signal)).all())):
         return ""
     is_still = abs(view.step[1]) <= 1e-6 * trace.scale
     if draw in STEP_DRAWERS and (is_still or (draw is _draw_overshoot and math.isnan(check.value))):

@@ -86,8 +86,7 @@ def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
     names = list(columns)
     rows = (",".join("" if math.isnan(v) else repr(v) for v in row)
             for row in zip(*(columns[name].tolist() for name in names), strict=True))
-    text = "\n".join([",".join(names), *rows]) + "\n"
-    raw = text.encode()
+    raw = ("\n".join([",".join(names), *rows]) + "\n").encode()
     with report_system_error(path, "", "a place that can be written"), write_whole(path) as part:
         part.write_bytes(gzip.compress(raw, mtime=0) if path.suffix == ".gz" else raw)
 
@@ -170,8 +169,7 @@ def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...]
 def combine_columns(sources: Mapping[str, Floats], table: Table) -> dict[str, Floats]:
     """The columns of a trace from those of a plant's own rig; NaN where a part of one is missing."""
     def shift_term(term: Term) -> Floats:
-        values = term.factor * sources[term.source]
-        return np.concatenate([values[term.later:], np.full(term.later, np.nan)])
+        return np.concatenate([(term.factor * sources[term.source])[term.later:], np.full(term.later, np.nan)])
 
     columns = {name: sum(map(shift_term, terms), start=np.zeros(1))[table.skip:]
                for name, terms in table.columns.items()}

@@ -252,8 +252,7 @@ def _message_offsets(stream: BinaryIO, index: ChunkIndex, channel: int) -> NDArr
     file = BoundedFile(stream)
     file.seek(index.message_index_offsets[channel])
     _, length = _RECORD.unpack(file.read(_RECORD.size))
-    pairs = np.frombuffer(file.read(length)[6:], "<u8").reshape(-1, 2)
-    return pairs[:, 1].astype(np.int64)
+    return np.frombuffer(file.read(length)[6:], "<u8").reshape(-1, 2)[:, 1].astype(np.int64)
 
 
 def _decode_rows(raw: bytes, offsets: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArray[Any] | None:

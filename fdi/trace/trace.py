@@ -505,8 +505,7 @@ def hold_last(x: Floats) -> Floats:
     >>> hold_last(np.array([np.nan, 1.0, np.nan, 2.0])).tolist()
     [0.0, 1.0, 1.0, 2.0]
     """
-    last = np.maximum.accumulate(np.where(np.isnan(x), 0, np.arange(len(x))))
-    return np.nan_to_num(x[last])
+    return np.nan_to_num(x[np.maximum.accumulate(np.where(np.isnan(x), 0, np.arange(len(x))))])
 
 
 def hold_next(x: Floats) -> Floats:

@@ -614,8 +614,7 @@ def _list_costs(figures: Mapping[str, Any]) -> list[Item]:
         ["rig --help, the whole process", f"{figures['help_process']:.2f} s", "", ""],
         ["one cycle of Actuator from Python", f"{figures['cycle'] * 1e6:.1f} us", "", ""]]
     if step is not None:
-        is_same = step["identical"]
-        same = Cell("equal bit for bit", "good") if is_same else Cell("NOT equal", "bad")
+        same = Cell("equal bit for bit", "good") if step["identical"] else Cell("NOT equal", "bad")
         rows += [
             ["one step, compiled Python", f"{step['python']:.1f} ns", "", ""],
             [f"one step, {step['compiler']} -O3 -march=native", f"{step['c']:.1f} ns", format_digits(step["ratio"]),

@@ -268,8 +268,7 @@ def list_values(dictionary: Any) -> tuple[tuple[int, int, bytes], ...]:
         own = {sub: data for (index, sub), data in given.items() if index == parameter and sub}
         cob_id = own.pop(1, None)
         if mapping and cob_id is not None:
-            off = int.from_bytes(cob_id, "little") | INVALID
-            ordered.append((parameter, 1, off.to_bytes(4, "little")))
+            ordered.append((parameter, 1, (int.from_bytes(cob_id, "little") | INVALID).to_bytes(4, "little")))
         count = mapping.pop(0, None)
         if count is not None and mapping:
             ordered.append((parameter + MAPPING, 0, bytes(len(count))))

@@ -80,8 +80,7 @@ def compute_checksum(each: Field, data: bytes, counter: int) -> int:
         crc = CHECKSUMS[each.checksum]
         return compute_crc8(crc.list_bytes(each, data, counter), crc.polynomial, crc.start, crc.inversion)
     try:
-        found = _USERS[each.checksum](insert_bits(each, data, 0), counter)
-        return int(found) & (1 << each.length) - 1
+        return int(_USERS[each.checksum](insert_bits(each, data, 0), counter)) & (1 << each.length) - 1
     except Exception as error:
         name, _, function = each.checksum.partition("#")[0].rpartition(":")
         raise InputError(name, function, f"a whole number from (data, counter), not "

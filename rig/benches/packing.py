@@ -282,8 +282,7 @@ def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], mine: Role
         mine: who sends.
     """
     width = FRAMES_AT + FRAME_WORDS * len(frames)
-    count = sum(len(each.fields) for each in frames)
-    values = width + _FIELD_WORDS * count
+    values = width + _FIELD_WORDS * sum(len(each.fields) for each in frames)
     data_ids = [one for each in frames for one in each.fields if one.data_ids]
     words = np.zeros(values + len(channels) + sum(1 + len(one.data_ids) for one in data_ids), np.int64)
     m = Layout(words, words.view(np.float64), words.view(np.float32), words.view(np.uint8))

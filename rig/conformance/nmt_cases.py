@@ -41,8 +41,7 @@ def check_boot(t: Target, specifier: NmtCommand) -> str:
 
 def check_state_after_boot(t: Target) -> str:
     """A node without 0x1F80 waits for its master."""
-    is_waiting = t.sheet.find(0x1F80) is None or t.read(0x1F80) & 4
-    require_applicable(is_waiting, "0x1F80 lets the node start itself")
+    require_applicable(t.sheet.find(0x1F80) is None or t.read(0x1F80) & 4, "0x1F80 lets the node start itself")
     t.reset()
     t.beat()
     t.require_state(PRE_OPERATIONAL, "after the boot-up")

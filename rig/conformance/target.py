@@ -572,8 +572,7 @@ class Variable(NamedTuple):
         """The value for a reader: a number, a text or bytes in hexadecimal."""
         if self.size and len(data) == self.size:
             value = self.decode(data)
-            is_signed = self.data_type in (*FLOATS, *datatypes.SIGNED_TYPES)
-            return f"{value:g}" if is_signed else f"0x{value:X}"
+            return f"{value:g}" if self.data_type in (*FLOATS, *datatypes.SIGNED_TYPES) else f"0x{value:X}"
         return repr(data.decode("latin-1")) if self.data_type == datatypes.VISIBLE_STRING else data.hex(" ")
 
     def change(self, data: bytes) -> bytes:

@@ -50,9 +50,7 @@ class Dictionary:
 
     def restore(self, first: int, last: int) -> None:
         """Set the objects from index `first` to `last` to their defaults."""
-        for key, entry in self.entries.items():
-            if first <= key[0] <= last:
-                self.values[key] = entry.default
+        self.values |= {key: entry.default for key, entry in self.entries.items() if first <= key[0] <= last}
 
     def __contains__(self, key: tuple[int, int]) -> bool:
         return key in self.entries

@@ -37,8 +37,7 @@ def _name_position(index: int, sub: int) -> str:
 
 
 def _write_entry(index: int, sub: int, entry: Entry, default_of_node_2: Value) -> str:
-    is_text = isinstance(entry.default, bytes)
-    kind = "KIND_TEXT" if is_text else _KINDS.get(entry.code, "KIND_UNSIGNED")
+    kind = "KIND_TEXT" if isinstance(entry.default, bytes) else _KINDS.get(entry.code, "KIND_UNSIGNED")
     flags = {"READABLE": entry.readable, "WRITABLE": entry.writable, "MAPPABLE": entry.mappable,
              "HAS_LOW_LIMIT": entry.low is not None, "HAS_HIGH_LIMIT": entry.high is not None,
              "NODE_RELATIVE": default_of_node_2 != entry.default}

@@ -80,8 +80,7 @@ class EmbeddedBus:
     def add(self, make: Callable[[Send], AnyNode]) -> AnyNode:
         """Create a node with its `send` and attach it: `add(lambda send: Device(2, EDS[2], send))`."""
         nodes: list[AnyNode] = []
-        send = self.attach(lambda frame: nodes[0].receive(frame))
-        nodes.append(make(send))
+        nodes.append(make(self.attach(lambda frame: nodes[0].receive(frame))))
         return nodes[0]
 
     def deliver(self, t_ns: int) -> int:
@@ -488,8 +487,7 @@ class LinkWire(Wire):
 
         When a node is gone, a cycle takes its 1 ms, in which the other nodes can answer.
         """
-        is_patient = self._missed < _PATIENCE
-        grace = self.grace if is_patient else 0.1 * self.grace
+        grace = self.grace if self._missed < _PATIENCE else 0.1 * self.grace
         is_answered = not self.is_node_gone() and self.wait(lambda: done() or self.is_node_gone(), grace)
         if self.is_node_gone():
             self.wait(done, 1e-3)

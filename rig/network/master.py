@@ -176,8 +176,7 @@ class Master:
     @property
     def pause(self) -> float:
         """The longer of the times between the rig's last two heartbeats and since the last one, s."""
-        now = self.wire.clock.now()
-        return 1e-9 * max(self._last_pause_ns, now - self._beat_ns if self._beat_ns else 0)
+        return 1e-9 * max(self._last_pause_ns, self.wire.clock.now() - self._beat_ns if self._beat_ns else 0)
 
     def is_behind(self) -> bool:
         """Whether the rig's heartbeat paused so long that the nodes may have missed it: then the rig stood still."""

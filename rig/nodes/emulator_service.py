@@ -276,8 +276,7 @@ class EmulatorService:
         """The record of the cycles so far, at most the last RING."""
         recorded = int(self._memory.words[ec.RECORDED])
         times = self._memory.words[ec.TIMES_AT: ec.TIMES_AT + 6 * RING].reshape(-1, 6)
-        rows = times[np.arange(max(0, recorded - RING), recorded) % RING]
-        return CycleRecord(*rows.T)
+        return CycleRecord(*times[np.arange(max(0, recorded - RING), recorded) % RING].T)
 
 
 def list_unheard(bench: Bench) -> tuple[int, ...]:

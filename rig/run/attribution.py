@@ -377,8 +377,7 @@ def _find_run_start(missing: Mask, cycle: int, near: int = 4) -> int:
     before = np.flatnonzero(missing[:cycle + 1])
     if not len(before) or before[-1] < cycle - near:
         return cycle
-    last = int(before[-1])
-    present = np.flatnonzero(~missing[:last + 1])
+    present = np.flatnonzero(~missing[:int(before[-1]) + 1])
     return int(present[-1]) + 1 if len(present) else 0
 
 

@@ -79,8 +79,7 @@ def measure_settling_time(position: Array, com: Array, before: float, rate: floa
 
 def measure_rise_time(position: Array, com: Array, before: float, rate: float) -> float:
     """Time from 10 % to 90 % of the step, s, interpolated between samples."""
-    size = measure_step_size(com, before)
-    done = (filter_median(position, rate) - before) / size
+    done = (filter_median(position, rate) - before) / measure_step_size(com, before)
 
     def find_time(level: float) -> float:
         beyond = np.flatnonzero(done >= level)

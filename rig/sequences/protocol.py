@@ -282,8 +282,7 @@ def list_wrong_changes(rows: Rows, delay: int) -> list[str]:
 def measure_delays(rows: Rows) -> Whole:
     """Of each answered cycle, for how many cycles a CiA 402 drive has kept a state that the control word ends."""
     states = find_states(rows, CIA402)
-    wanted = map_words(rows.control, lambda word: find_wanted(CIA402, word))
-    pairs = states * len(State) + wanted
+    pairs = states * len(State) + map_words(rows.control, lambda word: find_wanted(CIA402, word))
     due = {state * len(State) + word for state, word in list_transitions()}
     k = np.arange(len(pairs))
     begin = np.maximum.accumulate(np.where(np.diff(pairs, prepend=-1) != 0, k, 0))  # of the run of this pair
@@ -492,8 +491,7 @@ def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterato
         return
     for node, beats in record.heartbeats.items():
         t, waited = np.array(beats, float).reshape(-1, 2).T
-        is_known = np.maximum(waited[1:], waited[:-1]) <= tolerance
-        gaps = np.diff(t)[is_known]
+        gaps = np.diff(t)[np.maximum(waited[1:], waited[:-1]) <= tolerance]
         if len(gaps) == 0 and len(beats) > 1:
             continue
         value = 1e3 * float(np.median(gaps)) if len(gaps) else nan

@@ -106,8 +106,7 @@ def _list_chunks(data: bytes) -> Iterator[tuple[bytes, int]]:
         opcode, length = _RECORD.unpack_from(data, at)
         at += _RECORD.size + length
         if opcode == Opcode.CHUNK and at <= len(data):
-            chunk = Chunk.read(ReadDataStream(BytesIO(data[at - length:at])))
-            yield unpack_chunk(chunk), at
+            yield unpack_chunk(Chunk.read(ReadDataStream(BytesIO(data[at - length:at])))), at
 
 
 _STYLES = {"PASS": "green", "FAIL": "bold red", "CANNOT_TELL": "bold yellow", "measures": "bold cyan", "waits": "dim",
