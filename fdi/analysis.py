@@ -280,9 +280,8 @@ def explain(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
     own_model = _load_model(model, trust)
     runs = _collect_runs(own_model, trace, repeats, holdout, signals)
     answer, pattern = explain_runs(runs, seed, effect_file)
-    report = build_explanation_report(answer, runs.sources[0].file, own_model.name, runs.sources, pattern=pattern,
-                                      notes=runs.notes)
-    return ExplanationResult(report, answer)
+    return ExplanationResult(build_explanation_report(answer, runs.sources[0].file, own_model.name, runs.sources,
+                                                      pattern=pattern, notes=runs.notes), answer)
 
 
 def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPath = "eha", *,

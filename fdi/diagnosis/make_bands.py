@@ -91,8 +91,8 @@ def make_bands_file(sources: Sequence[str | Path], out: str | Path, model: Model
         bands = make_bands_by_simulation(model, com, np.zeros_like(com), model["controller.period"], seed=seed,
                                          progress=progress, name=name, faults=faults)
     write_text(place, format_bands(bands))
-    judged = [fault.name for fault in bands.faults if bands.shows(fault)]
-    return {"bands": str(out), "judges": judged, "provenance": dict(bands.provenance)}
+    return {"bands": str(out), "judges": [fault.name for fault in bands.faults if bands.shows(fault)],
+            "provenance": dict(bands.provenance)}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -355,8 +355,8 @@ def learn_bands(traces: Sequence[Trace], model: Model | None = None, names: Sequ
     doubtful = [name for (c, x), name in zip(rows, names, strict=True)
                 if any(level > Level.ACCEPTABLE for level in judge_position(c, x, period, base).levels.values())]
     if doubtful:
-        words = "beyond MidBand of simulated healthy units: " + ", ".join(doubtful)
-        return replace(found, provenance={**found.provenance, "doubtful": words})
+        return replace(found, provenance={
+            **found.provenance, "doubtful": f"beyond MidBand of simulated healthy units: {', '.join(doubtful)}"})
     return found
 
 

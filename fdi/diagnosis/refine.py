@@ -223,8 +223,7 @@ def _make_suspect(s: Suspect, model: Model) -> Free:
         usual = get_positive(model, s.parameter)
         return LogFree(s.parameter, math.log(usual), s.spread, 1.0, math.log(0.05 * usual), math.log(100.0 * usual),
                        0.02)
-    usual = model.values.get(s.parameter, own.centre)
-    return own._replace(centre=usual, scale=s.spread, prior=1.0, step=0.02)
+    return own._replace(centre=model.values.get(s.parameter, own.centre), scale=s.spread, prior=1.0, step=0.02)
 
 
 def make_start(free: Sequence[Free], faults: Sequence[Fault], sizes: Sequence[float],

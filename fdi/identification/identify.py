@@ -244,8 +244,8 @@ def read_identification_runs(model: Model, ranges: Sequence[Range], fitted: Sequ
     """
     files = [*fitted, *held_out]
     sources = [read_source(file) for file in files]
-    traces = [Trace.read(file, signals=model.kind.signals) for file in files]
-    return prepare_runs(model, ranges, traces, sources, len(fitted), signals)
+    return prepare_runs(model, ranges, [Trace.read(file, signals=model.kind.signals) for file in files], sources,
+                        len(fitted), signals)
 
 
 def collect_identification_runs(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace],
@@ -696,8 +696,8 @@ def hold_parameters(problem: LogProblem, fit: Fit, held: Mapping[str, float]) ->
         return problem, fit
     kept = [k for k, f in enumerate(fit.free) if f.name not in held]
     values = limit_friction_values({**problem.model.values, **held})
-    fixed = replace(problem, model=replace(problem.model, values=values), _lanes={})
-    return fixed, start_fit([fit.free[k] for k in kept], fit.x[kept])
+    return (replace(problem, model=replace(problem.model, values=values), _lanes={}),
+            start_fit([fit.free[k] for k in kept], fit.x[kept]))
 
 
 def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress: Progress = ignore_progress

@@ -539,8 +539,7 @@ def measure_cycle_cost(cycles: int = 5000, rounds: int = 9) -> float:
 def measure_simulation_speed(command: Floats, rounds: int = 9) -> float:
     """The speed of a simulated run over `command` (n,) m, with noise and columns, as a multiple of real time."""
     model = Model()
-    seconds = measure_median_duration(lambda: simulate(model, command), rounds)
-    return len(command) * model["controller.period"] / seconds
+    return len(command) * model["controller.period"] / measure_median_duration(lambda: simulate(model, command), rounds)
 
 
 def measure_bus_run_speed(runs: int = 3) -> float:

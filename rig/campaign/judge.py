@@ -295,8 +295,7 @@ def sample_random_parts(case: Case, cycles: int, colour: float, hum: float, mode
     scatter, rng = sample_scatter(case, model.kind)
     level, period = _find_noise(model) or 1.0, model["controller.period"]
     position = sample_coloured_noise(cycles, level, colour, hum, period, rng)
-    others = rng.standard_normal((cycles, len(model.kind.signals.outputs)))
-    return scatter, np.column_stack([position / level, others])
+    return scatter, np.column_stack([position / level, rng.standard_normal((cycles, len(model.kind.signals.outputs)))])
 
 
 def sample_scatter(case: Case, kind: Plant) -> tuple[dict[str, float], np.random.Generator]:

@@ -183,8 +183,7 @@ def _map_parameter(about: Description, name: str, entry: Entry, place: Place) ->
     variable = about.variables[entry.variable]
     low, high = entry.range or tuple(worth * _read_number(_find_attribute(about, entry.variable, name), far)
                                      for name, far in (("min", -inf), ("max", inf)))
-    quantity = Quantity(unit, low=low, high=high)
-    return port._replace(worth=worth), quantity, worth * _read_number(variable.start, 0.0)
+    return port._replace(worth=worth), Quantity(unit, low=low, high=high), worth * _read_number(variable.start, 0.0)
 
 
 def _parse(text: str, unit: str, place: Place) -> float:

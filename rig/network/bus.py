@@ -150,9 +150,8 @@ def can_open(spec: str) -> bool:
 
 def list_can_interfaces() -> list[str]:
     """The kernel's CAN interfaces that are up, real and virtual."""
-    found = _NETWORK.glob("*/type") if _NETWORK.exists() else []
-    names = sorted(path.parent.name for path in found if path.read_text().strip() == _ARPHRD_CAN)
-    return [name for name in names if not explain_socketcan_problem(name)]
+    names = (path.parent.name for path in _NETWORK.glob("*/type") if path.read_text().strip() == _ARPHRD_CAN)
+    return sorted(name for name in names if not explain_socketcan_problem(name))
 
 
 def has_socketcan() -> bool:

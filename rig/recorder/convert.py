@@ -213,8 +213,8 @@ class _CycleBuilder:
             self._open(frame.t_ns)
         elif spec is not None:
             if len(frame.data) < spec.length:
-                where = describe_identifier(cob_id)
-                return [Event("WARN", "frame", f"{where}: {len(frame.data)} bytes instead of {spec.length}")]
+                return [Event("WARN", "frame",
+                              f"{describe_identifier(cob_id)}: {len(frame.data)} bytes instead of {spec.length}")]
             self._take(frame.t_ns, spec, self._readers[spec](frame.data[:spec.length]))
         elif (self._is_canopen and 0x700 < cob_id < 0x780 and len(frame.data) == 1
               and self._nmt.get(node) != frame.data[0]):

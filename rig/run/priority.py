@@ -170,8 +170,8 @@ class Lateness(NamedTuple):
 def summarise_lateness(late_ns: np.ndarray, period_ns: int) -> Lateness:
     """Summarise wake-ups that came `late_ns` (n,) after they were due."""
     p50, p99, p99_9 = (float(value) for value in np.percentile(late_ns, [50, 99, 99.9]) / 1e3)
-    missed = int(np.count_nonzero(late_ns >= period_ns))
-    return Lateness(p50, p99, p99_9, float(late_ns.max()) / 1e3, late_ns.size, missed)
+    return Lateness(p50, p99, p99_9, float(late_ns.max()) / 1e3, late_ns.size,
+                    int(np.count_nonzero(late_ns >= period_ns)))
 
 
 def measure_timer_lateness(seconds: float, period_ns: int = 1_000_000) -> Lateness:

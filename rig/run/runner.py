@@ -352,7 +352,6 @@ def diagnose_servovalve(trace: Trace, progress: Progress, workers: int = 2) -> d
     """
     from fdi.diagnosis.diagnosis import diagnose  # here: loads the compiler, which other runs do not need
     from fdi.report.diagnosis_report import collect_data
-    from fdi.report.report import to_plain
 
     try:
         diagnosis = diagnose(trace, progress=progress, source=trace.provenance["source"], workers=workers)

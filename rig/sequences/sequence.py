@@ -176,8 +176,8 @@ class Sequence:
     def plan(self, seed: int) -> Plan:
         """The faults by cycle of the run."""
         start = round(sum(segment.duration for segment in self.setup) * self.rate)
-        stop = start + round(self.duration * self.rate)
-        return Plan(faults=self.faults, start=start, stop=stop, seed=seed, rate=self.rate, plant=self.plant)
+        return Plan(faults=self.faults, start=start, stop=start + round(self.duration * self.rate), seed=seed,
+                    rate=self.rate, plant=self.plant)
 
     @property
     def loses_frames(self) -> bool:
@@ -329,8 +329,8 @@ def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Seq
 
     def fill_in(part: Any, key: str, here: Place) -> Any:
         if isinstance(part, Csv):
-            values = _read_column(part.file, read, key, here.at("file"), 1 / sequence.rate)
-            return replace(part, values=values, rate=sequence.rate)
+            return replace(part, values=_read_column(part.file, read, key, here.at("file"), 1 / sequence.rate),
+                           rate=sequence.rate)
         if isinstance(part, PythonSegment | PythonCheck | Step):
             file, name = require_function_name(part.python)
             source = read(file, here.at("python"), "a Python file beside the sequence")

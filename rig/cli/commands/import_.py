@@ -62,8 +62,8 @@ def import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
     else:
         raise InputError(source, "", f"--map for other formats than .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}; "
                                      "--guess writes one")
-    data = {"trace": str(out), "cycles": cycles}
-    return give_answer(Report("import", str(source), sentence=f"{out}: {cycles} cycles", data=data), args)
+    return give_answer(Report("import", str(source), sentence=f"{out}: {cycles} cycles",
+                              data={"trace": str(out), "cycles": cycles}), args)
 
 
 def import_by_map(args: argparse.Namespace, source: Path, out: Path) -> int:

@@ -108,15 +108,13 @@ def list_checks(model: Model) -> Rows:
 
     return [{"name": name, "measures": kind.text.rstrip("."),
              "unit": "any" if name == "python" else kind.unit or "the signal's",
-             "keys": "\n".join(_describe_keys(kind.keys))}
+             "keys": "\n".join(_describe_keys(kind.keys, checks.Check))}
             for name, kind in checks.KINDS.items()]
 
 
-def _describe_keys(kind: type[Any]) -> Iterator[str]:
-    """The keys of a kind of check beside those that every check has."""
-    from rig.sequences.checks import Check
-
-    common = {f.name for f in fields(Check)} - {"window"}
+def _describe_keys(kind: type[Any], base: type[Any]) -> Iterator[str]:
+    """The keys of a kind of check beside those that every check has, whose class is `base`."""
+    common = {f.name for f in fields(base)} - {"window"}
     for f in fields(kind):
         if f.name not in common and f.metadata.get("key", True):
             default = f.default if f.default_factory is MISSING else f.default_factory()

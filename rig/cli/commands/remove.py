@@ -25,5 +25,5 @@ def run_command(args: argparse.Namespace) -> int:
         progress("reading", 0.0)
         runs = find_runs(model, known, trace, args.repeat, args.holdout, list_signals(args)) if trace else None
         update = remove_effect_and_refit(effects[0], runs, model, known, format_command_line(), progress)
-    report = build_model_report(update, path, write_model_file(update, path), page)
-    return give_answer(report, args, places=Places(page))
+    return give_answer(build_model_report(update, path, write_model_file(update, path), page), args,
+                       places=Places(page))

@@ -79,8 +79,8 @@ def write_samples(args: argparse.Namespace) -> int:
                            model.kind.signals).write_csv(places[name])
     sentence = (f"{', '.join(map(str, places.values()))}: a run, its repeat, and a run of another command. Next: "
                 f"rig compare {places['run.csv']} --repeat {places['run2.csv']}")
-    data = {"traces": [str(place) for place in places.values()]}
-    return give_answer(Report("simulate", "samples", sentence=sentence, data=data), args)
+    return give_answer(Report("simulate", "samples", sentence=sentence,
+                              data={"traces": [str(place) for place in places.values()]}), args)
 
 
 def load_command(file: str | None, period: float, kind: Plant) -> tuple[Any, Any, str]:

@@ -107,8 +107,8 @@ def draw(args: argparse.Namespace, progress: Progress) -> Drawing:
         InputError: a trace, model or option that cannot be used.
     """
     if args.others:
-        signals = load_declared_model(args).kind.signals
-        return draw_runs(read_and_compare_runs([args.trace, *args.others], signals, progress))
+        return draw_runs(read_and_compare_runs([args.trace, *args.others], load_declared_model(args).kind.signals,
+                                               progress))
     progress("reading", 0.0)
     if not args.compare:
         return draw_run(Trace.read(args.trace, all=True, signals=load_declared_model(args).kind.signals))
