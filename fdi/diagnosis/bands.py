@@ -539,10 +539,9 @@ def format_bands(bands: Bands) -> str:
     for ramp in bands.ramps:
         lines += ["", "[[ramp]]", f"section = {ramp.section}", f"fault = {json.dumps(ramp.fault)}",
                   f"position = {_format_numbers(ramp.position._asdict(), count)}",
-                  f"speed = {_format_numbers(ramp.speed._asdict(), SPEED_COUNT * count)}"]
-        if len(ramp.half_range):
-            lines += [f"half_range = {_format_list(ramp.half_range / count, 2)}", f"slip = {ramp.slip:.4g}",
-                      f"ease = {ramp.ease:.4g}"]
+                  f"speed = {_format_numbers(ramp.speed._asdict(), SPEED_COUNT * count)}",
+                  *([f"half_range = {_format_list(ramp.half_range / count, 2)}", f"slip = {ramp.slip:.4g}",
+                     f"ease = {ramp.ease:.4g}"] if len(ramp.half_range) else [])]
     lines += ["", "[precursors]", *(f"{name if BARE.fullmatch(name) else json.dumps(name)} = {_format_numbers(own)}"
                                     for name, own in bands.precursors.items())]
     return "\n".join(lines) + "\n"

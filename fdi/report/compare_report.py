@@ -217,11 +217,10 @@ def _describe_controller(c: Comparison) -> str:
     if a.ratio <= CONTROLLER_ERROR_RATIO:
         return f"{path}: equal to the last digit"
     factor, shown = (1e6, "uA") if d.drive.unit == "A" else (1.0, d.drive.unit)
-    found = f"{path}: error {factor * a.error:.3g} {shown} RMS, floor {factor * a.floor:.3g} {shown}"
     gain, unit = find_controller_gain(c.model, c.trace.period)[0], f"{d.drive.unit}/{d.controlled.unit}"
-    if math.isfinite(a.gain) and abs(a.gain - gain) > 0.002 * gain:
-        found += f"; its gain is {a.gain:.4g} {unit}, the model's {gain:.4g} {unit}"
-    return found
+    is_off = math.isfinite(a.gain) and abs(a.gain - gain) > 0.002 * gain
+    return (f"{path}: error {factor * a.error:.3g} {shown} RMS, floor {factor * a.floor:.3g} {shown}"
+            + (f"; its gain is {a.gain:.4g} {unit}, the model's {gain:.4g} {unit}" if is_off else ""))
 
 
 def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6) -> list[Line]:

@@ -253,11 +253,11 @@ def _tabulate_candidates(a: Answer, most: int = 8) -> Table:
     """The candidates, best first, below the model without any further effect."""
     floor, has_holdout = a.explanation.floor, any(c.holdout for c in a.candidates)
     symbols = [find_signals(a).find(s).symbol for s in floor]
-    columns = [Column("effect"), Column("result"), *(Column(symbol, align="right") for symbol in symbols)]
-    if has_holdout:
-        columns += [Column("held-out run", align="right", medium=Medium.TERMINAL),
-                    *(Column(f"{symbol}, held-out run", align="right", medium=Medium.PAGE) for symbol in symbols)]
-    columns += [Column("evidence", align="right"), Column("p", align="right"), Column("size", medium=Medium.PAGE)]
+    held_out = [Column("held-out run", align="right", medium=Medium.TERMINAL),
+                *(Column(f"{symbol}, held-out run", align="right", medium=Medium.PAGE) for symbol in symbols)]
+    columns = [Column("effect"), Column("result"), *(Column(symbol, align="right") for symbol in symbols),
+               *(held_out if has_holdout else []), Column("evidence", align="right"), Column("p", align="right"),
+               Column("size", medium=Medium.PAGE)]
 
     def show_ratios(ratios: BySignal, holdout: BySignal) -> list[str]:
         """Errors over noise floors: of each signal; on the held-out run of the worst signal, then of each."""

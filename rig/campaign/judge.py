@@ -270,9 +270,8 @@ def simulate_case(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
     signals, period = model.kind.signals, model["controller.period"]
     command = np.round(load_nominal_test(model.kind, period)[0], 12)
     scatter, noise = sample_random_parts(case, len(command), spec["colour"], spec["hum"], model)
-    simulator: Simulator = simulate_unit
-    if spec["simulator"] != OWN_SIMULATOR:
-        simulator = import_function(spec["simulator"], "--simulator", "a simulator of units")
+    simulator: Simulator = simulate_unit if spec["simulator"] == OWN_SIMULATOR else import_function(
+        spec["simulator"], "--simulator", "a simulator of units")
     columns = simulator(Unit(model, scatter, case.sizes, command, noise, restore_faults(spec)))
     measured = {signals.command.name, signals.drive.name, "load", *spec["signals"].split(",")}
     return Trace.from_columns({name: columns[name] for name in columns if name in measured}, period,

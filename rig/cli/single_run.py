@@ -154,9 +154,8 @@ def add_outcome(report: Report, outcome: Outcome) -> Report:
         "missing": _list_counts(outcome.counters),
         "not nominal": differences if differences != "nothing" else "",
         "servovalve": f"{fdi['verdict']}: {fdi['sentence']}" if fdi else ""}
-    reason = outcome.why or "every check passed"
-    if fdi.get("verdict") == "CANNOT_TELL":
-        reason += "; rig fdi cannot tell"
+    reason = (outcome.why or "every check passed") + (
+        "; rig fdi cannot tell" if fdi.get("verdict") == "CANNOT_TELL" else "")
     lines = [Line(label, text) for label, text in texts.items() if text]
     return replace(report, sections=[*report.sections, Section("Run", lines, medium=Medium.TERMINAL)],
                    files=[("results", f"{outcome.folder}/ trace.mcap, verdict.json, report.html")],

@@ -42,9 +42,7 @@ def _write_entry(index: int, sub: int, entry: Entry, default_of_node_2: Value) -
              "HAS_LOW_LIMIT": entry.low is not None, "HAS_HIGH_LIMIT": entry.high is not None,
              "NODE_RELATIVE": default_of_node_2 != entry.default}
     words = " | ".join(name for name, is_set in flags.items() if is_set) or "0"
-    initial = entry.default
-    if not isinstance(initial, bytes) and flags["NODE_RELATIVE"]:
-        initial -= 1
+    initial = entry.default if isinstance(entry.default, bytes) else entry.default - flags["NODE_RELATIVE"]
     text = f'"{entry.default.decode("ascii")}"' if isinstance(entry.default, bytes) else "NULL"
     length = len(entry.default) if isinstance(entry.default, bytes) else 0
     return (f"{{0x{index:04X}, 0x{sub:02X}, {kind}, {struct.calcsize('<' + entry.code)}, {words}, "

@@ -526,9 +526,8 @@ def draw_comparison(c: Comparison, before: Comparison | None) -> Drawing:
              ShownView(COMMAND_AND_ERROR, (PASS, FAIL, *SECTIONS.values()), is_lanes=True)]
     lanes = [make_command_lane(c.trace, "run", 0.0), *(_make_error_lane(word, found) for word, found in models),
              *_list_left_out(c)]
-    text = format_document(build_comparison_report(c))
-    if before:
-        text += f"\n\nBefore the change:\n\n{format_document(build_comparison_report(before))}"
+    was = f"\n\nBefore the change:\n\n{format_document(build_comparison_report(before))}" if before else ""
+    text = format_document(build_comparison_report(c)) + was
     return Drawing(f"{c.source}, {c.model.name}", plots, COMMAND_AND_ERROR, lanes, ("Result", text), shown,
                    verdict=c.verdict)
 

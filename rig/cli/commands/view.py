@@ -35,9 +35,7 @@ def run_command(args: argparse.Namespace) -> int:
         drawing = draw(args, progress)
         progress("writing the recording", 0.0)
         write_recording(drawing, rrd)
-        data: dict[str, object] = {"rrd": str(rrd)}
-        if drawing.verdict:
-            data["verdict"] = drawing.verdict
+        data: dict[str, object] = {"rrd": str(rrd), **({"verdict": drawing.verdict} if drawing.verdict else {})}
         if args.screenshot:
             progress("the viewer draws the picture", 0.0)
             pixels = viewer.take_screenshot(drawing.shown, rrd, Path(args.screenshot))
