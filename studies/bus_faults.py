@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi.progress import Progress, ignore_progress
-from fdi.report.report import Cell as TableCell
-from fdi.report.report import Column, Medium, Mood, Report, Section, Table
+from fdi.report.report import Cell as TableCell, Column, Medium, Mood, Report, Section, Table
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import Trace
 from plant import load_model

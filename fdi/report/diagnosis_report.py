@@ -72,8 +72,7 @@ from fdi.report.report import (
 )
 from fdi.sources import name_software
 from fdi.thresholds import BAND_NEAREST_LIMIT_SD
-from fdi.trace.sections import Section as CommandSection
-from fdi.trace.sections import find_sections
+from fdi.trace.sections import Section as CommandSection, find_sections
 from fdi.trace.trace import Trace
 from plant.model import Model, find_quantity
 from plant.signals import Signal

@@ -154,8 +154,7 @@ def show_progress(*, is_silent: bool, is_realtime: bool = False) -> Iterator[Pro
 def _show_bar(delay: float = 2.0) -> Iterator[Progress]:
     """A bar that appears after `delay` s: shorter work needs none."""
     from rich.console import Console  # here: 0.1 s that a command without a bar does not spend
-    from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
+    from rich.progress import BarColumn, Progress as Bar, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     bar = Bar(SpinnerColumn("line"), TextColumn("{task.description:<14}", markup=False), BarColumn(20),
               TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(),

@@ -4,8 +4,7 @@ from __future__ import annotations
 import logging
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from configparser import Error as ConfigError
-from configparser import RawConfigParser
+from configparser import Error as ConfigError, RawConfigParser
 from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path

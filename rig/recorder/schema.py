@@ -21,8 +21,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, cast, get_type_hints
 
-from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Fd
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Fd, FileDescriptorSet
 
 from fdi.trace.check_result import CheckResult, describe_field
 from plant import signals as plant_signals

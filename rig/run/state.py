@@ -4,8 +4,7 @@ import bisect
 
 from fdi.trace.trace import Event
 from rig.network.frame import Clock
-from rig.recorder import Event as EventRecord
-from rig.recorder import Recorder
+from rig.recorder import Event as EventRecord, Recorder
 from rig.run.attribution import Trouble
 from rig.run.loop import Loop
 

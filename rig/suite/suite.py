@@ -19,8 +19,7 @@ from urllib.parse import quote
 from fdi.progress import ignore_progress
 from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table, tabulate, to_plain
-from fdi.report.run_report import MOODS as RUN_MOODS
-from fdi.report.run_report import write_run_page
+from fdi.report.run_report import MOODS as RUN_MOODS, write_run_page
 from fdi.trace.check_result import CheckResult
 from plant.errors import InputError, RigError
 from plant.quantity import Quantity

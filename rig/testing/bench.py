@@ -27,8 +27,7 @@ from plant.plants import find_plant
 from plant.segments import RATE
 from rig.run.job import JobChoice, build_job, load_tested_plant
 from rig.run.runner import Outcome, run_job
-from rig.sequences.sequence import Sequence as TestSequence
-from rig.sequences.sequence import load_sequence, parse_sequence
+from rig.sequences.sequence import Sequence as TestSequence, load_sequence, parse_sequence
 
 
 class CheckFailedError(AssertionError):

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from effects_cases import EASY, QUIET_SPOOL, WHOLE, H, drive_plant, measure_speed, measure_spool
 from effects_reference import simulate_jack
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from node_bench import FirmwareDesk
 from physics_cases import SILENT, SMOOTH
 
@@ -19,8 +18,7 @@ from plant.effects import CATALOGUE
 from plant.effects.current import Behind, coil_lag
 from plant.effects.sensors import Lag, Recoil, mount_compliance, sensor_lag
 from plant.effects.supply import Drawn, supply_droop
-from plant.eha import State, compute_coefficients, compute_metering_line, step_actuator
-from plant.eha import step_jack as ram
+from plant.eha import State, compute_coefficients, compute_metering_line, step_actuator, step_jack as ram
 from plant.kernels import unpack_state
 from plant.plants import find_plant
 from plant.state import Input, Line

@@ -12,8 +12,7 @@ from noisy_traces import record_plant
 from other_cpus import compiles_for
 from refusals import catch_refusal
 
-from plant import Actuator, Model, kernel_use, simulate
-from plant import lanes as lanes_module
+from plant import Actuator, Model, kernel_use, lanes as lanes_module, simulate
 from plant.anchor import pull_plant, rest_at_reading, show_start
 from plant.compile import compile_function, interpret_function
 from plant.effects import CATALOGUE, load_effects

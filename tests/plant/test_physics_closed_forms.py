@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 from physics_cases import PREFLIGHT, SILENT, SMOOTH
 
 from plant import Actuator, Model, simulate

@@ -9,8 +9,7 @@ import pytest
 from physics_cases import PREFLIGHT
 
 from rig.bench import benchmarks
-from studies.peers import __main__ as command
-from studies.peers import grid_runs, many_runs, rivals
+from studies.peers import __main__ as command, grid_runs, many_runs, rivals
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {benchmarks.GET_GCC}")
 

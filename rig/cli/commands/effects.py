@@ -11,8 +11,7 @@ from plant.effects import Effect
 from plant.model import find_effect, load_model
 from plant.plants import find_plant, load_plant
 from plant.segments import build_profile
-from plant.selftest import Report as SelfTest
-from plant.selftest import check_effect
+from plant.selftest import Report as SelfTest, check_effect
 from rig.cli.answer import Places, give_answer
 from rig.cli.inputs import load_user_effects
 

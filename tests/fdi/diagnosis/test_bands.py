@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from noisy_traces import SHORT as RAMP_AND_SINE
-from noisy_traces import record_plant
+from noisy_traces import SHORT as RAMP_AND_SINE, record_plant
 from refusals import catch_refusal
 from rig_command import answer, refuse, rig
 
@@ -30,9 +29,7 @@ from fdi.diagnosis.bands import (
     parse_bands,
 )
 from fdi.diagnosis.diagnosis import diagnose
-from fdi.diagnosis.faults import CLOGGING as CLOGGED
-from fdi.diagnosis.faults import FAULTS, Estimate, Level, load_faults
-from fdi.diagnosis.faults import FRICTION as RUBBING
+from fdi.diagnosis.faults import CLOGGING as CLOGGED, FAULTS, FRICTION as RUBBING, Estimate, Level, load_faults
 from fdi.diagnosis.make_bands import (
     choose_bands,
     learn_bands,
@@ -55,8 +52,7 @@ from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
 from plant import Model, load_model, simulate
-from plant.segments import Hold, Ramp, Step
-from plant.segments import build_profile as profile
+from plant.segments import Hold, Ramp, Step, build_profile as profile
 from rig.sequences import load_sequence
 
 CLOGGING, FRICTION = "filter_clogging", "spool_friction"

@@ -10,8 +10,7 @@ from cantools.autosar.end_to_end import compute_profile2_crc
 from cantools.database import Database, load_string
 from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from plant.errors import InputError
 from rig.benches.bench import EXTENDED, FD, SWITCHED, Field, FrameSpec, Guard, Kind, Role, extract_bits, pack, unpack

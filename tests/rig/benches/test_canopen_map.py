@@ -7,10 +7,8 @@ from typing import Any
 import canopen
 import pytest
 from canopen.objectdictionary.eds import import_eds
-from device_files import BENCH as DRIVE
-from device_files import NODE, OBJECTS, RPDOS, TPDOS, Entry, Mapped, format_eds
-from hypothesis import given
-from hypothesis import strategies as st
+from device_files import BENCH as DRIVE, NODE, OBJECTS, RPDOS, TPDOS, Entry, Mapped, format_eds
+from hypothesis import given, strategies as st
 
 from rig.benches.bench import EXTENDED, Kind, Role, extract_bits, pack, unpack
 from rig.benches.bench_file import load_bench_from_files

@@ -25,8 +25,7 @@ from fdi.report.terminal import format_report
 from fdi.trace.trace import Trace
 from plant import InputError, Model, RigError
 from plant.effects import CATALOGUE
-from rig.campaign import batch, judge
-from rig.campaign import summary as campaign_summary
+from rig.campaign import batch, judge, summary as campaign_summary
 from rig.campaign.batch import BatchProgress, RowFile, Workers, run_in_processes, run_jobs
 from rig.campaign.judge import plan_batch, run_campaign
 from rig.campaign.summary import build_campaign_report

@@ -7,8 +7,7 @@ import can
 import pytest
 from c_device import CFrame, load_library, skip_without_compiler
 from can.interfaces.udp_multicast.utils import pack_message, unpack_message
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 EXTENDED = 1 << 31  # in an identifier: it has 29 bits
 

@@ -5,8 +5,7 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from plant.errors import InputError
 from rig.network.node_objects import CycleRecord, decode_cycle_record, encode_cycle_record

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from bus_stations import spec
 from can.interfaces.udp_multicast.utils import pack_message, unpack_message
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from plant.compile import compile_function
 from plant.errors import InputError, RigError
