@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from importlib import metadata
@@ -245,7 +244,7 @@ def examine_rights() -> list[Finding]:
     is_preempt_rt = _read_text("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in platform.version()
     kernel = f"{platform.release()}, {'PREEMPT_RT' if is_preempt_rt else 'not PREEMPT_RT'}, {os.cpu_count()} CPUs"
     is_fifo, locked = bool(priority.run_under_fifo(lambda: True)), priority.read_memory_lock_limit()
-    resolution = time.clock_getres(time.CLOCK_MONOTONIC) * 1e9  # ns
+    resolution = priority.read_clock_resolution_ns()
     source = _read_text("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "unknown source"
     return [
         _grade("real time", "kernel", is_preempt_rt, kernel, "bounds the worst lateness",
