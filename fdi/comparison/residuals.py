@@ -298,7 +298,7 @@ def cumulate_periodogram(x: Floats, period: float) -> tuple[Floats, Floats, floa
     total = power.sum()
     added = np.cumsum(power) / total if total > 0.0 else np.linspace(0, 1, len(power))
     line = np.arange(1, len(added) + 1) / len(added)
-    return frequencies, added, float(np.abs(added - line).max()), (float(kolmogi(0.05)) / math.sqrt(len(added)))
+    return frequencies, added, float(np.abs(added - line).max()), float(kolmogi(0.05)) / math.sqrt(len(added))
 
 
 def correlate_with_input(name: str, u: Floats, by: Floats, residual: Floats, period: float) -> Follows:
