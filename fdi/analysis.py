@@ -108,12 +108,9 @@ class Result:
 
     def _list_figures(self) -> list[tuple[str, Figure]]:
         """(title, figure) in the order of the page; a second figure of a section is numbered."""
-        found: list[tuple[str, Figure]] = []
-        for section, items in self.report.select_sections(Medium.PAGE):
-            figures = [item for item in items if isinstance(item, Figure)]
-            for number, figure in enumerate(figures, 1):
-                found.append((section.title if number == 1 else f"{section.title} {number}", figure))
-        return found
+        return [(section.title if number == 1 else f"{section.title} {number}", figure)
+                for section, items in self.report.select_sections(Medium.PAGE)
+                for number, figure in enumerate((item for item in items if isinstance(item, Figure)), 1)]
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON answer as plain values: SI units, None for NaN and infinity."""

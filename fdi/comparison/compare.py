@@ -361,9 +361,8 @@ def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place],
         doubt = f"{100 * edgy:.0f} % of the trace {_describe_cause(replay)}"
     sure = any(s.ratio > LOWER_BOUND_ERROR_RATIO or not (edgy > UNDECIDED_SHARE or s.floor.lower_bound)
                for s in above)
-    if doubt and not sure and (ratios["controller"] or 0.0) <= CONTROLLER_ERROR_RATIO:
-        return "CANNOT_TELL", doubt
-    return "MODEL_INCOMPLETE", ""
+    is_open = doubt and not sure and (ratios["controller"] or 0.0) <= CONTROLLER_ERROR_RATIO
+    return ("CANNOT_TELL", doubt) if is_open else ("MODEL_INCOMPLETE", "")
 
 
 def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> list[str]:

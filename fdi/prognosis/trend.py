@@ -260,9 +260,8 @@ def compute_end_covariance(data: Scaled, u: Floats, wander: int) -> Floats:
     kind, strength = WANDERS[wander]
     counted = np.sum([u >= data.u[row] for row in data.steps], axis=0) if data.steps else 0.0
     level = OFFSET_PRIOR_SD ** 2 + STEP_PRIOR_SD ** 2 * counted + np.zeros_like(u)
-    if kind == "integrated":
-        return np.array([level + 3 * strength ** 2 * (u ** 2 / 2 - u ** 3 / 6), 3 * strength ** 2 * u ** 2 / 2])
-    return np.array([level + strength ** 2 * u, np.zeros_like(u)])
+    return np.array([level + 3 * strength ** 2 * (u ** 2 / 2 - u ** 3 / 6), 3 * strength ** 2 * u ** 2 / 2]
+                    if kind == "integrated" else [level + strength ** 2 * u, np.zeros_like(u)])
 
 
 def estimate_level(data: Scaled, posterior: Posterior, u: Floats) -> Floats:

@@ -490,9 +490,9 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
         def ratio(name: str) -> Cell | str:
             return show_deviation(found[name].compute_ratio(fault.name))
 
-        if d.bands and len(d.bands.faults) > 2:  # of many faults there is no room for both
-            return [(number(title, unit="s.d."), ratio)]
-        return [show_value(title, lambda p: p.adds.get(fault.name, math.nan)), (number("in s.d."), ratio)]
+        # of many faults there is no room for both
+        return [(number(title, unit="s.d."), ratio)] if d.bands and len(d.bands.faults) > 2 else [
+            show_value(title, lambda p: p.adds.get(fault.name, math.nan)), (number("in s.d."), ratio)]
 
     return [tabulate(
         found, (Column("precursor"), lambda name: found[name].words),
@@ -580,9 +580,8 @@ MS = 1e3
 def _choose_axes(signal: Signal) -> tuple[tuple[str, float], ...]:
     """Units of the axes of a controlled signal, of its departures and its speed; each with how many make one SI unit.
     """
-    if signal.unit == "m":
-        return ("mm", 1e3), ("um", 1e6), ("mm/s", 1e3)
-    return (signal.unit, 1.0), (signal.unit, 1.0), (f"{signal.unit}/s", 1.0)
+    return (("mm", 1e3), ("um", 1e6), ("mm/s", 1e3)) if signal.unit == "m" else (
+        (signal.unit, 1.0), (signal.unit, 1.0), (f"{signal.unit}/s", 1.0))
 
 
 def draw_overview(trace: Trace, judged: BandVerdict) -> str:

@@ -55,13 +55,12 @@ def compute_time(identifier: int, length: int, bitrate: float, data_bitrate: flo
 def list_loads(bench: Bench) -> list[FrameLoad]:
     """The cyclic frames of a bench, then SYNC and the heartbeats."""
     cycle = bench.cycle_ns / 1e9
-    found = [(spec.name, spec.sent_as, _describe_direction(bench, spec), spec.length, list_content(spec),
-              cycle * spec.every) for spec in bench.frames.frames]
-    if bench.frames.sync is not None:
-        found.append(("SYNC", bench.frames.sync, "rig > all", 0, (), cycle))
+    sync = [] if bench.frames.sync is None else [("SYNC", bench.frames.sync, "rig > all", 0, (), cycle)]
     nodes = {Role.RIG: bench.rig_node, **{role: each.node for role, each in bench.nodes.items()}} if bench.nodes else {}
-    for role, node in sorted(nodes.items()):
-        found.append((f"heartbeat {node}", 0x700 + node, f"{role.name.lower()} > all", 1, (), HEARTBEAT))
+    found = [*((spec.name, spec.sent_as, _describe_direction(bench, spec), spec.length, list_content(spec),
+                cycle * spec.every) for spec in bench.frames.frames), *sync,
+             *((f"heartbeat {node}", 0x700 + node, f"{role.name.lower()} > all", 1, (), HEARTBEAT)
+               for role, node in sorted(nodes.items()))]
     return [FrameLoad(*each, share=compute_time(each[1], each[3], bench.bitrate, bench.data_bitrate) / each[5])
             for each in found]
 

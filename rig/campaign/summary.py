@@ -306,10 +306,9 @@ def show_share(count: Mapping[str, Any]) -> tuple[str, str, str]:
     >>> show_share({"good": 19, "of": 20, "share": 0.95, "low": 0.7513, "high": 0.9987})
     ('19/20', '95.0 %', '75.1 .. 99.9')
     """
-    if not count["of"]:
-        return "0/0", NO_NUMBER, NO_NUMBER
-    return (f"{count['good']}/{count['of']}", f"{100 * count['share']:.1f} %",
-            f"{100 * count['low']:.1f} .. {100 * count['high']:.1f}")
+    return ("0/0", NO_NUMBER, NO_NUMBER) if not count["of"] else (
+        f"{count['good']}/{count['of']}", f"{100 * count['share']:.1f} %",
+        f"{100 * count['low']:.1f} .. {100 * count['high']:.1f}")
 
 
 def _tabulate_rates(rates: Sequence[Mapping[str, Any]]) -> Table:

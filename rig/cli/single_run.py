@@ -81,9 +81,8 @@ def choose_bus_of_run(args: argparse.Namespace, wanted: str, controller: str | N
         RigError: a bus that is not there.
     """
     bus, why = choose_bus(wanted)
-    if controller == "c" and bus == "embedded" and args.bus == "auto":
-        return "udp_multicast", "udp_multicast: --controller c is a program and needs a bus between programs"
-    return bus, why
+    return (bus, why) if controller != "c" or bus != "embedded" or args.bus != "auto" else (
+        "udp_multicast", "udp_multicast: --controller c is a program and needs a bus between programs")
 
 
 @contextlib.contextmanager

@@ -155,9 +155,8 @@ def works_as(t: Target, pdo: Pdo, values: list[bytes], cob_id: int, is_expected:
 
     The wrong length changes nothing.
     """
-    if pdo.is_sent:
-        return len(answer_syncs(t, cob_id, 3, 3 * is_expected)) == 3 * is_expected
-    return bool(send_short(t, pdo, values, cob_id, is_expected)) is is_expected
+    return (len(answer_syncs(t, cob_id, 3, 3 * is_expected)) == 3 * is_expected if pdo.is_sent else
+            bool(send_short(t, pdo, values, cob_id, is_expected)) is is_expected)
 
 
 def check_short_rpdo(t: Target, pdo: Pdo) -> str:

@@ -46,8 +46,7 @@ def build_device(folder: Path, flags: Sequence[str] = (*FLAGS, "-Werror")) -> Pa
     if not own:
         raise InputError(folder, "", "a folder with the C files of a device")
     stack = [path for path in sorted(FOLDER.glob("*.c")) if path.name not in REFERENCE]
-    for eds in folder.glob("*.eds"):
-        own.append(_write_generated(write_object_table(eds)) / "object_table.c")
+    own += [_write_generated(write_object_table(eds)) / "object_table.c" for eds in folder.glob("*.eds")]
     return build_program(folder.resolve().name, [*own, *stack], flags)
 
 

@@ -318,9 +318,10 @@ def _describe_fmi3(model: Model, variables: Sequence[Variable], identifier: str,
     for i, v in enumerate(variables):
         itself, number = _list_attributes(v)
         scalars.append(_tag("Float64", {"name": v.name, "valueReference": i, **itself, **number}))
-    for i, ((name, text), kind, start) in enumerate(zip(_OTHERS, ("Int32", "Boolean"), (seed, "false"), strict=True)):
-        scalars.append(_tag(kind, {"name": name, "valueReference": len(variables) + i, "description": text,
-                                   "causality": "parameter", "variability": "fixed", "start": start}))
+    scalars += [_tag(kind, {"name": name, "valueReference": i, "description": text, "causality": "parameter",
+                            "variability": "fixed", "start": start})
+                for i, ((name, text), kind, start) in enumerate(zip(
+                    _OTHERS, ("Int32", "Boolean"), (seed, "false"), strict=True), len(variables))]
     outputs = [i for i, v in enumerate(variables) if v.role == "OUTPUT"]
     return _describe("3.0", model, {"instantiationToken": token}, [
         _tag("CoSimulation", {"modelIdentifier": identifier, "canHandleVariableCommunicationStepSize": "true",

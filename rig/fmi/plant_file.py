@@ -163,9 +163,8 @@ def _find_worth(about: Description, entry: Entry, unit: str, place: Place) -> tu
         number, _, named = entry.count.partition(" ")
         known = find_unit(named)
         si = unit or (known.si if known else named or "1")
-        if not unit and known is None:
-            return _parse(number, "", place.at("count")), si
-        return _parse(entry.count, si, place.at("count")), si
+        count, of = (entry.count, si) if unit or known is not None else (number, "")
+        return _parse(count, of, place.at("count")), si
     known = find_unit(stated)
     if known is not None and unit in ("", known.si):
         return float(known.factor), known.si

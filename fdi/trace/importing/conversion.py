@@ -262,9 +262,8 @@ def convert_to_si(values: Floats, unit: Unit) -> Floats:
     >>> convert_to_si(np.array([12.3456]), UNITS["mm"]).tolist()
     [0.0123456]
     """
-    if unit.factor < 1 and unit.factor.numerator == 1:
-        return values / float(unit.factor.denominator)
-    return values * float(unit.factor)
+    is_part = unit.factor < 1 and unit.factor.numerator == 1
+    return values / float(unit.factor.denominator) if is_part else values * float(unit.factor)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
