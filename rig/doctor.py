@@ -210,9 +210,9 @@ def count_frames(bench: Bench, frames: Iterable[Frame]) -> tuple[dict[str, Count
     return heard, others
 
 
-def judge_frames(bench: Bench, heard: dict[str, Counter[int]], others: Counter[str], seconds: float) -> list[Finding]:
+def judge_frames(bench: Bench, heard: dict[str, Counter[int]], others: Counter[str], seconds: float
+                 ) -> Iterator[Finding]:
     """Which frames of a bench were heard within `seconds`."""
-    found = []
     for load in list_loads(bench):
         received, is_ours = heard[load.name].total(), load.direction.startswith("rig")
         wrong = sorted(length for length in heard[load.name] if length != load.length)
@@ -224,12 +224,11 @@ def judge_frames(bench: Bench, heard: dict[str, Counter[int]], others: Counter[s
             status, remedy = "missing", "power, wiring, bit rate" + (
                 "; PDOs come after NMT start" if bench.nodes and load.content else "") + (
                 "; some devices send it when the rig has set 0x1017" if load.name.startswith("heartbeat") else "")
-        found.append(Finding(bench.name, f"{load.name} {describe_identifier(load.identifier)}", status, text,
-                             f"{load.direction}, every {1000 * load.period:g} ms", remedy))
+        yield Finding(bench.name, f"{load.name} {describe_identifier(load.identifier)}", status, text,
+                      f"{load.direction}, every {1000 * load.period:g} ms", remedy)
     if others:
         shown = ", ".join(f"{name} ({count})" for name, count in sorted(others.items())[:8])
-        found.append(Finding(bench.name, "other frames", "ok", shown, "not of this bench"))
-    return found
+        yield Finding(bench.name, "other frames", "ok", shown, "not of this bench")
 
 
 def _read_text(path: str) -> str:

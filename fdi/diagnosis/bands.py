@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
@@ -328,7 +328,7 @@ def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: F
         unit = signal.unit if signal is not None else ""
         raise InputError(where, "load", f"none, as these bands are of an unloaded plant, not {most:.3g} {unit}")
     found, shown, notes = find_excursions(com, xj, period, bands, parts)
-    levels, severity, events = {}, {}, {i: _find_events(e, t0, period, bands.unit) for i, e in enumerate(found)}
+    levels, severity, events = {}, {}, {i: [*_find_events(e, t0, period, bands.unit)] for i, e in enumerate(found)}
     for fault in bands.faults:
         own = [i for i, e in enumerate(found) if e.fault == fault.name and e.signal == "position" and e.is_judged]
         if own:
@@ -459,16 +459,14 @@ def _make_step_excursion(xj: Floats, period: float, bands: Bands, step: StepBand
                      fault.name)
 
 
-def _find_events(e: Excursion, t0: float, period: float, unit: str) -> list[Event]:
-    out = []
+def _find_events(e: Excursion, t0: float, period: float, unit: str) -> Iterator[Event]:
     for band, limit in (("middle", e.middle), ("most", e.most)):
         with np.errstate(invalid="ignore"):
             beyond = e.departure > limit
         for first, last in find_stays(beyond):
             excess = float(np.nanmax((e.departure - limit)[first:last + 1]))
             begin, end = (t0 + (e.start + row) * period for row in (first, last + 1))
-            out.append(Event(band, e.fault, e.signal, describe_section(e.section, unit=unit), begin, end, excess))
-    return out
+            yield Event(band, e.fault, e.signal, describe_section(e.section, unit=unit), begin, end, excess)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

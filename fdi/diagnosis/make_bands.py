@@ -1,7 +1,7 @@
 """Bands by simulating units of a model on a command, or from a fleet's own healthy traces."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -195,7 +195,7 @@ def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: fl
                             f.both_ways, amounts=np.array(amounts.get(f.name, ()))) for f in faults)
     bands = Bands(model.kind, tuple(parts), period, scale, known, stepped, tuple(ramped), facts,
                   _measure_sensitivities(tables, healthy, com, period, parts, signals.controlled.unit, scale))
-    shares = {f.name: _find_limit_shares(bands, com, f, faulted[f.name]) for f in known if f.name in faulted}
+    shares = {f.name: [*_find_limit_shares(bands, com, f, faulted[f.name])] for f in known if f.name in faulted}
     return replace(bands, faults=tuple(f._replace(middle_share=shares[f.name][0], most_share=shares[f.name][1])
                                        if f.name in shares else f for f in known))
 
@@ -283,7 +283,7 @@ def _make_width(healthy: Floats, middle: Floats, most: Floats) -> Width:
     return Width(centre, float(np.quantile(usual, RAMP_HEALTHY_SHARE)), wide[0], max(wide))
 
 
-def _find_limit_shares(bands: Bands, com: Floats, fault: BandFault, units: Sequence[Floats]) -> list[float]:
+def _find_limit_shares(bands: Bands, com: Floats, fault: BandFault, units: Sequence[Floats]) -> Iterator[float]:
     """The shares of the shifts at MidBand and MaxBand that nearly every unit (m, n) with that fault shows, for three
     samples in a row.
 
@@ -295,11 +295,9 @@ def _find_limit_shares(bands: Bands, com: Floats, fault: BandFault, units: Seque
                     if e.fault == fault.name and e.section.kind == "step" and np.isfinite(e.departure).any()),
                    default=1.0)
 
-    shares = []
     for i, limit in enumerate(("middle", "most")):
         logs = np.log([max(find_furthest(x, limit), 1e-3) for x in units[i]])
-        shares.append(float(np.exp(logs.mean() - STEP_FAULT_LEAVES_SD[i] * logs.std(ddof=1))))
-    return shares
+        yield float(np.exp(logs.mean() - STEP_FAULT_LEAVES_SD[i] * logs.std(ddof=1)))
 
 
 def _measure_sensitivities(tables: Mapping[str, Floats], healthy: Floats, com: Floats, period: float,

@@ -8,7 +8,7 @@ the data sheet's value, and simulated candidate runs say which one would show it
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -388,7 +388,7 @@ EXPERIMENTS = (
 
 
 def advise_experiments(model: Model, free: Sequence[Free], problem: LogProblem, fit: Fit | None, unseen: Sequence[str]
-                       ) -> list[Advice]:
+                       ) -> Iterator[Advice]:
     """For each parameter that is not identifiable the candidate run that would show it best.
 
     Args:
@@ -421,12 +421,10 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: LogProblem, 
         found["sensors"] = np.diag([f.prior**-2 for f in free]) + _measure_information(sensed, free, x)
         what["sensors"] = f"the same runs with {' and '.join(s.symbol for s in missing)} measured"
     shares = {name: _compute_shares(free, information) for name, information in found.items()}
-    advice = []
     for name in unseen:
         share, best = min((shares[experiment][name], experiment) for experiment in shares)
         is_enough = share <= IDENTIFIABLE_SHARE
-        advice.append(Advice(name, best if is_enough else None, what[best] if is_enough else "", share))
-    return advice
+        yield Advice(name, best if is_enough else None, what[best] if is_enough else "", share)
 
 
 def _simulate(model: Model, com: Floats, load: Floats, outputs: Sequence[str]) -> Trace:

@@ -1,7 +1,7 @@
 """The report of a diagnosis: verdict, faults, response in its bands, RMS maps, precursors, provenance."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -630,11 +630,11 @@ def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict, fault: BandFault
     """Each ramp as it judges a fault: following error and speed within their limits, and events."""
     place = _find_sections(trace, bands)
     own = [ramp for ramp in bands.ramps if ramp.fault == fault.name]
-    pairs = [_draw_ramp(trace, ramp, place[ramp.section], judged, number == 0) for number, ramp in enumerate(own)]
+    pairs = [[*_draw_ramp(trace, ramp, place[ramp.section], judged, number == 0)] for number, ramp in enumerate(own)]
     return draw_panels("ramps", list(zip(*pairs, strict=True)), 4.6, common_legend=True, sharex="col", sharey="row")
 
 
-def _draw_ramp(trace: Trace, ramp: RampBand, s: CommandSection, judged: BandVerdict, is_first: bool) -> list[Panel]:
+def _draw_ramp(trace: Trace, ramp: RampBand, s: CommandSection, judged: BandVerdict, is_first: bool) -> Iterator[Panel]:
     rows, way = select_ramp_rows(s, trace.period), np.sign(s.rate)
     x = trace.mask_unusable(trace.declared.controlled.name)
     _, (small, factor), (speed, speed_factor) = _choose_axes(trace.declared.controlled)
@@ -646,18 +646,16 @@ def _draw_ramp(trace: Trace, ramp: RampBand, s: CommandSection, judged: BandVerd
     above = axes(title=f"ramp at {s.rate * speed_factor:+.3g} {speed}, judged from {limits[0]:.4g} s",
                  ylabel=f"error [{small}]" if is_first else "")
     below = axes(xlabel="time [s]", ylabel=f"speed beyond the\ndemand's [{speed}]" if is_first else "")
-    panels: list[Panel] = []
     for values, width, unit, nearer, name, labels in (
             (error, ramp.position, factor, 1 / scale, "position", above),
             (fast, ramp.speed, speed_factor, 1.0, "speed", below)):
         middle, healthy = width.centre * unit, width.healthy * unit
-        panels.append([
+        yield [
             band(middle - healthy, middle + healthy, GREEN, "healthy", 0.15),
             *(mark for limit, colour, label in ((width.middle, ORANGE, "MidBand"), (width.most, RED, "MaxBand"))
               if np.isfinite(limit) for mark in levels(nearer * limit * unit, colour, label, 1.2, middle=middle)),
             line(trace.t[rows], values * unit, INK, "measured", 0.8), *_shade_events(events, limits, name),
-            axes(xlim=limits), labels])
-    return panels
+            axes(xlim=limits), labels]
 
 
 def _find_sections(trace: Trace, bands: Bands) -> dict[int, CommandSection]:

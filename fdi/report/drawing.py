@@ -282,7 +282,7 @@ def to_svg(figure: Figure, salt: str) -> Drawing:
     for drawn, whole in lines:
         drawn.set_data(*whole)
     text = shorten_svg(out.getvalue(), 2)
-    notes = html.escape(json.dumps(_describe_axes(figure, salt), separators=(",", ":")))
+    notes = html.escape(json.dumps([*_describe_axes(figure, salt)], separators=(",", ":")))
     drawing = Drawing(f'<svg data-axes="{notes}"{text[text.index("<svg") + 4:]}')
     drawing.figure = figure
     return drawing
@@ -313,13 +313,12 @@ def _name_artists(figure: Figure, salt: str) -> None:
                 artist.set_gid(f"{salt}-{i}-{kind}{j}")
 
 
-def _describe_axes(figure: Figure, salt: str) -> list[dict[str, Any]]:
+def _describe_axes(figure: Figure, salt: str) -> Iterator[dict[str, Any]]:
     """Box (points from the top left: x0, top, x1, bottom), limits, labels, lines and texts of each axes of a figure.
 
     Axes with the same `group` have one x axis. Axes that are not drawn are left out.
     """
     width, height = (72.0 * inches for inches in figure.get_size_inches())
-    notes = []
     for i, ax in enumerate(figure.axes):
         if not ax.axison:
             continue
@@ -327,15 +326,14 @@ def _describe_axes(figure: Figure, salt: str) -> list[dict[str, Any]]:
         joined = ax.get_shared_x_axes().joined
         shared = min(j for j, other in enumerate(figure.axes) if other is ax or joined(ax, other))
         limits = [_find_limits(ax.xaxis, ax.get_xlim()), _find_limits(ax.yaxis, ax.get_ylim())]
-        notes.append({
+        yield {
             "id": f"{salt}-{i}", "group": shared, "xlabel": ax.get_xlabel(), "ylabel": ax.get_ylabel(),
             "box": [round(float(x), 3) for x in (place.x0 * width, (1 - place.y1) * height, place.x1 * width,
                                                  (1 - place.y0) * height)],
             "x": limits[0][1], "y": limits[1][1], "kinds": [kind for kind, _ in limits],
             "lines": [[line.get_gid(), "" if str(line.get_label()).startswith("_") else str(line.get_label())]
                       for line in ax.lines if len(np.asarray(line.get_xdata())) > 2],
-            "texts": [text.get_gid() for text in ax.texts]})
-    return notes
+            "texts": [text.get_gid() for text in ax.texts]}
 
 
 def _find_limits(axis: Axis, limits: tuple[float, float]) -> tuple[str, list[float]]:

@@ -436,7 +436,7 @@ def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use
         node = replace(node, profile=keys.profile, mode=mode, settings=tuple(_list_settings(
             reader.kind, dictionary, keys.parameters, place.at("parameters"))),
             values=(*node.values, *_list_values(dictionary, keys.values, place.at("values"))))
-    frames = canopen_map.map_pdos(eds, dictionary, keys.node, uses)
+    frames = list(canopen_map.map_pdos(eds, dictionary, keys.node, uses))
     node = replace(node, inputs=_list_objects(frames, uses, is_received=True),
                    outputs=_list_objects(frames, uses, is_received=False))
     return uses, frames, canopen_map.find_sync(dictionary), node

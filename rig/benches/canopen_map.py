@@ -123,9 +123,8 @@ def _read_identifier(cob_id: int) -> int:
     return cob_id & 0x1FFF_FFFF | EXTENDED if cob_id & LONG else cob_id & 0x7FF
 
 
-def list_pdos(dictionary: Any, node: int) -> list[Pdo]:
+def list_pdos(dictionary: Any, node: int) -> Iterator[Pdo]:
     """All PDOs of a dictionary, also those that are switched off; an empty mapping entry is left out."""
-    found = []
     for base, kind, first in ((RPDO, "RPDO", 0x200), (TPDO, "TPDO", 0x180)):
         for number in (index - base for index in sorted(dictionary) if base <= index < base + MAPPING):
             predefined = first + 0x100 * number + node if number < 4 else INVALID
@@ -134,10 +133,9 @@ def list_pdos(dictionary: Any, node: int) -> list[Pdo]:
             count = read_number(dictionary, base + MAPPING + number, 0) or 0
             words = [read_number(dictionary, base + MAPPING + number, sub) for sub in range(1, min(count, 64) + 1)]
             entries = tuple((word >> 16 & 0xFFFF, word >> 8 & 0xFF, word & 0xFF) for word in words if word)
-            found.append(Pdo(f"{kind}{number + 1}", base + number, base == RPDO,
-                             predefined if cob_id is None else cob_id, 255 if transmission is None else transmission,
-                             entries))
-    return found
+            yield Pdo(f"{kind}{number + 1}", base + number, base == RPDO,
+                      predefined if cob_id is None else cob_id, 255 if transmission is None else transmission,
+                      entries)
 
 
 def is_mapped(dictionary: Any, key: str, *, is_received: bool) -> bool:
@@ -146,14 +144,14 @@ def is_mapped(dictionary: Any, key: str, *, is_received: bool) -> bool:
                if pdo.is_received is is_received and not pdo.cob_id & INVALID)
 
 
-def map_pdos(name: str, dictionary: Any, node: int, uses: Mapping[str, Use]) -> list[DeviceFrame]:
+def map_pdos(name: str, dictionary: Any, node: int, uses: Mapping[str, Use]) -> Iterator[DeviceFrame]:
     """The PDOs in which `uses` (objects, as `name_object` writes them) lie.
 
     Raises:
         InputError: an object that the dictionary lacks, that has the wrong type or access, or that no PDO maps; a PDO
             of more than 8 bytes, or with a transmission type that the rig cannot serve.
     """
-    pdos = list_pdos(dictionary, node)
+    pdos = list(list_pdos(dictionary, node))
     on = [(pdo, [name_object(index, sub) for index, sub, _ in pdo.entries]) for pdo in pdos if not pdo.cob_id & INVALID]
     for key, use in uses.items():
         _check_object(name, dictionary, key, use)
@@ -161,12 +159,10 @@ def map_pdos(name: str, dictionary: Any, node: int, uses: Mapping[str, Use]) -> 
             raise use.place.refuse(_describe_unmapped(dictionary, pdos, key, use))
     synchronous = {key for pdo, keys in on for key in keys if not pdo.is_received and 1 <= pdo.kind <= 240}
     awaited = {key for key, use in uses.items() if use.is_needed} - synchronous  # only this PDO brings them
-    frames = []
     for pdo, keys in on:
         if own := {key for key in keys if key in uses and uses[key].is_received in (pdo.is_received, None)}:
             is_answer = 1 <= pdo.kind <= 240 or (pdo.kind in _EVENT and not awaited.isdisjoint(own))
-            frames.append(_map_pdo(name, dictionary, pdo, own, is_answer=is_answer))
-    return frames
+            yield _map_pdo(name, dictionary, pdo, own, is_answer=is_answer)
 
 
 def _check_object(name: str, dictionary: Any, key: str, use: Use) -> None:

@@ -84,7 +84,7 @@ def _summarise_tolerance(tolerance: float, rows: Sequence[Row], faults: Sequence
     return {"tolerance": tolerance, "cases": len(rows), "rates": count_rates(rows, faults),
             "curves": {fault.name: count_detections(rows, fault) for fault in faults},
             "levels": {fault.name: count_levels(rows, fault, faults) for fault in faults},
-            "ruling": count_ruling_faults(rows, faults), "errors": measure_errors(rows, faults),
+            "ruling": count_ruling_faults(rows, faults), "errors": [*measure_errors(rows, faults)],
             "false_alarms": [{key: row.get(key) for key in shown} for row in false_alarms]}
 
 
@@ -103,7 +103,7 @@ def count_rates(rows: Sequence[Row], faults: Sequence[Fault] = FAULTS) -> list[F
               if classify_size(fault, true_size(row, fault)) > Level.ACCEPTABLE]
     rates.append(judge_rate("ruling fault, MidBand on", measure_share(sum(beyond), len(beyond)), 0.97))
     # The coverage over all plants that scatter, without those at a bound, where an interval starts at the truth.
-    errors = measure_errors([row for row in rows if row["tolerance"] > 0.0], faults)
+    errors = list(measure_errors([row for row in rows if row["tolerance"] > 0.0], faults))
     for fault in faults:
         covered = [error["covered"] for error in errors
                    if error["fault"] == fault.name and error["truth"] != fault.range[0]]
@@ -215,19 +215,17 @@ def _describe_faults(row: Row, faults: Sequence[Fault]) -> str:
     return " and ".join(names) or HEALTHY
 
 
-def measure_errors(rows: Sequence[Row], faults: Sequence[Fault] = FAULTS) -> list[Figures]:
+def measure_errors(rows: Sequence[Row], faults: Sequence[Fault] = FAULTS) -> Iterator[Figures]:
     """Errors of the estimates by label and fault: healthy plants, single faults, both faults, each by size."""
     first, *others = faults
     order = {row["label"]: (row["faults"], true_size(row, first) == first.healthy,
                             *(true_size(row, fault) for fault in (first, *others)), row["label"]) for row in rows}
-    errors = []
     for label in sorted(order, key=lambda label: order[label]):
         group = [row for row in rows
                  if row["label"] == label and row["status"] == OK and not has_other_fault(row, faults)]
         for fault in faults:
             if estimated := [row for row in group if math.isfinite(_measure_width(row, fault))]:
-                errors.append(_measure_error(label, estimated, fault))
-    return errors
+                yield _measure_error(label, estimated, fault)
 
 
 def _measure_width(row: Row, fault: Fault) -> float:

@@ -1,6 +1,6 @@
 """Runs the cases on a node one after the other: each begins with a reset of the communication and forgets the last."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from fdi.progress import Progress, ignore_progress
@@ -127,11 +127,10 @@ def _read_all(target: Target) -> dict[Variable, bytes]:
                             CaseFailed))
 
 
-def _restore(target: Target, snapshot: dict[Variable, bytes]) -> list[str]:
+def _restore(target: Target, snapshot: dict[Variable, bytes]) -> Iterator[str]:
     """Reset the node's communication and write back what differs from the beginning; a line for each that did."""
     _reset(target)
     after = _read_all(target)
-    notes = []
     for variable, before in ((known, data) for known, data in snapshot.items() if after.get(known) != data):
         try:
             target.download(*variable.key, before)
@@ -139,8 +138,7 @@ def _restore(target: Target, snapshot: dict[Variable, bytes]) -> list[str]:
         except CaseFailed as error:
             done = f"it could not be set back ({error})"
         changed = variable.show(after[variable]) if variable in after else "nothing"
-        notes.append(f"{variable.label} held {variable.show(before)} before and {changed} after the test; {done}.")
-    return notes
+        yield f"{variable.label} held {variable.show(before)} before and {changed} after the test; {done}."
 
 
 MOODS: dict[Verdict, Mood] = {Verdict.PASS: "good", Verdict.FAIL: "bad", Verdict.NOT_APPLICABLE: "muted",

@@ -269,7 +269,7 @@ class Link:
         bus is gone.
         """
         try:
-            return self._poll_messages(timeout) if self._socket is None else self._poll_socket(self._socket, timeout)
+            return [*self._poll_messages(timeout)] if self._socket is None else self._poll_socket(self._socket, timeout)
         except can.CanError as error:
             raise RigError(str(error)) from error
         except OSError as error:
@@ -302,8 +302,7 @@ class Link:
         """Give the bus back."""
         self._bus.shutdown()
 
-    def _poll_messages(self, timeout: float) -> list[Frame]:
-        frames = []
+    def _poll_messages(self, timeout: float) -> Iterator[Frame]:
         for message in self._take_messages(timeout):
             if message.is_error_frame:
                 self.error_frames += 1
@@ -314,8 +313,7 @@ class Link:
             elif not has_valid_length(cob_id, len(message.data)):
                 self.error_frames += 1
             elif cob_id not in self._left_out and not cob_id & self._foreign:
-                frames.append(Frame(self._clock(), cob_id, bytes(message.data)))
-        return frames
+                yield Frame(self._clock(), cob_id, bytes(message.data))
 
     def _take_messages(self, timeout: float) -> Iterator[can.Message]:
         if isinstance(self._bus, UdpBus):

@@ -258,7 +258,7 @@ def _judge_status(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
     yield _make_result(name, "status word", value, "ms", high=delay * 1e3, detail=detail)
 
 
-def list_wrong_changes(rows: Rows, delay: int) -> list[str]:
+def list_wrong_changes(rows: Rows, delay: int) -> Iterator[str]:
     """The changes of state of a CiA 402 drive, in words, that no control word of the last `delay` cycles explains.
 
     Before the first cycle it is switched off, or in fault.
@@ -268,15 +268,13 @@ def list_wrong_changes(rows: Rows, delay: int) -> list[str]:
     rises = np.diff(control & CIA402.reset, prepend=0) > 0
     answered = np.flatnonzero(~np.isnan(rows.drive))
     before = np.concatenate(([int(State.NOT_READY)], states[answered]))[:-1]
-    wrong = []
     for i in np.flatnonzero(states[answered] != before).tolist():
         k, old = int(answered[i]), State(int(before[i]))
         near = slice(max(0, int(answered[max(i - 1, 0)]) - delay), k + 1)
         new = State(int(states[k]))
         if new not in list_reachable(old, frozenset(wanted[near].tolist()), resets=bool(rises[near].any())):
             names = [each.name.lower().replace("_", " ") for each in (new, old)]
-            wrong.append(f"cycle {k}: {names[0]} after {names[1]} with control word 0x{control[k]:02X}")
-    return wrong
+            yield f"cycle {k}: {names[0]} after {names[1]} with control word 0x{control[k]:02X}"
 
 
 def measure_delays(rows: Rows) -> Whole:

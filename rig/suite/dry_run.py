@@ -152,7 +152,7 @@ def make_dry_run(job: Job) -> DryRun:
         checks=evaluate_checks(chosen, columns, sequence.sections(), (), sequence.fault_starts(), rate=rate,
                                signals=model.kind.signals),
         not_predicted=[check.name for check in sequence.checks if check.kind in OF_EVENTS],
-        trips=[] if sequence.faults else find_trips(sequence.guards, columns, model.kind.signals))
+        trips=[] if sequence.faults else [*find_trips(sequence.guards, columns, model.kind.signals)])
 
 
 def name_rows(sequence: TestSequence, commands: Sequence[Array]) -> list[tuple[int, str]]:
@@ -222,17 +222,15 @@ def find_capabilities(model: Model) -> dict[str, float]:
     return found
 
 
-def find_trips(guards: Sequence[Guard], columns: Columns, signals: Signals) -> list[GuardTrip]:
+def find_trips(guards: Sequence[Guard], columns: Columns, signals: Signals) -> Iterator[GuardTrip]:
     """The guards that the predicted main phase violates."""
-    trips = []
     for guard in guards:
         low, high = guard.compute_limits()
         values = compute_error(columns, signals) if guard.signal not in signals.names else getattr(
             columns, guard.signal)
         outside = np.convolve((values < low) | (values > high), np.ones(guard.cycles))[:len(values)] >= guard.cycles
         if outside.any():
-            trips.append(GuardTrip(guard.name, float(columns.t[int(np.argmax(outside))])))
-    return trips
+            yield GuardTrip(guard.name, float(columns.t[int(np.argmax(outside))]))
 
 
 class PlannedFault(NamedTuple):

@@ -250,19 +250,17 @@ def draw_plot(lines: dict[str, NDArray[np.float64]], width: int, height: int, sm
 
 
 def _list_dots(values: NDArray[np.float64], low: float, high: float, across: int, down: int
-               ) -> list[tuple[int, int, int]]:
+               ) -> Iterator[tuple[int, int, int]]:
     """(row, column, bit) of the dots of a line; each column of dots spans what the line passes there."""
     if not len(values):
-        return []
+        return
     edges = np.linspace(0, len(values), across + 1).astype(int)
-    found = []
     for x in range(across):
         part = values[max(edges[x] - 1, 0):max(edges[x + 1], edges[x] + 1)]  # with the one before: steps are joined
         part = part[~np.isnan(part)]
         if len(part):
             y0, y1 = ((high - edge) / (high - low) * (down - 1) for edge in (float(part.max()), float(part.min())))
-            found += [(y // 4, x // 2, int(_DOTS[y % 4, x % 2])) for y in range(round(y0), round(y1) + 1)]
-    return found
+            yield from ((y // 4, x // 2, int(_DOTS[y % 4, x % 2])) for y in range(round(y0), round(y1) + 1))
 
 
 _WORDS = {"waits": NEUTRAL, "measures": MEASURED, "after the run": NEUTRAL, "PASS": PASS, "FAIL": FAIL,

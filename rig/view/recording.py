@@ -460,7 +460,7 @@ def draw_runs(found: RunDifferences) -> Drawing:
     colours = {curve.colour for plot in plots for curve in plot.curves} - {NOISE, REFERENCE}
     lanes = {PASS, NEUTRAL, *SECTIONS.values(), *VERDICTS.values()}
     views = [ShownView(SIGNALS, tuple(colours)), ShownView(RUN_LANES, tuple(lanes), is_lanes=True)]
-    return Drawing(join_words([run.source for run in found.runs]), plots, RUN_LANES, _list_lanes_of_runs(found),
+    return Drawing(join_words([run.source for run in found.runs]), plots, RUN_LANES, [*_list_lanes_of_runs(found)],
                    ("Result", format_document(build_diff_report(found))), views, verdict=found.verdict)
 
 
@@ -496,16 +496,14 @@ def _shorten_source(run: Run) -> str:
     return path.parent.name or path.name if path.name == "trace.mcap" else path.name
 
 
-def _list_lanes_of_runs(found: RunDifferences) -> list[Lane]:
+def _list_lanes_of_runs(found: RunDifferences) -> Iterator[Lane]:
     """Verdict and faults of each run, and the command of each run that has another one than the first."""
-    lanes: list[Lane] = []
     for run, pair in zip(found.runs, [None, *found.pairs], strict=True):
         offset = pair.offset if pair else 0.0
-        lanes += list_verdict_lanes(run.trace, run.label, offset)
+        yield from list_verdict_lanes(run.trace, run.label, offset)
         if pair is None or not pair.has_same_command:
-            lanes.append(make_command_lane(run.trace, run.label, offset))
-        lanes += list_fault_lanes(run.trace, f"{run.label}/fault ", offset)
-    return lanes
+            yield make_command_lane(run.trace, run.label, offset)
+        yield from list_fault_lanes(run.trace, f"{run.label}/fault ", offset)
 
 
 BEFORE, FLOOR = 0xE5534BFF, MEASURED

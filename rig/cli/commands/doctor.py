@@ -32,7 +32,8 @@ def run_command(args: argparse.Namespace) -> int:
 
 def build_listening_report(bench: Bench, spec: str, seconds: float) -> Report:
     """Report on the frames of a bench that are heard on a bus."""
-    findings = doctor.judge_frames(bench, *doctor.count_frames(bench, doctor.listen(bench, spec, seconds)), seconds)
+    heard, others = doctor.count_frames(bench, doctor.listen(bench, spec, seconds))
+    findings = list(doctor.judge_frames(bench, heard, others, seconds))
     theirs = [each for each in findings if each.purpose.startswith("controller")]
     is_there = any(each.status == "ok" for each in theirs)
     sentence = (f"The controller is on {spec}." if is_there else

@@ -1,7 +1,7 @@
 """`rig effects`: the catalogue of physical effects, one effect in detail, and the self-test of an effect."""
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,7 @@ def build_effects_report(chosen: Sequence[Effect], plant: str, tests: Mapping[st
         law = ((chosen[0].function.__doc__ if chosen[0].function else "") or "").partition("\n")[0]
         title, sentence = chosen[0].name, ": ".join(filter(None, (chosen[0].name, law)))
     sections = [Section("", _list_properties(chosen[0], rows[0], plant) if is_detailed else _tabulate_effects(chosen)),
-                *(Section(f"self-test of {name}", _show_test(test, plant)) for name, test in tests.items())]
+                *(Section(f"self-test of {name}", [*_show_test(test, plant)]) for name, test in tests.items())]
     return Report("effects", title, sentence=sentence, sections=sections, data={"effects": rows})
 
 
@@ -96,9 +96,8 @@ def _list_properties(e: Effect, row: Mapping[str, Any], plant: str) -> list[Item
     return [Line(label, text) for label, text in properties if text]
 
 
-def _show_test(test: SelfTest, plant: str) -> list[Item]:
+def _show_test(test: SelfTest, plant: str) -> Iterator[Item]:
     """The faults that a self-test found, and what each size changes."""
-    items: list[Item] = []
     if test.shown:
         units = {s: CONVENIENT.get(s.unit, (1.0, s.unit)) for s in find_plant(plant).signals.outputs}
         rows = [[", ".join(f"{name.partition('.')[2]} = {value:.3g}" for name, value in shown.start.items()),
@@ -106,11 +105,10 @@ def _show_test(test: SelfTest, plant: str) -> list[Item]:
                  format_digits(shown.level)] for shown in test.shown]
         columns = [Column("size"), *(Column(s.symbol, unit, "right") for s, (_, unit) in units.items()),
                    Column("over noise", align="right")]
-        items.append(Table(columns, rows, f"What {test.effect} changes: RMS over the nominal test, driven by the "
-                                          "same drive; and the largest change over the noise of its sensor."))
-    items += [Line("FAULT", f"{test.effect}: {fault}", "bad") for fault in test.faults]
+        yield Table(columns, rows, f"What {test.effect} changes: RMS over the nominal test, driven by the "
+                                   "same drive; and the largest change over the noise of its sensor.")
+    yield from (Line("FAULT", f"{test.effect}: {fault}", "bad") for fault in test.faults)
     if not test.faults:
         hidden = "" if test.visible or not test.shown else "; below the noise on this command"
-        items.append(Line("passed", f"{test.effect}: exact at its off value, finite, repeatable, compiled code equal "
-                                    f"to plain Python{hidden}", "good"))
-    return items
+        yield Line("passed", f"{test.effect}: exact at its off value, finite, repeatable, compiled code equal "
+                             f"to plain Python{hidden}", "good")
