@@ -88,12 +88,11 @@ def describe_differences(found: RunDifferences) -> str:
 def _tabulate_runs(found: RunDifferences) -> Table:
     columns = [Column("run"), Column("file"), Column("verdict"), Column("length", "s", "right"),
                Column("every", "ms", "right"), Column("same command"), Column("offset", "s", "right")]
-    rows: list[list[Cell | str]] = []
-    for run, pair in zip(found.runs, [None, *found.pairs], strict=True):
-        agreement = ["", ""] if pair is None else [
-            "yes" if pair.has_same_command else Cell("no", "bad"), f"{pair.offset:.6g}"]
-        rows.append([run.label, run.source, read_verdict(run.trace).word, f"{len(run.trace) * run.trace.period:.3f}",
-                     f"{1e3 * run.trace.period:g}", *agreement])
+    rows: list[list[Cell | str]] = [
+        [run.label, run.source, read_verdict(run.trace).word, f"{len(run.trace) * run.trace.period:.3f}",
+         f"{1e3 * run.trace.period:g}", *(["", ""] if pair is None else [
+             "yes" if pair.has_same_command else Cell("no", "bad"), f"{pair.offset:.6g}"])]
+        for run, pair in zip(found.runs, [None, *found.pairs], strict=True)]
     return Table(columns, rows, "Offset: time of A minus time of the run in the same cycle.")
 
 
@@ -103,16 +102,13 @@ def _show_signals(found: RunDifferences) -> list[Item]:
                Column("largest", align="right"), Column("at", "s", "right"), Column("noise, A", align="right"),
                Column("noise, run", align="right"), Column("times the noise", align="right"),
                Column("time within noise", align="right", medium=Medium.PAGE)]
-    rows: list[list[Cell | str]] = []
-    for pair in found.pairs:
-        for s in pair.signals:
-            scale, unit = units[s.name]
-            rows.append([f"{pair.run.label} - A", s.signal.symbol, unit,
-                         Cell(format_digits(s.rms / scale), is_strong=True),
-                         *(("-", "-") if s.is_equal else (format_digits(s.largest / scale), f"{s.t:.3f}")),
-                         *(format_digits(noise / scale) for noise in s.noise),
-                         Cell("equal" if s.is_equal else format_ratio(s.ratio), "good" if s.is_within_noise else "bad"),
-                         Cell(format_percent(s.calm_share), "muted")])
+    rows: list[list[Cell | str]] = [
+        [f"{pair.run.label} - A", s.signal.symbol, unit, Cell(format_digits(s.rms / scale), is_strong=True),
+         *(("-", "-") if s.is_equal else (format_digits(s.largest / scale), f"{s.t:.3f}")),
+         *(format_digits(noise / scale) for noise in s.noise),
+         Cell("equal" if s.is_equal else format_ratio(s.ratio), "good" if s.is_within_noise else "bad"),
+         Cell(format_percent(s.calm_share), "muted")]
+        for pair in found.pairs for s in pair.signals for scale, unit in [units[s.name]]]
     caption = ("RMS and largest difference, run minus A, where both commands agree. Noise: RMS of the noise of each "
                f"run, from its own second differences. Up to {format_digits(RUN_DIFFERENCE_RATIO, 2)} times the noise "
                "of both runs, noise explains a difference.")

@@ -269,11 +269,10 @@ def _tabulate_candidates(a: Answer, most: int = 8) -> Table:
 
     rows: list[list[Cell | str]] = [[Cell(text, "muted") for text in (
         "no effect", "", *show_ratios(a.explanation.base.ratio, a.baseline["holdout"]), "", "", "")]]
-    for c in a.explanations:
-        mood, sizes = WORD_MOODS.get(c.word, "muted"), (describe_parameter(name, v) for name, v in c.parameters.items())
-        rows.append([Cell(" + ".join([*c.beside, c.effect]), is_strong=mood != "muted"), Cell(c.word, mood),
-                     *show_ratios(c.ratios, c.holdout), f"{c.evidence:.0f}", format_p_value(c.p_value),
-                     Cell(", ".join(sizes), "muted")])
+    rows += [[Cell(" + ".join([*c.beside, c.effect]), is_strong=mood != "muted"), Cell(c.word, mood),
+              *show_ratios(c.ratios, c.holdout), f"{c.evidence:.0f}", format_p_value(c.p_value),
+              Cell(", ".join(describe_parameter(name, v) for name, v in c.parameters.items()), "muted")]
+             for c in a.explanations for mood in [WORD_MOODS.get(c.word, "muted")]]
     return Table(columns, rows, (
         "Signals: repeatable part of the error over its noise floor (1: noise alone). Held-out run: error of the worst "
         "signal over its noise floor (on the page: that of each signal). Evidence: gain in log likelihood minus a "
@@ -496,11 +495,10 @@ def _tabulate_law_errors(found: LawSearch, law: Law) -> Table:
     signals = found.signals
     columns = [Column(f"{signals.find(s).symbol}{words}", align="right")
                for words in ("", ", held-out")[:2 if law.holdout else 1] for s in found.floor]
-    rows: list[list[Cell | str]] = []
-    for name, *sides in _list_errors(found, law):
-        is_law = name == "with the law"
-        shown = [_format(errors, s, signals) for errors in sides for s in found.floor]
-        rows.append([Cell(name, "good" if is_law else "", is_law), *shown[:len(columns)]])
+    rows: list[list[Cell | str]] = [
+        [Cell(name, "good", True) if name == "with the law" else name,
+         *[_format(errors, s, signals) for errors in sides for s in found.floor][:len(columns)]]
+        for name, *sides in _list_errors(found, law)]
     return Table([Column("model"), *columns], rows, (
         "Errors, RMS; of the held-out run those of the typical block (the worst 15 % are left out). The law explains "
         "what is missing where its error reaches the noise floor on both runs."))

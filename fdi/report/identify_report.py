@@ -117,16 +117,13 @@ def _tabulate_errors(errors: Sequence[RunError], signals: Signals) -> Table:
     columns = [Column("run"), Column(""), Column("signal"), Column("before", align="right"),
                Column("after", align="right"), Column("noise floor", align="right"),
                Column("over floor", align="right")]
-    rows: list[list[Cell | str]] = []
-    for e in errors:
-        kind = "held-out" if e.is_held_out else "fitted"
-        for number, name in enumerate(e.after):
-            ratio, s = e.after[name] / e.floor[name], signals.find(name)
-            file, role = (e.source.file, kind) if number == 0 else ("", "")  # once for the rows of a run
-            rows.append([file, Cell(role, "muted"), s.symbol,
-                         Cell(format_signal(e.before[name], s), "muted"), format_signal(e.after[name], s),
-                         Cell(format_signal(e.floor[name], s), "muted"),
-                         Cell(format_ratio(ratio), "good" if ratio <= RESIDUAL_HELD_OUT else "bad")])
+    rows: list[list[Cell | str]] = [
+        [*((e.source.file, Cell("held-out" if e.is_held_out else "fitted", "muted")) if number == 0 else ("", "")),
+         s.symbol, Cell(format_signal(e.before[s.name], s), "muted"), format_signal(e.after[s.name], s),
+         Cell(format_signal(e.floor[s.name], s), "muted"),
+         Cell(format_ratio(ratio), "good" if ratio <= RESIDUAL_HELD_OUT else "bad")]
+        for e in errors for number, s in enumerate(map(signals.find, e.after))
+        for ratio in [e.after[s.name] / e.floor[s.name]]]
     return Table(columns, rows, "RMS error of each signal with the data sheet's values (before) and with those found.")
 
 

@@ -1,7 +1,7 @@
 """A run as data: everything that determines its result, from the command line or from an earlier run's log."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -164,7 +164,7 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
         raise InputError(path, "attachment model.toml", "text in UTF-8") from error
     if plant_codes:
         tables["plant"] = _load_stored_plant(plant_codes, str(tables.get("plant")), keeps_name=True)
-    effects = _store_code(effect_codes)
+    effects = tuple(_store_code(effect_codes))
     for code, file in zip(effect_codes, effects, strict=True):
         load_effects(file, code.content)
     model = parse_model(tables, where)
@@ -260,12 +260,11 @@ def _read_settings(log: Path, said: Mapping[str, str]) -> dict[str, Any]:
             "max_overruns": share}
 
 
-def _store_code(codes: list[ForeignCode]) -> tuple[Path, ...]:
+def _store_code(codes: list[ForeignCode]) -> Iterator[Path]:
     """Write a user's code to files, which outlive this process: nodes in other processes read them."""
     from plant.compile import find_cache_folder, make_private_folder
 
     digest = hashlib.sha256(repr([(code.name, code.content) for code in codes]).encode()).hexdigest()
-    files = []
     for code in codes:
         with report_system_error(code.name, "", "room for its code in the cache folder"):
             folder = make_private_folder(find_cache_folder() / f"effects-{digest}")
@@ -273,8 +272,7 @@ def _store_code(codes: list[ForeignCode]) -> tuple[Path, ...]:
             if not file.is_file() or file.read_bytes() != code.content:
                 with write_whole(file) as part:
                     part.write_bytes(code.content)
-        files.append(file)
-    return tuple(files)
+        yield file
 
 
 class JobChoice(NamedTuple):
