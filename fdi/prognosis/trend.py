@@ -406,10 +406,9 @@ def fit_trend(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate
     span = float(t[-1] - t[found.first])
     posterior = fit_growth(found.data)
     paths, laws = _sample_paths(found, posterior, _fit_unit_error(data, used)), posterior.compute_law_probabilities()
-    remaining = {}
-    for reached, limit in (("maintenance", fault.acceptable), ("non_nominal", fault.maintenance)):
-        draws = find_first_passage(paths, (limit - fault.healthy) / unit) * span
-        remaining[reached] = Remaining(limit, *_summarise_draws(draws), draws)
+    remaining = {reached: Remaining(limit, *_summarise_draws(draws), draws)
+                 for reached, limit in (("maintenance", fault.acceptable), ("non_nominal", fault.maintenance))
+                 for draws in [find_first_passage(paths, (limit - fault.healthy) / unit) * span]}
     middle = np.linspace(0.0, 1.0, 60)
     level = fault.healthy + unit * estimate_level(found.data, posterior, middle)
     past = Curve(t[found.first] + span * middle, *level)

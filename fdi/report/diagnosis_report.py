@@ -230,13 +230,13 @@ def list_found_faults(answer: Mapping[str, Any]) -> list[FoundFault]:
     if not answer.get("level"):
         return []
     words = {level.word: name for level, name in LEVEL_NAMES.items() if level is not None}
-    found = []
-    for name, fault in (answer.get("faults") or _collect_faults(FAULTS)).items():
-        size = Estimate(**{key: math.nan if x is None else x for key, x in answer["refined"][fault["key"]].items()})
-        found.append(FoundFault(
-            fault["title"], words.get(answer["level"][name], LEVEL_NAMES[None]),
-            f"{fault['symbol']} {format_interval(size.value, size.low, size.high, fault['unit'])}"))
-    return found
+
+    def show_size(fault: Mapping[str, Any]) -> str:
+        size = {key: math.nan if x is None else x for key, x in answer["refined"][fault["key"]].items()}
+        return f"{fault['symbol']} {format_interval(size['value'], size['low'], size['high'], fault['unit'])}"
+
+    return [FoundFault(fault["title"], words.get(answer["level"][name], LEVEL_NAMES[None]), show_size(fault))
+            for name, fault in (answer.get("faults") or _collect_faults(FAULTS)).items()]
 
 
 def format_limits_of_fault(fault: Fault) -> tuple[str, ...]:
@@ -696,10 +696,8 @@ def _draw_sizes_of_fault(fault: Fault, fit: Estimate, found: Sequence[tuple[str,
     ways = (-1.0, 1.0) if fault.both_ways else (1.0,)
     zones = ((0.0 if fault.healthy >= 0.0 and not fault.falls else fault.limits[0], middle, GREEN),
              (middle, most, ORANGE), (most, end, RED))
-    shades = []
-    for (low, high, colour), way in product(zones, ways):
-        left, right = sorted(_place_size(fault, x, way) for x in (low, high))
-        shades.append(shade(left, right, colour, 0.13))
+    shades = [shade(left, right, colour, 0.13) for (low, high, colour), way in product(zones, ways)
+              for left, right in [sorted(_place_size(fault, x, way) for x in (low, high))]]
     limits = sorted(_place_size(fault, x, way) for x in (zones[0][0], end) for way in ways)
     return [*shades, call("errorbar", fit.value, 0, xerr=interval, color=INK, capsize=3, marker="o", ms=6),
             *(dot(size, row, INK, marker="D", ms=4) for row, (_, size) in enumerate(found, 1)),

@@ -94,11 +94,10 @@ def count_rates(rows: Sequence[Row], faults: Sequence[Fault] = FAULTS) -> list[F
     rates = [judge_rate("healthy: false alarm", count_share(healthy, partial(is_alarm, faults=faults)), most=0.005),
              judge_rate("  event outside a band", count_share(healthy, lambda row: bool(row.get("event_count")))),
              judge_rate("  judged acceptable", count_share(healthy, lambda row: row.get("verdict") == "ACCEPTABLE"))]
-    for fault in faults:
-        for band, least, size in (("MidBand", 0.95, fault.acceptable), ("MaxBand", 0.995, fault.maintenance)):
-            group = [row for row in select_single_fault(rows, fault) if true_size(row, fault) == size]
-            rates.append(judge_rate(f"{fault.symbol} at {band} detected",
-                                    count_share(group, partial(is_detected, fault=fault)), least))
+    rates += [judge_rate(f"{fault.symbol} at {band} detected", count_share(
+        [row for row in select_single_fault(rows, fault) if true_size(row, fault) == size],
+        partial(is_detected, fault=fault)), least) for fault in faults for band, least, size in (
+            ("MidBand", 0.95, fault.acceptable), ("MaxBand", 0.995, fault.maintenance))]
     beyond = [row.get("ruling") == fault.name for fault in faults for row in select_single_fault(rows, fault)
               if classify_size(fault, true_size(row, fault)) > Level.ACCEPTABLE]
     rates.append(judge_rate("ruling fault, MidBand on", measure_share(sum(beyond), len(beyond)), 0.97))

@@ -96,12 +96,11 @@ def list_signals(args: argparse.Namespace) -> list[str] | None:
 
 def format_arguments(args: argparse.Namespace) -> str:
     """The runs and the model of a command, as arguments of the command to type next."""
-    words = [args.trace]
-    for name in ("repeat", "holdout", "model", "set", "effects", "signals", "faults"):
-        values = getattr(args, name, None) or []
-        words += [word for value in (values if isinstance(values, list) else [values])
-                  for word in (f"--{name}", str(value))]
-    return shlex.join([*words, *(["--trust"] if args.trust else [])])
+    given = {name: getattr(args, name, None) or []
+             for name in ("repeat", "holdout", "model", "set", "effects", "signals", "faults")}
+    words = [word for name, values in given.items() for value in (values if isinstance(values, list) else [values])
+             for word in (f"--{name}", str(value))]
+    return shlex.join([args.trace, *words, *(["--trust"] if args.trust else [])])
 
 
 def list_shipped_sequences() -> list[str]:

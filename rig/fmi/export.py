@@ -296,14 +296,12 @@ def _list_common(model: Model, variables: Sequence[Variable]) -> list[str]:
 
 
 def _describe_fmi2(model: Model, variables: Sequence[Variable], identifier: str, token: str, seed: int) -> str:
-    scalars = []
-    for i, v in enumerate(variables):
-        itself, number = _list_attributes(v)
-        scalars.append(_tag("ScalarVariable", {"name": v.name, "valueReference": i, **itself}, [_tag("Real", number)]))
-    for i, ((name, text), kind, start) in enumerate(zip(_OTHERS, ("Integer", "Boolean"), (seed, "false"), strict=True)):
-        attributes = {"name": name, "valueReference": len(variables) + i, "description": text,
-                      "causality": "parameter", "variability": "fixed"}
-        scalars.append(_tag("ScalarVariable", attributes, [_tag(kind, {"start": start})]))
+    scalars = [_tag("ScalarVariable", {"name": v.name, "valueReference": i, **itself}, [_tag("Real", number)])
+               for i, v in enumerate(variables) for itself, number in [_list_attributes(v)]]
+    scalars += [_tag("ScalarVariable", {"name": name, "valueReference": i, "description": text,
+                                        "causality": "parameter", "variability": "fixed"},
+                     [_tag(kind, {"start": start})]) for i, ((name, text), kind, start) in enumerate(zip(
+                         _OTHERS, ("Integer", "Boolean"), (seed, "false"), strict=True), len(variables))]
     unknowns = [_tag("Unknown", {"index": i}) for i, v in enumerate(variables, 1) if v.role == "OUTPUT"]
     return _describe("2.0", model, {"guid": token}, [
         _tag("CoSimulation", {"modelIdentifier": identifier, "canHandleVariableCommunicationStepSize": "false",
@@ -314,10 +312,8 @@ def _describe_fmi2(model: Model, variables: Sequence[Variable], identifier: str,
 
 
 def _describe_fmi3(model: Model, variables: Sequence[Variable], identifier: str, token: str, seed: int) -> str:
-    scalars = []
-    for i, v in enumerate(variables):
-        itself, number = _list_attributes(v)
-        scalars.append(_tag("Float64", {"name": v.name, "valueReference": i, **itself, **number}))
+    scalars = [_tag("Float64", {"name": v.name, "valueReference": i, **itself, **number})
+               for i, v in enumerate(variables) for itself, number in [_list_attributes(v)]]
     scalars += [_tag(kind, {"name": name, "valueReference": i, "description": text, "causality": "parameter",
                             "variability": "fixed", "start": start})
                 for i, ((name, text), kind, start) in enumerate(zip(

@@ -87,13 +87,13 @@ def _list_properties(e: Effect, row: Mapping[str, Any], plant: str) -> list[Item
     port = f"{e.port} ({find_plant(plant).ports[e.port].unit})" if e.port else "the reference model itself"
     properties = [("law", e.law), ("acts on", port), ("symptoms", e.symptoms), ("source", e.source),
                   ("confused with", ", ".join(e.confused_with)), ("excludes", ", ".join(e.excludes))]
-    for name, p in row["parameters"].items():
-        words = [p["expected"], f"off at {p['off']:g}", p["typical"] and f"typically {p['typical']}",
-                 "" if p["fitted"] else "not fitted"]
-        properties.append(("parameter", f"{name} in {p['unit']}: {'; '.join(filter(None, words))}"))
-    properties += [("fits start at", ", ".join(f"{name} = {value:g}" for name, value in start.items()))
-                   for start in e.starts]
-    return [Line(label, text) for label, text in properties if text]
+    parameters = [(f"{name} in {p['unit']}", filter(None, (
+        p["expected"], f"off at {p['off']:g}", p["typical"] and f"typically {p['typical']}",
+        "" if p["fitted"] else "not fitted"))) for name, p in row["parameters"].items()]
+    return [*(Line(label, text) for label, text in properties if text),
+            *(Line("parameter", f"{name}: {'; '.join(words)}") for name, words in parameters),
+            *(Line("fits start at", ", ".join(f"{name} = {value:g}" for name, value in start.items()))
+              for start in e.starts)]
 
 
 def _show_test(test: SelfTest, plant: str) -> Iterator[Item]:

@@ -1,7 +1,7 @@
 """`rig list`: the names that other commands take, with unit, range and default."""
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, fields
 from math import isfinite
 from typing import Any
@@ -48,18 +48,16 @@ def _format(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def list_parameters(model: Model) -> Rows:
+def list_parameters(model: Model) -> Iterator[dict[str, Any]]:
     """Every parameter that --set takes: of the model, and of the effects that it does not have yet."""
     off = {name: value for e in model.kind.list_effects() for name, value in e.off.items()}
-    rows = []
     for group, fields_ in model.kind.list_groups().items():
         for name in (f"{group}.{field}" for field in fields_._fields):
             quantity = find_quantity(name, plant=model.plant)
             default = model.values.get(name, off.get(name))
             word = next((word for word, value in quantity.words.items() if value == default), None)
-            rows.append({"name": name, "unit": quantity.unit, "default": word or default,
-                         "range": _describe_range(quantity)})
-    return rows
+            yield {"name": name, "unit": quantity.unit, "default": word or default,
+                   "range": _describe_range(quantity)}
 
 
 def _describe_range(q: Quantity) -> str:
@@ -91,15 +89,11 @@ def list_sequences(model: Model) -> Rows:
 
 def list_effects(model: Model) -> Rows:
     """The catalogue, the user's own effects included."""
-    rows = []
-    for e in model.kind.list_effects():
-        parameters = [f"{name} [{q.unit}], {_describe_range(q)}, " + (
-            f"off at {e.off[name]:g}" if name in e.off else f"nominal {model.kind.nominal.get(name, 0.0):g}")
-            for name, q in e.parameters.items()]
-        rows.append({"name": e.name, "acts on": e.port or "reference model",
-                     "in model": "yes" if e.base or e.name in model.effects else "no",
-                     "parameters [unit], range, default": "\n".join(parameters)})
-    return rows
+    return [{"name": e.name, "acts on": e.port or "reference model",
+             "in model": "yes" if e.base or e.name in model.effects else "no",
+             "parameters [unit], range, default": "\n".join(f"{name} [{q.unit}], {_describe_range(q)}, " + (
+                 f"off at {e.off[name]:g}" if name in e.off else f"nominal {model.kind.nominal.get(name, 0.0):g}")
+                 for name, q in e.parameters.items())} for e in model.kind.list_effects()]
 
 
 def list_checks(model: Model) -> Rows:
@@ -150,7 +144,7 @@ def list_faults(model: Model, source: str | None = None) -> Rows:
              "range": f"{f.range[0]:g} .. {f.range[1]:g}"} for name, faults in found.items() for f in faults]
 
 
-KINDS: Mapping[str, tuple[Callable[[Model], Rows], str]] = {  # what lists them, and how to use one
+KINDS: Mapping[str, tuple[Callable[[Model], Iterable[dict[str, Any]]], str]] = {  # what lists them, and how to use one
     "parameters": (list_parameters, "Change one with --set NAME=VALUE."),
     "signals": (list_signals, "Choose outputs with --signals NAME,NAME."),
     "sequences": (list_sequences, "Run one with rig run NAME."),
