@@ -1,7 +1,7 @@
 """Model against measurement: how large the error is beside what noise explains, where, when, and in which block."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -365,19 +365,19 @@ def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place],
     return ("CANNOT_TELL", doubt) if is_open else ("MODEL_INCOMPLETE", "")
 
 
-def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> list[str]:
+def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> Iterator[str]:
     """What a reader must know about the floor and about rows left out."""
-    said = [f"{name} of the model passes the sensor of the trace: {sensor.describe(trace.period, trace.units[name])}"
-            for name, sensor in trace.sensors.items() if name in trace.outputs]
+    yield from (f"{name} of the model passes the sensor of the trace: "
+                f"{sensor.describe(trace.period, trace.units[name])}"
+                for name, sensor in trace.sensors.items() if name in trace.outputs)
     if trace.filtered:
-        said.append(f"flow and force are not balanced: {', '.join(trace.filtered)} is filtered by its sensor")
+        yield f"flow and force are not balanced: {', '.join(trace.filtered)} is filtered by its sensor"
     if apart := [_describe_apart(trace.declared.find(name), f) for name, f in floor.items() if _is_apart(f)]:
-        said.append(f"the error differs between the repeats, as with stick-slip: {', '.join(apart)} noise floors")
+        yield f"the error differs between the repeats, as with stick-slip: {', '.join(apart)} noise floors"
     if replay.undecided.any() and replay.undecided.mean() <= UNDECIDED_SHARE:
         seconds = float(replay.undecided.sum()) * trace.period
-        said.append(f"{seconds:.1f} s are not judged: whether the {trace.declared.controlled.phrase} stops "
-                    f"{_describe_cause(replay)}")
-    return said
+        yield (f"{seconds:.1f} s are not judged: whether the {trace.declared.controlled.phrase} stops "
+               f"{_describe_cause(replay)}")
 
 
 def _is_apart(floor: Floor) -> bool:

@@ -281,9 +281,8 @@ def _list_notes(reference: Run, other: Run, offset: float, rows: _Rows, agrees: 
     uncovered = max(len(a) * a.period, len(b) * b.period) - len(rows.t) * max(a.period, b.period)
     if uncovered > 2.0 * max(a.period, b.period):
         yield f"{where}: {uncovered:.3f} s of the longer run have no counterpart"
-    for run in (reference, other):
-        if run.trace.gaps:
-            yield f"{run.label}: {sum(gap.cycles for gap in run.trace.gaps)} cycles are missing"
+    yield from (f"{run.label}: {sum(gap.cycles for gap in run.trace.gaps)} cycles are missing"
+                for run in (reference, other) if run.trace.gaps)
 
 
 @dataclass(frozen=True)

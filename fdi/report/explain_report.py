@@ -559,9 +559,8 @@ def build_model_report(update: ModelUpdate, path: Path | None = None, backup: Pa
     """
     p, r, floor, signals = update.provenance, update.refit, update.floor, update.model.kind.signals
     parameters = _list_parameters(update.parameters)
-    lines = [Line(str(name), str(value), medium=Medium.TERMINAL) for name, value in parameters.rows]
-    if update.suspicious:
-        lines.append(Line("suspicious", describe_suspicious(update.suspicious), medium=Medium.TERMINAL))
+    suspicious = [("suspicious", describe_suspicious(update.suspicious))] if update.suspicious else []
+    lines = [Line(str(name), str(value), medium=Medium.TERMINAL) for name, value in [*parameters.rows, *suspicious]]
     sections = [Section("Parameters", [*lines, replace(parameters, medium=Medium.PAGE)])]
     if r is not None:
         first, last = r.steps[0].hypothesis, r.last.hypothesis

@@ -59,13 +59,11 @@ def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path,
 def _list_notes(imported: Imported, measurement: Measurement) -> list[str]:
     """Signals that the trace does not have, and columns of the recording that no signal uses."""
     signals, known = imported.trace.declared, {s.name for s in imported.signals}
-    notes = [f"no {s.symbol}: {s.quantity} is not judged by itself" for s in signals.outputs if s.name not in known]
-    if signals.load and signals.load.name not in known:
-        notes.append(f"no {signals.load.symbol}: it is taken as 0; a load that did act is then a force that the model "
-                     "lacks")
-    if unused := [name for name in measurement.units if name not in imported.used]:
-        notes.append(f"not in the map, not imported: {list_first(unused, MOST)}")
-    return notes
+    unused = [name for name in measurement.units if name not in imported.used]
+    return [*(f"no {s.symbol}: {s.quantity} is not judged by itself" for s in signals.outputs if s.name not in known),
+            *([f"no {signals.load.symbol}: it is taken as 0; a load that did act is then a force that the model lacks"]
+              if signals.load and signals.load.name not in known else []),
+            *([f"not in the map, not imported: {list_first(unused, MOST)}"] if unused else [])]
 
 
 def _format_range(s: ImportedSignal, si: str) -> str:

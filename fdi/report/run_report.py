@@ -295,9 +295,9 @@ def draw_signals(trace: Trace) -> str:
              (error, f"error [{fine}]", 1.0 / size, ORANGE),
              (error if half else np.full_like(error, math.nan), f"error, close up [{fine}]", 1.0 / size, ORANGE),
              (trace.drive, f"{d.drive.called} [{d.drive.shown_unit}]", d.drive.shown_scale, VIOLET),
-             *((trace.column(s.name), label_signal(s), s.shown_scale, choose_colour(d, s.name)) for s in d.outputs[1:])]
-    if d.load and np.nan_to_num(trace.load).any():
-        shown.append((trace.load, label_signal(d.load), d.load.shown_scale, GREY))
+             *((trace.column(s.name), label_signal(s), s.shown_scale, choose_colour(d, s.name)) for s in d.outputs[1:]),
+             *([(trace.load, label_signal(d.load), d.load.shown_scale, GREY)]
+               if d.load and np.nan_to_num(trace.load).any() else [])]
     faults = list_faults(trace)
     legends = f"{d.controlled.symbol}, {d.controlled.called}", f"{d.command.symbol}, command"
     panels = [[line(t, _bridge_short_gaps(values) * scale, colour, None if number else legends[0]),

@@ -621,11 +621,9 @@ def _list_costs(figures: Mapping[str, Any]) -> list[Item]:
             ["one step, gcc with -ffp-contract=off", f"{step['c_same_rounding']:.1f} ns",
              format_digits(step["ratio_same_rounding"]), same]]
     columns = [Column("work"), Column("cost", align="right"), Column("Python / C", align="right"), Column("result")]
-    items: list[Item] = [Table(columns, rows, "Python / C: time of the compiled Python step over that of C. Result: "
-                                              "difference between both steps.")]
-    if step is None:
-        items.append(Line("C", f"skipped: gcc is not installed; to get it: {GET_GCC}"))
-    return items
+    return [Table(columns, rows, "Python / C: time of the compiled Python step over that of C. Result: difference "
+                                 "between both steps."),
+            *([Line("C", f"skipped: gcc is not installed; to get it: {GET_GCC}")] if step is None else [])]
 
 
 def _tabulate_accuracy(accuracy: Sequence[Mapping[str, float]]) -> list[Table]:

@@ -377,11 +377,9 @@ def _tabulate_traces(traces: Sequence[Mapping[str, Any]], faults: Sequence[Fault
 
 def _list_reasons(reasons: Sequence[Mapping[str, Any]], most: int = 10) -> list[Item]:
     moods: dict[str, Mood] = {"failed": "bad", "refused": "doubtful"}
-    items: list[Item] = [Line(reason["status"], f"{reason['case']}, seed {reason['seed']}: {reason['reason']}",
-                              moods.get(reason["status"], "")) for reason in reasons[:most]]
-    if len(reasons) > most:
-        items.append(Paragraph(f"and {len(reasons) - most} more"))
-    return items
+    return [*(Line(reason["status"], f"{reason['case']}, seed {reason['seed']}: {reason['reason']}",
+                   moods.get(reason["status"], "")) for reason in reasons[:most]),
+            *([Paragraph(f"and {len(reasons) - most} more")] if len(reasons) > most else [])]
 
 
 LINES = (("detected", "maintenance or worse", BLUE), ("most", "non-nominal", RED), ("ruling", "ruling fault", GREEN),

@@ -148,15 +148,15 @@ def check_pdo_parameters(t: Target) -> str:
     """Communication and mapping parameters come in pairs."""
     pdos = t.sheet.pdos
     known = {pdo.mapping for pdo in pdos}
-    problems = [f"{pdo.name} has no 0x{pdo.parameter:04X}:{sub}" for pdo in pdos for sub in (0, 1, 2)
-                if t.sheet.find(pdo.parameter, sub) is None]
-    problems += [f"{pdo.name} has no mapping 0x{pdo.mapping:04X}" for pdo in pdos if pdo.mapping not in t.sheet.objects]
-    problems += [f"{variable.label} maps a PDO that is not there" for variable in t.sheet.variables
-                 if variable.is_mapping and variable.sub == 0 and variable.index not in known]
-    for key, is_sent in (("NrOfRXPDO", False), ("NrOfTXPDO", True)):
-        stated, count = read_number(t, "DeviceInfo", key, -1), sum(pdo.is_sent is is_sent for pdo in pdos)
-        if stated != count:
-            problems.append(f"{key} is {stated}, {count} are described")
+    counts = [(key, read_number(t, "DeviceInfo", key, -1), sum(pdo.is_sent is is_sent for pdo in pdos))
+              for key, is_sent in (("NrOfRXPDO", False), ("NrOfTXPDO", True))]
+    problems = [
+        *(f"{pdo.name} has no 0x{pdo.parameter:04X}:{sub}" for pdo in pdos for sub in (0, 1, 2)
+          if t.sheet.find(pdo.parameter, sub) is None),
+        *(f"{pdo.name} has no mapping 0x{pdo.mapping:04X}" for pdo in pdos if pdo.mapping not in t.sheet.objects),
+        *(f"{variable.label} maps a PDO that is not there" for variable in t.sheet.variables
+          if variable.is_mapping and variable.sub == 0 and variable.index not in known),
+        *(f"{key} is {stated}, {count} are described" for key, stated, count in counts if stated != count)]
     require(not problems, join_labels(problems))
     return f"{len(pdos)} PDOs"
 
@@ -187,13 +187,14 @@ def check_identity(t: Target) -> str:
 
 def check_identifiers(t: Target) -> str:
     """COB-IDs as they are after a reset."""
-    words = [(pdo.name, t.sheet.default(pdo.parameter, 1), pdo.is_sent) for pdo in t.sheet.pdos]
-    words += [("SYNC", t.sheet.default(0x1005), False), ("EMCY", t.sheet.default(0x1014), True)]
+    words = [*((pdo.name, t.sheet.default(pdo.parameter, 1), pdo.is_sent) for pdo in t.sheet.pdos),
+             ("SYNC", t.sheet.default(0x1005), False), ("EMCY", t.sheet.default(0x1014), True)]
     used = [(name, word & 0x7FF, is_sent) for name, word, is_sent in words
             if word is not None and (name == "SYNC" or not word & INVALID)]
-    problems = [f"{name} uses 0x{can_id:03X}, which is restricted" for name, can_id, _ in used if is_restricted(can_id)]
-    problems += [f"{second[0]} and {first[0]} send 0x{first[1]:03X}" for first, second in combinations(used, 2)
-                 if first[1:] == second[1:] and first[2]]
+    problems = [
+        *(f"{name} uses 0x{can_id:03X}, which is restricted" for name, can_id, _ in used if is_restricted(can_id)),
+        *(f"{second[0]} and {first[0]} send 0x{first[1]:03X}" for first, second in combinations(used, 2)
+          if first[1:] == second[1:] and first[2])]
     require(not problems, join_labels(problems))
     return f"{len(used)} COB-IDs"
 

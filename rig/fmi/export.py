@@ -218,9 +218,8 @@ def write_tables(model: Model, variables: Sequence[Variable], seed: int) -> str:
         "ZIGGURAT_W": [w.hex() for w in normal.w],
         "ZIGGURAT_F": [f.hex() for f in normal.f],
     }
-    lines = [f"#define {name} {value}" for name, value in counts.items()]
-    lines += [f"#define {name} {{{', '.join(values)}}}" for name, values in tables.items()]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*(f"#define {name} {value}" for name, value in counts.items()),
+                      *(f"#define {name} {{{', '.join(values)}}}" for name, values in tables.items()), ""])
 
 
 # -------------------------------------------------------------------------------------------- modelDescription.xml
@@ -273,14 +272,9 @@ def _list_attributes(v: Variable) -> tuple[dict[str, object], dict[str, object]]
     """What both versions say of a variable: of itself, and of its number."""
     causality, variability = _CAUSALITY[v.role]
     itself: dict[str, object] = {"description": v.description, "causality": causality, "variability": variability}
-    number: dict[str, object] = {"unit": v.unit}
-    if v.low > -_LARGEST:
-        number["min"] = repr(float(v.low))
-    if v.high < _LARGEST:
-        number["max"] = repr(float(v.high))
-    if v.role in ("INPUT", "FIXED", "TUNABLE"):
-        number["start"] = repr(v.start)
-    return itself, number
+    limits = (("min", float(v.low), v.low > -_LARGEST), ("max", float(v.high), v.high < _LARGEST),
+              ("start", v.start, v.role in ("INPUT", "FIXED", "TUNABLE")))
+    return itself, {"unit": v.unit, **{name: repr(value) for name, value, is_given in limits if is_given}}
 
 
 def _describe(version: str, model: Model, token: dict[str, object], parts: Iterable[str]) -> str:

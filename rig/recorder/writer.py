@@ -115,8 +115,9 @@ def pack_block(block: CycleBlock, epoch_ns: int) -> tuple[bytes, dict[int, NDArr
         table[name]["time"] = table[name]["published"] = times
     places = {name: int(offset) for name, (_, offset) in (kind.fields or {}).items()}  # type: ignore[misc]
     starts = np.arange(count, dtype=np.uint64) * np.uint64(kind.itemsize)
-    kinds: dict[type, tuple[list[str], int]] = {CanFrame: ([f"{i}" for i in range(len(block.frames))], count)}
-    kinds |= {record: ([record.__name__], count - 1) for record in (block.record, Timing)}
+    kinds: dict[type, tuple[list[str], int]] = {
+        CanFrame: ([f"{i}" for i in range(len(block.frames))], count),
+        **{record: ([record.__name__], count - 1) for record in (block.record, Timing)}}
     index = {}
     for record, (names, rows) in kinds.items():
         pairs = np.empty((rows, len(names), 2), np.uint64)

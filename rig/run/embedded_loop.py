@@ -338,8 +338,8 @@ def find_busy_cycles(plan: Plan, schedule: Schedule) -> NDArray[np.int64]:
     A parameter acts on the plant by itself, but where it changes; a frame that is lost or late concerns the cycles to
     come as well, until the nodes are well again.
     """
-    ranges = [range(edge.cycle - 1, edge.cycle + 2) for edge in schedule.edges]
-    ranges += [range(k - 1, k + 3) for name in FRAMES for k in schedule.list_frame_hits(name)[:, 0].tolist()]
+    ranges = [*(range(edge.cycle - 1, edge.cycle + 2) for edge in schedule.edges),
+              *(range(k - 1, k + 3) for name in FRAMES for k in schedule.list_frame_hits(name)[:, 0].tolist())]
     for fault in plan.faults:
         first, last = plan.find_cycles(fault)
         if isinstance(fault, Parameter):

@@ -96,13 +96,14 @@ class Job:
 
     def build_attachments(self) -> dict[str, tuple[str, bytes]]:
         """What a log carries so that the run can be repeated: name to (media type, bytes)."""
-        found = {"model.toml": ("application/toml", self.model.to_toml().encode()),
-                 **{_SEQUENCE_FOLDER + name: ("text/plain", data) for name, data in self.sequence.bundle().items()}}
-        found |= {_EFFECT_FOLDER + path.name: ("text/x-python", path.read_bytes()) for path in self.effects}
         own = self.model.kind
-        found |= {_PLANT_FOLDER + path.name: ("text/plain", own.source or path.read_bytes())
-                  for path in ((own.file, Path(own.key)) if own.foreign else (own.file,)) if path is not None}
-        return found | {_BENCH_FOLDER + name: ("text/plain", data) for name, data in self.bench.files.items()}
+        return {
+            "model.toml": ("application/toml", self.model.to_toml().encode()),
+            **{_SEQUENCE_FOLDER + name: ("text/plain", data) for name, data in self.sequence.bundle().items()},
+            **{_EFFECT_FOLDER + path.name: ("text/x-python", path.read_bytes()) for path in self.effects},
+            **{_PLANT_FOLDER + path.name: ("text/plain", own.source or path.read_bytes())
+               for path in ((own.file, Path(own.key)) if own.foreign else (own.file,)) if path is not None},
+            **{_BENCH_FOLDER + name: ("text/plain", data) for name, data in self.bench.files.items()}}
 
     def list_settings(self) -> dict[str, object]:
         """The settings of the run, for the log's metadata."""

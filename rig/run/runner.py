@@ -103,12 +103,10 @@ class Outcome:
     @property
     def failures(self) -> list[str]:
         """The checks that failed, an end other than the one the sequence requires, and the faults found."""
-        failed = [check.name for check in self._list_checks("FAIL")]
-        if self.job.sequence.ends == "safe_state" and not self.safe:
-            failed.append("the run did not end in the safe state")
-        if has_fault(self.fdi):
-            failed.append(f"rig fdi: {self.fdi['sentence'].rstrip('.')}")
-        return failed
+        is_unsafe = self.job.sequence.ends == "safe_state" and not self.safe
+        return [*(check.name for check in self._list_checks("FAIL")),
+                *(["the run did not end in the safe state"] if is_unsafe else []),
+                *([f"rig fdi: {self.fdi['sentence'].rstrip('.')}"] if has_fault(self.fdi) else [])]
 
     def _list_checks(self, verdict: str) -> list[CheckResult]:
         return [check for check in self.checks if check.verdict == verdict]

@@ -496,8 +496,8 @@ class Window:
 
 def _measure_python(check: PythonCheck, run: RunData, span: slice) -> float:
     assert check.function is not None
-    columns = {name: np.array(getattr(run.trace, name)[span], dtype=np.float64) for name in run.signals.names}
-    columns["t"] = np.arange(span.start, span.stop) / run.rate
+    columns = {**{name: np.array(getattr(run.trace, name)[span], dtype=np.float64) for name in run.signals.names},
+               "t": np.arange(span.start, span.stop) / run.rate}
     value = check.function.call(Window(run.signals, columns), **check.arguments)
     if value is None:
         raise NotMeasurable(f"{check.python} returned no value")

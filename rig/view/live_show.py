@@ -164,8 +164,8 @@ def _draw_title(run: LiveRun, width: int) -> Text:
 
 
 def _draw_nodes(run: LiveRun, silence: float) -> list[Text]:
-    said = {node: (state, _NODE_STYLES.get(state, "dim")) for node, state in run.states.items()}
-    said |= {node: (f"DEAD: {trouble}", "bold white on red") for node, trouble in run.troubles.items()}
+    said = {**{node: (state, _NODE_STYLES.get(state, "dim")) for node, state in run.states.items()},
+            **{node: (f"DEAD: {trouble}", "bold white on red") for node, trouble in run.troubles.items()}}
     lines = [Text.assemble(f"{name:<18}", said[node]) for node, name in run.plan.nodes.items()]
     if silence >= 1.0 and run.cycles and not run.is_over:
         lines[0].append(f"   no new cycle in the log for {silence:.1f} s", style="yellow")
@@ -280,10 +280,9 @@ def draw_plan(plan: LivePlan) -> Drawing:
 
 def _list_signals(plan: LivePlan) -> list[str]:
     """The signals that are drawn; in lockstep nothing is ever late."""
-    left_out = {"lateness": plan.pace == "lockstep"}
-    if plan.signals.load:
-        left_out[plan.signals.load.name] = not plan.has_load
-    return [name for name in ("error", *plan.columns[2:-1]) if not left_out.get(name)]
+    load = plan.signals.load.name if plan.signals.load and not plan.has_load else ""
+    left_out = (load, "lateness" if plan.pace == "lockstep" else "")
+    return [name for name in ("error", *plan.columns[2:-1]) if name not in left_out]
 
 
 class LiveView:

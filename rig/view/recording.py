@@ -304,9 +304,9 @@ def draw_run(trace: Trace) -> Drawing:
 def list_columns(trace: Trace) -> dict[str, tuple[Floats, Floats]]:
     """Signal -> times, s, and values in SI; signals without a value are left out, and lateness that is 0 throughout."""
     timing = trace.timing
-    columns = {name: (trace.t, column) for name, column in trace.columns.items()}
-    columns["error"] = trace.t, trace.command - trace.controlled
-    columns |= {name: (timing.t, getattr(timing, name)) for name in ("lateness", "response", "work")}
+    columns = {**{name: (trace.t, column) for name, column in trace.columns.items()},
+               "error": (trace.t, trace.command - trace.controlled),
+               **{name: (timing.t, getattr(timing, name)) for name in ("lateness", "response", "work")}}
     seldom = {"lateness", *([trace.declared.load.name] if trace.declared.load else [])}
     return {name: (t, values) for name, (t, values) in columns.items() if not np.isnan(values).all()
             and (name not in seldom or np.nan_to_num(values).any())}  # in lockstep nothing is ever late
@@ -342,8 +342,7 @@ def _list_lanes(trace: Trace) -> Iterator[Lane]:
         name = trace.provenance.get(f"nodes.{node}")
         yield Lane(name_node_lane(node, name), [(s.t, s.name) for s in trace.nmt if s.node == node], STATES)
     yield from list_fault_lanes(trace, "fault/", 0.0)
-    for check in trace.sequence_checks:
-        yield _make_check_lane(check, trace)
+    yield from (_make_check_lane(check, trace) for check in trace.sequence_checks)
 
 
 def list_verdict_lanes(trace: Trace, group: str, offset: float) -> list[Lane]:
