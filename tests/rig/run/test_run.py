@@ -36,7 +36,6 @@ from rig.network.node_objects import CONTROLLER, PLANT
 from rig.run import participants, runner
 from rig.run.participants import NodeProcesses
 from rig.run.session import Session
-from rig.sequences import load_sequence
 
 SIGNALS = ("com", "xj", "cor", "p12", "xs")
 LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 60')
@@ -174,14 +173,14 @@ def bus_with_nodes() -> Iterator[str]:
         yield where
 
 
-@pytest.mark.parametrize("name", ["clogging_in_flight", "lost_frames", *TEXTS])
+@pytest.mark.parametrize("name", TEXTS)
 def test_compiled_cycles_in_lockstep_are_those_in_python(bus_with_nodes: str, name: str, tmp_path: Path) -> None:
     """The same rows and the same events in the same cycles, whatever the faults, also where the run is aborted.
 
     A heartbeat that stops is not among them: in lockstep between processes nobody watches heartbeats. The rows of the
     preflight are compared in test_c_run.py, on a CAN interface in test_vcan_guest.py.
     """
-    text = TEXTS.get(name) or load_sequence(name).source
+    text = TEXTS[name]
     here = play(job(text, seed=3), tmp_path / "a")
     there = play(job(text, seed=3, bus=bus_with_nodes, controller="external", plant="external"), tmp_path / "b")
     assert there.timing["kind"] == "lockstep" and (there.verdict, there.aborted) == (here.verdict, here.aborted)
