@@ -190,6 +190,9 @@ SUSPICIOUS_TOLERANCES = 3.0
 # Rounding of what the bus and the file hold gives 1; columns that are rounded twice, 1.9.
 FIRMWARE_DIFFERS = 3.0
 
+# Steps of a position, over the noise of its sensor, that are no effect of the transducer: the noise hides them.
+COMB_HIDDEN = 0.125
+
 # Steps of a recorded position, m, above which they are none of the bus, whose counts are 1e-7 m.
 FINEST_COMB = 2.5e-7
 

@@ -34,7 +34,7 @@ SPELLINGS = {"µm": "um", "μm": "um", "µs": "us", "μs": "us", "µA": "uA", "�
              "seconds": "s", "second": "s", "msec": "ms", "usec": "us", "pa": "Pa", "kpa": "kPa", "mpa": "MPa",
              "Bar": "bar", "BAR": "bar", "MM": "mm", "a": "A", "ma": "mA", "n": "N", "kn": "kN", "S": "s", "MS": "ms",
              "PSI": "psi", "Volt": "V", "v": "V", "Nm": "N m", "mNm": "mN m", "micron": "um", "metre": "m",
-             "meter": "m"}
+             "meter": "m", "°": "deg", "degree": "deg", "degrees": "deg", "°/s": "deg/s", "1/min": "rpm", "RPM": "rpm"}
 _QUANTITY = re.compile(r"\s*([+-]?(?:\d{1,30}\.?\d{0,30}|\.\d{1,30})(?:[eE][+-]?\d{1,2})?)\s*(.*?)\s*")
 
 
@@ -43,17 +43,36 @@ def find_unit(name: str) -> Unit | None:
     return UNITS.get(SPELLINGS.get(name.strip(), name.strip()))
 
 
-def require_unit(name: str, si: str, where: object, field: str) -> Unit:
-    """The unit `name`, which must measure what `si` measures.
+def fit_unit(name: str, own: str) -> Unit | None:
+    """The unit of this name or spelling in the `own` one of a signal, SI or as its plant declares it, such as deg.
+
+    None if it is of another quantity, or if one of them is not known and they differ.
+
+    >>> fit_unit("mrad", "rad").factor, fit_unit("rpm", "deg/s").factor == 6, fit_unit("mm", "deg")
+    (Fraction(1, 1000), True, None)
+    """
+    if name.strip() == own:
+        return Unit(own, own, Fraction(1))
+    unit, base = find_unit(name), find_unit(own)
+    if unit is None or unit.si != (base.si if base else own):
+        return None
+    return unit._replace(si=own, factor=unit.factor / (base.factor if base else 1))
+
+
+def list_fitting_units(own: str) -> list[str]:
+    """The units of the quantity of which `own` is one."""
+    return [name for name in UNITS if fit_unit(name, own)] or [own]
+
+
+def require_unit(name: str, own: str, where: object, field: str) -> Unit:
+    """The unit `name`, which must measure what the `own` one of a signal measures.
 
     Raises:
         InputError: an unknown unit, or one of another quantity.
     """
-    unit = find_unit(name)
-    if name == si:  # also one that only the plant knows
-        return Unit(si, si, Fraction(1))
-    fitting = [known for known, u in UNITS.items() if u.si == si] or [si]
-    if unit is None or unit.si != si:
+    unit = fit_unit(name, own)
+    if unit is None:
+        fitting = list_fitting_units(own)
         raise InputError(where, field, f"one of {', '.join(fitting)}, not {name!r}{suggest_name(name, fitting)}")
     return unit
 

@@ -21,7 +21,7 @@ from plant.errors import InputError
 from rig.benches.bench import Role, decode_device_text, pack, unpack
 from rig.benches.bench_file import load_bench, load_bench_from_files
 from rig.benches.bench_report import list_loads
-from rig.benches.guess import guess_can, guess_canopen
+from rig.benches.guess import Wanted, guess_can, guess_canopen
 from rig.benches.packing import make_layout
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -128,9 +128,9 @@ def _use_bench(files: Mapping[str, bytes]) -> None:
 
 def _guess_bench(name: str, data: bytes) -> None:
     if name.endswith(".dbc"):
-        guess_can("x", name, decode_device_text(data))
+        guess_can("x", name, decode_device_text(data), Wanted())
     elif not name.endswith(".toml"):
-        guess_canopen("x", name, decode_device_text(data), None)
+        guess_canopen("x", name, decode_device_text(data), None, Wanted())
 
 
 def run_trials(count: int, seed: int) -> Iterator[tuple[int, Mapping[str, bytes], Outcome]]:

@@ -53,6 +53,7 @@ from fdi.estimation.replay import (
 )
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (
+    COMB_HIDDEN,
     ERROR_PARTLY_EXPLAINED,
     FINEST_COMB,
     FIRMWARE_DIFFERS,
@@ -518,7 +519,9 @@ def find_marks(model: Model, traces: Sequence[Trace]) -> Marks:
         left = find_controller_gain(model, traces[0].period)[0] * step
         is_recorder = is_rounding_left(compute_firmware_residual(model, traces[0]), left, resolution)
         resolution = float(np.hypot(resolution, left / np.sqrt(12.0))) if is_recorder else resolution
-    if comb and not is_recorder and "quantisation" not in model.effects:
+    hidden = COMB_HIDDEN * model.nominal.get(model.kind.signals.controlled.noise, 0.0)
+    is_offered = "quantisation" in {e.name for e in model.kind.list_effects()} - {*model.effects}
+    if comb and comb.step > hidden and not is_recorder and is_offered:
         sizes = {"quantisation.lsb": (step, step - comb.doubt, step + comb.doubt)}
         prints.append(Fingerprint("quantisation", sizes, step / FINEST_COMB, 0.0))
     error, firmware = 0.0, list[Fingerprint]()

@@ -5,10 +5,10 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple
 
-from plant.signals import EHA
-from plant.units import find_unit
+from plant.signals import EHA, Signals
+from plant.units import find_unit, fit_unit
 from rig.benches.bench import list_inputs, list_outputs
 from rig.benches.can_map import read_database
 from rig.benches.canopen_map import (
@@ -22,7 +22,6 @@ from rig.benches.canopen_map import (
 )
 
 UNSURE = "# unsure: "
-INPUTS, OUTPUTS = list_inputs(EHA), list_outputs(EHA)
 # What a name says of a signal: the quantity, and which of several it is.
 _WORDS: dict[str, tuple[set[str], set[str]]] = {
     "position_demand": ({"position", "pos", "target", "stroke"},
@@ -38,10 +37,10 @@ for _signal in EHA[1:]:  # its name in a recording says both
     if _signal.role in ("output", "drive"):
         for _words in _WORDS[_signal.alias]:
             _words.add(_signal.name)
+_DEMAND = _WORDS["position_demand"][1]
 _WORDS_OF_PROFILES = ("control_word", "status_word", "mode", "mode_display")
-_NEEDED = ("position_demand", "ram_position", "current")
 _USUAL = {"m": "1 um", "Pa": "1 kPa", "N": "1 N", "A": "1 uA"}  # counts, where the file says nothing
-_KNOWN_OBJECTS = {"0x607A": "position_demand", "0x6078": "current"}  # CiA 402
+_KNOWN_OBJECTS = {"0x607A": "command", "0x6078": "A", "0x6077": "N m"}  # CiA 402: role, or unit of the drive
 _RATED_CURRENT = 0x6075  # mA; 0x6078 counts thousandths of it
 _ENABLING = {"enable", "enabled", "active", "activate", "engage", "engaged", "request", "run", "on", "operational",
              "ready"}
@@ -57,7 +56,39 @@ class Candidate:
     count: str | None = None  # what a count is worth, where the file gives it apart from the unit
 
 
-def guess_canopen(title: str, file: str, text: str, node: int | None) -> str:
+class Wanted(NamedTuple):
+    """What a bench file connects a device with: a plant, as the file names it, and its signals."""
+
+    plant: str = "eha"
+    signals: Signals = EHA
+
+    @property
+    def tables(self) -> dict[str, dict[str, str]]:
+        """The words of [inputs] and [outputs], each with its unit."""
+        return {"inputs": list_inputs(self.signals), "outputs": list_outputs(self.signals)}
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """Words without which there is no loop."""
+        return tuple(s.word for s in (self.signals.command, self.signals.controlled, self.signals.drive))
+
+    def list_words(self, word: str) -> tuple[set[str], set[str]]:
+        """What names say of the signal of that word: the quantity, and which of several it is."""
+        if word in _WORDS or word not in {s.word for s in self.signals}:
+            return _WORDS.get(word, ({word}, {word}))
+        said = next(s for s in self.signals if s.word == word)
+        own = {word.replace("_", "").lower(), said.symbol.lower()}
+        parts = {part for part in word.lower().split("_") if len(part) > 1}
+        return parts | own, own | ({word.lower().split("_")[-1]} if len(parts) > 1 else set()) | (
+            _DEMAND if said == self.signals.command else set())
+
+    def is_known_object(self, key: str, word: str) -> bool:
+        """Whether an object of CiA 402 holds that signal."""
+        known, s = _KNOWN_OBJECTS.get(key), self.signals
+        return (known == "command" and word == s.command.word) or (known == s.drive.unit and word == s.drive.word)
+
+
+def guess_canopen(title: str, file: str, text: str, node: int | None, wanted: Wanted) -> str:
     """A bench file for a CANopen device; `node` is its node-ID, None for that of the DCF, or 2.
 
     Raises:
@@ -69,14 +100,14 @@ def guess_canopen(title: str, file: str, text: str, node: int | None) -> str:
     has_words = all(find_variable(dictionary, index, 0) is not None for index in (0x6040, 0x6041))
     profile = {402: "cia402", 408: "cia408"}.get(device_type if has_words else 0, "none")
     doubt = "" if profile != "none" or not has_words else f"  {UNSURE}0x6040 and 0x6041 are there; cia402 or cia408?"
-    lines = [f"name = {json.dumps(title)}", 'plant = "eha"', 'cycle = "1 ms"', "bitrate = 1_000_000", "",
-             "[controller]", 'protocol = "canopen"',
+    lines = [f"name = {json.dumps(title)}", f"plant = {json.dumps(wanted.plant)}", 'cycle = "1 ms"',
+             "bitrate = 1_000_000", "", "[controller]", 'protocol = "canopen"',
              f"node = {number}" + ("" if node or read_node(text) else f"  {UNSURE}the EDS does not say"),
              f"eds = {json.dumps(file)}", f'profile = "{profile}"{doubt}']
     lines += ['mode = 8                        # cyclic synchronous position'] if profile == "cia402" else []
-    for table, known, kind in (("inputs", INPUTS, "RPDO"), ("outputs", OUTPUTS, "TPDO")):
-        candidates = _list_objects(dictionary, number, is_received=kind == "RPDO")
-        lines += ["", f"[controller.{table}]", *_write_signals(candidates, known, "object", "0x0000")]
+    for table, known in wanted.tables.items():
+        candidates = _list_objects(dictionary, number, is_received=table == "inputs")
+        lines += ["", f"[controller.{table}]", *_write_signals(candidates, known, wanted, "object", "0x0000")]
     return "\n".join([_HEAD, *lines, ""])
 
 
@@ -101,7 +132,7 @@ def _list_objects(dictionary: Any, node: int, *, is_received: bool) -> list[Cand
     return [each for each in found if each.key not in ("0x6040", "0x6041", "0x6060", "0x6061")]  # the profile's
 
 
-def guess_can(title: str, file: str, text: str) -> str:
+def guess_can(title: str, file: str, text: str, wanted: Wanted) -> str:
     """A bench file for a device on plain CAN.
 
     Raises:
@@ -111,22 +142,24 @@ def guess_can(title: str, file: str, text: str) -> str:
     candidates = {message.name: [Candidate(f"{message.name}.{signal.name}", f"{message.name} {signal.name}",
                                            signal.unit or "")
                                  for signal in message.signals if not signal.is_multiplexer] for message in messages}
-    current = _assign([each for own in candidates.values() for each in own], ("current",)).get("current")
+    every = [each for own in candidates.values() for each in own]
+    drive = wanted.signals.drive.word
+    current = _assign(every, {drive: wanted.tables["outputs"][drive]}, wanted).get(drive)
     senders = {message.name: set(message.senders) for message in messages}
     device = senders.get(current[0].key.partition(".")[0], set()) if current else set()
     sent = [message for message in messages if device and senders[message.name] & device]
     received = [message for message in messages if message not in sent]
     inputs = [each for message in received for each in candidates[message.name]]
     outputs = [each for message in (sent or messages) for each in candidates[message.name]]
-    lines = [f"name = {json.dumps(title)}", 'plant = "eha"', 'cycle = "1 ms"',
+    lines = [f"name = {json.dumps(title)}", f"plant = {json.dumps(wanted.plant)}", 'cycle = "1 ms"',
              f"bitrate = 1_000_000  {UNSURE}the DBC does not say", "", "[controller]", 'protocol = "can"',
              f"dbc = {json.dumps(file)}", f'timeout = "20 ms"  {UNSURE}without a frame for so long the device is gone']
     used = set()
-    for table, known, own in (("inputs", INPUTS, inputs), ("outputs", OUTPUTS, outputs)):
+    for (table, known), own in zip(wanted.tables.items(), (inputs, outputs), strict=True):
         chosen = {signal: unit for signal, unit in known.items() if signal not in _WORDS_OF_PROFILES}
-        names = {found.key.partition(".")[0] for found, _ in _assign(own, [*chosen]).values()}
+        names = {found.key.partition(".")[0] for found, _ in _assign(own, chosen, wanted).values()}
         near = [each for each in own if each.key.partition(".")[0] in names] or own
-        lines += ["", f"[controller.{table}]", *_write_signals(near, chosen, "signal", "MESSAGE.SIGNAL")]
+        lines += ["", f"[controller.{table}]", *_write_signals(near, chosen, wanted, "signal", "MESSAGE.SIGNAL")]
         used |= names
     lines += _write_states([message for message in messages if message.name in used], sent)
     return "\n".join([_HEAD, *lines, ""])
@@ -161,19 +194,18 @@ def split_words(name: str) -> set[str]:
     return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+\d*(?![a-z])|[a-z]+\d+", name)} | {name.lower()}
 
 
-def _assign(candidates: Iterable[Candidate], signals: Iterable[str]) -> dict[str, tuple[Candidate, bool]]:
-    """The likeliest candidate of each signal, and whether it is sure; no candidate is two signals."""
-    units = {**INPUTS, **OUTPUTS}
+def _assign(candidates: Iterable[Candidate], known: Mapping[str, str], wanted: Wanted
+            ) -> dict[str, tuple[Candidate, bool]]:
+    """The likeliest candidate of each word, with its unit, and whether it is sure; no candidate is two signals."""
     scored = []
     for each in candidates:
         words = split_words(each.name) | {word for part in each.name.split() for word in split_words(part)}
-        for signal in signals:
-            quantity, which = _WORDS.get(signal, ({signal}, {signal}))
-            unit = find_unit(each.unit)
-            fits = unit is not None and unit.si == units[signal]
+        for signal, unit in known.items():
+            quantity, which = wanted.list_words(signal)
+            fits = bool(unit) and fit_unit(each.unit, unit) is not None
             score = 3 * bool(words & quantity) + 2 * bool(words & which) + fits
-            score += 9 * (_KNOWN_OBJECTS.get(each.key) == signal)
-            if score >= 3 and (unit is None or fits):
+            score += 9 * wanted.is_known_object(each.key, signal)
+            if score >= 3 and (find_unit(each.unit) is None or fits):
                 scored.append((score, signal, each))
     found: dict[str, tuple[Candidate, bool]] = {}
     for score, signal, each in sorted(scored, key=lambda entry: -entry[0]):
@@ -183,23 +215,23 @@ def _assign(candidates: Iterable[Candidate], signals: Iterable[str]) -> dict[str
     return found
 
 
-def _write_signals(candidates: Sequence[Candidate], known: Mapping[str, str], word: str, example: str) -> list[str]:
+def _write_signals(candidates: Sequence[Candidate], known: Mapping[str, str], wanted: Wanted, word: str, example: str
+                   ) -> list[str]:
     """The lines of [inputs] or [outputs]."""
-    found, lines = _assign(candidates, [*known]), []
+    found, lines = _assign(candidates, known, wanted), []
     for signal, unit in known.items():
         if signal in found:
             each, is_sure = found[signal]
             doubts = [] if is_sure else [f"is {each.name!r} the {signal}?"]
             entry = f'{signal} = {{ {word} = "{each.key}" }}' if word == "object" else f'{signal} = "{each.key}"'
-            own = find_unit(each.unit)
-            if unit and each.count is None and (own is None or own.si != unit):
+            if unit and each.count is None and fit_unit(each.unit, unit) is None:
                 doubts.append(f"what one count is worth; the file gives {each.name!r} no unit")
-                entry = f'{signal} = {{ {word} = "{each.key}", count = "{_USUAL[unit]}" }}'
+                entry = f'{signal} = {{ {word} = "{each.key}", count = "{_USUAL.get(unit, f"1 {unit}")}" }}'
             elif unit and each.count is not None:
                 entry = f'{signal} = {{ {word} = "{each.key}", count = "{each.count}" }}'
             lines.append(entry + (f"  {UNSURE}{'; '.join(doubts)}" if doubts else ""))
-        elif signal in _NEEDED:
-            count = f', count = "{_USUAL[unit]}"'
+        elif signal in wanted.needed:
+            count = f', count = "{_USUAL.get(unit, f"1 {unit}")}"'
             lines.append(f'# {signal} = {{ {word} = "{example}"{count} }}  {UNSURE}nothing looks like it')
     taken = {each.key for each, _ in found.values()}
     rest = [f"{each.key} ({each.name.rpartition(' ')[2] if word == 'signal' else each.name})" for each in candidates

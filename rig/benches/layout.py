@@ -10,7 +10,7 @@ from fractions import Fraction
 from typing import Any
 
 from plant.tables import Place, list_choices
-from plant.units import find_unit
+from plant.units import fit_unit
 from rig.benches.bench import Field, Guard, Kind, encode_float, list_bits
 
 PHASES = ("setup", "main", "cleanup", "safe")
@@ -139,10 +139,8 @@ def _find_worth(slot: Slot, use: Use) -> tuple[Fraction, Fraction]:
     if use.count is not None:
         offset = slot.offset / slot.scale * use.count if slot.scale else Fraction(0)
         return use.count, offset if use.offset is None else use.offset
-    known = find_unit(slot.unit or "")
-    factor = known.factor if known is not None and known.si == use.unit else None
-    if not use.unit:
-        factor = _PLAIN.get(slot.unit or "")
+    known = fit_unit(slot.unit or "", use.unit) if use.unit else None
+    factor = known.factor if known else None if use.unit else _PLAIN.get(slot.unit or "")
     if factor is None:
         said = "its file gives it no unit" if not slot.unit else f"its unit is {slot.unit!r}"
         worth = f"such as count = '1 {use.unit}'" if use.unit else "as a number"

@@ -25,7 +25,7 @@ from plant.plants import Plant, find_plant, keep_plant
 from plant.quantity import Quantity
 from plant.signals import EHA, Signal
 from plant.tables import Place, build_dataclass, decode_text, parse_table, read_file
-from plant.units import find_unit, parse_quantity
+from plant.units import find_unit, fit_unit, parse_quantity
 from rig.fmi.foreign import Description, Port, Unit, find_variable, read_description
 
 _COLUMNS = EHA.aliases  # these keep their columns and meaning; other names are new signals
@@ -166,8 +166,9 @@ def _find_worth(about: Description, entry: Entry, unit: str, place: Place) -> tu
         count, of = (entry.count, si) if unit or known is not None else (number, "")
         return _parse(count, of, place.at("count")), si
     known = find_unit(stated)
-    if known is not None and unit in ("", known.si):
-        return float(known.factor), known.si
+    fitting = fit_unit(stated, unit or known.si if known else unit)
+    if fitting is not None and stated:
+        return float(fitting.factor), fitting.si
     if unit and stated not in ("", unit):
         raise place.refuse(f'count = ".. {unit}": the variable {entry.variable} is in {stated}')
     return 1.0, unit or stated or "1"

@@ -22,7 +22,7 @@ from plant.quantity import Quantity
 from plant.run import Columns
 from plant.segments import LONGEST, RATE, Array
 from plant.signals import EHA, Signals
-from plant.units import UNITS
+from plant.units import list_fitting_units, require_unit
 from rig.benches.bench import Bench
 from rig.benches.profiles import CIA408, ProfileWords, State, find_state
 from rig.sequences.faults import Time
@@ -132,11 +132,11 @@ def find_crossing(signal: Array, rate: float, above: float | None, below: float 
 
 
 def find_scale(unit: str, si: str) -> float:
-    """How many of the SI unit `si` one `unit` is; InputError at the key `unit` if it measures something else."""
-    fitting = {name: float(each.factor) for name, each in UNITS.items() if each.si == si} | {si: 1.0}
+    """How many of a signal's own unit, `si`, one `unit` is; InputError at the key `unit` for another quantity."""
+    fitting = dict.fromkeys([*list_fitting_units(si), si])
     if unit not in fitting:
         raise InputError("unit", "unit", tables.list_choices(unit, fitting))
-    return fitting[unit]
+    return float(require_unit(unit, si, "", "").factor)
 
 
 MAIN = "main"  # the window that is all of the main phase

@@ -17,7 +17,7 @@ from fdi.trace.trace import Floats, Trace
 from plant.errors import InputError, show_value, suggest_name
 from plant.parameters import parse_toml
 from plant.signals import EHA, Signals
-from plant.units import UNITS, Unit, find_unit, require_unit
+from plant.units import Unit, fit_unit, list_fitting_units, require_unit
 
 
 @dataclass(frozen=True)
@@ -246,9 +246,8 @@ def _parse_term(path: Path, name: str, table: Mapping[str, Any], si: str) -> Sou
 
 def _require_unit(name: str, si: str, where: object, field: str) -> Unit:
     """As of `plant.units`; of a unit that is raw it says what to do."""
-    unit = find_unit(name)
-    if name in OTHER_UNITS and (unit is None or unit.si != si):
-        fitting = next(known for known, u in UNITS.items() if u.si == si)
+    if name in OTHER_UNITS and not fit_unit(name, si):
+        fitting = list_fitting_units(si)[0]
         raise InputError(where, field, f"the unit that scale and offset lead to, such as {fitting} ({name} is raw: "
                                        f"value = sign * (scale * raw + offset) in `unit`)")
     return require_unit(name, si, where, field)
@@ -259,7 +258,7 @@ def convert_to_si(values: Floats, unit: Unit) -> Floats:
 
     A factor below 1 is a division by a whole number: 12.3456 mm becomes the float nearest to 0.0123456 m.
 
-    >>> convert_to_si(np.array([12.3456]), UNITS["mm"]).tolist()
+    >>> convert_to_si(np.array([12.3456]), require_unit("mm", "m", "", "")).tolist()
     [0.0123456]
     """
     is_part = unit.factor < 1 and unit.factor.numerator == 1

@@ -19,7 +19,7 @@ from fdi.trace.trace import Floats
 from plant.errors import InputError
 from plant.parameters import load_nominal_values
 from plant.signals import EHA, Signal, Signals
-from plant.units import UNITS, Unit, find_unit
+from plant.units import UNITS, Unit, find_unit, fit_unit
 
 # Words of a column's name, in English, German, French, Spanish and Italian, and how much each says for a signal: of a
 # role, or of an output with that SI unit. Name and symbol of the signal itself say most.
@@ -89,12 +89,11 @@ class Columns(NamedTuple):
     def has_raw_unit(self, name: str, si: str) -> bool:
         """Whether the recording names a unit that scale and offset must convert to the quantity with this SI unit."""
         said, unit = self.units[name], find_unit(self.units[name])
-        return bool(said) and (unit is None or (unit.si != si and said in OTHER_UNITS))
+        return bool(said) and not fit_unit(said, si) and (unit is None or said in OTHER_UNITS)
 
     def measures(self, name: str, si: str) -> bool:
         """Whether the unit of a column is one of the quantity with this SI unit."""
-        unit = find_unit(self.units[name])
-        return unit is not None and unit.si == si
+        return fit_unit(self.units[name], si) is not None
 
 
 class GuessedMap(NamedTuple):
@@ -275,10 +274,10 @@ def _list_words(signal: Signal, signals: Signals) -> list[tuple[str, float]]:
 def _rate_column(signal: Signal, signals: Signals, column: str, columns: Columns) -> Guess | None:
     """How well a column fits a signal by name, unit and range; None if its name or its unit excludes it."""
     said, si = columns.units[column], signal.unit
-    unit = None if columns.has_raw_unit(column, si) else find_unit(said)
-    if unit is not None and unit.si != si:
+    unit = fit_unit(said, si)
+    if unit is None and said and not columns.has_raw_unit(column, si):
         return None
-    guess = Guess(column, unit or find_unit(si) or Unit(si, si, Fraction(1)))
+    guess = Guess(column, unit or Unit(si, si, Fraction(1)))
     for words, worth in _list_words(signal, signals):
         if word := _has_word(column, words):
             guess.note(worth, f"its name has {word!r}")
@@ -345,8 +344,7 @@ def _guess_by_motion(found: dict[str, Guess], columns: Columns, signals: Signals
         a, b = b, a
     for signal, column, other, order in ((first, a, b, "first"), (controlled, b, a, "later")):
         unit = next((guess.unit for guess in known.values() if guess.unit.si == signal.unit),
-                    UNITS["mm"] if signal.unit == "m" else
-                    find_unit(signal.unit) or Unit(signal.unit, signal.unit, Fraction(1)))
+                    UNITS["mm"] if signal.unit == "m" else Unit(signal.unit, signal.unit, Fraction(1)))
         found.setdefault(signal.name, Guess(column, unit, 1.5, [
             f"no name says so; correlation {r:.3f} {'of drive and speed ' if is_open else ''}with {other}"
             + ("" if known else f", and it comes {order}")]))

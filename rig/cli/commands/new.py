@@ -14,11 +14,12 @@ from fdi.report.report import Line, Report, Section
 from plant.effects import load_effects
 from plant.errors import InputError
 from plant.faults import EXAMPLE, WORD
+from plant.model import load_model
 from plant.plants import load_plant
 from plant.tables import read_file
 from rig.benches.bench import decode_device_text
 from rig.benches.bench_file import load_bench
-from rig.benches.guess import UNSURE, guess_can, guess_canopen
+from rig.benches.guess import UNSURE, Wanted, guess_can, guess_canopen
 from rig.cli.answer import give_answer
 from rig.sequences import load_sequence
 
@@ -46,8 +47,8 @@ def run_command(args: argparse.Namespace) -> int:
 def write_example(path: Path, args: argparse.Namespace) -> str:
     """The text of a file of the kinds that need no device: a shipped example, with the name of the file in it."""
     kind = args.kind
-    if args.eds or args.dbc or args.node:
-        raise InputError(f"rig new {kind}", "", "no device: --eds, --dbc and --node are of a bench")
+    if args.eds or args.dbc or args.node or args.model:
+        raise InputError(f"rig new {kind}", "", "no device: --eds, --dbc, --node and --model are of a bench")
     if kind in ("fault", "effect") and not WORD.fullmatch(path.stem):
         raise InputError("NAME", path.stem, f"small letters, digits and _ : the name is also that of the {kind}")
     if kind == "fault":
@@ -64,8 +65,19 @@ def write_bench(path: Path, args: argparse.Namespace) -> str:
     if args.node is not None and not (args.eds and args.node < 128):
         raise InputError("--node", str(args.node), "1 to 127, together with --eds")
     source = args.eds or args.dbc
-    text, name = decode_device_text(read_file(source)), Path(os.path.relpath(source, path.parent)).as_posix()
-    return guess_can(path.stem, name, text) if args.dbc else guess_canopen(path.stem, name, text, args.node)
+    text, name = decode_device_text(read_file(source)), _name_from(path, source)
+    wanted = Wanted()
+    if args.model:
+        kind = load_model(args.model).kind
+        wanted = Wanted(_name_from(path, args.model) if Path(args.model).is_file() else kind.key, kind.signals)
+    if args.dbc:
+        return guess_can(path.stem, name, text, wanted)
+    return guess_canopen(path.stem, name, text, args.node, wanted)
+
+
+def _name_from(path: Path, file: str | Path) -> str:
+    """A file as one beside `path` names it."""
+    return Path(os.path.relpath(file, path.parent)).as_posix()
 
 
 def build_new_report(path: Path, text: str, problem: str) -> Report:

@@ -1,5 +1,6 @@
 """`rig check --bench`, `rig new bench`, `rig doctor --bench` and docs/bench.md."""
 
+import math
 import re
 import shutil
 import threading
@@ -21,6 +22,7 @@ from rig.benches.guess import UNSURE
 from rig.network.bus import Link, open_can
 from rig.network.frame import Frame, WallClock
 
+PLANT = ROOT / "tests" / "support" / "trim_jack.py"
 PAGE = (ROOT / "docs" / "bench.md").read_text()
 DRIVE, ECU = ROOT / "examples" / "cia402_drive", ROOT / "examples" / "can_ecu"
 SHEETS = {"drive": DRIVE / "drive.eds", "ecu": ECU / "ecu.dbc", "eha": ROOT / "dbc" / "node2.eds",
@@ -74,6 +76,32 @@ def test_the_guess_of_an_example_is_the_example(tmp_path: Path) -> None:
         assert rig("new", "bench", name, option, sheet, *words, "--out", path).status == 0
         guessed, own = load_bench(str(path)), load_bench(str(sheet.parent / "bench.toml"))
         assert (repr(guessed.frames), guessed.phases, guessed.ready) == (repr(own.frames), own.phases, own.ready)
+
+
+TRIM_DBC = """VERSION ""
+BU_: ECU RIG
+BO_ 256 Command: 4 RIG
+ SG_ TrimCmd : 0|16@1- (0.01,0) [-100|100] "deg" ECU
+BO_ 257 Feedback: 8 RIG
+ SG_ TrimAngle : 0|32@1- (1,0) [0|0] "urad" ECU
+ SG_ ShaftRate : 32|32@1- (0.01,0) [0|0] "1/min" ECU
+BO_ 512 Drive: 4 ECU
+ SG_ TorqueRef : 0|32@1- (1,0) [0|0] "mNm" RIG
+"""
+
+
+def test_a_bench_of_an_own_plant_is_guessed_from_its_signals(tmp_path: Path) -> None:
+    """A plant may declare units of its own, such as deg, and the device others of the same quantity."""
+    (tmp_path / "trim.dbc").write_text(TRIM_DBC)
+    (tmp_path / "jack.py").write_text(PLANT.read_text().replace('"tc", "rad"', '"tc", "deg"'))
+    made = rig("new", "bench", "trim", "--dbc", tmp_path / "trim.dbc", "--model", tmp_path / "jack.py",
+               "--out", tmp_path / "trim.toml")
+    assert made.status == 0 and "COMPLETE" in made.out
+    bench = load_bench(str(tmp_path / "trim.toml"))
+    counts = {each.name: each.count for spec in bench.frames.frames for each in spec.fields}
+    assert {name: float(count) for name, count in counts.items()} == pytest.approx({
+        "trim_cmd": 0.01, "trim_angle": 1e-6, "shaft_rate": 0.01 * math.pi / 30.0, "torque_ref": 1e-3})
+    assert "expected no device" in refuse("new", "plant", "x", "--model", "ema")
 
 
 def test_a_sheet_without_the_signals_is_completed_by_the_user(tmp_path: Path) -> None:
