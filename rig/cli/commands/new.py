@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fdi.diagnosis.faults import load_faults
-from fdi.output import require_writable, write_text
+from fdi.output import require_new, require_writable, write_text
 from fdi.report.report import Line, Report, Section
 from plant.effects import load_effects
 from plant.errors import InputError
@@ -30,9 +30,7 @@ def run_command(args: argparse.Namespace) -> int:
     path = Path(args.out or f"{args.name.removesuffix(suffix)}{suffix}")
     if path.suffix != suffix:
         raise InputError("--out", str(path), f"FILE{suffix}")
-    if path.exists() and not args.force:
-        raise InputError("--out", str(path), "a file that does not exist yet, or --force")
-    require_writable(path, "--out")
+    require_new(require_writable(path, "--out"), is_forced=args.force)
     text = write(path, args)
     write_text(path, text)
     try:
@@ -83,9 +81,8 @@ def _name_from(path: Path, file: str | Path) -> str:
 def build_new_report(path: Path, text: str, problem: str) -> Report:
     """Report on a file that was written: what is unsure in it, and what is missing."""
     marked = [line.strip() for line in text.splitlines() if UNSURE in line]
-    sentence = f"{path} can be used." if not problem else f"{path} is to be completed: {problem}"
-    if marked and not problem:
-        sentence = f"{path} can be used; check what it marks as unsure."
+    unsure = "; check what it marks as unsure" if marked else ""
+    sentence = f"{path} is to be completed: {problem}" if problem else f"{path} can be used{unsure}."
     return Report("new", str(path), "INCOMPLETE" if problem else "COMPLETE", "doubtful" if problem else "good",
                   sentence, sections=[Section("Unsure", [Line("unsure", line) for line in marked])],
                   data={"verdict": "INCOMPLETE" if problem else "COMPLETE", "file": str(path), "problem": problem,
