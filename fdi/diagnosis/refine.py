@@ -263,11 +263,10 @@ def list_coarse_starts(faults: Sequence[Fault]) -> list[Sizes]:
     if len(faults) <= 2:
         return list(product(*ladders))
     healthy = tuple(fault.healthy for fault in faults)
-    found = [healthy, *((*healthy[:i], size, *healthy[i + 1:]) for i, ladder in enumerate(ladders) for size in ladder)]
-    for i, j in combinations(range(len(faults)), 2):
-        found += [(*healthy[:i], a, *healthy[i + 1:j], b, *healthy[j + 1:])
-                  for a, b in product(_pick_two(ladders[i]), _pick_two(ladders[j]))]
-    return found
+    return [healthy, *((*healthy[:i], size, *healthy[i + 1:]) for i, ladder in enumerate(ladders) for size in ladder),
+            *((*healthy[:i], a, *healthy[i + 1:j], b, *healthy[j + 1:])
+              for i, j in combinations(range(len(faults)), 2)
+              for a, b in product(_pick_two(ladders[i]), _pick_two(ladders[j])))]
 
 
 def _list_ladder(fault: Fault) -> list[float]:

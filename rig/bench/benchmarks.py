@@ -398,16 +398,14 @@ def parse_histogram(text: str) -> Floats:
     return np.repeat(latencies, counts) * 1e-6
 
 
+_OF_PLANT = {name: f"rig with its plant ({name} controller)" for name in MAPPED}
 _NAMES = {
     "lateness": {CYCLICTEST: "cyclictest", COMPILED: "rig, compiled cycle", IN_C: "rig, compiled cycle (C answers)",
-                 PYTHON: "rig, cycle in Python"},
+                 PYTHON: "rig, cycle in Python", **_OF_PLANT},
     "feedback_response": {COMPILED: "plant emulator, compiled", IN_C: "responder in C",
                           PYTHON: "plant emulator in Python"},
-    "execution": {COMPILED: "rig, compiled cycle", IN_C: "rig, compiled cycle (C answers)"},
+    "execution": {COMPILED: "rig, compiled cycle", IN_C: "rig, compiled cycle (C answers)", **_OF_PLANT},
 }
-for _name in MAPPED:
-    for _quantity in ("lateness", "execution"):
-        _NAMES[_quantity][_name] = f"rig with its plant ({_name} controller)"
 _NAMES["valve_response"] = _NAMES["feedback_response"]
 _TITLES = {
     "lateness": ("SYNC lateness", "How long after its due time SYNC was sent; for cyclictest, how late it woke up. The "

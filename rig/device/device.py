@@ -129,18 +129,13 @@ class Device:
     def _gate(self) -> None:
         """Fill the table of frames that the present state lets in."""
         state = self.nmt.state
-        self._handlers = {}
-        if state is NmtState.INITIALISING:
-            return
-        self._handlers[0x000] = self.nmt.receive
-        self._handlers.update(dict.fromkeys(self.consumer.cob_ids, self.consumer.receive))
+        self._handlers = {} if state is NmtState.INITIALISING else {
+            0x000: self.nmt.receive, **dict.fromkeys(self.consumer.cob_ids, self.consumer.receive)}
         if state in _COMMUNICATING:
             self._handlers[0x600 + self.node_id] = self.sdo.receive
         if state is NmtState.OPERATIONAL:
-            self._handlers[self.od.read_number(0x1005, 0, 0x80) & 0x7FF] = self.sync.receive
-            for pdo in self.pdo.rpdos.values():
-                if pdo.cob_id is not None:
-                    self._handlers[pdo.cob_id] = pdo.receive
+            self._handlers |= {self.od.read_number(0x1005, 0, 0x80) & 0x7FF: self.sync.receive, **{
+                pdo.cob_id: pdo.receive for pdo in self.pdo.rpdos.values() if pdo.cob_id is not None}}
 
     def _cycle(self) -> None:
         for rpdo in self.pdo.latched:

@@ -145,8 +145,8 @@ def _make_command(job: Job, node: Role) -> list[str]:
     if node == PLANT and job.model.kind.foreign is not None:
         words += ["--model", job.model.plant]
     if node == CONTROLLER:  # all else about the model comes by SDO
-        for parameter, value in find_firmware_parameters(job.model).items():
-            words += ["--set", f"{parameter}={value!r}"]
+        words += [word for parameter, value in find_firmware_parameters(job.model).items()
+                  for word in ("--set", f"{parameter}={value!r}")]
     return make_node_command(node, job.bus, *words, is_in_c=node == CONTROLLER and job.controller == "c")
 
 

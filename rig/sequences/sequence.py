@@ -340,9 +340,9 @@ def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Seq
             return replace(part, function=load_function(modules[file], name, given, part.arguments))
         return part
 
-    filled: dict[str, Any] = {}
-    for key in (*PHASES, "checks", "steps"):
-        filled[key] = tuple(fill_in(part, key, place.at(key, i)) for i, part in enumerate(getattr(sequence, key)))
+    filled: dict[str, Any] = {
+        key: tuple(fill_in(part, key, place.at(key, i)) for i, part in enumerate(getattr(sequence, key)))
+        for key in (*PHASES, "checks", "steps")}
     return replace(sequence, files=embedded, **filled)
 
 

@@ -77,10 +77,9 @@ def compute_expanded_uncertainty(measure: Callable[[Columns], float], value: flo
     wrong = [name for name in names if name in metrology.calibration or metrology.counts.get(name)]
     number = max(_LEAST_DRAWS, min(DRAWS, _MOST_SAMPLES // len(trace.t))) if wrong else 0
     errors = {name: _draw_errors(name, metrology, number, random) for name in wrong}
-    again = np.empty(number)
-    for row in range(number):
-        again[row] = measure(trace._replace(**{
-            name: _read_again(getattr(trace, name), errors[name][row], random) for name in wrong}))
+    again = np.array([measure(trace._replace(**{
+        name: _read_again(getattr(trace, name), errors[name][row], random) for name in wrong}))
+        for row in range(number)])
     share = float(np.isnan(again).mean()) if number else float(isnan(value))
     if isnan(value):
         return nan if share > 0.95 else inf

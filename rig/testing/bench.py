@@ -198,8 +198,7 @@ def build_sequence(sequence: str | None, command: Command | None, rate: float = 
             raise InputError("sequence", sequence, "either a sequence or a command")
         table, files = _make_table(command, rate, find_plant(plant).signals.command.name)
         name = "command.toml"
-    for key, entries in added.items():
-        table[key] = [*table.get(key, []), *entries]
+    table |= {key: [*table.get(key, []), *entries] for key, entries in added.items()}
 
     def read_file(file: str) -> bytes:
         if file not in files:

@@ -90,11 +90,9 @@ def _open_with(path: Path, kind: str, reader: Callable[[Path], Any]) -> Any:
 def _open_mdf(path: Path) -> Measurement:
     """An MDF file of version 3 or 4; each channel group has its own times."""
     file = _open_with(path, "an MDF file", _import_reader("asammdf", path).MDF)
-    places: dict[str, tuple[str, int, int]] = {}  # name, group, index
-    for name, where in file.channels_db.items():
-        for group, index in where:
-            if file.masters_db.get(group) != index:
-                places[name if len(where) == 1 else f"{name} (group {group})"] = name, group, index
+    places: dict[str, tuple[str, int, int]] = {  # name, group, index
+        name if len(where) == 1 else f"{name} (group {group})": (name, group, index)
+        for name, where in file.channels_db.items() for group, index in where if file.masters_db.get(group) != index}
     if not places:
         raise InputError(path, "", "an MDF file with at least one channel")
 
