@@ -982,8 +982,8 @@ def _estimate_spool(runs: Sequence[Trace], model: Model) -> dict[str, float]:
     if gain is None or gain[0] <= 0.0:
         return found
     ratio = model["feedback_spring.stiffness"] / model["torque_motor.gain"] * gain[0]  # KSF/GM of the model over own
-    found["feedback_spring.stiffness"] = model["feedback_spring.stiffness"] / np.sqrt(ratio)
-    found["torque_motor.gain"] = model["torque_motor.gain"] * np.sqrt(ratio)
+    found |= {"feedback_spring.stiffness": model["feedback_spring.stiffness"] / np.sqrt(ratio),
+              "torque_motor.gain": model["torque_motor.gain"] * np.sqrt(ratio)}
     if float(np.nanmax(np.abs(every))) > 0.98 * model["spool.travel"] or _dwells(every, limit):
         found["spool.travel"] = limit
     speeds = [np.abs(differentiate(_fill(x), 5, 1)) / t.period for t, x in zip(runs, spool, strict=True)]

@@ -260,12 +260,12 @@ def _collect_facts(traces: Sequence[Trace]) -> dict[str, Facts]:
                               for trace in traces]
                        for name, start in (("sequence file", "sequence/"), ("effect files", "effects/"),
                                            ("model file", "model.toml"))}
-    facts["timing"] |= {f"{words}, p50 / p99 / max": [_format_percentiles(getattr(trace.timing, field))
-                                                      for trace in traces]
-                        for words, field in (("SYNC lateness", "lateness"), ("controller's response", "response"),
-                                             ("bench's own work", "work"))}
-    facts["timing"]["overruns"] = [f"{int(trace.timing.overrun.sum())} of {len(trace.timing.t)}"
-                                   if len(trace.timing.t) else "" for trace in traces]
+    measured = {"SYNC lateness": "lateness", "controller's response": "response", "bench's own work": "work"}
+    facts["timing"] |= {
+        **{f"{words}, p50 / p99 / max": [_format_percentiles(getattr(trace.timing, field)) for trace in traces]
+           for words, field in measured.items()},
+        "overruns": [f"{int(trace.timing.overrun.sum())} of {len(trace.timing.t)}" if len(trace.timing.t) else ""
+                     for trace in traces]}
     return facts
 
 

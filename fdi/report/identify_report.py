@@ -180,7 +180,7 @@ def draw_estimates(estimates: Sequence[Estimate]) -> str:
              axes(xscale="log", xlabel="value over that of the data sheet (green line)")]
     for row, e in enumerate(shown):
         colour = AFTER if e.is_identifiable else ORANGE
-        panel += [line([low / e.before, high / e.before], [row, row], paint, width=width, solid_capstyle="butt")
-                  for low, high, paint, width in ((e.least, e.most, BEFORE, 7.0), (e.low, e.high, colour, 3.0))]
-        panel.append(dot(e.value / e.before, row, colour, ms=5.0))
+        panel += [*(line([low / e.before, high / e.before], [row, row], paint, width=width, solid_capstyle="butt")
+                    for low, high, paint, width in ((e.least, e.most, BEFORE, 7.0), (e.low, e.high, colour, 3.0))),
+                  dot(e.value / e.before, row, colour, ms=5.0)]
     return draw_panels("estimates", [[panel]], 0.9 + 0.3 * len(shown))

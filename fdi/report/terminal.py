@@ -38,12 +38,9 @@ def print_report(report: Report, console: Console) -> None:
             else:
                 _flush_lines(labels, console)
                 _print_item(item, console)
-    labels += [Line("note", note) for note in report.notes]
-    labels += [Line(label, path) for label, path in report.files]
-    if report.next_command:
-        labels.append(Line("next", report.next_command, "neutral"))
-    if report.conclusion:
-        labels.append(Line("verdict", report.conclusion, report.mood))
+    labels += [*(Line("note", note) for note in report.notes), *(Line(label, path) for label, path in report.files),
+               *([Line("next", report.next_command, "neutral")] if report.next_command else []),
+               *([Line("verdict", report.conclusion, report.mood)] if report.conclusion else [])]
     _flush_lines(labels, console, whole={"next", *(label for label, _ in report.files)})
 
 

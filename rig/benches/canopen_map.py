@@ -268,10 +268,10 @@ def list_values(dictionary: Any) -> tuple[tuple[int, int, bytes], ...]:
         count = mapping.pop(0, None)
         if count is not None and mapping:
             ordered.append((parameter + MAPPING, 0, bytes(len(count))))
-        ordered += [(parameter + MAPPING, sub, data) for sub, data in mapping.items()]
-        ordered += [(parameter + MAPPING, 0, count)] if count is not None else []
-        ordered += [(parameter, sub, data) for sub, data in own.items()]
-        ordered += [(parameter, 1, cob_id)] if cob_id is not None else []
+        ordered += [*((parameter + MAPPING, sub, data) for sub, data in mapping.items()),
+                    *([(parameter + MAPPING, 0, count)] if count is not None else []),
+                    *((parameter, sub, data) for sub, data in own.items()),
+                    *([(parameter, 1, cob_id)] if cob_id is not None else [])]
     return tuple(ordered)
 
 

@@ -435,12 +435,12 @@ def judge_by_fdi(trace: Trace, model: Model, faults: Sequence[Fault] = FAULTS) -
     row: dict[str, Any] = {"verdict": found.verdict, "ruling": found.ruling or ""}
     for fault in faults:
         size = found.sizes[fault.name]
-        row[f"level_{fault.name}"] = _format_level(found.levels[fault.name])
-        row |= {fault.key: size.value, f"{fault.key}_low": size.low, f"{fault.key}_high": size.high}
+        row |= {f"level_{fault.name}": _format_level(found.levels[fault.name]), fault.key: size.value,
+                f"{fault.key}_low": size.low, f"{fault.key}_high": size.high}
     if found.band_verdict is not None:
         levels, by = found.band_verdict.levels, found.band_verdict.severity
-        row |= {f"band_{fault.name}": _format_level(levels.get(fault.name)) for fault in faults}
-        row |= {f"severity_{fault.name}": by[fault.name] for fault in faults if fault.name in by}
+        row |= {**{f"band_{fault.name}": _format_level(levels.get(fault.name)) for fault in faults},
+                **{f"severity_{fault.name}": by[fault.name] for fault in faults if fault.name in by}}
     for grid in found.grids[:1]:
         row |= {f"grid_{fault.key}": grid.find_size(fault, grid.merged) for fault in grid.faults}
     if found.groups:

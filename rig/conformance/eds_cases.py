@@ -80,9 +80,10 @@ def check_lists(t: Target) -> str:
         problems += [f"0x{index:04X} in {name}" for index in entries if index not in permitted]
         listed += entries
     described = {int(section, 16) for section in list_described(t)}
-    problems += [f"0x{index:04X} is listed twice" for index in sorted(set(listed)) if listed.count(index) > 1]
-    problems += [f"0x{index:04X} is listed and not described" for index in sorted(set(listed) - described)]
-    problems += [f"0x{index:04X} is described and not listed" for index in sorted(described - set(listed))]
+    problems += [
+        *(f"0x{index:04X} is listed twice" for index in sorted(set(listed)) if listed.count(index) > 1),
+        *(f"0x{index:04X} is listed and not described" for index in sorted(set(listed) - described)),
+        *(f"0x{index:04X} is described and not listed" for index in sorted(described - set(listed)))]
     require(not problems, join_labels(problems))
     return f"{len(listed)} objects in the lists"
 

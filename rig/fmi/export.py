@@ -96,9 +96,9 @@ def export_fmu(model: Model, out: Path, version: str = "2", seed: int = 0) -> li
              for machine, library in _build_libraries(model, run, tables, sources).items()}
     platforms = [name.split("/")[1] for name in files]
     describe = {"2": _describe_fmi2, "3": _describe_fmi3}[version]
-    files["modelDescription.xml"] = describe(model, variables, identifier, token, seed).encode()
-    files["documentation/index.html"] = _write_page(model, variables).encode()
-    files["resources/model.toml"] = model.to_toml().encode()
+    files |= {"modelDescription.xml": describe(model, variables, identifier, token, seed).encode(),
+              "documentation/index.html": _write_page(model, variables).encode(),
+              "resources/model.toml": model.to_toml().encode()}
     with write_whole(out) as unfinished, zipfile.ZipFile(unfinished, "w") as archive:
         for name in sorted(files):
             entry = zipfile.ZipInfo(name)  # without a time: the same model gives the same file

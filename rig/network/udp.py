@@ -80,9 +80,8 @@ def attach_filter(rx: socket.socket, own_port: int, cob_ids: Collection[int], le
                     (load, 0, 0, 8 + 35 + at), (add_copy, 0, 0, 0), (always, 0, 0, len(branches))]
             taken = (equal, 0, len(body), first) if at else (at_least, len(body), 0, first)
             branches = [(load_byte, 0, 0, 8 + 35), taken, *body, *branches]
-        program += branches
-        program += [step for cob_id in cob_ids for step in ((equal, 0, 1, cob_id & ~FD), (give, 0, 0, listed))]
-        program.append((give, 0, 0, others))
+        program += [*branches, *(step for cob_id in cob_ids for step in (
+            (equal, 0, 1, cob_id & ~FD), (give, 0, 0, listed))), (give, 0, 0, others)]
     else:
         program.append((give, 0, 0, accept))
     steps = bytearray(b"".join(struct.pack("=HBBI", *step) for step in program))

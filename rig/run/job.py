@@ -376,13 +376,13 @@ class Differences(NamedTuple):
 
     def describe(self) -> str:
         """All differences in one line; "nothing" if there are none."""
-        parts = [f"model {self.model}"] if self.model else []
-        parts += [_describe_parameter(name, value, self.plant) for name, value in self.parameters.items()]
-        parts += [f"effect {name}" for name in self.effects if not any(key.startswith(f"{name}.")
-                                                                       for key in self.parameters)]
-        parts += [f"effects of {name}" for name in self.effect_files]
-        parts += [f"fault {text}" for text in self.faults]
-        return "; ".join(parts) or "nothing"
+        return "; ".join([
+            *([f"model {self.model}"] if self.model else []),
+            *(_describe_parameter(name, value, self.plant) for name, value in self.parameters.items()),
+            *(f"effect {name}" for name in self.effects if not any(key.startswith(f"{name}.")
+                                                                   for key in self.parameters)),
+            *(f"effects of {name}" for name in self.effect_files), *(f"fault {text}" for text in self.faults),
+        ]) or "nothing"
 
     def to_json(self) -> dict[str, Any]:
         """The entry `differences` of verdict.json."""

@@ -217,8 +217,8 @@ def find_capabilities(model: Model) -> dict[str, float]:
     values, limit = model.values, model.kind.signals.controlled.limit
     found = {limit: values[limit]} if limit else {}
     if {"valve.flow_gain", "spool.travel"} <= values.keys():
-        found["no-load speed"] = model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"]
-        found["stall force"] = model["supply.pressure"] * model["jack.area"]
+        found |= {"no-load speed": model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"],
+                  "stall force": model["supply.pressure"] * model["jack.area"]}
     return found
 
 
@@ -303,9 +303,9 @@ def describe_size(fault: Fault, base: Mapping[str, float], kind: Plant) -> str:
         case Reset():
             parts = [fault.reset]
     if isinstance(fault, Frames):
-        parts.append("every frame" if fault.every == 1 else f"one of {fault.every} frames")
-        parts += [f"with probability {fault.probability:g}"] if fault.probability < 1.0 else []
-        parts += [f"at most {fault.count}"] if fault.count is not None else []
+        parts += ["every frame" if fault.every == 1 else f"one of {fault.every} frames",
+                  *([f"with probability {fault.probability:g}"] if fault.probability < 1.0 else []),
+                  *([f"at most {fault.count}"] if fault.count is not None else [])]
     ramp = getattr(fault, "ramp", 0.0)
     return ", ".join(parts) + (f" within {format_amount(ramp, 's')}" if ramp else "")
 

@@ -110,9 +110,8 @@ class BenchRun:
         lines = [f"{title}: {len(failed)} of {len(chosen)} checks failed" if failed else
                  f"{title}: {self.verdict}, {self.why}", *map(describe_failure, failed)]
         close_ups = [picture for check in failed[:3] if (picture := self.write_close_up(check.name)) is not None]
-        lines += [f"picture: {picture}" for picture in close_ups or [self.write_picture()]]
-        lines.append(f"page: {self.write_page()}")
-        raise CheckFailedError("\n".join(lines))
+        pictures = [f"picture: {picture}" for picture in close_ups or [self.write_picture()]]
+        raise CheckFailedError("\n".join([*lines, *pictures, f"page: {self.write_page()}"]))
 
 
 def describe_failure(check: CheckResult) -> str:
