@@ -205,12 +205,12 @@ def describe_block(c: Comparison, name: str) -> str:
 
 def _describe_controller(c: Comparison) -> str:
     d, a = c.trace.declared, c.answer
-    path = f"{d.command.symbol} and {d.controlled.symbol} to {d.drive.symbol}"
+    late = ((d.command.symbol, a.com_lag), (d.controlled.symbol, a.xj_lag))
+    lags = [f"{symbol} {count_nouns(lag, 'cycle')} earlier" for symbol, lag in late if lag > 0]
+    path = f"{d.command.symbol} and {d.controlled.symbol} to {d.drive.symbol}" + (
+        f" (from {' and '.join(lags)})" if lags else "")
     if not c.model.kind.controller:
         return f"{path}: the firmware is not known"
-    late = ((d.command.symbol, a.com_lag), (d.controlled.symbol, a.xj_lag))
-    if lags := [f"{symbol} {count_nouns(lag, 'cycle')} earlier" for symbol, lag in late if lag > 0]:
-        path += f" (from {' and '.join(lags)})"
     if not math.isfinite(a.error):
         remembers = has_controller_memory(c.model) and not c.trace.usable.all()
         return f"{path}: its law {'remembers what is not in the log' if remembers else 'needs unknown readings'}"

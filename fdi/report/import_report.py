@@ -41,9 +41,9 @@ def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path,
     chosen = guessed.chosen
     signals = guessed.signals
     missing = [s.symbol for s in list_recorded(signals) if s.name in signals.required and s.name not in chosen]
-    notes = [f"no column was found for {', '.join(missing)}: complete the map by hand"] if missing else []
-    if guessed.left:
-        notes.append(f"columns left out: {list_first([f'{name} ({why})' for name, why in guessed.left.items()], MOST)}")
+    left = [f"{name} ({why})" for name, why in guessed.left.items()]
+    notes = [*([f"no column was found for {', '.join(missing)}: complete the map by hand"] if missing else []),
+             *([f"columns left out: {list_first(left, MOST)}"] if left else [])]
     table = tabulate(
         chosen, (Column("signal"), lambda name: name if name == "time" else signals.find(name).symbol),
         (Column("source"), lambda name: chosen[name][0]),

@@ -118,14 +118,13 @@ def _describe_arrival(remaining: Remaining, trend: Trend, unit: UnitTrend) -> st
 def _describe_trend(trend: Trend, unit: UnitTrend) -> list[str]:
     """What the traces say about one fault, a sentence each, the most important first."""
     points = unit.gathered.points[-len(trend.t):]
-    sentences = [_describe_growth(trend, unit),
-                 *(_describe_break(b, points[b.row], trend.fault.unit, unit) for b in trend.breaks)]
-    if len(unit.gathered.points) > TREND_MOST_TRACES:
-        sentences.append(f"only the latest {TREND_MOST_TRACES} traces are used")
-    if trend.verdict == "TREND" and trend.laws:
-        ranked = sorted(trend.laws.items(), key=lambda item: -item[1])
-        sentences.append("growth law: " + ", ".join(f"{law} {100 * p:.0f} %" for law, p in ranked if p >= 0.005))
-    return sentences
+    is_cut = len(unit.gathered.points) > TREND_MOST_TRACES
+    ranked = sorted(trend.laws.items(), key=lambda item: -item[1]) if trend.verdict == "TREND" else []
+    laws = ", ".join(f"{law} {100 * p:.0f} %" for law, p in ranked if p >= 0.005)
+    return [_describe_growth(trend, unit),
+            *(_describe_break(b, points[b.row], trend.fault.unit, unit) for b in trend.breaks),
+            *([f"only the latest {TREND_MOST_TRACES} traces are used"] if is_cut else []),
+            *([f"growth law: {laws}"] if laws else [])]
 
 
 def _describe_growth(trend: Trend, unit: UnitTrend) -> str:

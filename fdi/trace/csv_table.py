@@ -171,10 +171,7 @@ def combine_columns(sources: Mapping[str, Floats], table: Table) -> dict[str, Fl
     def shift_term(term: Term) -> Floats:
         return np.concatenate([(term.factor * sources[term.source])[term.later:], np.full(term.later, np.nan)])
 
-    columns = {name: sum(map(shift_term, terms), start=np.zeros(1))[table.skip:]
-               for name, terms in table.columns.items()}
-    if table.derive:
-        columns |= {name: values[table.skip:] for name, values in table.derive(sources).items()}
-    if table.load:
-        columns["load"] = table.load(columns)
-    return columns
+    summed = {name: sum(map(shift_term, terms), start=np.zeros(1)) for name, terms in table.columns.items()}
+    whole = summed | (table.derive(sources) if table.derive else {})
+    columns = {name: values[table.skip:] for name, values in whole.items()}
+    return columns | ({"load": table.load(columns)} if table.load else {})

@@ -174,11 +174,9 @@ def list_reachable(state: int, wanted: frozenset[int], *, resets: bool) -> froze
         wanted: what the control words since then have asked for.
         resets: whether the reset bit rose among them.
     """
-    asked = set(wanted) | ({int(State.FAULT)} if resets else set())
-    if State.QUICK_STOP in wanted:
-        asked.add(State.OFF)  # 7 and 10 are by Quick stop as well
-    if State.ACTIVE in wanted:
-        asked.add(State.ON)  # Enable operation may mean 3 and 4
+    # 7 and 10 are by Quick stop as well; Enable operation may mean 3 and 4
+    asked = {*wanted, *([State.FAULT] if resets else []), *([State.OFF] if State.QUICK_STOP in wanted else []),
+             *([State.ON] if State.ACTIVE in wanted else [])}
     found, rest = {state}, [state]
     while rest:
         before = rest.pop()

@@ -141,12 +141,10 @@ def make_node_command(node: Role, bus: str, *words: str, is_in_c: bool = False) 
 
 def _make_command(job: Job, node: Role) -> list[str]:
     """The command that runs a node of this job."""
-    words = [word for path in job.effects for word in ("--effects", str(path))]
-    if node == PLANT and job.model.kind.foreign is not None:
-        words += ["--model", job.model.plant]
-    if node == CONTROLLER:  # all else about the model comes by SDO
-        words += [word for parameter, value in find_firmware_parameters(job.model).items()
-                  for word in ("--set", f"{parameter}={value!r}")]
+    given = find_firmware_parameters(job.model) if node == CONTROLLER else {}  # all else about the model comes by SDO
+    words = [*(word for path in job.effects for word in ("--effects", str(path))),
+             *(["--model", job.model.plant] if node == PLANT and job.model.kind.foreign is not None else []),
+             *(word for parameter, value in given.items() for word in ("--set", f"{parameter}={value!r}"))]
     return make_node_command(node, job.bus, *words, is_in_c=node == CONTROLLER and job.controller == "c")
 
 

@@ -501,18 +501,14 @@ def _find_sensor(signal: SignalMap, samples: Samples, rows: Floats, how: str, pe
     sensor = replace(signal.sensor, sample_period=0.0)
     if sensor.moving_mean > 1.0:
         sensor = replace(sensor, sample_period=round(samples.period, 9))
-    parts = [how]
-    if signal.delay:
-        parts.append(f"moved {1e3 * signal.delay:g} ms earlier")
-        if how.startswith(("as recorded", "every")) and "held" not in how:
-            rest = float(samples.t[0] - rows[0] + 0.5 * samples.period) % samples.period - 0.5 * samples.period
-            if abs(rest) > 0.01 * period:
-                sensor = replace(sensor, delay=-rest)
-    if signal.dead:
-        parts.append("dead spans left out")
-    if not sensor.is_ideal:
-        parts.append(f"the model gets {sensor.describe(period, unit)}")
-    return sensor, "; ".join(parts)
+    if signal.delay and how.startswith(("as recorded", "every")) and "held" not in how:
+        rest = float(samples.t[0] - rows[0] + 0.5 * samples.period) % samples.period - 0.5 * samples.period
+        if abs(rest) > 0.01 * period:
+            sensor = replace(sensor, delay=-rest)
+    return sensor, "; ".join(filter(None, (
+        how, f"moved {1e3 * signal.delay:g} ms earlier" if signal.delay else "",
+        "dead spans left out" if signal.dead else "",
+        "" if sensor.is_ideal else f"the model gets {sensor.describe(period, unit)}")))
 
 
 def _describe_unit(s: SourceTerm) -> str:
