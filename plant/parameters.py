@@ -221,8 +221,7 @@ def read_shipped_model(file: str, groups: Mapping[str, type[Any]]) -> dict[str, 
     Raises:
         InputError: an unknown group or field, or a value out of range.
     """
-    source = files("plant").joinpath("models", file)
-    tables = tomllib.loads(source.read_text(encoding="utf-8"))
+    tables = tomllib.loads(files("plant").joinpath("models", file).read_text(encoding="utf-8"))
     tables.pop("identify", None)  # which parameters rig identify fits
     return flatten_tables(f"plant/models/{file}", tables, groups)
 

@@ -202,11 +202,10 @@ def _measure_difference(signal: Signal, t: Floats, difference: Floats,
                         columns: tuple[Floats, Floats]) -> SignalDifference:
     known = np.flatnonzero(~np.isnan(difference))
     row = int(known[np.argmax(np.abs(difference[known]))])
-    is_equal = not difference[known].any()
     noise = [max(float(floor_from_data(column).value), signal.finest) for column in columns]
     calm = np.abs(difference[known]) <= NOISE_BAND_RATIO * math.hypot(*noise)
     return SignalDifference(signal, rms(difference), float(difference[row]), float(t[row]), (noise[0], noise[1]),
-                            len(known), float(calm.mean()), is_equal)
+                            len(known), float(calm.mean()), not difference[known].any())
 
 
 def find_offset(a: Trace, b: Trace) -> float:

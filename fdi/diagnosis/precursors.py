@@ -200,8 +200,7 @@ def compute_features(com: Floats, x: Floats, period: float, parts: Sequence[Sect
                 out.setdefault(word, []).append(values)
             ramps[float(np.sign(s.rate))].append(out["mean_ramp_error"][-1])
         elif s.kind == "dynamic":
-            error = com[rows] - x[:, rows]
-            out.setdefault("tracking_error", []).append(np.sqrt(np.nanmean(error**2, axis=1)))
+            out.setdefault("tracking_error", []).append(np.sqrt(np.nanmean((com[rows] - x[:, rows])**2, axis=1)))
     if ramps[1.0] and ramps[-1.0]:
         out["ramp_asymmetry"] = [(np.mean(ramps[1.0], axis=0) - np.mean(ramps[-1.0], axis=0)) / 2]
     order = {word: i for i, word in enumerate(MEANINGS)}

@@ -827,9 +827,8 @@ def _tell_nothing(model: Model, ranges: Sequence[Range], runs: Sequence[Trace], 
     estimates = tuple(Estimate(r.name, r.unit, model[r.name], r.low, r.high, r.centre, r.low, r.high, False, 1.0)
                       for r in ranges)
     errors, residuals = measure_errors(model, model, runs, sources, fitted, floor)
-    problem = make_problem(model, runs[:1], floor, 1)
-    free = list_unknowns(model, tuple(ranges))
-    advice = advise_experiments(model, free, problem, None, [r.name for r in ranges])
+    advice = advise_experiments(model, list_unknowns(model, tuple(ranges)), make_problem(model, runs[:1], floor, 1),
+                                None, [r.name for r in ranges])
     return Identification("CANNOT_TELL", reason, model, model, estimates, None, (), tuple(advice), errors, floor,
                           tuple(runs), residuals, tuple(sources), tuple(notes))
 

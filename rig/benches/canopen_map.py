@@ -217,8 +217,7 @@ def _map_pdo(name: str, dictionary: Any, pdo: Pdo, own: set[str], *, is_answer: 
             raise InputError(name, where, f"{key} with {size} bits in {pdo.name}, not {length}")
         if kind is Kind.FLOAT and length != size:
             kind = Kind.UNSIGNED
-        start = read_start(found)
-        slots.append(Slot(name=key if key in own else "", start=start,
+        slots.append(Slot(name=key if key in own else "", start=read_start(found),
                           bits=Field(name="", lowest=lowest, length=length, kind=kind)))
         lowest += length
     return DeviceFrame(

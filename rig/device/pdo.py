@@ -33,8 +33,8 @@ def read_mapping(od: Dictionary, index: int) -> tuple[list[tuple[int, int]], str
         key, bits = (word >> 16, word >> 8 & 0xFF), word & 0xFF
         entry = od.entries.get(key)
         if entry is None or not entry.mappable or not entry.code or struct.calcsize(entry.code) * 8 != bits:
-            field = f"{index:04X}sub{sub:X}"
-            raise InputError(od.path, field, f"a mappable object and its length, not 0x{word:08X}")
+            raise InputError(od.path, f"{index:04X}sub{sub:X}",
+                             f"a mappable object and its length, not 0x{word:08X}")
         keys.append(key)
         codes += entry.code
     packer = struct.Struct(codes)

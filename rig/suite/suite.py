@@ -370,11 +370,10 @@ def build_suite_report(suite: Suite, results: Sequence[CaseResult], seconds: flo
     """
     requirements = trace_requirements((result.judged for result in results), suite.requirements)
     verdict = find_verdict(results)
-    verdicts = [each.verdict for each in requirements]
     facts = [("cases", count_verdicts([result.verdict for result in results])),
              ("wall-clock time", f"{seconds:.1f} s, {processes} at a time"),
              *([("suite file", suite.source)] if suite.source else []),
-             *([("requirements", count_verdicts(verdicts))] if requirements else [])]
+             *([("requirements", count_verdicts([each.verdict for each in requirements]))] if requirements else [])]
     missing = [each.id for each in requirements if each.verdict == "NOT_COVERED"]
     return Report(
         command="run", title=suite.title, verdict=verdict, mood=MOODS[verdict], sentence=_describe(results),

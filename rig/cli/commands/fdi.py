@@ -29,9 +29,8 @@ def run_command(args: argparse.Namespace) -> int:
     with show_progress(is_silent=args.json or args.quiet) as progress:
         bands = None if args.bands is None else load_bands(Path(args.bands), model.kind)
         faults = choose_faults(args.faults, model.kind)
-        trace = Trace.read(args.trace, signals=model.kind.signals)
-        found = diagnose(trace, model, bands, progress, args.trace, with_effects=args.with_effects,
-                         faults=faults)
+        found = diagnose(Trace.read(args.trace, signals=model.kind.signals), model, bands, progress, args.trace,
+                         with_effects=args.with_effects, faults=faults)
     report = replace(build_diagnosis_report(found), next_command=suggest_next_command(args, found), files=places.files)
     return give_answer(report, args, int(found.verdict != "ACCEPTABLE"), places)
 
