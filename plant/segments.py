@@ -324,8 +324,8 @@ def parse_columns(data: bytes, where: object, period: float = 1 / RATE, signals:
     titles = [title.strip().lower() for title in header]
     if "t" not in titles:
         raise InputError(where, "line 1", "a header with a column t and commas between columns")
-    named = {"t": "t", "com": signals.command.name, "value": "value"}
-    named |= {"load": signals.load.name} if signals.load else {}
+    named = {"t": "t", "com": signals.command.name, "value": "value",
+             **({"load": signals.load.name} if signals.load else {})}
     picked = {key: titles.index(name.lower()) for key, name in named.items() if name.lower() in titles}
     largest = {"com": signals.command.largest, "load": signals.load.largest if signals.load else 0.0}
     table = {key: np.array(values) for key, values in _parse_numbers(rows, picked, where, largest).items()}

@@ -203,8 +203,8 @@ def examine_residuals(trace: Trace, residual: Columns, repeats: Mapping[str, Flo
                       ) -> dict[str, ResidualTests]:
     """Each signal's residual (n,); `repeats`: the difference to a repeat's residual over sqrt 2, where there is one."""
     d = trace.declared
-    inputs = {d.drive.symbol: trace.drive, d.command.symbol: trace.command}
-    inputs |= {d.load.symbol: trace.load} if d.load and np.ptp(trace.load) > 0.0 else {}
+    inputs = {d.drive.symbol: trace.drive, d.command.symbol: trace.command,
+              **({d.load.symbol: trace.load} if d.load and np.ptp(trace.load) > 0.0 else {})}
     colours = {name: fit_whitener(np.diff(u)) for name, u in inputs.items() if np.ptp(u) > 0.0}
     levels = {s.symbol: m.others[s.name] for s in d.outputs[1:] if s.unit != d.controlled.unit}  # such as pressures
     quantities = {"speed": m.v, "position": m.x, **levels, "acceleration": m.a}

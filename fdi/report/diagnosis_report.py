@@ -456,8 +456,9 @@ def _group_events(events: Sequence[Event], apart: float = 0.5) -> list[list[Even
 
 def _show_maps(grid: Grid) -> list[Item]:
     found = (("steps, A", grid.step), ("ramps, B", grid.ramp), ("both, C", grid.joint))
-    points: list[tuple[str, Point | Merged]] = [(name, m.minimum) for name, m in found if m]
-    points.append((f"centre of gravity, G ({100 * grid.merged.weight:.0f} % of A)", grid.merged))
+    points: list[tuple[str, Point | Merged]] = [
+        *((name, m.minimum) for name, m in found if m),
+        (f"centre of gravity, G ({100 * grid.merged.weight:.0f} % of A)", grid.merged)]
     first, second = grid.faults
     return [Figure(f"{first.title.capitalize()} and {second.title}: RMS difference between the measured position and "
                    "that of a plant with these two faults alone, for every pair of sizes (logarithmic colours). The "

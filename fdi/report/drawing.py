@@ -402,14 +402,13 @@ def _describe_axis(axis: Axis, domain: Any, anchor: str) -> dict[str, Any]:
 
     is_log, sides = axis.get_scale() == "log", axis.get_tick_params()
     limits = np.asarray(axis.get_view_interval(), float)
-    out = {"title": {"text": axis.get_label_text().replace("\n", "<br>")}, "type": "log" if is_log else "linear",
-           "range": (np.log10(limits) if is_log else limits).tolist(), "gridcolor": "#e4e7eb", "zeroline": False,
-           "domain": np.clip(domain, 0.0, 1.0).tolist(), "anchor": anchor,
-           "showticklabels": any(sides.get(f"label{side}") for side in ("bottom", "top", "left", "right"))}
-    if isinstance(axis.get_major_locator(), FixedLocator):
-        out |= {"tickvals": [float(tick) for tick in axis.get_ticklocs()],
-                "ticktext": [label.get_text() for label in axis.get_ticklabels()]}
-    return out
+    ticks = {"tickvals": [float(tick) for tick in axis.get_ticklocs()],
+             "ticktext": [label.get_text() for label in axis.get_ticklabels()]}
+    return {"title": {"text": axis.get_label_text().replace("\n", "<br>")}, "type": "log" if is_log else "linear",
+            "range": (np.log10(limits) if is_log else limits).tolist(), "gridcolor": "#e4e7eb", "zeroline": False,
+            "domain": np.clip(domain, 0.0, 1.0).tolist(), "anchor": anchor,
+            "showticklabels": any(sides.get(f"label{side}") for side in ("bottom", "top", "left", "right")),
+            **(ticks if isinstance(axis.get_major_locator(), FixedLocator) else {})}
 
 
 def _list_traces(ax: Axes) -> Iterator[dict[str, Any]]:

@@ -262,10 +262,8 @@ def _tabulate_candidates(a: Answer, most: int = 8) -> Table:
     def show_ratios(ratios: BySignal, holdout: BySignal) -> list[str]:
         """Errors over noise floors: of each signal; on the held-out run of the worst signal, then of each."""
         held = {s: x / floor[s] for s, x in holdout.items() if s in floor}
-        shown = [ratios.get(s, math.nan) for s in floor]
-        if has_holdout:
-            shown += [max(held.values(), default=math.nan), *(held.get(s, math.nan) for s in floor)]
-        return list(map(format_ratio, shown))
+        also = [max(held.values(), default=math.nan), *(held.get(s, math.nan) for s in floor)] if has_holdout else []
+        return list(map(format_ratio, [*(ratios.get(s, math.nan) for s in floor), *also]))
 
     rows: list[list[Cell | str]] = [[Cell(text, "muted") for text in (
         "no effect", "", *show_ratios(a.explanation.base.ratio, a.baseline["holdout"]), "", "", "")]]

@@ -103,8 +103,8 @@ def guess_canopen(title: str, file: str, text: str, node: int | None, wanted: Wa
     lines = [f"name = {json.dumps(title)}", f"plant = {json.dumps(wanted.plant)}", 'cycle = "1 ms"',
              "bitrate = 1_000_000", "", "[controller]", 'protocol = "canopen"',
              f"node = {number}" + ("" if node or read_node(text) else f"  {UNSURE}the EDS does not say"),
-             f"eds = {json.dumps(file)}", f'profile = "{profile}"{doubt}']
-    lines += ['mode = 8                        # cyclic synchronous position'] if profile == "cia402" else []
+             f"eds = {json.dumps(file)}", f'profile = "{profile}"{doubt}',
+             *(['mode = 8                        # cyclic synchronous position'] if profile == "cia402" else [])]
     for table, known in wanted.tables.items():
         candidates = _list_objects(dictionary, number, is_received=table == "inputs")
         lines += ["", f"[controller.{table}]", *_write_signals(candidates, known, wanted, "object", "0x0000")]

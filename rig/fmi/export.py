@@ -290,12 +290,13 @@ def _list_common(model: Model, variables: Sequence[Variable]) -> list[str]:
 
 
 def _describe_fmi2(model: Model, variables: Sequence[Variable], identifier: str, token: str, seed: int) -> str:
-    scalars = [_tag("ScalarVariable", {"name": v.name, "valueReference": i, **itself}, [_tag("Real", number)])
-               for i, v in enumerate(variables) for itself, number in [_list_attributes(v)]]
-    scalars += [_tag("ScalarVariable", {"name": name, "valueReference": i, "description": text,
-                                        "causality": "parameter", "variability": "fixed"},
-                     [_tag(kind, {"start": start})]) for i, ((name, text), kind, start) in enumerate(zip(
-                         _OTHERS, ("Integer", "Boolean"), (seed, "false"), strict=True), len(variables))]
+    scalars = [
+        *(_tag("ScalarVariable", {"name": v.name, "valueReference": i, **itself}, [_tag("Real", number)])
+          for i, v in enumerate(variables) for itself, number in [_list_attributes(v)]),
+        *(_tag("ScalarVariable", {"name": name, "valueReference": i, "description": text, "causality": "parameter",
+                                  "variability": "fixed"}, [_tag(kind, {"start": start})])
+          for i, ((name, text), kind, start) in enumerate(zip(
+              _OTHERS, ("Integer", "Boolean"), (seed, "false"), strict=True), len(variables)))]
     unknowns = [_tag("Unknown", {"index": i}) for i, v in enumerate(variables, 1) if v.role == "OUTPUT"]
     return _describe("2.0", model, {"guid": token}, [
         _tag("CoSimulation", {"modelIdentifier": identifier, "canHandleVariableCommunicationStepSize": "false",
@@ -306,12 +307,13 @@ def _describe_fmi2(model: Model, variables: Sequence[Variable], identifier: str,
 
 
 def _describe_fmi3(model: Model, variables: Sequence[Variable], identifier: str, token: str, seed: int) -> str:
-    scalars = [_tag("Float64", {"name": v.name, "valueReference": i, **itself, **number})
-               for i, v in enumerate(variables) for itself, number in [_list_attributes(v)]]
-    scalars += [_tag(kind, {"name": name, "valueReference": i, "description": text, "causality": "parameter",
-                            "variability": "fixed", "start": start})
-                for i, ((name, text), kind, start) in enumerate(zip(
-                    _OTHERS, ("Int32", "Boolean"), (seed, "false"), strict=True), len(variables))]
+    scalars = [
+        *(_tag("Float64", {"name": v.name, "valueReference": i, **itself, **number})
+          for i, v in enumerate(variables) for itself, number in [_list_attributes(v)]),
+        *(_tag(kind, {"name": name, "valueReference": i, "description": text, "causality": "parameter",
+                      "variability": "fixed", "start": start})
+          for i, ((name, text), kind, start) in enumerate(zip(
+              _OTHERS, ("Int32", "Boolean"), (seed, "false"), strict=True), len(variables)))]
     outputs = [i for i, v in enumerate(variables) if v.role == "OUTPUT"]
     return _describe("3.0", model, {"instantiationToken": token}, [
         _tag("CoSimulation", {"modelIdentifier": identifier, "canHandleVariableCommunicationStepSize": "true",

@@ -293,8 +293,8 @@ class Link:
             self._bus.leave_out(sorted(self._left_out))
         elif self._socket is not None:
             exact = IDENTIFIER | EXTENDED | _REMOTE
-            filters = [_FILTER.pack(cob_id & ~FD | _INVERTED, exact) for cob_id in sorted(self._left_out)]
-            filters += [_FILTER.pack(0, self._foreign)] if self._foreign else []
+            filters = [*(_FILTER.pack(cob_id & ~FD | _INVERTED, exact) for cob_id in sorted(self._left_out)),
+                       *([_FILTER.pack(0, self._foreign)] if self._foreign else [])]
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, int(bool(filters)))
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"".join(filters) or _FILTER.pack(0, 0))
 

@@ -27,8 +27,8 @@ def raise_priority(priority: int = LOOP_PRIORITY) -> Iterator[None]:
     interpreter lock, other programs must not keep it from going on, for the loop would wait with it. A thread that has
     a real-time priority keeps it: a compiled loop that runs already (`enter_loop_thread`) is not to be slowed down.
     """
-    raised = [thread for thread in _list_other_threads() if _is_ordinary(thread) and _set_fifo(thread, 1)]
-    raised += [0] if _set_fifo(0, priority) else []
+    raised = [*(thread for thread in _list_other_threads() if _is_ordinary(thread) and _set_fifo(thread, 1)),
+              *([0] if _set_fifo(0, priority) else [])]
     try:
         yield
     finally:

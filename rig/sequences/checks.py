@@ -346,9 +346,9 @@ class Check:
             return nan, f"no calibration of {', '.join(missing)}"
         step = 1 / run.rate / self.scale if KINDS[self.kind].is_rounded else 0.0
         found = compute_expanded_uncertainty(measure, value, run.trace, names, run.metrology, step)
-        problems = [run.metrology.problems[name] for name in names if name in run.metrology.problems]
-        problems += ["errors of the sensor decide whether it can be measured"] if found == inf else []
-        return found, "; ".join(problems)
+        open_ = ["errors of the sensor decide whether it can be measured"] if found == inf else []
+        return found, "; ".join([*(run.metrology.problems[name] for name in names if name in run.metrology.problems),
+                                 *open_])
 
     def _list_readings(self, signals: Signals) -> tuple[str, ...]:
         """The signals that the number depends on; the demand is exact."""
