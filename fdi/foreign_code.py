@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from plant.effects import CATALOGUE, load_effects
-from plant.errors import InputError, escape_control_characters
+from plant.errors import InputError, escape_control_characters, require
 from plant.parameters import read_toml
 from plant.plant_files import read_model_tables
 from plant.plants import load_plant
@@ -96,8 +96,7 @@ def load_plant_of_model(model: str | Path | None, *, is_trusted: bool,
         if not isinstance(named, str) or not named.endswith(".py"):
             return
         places = [place for place in (path.parent / named, Path(named)) if place.is_file()]
-        if not places:
-            raise InputError(path, "plant", f"a file that exists, not {named!r}")
+        require(places, path, "plant", f"a file that exists, not {named!r}")
         code = ForeignCode(str(places[0]), read_file(places[0]))
         require_trust(path, [code], is_trusted=is_trusted, announce=announce)
         load_plant(places[0], code.content)
@@ -131,5 +130,5 @@ def require_different_names(files: Sequence[Path]) -> None:
         InputError: the second file of that name.
     """
     for i, file in enumerate(files):
-        if file.name in [other.name for other in files[:i]]:
-            raise InputError("--effects", str(file), f"files of different names, not a second {file.name}")
+        require(file.name not in [other.name for other in files[:i]], "--effects", str(file),
+                f"files of different names, not a second {file.name}")

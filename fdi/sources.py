@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from plant.errors import InputError
+from plant.errors import InputError, require
 
 SUFFIXES = (".py", ".toml", ".c", ".json", ".npz")  # what a number can depend on; no pages, no caches
 
@@ -30,8 +30,7 @@ def import_function(name: str, field: str, expected: str) -> Callable[..., Any]:
         found = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise InputError(field, name, f"module:function of {expected} ({error})") from None
-    if not callable(found):
-        raise InputError(field, name, f"module:function of {expected}")
+    require(callable(found), field, name, f"module:function of {expected}")
     return found  # type: ignore[no-any-return]
 
 

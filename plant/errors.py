@@ -27,6 +27,16 @@ class InputError(RigError):
         return type(self), (self.where, self.field, self.expected)
 
 
+def require(holds: object, where: object, field: str, expected: str) -> None:
+    """Refuse input unless what it must be `holds`; `expected` says what that is.
+
+    Raises:
+        InputError: it does not.
+    """
+    if not holds:
+        raise InputError(where, field, expected)
+
+
 @contextmanager
 def report_system_error(where: object, field: str, expected: str) -> Iterator[None]:
     """Turn what the system refuses within into bad input, with the system's own words."""

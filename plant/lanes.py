@@ -28,7 +28,7 @@ from plant.compile import (
 )
 from plant.controller import take_demand
 from plant.effects import Effect
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.foreign import run_foreign
 from plant.kernel_use import KernelUse
 from plant.kernels import (
@@ -164,8 +164,8 @@ class Lanes:
         self.workers = workers or count_threads()
         known = model.list_names()
         for name in self.names:
-            if name not in known or name == "controller.period":
-                raise InputError("lanes", name, f"a parameter of the model {model.name} other than the period")
+            require(name in known and name != "controller.period", "lanes", name,
+                    f"a parameter of the model {model.name} other than the period")
         self._rungs = list_kernel_variants(model)
         self._own: dict[tuple[str, ...], KernelVariant] = {}
 
@@ -289,8 +289,8 @@ class Lanes:
             InputError: shapes that do not fit.
         """
         values, driven, load, position = (np.ascontiguousarray(x, float) for x in (values, driven, load, position))
-        if values.ndim != 2 or values.shape[1] != len(self.names):
-            raise InputError("lanes", "values", f"one row a run of {len(self.names)} values, not shape {values.shape}")
+        require(values.ndim == 2 and values.shape[1] == len(self.names), "lanes", "values",
+                f"one row a run of {len(self.names)} values, not shape {values.shape}")
         if driven.ndim != 1 or load.shape != driven.shape or position.shape not in (driven.shape, (0,)):
             raise InputError("lanes", "load", "one number a cycle in each input, not shapes "
                              f"{driven.shape}, {load.shape} and {position.shape}")

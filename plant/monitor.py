@@ -18,7 +18,7 @@ import numpy as np
 
 from plant.compile import Function, compile_function, raise_unbound
 from plant.controller import Loop, compute_current
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.friction import clip, soften
 from plant.kernels import make_lane_packers
 from plant.lanes import Array, Drive
@@ -214,8 +214,8 @@ class Monitor:
         self.model, self.names, self.steps, self.sliding = model, tuple(names), steps, sliding
         self.workers = workers or count_threads()
         for name in self.names:
-            if name not in model.values or name == "controller.period" or model.plant != "eha":
-                raise InputError("monitor", name, "a parameter of the reference model other than the period")
+            require(name in model.values and name != "controller.period" and model.plant == "eha", "monitor", name,
+                    "a parameter of the reference model other than the period")
 
     def replay(self, values: Array, current: Array, position: Array | None = None, anchor: float = 0.0,
                whole: bool = False, reduced: Reduction = lambda rows: rows) -> Array:
@@ -245,8 +245,8 @@ class Monitor:
     def _run(self, values: Array, driven: Array, position: Array, anchor: float, closed: bool, whole: bool,
              reduced: Reduction) -> Array:
         values, driven, position = (np.ascontiguousarray(x, float) for x in (values, driven, position))
-        if values.ndim != 2 or values.shape[1] != len(self.names):
-            raise InputError("monitor", "values", f"one row a run of {len(self.names)}, not shape {values.shape}")
+        require(values.ndim == 2 and values.shape[1] == len(self.names), "monitor", "values",
+                f"one row a run of {len(self.names)}, not shape {values.shape}")
         if driven.ndim != 1 or position.shape not in (driven.shape, (0,), (1,)) or np.isnan(position[:1]).any():
             raise InputError("monitor", "position", "one a cycle, the first of them known, "
                              f"not {position.shape} beside {driven.shape}")

@@ -20,7 +20,7 @@ import numpy as np
 
 from plant.compile import Function, find_called_functions, find_fields_of, raise_unbound, rebind_names
 from plant.effects import CATALOGUE, Effect, build_base_effect, build_effect, combine_laws
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.faults import Fault
 from plant.foreign import Program
 from plant.kernels import make_packers, write_constant, write_mover, write_signal_functions
@@ -347,8 +347,7 @@ def find_plant(name: str) -> Plant:
     """
     if name in _LOADED:
         return _LOADED[name]
-    if name not in MODULES:
-        raise InputError("plant", name, f"one of {', '.join(MODULES)}, or a Python file that declares a plant")
+    require(name in MODULES, "plant", name, f"one of {', '.join(MODULES)}, or a Python file that declares a plant")
     return _find_shipped_plant(name)
 
 

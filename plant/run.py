@@ -13,7 +13,7 @@ import numpy as np
 
 from plant.compile import compute_fingerprint, find_cache_folder, interpret_function
 from plant.controller import take_demand
-from plant.errors import InputError, RigError
+from plant.errors import InputError, RigError, require
 from plant.foreign import run_foreign_loop
 from plant.kernels import make_packers, write_reader
 from plant.machine_code import Call, StoredCode
@@ -97,9 +97,8 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
     """
     com = np.ascontiguousarray(command, float)
     force = np.zeros_like(com) if load is None else np.ascontiguousarray(load, float)
-    if com.ndim != 1 or not len(com) or force.shape != com.shape:
-        raise InputError("command", model.kind.signals.command.name,
-                         f"one demand and one load a cycle, not shapes {com.shape} and {force.shape}")
+    require(com.ndim == 1 and len(com) and force.shape == com.shape, "command", model.kind.signals.command.name,
+            f"one demand and one load a cycle, not shapes {com.shape} and {force.shape}")
     signals = model.kind.signals
     out = np.empty((len(com), len(signals.columns)))
     with report_law_errors(model):
@@ -306,8 +305,7 @@ class Actuator:
         Raises:
             InputError: the running model has no such parameter.
         """
-        if name not in self._index:
-            raise InputError("set", name, f"a parameter of the running model ({self.model.name})")
+        require(name in self._index, "set", name, f"a parameter of the running model ({self.model.name})")
         self._live[self._index[name]] = value
         if self._program is not None:
             self._program.change(name, value)

@@ -17,7 +17,7 @@ from typing import Annotated, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.functions import exp_of, sin_of_turns
 from plant.signals import EHA, Signals
 from plant.tables import read_file
@@ -53,10 +53,11 @@ class Segment(ABC):
         """The demand at times `t` (s, from the segment's start), after one that ended at `last`."""
 
     def __post_init__(self) -> None:
-        require(0.0 < self.duration <= LONGEST, "time", f"above 0 and at most {LONGEST:g} s, not {self.duration:g}")
+        require(0.0 < self.duration <= LONGEST, "segment", "time",
+                f"above 0 and at most {LONGEST:g} s, not {self.duration:g}")
         for key in self.frequencies_in:
             lowest = float(np.min(getattr(self, key)))
-            require(lowest > 0.0, key, f"a frequency above 0 Hz, not {lowest:g}")
+            require(lowest > 0.0, "segment", key, f"a frequency above 0 Hz, not {lowest:g}")
 
     def require_rate(self, rate: float) -> None:
         """Refuse a segment that `rate` samples a second cannot show: not whole cycles, or half the rate and above.
@@ -65,11 +66,11 @@ class Segment(ABC):
             InputError: the key, and what it must be; whoever read the segment knows its file and line and adds them.
         """
         cycles = self.duration * rate
-        require(cycles > 0.5 and abs(cycles - round(cycles)) < 1e-6, "time",
+        require(cycles > 0.5 and abs(cycles - round(cycles)) < 1e-6, "segment", "time",
                 f"whole cycles of {1 / rate:g} s, not {self.duration:g}")
         for key in self.frequencies_in:
             highest = float(np.max(getattr(self, key)))
-            require(highest < rate / 2, key, f"a frequency below {rate / 2:g} Hz, not {highest:g}")
+            require(highest < rate / 2, "segment", key, f"a frequency below {rate / 2:g} Hz, not {highest:g}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +140,7 @@ class Chirp(Timed):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.fade >= 0, "fade", f"0 or more 1/s, not {self.fade:g}")
+        require(self.fade >= 0, "segment", "fade", f"0 or more 1/s, not {self.fade:g}")
 
     def demand(self, t: Array, last: float) -> Array:
         cycles = self.f0 * t + (self.f1 - self.f0) / (2 * self.time) * t**2
@@ -161,11 +162,11 @@ class Multisine(Timed):
     fade: PerSecond = 20.0
 
     def __post_init__(self) -> None:
-        require(bool(self.frequencies), "frequencies", "at least one frequency in Hz")
+        require(bool(self.frequencies), "segment", "frequencies", "at least one frequency in Hz")
         super().__post_init__()
-        require(len(self.phases) in (0, len(self.frequencies)), "phases",
+        require(len(self.phases) in (0, len(self.frequencies)), "segment", "phases",
                  f"{len(self.frequencies)} phases in rad, one a frequency, not {len(self.phases)}")
-        require(self.fade >= 0, "fade", f"0 or more 1/s, not {self.fade:g}")
+        require(self.fade >= 0, "segment", "fade", f"0 or more 1/s, not {self.fade:g}")
 
     def demand(self, t: Array, last: float) -> Array:
         lines = len(self.frequencies)
@@ -188,7 +189,7 @@ class Points(Segment):
 
     def __post_init__(self) -> None:
         times = [t for t, _ in self.points]
-        require(bool(times) and times[0] >= 0 and all(a < b for a, b in pairwise(times)), "points",
+        require(bool(times) and times[0] >= 0 and all(a < b for a, b in pairwise(times)), "segment", "points",
                  "[t, demand] pairs with t from 0 s and increasing")
         super().__post_init__()
 
@@ -226,16 +227,6 @@ KINDS: dict[str, type[Segment]] = {
 
 def _fade_in(t: Array, fade: float) -> Array:
     return 1 - exp_of(-fade * t) if fade else np.ones_like(t)
-
-
-def require(holds: bool, key: str, expected: str) -> None:
-    """Refuse a segment; whoever read it knows the file and the line and adds them.
-
-    Raises:
-        InputError: unless it `holds`; `expected` says what `key` must be.
-    """
-    if not holds:
-        raise InputError("segment", key, expected)
 
 
 SLACK = 0.01  # of a cycle: a time within it of a row is that row's
@@ -287,7 +278,7 @@ def build_profile(segments: Sequence[Segment], start: float = 0.0, rate: float =
         demand = segment.demand(np.arange(cycles + 1) / rate, last)
         pieces.append(demand[:-1])
         last = float(demand[-1])
-        require(all(name != s.name for s in sections), "name", f"a name used once, not a second {name!r}")
+        require(all(name != s.name for s in sections), "segment", "name", f"a name used once, not a second {name!r}")
         sections.append(Section(name, segment.kind, begin, begin + cycles))
         begin += cycles
     return Profile(np.concatenate(pieces), tuple(sections), last)
@@ -304,8 +295,7 @@ def read_command(path: str | Path, period: float = 1 / RATE, signals: Signals = 
         InputError: the file, the line and what was expected there.
     """
     columns = parse_columns(read_file(Path(path)), path, period, signals)
-    if "com" not in columns:
-        raise InputError(path, "line 1", f"a header with the columns t and {signals.command.name}")
+    require("com" in columns, path, "line 1", f"a header with the columns t and {signals.command.name}")
     return Command(columns["com"], columns.get("load"))
 
 
@@ -322,8 +312,7 @@ def parse_columns(data: bytes, where: object, period: float = 1 / RATE, signals:
     rows = _read_rows(data, where)
     _, header = next(rows, (0, [""]))
     titles = [title.strip().lower() for title in header]
-    if "t" not in titles:
-        raise InputError(where, "line 1", "a header with a column t and commas between columns")
+    require("t" in titles, where, "line 1", "a header with a column t and commas between columns")
     named = {"t": "t", "com": signals.command.name, "value": "value",
              **({"load": signals.load.name} if signals.load else {})}
     picked = {key: titles.index(name.lower()) for key, name in named.items() if name.lower() in titles}
@@ -388,6 +377,5 @@ def _parse_numbers(rows: Iterator[tuple[int, list[str]]], picked: dict[str, int]
         for name, most in largest.items():
             if name in table and abs(table[name][-1]) > most:
                 raise InputError(where, f"line {line}, {name}", f"at most {most:g} either way, not {table[name][-1]:g}")
-    if not t:
-        raise InputError(where, "line 2", "at least one row below the header")
+    require(t, where, "line 2", "at least one row below the header")
     return table

@@ -47,7 +47,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.sections import Section, describe_section, find_sections
 from fdi.trace.trace import Flags, Floats, Trace
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.model import Model
 from plant.parameters import parse_toml
 from plant.plants import Plant, find_plant
@@ -319,8 +319,8 @@ def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: F
     Raises:
         InputError: no position, bands of another command, or a load that the bands do not know.
     """
-    if np.isnan(xj).all():
-        raise InputError(where, bands.kind.signals.controlled.name, "a measured position: bands judge nothing else")
+    require(not np.isnan(xj).all(), where, bands.kind.signals.controlled.name,
+            "a measured position: bands judge nothing else")
     parts = parts or find_sections(com, period, bands.scale)
     require_same_command(bands, parts, period, where)
     if load is not None and is_loaded(load, bands.kind) and "load" not in bands.provenance:

@@ -59,7 +59,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Floats, Trace, measure_scale
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.lanes import NARROW, Lanes
 from plant.model import Model, load_model
 from plant.threads import count_threads
@@ -149,9 +149,8 @@ def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: fl
                                                            "closed loop")
     scale = measure_scale(signals.command, com)
     parts = find_sections(com, period, scale)
-    if not any(s.kind in ("step", "ramp") for s in parts):
-        raise InputError("trace", signals.command.name, "a command with steps or slow ramps: bands are drawn around "
-                                                        "those")
+    require(any(s.kind in ("step", "ramp") for s in parts), "trace", signals.command.name,
+            "a command with steps or slow ramps: bands are drawn around those")
     if abs(period / model["controller.period"] - 1) > 0.01:
         raise InputError("trace", "t", f"one row per {1e3 * model['controller.period']:g} ms, the model's cycle, for "
                                        f"bands by simulation, not per {1e3 * period:g} ms")
@@ -339,9 +338,8 @@ def learn_bands(traces: Sequence[Trace], model: Model | None = None, names: Sequ
         InputError: too few traces, another command or period in one, a load, or a position with holes.
     """
     names = names or [f"trace {i + 1}" for i in range(len(traces))]
-    if len(traces) < FLEET_FEWEST_TRACES:
-        raise InputError("--learn-bands", f"{len(traces)} traces",
-                         f"at least {FLEET_FEWEST_TRACES} healthy traces of one command")
+    require(len(traces) >= FLEET_FEWEST_TRACES, "--learn-bands", f"{len(traces)} traces",
+            f"at least {FLEET_FEWEST_TRACES} healthy traces of one command")
     com, _, _, period, _ = read_columns(traces[0])
     base = choose_bands(com, np.zeros_like(com), period, model, progress, faults)
     rows = [_align_trace(base, trace, name) for trace, name in zip(traces, names, strict=True)]
@@ -361,8 +359,7 @@ def learn_bands(traces: Sequence[Trace], model: Model | None = None, names: Sequ
 def _align_trace(base: Bands, trace: Trace, name: str) -> tuple[Floats, Floats]:
     """Command and position of a trace on the rows of the base's command, gaps interpolated."""
     com, xj, load, period, _ = read_columns(trace)
-    if is_loaded(load, base.kind):
-        raise InputError(name, "load", "none: bands are learned from an unloaded plant")
+    require(not is_loaded(load, base.kind), name, "load", "none: bands are learned from an unloaded plant")
     missing = np.isnan(xj)
     if missing.mean() > POSITION_MISSING_SHARE:
         raise InputError(name, base.kind.signals.controlled.name,

@@ -20,7 +20,7 @@ from fdi.estimation.replay import has_known_start, read_cycles, replay_lanes
 from fdi.thresholds import ANCHOR_RATE
 from fdi.trace.trace import Flags, Floats, Trace
 from plant import monitor
-from plant.errors import InputError
+from plant.errors import require
 from plant.lanes import Lanes
 from plant.model import Model
 from plant.monitor import Monitor
@@ -97,15 +97,13 @@ def search_grid(trace: Trace, model: Model | None = None, faults: Sequence[Fault
     model = Model() if model is None else model
     if not trace.outputs:
         trace = read_cycles(trace, model)[0]
-    if drive not in DRIVES:
-        raise InputError("grid", "drive", f"one of {', '.join(DRIVES)}")
+    require(drive in DRIVES, "grid", "drive", f"one of {', '.join(DRIVES)}")
     first, second = faults
     parts = trace.sections()
     kinds = np.repeat([s.kind for s in parts], [s.stop - s.start for s in parts])
     measured = ~np.isnan(trace.mask_unusable(trace.declared.controlled.name))
     rows = {kind: chosen for kind in ("step", "ramp") if (chosen := (kinds == kind) & measured).any()}
-    if not rows:
-        raise InputError("trace", trace.declared.command.name, "steps or ramps, for the RMS grid")
+    require(rows, "trace", trace.declared.command.name, "steps or ramps, for the RMS grid")
     axes = np.linspace(*first.axis, CELLS), np.linspace(*second.axis, CELLS)
     values = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     has_monitor = model.kind.name == "eha" and (first.parameter, second.parameter) == monitor.FAULTS

@@ -78,7 +78,7 @@ from fdi.thresholds import (
     STATIC_FRICTION_SYSTEMATIC_SD,
 )
 from fdi.trace.trace import Floats, Trace, rms, shift_rows
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.lanes import Lanes
 from plant.model import Model, find_quantity, find_shipped_model
 from plant.parameters import read_toml
@@ -139,8 +139,7 @@ def read_free_parameters(model: Model, source: str | Path | None) -> tuple[Range
                    if math.isfinite(q.high - q.low) and name.partition(".")[0] not in ("controller", "sensors")}
     scattering = {name: _parse_range(name, width, model, model.name) for name, width in widths.items()
                   if model[name] > 0.0 or isinstance(width, list)}
-    if not scattering:
-        raise InputError(source, "identify", "tables [identify.GROUP] that say what is free (docs/identify.md)")
+    require(scattering, source, "identify", "tables [identify.GROUP] that say what is free (docs/identify.md)")
     return tuple(scattering.values())
 
 
@@ -159,12 +158,10 @@ def parse_free_parameters(tables: object, model: Model, where: object) -> tuple[
         for field, width in fields.items():
             name = f"{group}.{field}"
             find_quantity(name, where, model.plant)
-            if name not in model.values:
-                raise InputError(where, f"identify.{name}", f"a parameter that the model has; add {group} to its "
-                                                            "effects")
+            require(name in model.values, where, f"identify.{name}",
+                    f"a parameter that the model has; add {group} to its effects")
             found[name] = _parse_range(name, width, model, where)
-    if not found:
-        raise InputError(where, "identify", "at least one free parameter")
+    require(found, where, "identify", "at least one free parameter")
     return tuple(found[name] for name in model.list_names() if name in found)
 
 
@@ -267,13 +264,11 @@ def prepare_runs(model: Model, ranges: Sequence[Range], traces: Sequence[Trace],
     Raises:
         InputError: a trace that cannot be used, or a run given twice.
     """
-    if not fitted:
-        raise InputError("RUN", "", "at least one run to fit")
+    require(fitted, "RUN", "", "at least one run to fit")
     require_distinct(sources, "RUN", "other runs", fitted)
     outputs = tuple(s.name for s in model.kind.signals.outputs)
     for name in signals or ():
-        if name not in outputs:
-            raise InputError("--signals", name, f"some of {','.join(outputs)}")
+        require(name in outputs, "--signals", name, f"some of {','.join(outputs)}")
     chosen = [s for s in outputs if any(s in t.signals for t in traces[:fitted]) and (signals is None or s in signals)]
     if not chosen:
         raise InputError(sources[0].file, ", ".join(signals or outputs), "a signal that a run to fit has")

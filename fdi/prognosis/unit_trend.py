@@ -22,7 +22,7 @@ from fdi.sources import hash_sources
 from fdi.trace.csv_table import report_unreadable
 from fdi.trace.trace import Trace
 from plant.compile import find_cache_folder
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.model import Model
 
 LIMIT_NAMES = {"maintenance": "MidBand", "non_nominal": "MaxBand"}
@@ -72,8 +72,7 @@ def read_points(path: Path, faults: Sequence[Fault] | None = None) -> Gathered:
             raise ValueError("finite times, and sizes within their intervals")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(path, "", f"an answer of rig trend ({type(error).__name__}: {error})") from error
-    if axis not in AXES or not points:
-        raise InputError(path, "axis", f"one of {', '.join(AXES)} and at least one point")
+    require(axis in AXES and points, path, "axis", f"one of {', '.join(AXES)} and at least one point")
     return Gathered(str(path), axis, tuple(sorted(points, key=lambda p: p.t)), (), faults)
 
 
@@ -151,12 +150,10 @@ def list_traces(folder: Path) -> list[Path]:
     Raises:
         InputError: no folder, or no such file.
     """
-    if not folder.is_dir():
-        raise InputError(folder, "", "a folder of dated traces, or the JSON file of an earlier answer")
+    require(folder.is_dir(), folder, "", "a folder of dated traces, or the JSON file of an earlier answer")
     found = sorted(path for path in folder.rglob("*") if path.name.endswith(ENDINGS) and path.name != TABLE
                    and not any(part.startswith(".") for part in path.relative_to(folder).parts))
-    if not found:
-        raise InputError(folder, "", "traces in it: .mcap, .csv or .csv.gz")
+    require(found, folder, "", "traces in it: .mcap, .csv or .csv.gz")
     return found
 
 
@@ -296,16 +293,14 @@ def read_dates_table(path: Path) -> dict[str, Row]:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(path, "", f"a table file,date ({error})") from error
     head = [word.strip().lower() for word in rows[0]] if rows else []
-    if "file" not in head or not set(AXES) & set(head):
-        raise InputError(path, "header", "file and one or more of date, hours, flights")
+    require("file" in head and set(AXES) & set(head), path, "header", "file and one or more of date, hours, flights")
     found: dict[str, Row] = {}
     for number, words in enumerate(rows[1:], 2):
         cells = dict(zip(head, (word.strip() for word in words), strict=False))
         name = cells.get("file", "").removeprefix("./")
         if not name:
             continue
-        if name in found:
-            raise InputError(f"{path}: line {number}", "file", f"each file once, not {name} again")
+        require(name not in found, f"{path}: line {number}", "file", f"each file once, not {name} again")
         found[name] = Row(*(_read_cell(f"{path}: line {number}", axis, cells.get(axis, "")) for axis in AXES))
     return found
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.output import write_whole
-from plant.errors import InputError, report_system_error
+from plant.errors import InputError, report_system_error, require
 from plant.plants import Plant, Table, Term, find_plant, list_plants
 from plant.signals import Signals
 from plant.unpacking import UnpackingError, limit_unpacked_size
@@ -129,8 +129,7 @@ def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...]
         if name not in header:
             raise InputError(f"{path}: line 1", name,
                              f"a column of this name in the header {','.join([*required, *optional])}")
-    if len(set(header)) < len(header):
-        raise InputError(f"{path}: line 1", "header", "each column once")
+    require(len(set(header)) >= len(header), f"{path}: line 1", "header", "each column once")
     known = [(i, name) for i, name in enumerate(header) if name in required or name in optional]
     values: dict[str, list[float]] = {name: [] for _, name in known}
     words = dict.fromkeys(values, 0)  # fields that say "nan"
@@ -155,8 +154,7 @@ def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...]
                 raise InputError(f"{path}: line {line}", "t", f"a time after {last:g} s, "
                                                               f"not {row[header.index('t')]!r}")
             last = t
-    if not values[known[0][1]]:
-        raise InputError(path, "", "at least one row after the header")
+    require(values[known[0][1]], path, "", "at least one row after the header")
     unknown = [name for name in header if name not in values]
     notes = [f"column {name} is not known and was left out" for name in unknown]
     if len(unknown) > 1:

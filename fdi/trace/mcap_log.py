@@ -26,7 +26,7 @@ from mcap.summary import Summary
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.unpacking import UnpackingError, limit_unpacked_size
 
 _NUMBERS = {  # protobuf types of fixed width: wire type and numpy type
@@ -201,8 +201,7 @@ def _check_sizes(path: Path, summary: Summary, size: int) -> None:
     if len({index.chunk_start_offset for index in summary.chunk_indexes}) < len(summary.chunk_indexes):
         raise InputError(path, "chunks", "each chunk once in the index")
     for what, count in (("attachments", len(summary.attachment_indexes)), ("metadata", len(summary.metadata_indexes))):
-        if count > MOST_RECORDS:
-            raise InputError(path, what, f"at most {MOST_RECORDS} records, not {count}")
+        require(count <= MOST_RECORDS, path, what, f"at most {MOST_RECORDS} records, not {count}")
 
 
 def _read_chunk(path: Path, stream: BinaryIO, index: ChunkIndex) -> bytes:

@@ -19,7 +19,7 @@ from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.sensor_dynamics import SensorDynamics, read_sensors
 from plant import signals as plant_signals
-from plant.errors import InputError, escape_control_characters
+from plant.errors import InputError, escape_control_characters, require
 from plant.signals import Signal, Signals
 
 if TYPE_CHECKING:
@@ -142,12 +142,10 @@ class Trace:
         them. Raises InputError, naming file, line or field, for what cannot be a trace.
         """
         path = Path(path)
-        if not path.exists():
-            raise InputError(path, "", "a readable file or the folder of a run; it does not exist")
+        require(path.exists(), path, "", "a readable file or the folder of a run; it does not exist")
         if path.is_dir():
             path /= "trace.mcap"
-            if not path.is_file():
-                raise InputError(path.parent, "", "the folder of a run; it has no trace.mcap")
+            require(path.is_file(), path.parent, "", "the folder of a run; it has no trace.mcap")
         if path.suffix == ".mcap":
             return _from_log(open_log(path), all, signals)
         if path.name.endswith((".csv", ".csv.gz")):
@@ -332,8 +330,7 @@ def make_table_trace(path: Path, columns: dict[str, Floats], signals: Signals, n
         InputError: fewer than two rows, or more than one a cycle.
     """
     t = columns.pop("t")
-    if len(t) < 2:
-        raise InputError(path, "t", "at least two rows")
+    require(len(t) >= 2, path, "t", "at least two rows")
     typical = float(np.percentile(np.diff(t), 50, method="lower"))
     rows = np.concatenate([[0], np.cumsum(np.rint(np.diff(t) / typical).astype(int))])
     if (np.diff(rows) < 1).any():
@@ -383,8 +380,7 @@ def _from_log(log: Log, everything: bool, declared: Signals) -> Trace:
     notes = [f"only the first {MOST_MESSAGES} messages of {name} were read"
              for name, messages in rest.items() if len(messages) == MOST_MESSAGES]
     run = dict(log.metadata.get("run", {}))
-    if not len(signals["time_ns"]):
-        raise InputError(log.path, "/signals", "at least one cycle")
+    require(len(signals["time_ns"]), log.path, "/signals", "at least one cycle")
     table = np.column_stack([signals[name].astype(float) for name in ("time_ns", "cycle", "phase", *names)])
     table = table[np.argsort(table[:, 1], kind="stable")]
     cycle, phase = table[:, 1].astype(int), table[:, 2].astype(int)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from plant.compile import Function
-from plant.errors import InputError
+from plant.errors import require
 from plant.parameters import GROUPS
 from plant.ports import PORTS, chain_laws
 from plant.quantity import Quantity, list_quantities
@@ -189,12 +189,10 @@ def load_effects(path: Path, source: bytes | None = None) -> list[str]:
         InputError: unreadable, not Python, or it registers nothing.
     """
     path = path.absolute()  # as the code of its functions will say where it comes from
-    if not path.is_file():
-        raise InputError(path, "", "a Python file with effects; it does not exist")
+    require(path.is_file(), path, "", "a Python file with effects; it does not exist")
     run_file(path, read_file(path) if source is None else source)
     new = [name for name, entry in CATALOGUE.items() if entry.file == path]
-    if not new:
-        raise InputError(path, "", "at least one function marked @effect(...)")
+    require(new, path, "", "at least one function marked @effect(...)")
     return new
 
 

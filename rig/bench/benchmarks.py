@@ -27,7 +27,7 @@ from fdi.report.numbers import format_digits
 from fdi.report.report import Cell, Column, Item, Line, Report, Section, Table, tabulate
 from fdi.trace.trace import Floats
 from plant import Actuator, Model, simulate
-from plant.errors import InputError, RigError
+from plant.errors import InputError, RigError, require
 from plant.model import build_kernel
 from plant.run import sample_noise
 from plant.solve import run_closed_loop
@@ -108,8 +108,7 @@ def measure_blocks(bus: str, seconds: float, blocks: int, contenders: Mapping[st
     Raises:
         InputError: a bus that compiled code cannot use.
     """
-    if not can_open(bus):
-        raise InputError("--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP]")
+    require(can_open(bus), "--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP]")
     compile_cycle()
     names, found = list(contenders), {name: list[Times]() for name in contenders}
     for block in range(blocks):
@@ -129,8 +128,7 @@ def choose_bus(bus: str, seconds: float, blocks: int, least_block: float = 0.5) 
     """
     if blocks < 1:
         raise InputError("--blocks", str(blocks), "1 or more")
-    if not seconds >= least_block * blocks:
-        raise InputError("--seconds", f"{seconds:g}", f"{least_block:g} s or more for each block")
+    require(seconds >= least_block * blocks, "--seconds", f"{seconds:g}", f"{least_block:g} s or more for each block")
     return f"udp_multicast:239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}" if bus == "auto" else bus
 
 

@@ -8,7 +8,7 @@ from fractions import Fraction
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from plant.errors import InputError, suggest_name
+from plant.errors import InputError, require, suggest_name
 from plant.tables import list_choices
 from rig.benches.bench import EXTENDED, FD, MOST_FRAMES, Field, Kind
 from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
@@ -84,9 +84,8 @@ def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns:
     if len(ways) != 1:
         expected = "in one direction" if ways else "that other tables of this file use"
         raise place.refuse(f"signals of a message {expected}; {message.name} has {', '.join(uses)}")
-    if message.length not in _FD_LENGTHS:
-        raise InputError(name, message.name, f"a length of a CAN frame, 0 to 8 bytes (CAN FD also 12, 16, 20, 24, 32, "
-                                             f"48, 64), not {message.length}")
+    require(message.length in _FD_LENGTHS, name, message.name,
+            f"a length of a CAN frame, 0 to 8 bytes (CAN FD also 12, 16, 20, 24, 32, 48, 64), not {message.length}")
     is_fd = message.is_fd or message.length > 8
     identifier = message.frame_id | (EXTENDED if message.is_extended_frame else 0) | (FD if is_fd else 0)
     slots = {signal.name: _read_slot(name, message, signal) for signal in message.signals}

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from canopen.objectdictionary import ODVariable, datatypes
 from canopen.objectdictionary.eds import import_eds
 
-from plant.errors import InputError
+from plant.errors import InputError, require
 from rig.benches.bench import EXTENDED, Field, Kind
 from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 
@@ -77,11 +77,9 @@ def read_dictionary(name: str, text: str, node: int) -> Any:
     except Exception as error:  # whatever canopen stumbles over in a file that is no EDS
         said = " ".join(str(error).split())[:200]
         raise InputError(name, "", f"an electronic data sheet (CiA 306): {said or type(error).__name__}") from error
-    if not any(index >= 0x1000 for index in dictionary):
-        raise InputError(name, "", "an electronic data sheet (CiA 306) with objects")
+    require(any(index >= 0x1000 for index in dictionary), name, "", "an electronic data sheet (CiA 306) with objects")
     own = read_node(text)
-    if own not in (None, node):
-        raise InputError(name, "NodeID", f"{node}, the node of the bench file, not {own}")
+    require(own in (None, node), name, "NodeID", f"{node}, the node of the bench file, not {own}")
     if own is None and not name.lower().endswith(".dcf"):
         for variable in _list_variables(dictionary):
             variable.value = None  # in an EDS it is a slip of its tool: the device is not to be configured so
@@ -203,8 +201,7 @@ def _describe_unmapped(dictionary: Any, pdos: list[Pdo], key: str, use: Use) -> 
 def _map_pdo(name: str, dictionary: Any, pdo: Pdo, own: set[str], *, is_answer: bool) -> DeviceFrame:
     """The frame of a PDO; only `own` objects keep their names."""
     where = f"0x{pdo.parameter + MAPPING:04X}"
-    if not 0 < pdo.length <= _LONGEST:
-        raise InputError(name, where, f"at most 8 bytes in {pdo.name}, not {pdo.length} bits")
+    require(0 < pdo.length <= _LONGEST, name, where, f"at most 8 bytes in {pdo.name}, not {pdo.length} bits")
     if 241 <= pdo.kind <= 253 or not 0 <= pdo.kind <= 255:
         raise InputError(name, f"0x{pdo.parameter:04X}:2",
                          f"a transmission type 0 to 240, 254 or 255 for {pdo.name}, not {pdo.kind}")

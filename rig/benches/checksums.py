@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.user_code import run_file
 from rig.benches.bench import Field, Guard, insert_bits
 
@@ -104,8 +104,8 @@ def load_checksum(name: str, source: bytes, function: str) -> str:
         for place, value in vars(module).items():  # tables: compiled code takes constants alone
             if isinstance(value, list | bytearray):
                 vars(module)[place] = bytes(value) if isinstance(value, bytearray) else tuple(value)
-        if not callable(getattr(module, function, None)):
-            raise InputError(name, function, "a function (data: bytes, counter: int) -> int")
+        require(callable(getattr(module, function, None)), name, function,
+                "a function (data: bytes, counter: int) -> int")
         _USERS[known] = getattr(module, function)
         compute_checksum(Field(name="", lowest=0, length=8, guard=Guard.CHECKSUM, checksum=known), bytes(8), 0)
     return known

@@ -30,7 +30,7 @@ from fdi.sources import hash_sources, import_function
 from fdi.thresholds import UNIT_TOLERANCE
 from fdi.trace.trace import Floats, Trace
 from plant import simulate
-from plant.errors import InputError, RigError, report_system_error
+from plant.errors import InputError, RigError, report_system_error, require
 from plant.model import Model, build_bare_model, find_effect, find_quantity, parse_model
 from plant.parameters import load_nominal_values, parse_toml, parse_value, read_toml
 from plant.plants import Plant, load_plant
@@ -61,8 +61,7 @@ class Settings:
     signals: str = ""  # outputs that are measured
 
     def __post_init__(self) -> None:
-        if self.tolerance == ():
-            raise InputError("matrix", "tolerance", "at least one")
+        require(self.tolerance != (), "matrix", "tolerance", "at least one")
         if self.simulator != OWN_SIMULATOR and ":" not in self.simulator:
             raise InputError("matrix", "simulator", f"{OWN_SIMULATOR} or MODULE:FUNCTION, not {self.simulator!r}")
 
@@ -116,8 +115,7 @@ def build_matrix(tables: Mapping[str, Any], model: Model, work: str, where: obje
     given = {"hum": usual_hum * _find_noise(model), "signals": measured[0],
              **{key: value for key, value in tables.items() if key != "case"}}
     settings = build_dataclass(Settings, given, place)
-    if settings.signals not in measured:
-        raise InputError(where, "signals", f"one of {' or '.join(measured)}, not {settings.signals!r}")
+    require(settings.signals in measured, where, "signals", f"one of {' or '.join(measured)}, not {settings.signals!r}")
     load_nominal_test(model.kind, model["controller.period"])
     blocks = tables.get("case", [])
     if not isinstance(blocks, list) or not blocks or not all(isinstance(block, Mapping) for block in blocks):
@@ -154,8 +152,7 @@ def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Mod
                 quantity = _find_size(name, model, faults)
                 sizes[name] = [parse_value("", name, quantity, value)
                                for value in (values if isinstance(values, list) else [values])]
-                if not sizes[name]:
-                    raise InputError("", name, "at least one size")
+                require(sizes[name], "", name, "at least one size")
     return {"seeds": settings["seeds"], "sizes": sizes, "tolerance": settings["tolerance"]}
 
 
@@ -164,8 +161,7 @@ def _find_size(name: str, model: Model, faults: Sequence[Fault]) -> Quantity:
     if (own := next((fault for fault in faults if fault.name == name), None)) is not None:
         return find_quantity(own.parameter, plant=model.plant)
     effect = find_effect(name, model.plant)
-    if not effect.fitted:
-        raise InputError("", name, "an effect with a size; this one is noise of the bench")
+    require(effect.fitted, "", name, "an effect with a size; this one is noise of the bench")
     return effect.parameters[effect.fitted[0]]
 
 
@@ -236,8 +232,7 @@ def parse_faults(words: Sequence[str]) -> list[dict[str, Any]]:
             except ValueError:
                 raise InputError("--fault", word, "healthy, EFFECT=SIZE,SIZE.., or several of these with / between"
                                  ) from None
-            if not equals:
-                raise InputError("--fault", word, "EFFECT=SIZE")
+            require(equals, "--fault", word, "EFFECT=SIZE")
         blocks.append(block)
     return blocks
 
@@ -523,8 +518,8 @@ def open_campaign(path: str | Path, matrix: Matrix, sources: str) -> RowFile:
                            if present["matrix"].get(key) != expected["matrix"].get(key)]:
                 raise InputError(path, "--out", "a folder of this matrix, or a new one; it differs in "
                                                 f"{', '.join(changed)}")
-            if present["code"] != sources:
-                raise InputError(path, "--out", "a new folder: the code has changed since this campaign was started")
+            require(present["code"] == sources, path, "--out",
+                    "a new folder: the code has changed since this campaign was started")
         elif any(not file.name.startswith(".part-") for file in folder.iterdir()):
             raise InputError(path, "--out", "an empty folder, or one of this campaign")
         else:
@@ -551,8 +546,7 @@ def read_campaign_rows(source: str | Path) -> list[Row]:
     path = Path(source)
     if path.is_dir() and is_campaign_folder(path):
         return select_newest(read_rows(path / ROWS))
-    if path.suffix != ".parquet" or not path.is_file():
-        raise InputError(source, "", f"the folder of a campaign, or its {RESULTS}")
+    require(path.suffix == ".parquet" and path.is_file(), source, "", f"the folder of a campaign, or its {RESULTS}")
     parquet = import_extra("pyarrow.parquet")
     try:
         rows: list[Row] = parquet.read_table(path).to_pylist()

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fdi.discovery.update_model import Provenance, load_model_file
-from plant.errors import InputError, suggest_name
+from plant.errors import InputError, require, suggest_name
 from plant.model import Model, load_model
 from plant.plants import find_plant
 from rig.cli.answer import choose_file
@@ -44,8 +44,7 @@ def split_words(words: Sequence[str], trace: str | None, plant: str) -> tuple[li
         else:
             hint = suggest_name(word, known, 0.5) or " (rig effects lists them)"
             raise InputError("effect", word, f"an effect of the catalogue{hint}")
-    if not effects:
-        raise InputError("effect", "", "at least one effect (rig effects lists them)")
+    require(effects, "effect", "", "at least one effect (rig effects lists them)")
     return effects, trace
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fdi import foreign_code
 from plant.effects import load_effects
-from plant.errors import InputError
+from plant.errors import require
 from plant.model import Model, load_model
 
 
@@ -22,8 +22,7 @@ def parse_changes(pairs: Sequence[str]) -> dict[str, str]:
     table: dict[str, str] = {}
     for pair in pairs:
         name, equals, value = pair.partition("=")
-        if not (equals and value and "." in name):
-            raise InputError("--set", pair, "GROUP.FIELD=VALUE, such as spool.static_friction=35")
+        require(equals and value and "." in name, "--set", pair, "GROUP.FIELD=VALUE, such as spool.static_friction=35")
         table[name.strip()] = value.strip()
     return table
 

@@ -6,7 +6,7 @@ The mapping is fixed (1600.., 1A00.. are const); COB-ID and transmission type (1
 import struct
 from collections.abc import Callable
 
-from plant.errors import InputError
+from plant.errors import InputError, require
 from rig.device.dictionary import INVALID, Dictionary, check_switchable
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
 from rig.device.sdo import Abort, SdoAbort
@@ -38,8 +38,7 @@ def read_mapping(od: Dictionary, index: int) -> tuple[list[tuple[int, int]], str
         keys.append(key)
         codes += entry.code
     packer = struct.Struct(codes)
-    if packer.size > 8:
-        raise InputError(od.path, f"{index:04X}", f"at most 8 bytes in a PDO, not {packer.size}")
+    require(packer.size <= 8, od.path, f"{index:04X}", f"at most 8 bytes in a PDO, not {packer.size}")
     return keys, packer
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from fdi.report.report import to_plain
 from fdi.trace.trace import Trace
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.tables import decode_text, read_file
 from rig.evidence.package import INDEX
 from rig.evidence.requirements import RUN, JudgedCheck, JudgedRun, Requirement
@@ -96,8 +96,7 @@ def collect_runs(sources: Iterable[str]) -> Package:
     for source in map(Path, sources):
         root = source.parent if source.name == "trace.mcap" else source
         verdicts = sorted(root.rglob("verdict.json"))
-        if not verdicts:
-            raise InputError(source, "", "the folder of a run or suite, with the verdict.json of a run in it")
+        require(verdicts, source, "", "the folder of a run or suite, with the verdict.json of a run in it")
         stem = root.resolve().name
         base = next(name for number in range(1, len(taken) + 2)
                     if (name := stem if number == 1 else f"{stem}-{number}") not in taken)

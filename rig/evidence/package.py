@@ -20,7 +20,7 @@ from typing import IO, NamedTuple
 
 from fdi.output import write_whole
 from fdi.progress import Progress
-from plant.errors import InputError, report_system_error, show_value
+from plant.errors import InputError, report_system_error, require, show_value
 
 MANIFEST, INDEX = "MANIFEST.sha256", "evidence.json"
 Files = Mapping[str, Callable[[], IO[bytes]]]  # name -> opens its content
@@ -89,8 +89,7 @@ def write_package(contents: Mapping[str, bytes | Path], out: Path, key: str, pro
         if not is_inside(name) or not name.isprintable():
             raise InputError(out, "", f"files whose names stay in the folder, not {show_value(name)}")
         hashes[name] = _compute_sha256(files[name])
-        if not hashes[name]:
-            raise InputError(name, "", "a file that can be read")
+        require(hashes[name], name, "", "a file that can be read")
         progress("sealing", 0.5 * number / len(files))
     manifest = _format_manifest(hashes)
     files[MANIFEST] = partial(open_content, manifest)

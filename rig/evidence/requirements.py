@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 from fdi.report.report import Cell, Column, Medium, Mood, Table, tabulate
-from plant.errors import InputError, suggest_name
+from plant.errors import InputError, require, suggest_name
 from plant.tables import decode_text, read_file
 
 RUN = "whole run"  # the name of what verifies a requirement of a case
@@ -121,15 +121,13 @@ def read_requirements(path: Path) -> dict[str, str]:
         InputError: the file, and the line or object that cannot be used.
     """
     readers = {".csv": _read_csv, ".reqif": _read_reqif, ".xml": _read_reqif}
-    if path.suffix.lower() not in readers:
-        raise InputError(path, "", "a .csv or .reqif file with requirements")
+    require(path.suffix.lower() in readers, path, "", "a .csv or .reqif file with requirements")
     found: dict[str, str] = {}
     for place, name, text in readers[path.suffix.lower()](decode_text(read_file(path), path), path):
         if not name or not name.isprintable() or name in found:
             raise InputError(place, "id", f"an id in one line, used once, not {name[:80]!r}")
         found[name] = " ".join(text.split())
-    if not found:
-        raise InputError(path, "", "at least one requirement")
+    require(found, path, "", "at least one requirement")
     return found
 
 
@@ -152,14 +150,12 @@ def _read_csv(text: str, path: Path) -> Iterator[tuple[str, str, str]]:
 
 def _read_reqif(text: str, path: Path) -> Iterator[tuple[str, str, str]]:
     """Place, id and text of each object that is no heading: ReqIF.ForeignID or LONG-NAME, ReqIF.Text or DESC."""
-    if "<!DOCTYPE" in text:
-        raise InputError(path, "", "ReqIF without a document type, whose entities could fill the memory")
+    require("<!DOCTYPE" not in text, path, "", "ReqIF without a document type, whose entities could fill the memory")
     try:
         root = ElementTree.fromstring(text.encode())
     except ElementTree.ParseError as error:
         raise InputError(f"{path}:{error.position[0]}", "", f"ReqIF, which is XML ({error})") from error
-    if root.tag != f"{_REQIF}REQ-IF":
-        raise InputError(path, "", f"ReqIF 1.x: REQ-IF as outermost element, not {root.tag}")
+    require(root.tag == f"{_REQIF}REQ-IF", path, "", f"ReqIF 1.x: REQ-IF as outermost element, not {root.tag}")
     names = {each.get("IDENTIFIER", ""): each.get("LONG-NAME", "") for each in root.iter()
              if each.tag.startswith(f"{_REQIF}ATTRIBUTE-DEFINITION-") and "IDENTIFIER" in each.attrib}
     for thing in root.iter(f"{_REQIF}SPEC-OBJECT"):

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from plant.compile import find_cache_folder
-from plant.errors import InputError, RigError
+from plant.errors import InputError, RigError, require
 from rig.firmware.object_table import write_object_table
 
 FOLDER = Path(__file__).parent
@@ -43,8 +43,7 @@ def build_device(folder: Path, flags: Sequence[str] = (*FLAGS, "-Werror")) -> Pa
         RigError: the compiler reports an error.
     """
     own = sorted(folder.glob("*.c"))
-    if not own:
-        raise InputError(folder, "", "a folder with the C files of a device")
+    require(own, folder, "", "a folder with the C files of a device")
     stack = [path for path in sorted(FOLDER.glob("*.c")) if path.name not in REFERENCE]
     own += [_write_generated(write_object_table(eds)) / "object_table.c" for eds in folder.glob("*.eds")]
     return build_program(folder.resolve().name, [*own, *stack], flags)

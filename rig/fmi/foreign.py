@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.errors import InputError, RigError, suggest_name
+from plant.errors import InputError, RigError, require, suggest_name
 from plant.tables import Place
 from rig.fmi.host import Settings, Variable
 
@@ -69,8 +69,7 @@ def read_description(path: Path) -> Description:
     except Exception as error:  # FMPy raises Exception itself
         said = " ".join(str(error).split())
         raise InputError(path, "modelDescription.xml", f"that of an FMU 2.0 or 3.0 ({said})") from error
-    if version[:2] not in ("2.", "3."):
-        raise InputError(path, "fmiVersion", f"2.0 or 3.0, not {version}")
+    require(version[:2] in ("2.", "3."), path, "fmiVersion", f"2.0 or 3.0, not {version}")
     unit = found.coSimulation
     if unit is None:
         kind = "model exchange" if found.modelExchange is not None else "scheduled execution"

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from plant.errors import InputError, RigError
+from plant.errors import InputError, RigError, require
 from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.network.can_interface import UdpBus
 from rig.network.frame import (
@@ -127,8 +127,7 @@ def open_can(spec: str, bitrate: int = BITRATE, fd: bool = False) -> can.BusABC:
     Raises InputError for a bad spec, RigError if the bus cannot be opened.
     """
     kind, channel = parse_spec(spec, "--bus")
-    if kind == "embedded":
-        raise InputError("--bus", spec, "a bus between programs, such as udp_multicast or socketcan:vcan0")
+    require(kind != "embedded", "--bus", spec, "a bus between programs, such as udp_multicast or socketcan:vcan0")
     if kind == "socketcan":
         require_interface(channel, fd)
     try:
@@ -197,8 +196,7 @@ def parse_spec(spec: str, where: str) -> tuple[str, str]:
     if kind == "virtual":
         return kind, channel or "eha-rig"
     if kind == "udp_multicast":
-        if not is_group(channel or GROUP):
-            raise InputError(where, spec, "an IPv4 multicast group, such as udp_multicast:239.0.0.1")
+        require(is_group(channel or GROUP), where, spec, "an IPv4 multicast group, such as udp_multicast:239.0.0.1")
         return kind, channel or GROUP
     if kind in can.VALID_INTERFACES and channel:
         return kind, channel

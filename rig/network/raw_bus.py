@@ -47,7 +47,7 @@ from can.interfaces.udp_multicast.utils import pack_message
 from numpy.typing import NDArray
 
 from plant.compile import ForeignCall, keep_apart
-from plant.errors import InputError, RigError
+from plant.errors import RigError, require
 from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.network import udp
 from rig.network.bus import can_open, parse_spec, require_interface
@@ -504,8 +504,8 @@ class RawBus:
             RigError: the bus cannot be opened.
         """
         kind, channel = parse_spec(spec, "--bus")
-        if not can_open(spec):
-            raise InputError("--bus", spec, "socketcan:INTERFACE or udp_multicast[:GROUP] on a little-endian machine")
+        require(can_open(spec), "--bus", spec,
+                "socketcan:INTERFACE or udp_multicast[:GROUP] on a little-endian machine")
         self.spec = spec
         self.port = _make_port()
         self._turn: Turn | None = None

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import NamedTuple, cast
 
 from plant import load_model
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.signals import Signals
 from rig.benches.bench import Bench, CanopenNode, Flags, FrameSpec
 from rig.benches.bench_file import load_bench
@@ -63,9 +63,8 @@ class PlantPlace(NamedTuple):
         Raises:
             InputError: the bench has none, or one that lacks a signal or frame of our emulator.
         """
-        if PLANT not in bench.nodes:
-            raise InputError(bench.name, "plant_node", "a table with the plant as a node; the rig itself moves the "
-                                                       "plant of this bench")
+        require(PLANT in bench.nodes, bench.name, "plant_node",
+                "a table with the plant as a node; the rig itself moves the plant of this bench")
         readings, node = [s.word for s in bench.signals.outputs], bench.nodes[PLANT]
         try:
             found = cls(node, bench.frames.sync or 0, bench.frames.find_role("feedback"),

@@ -21,7 +21,7 @@ from fdi.trace.mcap_log import open_log
 from fdi.trace.sensor_dynamics import write_sensors
 from fdi.trace.trace import Trace, make_table_trace
 from plant import signals as plant_signals
-from plant.errors import InputError, report_system_error
+from plant.errors import InputError, report_system_error, require
 from plant.tables import read_file
 from rig.benches.bench import (
     EXTENDED,
@@ -58,16 +58,13 @@ def export_trace(source: Path, out: Path, everything: bool = False) -> int:
         trace = Trace.read(source, all=everything)
         trace.write_csv(require_writable(out, "--out", source=source))
         return len(trace)
-    if out.suffix not in RAW_SUFFIXES:
-        raise InputError(out, "--out", f"a name that ends in .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}")
+    require(out.suffix in RAW_SUFFIXES, out, "--out", f"a name that ends in .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}")
     import can
 
     path = source / "trace.mcap" if source.is_dir() else source
-    if path.suffix != ".mcap":
-        raise InputError(path, "", "a log with raw frames (.mcap)")
+    require(path.suffix == ".mcap", path, "", "a log with raw frames (.mcap)")
     raw = list(read_raw_frames(path))
-    if not raw:
-        raise InputError(path, "/can", "at least one raw frame")
+    require(raw, path, "/can", "at least one raw frame")
     if out.suffix == ".trc" and any(frame.cob_id & FD for frame in raw):
         raise InputError(out, "--out", "a name that ends in .log, .blf or .asc: a .trc would lose the CAN FD frames")
     with (report_system_error(out, "--out", "a place that can be written"),
@@ -337,8 +334,7 @@ def _read_signals(path: Path, messages: Mapping[tuple[int, bool], Any], names: C
                 columns[name][0].append(float(value))
                 columns[name][1].append(frame.timestamp - first)
     for name, (values, _) in columns.items():
-        if not values:
-            raise InputError(path, name, "at least one frame of this message")
+        require(values, path, name, "at least one frame of this message")
     return {name: Channel(*map(np.frombuffer, column)) for name, column in columns.items()}
 
 
@@ -350,6 +346,5 @@ def open_can_log(path: Path, dbc: Path) -> Measurement:
     """
     messages = _load_messages(dbc)
     units = {f"{m.name}.{s.name}": s.unit or "" for m in messages.values() for s in m.signals}
-    if not units:
-        raise InputError(dbc, "--dbc", "a DBC file with at least one signal")
+    require(units, dbc, "--dbc", "a DBC file with at least one signal")
     return Measurement(path, f"CAN log, {dbc.name}", units, partial(_read_signals, path, messages), has_times=True)

@@ -25,7 +25,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Fd, FileDescr
 
 from fdi.trace.check_result import CheckResult, describe_field
 from plant import signals as plant_signals
-from plant.errors import InputError
+from plant.errors import require
 
 U32 = Annotated[int, "fixed32"]
 
@@ -108,9 +108,8 @@ def make_row_record(declared: plant_signals.Signals) -> type[Signals]:
     kept = {item.name: item for item in fields(Signals)}
     taken = {*kept, *(item.name for item in fields(Timing))} - {*plant_signals.EHA.names}
     for name in declared.names:
-        if name in taken or not name.isidentifier():
-            raise InputError("plant", f"signal {name}", "the name of a column that no row of a run has already (it has "
-                                                        f"{', '.join(sorted(taken))})")
+        require(name not in taken and name.isidentifier(), "plant", f"signal {name}",
+                f"the name of a column that no row of a run has already (it has {', '.join(sorted(taken))})")
     first, last = (("cycle", "phase"), ("control", "status", "flags"))
     hints = get_type_hints(Signals, include_extras=True)
 

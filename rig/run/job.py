@@ -21,7 +21,7 @@ from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import Trace
 from plant import InputError, Model, load_model
 from plant.effects import load_effects
-from plant.errors import report_system_error
+from plant.errors import report_system_error, require
 from plant.model import find_plant_of_model, find_quantity, parse_model
 from plant.parameters import parse_toml
 from plant.plant_files import read_named_plant
@@ -128,9 +128,8 @@ def require_bench_cycle(model: Model, bench: Bench, where: object) -> None:
         InputError: it names `where` the model comes from.
     """
     cycle = bench.cycle_ns / 1e9
-    if model["controller.period"] not in (cycle, model.nominal["controller.period"]):
-        raise InputError(where, "controller.period", f"{cycle:g} s, the cycle of {bench.name!r}: a bench file gives "
-                                                     "another, and rig simulate takes any")
+    require(model["controller.period"] in (cycle, model.nominal["controller.period"]), where, "controller.period",
+            f"{cycle:g} s, the cycle of {bench.name!r}: a bench file gives another, and rig simulate takes any")
 
 
 def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print_on_standard_error) -> Job:
@@ -146,8 +145,8 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
     attachments, said = trace.attachments, trace.provenance
     bundle = {name.removeprefix(_SEQUENCE_FOLDER): data for name, data in attachments.items()
               if name.startswith(_SEQUENCE_FOLDER)}
-    if "model.toml" not in attachments or not bundle or not said.keys() >= _REQUIRED_SETTINGS:
-        raise InputError(path, "attachments", "the sequence and the model of a run; only logs of `rig run` have them")
+    require("model.toml" in attachments and bundle and said.keys() >= _REQUIRED_SETTINGS, path, "attachments",
+            "the sequence and the model of a run; only logs of `rig run` have them")
     effect_codes = [ForeignCode(name, content) for name, content in attachments.items()
                     if name.startswith(_EFFECT_FOLDER)]
     plant_codes = [ForeignCode(name, content) for name, content in attachments.items()

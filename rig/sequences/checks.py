@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fdi.trace.check_result import CheckResult, compute_speed, filter_median
 from plant import tables
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.quantity import Quantity
 from plant.run import Columns
 from plant.segments import LONGEST, RATE, Array
@@ -264,13 +264,13 @@ class Check:
     signals: Signals = field(default_factory=find_tested, metadata={"key": False}, repr=False)  # of the plant
 
     def __post_init__(self) -> None:
-        require_check(self.low is not None or self.high is not None, "", "a low, a high, or both")
+        require(self.low is not None or self.high is not None, "check", "", "a low, a high, or both")
         if self.low is not None and self.high is not None:
-            require_check(self.low <= self.high, "high", f"a number from low = {self.low:g} up, not {self.high:g}")
+            require(self.low <= self.high, "check", "high", f"a number from low = {self.low:g} up, not {self.high:g}")
         if isinstance(self.window, tuple):
-            require_check(self.window[0] < self.window[1], "window", f"[t0, t1] with t0 < t1, not {[*self.window]}")
+            require(self.window[0] < self.window[1], "check", "window", f"[t0, t1] with t0 < t1, not {[*self.window]}")
         for word in self.requirements:
-            require_check(bool(word.strip()) and word.isprintable(), "requirement",
+            require(bool(word.strip()) and word.isprintable(), "check", "requirement",
                           f"the id of a requirement, such as REQ-12, not {word!r}")
         _ = self.scale  # raises InputError for a unit of something else
 
@@ -377,12 +377,6 @@ def find_skipped(check: Check, bench: Bench) -> SkippedCheck | None:
     return None
 
 
-def require_check(holds: bool, key: str, expected: str) -> None:
-    """Raise InputError unless `holds`; the caller adds file and line."""
-    if not holds:
-        raise InputError("check", key, expected)
-
-
 @dataclass(frozen=True, kw_only=True)
 class OfPosition(Check):
     """A number of the position against the demand."""
@@ -423,9 +417,9 @@ class Response(Check):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_check(bool(self.event) != (self.signal is not None), "event", "either an event or a signal")
+        require(bool(self.event) != (self.signal is not None), "check", "event", "either an event or a signal")
         levelled = self.above is not None or self.below is not None
-        require_check(levelled == (self.signal is not None), "signal",
+        require(levelled == (self.signal is not None), "check", "signal",
                       "a signal with a level above or below which it counts")
 
 
@@ -448,7 +442,7 @@ class OfEvent(Check):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_check(bool(self.event.split()), "event", "at least one word")
+        require(bool(self.event.split()), "check", "event", "at least one word")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -470,7 +464,7 @@ class PythonCheck(Check):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_function_name(self.python)
-        require_check(self.unit.isprintable() and len(self.unit) <= 20, "unit", "a unit of at most 20 characters")
+        require(self.unit.isprintable() and len(self.unit) <= 20, "check", "unit", "a unit of at most 20 characters")
 
     @property
     def scale(self) -> float:

@@ -12,8 +12,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from plant.errors import InputError
-from plant.segments import Array, Timed, require
+from plant.errors import InputError, require
+from plant.segments import Array, Timed
 from plant.user_code import explain_errors
 
 Argument = float | str | bool
@@ -53,7 +53,7 @@ class PythonSegment(Timed):
         except (TypeError, ValueError):
             values = np.empty(0)
         is_whole = values.shape == t.shape and bool(np.isfinite(values).all())
-        require(is_whole, "python", f"a function that returns {len(t)} finite numbers, one for each time; "
+        require(is_whole, "segment", "python", f"a function that returns {len(t)} finite numbers, one for each time; "
                                     f"{self.python} returned {describe_value(returned)}")
         return values
 

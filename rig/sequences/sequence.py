@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from plant import segments, tables
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.model import build_bare_model, find_quantity, load_model
 from plant.parameters import parse_value
 from plant.plant_check import MOST_FOLLOWING_ERROR
@@ -215,12 +215,10 @@ class Sequence:
             InputError: a file is not in it or does not make a sequence.
         """
         sources = [name for name in bundle if name.endswith(".toml")]
-        if len(sources) != 1:
-            raise InputError("bundle", "", f"one .toml file, not {len(sources)}")
+        require(len(sources) == 1, "bundle", "", f"one .toml file, not {len(sources)}")
 
         def read_file(name: str) -> bytes:
-            if name not in bundle:
-                raise InputError("bundle", name, "to be part of the bundle")
+            require(name in bundle, "bundle", name, "to be part of the bundle")
             return bundle[name]
 
         return parse_sequence(tables.decode_text(bundle[sources[0]], sources[0]), sources[0], read_file, rate, plant)
@@ -476,9 +474,8 @@ def load_nominal_test(kind: Plant, period: float) -> tuple[Array, Array | None, 
     """
     if kind.profile:
         return build_profile(kind.profile, rate=1.0 / period).command, None, f"profile of {kind.name}"
-    if kind.signals.names != EHA.names:
-        raise InputError("--command", "", f"FILE with the columns t and {kind.signals.command.name}: {kind.name} "
-                                          "declares no profile")
+    require(kind.signals.names == EHA.names, "--command", "",
+            f"FILE with the columns t and {kind.signals.command.name}: {kind.name} declares no profile")
     try:
         return (*_sample_preflight(1.0 / period), "preflight")
     except InputError:  # its segments are not whole cycles of this period

@@ -21,7 +21,7 @@ from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table, tabulate, to_plain
 from fdi.report.run_report import MOODS as RUN_MOODS, write_run_page
 from fdi.trace.check_result import CheckResult
-from plant.errors import InputError, RigError
+from plant.errors import InputError, RigError, require
 from plant.quantity import Quantity
 from plant.tables import build_dataclass, decode_text, parse_table, read_file
 from rig import junit
@@ -70,8 +70,7 @@ class CaseEntry:
 
     def __post_init__(self) -> None:
         for key, values in (("sequence", self.sequence), ("seed", self.seed), *(("set", x) for x in self.set.values())):
-            if values == ():
-                raise InputError("case", key, "at least one")
+            require(values != (), "case", key, "at least one")
 
 
 @dataclass(frozen=True, kw_only=True)

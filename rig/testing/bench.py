@@ -22,7 +22,7 @@ from fdi.report.run_report import (
 )
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Event, Trace
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.plants import find_plant
 from plant.segments import RATE
 from rig.run.job import JobChoice, build_job, load_tested_plant
@@ -200,8 +200,7 @@ def build_sequence(sequence: str | None, command: Command | None, rate: float = 
     table |= {key: [*table.get(key, []), *entries] for key, entries in added.items()}
 
     def read_file(file: str) -> bytes:
-        if file not in files:
-            raise InputError(file, "", "a file of the sequence")
+        require(file in files, file, "", "a file of the sequence")
         return files[file]
 
     return parse_sequence(write_toml(table), name, read_file, rate, plant)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fdi.output import require_writable
-from plant.errors import InputError
+from plant.errors import InputError, require
 from rig.interrupts import ignore_interrupts
 from rig.view.live_run import LivePlan
 from rig.view.viewer import is_listening, lacks_display
@@ -99,13 +99,11 @@ def find_viewer_place(text: str) -> ViewerPlace:
     if word.endswith(".rrd"):
         return ViewerPlace(file=Path(require_writable(word, "--live")).absolute())
     if word.isdecimal() and 0 < int(word) < 65536:
-        if not is_listening(int(word)):
-            raise InputError("--live", text, f"a viewer that listens on 127.0.0.1:{word} (rerun --bind 127.0.0.1 "
-                                             f"--port {word})")
+        require(is_listening(int(word)), "--live", text,
+                f"a viewer that listens on 127.0.0.1:{word} (rerun --bind 127.0.0.1 --port {word})")
         return ViewerPlace(port=int(word))
-    if text != "rerun":
-        raise InputError("--live", text, "rerun, rerun:PORT of an open viewer, or rerun:FILE.rrd")
-    if lacks_display():
-        raise InputError("--live", text, "a display for the viewer's window; without one rerun:FILE.rrd writes a file, "
-                                         "and rerun:PORT uses a viewer that is open")
+    require(text == "rerun", "--live", text, "rerun, rerun:PORT of an open viewer, or rerun:FILE.rrd")
+    require(not lacks_display(), "--live", text,
+            "a display for the viewer's window; without one rerun:FILE.rrd writes a file, "
+            "and rerun:PORT uses a viewer that is open")
     return ViewerPlace()

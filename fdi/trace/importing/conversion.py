@@ -14,7 +14,7 @@ import numpy as np
 from fdi.trace.importing.formats import OTHER_UNITS, Channel, Measurement
 from fdi.trace.sensor_dynamics import SensorDynamics
 from fdi.trace.trace import Floats, Trace
-from plant.errors import InputError, show_value, suggest_name
+from plant.errors import InputError, require, show_value, suggest_name
 from plant.parameters import parse_toml
 from plant.signals import EHA, Signals
 from plant.units import Unit, fit_unit, list_fitting_units, require_unit
@@ -370,8 +370,7 @@ def import_measurement(measurement: Measurement, chosen: ImportMap, cycle: float
     for name, signal in chosen.signals.items():
         own, part = samples[name], CYCLE_PARTS.get(signals.find(name).role, "")
         x, how = place_samples(own, rows, period, signal.method, signal.low_pass, part)
-        if np.isnan(x).all():
-            raise InputError(chosen.path, f"signals.{name}", "samples within the time of the other signals")
+        require(not np.isnan(x).all(), chosen.path, f"signals.{name}", "samples within the time of the other signals")
         sensors[name], how = _find_sensor(signal, own, rows, how, period, signals.find(name).unit)
         columns[name] = x
         source = f"{signal.term.source} - {signal.minus.source}" if signal.minus else signal.term.source
@@ -476,11 +475,9 @@ def _make_rows(chosen: ImportMap, samples: Mapping[str, Samples], period: float)
     origin = _find_origin(samples[chosen.declared.controlled.name], samples[chosen.declared.drive.name], period)
     start = origin + period * math.ceil((first - origin) / period - 0.5)
     count = math.floor((last - start) / period + 0.5) + 1
-    if count < 2:
-        raise InputError(chosen.path, "signals", f"{', '.join(chosen.declared.required)} recorded at the same time")
-    if count > MOST_ROWS:
-        raise InputError(chosen.path, "time", f"at most {MOST_ROWS} rows of {period:g} s, not {count}; is the unit of "
-                                              "the time right?")
+    require(count >= 2, chosen.path, "signals", f"{', '.join(chosen.declared.required)} recorded at the same time")
+    require(count <= MOST_ROWS, chosen.path, "time",
+            f"at most {MOST_ROWS} rows of {period:g} s, not {count}; is the unit of the time right?")
     out: Floats = start + period * np.arange(count)
     return out
 

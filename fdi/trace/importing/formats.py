@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from fdi.trace.csv_table import open_text, report_unreadable
 from fdi.trace.trace import Floats, Trace
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.units import find_unit
 
 OTHER_UNITS = ("V", "mV", "counts", "%")  # what a logger may write that needs scale and offset
@@ -37,8 +37,7 @@ def open_measurement(path: Path, separator: str | None = None, decimal: str | No
         InputError: a file that cannot be read, another format, or a package that is not installed.
     """
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(path, "", f"a file that ends in {', '.join(SUFFIXES)}")
+    require(suffix in SUFFIXES, path, "", f"a file that ends in {', '.join(SUFFIXES)}")
     if suffix != ".mcap" and not path.is_file():
         raise InputError(path, "", "a readable file" + ("" if path.exists() else "; it does not exist"))
     return (open_text_table(path, separator, decimal, name_line) if suffix in TEXT_SUFFIXES else
@@ -60,8 +59,8 @@ def _as_floats(path: Path, name: str, values: Any) -> Floats:
         InputError: anything else.
     """
     column = np.asarray(values)
-    if column.dtype.kind not in "biuf" or column.ndim != 1:
-        raise InputError(path, name, f"a channel of numbers, not {column.dtype} of shape {column.shape}")
+    require(column.dtype.kind in "biuf" and column.ndim == 1, path, name,
+            f"a channel of numbers, not {column.dtype} of shape {column.shape}")
     floats: Floats = column.astype(np.float64)
     if np.isinf(floats).any():
         raise InputError(path, name, f"finite numbers; value {int(np.isinf(floats).argmax()) + 1} is infinite")
@@ -93,8 +92,7 @@ def _open_mdf(path: Path) -> Measurement:
     places: dict[str, tuple[str, int, int]] = {  # name, group, index
         name if len(where) == 1 else f"{name} (group {group})": (name, group, index)
         for name, where in file.channels_db.items() for group, index in where if file.masters_db.get(group) != index}
-    if not places:
-        raise InputError(path, "", "an MDF file with at least one channel")
+    require(places, path, "", "an MDF file with at least one channel")
 
     def read(label: str) -> Channel:
         signal = file.get(*places[label], ignore_invalidation_bits=False)
@@ -116,8 +114,7 @@ def _open_mat(path: Path) -> Measurement:
     content = _open_with(path, "a MAT file of version 5 to 7.2, as save -v7 writes it",
                          partial(loadmat, squeeze_me=True, struct_as_record=False))
     columns = dict(_flatten({name: value for name, value in content.items() if not name.startswith("__")}))
-    if not columns:
-        raise InputError(path, "", "a MAT file with at least one vector of numbers")
+    require(columns, path, "", "a MAT file with at least one vector of numbers")
     return Measurement(path, "MAT", {name: split_unit(name)[1] for name in columns},
                        read_singly(lambda name: Channel(_as_floats(path, name, columns[name]))))
 
@@ -204,8 +201,7 @@ def _read_columns(path: Path, layout: Layout, names: Collection[str], dates: Col
                 except ValueError:
                     kind = "a date and time (ISO 8601)" if name in dates else "a finite number or an empty field"
                     raise InputError(f"{path}: line {line}", name, f"{kind}, not {fields[i]!r}") from None
-    if not len(next(iter(columns.values()), array("d"))):
-        raise InputError(path, "", "at least one row of numbers")
+    require(len(next(iter(columns.values()), array("d"))), path, "", "at least one row of numbers")
     return {name: Channel(np.frombuffer(column)) for name, column in columns.items()}
 
 
@@ -262,8 +258,7 @@ def _find_encoding(path: Path) -> str:
         start = stream.read(65536).encode("latin-1")
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
-    if b"\0" in start:
-        raise InputError(path, "", "a text file; it holds zero bytes")
+    require(b"\0" not in start, path, "", "a text file; it holds zero bytes")
     try:
         codecs.getincrementaldecoder("utf-8-sig")().decode(start)
     except UnicodeDecodeError:
@@ -340,8 +335,7 @@ def _find_separators(path: Path, lines: list[str], separator: str | None, decima
         score = len(cells) * (sum(_is_number(cell, parse) for cell in cells) / max(len(cells), 1)) ** 3
         if score > best:
             best, found = score, (sep, dec)
-    if not best:
-        raise InputError(path, "", "a table with at least two columns of numbers")
+    require(best, path, "", "a table with at least two columns of numbers")
     return found
 
 
@@ -364,9 +358,8 @@ def _find_names(path: Path, rows: list[list[str]], lines: list[str], first: int,
     """Names, units, and the line of the names: the text lines just above the numbers."""
     above = [i for i in range(first) if len(rows[i]) == width]
     if name_line is not None:
-        if name_line - 1 not in above:
-            raise InputError(f"{path}: line {name_line}", "names", f"{width} names above the first row of numbers, "
-                                                                   f"line {first + 1}")
+        require(name_line - 1 in above, f"{path}: line {name_line}", "names",
+                f"{width} names above the first row of numbers, line {first + 1}")
         above = [i for i in above if i >= name_line - 1]
     elif above:
         above = above[-2:] if _is_unit_line(rows[above[-1]]) else above[-1:]

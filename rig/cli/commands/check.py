@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fdi.report.report import Column, Line, Report, Section, Table
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.faults import is_fault_file
 from plant.model import load_model
 from plant.plant_check import check_behaviour
@@ -46,8 +46,7 @@ def check_plant(args: argparse.Namespace) -> int:
     """Exit status 1 if a plant file fails a check over its nominal test."""
     model = load_model(args.sequence).replace(parse_changes(args.set))
     kind = model.kind
-    if not kind.profile:
-        raise InputError(args.sequence, "profile", "segments of a nominal test, over which the plant is checked")
+    require(kind.profile, args.sequence, "profile", "segments of a nominal test, over which the plant is checked")
     places, findings = choose_places(args, "", args.sequence), []
     with show_progress(is_silent=args.json or args.quiet) as progress:
         progress("compiling and simulating", 0.0)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from fdi.output import write_text
-from plant.errors import InputError, RigError
+from plant.errors import InputError, RigError, require
 from rig.benches.bench import Role
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, show_progress
@@ -32,11 +32,10 @@ def run_command(args: argparse.Namespace) -> int:
     sheet = DataSheet(eds or load_bench().nodes[OWN_NODES[name]].eds, node)
     cases = choose_cases(args.chapter)
     for word in args.chapter:
-        if not choose_cases([word]):
-            raise InputError("--chapter", word, "the number of a chapter, such as 3, or of a test, such as 3.6")
+        require(choose_cases([word]), "--chapter", word,
+                "the number of a chapter, such as 3, or of a test, such as 3.6")
     for option, value, least in (("--tolerance", args.tolerance, 0.0), ("--timeout", args.timeout, 0.01)):
-        if not least <= value <= 60_000:
-            raise InputError(option, f"{value:g}", f"a number from {least:g}")
+        require(least <= value <= 60_000, option, f"{value:g}", f"a number from {least:g}")
     places = choose_places(args.out)
     junit = choose_file(args.junit, (".xml",), sheet.path, "--junit")  # may be a file in the folder of --out
     bus, _ = choose_bus(args.bus)
@@ -88,8 +87,8 @@ def choose_places(out: str | None) -> Places:
     """
     if out is None:
         return Places()
-    if out.endswith((".html", ".json", ".xml")):
-        raise InputError("--out", out, "a folder; the page and the JSON answer go there, JUnit to --junit FILE.xml")
+    require(not out.endswith((".html", ".json", ".xml")), "--out", out,
+            "a folder; the page and the JSON answer go there, JUnit to --junit FILE.xml")
     folder = make_folder(Path(out))
     return Places(folder / "conformance.html", folder / "conformance.json")
 
@@ -103,8 +102,7 @@ def open_wire(node: str, bus: str) -> Iterator[Wire]:
         RigError: the bus cannot be opened, or our own node does not start.
     """
     if bus.partition(":")[0] in EMBEDDED_NAMES:
-        if node not in ("plant", "controller"):
-            raise InputError("--bus", bus, "a bus that the node is on, such as socketcan:can0")
+        require(node in ("plant", "controller"), "--bus", bus, "a bus that the node is on, such as socketcan:can0")
         yield EmbeddedWire(VirtualClock(), [Emulator if node == "plant" else Firmware])
         return
     clock = WallClock()

@@ -7,7 +7,7 @@ from itertools import groupby
 from pathlib import Path
 
 from fdi.report.report import Cell, Column, Mood, Report, Section, Table
-from plant.errors import InputError
+from plant.errors import require
 from rig import doctor
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
@@ -19,8 +19,7 @@ MOODS: dict[doctor.Status, Mood] = {"ok": "good", "limited": "doubtful", "missin
 
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 1 if the embedded bench cannot run here."""
-    if not 0 <= args.seconds <= 3600:
-        raise InputError("--seconds", "", f"between 0 and 3600 s, not {args.seconds:g}")
+    require(0 <= args.seconds <= 3600, "--seconds", "", f"between 0 and 3600 s, not {args.seconds:g}")
     places = Places(answer=None if args.out is None else Path(args.out))
     if args.bench is not None:
         bench = load_bench(args.bench, is_trusted=args.trust)

@@ -8,7 +8,7 @@ from fdi.output import require_new
 from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell, Column, Line, Report, Section, tabulate
 from fdi.report.run_report import MOODS
-from plant.errors import InputError, escape_control_characters
+from plant.errors import InputError, escape_control_characters, require
 from rig.cli.answer import give_answer, show_progress
 from rig.evidence.contents import BILL, add_index, collect_runs
 from rig.evidence.package import verify_package, write_package
@@ -50,8 +50,8 @@ def pack(args: argparse.Namespace) -> int:
         require_new(out, is_forced=args.force)
     elif out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError("--out", str(out), "a FILE.zip, or a folder that is new or empty")
-    if any(out.resolve().is_relative_to(Path(run).resolve()) for run in args.runs):
-        raise InputError("--out", str(out), "a place outside the runs that it packs")
+    require(not any(out.resolve().is_relative_to(Path(run).resolve()) for run in args.runs), "--out", str(out),
+            "a place outside the runs that it packs")
     with show_progress(is_silent=args.json or args.quiet) as progress:
         progress("reading", 0.0)
         package = collect_runs(args.runs)

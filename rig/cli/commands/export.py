@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fdi.output import require_new, require_writable
 from fdi.report.report import Report
-from plant.errors import InputError
+from plant.errors import InputError, require
 from rig.cli.answer import give_answer
 from rig.cli.inputs import load_chosen_model
 from rig.recorder.convert import export_trace
@@ -31,8 +31,7 @@ def write_fmu(args: argparse.Namespace) -> int:
     """Write the model of --model, --set and --effects as a functional mock-up unit; exit status 0."""
     if args.trace or args.out or args.all:
         raise InputError("--fmu", str(args.fmu), "no TRACE, --out and --all beside it: it exports a model")
-    if args.fmu.suffix != ".fmu":
-        raise InputError("--fmu", str(args.fmu), "a file .fmu")
+    require(args.fmu.suffix == ".fmu", "--fmu", str(args.fmu), "a file .fmu")
     out = require_new(require_writable(args.fmu, "--fmu", source=args.model), is_forced=args.force)
     from rig.fmi.export import export_fmu  # here: it loads numba
 

@@ -10,7 +10,7 @@ from fdi.report.report import Report
 from fdi.trace.importing.conversion import ImportMap, import_measurement, read_map
 from fdi.trace.importing.formats import Measurement, open_measurement
 from fdi.trace.importing.guess import guess_map
-from plant.errors import InputError
+from plant.errors import InputError, require
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import give_answer
 from rig.cli.inputs import load_declared_model
@@ -20,8 +20,7 @@ from rig.recorder.convert import RAW_SUFFIXES, import_csv, import_frames, import
 def run_command(args: argparse.Namespace) -> int:
     """The log goes to --out (default: FILE with .mcap in place of its suffix)."""
     source = Path(args.file)
-    if not source.exists():
-        raise InputError(source, "", "a file that can be read; it does not exist")
+    require(source.exists(), source, "", "a file that can be read; it does not exist")
     if args.guess and args.map:
         raise InputError("--guess", args.map, "--guess or --map, not both")
     if args.force and not args.guess:
@@ -34,8 +33,7 @@ def run_command(args: argparse.Namespace) -> int:
     out = source.with_name(source.name.split(".")[0] + suffix) if args.out is None else Path(args.out)
     if args.guess:
         return write_guess(args, source, require_new(out, is_forced=args.force))
-    if out.suffix != ".mcap":
-        raise InputError(out, "--out", "a name that ends in .mcap")
+    require(out.suffix == ".mcap", out, "--out", "a name that ends in .mcap")
     require_writable(out, "--out", source=source)
     return import_by_map(args, source, out) if args.map else import_own(args, source, out)
 

@@ -12,7 +12,7 @@ from fdi.diagnosis.faults import load_faults
 from fdi.output import require_new, require_writable, write_text
 from fdi.report.report import Line, Report, Section
 from plant.effects import load_effects
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.faults import EXAMPLE, WORD
 from plant.model import load_model
 from plant.plants import load_plant
@@ -28,8 +28,7 @@ def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 also where the file is to be completed."""
     suffix, write, read, check = KINDS[args.kind]
     path = Path(args.out or f"{args.name.removesuffix(suffix)}{suffix}")
-    if path.suffix != suffix:
-        raise InputError("--out", str(path), f"FILE{suffix}")
+    require(path.suffix == suffix, "--out", str(path), f"FILE{suffix}")
     require_new(require_writable(path, "--out"), is_forced=args.force)
     text = write(path, args)
     write_text(path, text)
