@@ -14,7 +14,7 @@ from fdi.progress import Progress
 from fdi.report.report import Line, Medium, Report, Section
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Trace
-from plant.errors import InputError
+from plant.errors import InputError, require
 from rig.cli.answer import choose_file, give_answer, open_console, show_progress
 from rig.cli.command_list import LIVE_ON_TERMINAL
 from rig.cli.inputs import is_suite_file, parse_changes
@@ -36,8 +36,7 @@ def run_sequence(args: argparse.Namespace, pages: PageWriter) -> int:
         args.live, args.sequence = LIVE_ON_TERMINAL, [args.live, *args.sequence]  # the word behind --live is a sequence
     if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
         raise InputError("--max-overruns", "", f"a fraction from 0 to 1, not {args.max_overruns:g}")
-    if args.requirements and args.source:
-        raise InputError("--requirements", "", "sequences or a suite file, not --from")
+    require(not (args.requirements and args.source), "--requirements", "", "sequences or a suite file, not --from")
     if not args.source and (len(args.sequence) > 1 or args.requirements or any(map(is_suite_file, args.sequence))):
         if args.live:
             raise InputError("--live", "", "one sequence; runs of a suite run side by side")
@@ -191,8 +190,8 @@ def repeat_job(source: Path, args: argparse.Namespace) -> Job:
         raise InputError("--from", str(source), "no SEQUENCE, --model, --set, --seed, --effects or --bench: the log "
                                                 "has them")
     log = source / "trace.mcap" if source.is_dir() else source
-    if args.out and (Path(args.out) / "trace.mcap").resolve() == log.resolve():
-        raise InputError("--out", args.out, "another folder than that of the log to repeat, which would be overwritten")
+    require(not (args.out and (Path(args.out) / "trace.mcap").resolve() == log.resolve()), "--out", args.out,
+            "another folder than that of the log to repeat, which would be overwritten")
     job = read_job(source, is_trusted=args.trust)
     if args.bus == "auto" and job.bus.partition(":")[0] not in EMBEDDED_NAMES:
         raise InputError(log, f"bus {job.bus}", f"--bus {job.bus} to use it again, or --bus embedded: the bus of a log "

@@ -65,8 +65,8 @@ def export_trace(source: Path, out: Path, everything: bool = False) -> int:
     require(path.suffix == ".mcap", path, "", "a log with raw frames (.mcap)")
     raw = list(read_raw_frames(path))
     require(raw, path, "/can", "at least one raw frame")
-    if out.suffix == ".trc" and any(frame.cob_id & FD for frame in raw):
-        raise InputError(out, "--out", "a name that ends in .log, .blf or .asc: a .trc would lose the CAN FD frames")
+    require(not (out.suffix == ".trc" and any(frame.cob_id & FD for frame in raw)), out, "--out",
+            "a name that ends in .log, .blf or .asc: a .trc would lose the CAN FD frames")
     with (report_system_error(out, "--out", "a place that can be written"),
           write_whole(require_writable(out, "--out")) as part, can.Logger(part) as writer):
         for frame in raw:

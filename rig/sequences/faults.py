@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from plant import tables
 from plant.effects import CATALOGUE
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.model import Model, find_quantity
 from plant.parameters import check_combinations, parse_value
 from plant.plants import find_plant
@@ -85,9 +85,8 @@ class Parameter(_Ramped):
     def find_target(self, quantity: Quantity) -> float:
         """The number that `value` stands for; raises InputError at the key that cannot be for such a parameter."""
         value = parse_value("fault", "value", quantity, self.value)
-        if quantity.words and self.ramp:
-            raise InputError("fault", "ramp",
-                             f"none: {self.parameter} is {quantity.expected}, with nothing between them")
+        require(not (quantity.words and self.ramp), "fault", "ramp",
+                f"none: {self.parameter} is {quantity.expected}, with nothing between them")
         return value
 
 

@@ -17,8 +17,8 @@ def run_command(args: argparse.Namespace) -> int:
         return write_fmu(args)
     if args.trace is None:
         raise InputError("TRACE", "", "a trace to export, or --fmu OUT.fmu for a model")
-    if args.model or args.set or args.effects:
-        raise InputError("--fmu", "", "OUT.fmu beside --model, --set and --effects: they do not change a trace")
+    require(not (args.model or args.set or args.effects), "--fmu", "",
+            "OUT.fmu beside --model, --set and --effects: they do not change a trace")
     if args.out is None:
         raise InputError("--out", "", "the file to write, such as run.csv or frames.blf")
     out = require_new(require_writable(args.out, "--out", source=args.trace), is_forced=args.force)
@@ -29,8 +29,8 @@ def run_command(args: argparse.Namespace) -> int:
 
 def write_fmu(args: argparse.Namespace) -> int:
     """Write the model of --model, --set and --effects as a functional mock-up unit; exit status 0."""
-    if args.trace or args.out or args.all:
-        raise InputError("--fmu", str(args.fmu), "no TRACE, --out and --all beside it: it exports a model")
+    require(not (args.trace or args.out or args.all), "--fmu", str(args.fmu),
+            "no TRACE, --out and --all beside it: it exports a model")
     require(args.fmu.suffix == ".fmu", "--fmu", str(args.fmu), "a file .fmu")
     out = require_new(require_writable(args.fmu, "--fmu", source=args.model), is_forced=args.force)
     from rig.fmi.export import export_fmu  # here: it loads numba

@@ -21,8 +21,7 @@ def run_command(args: argparse.Namespace) -> int:
     """The log goes to --out (default: FILE with .mcap in place of its suffix)."""
     source = Path(args.file)
     require(source.exists(), source, "", "a file that can be read; it does not exist")
-    if args.guess and args.map:
-        raise InputError("--guess", args.map, "--guess or --map, not both")
+    require(not (args.guess and args.map), "--guess", args.map, "--guess or --map, not both")
     if args.force and not args.guess:
         raise InputError("--force", "", "--guess, whose map it lets replace another")
     if args.bench and (args.map or args.guess or source.suffix not in RAW_SUFFIXES):
