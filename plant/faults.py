@@ -114,8 +114,7 @@ def read_faults(path: Path, kind: Any) -> tuple[Fault, ...]:
     """
     tables, place = parse_table(decode_text(read_file(path), path), str(path))
     for key in tables:
-        if key != "faults":
-            raise place.at(key).refuse("only tables [faults.NAME]")
+        place.at(key).require(key == "faults", "only tables [faults.NAME]")
     found = tables.get("faults")
     if not isinstance(found, dict) or not found:
         raise place.refuse("at least one table [faults.NAME]")

@@ -60,6 +60,11 @@ class Place:
             known = known[:max(known.rfind("."), known.rfind("["), 0)]
         return InputError(f"{self.file}:{self.lines[known]}" if known else self.file, self.keys, expected)
 
+    def require(self, holds: object, expected: str) -> None:
+        """Refuse the value at this place unless what it must be `holds`. Raises InputError."""
+        if not holds:
+            raise self.refuse(expected)
+
     @contextmanager
     def locate(self, *, has_field: bool = False) -> Iterator[None]:
         """Turn an InputError raised within into one at this place, or, with `has_field`, at its field below."""

@@ -242,8 +242,7 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, signals
     specs = [_build_spec(frame, uses, Role.RIG if frame.is_received else Role.CONTROLLER, signals) for frame in frames]
     if keys.plant_node is not None:
         specs, nodes[Role.PLANT] = _join_plant_node(reader, specs, sync, nodes, folder, signals)
-    if len(specs) > MOST_FRAMES:
-        raise reader.place.refuse(f"at most {MOST_FRAMES} frames or pages of multiplexed ones")
+    reader.place.require(len(specs) <= MOST_FRAMES, f"at most {MOST_FRAMES} frames or pages of multiplexed ones")
     phases, ready = _list_states(frames, uses)
     decision, calibration = read_calibration(_group_keys(keys.calibration, 0), reader.place.at("calibration"), signals)
     nominal = find_plant(reader.kind).nominal if is_known(reader.kind) else {}
@@ -319,8 +318,7 @@ def _list_uses(keys: NodeKeys, place: Place, signals: Signals, *, is_canopen: bo
                 if text is not None:
                     with own.at(key).locate():
                         numbers[key] = parse_quantity(text, known[signal], "", "")
-            if numbers.get("count") == 0:
-                raise own.at("count").refuse("a number other than 0")
+            own.at("count").require(numbers.get("count") != 0, "a number other than 0")
             use = Use(place=own, is_received=is_received, signal=signal, unit=known[signal], count=numbers.get("count"),
                       offset=numbers.get("offset"), is_needed=signal in needed)
             _add_use(uses, name, use, is_canopen=is_canopen)
@@ -397,8 +395,7 @@ def _check_signals(uses: Mapping[str, Use], inputs: tuple[str, ...], outputs: tu
     for table, needed, is_received in (("inputs", inputs, True), ("outputs", outputs, False)):
         known = {use.signal for use in uses.values() if use.is_received is is_received}
         for signal in needed:
-            if signal not in known:
-                raise place.at(table).refuse(f"also the signal {signal}")
+            place.at(table).require(signal in known, f"also the signal {signal}")
 
 
 def _list_states(frames: list[DeviceFrame], uses: Mapping[str, Use],
@@ -515,10 +512,9 @@ def _join_plant_node(reader: _Reader, specs: list[FrameSpec], sync: int | None, 
     uses = _list_uses(keys, place, signals, is_canopen=True, is_plant=True)
     _check_signals(uses, (signals.drive.word,), (signals.controlled.word,), place)
     uses, frames, own_sync, node = _map_node(reader, keys, place, uses, folder)
-    if node.node == nodes[Role.CONTROLLER].node:
-        raise place.at("node").refuse(f"a node-ID other than {node.node}, which the controller has")
-    if own_sync != sync:
-        raise place.at("eds").refuse("the controller's identifier of SYNC in 0x1005")
+    place.at("node").require(node.node != nodes[Role.CONTROLLER].node,
+                             f"a node-ID other than {node.node}, which the controller has")
+    place.at("eds").require(own_sync == sync, "the controller's identifier of SYNC in 0x1005")
     joined = {spec.identifier: spec for spec in specs}
     for frame in frames:
         own = replace(_build_spec(frame, uses, Role.PLANT, signals), name=f"plant {frame.name}", roles=("valve_state",))

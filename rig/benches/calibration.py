@@ -91,13 +91,11 @@ def read_calibration(tables: Mapping[str, Mapping[str, Any]], place: Place,
         if word not in sensed:
             raise own.refuse(f"decision or a measured signal: {list_choices(word, sensed)}")
         signal = sensed[word]
-        if signal.name in found:
-            raise own.refuse(f"each signal once; {signal.name} and {signal.alias} are the same")
+        own.require(signal.name not in found, f"each signal once; {signal.name} and {signal.alias} are the same")
         keys = build_dataclass(SensorKeys, {key: str(value) if isinstance(value, datetime.date) else value
                                             for key, value in table.items()}, own)
         first, last = (_read_date(getattr(keys, key), own.at(key)) for key in ("date", "expiry"))
-        if last < first:
-            raise own.at("expiry").refuse(f"a date from {first} on, not {last}")
+        own.at("expiry").require(last >= first, f"a date from {first} on, not {last}")
         distribution, half_width = _split_distribution(keys.u)
         u = _read_size(half_width, signal.unit, own.at("u")) / WIDTHS[distribution]
         noise = 0.0 if keys.noise is None else _read_size(keys.noise, signal.unit, own.at("noise"))

@@ -95,11 +95,9 @@ def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ..
             if length > 64 or (slot.bits.kind is Kind.FLOAT and length not in (32, 64)):
                 raise use.place.refuse(f"at most 64 bits, and 32 or 64 for a floating point number; {slot.name} has "
                                        f"{length}")
-            if not is_inside:
-                raise use.place.refuse(f"a signal inside its frame; {slot.name} lies outside the {frame.length} bytes "
-                                       f"of {frame.name}")
-            if other:
-                raise use.place.refuse(f"signals that do not overlap; {slot.name} has bits of {other}")
+            use.place.require(is_inside, f"a signal inside its frame; {slot.name} lies outside the {frame.length} "
+                              f"bytes of {frame.name}")
+            use.place.require(not other, f"signals that do not overlap; {slot.name} has bits of {other}")
         if is_inside and not other:
             taken |= dict.fromkeys(places, slot.name)
             fields.append(_build_field(slot, use))
@@ -118,8 +116,8 @@ def _build_field(slot: Slot, use: Use | None) -> Field:
         if slot.bits.kind is Kind.FLOAT:
             raise use.place.refuse(f"a whole number to protect the frame with; {slot.name} is floating point")
         if use.guard is Guard.COUNTER:
-            if slot.bits.length > 32:
-                raise use.place.refuse(f"a counter of at most 32 bits; {slot.name} has {slot.bits.length}")
+            use.place.require(slot.bits.length <= 32,
+                              f"a counter of at most 32 bits; {slot.name} has {slot.bits.length}")
             return replace(slot.bits, name=slot.name, guard=use.guard)
         if "#" not in use.checksum and (slot.bits.length != 8 or slot.bits.lowest % 8):
             raise use.place.refuse(f"a byte for {use.checksum}; {slot.name} has {slot.bits.length} bits from bit "

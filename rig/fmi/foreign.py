@@ -98,8 +98,8 @@ def find_variable(description: Description, name: str, causality: Sequence[str],
     if found is None:
         hint = suggest_name(name, list(description.variables))
         raise place.refuse(f"a variable of {description.path.name}, not {name!r}{hint}")
-    if found.causality not in causality:
-        raise place.refuse(f"a variable that is {' or '.join(causality)}; {name} is {found.causality}")
+    place.require(found.causality in causality,
+                  f"a variable that is {' or '.join(causality)}; {name} is {found.causality}")
     kind = _NUMBERS.get(found.type) if description.version[0] == "2" else found.type.replace("Enumeration", "Int64")
     if kind is None or kind in ("String", "Binary", "Clock") or found.dimensions:
         raise place.refuse(f"a variable that is one number; {name} is of type {found.type}")

@@ -69,8 +69,7 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str) 
     about = read_description(file)
     known = ("file", "seed", "inputs", "outputs", "parameters")
     for name in table:
-        if name not in known:
-            raise place.at(name).refuse(f"one of {', '.join(known)}")
+        place.at(name).require(name in known, f"one of {', '.join(known)}")
     inputs, outputs, parameters = (
         dict(_list_entries(table[name], place.at(name))) if name in table else _guess_entries(about, name, place)
         for name in known[2:])
@@ -79,8 +78,8 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str) 
         raise place.refuse(f"tables [plant.inputs] and [plant.outputs], SIGNAL = VARIABLE; the unit has {has}")
     given = [_map_signal(about, name, *entry, "input") for name, entry in inputs.items()]
     shown = [_map_signal(about, name, *entry, "output") for name, entry in outputs.items()]
-    if sorted(s.role for s, _ in given) not in (["drive"], ["drive", "load"]):
-        raise place.at("inputs").refuse('one signal that drives the plant, and at most one of role = "load"')
+    place.at("inputs").require(sorted(s.role for s, _ in given) in (["drive"], ["drive", "load"]),
+                               'one signal that drives the plant, and at most one of role = "load"')
     given.sort(key=lambda item: item[0].role)
     first, drive = shown[0][0], given[0][0]
     usual = find_plant("eha")
@@ -176,8 +175,7 @@ def _find_worth(about: Description, entry: Entry, unit: str, place: Place) -> tu
 
 def _map_parameter(about: Description, name: str, entry: Entry, place: Place) -> tuple[Port, Quantity, float]:
     """A parameter, its meaning and its nominal value."""
-    if not re.fullmatch(r"\w+\.\w+", name):
-        raise place.refuse("GROUP.NAME = VARIABLE")
+    place.require(re.fullmatch(r"\w+\.\w+", name), "GROUP.NAME = VARIABLE")
     port = Port(name, find_variable(about, entry.variable, ("parameter",), place))
     worth, unit = _find_worth(about, entry, "", place)
     variable = about.variables[entry.variable]

@@ -367,16 +367,13 @@ def _check_phases(sequence: Sequence, place: Place) -> None:
                 segment.require_rate(sequence.rate)
         called = list_section_names(getattr(sequence, phase))
         for i, name in enumerate(called):
-            if name in called[:i]:
-                raise place.at(phase, i, "name").refuse(f"a name used once, not a second {name!r}")
-            if name == MAIN:
-                raise place.at(phase, i, "name").refuse(f"another name than {MAIN!r}, which is all of main")
+            place.at(phase, i, "name").require(name not in called[:i], f"a name used once, not a second {name!r}")
+            place.at(phase, i, "name").require(name != MAIN, f"another name than {MAIN!r}, which is all of main")
     _check_sizes(sequence, place)
-    if not sequence.main:
-        raise place.at("main").refuse("at least one segment")
+    place.at("main").require(sequence.main, "at least one segment")
     length = sum(segment.duration for segment in sequence.load)
-    if round(length * sequence.rate) > round(sequence.duration * sequence.rate):
-        raise place.at("load").refuse(f"at most the {sequence.duration:g} s that main lasts, not {length:g} s")
+    place.at("load").require(round(length * sequence.rate) <= round(sequence.duration * sequence.rate),
+                             f"at most the {sequence.duration:g} s that main lasts, not {length:g} s")
 
 
 def _check_sizes(sequence: Sequence, place: Place) -> None:
@@ -404,18 +401,17 @@ def _check_faults(sequence: Sequence, place: Place) -> None:
     plan = sequence.plan(0)
     taken: dict[str, list[tuple[int, int]]] = {}
     for i, fault in enumerate(sequence.faults):
-        if fault.start >= sequence.duration:
-            raise place.at(i, "start").refuse(f"a time within main's {sequence.duration:g} s, not {fault.start:g}")
+        place.at(i, "start").require(fault.start < sequence.duration,
+                                     f"a time within main's {sequence.duration:g} s, not {fault.start:g}")
         first, last = plan.find_cycles(fault)
-        if first == last:
-            raise place.at(i, "start" if fault.end is None else "end").refuse(
-                f"a fault that acts in a cycle of {1 / sequence.rate:g} s of main or more")
+        place.at(i, "start" if fault.end is None else "end").require(
+            first != last, f"a fault that acts in a cycle of {1 / sequence.rate:g} s of main or more")
         if isinstance(fault, faults.Jitter) and fault.size * sequence.rate >= 1.0:
             raise place.at(i, "size").refuse(f"a time below a cycle, {1 / sequence.rate:g} s, not {fault.size:g}")
         if isinstance(fault, Parameter):
             others = taken.setdefault(fault.parameter, [])
-            if any(first < b and a < last for a, b in others):
-                raise place.at(i, "start").refuse(f"a time when no other fault changes {fault.parameter}")
+            place.at(i, "start").require(not any(first < b and a < last for a, b in others),
+                                         f"a time when no other fault changes {fault.parameter}")
             others.append((first, last))
 
 

@@ -121,8 +121,7 @@ def read_suite_file(path: Path, base: JobChoice, *, is_trusted: bool = False) ->
     """
     table, place = parse_table(decode_text(read_file(path), path), str(path))
     suite = build_dataclass(SuiteFile, table, place)
-    if not suite.case:
-        raise place.at("case").refuse("at least one case")
+    place.at("case").require(suite.case, "at least one case")
     cases: list[Case] = []
     for i, entry in enumerate(suite.case):
         for case in _vary(entry, path.parent, base):
@@ -133,8 +132,7 @@ def read_suite_file(path: Path, base: JobChoice, *, is_trusted: bool = False) ->
                     raise place.at("case", i, "sequence").refuse(f"a sequence; {error}") from error
                 raise
             cases.append(case)
-            if len(cases) > MOST_CASES:
-                raise place.at("case", i).refuse(f"at most {MOST_CASES} cases in all")
+            place.at("case", i).require(len(cases) <= MOST_CASES, f"at most {MOST_CASES} cases in all")
     return suite, cases
 
 
