@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from plant.errors import InputError, report_system_error
+from plant.errors import InputError, report_system_error, require
 
 
 def require_writable(out: str | Path, field: str, *, source: str | Path | None = None) -> Path:
@@ -77,6 +77,6 @@ def require_new(out: str | Path, *, is_forced: bool) -> Path:
         InputError: there is a file.
     """
     path = Path(out)
-    if path.is_file() and not is_forced:
-        raise InputError("--out", str(path), "a file that does not exist yet; --force replaces this one")
+    require(is_forced or not path.is_file(), "--out", str(path),
+            "a file that does not exist yet; --force replaces this one")
     return path

@@ -28,7 +28,7 @@ from plant.compile import (
 )
 from plant.controller import take_demand
 from plant.effects import Effect
-from plant.errors import InputError, require
+from plant.errors import require
 from plant.foreign import run_foreign
 from plant.kernel_use import KernelUse
 from plant.kernels import (
@@ -291,9 +291,9 @@ class Lanes:
         values, driven, load, position = (np.ascontiguousarray(x, float) for x in (values, driven, load, position))
         require(values.ndim == 2 and values.shape[1] == len(self.names), "lanes", "values",
                 f"one row a run of {len(self.names)} values, not shape {values.shape}")
-        if driven.ndim != 1 or load.shape != driven.shape or position.shape not in (driven.shape, (0,)):
-            raise InputError("lanes", "load", "one number a cycle in each input, not shapes "
-                             f"{driven.shape}, {load.shape} and {position.shape}")
+        require(driven.ndim == 1 and load.shape == driven.shape and position.shape in (driven.shape, (0,)),
+                "lanes", "load", "one number a cycle in each input, not shapes "
+                f"{driven.shape}, {load.shape} and {position.shape}")
         slack = 0.0 if self.model.kind.correct is None else float(slack)
         shares = [Share(rung, self.names, values[members], members)
                   for rung, members in self._assign_runs(values, len(driven))]

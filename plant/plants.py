@@ -194,8 +194,7 @@ class Plant:
 
     def require_equations(self) -> None:
         """Refuse a plant whose equations are another program's. Raises InputError."""
-        if self.foreign is not None:
-            raise InputError(self.file, "", "a plant with equations for this; those of an FMU cannot be read")
+        require(self.foreign is None, self.file, "", "a plant with equations for this; those of an FMU cannot be read")
 
     def list_effects(self) -> list[Effect]:
         """The effects it can have: those of the catalogue that suit it, then its own, which may have their names."""
@@ -435,8 +434,7 @@ def load_plant(path: Path, source: bytes | None = None, key: str = "") -> Plant:
         InputError: unreadable, not Python, or what it declares is incomplete.
     """
     key, path = key or str(path), path.absolute()
-    if not path.is_file() and source is None:
-        raise InputError(path, "", "a Python file that declares a plant; it does not exist")
+    require(source is not None or path.is_file(), path, "", "a Python file that declares a plant; it does not exist")
     code = read_file(path) if source is None else source
     known = _LOADED.get(key)
     if known is not None and (known.file, known.source) == (path, code):

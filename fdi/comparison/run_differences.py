@@ -17,7 +17,7 @@ from fdi.estimation.noise import floor_from_data
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Flags, Floats, Trace, rms
-from plant.errors import InputError
+from plant.errors import require
 from plant.signals import Signal
 
 SAME_COMMAND = 1.5e-7  # m, times `Trace.scale`; the bus carries steps of 1e-7 m
@@ -117,8 +117,8 @@ def compare_runs(sources: Sequence[str], traces: Sequence[Trace]) -> RunDifferen
     """
     names = traces[0].declared.names
     for source, trace in zip(sources, traces, strict=True):
-        if trace.declared.names != names:
-            raise InputError(source, "", f"a run with the signals of {sources[0]}: {', '.join(names)}")
+        require(trace.declared.names == names, source, "",
+                f"a run with the signals of {sources[0]}: {', '.join(names)}")
     runs = tuple(Run(_make_label(i), source, trace)
                  for i, (source, trace) in enumerate(zip(sources, traces, strict=True)))
     pairs = tuple(_subtract(runs[0], other) for other in runs[1:])

@@ -16,7 +16,7 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 from fdi.thresholds import ABSENT_FAULT_SHARE, ACCEPTABLE_INTERVAL_FACTOR, INTERVAL_95_SD
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.faults import Fault, place_faults, read_faults
 from plant.plants import Plant, find_plant
 
@@ -81,8 +81,8 @@ def choose_faults(source: str | Path | None, kind: Plant) -> tuple[Fault, ...]:
     """
     if source is None and kind.faults:
         return place_faults(kind.faults, kind, kind.name)
-    if source is None and kind.name != "eha":
-        raise InputError("--faults", "", f"a fault file: the plant {kind.name} brings no faults of its own")
+    require(source is not None or kind.name == "eha", "--faults", "",
+            f"a fault file: the plant {kind.name} brings no faults of its own")
     return load_faults(source or "paper", kind)
 
 

@@ -144,16 +144,15 @@ def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: fl
         InputError: no controller, a command without steps and ramps, or a period that is not the model's.
     """
     signals = model.kind.signals
-    if model.kind.control is None or signals.is_open_loop:
-        raise InputError("--learn-bands", model.kind.name, "a plant with a controller of its own: bands are those of a "
-                                                           "closed loop")
+    require(model.kind.control is not None and not signals.is_open_loop, "--learn-bands", model.kind.name,
+            "a plant with a controller of its own: bands are those of a closed loop")
     scale = measure_scale(signals.command, com)
     parts = find_sections(com, period, scale)
     require(any(s.kind in ("step", "ramp") for s in parts), "trace", signals.command.name,
             "a command with steps or slow ramps: bands are drawn around those")
-    if abs(period / model["controller.period"] - 1) > 0.01:
-        raise InputError("trace", "t", f"one row per {1e3 * model['controller.period']:g} ms, the model's cycle, for "
-                                       f"bands by simulation, not per {1e3 * period:g} ms")
+    require(abs(period / model["controller.period"] - 1) <= 0.01, "trace", "t",
+            f"one row per {1e3 * model['controller.period']:g} ms, the model's cycle, for bands by simulation, not per "
+            f"{1e3 * period:g} ms")
     ready = model.with_effects(name.partition(".")[0] for fault in faults for name in fault.parameters)
 
     def draw(words: str, changes: Mapping[str, float], number: int = faulty) -> Floats:
@@ -361,11 +360,10 @@ def _align_trace(base: Bands, trace: Trace, name: str) -> tuple[Floats, Floats]:
     com, xj, load, period, _ = read_columns(trace)
     require(not is_loaded(load, base.kind), name, "load", "none: bands are learned from an unloaded plant")
     missing = np.isnan(xj)
-    if missing.mean() > POSITION_MISSING_SHARE:
-        raise InputError(name, base.kind.signals.controlled.name,
-                         f"a whole position, not one with {100 * missing.mean():.0f} % missing")
-    if abs(period / base.period - 1) > 0.01:
-        raise InputError(name, "t", f"one row per {1e3 * base.period:g} ms as the others, not {1e3 * period:g} ms")
+    require(missing.mean() <= POSITION_MISSING_SHARE, name, base.kind.signals.controlled.name,
+            f"a whole position, not one with {100 * missing.mean():.0f} % missing")
+    require(abs(period / base.period - 1) <= 0.01, name, "t",
+            f"one row per {1e3 * base.period:g} ms as the others, not {1e3 * period:g} ms")
     parts = find_sections(com, period, base.scale)
     require_same_command(base, parts, period, name)
     own, usual = (next(s.start for s in p if s.kind in ("step", "ramp")) for p in (parts, base.sections))

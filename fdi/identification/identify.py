@@ -170,10 +170,8 @@ def _parse_range(name: str, width: Any, model: Model, where: object) -> Range:
     possible_low, possible_high = max(q.low, q.above), min(q.high, q.below)
     field = f"identify.{name}"
     if _is_number(width):
-        if not width > 1.0 or math.isinf(width):
-            raise InputError(where, field, f"a factor above 1, not {width:g}")
-        if value <= 0.0:
-            raise InputError(where, field, f"a range [low, high]: a factor says nothing of {value:g}")
+        require(1.0 < width < math.inf, where, field, f"a factor above 1, not {width:g}")
+        require(value > 0.0, where, field, f"a range [low, high]: a factor says nothing of {value:g}")
         low, high = max(value / width, possible_low), min(value * width, possible_high)
     elif isinstance(width, list) and len(width) == 2 and all(map(_is_number, width)) and width[0] < width[1]:
         low, high = map(float, width)
@@ -270,8 +268,7 @@ def prepare_runs(model: Model, ranges: Sequence[Range], traces: Sequence[Trace],
     for name in signals or ():
         require(name in outputs, "--signals", name, f"some of {','.join(outputs)}")
     chosen = [s for s in outputs if any(s in t.signals for t in traces[:fitted]) and (signals is None or s in signals)]
-    if not chosen:
-        raise InputError(sources[0].file, ", ".join(signals or outputs), "a signal that a run to fit has")
+    require(chosen, sources[0].file, ", ".join(signals or outputs), "a signal that a run to fit has")
     limits = {s.limit for s in model.kind.signals if s.limit}
     widest = replace(model, values={**model.values, **{r.name: r.high for r in ranges if r.name in limits}})
     prepared = [_prepare(t, widest, [s for s in chosen if s in t.signals] or chosen, source)
@@ -279,8 +276,8 @@ def prepare_runs(model: Model, ranges: Sequence[Range], traces: Sequence[Trace],
     model = match_period(model, prepared[0], SAME_PERIOD)
     period = model["controller.period"]
     for trace, source in zip(prepared, sources, strict=True):
-        if abs(trace.period / period - 1.0) > SAME_PERIOD:
-            raise InputError(source.file, "t", f"rows {period:g} s apart, as in {sources[0].file}")
+        require(abs(trace.period / period - 1.0) <= SAME_PERIOD, source.file, "t",
+                f"rows {period:g} s apart, as in {sources[0].file}")
     return IdentificationRuns(model, tuple(prepared[:fitted]), tuple(prepared[fitted:]), tuple(sources))
 
 

@@ -182,8 +182,8 @@ def open_log(path: Path) -> Log:
 def _read_epoch(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> int:
     """The start of the run, ns since 1970; 0 in a log without the record `clock`. Raises InputError."""
     text = metadata.get("clock", {}).get("epoch_ns", "0")
-    if not (text.isascii() and text.isdecimal() and len(text) < 20 and int(text) < 2**63):
-        raise InputError(path, "metadata clock.epoch_ns", f"nanoseconds since 1970, not {text[:40]!r}")
+    require(text.isascii() and text.isdecimal() and len(text) < 20 and int(text) < 2**63, path,
+            "metadata clock.epoch_ns", f"nanoseconds since 1970, not {text[:40]!r}")
     return int(text)
 
 
@@ -196,10 +196,10 @@ def _check_sizes(path: Path, summary: Summary, size: int) -> None:
     if (stored := sum(index.data_size for index in summary.attachment_indexes)) > size:
         raise InputError(path, "attachments", f"at most the {size} bytes of the file, not {stored}")
     unpacked, most = sum(index.uncompressed_size for index in summary.chunk_indexes), limit_unpacked_size(size)
-    if unpacked > most:
-        raise InputError(path, "chunks", f"at most {most >> 20} MiB for {size} bytes packed, not {unpacked >> 20} MiB")
-    if len({index.chunk_start_offset for index in summary.chunk_indexes}) < len(summary.chunk_indexes):
-        raise InputError(path, "chunks", "each chunk once in the index")
+    require(unpacked <= most, path, "chunks",
+            f"at most {most >> 20} MiB for {size} bytes packed, not {unpacked >> 20} MiB")
+    require(len({index.chunk_start_offset for index in summary.chunk_indexes}) == len(summary.chunk_indexes), path,
+            "chunks", "each chunk once in the index")
     for what, count in (("attachments", len(summary.attachment_indexes)), ("metadata", len(summary.metadata_indexes))):
         require(count <= MOST_RECORDS, path, what, f"at most {MOST_RECORDS} records, not {count}")
 

@@ -346,8 +346,8 @@ def make_table_trace(path: Path, columns: dict[str, Floats], signals: Signals, n
 def _spread_rows(path: Path, rows: NDArray[np.int64], columns: Mapping[str, Floats]) -> dict[str, Floats]:
     """Columns, shape (m,), spread over all cycles 0..rows[-1]: NaN where there is none."""
     n = int(rows[-1]) + 1
-    if n > 10 * len(rows) + 1_000_000:  # the columns are as long as the numbers say, not as the file
-        raise InputError(path, "t", f"gaps that leave more than {len(rows)} of {n} cycles")
+    # The columns are as long as the numbers say, not as the file.
+    require(n <= 10 * len(rows) + 1_000_000, path, "t", f"gaps that leave more than {len(rows)} of {n} cycles")
     out = {name: np.full(n, math.nan) for name in columns}
     for name, values in columns.items():
         out[name][rows] = values
@@ -388,8 +388,7 @@ def _from_log(log: Log, everything: bool, declared: Signals) -> Trace:
         raise InputError(log.path, "/signals.cycle", f"each cycle once, not {cycle[:-1][np.diff(cycle) == 0][0]} again")
     period = _find_period(log, run, table[:, 0] * 1e-9, cycle)
     main = np.flatnonzero(phase == MAIN)
-    if not everything and not len(main):
-        raise InputError(log.path, "/signals.phase", "a main phase; this run ended in its set-up")
+    require(everything or len(main), log.path, "/signals.phase", "a main phase; this run ended in its set-up")
     first = main[0] if len(main) else 0
     kept = slice(None) if everything else slice(main[0], main[-1] + 1)
     seconds = _make_clock(table[:, 0], (cycle - cycle[first]) * period, table[first, 0])
@@ -454,8 +453,8 @@ def _find_period(log: Log, run: Mapping[str, str], t: Floats, cycle: NDArray[np.
         period = float(said)
     except ValueError:
         period = math.nan
-    if not 1e-6 <= period <= 3600.0:  # nor NaN
-        raise InputError(log.path, "metadata run.period", f"seconds, from 1e-6 to 3600, not {str(said)!r}")
+    # the bounds hold for no NaN
+    require(1e-6 <= period <= 3600.0, log.path, "metadata run.period", f"seconds, from 1e-6 to 3600, not {str(said)!r}")
     return period
 
 

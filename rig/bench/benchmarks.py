@@ -27,7 +27,7 @@ from fdi.report.numbers import format_digits
 from fdi.report.report import Cell, Column, Item, Line, Report, Section, Table, tabulate
 from fdi.trace.trace import Floats
 from plant import Actuator, Model, simulate
-from plant.errors import InputError, RigError, require
+from plant.errors import RigError, require
 from plant.model import build_kernel
 from plant.run import sample_noise
 from plant.solve import run_closed_loop
@@ -126,8 +126,7 @@ def choose_bus(bus: str, seconds: float, blocks: int, least_block: float = 0.5) 
     Raises:
         InputError: a time for each block below `least_block` s, or no block.
     """
-    if blocks < 1:
-        raise InputError("--blocks", str(blocks), "1 or more")
+    require(blocks >= 1, "--blocks", str(blocks), "1 or more")
     require(seconds >= least_block * blocks, "--seconds", f"{seconds:g}", f"{least_block:g} s or more for each block")
     return f"udp_multicast:239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}" if bus == "auto" else bus
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from dbc import EDS
 from fdi.foreign_code import ForeignCode, load_plant_of_model, require_trust
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.model import find_plant_of_model, find_quantity
 from plant.plants import Plant, find_plant, is_known, is_loaded, load_plant
 from plant.quantity import Quantity
@@ -161,8 +161,7 @@ def load_bench_from_files(content: Mapping[str, bytes], signals: Signals | None 
     bench_file = next((name for name in content if name.endswith(".toml")), "")
 
     def read(name: str) -> bytes:
-        if name not in content:
-            raise InputError(bench_file or "log", "", "a file of the log")
+        require(name in content, bench_file or "log", "", "a file of the log")
         return content[name]
 
     return _parse_bench(bench_file, read(bench_file), read, Path(), signals, is_trusted=is_trusted)
@@ -269,8 +268,7 @@ def _refuse_canopen_keys(keys: BenchKeys, place: Place) -> None:
     for key in ("node", "eds", "mode", "parameters", "values", "profile", "emcy"):
         if getattr(keys.controller, key) not in (None, {}, "none", ()):
             raise place.at("controller", key).refuse('protocol = "canopen" together with this key')
-    if keys.plant_node is not None:
-        raise place.at("plant_node").refuse('protocol = "canopen" of the controller')
+    place.at("plant_node").require(keys.plant_node is None, 'protocol = "canopen" of the controller')
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -125,6 +125,5 @@ def _read_size(text: str, unit: str, place: Place) -> float:
     """A size above 0 in an SI unit."""
     with place.locate():
         size = float(parse_quantity(text, unit, "", ""))
-    if size <= 0.0:
-        raise place.refuse(f"a size above 0, not {text!r}")
+    place.require(size > 0.0, f"a size above 0, not {text!r}")
     return size

@@ -51,8 +51,8 @@ def map_messages(name: str, database: Any, uses: Mapping[str, Use], cycle_ns: in
         message, _, signal = full.partition(".")
         if message not in messages or not signal:
             raise use.place.refuse(f"MESSAGE.SIGNAL of {name}, not {full!r}{suggest_name(message, messages)}")
-        if sum(each.name == message for each in database.messages) > 1:
-            raise use.place.refuse(f"one message {message}; {name} has several")
+        use.place.require(sum(each.name == message for each in database.messages) == 1,
+                          f"one message {message}; {name} has several")
         known = {each.name for each in messages[message].signals}
         if signal not in known:
             raise use.place.refuse(f"a signal of message {message}: {list_choices(signal, known)}")
@@ -160,16 +160,14 @@ def _is_on_page(signals: Mapping[str, Signal], name: str, page: Page) -> bool:
 def _find_period(name: str, message: Message, cycle_ns: int) -> int:
     given = _read_number(name, f"{message.name} GenMsgCycleTime", message.cycle_time)
     period = given * 1_000_000 / cycle_ns
-    if period.denominator != 1 or not 0 <= period < 1_000_000:
-        raise InputError(name, message.name, f"a GenMsgCycleTime that is a multiple of the cycle, {cycle_ns / 1e6:g} "
-                                             f"ms, not {float(given):g} ms")
+    require(period.denominator == 1 and 0 <= period < 1_000_000, name, message.name,
+            f"a GenMsgCycleTime that is a multiple of the cycle, {cycle_ns / 1e6:g} ms, not {float(given):g} ms")
     return int(period) or 1
 
 
 def _read_number(name: str, field: str, value: object) -> Fraction:
     """A number of a DBC as its text stands there; 0 for None."""
-    if value is not None and not (isinstance(value, int | float) and abs(value) < _LARGEST):
-        raise InputError(name, field, "a finite number")
+    require(value is None or (isinstance(value, int | float) and abs(value) < _LARGEST), name, field, "a finite number")
     return Fraction(str(value or 0))
 
 

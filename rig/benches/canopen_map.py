@@ -174,8 +174,8 @@ def _check_object(name: str, dictionary: Any, key: str, use: Use) -> None:
         raise use.place.refuse(f"an object of {name}; it has no {key}{subs}")
     if found.data_type not in _KINDS:
         raise use.place.refuse(f"a number; {key} ({found.name}) has the data type 0x{found.data_type or 0:04X}")
-    if use.is_received and not found.writable:
-        raise use.place.refuse(f"an object that can be written; {key} ({found.name}) is {found.access_type}")
+    use.place.require(found.writable or not use.is_received,
+                      f"an object that can be written; {key} ({found.name}) is {found.access_type}")
     if use.is_received is False and not found.readable:
         raise use.place.refuse(f"an object that can be read; {key} ({found.name}) is {found.access_type}")
 
@@ -202,9 +202,8 @@ def _map_pdo(name: str, dictionary: Any, pdo: Pdo, own: set[str], *, is_answer: 
     """The frame of a PDO; only `own` objects keep their names."""
     where = f"0x{pdo.parameter + MAPPING:04X}"
     require(0 < pdo.length <= _LONGEST, name, where, f"at most 8 bytes in {pdo.name}, not {pdo.length} bits")
-    if 241 <= pdo.kind <= 253 or not 0 <= pdo.kind <= 255:
-        raise InputError(name, f"0x{pdo.parameter:04X}:2",
-                         f"a transmission type 0 to 240, 254 or 255 for {pdo.name}, not {pdo.kind}")
+    require(0 <= pdo.kind <= 240 or pdo.kind in (254, 255), name, f"0x{pdo.parameter:04X}:2",
+            f"a transmission type 0 to 240, 254 or 255 for {pdo.name}, not {pdo.kind}")
     slots, lowest = [], 0
     for index, sub, length in pdo.entries:
         key, found = name_object(index, sub), find_variable(dictionary, index, sub)

@@ -113,8 +113,8 @@ def _build_field(slot: Slot, use: Use | None) -> Field:
         return replace(slot.bits, name=slot.name if slot.is_selector else "", wrap=None,
                        fixed=start & (1 << slot.bits.length) - 1)
     if use.guard is not Guard.NONE:
-        if slot.bits.kind is Kind.FLOAT:
-            raise use.place.refuse(f"a whole number to protect the frame with; {slot.name} is floating point")
+        use.place.require(slot.bits.kind is not Kind.FLOAT,
+                          f"a whole number to protect the frame with; {slot.name} is floating point")
         if use.guard is Guard.COUNTER:
             use.place.require(slot.bits.length <= 32,
                               f"a counter of at most 32 bits; {slot.name} has {slot.bits.length}")
@@ -127,8 +127,8 @@ def _build_field(slot: Slot, use: Use | None) -> Field:
     if not use.signal:
         return replace(slot.bits, name=slot.name, wrap=None)
     count, offset = _find_worth(slot, use)
-    if not _SMALLEST <= abs(count) <= _LARGEST or abs(offset) > _LARGEST:
-        raise use.place.refuse("counts that are worth something, from 1e-30 to 1e30")
+    use.place.require(_SMALLEST <= abs(count) <= _LARGEST and abs(offset) <= _LARGEST,
+                      "counts that are worth something, from 1e-30 to 1e30")
     return replace(slot.bits, name=use.signal, wrap=None, count=count, offset=offset)
 
 

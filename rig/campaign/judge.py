@@ -62,8 +62,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         require(self.tolerance != (), "matrix", "tolerance", "at least one")
-        if self.simulator != OWN_SIMULATOR and ":" not in self.simulator:
-            raise InputError("matrix", "simulator", f"{OWN_SIMULATOR} or MODULE:FUNCTION, not {self.simulator!r}")
+        require(self.simulator == OWN_SIMULATOR or ":" in self.simulator, "matrix", "simulator",
+                f"{OWN_SIMULATOR} or MODULE:FUNCTION, not {self.simulator!r}")
 
     def list_values(self) -> dict[str, Any]:
         """JSON values, with a list of tolerances."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from fdi.output import require_writable, write_text
 from fdi.progress import Progress, ignore_progress
-from plant.errors import InputError, report_system_error
+from plant.errors import report_system_error, require
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -45,8 +45,7 @@ def choose_file(out: str | None, suffixes: Sequence[str], source: str | Path | N
     if out is None:
         return None
     path = Path(out)
-    if path.suffix not in suffixes:
-        raise InputError(option, out, expected or " or ".join(f"FILE{suffix}" for suffix in suffixes))
+    require(path.suffix in suffixes, option, out, expected or " or ".join(f"FILE{suffix}" for suffix in suffixes))
     return require_writable(path, option, source=source)
 
 

@@ -34,12 +34,11 @@ def run_sequence(args: argparse.Namespace, pages: PageWriter) -> int:
     """Run what the command line says, several sequences too; return the exit status. Raises RigError."""
     if args.live not in (None, LIVE_ON_TERMINAL) and args.live.partition(":")[0] != "rerun":
         args.live, args.sequence = LIVE_ON_TERMINAL, [args.live, *args.sequence]  # the word behind --live is a sequence
-    if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
-        raise InputError("--max-overruns", "", f"a fraction from 0 to 1, not {args.max_overruns:g}")
+    require(args.max_overruns is None or 0 <= args.max_overruns <= 1, "--max-overruns", "",
+            f"a fraction from 0 to 1, not {args.max_overruns}")
     require(not (args.requirements and args.source), "--requirements", "", "sequences or a suite file, not --from")
     if not args.source and (len(args.sequence) > 1 or args.requirements or any(map(is_suite_file, args.sequence))):
-        if args.live:
-            raise InputError("--live", "", "one sequence; runs of a suite run side by side")
+        require(not args.live, "--live", "", "one sequence; runs of a suite run side by side")
         pages.close()  # each case of a suite writes its own
         from rig.cli.suite import run_suite  # here: it loads rich, which a run with --json does not need
 
@@ -186,16 +185,15 @@ def repeat_job(source: Path, args: argparse.Namespace) -> Job:
         InputError: no log of a run, options that would change the job, code in the log that --trust does not allow, or
             a bus in the log that --bus does not name.
     """
-    if args.sequence or args.set or args.model or args.effects or args.bench or args.seed is not None:
-        raise InputError("--from", str(source), "no SEQUENCE, --model, --set, --seed, --effects or --bench: the log "
-                                                "has them")
+    require(not (args.sequence or args.set or args.model or args.effects or args.bench or args.seed is not None),
+            "--from", str(source), "no SEQUENCE, --model, --set, --seed, --effects or --bench: the log has them")
     log = source / "trace.mcap" if source.is_dir() else source
     require(not (args.out and (Path(args.out) / "trace.mcap").resolve() == log.resolve()), "--out", args.out,
             "another folder than that of the log to repeat, which would be overwritten")
     job = read_job(source, is_trusted=args.trust)
-    if args.bus == "auto" and job.bus.partition(":")[0] not in EMBEDDED_NAMES:
-        raise InputError(log, f"bus {job.bus}", f"--bus {job.bus} to use it again, or --bus embedded: the bus of a log "
-                                                "is opened only if the command line names it")
+    require(args.bus != "auto" or job.bus.partition(":")[0] in EMBEDDED_NAMES, log, f"bus {job.bus}",
+            f"--bus {job.bus} to use it again, or --bus embedded: the bus of a log "
+            "is opened only if the command line names it")
     return replace_settings(job, bus=None if args.bus == "auto" else args.bus, pace=args.pace,
                             controller=args.controller, plant=args.plant, max_overruns=args.max_overruns)
 

@@ -11,7 +11,7 @@ from fdi.output import write_text
 from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell
 from fdi.report.terminal import style_of
-from plant.errors import InputError
+from plant.errors import require
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, open_console
 from rig.cli.inputs import is_suite_file
 from rig.cli.single_run import build_choice, choose_bus_of_run, make_new_folder
@@ -78,8 +78,8 @@ def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
         if not is_suite_file(name):
             cases.append(Case(Path(name).stem, base._replace(sequence=name)))
             continue
-        if args.model or args.set or args.seed is not None:
-            raise InputError("--model, --set, --seed", "", f"in the suite file {name}, as keys of its cases")
+        require(not (args.model or args.set or args.seed is not None), "--model, --set, --seed", "",
+                f"in the suite file {name}, as keys of its cases")
         content, own = read_suite_file(Path(name), base, is_trusted=args.trust)
         cases += own
         titles[name] = content.title
@@ -103,8 +103,8 @@ def choose_processes(args: argparse.Namespace, base: JobChoice, cases: int) -> i
         InputError: --jobs above 1 where only one run at a time is possible.
     """
     is_alone = base.bus.partition(":")[0] not in EMBEDDED_NAMES or base.pace == "realtime"
-    if is_alone and (args.jobs or 1) > 1:
-        raise InputError("--jobs", str(args.jobs), "1 in real time and on a bus between programs, which the runs share")
+    require(not is_alone or (args.jobs or 1) == 1, "--jobs", str(args.jobs),
+            "1 in real time and on a bus between programs, which the runs share")
     return min(1 if is_alone else args.jobs or len(os.sched_getaffinity(0)), cases)
 
 

@@ -25,8 +25,8 @@ def read_mapping(od: Dictionary, index: int) -> tuple[list[tuple[int, int]], str
     lets a master change the mapping.
     """
     for sub in (0, *od.list_subs(index)):
-        if (index, sub) in od and od.entries[index, sub].writable:
-            raise InputError(od.path, f"{index:04X}sub{sub:X}.AccessType", "const: the mapping cannot be changed")
+        require((index, sub) not in od or not od.entries[index, sub].writable, od.path,
+                f"{index:04X}sub{sub:X}.AccessType", "const: the mapping cannot be changed")
     keys, codes = [], "<"
     for sub in range(1, od.read_number(index, 0) + 1):
         word = od.read_number(index, sub)

@@ -150,8 +150,8 @@ def _read_run(file: Path, name: str, requirement: tuple[str, ...]) -> PackedRun:
         raise InputError(file, "", f"the verdict of a run by this version ({error})") from error
     logged = trace.provenance.get("verdict.verdict", "")
     known = [(check.name, to_plain(check.value), check.verdict, check.requirement) for check in trace.checks]
-    if judged.verdict != logged or said != known:
-        raise InputError(file, "verdict", f"what its log says, {logged or 'no verdict'}, check by check")
+    require(judged.verdict == logged and said == known, file, "verdict",
+            f"what its log says, {logged or 'no verdict'}, check by check")
     return PackedRun(answer, trace, judged)
 
 

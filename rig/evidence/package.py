@@ -86,8 +86,8 @@ def write_package(contents: Mapping[str, bytes | Path], out: Path, key: str, pro
     files = {name: partial(open_content, content) for name, content in contents.items()}
     hashes = {}
     for number, name in enumerate(sorted(files)):
-        if not is_inside(name) or not name.isprintable():
-            raise InputError(out, "", f"files whose names stay in the folder, not {show_value(name)}")
+        require(is_inside(name) and name.isprintable(), out, "",
+                f"files whose names stay in the folder, not {show_value(name)}")
         hashes[name] = _compute_sha256(files[name])
         require(hashes[name], name, "", "a file that can be read")
         progress("sealing", 0.5 * number / len(files))
@@ -151,11 +151,10 @@ def _compare_files(path: Path, files: Files, key: str) -> Verification:
     for number, line in enumerate(manifest.decode("utf-8", "replace").split("\n"), 1):
         if (entry := re.fullmatch(r"([0-9a-f]{64})  (.+)", line)) is not None:
             hashes[entry[2]] = entry[1]
-            if not is_inside(entry[2]):
-                raise InputError(f"{path}: {MANIFEST}:{number}", "", f"a file of the package, not {entry[2][:200]!r}")
+            require(is_inside(entry[2]), f"{path}: {MANIFEST}:{number}", "",
+                    f"a file of the package, not {entry[2][:200]!r}")
     for name in files:
-        if not is_inside(name):
-            raise InputError(path, "", f"names that stay in the package, not {show_value(name)}")
+        require(is_inside(name), path, "", f"names that stay in the package, not {show_value(name)}")
     changed = [] if _format_manifest(hashes) == manifest else [MANIFEST]
     changed += [name for name in sorted(hashes.keys() & files) if _compute_sha256(files[name]) != hashes[name]]
     missing = sorted(hashes.keys() - files)

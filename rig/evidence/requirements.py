@@ -83,9 +83,8 @@ def require_listed(runs: Iterable[JudgedRun], listed: Mapping[str, str], file: o
     for run in runs:
         for check in (JudgedCheck(RUN, run.requirement), *run.checks):
             for name in check.requirement:
-                if name not in listed:
-                    raise InputError(run.name, f"requirement of {check.name!r}",
-                                     f"an id of {file}, not {name!r}{suggest_name(name, listed)}")
+                require(name in listed, run.name, f"requirement of {check.name!r}",
+                        f"an id of {file}, not {name!r}{suggest_name(name, listed)}")
 
 
 def tabulate_requirements(requirements: Sequence[Requirement]) -> list[Table]:
@@ -124,8 +123,8 @@ def read_requirements(path: Path) -> dict[str, str]:
     require(path.suffix.lower() in readers, path, "", "a .csv or .reqif file with requirements")
     found: dict[str, str] = {}
     for place, name, text in readers[path.suffix.lower()](decode_text(read_file(path), path), path):
-        if not name or not name.isprintable() or name in found:
-            raise InputError(place, "id", f"an id in one line, used once, not {name[:80]!r}")
+        require(name and name.isprintable() and name not in found, place, "id",
+                f"an id in one line, used once, not {name[:80]!r}")
         found[name] = " ".join(text.split())
     require(found, path, "", "at least one requirement")
     return found

@@ -65,9 +65,8 @@ class Job:
         noise = kind.nominal.get(kind.signals.controlled.noise, 0.0)
         object.__setattr__(self, "bench", self.bench.replace_signals(kind.signals, noise, self.model.name))
         require_possible(self.sequence.faults, self.bench, self.sequence.name)
-        if self.plant == "external" and not self.bench.has_plant_node:
-            raise InputError("--plant", self.plant, f"auto: the rig moves the plant of {self.bench.name!r}, which has "
-                                                    "no plant node")
+        require(self.plant != "external" or self.bench.has_plant_node, "--plant", self.plant,
+                f"auto: the rig moves the plant of {self.bench.name!r}, which has no plant node")
         if self.plant != "external" and self.bench.has_plant_node and not speaks_as_shipped(self.bench):
             raise InputError("--plant", self.plant, "external: our own plant emulator does not speak as that of "
                                                     f"{self.bench.name!r}")
@@ -245,8 +244,7 @@ def _read_settings(log: Path, said: Mapping[str, str]) -> dict[str, Any]:
         InputError: a value that no run can have.
     """
     for name, known in (("pace", PACES), ("controller", CONTROLLERS), ("plant", PLANTS)):
-        if said[name] not in known:
-            raise InputError(log, f"metadata run.{name}", f"{' or '.join(known)}, not {said[name][:100]!r}")
+        require(said[name] in known, log, f"metadata run.{name}", f"{' or '.join(known)}, not {said[name][:100]!r}")
     if not said["seed"].isascii() or not said["seed"].isdigit() or len(said["seed"]) > 100:
         raise InputError(log, "metadata run.seed", f"a whole number from 0, not {said['seed'][:100]!r}")
     overruns = said["max_overruns"]
@@ -254,8 +252,8 @@ def _read_settings(log: Path, said: Mapping[str, str]) -> dict[str, Any]:
         share = float(overruns)
     except ValueError:
         share = -1.0
-    if not 0.0 <= share <= 1.0:  # nor NaN
-        raise InputError(log, "metadata run.max_overruns", f"a fraction from 0 to 1, not {overruns[:100]!r}")
+    # the bounds hold for no NaN
+    require(0.0 <= share <= 1.0, log, "metadata run.max_overruns", f"a fraction from 0 to 1, not {overruns[:100]!r}")
     return {**{name: said[name] for name in ("bus", "pace", "controller", "plant")}, "seed": int(said["seed"]),
             "max_overruns": share}
 

@@ -10,7 +10,8 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 
-from plant import InputError, Model
+from plant import Model
+from plant.errors import InputError, require
 from rig.benches.bench import Role
 from rig.benches.bench_file import is_plant_bench
 from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, open_can
@@ -44,16 +45,16 @@ def open_participants(job: Job) -> Iterator[tuple[Wire, NodeProcesses]]:
                                                          f"{', '.join(find_firmware_parameters(job.model))}")
     _require_time(job)
     if job.bus.partition(":")[0] in EMBEDDED_NAMES:
-        if job.controller != "builtin" or job.plant == "external":
-            raise InputError("--bus", job.bus, "a bus that an external node can be on, such as socketcan:can0")
+        require(job.controller == "builtin" and job.plant != "external", "--bus", job.bus,
+                "a bus that an external node can be on, such as socketcan:can0")
         makers: list[Callable[[Send], Node]] = (
             [Emulator, partial(Firmware, model=job.model)] if job.bench.has_plant_node else
             [partial(StandIn, bench=job.bench, model=job.model)])
         wire = EmbeddedWire(WallClock() if job.realtime else VirtualClock(), makers, job.period_ns)
         yield wire, NodeProcesses()
         return
-    if job.controller == "builtin" and is_plant_bench(job.bench):
-        raise InputError("--bus", job.bus, "embedded: the controller that the plant declares runs inside the rig")
+    require(not (job.controller == "builtin" and is_plant_bench(job.bench)), "--bus", job.bus,
+            "embedded: the controller that the plant declares runs inside the rig")
     if job.controller == "c":
         require_firmware_bus(job.bus)
         from rig.firmware.build import build_controller  # here and below: other runs need no compiler
@@ -119,8 +120,8 @@ def _start_missing_nodes(job: Job, master: Master, processes: NodeProcesses, riv
 
 def require_firmware_bus(bus: str) -> None:
     """Refuse a bus for which the C firmware has no port. Raises InputError."""
-    if bus.partition(":")[0] not in ("socketcan", "udp_multicast"):
-        raise InputError("--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP] for --controller c")
+    require(bus.partition(":")[0] in ("socketcan", "udp_multicast"), "--bus", bus,
+            "socketcan:INTERFACE or udp_multicast[:GROUP] for --controller c")
 
 
 def find_firmware_parameters(model: Model) -> dict[str, float]:

@@ -48,8 +48,7 @@ class Fault(ABC):
     name: str = ""
 
     def __post_init__(self) -> None:
-        if self.end is not None and self.end <= self.start:
-            raise InputError("fault", "end", f"after the start at {self.start:g} s")
+        require(self.end is None or self.end > self.start, "fault", "end", f"after the start at {self.start:g} s")
 
     @property
     def label(self) -> str:
@@ -77,10 +76,9 @@ class Parameter(_Ramped):
     def __post_init__(self) -> None:
         super().__post_init__()
         group = self.parameter.partition(".")[0]
-        if group == "controller" or (group in CATALOGUE and CATALOGUE[group].firmware):
-            raise InputError("fault", "parameter",
-                             f"a parameter of the plant, not {self.parameter!r}: the controller is the thing under "
-                             "test, no fault reaches into it")
+        require(group != "controller" and not (group in CATALOGUE and CATALOGUE[group].firmware), "fault", "parameter",
+                f"a parameter of the plant, not {self.parameter!r}: the controller is the thing under test, no fault "
+                "reaches into it")
 
     def find_target(self, quantity: Quantity) -> float:
         """The number that `value` stands for; raises InputError at the key that cannot be for such a parameter."""

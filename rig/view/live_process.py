@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fdi.output import require_writable
-from plant.errors import InputError, require
+from plant.errors import require
 from rig.interrupts import ignore_interrupts
 from rig.view.live_run import LivePlan
 from rig.view.viewer import is_listening, lacks_display
@@ -93,8 +93,8 @@ def find_viewer_place(text: str) -> ViewerPlace:
         InputError: the viewer is not installed, there is no display for its window, nothing listens at the port, or the
             file cannot be written.
     """
-    if importlib.util.find_spec("rerun") is None:
-        raise InputError("--live", "rerun", "the viewer, which is not installed: pip install 'eha-rig[view]'")
+    require(importlib.util.find_spec("rerun") is not None, "--live", "rerun",
+            "the viewer, which is not installed: pip install 'eha-rig[view]'")
     word = text.partition(":")[2]
     if word.endswith(".rrd"):
         return ViewerPlace(file=Path(require_writable(word, "--live")).absolute())

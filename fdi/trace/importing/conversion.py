@@ -147,8 +147,7 @@ def _read_table(where: object, name: str, values: Any, keys: Mapping[str, Key]) 
         if word not in keys:
             raise InputError(where, f"{prefix}{word}", f"one of {', '.join(keys)}{suggest_name(word, keys)}")
     for word, key in keys.items():
-        if word not in values and key.default is ...:
-            raise InputError(where, f"{prefix}{word}", key.expected)
+        require(word in values or key.default is not ..., where, f"{prefix}{word}", key.expected)
         if word in values and not (type(values[word]) in key.kinds
                                    and (type(values[word]) is not int or abs(values[word]) <= 1e308)  # a float holds it
                                    and key.is_valid(values[word])):

@@ -38,8 +38,8 @@ def open_measurement(path: Path, separator: str | None = None, decimal: str | No
     """
     suffix = path.suffix.lower()
     require(suffix in SUFFIXES, path, "", f"a file that ends in {', '.join(SUFFIXES)}")
-    if suffix != ".mcap" and not path.is_file():
-        raise InputError(path, "", "a readable file" + ("" if path.exists() else "; it does not exist"))
+    require(suffix == ".mcap" or path.is_file(), path, "",
+            "a readable file" + ("" if path.exists() else "; it does not exist"))
     return (open_text_table(path, separator, decimal, name_line) if suffix in TEXT_SUFFIXES else
             READERS[suffix](path))
 

@@ -14,7 +14,8 @@ from typing import Any
 from fdi.diagnosis.faults import choose_faults, load_faults
 from fdi.foreign_code import ForeignCode, load_plant_of_model, require_trust
 from fdi.output import write_text
-from plant import InputError, load_model
+from plant import load_model
+from plant.errors import InputError, require
 from rig.campaign.batch import BatchProgress, Row, Workers
 from rig.campaign.judge import (
     WORKS,
@@ -86,12 +87,11 @@ def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
     changed = {key: value for key, value in wanted.items() if value is not None}
     work = WORKS.get(args.work, args.work)
     if args.what and is_campaign_folder(args.what):
-        if changed or args.fault or args.faults or args.model or args.set or args.out:
-            raise InputError(args.what, "", "no other option about the matrix: this folder has its own")
+        require(not (changed or args.fault or args.faults or args.model or args.set or args.out), args.what, "",
+                "no other option about the matrix: this folder has its own")
         found = read_matrix_of_folder(args.what)
-        if found.spec["work"] not in (*WORKS.values(), work):  # a folder is data
-            raise InputError(args.what, "work", f"--work {found.spec['work']} on the command line, to call that "
-                                                "function")
+        require(found.spec["work"] in (*WORKS.values(), work), args.what, "work",  # a folder is data
+                f"--work {found.spec['work']} on the command line, to call that function")
         if "plant_file" in found.spec:
             path = Path(found.spec["plant_file"])
             code = [ForeignCode(str(path), path.read_bytes())] if path.is_file() else []
@@ -102,8 +102,7 @@ def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
     faults = choose_faults(args.faults, model.kind)
     campaigns = Path("campaigns")
     if args.what and Path(args.what).is_dir():
-        if changed or args.fault:
-            raise InputError(args.what, "", "no faults or seeds: these are recorded traces")
+        require(not (changed or args.fault), args.what, "", "no faults or seeds: these are recorded traces")
         return (build_trace_matrix(args.what, model, work, faults),
                 Path(args.out or campaigns / Path(args.what).absolute().name))
     tables = read_matrix(args.what) if args.what else {}

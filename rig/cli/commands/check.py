@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fdi.report.report import Column, Line, Report, Section, Table
-from plant.errors import InputError, require
+from plant.errors import require
 from plant.faults import is_fault_file
 from plant.model import load_model
 from plant.plant_check import check_behaviour
@@ -70,8 +70,7 @@ def check_plant(args: argparse.Namespace) -> int:
 
 def check_bench(args: argparse.Namespace) -> int:
     """Exit status 1 if the frames need more than the whole bus."""
-    if args.bench is None:
-        raise InputError("rig check", "", "a SEQUENCE, --bench FILE, or both")
+    require(args.bench is not None, "rig check", "", "a SEQUENCE, --bench FILE, or both")
     bench = load_bench(args.bench, is_trusted=args.trust)
     places = choose_places(args, "", args.bench if Path(args.bench).is_file() else "")
     report = build_bench_report(bench, places.files)

@@ -27,8 +27,8 @@ def run_command(args: argparse.Namespace) -> int:
     if name is None:
         raise InputError("NODE", "", "a node-ID, plant, controller or c; or --bench FILE")
     node, is_own = parse_node(name), name in OWN_NODES
-    if eds is None and not is_own:
-        raise InputError("--eds", "", f"the electronic data sheet of node {name}: --eds FILE, or --bench FILE")
+    require(eds is not None or is_own, "--eds", "",
+            f"the electronic data sheet of node {name}: --eds FILE, or --bench FILE")
     sheet = DataSheet(eds or load_bench().nodes[OWN_NODES[name]].eds, node)
     cases = choose_cases(args.chapter)
     for word in args.chapter:

@@ -18,12 +18,11 @@ from rig.recorder.schema import read_epoch_ns
 
 def run_command(args: argparse.Namespace) -> int:
     """The package goes to --out (default: evidence.zip). Exit status of --verify: 1 if a byte differs."""
-    if args.verify is not None and (args.runs or args.out or args.sign or args.requirements):
-        raise InputError("--verify", args.verify, "no RUN, --out, --sign or --requirements: it only reads")
+    require(args.verify is None or not (args.runs or args.out or args.sign or args.requirements), "--verify",
+            args.verify, "no RUN, --out, --sign or --requirements: it only reads")
     if args.verify is not None:
         return verify(args)
-    if not args.runs or args.key:
-        raise InputError("RUN", "", "at least one folder of a run; --key goes with --verify")
+    require(args.runs and not args.key, "RUN", "", "at least one folder of a run; --key goes with --verify")
     return pack(args)
 
 

@@ -10,7 +10,7 @@ from fdi.discovery.runs import Runs, read_runs
 from fdi.discovery.sensitivity import Claim, describe_unit
 from fdi.progress import Progress
 from fdi.report.explain_report import build_explanation_report
-from plant.errors import InputError
+from plant.errors import require
 from rig.campaign.batch import Workers
 from rig.campaign.sensitivity import measure_sensitivity
 from rig.cli.answer import Places, choose_file, choose_places, give_answer, show_progress
@@ -23,8 +23,8 @@ def run_command(args: argparse.Namespace) -> int:
     places = choose_places(args, "explain.html", args.trace)
     choose_file(args.write_effect, (".py",), args.trace, "--write-effect")
     workers = parse_workers(args.workers)
-    if not args.sensitivity and (args.hide or args.workers):
-        raise InputError("--hide" if args.hide else "--workers", args.hide or args.workers, "--sensitivity beside it")
+    require(args.sensitivity or not (args.hide or args.workers), "--hide" if args.hide else "--workers",
+            args.hide or args.workers, "--sensitivity beside it")
     model, known = load_known_model(args)
     hidden = args.hide.split(",") if args.hide else []
     if hidden:
@@ -49,9 +49,8 @@ def parse_workers(text: str | None) -> Workers:
         return Workers(len(os.sched_getaffinity(0)), single_threaded=True)
     if "://" in text:
         return Workers(scheduler=text, single_threaded=True)
-    if not text.isdecimal() or int(text) < 1:
-        raise InputError("--workers", text, "1 or more processes, or the address of a Dask scheduler such as "
-                                            "tcp://127.0.0.1:8786")
+    require(text.isdecimal() and int(text) >= 1, "--workers", text,
+            "1 or more processes, or the address of a Dask scheduler such as tcp://127.0.0.1:8786")
     return Workers(int(text), single_threaded=True)
 
 

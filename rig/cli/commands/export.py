@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fdi.output import require_new, require_writable
 from fdi.report.report import Report
-from plant.errors import InputError, require
+from plant.errors import require
 from rig.cli.answer import give_answer
 from rig.cli.inputs import load_chosen_model
 from rig.recorder.convert import export_trace
@@ -15,12 +15,10 @@ def run_command(args: argparse.Namespace) -> int:
     """The suffix of --out chooses the format of a trace; --fmu writes a model."""
     if args.fmu is not None:
         return write_fmu(args)
-    if args.trace is None:
-        raise InputError("TRACE", "", "a trace to export, or --fmu OUT.fmu for a model")
+    require(args.trace is not None, "TRACE", "", "a trace to export, or --fmu OUT.fmu for a model")
     require(not (args.model or args.set or args.effects), "--fmu", "",
             "OUT.fmu beside --model, --set and --effects: they do not change a trace")
-    if args.out is None:
-        raise InputError("--out", "", "the file to write, such as run.csv or frames.blf")
+    require(args.out is not None, "--out", "", "the file to write, such as run.csv or frames.blf")
     out = require_new(require_writable(args.out, "--out", source=args.trace), is_forced=args.force)
     count = export_trace(Path(args.trace), out, args.all)
     sentence = f"{out}: {count} {'rows' if '.csv' in out.suffixes else 'frames'}"

@@ -10,7 +10,7 @@ from fdi.diagnosis.faults import choose_faults
 from fdi.diagnosis.make_bands import make_bands_file
 from fdi.report.diagnosis_report import build_bands_report, build_diagnosis_report
 from fdi.trace.trace import Trace
-from plant.errors import InputError
+from plant.errors import require
 from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.commands.simulate import load_command
 from rig.cli.inputs import format_arguments, load_chosen_model
@@ -20,10 +20,9 @@ def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 if all faults are acceptable, 1 otherwise. --learn-bands makes bands instead."""
     if args.learn_bands is not None:
         return learn_bands(args)
-    if args.command_file is not None:
-        raise InputError("--command", str(args.command_file), "--learn-bands beside it; a trace has its own command")
-    if args.trace is None:
-        raise InputError("TRACE", "", "a trace: trace.mcap, the folder of a run, or a CSV")
+    require(args.command_file is None, "--command", str(args.command_file),
+            "--learn-bands beside it; a trace has its own command")
+    require(args.trace is not None, "TRACE", "", "a trace: trace.mcap, the folder of a run, or a CSV")
     places = choose_places(args, "", args.trace)
     model = load_chosen_model(args)
     with show_progress(is_silent=args.json or args.quiet) as progress:
@@ -37,10 +36,9 @@ def run_command(args: argparse.Namespace) -> int:
 
 def learn_bands(args: argparse.Namespace) -> int:
     """Make bands for a command and write them; exit status 0."""
-    if args.trace is not None:
-        raise InputError("--learn-bands", str(args.trace), "traces after the option, not before it")
-    if not args.out or Path(args.out).suffix != ".toml":
-        raise InputError("--out", str(args.out or ""), "FILE.toml, where the bands go")
+    require(args.trace is None, "--learn-bands", str(args.trace), "traces after the option, not before it")
+    require(args.out and Path(args.out).suffix == ".toml", "--out", str(args.out or ""),
+            "FILE.toml, where the bands go")
     model = load_chosen_model(args)
     faults = choose_faults(args.faults, model.kind)
     com, _, name = load_command(args.command_file, model["controller.period"], model.kind)

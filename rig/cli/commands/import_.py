@@ -22,12 +22,11 @@ def run_command(args: argparse.Namespace) -> int:
     source = Path(args.file)
     require(source.exists(), source, "", "a file that can be read; it does not exist")
     require(not (args.guess and args.map), "--guess", args.map, "--guess or --map, not both")
-    if args.force and not args.guess:
-        raise InputError("--force", "", "--guess, whose map it lets replace another")
-    if args.bench and (args.map or args.guess or source.suffix not in RAW_SUFFIXES):
-        raise InputError("--bench", args.bench, "a CAN log without --map or --guess")
-    if args.dbc and source.suffix not in RAW_SUFFIXES:
-        raise InputError("--dbc", args.dbc, "a CAN log to decode; a CSV of signals has no frames")
+    require(args.guess or not args.force, "--force", "", "--guess, whose map it lets replace another")
+    require(not args.bench or (source.suffix in RAW_SUFFIXES and not args.map and not args.guess),
+            "--bench", args.bench, "a CAN log without --map or --guess")
+    require(not args.dbc or source.suffix in RAW_SUFFIXES, "--dbc", args.dbc,
+            "a CAN log to decode; a CSV of signals has no frames")
     suffix = ".map.toml" if args.guess else ".mcap"
     out = source.with_name(source.name.split(".")[0] + suffix) if args.out is None else Path(args.out)
     if args.guess:

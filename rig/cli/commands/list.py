@@ -7,7 +7,7 @@ from math import isfinite
 from typing import Any
 
 from fdi.report.report import Cell, Column, Report, Section, Table
-from plant.errors import InputError
+from plant.errors import require
 from plant.model import (
     SHIPPED_MODELS,
     Model,
@@ -25,8 +25,7 @@ Rows = list[dict[str, Any]]
 def run_command(args: argparse.Namespace) -> int:
     """Names come with unit, range and default."""
     find, use = KINDS[args.kind]
-    if args.faults is not None and args.kind != "faults":
-        raise InputError("--faults", args.faults, f"rig list faults, not {args.kind}")
+    require(args.faults is None or args.kind == "faults", "--faults", args.faults, f"rig list faults, not {args.kind}")
     model = load_chosen_model(args)
     listed = list_faults(model, args.faults) if args.kind == "faults" else find(model)
     rows = [row for row in listed if args.word.lower() in row["name"].lower()]

@@ -44,10 +44,10 @@ def run_command(args: argparse.Namespace) -> int:
 def write_example(path: Path, args: argparse.Namespace) -> str:
     """The text of a file of the kinds that need no device: a shipped example, with the name of the file in it."""
     kind = args.kind
-    if args.eds or args.dbc or args.node or args.model:
-        raise InputError(f"rig new {kind}", "", "no device: --eds, --dbc, --node and --model are of a bench")
-    if kind in ("fault", "effect") and not WORD.fullmatch(path.stem):
-        raise InputError("NAME", path.stem, f"small letters, digits and _ : the name is also that of the {kind}")
+    require(not (args.eds or args.dbc or args.node or args.model), f"rig new {kind}", "",
+            "no device: --eds, --dbc, --node and --model are of a bench")
+    require(kind not in ("fault", "effect") or WORD.fullmatch(path.stem), "NAME", path.stem,
+            f"small letters, digits and _ : the name is also that of the {kind}")
     if kind == "fault":
         return EXAMPLE.format(file=path, name=path.stem)
     package, *place = EXAMPLES[kind]
@@ -57,10 +57,10 @@ def write_example(path: Path, args: argparse.Namespace) -> str:
 
 def write_bench(path: Path, args: argparse.Namespace) -> str:
     """The text of a bench file at `path`, from the EDS, DCF or DBC that the options name."""
-    if (args.eds is None) == (args.dbc is None):
-        raise InputError("rig new bench", "", "--eds FILE (EDS or DCF of a CANopen device), or --dbc FILE")
-    if args.node is not None and not (args.eds and args.node < 128):
-        raise InputError("--node", str(args.node), "1 to 127, together with --eds")
+    require((args.eds is None) != (args.dbc is None), "rig new bench", "",
+            "--eds FILE (EDS or DCF of a CANopen device), or --dbc FILE")
+    require(args.node is None or (args.eds and args.node < 128), "--node", str(args.node),
+            "1 to 127, together with --eds")
     source = args.eds or args.dbc
     text, name = decode_device_text(read_file(source)), _name_from(path, source)
     wanted = Wanted()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fdi.discovery.update_model import find_runs, remove_effect_and_refit, write_model_file
 from fdi.report.explain_report import build_model_report
-from plant.errors import InputError
+from plant.errors import InputError, require
 from rig.cli.answer import Places, choose_file, give_answer, show_progress
 from rig.cli.discovery_inputs import choose_model_file, format_command_line, load_known_model, split_words
 from rig.cli.inputs import list_signals
@@ -13,8 +13,8 @@ from rig.cli.inputs import list_signals
 
 def run_command(args: argparse.Namespace) -> int:
     """Without a trace the other parameters keep their values."""
-    if not args.model or not Path(args.model).is_file():
-        raise InputError("--model", str(args.model or ""), "the model file to remove the effect from: --model FILE")
+    require(args.model and Path(args.model).is_file(), "--model", str(args.model or ""),
+            "the model file to remove the effect from: --model FILE")
     model, known = load_known_model(args)
     effects, trace = split_words(args.words, args.trace, model.plant)
     if len(effects) > 1:

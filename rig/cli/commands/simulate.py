@@ -8,7 +8,8 @@ from fdi.output import require_new, require_writable
 from fdi.report.numbers import format_amount
 from fdi.report.report import Report
 from fdi.trace.trace import Trace
-from plant import InputError, load_model, simulate
+from plant import load_model, simulate
+from plant.errors import InputError, require
 from plant.plant_check import find_divergence
 from plant.plants import Plant
 from plant.segments import Points, build_profile, read_command
@@ -30,11 +31,9 @@ def run_command(args: argparse.Namespace) -> int:
     period = model["controller.period"]
     signals = model.kind.signals
     com, load, name = load_command(args.command_file, period, model.kind)
-    if args.steps == 0:
-        raise InputError("--steps", "0", "at least 1 step a cycle")
+    require(args.steps != 0, "--steps", "0", "at least 1 step a cycle")
     out = Path(args.out or "simulation.csv")
-    if not out.name.endswith((".csv", ".csv.gz", ".mcap")):
-        raise InputError("--out", str(out), "a file .csv, .csv.gz or .mcap")
+    require(out.name.endswith((".csv", ".csv.gz", ".mcap")), "--out", str(out), "a file .csv, .csv.gz or .mcap")
     require_new(require_writable(out, "--out", source=args.command_file), is_forced=args.force)
     columns = simulate(model, com, load, args.seed, args.steps)._asdict()
     if diverged := find_divergence(model, columns):
@@ -61,11 +60,10 @@ def run_command(args: argparse.Namespace) -> int:
 
 def write_samples(args: argparse.Namespace) -> int:
     """Write the recordings of --samples; exit status 0."""
-    if args.model or args.set or args.effects or args.command_file:
-        raise InputError("--samples", "", "no --model, --set, --effects and --command beside it: the unit is fixed")
+    require(not (args.model or args.set or args.effects or args.command_file), "--samples", "",
+            "no --model, --set, --effects and --command beside it: the unit is fixed")
     folder = Path(args.out or ".")
-    if not folder.is_dir():
-        raise InputError("--out", str(folder), "a folder that exists")
+    require(folder.is_dir(), "--out", str(folder), "a folder that exists")
     model = load_model().replace(SAMPLE_UNIT)
     period = model["controller.period"]
     usual, load, _ = load_command(None, period, model.kind)

@@ -8,15 +8,14 @@ from fdi.diagnosis.faults import choose_faults, load_faults
 from fdi.prognosis.unit_trend import UnitTrend, follow_unit, gather_sizes, read_points
 from fdi.report.drawing import save_drawing
 from fdi.report.trend_report import build_trend_report, draw_trends
-from plant.errors import InputError
+from plant.errors import require
 from rig.cli.answer import Places, choose_file, give_answer, show_progress
 from rig.cli.inputs import load_chosen_model
 
 
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 if all faults are within MidBand at the last trace, 1 otherwise."""
-    if args.folder is None:
-        raise InputError("FOLDER", "", "a folder of dated traces")
+    require(args.folder is not None, "FOLDER", "", "a folder of dated traces")
     out = choose_file(args.out or None, (".html", ".png", ".svg", ".json"), args.folder)
     unit = follow_traces(args)
     report = build_trend_report(unit)
