@@ -18,7 +18,7 @@ import numpy as np
 
 from plant.compile import Function, compile_function, raise_unbound
 from plant.controller import Loop, compute_current
-from plant.errors import InputError, require
+from plant.errors import require
 from plant.friction import clip, soften
 from plant.kernels import make_lane_packers
 from plant.lanes import Array, Drive
@@ -247,9 +247,9 @@ class Monitor:
         values, driven, position = (np.ascontiguousarray(x, float) for x in (values, driven, position))
         require(values.ndim == 2 and values.shape[1] == len(self.names), "monitor", "values",
                 f"one row a run of {len(self.names)}, not shape {values.shape}")
-        if driven.ndim != 1 or position.shape not in (driven.shape, (0,), (1,)) or np.isnan(position[:1]).any():
-            raise InputError("monitor", "position", "one a cycle, the first of them known, "
-                             f"not {position.shape} beside {driven.shape}")
+        require(driven.ndim == 1 and position.shape in (driven.shape, (0,), (1,)) and not np.isnan(position[:1]).any(),
+                "monitor", "position",
+                f"one a cycle, the first of them known, not {position.shape} beside {driven.shape}")
         period = float(self.model["controller.period"])
         kv = compute_cells(self.model, self.names, values, period, self.sliding)[Cell._fields.index("rate")]
         steps = max(self.steps, ceil(period * kv.max(initial=0.0)))  # `compute_decay` reaches no further

@@ -13,7 +13,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, cast
 
-from plant.errors import InputError, show_value, suggest_name
+from plant.errors import InputError, require, show_value, suggest_name
 from plant.quantity import Quantity, list_quantities
 from plant.tables import decode_text, parse_table, read_file
 
@@ -236,6 +236,5 @@ def check_combinations(where: object, values: Mapping[str, float]) -> None:
         if f"{body}.static_friction" not in values:
             continue
         static, dynamic = values[f"{body}.static_friction"], values[f"{body}.dynamic_friction"]
-        if dynamic > static and not math.isclose(dynamic, static):
-            raise InputError(where, f"{body}.dynamic_friction",
-                             f"at most {body}.static_friction ({static:g} N), not {dynamic:g}")
+        require(dynamic <= static or math.isclose(dynamic, static), where, f"{body}.dynamic_friction",
+                f"at most {body}.static_friction ({static:g} N), not {dynamic:g}")

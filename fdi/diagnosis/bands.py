@@ -558,8 +558,8 @@ def parse_bands(content: str, where: object, kind: Plant | None = None) -> Bands
         raise InputError(where, str(error.args[0]), "a file of bands, which has this key") from error
     except (TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         raise InputError(where, "", f"a file of bands as rig fdi --learn-bands writes it ({error})") from error
-    if (own := found.provenance.get("plant", "eha")) != kind.name:
-        raise InputError(where, "plant", f"bands of the plant {kind.name}, not of {own}")
+    require((own := found.provenance.get("plant", "eha")) == kind.name, where, "plant",
+            f"bands of the plant {kind.name}, not of {own}")
     return found
 
 

@@ -193,8 +193,8 @@ def _check_sizes(path: Path, summary: Summary, size: int) -> None:
     Raises:
         InputError: it names the declared size.
     """
-    if (stored := sum(index.data_size for index in summary.attachment_indexes)) > size:
-        raise InputError(path, "attachments", f"at most the {size} bytes of the file, not {stored}")
+    require((stored := sum(index.data_size for index in summary.attachment_indexes)) <= size, path, "attachments",
+            f"at most the {size} bytes of the file, not {stored}")
     unpacked, most = sum(index.uncompressed_size for index in summary.chunk_indexes), limit_unpacked_size(size)
     require(unpacked <= most, path, "chunks",
             f"at most {most >> 20} MiB for {size} bytes packed, not {unpacked >> 20} MiB")

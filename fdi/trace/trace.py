@@ -442,8 +442,8 @@ def _require_numbers(log: Log, topic: str, columns: Mapping[str, NDArray[Any]], 
         InputError: it names the field.
     """
     for name in names if len(columns["time_ns"]) else ():
-        if name not in columns or columns[name].ndim != 1 or columns[name].dtype.kind not in "bfiu":
-            raise InputError(log.path, f"{topic}.{name}", "a field of this name with a number")
+        require(name in columns and columns[name].ndim == 1 and columns[name].dtype.kind in "bfiu", log.path,
+                f"{topic}.{name}", "a field of this name with a number")
 
 
 def _find_period(log: Log, run: Mapping[str, str], t: Floats, cycle: NDArray[np.int64]) -> float:

@@ -209,8 +209,9 @@ def _map_pdo(name: str, dictionary: Any, pdo: Pdo, own: set[str], *, is_answer: 
         key, found = name_object(index, sub), find_variable(dictionary, index, sub)
         kind = Kind.UNSIGNED if found is None else _KINDS.get(found.data_type or 0, Kind.UNSIGNED)
         size = 1 if found is None or found.data_type == datatypes.BOOLEAN else len(found)
-        if key in own and length != size and (size, length) != (1, 8):  # many devices map a BOOLEAN as a byte
-            raise InputError(name, where, f"{key} with {size} bits in {pdo.name}, not {length}")
+        # Many devices map a BOOLEAN as a byte.
+        require(key not in own or length == size or (size, length) == (1, 8), name, where,
+                f"{key} with {size} bits in {pdo.name}, not {length}")
         if kind is Kind.FLOAT and length != size:
             kind = Kind.UNSIGNED
         slots.append(Slot(name=key if key in own else "", start=read_start(found),

@@ -24,7 +24,7 @@ import numpy as np
 
 from fdi.output import write_whole
 from plant.compile import read_normal_tables
-from plant.errors import InputError, RigError
+from plant.errors import InputError, RigError, require
 from plant.kernels import list_state_values
 from plant.machine_code import emit_object
 from plant.model import Model, build_kernel, find_quantity
@@ -136,8 +136,7 @@ def find_platforms() -> list[tuple[Platform, str]]:
     """
     own = f"{platform.machine()}-{platform.system().lower()}"
     here = [machine for machine in PLATFORMS if machine.name == own]
-    if not here:
-        raise InputError("--fmu", own, f"a machine that is one of {', '.join(m.name for m in PLATFORMS)}")
+    require(here, "--fmu", own, f"a machine that is one of {', '.join(m.name for m in PLATFORMS)}")
     others = ((machine, shutil.which(machine.compiler)) for machine in PLATFORMS if machine.name != own)
     return [(here[0], find_compiler("--fmu", "to link the FMU with")),
             *((machine, compiler) for machine, compiler in others if compiler)]

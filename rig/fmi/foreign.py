@@ -55,9 +55,8 @@ def read_description(path: Path) -> Description:
         import fmpy
     except ImportError:
         raise InputError(path, "", "the package fmpy to run FMUs: pip install 'eha-rig[fmu]'") from None
-    if not zipfile.is_zipfile(path):
-        raise InputError(path, "", "an FMU, a zip archive with a modelDescription.xml" if path.is_file() else
-                         "an FMU; it does not exist")
+    require(zipfile.is_zipfile(path), path, "",
+            "an FMU, a zip archive with a modelDescription.xml" if path.is_file() else "an FMU; it does not exist")
     version = "none"
     try:
         with zipfile.ZipFile(path) as archive:

@@ -67,9 +67,9 @@ class Job:
         require_possible(self.sequence.faults, self.bench, self.sequence.name)
         require(self.plant != "external" or self.bench.has_plant_node, "--plant", self.plant,
                 f"auto: the rig moves the plant of {self.bench.name!r}, which has no plant node")
-        if self.plant != "external" and self.bench.has_plant_node and not speaks_as_shipped(self.bench):
-            raise InputError("--plant", self.plant, "external: our own plant emulator does not speak as that of "
-                                                    f"{self.bench.name!r}")
+        require(self.plant == "external" or not self.bench.has_plant_node or speaks_as_shipped(self.bench),
+                "--plant", self.plant,
+                f"external: our own plant emulator does not speak as that of {self.bench.name!r}")
         if self.controller != "external" and not speaks_as_shipped(self.bench) and not (
                 self.controller == "builtin" and is_plant_bench(self.bench)):
             raise InputError("--controller", self.controller, "external: our own firmware does not speak as the device "
@@ -245,8 +245,8 @@ def _read_settings(log: Path, said: Mapping[str, str]) -> dict[str, Any]:
     """
     for name, known in (("pace", PACES), ("controller", CONTROLLERS), ("plant", PLANTS)):
         require(said[name] in known, log, f"metadata run.{name}", f"{' or '.join(known)}, not {said[name][:100]!r}")
-    if not said["seed"].isascii() or not said["seed"].isdigit() or len(said["seed"]) > 100:
-        raise InputError(log, "metadata run.seed", f"a whole number from 0, not {said['seed'][:100]!r}")
+    require(said["seed"].isascii() and said["seed"].isdigit() and len(said["seed"]) <= 100, log, "metadata run.seed",
+            f"a whole number from 0, not {said['seed'][:100]!r}")
     overruns = said["max_overruns"]
     try:
         share = float(overruns)

@@ -637,8 +637,7 @@ class Guard:
 
     def __post_init__(self) -> None:
         low, high = self.compute_limits()
-        if low >= high or (low, high) == (-inf, inf):
-            raise InputError("guard", "", "a low, a high, or both with low below high")
+        require(low < high and (low, high) != (-inf, inf), "guard", "", "a low, a high, or both with low below high")
 
     def compute_limits(self) -> tuple[float, float]:
         """Low and high in SI; infinite where there is none."""

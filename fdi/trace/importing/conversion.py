@@ -186,9 +186,8 @@ def parse_map(text: str, path: Path, declared: Signals = EHA) -> ImportMap:
     owner: dict[str, str] = {}
     for name, signal in signals.items():
         other = owner.setdefault(signal.term.source, name)
-        if other != name and signal.minus is None and signals[other].minus is None:
-            raise InputError(path, f"signals.{name}.source",
-                             f"a column of its own; signals.{other} has {signal.term.source!r} already")
+        require(other == name or signal.minus is not None or signals[other].minus is not None, path,
+                f"signals.{name}.source", f"a column of its own; signals.{other} has {signal.term.source!r} already")
     # in an open loop the drive is the command
     signals.setdefault(declared.command.name, replace(signals[declared.drive.name], name=declared.command.name))
     return ImportMap(path, text, declared, signals, _parse_time(path, "time", top["time"]),
@@ -200,12 +199,11 @@ def _parse_time(path: Path, name: str, values: Any) -> TimeBase | None:
         return None
     table = _read_table(path, name, values, TIME)
     source, rate, bits = table["source"], table["rate"], table["bits"]
-    if bits is not None and (source is None or rate is None):
-        raise InputError(path, name, "source and rate (counts a second) for a counter of so many bits")
-    if source is None and rate is None:
-        raise InputError(path, name, "source (a column), or rate (rows a second)")
-    if source is not None and rate is not None and bits is None:
-        raise InputError(path, f"{name}.bits", "the bits of the counter, as source and rate are given")
+    require(bits is None or (source is not None and rate is not None), path, name,
+            "source and rate (counts a second) for a counter of so many bits")
+    require(source is not None or rate is not None, path, name, "source (a column), or rate (rows a second)")
+    require(source is None or rate is None or bits is not None, path, f"{name}.bits",
+            "the bits of the counter, as source and rate are given")
     has_unit = rate is None and table["unit"] != "iso"
     return TimeBase(source, _require_unit(table["unit"], "s", path, f"{name}.unit") if has_unit else None, rate, bits)
 

@@ -9,7 +9,7 @@ from fdi.report.numbers import format_amount
 from fdi.report.report import Report
 from fdi.trace.trace import Trace
 from plant import load_model, simulate
-from plant.errors import InputError, require
+from plant.errors import require
 from plant.plant_check import find_divergence
 from plant.plants import Plant
 from plant.segments import Points, build_profile, read_command
@@ -36,9 +36,8 @@ def run_command(args: argparse.Namespace) -> int:
     require(out.name.endswith((".csv", ".csv.gz", ".mcap")), "--out", str(out), "a file .csv, .csv.gz or .mcap")
     require_new(require_writable(out, "--out", source=args.command_file), is_forced=args.force)
     columns = simulate(model, com, load, args.seed, args.steps)._asdict()
-    if diverged := find_divergence(model, columns):
-        raise InputError(args.model or "--set", "", f"a plant that stays finite; {diverged} (rig simulate --steps "
-                                                    "takes shorter steps)")
+    require(not (diverged := find_divergence(model, columns)), args.model or "--set", "",
+            f"a plant that stays finite; {diverged} (rig simulate --steps takes shorter steps)")
     trace = Trace.from_columns(columns, period, {"model": model.name, "seed": str(args.seed), "command": name,
                                                  **({} if model.plant == "eha" else {"plant": model.plant})}, signals)
     if out.suffix == ".mcap":
