@@ -227,8 +227,8 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, signals
     command, controlled, drive = signals.command.word, signals.controlled.word, signals.drive.word
     _check_signals(uses, (command, controlled), (drive,), place)
     for use in uses.values():
-        if use.signal in ("control_word", "mode") and keys.controller.profile == "none":
-            raise use.place.refuse("a profile that gives it a meaning, or values in [controller.phases]")
+        use.place.require(not (use.signal in ("control_word", "mode") and keys.controller.profile == "none"),
+                          "a profile that gives it a meaning, or values in [controller.phases]")
     nodes: dict[Role, CanopenNode] = {}
     sync = None
     if is_canopen:
@@ -258,16 +258,16 @@ def _read_time(text: str, place: Place, low: Fraction, high: Fraction) -> int:
     """A time with its unit, in ns."""
     with place.locate():
         time = parse_quantity(text, "s", "", "")
-    if not low <= time <= high or time * 1_000_000 % 1:
-        raise place.refuse(f"whole microseconds from {float(low * 1000):g} to {float(high * 1000):g} ms, not {text!r}")
+    place.require(low <= time <= high and not time * 1_000_000 % 1,
+                  f"whole microseconds from {float(low * 1000):g} to {float(high * 1000):g} ms, not {text!r}")
     return int(time * 1_000_000_000)
 
 
 def _refuse_canopen_keys(keys: BenchKeys, place: Place) -> None:
     """Refuse keys of CANopen on plain CAN."""
     for key in ("node", "eds", "mode", "parameters", "values", "profile", "emcy"):
-        if getattr(keys.controller, key) not in (None, {}, "none", ()):
-            raise place.at("controller", key).refuse('protocol = "canopen" together with this key')
+        place.at("controller", key).require(getattr(keys.controller, key) in (None, {}, "none", ()),
+                                            'protocol = "canopen" together with this key')
     place.at("plant_node").require(keys.plant_node is None, 'protocol = "canopen" of the controller')
 
 
@@ -382,9 +382,9 @@ def _set_data_id(use: Use, data_id: int | tuple[int, ...] | None) -> Use:
         return replace(use, data_ids=data_id)
     if use.checksum == "e2e_profile_1" and isinstance(data_id, int):
         return replace(use, data_id=data_id)
-    if use.checksum.startswith("e2e") or data_id is not None:
-        raise use.place.refuse("a data_id of 0 to 65535 with e2e_profile_1, data_id = [16 numbers], one for each value "
-                               "of the counter, with e2e_profile_2, and none with the others")
+    use.place.require(not use.checksum.startswith("e2e") and data_id is None,
+                      "a data_id of 0 to 65535 with e2e_profile_1, data_id = [16 numbers], one for each value "
+                      "of the counter, with e2e_profile_2, and none with the others")
     return use
 
 
@@ -425,8 +425,7 @@ def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use
                        emcy=keys.emcy)
     if isinstance(keys, ControllerKeys):
         uses = _add_profile(uses, dictionary, keys, place)
-        if keys.profile != "cia402" and keys.mode is not None:
-            raise place.at("mode").refuse('profile = "cia402" with it')
+        place.at("mode").require(keys.profile == "cia402" or keys.mode is None, 'profile = "cia402" with it')
         mode = CYCLE_POSITION if keys.profile == "cia402" and keys.mode is None else keys.mode
         node = replace(node, profile=keys.profile, mode=mode, settings=tuple(_list_settings(
             reader.kind, dictionary, keys.parameters, place.at("parameters"))),

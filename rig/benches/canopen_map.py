@@ -172,12 +172,12 @@ def _check_object(name: str, dictionary: Any, key: str, use: Use) -> None:
         subs = "" if near is None or isinstance(near, ODVariable) else (
             f"; it has the sub-indices {', '.join(map(str, list(near.subindices)[:12]))}")
         raise use.place.refuse(f"an object of {name}; it has no {key}{subs}")
-    if found.data_type not in _KINDS:
-        raise use.place.refuse(f"a number; {key} ({found.name}) has the data type 0x{found.data_type or 0:04X}")
+    use.place.require(found.data_type in _KINDS,
+                      f"a number; {key} ({found.name}) has the data type 0x{found.data_type or 0:04X}")
     use.place.require(found.writable or not use.is_received,
                       f"an object that can be written; {key} ({found.name}) is {found.access_type}")
-    if use.is_received is False and not found.readable:
-        raise use.place.refuse(f"an object that can be read; {key} ({found.name}) is {found.access_type}")
+    use.place.require(found.readable or use.is_received is not False,
+                      f"an object that can be read; {key} ({found.name}) is {found.access_type}")
 
 
 def _describe_unmapped(dictionary: Any, pdos: list[Pdo], key: str, use: Use) -> str:

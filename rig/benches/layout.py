@@ -92,9 +92,9 @@ def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ..
         other = next((taken[place] for place in places if place in taken), "")
         is_inside = bool(places) and min(places) >= 0 and max(places) < 8 * frame.length
         if use is not None:
-            if length > 64 or (slot.bits.kind is Kind.FLOAT and length not in (32, 64)):
-                raise use.place.refuse(f"at most 64 bits, and 32 or 64 for a floating point number; {slot.name} has "
-                                       f"{length}")
+            use.place.require(length <= 64 and (slot.bits.kind is not Kind.FLOAT or length in (32, 64)),
+                              f"at most 64 bits, and 32 or 64 for a floating point number; {slot.name} has "
+                              f"{length}")
             use.place.require(is_inside, f"a signal inside its frame; {slot.name} lies outside the {frame.length} "
                               f"bytes of {frame.name}")
             use.place.require(not other, f"signals that do not overlap; {slot.name} has bits of {other}")
@@ -119,9 +119,9 @@ def _build_field(slot: Slot, use: Use | None) -> Field:
             use.place.require(slot.bits.length <= 32,
                               f"a counter of at most 32 bits; {slot.name} has {slot.bits.length}")
             return replace(slot.bits, name=slot.name, guard=use.guard)
-        if "#" not in use.checksum and (slot.bits.length != 8 or slot.bits.lowest % 8):
-            raise use.place.refuse(f"a byte for {use.checksum}; {slot.name} has {slot.bits.length} bits from bit "
-                                   f"{slot.bits.lowest} on")
+        use.place.require("#" in use.checksum or (slot.bits.length == 8 and slot.bits.lowest % 8 == 0),
+                          f"a byte for {use.checksum}; {slot.name} has {slot.bits.length} bits from bit "
+                          f"{slot.bits.lowest} on")
         return replace(slot.bits, name=slot.name, guard=use.guard, wrap=None, checksum=use.checksum,
                        data_id=use.data_id, data_ids=use.data_ids)
     if not use.signal:
@@ -161,8 +161,8 @@ def compute_counts(slot: Slot, value: float | str, place: Place) -> float:
     low, high = slot.bits.range
     if slot.bits.kind is Kind.FLOAT:
         return float(counts)
-    if counts.denominator != 1 and not math.isclose(counts, round(counts), rel_tol=1e-9):
-        raise place.refuse(f"a multiple of {float(slot.scale):g}, the step of {slot.name}, not {value:g}")
+    place.require(counts.denominator == 1 or math.isclose(counts, round(counts), rel_tol=1e-9),
+                  f"a multiple of {float(slot.scale):g}, the step of {slot.name}, not {value:g}")
     if not low <= round(counts) <= high:
         ends = sorted(float(slot.scale * end + slot.offset) for end in (low, high))
         raise place.refuse(f"{slot.name} from {ends[0]:g} to {ends[1]:g}, not {value:g}")

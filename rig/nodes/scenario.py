@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from plant import Actuator, InputError, Model, RigError
+from plant import Actuator, Model, RigError
+from plant.errors import InputError, require
 from plant.model import build_bare_model
 from plant.plants import find_key
 from plant.segments import Array
@@ -54,9 +55,9 @@ class Scenario(NamedTuple):
             "model": {"name": self.model.name, "effects": self.model.effects, "values": self.model.list_changes(),
                       "plant": self.model.plant},
             "plan": self.plan.to_json(), "load": changes, "seed": self.seed}).encode(), 9)
-        if len(data) > LARGEST_DOWNLOAD:
-            raise InputError("load", "", f"a load (and faults) of at most {LARGEST_DOWNLOAD >> 10} KiB compressed, not "
-                                         f"{len(data) >> 10} KiB: fewer recorded cycles, or fewer digits")
+        require(len(data) <= LARGEST_DOWNLOAD, "load", "",
+                f"a load (and faults) of at most {LARGEST_DOWNLOAD >> 10} KiB compressed, not "
+                f"{len(data) >> 10} KiB: fewer recorded cycles, or fewer digits")
         return data
 
     @classmethod
@@ -74,8 +75,8 @@ class Scenario(NamedTuple):
             model = bare.with_effects(named["effects"]).replace(named["values"], WHERE)
             force = np.cumsum(np.cumsum(np.array(table["load"], np.int64))).tolist()
             plan, seed = Plan.from_json(table["plan"], bare.plant), int(table["seed"])
-            if min(seed, plan.seed) < 0 or not 0 <= plan.start <= plan.stop <= LONGEST_PLAN:
-                raise InputError(WHERE, "plan", f"seeds from 0, and at most {LONGEST_PLAN} cycles")
+            require(min(seed, plan.seed) >= 0 and 0 <= plan.start <= plan.stop <= LONGEST_PLAN, WHERE, "plan",
+                    f"seeds from 0, and at most {LONGEST_PLAN} cycles")
             require_sensible(plan, model)
             return cls(model, plan, tuple(force), seed)
         except InputError:
