@@ -1,7 +1,7 @@
 """The reference pages of effects, parameters, signals and models."""
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from markdown_text import MADE, escape_markup, make_table, name_anchor, quote_code
@@ -56,11 +56,12 @@ def write_parameter_page() -> list[str]:
     return [*lines, "## Models", *make_plain_table(list_command.list_models(Model()))]
 
 
-def make_plain_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def make_plain_table(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     """A table of `rig list`; the names are code."""
+    table = list(rows)
     shown = [[quote_code(value) if key in ("name", "effects") else _format_value(value) for key, value in row.items()]
-             for row in rows]
-    return make_table(list(rows[0]), shown)
+             for row in table]
+    return make_table(list(table[0]), shown)
 
 
 def _format_value(value: Any) -> str:
