@@ -190,6 +190,10 @@ SUSPICIOUS_TOLERANCES = 3.0
 # Rounding of what the bus and the file hold gives 1; columns that are rounded twice, 1.9.
 FIRMWARE_DIFFERS = 3.0
 
+# Least noise, over that of the sensor, that a recording is taken to have: a simulated one may have none, and then the
+# error of the solver would be the only thing left to explain.
+QUIETEST_NOISE = 0.1
+
 # Steps of a position, over the noise of its sensor, that are no effect of the transducer: the noise hides them.
 COMB_HIDDEN = 0.125
 

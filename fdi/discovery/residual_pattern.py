@@ -132,7 +132,7 @@ def fit_curve(y: Floats, x: Floats, noise: float) -> tuple[float, Floats, Floats
     total = np.bincount(place, y, len(count))
     at = np.bincount(place, x, len(count))[kept] / count[kept]
     height = total[kept] / count[kept]
-    spread = np.sqrt(np.bincount(place, y * y, len(count))[kept] / count[kept] - height**2)
+    spread = np.sqrt(np.maximum(np.bincount(place, y * y, len(count))[kept] / count[kept] - height**2, 0.0))
     there = kept[place]
     left = y[there] - np.interp(x[there], at, height)
     whole = float(np.mean(y[there] ** 2)) - noise**2

@@ -22,6 +22,7 @@ from fdi.estimation.fit import (
     continue_fit,
     cut_blocks,
     cut_runs,
+    find_fewest_steps,
     fit_unknowns,
     follow_population,
     linearise,
@@ -50,6 +51,7 @@ from fdi.thresholds import (
     GAIN_WORTH_A_FIT,
     LOOKS_ALIKE,
     NULL_DRAWS,
+    QUIETEST_NOISE,
     RESIDUAL_IS_NEAR_NOISE,
     RESIDUAL_IS_NOISE,
     TOLERANCES_FAR_SHARE,
@@ -363,7 +365,11 @@ class Search:
 
     def learn_noise(self, best: Hypothesis) -> None:
         """Take the noise from what differs between the runs under the best hypothesis."""
-        self.noise = tuple(learn_noise(best, self.problem.trace, self.noise))
+        self.noise = self._measure_noise(best)
+        levels = zip(self.noise, map(self.sensors.__getitem__, self.problem.trace.outputs), strict=True)
+        if any(noise.level < 0.5 * sensor.level for noise, sensor in levels):  # of a simulation: the steps err by more
+            steps = find_fewest_steps(self.model.kind, QUIETEST_NOISE)
+            self.problem = replace(self.problem, steps=max(self.problem.steps, steps), _lanes={})
         if self.model.kind.correct is not None:
             self.noise = self._add_rounding(self.problem.trace, self.noise)
         self.problem = replace(self.problem, noise=self.noise)
@@ -394,9 +400,15 @@ class Search:
 
     def estimate_floor(self, best: Hypothesis) -> dict[str, float]:
         """What the sensors' noise alone leaves of each signal, RMS SI, under the best hypothesis."""
-        found = learn_noise(best, self.problem.trace, self.noise)
         return {s: float(np.hypot(n.level, self.coarse.get(s, 0.0)))
-                for s, n in zip(self.problem.trace.outputs, found, strict=True)}
+                for s, n in zip(self.problem.trace.outputs, self._measure_noise(best), strict=True)}
+
+    def _measure_noise(self, best: Hypothesis) -> tuple[Noise, ...]:
+        """What `learn_noise` finds, and no less than a small part of what the sensors are said to have."""
+        trace = self.problem.trace
+        least = [QUIETEST_NOISE * self.sensors[name].level for name in trace.outputs]
+        return tuple(noises.white_noise(low) if found.level < low else found
+                     for found, low in zip(learn_noise(best, trace, self.noise), least, strict=True))
 
     def refit_hypothesis(self, h: Hypothesis, rounds: int = 4) -> Hypothesis:
         """A hypothesis refitted with the noise, the steps and the runs as they are now."""
@@ -541,6 +553,7 @@ class Search:
 
     def refine_steps(self, steps: int, finest: int = TRUEST) -> None:
         """Finer steps from here on, `finest` where only slopes do not ask for them; fits to the repeats as well."""
+        steps = max(steps, self.problem.steps)
         self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.trace for p in self.repeats))
         self.fine = replace(self.problem, steps=finest, _lanes={})
         self.repeats = [replace(p, steps=finest, _lanes={}) for p in self.repeats]

@@ -82,9 +82,9 @@ def limit_friction_values(values: Mapping[str, float]) -> dict[str, float]:
 
 
 @cache
-def find_fewest_steps(kind: Plant) -> int:
+def find_fewest_steps(kind: Plant, noise_share: float = 1.0) -> int:
     """Steps a cycle with which fits may begin: the fewest that change a replay of the plant's nominal test by less than
-    the noise of each sensor, of 10, 20 and 50 against 200. Of a plant without such a test they are 10.
+    a share of the noise of each sensor, of 10, 20 and 50 against 200. Of a plant without such a test they are 10.
     """
     if not kind.profile or kind.foreign is not None:
         return 10
@@ -96,7 +96,7 @@ def find_fewest_steps(kind: Plant) -> int:
                        for n in (200, 10, 20, 50))
     with np.errstate(all="ignore"):  # too few steps may let it diverge
         changes = [np.sqrt(((out - finest) ** 2).mean(axis=0))[noise > 0.0] / noise[noise > 0.0] for out in others]
-    return next((n for n, change in zip((10, 20, 50), changes, strict=True) if (change < 1.0).all()), 100)
+    return next((n for n, change in zip((10, 20, 50), changes, strict=True) if (change < noise_share).all()), 100)
 
 
 @dataclass

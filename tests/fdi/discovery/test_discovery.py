@@ -47,6 +47,7 @@ from fdi.estimation.fit import (
     linearise,
     list_all_unknowns,
     list_effect_unknowns,
+    silence_sensors,
     turn_amplitudes_positive,
 )
 from fdi.estimation.noise import fit_noise, measure_level
@@ -250,6 +251,15 @@ def test_with_more_noise_an_effect_is_found_from_a_fit_in_a_wrong_valley() -> No
 T = 1e-3 * np.arange(1000)
 COMMAND = 5e-4 * np.sin(2.0 * np.pi * 2.0 * T) * (1.0 - np.exp(-5.0 * T))  # m
 BIAS = {"null_bias.current": 1e-4}
+
+
+def test_a_recording_without_noise_is_taken_to_have_some() -> None:
+    """Else what solver and rounding leave would be all that is left to explain: of a simulation, by a second effect."""
+    run = simulate(silence_sensors(Model()), SHORT)
+    columns = {"com": SHORT, "xj": run.xj, "cor": run.cor, "p12": run.p12, "xs": run.xs}
+    search = Search(Model(), hold_inputs(Trace.from_columns(columns, 1e-3, {})), [], ["supply_ripple"], 1)
+    search.learn_noise(search.fit_base())
+    assert [n.level for n in search.noise] == pytest.approx([2e-7, 2e3, 1e-7], rel=1e-9)
 
 
 @pytest.fixture(scope="module")
