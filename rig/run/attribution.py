@@ -244,9 +244,9 @@ def _describe_disturbance(records: CycleRecords, late: LateCycles, first: int, l
     # The rig is named if its SYNC was late first: a stalled rig also takes the plant's frames in late.
     is_rig = late.sync[first] or (
         late.sync[span].any() and not late.stalled[span].any() and late.feedback[span].sum() < 2)
-    source, text = (RIG, f"the rig sent SYNC {1e3 * float(np.nanmax(records.lateness[span])):.1f} ms late") if (
-        is_rig) else (PLANT, _describe_plant(records, late, span))
-    return Disturbance(first, last, last + 3 + (last - first + 1) + skipped, source, text)
+    late_ms = 1e3 * float(np.nanmax(records.lateness[span]))
+    text = f"the rig sent SYNC {late_ms:.1f} ms late" if is_rig else _describe_plant(records, late, span)
+    return Disturbance(first, last, last + 3 + (last - first + 1) + skipped, RIG if is_rig else PLANT, text)
 
 
 def _describe_plant(records: CycleRecords, late: LateCycles, span: slice) -> str:
