@@ -205,10 +205,13 @@ class Trace:
         return replace(self, columns={**self.columns, **columns}, **fields)
 
     def join_lead(self) -> Trace:
-        """The trace from the start of its set-up on, whose rows are not usable: there the plant rests."""
-        if not self.lead:
+        """The trace from the start of its set-up on, whose rows are not usable: there the plant rests.
+
+        The trace itself where there is none, or where it takes longer than main: a replay is then mostly of the set-up.
+        """
+        rows = len(self.lead.get(self.declared.command.name, ()))
+        if not 0 < rows <= len(self):
             return self
-        rows = len(self.lead[self.declared.command.name])
         before, unusable = self.t[0] + self.period * np.arange(-rows, 0), np.zeros(rows, bool)
         columns = {name: np.concatenate([self.lead[name], column]) for name, column in self.columns.items()}
         drive = columns[self.declared.drive.name]

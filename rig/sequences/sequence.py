@@ -240,7 +240,8 @@ def load_sequence(name_or_path: str | Path, rate: float = RATE, plant: str = "eh
     shipped = {Path(entry.name).stem: entry for entry in found if entry.name.endswith(".toml")}
     if str(name_or_path) in shipped:
         entry, kind = shipped[str(name_or_path)], find_plant(plant)
-        require(entry.name != PREFLIGHT or kind.profile or kind.foreign or kind.key == "eha", name_or_path, "",
+        is_eha = kind.key == "eha" or (kind.foreign and kind.signals.controlled.name == EHA.controlled.name)
+        require(entry.name != PREFLIGHT or kind.profile or is_eha, name_or_path, "",
                 f"a sequence of your own: {kind.title} ({kind.key}) declares no nominal test")
         if entry.name == PREFLIGHT and kind.profile:  # the shipped one is that of the EHA
             entry = shipped.get(f"preflight_{kind.key}", entry)
