@@ -561,7 +561,7 @@ _FIRST_IDENTIFIER, _DRIVE_IDENTIFIER = 0x101, 0x201
 
 
 def make_plant_bench(plant: Plant, model: str) -> Bench:
-    """The bench for a plant: its command and readings go to the controller, its drive comes back, as 64-bit numbers.
+    """The bench for a plant, with the cycle of its law: command and readings out, drive back, as 64-bit numbers.
 
     Args:
         plant: as declared.
@@ -578,8 +578,9 @@ def is_plant_bench(bench: Bench) -> bool:
 
 def _write_plant_bench(plant: Plant, model: str) -> str:
     sent = [f"{s.word} = {_write_plant_place(s)}" for s in (plant.signals.command, *plant.signals.outputs)]
-    return "\n".join([f'name = "{plant.title}, with its own controller"', f"plant = {model!r}", "", "[controller]",
-                      'protocol = "can"', f'dbc = "{_PLANT_DBC}"', "", "[controller.inputs]", *sent, "",
+    cycle = f'cycle = "{1e6 * plant.nominal["controller.period"]:.12g} us"'
+    return "\n".join([f'name = "{plant.title}, with its own controller"', f"plant = {model!r}", cycle, "",
+                      "[controller]", 'protocol = "can"', f'dbc = "{_PLANT_DBC}"', "", "[controller.inputs]", *sent, "",
                       "[controller.outputs]",
                       f"{plant.signals.drive.word} = {_write_plant_place(plant.signals.drive)}", ""])
 

@@ -110,8 +110,11 @@ def test_a_plant_without_a_device_runs_with_its_own_controller(tmp_path: Path, m
     """Nothing but the plant file: run, repeat, and find what was hidden in the plant of the run."""
     monkeypatch.chdir(tmp_path)
     assert rig("new", "plant", "motor").status == 0
+    slower = Path("motor.py").read_text().replace('high=0.1)] = 1e-3', 'high=0.1)] = 2e-3')
+    Path("motor.py").write_text(slower)
     said = rig("run", "--model", "motor.py", "--set", "dry_friction.torque=0.3", "--json", "--out", "run")
     assert (said.status, said.json["verdict"]) == (0, "PASS"), said
+    assert Trace.read("run").period == 2e-3
     skipped = {each["name"] for each in said.json["not_applicable"]}
     assert "same answers after a reset" in skipped  # and so not counted as passed
     again = rig("run", "--from", "run", "--trust", "--out", "again")
