@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from effect_files import restored_catalogue
 from places import ROOT
 from rig_command import rig
 
@@ -16,7 +17,8 @@ def test_the_page_lists_every_program() -> None:
 
 
 def test_an_effect_of_ones_own() -> None:
-    said = rig("effects", "--effects", EXAMPLES / "cogging.py", "cogging")
+    with restored_catalogue():
+        said = rig("effects", "--effects", EXAMPLES / "cogging.py", "cogging")
     assert said.status == 0 and "F sin(2 pi XJ / pitch)" in said.out
 
 
