@@ -566,7 +566,13 @@ def make_plant_bench(plant: Plant, model: str) -> Bench:
     Args:
         plant: as declared.
         model: that has it; the folder of its file is left out.
+
+    Raises:
+        InputError: its law has a cycle that no bench has.
     """
+    cycle = Fraction(str(plant.nominal["controller.period"]))
+    require(_CYCLES[0] <= cycle <= _CYCLES[1] and not cycle * 1_000_000 % 1, Path(model).name, "controller.period",
+            f"whole microseconds from 0.1 to 100 ms, as a cycle of a bus, not {float(cycle):g} s")
     return load_bench_from_files({_PLANT_BENCH: _write_plant_bench(plant, Path(model).name).encode(),
                                   _PLANT_DBC: _write_plant_dbc(plant).encode()}, plant.signals)
 
