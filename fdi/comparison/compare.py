@@ -312,7 +312,9 @@ def _align_delays(trace: Trace, model: Model, found: ControllerBlock) -> tuple[T
 
 
 def _describe_cycles(n: int) -> str:
-    return f"{abs(n)} {'cycle' if abs(n) == 1 else 'cycles'} {'later' if n > 0 else 'earlier'}"
+    cycles = "cycle" if abs(n) == 1 else "cycles"
+    direction = "later" if n > 0 else "earlier"
+    return f"{abs(n)} {cycles} {direction}"
 
 
 def _judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],

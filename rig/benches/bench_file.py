@@ -570,10 +570,9 @@ def make_plant_bench(plant: Plant, model: str) -> Bench:
     Raises:
         InputError: its law has a cycle that no bench has.
     """
-    cycle = Fraction(str(plant.nominal["controller.period"]))
-    require(_CYCLES[0] <= cycle <= _CYCLES[1] and not cycle * 1_000_000 % 1, Path(model).name, "controller.period",
-            f"whole microseconds from 0.1 to 100 ms, as a cycle of a bus, not {float(cycle):g} s")
-    return load_bench_from_files({_PLANT_BENCH: _write_plant_bench(plant, Path(model).name).encode(),
+    name, cycle = Path(model).name, f"{1e6 * plant.nominal['controller.period']:.12g} us"
+    _read_time(cycle, Place(name).at("controller", "period"), *_CYCLES)
+    return load_bench_from_files({_PLANT_BENCH: _write_plant_bench(plant, name, cycle).encode(),
                                   _PLANT_DBC: _write_plant_dbc(plant).encode()}, plant.signals)
 
 
@@ -582,10 +581,10 @@ def is_plant_bench(bench: Bench) -> bool:
     return next(iter(bench.files), "") == _PLANT_BENCH
 
 
-def _write_plant_bench(plant: Plant, model: str) -> str:
+def _write_plant_bench(plant: Plant, model: str, cycle: str) -> str:
     sent = [f"{s.word} = {_write_plant_place(s)}" for s in (plant.signals.command, *plant.signals.outputs)]
-    cycle = f'cycle = "{1e6 * plant.nominal["controller.period"]:.12g} us"'
-    return "\n".join([f'name = "{plant.title}, with its own controller"', f"plant = {model!r}", cycle, "",
+    return "\n".join([f'name = "{plant.title}, with its own controller"', f"plant = {model!r}",
+                      f'cycle = "{cycle}"', "",
                       "[controller]", 'protocol = "can"', f'dbc = "{_PLANT_DBC}"', "", "[controller.inputs]", *sent, "",
                       "[controller.outputs]",
                       f"{plant.signals.drive.word} = {_write_plant_place(plant.signals.drive)}", ""])

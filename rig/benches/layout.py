@@ -137,8 +137,11 @@ def _find_worth(slot: Slot, use: Use) -> tuple[Fraction, Fraction]:
     if use.count is not None:
         offset = slot.offset / slot.scale * use.count if slot.scale else Fraction(0)
         return use.count, offset if use.offset is None else use.offset
-    known = fit_unit(slot.unit or "", use.unit) if use.unit else None
-    factor = known.factor if known else None if use.unit else _PLAIN.get(slot.unit or "")
+    if use.unit:
+        known = fit_unit(slot.unit or "", use.unit)
+        factor = known.factor if known else None
+    else:
+        factor = _PLAIN.get(slot.unit or "")
     if factor is None:
         said = "its file gives it no unit" if not slot.unit else f"its unit is {slot.unit!r}"
         worth = f"such as count = '1 {use.unit}'" if use.unit else "as a number"

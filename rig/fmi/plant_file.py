@@ -165,8 +165,8 @@ def _find_worth(about: Description, entry: Entry, unit: str, place: Place) -> tu
         count, of = (entry.count, si) if unit or known is not None else (number, "")
         return _parse(count, of, place.at("count")), si
     known = find_unit(stated)
-    fitting = fit_unit(stated, unit or known.si if known else unit)
-    if fitting is not None and stated:
+    own = unit or (known.si if known else "")
+    if own and (fitting := fit_unit(stated, own)) is not None:
         return float(fitting.factor), fitting.si
     if unit and stated not in ("", unit):
         raise place.refuse(f'count = ".. {unit}": the variable {entry.variable} is in {stated}')
