@@ -314,7 +314,8 @@ class Search:
         if self.model.kind.correct is not None and max(ratio.values()) > RESIDUAL_IS_NOISE:
             undecided = find_undecided_rows(replace(self.problem, also=(), _lanes={}), found, floor)
             typical = _leave_out_worst(np.where(undecided, np.nan, own))
-            ratio = dict(zip(signals, measure_repeating(typical, others, coarse), strict=True))
+            if not np.isnan(typical).all(axis=1).any():
+                ratio = dict(zip(signals, measure_repeating(typical, others, coarse), strict=True))
         return Hypothesis(effects, found, errors, ratio, cost, tuple(others))
 
     def make_problem(self, trace: Trace, steps: int) -> Problem:
@@ -589,12 +590,13 @@ def measure_repeating(residual: Floats, others: Sequence[Floats], coarse: Sequen
 
 
 def _leave_out_worst(residuals: Floats, share: float = 0.15) -> Floats:
-    """Residuals (s, n) without each signal's worst blocks, a share of all of them.
+    """Residuals (s, n) without each signal's worst blocks, a share of those that were compared.
 
     A surface may stop for an instant in a slow motion.
     """
     sums = sum_blocks(np.nan_to_num(residuals))
-    kept = sums <= np.quantile(sums, 1.0 - share, axis=1, keepdims=True)
+    compared = [np.quantile(each[each > 0.0], 1.0 - share) if each.any() else 0.0 for each in sums]
+    kept = sums <= np.array(compared)[:, None]
     return np.where(np.repeat(kept, BLOCK, axis=1)[:, :residuals.shape[1]], residuals, np.nan)
 
 

@@ -133,6 +133,7 @@ def _finish_chain(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesi
     search.match_noise(chain[-1])
     coarse = search.problem.steps
     search.refine_steps(LAST_FIT_STEPS, LAST_FIT_STEPS)
+    search.leave_out_undecided(chain[-1])
     slopes = replace(search.problem, steps=coarse, _lanes={})
     last = finish_fit(search.problem, chain[-1].fit, LAST_FIT_ROUNDS, slopes, search.stage)
     if last.misfit > WHITE_SQUARE_POOR * np.count_nonzero(last.white):

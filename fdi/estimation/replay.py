@@ -56,6 +56,8 @@ Columns = dict[str, Floats]  # by signal, (n,)
 
 REPLAY_STEPS, FINEST_REPLAY_STEPS = 50, 800  # a cycle
 SCATTER_DIFFERENCE = 0.3  # tolerances, of the differences that the Jacobian is made of
+MEMORY = 4.0 / ANCHOR_RATE  # s, until an anchored replay is back on the recording
+LEAST_MOVING = 5 * WINDOW  # rows of a motion that are worth more than a run with all its rests
 NEAR_NOISE = 2.0  # floors, in the better half of a run: else physics is missing, and no stop matters
 ALIKE = 20  # neighbouring samples that say the same thing
 
@@ -250,7 +252,7 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
 
 
 def find_rest_rows(position: Floats, period: float, noise: float, window: float = 0.05,
-                   memory: float = 4.0 / ANCHOR_RATE) -> Flags:
+                   memory: float = MEMORY) -> Flags:
     """Rows, (n,), in which the controlled signal rests, and those in which a replay still remembers that.
 
     Args:
@@ -267,21 +269,23 @@ def find_rest_rows(position: Floats, period: float, noise: float, window: float 
     return extend_flags(maximum_filter1d(rests.astype(np.int8), rows) > 0, round(memory / period))
 
 
-def leave_out_rest(trace: Trace, model: Model) -> Trace:
+def leave_out_rest(trace: Trace, model: Model, memory: float = MEMORY) -> Trace:
     """A prepared run of a plant that is replayed by an observer, without the rows that hang on its stops.
 
     At rest dry friction has any value up to its static level: whether a replay stays or slips hangs on less than a
     sensor shows, and one that slips alone is off by many times the noise. Speed and friction of a motion are certain.
-    Without an observer, or where too little would remain, the run is as it is. A note says how much is not compared.
+    Without an observer, or where less than `LEAST_MOVING` would remain, the run is as it is: steps that are held for
+    seconds rest most of the time. A note says how much is not compared. `memory`: as for `find_rest_rows`.
     """
     if model.kind.correct is None:
         return trace
     noise = find_sensor_level(trace, trace.declared.controlled, model)
-    moving = leave_out_rows(trace, find_rest_rows(trace.controlled, trace.period, noise))
-    if moving is trace:
+    moving = trace.usable & ~find_rest_rows(trace.controlled, trace.period, noise, memory=memory)
+    rests = float((trace.usable & ~moving).sum()) * trace.period
+    if rests == 0.0 or moving.sum() < LEAST_MOVING:
         return trace
-    rests = float((trace.usable & ~moving.usable).sum()) * trace.period
-    return moving.with_notes(f"{rests:.1f} s at rest are not compared: friction has any value there")
+    return trace.with_columns({}, usable=moving).with_notes(
+        f"{rests:.1f} s at rest are not compared: friction has any value there")
 
 
 def leave_out_rows(trace: Trace, rows: Flags) -> Trace:

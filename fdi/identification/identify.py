@@ -39,6 +39,7 @@ from fdi.estimation.replay import (
     differentiate,
     find_undecided_rows,
     hold_inputs,
+    leave_out_rest,
     match_period,
     prepare_trace,
 )
@@ -494,8 +495,8 @@ class RunError(NamedTuple):
     after: Mapping[str, float]
     typical: Mapping[str, float]  # after, without the worst blocks
     floor: Mapping[str, float]
-    decided: Mapping[str, float]  # after, of a held-out run without the rows that no model can predict
-    undecided: float = 0.0  # share of these rows; 0 for a fitted run
+    decided: Mapping[str, float]  # after, without the rows that no model can predict
+    undecided: float = 0.0  # share of these rows; 0 for a fitted run without an observer
 
     @property
     def ratio(self) -> float:
@@ -558,7 +559,9 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
         workers: threads; default one a core.
     """
     runs = (*fitted, *held_out)
-    notes = [f"{source.file}: {note}" for trace, source in zip(runs, sources, strict=True) for note in trace.notes]
+    fitted = [leave_out_rest(t, model) for t in fitted]
+    notes = [f"{source.file}: {note}" for trace, source in zip((*fitted, *held_out), sources, strict=True)
+             for note in trace.notes]
     floors = [sensor_floors(t, model) for t in fitted]
     floor = {s: float(np.median([f[s].value for f in floors if s in f])) for s in fitted[0].output_names
              if any(s in f for f in floors)}
@@ -767,21 +770,28 @@ def list_correlations(estimates: Sequence[Estimate], matrix: Floats, least: floa
 
 def measure_errors(before: Model, after: Model, runs: Sequence[Trace], sources: Sequence[Source], fitted: int,
                    floor: Mapping[str, float]) -> tuple[tuple[RunError, ...], tuple[tuple[Floats, Floats], ...]]:
-    """The error of each run with both models, the first `fitted` being those of the fit; and the residuals, SI."""
+    """The error of each run with both models, the first `fitted` being those of the fit; and the residuals, SI.
+
+    Where a replay has an observer, no fit saw the beginning of a motion: here it counts as far as it is decided.
+    """
     errors, residuals = [], []
     for number, (trace, source) in enumerate(zip(runs, sources, strict=True)):
+        trace = leave_out_rest(trace, after, memory=0.0)
         noise = tuple(noises.white_noise(1.0) for _ in trace.outputs)
         first, last = (Problem(silence_readings(model), trace, noise, steps=LAST_STEPS) for model in (before, after))
         left = [problem.compute_residuals((), np.empty((1, 0)))[0] for problem in (first, last)]
         sizes = [{s: rms(r) for s, r in zip(trace.outputs, each, strict=True)} for each in left]
-        typical = dict(zip(trace.outputs, compute_typical_rms(left[1]).tolist(), strict=True))
         own = {s: floor[s] for s in trace.outputs}
-        decided, share = sizes[1], 0.0
-        if number >= fitted and _moves(trace) and not is_long(trace):  # nine replays of a long one take too much memory
+        decided, share, judged = sizes[1], 0.0, left[1]
+        is_seen = number < fitted and after.kind.correct is None
+        if not is_seen and _moves(trace) and not is_long(trace):  # nine replays of a long one take too much memory
             undecided = find_undecided_rows(last, start_fit((), np.empty(0)), own)
             share = float(undecided.mean())
             if 0.0 < share < 1.0:
                 decided = {s: rms(r[~undecided]) for s, r in zip(trace.outputs, left[1], strict=True)}
+            if after.kind.correct is not None:
+                judged = left[1][:, ~undecided]
+        typical = dict(zip(trace.outputs, compute_typical_rms(judged).tolist(), strict=True))
         errors.append(RunError(source, number >= fitted, sizes[0], sizes[1], typical, own, decided, share))
         residuals.append((left[0], left[1]))
     return tuple(errors), tuple(residuals)
@@ -801,11 +811,11 @@ def decide_verdict(estimates: Sequence[Estimate], errors: Sequence[RunError]) ->
         return "CANNOT_TELL", "these runs show none of the free parameters"
     if unseen:
         return "PARTLY", f"these runs do not show {len(unseen)} of {len(estimates)} free parameters"
-    worst = max((e for e in errors if not e.is_held_out), key=lambda e: e.ratio)
-    if worst.ratio > FITTED_RUN_WORST:
+    worst = max((e for e in errors if not e.is_held_out), key=lambda e: e.decided_ratio)
+    if worst.decided_ratio > FITTED_RUN_WORST:
         return "PARTLY", (f"single stops in {worst.source.file} come at the wrong moment "
-                          f"({worst.ratio:.3g} noise floors over all of the run), so frictions and gains may be off by "
-                          "more than their intervals")
+                          f"({worst.decided_ratio:.3g} noise floors over all of the run), so frictions and gains may "
+                          "be off by more than their intervals")
     return "IDENTIFIED", ""
 
 

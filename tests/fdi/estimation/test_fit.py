@@ -12,6 +12,7 @@ from noisy_traces import record_plant
 
 from fdi.discovery.explain import judge_left_out_rows
 from fdi.discovery.search import Search
+from fdi.discovery.update_model import refit_effects
 from fdi.estimation.fit import (
     Fit,
     Problem,
@@ -213,6 +214,12 @@ def test_rows_in_which_a_motor_bounces_in_its_backlash_are_left_out_of_last_fits
     kept = search.problem.trace.usable
     assert kept[700:1200].all() and usable[-1000:].all() and kept[-1000:].mean() < 0.5
     assert not Search(Model(), hold_inputs(record_plant({}, np.zeros(200))), [], [], 1).leave_out_undecided(true)
+
+
+def test_error_that_is_watched_while_a_backlash_is_added_falls_to_the_noise() -> None:
+    found = refit_effects(load_model("ema"), ["backlash"], _record_motor({"screw.backlash": 1e-4}))
+    assert max(found.last.error[s] / found.floor[s] for s in found.floor) < 1.3
+    assert found.last.hypothesis.fit.values["screw.backlash"] == pytest.approx(1e-4, rel=0.05)
 
 
 def test_what_is_missing_in_rows_that_a_search_left_out_is_no_noise() -> None:

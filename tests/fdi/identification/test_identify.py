@@ -28,7 +28,10 @@ from fdi.identification.identify import (
 from fdi.report.identify_report import build_identification_report, describe_identification
 from fdi.report.terminal import format_report
 from fdi.trace.trace import Trace
+from plant import simulate
+from plant.declare import Chirp, Hold, Ramp, Step
 from plant.model import Model, load_model
+from plant.segments import build_profile
 from studies.hidden_effects.truth import SYMBOLS, has_compiler, simulate_truth
 from studies.identification import sample_actuator
 
@@ -88,7 +91,7 @@ def test_actuator_of_twice_the_size_is_identified(found: Identification) -> None
 
 def test_stops_at_the_wrong_moment_in_a_fitted_run_leave_doubt(found: Identification) -> None:
     first, *others = found.errors
-    late = first._replace(after={s: 2.5 * first.floor[s] for s in first.after})
+    late = first._replace(decided={s: 2.5 * first.floor[s] for s in first.after})
     verdict, reason = decide_verdict(found.estimates, [late, *others])
     assert verdict == "PARTLY" and "2.5 noise floors" in reason and first.source.file in reason
     assert "wrong moment" in describe_identification(replace(found, verdict=verdict, reason=reason))
@@ -172,6 +175,23 @@ def test_long_run_is_fitted_by_parts_and_an_end_stop_that_it_never_met_is_not_at
     flow, travel = found.estimates
     assert [(e.is_identifiable, e.is_at_bound) for e in (flow, travel)] == [(True, False), (False, False)]
     assert travel.low < 0.013 and travel.high == 0.05
+
+
+@pytest.mark.parametrize(("ramps", "verdict"), [(True, "IDENTIFIED"), (False, "UNEXPLAINED")])
+def test_motor_that_rests_is_identified_if_its_motions_show_it(ramps: bool, verdict: str) -> None:
+    """Dry friction at rest has any value, so rests are not compared; of short steps too little is left to find mass."""
+    model, unit = load_model("ema"), {"surface.mass": 300.0, "surface.damping": 3500.0, "surface.friction": 180.0}
+    moved = [Chirp(amplitude=2e-3, f0=1.0, f1=15.0, fade=15.0, time=3.0)] if ramps else [Hold(time=1.0)]
+    command = build_profile([Hold(time=0.5), Step(to=0.01, time=1.0), Ramp(to=-0.005, time=1.0), *moved,
+                             Step(to=0.0, time=1.0)], rate=1000.0).command
+    columns = simulate(model.replace(unit), command, seed=1)._asdict()
+    trace = Trace.from_columns(columns, 1e-3, {"source": "motor"}, model.kind.signals)
+    ranges = read_free_parameters(model, None)
+    own = collect_identification_runs(model, ranges, [trace], [])
+    found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources)
+    assert found.verdict == verdict and any("at rest" in note for note in found.notes)
+    held = {e.name: e.low <= unit[e.name] <= e.high for e in found.estimates if e.name in unit}
+    assert not ramps or held == dict.fromkeys(unit, True)
 
 
 def test_run_at_rest_identifies_nothing() -> None:
