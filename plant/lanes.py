@@ -375,10 +375,8 @@ class KernelVariant:
         self._names, self._laws = self.model.list_names(), model.kind.list_laws(effects)
         self._state: Array | None = None
         self._parameters = self.model.build_record().view(np.float64)[:, None]
-        # lanes of its blocks: a costly step keeps the processor busy with one register, a short one is half waiting
-        self.widths: tuple[int, ...] = (FEWEST, NARROW) if not effects else (NARROW,)
-        if not all(_is_cheap(model.find_effect(name)) for name in effects):
-            self.widths = (FEWEST,)
+        # lanes of its blocks: with effects a step keeps the processor busy with one register, else it is half waiting
+        self.widths = (FEWEST,) if effects else (FEWEST, NARROW)
 
     def is_ready(self, steps: float) -> bool:
         """Whether the kernel can make so many steps of all lanes now: see `KernelUse.is_ready`."""
