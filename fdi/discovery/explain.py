@@ -494,6 +494,7 @@ class Marks(NamedTuple):
     step: float = 0.0  # m, of the positions, where all are multiples of one; 0: they are not
     is_recorder: bool = False  # whether only the recording is rounded to that step, and the controller reads finer
     rivals: tuple[Fingerprint, ...] = ()  # effects of the firmware that explain its answer less well than the best one
+    unseen: tuple[str, ...] = ()  # effects of the firmware, where its answer cannot be computed from these runs
 
     @property
     def rounding(self) -> float:
@@ -524,13 +525,15 @@ def find_marks(model: Model, traces: Sequence[Trace]) -> Marks:
     if comb and comb.step > hidden and not is_recorder and is_offered:
         sizes = {"quantisation.lsb": (step, step - comb.doubt, step + comb.doubt)}
         prints.append(Fingerprint("quantisation", sizes, step / FINEST_COMB, 0.0))
-    error, firmware = 0.0, list[Fingerprint]()
+    error, firmware, unseen = 0.0, list[Fingerprint](), tuple[str, ...]()
     if model.kind.controller:
         error = _measure_rms(model, traces) / resolution
-        tried = [_fit_size(model, traces, e.name, error, resolution) for e in model.kind.list_effects()
-                 if e.firmware and e.name not in model.effects and len(e.fitted) == 1 and error > FIRMWARE_DIFFERS]
+        offered = [e.name for e in model.kind.list_effects()
+                   if e.firmware and e.name not in model.effects and len(e.fitted) == 1]
+        tried = [_fit_size(model, traces, e, error, resolution) for e in offered if error > FIRMWARE_DIFFERS]
         firmware = sorted((f for f in tried if f.after < 0.7 * error), key=lambda f: f.after)
-    return Marks(error, resolution, (*prints, *firmware[:1]), step, is_recorder, tuple(firmware[1:]))
+        unseen = tuple(offered) if all(np.isnan(compute_firmware_residual(model, t)).all() for t in traces) else ()
+    return Marks(error, resolution, (*prints, *firmware[:1]), step, is_recorder, tuple(firmware[1:]), unseen)
 
 
 def measure_firmware_resolution(model: Model, trace: Trace) -> float:

@@ -616,6 +616,7 @@ Start = Mapping[str, float]
 ZOOM = (  # factors on the size, pass by pass; the first reaches down to sizes that only just show
     (0.015, 0.05, 0.15, 0.4, 0.65, 1.5, 2.5), (0.6, 0.8, 1.25, 1.7), (0.88, 0.94, 1.06, 1.13),
     (0.97, 0.985, 1.015, 1.03))
+LINE = tuple(1.02**k for k in range(-120, 181))  # a tenth to 35 times the size, for plants with an observer
 LOOKED_AT = (40, 14, 10, 8)  # effects in each of these passes
 TOGETHER = 64  # runs at a time
 FINER = 16  # times the length of a run: bins of a spectrum fine enough for a fit to begin in
@@ -661,6 +662,9 @@ def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: in
     best = _keep_best(simulate_starts(problem, fit, first, workers))
     for factors, count in zip(ZOOM, LOOKED_AT, strict=True):
         near = [(t.effect, start, t.along) for t in best[:count] for start in _list_starts_around(problem, t, factors)]
+        best = _keep_best([*best, *simulate_starts(problem, fit, near, workers)])
+    if problem.model.kind.correct is not None:  # a backlash that is 2 % off bounces otherwise than the motor
+        near = [(t.effect, start, t.along) for t in best[:4] for start in _list_starts_around(problem, t, LINE)]
         best = _keep_best([*best, *simulate_starts(problem, fit, near, workers)])
     beside = [(t.effect, start, t.along) for t in best[:LOOKED_AT[-1]] for start in _list_lines_beside(problem, t)]
     best = _keep_best([*best, *simulate_starts(problem, fit, beside, workers)])

@@ -57,7 +57,6 @@ Columns = dict[str, Floats]  # by signal, (n,)
 REPLAY_STEPS, FINEST_REPLAY_STEPS = 50, 800  # a cycle
 SCATTER_DIFFERENCE = 0.3  # tolerances, of the differences that the Jacobian is made of
 MEMORY = 4.0 / ANCHOR_RATE  # s, until an anchored replay is back on the recording
-LEAST_MOVING = 5 * WINDOW  # rows of a motion that are worth more than a run with all its rests
 NEAR_NOISE = 2.0  # floors, in the better half of a run: else physics is missing, and no stop matters
 ALIKE = 20  # neighbouring samples that say the same thing
 
@@ -274,7 +273,7 @@ def leave_out_rest(trace: Trace, model: Model, memory: float = MEMORY) -> Trace:
 
     At rest dry friction has any value up to its static level: whether a replay stays or slips hangs on less than a
     sensor shows, and one that slips alone is off by many times the noise. Speed and friction of a motion are certain.
-    Without an observer, or where less than `LEAST_MOVING` would remain, the run is as it is: steps that are held for
+    Without an observer, or where fewer than `FEWEST_ROWS` would remain, the run is as it is: steps that are held for
     seconds rest most of the time. A note says how much is not compared. `memory`: as for `find_rest_rows`.
     """
     if model.kind.correct is None:
@@ -282,7 +281,7 @@ def leave_out_rest(trace: Trace, model: Model, memory: float = MEMORY) -> Trace:
     noise = find_sensor_level(trace, trace.declared.controlled, model)
     moving = trace.usable & ~find_rest_rows(trace.controlled, trace.period, noise, memory=memory)
     rests = float((trace.usable & ~moving).sum()) * trace.period
-    if rests == 0.0 or moving.sum() < LEAST_MOVING:
+    if rests == 0.0 or moving.sum() < FEWEST_ROWS:
         return trace
     return trace.with_columns({}, usable=moving).with_notes(
         f"{rests:.1f} s at rest are not compared: friction has any value there")

@@ -9,7 +9,7 @@ import numpy as np
 
 from fdi.comparison.compare import Comparison, SignalError
 from fdi.comparison.residuals import Depends, ResidualTests, map_deviation
-from fdi.estimation.replay import find_controller_gain, has_controller_memory
+from fdi.estimation.replay import find_controller_gain
 from fdi.report.drawing import (
     BLUE,
     COMMAND,
@@ -212,8 +212,8 @@ def _describe_controller(c: Comparison) -> str:
     if not c.model.kind.controller:
         return f"{path}: the firmware is not known"
     if not math.isfinite(a.error):
-        remembers = has_controller_memory(c.model) and not c.trace.usable.all()
-        return f"{path}: its law {'remembers what is not in the log' if remembers else 'needs unknown readings'}"
+        is_read = len(c.trace.outputs) == len(d.outputs)
+        return f"{path}: its law {'remembers what is not in the log' if is_read else 'needs unknown readings'}"
     if a.ratio <= CONTROLLER_ERROR_RATIO:
         return f"{path}: equal to the last digit"
     factor, shown = (1e6, "uA") if d.drive.unit == "A" else (1.0, d.drive.unit)

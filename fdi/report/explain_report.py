@@ -88,6 +88,9 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
         notes.append(f"{d.controlled.symbol} is recorded in steps of {format_amount(marks.step, d.controlled.unit)}, "
                      f"but {d.drive.symbol} shows that the controller "
                      "reads it finer: the rounding is noise of the recording and no effect")
+    if marks.unseen:
+        notes.append("the controller's answers are not judged, as its law needs readings that are not in the file, "
+                     f"or remembers what came before: {join_words(marks.unseen)} would not be seen")
     sections = [
         Section("Candidates", [_tabulate_candidates(a)] if a.candidates else []),
         Section("Parameters of the missing effect",

@@ -198,6 +198,8 @@ def _describe_case(plant: str, case: Case) -> dict[str, Any]:
         effects.append({"name": name, "parameter": parameter, "value": values[parameter], "unit": unit,
                         "size": values[parameter], "symbols": values,
                         "floors": measure_levels(plant, effect, [values], command)[0], "where": None})
+        if case.signals != ",".join(s.name for s in kind.signals.outputs):  # the law may need them all
+            effects[-1]["floors"]["controller"] = 0.0
     signals = [*(s.name for s in kind.signals.outputs), "controller"]
     together = {signal: max((e["floors"][signal] for e in effects), default=0.0) for signal in signals}
     return {"case": f"{case.seed:05d}", "plant": plant, "kind": case.kind, "signals": case.signals, "effects": effects,

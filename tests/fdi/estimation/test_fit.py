@@ -11,7 +11,7 @@ import pytest
 from noisy_traces import record_plant
 
 from fdi.discovery.explain import judge_left_out_rows
-from fdi.discovery.search import Search
+from fdi.discovery.search import Search, scan_effects
 from fdi.discovery.update_model import refit_effects
 from fdi.estimation.fit import (
     Fit,
@@ -46,7 +46,7 @@ from fdi.estimation.unidentifiable import (
 )
 from fdi.trace.trace import Floats, Trace, rms
 from plant import Model, load_model, simulate
-from plant.declare import Chirp, Hold, Ramp
+from plant.declare import Chirp, Hold, Ramp, Step
 from plant.segments import build_profile
 
 
@@ -214,6 +214,21 @@ def test_rows_in_which_a_motor_bounces_in_its_backlash_are_left_out_of_last_fits
     kept = search.problem.trace.usable
     assert kept[700:1200].all() and usable[-1000:].all() and kept[-1000:].mean() < 0.5
     assert not Search(Model(), hold_inputs(record_plant({}, np.zeros(200))), [], [], 1).leave_out_undecided(true)
+
+
+def test_scan_of_a_step_test_finds_the_size_at_which_a_backlash_bounces_like_the_motor() -> None:
+    """Two percent beside it a replay bounces otherwise; most of the run is at rest and is not compared."""
+    model = load_model("ema")
+    steps = [Step(to=to, time=2.0) for to in (0.01, -0.01, 0.005, 0.0)]
+    command = build_profile([Hold(time=0.3), *steps], rate=1000.0).command
+    columns = simulate(model.replace({"screw.backlash": 1e-4}), command, seed=3)._asdict()
+    trace = hold_inputs(Trace.from_columns(columns, 1e-3, {}, model.kind.signals))
+    search = Search(model, trace, [], ["backlash"], 1)
+    assert 200 <= search.problem.trace.usable.sum() < 0.3 * len(trace)
+    healthy = linearise(search.problem, list_all_unknowns(search.model), np.zeros(4))
+    found = scan_effects(search.problem, healthy, ["backlash"])[0]
+    u = [f.name for f in found.free].index("screw.backlash")
+    assert found.free[u].centre + found.free[u].scale * found.x[u] == pytest.approx(1e-4, rel=0.3)  # else a tenth of it
 
 
 def test_error_that_is_watched_while_a_backlash_is_added_falls_to_the_noise() -> None:
