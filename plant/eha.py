@@ -7,6 +7,7 @@ will be in mid step. That leaves 1/170 of the error of the plain implicit scheme
 Names in capitals in the comments are the paper's symbols; functions named `at_<port>` are bound to the model's effects.
 """
 
+from collections import namedtuple
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -46,25 +47,25 @@ class State(NamedTuple):
     sensed: Metre = 0.0  # XJ as its transducer shows it, without noise
 
 
-class Coefficients(NamedTuple):
-    """Coefficients computed from the parameters, so that no step divides; constant while the parameters are."""
-
-    flapper_keep: float  # velocity kept over a step
-    flapper_push: float  # velocity gained per unit of torque
-    pilot_gain: float  # GPF1, Pa/m
-    pilot_slope: float  # GPF1 ASV / GQF1, Pa s/m
-    pilot_limit: float  # PS1, Pa
-    spool_free: float  # 1/kg
-    spool_coupled: float  # 1/kg
-    spool_push: float  # h ASV
-    valve_stiffness: float  # GP AJ / GQ, Pa s/m, the metering edges without leakage
-    valve_loss: float  # GP CLK / GQ, their loss of pressure gain by leakage
-    valve_gain: float  # Pa/m, the metering edges with leakage
-    valve_slope: float  # Pa s/m
-    valve_limit: float  # PSR, Pa
-    jack_damping: float  # CJ, N s/m
-    jack_free: float  # 1/kg
-    jack_coupled: float  # 1/kg
+# computed from the parameters, so that no step divides; constant while these are
+Coefficients = namedtuple("Coefficients", (
+    "flapper_keep",  # velocity kept over a step
+    "flapper_push",  # velocity gained per unit of torque
+    "pilot_gain",  # GPF1, Pa/m
+    "pilot_slope",  # GPF1 ASV / GQF1, Pa s/m
+    "pilot_limit",  # PS1, Pa
+    "spool_free",  # 1/kg
+    "spool_coupled",  # 1/kg
+    "spool_push",  # h ASV
+    "valve_stiffness",  # GP AJ / GQ, Pa s/m, the metering edges without leakage
+    "valve_loss",  # GP CLK / GQ, their loss of pressure gain by leakage
+    "valve_gain",  # Pa/m, the metering edges with leakage
+    "valve_slope",  # Pa s/m
+    "valve_limit",  # PSR, Pa
+    "jack_damping",  # CJ, N s/m
+    "jack_free",  # 1/kg
+    "jack_coupled",  # 1/kg
+))
 
 
 def compute_flow_share(left: float, law: float) -> float:

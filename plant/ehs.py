@@ -5,19 +5,19 @@ and data: github.com/ivliev123/Electro-Hydraulic-Actuator; "raw" is the unit of 
 """
 from collections import namedtuple
 from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from plant import signals
 from plant.effects.sensors import Quantisation
-from plant.effects.valve import Compressibility
+from plant.effects.servovalve import Compressibility
 from plant.eha import step_jack, update_compliance
 from plant.friction import clip
 from plant.parameters import GROUPS, convert_group_unit, read_shipped_model
 from plant.plants import MeasuredPressures, Plant, Table, Term, base_effect
 from plant.ports import at_position, at_valve, port
-from plant.quantity import Metre, MetrePerSecond, Pascal, Quantity
+from plant.quantity import Metre, MetrePerSecond, Pascal, Quantity, make_group
 from plant.segments import Array
 from plant.signals import Signals
 from plant.state import Input, Line, Memory
@@ -28,25 +28,20 @@ RAW_PER_TURN = 60.0 / 0.88  # raw/(turn/s): the firmware calls its unit rpm; by 
 at_current = port("raw", "speed of the motor")
 SEAL_LEAKAGE = 1e-16  # m3/s/Pa, negligible; it keeps the pressure finite in a model without leakage
 
+Pump = make_group("Pump", "The pump, and the valve that gives its flow to one chamber and the other to the tank.", {
+    "displacement": Quantity("m3/s/raw", "D", low=1e-10, high=1e-6),
+    "area_ratio": Quantity("1", low=0.1, high=2),  # that the flow meets, backwards over forwards
+    "drain": Quantity("s", low=1e-3, high=10),  # time constant of a chamber that is given to the tank
+    "least_speed": Quantity("raw", low=0, high=1e3),  # of the motor; below it the ram is locked
+    "return_pressure": Quantity("Pa", low=0, high=1e7),  # of both chambers at rest
+    "settling": Quantity("Pa/s", low=0, high=1e9),  # how fast the locked line gets there
+    "pressure_given": Quantity("1", low=0, high=1),  # 1: the load is the force of measured pressures
+}, __name__)
 
-class Pump(NamedTuple):
-    """The pump, and the valve that gives its flow to one chamber and the other chamber to the tank."""
-
-    displacement: Annotated[float, Quantity("m3/s/raw", "D", low=1e-10, high=1e-6)]
-    area_ratio: Annotated[float, Quantity("1", low=0.1, high=2)]  # that the flow meets, backwards over forwards
-    drain: Annotated[float, Quantity("s", low=1e-3, high=10)]  # time constant of a chamber that is given to the tank
-    least_speed: Annotated[float, Quantity("raw", low=0, high=1e3)]  # of the motor; below it the ram is locked
-    return_pressure: Annotated[float, Quantity("Pa", low=0, high=1e7)]  # of both chambers at rest
-    settling: Annotated[float, Quantity("Pa/s", low=0, high=1e9)]  # how fast the locked line gets there
-    pressure_given: Annotated[float, Quantity("1", low=0, high=1)]  # 1: the load is the force of measured pressures
-
-
-class PressureSensors(NamedTuple):
-    """By how much the readings of the chamber pressures are late; negative: early."""
-
-    delay_a: Annotated[float, Quantity("s", low=-0.1, high=0.1)]  # chamber A, which extends the ram
-    delay_b: Annotated[float, Quantity("s", low=-0.1, high=0.1)]  # chamber B
-
+PressureSensors = make_group("PressureSensors", "By how much readings of the chambers are late; negative: early.", {
+    "delay_a": Quantity("s", low=-0.1, high=0.1),  # chamber A, which extends the ram
+    "delay_b": Quantity("s", low=-0.1, high=0.1),  # chamber B
+}, __name__)
 
 Coefficients = namedtuple("Coefficients", "gain valve_slope jack_damping jack_free jack_coupled")
 

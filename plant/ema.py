@@ -11,6 +11,7 @@ Permanent Magnet Synchronous and Brushless DC Motor Drives, 2010). Backlash as a
 (Nordin and Gutman, Automatica 38, 2002); dry friction after Karnopp 1985. Faults and their ranges: Dalla Vedova,
 Germana, Berri and Maggiore, Aerospace 6(9), 94, 2019.
 """
+from collections import namedtuple
 from collections.abc import Mapping
 from math import cos, exp, pi
 from typing import Annotated, Any, NamedTuple
@@ -114,27 +115,26 @@ class Friction(NamedTuple):
     dynamic: float
 
 
-class Coefficients(NamedTuple):
-    """What follows from the parameters and the step, so that no step divides."""
-
-    half_step: float  # h/(2 L)
-    loop_gain: float  # L wc + h R wc/2, V/A
-    follow: float  # of the mean current of a step, within the voltage
-    decay: float  # the same at the limit of the voltage
-    integration: float  # h R wc
-    emf: float  # V s/m
-    thrust: float  # Kt/r, N/A
-    per_radius: float  # 1/r
-    motor_keep: float
-    motor_push: float  # h over the effective mass of the motor
-    before: float  # s, of the relative speed before the step in the stretch that makes the force
-    after: float  # s, the same of that after it
-    lever: float  # after + tau
-    stiffness: float  # of the screw with the motor behind it, N/m
-    slope: float  # N s/m, fall of the screw's force with the speed of the surface
-    free: float  # 1/kg
-    coupled: float  # 1/kg
-    new: float  # weight of the new speed in the way of a step
+# what follows from the parameters and the step, so that no step divides
+Coefficients = namedtuple("Coefficients", (
+    "half_step",  # h/(2 L)
+    "loop_gain",  # L wc + h R wc/2, V/A
+    "follow",  # of the mean current of a step, within the voltage
+    "decay",  # the same at the limit of the voltage
+    "integration",  # h R wc
+    "emf",  # V s/m
+    "per_radius",  # 1/r
+    "motor_keep",
+    "motor_push",  # h over the effective mass of the motor
+    "before",  # s, of the relative speed before the step in the stretch that makes the force
+    "after",  # s, the same of that after it
+    "lever",  # after + tau
+    "stiffness",  # of the screw with the motor behind it, N/m
+    "slope",  # N s/m, fall of the screw's force with the speed of the surface
+    "free",  # 1/kg
+    "coupled",  # 1/kg
+    "new",  # weight of the new speed in the way of a step
+))
 
 
 def compute_coefficients(p: Any, h: float) -> Coefficients:
@@ -156,7 +156,7 @@ def compute_coefficients(p: Any, h: float) -> Coefficients:
     surface = mt + h * p.surface.damping
     return Coefficients(half, gain, 1.0 / (1.0 + half * (p.motor.resistance + gain)),
                         1.0 / (1.0 + half * p.motor.resistance), h * p.drive.bandwidth * p.motor.resistance,
-                        p.motor.torque_constant / r, p.motor.torque_constant / r, 1.0 / r, push * mass / h, push,
+                        p.motor.torque_constant / r, 1.0 / r, push * mass / h, push,
                         0.25 * h * (1.0 - w), after, lever, stiffness, stiffness * lever, 1.0 / surface,
                         1.0 / (surface + h * stiffness * lever), 0.5 + 0.5 * w)
 

@@ -17,12 +17,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.parameters import find_field, read_toml
 from plant.tables import Place, build_dataclass, decode_text, parse_table, read_file
 
@@ -168,42 +168,38 @@ def place_fault(fault: Fault, kind: Any, where: object = "faults") -> Fault:
     Raises:
         InputError: a parameter that the plant lacks, another unit, or limits that contradict each other or the range.
     """
-    groups = kind.list_groups()
+    groups, effects = kind.list_groups(), kind.list_effects()
 
-    def refuse(key: str, expected: str) -> InputError:
-        return InputError(where, f"faults.{fault.name}.{key}".rstrip("."), expected)
+    def check(holds: object, key: str, expected: str) -> None:
+        require(holds, where, f"faults.{fault.name}.{key}".rstrip("."), expected)
 
     def look_up(key: str, name: object) -> Any:
         try:
             return find_field(where, str(name), groups)
         except InputError as error:
-            raise refuse(key, f"a parameter of the plant {kind.name} or of an effect, not {name} "
-                              f"(there expected {error.expected})") from error
+            raise InputError(where, f"faults.{fault.name}.{key}", f"a parameter of the plant {kind.name} or of an "
+                             f"effect, not {name} (there expected {error.expected})") from error
 
-    if not WORD.fullmatch(fault.name):
-        raise refuse("", "a name of small letters, digits and _")
+    check(WORD.fullmatch(fault.name), "", "a name of small letters, digits and _")
     q = look_up("parameter", fault.parameter)
-    group = fault.parameter.partition(".")[0]
-    if group in ("controller", "sensors") or any(e.name == group and e.port in ("command", "reading")
-                                                 for e in kind.list_effects()):
-        raise refuse("parameter", f"a parameter that a replay of the measured drive shows; {fault.parameter} is none")
-    if not q.unit:
-        raise refuse("parameter", f"a parameter with a unit; {fault.parameter} is declared without one")
-    if fault.unit not in ("", q.unit):
-        raise refuse("unit", f"{q.unit}, that of {fault.parameter}, not {fault.unit}")
-    usual = {name: _find_usual(name, kind) for name in fault.parameters}
-    if usual[fault.parameter] == 0.0 and any(map(math.isnan, fault.follow.values())):
-        raise refuse("follow", f"a table of factors: {fault.parameter} is 0 in a healthy unit")
+    unseen = {"controller", "sensors", *(e.name for e in effects if e.port in ("command", "reading"))}
+    check(fault.parameter.partition(".")[0] not in unseen, "parameter",
+          f"a parameter that a replay of the measured drive shows; {fault.parameter} is none")
+    check(q.unit, "parameter", f"a parameter with a unit; {fault.parameter} is declared without one")
+    check(fault.unit in ("", q.unit), "unit", f"{q.unit}, that of {fault.parameter}, not {fault.unit}")
+    known = {**{name: off for e in effects for name, off in e.off.items()}, **kind.nominal}
+    usual = {name: float(known.get(name, 0.0)) for name in fault.parameters}
+    check(usual[fault.parameter] or not any(map(math.isnan, fault.follow.values())), "follow",
+          f"a table of factors: {fault.parameter} is 0 in a healthy unit")
     follow = {name: usual[name] / usual[fault.parameter] if math.isnan(factor) else factor
               for name, factor in fault.follow.items()}
     placed = replace(fault, unit=q.unit, symbol=fault.symbol or q.symbol or fault.name, follow=follow,
                      healthy=usual[fault.parameter] if math.isnan(fault.healthy) else fault.healthy)
-    _check_limits(placed, q, refuse)
+    _check_limits(placed, q, check)
     for name, factor in follow.items():
         led = look_up("follow", name)
-        if any(led.refuses(factor * size) for size in fault.range):
-            raise refuse("follow", f"factors that make values of {name}, {led.expected}, over the whole range, not "
-                                   f"{factor:g}")
+        check(not any(led.refuses(factor * size) for size in fault.range), "follow",
+              f"factors that make values of {name}, {led.expected}, over the whole range, not {factor:g}")
     if math.isnan(placed.axis[0]):
         beyond = 10.0 / 7.0 * (placed.maintenance - (0.0 if placed.both_ways else placed.healthy))
         ends = placed.healthy - beyond if placed.both_ways else placed.healthy, placed.healthy + beyond
@@ -215,33 +211,25 @@ def place_fault(fault: Fault, kind: Any, where: object = "faults") -> Fault:
     return replace(placed, range=(min(placed.range[0], low), max(placed.range[1], high)))
 
 
-def _find_usual(name: str, kind: Any) -> float:
-    """The nominal value of a parameter: the plant's own, or the off value of the effect that has it."""
-    off = {key: value for e in kind.list_effects() for key, value in e.off.items()}
-    return float({**off, **kind.nominal}.get(name, 0.0))
-
-
-def _check_limits(f: Fault, q: Any, refuse: Any) -> None:
+def _check_limits(f: Fault, q: Any, check: Callable[[object, str, str], None]) -> None:
     """Raises InputError for sizes that contradict each other."""
     low, high = f.range
-    if low >= high:
-        raise refuse("range", f"[least, largest], not [{low:g}, {high:g}]")
-    if q.refuses(low) or q.refuses(high):
-        raise refuse("range", f"values of {f.parameter}, {q.expected}, not [{low:g}, {high:g}]")
-    if not low <= f.healthy <= high:
-        raise refuse("range", f"a range that holds the healthy size, {f.healthy:g} {f.unit}, not [{low:g}, {high:g}]")
-    shift = f.healthy if f.both_ways else 0.0
+    healthy, shift = (0.0, f.healthy) if f.both_ways else (f.healthy, 0.0)
+    rises, falls = healthy < f.acceptable < f.maintenance, healthy > f.acceptable > f.maintenance
+    whole = f"{low:g} .. {high:g} {f.unit}"
+    check(low < high, "range", f"[least, largest], not [{low:g}, {high:g}]")
+    check(not (q.refuses(low) or q.refuses(high)), "range",
+          f"values of {f.parameter}, {q.expected}, not [{low:g}, {high:g}]")
+    check(low <= f.healthy <= high, "range",
+          f"a range that holds the healthy size, {f.healthy:g} {f.unit}, not [{low:g}, {high:g}]")
     for key, size in (("acceptable", f.acceptable), ("maintenance", f.maintenance)):
-        if not low <= shift + size <= high:
-            raise refuse(key, f"a size within the range {low:g} .. {high:g} {f.unit}, not {size:g}")
-    healthy = 0.0 if f.both_ways else f.healthy
-    if not (healthy < f.acceptable < f.maintenance or (healthy > f.acceptable > f.maintenance and not f.both_ways)):
-        raise refuse("acceptable", f"a size between that of a healthy unit, {healthy:g}, and maintenance, "
-                                   f"{f.maintenance:g} {f.unit}, not {f.acceptable:g}")
-    if not (math.isnan(f.axis[0]) or low <= f.axis[0] < f.axis[1] <= high):
-        raise refuse("axis", f"[least, largest] within the range {low:g} .. {high:g} {f.unit}, not {list(f.axis)}")
-    if not 0.1 <= f.interval_factor <= 10.0:
-        raise refuse("interval_factor", f"a factor from 0.1 to 10, not {f.interval_factor:g}")
+        check(low <= shift + size <= high, key, f"a size within the range {whole}, not {size:g}")
+    check(rises or (falls and not f.both_ways), "acceptable",
+          f"a size between that of a healthy unit, {healthy:g}, and maintenance, {f.maintenance:g} {f.unit}, not "
+          f"{f.acceptable:g}")
+    check(math.isnan(f.axis[0]) or low <= f.axis[0] < f.axis[1] <= high, "axis",
+          f"[least, largest] within the range {whole}, not {list(f.axis)}")
+    check(0.1 <= f.interval_factor <= 10.0, "interval_factor", f"a factor from 0.1 to 10, not {f.interval_factor:g}")
 
 
 EXAMPLE = """\

@@ -9,6 +9,7 @@ loop's Kv = KSF GQF1/(KF ASV). The ram lags behind it by MJ/(AJ^2 GP/GQ + CJ), 2
 reference model takes 20 to 100. Many runs are simulated side by side, as in `plant.lanes`.
 """
 
+from collections import namedtuple
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from math import ceil
@@ -33,29 +34,29 @@ WIDTH = 64  # runs side by side
 LEAST_SPEED = 1e-300  # stands for no speed at all, where something is divided by it
 
 
-class Cell(NamedTuple):
-    """The coefficients of one step of one run."""
-
-    tilt: float  # GM/KF, flapper displacement by current, m/A
-    back: float  # KSF/KF, by the spool's
-    unback: float  # 1 over it
-    dead: float  # FSS/(GPF1 ASV), flapper displacement at which the spool breaks away, m
-    slide: float  # the same of a spool that slides, m
-    most: float  # XFM less the latter, m
-    speed: float  # GQF1/ASV, spool speed by flapper displacement, 1/s
-    rate: float  # Kv, 1/s
-    unrate: float  # 1/Kv, s
-    wait: float  # 1 over the speed at which the spool takes back flapper displacement at the stop, s/m
-    spool_travel: float  # XSM, m
-    follow: float  # ram speed by spool displacement in a steady state, 1/s
-    lag: float  # of the ram behind it, s
-    fade: float  # exp(-h/lag)
-    push: float  # h AJ PSR/(MJ + h CJ), the most that the ram's speed can gain, m/s
-    coast: float  # MJ/(MJ + h CJ)
-    jack_travel: float  # XJM, m
-    pressure_gain: float  # GP, Pa/m
-    pressure_slope: float  # GP AJ/GQ, Pa s/m
-    pressure_limit: float  # PSR, Pa
+# the coefficients of one step of one run
+Cell = namedtuple("Cell", (
+    "tilt",  # GM/KF, flapper displacement by current, m/A
+    "back",  # KSF/KF, by the spool's
+    "unback",  # 1 over it
+    "dead",  # FSS/(GPF1 ASV), flapper displacement at which the spool breaks away, m
+    "slide",  # the same of a spool that slides, m
+    "most",  # XFM less the latter, m
+    "speed",  # GQF1/ASV, spool speed by flapper displacement, 1/s
+    "rate",  # Kv, 1/s
+    "unrate",  # 1/Kv, s
+    "wait",  # 1 over the speed at which the spool takes back flapper displacement at the stop, s/m
+    "spool_travel",  # XSM, m
+    "follow",  # ram speed by spool displacement in a steady state, 1/s
+    "lag",  # of the ram behind it, s
+    "fade",  # exp(-h/lag)
+    "push",  # h AJ PSR/(MJ + h CJ), the most that the ram's speed can gain, m/s
+    "coast",  # MJ/(MJ + h CJ)
+    "jack_travel",  # XJM, m
+    "pressure_gain",  # GP, Pa/m
+    "pressure_slope",  # GP AJ/GQ, Pa s/m
+    "pressure_limit",  # PSR, Pa
+))
 
 
 class Motion(NamedTuple):

@@ -1,4 +1,4 @@
-"""The parameters of the actuator: one NamedTuple for each component, every field with unit, symbol and range.
+"""The parameters of the actuator: a group for each component, every field with unit, symbol and range.
 
 The values are data (`plant/models/nominal.toml`); this file gives their meaning and rejects impossible values. The
 ranges are wide, about three orders of magnitude either way: a value outside is a mistake (a unit, an exponent), and for
@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Any
 
 from plant.errors import InputError, require, show_value, suggest_name
-from plant.quantity import Quantity, list_quantities
+from plant.quantity import Quantity, list_quantities, make_group
 from plant.tables import decode_text, parse_table, read_file
 
 FILTER_LAWS = {"sqrt": 0.5, "linear": 1.0, "pressure": 0.0}
@@ -24,110 +24,64 @@ FILTER_LAWS = {"sqrt": 0.5, "linear": 1.0, "pressure": 0.0}
 """
 
 
-class Controller(NamedTuple):
-    """The position loop of the reference firmware: a PID law on the sensed error, limited."""
-
-    proportional_gain: Annotated[float, Quantity("A/m", "GAP", low=0, high=1e6)]
-    integral_gain: Annotated[float, Quantity("A/(m s)", low=0, high=1e9)]
-    derivative_gain: Annotated[float, Quantity("A s/m", low=0, high=1e6)]
-    current_limit: Annotated[float, Quantity("A", "Imax", low=1e-6, high=20)]
-    period: Annotated[float, Quantity("s", low=1e-4, high=0.1)]
-
-
-class TorqueMotor(NamedTuple):
-    """Current to torque on the flapper."""
-
-    gain: Annotated[float, Quantity("N m/A", "GM", low=1e-3, high=1e3, tolerance=0.015)]
-
-
-class Flapper(NamedTuple):
-    """The armature and flapper, between two inelastic stops."""
-
-    inertia: Annotated[float, Quantity("N m s2/m", "JF", low=1e-9, high=1, tolerance=0.015)]
-    damping: Annotated[float, Quantity("N m s/m", "BF", low=0, high=1e3, tolerance=0.015)]
-    stiffness: Annotated[float, Quantity("N m/m", "KF", low=1e-2, high=1e6, tolerance=0.015)]
-    travel: Annotated[float, Quantity("m", "XFM", low=1e-7, high=1e-2)]
-
-
-class FeedbackSpring(NamedTuple):
-    """The wire from spool to flapper."""
-
-    stiffness: Annotated[float, Quantity("N m/m", "KSF", low=1e-6, high=1e5, tolerance=0.015)]
-
-
-class Filter(NamedTuple):
-    """The pilot stage's filter."""
-
-    clogging: Annotated[float, Quantity("1", "Kintas", low=0, below=1)]
-    law: Annotated[float, Quantity("1", words=FILTER_LAWS)]
-
-
-class Pilot(NamedTuple):
-    """The double nozzle with a clean filter."""
-
-    flow_gain: Annotated[float, Quantity("m2/s", "GQF", low=1e-5, high=1e2, tolerance=0.015)]
-    pressure_gain: Annotated[float, Quantity("Pa/m", "GPF", low=1e8, high=1e15, tolerance=0.015)]
-
-
-class Spool(NamedTuple):
-    """The second stage."""
-
-    end_area: Annotated[float, Quantity("m2", "ASV", low=1e-8, high=0.1)]
-    mass: Annotated[float, Quantity("kg", "MS", low=1e-6, high=100)]
-    damping: Annotated[float, Quantity("N s/m", "CS", low=0, high=1e6)]
-    static_friction: Annotated[float, Quantity("N", "FSS", low=0, high=1e6)]
-    dynamic_friction: Annotated[float, Quantity("N", "FDS", low=0, high=1e6)]
-    travel: Annotated[float, Quantity("m", "XSM", low=1e-6, high=1)]
-
-
-class Valve(NamedTuple):
-    """The metering edges, linearised."""
-
-    flow_gain: Annotated[float, Quantity("m2/s", "GQ", low=1e-5, high=1e3, tolerance=0.015)]
-    pressure_gain: Annotated[float, Quantity("Pa/m", "GP", low=1e8, high=1e15, tolerance=0.015)]
-
-
-class Supply(NamedTuple):
-    """The hydraulic supply."""
-
-    pressure: Annotated[float, Quantity("Pa", "PSR", low=1e5, high=1e8, tolerance=0.015)]
-
-
-class Jack(NamedTuple):
-    """The cylinder with the surface it moves."""
-
-    area: Annotated[float, Quantity("m2", "AJ", low=1e-7, high=1, tolerance=0.015)]
-    mass: Annotated[float, Quantity("kg", "MJ", low=1e-2, high=1e6, tolerance=0.015)]
-    damping: Annotated[float, Quantity("N s/m", "CJ", low=0, high=1e9, tolerance=0.015)]
-    static_friction: Annotated[float, Quantity("N", "FSJ", low=0, high=1e7, tolerance=0.015)]
-    dynamic_friction: Annotated[float, Quantity("N", "FDJ", low=0, high=1e7, tolerance=0.015)]
-    leakage: Annotated[float, Quantity("m3/s/Pa", "CLK", low=0, high=1e-6, tolerance=0.015)]
-    travel: Annotated[float, Quantity("m", "XJM", low=1e-4, high=10)]
-
-
-class Sensors(NamedTuple):
-    """White noise of the bench's transducers, one sample a cycle."""
-
-    position_noise: Annotated[float, Quantity("m rms", low=0, high=1)]
-    pressure_noise: Annotated[float, Quantity("Pa rms", low=0, high=1e8)]
-    spool_noise: Annotated[float, Quantity("m rms", low=0, high=1)]
-
-
-GROUPS: dict[str, type[Any]] = {
-    "controller": Controller, "torque_motor": TorqueMotor, "flapper": Flapper, "feedback_spring": FeedbackSpring,
-    "filter": Filter, "pilot": Pilot, "spool": Spool, "valve": Valve, "supply": Supply, "jack": Jack,
-    "sensors": Sensors,
+# group: what it is, and its fields
+_FIELDS: Mapping[str, tuple[str, Mapping[str, Quantity]]] = {
+    "controller": ("The position loop of the reference firmware: a PID law on the sensed error, limited.", {
+        "proportional_gain": Quantity("A/m", "GAP", low=0, high=1e6),
+        "integral_gain": Quantity("A/(m s)", low=0, high=1e9),
+        "derivative_gain": Quantity("A s/m", low=0, high=1e6),
+        "current_limit": Quantity("A", "Imax", low=1e-6, high=20),
+        "period": Quantity("s", low=1e-4, high=0.1)}),
+    "torque_motor": ("Current to torque on the flapper.", {
+        "gain": Quantity("N m/A", "GM", low=1e-3, high=1e3, tolerance=0.015)}),
+    "flapper": ("The armature and flapper, between two inelastic stops.", {
+        "inertia": Quantity("N m s2/m", "JF", low=1e-9, high=1, tolerance=0.015),
+        "damping": Quantity("N m s/m", "BF", low=0, high=1e3, tolerance=0.015),
+        "stiffness": Quantity("N m/m", "KF", low=1e-2, high=1e6, tolerance=0.015),
+        "travel": Quantity("m", "XFM", low=1e-7, high=1e-2)}),
+    "feedback_spring": ("The wire from spool to flapper.", {
+        "stiffness": Quantity("N m/m", "KSF", low=1e-6, high=1e5, tolerance=0.015)}),
+    "filter": ("The pilot stage's filter.", {
+        "clogging": Quantity("1", "Kintas", low=0, below=1),
+        "law": Quantity("1", words=FILTER_LAWS)}),
+    "pilot": ("The double nozzle with a clean filter.", {
+        "flow_gain": Quantity("m2/s", "GQF", low=1e-5, high=1e2, tolerance=0.015),
+        "pressure_gain": Quantity("Pa/m", "GPF", low=1e8, high=1e15, tolerance=0.015)}),
+    "spool": ("The second stage.", {
+        "end_area": Quantity("m2", "ASV", low=1e-8, high=0.1),
+        "mass": Quantity("kg", "MS", low=1e-6, high=100),
+        "damping": Quantity("N s/m", "CS", low=0, high=1e6),
+        "static_friction": Quantity("N", "FSS", low=0, high=1e6),
+        "dynamic_friction": Quantity("N", "FDS", low=0, high=1e6),
+        "travel": Quantity("m", "XSM", low=1e-6, high=1)}),
+    "valve": ("The metering edges, linearised.", {
+        "flow_gain": Quantity("m2/s", "GQ", low=1e-5, high=1e3, tolerance=0.015),
+        "pressure_gain": Quantity("Pa/m", "GP", low=1e8, high=1e15, tolerance=0.015)}),
+    "supply": ("The hydraulic supply.", {
+        "pressure": Quantity("Pa", "PSR", low=1e5, high=1e8, tolerance=0.015)}),
+    "jack": ("The cylinder with the surface it moves.", {
+        "area": Quantity("m2", "AJ", low=1e-7, high=1, tolerance=0.015),
+        "mass": Quantity("kg", "MJ", low=1e-2, high=1e6, tolerance=0.015),
+        "damping": Quantity("N s/m", "CJ", low=0, high=1e9, tolerance=0.015),
+        "static_friction": Quantity("N", "FSJ", low=0, high=1e7, tolerance=0.015),
+        "dynamic_friction": Quantity("N", "FDJ", low=0, high=1e7, tolerance=0.015),
+        "leakage": Quantity("m3/s/Pa", "CLK", low=0, high=1e-6, tolerance=0.015),
+        "travel": Quantity("m", "XJM", low=1e-4, high=10)}),
+    "sensors": ("White noise of the bench's transducers, one sample a cycle.", {
+        "position_noise": Quantity("m rms", low=0, high=1),
+        "pressure_noise": Quantity("Pa rms", low=0, high=1e8),
+        "spool_noise": Quantity("m rms", low=0, high=1)}),
 }
+GROUPS = {name: make_group(name.title().replace("_", ""), meaning, fields, __name__)
+          for name, (meaning, fields) in _FIELDS.items()}
+Controller = GROUPS["controller"]
 
 
 def convert_group_unit(group: type[Any], unit: str, other: str, wider: float) -> type[Any]:
     """A parameter group whose fields are in another unit, such as raw/m for A/m, and as much wider in range."""
-    known = list_quantities(group).items()
-    changed = [(name, q._replace(unit=q.unit.replace(unit, other), high=wider * q.high) if unit in q.unit else q)
-               for name, q in known]
-    made: Any = NamedTuple(group.__name__, [(name, Annotated[float, q]) for name, q in changed])  # type: ignore[misc]
-    made.__doc__ = group.__doc__
-    return cast("type[Any]", made)
+    changed = {name: q._replace(unit=q.unit.replace(unit, other), high=wider * q.high) if unit in q.unit else q
+               for name, q in list_quantities(group).items()}
+    return make_group(group.__name__, str(group.__doc__), changed, __name__)
 
 
 def parse_value(where: object, name: str, quantity: Quantity, value: object) -> float:
@@ -197,8 +151,7 @@ def flatten_tables(where: object, tables: Mapping[str, Any], groups: Mapping[str
     """
     values: dict[str, float] = {}
     for group, fields in tables.items():
-        if not isinstance(fields, Mapping):
-            raise InputError(where, group, f"a table [{group}] of fields")
+        require(isinstance(fields, Mapping), where, group, f"a table [{group}] of fields")
         for field, value in fields.items():
             name = f"{group}.{field}"
             values[name] = parse_value(where, name, find_field(where, name, groups), value)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from plant.ports import (
     make_memory_type,
     port,
 )
-from plant.quantity import Quantity
+from plant.quantity import Quantity, make_group
 from plant.segments import Array, Segment, build_profile
 from plant.signals import Signals
 from plant.state import Sampled
@@ -389,13 +389,10 @@ def name_group(cls: type[Any]) -> str:
 
 def make_noise_group(levels: Mapping[str, float], units: Mapping[str, str]) -> type[Any]:
     """The group `sensors` of a plant whose signals give the noise of their sensors as numbers."""
-    made: Any = NamedTuple("Sensors", [  # type: ignore[misc]
-        (f"{name}_noise", Annotated[float, Quantity(f"{units[name]} rms", low=0, high=max(1.0, 1e4 * level))])
-        for name, level in levels.items()])
-    made.__new__.__defaults__ = tuple(levels.values())
-    made._field_defaults = {f"{name}_noise": float(level) for name, level in levels.items()}
-    made.__doc__ = "White noise of the sensors, one sample a cycle."
-    return cast("type[Any]", made)
+    fields = {f"{name}_noise": Quantity(f"{units[name]} rms", low=0, high=max(1.0, 1e4 * level))
+              for name, level in levels.items()}
+    return make_group("Sensors", "White noise of the sensors, one sample a cycle.", fields, __name__,
+                      map(float, levels.values()))
 
 
 def effect(port: str, group: type[Any], **more: Any) -> Callable[[Function], Function]:

@@ -1,11 +1,12 @@
 """The meaning of a number: its unit, its symbol in the paper, and its possible values.
 
-A parameter group is a NamedTuple whose fields are `Annotated[float, Quantity(...)]`. The unit lives in the type, where
-people, error messages, logs and tables all read the same one.
+A parameter group is a NamedTuple whose fields are `Annotated[float, Quantity(...)]`, or a table of fields
+(`make_group`). The unit lives in the type, where people, error messages, logs and tables all read the same one.
 """
 
 import math
-from collections.abc import Mapping
+from collections import namedtuple
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 
@@ -64,6 +65,16 @@ def list_quantities(group: type[Any]) -> Mapping[str, Quantity]:
 
 
 _KNOWN_GROUPS: dict[type[Any], Mapping[str, Quantity]] = {}
+
+
+def make_group(name: str, meaning: str, fields: Mapping[str, Quantity], module: str, values: Iterable[float] = ()
+               ) -> type[Any]:
+    """A parameter group from a table of its fields; `module` has it as `name`, `values` are the nominal ones."""
+    make: Any = namedtuple
+    made: type[Any] = make(name, fields, defaults=values, module=module)
+    made.__annotations__ = {field: Annotated[float, q] for field, q in fields.items()}
+    made.__doc__ = meaning
+    return made
 
 
 Metre = Annotated[float, Quantity("m")]

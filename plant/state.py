@@ -1,4 +1,4 @@
-"""What every step gets: its inputs; and two records that laws of hydraulic actuators exchange at their ports."""
+"""What every step gets: its inputs; and records that laws of effects remember, or exchange at their ports."""
 
 from typing import Any, NamedTuple
 
@@ -22,6 +22,19 @@ class Sampled(NamedTuple):
     """What the controller knows of the plant, for effects at the port `command`."""
 
     sensed: float = 0.0  # the controlled signal as it was read
+
+
+class Held(NamedTuple):
+    """Where something has been dragged to: the memory of a play."""
+
+    held: float = 0.0
+
+
+class Lag(NamedTuple):
+    """What a lag remembers: how far it is behind, and its last input."""
+
+    behind: float = 0.0
+    last: float = 0.0
 
 
 class Line(NamedTuple):

@@ -201,6 +201,5 @@ def combine_laws(port: str, effects: Iterable[Effect]) -> tuple[Law, Memory]:
     return chain_laws((e.function, e.memory) for e in effects if e.port == port)
 
 
-for _family in ("reference", "controller", "current", "servovalve", "valve", "supply", "jack", "friction", "press",
-                "sensors", "wear"):
+for _family in ("reference", "controller", "current", "servovalve", "supply", "jack", "sensors", "wear"):
     importlib.import_module(f"plant.effects.{_family}")

@@ -6,6 +6,7 @@ from typing import Annotated, Any, NamedTuple
 from plant.effects import effect
 from plant.friction import clip, play
 from plant.quantity import Quantity
+from plant.state import Held, Lag
 
 
 class TransportDelay(NamedTuple):
@@ -142,23 +143,16 @@ class CoilLag(NamedTuple):
     time: Annotated[float, Quantity("s", low=0, high=0.1, typical="0.3-3 ms")] = 0.0
 
 
-class Behind(NamedTuple):
-    """How far the coil's current is from the driver's, and the driver's last."""
-
-    behind: float = 0.0
-    last: float = 0.0
-
-
 @effect("current", CoilLag, law="tau i' + i = i_driver", symptoms="attenuates above 1/(2 pi tau); a delay does not",
-        memory=Behind, starts=(0.3e-3, 1e-3, 3e-3), confused_with=("transport_delay", "sensor_lag"),
+        memory=Lag, starts=(0.3e-3, 1e-3, 3e-3), confused_with=("transport_delay", "sensor_lag"),
         source="inductance and resistance of the coil, Merritt 1967")
-def coil_lag(x: float, m: Behind, s: Any, u: Any, p: Any) -> tuple[float, Behind]:
+def coil_lag(x: float, m: Lag, s: Any, u: Any, p: Any) -> tuple[float, Lag]:
     """The coil's inductance: the mean current over a step in which the driver's is constant (no lag: exactly it)."""
     two = 2.0 * p.coil_lag.time
     whole = 1.0 / (two + u.h)
     keep = (two - u.h) * whole
     before = m.behind - (x - m.last)
-    return x + two * whole * before, Behind((keep if keep > 0.0 else 0.0) * before, x)
+    return x + two * whole * before, Lag((keep if keep > 0.0 else 0.0) * before, x)
 
 
 class NullBias(NamedTuple):
@@ -181,16 +175,10 @@ class TorqueMotorHysteresis(NamedTuple):
     width: Annotated[float, Quantity("A", low=0, high=20, typical="1-5 % of Imax")] = 0.0
 
 
-class Dragged(NamedTuple):
-    """Where the play has been dragged to."""
-
-    held: float = 0.0
-
-
 @effect("current", TorqueMotorHysteresis, law="i = play(i, width)",
-        symptoms="loop in current against spool, rate free; the spool keeps moving", memory=Dragged,
+        symptoms="loop in current against spool, rate free; the spool keeps moving", memory=Held,
         starts=(8e-5, 2e-4, 4e-4), source="play operator, Krasnosel'skii and Pokrovskii 1989")
-def torque_motor_hysteresis(x: float, m: Dragged, s: Any, u: Any, p: Any) -> tuple[float, Dragged]:
+def torque_motor_hysteresis(x: float, m: Held, s: Any, u: Any, p: Any) -> tuple[float, Held]:
     """Magnetic hysteresis and friction of the armature: after a reversal the torque waits for the play."""
     held = play(x, m.held, 0.5 * p.torque_motor_hysteresis.width)
-    return held, Dragged(held)
+    return held, Held(held)

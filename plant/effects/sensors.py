@@ -8,6 +8,7 @@ from numpy import floor
 from plant.effects import effect
 from plant.friction import play
 from plant.quantity import Quantity
+from plant.state import Held, Lag
 
 
 class MountCompliance(NamedTuple):
@@ -53,36 +54,23 @@ class RodBacklash(NamedTuple):
     width: Annotated[float, Quantity("m", low=0, high=1, typical="20-200 um")] = 0.0
 
 
-class Dragged(NamedTuple):
-    """Where the ram has dragged the transducer's rod to."""
-
-    held: float = 0.0
-
-
-def drag_along(m: Dragged, moved: float) -> Dragged:
+def drag_along(m: Held, moved: float) -> Held:
     """The rod where an anchored replay has moved the ram by `moved` m."""
-    return Dragged(m.held + moved)
+    return Held(m.held + moved)
 
 
-@effect("position", RodBacklash, law="XJ = play(XJ, width)", symptoms="lost motion at every reversal", memory=Dragged,
+@effect("position", RodBacklash, law="XJ = play(XJ, width)", symptoms="lost motion at every reversal", memory=Held,
         shift=drag_along, starts=(2e-5, 6e-5, 2e-4), source="play operator, Krasnosel'skii and Pokrovskii 1989")
-def rod_backlash(x: float, m: Dragged, s: Any, u: Any, p: Any) -> tuple[float, Dragged]:
+def rod_backlash(x: float, m: Held, s: Any, u: Any, p: Any) -> tuple[float, Held]:
     """A worn rod end: on reversal the transducer waits until the ram has crossed the play."""
     held = play(x, m.held, 0.5 * p.rod_backlash.width)
-    return held, Dragged(held)
+    return held, Held(held)
 
 
 class SensorLag(NamedTuple):
     """First-order lag."""
 
     time: Annotated[float, Quantity("s", low=0, high=0.1, typical="0.3-3 ms")] = 0.0
-
-
-class Lag(NamedTuple):
-    """What a lag remembers: how far it is behind, and its last input."""
-
-    behind: float = 0.0
-    last: float = 0.0
 
 
 def move_last_input(m: Lag, moved: float) -> Lag:

@@ -15,13 +15,13 @@ from plant import Actuator, Model, simulate
 from plant.compile import compile_function, interpret_function
 from plant.controller import compute_answers
 from plant.effects import CATALOGUE
-from plant.effects.current import Behind, coil_lag
-from plant.effects.sensors import Lag, Recoil, mount_compliance, sensor_lag
+from plant.effects.current import coil_lag
+from plant.effects.sensors import Recoil, mount_compliance, sensor_lag
 from plant.effects.supply import Drawn, supply_droop
 from plant.eha import State, compute_coefficients, compute_metering_line, step_actuator, step_jack as ram
 from plant.kernels import unpack_state
 from plant.plants import find_plant
-from plant.state import Input, Line
+from plant.state import Input, Lag, Line
 from rig.benches.profiles import Control
 
 MILLI = 1e-3
@@ -60,7 +60,7 @@ def follow(law: Callable[..., Any], x: Iterable[float], memory: Any, p: Any, s: 
 def test_coil_lag_is_3_dB_down_where_it_should(tau: float) -> None:
     p = EASY.replace({"coil_lag.time": tau}).build_record()[0]
     t = (np.arange(round(40 * tau / H)) + 0.5) * H  # the current is constant over a step: taken at its middle
-    out = follow(coil_lag, np.sin(t / tau), Behind(), p)
+    out = follow(coil_lag, np.sin(t / tau), Lag(), p)
     settled = t > 10 * tau
     np.testing.assert_allclose(out[settled], np.sin(t / tau - np.pi / 4)[settled] / np.sqrt(2), atol=2e-3)
 

@@ -13,7 +13,7 @@ from plant import load_model, simulate
 from plant.controller import compute_answers
 from plant.effects import CATALOGUE
 from plant.effects.current import Cascade, Switched, flow_delay, valve_switching
-from plant.effects.valve import ATMOSPHERE, undissolved_air
+from plant.effects.servovalve import ATMOSPHERE, undissolved_air
 from plant.ehs import (
     RAW_PER_TURN,
     State,
