@@ -1,5 +1,4 @@
 """Offline analysis of traces: compare, explain, add an effect, identify, diagnose (docs/python.md). No CAN."""
-from __future__ import annotations
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

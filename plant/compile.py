@@ -369,16 +369,16 @@ def _describe_code(f: Function) -> str:
 
 
 def _describe_constant(value: Any) -> str:
-    if isinstance(value, ModuleType):
-        return value.__name__
-    if isinstance(value, CodeType):
-        inner = " ".join(_describe_constant(constant) for constant in value.co_consts)
-        return f"{value.co_code.hex()} {inner} {value.co_names} {value.co_varnames}"
-    if isinstance(value, np.ndarray):  # its repr would leave out the middle
-        return f"{value.dtype} {value.shape} {value.tobytes().hex()}"
-    fields = getattr(value, "_fields", None)
-    if fields and isinstance(value, type):  # numba's cache finds the type by its name: a user's renamed file is another
-        return f"{value.__module__}.{value.__qualname__}{fields}"
+    match value:
+        case ModuleType():
+            return value.__name__
+        case CodeType():
+            inner = " ".join(_describe_constant(constant) for constant in value.co_consts)
+            return f"{value.co_code.hex()} {inner} {value.co_names} {value.co_varnames}"
+        case np.ndarray():  # its repr would leave out the middle
+            return f"{value.dtype} {value.shape} {value.tobytes().hex()}"
+        case type() if hasattr(value, "_fields"):  # numba's cache finds it by its name: a user's file is renamed
+            return f"{value.__module__}.{value.__qualname__}{value._fields}"
     return repr(value)
 
 

@@ -8,7 +8,6 @@ every value inside the simulation stays finite.
 import math
 import tomllib
 from collections.abc import Mapping
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -160,11 +159,6 @@ def flatten_tables(where: object, tables: Mapping[str, Any], groups: Mapping[str
 
 def load_nominal_values() -> dict[str, float]:
     """The values of the nominal actuator, "group.field" to SI value."""
-    return dict(_load_nominal_values())
-
-
-@cache
-def _load_nominal_values() -> Mapping[str, float]:
     return read_shipped_model("nominal.toml", GROUPS)
 
 

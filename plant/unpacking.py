@@ -1,8 +1,10 @@
 """Limits on unpacking. A file says itself how much it unpacks to, and a file of 240 kB can say 6 GB."""
 
+import gzip
+import io
 import zlib
-
-_GZIP = 31  # window bits of zlib that mean gzip
+from pathlib import Path
+from typing import Any
 
 
 class UnpackingError(ValueError):
@@ -17,23 +19,36 @@ def limit_unpacked_size(packed: int) -> int:
     return (64 << 20) + 100 * packed
 
 
+class LimitedGzip(io.RawIOBase):
+    """The content of `size` bytes of gzip data, up to what `limit_unpacked_size` allows; beyond it, UnpackingError."""
+
+    def __init__(self, packed: Path | io.BytesIO, size: int) -> None:
+        self._file = gzip.open(packed)  # noqa: SIM115 (closed by `close`)
+        self._left = self._most = limit_unpacked_size(size)
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._file.read(len(buffer))
+        self._left -= len(data)
+        if self._left < 0:
+            raise UnpackingError(f"it unpacks to more than {self._most >> 20} MiB")
+        buffer[:len(data)] = data
+        return len(data)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
 def unpack_gzip(packed: bytes) -> bytes:
     """Unpack gzip data of one or several members.
 
     Raises:
         UnpackingError: no gzip data, cut short, or more of them than `limit_unpacked_size` allows.
     """
-    most, parts, size = limit_unpacked_size(len(packed)), [], 0
-    while packed:
-        member = zlib.decompressobj(_GZIP)
-        try:
-            parts.append(member.decompress(packed, most - size + 1))
-        except zlib.error as error:
-            raise UnpackingError(str(error)) from error
-        size += len(parts[-1])
-        if size > most:
-            raise UnpackingError(f"it unpacks to more than {most >> 20} MiB")
-        if not member.eof:
-            raise UnpackingError("it is cut short")
-        packed = member.unused_data.lstrip(b"\0")  # zeros may follow the last member
-    return b"".join(parts)
+    try:
+        return LimitedGzip(io.BytesIO(packed), len(packed)).readall()
+    except (OSError, EOFError, zlib.error) as error:
+        raise UnpackingError(str(error)) from error

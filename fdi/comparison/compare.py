@@ -189,16 +189,6 @@ class SignalError:
     limit: float  # the ratio up to which the error is noise
 
     @property
-    def name(self) -> str:
-        """Of its column."""
-        return self.signal.name
-
-    @property
-    def unit(self) -> str:
-        """Of error and floor."""
-        return self.signal.unit
-
-    @property
     def ratio(self) -> float:
         """Error over floor; 1 for a perfect model."""
         if self.floor.value > 0.0:
@@ -342,7 +332,7 @@ def _list_blocks_above(ratios: Mapping[str, float | None], table: Mapping[str, S
 def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place], ratios: Mapping[str, float | None],
                     replay: Replay, period: float, doubtful: str) -> tuple[str, str]:
     """The verdict, and why it cannot tell; `doubtful` says why the repeats are no measure of the noise."""
-    if coarse := [s.name for s in table.values() if s.solver_error > SOLVER_HIDES_RATIO * s.floor.value]:
+    if coarse := [s.signal.name for s in table.values() if s.solver_error > SOLVER_HIDES_RATIO * s.floor.value]:
         return "CANNOT_TELL", f"the solver's own error in {', '.join(coarse)} is as large as the floor"
     above = [s for s in table.values() if s.ratio > s.limit]
     least = min((s.floor.freedom for s in table.values()), default=1.0)

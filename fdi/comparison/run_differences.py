@@ -53,11 +53,6 @@ class SignalDifference:
         return self.signal.name
 
     @property
-    def unit(self) -> str:
-        """Of the difference."""
-        return self.signal.unit
-
-    @property
     def ratio(self) -> float:
         """RMS difference over what the noise of both runs leaves; 1 for two runs that differ only by noise."""
         if (expected := math.hypot(*self.noise)) > 0.0:

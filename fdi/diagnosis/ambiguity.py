@@ -29,7 +29,6 @@ class Group(NamedTuple):
     """Faults of which at least one has grown, and may have reached MidBand."""
 
     names: tuple[str, ...]
-    excluded: float  # distance from the nearest unit in which all of them are healthy, standard deviations
 
 
 class _Region:
@@ -124,9 +123,8 @@ def find_groups(found: Refinement, levels: Mapping[str, Level | None], tolerance
         low, high = region.low.copy(), region.high.copy()
         for i in group:
             region.limit_to_healthy(low, high, i, (tolerances or {}).get(found.faults[i].parameter, 0.0))
-        distance = region.measure_distance(low, high)
-        if len(group) > 1 and distance > _exclude_all(len(group), len(found.faults)):
-            groups.append(Group(tuple(found.faults[i].name for i in group), distance))
+        if len(group) > 1 and region.measure_distance(low, high) > _exclude_all(len(group), len(found.faults)):
+            groups.append(Group(tuple(found.faults[i].name for i in group)))
     return tuple(groups)
 
 

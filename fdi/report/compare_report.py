@@ -232,7 +232,7 @@ def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6
     changes = [f"{name} = {value:g}" for name, value in sorted(c.model.list_changes().items())
                if c.model.design.get(name) != value]
     errors = ", ".join(f"{s.signal.symbol} by {format_signal(s.solver_error, s.signal)}" for s in c.signals.values())
-    lines = [
+    return [
         Line("floor", _describe_floor(c)),
         Line("solver", f"halving the step to {1e6 * c.trace.period / c.replay.steps:g} us changes {errors}"),
         *(Line("where", f"{p.section}, {p.t0:.2f}-{p.t1:.2f} s: {format_percent(p.share)} of the squared error, "
@@ -247,7 +247,6 @@ def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6
           if c.signals[name].ratio > c.signals[name].limit),
         Line("scatter", _describe_scatter(c)),
         Line("not nominal", list_first(changes, most_changes), medium=Medium.TERMINAL)]
-    return [finding for finding in lines if finding.text]
 
 
 def _describe_floor(c: Comparison) -> str:
@@ -320,7 +319,7 @@ def collect_data(c: Comparison) -> dict[str, Any]:
     return {
         "verdict": c.verdict, "reason": c.reason or describe_verdict(c), "trace": c.source, "model": c.model.name,
         "signals": {name: {
-            "unit": s.unit, "error": s.error, "floor": s.floor.value, "ratio": s.ratio,
+            "unit": s.signal.unit, "error": s.error, "floor": s.floor.value, "ratio": s.ratio,
             "closed_loop_error": s.closed_loop_error, "solver_error": s.solver_error, "limit": s.limit,
             "floor_source": s.floor.source, "sensor_noise": s.sensor_noise, "lower_bound": s.floor.lower_bound,
             "hum": s.floor.hum, "difference": s.floor.difference} for name, s in c.signals.items()},

@@ -186,7 +186,7 @@ def _collect_data(found: RunDifferences, facts: Mapping[str, Facts]) -> dict[str
             "run": pair.run.label, "same_command": pair.has_same_command, "common": pair.common,
             "overlap": pair.overlap, "offset": pair.offset, "notes": pair.notes,
             "signals": {s.name: {
-                "unit": s.unit, "rms": s.rms, "largest": s.largest, "t": s.t, "noise_reference": s.noise[0],
+                "unit": s.signal.unit, "rms": s.rms, "largest": s.largest, "t": s.t, "noise_reference": s.noise[0],
                 "noise": s.noise[1], "ratio": s.ratio, "samples": s.samples, "share_within_noise": s.calm_share,
                 "within_noise": s.is_within_noise, "equal": s.is_equal} for s in pair.signals},
             "not_compared": pair.not_compared} for pair in found.pairs],
@@ -204,7 +204,7 @@ COLOURS = (BLUE, ORANGE, PINK, TEAL, VIOLET, GREY)  # of the runs, the reference
 def choose_difference_units(found: RunDifferences) -> dict[str, tuple[float, str]]:
     """SI value and name of the unit in which the differences of each signal are tabulated and drawn."""
     signals = [s for pair in found.pairs for s in pair.signals]
-    return {s.name: choose_unit(s.unit, max(abs(other.largest) for other in signals if other.name == s.name))
+    return {s.name: choose_unit(s.signal.unit, max(abs(other.largest) for other in signals if other.name == s.name))
             for s in signals}
 
 

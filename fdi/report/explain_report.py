@@ -142,20 +142,22 @@ def describe_verdict(a: Answer) -> str:
     error, floor, signals = a.baseline["error"], a.baseline["floor"], find_signals(a)
     floors = "; ".join(f"{signals.find(s).symbol} error {_format(error, s, signals)}, noise floor "
                        f"{_format(floor, s, signals)}" for s in error)
-    if a.verdict == "NOTHING_MISSING":
-        return f"Nothing is missing: the residual is noise ({floors})."
-    if a.verdict == "NOT_RESOLVABLE" and not a.explanation.effects:
-        return (f"The residual is noise ({floors}), but this run shows little: {len(a.blind)} of "
-                f"{len(a.explanation.search.effects)} effects would change nothing in it that the tolerances do not.")
-    if a.verdict == "NOT_RESOLVABLE":
-        c = a.candidates[0]
-        return (f"The error is at the noise floor ({floors}). {c.effect} may be present ({_describe_sizes([c])}), but "
-                "it is too small in this test to be certain.")
-    if a.verdict == "AMBIGUOUS":
-        return (f"{join_words(a.explanation.effects, 'or')}: each explains the residual, and these data cannot "
-                f"discriminate between them; {_describe_change(a, a.candidates[0])}.")
-    if a.verdict == "UNEXPLAINED" or not named:
-        return _describe_unexplained(a)
+    match a.verdict:
+        case "NOTHING_MISSING":
+            return f"Nothing is missing: the residual is noise ({floors})."
+        case "NOT_RESOLVABLE" if not a.explanation.effects:
+            return (f"The residual is noise ({floors}), but this run shows little: {len(a.blind)} of "
+                    f"{len(a.explanation.search.effects)} effects would change nothing in it that the tolerances do "
+                    "not.")
+        case "NOT_RESOLVABLE":
+            first = a.candidates[0]
+            return (f"The error is at the noise floor ({floors}). {first.effect} may be present "
+                    f"({_describe_sizes([first])}), but it is too small in this test to be certain.")
+        case "AMBIGUOUS":
+            return (f"{join_words(a.explanation.effects, 'or')}: each explains the residual, and these data cannot "
+                    f"discriminate between them; {_describe_change(a, a.candidates[0])}.")
+        case word if word == "UNEXPLAINED" or not named:
+            return _describe_unexplained(a)
     rest = f"{_describe_sizes(named)}; {_describe_change(a, named[-1])}."
     if a.verdict == "EXPLAINED":
         return f"{words} {'together ' if len(named) > 1 else ''}{verb} the residual: {rest}"
@@ -218,13 +220,12 @@ def describe_findings(a: Answer) -> list[Line]:
     elif a.verdict == "AMBIGUOUS":
         separation = "no sensor and no command that was tried discriminates between them"
     is_another = a.verdict in ("PARTLY", "UNEXPLAINED") and a.best.is_far
-    lines = [Line("to discriminate", separation), Line("residual", a.pattern),
-             *([] if a.law is None else [Line("law", _describe_law(a.law)), *(
-                 Line("not observable", f"{PLACES[place]}: {why}") for place, why in a.law.hidden.items())]),
-             Line("suspicious", describe_suspicious(a.suspicious)),
-             Line("another actuator?", OTHER_ACTUATOR if is_another else ""),
-             Line("held-out run", _describe_undecided(a)), Line("not detectable", describe_blind(a))]
-    return [finding for finding in lines if finding.text]
+    return [Line("to discriminate", separation), Line("residual", a.pattern),
+            *([] if a.law is None else [Line("law", _describe_law(a.law)), *(
+                Line("not observable", f"{PLACES[place]}: {why}") for place, why in a.law.hidden.items())]),
+            Line("suspicious", describe_suspicious(a.suspicious)),
+            Line("another actuator?", OTHER_ACTUATOR if is_another else ""),
+            Line("held-out run", _describe_undecided(a)), Line("not detectable", describe_blind(a))]
 
 
 def _describe_undecided(a: Answer) -> str:
@@ -560,9 +561,9 @@ def build_model_report(update: ModelUpdate, path: Path | None = None, backup: Pa
     """
     p, r, floor, signals = update.provenance, update.refit, update.floor, update.model.kind.signals
     parameters = _list_parameters(update.parameters)
-    suspicious = [("suspicious", describe_suspicious(update.suspicious))] if update.suspicious else []
-    lines = [Line(str(name), str(value), medium=Medium.TERMINAL) for name, value in [*parameters.rows, *suspicious]]
-    sections = [Section("Parameters", [*lines, replace(parameters, medium=Medium.PAGE)])]
+    lines = [*parameters.rows, ("suspicious", describe_suspicious(update.suspicious))]
+    sections = [Section("Parameters", [*(Line(str(name), str(value), medium=Medium.TERMINAL) for name, value in lines),
+                                       replace(parameters, medium=Medium.PAGE)])]
     if r is not None:
         first, last = r.steps[0].hypothesis, r.last.hypothesis
         after = last if last is not first else None

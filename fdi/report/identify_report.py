@@ -140,7 +140,7 @@ def _describe_findings(found: Identification) -> list[Line]:
         limit = "" if gains.limit is None else f", limit {format_amount(gains.limit, drive)}"
         gain = format_amount(gains.gain, f"{drive}/{controlled}", 4)
         law = f"gain {gain}{limit}; exact in {format_percent(gains.exact, 3)} of the rows"
-    lines = [
+    return [
         *(Line("to identify", f"{join_words(names)}: {text}") for text, names in advised.items()),
         Line("at a bound", f"{at_bound}: the interval reaches the end of the data sheet's range; give a wider one"
              if at_bound else "", "bad"),
@@ -150,7 +150,6 @@ def _describe_findings(found: Identification) -> list[Line]:
                                f"{format_ratio(e.decided_ratio)} noise floors")
           for e in found.holdouts if 0.0 < e.undecided <= HELD_OUT_UNDECIDED_SHARE),
         Line("controller", law)]
-    return [finding for finding in lines if finding.text]
 
 
 def _collect_data(found: Identification) -> dict[str, Any]:

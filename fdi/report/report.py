@@ -116,7 +116,7 @@ def tabulate(values: Iterable[T], *columns: tuple[Column, Callable[[T], Cell | s
 
 @dataclass(frozen=True)
 class Line:
-    """A label and what it says: "floor     from 1 repeat of the test"."""
+    """A label and what it says: "floor     from 1 repeat of the test". A line without text is not shown."""
 
     label: str
     text: str
@@ -180,8 +180,9 @@ class Section:
 
     def select_items(self, medium: Medium) -> list[Item]:
         """The items that one medium shows; none if it does not show the section."""
-        return [item for item in self.items if self.medium.includes(medium) and item.medium.includes(medium)
-                and (not isinstance(item, Table) or item.rows)]
+        shown = (item for item in self.items if self.medium.includes(medium) and item.medium.includes(medium))
+        return [item for item in shown if not ((isinstance(item, Table) and not item.rows)
+                                               or (isinstance(item, Line) and not item.text))]
 
 
 @dataclass(frozen=True)
@@ -239,20 +240,21 @@ def to_plain(value: Any) -> Any:
     Raises:
         TypeError: a value of another type, which an answer must not hold.
     """
-    if isinstance(value, np.ndarray | np.generic):
-        return to_plain(value.tolist())
-    if isinstance(value, Enum):
-        return to_plain(value.value)
-    if isinstance(value, Mapping):
-        return {str(key): to_plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [to_plain(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Path):
-        return str(value)
-    if value is None or isinstance(value, bool | int | str):
-        return value
+    match value:
+        case np.ndarray() | np.generic():
+            return to_plain(value.tolist())
+        case Enum():
+            return to_plain(value.value)
+        case Mapping():
+            return {str(key): to_plain(item) for key, item in value.items()}
+        case list() | tuple() | set() | frozenset():
+            return [to_plain(item) for item in value]
+        case float():
+            return value if math.isfinite(value) else None
+        case Path():
+            return str(value)
+        case None | bool() | int() | str():
+            return value
     raise TypeError(f"{type(value).__name__} in an answer: {value!r}")
 
 

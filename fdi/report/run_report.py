@@ -132,11 +132,10 @@ def _show_cause(trace: Trace) -> list[Item]:
     notes = trace.provenance
     if not notes.get("cause.text"):
         return []
-    lines = [Line("first cause", f"t = {notes.get('cause.t', '?')} s: {notes['cause.text']}", "bad"),
-             Line("who", notes.get("cause.source", "")),
-             *(Line("evidence", str(text)) for text in _read_list(notes.get("cause.evidence", "")))]
     consequences = [each for each in _read_list(notes.get("cause.consequences", "")) if isinstance(each, dict)]
-    return [*(line for line in lines if line.text), tabulate(
+    return [Line("first cause", f"t = {notes.get('cause.t', '?')} s: {notes['cause.text']}", "bad"),
+            Line("who", notes.get("cause.source", "")),
+            *(Line("evidence", str(text)) for text in _read_list(notes.get("cause.evidence", ""))), tabulate(
         consequences, (Column("t", "s", "right"), lambda each: f"{float(each.get('t', math.nan)):.3f}"),
         (Column("node"), lambda each: str(each.get("source", ""))),
         (Column("consequence"), lambda each: str(each.get("text", ""))),
@@ -156,8 +155,7 @@ def _show_diagnosis(trace: Trace) -> list[Item]:
     """What `rig fdi` found, if the run was asked for it."""
     word, sentence, faults = (trace.provenance.get(f"fdi.{key}", "") for key in ("verdict", "sentence", "faults"))
     moods: dict[str, Mood] = {"ACCEPTABLE": "good", "CANNOT_TELL": "doubtful"}  # all others fail the run
-    lines = (Line(word, sentence, moods.get(word, "bad")), Line("faults", faults))
-    return [line for line in lines if word and line.text]
+    return [Line(word, sentence, moods.get(word, "bad")), Line("faults", faults)] if word else []
 
 
 def _list_notes(trace: Trace, most: int = 5) -> list[str]:

@@ -52,14 +52,15 @@ def format_report(report: Report, width: int = 100) -> str:
 
 
 def _print_item(item: Item, console: Console) -> None:
-    if isinstance(item, Table):
-        console.print()
-        _print_table(item.select_columns(Medium.TERMINAL), console)
-    elif isinstance(item, Paragraph):
-        console.print()
-        console.print(Text(item.text, STYLES[item.mood]))
-    elif isinstance(item, Listing):
-        console.print(Text(item.text), soft_wrap=True)
+    match item:
+        case Table():
+            console.print()
+            _print_table(item.select_columns(Medium.TERMINAL), console)
+        case Paragraph():
+            console.print()
+            console.print(Text(item.text, STYLES[item.mood]))
+        case Listing():
+            console.print(Text(item.text), soft_wrap=True)
 
 
 def _flush_lines(lines: list[Line], console: Console, whole: Collection[str] = ()) -> None:

@@ -9,7 +9,6 @@ import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,24 +17,20 @@ from fdi.output import write_whole
 from plant.errors import InputError, report_system_error, require
 from plant.plants import Plant, Table, Term, find_plant, list_plants
 from plant.signals import Signals
-from plant.unpacking import UnpackingError, limit_unpacked_size
+from plant.unpacking import LimitedGzip, UnpackingError
 
 Floats = NDArray[np.float64]
 
 
-class CsvColumns(NamedTuple):
-    """What a CSV file holds."""
-
-    columns: dict[str, Floats]  # the known ones, shape (rows,), NaN where a field is empty
-    notes: tuple[str, ...]  # what a reader should know: columns left out, fields that say "nan"
-    plant: Plant | None  # whose rig wrote the file in its own columns; None for a trace of this software
-    signals: Signals  # that the columns are
-
-
-def read_csv(path: Path, signals: Signals) -> CsvColumns:
+def read_csv(path: Path, signals: Signals) -> tuple[dict[str, Floats], tuple[str, ...], str, Signals]:
     """Read a CSV of t and these signals, or of those of another plant, or of a plant's own rig: the header tells.
 
-    Raises InputError naming the line for anything but numbers, and for t that does not grow.
+    Returns:
+        The known columns, (rows,), NaN where a field is empty; what a reader should know, such as columns left out; the
+        plant whose rig wrote the file in its own columns, "" for a trace of this software; the signals of the columns.
+
+    Raises:
+        InputError: anything but numbers, and t that does not grow; it names the line.
     """
     with report_unreadable(path, "UTF-8"), open_text(path) as stream:
         header = stream.readline()
@@ -46,14 +41,14 @@ def read_csv(path: Path, signals: Signals) -> CsvColumns:
             plant, table = found
             rows = csv.reader(chain([header], stream), delimiter=table.separator)
             sources, notes = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
-            return CsvColumns(combine_columns(sources, table), notes, plant, plant.signals)
+            return combine_columns(sources, table), notes, plant.name, plant.signals
         rows = csv.reader(chain([header], stream))
         names = {name.strip() for name in next(csv.reader([header]), [])}
         known = (signals, *(find_plant(name).signals for name in list_plants() if not {*signals.required} <= names))
         signals = next((s for s in known if {*s.required} <= names), signals)
         required = ("t", *signals.required)
         optional = tuple(name for name in signals.names if name not in required)
-        return CsvColumns(*_parse_rows(path, rows, required, optional), None, signals)
+        return *_parse_rows(path, rows, required, optional), "", signals
 
 
 def find_own_table(list_names: Callable[[str], Collection[str]]) -> tuple[Plant, Table] | None:
@@ -94,31 +89,9 @@ def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
 def open_text(path: Path, encoding: str = "utf-8-sig") -> io.TextIOBase:
     """A text file, unpacked if it is a `.gz`. Reading a `.gz` beyond its limit raises UnpackingError."""
     if path.suffix == ".gz":
-        return io.TextIOWrapper(io.BufferedReader(_LimitedGzip(path)), encoding=encoding, newline="")
+        unpacked = io.BufferedReader(LimitedGzip(path, path.stat().st_size))
+        return io.TextIOWrapper(unpacked, encoding=encoding, newline="")
     return path.open(encoding=encoding, newline="")
-
-
-class _LimitedGzip(io.RawIOBase):
-    """The content of a gzip file, up to what `limit_unpacked_size` allows for a file of its size."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = gzip.open(path)  # noqa: SIM115 (closed by `close`)
-        self._left = limit_unpacked_size(path.stat().st_size)
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        data = self._file.read(len(buffer))
-        self._left -= len(data)
-        if self._left < 0:
-            raise UnpackingError("it unpacks to more than a hundred times its size")
-        buffer[:len(data)] = data
-        return len(data)
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()
 
 
 def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...],
@@ -126,9 +99,8 @@ def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...]
     """The columns and the notes of a CSV text."""
     header = [name.strip() for name in next(rows, [])]
     for name in required:
-        if name not in header:
-            raise InputError(f"{path}: line 1", name,
-                             f"a column of this name in the header {','.join([*required, *optional])}")
+        require(name in header, f"{path}: line 1", name,
+                f"a column of this name in the header {','.join([*required, *optional])}")
     require(len(set(header)) >= len(header), f"{path}: line 1", "header", "each column once")
     known = [(i, name) for i, name in enumerate(header) if name in required or name in optional]
     values: dict[str, list[float]] = {name: [] for _, name in known}

@@ -150,7 +150,7 @@ class Trace:
             return _from_log(open_log(path), all, signals)
         if path.name.endswith((".csv", ".csv.gz")):
             columns, notes, plant, signals = read_csv(path, signals)
-            return make_table_trace(path, columns, signals, notes, plant.name if plant else "")
+            return make_table_trace(path, columns, signals, notes, plant)
         raise InputError(path, "", "a trace: .mcap, .csv, .csv.gz or the folder of a run")
 
     @classmethod

@@ -3,20 +3,21 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
 from fdi.trace.importing.formats import OTHER_UNITS, Channel, Measurement
 from fdi.trace.sensor_dynamics import SensorDynamics
 from fdi.trace.trace import Floats, Trace
-from plant.errors import InputError, require, show_value, suggest_name
-from plant.parameters import parse_toml
+from plant.errors import InputError, require, suggest_name
+from plant.quantity import Quantity
 from plant.signals import EHA, Signals
+from plant.tables import Place, build_dataclass, decode_text, list_choices, parse_table, read_file
 from plant.units import Unit, fit_unit, list_fitting_units, require_unit
 
 
@@ -25,10 +26,21 @@ class SourceTerm:
     """A column of the recording, and how its raw values become SI: sign * (scale * raw + offset), in `unit`."""
 
     source: str
-    unit: Unit
-    sign: float
-    scale: float
-    offset: float
+    unit: str = ""  # default: that of the signal
+    sign: Literal[1, -1] = 1
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        require(self.scale != 0.0, "", "scale", "a number other than 0")
+
+    def find_unit(self, si: str, where: object = "", field: str = "") -> Unit:
+        """Its unit, of a signal in the unit `si`; as of `plant.units`, and of one that is raw it says what to do."""
+        if self.unit in OTHER_UNITS and not fit_unit(self.unit, si):
+            fitting = list_fitting_units(si)[0]
+            raise InputError(where, field, f"the unit that scale and offset lead to, such as {fitting} ({self.unit} is "
+                                           f"raw: value = sign * (scale * raw + offset) in `unit`)")
+        return require_unit(self.unit or si, si, where, field)
 
 
 @dataclass(frozen=True)
@@ -36,28 +48,94 @@ class TimeBase:
     """Where the times come from: a column in a unit, the row number at a rate, or a counter that wraps."""
 
     source: str | None = None
-    unit: Unit | None = None  # None with a source: calendar times, or a counter
-    rate: float | None = None  # rows, or counts, a second
-    bits: int | None = None  # of a counter
+    unit: str = "s"  # or iso: calendar times
+    rate: Annotated[float, Quantity("1/s", above=0)] | None = None  # rows, or counts, a second
+    bits: Annotated[int, Quantity("1", low=1, high=64)] | None = None  # of a counter
+
+    def __post_init__(self) -> None:
+        has_source, has_rate, is_counter = self.source is not None, self.rate is not None, self.bits is not None
+        require(not is_counter or (has_source and has_rate), "", "",
+                "source and rate (counts a second) for a counter of so many bits")
+        require(has_source or has_rate, "", "", "source (a column), or rate (rows a second)")
+        require(is_counter or not (has_source and has_rate), "", "bits",
+                "the bits of the counter, as source and rate are given")
+        if not (has_rate or self.is_calendar):
+            require_unit(self.unit, "s", "", "unit")
+
+    @property
+    def is_calendar(self) -> bool:
+        """Whether the column has dates."""
+        return self.unit == "iso" and self.rate is None
 
 
 @dataclass(frozen=True)
-class SignalMap:
+class SensorKeys:
+    """The measuring chain of a signal, as a map has it."""
+
+    moving_mean: Annotated[float, Quantity("1", low=1, high=999_999)] = 1.0  # samples of the recording
+    centred: bool = False
+    lag: Annotated[float, Quantity("s", low=0)] = 0.0
+    quantum: Annotated[float, Quantity("1", low=0)] = 0.0  # in the unit of the signal
+    dead: bool | tuple[tuple[float, float], ...] = ()  # s, from and to; True: always
+
+    def __post_init__(self) -> None:
+        require(self.moving_mean % 1.0 == 0.0, "", "moving_mean", "a whole number of samples")
+        spans = () if isinstance(self.dead, bool) else self.dead
+        require(all(start < end for start, end in spans), "", "dead",
+                "true, or a list of [from, to] in s, from before to")
+
+
+@dataclass(frozen=True)
+class SignalMap(SourceTerm):
     """Where a signal comes from."""
 
-    name: str
-    term: SourceTerm
-    minus: SourceTerm | None  # is subtracted, as the pressure of the other chamber
-    time: TimeBase | None  # None: that of the recording
-    delay: float  # s, that the recorded signal is late
-    method: str  # auto, samples, interpolate, hold
-    low_pass: bool | None  # before samples are left out; None: if it is needed
-    sensor: SensorDynamics = field(default_factory=SensorDynamics)
-    dead: tuple[tuple[float, float], ...] = ()  # s, when the channel was dead; -inf .. inf: always
+    minus: SourceTerm | None = None  # is subtracted, as the pressure of the other chamber
+    time: TimeBase | None = None  # None: that of the recording
+    delay: float = 0.0  # s, that the recorded signal is late
+    method: Literal["auto", "samples", "interpolate", "hold"] = "auto"
+    low_pass: bool | None = None  # before samples are left out; None: if it is needed
+    sensor: SensorKeys = SensorKeys()
+
+    def make_dynamics(self, si: str) -> SensorDynamics:
+        """The measuring chain, in the unit `si` of the signal."""
+        keys = self.sensor
+        return SensorDynamics(keys.lag, keys.moving_mean, centred=keys.centred,
+                              quantum=keys.quantum * float(self.find_unit(si).factor))
 
 
 @dataclass(frozen=True)
-class ImportMap:
+class TextKeys:
+    """How a text table is written; what is not given is found in it."""
+
+    separator: str | None = None
+    decimal: Literal[".", ","] | None = None
+    header: Annotated[int, Quantity("1", low=1)] | None = None  # line of the names
+
+    def __post_init__(self) -> None:
+        require(len(self.separator or ";") == 1, "", "separator", "one character, such as ';' or '\\t'")
+
+
+@dataclass(frozen=True)
+class RowKeys:
+    """The rows of the trace."""
+
+    period: Annotated[float, Quantity("s", above=0)] | None = None
+    start: float | None = None  # s of the recording, first and last that is taken
+    end: float | None = None
+
+
+@dataclass(frozen=True)
+class MapTables:
+    """The tables of a map."""
+
+    file: TextKeys = TextKeys()
+    trace: RowKeys = RowKeys()
+    time: TimeBase | None = None
+    signals: Any = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportMap(TextKeys, RowKeys):
     """A whole map."""
 
     path: Path
@@ -65,96 +143,6 @@ class ImportMap:
     declared: Signals  # of the plant that was recorded
     signals: Mapping[str, SignalMap]
     time: TimeBase | None
-    period: float | None  # s, of the trace's rows
-    start: float | None  # s of the recording, first and last that is taken
-    end: float | None
-    separator: str | None
-    decimal: str | None
-    header: int | None  # line of the names
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# The keys of a map
-# ---------------------------------------------------------------------------------------------------------------------
-
-class Key(NamedTuple):
-    """A key of a table: the types that its value may have, what is expected in words, and its default (...: none)."""
-
-    kinds: tuple[type, ...]
-    expected: str
-    default: Any = None
-    is_valid: Callable[[Any], bool] = lambda value: True
-
-
-def _is_positive(x: float) -> bool:
-    return 0.0 < x < math.inf
-
-
-def _is_duration(x: float) -> bool:
-    return 0.0 <= x < math.inf
-
-
-def _is_span(x: Any) -> bool:
-    """Whether it is [from, to] with from before to."""
-    return (isinstance(x, list) and len(x) == 2
-            and all(isinstance(end, float) or (type(end) is int and abs(end) <= 1e308) for end in x) and x[0] < x[1])
-
-
-NUMBER = (int, float)
-METHODS = ("auto", "samples", "interpolate", "hold")
-MAP = {"file": Key((dict,), "a table", {}), "trace": Key((dict,), "a table", {}), "time": Key((dict,), "a table"),
-       "signals": Key((dict,), "a table of signals", {})}
-FILE = {"separator": Key((str,), "one character, such as ';' or '\\t'", None, lambda x: len(x) == 1),
-        "decimal": Key((str,), "'.' or ','", None, lambda x: x in (".", ",")),
-        "header": Key((int,), "the number of the line with the names, from 1", None, lambda x: x >= 1)}
-ROWS = {"period": Key(NUMBER, "a period above 0 s", None, _is_positive),
-        "start": Key(NUMBER, "a finite number", None, math.isfinite),
-        "end": Key(NUMBER, "a finite number", None, math.isfinite)}
-TIME = {"source": Key((str,), "the name of a column"),
-        "rate": Key(NUMBER, "rows or counts a second, above 0", None, _is_positive),
-        "bits": Key((int,), "bits of a counter, 1 to 64", None, lambda x: 1 <= x <= 64),
-        "unit": Key((str,), "a unit of time, or iso", "s")}
-TERM = {"source": Key((str,), "the name of a column", ...),
-        "unit": Key((str,), "a unit"),
-        "sign": Key(NUMBER, "1 or -1", 1.0, lambda x: x in (1, -1)),
-        "scale": Key(NUMBER, "a number other than 0", 1.0, lambda x: math.isfinite(x) and x != 0),
-        "offset": Key(NUMBER, "a finite number", 0.0, math.isfinite)}
-SIGNAL = {**TERM,
-          "minus": Key((str, dict), "a column, or a table with source, unit, scale and offset"),
-          "time": Key((dict,), "a table as [time]"),
-          "method": Key((str,), "auto, samples, interpolate or hold", "auto", lambda x: x in METHODS),
-          "delay": Key(NUMBER, "seconds that the signal is late", 0.0, math.isfinite),
-          "low_pass": Key((bool,), "true or false"),
-          "sensor": Key((dict,), "a table", {})}
-SENSOR = {"moving_mean": Key(NUMBER, "samples of the recording, from 1", 1.0, lambda x: x in range(1, 1_000_000)),
-          "centred": Key((bool,), "true or false", False),
-          "lag": Key(NUMBER, "a time constant from 0 s", 0.0, _is_duration),
-          "quantum": Key(NUMBER, "a step from 0, in the unit of the signal", 0.0, _is_duration),
-          "dead": Key((bool, list), "true, or a list of [from, to] in s, from before to", [],
-                      lambda x: isinstance(x, bool) or all(map(_is_span, x)))}
-
-
-def _read_table(where: object, name: str, values: Any, keys: Mapping[str, Key]) -> dict[str, Any]:
-    """The values of a table, defaults included.
-
-    Raises:
-        InputError: an unknown key, or a value that it cannot have.
-    """
-    if not isinstance(values, dict):
-        raise InputError(where, name, "a table")
-    prefix = f"{name}." if name else ""
-    for word in values:
-        if word not in keys:
-            raise InputError(where, f"{prefix}{word}", f"one of {', '.join(keys)}{suggest_name(word, keys)}")
-    for word, key in keys.items():
-        require(word in values or key.default is not ..., where, f"{prefix}{word}", key.expected)
-        if word in values and not (type(values[word]) in key.kinds
-                                   and (type(values[word]) is not int or abs(values[word]) <= 1e308)  # a float holds it
-                                   and key.is_valid(values[word])):
-            raise InputError(where, f"{prefix}{word}", f"{key.expected}, not {show_value(values[word])}")
-    found = {word: values.get(word, key.default) for word, key in keys.items()}
-    return {word: float(value) if type(value) is int and float in keys[word].kinds else value
-            for word, value in found.items()}
 
 
 def read_map(path: Path, declared: Signals = EHA) -> ImportMap:
@@ -163,11 +151,7 @@ def read_map(path: Path, declared: Signals = EHA) -> ImportMap:
     Raises:
         InputError: a file that cannot be read, is no TOML, or has a key or value that a map cannot have.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, "", f"a readable map ({getattr(error, 'strerror', None) or error})") from error
-    return parse_map(text, path, declared)
+    return parse_map(decode_text(read_file(path), path).removeprefix("\ufeff"), path, declared)
 
 
 def parse_map(text: str, path: Path, declared: Signals = EHA) -> ImportMap:
@@ -177,78 +161,50 @@ def parse_map(text: str, path: Path, declared: Signals = EHA) -> ImportMap:
         InputError: as of `read_map`; or a map without a signal that every analysis needs, or with a column that is two
             signals.
     """
-    top = _read_table(path, "", parse_toml(text, path), MAP)
-    signals = {name: _parse_signal(path, name, table, declared) for name, table in top["signals"].items()}
+    table, place = parse_table(text, str(path))
+    top = build_dataclass(MapTables, table, place)
+    place.at("signals").require(isinstance(top.signals, dict), "a table of signals")
+    signals = {name: _parse_signal(name, own, place.at("signals", name), declared)
+               for name, own in top.signals.items()}
     for name in declared.required:
-        if name not in signals and not (declared.is_open_loop and name == declared.command.name):
-            needed = declared.find(name)
-            raise InputError(path, f"signals.{name}", f"a table with the source of {needed.symbol}, {needed.quantity}")
+        needed = declared.find(name)
+        place.at("signals", name).require(
+            name in signals or (declared.is_open_loop and needed == declared.command),
+            f"a table with the source of {needed.symbol}, {needed.quantity}")
     owner: dict[str, str] = {}
     for name, signal in signals.items():
-        other = owner.setdefault(signal.term.source, name)
-        require(other == name or signal.minus is not None or signals[other].minus is not None, path,
-                f"signals.{name}.source", f"a column of its own; signals.{other} has {signal.term.source!r} already")
+        other = owner.setdefault(signal.source, name)
+        place.at("signals", name, "source").require(
+            other == name or signal.minus is not None or signals[other].minus is not None,
+            f"a column of its own; signals.{other} has {signal.source!r} already")
     # in an open loop the drive is the command
-    signals.setdefault(declared.command.name, replace(signals[declared.drive.name], name=declared.command.name))
-    return ImportMap(path, text, declared, signals, _parse_time(path, "time", top["time"]),
-                     **_read_table(path, "trace", top["trace"], ROWS), **_read_table(path, "file", top["file"], FILE))
+    signals.setdefault(declared.command.name, signals[declared.drive.name])
+    return ImportMap(path=path, text=text, declared=declared, signals=signals, time=top.time, **vars(top.file),
+                     **vars(top.trace))
 
 
-def _parse_time(path: Path, name: str, values: Any) -> TimeBase | None:
-    if values is None:
-        return None
-    table = _read_table(path, name, values, TIME)
-    source, rate, bits = table["source"], table["rate"], table["bits"]
-    require(bits is None or (source is not None and rate is not None), path, name,
-            "source and rate (counts a second) for a counter of so many bits")
-    require(source is not None or rate is not None, path, name, "source (a column), or rate (rows a second)")
-    require(source is None or rate is None or bits is not None, path, f"{name}.bits",
-            "the bits of the counter, as source and rate are given")
-    has_unit = rate is None and table["unit"] != "iso"
-    return TimeBase(source, _require_unit(table["unit"], "s", path, f"{name}.unit") if has_unit else None, rate, bits)
-
-
-def _parse_signal(path: Path, signal: str, values: Any, declared: Signals) -> SignalMap:
-    name = f"signals.{signal}"
-    if signal not in declared.names:
-        raise InputError(path, name, f"one of {', '.join(declared.names)}{suggest_name(signal, declared.names)}")
-    table = _read_table(path, name, values, SIGNAL)
-    si, minus = declared.find(signal).unit, table["minus"]
-    term = _parse_term(path, name, {word: table[word] for word in TERM}, si)
-    if isinstance(minus, str):
-        minus = {"source": minus}
-    if minus is not None:
-        usual = {word: TERM[word]._replace(default=table[word]) for word in TERM if word != "source"}
-        minus = _parse_term(path, f"{name}.minus", _read_table(path, f"{name}.minus", minus, TERM | usual), si)
-    sensor = _read_table(path, f"{name}.sensor", table["sensor"], SENSOR)
-    dead = sensor.pop("dead")
-    if isinstance(dead, bool):
-        dead = [(-math.inf, math.inf)] if dead else []
-    dynamics = SensorDynamics(**{**sensor, "quantum": sensor["quantum"] * float(term.unit.factor)})
-    if dynamics.filters and declared.find(signal).role != "output":
-        outputs = ", ".join(s.name for s in declared.outputs)
-        raise InputError(path, f"{name}.sensor", f"moving_mean and lag for {outputs} alone; {signal} is an input of "
-                                                 "the model and is used as recorded")
-    return SignalMap(signal, term, minus, _parse_time(path, f"{name}.time", table["time"]), table["delay"],
-                     table["method"], table["low_pass"], dynamics, tuple((float(a), float(b)) for a, b in dead))
-
-
-def _parse_term(path: Path, name: str, table: Mapping[str, Any], si: str) -> SourceTerm:
-    return SourceTerm(**{**table, "unit": _require_unit(table["unit"] or si, si, path, f"{name}.unit")})
+def _parse_signal(name: str, table: Any, place: Place, declared: Signals) -> SignalMap:
+    place.require(name in declared.names, list_choices(name, declared.names))
+    known, minus = declared.find(name), table.get("minus") if isinstance(table, dict) else None
+    if minus is not None:  # what it does not say is as of the other chamber
+        usual = {key: table[key] for key in ("unit", "sign", "scale", "offset") if key in table}
+        own = {"source": minus} if isinstance(minus, str) else minus
+        table = {**table, "minus": usual | own if isinstance(own, dict) else own}
+    signal = build_dataclass(SignalMap, table, place)
+    for term, at in ((signal, place), (signal.minus, place.at("minus"))):
+        if term is not None:
+            with at.locate(has_field=True):
+                term.find_unit(known.unit, "", "unit")
+    outputs = ", ".join(s.name for s in declared.outputs)
+    place.at("sensor").require(known.role == "output" or not signal.make_dynamics(known.unit).filters,
+                               f"moving_mean and lag for {outputs} alone; {name} is an input of the model and is used "
+                               "as recorded")
+    return signal
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Units
 # ---------------------------------------------------------------------------------------------------------------------
-
-def _require_unit(name: str, si: str, where: object, field: str) -> Unit:
-    """As of `plant.units`; of a unit that is raw it says what to do."""
-    if name in OTHER_UNITS and not fit_unit(name, si):
-        fitting = list_fitting_units(si)[0]
-        raise InputError(where, field, f"the unit that scale and offset lead to, such as {fitting} ({name} is raw: "
-                                       f"value = sign * (scale * raw + offset) in `unit`)")
-    return require_unit(name, si, where, field)
-
 
 def convert_to_si(values: Floats, unit: Unit) -> Floats:
     """Values in SI units.
@@ -280,7 +236,7 @@ def compute_times(base: TimeBase, samples: int, column: Floats | None, where: ob
         raise InputError(where, field, f"a time in every row; row {int(missing.argmax()) + 1} has none")
     if base.bits is not None and base.rate is not None:
         return unwrap_counter(column, base.bits, where, field) / base.rate
-    t = column - column[0] if base.unit is None else convert_to_si(column, base.unit)
+    t = column - column[0] if base.is_calendar else convert_to_si(column, require_unit(base.unit, "s", where, field))
     require_growth(t, where, field)
     return t
 
@@ -360,7 +316,7 @@ def import_measurement(measurement: Measurement, chosen: ImportMap, cycle: float
         InputError: a column, time or value that cannot be used.
     """
     channels = _read_channels(measurement, chosen)
-    samples = {name: _scale(measurement, chosen, signal, channels) for name, signal in chosen.signals.items()}
+    samples = {name: _scale(measurement, chosen, name, channels) for name in chosen.signals}
     period = chosen.period or _measure_cycle(samples[chosen.declared.controlled.name], cycle)
     rows = _make_rows(chosen, samples, period)
     columns, done, sensors, signals = {}, [], {}, chosen.declared
@@ -370,8 +326,8 @@ def import_measurement(measurement: Measurement, chosen: ImportMap, cycle: float
         require(not np.isnan(x).all(), chosen.path, f"signals.{name}", "samples within the time of the other signals")
         sensors[name], how = _find_sensor(signal, own, rows, how, period, signals.find(name).unit)
         columns[name] = x
-        source = f"{signal.term.source} - {signal.minus.source}" if signal.minus else signal.term.source
-        done.append(ImportedSignal(name, source, _describe_unit(signal.term), 1.0 / own.period,
+        source = f"{signal.source} - {signal.minus.source}" if signal.minus else signal.source
+        done.append(ImportedSignal(name, source, _describe_unit(signal, signals.find(name).unit), 1.0 / own.period,
                                    float(np.nanmin(x)), float(np.nanmax(x)),
                                    int((np.diff(own.t) > 1.5 * own.period).sum()), int(np.isnan(x).sum()), how))
     origin = {"imported": measurement.path.name, "imported.sha256": hash_file(measurement.path),
@@ -399,7 +355,7 @@ def _read_channels(measurement: Measurement, chosen: ImportMap) -> Mapping[str, 
     wanted = {}  # field of the map: channel
     for name, signal in chosen.signals.items():
         bases[f"signals.{name}.time"] = signal.time
-        wanted[f"signals.{name}.source"] = signal.term.source
+        wanted[f"signals.{name}.source"] = signal.source
         if signal.minus:
             wanted[f"signals.{name}.minus.source"] = signal.minus.source
     timed = {place: base for place, base in bases.items() if base and base.source}
@@ -410,33 +366,34 @@ def _read_channels(measurement: Measurement, chosen: ImportMap) -> Mapping[str, 
             raise InputError(chosen.path, place, f"a column of {measurement.path.name} ({shown}), not {name!r}"
                                                  f"{suggest_name(name, measurement.units)}")
     return measurement.read(list(dict.fromkeys(wanted.values())),
-                            [str(base.source) for base in timed.values() if base.unit is None and base.bits is None])
+                            [str(base.source) for base in timed.values() if base.is_calendar])
 
 
-def _scale(measurement: Measurement, chosen: ImportMap, signal: SignalMap, channels: Mapping[str, Channel]) -> Samples:
+def _scale(measurement: Measurement, chosen: ImportMap, name: str, channels: Mapping[str, Channel]) -> Samples:
     """A signal's samples in SI at their true times, missing ones left out."""
-    channel = channels[signal.term.source]
-    x = _convert(channel.values, signal.term)
+    signal, si = chosen.signals[name], chosen.declared.find(name).unit
+    channel = channels[signal.source]
+    x = _convert(channel.values, signal, si)
     t = _find_times(measurement, chosen, signal, channel, channels)
     t = t - signal.delay if signal.delay else t
     if signal.minus:
         other = channels[signal.minus.source]
         if len(other.values) != len(x) or (other.t is not None and channel.t is not None
                                               and not np.array_equal(other.t, channel.t)):
-            raise InputError(chosen.path, f"signals.{signal.name}.minus", "a channel with the same times")
-        x = x - _convert(other.values, signal.minus)
-    there = ~np.isnan(x)
-    for first, last in signal.dead:
+            raise InputError(chosen.path, f"signals.{name}.minus", "a channel with the same times")
+        x = x - _convert(other.values, signal.minus, si)
+    dead = signal.sensor.dead
+    there = ~np.isnan(x) & (dead is not True)
+    for first, last in () if isinstance(dead, bool) else dead:
         there &= (t < first) | (t > last)
-    if there.sum() < 2:
-        reason = "it is marked dead; leave it out of the map" if signal.dead else f"it has {int(there.sum())}"
-        raise InputError(measurement.path, signal.term.source, f"at least two values; {reason}")
+    reason = "it is marked dead; leave it out of the map" if dead else f"it has {int(there.sum())}"
+    require(there.sum() >= 2, measurement.path, signal.source, f"at least two values; {reason}")
     return Samples(t, x) if there.all() else Samples(t[there], x[there])
 
 
-def _convert(values: Floats, term: SourceTerm) -> Floats:
+def _convert(values: Floats, term: SourceTerm, si: str) -> Floats:
     x = values if term.scale == 1.0 and term.offset == 0.0 else term.scale * values + term.offset
-    x = convert_to_si(x, term.unit)
+    x = convert_to_si(x, term.find_unit(si))
     return x if term.sign > 0 else 0.0 - x
 
 
@@ -446,12 +403,12 @@ def _find_times(measurement: Measurement, chosen: ImportMap, signal: SignalMap, 
     if base is None:
         if channel.t is None:
             raise InputError(chosen.path, "time", "a table with source (a column) or rate (rows a second)")
-        require_growth(channel.t, measurement.path, signal.term.source)
+        require_growth(channel.t, measurement.path, signal.source)
         return channel.t
     column = channels[base.source].values if base.source else None
     if column is not None and len(column) != len(channel.values):
         raise InputError(measurement.path, str(base.source), f"{len(channel.values)} times, one for each value of "
-                                                             f"{signal.term.source}, not {len(column)}")
+                                                             f"{signal.source}, not {len(column)}")
     return compute_times(base, len(channel.values), column, measurement.path, base.source or "rate")
 
 
@@ -492,7 +449,7 @@ def _find_origin(controlled: Samples, drive: Samples, period: float) -> float:
 def _find_sensor(signal: SignalMap, samples: Samples, rows: Floats, how: str, period: float, unit: str
                  ) -> tuple[SensorDynamics, str]:
     """The dynamics as the trace keeps them, and the whole list of what was done."""
-    sensor = replace(signal.sensor, sample_period=0.0)
+    sensor = signal.make_dynamics(unit)
     if sensor.moving_mean > 1.0:
         sensor = replace(sensor, sample_period=round(samples.period, 9))
     if signal.delay and how.startswith(("as recorded", "every")) and "held" not in how:
@@ -501,15 +458,15 @@ def _find_sensor(signal: SignalMap, samples: Samples, rows: Floats, how: str, pe
             sensor = replace(sensor, delay=-rest)
     return sensor, "; ".join(filter(None, (
         how, f"moved {1e3 * signal.delay:g} ms earlier" if signal.delay else "",
-        "dead spans left out" if signal.dead else "",
+        "dead spans left out" if signal.sensor.dead else "",
         "" if sensor.is_ideal else f"the model gets {sensor.describe(period, unit)}")))
 
 
-def _describe_unit(s: SourceTerm) -> str:
-    sign = "-" if s.sign < 0 else ""
+def _describe_unit(s: SourceTerm, si: str) -> str:
+    unit, sign = s.find_unit(si).name, "-" if s.sign < 0 else ""
     scale = f"{s.scale:g} " if s.scale != 1.0 else ""
-    offset = f" {s.offset:+g} {s.unit.name}" if s.offset else ""
-    return f"{sign}{scale}{s.unit.name}{offset}"
+    offset = f" {s.offset:+g} {unit}" if s.offset else ""
+    return f"{sign}{scale}{unit}{offset}"
 
 
 SLIP = 0.4  # of a row: two clocks that drift apart by less over the recording are the same

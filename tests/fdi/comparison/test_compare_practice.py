@@ -44,7 +44,7 @@ def test_the_truth_is_at_the_floor(case: str) -> None:
         found = compare(trace(case, name), Model().replace(TRUE[case]), repeats)
         assert found.verdict == "WITHIN_FLOOR", describe_verdict(found)
         for signal in found.signals.values():
-            assert (signal.ratio, signal.floor.value / LEVELS[signal.name]) == pytest.approx((1.0, 1.0), abs=0.03)
+            assert (signal.ratio, signal.floor.value / LEVELS[signal.signal.name]) == pytest.approx((1.0, 1.0), abs=0.03)
 
 
 @pytest.mark.parametrize("case", BLOCK)
@@ -58,7 +58,7 @@ def test_the_nominal_model_lacks_something_in_the_right_block(case: str) -> None
 def test_the_floor_is_the_sensors_noise_however_wrong_the_model(case: str) -> None:
     """Also where it is coloured with hum of one phase, and stick-slip differs between the repeats by 30 floors."""
     for signal in nominal(case).signals.values():
-        assert signal.floor.value == pytest.approx(LEVELS[signal.name], rel=0.15)
+        assert signal.floor.value == pytest.approx(LEVELS[signal.signal.name], rel=0.15)
 
 
 def test_plant_scatter_alone_is_said_to_be_possible() -> None:
