@@ -30,21 +30,20 @@ from plant.ports import (
     at_valve,
     at_viscosity,
 )
-from plant.quantity import Metre, MetrePerSecond, Pascal
 from plant.state import Drag, Input, Line, Memory
 
 
 class State(NamedTuple):
     """The plant at one instant; all zero is the centred actuator at rest."""
 
-    flapper_position: Metre = 0.0  # XF, at the nozzles
-    flapper_speed: MetrePerSecond = 0.0
-    spool_position: Metre = 0.0  # XS
-    spool_speed: MetrePerSecond = 0.0
-    jack_position: Metre = 0.0  # XJ
-    jack_speed: MetrePerSecond = 0.0
-    pressure: Pascal = 0.0  # P12, across the piston
-    sensed: Metre = 0.0  # XJ as its transducer shows it, without noise
+    flapper_position: float = 0.0  # m, XF, at the nozzles
+    flapper_speed: float = 0.0  # m/s
+    spool_position: float = 0.0  # m, XS
+    spool_speed: float = 0.0  # m/s
+    jack_position: float = 0.0  # m, XJ
+    jack_speed: float = 0.0  # m/s
+    pressure: float = 0.0  # Pa, P12, across the piston
+    sensed: float = 0.0  # m, XJ as its transducer shows it, without noise
 
 
 # computed from the parameters, so that no step divides; constant while these are

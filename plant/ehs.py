@@ -17,7 +17,7 @@ from plant.friction import clip
 from plant.parameters import GROUPS, convert_group_unit, read_shipped_model
 from plant.plants import MeasuredPressures, Plant, Table, Term, base_effect
 from plant.ports import at_position, at_valve, port
-from plant.quantity import Metre, MetrePerSecond, Pascal, Quantity, make_group
+from plant.quantity import Quantity, make_group
 from plant.segments import Array
 from plant.signals import Signals
 from plant.state import Input, Line, Memory
@@ -56,10 +56,10 @@ def compute_servo_coefficients(p: Any, h: float) -> Any:
 class State(NamedTuple):
     """The servo at one instant; all zero is the ram at rest in the middle."""
 
-    jack_position: Metre = 0.0  # XJ
-    jack_speed: MetrePerSecond = 0.0
-    pressure: Pascal = 0.0  # P12, the force on the ram over the area of the piston's larger side
-    sensed: Metre = 0.0  # XJ as its transducer shows it, without noise
+    jack_position: float = 0.0  # m, XJ
+    jack_speed: float = 0.0  # m/s
+    pressure: float = 0.0  # Pa, P12, the force on the ram over the area of the piston's larger side
+    sensed: float = 0.0  # m, XJ as its transducer shows it, without noise
 
 
 def step_servo(s: State, m: Memory, u: Input, p: Any, k: Any) -> tuple[State, Memory]:

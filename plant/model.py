@@ -17,7 +17,7 @@ from plant import plants
 from plant.anchor import show_start
 from plant.compile import Function, compile_function, interpret_function
 from plant.effects import Effect
-from plant.errors import InputError, suggest_name
+from plant.errors import InputError, require, suggest_name
 from plant.kernels import list_state_values
 from plant.parameters import check_combinations, find_field, flatten_tables, parse_value
 from plant.plant_files import READERS, read_model_tables, read_named_plant
@@ -138,14 +138,11 @@ class Model:
 
     def list_names(self) -> list[str]:
         """The parameters "group.field", in the order of `build_record`."""
-        return [f"{group}.{f}" for group, cls in self._find_groups().items() for f in cls._fields]
-
-    def _find_groups(self) -> dict[str, type[Any]]:
-        return self.kind.list_groups(self.effects)
+        return [f"{group}.{f}" for group, cls in self.kind.list_groups(self.effects).items() for f in cls._fields]
 
     def build_record(self) -> NDArray[Any]:
         """The values as a record array of one row, fields group.field; compiled code reads it in each step."""
-        groups = self._find_groups()
+        groups = self.kind.list_groups(self.effects)
         inner = {group: np.dtype((np.record, [(f, float) for f in cls._fields])) for group, cls in groups.items()}
         row = tuple(tuple(self.values[f"{group}.{f}"] for f in cls._fields) for group, cls in groups.items())
         return np.array([row], np.dtype((np.record, list(inner.items()))))
@@ -232,20 +229,17 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     tables = dict(tables)
     name, effects = tables.pop("name", name), tables.pop("effects", [])
     named = tables.pop("plant", "eha")
-    tables.pop("provenance", None)
-    tables.pop("identify", None)
     design = tables.pop("design", {})
-    if not isinstance(name, str) or not name:
-        raise InputError(where, "name", f"a text, not {name!r}")
-    tables.pop("plant_sha256", None)
+    for key in ("provenance", "identify", "plant_sha256"):
+        tables.pop(key, None)
+    require(isinstance(name, str) and name, where, "name", f"a text, not {name!r}")
     plant = _find_plant(named, where)
     known = [e.name for e in list_offered_effects(plant)]  # a list, as what stands in a file need not be hashable
     unknown = [e for e in effects if e not in known] if isinstance(effects, list) else [effects]
     if unknown:
         hint = suggest_name(str(unknown[0]), known)
         raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown[0]!r}{hint}")
-    if not isinstance(design, Mapping):
-        raise InputError(where, "design", "tables [design.GROUP] of nominal values")
+    require(isinstance(design, Mapping), where, "design", "tables [design.GROUP] of nominal values")
     values = flatten_tables(where, tables, plants.find_plant(plant).list_groups())
     usual = flatten_tables(where, design, plants.find_plant(plant).list_groups(()))
     bare = build_bare_model(plant, name)

@@ -11,7 +11,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, cast
@@ -335,7 +335,7 @@ def _sense_nothing(s: Any, m: Any, u: Any, p: Any) -> Any:
 step: Function = _step_without_coefficients  # bound for a plant whose step needs no coefficients
 
 
-_LOADED: dict[str, Plant] = {}  # users' plants, by the path that they were named by
+_LOADED: dict[str, Plant] = {}  # by the name of a shipped plant, or the path that a user's was named by
 
 
 def find_plant(name: str) -> Plant:
@@ -344,10 +344,11 @@ def find_plant(name: str) -> Plant:
     Raises:
         InputError: there is none.
     """
-    if name in _LOADED:
-        return _LOADED[name]
-    require(name in MODULES, "plant", name, f"one of {', '.join(MODULES)}, or a Python file that declares a plant")
-    return _find_shipped_plant(name)
+    if name not in _LOADED:
+        require(name in MODULES, "plant", name, f"one of {', '.join(MODULES)}, or a Python file that declares a plant")
+        _LOADED[name] = find_declared_plant(importlib.import_module(MODULES[name]), name)
+        CATALOGUE.of_plants.update(_LOADED[name].effects)
+    return _LOADED[name]
 
 
 def find_loaded_plant(name: str, where: object) -> Plant | None:
@@ -373,13 +374,6 @@ def is_known(name: str) -> bool:
 def list_plants() -> tuple[str, ...]:
     """All shipped plants."""
     return tuple(MODULES)
-
-
-@cache
-def _find_shipped_plant(name: str) -> Plant:
-    plant = find_declared_plant(importlib.import_module(MODULES[name]), name)
-    CATALOGUE.of_plants.update(plant.effects)
-    return plant
 
 
 def name_group(cls: type[Any]) -> str:

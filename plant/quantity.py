@@ -75,11 +75,3 @@ def make_group(name: str, meaning: str, fields: Mapping[str, Quantity], module: 
     made.__annotations__ = {field: Annotated[float, q] for field, q in fields.items()}
     made.__doc__ = meaning
     return made
-
-
-Metre = Annotated[float, Quantity("m")]
-MetrePerSecond = Annotated[float, Quantity("m/s")]
-Pascal = Annotated[float, Quantity("Pa")]
-Newton = Annotated[float, Quantity("N")]
-Second = Annotated[float, Quantity("s")]
-One = Annotated[float, Quantity("1")]

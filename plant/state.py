@@ -2,8 +2,6 @@
 
 from typing import Any, NamedTuple
 
-from plant.quantity import Newton, One, Pascal, Second
-
 Memory = Any  # of a port: 0.0 for none, else what its effects keep, nested tuples of floats
 
 
@@ -12,10 +10,10 @@ class Input(NamedTuple):
 
     drive: float = 0.0  # the controller's answer of the cycle before, held for this cycle
     load: float = 0.0  # held for this cycle
-    noise: One = 0.0  # one standard normal number a cycle, for effects that are noise
-    t: Second = 0.0  # time at the start of the step
-    phase: Second = 0.0  # the part of t since the cycle began
-    h: Second = 1e-5  # length of the step
+    noise: float = 0.0  # one standard normal number a cycle, for effects that are noise
+    t: float = 0.0  # s, time at the start of the step
+    phase: float = 0.0  # s, the part of t since the cycle began
+    h: float = 1e-5  # s, length of the step
 
 
 class Sampled(NamedTuple):
@@ -40,16 +38,16 @@ class Lag(NamedTuple):
 class Line(NamedTuple):
     """A pressure that falls with the speed of the body it drives: p = offset - slope * v, within +-limit."""
 
-    offset: Pascal
+    offset: float  # Pa
     slope: float  # Pa s/m
-    limit: Pascal
-    drive: Pascal  # the part of the offset that the opening of the metering edges makes
+    limit: float  # Pa
+    drive: float  # Pa, the part of the offset that the opening of the metering edges makes
 
 
 class Drag(NamedTuple):
     """The resistance of a body: dry(static, dynamic) + damping * v + force."""
 
-    force: Newton
+    force: float  # N
     damping: float  # N s/m
-    static: Newton
-    dynamic: Newton
+    static: float  # N
+    dynamic: float  # N

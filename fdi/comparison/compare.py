@@ -218,7 +218,6 @@ class Comparison:
     scatter: Scatter | None  # None: nothing to explain
     diagnoses: Mapping[str, ResidualTests]
     replay: Replay
-    closed: Columns  # residuals of the replay from the command alone, (n,)
     repeats: int
     notes: tuple[str, ...]
 
@@ -268,7 +267,7 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     progress("done", 1.0)
     named = _list_blocks_above(ratios, table)
     return Comparison(source, model, trace, verdict, reason, table, found, ratios, parts, named, tuple(sections),
-                      when, free, speed, measure_drive_error(trace, model), scattered, diagnoses, replay, closed,
+                      when, free, speed, measure_drive_error(trace, model), scattered, diagnoses, replay,
                       len(others), (*trace.notes, *([doubtful] if doubtful and verdict != "CANNOT_TELL" else []),
                                     *_list_notes(floor, replay, trace)))
 

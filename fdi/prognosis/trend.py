@@ -173,11 +173,6 @@ class Posterior(NamedTuple):
         weights: Floats = np.exp(evidence - np.logaddexp.reduce(evidence, axis=None))
         return weights
 
-    @property
-    def evidence(self) -> float:
-        """Log probability of the data."""
-        return float(np.logaddexp.reduce([part.evidence for part in self.parts], axis=None))
-
     def compute_law_probabilities(self) -> dict[str, float]:
         """Probability of each law."""
         found: dict[str, float] = {}

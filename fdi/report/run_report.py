@@ -404,8 +404,9 @@ class _View(NamedTuple):
     rows: slice
 
     @property
-    def t(self) -> Floats:
-        return self.trace.t[self.rows]
+    def shown(self) -> Trace:
+        """The trace of these rows alone."""
+        return self.trace.take_rows(self.rows)
 
     def read(self, name: str) -> Floats:
         """A signal over the window; `error` is command less controlled signal, `speed` that of the latter over 20 ms.
@@ -425,14 +426,6 @@ class _View(NamedTuple):
     def symbol(self) -> str:
         return self.trace.declared.controlled.symbol
 
-    @property
-    def command(self) -> Floats:
-        return self.trace.command[self.rows]
-
-    @property
-    def controlled(self) -> Floats:
-        return self.trace.controlled[self.rows]
-
     def find_unit(self, name: str) -> str:
         """The unit in which a signal, `error` or `speed` is shown."""
         d = self.trace.declared
@@ -450,7 +443,7 @@ class _View(NamedTuple):
     def compute_share(self) -> Floats:
         """How much of the step the plant has done, %; filtered as the checks do it."""
         before, size = self.step
-        return 100.0 * (filter_median(self.controlled, 1.0 / self.trace.period) - before) / size
+        return 100.0 * (filter_median(self.shown.controlled, 1.0 / self.trace.period) - before) / size
 
 
 def draw_failed_check(trace: Trace, check: CheckResult, salt: str = "check") -> str:
@@ -474,7 +467,7 @@ def draw_failed_check(trace: Trace, check: CheckResult, salt: str = "check") -> 
 
 def _draw_overshoot(view: _View) -> Panel:
     """Beyond the target, % of the step; from 20 ms before the step until four times the time to the peak."""
-    check, t, beyond = view.check, view.t, view.compute_share() - 100.0
+    check, t, beyond = view.check, view.shown.t, view.compute_share() - 100.0
     peak = t[int(np.nanargmax(beyond))]
     high = 1.5 * max(check.value, np.nan_to_num(check.high))
     return [line(t, beyond, BLUE, f"{view.symbol} beyond the target", 1.2), *_draw_limits(check),
@@ -485,9 +478,9 @@ def _draw_overshoot(view: _View) -> Panel:
 
 def _draw_rise_time(view: _View) -> Panel:
     """Share of the step that is done, with the times of 10 % and 90 %."""
-    done = view.compute_share()
-    start = next(iter(view.t[done >= 10.0]), math.nan)
-    return [line(view.t, done, BLUE, f"{view.symbol}, share of the step", 1.2),
+    t, done = view.shown.t, view.compute_share()
+    start = next(iter(t[done >= 10.0]), math.nan)
+    return [line(t, done, BLUE, f"{view.symbol}, share of the step", 1.2),
             *(level(share, COMMAND, width=0.8, style=":") for share in (10.0, 90.0)),
             *([] if math.isnan(start) else [instant(start, COMMAND, width=0.8, style=":"), *_draw_times(view, start)]),
             axes(ylim=(-10.0, 125.0), ylabel="done [%]")]
@@ -495,9 +488,9 @@ def _draw_rise_time(view: _View) -> Panel:
 
 def _draw_settling_time(view: _View) -> Panel:
     """Distance from the target; the position has to stay near it after the time limit."""
-    check = view.check
+    check, t = view.check, view.shown.t
     beyond = math.copysign(1.0, view.step[1]) * (view.compute_share() - 100.0)
-    panel = [line(view.t, beyond, BLUE, f"{view.symbol} less the target", 1.2), *_draw_times(view, float(view.t[0]))]
+    panel = [line(t, beyond, BLUE, f"{view.symbol} less the target", 1.2), *_draw_times(view, float(t[0]))]
     size = 110.0
     if check.value > 0.0:
         last_outside = round(_to_seconds(check, check.value) / view.trace.period) - 1
@@ -521,27 +514,27 @@ def _draw_size(view: _View) -> Panel:
     if check.kind == "break_away":
         values, middle = filtered, 0.5 * float(np.nanpercentile(filtered, (1, 99)).sum())
     elif check.kind in ("steady_error", "ramp_error"):
-        com = view.command
+        com = view.shown.command
         sides = (float(np.sign(com[-1] - com[0] if check.kind == "ramp_error" else np.nanmean(values))),)
-    d = view.trace.declared
+    d, t = view.trace.declared, view.shown.t
     words = f"error, {d.command.symbol} - {d.controlled.symbol}" if is_error else name
-    panel = [line(view.t, values, BLUE, words, 0.9),
+    panel = [line(t, values, BLUE, words, 0.9),
              axes(ylabel=f"{name} [{check.unit}]"), *_draw_limits(check, sides, middle)]
     if check.kind in ("max_error", "never_exceeds"):
         row = int(np.nanargmax(np.abs(filtered)))
-        return [*panel, dot(view.t[row], filtered[row], RED, _name_value(check))]
+        return [*panel, dot(t[row], filtered[row], RED, _name_value(check))]
     return [*panel, *_draw_sides(check.value, RED, _name_value(check), sides, middle)]
 
 
 def _draw_response(view: _View) -> Panel:
     """Demand and position; for a gain also the amplitudes that the limits allow."""
-    d = view.trace.declared
+    d, shown = view.trace.declared, view.shown
     scale, command, unit = d.controlled.shown_scale, d.command.symbol, d.controlled.shown_unit
-    com, check = scale * view.command, view.check
+    com, check = scale * shown.command, view.check
     middle, amplitude = 0.5 * (np.nanmax(com) + np.nanmin(com)), 0.5 * (np.nanmax(com) - np.nanmin(com))
     limits = (check.low, check.high) if check.kind == "amplitude_ratio" else ()
-    return [line(view.t, com, COMMAND, command, 1.6),
-            line(view.t, scale * view.controlled, BLUE, d.controlled.symbol),
+    return [line(shown.t, com, COMMAND, command, 1.6),
+            line(shown.t, scale * shown.controlled, BLUE, d.controlled.symbol),
             *(mark for limit in limits
               for mark in _draw_sides(limit * amplitude, AMBER, f"{limit:g} of {command}", BOTH, middle, "--")),
             _write_in_legend(_name_value(check)),
@@ -560,7 +553,8 @@ def _draw_reaction(view: _View) -> Panel:
     size = UNIT_SIZES.get(unit, 1.0)
     if not math.isnan(check.after):
         view = view._replace(rows=_find_reaction_rows(view))
-    panel = [line(view.t, view.read(name) / size, BLUE, name, 1.2), axes(ylabel=f"{name} [{unit}]")]
+    t = view.shown.t
+    panel = [line(t, view.read(name) / size, BLUE, name, 1.2), axes(ylabel=f"{name} [{unit}]")]
     if math.isnan(check.after):
         return [*panel, _write_in_legend(f"{_name_value(check)}; limits in the table")]
     unmeasured = [_write_in_legend(_name_value(check))] if math.isnan(check.value) else []
@@ -568,7 +562,7 @@ def _draw_reaction(view: _View) -> Panel:
     bounds = ((x / size, word) for x, word in ((check.above, "above"), (check.below, "below")))
     return [*panel, instant(check.after, COMMAND, begin, 1.2, ":"),
             *(level(x, COMMAND, f"{word} {x:g} {unit}", 1.2, "--") for x, word in bounds if not math.isnan(x)),
-            *_draw_times(view, check.after), *unmeasured, axes(xlim=(view.t[0], view.t[-1]))]
+            *_draw_times(view, check.after), *unmeasured, axes(xlim=(t[0], t[-1]))]
 
 
 def _find_reaction_rows(view: _View, least: float = 0.02) -> slice:
@@ -596,7 +590,7 @@ def _draw_times(view: _View, start: float) -> list[Mark]:
         return marks
     longest = _to_seconds(check, float(np.nanmax([check.value, check.high, check.low])))
     return [*marks, instant(start + _to_seconds(check, check.value), RED, _name_value(check), 1.4),
-            axes(xlim=(view.t[0], min(float(view.t[-1]), start + 3.0 * longest)))]
+            axes(xlim=(view.shown.t[0], min(float(view.shown.t[-1]), start + 3.0 * longest)))]
 
 
 def _to_seconds(check: CheckResult, value: float) -> float:
