@@ -38,7 +38,6 @@ from fdi.report.drawing import (
     call,
     dot,
     draw_panels,
-    instant,
     legend,
     levels,
     line,
@@ -502,10 +501,7 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
                show_deviation(found[name].departure), "bad" if 4.0 < abs(found[name].departure) < math.inf else "")),
            *(column for fault in d.bands.faults for column in show_fault(fault))) if d.bands else ()),
         caption="Deviation: measured minus healthy mean, in standard deviations of healthy units; red beyond 4."
-        if d.bands else "As measured; without bands there are no healthy units to compare with."),
-        *([Figure("How far a fault at MidBand moves each precursor, in standard deviations of healthy units: longer "
-                  "bars discriminate better; below the dotted line (3) a single test does not show the fault.",
-                  partial(draw_precursor_shifts, found, d.bands.faults))] if d.bands else [])]
+        if d.bands else "As measured; without bands there are no healthy units to compare with.")]
 
 
 def _name_limit(fault: BandFault | Fault) -> str:
@@ -707,23 +703,6 @@ def _draw_sizes_of_fault(fault: Fault, fit: Estimate, found: Sequence[tuple[str,
 
 def _place_size(fault: Fault, departure: float, way: float) -> float:
     return 2.0 * fault.healthy - fault.place_size(departure) if way < 0.0 else fault.place_size(departure)
-
-
-def draw_precursor_shifts(found: Mapping[str, Precursor], faults: Sequence[BandFault | Fault]) -> str:
-    """How many healthy standard deviations each fault at MidBand moves each precursor by; "" without bands."""
-    known = [p for p in found.values() if all(math.isfinite(p.compute_ratio(fault.name)) for fault in faults)]
-    if not known:
-        return ""
-    rows, height = np.arange(len(known)), 0.8 / len(faults)
-    bars = [call("barh", rows + (i - 0.5 * (len(faults) - 1)) * height,
-                 [abs(p.compute_ratio(fault.name)) for p in known], height=0.95 * height,
-                 label=_name_limit(fault), **({"color": (BLUE, ORANGE)[i]} if len(faults) <= 2 else {}))
-            for i, fault in enumerate(faults)]
-    return draw_panels("telling", [[[
-        *bars, instant(3.0, INK, width=0.8, style=":"), *name_rows([p.words for p in known]),
-        call("set_xscale", "log"), call("set_xlim", left=0.1), legend(2),
-        axes(xlabel="shift / healthy standard deviation [1] (dotted: 3, below it one test does not show the fault)")]]],
-        0.8 + (0.3 if len(faults) <= 2 else 0.15 * len(faults)) * len(known))
 
 
 def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:

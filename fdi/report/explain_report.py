@@ -34,7 +34,6 @@ from fdi.report.drawing import (
     dot,
     draw_panels,
     draw_residuals,
-    instant,
     legend,
     level,
     line,
@@ -112,9 +111,6 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
             "only the blue bar is overfitting.",
             partial(draw_ledger, [Row(*row) for row in a.ledger], a.baseline["floor"], trace.declared))]
             if len(a.ledger) > 2 else []),
-        Section("Ranking", [Figure(
-            "Error over noise floor of the worst signal, for the best candidates. The right effect reaches the green "
-            "line on both runs.", partial(draw_ranking, a.explanations, e.floor))] if a.candidates else []),
         _list_suspicious(a.suspicious),
         Section("What this test cannot detect", [tabulate(
             a.blind, (Column("effect"), lambda b: Cell(b.effect, "bad")),
@@ -386,20 +382,6 @@ def draw_change(trace: Trace, before: Hypothesis, after: Hypothesis | None, floo
         *([] if after is None else [(name_of_after, AFTER, after.fit.residuals[:, :len(trace)])])], floor)
 
 
-def draw_ranking(candidates: Sequence[Candidate], floor: BySignal, most: int = 12) -> str:
-    """Error over noise floor of each candidate's worst signal, on the run and on the held-out one."""
-    shown, rows = candidates[:most], np.arange(len(candidates[:most]))
-    nothing = 1e-3  # left of the axis
-    held = [max((x / floor[s] for s, x in c.holdout.items() if s in floor), default=nothing) for c in shown]
-    own = [max(c.ratio, nothing) for c in shown]
-    return draw_panels("ranking", [[[
-        call("barh", rows - 0.19, own, height=0.36, color=AFTER, label="this run"),
-        call("barh", rows + 0.19, held, height=0.36, color=ORANGE, label="held-out run"),
-        instant(1.0, GREEN, "noise floor", 1.2), *name_rows([" + ".join([*c.beside, c.effect]) for c in shown]),
-        axes(xscale="log", xlim=(0.8, 1.3 * max(*own, *held, 2.0)),
-             xlabel="error of the worst signal over its noise floor"), legend(3)]]], 0.9 + 0.34 * len(shown))
-
-
 def draw_ledger(rows: Sequence[Row], floor: BySignal, declared: Signals) -> str:
     """Error over noise floor of each signal after each effect, on the fitted run and on the held-out one."""
     x, signals = np.arange(len(rows)), [s for s in floor if s in rows[0].error]
@@ -569,7 +551,7 @@ def build_model_report(update: ModelUpdate, path: Path | None = None, backup: Pa
         after = last if last is not first else None
         sections = [
             Section("Error after each step", [
-                _tabulate_errors(p.ledger, floor, signals), _draw_bars(p.ledger, floor), Figure(
+                _tabulate_errors(p.ledger, floor, signals), Figure(
                     "Error over noise floor after each step, on the fitted and on the held-out run. An effect that "
                     "lowers only the blue bar is overfitting.", partial(draw_ledger, p.ledger, floor, signals))]),
             *sections,
@@ -619,36 +601,16 @@ def _describe_step(s: str, before: BySignal, after: BySignal, floor: BySignal, s
     return f"{signals.find(s).symbol} error {was} -> {now}, noise floor {noise}"
 
 
-def _list_runs(rows: Sequence[Row]) -> list[tuple[str, Cell, BySignal]]:
-    """Step, role and RMS errors of each run of each step; a held-out run stands below the fitted one."""
-    return [run for row in rows for run in (
-        (name_step(row), Cell("fitted"), row.error), ("", Cell("held-out", "muted"), row.holdout)) if run[2]]
-
-
 def _tabulate_errors(rows: Sequence[Row], floor: BySignal, signals: Signals) -> Table:
     """RMS error of each signal after each step, on the fitted run and on the held-out one."""
     columns = [column for s in floor for column in (
         Column(signals.find(s).symbol, align="right"), Column("over floor", align="right", medium=Medium.PAGE))]
+    runs = [run for row in rows for run in (
+        (name_step(row), Cell("fitted"), row.error), ("", Cell("held-out", "muted"), row.holdout)) if run[2]]
     cells: list[list[Cell | str]] = [[step, role, *(
         cell for s in floor for ratio in [errors.get(s, math.nan) / floor[s]]
-        for cell in (Cell(_format(errors, s, signals), _choose_mood(ratio)), Cell(format_ratio(ratio), "muted")))]
-        for step, role, errors in _list_runs(rows)]
+        for cell in (Cell(_format(errors, s, signals), "good" if ratio <= GOOD_RATIO else "bad"),
+                     Cell(format_ratio(ratio), "muted")))] for step, role, errors in runs]
     floors = [Cell(text, "muted") for s in floor for text in (_format(floor, s, signals), "1")]
     return Table([Column("step"), Column("run"), *columns], [*cells, [Cell("noise floor", "muted"), "", *floors]],
                  f"RMS error of each signal. Green: at most {GOOD_RATIO:g} times the noise floor.")
-
-
-def _choose_mood(ratio: float) -> Mood:
-    return "good" if ratio <= GOOD_RATIO else "bad"
-
-
-def _draw_bars(rows: Sequence[Row], floor: BySignal, width: int = 30) -> Table:
-    """The worst signal's error over its noise floor, as bars of characters on a logarithmic scale."""
-    bars = [(step, role, max((x / floor[s] for s, x in errors.items() if s in floor), default=1.0))
-            for step, role, errors in _list_runs(rows)]
-    longest = math.log(max(1.1, *(ratio for _, _, ratio in bars)))
-    cells: list[list[Cell | str]] = [
-        [step, role, Cell("█" * max(1, round(width * math.log(max(ratio, 1.0)) / longest)), _choose_mood(ratio)),
-         format_ratio(ratio)] for step, role, ratio in bars]
-    return Table([Column("step"), Column("run"), Column("worst signal"), Column("over floor", align="right")], cells,
-                 "Error of the worst signal over its noise floor, on a logarithmic scale.", medium=Medium.TERMINAL)

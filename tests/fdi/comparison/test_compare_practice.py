@@ -44,7 +44,8 @@ def test_the_truth_is_at_the_floor(case: str) -> None:
         found = compare(trace(case, name), Model().replace(TRUE[case]), repeats)
         assert found.verdict == "WITHIN_FLOOR", describe_verdict(found)
         for signal in found.signals.values():
-            assert (signal.ratio, signal.floor.value / LEVELS[signal.signal.name]) == pytest.approx((1.0, 1.0), abs=0.03)
+            noise = signal.floor.value / LEVELS[signal.signal.name]
+            assert (signal.ratio, noise) == pytest.approx((1.0, 1.0), abs=0.03)
 
 
 @pytest.mark.parametrize("case", BLOCK)

@@ -47,7 +47,7 @@ from fdi.diagnosis.precursors import (
     measure_precursors,
     smooth_spikes,
 )
-from fdi.report.diagnosis_report import draw_precursor_shifts, draw_sizes
+from fdi.report.diagnosis_report import draw_sizes
 from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
@@ -495,11 +495,9 @@ def test_the_page(tmp_path: Path) -> None:
     assert "&lt;b&gt;run&lt;b&gt;.csv" in page and "<b>run<b>" not in page and len(page) < 3_000_000
     assert [words for words in ("Response in its bands", "RMS maps", "Precursors", "MaxBand", "break-away",
                                 "command_hash") if words not in page] == []
-    assert page.count("<svg") == len(re.findall(r'<g id="figure_\d+"', page)) == 6
+    assert page.count("<svg") == len(re.findall(r'<g id="figure_\d+"', page)) == 5
 
 
-def test_pictures_without_bands() -> None:
-    """Sizes can be drawn without grid and bands; precursors without a table are not."""
+def test_picture_of_sizes_without_bands() -> None:
     sizes = {CLOGGING: Estimate(0.9, 0.8, 0.97), FRICTION: Estimate(150.0, 140.0, 170.0)}
     assert draw_sizes(FAULTS, sizes).startswith("<svg")
-    assert draw_precursor_shifts(measure_precursors(run()), FAULTS) == ""

@@ -170,8 +170,7 @@ def test_the_report_of_a_model_update_in_all_forms(tmp_path: Any) -> None:
                                "2.00 um.")
     assert not [words for words in ("model as it was", "+ a", "noise floor", "150 uA (140 .. 160)", "m.toml.bak",
                                     "m.html") if words not in text.replace("\n", "")]
-    assert max(line.count("█") for line in text.splitlines()) == 30
-    assert "held-out" in page and "22.5" in page and "█" not in page and to_plain(report.data)["helps"] is True
+    assert "held-out" in page and "22.5" in page and to_plain(report.data)["helps"] is True
 
 
 def test_a_removal_without_a_run_has_nothing_to_show() -> None:

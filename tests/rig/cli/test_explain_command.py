@@ -62,7 +62,7 @@ def test_effects_that_hide_in_the_tolerances_are_listed_with_what_would_reveal_t
 
 def test_the_page_of_a_search_needs_no_network(found: Said, runs: dict[str, Path]) -> None:
     page = runs["est"].with_name("page.html").read_text()
-    assert "null_bias explains the residual" in page and page.count("<svg") == 2
+    assert "null_bias explains the residual" in page and page.count("<svg") == 1
     assert "http" not in page.replace("http://www.w3.org", "")
     assert ">1</text>" in page and "math" not in page, "the noise floor on a logarithmic axis, as a plain number"
 
