@@ -327,16 +327,17 @@ def evaluate_shapes(every: tuple[Shape, ...], u: Floats, largest: float = 1e6) -
 
 def _evaluate_shape(shape: Shape, u: Floats, largest: float) -> Floats:
     since = np.maximum(u - shape.onset, 0.0) / (1.0 - shape.onset)
-    if shape.law == "none":
-        return np.zeros_like(u)
-    if shape.law == "exponential":
-        top = np.log(largest) + shape.bend
-        grown = np.expm1(np.minimum(shape.bend * since, top)) / np.expm1(shape.bend)
-    elif shape.law == "runaway":
-        left = np.maximum(shape.bend - since, 1e-9)
-        grown = (1.0 / left - 1.0 / shape.bend) / (1.0 / (shape.bend - 1.0) - 1.0 / shape.bend)
-    else:
-        grown = since ** shape.bend
+    match shape.law:
+        case "none":
+            grown = np.zeros_like(u)
+        case "exponential":
+            top = np.log(largest) + shape.bend
+            grown = np.expm1(np.minimum(shape.bend * since, top)) / np.expm1(shape.bend)
+        case "runaway":
+            left = np.maximum(shape.bend - since, 1e-9)
+            grown = (1.0 / left - 1.0 / shape.bend) / (1.0 / (shape.bend - 1.0) - 1.0 / shape.bend)
+        case _:
+            grown = since ** shape.bend
     return np.asarray(np.minimum(grown, largest))
 
 
@@ -486,12 +487,13 @@ def find_breaks(data: Scaled) -> Cleaned:
             break
         kind, at, size = strongest
         found.append(Break(kind, first + at, size))
-        if kind == "step":
-            data = data._replace(steps=(*data.steps, at))
-        elif kind == "repair":
-            data, first = _cut_before(data, at), first + at
-        else:
-            data = data._replace(loose=(*data.loose, at))
+        match kind:
+            case "step":
+                data = data._replace(steps=(*data.steps, at))
+            case "repair":
+                data, first = _cut_before(data, at), first + at
+            case _:
+                data = data._replace(loose=(*data.loose, at))
     return Cleaned(data, first, tuple(sorted(found, key=lambda b: b.row)))
 
 

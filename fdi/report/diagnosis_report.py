@@ -133,38 +133,40 @@ def build_bands_report(made: Mapping[str, Any]) -> Report:
 def describe_verdict(d: Diagnosis) -> str:
     """The verdict in a sentence or two."""
     whole, each = ("neither fault", "the two faults") if len(d.faults) == 2 else ("no fault", "the faults")
-    if d.verdict == "SOMETHING_ELSE" and d.beside is not None:
-        return (f"Neither {each} nor they and other effects of the catalogue explain this trace: the residual "
-                f"of the best fit is {describe_residual(d)}. No fault is reported until the cause is known.")
-    if d.verdict == "SOMETHING_ELSE":
-        return (f"{whole.capitalize()} explains this trace: the residual of the best fit is {describe_residual(d)}. "
-                "Something else is wrong; no fault is reported until the cause is known. rig fdi --with-effects "
-                f"searches for the cause and sizes {'both' if len(d.faults) == 2 else 'the'} faults beside it.")
     titles = {fault.name: fault.title for fault in d.faults}
     grouped = {name for group in d.groups for name in group.names}
     names = join_words(titles[name] for name, level in d.levels.items() if level is None and name not in grouped)
     is_disputed = d.beside is not None and d.beside.disputed
     groups = " ".join(describe_group(d, group) for group in d.groups)
-    if d.verdict == "CANNOT_TELL" and not is_disputed:
-        return f"This trace does not determine {names}: a healthy unit and MidBand are both within the 95 % interval."
-    if d.verdict == "AMBIGUOUS":
-        return groups + (f" This trace does not determine {names} either." if names else "")
-    if d.verdict == "CANNOT_TELL" and d.beside is not None:
-        sentence = (f"The level of {names} depends on what else is wrong, and this trace does not tell "
-                    f"{_join_alternatives(d.beside)} apart.")
-    elif d.verdict == "ACCEPTABLE":
-        many = {1: f"{d.faults[0].title.capitalize()} is acceptable.", 2: "Both faults are acceptable."}
-        sentence = many.get(len(d.faults), f"All {len(d.faults)} faults are acceptable.")
-    else:
-        worst = next(fault for fault in d.faults if fault.name == d.ruling)
-        need = "requires maintenance" if d.levels[worst.name] == Level.MAINTENANCE else "is non-nominal"
-        rest = _describe_rest(d, worst)
-        middle, most = format_limits_of_fault(worst)
-        sentence = (f"{worst.title.capitalize()} {need}: {worst.symbol} "
-                    f"{format_size(worst, d.sizes[worst.name])}, MidBand {middle}, MaxBand {most}")
-        sentence += f"; {rest}." if rest else "."
-        if groups:
-            sentence += f" {groups}"
+    match d.verdict:
+        case "SOMETHING_ELSE" if d.beside is not None:
+            return (f"Neither {each} nor they and other effects of the catalogue explain this trace: the residual "
+                    f"of the best fit is {describe_residual(d)}. No fault is reported until the cause is known.")
+        case "SOMETHING_ELSE":
+            return (f"{whole.capitalize()} explains this trace: the residual of the best fit is "
+                    f"{describe_residual(d)}. Something else is wrong; no fault is reported until the cause is known. "
+                    "rig fdi --with-effects searches for the cause and sizes "
+                    f"{'both' if len(d.faults) == 2 else 'the'} faults beside it.")
+        case "CANNOT_TELL" if not is_disputed:
+            return (f"This trace does not determine {names}: a healthy unit and MidBand are both within the 95 % "
+                    "interval.")
+        case "AMBIGUOUS":
+            return groups + (f" This trace does not determine {names} either." if names else "")
+        case "CANNOT_TELL" if d.beside is not None:
+            sentence = (f"The level of {names} depends on what else is wrong, and this trace does not tell "
+                        f"{_join_alternatives(d.beside)} apart.")
+        case "ACCEPTABLE":
+            many = {1: f"{d.faults[0].title.capitalize()} is acceptable.", 2: "Both faults are acceptable."}
+            sentence = many.get(len(d.faults), f"All {len(d.faults)} faults are acceptable.")
+        case _:
+            worst = next(fault for fault in d.faults if fault.name == d.ruling)
+            need = "requires maintenance" if d.levels[worst.name] == Level.MAINTENANCE else "is non-nominal"
+            rest = _describe_rest(d, worst)
+            middle, most = format_limits_of_fault(worst)
+            sentence = (f"{worst.title.capitalize()} {need}: {worst.symbol} "
+                        f"{format_size(worst, d.sizes[worst.name])}, MidBand {middle}, MaxBand {most}")
+            sentence += f"; {rest}." if rest else "."
+            sentence += f" {groups}" if groups else ""
     if d.beside is not None and d.beside.is_explained and d.beside.effects:
         sentence += f" Beside the faults: {_join_alternatives(d.beside)}."
     return sentence + (f" Other deviations: {_list_others(d)}." if d.others else "")

@@ -270,12 +270,13 @@ def read_verdict(trace: Trace) -> Verdict:
     words = {check.verdict for check in trace.checks}
     judged = next((word for word in ("FAIL", "CANNOT_TELL", "PASS") if word in words), "NOT_JUDGED")
     word, why = notes.get("verdict.verdict") or judged, notes.get("verdict.why", "")
-    if word == "INVALID_TIMING":
-        why = notes.get("verdict.timing", why)
-    elif word == "FAIL" and not why and failed:
-        why = f"{len(failed)} of {len(trace.checks)} checks failed: {list_first(failed, 4)}"
-    elif word == "FAIL" and not why:
-        why = "the checks passed, but the run did not end as the sequence says"
+    match word:
+        case "INVALID_TIMING":
+            why = notes.get("verdict.timing", why)
+        case "FAIL" if failed and not why:
+            why = f"{len(failed)} of {len(trace.checks)} checks failed: {list_first(failed, 4)}"
+        case "FAIL" if not why:
+            why = "the checks passed, but the run did not end as the sequence says"
     return Verdict(word, why)
 
 

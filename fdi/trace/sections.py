@@ -29,10 +29,11 @@ def describe_section(section: Section, furthest: float = 0.0, unit: str = "m") -
     """
     factor, shown = (1e3, "mm") if unit == "m" else (1.0, unit)
     level = f"{factor * section.last:.4g} {shown}"
-    if section.kind == "ramp":
-        return f"ramp at {factor * section.rate:.3g} {shown}/s"
-    if section.kind == "dynamic":
-        return f"motion within {factor * furthest:.4g} {shown}"
+    match section.kind:
+        case "ramp":
+            return f"ramp at {factor * section.rate:.3g} {shown}/s"
+        case "dynamic":
+            return f"motion within {factor * furthest:.4g} {shown}"
     return f"{section.kind} {'to' if section.kind == 'step' else 'at'} {level}"
 
 
