@@ -9,14 +9,11 @@ Names in capitals in the comments are the paper's symbols; functions named `at_<
 
 from collections import namedtuple
 from math import sqrt
-from typing import Any, NamedTuple
 
 from plant import signals
 from plant.compile import bind_later
-from plant.friction import clip, solve_velocity
+from plant.declare import Any, Loop, NamedTuple, Plant, clip, control_by_pid, solve_velocity
 from plant.parameters import GROUPS, load_nominal_values
-from plant.pid import Loop, control_by_pid
-from plant.plants import Plant
 from plant.ports import (
     at_current,
     at_feedback,

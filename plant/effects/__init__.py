@@ -18,18 +18,21 @@ import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 from plant.compile import Function
 from plant.errors import require
+from plant.friction import clip, play, soften
 from plant.parameters import GROUPS
 from plant.ports import PORTS, chain_laws
 from plant.quantity import Quantity, list_quantities
-from plant.state import Memory
+from plant.state import Drag, Held, Lag, Line, Memory
 from plant.tables import read_file
 from plant.user_code import run_file
 
-__all__ = ["CATALOGUE", "Effect", "Law", "combine_laws", "effect", "load_effects", "register_base"]
+# some of them for files of effects: `from plant.effects import ...` has all names that one needs
+__all__ = ["CATALOGUE", "Annotated", "Any", "Drag", "Effect", "Held", "Lag", "Law", "Line", "NamedTuple", "Quantity",
+           "clip", "combine_laws", "effect", "load_effects", "play", "register_base", "soften"]
 
 Law = Function
 

@@ -1,10 +1,6 @@
 """Effects in the firmware: they show in its answer against what it was told and what it sensed, without any noise."""
 
-from typing import Annotated, Any, NamedTuple
-
-from plant.effects import effect
-from plant.friction import clip
-from plant.quantity import Quantity
+from plant.effects import Annotated, Any, NamedTuple, Quantity, clip, effect
 
 
 class AsymmetricGain(NamedTuple):

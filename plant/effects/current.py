@@ -1,12 +1,8 @@
 """Effects on the way of the current, from the bus through driver, line and coil to the armature, in this order."""
 
 from math import inf, pi, sin
-from typing import Annotated, Any, NamedTuple
 
-from plant.effects import effect
-from plant.friction import clip, play
-from plant.quantity import Quantity
-from plant.state import Held, Lag
+from plant.effects import Annotated, Any, Held, Lag, NamedTuple, Quantity, clip, effect, play
 
 
 class TransportDelay(NamedTuple):

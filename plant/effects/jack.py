@@ -1,11 +1,8 @@
 """Forces on the ram and what resists it: loads, dry friction, a press. Positive force acts against extension."""
 
 from math import exp, pi, sqrt
-from typing import Annotated, Any, NamedTuple
 
-from plant.effects import effect
-from plant.quantity import Quantity
-from plant.state import Drag, Held
+from plant.effects import Annotated, Any, Drag, Held, NamedTuple, Quantity, effect
 
 
 class ConstantLoad(NamedTuple):

@@ -1,14 +1,10 @@
 """Effects of the position transducer, in the order of its signal path."""
 
 from math import sqrt
-from typing import Annotated, Any, NamedTuple
 
 from numpy import floor
 
-from plant.effects import effect
-from plant.friction import play
-from plant.quantity import Quantity
-from plant.state import Held, Lag
+from plant.effects import Annotated, Any, Held, Lag, NamedTuple, Quantity, effect, play
 
 
 class MountCompliance(NamedTuple):

@@ -1,12 +1,8 @@
 """Effects of the pilot stage, of the spool, and of the oil between its metering edges and the piston."""
 
 from math import exp, log, sqrt
-from typing import Annotated, Any, NamedTuple
 
-from plant.effects import effect
-from plant.friction import clip, soften
-from plant.quantity import Quantity
-from plant.state import Line
+from plant.effects import Annotated, Any, Line, NamedTuple, Quantity, clip, effect, soften
 
 _LANDS = "lap of the spool's lands, Merritt 1967"
 

@@ -1,10 +1,8 @@
 """Effects of the hydraulic supply and of its oil."""
 
 from math import pi, sin
-from typing import Annotated, Any, NamedTuple
 
-from plant.effects import effect
-from plant.quantity import Quantity
+from plant.effects import Annotated, Any, NamedTuple, Quantity, effect
 
 
 class SupplyRipple(NamedTuple):

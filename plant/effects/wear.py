@@ -10,11 +10,8 @@ the spool, rounding of its lands' corners, torque of the first stage, contaminat
 """
 
 from math import sqrt
-from typing import Annotated, Any, NamedTuple
 
-from plant.effects import effect
-from plant.quantity import Quantity
-from plant.state import Line
+from plant.effects import Annotated, Any, Line, NamedTuple, Quantity, effect
 
 NOWHERE = ("none",)  # plants in which rig explain tests them unasked
 
