@@ -16,13 +16,14 @@ import os
 import shutil
 import stat
 import tempfile
+from collections import namedtuple
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import takewhile
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -71,14 +72,8 @@ class ForeignCall:
         return numba.extending.intrinsic(made[f"call_{self.signature}"])
 
 
-class NormalTables(NamedTuple):
-    """numpy's tables of the ziggurat of the normal distribution: 256 layers, and where the tail begins."""
-
-    k: list[int]
-    w: list[float]
-    f: list[float]
-    r: float
-    inverse_r: float
+# numpy's tables of the ziggurat of the normal distribution: 256 layers, and where the tail begins
+NormalTables = namedtuple("NormalTables", "k w f r inverse_r")
 
 
 def read_normal_tables() -> NormalTables:

@@ -8,8 +8,7 @@ import contextlib
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 THREAD_NAME = "side_by_side"  # how the names of these threads begin
@@ -54,14 +53,8 @@ MOST_TOGETHER = 16  # threads of one `map_together`
 _thread = threading.local()  # `.meeting`: of a thread of `map_together`
 
 
-@dataclass(eq=False)
-class _Request:
-    """Work that a thread waits for."""
-
-    work: Any
-    is_taken: bool = False
-    is_done: bool = False
-    error: BaseException | None = None
+Request = tuple[Any, Future[None]]
+"""Work that a thread waits for, and what tells it that the work is running or done."""
 
 
 class _Meeting:
@@ -69,40 +62,39 @@ class _Meeting:
 
     def __init__(self, tasks: int, workers: int) -> None:
         self._tasks, self._workers = tasks, workers
-        self._waiting = list[_Request]()
+        self._waiting = list[Request]()
         self._change = threading.Condition()
 
     def meet_request(self, work: Any, do: Callable[[Sequence[Any], int], None]) -> None:
         """Return when the work is done: `do` gets that of several threads and the number of workers."""
-        mine, together = _Request(work), list[_Request]()
+        mine, together = Future[None](), list[Request]()
+
+        def is_taken() -> bool:
+            return mine.running() or mine.done()
+
         with self._change:
-            self._waiting.append(mine)
-            self._change.wait_for(lambda: mine.is_taken or len(self._waiting) >= min(self._tasks, MOST_TOGETHER))
-            if not mine.is_taken:
+            self._waiting.append((work, mine))
+            self._change.wait_for(lambda: is_taken() or len(self._waiting) >= min(self._tasks, MOST_TOGETHER))
+            if not is_taken():
                 together, self._waiting = self._waiting, together
-                for each in together:
-                    each.is_taken = True
+                for _, each in together:
+                    each.set_running_or_notify_cancel()
                 self._change.notify_all()
         if together:
             self._meet(together, do)
-        with self._change:
-            self._change.wait_for(lambda: mine.is_done)
-        if mine.error is not None:
-            raise mine.error
+        mine.result()
 
-    def _meet(self, together: Sequence[_Request], do: Callable[[Sequence[Any], int], None]) -> None:
+    def _meet(self, together: Sequence[Request], do: Callable[[Sequence[Any], int], None]) -> None:
         error: BaseException | None = None
         _thread.meeting = None  # what is done together may use threads
         try:
-            do([each.work for each in together], self._workers)
+            do([work for work, _ in together], self._workers)
         except BaseException as raised:
             error = raised
         finally:
             _thread.meeting = self
-        with self._change:
-            for each in together:
-                each.is_done, each.error = True, error
-            self._change.notify_all()
+        for _, each in together:
+            each.set_exception(error)  # None: it is done
 
     def end_task(self, tasks: int = 1) -> None:
         """So many tasks make no further requests."""
