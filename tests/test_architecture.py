@@ -83,7 +83,7 @@ ONLY_IN = {
 CLOCK_MODULES = {"time", "datetime", "sched"}
 CLOCK_FILES = (
     "studies/",
-    "rig/benches/calibration.py",  # reads dates; a run gives it the time
+    "rig/benches/calibration.py", "fdi/prognosis/unit_trend.py",  # read dates; others give them the time
     "rig/bench/benchmarks.py",  # waits for a node to boot
     "rig/network/", "rig/run/loop.py", "rig/run/priority.py", "rig/cli/commands/",
     "rig/view/live_",  # a screen has a rate
@@ -93,8 +93,8 @@ CLOCK_FILES = (
 # Public names of each package: what `from package import *` gives.
 PUBLIC = {
     "plant": {"Actuator", "Columns", "InputError", "Model", "RigError", "load_model", "simulate"},
-    "plant.effects": {"CATALOGUE", "Effect", "Law", "combine_laws", "effect", "load_effects",
-                      "register_base"},
+    "plant.effects": {"CATALOGUE", "Annotated", "Any", "Drag", "Effect", "Held", "Lag", "Law", "Line", "NamedTuple",
+                      "Quantity", "clip", "combine_laws", "effect", "load_effects", "play", "register_base", "soften"},
     "fdi": {"Trace", "add_effect", "compare", "diagnose", "explain", "identify", "read_trace"},
     "fdi.discovery": {"Explanation", "explain"},
     "rig.device": {
