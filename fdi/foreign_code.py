@@ -71,7 +71,8 @@ def load_effects_of_model(model: str | Path | None, given: Sequence[Path] = (), 
     Raises:
         InputError: there are such files and the user does not trust them, or one of them cannot be used.
     """
-    found = [path for path in find_effect_files(model, given) if not _is_loaded(path)]
+    loaded = {effect.file for effect in CATALOGUE.list_all().values()}  # as each file is now or was before
+    found = [path for path in find_effect_files(model, given) if path.absolute() not in loaded]
     codes = [ForeignCode(str(path), read_file(path)) for path in found]
     require_trust(model, codes, is_trusted=is_trusted, announce=announce)
     for path, code in zip(found, codes, strict=True):
@@ -116,11 +117,6 @@ def find_effect_files(model: str | Path | None, given: Sequence[Path] = ()) -> l
     places = [next((p for p in (file, Path(model).parent / file) if p.is_file()), None) for file in files]
     replaced = {file.name for file in given}
     return list(dict.fromkeys(path for path in places if path is not None and path.name not in replaced))
-
-
-def _is_loaded(path: Path) -> bool:
-    """Whether the effects of the catalogue include some of this file, as it is now or was before."""
-    return any(effect.file == path.absolute() for effect in CATALOGUE.list_all().values())
 
 
 def require_different_names(files: Sequence[Path]) -> None:

@@ -14,14 +14,16 @@ Germana, Berri and Maggiore, Aerospace 6(9), 94, 2019.
 from collections import namedtuple
 from collections.abc import Mapping
 from math import cos, exp, pi
-from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from plant.declare import (
+    Annotated,
+    Any,
     Chirp,
     Fault,
     Hold,
+    NamedTuple,
     Plant,
     Quantity,
     Ramp,

@@ -130,18 +130,14 @@ def _describe_trend(trend: Trend, unit: UnitTrend) -> list[str]:
 def _describe_growth(trend: Trend, unit: UnitTrend) -> str:
     state = f"{trend.fault.symbol} {_format_size(trend.now, trend.fault.unit)} now"
     if trend.verdict == "TOO_FEW":
-        return f"{state}; no trend: {_explain_too_few(int(trend.used.sum()))}"
+        reasons = {1: "one trace shows no growth", 2: "two traces fit every growth law"}
+        reason = reasons.get(int(trend.used.sum()), "all traces have the same date")
+        return f"{state}; no trend: {reason}; at least {TREND_FEWEST_TRACES} traces of different dates are needed"
     if trend.verdict == "NO_TREND" or trend.rate is None:
         return f"{state}; no trend: the probability that nothing grows is {100 * trend.laws['none']:.0f} %"
     period, length = {"days": ("month", 30.44), "h": ("100 h", 100.0), "flights": ("100 flights", 100.0)}[unit.unit]
     rate = Estimate(*(length * x for x in trend.rate))
     return f"{state}; grows by {_format_size(rate, trend.fault.unit)} per {period}"
-
-
-def _explain_too_few(used: int) -> str:
-    reason = {1: "one trace shows no growth", 2: "two traces fit every growth law"}.get(used)
-    return (f"{reason or 'all traces have the same date'}; at least {TREND_FEWEST_TRACES} traces of different dates "
-            "are needed")
 
 
 def _describe_break(found: Break, point: Point, size_unit: str, unit: UnitTrend) -> str:

@@ -320,11 +320,6 @@ class Trace:
         write_csv(Path(path), {name: self.column(name)[there] for name in names})
 
 
-def list_units(signals: Signals) -> dict[str, str]:
-    """The unit of each signal by its name."""
-    return {s.name: s.unit for s in signals}
-
-
 def make_table_trace(path: Path, columns: dict[str, Floats], signals: Signals, notes: tuple[str, ...] = (),
                      plant: str = "") -> Trace:
     """The trace of the columns of a file, t among them, (rows,); `plant`: whose rig wrote it in its own columns.
@@ -364,8 +359,8 @@ def _make_trace(grid: Mapping[str, Floats], signals: Signals, period: float, row
     columns = {name: grid.get(name, np.full(len(t), math.nan)) for name in signals.names}
     if "pa" in grid and "pb" in grid:
         more["chambers"] = np.column_stack([grid["pa"], grid["pb"]])
-    fields = {"phase": np.full(len(t), MAIN), "units": list_units(signals), **more, "usable": np.ones(len(t), bool),
-              "filled": np.zeros(len(t), bool), "incomplete": np.zeros(len(t), bool)}
+    fields = {"phase": np.full(len(t), MAIN), "units": {s.name: s.unit for s in signals}, **more,
+              "usable": np.ones(len(t), bool), "filled": np.zeros(len(t), bool), "incomplete": np.zeros(len(t), bool)}
     gaps = tuple(Gap(float(t[a]), float(t[b]), int(b - a - 1)) for a, b in pairwise(rows) if b - a > 1)
     return Trace(t=t, declared=signals, columns=columns, period=period, gaps=gaps, **fields)
 
@@ -409,7 +404,8 @@ def _from_log(log: Log, everything: bool, declared: Signals) -> Trace:
     said = {escape_control_characters(key): escape_control_characters(text) for key, text in {**run, **more}.items()}
     return _make_trace(grid, declared, period, rows, phase=filled.astype(int),
                        provenance={"source": log.path.name, **said},
-                       units=list_units(declared) | log.read_units("/signals"), attachments=log.attachments,
+                       units={s.name: s.unit for s in declared} | log.read_units("/signals"),
+                       attachments=log.attachments,
                        notes=tuple(notes), sensors=read_sensors(log.path, run), lead=lead,
                        timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
                        events=tuple(_list_records(log, "/events", Event, rest, seconds)),

@@ -2,9 +2,22 @@
 
     L i' = V - R i - Ke N w      J w' = N Kt i - B w - dry(w) - M      theta' = w
 """
-from typing import Annotated, Any, NamedTuple
-
-from plant.declare import Fault, Hold, Plant, Quantity, Signal, Sine, Step, clip, effect, port, solve_sliding
+from plant.declare import (
+    Annotated,
+    Any,
+    Fault,
+    Hold,
+    NamedTuple,
+    Plant,
+    Quantity,
+    Signal,
+    Sine,
+    Step,
+    clip,
+    effect,
+    port,
+    solve_sliding,
+)
 
 
 class Motor(NamedTuple):
