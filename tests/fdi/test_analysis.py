@@ -138,7 +138,7 @@ def test_every_result_prints_shows_plots_and_converts(name: str, lines: dict[str
     assert isinstance(drawn, Plot) and drawn.startswith("<svg") and drawn.caption in page
     assert f"one of {result.figures[0]}" in catch_refusal(result.plot, "nothing of this name")
     plots = [str(result.plot(title)) for title in result.figures if name != "diagnosis"]
-    assert len(set(plots)) == len(plots) and (len(plots) > 1 or name == "diagnosis")
+    assert len(set(plots)) == len(plots) and (len(plots) > 1 or name in ("explanation", "diagnosis"))
 
 
 def test_a_figure_without_data_is_an_error() -> None:
