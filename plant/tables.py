@@ -145,7 +145,7 @@ def list_choices(word: object, known: Iterable[str]) -> str:
     listed = " or ".join(filter(None, (", ".join(map(repr, names[:-1])), "".join(map(repr, names[-1:])))))
     if word is None:
         return listed
-    close = get_close_matches(word, names, 1) if isinstance(word, str) else []
+    close = get_close_matches(word, [n for n in names if isinstance(n, str)], 1) if isinstance(word, str) else []
     return f"{listed}, not {show_value(word)}" + (f" (did you mean {close[0]!r}?)" if close else "")
 
 

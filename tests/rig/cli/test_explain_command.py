@@ -64,7 +64,6 @@ def test_the_page_of_a_search_needs_no_network(found: Said, runs: dict[str, Path
     page = runs["est"].with_name("page.html").read_text()
     assert "null_bias explains the residual" in page and page.count("<svg") == 1
     assert "http" not in page.replace("http://www.w3.org", "")
-    assert ">1</text>" in page and "math" not in page, "the noise floor on a logarithmic axis, as a plain number"
 
 
 FEW = ("null_bias", "constant_load", "friction_asymmetry", "spool_friction")
@@ -151,7 +150,6 @@ def test_a_run_at_rest_shows_next_to_nothing(tmp_path: Path) -> None:
 def test_the_page_has_the_ledger(added: tuple[Said, Path]) -> None:
     page = Path(added[0].json["report"]).read_text()
     assert "null_bias added" in page and page.count("<svg") == 2 and "http" not in page.replace("http://www.w3.org", "")
-    assert ">1</text>" in page and "math" not in page, "the noise floor on a logarithmic axis, as a plain number"
 
 
 def test_such_a_model_simulates_and_lacks_nothing(model: Path, runs: dict[str, Path], tmp_path: Path) -> None:
