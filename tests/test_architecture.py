@@ -313,29 +313,6 @@ def test_each_threshold_has_its_reason() -> None:
         assert len(reason) > 40 and not reason.startswith("# ---"), word
 
 
-def is_number(value: ast.expr) -> bool:
-    """Whether an expression is a number or several, possibly calculated from others."""
-    if isinstance(value, ast.Tuple | ast.List):
-        return bool(value.elts) and all(is_number(each) for each in value.elts)
-    if isinstance(value, ast.UnaryOp):
-        return is_number(value.operand)
-    if isinstance(value, ast.BinOp):
-        return is_number(value.left) and is_number(value.right)
-    return isinstance(value, ast.Constant) and type(value.value) in (int, float)
-
-
-def test_names_of_numbers_are_unique_in_fdi() -> None:
-    """One name in capitals means one number, wherever it stands."""
-    places: dict[str, list[str]] = {}
-    for path in MODULES:
-        if name(path).startswith("fdi/"):
-            for word, value in constants(path):
-                if is_number(value):
-                    places.setdefault(word, []).append(name(path))
-    assert len(places) > 60
-    assert {word: paths for word, paths in places.items() if len(paths) > 1} == {}
-
-
 def test_each_threshold_is_used() -> None:
     """A threshold that decides nothing any more is removed."""
     texts = [path.read_text() for path in MODULES if path.name != "thresholds.py"]

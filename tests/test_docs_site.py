@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 from build_site import NAVIGATION, build_site, compare_navigation, run_sphinx
 from check_site import find_faults
-from json_page import list_keys
-from notebook_page import NotebookError, RunCell, check_format, run_cell, run_notebook
+from notebook_page import RunCell, check_format, run_notebook
 from places import ROOT
 from reference_pages import write_reference
 
@@ -77,14 +76,6 @@ def test_the_reference_has_every_effect_key_and_kind(reference: Path) -> None:
     assert "```{py:function} compare(trace: TraceOrPath" in (reference / "python.md").read_text()
 
 
-def test_keys_below_lists_and_variants_are_found() -> None:
-    item = {"type": "object", "properties": {"b": {"type": "string"}}}
-    variant = {"type": "object", "properties": {"d": {"enum": [1, None]}}}
-    schema = {"properties": {"a": {"type": "array", "items": item}, "c": {"anyOf": [{"type": "null"}, variant]}}}
-    assert list(list_keys(schema)) == [("a", "list of object", ""), ("a[].b", "string", ""),
-                                       ("c", "null or object", ""), ("c.d", "`1`, null", "")]
-
-
 def require_sphinx() -> None:
     """Skip a test where the extra is missing."""
     missing = [name for name in ("sphinx", "myst_parser", "pydata_sphinx_theme") if not importlib.util.find_spec(name)]
@@ -142,11 +133,3 @@ def test_the_notebook_is_stored_without_results() -> None:
     assert check_format(notebook) == []
     code = next(cell for cell in notebook["cells"] if cell["cell_type"] == "code")
     assert check_format({**notebook, "cells": [{**code, "outputs": [1]}]}) == ["cell 1: expected no results"]
-
-
-def test_a_cell_gives_what_it_prints_and_its_last_value() -> None:
-    names: dict[str, object] = {}
-    source = "a = 2\nprint(a)\na + 1"
-    assert run_cell(source, names, "my.ipynb, cell 1") == RunCell("code", source, "2\n", 3)
-    with pytest.raises(NotebookError, match=r"my\.ipynb, cell 3: NameError: name 'b' is not defined"):
-        run_cell("b", names, "my.ipynb, cell 3")

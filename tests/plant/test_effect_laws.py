@@ -6,15 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 from effects_cases import EASY, QUIET_SPOOL, WHOLE, H, drive_plant, measure_speed, measure_spool
-from effects_reference import simulate_jack
 from hypothesis import given, settings, strategies as st
 from node_bench import FirmwareDesk
-from physics_cases import SILENT, SMOOTH
+from physics_cases import SMOOTH
 
 from plant import Actuator, Model, simulate
 from plant.compile import compile_function, interpret_function
 from plant.controller import compute_answers
-from plant.effects import CATALOGUE
 from plant.effects.current import Behind, coil_lag
 from plant.effects.sensors import Lag, Recoil, mount_compliance, sensor_lag
 from plant.effects.supply import Drawn, supply_droop
@@ -25,7 +23,6 @@ from plant.state import Input, Line
 from rig.benches.profiles import Control
 
 MILLI = 1e-3
-FRICTIONLESS = {"jack.static_friction": 0.0, "jack.dynamic_friction": 0.0}
 ADVANCED = np.random.default_rng(1).uniform(-4e-3, 4e-3, 60)  # A, a new one each cycle
 
 
@@ -177,34 +174,6 @@ def _moved(flat, spool, load, record, h, out):
         out[0, i], out[1, i] = x, p12
 
 
-IMPLICIT = ("compressibility", "orifice_root", "presliding")
-
-
-@pytest.mark.parametrize("changes", [
-    FRICTIONLESS | {"orifice_root.share": 1.0}, FRICTIONLESS | {"orifice_root.share": 0.4},
-    FRICTIONLESS | {"compressibility.coefficient": 1e-9}, FRICTIONLESS | {"compressibility.coefficient": 1e-11},
-    FRICTIONLESS | {"compressibility.coefficient": 1e-9, "orifice_root.share": 1.0},
-    {"presliding.deflection": 5e-6}, {"presliding.deflection": 1e-4, "presliding.speed": 2e-3},
-    {"presliding.deflection": 2e-5, "compressibility.coefficient": 1e-9, "orifice_root.share": 1.0},
-], ids=lambda c: ", ".join(f"{k} {v:g}" for k, v in c.items() if v))
-@pytest.mark.parametrize(("h", "um", "bar"), [(1e-5, 0.3, 0.05), (5e-5, 1.5, 0.25)])
-def test_implicit_effects_against_an_explicit_integration(changes: dict[str, float], h: float, um: float,
-                                                          bar: float) -> None:
-    """Each alone and all together, at pressures up to 150 of 201 bar; RMS over 0.4 s, speeds to 90 mm/s."""
-    model, fine = SILENT.with_effects(IMPLICIT).replace(changes), 5e-7
-    paths = {}
-    for step in (h, fine):
-        t = np.arange(1, round(0.4 / step) + 1) * step
-        paths[step] = (4e-4 * np.sin(16 * np.pi * t) * (1 - np.exp(-t / 5e-3)) + 1e-4 * np.sin(120 * np.pi * t),
-                       22e3 * np.sin(6 * np.pi * t))
-    every = round(h / fine)
-    ours = np.empty((2, len(paths[h][0])))
-    run = compile_function(_moved, model.kind.bind_functions(model.effects))
-    run(model.build_flat_state(), *paths[h], model.build_record(), h, ours)
-    error = ours - simulate_jack(model.values, *paths[fine], fine)[:, every - 1::every]
-    assert (np.sqrt((error**2).mean(axis=1)) * [1e6, 1e-5] < [um, bar]).all()
-
-
 @pytest.mark.parametrize("h", [1e-5, 5e-5])
 def test_compressibility_resonates_where_it_should_and_the_step_damps_nothing(h: float) -> None:
     """w = AJ/sqrt(V/4B MJ), 123 Hz; damping from CJ and the edges, within 3 % at 50 us."""
@@ -261,14 +230,6 @@ def test_pressure_at_constant_speed_is_friction_drag_and_load(model: Model, curr
                                                              dry: Callable[[float], float]) -> None:
     _, p12, _, _, v = drive_plant(model, current, load)[1][:, -1]
     assert AREA * p12 == pytest.approx(dry(v) + model["jack.damping"] * v + load, rel=2e-3) and abs(v) > 1e-6
-
-
-def test_leakage_shows_as_speed_in_proportion_to_pressure() -> None:
-    """Valve closed, a load on the ram: GQ XS = 0 = QJ + GQ/GP P12, QJ = AJ XJ' + CLK P12."""
-    model = EASY.replace(LEAKY)
-    _, p12, _, _, v = drive_plant(model, np.zeros(60), 6e3)[1][:, -1]
-    conductance = LEAKY["jack.leakage"] + model["valve.flow_gain"] / model["valve.pressure_gain"]
-    assert AREA * v == pytest.approx(-conductance * p12, rel=1e-4)
 
 
 def test_moving_mass_is_pressure_in_proportion_to_acceleration() -> None:
@@ -410,11 +371,6 @@ def test_friction_only_takes_energy(v: float, rise: float, speed: float, asymmet
         now = 0.5 * 100.0 * s.jack_speed**2 + 0.5 * stiffness * bent**2
         assert now <= last * (1 + 1e-9) + 1e-15
         last, (s, m) = now, moved(s, m, u, p, k)
-
-
-def test_the_order_of_the_sensors_chain_is_that_of_its_signal() -> None:
-    assert [e for e in CATALOGUE if CATALOGUE[e].port == "position"] == [
-        "mount_compliance", "rod_backlash", "sensor_lag", "sensor_gain", "sensor_offset"]
 
 
 def test_a_heavy_body_on_its_mount_rings_as_its_equation_says() -> None:

@@ -168,7 +168,7 @@ def test_the_surface_stops_at_the_end_of_its_travel() -> None:
     assert s[-1, 4] == 0.0 and np.isfinite(s).all()
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_replay_of_a_healthy_unit_leaves_noise_where_no_stop_decides(seed: int) -> None:
     """The noise of the position, as the observer takes it, tears no held surface off its stiction."""
     model = load_model("ema")

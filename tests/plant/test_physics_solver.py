@@ -1,6 +1,5 @@
 """The plant against independent solvers and the recordings of another simulator, and the error of its step."""
 
-import itertools
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
 from pathlib import Path
@@ -70,12 +69,6 @@ def test_against_an_independent_solver(model: Model, command: np.ndarray, load: 
         assert (np.abs(left).max() if kind == "largest" else rms(left)) < most, which
 
 
-def test_error_falls_with_the_step() -> None:
-    truth = simulate_linear(SMOOTH.values, GENTLE)[0]
-    errors = [rms(simulate(SMOOTH, GENTLE, steps=n).xj - truth) for n in (50, 100, 200, 1000)]
-    assert all(coarse > 1.8 * fine for coarse, fine in itertools.pairwise(errors)), errors
-
-
 def test_rig_simulate_follows_an_independent_simulation_at_1_us(tmp_path: Path) -> None:
     """The acceptance test, through the command: spool friction and noise of the position off."""
     command, out = tmp_path / "c.csv", tmp_path / "s.csv"
@@ -88,17 +81,6 @@ def test_rig_simulate_follows_an_independent_simulation_at_1_us(tmp_path: Path) 
     xj = np.genfromtxt(out, delimiter=",", names=True)["xj"]
     truth = simulate_explicit(Model().replace(off).values, PREFLIGHT)[0]
     assert rms(xj - truth) < 0.1e-6
-
-
-@pytest.mark.parametrize("friction", [5.0, 45.0])
-def test_replay_with_friction_against_an_explicit_scheme(friction: float) -> None:
-    """From the current there is no loop to lose the phase in: spool and pressure agree everywhere."""
-    model = SILENT.replace({"spool.static_friction": friction, "spool.dynamic_friction": friction / 1.5})
-    run = simulate(model, PREFLIGHT)
-    truth = simulate_explicit(model.values, PREFLIGHT, measured=run.cor, substeps=2000)
-    assert rms(run.xs - truth[3]) < 0.05e-6
-    assert rms(run.p12 - truth[2]) < 0.05e5
-    assert rms(np.diff(run.xj) - np.diff(truth[0])) < 0.01e-6
 
 
 @pytest.mark.parametrize(("law", "exponent"), [("sqrt", 0.5), ("linear", 1.0), ("pressure", 0.0)])
@@ -179,12 +161,6 @@ def test_only_sensor_noise_is_left(case: str, name: str) -> None:
     assert rms(left)[2] == pytest.approx(1.0, abs=0.03)  # um
     assert p12 == pytest.approx(0.2, abs=0.006)  # bar
     assert xj == pytest.approx(2.0, abs=0.1)  # um, although the replay integrates the speed for 13 s
-
-
-@practice
-def test_a_finer_step_makes_the_break_away_that_the_default_misses() -> None:
-    xj, p12, xs = rms(residuals("01", "est", EXACT["01"], steps=1000))
-    assert (xj, p12, xs) == pytest.approx((2.0, 0.2, 1.0), rel=0.03)
 
 
 @practice

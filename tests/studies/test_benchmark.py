@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 from scipy.stats import beta
 
-from fdi.sources import import_function
 from studies.hidden_effects import cases, score
 from studies.hidden_effects.__main__ import main
 from studies.hidden_effects.benchmark import answer_benchmark, describe_progress, make_benchmark
@@ -116,25 +115,6 @@ def test_intervals_are_those_of_clopper_and_pearson(good: int, of: int) -> None:
     assert score.compute_interval(good, of) == pytest.approx((low, high), abs=1e-9)
 
 
-def test_an_answer_in_csv_counts_as_in_json(folder: Path) -> None:
-    rows = ["case,verdict,effects,sizes,where", *(
-        f"{case},{given['verdict']},{';'.join(given['effects'])},{'20 19 21' if case == '00002' else ''},"
-        f"{';'.join(given.get('where', []))}" for case, (_, given) in PAIRS.items())]
-    (folder / "answers.csv").write_text("\n".join(rows) + "\n")
-    by_file = [json.loads(run_script(folder, folder / f"answers.{kind}", "--json").stdout) for kind in ("csv", "json")]
-    assert by_file[0]["where"] == by_file[1]["where"]
-    first, second = ({rate["name"]: rate for rate in scores["rates"]} for scores in by_file)
-    covered = first["one, named: true size in interval"]
-    assert first["one: named"] == second["one: named"] and (covered["good"], covered["of"]) == (1, 1)
-
-
-def test_the_text_says_rates_and_misses(folder: Path) -> None:
-    (folder / "answers.json").write_text(json.dumps({"00002": PAIRS["00002"][1]}))
-    shown = run_script(folder, folder / "answers.json").stdout
-    assert "1 of 11 cases answered" in shown and "one: named" in shown and "F1" in shown
-    assert "00004  spool_friction 1 (9.0 floors) -> failed" in shown
-
-
 @pytest.mark.parametrize(("text", "expected"), [
     ("[", "expected a JSON file"),
     ("{}", "expected an object with one entry per case"),
@@ -190,17 +170,6 @@ def test_a_benchmark_has_the_same_bytes_and_resumes(tmp_path: Path) -> None:
     assert len(described["catalogue"]) == 34 and described["sections"]["s02"]["command"] == "step to 5 mm"
 
 
-@compiled
-def test_the_command_makes_answers_and_scores(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    seed = next(s for s in range(99) if cases.sample_case(s).kind == "nothing")
-    made = ["--benchmark", str(tmp_path / "made")]
-    assert main([*made, "--cases", "1", "--seed", str(seed)]) == 0
-    assert main([*made, "--answer", f"{__name__}:knowing"]) == 0
-    assert "Every aim that was counted is reached." in (shown := capsys.readouterr().out) and "1 of 1 cases" in shown
-    assert main([*made, "--cases", "1", "--signals", "xj"]) == 2
-    assert "or one with cases of the same plant, signals and simulator" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(("options", "expected"), [
     (["--signals", "xj,pressure"], "--signals: xj,pressure: expected xj or xj,p12 or xj,p12,xs or drawn"),
     (["--cases", "0"], "--cases: 0: expected 1 or more"),
@@ -213,28 +182,3 @@ def test_bad_options_are_refused_in_one_line(options: list[str], expected: str, 
     said = capsys.readouterr().err
     assert said.startswith("studies.hidden_effects: ") and expected in said and said.count("\n") == 1
     assert not (tmp_path / "made").exists()
-
-
-@compiled
-@pytest.mark.parametrize(("module", "effect", "known"), [
-    ("regression", "null_bias", True), ("sindy", "compressibility", True), ("sindy", "rod_backlash", False)])
-def test_other_methods_name_an_effect_that_they_can_express(module: str, effect: str, known: bool, tmp_path: Path
-                                                                 ) -> None:
-    if module == "sindy":
-        pytest.importorskip("pysindy")
-    case = cases.sample_case(5, effects=[effect], level="exact", sizes=(0.5, 0.5), signals="xj,p12,xs")
-    cases.write_case(case, tmp_path)
-    method = import_function(f"studies.hidden_effects.{module}:answer_case", "", "")
-    given, hidden = method(tmp_path, "eha", "xj,p12,xs"), json.loads((tmp_path / "truth.json").read_text())
-    assert (effect in given["effects"][:score.NAMES]) is known
-    read = read_through_file({"00005": given}, tmp_path)
-    if known:
-        assert read["sizes"][effect]["value"] == pytest.approx(hidden["effects"][0]["value"], rel=0.5)
-        assert set(hidden["where"]) & set(read["where"])
-
-
-def read_through_file(answers: dict[str, Any], folder: Path) -> Any:
-    """The answer of the only case, as the scorer reads it from a file."""
-    (folder / "answers.json").write_text(json.dumps(answers, allow_nan=False))
-    (given,) = score.read_answers(folder / "answers.json", answers).values()
-    return given

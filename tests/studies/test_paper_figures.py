@@ -5,12 +5,10 @@ from functools import cache
 
 from fdi import Trace
 from fdi.diagnosis.bands import find_excursions
-from fdi.diagnosis.faults import FAULTS
 from fdi.diagnosis.make_bands import choose_bands
 from fdi.diagnosis.rms_grid import search_grid
 from fdi.report.diagnosis_report import draw_maps
 from plant import Model, simulate
-from plant.segments import Chirp, Hold, Step, build_profile
 from rig.sequences import load_sequence
 from studies import paper_figures as figures
 
@@ -56,10 +54,3 @@ def test_the_maps() -> None:
     assert {"A", "B", "C", "G", "injected", "between cells", "Kintas", "FSS [N]"} <= said
     assert any(text.startswith("step sections: ") for text in said)
     assert "injected" not in texts(draw_maps(grid))
-
-
-def test_maps_of_steps_alone() -> None:
-    com = build_profile([Hold(time=0.3), Step(to=2e-3, time=0.8), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
-    measured = Trace.from_columns(simulate(Model(), com)._asdict(), 1e-3, {})
-    said = texts(draw_maps(search_grid(measured, faults=FAULTS)))
-    assert {"A", "C"} <= said and not {"B", "G"} & said

@@ -17,7 +17,6 @@ from fdi.trace.trace import Trace
 from plant import Model, simulate
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes
-from studies import detectable_sizes
 from studies.hidden_effects import cases, command, hidden
 from studies.hidden_effects.truth import SYMBOLS, has_compiler, nominal_symbols, parameter_names, simulate_truth
 
@@ -57,13 +56,6 @@ def test_commands_and_loads_are_those_of_the_practice_traces() -> None:
     for name in ("est", "holdout"):
         load = read(PRACTICE / f"04/{name}.csv.gz")["load"]
         assert (command.known_load_profile(len(load), 6000.0) == load).all()
-
-
-def test_hold_outs_are_random_commands_within_the_stroke() -> None:
-    rng = np.random.default_rng(1)
-    made = [command.sample_holdout_command(rng) for _ in range(50)]
-    assert all(5000 < len(com) < 40_000 and np.abs(com).max() < 10e-3 and com[-1] == 0 for com in made)
-    assert len({len(com) for com in made}) > 40
 
 
 def test_every_effect_of_the_catalogue_is_hidden_in_some_case() -> None:
@@ -141,40 +133,6 @@ def test_a_case_repeats_by_its_seed(tmp_path: Path) -> None:
     assert len(est) == 13_500 and (est.com == repeat.com).all() and not (est.xj == repeat.xj).any()
 
 
-def test_chosen_signals_change_nothing_else_about_a_case() -> None:
-    for seed in range(30):
-        random = cases.sample_case(seed)
-        for signals in cases.SIGNALS:
-            chosen = cases.sample_case(seed, signals=signals)
-            assert chosen.signals == signals and str(chosen._replace(signals=random.signals)) == str(random)
-
-
-def test_kinds_are_drawn_as_often_as_they_should() -> None:
-    drawn = [cases.sample_case(seed) for seed in range(600)]
-    for kind, share in cases.KINDS.items():
-        assert sum(case.kind == kind for case in drawn) / 600 == pytest.approx(share, abs=0.06)
-    assert {len(case.effects) for case in drawn if case.kind == "two"} == {2}
-    assert len({case.effects[0].name for case in drawn if case.kind == "one"}) == len(hidden.CATALOGUE)
-    assert max(case.level.scatter for case in drawn) <= 0.02
-
-
-def test_the_noise_of_a_bench_is_coloured_and_hums() -> None:
-    noise = cases.measure_case(cases.sample_case(5, "nothing", level="bench"), "est").noise
-    xj, t = noise["xj"], np.arange(13_500) * 1e-3
-    hum = abs(2 * np.mean(xj * np.exp(-2j * np.pi * 50 * t)))
-    assert hum == pytest.approx(0.7e-6, abs=0.1e-6)
-    assert np.corrcoef(xj[1:], xj[:-1])[0, 1] == pytest.approx(0.8, abs=0.03)
-    assert rms(noise["p12"]) == pytest.approx(2e4, rel=0.03)
-    assert abs(np.corrcoef(noise["p12"][1:], noise["p12"][:-1])[0, 1]) < 0.03
-
-
-def test_nothing_hidden_leaves_no_trace_of_an_effect() -> None:
-    case = cases.sample_case(5, "nothing", level="bench")
-    est = cases.measure_case(case, "est")
-    shown = cases.describe_change(cases.measure_changes(case, est, []), est.trace.com)
-    assert max(shown["floors"].values()) < 1e-6 and shown["where"] == []
-
-
 def test_an_effect_is_located_where_it_acts() -> None:
     """A limit of the current acts in the large steps alone; a limit of the demand in the controller alone."""
     for name, signals in (("current_limit", {"xj", "p12", "xs"}), ("command_rate_limit", {"cor"})):
@@ -184,38 +142,6 @@ def test_an_effect_is_located_where_it_acts() -> None:
         assert {cell.partition("/")[0] for cell in cells} == signals, name
         assert {"s02", "s03"} <= {cell.partition("/")[2] for cell in cells}  # 5 mm
         assert not {"s01", "s07", "s09", "s11"} & {cell.partition("/")[2] for cell in cells}  # holds
-
-
-def test_signals_that_are_not_measured_are_in_no_file(tmp_path: Path) -> None:
-    cases.write_case(cases.sample_case(5, effects=["current_limit"], signals="xj"), tmp_path)
-    assert cases.read_columns(tmp_path / "est.csv.gz").keys() == {"t", "com", "xj", "cor", "load"}
-    truth = json.loads((tmp_path / "truth.json").read_text())
-    assert truth["floors"].keys() == {"xj", "cor"} and "p12" not in str(truth["where"]) + str(truth["effects"])
-
-
-@pytest.mark.parametrize("effect", detectable_sizes.EFFECTS)
-def test_the_hidden_size_is_the_claimed_one_in_the_unit_of_the_fit(effect: str) -> None:
-    first = CATALOGUE[effect].fitted[0]
-    off = CATALOGUE[effect].off.get(first, Model().kind.nominal.get(first, 0.0))
-    size = 0.3 * min(abs(start[first] - off) for start in CATALOGUE[effect].starts)
-    healthy = detectable_sizes.sample_healthy_case(1, effect)
-    (made,) = detectable_sizes.hide_effect(healthy, effect, size).effects
-    assert made.value == pytest.approx(off + size)
-    shown = {"jack_friction": "FSJ", "viscous_drag": "CJ", "moving_mass": "MJ", "spool_friction": "FSS",
-             "constant_load": "force", "filter_clogging": "Kintas"}
-    if effect in shown:
-        assert made.changes[shown[effect]] == pytest.approx(off + size)
-    assert set(made.changes) - set(hidden.NOT_SIMULATED) <= set(parameter_names())
-
-
-def test_the_table_counts_by_effect_and_size() -> None:
-    rows = [{"effect": "null_bias", "factor": 1.5, "claimed": 1e-6, "found": True},
-            {"effect": "null_bias", "factor": 1.5, "claimed": 2e-6, "found": False},
-            {"effect": "null_bias", "factor": 0.5, "claimed": 1e-6, "found": False},
-            {"effect": "sensor_gain", "factor": 1.5, "claimed": None, "found": None}]
-    table = detectable_sizes.format_table(rows).splitlines()
-    assert table[2] == "| `null_bias` | 1e-06 to 2e-06 A | 1 of 2 | 0 of 1 |"
-    assert table[3] == "| `sensor_gain` | none | 0 of 0 | 0 of 0 |"
 
 
 def test_tolerances_make_up_for_an_offset_of_any_usual_size_and_not_for_a_load() -> None:
@@ -228,13 +154,3 @@ def test_tolerances_make_up_for_an_offset_of_any_usual_size_and_not_for_a_load()
     problem = Problem(complete_model(model), trace, noise, bare=silence_readings(model), workers=2)
     fit = fit_unknowns(problem, list_all_unknowns(model), rounds=3)
     assert [(h.effect, h.usual) for h in find_hidden_effects(problem, fit, effects)] == [("sensor_offset", 2e-4)]
-
-
-@pytest.mark.slow
-def test_claims_hold(tmp_path: Path) -> None:
-    """About an hour for each effect."""
-    effects = ("null_bias", "constant_load")
-    rows = detectable_sizes.run_study(4 * len(effects), tmp_path, effects=effects)
-    large = [row["found"] for row in rows if row["factor"] > 1.0 and row["found"] is not None]
-    small = [row["found"] for row in rows if row["factor"] < 1.0 and row["found"] is not None]
-    assert sum(large) >= 0.9 * len(large) and sum(small) <= 0.5 * len(small)

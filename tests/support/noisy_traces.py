@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
+from effects_cases import LAWS
 from physics_cases import PREFLIGHT, QUIET
 from synthetic_run import build_command
 
@@ -34,6 +35,7 @@ def record_plant(changes: dict[str, float] | None = None, com: np.ndarray = PREF
                  colour: str = "white", sensor: Callable[[float], float] | None = None, load: float = 0.0) -> Trace:
     """A trace of the nominal plant with some `changes`; `sensor` turns the ram's position into what is sensed."""
     model = Model().replace(QUIET | (changes or {}))
+    model = model.with_effects(LAWS) if model.effects else model  # one kernel for all effects
     plant, n = Actuator(model), sample_noise(seed, len(com), colour).tolist()
     state = plant._flat
     gain, limit = model["controller.proportional_gain"], model["controller.current_limit"]

@@ -7,15 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from effect_files import HEAD, STIFF, restored_catalogue
+from effect_files import STIFF, restored_catalogue
 from places import SHARED
 from rig_command import Said, answer, refuse, rig
-from short_runs import HIDDEN, build_command, list_trace_arguments, write_measured_runs
+from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 
 from fdi.discovery import update_model
 from fdi.estimation.fit import Value
 from plant import Model, load_model
-from plant.effects import CATALOGUE
 
 SIGNALS = {"xj", "p12", "xs"}
 
@@ -65,35 +64,6 @@ def test_the_page_of_a_search_needs_no_network(found: Said, runs: dict[str, Path
     assert "null_bias explains the residual" in page and page.count("<svg") == 2
     assert "http" not in page.replace("http://www.w3.org", "")
     assert ">1</text>" in page and "math" not in page, "the noise floor on a logarithmic axis, as a plain number"
-
-
-FEW = ("null_bias", "constant_load", "friction_asymmetry", "spool_friction")
-SPRING = HEAD + '''
-class Spring(NamedTuple):
-    stiffness: Annotated[float, Quantity("N/m", low=0)] = 0.0
-
-@effect("load", Spring, law="FR = FR + K XJ")
-def own_spring(x, s, u, p):
-    return x + p.own_spring.stiffness * s.jack_position
-'''
-
-
-def test_a_users_effect_is_ranked_with_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a small catalogue, whose code compiles in a few seconds."""
-    monkeypatch.chdir(tmp_path)
-    Path("own.py").write_text(SPRING)
-    rows = "\n".join(f"{k / 1000:.3f},{x!r}" for k, x in enumerate(build_command().tolist()))
-    Path("command.csv").write_text(f"t,com\n{rows}\n")
-    with restored_catalogue():
-        for name in set(CATALOGUE) - set(FEW):
-            del CATALOGUE[name]
-        for seed in (1, 2):
-            assert rig("simulate", "--set=own_spring.stiffness=4e5", "--effects", "own.py", "--seed", seed,
-                       "--steps=200", "--quiet", "--command", "command.csv", "--out", f"{seed}.csv").status == 0
-        found = answer("explain", "1.csv", "--repeat", "2.csv", "--effects", "own.py", status=1)
-    assert (found["effects"], found["verdict"]) == (["own_spring"], "EXPLAINED")
-    stiffness = found["candidates"][0]["parameters"]["own_spring.stiffness"]
-    assert stiffness["low"] < 4e5 < stiffness["high"]
 
 
 SHARED = SHARED / "practice"
