@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from build_site import NAVIGATION, build_site, compare_navigation, run_sphinx
 from check_site import find_faults
+from effect_files import restored_catalogue
 from notebook_page import RunCell, check_format, run_notebook
 from places import ROOT
 from reference_pages import write_reference
@@ -36,7 +37,9 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def cells() -> list[RunCell]:
-    return run_notebook(NOTEBOOK)
+    """The notebook, run with a few effects to search among."""
+    with restored_catalogue("null_bias", "constant_load", "spool_friction", "jack_friction"):
+        return run_notebook(NOTEBOOK)
 
 
 def test_every_page_is_in_the_navigation(reference: Path) -> None:

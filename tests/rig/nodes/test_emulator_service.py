@@ -17,6 +17,7 @@ from node_bench import MS
 from plant import Model
 from plant.compile import compile_function
 from rig.benches.bench_file import load_bench
+from rig.device import NmtState
 from rig.network.bus import Link, open_can, serve_node
 from rig.network.frame import Frame, WallClock
 from rig.network.node_objects import decode_cycle_record
