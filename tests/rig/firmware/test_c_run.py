@@ -86,23 +86,15 @@ def test_the_program_says_what_it_needs(words: list[str]) -> None:
 
 CAUGHT_BY = {
     "late_frame": "drive frames of another cycle",
-    "late_current": "delay of the answer to a step",
     "stale_cycle": "drive frames of another cycle",
-    "frozen_output": "current follows the error",
-    "sign_error": "delay of the answer to a step",
-    "gain_high": "gain against 0x2110",
-    "gain_low": "gain against 0x2110",
     "missed_cycles": "drive frames missing or late",
-    "ignores_control": "no current unless ACTIVE",
-    "wrong_status": "status word follows the control word",
-    "missing_ready": "status word follows the control word",
     "no_heartbeat": "heartbeat period, controller",
     "nan_current": "current within its limit",
-    "saturated_current": "current within its limit",
     "leaks_state": "same answers after a reset",
 }
 
-# What a bus can change: frames and times. On a CAN interface the other faults are no others than on UDP.
+# What a program on a bus can change: frames, times and its memory. Other faults are those of firmware_variants.py,
+# and on a CAN interface they are no others than on UDP.
 CASES = [*(("udp_multicast", fault) for fault in CAUGHT_BY),
          *(("socketcan", fault) for fault in ("late_frame", "no_heartbeat"))]
 only_udp = pytest.mark.parametrize("bus_kind_with_plant", ["udp_multicast"], indirect=True)
@@ -166,10 +158,10 @@ def test_a_sound_firmware_with_an_integral_part_passes(tmp_path: Path, bus_kind_
 
 
 @only_udp
-def test_ten_runs_against_one_sound_firmware_pass(tmp_path: Path, bus_kind_with_plant: str) -> None:
+def test_runs_against_one_sound_firmware_pass(tmp_path: Path, bus_kind_with_plant: str) -> None:
     """Without one false alarm, and without a restart of the firmware in between."""
     with run_program(build_controller(), bus_kind_with_plant):
-        for seed in range(10):
+        for seed in range(4):
             outcome = play_short(tmp_path, bus_kind_with_plant, "none", seed)
             assert (seed, outcome.verdict, list_failed(outcome)) == (seed, "PASS", [])
             assert set(outcome.counters.values()) == {0}
