@@ -11,12 +11,9 @@ from typing import Any
 import pytest
 from scipy.stats import beta
 
-from studies.hidden_effects import cases, score
+from studies.hidden_effects import score
 from studies.hidden_effects.__main__ import main
-from studies.hidden_effects.benchmark import answer_benchmark, describe_progress, make_benchmark
-from studies.hidden_effects.truth import has_compiler
 
-compiled = pytest.mark.skipif(not has_compiler(), reason="no gcc: the trial's simulator cannot be built")
 SCRIPT = Path(score.__file__)
 
 
@@ -133,41 +130,6 @@ def test_bad_answers_are_refused_in_one_line(text: str, expected: str, folder: P
 def test_a_folder_without_truth_is_refused_in_one_line(tmp_path: Path) -> None:
     done = run_script(tmp_path, tmp_path / "answers.json")
     assert done.returncode == 2 and done.stderr == f"score.py: {tmp_path}: expected a folder with truth/CASE.json\n"
-
-
-def knowing(case: Path, plant: str, signals: str) -> dict[str, Any]:
-    """A method that looks up the truth, and keeps a tally."""
-    with (case.parent.parent / "tally").open("a") as tally:
-        tally.write(".")
-    hidden = json.loads((case.parent.parent / "truth" / f"{case.name}.json").read_text())
-    if hidden["kind"] == "outside":
-        raise ValueError("out of my depth")
-    names = [effect["name"] for effect in hidden["effects"]]
-    return {"verdict": "explained" if names else "nothing", "effects": names, "where": hidden["where"]}
-
-
-@compiled
-def test_a_benchmark_has_the_same_bytes_and_resumes(tmp_path: Path) -> None:
-    seeds = [next(s for s in range(99) if cases.sample_case(s).kind == kind) for kind in ("one", "outside")]
-    first, other, by = tmp_path / "first", tmp_path / "other", f"{__name__}:knowing"
-    make_benchmark(first, seeds[:1])
-    answer_benchmark(first, by)
-    make_benchmark(first, seeds)  # goes on
-    make_benchmark(other, seeds)
-    made = [sorted(path.relative_to(root) for path in root.rglob("*") if path.is_file() and "answers" not in path.name
-                   and path.name != "tally") for root in (first, other)]
-    assert made[0] == made[1] and len(made[0]) == 4 + 2 * 4
-    assert all((first / name).read_bytes() == (other / name).read_bytes() for name in made[0])
-    with next(first.glob("answers-*.jsonl")).open("a") as rows:
-        rows.write('{"case": 3, "cut')  # a process that was killed
-    told: list[str] = []
-    answers = json.loads(answer_benchmark(first, by, 1, lambda p: told.append(describe_progress(p))).read_text())
-    assert (first / "tally").read_text() == ".." and len(told) == 1 and told[0].startswith("2/2")
-    found = score.score_answers(score.read_truths(first), answers["answers"])
-    assert [answers["answers"][f"{seed:05d}"]["verdict"] for seed in seeds] == ["explained", "failed"]
-    assert found["answered"] == 2 and "out of my depth" in answers["answers"][f"{seeds[1]:05d}"]["error"]
-    described = json.loads((first / "benchmark.json").read_text())
-    assert len(described["catalogue"]) == 34 and described["sections"]["s02"]["command"] == "step to 5 mm"
 
 
 @pytest.mark.parametrize(("options", "expected"), [

@@ -19,8 +19,8 @@ def test_a_seed_gives_the_same_frames_again() -> None:
 
 def test_fuzz_frames_into_the_firmware_in_c(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fuzz, "Firmware", CFirmware)
-    count = fuzz_node("controller", 20_000, 5)
-    assert count.failures == () and count.works and count.answers > 500
+    count = fuzz_node("controller", 5000, 5)
+    assert count.failures == () and count.works and count.answers > 100
 
 
 @pytest.mark.parametrize("victim", ["plant", "rig"])
@@ -64,10 +64,10 @@ def test_the_study_as_a_whole() -> None:
 
     Some of the changed logs are still good enough to be read; the others are refused, and nothing else happens.
     """
-    figures = run_study(20_000, 0, 0.05, 1, "builtin", lambda stage, share: None)
+    figures = run_study(5000, 0, 0.05, 1, "builtin", lambda stage, share: None)
     assert figures["problems"] == [] and figures["soak"]["verdicts"] == {"PASS": figures["soak"]["runs"]}
-    assert [count["works"] and count["frames"] >= 20_000 for count in figures["frames"]] == [True] * 3
-    assert min(count["answers"] for count in figures["frames"][:2]) > 500
+    assert [count["works"] and count["frames"] >= 5000 for count in figures["frames"]] == [True] * 3
+    assert min(count["answers"] for count in figures["frames"][:2]) > 100
     assert max(figures["datagrams"]["growth"].values()) < 16 << 20
     accepted, refused = figures["logs"]["accepted"], figures["logs"]["refused"]
     assert accepted["recover"] > 15 and 0 < accepted["report"] < 20 == accepted["report"] + refused["report"]
