@@ -1,7 +1,6 @@
 """Runs with the C firmware: it gives the numbers of the built-in one, and each fault built into it is caught."""
 
 import os
-import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,19 +52,6 @@ def test_what_the_firmware_cannot_do_is_one_line(tmp_path: Path, monkeypatch: py
     monkeypatch.setenv("PATH", path or os.environ["PATH"])
     answer = rig("run", "--controller", "c", *words, "--out", tmp_path)
     assert answer.status == 2 and said in answer.err and answer.err.count("\n") == 1
-
-
-def test_it_is_compiled_once_and_again_when_a_source_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    skip_without_compiler()
-    monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / "cache"))
-    program = build_controller()
-    first = program.stat()
-    assert build_controller() == program and program.stat().st_mtime_ns == first.st_mtime_ns
-    folder = tmp_path / "sources"
-    shutil.copytree(FOLDER, folder)
-    (folder / "control_law.c").write_text((folder / "control_law.c").read_text() + "/* changed */\n")
-    assert build_program("controller", sorted(folder.glob("*.c")), STRICT) != program
-    assert sorted(path.name[:11] for path in (tmp_path / "cache").iterdir()) == ["controller-"] * 2
 
 
 def test_an_error_of_the_compiler_is_one_line(tmp_path: Path) -> None:
@@ -147,14 +133,6 @@ def test_a_firmware_that_is_slow_to_start_is_caught(tmp_path: Path, bus_kind_wit
         outcome = play_short(tmp_path, bus_kind_with_plant, "slow_start")
     assert (outcome.verdict, outcome.status) == ("ABORTED", 1)
     assert "node 2 controller must be OPERATIONAL within 1 s of NMT start" in outcome.aborted
-
-
-@only_udp
-def test_a_sound_firmware_with_an_integral_part_passes(tmp_path: Path, bus_kind_with_plant: str) -> None:
-    """It is the firmware of "leaks_state" without the leak."""
-    with run_program(build_faulty(), "integral", bus_kind_with_plant):
-        outcome = play_short(tmp_path, bus_kind_with_plant, "integral")
-    assert (outcome.verdict, list_failed(outcome)) == ("PASS", [])
 
 
 @only_udp
