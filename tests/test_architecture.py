@@ -253,22 +253,10 @@ def test_no_leftovers_and_no_machine_paths() -> None:
 
 
 def list_changing_fields(class_: ast.ClassDef) -> set[str]:
-    """The fields that methods other than `__init__` assign, or whose containers they change in place."""
-    in_place = {"append", "add", "pop", "clear", "update", "extend", "discard", "insert", "remove", "setdefault"}
-    found: set[str] = set()
-    for method in class_.body:
-        if isinstance(method, ast.FunctionDef) and method.name != "__init__":
-            for node in ast.walk(method):
-                targets: list[ast.expr] = node.targets if isinstance(node, ast.Assign) else []
-                targets = [node.target] if isinstance(node, ast.AugAssign | ast.AnnAssign) else targets
-                targets = [part for target in targets for part in getattr(target, "elts", [target])]
-                if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in in_place:
-                    targets = [node.func.value]
-                for target in targets:
-                    place = target.value if isinstance(target, ast.Subscript) else target
-                    if isinstance(place, ast.Attribute) and ast.unparse(place.value) == "self":
-                        found.add(place.attr)
-    return found
+    """The fields that methods other than `__init__` assign."""
+    methods = [node for node in class_.body if isinstance(node, ast.FunctionDef) and node.name != "__init__"]
+    return {node.attr for method in methods for node in ast.walk(method) if isinstance(node, ast.Attribute)
+            and isinstance(node.ctx, ast.Store) and ast.unparse(node.value) == "self"}
 
 
 def test_no_type_has_more_than_fifteen_fields_that_change() -> None:

@@ -181,13 +181,6 @@ def test_a_start_from_a_measured_position_and_the_pull_to_it() -> None:
     assert lanes.replay(values, none, none, position)[:, :, 0] == pytest.approx(2e-3, abs=1e-6)
 
 
-def test_the_pull_holds_a_drifting_run() -> None:
-    current, nothing = np.full(400, 2e-4), np.zeros(400)
-    free, held = (Lanes(QUIET, [], steps=10).replay(np.empty((1, 0)), current, nothing, nothing, anchor)[0, -1, 0]
-                  for anchor in (0.0, 50.0))
-    assert 0.0 < held < 0.2 * free
-
-
 def test_threads_do_not_matter() -> None:
     values = np.linspace(5.0, 40.0, 70)[:, None]
     alone, shared = (Lanes(QUIET, ["spool.static_friction"], 10, workers).replay(values, CURRENT, FORCE)

@@ -187,19 +187,6 @@ def test_a_ram_on_a_closed_valve_loses_energy(x: float, v: float, dry: bool, sti
     assert energy(s) <= before * (1 + 1e-9)
 
 
-@given(st.floats(-3e-5, 3e-5), st.floats(-0.2, 0.2))
-@settings(max_examples=30, deadline=None)
-def test_a_flapper_left_alone_loses_energy(x: float, v: float) -> None:
-    p = SILENT.build_record()[0]
-    k, s, f = compute_coefficients(p, H), State(flapper_position=x, flapper_speed=v), p.flapper
-    last = np.inf
-    for _ in range(50):
-        s, _ = step_actuator(s._replace(spool_position=0.0, spool_speed=0.0), 0.0, Input(h=H), p, k)
-        now = 0.5 * float(f.inertia) * s.flapper_speed**2 + 0.5 * float(f.stiffness) * s.flapper_position**2
-        assert now <= last * (1 + 1e-12)
-        last = now
-
-
 @given(st.lists(st.floats(-0.02, 0.02), min_size=1, max_size=12), st.floats(-6e4, 6e4))
 @settings(max_examples=40, deadline=None)
 def test_nothing_leaves_its_stops(currents: list[float], load: float) -> None:

@@ -93,18 +93,6 @@ def test_rates_count_what_they_say(folder: Path) -> None:
     assert scores["names_on_average"] == 1.5 and scores["seconds"] == {"median": 30.0, "longest": 30.0}
 
 
-def test_precision_recall_and_f1_are_those_of_the_cells(folder: Path) -> None:
-    """Blamed are four cells, two of them rightly; of seven visible cases with two cells each, and two with nothing."""
-    scores = json.loads(run_script(folder, folder / "answers.json", "--json").stdout)
-    where = scores["where"]["all"]
-    assert where["cases"] == 9
-    assert [where[name]["value"] for name in ("precision", "recall", "F1")] == pytest.approx([2 / 4, 2 / 14, 4 / 18])
-    assert where["F1"]["low"] < where["F1"]["value"] < where["F1"]["high"]
-    assert scores["where"]["xj"]["recall"]["value"] == pytest.approx(2 / 7)
-    assert scores["where"]["one"]["precision"]["value"] == pytest.approx(2 / 3)
-    assert scores["where"]["xs"] == {"cases": 9} and scores["where"]["outside"] == {"cases": 1}
-
-
 @pytest.mark.parametrize(("good", "of"), [(0, 5), (5, 5), (3, 7), (150, 200), (1, 1), (0, 0)])
 def test_intervals_are_those_of_clopper_and_pearson(good: int, of: int) -> None:
     low = beta.ppf(0.025, good, of - good + 1) if good else 0.0
@@ -125,11 +113,6 @@ def test_bad_answers_are_refused_in_one_line(text: str, expected: str, folder: P
     done = run_script(folder, folder / "answers.json")
     assert done.returncode == 2 and done.stdout == "" and len(done.stderr.splitlines()) == 1
     assert done.stderr.startswith(f"score.py: {folder / 'answers.json'}: ") and expected in done.stderr
-
-
-def test_a_folder_without_truth_is_refused_in_one_line(tmp_path: Path) -> None:
-    done = run_script(tmp_path, tmp_path / "answers.json")
-    assert done.returncode == 2 and done.stderr == f"score.py: {tmp_path}: expected a folder with truth/CASE.json\n"
 
 
 @pytest.mark.parametrize(("options", "expected"), [

@@ -23,11 +23,6 @@ def test_it_finds_gains_and_delay_exactly(delay: int) -> None:
     assert found.asymmetry == pytest.approx(-0.3) and found.limit <= 1000.0
 
 
-def test_it_refuses_a_side_without_rows() -> None:
-    with pytest.raises(ValueError, match="driven back"):
-        fit_directional_gains(np.ones(50), np.ones(50), np.ones(50))
-
-
 @real
 @pytest.mark.parametrize("run", ["1_1", "2_2"])
 def test_the_servos_firmware(run: str) -> None:

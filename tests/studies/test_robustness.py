@@ -70,7 +70,7 @@ def test_the_study_as_a_whole() -> None:
     assert min(count["answers"] for count in figures["frames"][:2]) > 100
     assert max(figures["datagrams"]["growth"].values()) < 16 << 20
     accepted, refused = figures["logs"]["accepted"], figures["logs"]["refused"]
-    assert accepted["recover"] > 15 and 0 < accepted["report"] < 20 == accepted["report"] + refused["report"]
+    assert accepted["recover"] > 3 and accepted["report"] + refused["report"] == 5
     report = build_robustness_report(figures)
     assert report.verdict == "PASS" and len(report.sections) == 4
     assert not has_semaphores("239.1.1.1") and not find_processes("239.1.1.1")

@@ -2,7 +2,6 @@
 
 Beside another effect: sizes averaged over what may be right, and the search that finds the effect.
 """
-from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from noisy_traces import record_plant
-from synthetic_run import build_command
+from physics_cases import PREFLIGHT
 
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import (
@@ -158,7 +157,7 @@ def test_a_fit_that_ends_behind_a_ridge_begins_again_from_the_other_side() -> No
     assert found.levels[FRICTION.name] == Level.ACCEPTABLE
 
 
-COMMAND = np.concatenate([build_command()[2000:4200], build_command()[9000:11600]])  # steps, a ramp and a sine
+COMMAND = np.concatenate([PREFLIGHT[2000:4200], PREFLIGHT[9000:11600]])  # steps, a ramp and a sine
 WORN = {"filter.clogging": 0.35, "sensor_lag.time": 1e-3}
 
 
@@ -215,7 +214,7 @@ def test_what_is_not_a_logarithm_goes_along_with_a_flat_direction(name: str, siz
 def test_how_far_the_flapper_moves_shows_only_where_it_meets_its_stops() -> None:
     free = list_unknowns(MODEL)
     x = make_start(free, FAULTS, (0.2, 20.0))
-    for command, more in ((COMMAND, 1), (build_command(), 0)):
+    for command, more in ((COMMAND, 1), (PREFLIGHT, 0)):
         problem = make_problem(MODEL, hold_inputs(record_plant({}, command)))
         flat = find_flat(problem, free, x)
         assert flat.shape[1] == find_flat_directions(problem, free, x).shape[1] + more

@@ -1,5 +1,4 @@
 """The RMS grid: its maps are what they say, its minima are where the faults are, and its rules are the paper's."""
-from __future__ import annotations
 
 from functools import cache
 from pathlib import Path

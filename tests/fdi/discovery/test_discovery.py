@@ -1,5 +1,4 @@
 """The statistics behind `rig explain`: noise, likelihood, nulls, marks, shapes, last fits, candidates."""
-from __future__ import annotations
 
 from dataclasses import replace
 from importlib import import_module

@@ -3,7 +3,6 @@
 Linear algebra has the same kernels there (plant/blas.py); NumPy's elementary functions have not. docs/statistics.md
 says what was measured, on older CPUs too.
 """
-from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any

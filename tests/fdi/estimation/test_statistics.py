@@ -1,5 +1,4 @@
 """Statistics against known answers: noise floors, and shares with their exact intervals."""
-from __future__ import annotations
 
 import math
 

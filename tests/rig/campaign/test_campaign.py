@@ -27,7 +27,7 @@ from plant import InputError, Model, RigError
 from plant.effects import CATALOGUE
 from rig.campaign import batch, judge, summary as campaign_summary
 from rig.campaign.batch import BatchProgress, RowFile, Workers, run_in_processes, run_jobs
-from rig.campaign.judge import plan_batch, run_campaign
+from rig.campaign.judge import run_campaign
 from rig.campaign.summary import build_campaign_report
 
 pytest.importorskip("distributed", reason="the extra fleet is not installed")
@@ -138,32 +138,11 @@ def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(
         assert again[f"{row['label']} {row['seed']}"] == 1
 
 
-class Dead:
-    """The future of a case that kills whoever tries it."""
-
-    status = "error"
-
-    def result(self) -> None:
-        raise type("KilledWorker", (Exception,), {})("Attempted to run task on 4 different workers")  # as Dask does
-
-    def cancelled(self) -> bool:
-        return False
-
-
 def test_processes_give_the_same_rows(environment: Path, local: Path, tmp_path: Path) -> None:
     whole = judge.read_matrix_of_folder(local)
     run_campaign(whole, tmp_path / "there", Workers(2, single_threaded=True), count=4)
     assert rows(tmp_path / "there") == rows(local)[:4]
     assert os.getpid() not in {pid for pid, _ in calls(environment)}
-
-
-def test_a_case_that_kills_every_worker_of_a_cluster_has_failed(local: Path) -> None:
-    whole = judge.read_matrix_of_folder(local)
-    plan = plan_batch(whole, judge.hash_campaign_sources())
-    row = batch.take_result(Dead(), whole.cases[3], plan.describe_failure)
-    assert row["reason"] == "KilledWorker: every worker that tried it died" and row["true_fss"] == 30.0
-    assert plan.is_failed(row) and plan.is_valid(row)
-    assert not plan_batch(whole, "", redo_failed=True).is_valid(row)
 
 
 def test_a_failed_case_is_kept_with_its_reason_and_judged_again_on_demand(local: Path, tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from effect_files import STIFF, restored_catalogue
-from places import SHARED
 from rig_command import Said, answer, refuse, rig
 from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 
@@ -64,9 +63,6 @@ def test_the_page_of_a_search_needs_no_network(found: Said, runs: dict[str, Path
     assert "null_bias explains the residual" in page and page.count("<svg") == 2
     assert "http" not in page.replace("http://www.w3.org", "")
     assert ">1</text>" in page and "math" not in page, "the noise floor on a logarithmic axis, as a plain number"
-
-
-SHARED = SHARED / "practice"
 
 
 @pytest.fixture(scope="module")
@@ -211,15 +207,3 @@ def test_a_model_with_a_users_effect_finds_its_file_or_asks_for_it(tmp_path: Pat
     own.rename(tmp_path / "elsewhere.py")
     for words in (["add", "null_bias", run], ["explain", run]):
         assert f"--effects {own} with it, where spring is defined" in refuse(*words, "--model", file)
-
-
-def test_on_traces_of_another_simulator(tmp_path: Path) -> None:
-    """Leakage under a known load, 1.5 % scatter of the plant, coloured noise and hum."""
-    folder = SHARED / "04"
-    if not folder.is_dir():
-        pytest.skip("the practice traces are not beside this checkout")
-    files = {name: folder / f"{name}.csv.gz" for name in ("est", "repeat", "holdout")}
-    told = answer("add", "internal_leakage", *list_trace_arguments(files), "--out", tmp_path / "m.toml")
-    assert all(told["ledger"][1]["holdout"][signal] < 1.15 * level for signal, level in told["floor"].items())
-    leakage = told["parameters"]["jack.leakage"]
-    assert leakage["low"] < 1.4e-11 < leakage["high"] < 1.1 * leakage["low"]

@@ -29,7 +29,7 @@ from fdi.trace.trace import Trace
 from rig.benches.bench_file import load_bench
 from rig.recorder import Event, NmtState, Record, Recorder, Signals, Timing
 from rig.sequences import load_sequence
-from rig.view.live_process import find_viewer_place, show_live
+from rig.view.live_process import find_viewer_place
 from rig.view.live_run import LiveRun, make_live_plan
 from rig.view.live_show import describe_line, draw_screen, follow_log
 from rig.view.viewer import find_free_port, is_listening
@@ -69,24 +69,6 @@ def test_what_is_written_is_there_soon(tmp_path: Path) -> None:
 def test_a_log_that_cannot_be_read_is_the_end(tmp_path: Path) -> None:
     (tmp_path / "trace.mcap").mkdir()
     assert list(follow_log(tmp_path / "trace.mcap")) == []
-
-
-class LeavesFolder:
-    """What the Python of a sequence may do where the plan arrives."""
-
-    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
-        return os.chdir, ("/",)
-
-
-def test_log_in_a_relative_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                                  capfd: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.chdir(tmp_path)
-    record_run(Path("trace.mcap"), stop=1000)
-    plan = make_live_plan(load_sequence("preflight"), "lockstep", load_bench())
-    with show_live(plan._replace(title=LeavesFolder()), Path("trace.mcap"), last_cpu_is_taken=False) as begin:
-        begin()
-    said = capfd.readouterr().err
-    assert "Traceback" not in said and "live: 0.7 of 13.5 s" in said.splitlines()[-1]
 
 
 Records = list[tuple[int, Record]]
