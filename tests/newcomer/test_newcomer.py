@@ -7,18 +7,14 @@ from pathlib import Path
 import pytest
 from bad_inputs import BAD_INPUTS, find_faults, write_bad_files
 from places import ROOT
-from play_newcomer import make_environment
 from rig_command import finished, rig, started
 from shown_commands import (
     NOT_PLAYED,
     NOT_PLAYED_PAGES,
     NOT_PLAYED_SECTIONS,
     PARTS,
-    Part,
     find_section,
     list_command_lines,
-    list_steps,
-    play_part,
 )
 
 from plant.effects import CATALOGUE
@@ -39,16 +35,6 @@ def test_bad_input_gets_one_line_that_names_it(tmp_path: Path, monkeypatch: pyte
 def test_bad_inputs_are_of_every_command() -> None:
     assert {case.words.split()[0] for case in BAD_INPUTS} == {*COMMANDS, "fly"}
     assert len(BAD_INPUTS) >= 60
-
-
-@pytest.mark.parametrize("page", ["README.md", "docs/tutorial.md"])
-def test_every_line_of_a_page_is_a_step(page: str) -> None:
-    """The newcomer plays what the reader sees: no command is left out, and an answer stands below its command."""
-    text = (ROOT / page).read_text()
-    steps = list_steps(text)
-    shown = [line for line in text.splitlines() if line.startswith("    rig ")]
-    assert len([step for step in steps if step.text.startswith("rig ")]) == len(shown) > 10
-    assert steps[0].kind == "line" and [step for step in steps if step.kind == "answer"]
 
 
 def test_ctrl_c_ends_a_search_and_leaves_nothing(tmp_path: Path) -> None:
@@ -74,10 +60,3 @@ def test_every_command_line_of_a_page_is_played_or_has_a_reason() -> None:
     assert missing == []
     assert {*NOT_PLAYED_PAGES} <= {page for page, lines in shown.items() if lines} - {*played}
     assert {*NOT_PLAYED} <= {line for page in played for line in shown[page]}
-
-
-def test_the_page_of_rig_diff_is_played(tmp_path: Path) -> None:
-    """One page as it stands; `make newcomer` plays all."""
-    played = list(play_part(Part("docs/diff.md"), tmp_path, make_environment()))
-    assert [(done.line.split()[1], done.status, done.faults) for done in played] == [
-        ("run", 0, ()), ("run", 1, ()), ("diff", 1, ())]

@@ -2,9 +2,9 @@
 
 # Those of half a minute and more begin first and in this order: none is left to one worker at the end.
 LONGEST = (
-    "vcan/", "studies/test_robustness.py", "rig/campaign/", "examples/", "rig/run/test_hard_loop.py", "rig/run/test_session.py",
-    "rig/view/", "fdi/diagnosis/test_refine.py", "fdi/identification/", "fdi/discovery/test_discovery.py",
-    "fdi/comparison/test_compare.py", "studies/", "rig/run/", "plant/test_lanes.py",
+    "vcan/", "studies/test_robustness.py", "rig/campaign/", "examples/", "rig/run/test_hard_loop.py",
+    "rig/run/test_session.py", "rig/view/", "fdi/diagnosis/test_refine.py", "fdi/identification/",
+    "fdi/discovery/test_discovery.py", "fdi/comparison/test_compare.py", "studies/", "rig/run/", "plant/test_lanes.py",
     "plant/test_plant_on_other_cpus.py", "test_docs_site.py", "test_examples.py", "rig/firmware/", "rig/suite/",
 )
 LONG_TESTS = (

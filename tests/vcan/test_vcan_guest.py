@@ -5,6 +5,7 @@ skipped, saying how to get it; with EHA_RIG_REQUIRE_VCAN=1 (as in CI) it fails i
 """
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import dissect
 import pytest
 from log_rows import describe_first_difference
 from plugin_bus_summary import GUEST_TESTS, LEFT_TO_GUEST, NOTE
-from vcan_host import FOLDER, guest_missing, in_guest, kernel_has_vcan0, skip_or_fail
+from vcan_host import FOLDER, GUEST, guest_missing, in_guest, kernel_has_vcan0, skip_or_fail
 
 CYCLIC = (0x080, 0x182, 0x183, 0x202, 0x283)
 HEARTBEATS = {0x701: "heartbeat of 1", 0x702: "heartbeat of 2", 0x703: "heartbeat of 3"}
@@ -29,10 +30,9 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder in which the bus tests and the preflight run left what they found."""
     if not kernel_has_vcan0() and guest_missing():
         skip_or_fail(guest_missing())
-    if shutil.which("candump") is None:
-        skip_or_fail("candump is missing")
-    if shutil.which("gcc") is None:
-        skip_or_fail("gcc is missing")
+    for tool in ("candump", "gcc"):
+        if shutil.which(tool) is None:
+            skip_or_fail(f"{tool} is missing")
     folder = tmp_path_factory.mktemp("vcan")
     subprocess.run([sys.executable, FOLDER / "inside.py", folder, "compile"], check=True)
     parts = ["preflight", "examples"]
@@ -130,3 +130,11 @@ def test_wireshark_decodes_every_frame(
     assert {cob_id: name for cob_id, name in SERVICES.items() if not counts[cob_id]} == {}
     named = ", ".join(f"{cob_id:03X}: {number}" for cob_id, number in sorted(counts.items()))
     record_property(NOTE, f"vcan0: tshark decoded {len(rows)} CANopen frames, none malformed; {named}")
+
+
+def test_the_check_of_a_guest_names_the_missing_package(tmp_path: Path) -> None:
+    """A kernel that is not there."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "GUEST_KERNEL": "linux.missing"}
+    done = subprocess.run(["bash", GUEST, "--check"], env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (125, "", 1)
+    assert "apt-get install user-mode-linux" in done.stderr
