@@ -386,15 +386,6 @@ def test_side_by_side_is_alone() -> None:
     assert (Monitor(QUIET).closed_loop(values, STEP)[:, 0] == runs[:, 0]).all()
 
 
-def test_compiled_is_interpreted() -> None:
-    c, s, current = cell(0.25, 30.0), Motion(0.0, 0.0, 0.0, 0.0), 4e-4
-    runs = Monitor(QUIET).replay(np.array([[0.25, 30.0]]), np.full(30, current), whole=True)[0]
-    s = step_monitor(s, 0.0, H, c)
-    for k in range(1, 30):
-        assert runs[0, k] == pytest.approx(s.position, abs=1e-18) and runs[3, k] == pytest.approx(s.spool, rel=1e-13)
-        s = step_monitor(s, current, H, c)
-
-
 def test_replay_follows_the_measured_ram() -> None:
     """Anchored, the ram stays near the measured one, over missing samples too; free, it drifts away."""
     run = simulate(Model().replace({FAULTS[1]: 30.0}), PREFLIGHT[:6000])

@@ -146,11 +146,6 @@ def test_percentiles_of_known_wake_ups() -> None:
     assert priority.summarise_lateness(late, 1_000_000) == pytest.approx((1000, 1980, 1998, 2000, 1001, 501))
 
 
-def test_timer_lateness_counts_its_periods() -> None:
-    late = priority.measure_timer_lateness(0.05)
-    assert late.periods == 50 and 0 <= late.p50 <= late.p99 <= late.p99_9 <= late.max
-
-
 def test_fifo_ends_with_its_thread_and_is_none_without_the_right(monkeypatch: pytest.MonkeyPatch) -> None:
     assert priority.run_under_fifo(lambda: os.sched_getscheduler(0)) in (None, os.SCHED_FIFO)
     assert os.sched_getscheduler(0) == os.SCHED_OTHER

@@ -255,15 +255,13 @@ def test_wrong_calls_are_refused_and_the_unit_goes_on(bare: Bare) -> None:
 
 
 def test_messages_reach_the_logger(unit: Callable[[str, str], Path], tmp_path: Path) -> None:
-    from fmpy.fmi3 import FMU3Slave
+    from fmpy.fmi3 import FMU3Slave, fmi3LogMessageCallback
 
     path = unit("nominal", "3")
     said: list[str] = []
     described = fmpy.read_model_description(str(path))
     slave = FMU3Slave(guid=described.guid, unzipDirectory=fmpy.extract(str(path), str(tmp_path)),
                       modelIdentifier=described.coSimulation.modelIdentifier, instanceName="unit")
-    from fmpy.fmi3 import fmi3LogMessageCallback
-
     slave.instantiate(logMessage=fmi3LogMessageCallback(lambda _e, _s, _c, text: said.append(text.decode())))
     with pytest.raises(Exception, match="fmi3DoStep"):
         slave.doStep(0.0, 1e-3)

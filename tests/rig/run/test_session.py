@@ -332,12 +332,6 @@ def test_too_many_overruns_in_a_row_end_main(tmp_path: Path) -> None:
     assert phases(tmp_path)[1] == 0 and outcome.to_json()["judged"]["judged"] == 0
 
 
-def test_overruns_within_the_grace_do_not_count(tmp_path: Path) -> None:
-    text = SHORT + "[timing]\ntolerate = 0\nsync = 1e-9\ngrace = 10.0\n"
-    outcome = play(job(text, pace="realtime", max_overruns=0.0), tmp_path)
-    assert outcome.verdict == "PASS", outcome.why
-
-
 EFFECT = '''
 from typing import Annotated, NamedTuple
 from plant.effects import effect
@@ -387,12 +381,6 @@ def test_all_that_decides_is_in_the_log(tmp_path: Path) -> None:
     third = read_job(tmp_path / "b" / "trace.mcap")
     assert third.bench.files == again.bench.files == first.bench.files
     assert replace(third, bench=again.bench) == again
-
-
-def test_another_seed_is_another_run(tmp_path: Path) -> None:
-    for name, seed in (("a", 1), ("b", 2)):
-        play(job(seed=seed), tmp_path / name)
-    assert not same(tmp_path / "a", tmp_path / "b")
 
 
 def test_with_faults_loads_a_recorded_command_and_the_users_effect(tmp_path: Path) -> None:
