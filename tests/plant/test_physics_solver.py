@@ -1,7 +1,7 @@
-"""The plant against independent solvers and the recordings of another simulator, and the error of its step."""
+"""The plant against independent solvers, and the error of its step."""
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from physics_cases import FRICTIONLESS, PREFLIGHT, QUIET, SILENT, SMOOTH, build_profile
 from physics_reference import simulate_explicit, simulate_linear
-from places import ROOT, SHARED
+from places import ROOT
 
-from fdi.trace.trace import Trace
-from plant import Actuator, Model, simulate
+from plant import Model, simulate
 from plant.segments import Chirp, Hold, Ramp, Sine
 from rig.bench.benchmarks import measure_accuracy
 from rig.cli import main
@@ -110,41 +109,3 @@ def test_error_of_the_step_is_what_the_page_says() -> None:
         measured = [row[key] for key in most]
         assert said[:2] == pytest.approx(measured[:2], rel=0.1, abs=2e-4), line
         assert said[2:] == pytest.approx(measured[2:], rel=0.5), line  # the phase of stick-slip may differ by machine
-
-
-FOLDER = SHARED / "practice"
-practice = pytest.mark.skipif(not FOLDER.exists(), reason="no ../shared: no traces of an independent simulator")
-
-BENCH = {  # with scatter and coloured noise
-    "03": {"spool_overlap.overlap": 22e-6}, "04": {"jack.leakage": 1.4e-11},
-    "05": {"rod_backlash.width": 0.11e-3}, "07": {"transport_delay.cycles": 1.0},
-}
-
-
-@cache
-def trace(case: str, name: str) -> Trace:
-    return Trace.read(FOLDER / case / f"{name}.csv.gz")
-
-
-def residuals(case: str, name: str, changes: dict[str, float], steps: int = 100) -> np.ndarray:
-    """(n, 3) plant minus trace: XJ in um, P12 in bar, XS in um, driven by the measured current."""
-    measured = trace(case, name)
-    plant = Actuator(Model().replace(QUIET | changes), steps=steps)
-    out, current = np.empty((len(measured.t), 3)), 0.0
-    for k, (answer, load) in enumerate(zip(measured.cor.tolist(), measured.load.tolist(), strict=True)):
-        out[k] = plant.sample()
-        plant.advance(current, load)
-        current = answer
-    return (out - np.column_stack([measured.xj, measured.p12, measured.xs])) * [1e6, 1e-5, 1e6]
-
-
-def speed_error(case: str, changes: dict[str, float]) -> float:
-    """Scatter of 1.5 % stays, and drifts in XJ: so the speed over 20 cycles is compared; um."""
-    xj = residuals(case, "est", changes)[:, 0]
-    return float(rms(xj[20:] - xj[:-20]))
-
-
-@practice
-@pytest.mark.parametrize("case", BENCH)
-def test_the_true_effect_explains_most_of_a_scattered_plant(case: str) -> None:
-    assert speed_error(case, BENCH[case]) < 0.7 * speed_error(case, {})
