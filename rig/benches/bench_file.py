@@ -132,8 +132,7 @@ def load_bench(name_or_path: str = "eha", *, is_trusted: bool = False) -> Bench:
     if name_or_path in shipped:
         return _load_shipped(name_or_path)
     path = Path(name_or_path)
-    if path.suffix != ".toml":
-        raise InputError(name_or_path, "", f"a .toml file, or {list_choices(name_or_path, shipped)}")
+    require(path.suffix == ".toml", name_or_path, "", f"a .toml file, or {list_choices(name_or_path, shipped)}")
     return _parse_bench(str(path), read_file(path), lambda name: read_file(path.parent / name), path.parent,
                         is_trusted=is_trusted)
 
@@ -179,8 +178,7 @@ class _Reader:
 
     def read_file(self, name: str, place: Place) -> bytes:
         """The content of a file that the key at `place` names."""
-        if not name or "\\0" in name:
-            raise place.refuse("the name of a file")
+        place.require(name and "\\0" not in name, "the name of a file")
         try:
             self.files[name] = self._read(name)
         except InputError as error:
@@ -197,8 +195,8 @@ class _Reader:
         """The name of a checksum for `Field.checksum`; a file of the user's runs, if he trusts it."""
         file, _, function = kind.rpartition(":")
         if kind in CHECKSUMS or not file.endswith(".py"):
-            if kind not in CHECKSUMS:
-                raise place.refuse(f"counter, FILE.py:FUNCTION or a checksum: {list_choices(kind, CHECKSUMS)}")
+            place.require(kind in CHECKSUMS,
+                          f"counter, FILE.py:FUNCTION or a checksum: {list_choices(kind, CHECKSUMS)}")
             return kind
         is_announced = file in self.files
         source = self.read_file(file, place)
@@ -356,8 +354,7 @@ def _add_states(reader: _Reader, uses: dict[str, Use], keys: ControllerKeys, pla
     for name, values in _group_keys(keys.phases, dots).items():
         own = place.at("phases", name)
         for phase in values:
-            if phase not in PHASES:
-                raise own.refuse(f"values by phase: {list_choices(phase or None, PHASES)}")
+            own.require(phase in PHASES, f"values by phase: {list_choices(phase or None, PHASES)}")
         _add_use(uses, name, Use(place=own, is_received=True, values=values), is_canopen=is_canopen)
     for name, value in keys.ready.items():
         use = Use(place=place.at("ready", name), is_received=False, values={"main": value})
@@ -516,9 +513,9 @@ def _join_plant_node(reader: _Reader, specs: list[FrameSpec], sync: int | None, 
     for frame in frames:
         own = replace(_build_spec(frame, uses, Role.PLANT, signals), name=f"plant {frame.name}", roles=("valve_state",))
         other = joined.get(frame.identifier)
-        if other is None and frame.is_received:
-            raise place.at("inputs").refuse(f"a frame of the controller; it has none with the COB-ID of {frame.name}, "
-                                            f"{describe_identifier(frame.identifier)}")
+        place.at("inputs").require(other is not None or not frame.is_received,
+                                   f"a frame of the controller; it has none with the COB-ID of {frame.name}, "
+                                   f"{describe_identifier(frame.identifier)}")
         if other is not None:
             own = _join_frame(other, own, frame, place)
         joined[frame.identifier] = own
@@ -527,18 +524,18 @@ def _join_plant_node(reader: _Reader, specs: list[FrameSpec], sync: int | None, 
 
 def _join_frame(other: FrameSpec, own: FrameSpec, frame: DeviceFrame, place: Place) -> FrameSpec:
     """The frame that the controller has as `other` and the plant node as `own`."""
-    if not frame.is_received and other.sender is Role.CONTROLLER:
-        raise place.at("outputs").refuse(f"COB-IDs that the controller does not send; {frame.name} has "
-                                         f"{describe_identifier(frame.identifier)} too")
+    place.at("outputs").require(frame.is_received or other.sender is not Role.CONTROLLER,
+                                f"COB-IDs that the controller does not send; {frame.name} has "
+                                f"{describe_identifier(frame.identifier)} too")
     places = [[(each.lowest, each.length) for each in spec.fields] for spec in (other, own)]
     fields = []
     for theirs, ours in zip(other.fields, own.fields, strict=False):
         if theirs.name and ours.name and theirs != ours:
             places.append([])
         fields.append(theirs if theirs.name else ours)
-    if places[0] != places[-1] or other.length != own.length:
-        raise place.at("eds").refuse(f"the layout and counts of the controller's {other.name} in {frame.name}, "
-                                     f"{describe_identifier(frame.identifier)}")
+    place.at("eds").require(places[0] == places[-1] and other.length == own.length,
+                            f"the layout and counts of the controller's {other.name} in {frame.name}, "
+                            f"{describe_identifier(frame.identifier)}")
     if frame.is_received:
         return replace(other, fields=tuple(fields))
     return replace(other, fields=tuple(fields), sender=Role.PLANT, every=own.every, is_answer=own.is_answer,
@@ -551,9 +548,9 @@ def _check_identifiers(bench: Bench, place: Place) -> None:
     for spec in bench.frames.frames:
         identifier = spec.identifier & ~FD
         message = spec.name.partition("[")[0]  # its pages share the identifier
-        if taken.setdefault(identifier, message) != message:
-            raise place.at("controller").refuse(f"each identifier once; {spec.name} and {taken[identifier]} have "
-                                                f"{describe_identifier(identifier)}")
+        place.at("controller").require(taken.setdefault(identifier, message) == message,
+                                       f"each identifier once; {spec.name} and {taken[identifier]} have "
+                                       f"{describe_identifier(identifier)}")
 
 
 _PLANT_BENCH, _PLANT_DBC = "plant_bench.toml", "plant_bench.dbc"

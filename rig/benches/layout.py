@@ -156,9 +156,8 @@ def compute_counts(slot: Slot, value: float | str, place: Place) -> float:
         InputError: an unknown name, or a value that the signal cannot hold.
     """
     if isinstance(value, str):
-        if value not in slot.choices:
-            raise place.refuse(f"a number{' or ' if slot.choices else ''}{list_choices(None, slot.choices)}"
-                               f", not {value!r}")
+        place.require(value in slot.choices,
+                      f"a number{' or ' if slot.choices else ''}{list_choices(None, slot.choices)}, not {value!r}")
         return slot.choices[value]
     counts = (Fraction(str(value)) - slot.offset) / slot.scale if slot.scale else Fraction(0)
     low, high = slot.bits.range

@@ -2,7 +2,8 @@
 from rig.device.device import Device
 from rig.device.dictionary import Dictionary, Value
 from rig.device.emcy import EmcyCode, ErrorRegister
-from rig.device.sdo import Abort, SdoAbort
+from rig.device.sdo import Abort, SdoAbort, abort_unless
 from rig.network.node_objects import NmtCommand, NmtState
 
-__all__ = ["Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value"]
+__all__ = ["Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value",
+           "abort_unless"]

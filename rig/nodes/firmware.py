@@ -14,7 +14,7 @@ from plant.run import Demand, report_law_errors
 from rig.benches.bench import Bench, Role, SignalObject, make_reader, make_writer
 from rig.benches.bench_file import load_bench
 from rig.benches.profiles import Control, Status
-from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
+from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, abort_unless
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import CONTROLLER, GAINS, Gains
 
@@ -75,12 +75,10 @@ class Firmware:
 
     def _on_write(self, index: int, sub: int, data: bytes) -> None:
         """Reject NaN and infinite gains (they would produce a NaN current), a negative limit and a period of 0."""
-        if index != GAINS:
-            return
-        value = struct.unpack("<d", data)[0]
-        is_limit, is_period = sub == _CURRENT_LIMIT, sub == _PERIOD
-        if not isfinite(value) or (is_limit and value < 0.0) or (is_period and value <= 0.0):
-            raise SdoAbort(Abort.VALUE)
+        if index == GAINS:
+            value = struct.unpack("<d", data)[0]
+            is_possible = {_CURRENT_LIMIT: value >= 0.0, _PERIOD: value > 0.0}.get(sub, True)
+            abort_unless(isfinite(value) and is_possible, Abort.VALUE)
 
     def _trip(self, node: int = 0) -> None:
         self._fault = True

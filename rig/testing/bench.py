@@ -193,8 +193,7 @@ def build_sequence(sequence: str | None, command: Command | None, rate: float = 
             return named
         table, files, name = tomllib.loads(named.source), dict(named.files), named.name
     else:
-        if sequence is not None:
-            raise InputError("sequence", sequence, "either a sequence or a command")
+        require(sequence is None, "sequence", str(sequence), "either a sequence or a command")
         table, files = _make_table(command, rate, find_plant(plant).signals.command.name)
         name = "command.toml"
     table |= {key: [*table.get(key, []), *entries] for key, entries in added.items()}

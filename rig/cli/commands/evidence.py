@@ -8,7 +8,7 @@ from fdi.output import require_new
 from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell, Column, Line, Report, Section, tabulate
 from fdi.report.run_report import MOODS
-from plant.errors import InputError, escape_control_characters, require
+from plant.errors import escape_control_characters, require
 from rig.cli.answer import give_answer, show_progress
 from rig.evidence.contents import BILL, add_index, collect_runs
 from rig.evidence.package import verify_package, write_package
@@ -47,8 +47,9 @@ def pack(args: argparse.Namespace) -> int:
     out = Path(args.out or "evidence.zip")
     if out.suffix == ".zip":
         require_new(out, is_forced=args.force)
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError("--out", str(out), "a FILE.zip, or a folder that is new or empty")
+    else:
+        require(not out.exists() or (out.is_dir() and not any(out.iterdir())), "--out", str(out),
+                "a FILE.zip, or a folder that is new or empty")
     require(not any(out.resolve().is_relative_to(Path(run).resolve()) for run in args.runs), "--out", str(out),
             "a place outside the runs that it packs")
     with show_progress(is_silent=args.json or args.quiet) as progress:
