@@ -28,8 +28,7 @@ def run_command(args: argparse.Namespace) -> int:
 
 def verify(args: argparse.Namespace) -> int:
     """Print a line for each file that was changed, is missing or was added."""
-    with show_progress(is_silent=args.json or args.quiet) as progress:
-        progress("verifying", 0.0)
+    with show_progress(args, "verifying"):
         found = verify_package(Path(args.verify), args.key or "")
     lines = [Line(word, escape_control_characters(name), "bad") for word in ("changed", "missing", "added")
              for name in getattr(found, word)]
@@ -52,8 +51,7 @@ def pack(args: argparse.Namespace) -> int:
                 "a FILE.zip, or a folder that is new or empty")
     require(not any(out.resolve().is_relative_to(Path(run).resolve()) for run in args.runs), "--out", str(out),
             "a place outside the runs that it packs")
-    with show_progress(is_silent=args.json or args.quiet) as progress:
-        progress("reading", 0.0)
+    with show_progress(args, "reading") as progress:
         package = collect_runs(args.runs)
         judged = [*(run.judged for run in package.runs), *package.lost]
         if args.requirements:

@@ -20,8 +20,7 @@ def run_command(args: argparse.Namespace) -> int:
     require(len(effects) == 1, "effect", effects[-1], "one effect at a time")
     path = choose_model_file(args, trace)
     page = choose_file(str(path.with_suffix(".html")), (".html",), trace) if trace else None
-    with show_progress(is_silent=args.json or args.quiet) as progress:
-        progress("reading", 0.0)
+    with show_progress(args, "reading") as progress:
         runs = find_runs(model, known, trace, args.repeat, args.holdout, list_signals(args)) if trace else None
         update = remove_effect_and_refit(effects[0], runs, model, known, format_command_line(), progress)
     return give_answer(build_model_report(update, path, write_model_file(update, path), page), args,

@@ -31,7 +31,7 @@ def run_command(args: argparse.Namespace) -> int:
     rrd = choose_recording(args)
     if args.screenshot:
         require_writable(args.screenshot, "--screenshot", source=args.trace)
-    with show_progress(is_silent=args.json or args.quiet) as progress:
+    with show_progress(args) as progress:
         drawing = draw(args, progress)
         progress("writing the recording", 0.0)
         write_recording(drawing, rrd)
