@@ -13,14 +13,13 @@ from plant.controller import Loop, compute_current
 from plant.run import Demand, report_law_errors
 from rig.benches.bench import Bench, Role, SignalObject, make_reader, make_writer
 from rig.benches.bench_file import load_bench
-from rig.benches.profiles import Control, Status
+from rig.benches.profiles import CIA408, State
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, abort_unless
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import CONTROLLER, GAINS, Gains
 
-# As plain integers: an operation on an IntFlag takes a microsecond, and there are five in each cycle.
-_RESET, _ACTIVE = int(Control.RESET), int(Control.ACTIVE)
-_LOOP_CLOSED, _READY = int(Status.MODE), int(Status.READY)
+_RESET, _ACTIVE = CIA408.reset, CIA408.ladder[State.ACTIVE]
+_LOOP_CLOSED, _READY = CIA408.powered, 0x8  # bits of the status word; the second: no fault
 _CURRENT_LIMIT, _PERIOD = 4, 5  # sub-indices of GAINS
 LOST_AFTER = 3  # SYNCs in a row without feedback, or without a command
 _COMMAND, _FEEDBACK = 1, 2  # RPDO numbers, first information byte of EMCY 0x8250

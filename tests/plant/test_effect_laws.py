@@ -20,7 +20,7 @@ from plant.eha import State, compute_coefficients, compute_metering_line, step_a
 from plant.kernels import unpack_state
 from plant.plants import find_plant
 from plant.state import Input, Line
-from rig.benches.profiles import Control
+from rig.benches.profiles import CIA408
 
 MILLI = 1e-3
 ADVANCED = np.random.default_rng(1).uniform(-4e-3, 4e-3, 60)  # A, a new one each cycle
@@ -306,7 +306,7 @@ def test_the_rigs_own_firmware_limits_the_rate_too() -> None:
     desk = FirmwareDesk(Model().replace({"command_rate_limit.rate": 0.1}))
     wanted = [0.0, *(0.1e-3 * k for k in range(1, 6))]
     for _ in range(2):
-        drives = [desk.cycle(int(Control.ACTIVE), demand) for demand in (0.0, *[5e-3] * 5)]
+        drives = [desk.cycle(CIA408.ladder[-1], demand) for demand in (0.0, *[5e-3] * 5)]
         assert [drive and drive.current for drive in drives] == pytest.approx([3.8 * x for x in wanted], abs=1e-8)
         desk.cycle(0)
 
