@@ -1,5 +1,4 @@
 """Runs one job (nodes and bus, log, session, checks), and its outcome: verdict, checks, timing, verdict.json."""
-from __future__ import annotations
 
 import contextlib
 import fcntl
@@ -56,6 +55,24 @@ from rig.sequences.uncertainty import NO_METROLOGY, Metrology, collect_metrology
 
 STATUS_OF_VERDICT = {"PASS": 0, "NOT_JUDGED": 0, "FAIL": 1, "CANNOT_TELL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
 INTERRUPTED = 130
+
+
+class LimitReached(NamedTuple):
+    """A limit that a run reached."""
+
+    parameter: str  # of the model: the limit
+    signal: str
+    limit: float  # SI; reached on either side of zero
+    t: float  # s of main, when it was reached first
+    seconds: float  # how long the signal was there, in all
+
+    def describe(self, signals: Signals) -> str:
+        """The limit in words, such as "ram at its stop (40 mm) for 120 ms, first at t = 1.250 s"."""
+        signal = signals.find(self.signal)
+        words = f"{signal.phrase} at its {'limit' if signal.role == 'drive' else 'stop'}"
+        shown = signals.controlled if signal.unit == signals.controlled.unit else signal
+        return (f"{words} ({shown.shown_scale * self.limit:.3g} {shown.shown_unit}) for "
+                f"{1e3 * self.seconds:.0f} ms, first at t = {self.t:.3f} s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,24 +306,6 @@ def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str, re
 
 
 NEAR_A_STOP = 5.0  # standard deviations of the sensor's noise from a stop within which a reading is at it
-
-
-class LimitReached(NamedTuple):
-    """A limit that a run reached."""
-
-    parameter: str  # of the model: the limit
-    signal: str
-    limit: float  # SI; reached on either side of zero
-    t: float  # s of main, when it was reached first
-    seconds: float  # how long the signal was there, in all
-
-    def describe(self, signals: Signals) -> str:
-        """The limit in words, such as "ram at its stop (40 mm) for 120 ms, first at t = 1.250 s"."""
-        signal = signals.find(self.signal)
-        words = f"{signal.phrase} at its {'limit' if signal.role == 'drive' else 'stop'}"
-        shown = signals.controlled if signal.unit == signals.controlled.unit else signal
-        return (f"{words} ({shown.shown_scale * self.limit:.3g} {shown.shown_unit}) for "
-                f"{1e3 * self.seconds:.0f} ms, first at t = {self.t:.3f} s")
 
 
 def find_limits(column: Callable[[str], NDArray[np.float64]], model: Model, zero: int) -> tuple[LimitReached, ...]:

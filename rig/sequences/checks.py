@@ -4,13 +4,12 @@ Every kind of check is a row of `KINDS`: the number that it measures, its unit, 
 number is held against `low` and `high`, all three in `unit`. What no run could answer (0 Hz, an empty band) is refused
 when the check is read. On a run a check never raises: what cannot be measured has failed, and `detail` says why.
 """
-from __future__ import annotations
 
 from cmath import phase
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import degrees, inf, isfinite, nan
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,10 +151,10 @@ class DriveFrames(NamedTuple):
     status: NDArray[np.int64]  # status word
     words: ProfileWords = CIA408  # what it means
 
-    def select_between(self, t0: float, t1: float) -> DriveFrames:
+    def select_between(self, t0: float, t1: float) -> Self:
         """Those with t0 <= t < t1."""
         chosen = (self.t >= t0 - 1e-9) & (self.t < t1 - 1e-9)  # times come from ns
-        return DriveFrames(self.t[chosen], self.current[chosen], self.status[chosen], self.words)
+        return self._replace(t=self.t[chosen], current=self.current[chosen], status=self.status[chosen])
 
     @property
     def states(self) -> NDArray[np.int64]:
