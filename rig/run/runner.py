@@ -429,8 +429,7 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     """Play the session of a job and judge it. Raises RigError."""
     progress("bring-up", 0.0)
     session.bring_up()
-    loop = session.stage.loop
-    assert loop is not None
+    loop = session.stage.playing
     stopwatch = WallClock()
     with contextlib.ExitStack() as rights:
         if job.realtime:
