@@ -162,7 +162,7 @@ class FrameSpec:
     identifier: int  # with EXTENDED and FD
     length: int  # bytes
     sender: Role
-    fields: tuple[Field, ...]
+    fields: tuple[Field, ...] = ()
     every: int = 1  # cycles from one to the next
     is_before_sync: bool = False  # sent before SYNC, with which its values take effect
     is_switched: bool = False  # CAN FD: the data go at the higher bit rate

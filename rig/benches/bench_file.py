@@ -236,7 +236,7 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, signals
         text = reader.read_text(keys.controller.dbc, place.at("dbc"), "DBC")
         dbc = keys.controller.dbc or ""
         frames = map_messages(dbc, read_database(dbc, text), uses, cycle_ns)
-    specs = [_build_spec(frame, uses, Role.RIG if frame.is_received else Role.CONTROLLER, signals) for frame in frames]
+    specs = [_build_spec(frame, uses, signals) for frame in frames]
     if keys.plant_node is not None:
         specs, nodes[Role.PLANT] = _join_plant_node(reader, specs, sync, nodes, folder, signals)
     reader.place.require(len(specs) <= MOST_FRAMES, f"at most {MOST_FRAMES} frames or pages of multiplexed ones")
@@ -487,14 +487,12 @@ def _list_settings(plant: str, dictionary: Any, parameters: Mapping[str, str],
         yield found.index, found.subindex, parameter
 
 
-def _build_spec(frame: DeviceFrame, uses: Mapping[str, Use], sender: Role, signals: Signals) -> FrameSpec:
+def _build_spec(frame: DeviceFrame, uses: Mapping[str, Use], signals: Signals) -> FrameSpec:
     """A frame of the controller as one of the bench."""
-    spec = FrameSpec(name=frame.name, identifier=frame.identifier, length=frame.length, sender=sender,
-                     fields=build_fields(frame, uses), every=frame.every, is_before_sync=frame.is_before_sync,
-                     is_answer=frame.is_answer, is_switched=frame.is_switched)
-    roles = {"drive": sender is Role.CONTROLLER and spec.has(signals.drive.word),
-             "command": sender is Role.RIG and spec.has(signals.command.word, "control_word"),
-             "feedback": sender is Role.RIG and spec.has(*list_measured(signals))}
+    spec = replace(frame.spec, fields=build_fields(frame, uses))
+    roles = {"drive": not frame.is_received and spec.has(signals.drive.word),
+             "command": frame.is_received and spec.has(signals.command.word, "control_word"),
+             "feedback": frame.is_received and spec.has(*list_measured(signals))}
     return replace(spec, roles=tuple(role for role, is_own in roles.items() if is_own))
 
 
@@ -511,22 +509,23 @@ def _join_plant_node(reader: _Reader, specs: list[FrameSpec], sync: int | None, 
     place.at("eds").require(own_sync == sync, "the controller's identifier of SYNC in 0x1005")
     joined = {spec.identifier: spec for spec in specs}
     for frame in frames:
-        own = replace(_build_spec(frame, uses, Role.PLANT, signals), name=f"plant {frame.name}", roles=("valve_state",))
-        other = joined.get(frame.identifier)
+        own = replace(frame.spec, name=f"plant {frame.spec.name}", sender=Role.PLANT, fields=build_fields(frame, uses),
+                      roles=("valve_state",))
+        other = joined.get(own.identifier)
         place.at("inputs").require(other is not None or not frame.is_received,
-                                   f"a frame of the controller; it has none with the COB-ID of {frame.name}, "
-                                   f"{describe_identifier(frame.identifier)}")
+                                   f"a frame of the controller; it has none with the COB-ID of {frame.spec.name}, "
+                                   f"{describe_identifier(own.identifier)}")
         if other is not None:
             own = _join_frame(other, own, frame, place)
-        joined[frame.identifier] = own
+        joined[own.identifier] = own
     return list(joined.values()), node
 
 
 def _join_frame(other: FrameSpec, own: FrameSpec, frame: DeviceFrame, place: Place) -> FrameSpec:
     """The frame that the controller has as `other` and the plant node as `own`."""
     place.at("outputs").require(frame.is_received or other.sender is not Role.CONTROLLER,
-                                f"COB-IDs that the controller does not send; {frame.name} has "
-                                f"{describe_identifier(frame.identifier)} too")
+                                f"COB-IDs that the controller does not send; {frame.spec.name} has "
+                                f"{describe_identifier(own.identifier)} too")
     places = [[(each.lowest, each.length) for each in spec.fields] for spec in (other, own)]
     fields = []
     for theirs, ours in zip(other.fields, own.fields, strict=False):
@@ -534,8 +533,8 @@ def _join_frame(other: FrameSpec, own: FrameSpec, frame: DeviceFrame, place: Pla
             places.append([])
         fields.append(theirs if theirs.name else ours)
     place.at("eds").require(places[0] == places[-1] and other.length == own.length,
-                            f"the layout and counts of the controller's {other.name} in {frame.name}, "
-                            f"{describe_identifier(frame.identifier)}")
+                            f"the layout and counts of the controller's {other.name} in {frame.spec.name}, "
+                            f"{describe_identifier(own.identifier)}")
     if frame.is_received:
         return replace(other, fields=tuple(fields))
     return replace(other, fields=tuple(fields), sender=Role.PLANT, every=own.every, is_answer=own.is_answer,
