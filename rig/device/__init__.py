@@ -2,8 +2,7 @@
 from rig.device.device import Device
 from rig.device.dictionary import Dictionary, Value
 from rig.device.emcy import EmcyCode, ErrorRegister
-from rig.device.sdo import Abort, SdoAbort, abort_unless
+from rig.device.sdo import Abort, SdoAbort
 from rig.network.node_objects import NmtCommand, NmtState
 
-__all__ = ["Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value",
-           "abort_unless"]
+__all__ = ["Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value"]

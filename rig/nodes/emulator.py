@@ -14,7 +14,7 @@ from plant.errors import InputError, require
 from plant.signals import Signals
 from rig.benches.bench import Bench, CanopenNode, Flags, FrameSpec
 from rig.benches.bench_file import load_bench
-from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort, abort_unless
+from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
 from rig.network import heartbeat
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import COUNTERS, PLANT, SCENARIO
@@ -30,7 +30,8 @@ def accept_scenario(device: Device, data: bytes, load: Callable[[Scenario], None
     Raises:
         SdoAbort: the node is OPERATIONAL, or the bytes are no scenario that can be run.
     """
-    abort_unless(device.state is not NmtState.OPERATIONAL, Abort.STATE)
+    if device.state is NmtState.OPERATIONAL:
+        raise SdoAbort(Abort.STATE)
     try:
         load(Scenario.from_bytes(data))
     except InputError as error:

@@ -14,7 +14,7 @@ from plant.run import Demand, report_law_errors
 from rig.benches.bench import Bench, Role, SignalObject, make_reader, make_writer
 from rig.benches.bench_file import load_bench
 from rig.benches.profiles import CIA408, State
-from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, abort_unless
+from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import CONTROLLER, GAINS, Gains
 
@@ -77,7 +77,8 @@ class Firmware:
         if index == GAINS:
             value = struct.unpack("<d", data)[0]
             is_possible = {_CURRENT_LIMIT: value >= 0.0, _PERIOD: value > 0.0}.get(sub, True)
-            abort_unless(isfinite(value) and is_possible, Abort.VALUE)
+            if not (isfinite(value) and is_possible):
+                raise SdoAbort(Abort.VALUE)
 
     def _trip(self, node: int = 0) -> None:
         self._fault = True
