@@ -14,6 +14,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rig.benches.bench import Bench, describe_identifier
 from rig.benches.bench_report import list_loads
 from rig.network import bus, udp
@@ -22,6 +25,7 @@ from rig.network.frame import Frame, WallClock
 from rig.run import priority
 
 Status = Literal["ok", "limited", "missing"]
+TIMER_PERIOD = 1_000_000  # ns
 
 
 class Finding(NamedTuple):
@@ -260,14 +264,15 @@ def examine_rights() -> list[Finding]:
 
 def measure_timers(seconds: float) -> Iterator[Finding]:
     """Lateness of a 1 kHz timer, measured now: as an ordinary process, and under SCHED_FIFO where that is allowed."""
-    ordinary = priority.measure_timer_lateness(seconds)
-    yield _make_timer_finding("timer at 1 kHz", ordinary, "what --pace realtime can expect here")
-    if (fifo := priority.run_under_fifo(lambda: priority.measure_timer_lateness(seconds))) is not None:
-        yield _make_timer_finding("timer under FIFO", fifo, "the same with real-time priority")
+    ordinary = priority.measure_timer_lateness(seconds, TIMER_PERIOD)
+    yield grade_timer("timer at 1 kHz", ordinary, "what --pace realtime can expect here")
+    if (fifo := priority.run_under_fifo(lambda: priority.measure_timer_lateness(seconds, TIMER_PERIOD))) is not None:
+        yield grade_timer("timer under FIFO", fifo, "the same with real-time priority")
 
 
-def _make_timer_finding(name: str, late: priority.Lateness, purpose: str) -> Finding:
-    text = f"late by {late.p50:.0f} us (p50), {late.p99:.0f} (p99), {late.p99_9:.0f} (p99.9), {late.max:.0f} (max)"
-    missed = f"; {late.missed} of {late.periods} periods missed" if late.missed else ""
-    return _grade("real time", name, not late.missed, text + missed, purpose,
-                  "an idle machine, real-time priority, PREEMPT_RT")
+def grade_timer(name: str, late_ns: NDArray[np.int64], purpose: str) -> Finding:
+    """Percentiles of the lateness, and how many periods were over at the wake-up."""
+    late, missed = priority.compute_percentiles(late_ns * 1e-9), int(np.count_nonzero(late_ns >= TIMER_PERIOD))
+    text = (f"late by {late['p50']:.0f} us (p50), {late['p99']:.0f} (p99), {late['p99_9']:.0f} (p99.9), "
+            f"{late['max']:.0f} (max){f'; {missed} of {len(late_ns)} periods missed' if missed else ''}")
+    return _grade("real time", name, not missed, text, purpose, "an idle machine, real-time priority, PREEMPT_RT")

@@ -5,6 +5,7 @@ that most other programs follow: a test case has neither properties nor elements
 """
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 from xml.etree import ElementTree
@@ -33,7 +34,7 @@ class TestSuite(NamedTuple):
 
 def write_junit(name: str, suites: Sequence[TestSuite]) -> str:
     """The JUnit XML of these suites. Control characters, which XML does not allow, become question marks."""
-    counts = [_count_problems(suite) for suite in suites]
+    counts = [Counter(case.problem for case in suite.cases) for suite in suites]
     root = ElementTree.Element(
         "testsuites", name=_clean(name), tests=str(sum(len(suite.cases) for suite in suites)),
         failures=str(sum(count["failure"] for count in counts)), errors=str(sum(count["error"] for count in counts)))
@@ -50,10 +51,6 @@ def write_junit(name: str, suites: Sequence[TestSuite]) -> str:
             _add_case(element, case)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
-
-
-def _count_problems(suite: TestSuite) -> dict[str, int]:
-    return {word: sum(case.problem == word for case in suite.cases) for word in ("failure", "error", "skipped")}
 
 
 def _add_case(suite: ElementTree.Element, case: TestCase) -> None:

@@ -150,8 +150,7 @@ def find_first_difference(sound: Path, faulty: Path) -> float | None:
     """When the frames of two logs first differ, s of main; None if they never do."""
     for one, other in zip_longest(_list_frames(sound), _list_frames(faulty)):
         if one != other:
-            times = [frame[0] for frame in (one, other) if frame is not None]
-            return min(times)
+            return min(frame[0] for frame in (one, other) if frame is not None)
     return None
 
 

@@ -2,14 +2,14 @@
 
 import argparse
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Fault
-from fdi.prognosis.trend import Trend, fit_trend
+from fdi.prognosis.trend import fit_trend
 from fdi.progress import Progress
 from fdi.report.report import Column, Line, Report, Section, Table, to_plain
 from fdi.thresholds import INTERVAL_95_SD, TREND_FEWEST_TRACES
@@ -209,15 +209,15 @@ def score_unit(unit: Unit, predict: Predict = predict_unit, every: int = 2) -> S
         relative=tuple(1.0 - abs(float(np.median(most)) - left) / left for _, most, left in drawn),
         held_middle=tuple(_is_covered(predictions[n].middle, middle - unit.t[n - 1]) for n in evaluated),
         held_most=tuple(_is_covered(most, left) for _, most, left in drawn),
-        width=tuple(_interval_width(most) / left for _, most, left in drawn),
+        width=tuple((high - low) / left for left, (low, high) in ((left, _interval(most)) for _, most, left in drawn)),
         below=tuple(float(_interval(most)[0] > left) for _, most, left in drawn),
         latency=(start - unit.onset) / life)
 
 
-def find_false_trends(units: Iterable[Unit]) -> list[Trend]:
-    """The trends of healthy units that have one after all their traces."""
-    trends = [fit_trend(unit.fault, list(unit.t), unit.sizes) for unit in units]
-    return [trend for trend in trends if trend.verdict == "TREND"]
+def has_false_trend(seed: int) -> bool:
+    """Whether a healthy unit has a trend after all its traces."""
+    unit = simulate_healthy_unit(seed)
+    return fit_trend(unit.fault, list(unit.t), unit.sizes).verdict == "TREND"
 
 
 def _probability_within(drawn: Floats, truth: float, bound: float) -> float:
@@ -229,11 +229,6 @@ def _interval(drawn: Floats) -> tuple[float, float]:
     """The 95 % interval of the drawn times."""
     low, high = np.quantile(drawn, [0.025, 0.975], method="nearest")
     return float(low), float(high)
-
-
-def _interval_width(drawn: Floats) -> float:
-    low, high = _interval(drawn)
-    return high - low
 
 
 def _is_covered(drawn: Floats, truth: float) -> float:
@@ -271,7 +266,7 @@ def score_laws(units: int, seed: int, progress: Progress, healthy_ratio: int = 5
     healthy = list(range(seed, seed + healthy_ratio * units))
     total = len(jobs) + len(healthy)
     scores = _run_in_order(_score_simulated_unit, jobs, lambda done: progress("units", done / total))
-    false_trends = _run_in_order(_count_false_trends, healthy,
+    false_trends = _run_in_order(has_false_trend, healthy,
                                  lambda done: progress("healthy units", (len(jobs) + done) / total))
     groups = {law: [s for s in scores if s.law == law] for law in LAWS}
     groups["laws fitted"] = [s for s in scores if s.law in FITTED]
@@ -295,10 +290,6 @@ def _raise_failure(job: object, reason: str) -> Any:
 
 def _score_simulated_unit(job: tuple[str, int]) -> Score:
     return score_unit(simulate_unit(*job))
-
-
-def _count_false_trends(seed: int) -> int:
-    return len(find_false_trends([simulate_healthy_unit(seed)]))
 
 
 def summarise_law(law: str, group: Sequence[Score]) -> LawScores:

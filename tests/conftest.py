@@ -31,7 +31,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """The longest first, so that no worker is left with one of them; leave out the long ones if --quick was given."""
-    items.sort(key=lambda item: not item.nodeid.removeprefix("tests/").startswith(LONGEST))
+    places = (*LONGEST, "")
+    items.sort(key=lambda item: [item.nodeid.removeprefix("tests/").startswith(place) for place in places].index(True))
     if config.getoption("--quick"):
         root = config.rootpath / "tests"
         long = [item for item in items if item.path.relative_to(root).as_posix().startswith(LONG_TESTS)]

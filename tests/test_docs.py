@@ -126,10 +126,6 @@ def test_files_and_names_in_the_text_exist() -> None:
             assert hasattr(importlib.import_module(module), attribute), f"{page.name}: {dotted}"
 
 
-def test_the_readme_is_short() -> None:
-    assert len(README.splitlines()) <= 120
-
-
 def test_every_figure_has_a_caption() -> None:
     """A line in italics below the figure that says what to see in it."""
     for page in PAGES:

@@ -1,4 +1,4 @@
-"""Docstrings and comments name only what exists: a name in backticks is defined in the project or used in that file."""
+"""Docstrings and comments name only what exists: a name in backticks is a word of the project's code."""
 
 import ast
 import builtins
@@ -9,7 +9,6 @@ import keyword
 import re
 import sys
 import tokenize
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -22,62 +21,33 @@ FOREIGN = {*LIBRARIES, "resid", "array_split", "udp_multicast", "_asdict", "ro",
 
 
 @cache
-def list_nodes(source: str) -> list[ast.AST]:
-    """All nodes of the syntax tree of a file."""
-    return list(ast.walk(ast.parse(source)))
-
-
-def list_definitions(source: str) -> Iterator[str]:
-    """Functions and classes, and the names that a module or a class assigns."""
-    for node in list_nodes(source):
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            yield node.name
-        if isinstance(node, ast.Module | ast.ClassDef):
-            for statement in node.body:
-                if isinstance(statement, ast.Assign | ast.AnnAssign):
-                    yield from (part.id for part in ast.walk(statement)
-                                if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store))
+def split_source(source: str) -> tuple[str, set[str]]:
+    """Docstrings and comments of a file, and the words of its code and of its other texts, such as keys of files."""
+    nodes = list(ast.walk(ast.parse(source)))
+    documented = [node for node in nodes if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module)]
+    texts = [ast.get_docstring(node, clean=False) or "" for node in documented]
+    words: set[str] = set()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            texts.append(token.string)
+        elif token.type == tokenize.NAME or not any(text and text in token.string for text in texts):
+            words |= set(re.split(r"\W+", token.string))
+    return "\n".join(texts), words
 
 
 @cache
 def list_known_names() -> set[str]:
-    """What Python, other programs and the project define, and the names of the project's files and folders."""
-    defined = {name for path in FILES for name in list_definitions(path.read_text())}
+    """What Python, other programs and the project's code name, and the names of the project's files and folders."""
+    code = {name for path in FILES for name in split_source(path.read_text())[1]}
     parts = {part for path in FILES for part in path.relative_to(ROOT).with_suffix("").parts}
-    return {*dir(builtins), *keyword.kwlist} | FOREIGN | defined | parts
-
-
-def find_docstrings(source: str) -> Iterator[ast.Constant]:
-    for node in list_nodes(source):
-        if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module) and ast.get_docstring(node) is not None:
-            first = node.body[0]
-            assert isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant)
-            yield first.value
-
-
-def list_words(source: str) -> Iterator[str]:
-    """Names that the code of a file uses, and the words of its texts, which may be keys of files and messages."""
-    docstrings = set(find_docstrings(source))
-    for node in list_nodes(source):
-        if isinstance(node, ast.Name):
-            yield node.id
-        elif isinstance(node, ast.Attribute):
-            yield node.attr
-        elif isinstance(node, ast.arg | ast.keyword) and node.arg:
-            yield node.arg
-        elif isinstance(node, ast.alias):
-            yield from (node.asname or node.name).split(".")
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in docstrings:
-            yield from re.split(r"\W+", node.value)
+    return {*dir(builtins), *keyword.kwlist} | FOREIGN | code | parts
 
 
 def find_unknown_names(source: str) -> list[str]:
     """Names in backticks in the docstrings and comments of a file that nothing defines or uses."""
-    tokens = tokenize.generate_tokens(io.StringIO(source).readline) if re.search("#.*`", source) else ()
-    texts = [str(node.value) for node in find_docstrings(source)]
-    texts += [token.string for token in tokens if token.type == tokenize.COMMENT]
-    known = list_known_names() | set(list_words(source))
-    return [name for text in texts for name in NAME.findall(text) if not set(filter(None, name.split("."))) <= known]
+    text, words = split_source(source)
+    known = list_known_names() | words
+    return [name for name in NAME.findall(text) if not set(filter(None, name.split("."))) <= known]
 
 
 def test_names_in_backticks_exist() -> None:

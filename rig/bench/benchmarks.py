@@ -46,6 +46,7 @@ from rig.run.hard_loop import compile_cycle
 from rig.run.loop import CycleInput, CycleLoop, History, Loop
 from rig.run.priority import (
     LOOP_PRIORITY,
+    compute_percentiles,
     list_cpus,
     lock_memory,
     prevent_deep_sleep,
@@ -140,14 +141,6 @@ def choose_priority() -> int:
 def pool_times(blocks: list[Times]) -> dict[str, Floats]:
     """The times of all blocks, by quantity."""
     return {quantity: np.concatenate([block[quantity] for block in blocks]) for quantity in blocks[0]}
-
-
-def compute_percentiles(seconds: Floats) -> dict[str, float]:
-    """p50, p99, p99.9 and the largest of the values that are there, us."""
-    known = seconds[~np.isnan(seconds)] * 1e6
-    if not len(known):
-        return {}
-    return dict(zip(("p50", "p99", "p99_9", "max"), np.percentile(known, (50, 99, 99.9, 100)).tolist(), strict=True))
 
 
 def describe_conditions(figures: Mapping[str, Any]) -> Line:

@@ -4,7 +4,6 @@ A frame says where each value lies, what a count is worth, who sends it, and whe
 EDS, DCF or DBC becomes a `Bench`. Python packs and unpacks with `pack` and `unpack`; compiled loops use the tables of
 packing.py, which hold the same.
 """
-from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping
@@ -13,7 +12,7 @@ from enum import IntEnum, IntFlag
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 from plant.errors import InputError
 from plant.signals import EHA, Signals
@@ -163,7 +162,7 @@ class FrameSpec:
     identifier: int  # with EXTENDED and FD
     length: int  # bytes
     sender: Role
-    fields: tuple[Field, ...]
+    fields: tuple[Field, ...] = ()
     every: int = 1  # cycles from one to the next
     is_before_sync: bool = False  # sent before SYNC, with which its values take effect
     is_switched: bool = False  # CAN FD: the data go at the higher bit rate
@@ -470,7 +469,7 @@ class Bench:
                   if each.name == word and each.kind is not Kind.FLOAT]
         return max(self.noise or 2e-6, 0.2 * max(counts, default=0.0))
 
-    def replace_signals(self, signals: Signals, noise: float, model: str) -> Bench:
+    def replace_signals(self, signals: Signals, noise: float, model: str) -> Self:
         """The bench with the plant of another model: its signals, and the noise of the controlled one's sensor.
 
         Raises:

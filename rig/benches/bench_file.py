@@ -132,8 +132,7 @@ def load_bench(name_or_path: str = "eha", *, is_trusted: bool = False) -> Bench:
     if name_or_path in shipped:
         return _load_shipped(name_or_path)
     path = Path(name_or_path)
-    if path.suffix != ".toml":
-        raise InputError(name_or_path, "", f"a .toml file, or {list_choices(name_or_path, shipped)}")
+    require(path.suffix == ".toml", name_or_path, "", f"a .toml file, or {list_choices(name_or_path, shipped)}")
     return _parse_bench(str(path), read_file(path), lambda name: read_file(path.parent / name), path.parent,
                         is_trusted=is_trusted)
 
@@ -179,8 +178,7 @@ class _Reader:
 
     def read_file(self, name: str, place: Place) -> bytes:
         """The content of a file that the key at `place` names."""
-        if not name or "\\0" in name:
-            raise place.refuse("the name of a file")
+        place.require(name and "\\0" not in name, "the name of a file")
         try:
             self.files[name] = self._read(name)
         except InputError as error:
@@ -197,8 +195,8 @@ class _Reader:
         """The name of a checksum for `Field.checksum`; a file of the user's runs, if he trusts it."""
         file, _, function = kind.rpartition(":")
         if kind in CHECKSUMS or not file.endswith(".py"):
-            if kind not in CHECKSUMS:
-                raise place.refuse(f"counter, FILE.py:FUNCTION or a checksum: {list_choices(kind, CHECKSUMS)}")
+            place.require(kind in CHECKSUMS,
+                          f"counter, FILE.py:FUNCTION or a checksum: {list_choices(kind, CHECKSUMS)}")
             return kind
         is_announced = file in self.files
         source = self.read_file(file, place)
@@ -238,7 +236,7 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, signals
         text = reader.read_text(keys.controller.dbc, place.at("dbc"), "DBC")
         dbc = keys.controller.dbc or ""
         frames = map_messages(dbc, read_database(dbc, text), uses, cycle_ns)
-    specs = [_build_spec(frame, uses, Role.RIG if frame.is_received else Role.CONTROLLER, signals) for frame in frames]
+    specs = [_build_spec(frame, uses, signals) for frame in frames]
     if keys.plant_node is not None:
         specs, nodes[Role.PLANT] = _join_plant_node(reader, specs, sync, nodes, folder, signals)
     reader.place.require(len(specs) <= MOST_FRAMES, f"at most {MOST_FRAMES} frames or pages of multiplexed ones")
@@ -356,8 +354,7 @@ def _add_states(reader: _Reader, uses: dict[str, Use], keys: ControllerKeys, pla
     for name, values in _group_keys(keys.phases, dots).items():
         own = place.at("phases", name)
         for phase in values:
-            if phase not in PHASES:
-                raise own.refuse(f"values by phase: {list_choices(phase or None, PHASES)}")
+            own.require(phase in PHASES, f"values by phase: {list_choices(phase or None, PHASES)}")
         _add_use(uses, name, Use(place=own, is_received=True, values=values), is_canopen=is_canopen)
     for name, value in keys.ready.items():
         use = Use(place=place.at("ready", name), is_received=False, values={"main": value})
@@ -490,14 +487,12 @@ def _list_settings(plant: str, dictionary: Any, parameters: Mapping[str, str],
         yield found.index, found.subindex, parameter
 
 
-def _build_spec(frame: DeviceFrame, uses: Mapping[str, Use], sender: Role, signals: Signals) -> FrameSpec:
+def _build_spec(frame: DeviceFrame, uses: Mapping[str, Use], signals: Signals) -> FrameSpec:
     """A frame of the controller as one of the bench."""
-    spec = FrameSpec(name=frame.name, identifier=frame.identifier, length=frame.length, sender=sender,
-                     fields=build_fields(frame, uses), every=frame.every, is_before_sync=frame.is_before_sync,
-                     is_answer=frame.is_answer, is_switched=frame.is_switched)
-    roles = {"drive": sender is Role.CONTROLLER and spec.has(signals.drive.word),
-             "command": sender is Role.RIG and spec.has(signals.command.word, "control_word"),
-             "feedback": sender is Role.RIG and spec.has(*list_measured(signals))}
+    spec = replace(frame.spec, fields=build_fields(frame, uses))
+    roles = {"drive": not frame.is_received and spec.has(signals.drive.word),
+             "command": frame.is_received and spec.has(signals.command.word, "control_word"),
+             "feedback": frame.is_received and spec.has(*list_measured(signals))}
     return replace(spec, roles=tuple(role for role, is_own in roles.items() if is_own))
 
 
@@ -514,31 +509,32 @@ def _join_plant_node(reader: _Reader, specs: list[FrameSpec], sync: int | None, 
     place.at("eds").require(own_sync == sync, "the controller's identifier of SYNC in 0x1005")
     joined = {spec.identifier: spec for spec in specs}
     for frame in frames:
-        own = replace(_build_spec(frame, uses, Role.PLANT, signals), name=f"plant {frame.name}", roles=("valve_state",))
-        other = joined.get(frame.identifier)
-        if other is None and frame.is_received:
-            raise place.at("inputs").refuse(f"a frame of the controller; it has none with the COB-ID of {frame.name}, "
-                                            f"{describe_identifier(frame.identifier)}")
+        own = replace(frame.spec, name=f"plant {frame.spec.name}", sender=Role.PLANT, fields=build_fields(frame, uses),
+                      roles=("valve_state",))
+        other = joined.get(own.identifier)
+        place.at("inputs").require(other is not None or not frame.is_received,
+                                   f"a frame of the controller; it has none with the COB-ID of {frame.spec.name}, "
+                                   f"{describe_identifier(own.identifier)}")
         if other is not None:
             own = _join_frame(other, own, frame, place)
-        joined[frame.identifier] = own
+        joined[own.identifier] = own
     return list(joined.values()), node
 
 
 def _join_frame(other: FrameSpec, own: FrameSpec, frame: DeviceFrame, place: Place) -> FrameSpec:
     """The frame that the controller has as `other` and the plant node as `own`."""
-    if not frame.is_received and other.sender is Role.CONTROLLER:
-        raise place.at("outputs").refuse(f"COB-IDs that the controller does not send; {frame.name} has "
-                                         f"{describe_identifier(frame.identifier)} too")
+    place.at("outputs").require(frame.is_received or other.sender is not Role.CONTROLLER,
+                                f"COB-IDs that the controller does not send; {frame.spec.name} has "
+                                f"{describe_identifier(own.identifier)} too")
     places = [[(each.lowest, each.length) for each in spec.fields] for spec in (other, own)]
     fields = []
     for theirs, ours in zip(other.fields, own.fields, strict=False):
         if theirs.name and ours.name and theirs != ours:
             places.append([])
         fields.append(theirs if theirs.name else ours)
-    if places[0] != places[-1] or other.length != own.length:
-        raise place.at("eds").refuse(f"the layout and counts of the controller's {other.name} in {frame.name}, "
-                                     f"{describe_identifier(frame.identifier)}")
+    place.at("eds").require(places[0] == places[-1] and other.length == own.length,
+                            f"the layout and counts of the controller's {other.name} in {frame.spec.name}, "
+                            f"{describe_identifier(own.identifier)}")
     if frame.is_received:
         return replace(other, fields=tuple(fields))
     return replace(other, fields=tuple(fields), sender=Role.PLANT, every=own.every, is_answer=own.is_answer,
@@ -551,9 +547,9 @@ def _check_identifiers(bench: Bench, place: Place) -> None:
     for spec in bench.frames.frames:
         identifier = spec.identifier & ~FD
         message = spec.name.partition("[")[0]  # its pages share the identifier
-        if taken.setdefault(identifier, message) != message:
-            raise place.at("controller").refuse(f"each identifier once; {spec.name} and {taken[identifier]} have "
-                                                f"{describe_identifier(identifier)}")
+        place.at("controller").require(taken.setdefault(identifier, message) == message,
+                                       f"each identifier once; {spec.name} and {taken[identifier]} have "
+                                       f"{describe_identifier(identifier)}")
 
 
 _PLANT_BENCH, _PLANT_DBC = "plant_bench.toml", "plant_bench.dbc"

@@ -84,12 +84,10 @@ def read_calibration(tables: Mapping[str, Mapping[str, Any]], place: Place,
     for word, table in tables.items():
         own = place.at(word)
         if word == "decision":
-            if table.get("") not in DECISIONS:
-                raise own.refuse(list_choices(table.get(""), DECISIONS))
+            own.require(table.get("") in DECISIONS, list_choices(table.get(""), DECISIONS))
             decision = table[""]
             continue
-        if word not in sensed:
-            raise own.refuse(f"decision or a measured signal: {list_choices(word, sensed)}")
+        own.require(word in sensed, f"decision or a measured signal: {list_choices(word, sensed)}")
         signal = sensed[word]
         own.require(signal.name not in found, f"each signal once; {signal.name} and {signal.alias} are the same")
         keys = build_dataclass(SensorKeys, {key: str(value) if isinstance(value, datetime.date) else value

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from plant.errors import InputError, require, suggest_name
 from plant.tables import list_choices
-from rig.benches.bench import EXTENDED, FD, MOST_FRAMES, Field, Kind
+from rig.benches.bench import EXTENDED, FD, MOST_FRAMES, Field, FrameSpec, Kind, Role
 from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 
 if TYPE_CHECKING:
@@ -58,8 +58,8 @@ def map_messages(name: str, database: Any, uses: Mapping[str, Use], cycle_ns: in
             raise use.place.refuse(f"a signal of message {message}: {list_choices(signal, known)}")
         grouped.setdefault(message, {})[full] = use
     switched = _find_switched(database)
-    return [replace(frame, is_switched=bool(frame.identifier & FD) and message in switched)
-            for message, own in grouped.items() for frame in _map_message(name, messages[message], own, cycle_ns)]
+    return [frame for message, own in grouped.items()
+            for frame in _map_message(name, messages[message], own, cycle_ns, is_switched=message in switched)]
 
 
 def _find_switched(database: Any) -> set[str]:
@@ -78,7 +78,8 @@ def _find_switched(database: Any) -> set[str]:
     return found
 
 
-def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns: int) -> Iterator[DeviceFrame]:
+def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns: int, *, is_switched: bool
+                 ) -> Iterator[DeviceFrame]:
     ways = {use.is_received for use in uses.values()} - {None}
     place = next(iter(uses.values())).place
     if len(ways) != 1:
@@ -99,11 +100,11 @@ def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns:
         on_page = [replace(slots[signal.name], start=page[signal.name], is_selector=True) if signal.name in page else
                    slots[signal.name] for signal in message.signals if _is_on_page(signals, signal.name, page)]
         is_needed = any(slot.name in uses and uses[slot.name].is_needed for slot in on_page)
-        yield DeviceFrame(
+        yield DeviceFrame(slots=tuple(on_page), spec=FrameSpec(
             name=f"{message.name}[{'.'.join(map(str, page.values()))}]" if page else message.name,
-            identifier=identifier, length=message.length, is_received=True in ways, slots=tuple(on_page),
-            every=_find_period(name, message, cycle_ns),
-            is_answer=True in ways or is_needed or (len(pages) == 1 and bool(message.cycle_time)))
+            identifier=identifier, length=message.length, sender=Role.RIG if True in ways else Role.CONTROLLER,
+            every=_find_period(name, message, cycle_ns), is_switched=is_fd and is_switched,
+            is_answer=True in ways or is_needed or (len(pages) == 1 and bool(message.cycle_time))))
 
 
 Page = Mapping[str, int]  # values of selectors

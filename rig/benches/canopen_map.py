@@ -11,7 +11,7 @@ from canopen.objectdictionary import ODVariable, datatypes
 from canopen.objectdictionary.eds import import_eds
 
 from plant.errors import InputError, require
-from rig.benches.bench import EXTENDED, Field, Kind
+from rig.benches.bench import EXTENDED, Field, FrameSpec, Kind, Role
 from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 
 INVALID = 1 << 31  # in a COB-ID: the PDO is switched off
@@ -217,10 +217,11 @@ def _map_pdo(name: str, dictionary: Any, pdo: Pdo, own: set[str], *, is_answer: 
         slots.append(Slot(name=key if key in own else "", start=read_start(found),
                           bits=Field(name="", lowest=lowest, length=length, kind=kind)))
         lowest += length
-    return DeviceFrame(
-        name=pdo.name, identifier=_read_identifier(pdo.cob_id), length=(lowest + 7) // 8, is_received=pdo.is_received,
-        slots=tuple(slots), every=pdo.kind if not pdo.is_received and 1 <= pdo.kind <= 240 else 1,
-        is_before_sync=pdo.is_received and pdo.kind <= 240, is_answer=is_answer or pdo.is_received)
+    return DeviceFrame(slots=tuple(slots), spec=FrameSpec(
+        name=pdo.name, identifier=_read_identifier(pdo.cob_id), length=(lowest + 7) // 8,
+        sender=Role.RIG if pdo.is_received else Role.CONTROLLER,
+        every=pdo.kind if not pdo.is_received and 1 <= pdo.kind <= 240 else 1,
+        is_before_sync=pdo.is_received and pdo.kind <= 240, is_answer=is_answer or pdo.is_received))
 
 
 def read_start(found: ODVariable | None) -> float:

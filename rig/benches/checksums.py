@@ -62,7 +62,7 @@ CHECKSUMS = {
     "e2e_profile_1": Crc(0x1D, 0, 0, has_data_id=True),  # AUTOSAR PRS E2E, profile 1A
     "e2e_profile_2": Crc(0x2F),  # AUTOSAR PRS E2E, profile 2, with a data ID for each counter
 }
-_USERS: dict[str, UserChecksum] = {}  # by `Field.checksum`
+USERS_CHECKSUMS: dict[str, UserChecksum] = {}  # by `Field.checksum`
 
 
 def compute_checksum(each: Field, data: bytes, counter: int) -> int:
@@ -80,16 +80,11 @@ def compute_checksum(each: Field, data: bytes, counter: int) -> int:
         crc = CHECKSUMS[each.checksum]
         return compute_crc8(crc.list_bytes(each, data, counter), crc.polynomial, crc.start, crc.inversion)
     try:
-        return int(_USERS[each.checksum](insert_bits(each, data, 0), counter)) & (1 << each.length) - 1
+        return int(USERS_CHECKSUMS[each.checksum](insert_bits(each, data, 0), counter)) & (1 << each.length) - 1
     except Exception as error:
         name, _, function = each.checksum.partition("#")[0].rpartition(":")
         raise InputError(name, function, f"a whole number from (data, counter), not "
                                          f"{type(error).__name__}: {error}") from error
-
-
-def find_user_checksum(name: str) -> UserChecksum:
-    """The user's function of `Field.checksum`."""
-    return _USERS[name]
 
 
 def load_checksum(name: str, source: bytes, function: str) -> str:
@@ -99,13 +94,13 @@ def load_checksum(name: str, source: bytes, function: str) -> str:
         InputError: not Python, or no such function.
     """
     known = f"{name}:{function}#{hashlib.sha256(source).hexdigest()[:8]}"
-    if known not in _USERS:
+    if known not in USERS_CHECKSUMS:
         module = run_file(Path(name), source)
         for place, value in vars(module).items():  # tables: compiled code takes constants alone
             if isinstance(value, list | bytearray):
                 vars(module)[place] = bytes(value) if isinstance(value, bytearray) else tuple(value)
         require(callable(getattr(module, function, None)), name, function,
                 "a function (data: bytes, counter: int) -> int")
-        _USERS[known] = getattr(module, function)
+        USERS_CHECKSUMS[known] = getattr(module, function)
         compute_checksum(Field(name="", lowest=0, length=8, guard=Guard.CHECKSUM, checksum=known), bytes(8), 0)
     return known

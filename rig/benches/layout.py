@@ -11,7 +11,7 @@ from typing import Any
 
 from plant.tables import Place, list_choices
 from plant.units import fit_unit
-from rig.benches.bench import Field, Guard, Kind, encode_float, list_bits
+from rig.benches.bench import Field, FrameSpec, Guard, Kind, Role, encode_float, list_bits
 
 PHASES = ("setup", "main", "cleanup", "safe")
 _PLAIN = {"": Fraction(1), "-": Fraction(1), "1": Fraction(1), "%": Fraction(1, 100)}  # units of a plain number
@@ -52,17 +52,15 @@ class Slot:
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceFrame:
-    """A frame of the device as its EDS or DBC describes it."""
+    """A frame of the device as its EDS or DBC describes it: what a bench needs but its fields, and where values lie."""
 
-    name: str
-    identifier: int
-    length: int
-    is_received: bool
+    spec: FrameSpec
     slots: tuple[Slot, ...]
-    every: int = 1
-    is_before_sync: bool = False
-    is_answer: bool = True
-    is_switched: bool = False
+
+    @property
+    def is_received(self) -> bool:
+        """By the device."""
+        return self.spec.sender is Role.RIG
 
 
 @contextmanager
@@ -90,13 +88,13 @@ def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ..
         use, length = uses.get(slot.name), slot.bits.length
         places = list_bits(slot.bits) if length <= 64 else []
         other = next((taken[place] for place in places if place in taken), "")
-        is_inside = bool(places) and min(places) >= 0 and max(places) < 8 * frame.length
+        is_inside = bool(places) and min(places) >= 0 and max(places) < 8 * frame.spec.length
         if use is not None:
             use.place.require(length <= 64 and (slot.bits.kind is not Kind.FLOAT or length in (32, 64)),
                               f"at most 64 bits, and 32 or 64 for a floating point number; {slot.name} has "
                               f"{length}")
-            use.place.require(is_inside, f"a signal inside its frame; {slot.name} lies outside the {frame.length} "
-                              f"bytes of {frame.name}")
+            use.place.require(is_inside, f"a signal inside its frame; {slot.name} lies outside the {frame.spec.length} "
+                              f"bytes of {frame.spec.name}")
             use.place.require(not other, f"signals that do not overlap; {slot.name} has bits of {other}")
         if is_inside and not other:
             taken |= dict.fromkeys(places, slot.name)
@@ -156,9 +154,8 @@ def compute_counts(slot: Slot, value: float | str, place: Place) -> float:
         InputError: an unknown name, or a value that the signal cannot hold.
     """
     if isinstance(value, str):
-        if value not in slot.choices:
-            raise place.refuse(f"a number{' or ' if slot.choices else ''}{list_choices(None, slot.choices)}"
-                               f", not {value!r}")
+        place.require(value in slot.choices,
+                      f"a number{' or ' if slot.choices else ''}{list_choices(None, slot.choices)}, not {value!r}")
         return slot.choices[value]
     counts = (Fraction(str(value)) - slot.offset) / slot.scale if slot.scale else Fraction(0)
     low, high = slot.bits.range

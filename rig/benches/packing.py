@@ -15,7 +15,7 @@ from plant.compile import ForeignCall, compile_function, keep_apart, raise_unbou
 from plant.errors import InputError
 from plant.machine_code import find_function_address
 from rig.benches.bench import Field, FrameSpec, Guard, Kind, Role
-from rig.benches.checksums import CHECKSUMS, find_user_checksum
+from rig.benches.checksums import CHECKSUMS, USERS_CHECKSUMS
 
 # Words of the layout: a scratch word, the payload, then counts and places of the tables
 _SCRATCH, PAYLOAD = 0, 8
@@ -294,8 +294,8 @@ def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], mine: Role
         rules = [_find_rule(one) for one in each.fields]
         words[at: at + FRAME_WORDS] = (
             each.identifier, each.length, each.every, is_mine, each.is_before_sync, each.is_answer, _CYCLE in rules,
-            _find_roles(each) | 1 << _FIRST_OWN_BIT + number, field, field + _FIELD_WORDS * len(each.fields), -1,
-            0 if is_mine else -1, 0, 0, -1, each.sent_as)
+            sum(BITS[role] for role in each.roles) | 1 << _FIRST_OWN_BIT + number, field,
+            field + _FIELD_WORDS * len(each.fields), -1, 0 if is_mine else -1, 0, 0, -1, each.sent_as)
         for one, rule in zip(each.fields, rules, strict=True):
             _fill_field(m, field, one, rule, places.get(one.name, -1))
             if one in each.selectors:
@@ -313,11 +313,6 @@ def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], mine: Role
 def list_frame_places(m: Layout) -> range:
     """Where the frames of a layout stand, in order."""
     return range(FRAMES_AT, FRAMES_AT + FRAME_WORDS * int(m.words[FRAMES]), FRAME_WORDS)
-
-
-def _find_roles(frame: FrameSpec) -> int:
-    """Bits of the roles that faults and rows know; of the controller's frames the drive is the one with its output."""
-    return sum(BITS[role] for role in frame.roles)
 
 
 def _find_rule(field: Field) -> int:
@@ -364,7 +359,7 @@ def _find_address(field: Field) -> int:
         InputError: it cannot be compiled.
     """
     if field.checksum not in _COMPILED:
-        run = compile_function(call_users_checksum, {"users_checksum": find_user_checksum(field.checksum)})
+        run = compile_function(call_users_checksum, {"users_checksum": USERS_CHECKSUMS[field.checksum]})
         try:
             run(np.zeros(8, np.uint8), 0)
         except Exception as error:  # whatever numba has against it

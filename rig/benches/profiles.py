@@ -4,7 +4,7 @@ Both enable in steps, up a ladder of states. A step up is asked for only when th
 before; a step down may skip others. The functions take plain numbers, so that compiled loops can call them.
 """
 
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 from typing import NamedTuple
 
 
@@ -20,26 +20,6 @@ class State(IntEnum):
     FAULT_REACTION = 6  # Fault reaction active
     FAULT = 7
     UNKNOWN = 8  # a status word that the profile does not have, or none yet
-
-
-class Control(IntFlag):
-    """Control word 0x6040 of CiA 408: all three level bits set = device mode active."""
-
-    DISABLE = 0x1  # D: 1 = not disabled
-    HOLD = 0x2  # H: 1 = hold released
-    MODE = 0x4  # M: 1 = device mode active, the loop is closed
-    RESET = 0x8  # R: a rising edge acknowledges a fault
-    ACTIVE = DISABLE | HOLD | MODE
-
-
-class Status(IntFlag):
-    """Status word 0x6041 of CiA 408: the level bits echo what is in force."""
-
-    DISABLE = 0x1
-    HOLD = 0x2
-    MODE = 0x4
-    READY = 0x8  # R: no fault
-    ACTIVE = DISABLE | HOLD | MODE | READY
 
 
 class ProfileWords(NamedTuple):
@@ -73,8 +53,8 @@ CIA402 = ProfileWords(  # IEC 61800-7-201 (CiA 402-2), state machine, tables of 
     delay=0.4,  # the standard has no limit; a drive may have a brake to release
     active="Operation enabled",
 )
-CIA408 = ProfileWords(  # docs/bus.md
-    ladder=(0x0, 0x1, 0x3, 0x7),
+CIA408 = ProfileWords(  # docs/bus.md; the status word has the bits of the levels in force, and 0x8: no fault
+    ladder=(0x0, 0x1, 0x3, 0x7),  # with one bit more each: not disabled, hold released, device mode active
     reset=0x8, quick_stop=0x0,
     commands=_list_pairs((0x7, 0x1, State.READY), (0x7, 0x3, State.ON), (0x7, 0x7, State.ACTIVE)),
     states=_list_pairs((0xF, 0x8, State.OFF), (0xF, 0x9, State.READY), (0xF, 0xB, State.ON), (0xF, 0xF, State.ACTIVE),

@@ -118,8 +118,8 @@ def build_matrix(tables: Mapping[str, Any], model: Model, work: str, where: obje
     require(settings.signals in measured, where, "signals", f"one of {' or '.join(measured)}, not {settings.signals!r}")
     load_nominal_test(model.kind, model["controller.period"])
     blocks = tables.get("case", [])
-    if not isinstance(blocks, list) or not blocks or not all(isinstance(block, Mapping) for block in blocks):
-        raise InputError(where, "case", "at least one [[case]] (an empty one is a healthy plant)")
+    is_list = isinstance(blocks, list) and all(isinstance(block, Mapping) for block in blocks)
+    require(blocks and is_list, where, "case", "at least one [[case]] (an empty one is a healthy plant)")
     parsed = [_parse_block(block, given, model, place, faults) for block in blocks]
     spec = {**settings.list_values(), **list_shared(model, work, faults), "case": parsed}
     return Matrix(spec, _expand_cases(spec))

@@ -2,7 +2,6 @@
 
 import hashlib
 import pickle
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -44,11 +43,6 @@ def measure_sensitivity(unit: Unit, answer: Answer, file: Path, workers: Workers
     report_progress("where the sizes begin", 0.0)
     first, key, clock, before = find_first_rungs(answer, unit.effects), hash_unit(unit), WallClock(), 0
 
-    def plan_round(jobs: Sequence[Injection]) -> Batch:
-        return Batch({job.number: job for job in jobs}, partial(_make_row, unit=unit, key=key), "number",
-                     partial(_describe_failure, key=key), lambda row: row.get("key") == key,
-                     lambda row: row["verdict"] == CRASHED)
-
     def show(finished: BatchProgress, is_open: int, before: int) -> None:
         made, decided = before + finished.done, len(unit.effects) - is_open
         runs_left = finished.total - finished.done + TYPICAL_RUNS * is_open
@@ -63,7 +57,10 @@ def measure_sensitivity(unit: Unit, answer: Answer, file: Path, workers: Workers
             if not jobs:
                 return summarise_injections(unit, known)
             is_open = len({job.effect for job in jobs})
-            run_batch(plan_round(jobs), rows, workers, partial(show, is_open=is_open, before=before))
+            batch = Batch({job.number: job for job in jobs}, partial(_make_row, unit=unit, key=key), "number",
+                          partial(_describe_failure, key=key), lambda row: row.get("key") == key,
+                          lambda row: row["verdict"] == CRASHED)
+            run_batch(batch, rows, workers, partial(show, is_open=is_open, before=before))
             before += len(jobs)
 
 

@@ -99,8 +99,7 @@ def give_answer(report: Report, args: argparse.Namespace, status: int = 0, place
     if places.answer is not None:
         write_text(places.answer, reports.to_json(report.data) + "\n")
     if places.page is not None:
-        with show_progress(is_silent=args.json or args.quiet) as progress:
-            progress("writing", 0.0)
+        with show_progress(args, "writing"):
             reports.write_html(report, places.page)
     if args.json:
         print(reports.to_json(report.data))
@@ -133,24 +132,27 @@ def discard_output() -> None:
 
 
 @contextlib.contextmanager
-def show_progress(*, is_silent: bool, is_realtime: bool = False) -> Iterator[Progress]:
+def show_progress(args: argparse.Namespace, stage: str = "", *, is_silent: bool = False, is_realtime: bool = False
+                  ) -> Iterator[Progress]:
     """Give a `Progress` whose calls move a bar on standard error; the bar disappears at the end.
 
     Args:
+        args: of the command; with --json and --quiet nothing is shown.
+        stage: what begins now.
         is_silent: show nothing.
         is_realtime: show a plain line without a refreshing thread, which would delay a real-time loop.
 
     Nothing is shown where standard error is no terminal.
     """
-    if is_silent or not sys.stderr.isatty():
+    if is_silent or args.json or args.quiet or not sys.stderr.isatty():
         yield ignore_progress
         return
-    with _show_line() if is_realtime else _show_bar() as update:
+    with _show_line() if is_realtime else _show_bar(stage or "starting") as update:
         yield update
 
 
 @contextlib.contextmanager
-def _show_bar(delay: float = 2.0) -> Iterator[Progress]:
+def _show_bar(stage: str, delay: float = 2.0) -> Iterator[Progress]:
     """A bar that appears after `delay` s: shorter work needs none."""
     from rich.console import Console  # here: 0.1 s that a command without a bar does not spend
     from rich.progress import BarColumn, Progress as Bar, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -158,7 +160,7 @@ def _show_bar(delay: float = 2.0) -> Iterator[Progress]:
     bar = Bar(SpinnerColumn("line"), TextColumn("{task.description:<14}", markup=False), BarColumn(20),
               TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(),
               console=Console(stderr=True), transient=True)
-    task = bar.add_task("starting", total=None)
+    task = bar.add_task(stage, total=None)
 
     def update(stage: str, share: float) -> None:
         bar.update(task, description=stage, completed=share, total=1.0 if share > 0.0 else None)

@@ -52,7 +52,7 @@ def run_sequence(args: argparse.Namespace, pages: PageWriter) -> int:
     junit = choose_file(args.junit, (".xml",), None, "--junit")
     clock = WallClock()
     with catch_signals() as is_to_stop:
-        with (announce_run(job, why, is_silent=is_silent or is_on_screen) as progress,
+        with (announce_run(args, job, why, is_silent=is_silent or is_on_screen) as progress,
               choose_observer(job, folder / "trace.mcap", place, is_live=args.live is not None) as observer):
             prepare = pages.wait_until_loaded if job.realtime else lambda: None
             diagnose = partial(diagnose_servovalve, progress=progress) if args.fdi else None
@@ -111,10 +111,10 @@ def announce_dead_node(nodes: Mapping[int, str], t_ns: int, record: Record) -> N
 
 
 @contextlib.contextmanager
-def announce_run(job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
+def announce_run(args: argparse.Namespace, job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
     """Show the progress bar of a run, and say on standard output what runs on which bus and `why` on that."""
     is_announced = is_silent
-    with show_progress(is_silent=is_silent, is_realtime=job.realtime) as update:
+    with show_progress(args, is_silent=is_silent, is_realtime=job.realtime) as update:
         def announce(stage: str, share: float) -> None:
             nonlocal is_announced
             if not is_announced:  # not before there is a bus and a place for the results: an error is one line

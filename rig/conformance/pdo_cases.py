@@ -16,7 +16,6 @@ from rig.conformance.target import (
     STATE,
     VALUE,
     Case,
-    CaseNotApplicable,
     CaseSkipped,
     Pdo,
     Problem,
@@ -397,8 +396,8 @@ def set_type(t: Target, pdo: Pdo, *kinds: int) -> bool:
 
 def require_type(t: Target, pdo: Pdo, *kinds: int) -> None:
     """The same. Raises CaseNotApplicable for a PDO that takes none."""
-    if not set_type(t, pdo, *kinds):
-        raise CaseNotApplicable(f"no TPDO accepts transmission type {' or '.join(map(str, kinds))}")
+    require_applicable(set_type(t, pdo, *kinds),
+                       f"no TPDO accepts transmission type {' or '.join(map(str, kinds))}")
 
 
 list_received, list_sent = partial(list_valid, is_sent=False), partial(list_valid, is_sent=True)

@@ -219,8 +219,8 @@ def begin_upload(t: Target) -> tuple[Variable, bytes]:
 def begin_download(t: Target, variable: Variable, size: int) -> int:
     """Begin a segmented one; its abort code. Raises CaseNotApplicable for a server without segments."""
     code = t.try_demand(HEAD.pack(0x21, *variable.key) + size.to_bytes(4, "little"))
-    if code == COMMAND and find_long_writable(t) is None:
-        raise CaseNotApplicable("no object needs segments, and the server refuses them")
+    require_applicable(code != COMMAND or find_long_writable(t) is not None,
+                       "no object needs segments, and the server refuses them")
     return code
 
 

@@ -355,8 +355,7 @@ class Target:
     def require_writable(self, index: int, sub: int = 0) -> Variable:
         """The object in the EDS, if a master may write it. Raises CaseNotApplicable."""
         variable = self.variable(index, sub)
-        if not variable.is_writable:
-            raise CaseNotApplicable(f"0x{index:04X}:{sub:X} is {variable.access} in the EDS")
+        require_applicable(variable.is_writable, f"0x{index:04X}:{sub:X} is {variable.access} in the EDS")
         return variable
 
     @contextmanager
@@ -397,16 +396,15 @@ class Target:
         """Let the node send heartbeats often, so that its state is seen soon. Raises CaseNotApplicable, Refusal."""
         if self.fixed_heartbeat is None:
             self.write(0x1017, 0, milliseconds)
-        elif not self.fixed_heartbeat:
-            raise CaseNotApplicable("the node sends no heartbeat")
+        else:
+            require_applicable(self.fixed_heartbeat, "the node sends no heartbeat")
 
     def require_state(self, state: int, after: str) -> None:
         """Raises Problem unless the heartbeat says so, after the present frames have had their effect.
 
         Raises CaseNotApplicable for a node without heartbeat, CaseFailed where none comes.
         """
-        if self.fixed_heartbeat == 0.0:
-            raise CaseNotApplicable("the node sends no heartbeat")
+        require_applicable(self.fixed_heartbeat != 0.0, "the node sends no heartbeat")
         seconds = self.options.timeout + 1.0 + 3 * (self.fixed_heartbeat or 0.0)
         frames = self.wait_for(self.heartbeat_id, seconds, lambda frame: frame.data != b"\0", 2)
         if not frames:

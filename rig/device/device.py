@@ -7,7 +7,7 @@ from rig.device.dictionary import Dictionary, Value, check_consumer_entry, check
 from rig.device.emcy import HISTORY, Emcy, EmcyCode, ErrorRegister
 from rig.device.nmt import Nmt
 from rig.device.pdo import PARAMETERS, Pdos
-from rig.device.sdo import Abort, SdoAbort, SdoServer
+from rig.device.sdo import Abort, SdoAbort, SdoServer, abort_unless
 from rig.device.sync import SyncConsumer
 from rig.network.frame import Frame, Send
 from rig.network.heartbeat import HeartbeatConsumer, HeartbeatProducer
@@ -155,8 +155,7 @@ class Device:
         value = self.od.decode(index, sub, data)
         self._check(index, sub, value)
         if index == HISTORY:
-            if value != 0:
-                raise SdoAbort(Abort.VALUE)
+            abort_unless(value == 0, Abort.VALUE)
             self.emcy.erase_history()
             return
         self.on_write(index, sub, data)

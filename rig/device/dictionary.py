@@ -10,7 +10,7 @@ import canopen
 from canopen.objectdictionary import ODVariable, datatypes
 
 from plant.errors import InputError
-from rig.device.sdo import Abort, SdoAbort
+from rig.device.sdo import Abort, SdoAbort, abort_unless
 
 Value = int | float | bytes
 
@@ -73,16 +73,14 @@ class Dictionary:
     def encode(self, index: int, sub: int) -> bytes:
         """The value as SDO upload sends it. Raises SdoAbort: absent, write-only."""
         entry = self.find(index, sub)
-        if not entry.readable:
-            raise SdoAbort(Abort.WRITE_ONLY)
+        abort_unless(entry.readable, Abort.WRITE_ONLY)
         value = self.values[index, sub]
         return value if isinstance(value, bytes) else struct.pack("<" + entry.code, value)
 
     def find_size(self, index: int, sub: int) -> int:
         """Bytes an SDO download must bring, 0 for any number. Raises SdoAbort: absent, read-only."""
         entry = self.find(index, sub)
-        if not entry.writable:
-            raise SdoAbort(Abort.READ_ONLY)
+        abort_unless(entry.writable, Abort.READ_ONLY)
         return struct.calcsize("<" + entry.code)
 
     def decode(self, index: int, sub: int, data: bytes) -> Value:
@@ -90,13 +88,11 @@ class Dictionary:
         size, entry = self.find_size(index, sub), self.find(index, sub)
         if not entry.code:
             return data
-        if excess := len(data) - size:
-            raise SdoAbort(Abort.TOO_LONG if excess > 0 else Abort.TOO_SHORT)
+        abort_unless(len(data) >= size, Abort.TOO_SHORT)
+        abort_unless(len(data) <= size, Abort.TOO_LONG)
         value: int | float = struct.unpack("<" + entry.code, data)[0]
-        if entry.high is not None and value > entry.high:
-            raise SdoAbort(Abort.TOO_HIGH)
-        if entry.low is not None and value < entry.low:
-            raise SdoAbort(Abort.TOO_LOW)
+        abort_unless(entry.high is None or value <= entry.high, Abort.TOO_HIGH)
+        abort_unless(entry.low is None or value >= entry.low, Abort.TOO_LOW)
         return value
 
 
@@ -158,14 +154,10 @@ def check_switchable(old: int, new: int) -> None:
     Raises:
         SdoAbort: a 29-bit or restricted identifier, or a change of a valid one.
     """
-    if new & _UNUSED:
-        raise SdoAbort(Abort.VALUE)
-    if new & INVALID:
-        return
-    if is_restricted(new & _CAN_ID):
-        raise SdoAbort(Abort.VALUE)
-    if not old & INVALID and (old ^ new) & _CAN_ID:
-        raise SdoAbort(Abort.STATE)
+    abort_unless(not new & _UNUSED, Abort.VALUE)
+    if not new & INVALID:
+        abort_unless(not is_restricted(new & _CAN_ID), Abort.VALUE)
+        abort_unless(old & INVALID or not (old ^ new) & _CAN_ID, Abort.STATE)
 
 
 def check_sync(new: int) -> None:
@@ -174,8 +166,7 @@ def check_sync(new: int) -> None:
     Raises:
         SdoAbort: a 29-bit or restricted identifier, or the order to produce SYNC.
     """
-    if new & (_UNUSED | PRODUCER) or is_restricted(new & _CAN_ID):
-        raise SdoAbort(Abort.VALUE)
+    abort_unless(not new & (_UNUSED | PRODUCER) and not is_restricted(new & _CAN_ID), Abort.VALUE)
 
 
 def check_consumer_entry(entry: int, others: list[int]) -> None:
@@ -187,10 +178,7 @@ def check_consumer_entry(entry: int, others: list[int]) -> None:
     Raises:
         SdoAbort: reserved bits are set, a node above 127, or a node that another entry watches.
     """
-    if entry >> 24:
-        raise SdoAbort(Abort.VALUE)
     node, time = entry >> 16, entry & 0xFFFF
-    if node > 127 and time:
-        raise SdoAbort(Abort.VALUE)
-    if node and time and any(other >> 16 & 0xFF == node and other & 0xFFFF for other in others):
-        raise SdoAbort(Abort.INCOMPATIBLE)
+    abort_unless(not entry >> 24 and (node <= 127 or not time), Abort.VALUE)
+    is_watched = any(other >> 16 & 0xFF == node and other & 0xFFFF for other in others)
+    abort_unless(not (node and time and is_watched), Abort.INCOMPATIBLE)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from plant.errors import InputError, require
 from rig.device.dictionary import INVALID, Dictionary, check_switchable
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
-from rig.device.sdo import Abort, SdoAbort
+from rig.device.sdo import Abort, abort_unless
 from rig.network.frame import Frame, Send
 
 RPDO, TPDO, MAPPING = 0x1400, 0x1800, 0x200  # communication parameters; the mapping is MAPPING further on
@@ -187,7 +187,8 @@ class Pdos:
         """Refuse a communication parameter that CiA 301 forbids. Raises SdoAbort."""
         if sub == 1:
             check_switchable(self._od.read_number(index, 1), value)
-            if not value & INVALID and value & 0x7FF == self._od.read_number(0x1005, 0, 0x80) & 0x7FF:
-                raise SdoAbort(Abort.VALUE)  # the device consumes SYNC under that identifier
-        if sub == 2 and _LAST_SYNCHRONOUS < value < _EVENT_DRIVEN[0]:  # reserved, or by remote frame
-            raise SdoAbort(Abort.VALUE)
+            # else the device consumes SYNC under that identifier
+            is_free = value & 0x7FF != self._od.read_number(0x1005, 0, 0x80) & 0x7FF
+            abort_unless(value & INVALID or is_free, Abort.VALUE)
+        elif sub == 2:  # those between are reserved, or by remote frame
+            abort_unless(value <= _LAST_SYNCHRONOUS or value >= _EVENT_DRIVEN[0], Abort.VALUE)

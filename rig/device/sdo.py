@@ -46,6 +46,12 @@ class SdoAbort(Exception):
         super().__init__(f"SDO abort 0x{self.code:08X}")
 
 
+def abort_unless(holds: object, code: Abort) -> None:
+    """Raises SdoAbort with this code unless what the server demands `holds`."""
+    if not holds:
+        raise SdoAbort(code)
+
+
 class SdoServer:
     """One transfer at a time.
 
@@ -132,10 +138,9 @@ class SdoServer:
         self._fixed = size
         if announced:
             self._announced = int.from_bytes(data[4:], "little")
-            if size and self._announced != size:
-                raise SdoAbort(Abort.TOO_LONG if self._announced > size else Abort.TOO_SHORT)
-            if self._announced > _LARGEST:
-                raise SdoAbort(Abort.MEMORY)
+            abort_unless(not size or self._announced >= size, Abort.TOO_SHORT)
+            abort_unless(not size or self._announced <= size, Abort.TOO_LONG)
+            abort_unless(self._announced <= _LARGEST, Abort.MEMORY)
         self._open = _DOWNLOAD_SEGMENT
 
     def _begin_upload(self) -> bytes:
@@ -147,10 +152,8 @@ class SdoServer:
         return _HEAD.pack(0x41, *self._object) + len(value).to_bytes(4, "little")
 
     def _segment(self, command: int, data: bytes) -> bytes:
-        if self._open != command >> 5:
-            raise SdoAbort(Abort.COMMAND)
-        if command & 0x10 != self._toggle:
-            raise SdoAbort(Abort.TOGGLE)
+        abort_unless(self._open == command >> 5, Abort.COMMAND)
+        abort_unless(command & 0x10 == self._toggle, Abort.TOGGLE)
         toggle, self._toggle = self._toggle, self._toggle ^ 0x10
         if self._open == _DOWNLOAD_SEGMENT:
             self._buffer += data[1 : 8 - (command >> 1 & 7)]
@@ -169,7 +172,6 @@ class SdoServer:
 
     def _check_length(self, last: bool) -> None:
         length, known = len(self._buffer), self._fixed or self._announced
-        if length > (_LARGEST if known is None else known):
-            raise SdoAbort(Abort.MEMORY if known is None else Abort.TOO_LONG)
-        if last and self._announced is not None and length < self._announced:
-            raise SdoAbort(Abort.TOO_SHORT)
+        abort_unless(known is None or length <= known, Abort.TOO_LONG)
+        abort_unless(length <= _LARGEST, Abort.MEMORY)
+        abort_unless(not last or self._announced is None or length >= self._announced, Abort.TOO_SHORT)

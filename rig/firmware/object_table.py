@@ -22,7 +22,7 @@ def write_object_table(eds: Path = EDS[2]) -> dict[str, str]:
         f"/* Objects of a node, generated from {eds.name} by object_table.py: do not edit. */",
         "#ifndef OBJECT_TABLE_H", "#define OBJECT_TABLE_H", "", '#include "dictionary.h"', "",
         "/* positions in the table and in the values, OBJECT_(index)_(sub-index) */", "enum {",
-        *(f"    {_name_position(*key)}," for key, _ in entries), "    OBJECT_COUNT", "};", "",
+        *(f"    OBJECT_{index:04X}_{sub:02X}," for (index, sub), _ in entries), "    OBJECT_COUNT", "};", "",
         "extern const struct object OBJECT_TABLE[OBJECT_COUNT];", "", "#endif", "",
     ]  # fmt: skip
     source = ["/* Generated, see object_table.h. */", '#include "object_table.h"', "",
@@ -30,10 +30,6 @@ def write_object_table(eds: Path = EDS[2]) -> dict[str, str]:
     for key, entry in entries:
         source += [f"    /* {entry.name} */", f"    {_write_entry(*key, entry, others[key].default)},"]
     return {"object_table.h": "\n".join(header), "object_table.c": "\n".join([*source, "};", ""])}
-
-
-def _name_position(index: int, sub: int) -> str:
-    return f"OBJECT_{index:04X}_{sub:02X}"
 
 
 def _write_entry(index: int, sub: int, entry: Entry, default_of_node_2: Value) -> str:

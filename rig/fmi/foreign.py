@@ -116,9 +116,9 @@ class Unit:
             InputError: the unit takes steps of another length.
         """
         fixed = description.step
-        if fixed and abs(cycle / fixed - round(cycle / fixed)) > 1e-6:
-            raise InputError(description.path, "fixedInternalStepSize",
-                             f"a step of which the cycle of {cycle * 1e3:g} ms is a multiple, not {fixed * 1e3:g} ms")
+        require(not fixed or abs(cycle / fixed - round(cycle / fixed)) <= 1e-6, description.path,
+                "fixedInternalStepSize",
+                f"a step of which the cycle of {cycle * 1e3:g} ms is a multiple, not {(fixed or 0.0) * 1e3:g} ms")
         self._path, self._library, self._cycle = description.path, description.library, cycle
         self._inputs, self._outputs, self._parameters = tuple(inputs), tuple(outputs), tuple(parameters)
         self._lock = RLock()

@@ -1,12 +1,11 @@
 """Participants of a run, and application objects of our own nodes, which the rig writes and the nodes obey."""
-from __future__ import annotations
 
 import struct
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +81,7 @@ class Identity:
         words = (f"{key.replace('_', ' ')} {_show_object(value)}" for key, value in self.known.items())
         return ", ".join(words) or "no identity objects"
 
-    def find_difference(self, found: Identity) -> tuple[str, str]:
+    def find_difference(self, found: Self) -> tuple[str, str]:
         """The first key that another identity must have alike and has not, and how, in words; two empty texts for none.
         """
         for key, required in self.known.items():

@@ -29,7 +29,6 @@ not asked for is dropped; remote frames, frames with 29 bits and CAN FD frames a
 System calls cost most of the time that a loop takes. `await_frame` waits inside the call that receives, which makes one
 call a frame; `receive_frame` needs three where it has to wait, and keeps its deadline to the microsecond.
 """
-from __future__ import annotations
 
 import contextlib
 import errno
@@ -38,7 +37,7 @@ import socket
 import struct
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import can
 import msgpack  # type: ignore[import-untyped]
@@ -533,7 +532,7 @@ class RawBus:
         except OSError as error:
             raise RigError(f"{spec}: {error.strerror}") from error
 
-    def __enter__(self) -> RawBus:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -17,7 +17,6 @@ import socket
 import struct
 import zlib
 from collections.abc import Collection
-from ctypes import addressof, c_char
 from pathlib import Path
 
 import numpy as np
@@ -85,8 +84,8 @@ def attach_filter(rx: socket.socket, own_port: int, cob_ids: Collection[int], le
     else:
         program.append((give, 0, 0, accept))
     steps = bytearray(b"".join(struct.pack("=HBBI", *step) for step in program))
-    code = (c_char * len(steps)).from_buffer(steps)
-    rx.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(program), addressof(code)))
+    code = (ctypes.c_char * len(steps)).from_buffer(steps)
+    rx.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(program), ctypes.addressof(code)))
 
 
 def open_sockets(group: str, port: int, stack: contextlib.ExitStack) -> tuple[socket.socket, socket.socket, Turn]:

@@ -4,11 +4,10 @@ At each SYNC it reads its transducers and sends them, then moves the plant one c
 the answer to cycle k acts from cycle k+1. All faults are loaded before the start (object 0x2210), so a fault takes no
 bus time and begins exactly in the cycle that the sequence gives.
 """
-from __future__ import annotations
 
 import heapq
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from typing import NamedTuple, Self, cast
 
 from plant import load_model
 from plant.errors import InputError, require
@@ -57,7 +56,7 @@ class PlantPlace(NamedTuple):
         return self.drive, self.feedback, self.valve_state
 
     @classmethod
-    def find(cls, bench: Bench) -> PlantPlace:
+    def find(cls, bench: Bench) -> Self:
         """That of a bench.
 
         Raises:

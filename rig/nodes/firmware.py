@@ -13,14 +13,13 @@ from plant.controller import Loop, compute_current
 from plant.run import Demand, report_law_errors
 from rig.benches.bench import Bench, Role, SignalObject, make_reader, make_writer
 from rig.benches.bench_file import load_bench
-from rig.benches.profiles import Control, Status
+from rig.benches.profiles import CIA408, State
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import CONTROLLER, GAINS, Gains
 
-# As plain integers: an operation on an IntFlag takes a microsecond, and there are five in each cycle.
-_RESET, _ACTIVE = int(Control.RESET), int(Control.ACTIVE)
-_LOOP_CLOSED, _READY = int(Status.MODE), int(Status.READY)
+_RESET, _ACTIVE = CIA408.reset, CIA408.ladder[State.ACTIVE]
+_LOOP_CLOSED, _READY = CIA408.powered, 0x8  # bits of the status word; the second: no fault
 _CURRENT_LIMIT, _PERIOD = 4, 5  # sub-indices of GAINS
 LOST_AFTER = 3  # SYNCs in a row without feedback, or without a command
 _COMMAND, _FEEDBACK = 1, 2  # RPDO numbers, first information byte of EMCY 0x8250
@@ -75,12 +74,11 @@ class Firmware:
 
     def _on_write(self, index: int, sub: int, data: bytes) -> None:
         """Reject NaN and infinite gains (they would produce a NaN current), a negative limit and a period of 0."""
-        if index != GAINS:
-            return
-        value = struct.unpack("<d", data)[0]
-        is_limit, is_period = sub == _CURRENT_LIMIT, sub == _PERIOD
-        if not isfinite(value) or (is_limit and value < 0.0) or (is_period and value <= 0.0):
-            raise SdoAbort(Abort.VALUE)
+        if index == GAINS:
+            value = struct.unpack("<d", data)[0]
+            is_possible = {_CURRENT_LIMIT: value >= 0.0, _PERIOD: value > 0.0}.get(sub, True)
+            if not (isfinite(value) and is_possible):
+                raise SdoAbort(Abort.VALUE)
 
     def _trip(self, node: int = 0) -> None:
         self._fault = True

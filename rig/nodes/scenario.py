@@ -1,10 +1,9 @@
 """The plant of a run with its faults: the scenario, sent before a run by one SDO download, and what moves by it."""
-from __future__ import annotations
 
 import json
 import zlib
 from math import isfinite
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -29,7 +28,7 @@ class Scenario(NamedTuple):
     seed: int = 0
 
     @classmethod
-    def build(cls, model: Model, plan: Plan, load: Array, seed: int) -> Scenario:
+    def build(cls, model: Model, plan: Plan, load: Array, seed: int) -> Self:
         """With `load` in SI over main, shape (cycles of main,); set-up and clean-up are without load.
 
         Raises:
@@ -61,7 +60,7 @@ class Scenario(NamedTuple):
         return data
 
     @classmethod
-    def from_bytes(cls, data: bytes) -> Scenario:
+    def from_bytes(cls, data: bytes) -> Self:
         """The scenario that was sent.
 
         Raises:

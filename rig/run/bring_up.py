@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plant.errors import InputError
+from plant.errors import require
 from rig.benches.bench import Bench, Flags, Role
 from rig.benches.profiles import PROFILES, State, choose_control, find_state
 from rig.network.bus import EmbeddedWire, LinkWire, can_open
@@ -396,8 +396,7 @@ class BringUp:
         for role in self.identities:
             self._master.require_identity(role)
         key, difference = sequence.firmware.find_difference(self.identities.get(CONTROLLER, Identity()))
-        if difference:
-            raise InputError(sequence.name, f"firmware.{key}", difference)
+        require(not difference, sequence.name, f"firmware.{key}", difference)
 
     def _wait_for_operational(self, limit: float) -> None:
         """Wait until each node says that it is OPERATIONAL, and log how long that took; too long ends the run.

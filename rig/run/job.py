@@ -70,10 +70,10 @@ class Job:
         require(self.plant == "external" or not self.bench.has_plant_node or speaks_as_shipped(self.bench),
                 "--plant", self.plant,
                 f"external: our own plant emulator does not speak as that of {self.bench.name!r}")
-        if self.controller != "external" and not speaks_as_shipped(self.bench) and not (
-                self.controller == "builtin" and is_plant_bench(self.bench)):
-            raise InputError("--controller", self.controller, "external: our own firmware does not speak as the device "
-                                                              f"of {self.bench.name!r}")
+        is_possible = self.controller == "external" or speaks_as_shipped(self.bench) or (
+            self.controller == "builtin" and is_plant_bench(self.bench))
+        require(is_possible, "--controller", self.controller,
+                f"external: our own firmware does not speak as the device of {self.bench.name!r}")
         object.__setattr__(self, "sequence", self.sequence.at_rate(self.bench.rate))
         object.__setattr__(self, "model", self.model.replace({"controller.period": self.period_ns / 1e9}))
 
@@ -340,9 +340,8 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     require_different_names(choice.effects)
     bench, model, brought = load_tested_model(choice, is_trusted=is_trusted, announce=announce)
     sequence = load_sequence(choice.sequence, bench.rate, model.plant) if built is None else built
-    if sequence.plant != model.plant and sequence.plant != "eha" and choice.model is None and (
-            sequence.model.name == "eha"):
-        raise InputError(sequence.name, "plant", f"a bench or model of {sequence.plant}, not of {model.plant}")
+    is_own_plant = sequence.plant in (model.plant, "eha") or choice.model is not None or sequence.model.name != "eha"
+    require(is_own_plant, sequence.name, "plant", f"a bench or model of {sequence.plant}, not of {model.plant}")
     if choice.model is None and sequence.model.name != "eha":
         own = choice._replace(model=sequence.model.name)
         _, model, more = load_tested_model(own, is_trusted=is_trusted, announce=announce)
@@ -354,8 +353,8 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     is_ours = speaks_as_shipped(bench) or is_plant_bench(bench)
     controller = choice.controller or ("builtin" if is_ours else "external")
     plant = choice.plant or ("auto" if is_ours or not bench.has_plant_node else "external")
-    if controller == "external" and foreign:
-        raise InputError("--set", foreign[0], "no gains beside --controller external: that firmware has its own")
+    require(controller != "external" or not foreign, "--set", "".join(foreign[:1]),
+            "no gains beside --controller external: that firmware has its own")
     job = Job(sequence=sequence, model=model, bench=bench, seed=choice.seed, effects=(*choice.effects, *brought),
               bus=choice.bus, controller=controller, plant=plant, max_overruns=sequence.timing.share)
     return replace_settings(job, pace=choice.pace, max_overruns=choice.max_overruns)

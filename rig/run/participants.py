@@ -39,10 +39,9 @@ def open_participants(job: Job) -> Iterator[tuple[Wire, NodeProcesses]]:
             an effect in the firmware.
         BusError: an external node does not answer.
     """
-    if job.controller != "builtin" and find_firmware_parameters(job.model):
-        raise InputError("--controller", job.controller, f"a model without effects in the firmware, which only the "
-                                                         f"builtin one has: not "
-                                                         f"{', '.join(find_firmware_parameters(job.model))}")
+    in_firmware = find_firmware_parameters(job.model)
+    require(job.controller == "builtin" or not in_firmware, "--controller", job.controller,
+            f"a model without effects in the firmware, which only the builtin one has: not {', '.join(in_firmware)}")
     _require_time(job)
     if job.bus.partition(":")[0] in EMBEDDED_NAMES:
         require(job.controller == "builtin" and job.plant != "external", "--bus", job.bus,

@@ -11,12 +11,14 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 SWITCH_INTERVAL = 50e-6  # s
 LOOP_PRIORITY = 20  # of 99: above the desktop, below the kernel's own threads
+PERCENTILES = ("p50", "p99", "p99_9", "max")
 
 
 @contextlib.contextmanager
@@ -156,26 +158,16 @@ def name_scheduler() -> str:
 R = TypeVar("R")
 
 
-class Lateness(NamedTuple):
-    """Wake-up lateness of a periodic task, us: percentiles over all periods, and periods missed altogether."""
-
-    p50: float
-    p99: float
-    p99_9: float
-    max: float
-    periods: int
-    missed: int  # periods whose whole time was over at the wake-up
+def compute_percentiles(seconds: NDArray[np.floating]) -> dict[str, float]:
+    """p50, p99, p99.9 and the largest of the times that are not missing, us; nothing if all are."""
+    known = seconds[~np.isnan(seconds)] * 1e6
+    if not len(known):
+        return {}
+    return dict(zip(PERCENTILES, np.percentile(known, (50, 99, 99.9, 100)).tolist(), strict=True))
 
 
-def summarise_lateness(late_ns: np.ndarray, period_ns: int) -> Lateness:
-    """Summarise wake-ups that came `late_ns` (n,) after they were due."""
-    p50, p99, p99_9 = (float(value) for value in np.percentile(late_ns, [50, 99, 99.9]) / 1e3)
-    return Lateness(p50, p99, p99_9, float(late_ns.max()) / 1e3, late_ns.size,
-                    int(np.count_nonzero(late_ns >= period_ns)))
-
-
-def measure_timer_lateness(seconds: float, period_ns: int = 1_000_000) -> Lateness:
-    """Sleep until t0 + k * period, as the real-time loop does, and note how late each wake-up is.
+def measure_timer_lateness(seconds: float, period_ns: int = 1_000_000) -> NDArray[np.int64]:
+    """Sleep until t0 + k * period, as the real-time loop does, and note how late each wake-up is, ns.
 
     Due times never move: a late wake-up does not push the next one, so lateness is not hidden by the sum of sleeps.
     """
@@ -186,7 +178,7 @@ def measure_timer_lateness(seconds: float, period_ns: int = 1_000_000) -> Latene
         if (rest := due - time.monotonic_ns()) > 0:
             time.sleep(rest / 1e9)
         late[k] = time.monotonic_ns() - due
-    return summarise_lateness(late, period_ns)
+    return late
 
 
 def run_under_fifo(function: Callable[[], R], priority: int = 1) -> R | None:

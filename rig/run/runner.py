@@ -1,5 +1,4 @@
 """Runs one job (nodes and bus, log, session, checks), and its outcome: verdict, checks, timing, verdict.json."""
-from __future__ import annotations
 
 import contextlib
 import fcntl
@@ -39,6 +38,8 @@ from rig.run.loop import History, Loop
 from rig.run.participants import open_participants
 from rig.run.priority import (
     LOOP_PRIORITY,
+    PERCENTILES,
+    compute_percentiles,
     lock_memory,
     name_scheduler,
     prevent_deep_sleep,
@@ -54,6 +55,24 @@ from rig.sequences.uncertainty import NO_METROLOGY, Metrology, collect_metrology
 
 STATUS_OF_VERDICT = {"PASS": 0, "NOT_JUDGED": 0, "FAIL": 1, "CANNOT_TELL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
 INTERRUPTED = 130
+
+
+class LimitReached(NamedTuple):
+    """A limit that a run reached."""
+
+    parameter: str  # of the model: the limit
+    signal: str
+    limit: float  # SI; reached on either side of zero
+    t: float  # s of main, when it was reached first
+    seconds: float  # how long the signal was there, in all
+
+    def describe(self, signals: Signals) -> str:
+        """The limit in words, such as "ram at its stop (40 mm) for 120 ms, first at t = 1.250 s"."""
+        signal = signals.find(self.signal)
+        words = f"{signal.phrase} at its {'limit' if signal.role == 'drive' else 'stop'}"
+        shown = signals.controlled if signal.unit == signals.controlled.unit else signal
+        return (f"{words} ({shown.shown_scale * self.limit:.3g} {shown.shown_unit}) for "
+                f"{1e3 * self.seconds:.0f} ms, first at t = {self.t:.3f} s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,41 +298,14 @@ def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str, re
     `kind`: "lockstep", "hard real time" (the cycle is compiled code) or "soft real time" (the cycle is Python).
     `reason`: which cycles are Python in real time, and why.
     """
+    times = {name: compute_percentiles(history.column(name)) for name in ("execution", "lateness", "response")}
     return {"kind": kind, "reason": reason, "cycles": len(history), "overruns": loop.overruns,
             "underruns": loop.underruns, "scheduler": scheduler,
-            "execution_us": _compute_percentiles(history.column("execution")),
-            "lateness_us": _compute_percentiles(history.column("lateness")),
-            "response_us": _compute_percentiles(history.column("response"))}
-
-
-def _compute_percentiles(seconds: Array) -> dict[str, float | None]:
-    """Percentiles of the values that are not missing, in us."""
-    values = seconds[~np.isnan(seconds)] * 1e6
-    if not len(values):
-        return dict.fromkeys(("p50", "p99", "p99_9", "max"))
-    p50, p99, p99_9 = np.percentile(values, (50, 99, 99.9))
-    return {"p50": round(p50, 1), "p99": round(p99, 1), "p99_9": round(p99_9, 1), "max": round(float(values.max()), 1)}
+            **{f"{name}_us": {key: round(found[key], 1) if found else None for key in PERCENTILES}
+               for name, found in times.items()}}
 
 
 NEAR_A_STOP = 5.0  # standard deviations of the sensor's noise from a stop within which a reading is at it
-
-
-class LimitReached(NamedTuple):
-    """A limit that a run reached."""
-
-    parameter: str  # of the model: the limit
-    signal: str
-    limit: float  # SI; reached on either side of zero
-    t: float  # s of main, when it was reached first
-    seconds: float  # how long the signal was there, in all
-
-    def describe(self, signals: Signals) -> str:
-        """The limit in words, such as "ram at its stop (40 mm) for 120 ms, first at t = 1.250 s"."""
-        signal = signals.find(self.signal)
-        words = f"{signal.phrase} at its {'limit' if signal.role == 'drive' else 'stop'}"
-        shown = signals.controlled if signal.unit == signals.controlled.unit else signal
-        return (f"{words} ({shown.shown_scale * self.limit:.3g} {shown.shown_unit}) for "
-                f"{1e3 * self.seconds:.0f} ms, first at t = {self.t:.3f} s")
 
 
 def find_limits(column: Callable[[str], NDArray[np.float64]], model: Model, zero: int) -> tuple[LimitReached, ...]:
@@ -437,8 +429,7 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     """Play the session of a job and judge it. Raises RigError."""
     progress("bring-up", 0.0)
     session.bring_up()
-    loop = session.stage.loop
-    assert loop is not None
+    loop = session.stage.playing
     stopwatch = WallClock()
     with contextlib.ExitStack() as rights:
         if job.realtime:
@@ -472,23 +463,22 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
         speed=len(history) * job.period_ns * 1e-9 / spent, due_ns=tuple(log.due_ns), start_times=starter.start_times,
         identities=starter.identities, metrology=metrology, started_ns=started_ns,
         limits=find_limits(history.column, job.model, job.scenario.plan.start))
-    if skipped:
-        recorder.metadata("not_applicable", {check.name: check.reason for check in skipped})
-    recorder.metadata("differences", {"text": find_differences(job).describe()})
-    if metrology.is_used:
-        recorder.metadata("metrology", {"decision": metrology.decision, **{
-            name: each.describe() for name, each in metrology.calibration.items()}})
-    if outcome.limits:
-        signals = job.model.kind.signals
-        recorder.metadata("limits", {f"{number:02d}": limit.describe(signals)
-                                     for number, limit in enumerate(outcome.limits)})
-    if outcome.fdi:
-        found = {key: str(outcome.fdi.get(key, "")) for key in ("verdict", "sentence")}
-        recorder.metadata("fdi", {**found, "faults": describe_faults(outcome.fdi)})
-    if outcome.attribution.cause is not None:
-        recorder.metadata("cause", outcome.describe_attribution())
-    recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.why, "overruns": str(loop.overruns),
-                                  "timing": outcome.timing_problem})
+    fdi, cause = outcome.fdi, attribution.cause
+    notes: dict[str, dict[str, str]] = {
+        "not_applicable": {check.name: check.reason for check in skipped},
+        "differences": {"text": find_differences(job).describe()},
+        "metrology": {"decision": metrology.decision, **{
+            name: each.describe() for name, each in metrology.calibration.items()}} if metrology.is_used else {},
+        "limits": {f"{number:02d}": limit.describe(job.model.kind.signals)
+                   for number, limit in enumerate(outcome.limits)},
+        "fdi": {"verdict": str(fdi.get("verdict", "")), "sentence": str(fdi.get("sentence", "")),
+                "faults": describe_faults(fdi)} if fdi else {},
+        "cause": outcome.describe_attribution() if cause is not None else {},
+        "verdict": {"verdict": outcome.verdict, "why": outcome.why, "overruns": str(loop.overruns),
+                    "timing": outcome.timing_problem}}
+    for name, values in notes.items():
+        if values:
+            recorder.metadata(name, values)
     return outcome
 
 

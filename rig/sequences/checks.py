@@ -4,20 +4,19 @@ Every kind of check is a row of `KINDS`: the number that it measures, its unit, 
 number is held against `low` and `high`, all three in `unit`. What no run could answer (0 Hz, an empty band) is refused
 when the check is read. On a run a check never raises: what cannot be measured has failed, and `detail` says why.
 """
-from __future__ import annotations
 
 from cmath import phase
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import degrees, inf, isfinite, nan
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.check_result import CheckResult, compute_speed, filter_median
 from plant import tables
-from plant.errors import InputError, require
+from plant.errors import require
 from plant.quantity import Quantity
 from plant.run import Columns
 from plant.segments import LONGEST, RATE, Array
@@ -35,14 +34,18 @@ class NotMeasurable(Exception):
     """A measure does not exist for a signal; the message says why."""
 
 
+def require_measurable(holds: object, reason: str) -> None:
+    """Raises NotMeasurable unless what the measure needs `holds`."""
+    if not holds:
+        raise NotMeasurable(reason)
+
+
 def bridge_gaps(signal: Array, name: str, allowed: float) -> Array:
     """The signal with missing samples (NaN) on straight lines; NotMeasurable if more than a fraction `allowed` are."""
     missing = ~np.isfinite(signal)
     count = int(missing.sum())
-    if count == len(signal):
-        raise NotMeasurable(f"{name} was not measured")
-    if count > allowed * len(signal):
-        raise NotMeasurable(f"{count} of {len(signal)} samples of {name} are missing")
+    require_measurable(count < len(signal), f"{name} was not measured")
+    require_measurable(count <= allowed * len(signal), f"{count} of {len(signal)} samples of {name} are missing")
     if not count:
         return signal
     rows = np.arange(len(signal))
@@ -54,9 +57,8 @@ def measure_step_size(com: Array, before: float, smallest: float = 20e-6) -> flo
 
     `smallest`: m; ten times the noise.
     """
-    size = float(com[-1] - before)
-    if abs(size) < smallest or np.abs(com - com[-1]).max() > 1e-9:
-        raise NotMeasurable("the command does not step here and then hold")
+    size, is_held = float(com[-1] - before), np.abs(com - com[-1]).max() <= 1e-9
+    require_measurable(abs(size) >= smallest and is_held, "the command does not step here and then hold")
     return size
 
 
@@ -72,8 +74,7 @@ def measure_settling_time(position: Array, com: Array, before: float, rate: floa
     outside = np.flatnonzero(np.abs(filter_median(position, rate) - com[-1]) > abs(size) * band / 100)
     if not len(outside):
         return 0.0
-    if outside[-1] == len(position) - 1:
-        raise NotMeasurable(f"still outside +-{band:g} % at the end of the window")
+    require_measurable(outside[-1] < len(position) - 1, f"still outside +-{band:g} % at the end of the window")
     return float(outside[-1] + 1) / rate
 
 
@@ -83,8 +84,7 @@ def measure_rise_time(position: Array, com: Array, before: float, rate: float) -
 
     def find_time(level: float) -> float:
         beyond = np.flatnonzero(done >= level)
-        if not len(beyond):
-            raise NotMeasurable(f"{100 * level:g} % of the step was never reached")
+        require_measurable(len(beyond), f"{100 * level:g} % of the step was never reached")
         k = int(beyond[0])
         return k - (done[k] - level) / (done[k] - done[k - 1]) if k else 0.0
 
@@ -93,8 +93,7 @@ def measure_rise_time(position: Array, com: Array, before: float, rate: float) -
 
 def measure_ramp_error(error: Array, com: Array) -> float:
     """Mean lag behind a ramp, m, positive when the ram is behind whichever way it goes (docs/physics.md)."""
-    if com[-1] == com[0]:
-        raise NotMeasurable("the command does not move here")
+    require_measurable(com[-1] != com[0], "the command does not move here")
     return float(error.mean() * np.sign(com[-1] - com[0]))
 
 
@@ -111,14 +110,12 @@ def measure_break_away(error: Array, rate: float) -> float:
 
 def measure_response(signal: Array, com: Array, rate: float, frequency: float) -> complex:
     """Signal over command as a complex number at `frequency`, Hz: least-squares sine, cosine and mean of both."""
-    if len(com) < rate / frequency:
-        raise NotMeasurable(f"the window is shorter than one period of {frequency:g} Hz")
+    require_measurable(len(com) >= rate / frequency, f"the window is shorter than one period of {frequency:g} Hz")
     phase = 2 * np.pi * frequency * np.arange(len(com)) / rate
     basis = np.column_stack((np.sin(phase), np.cos(phase), np.ones(len(com))))
     (sine, cosine, _), *_ = np.linalg.lstsq(basis, np.column_stack((com, signal)), rcond=None)
     asked, given = complex(sine[0], cosine[0]), complex(sine[1], cosine[1])
-    if abs(asked) < 1e-9:
-        raise NotMeasurable(f"the command has no {frequency:g} Hz here")
+    require_measurable(abs(asked) >= 1e-9, f"the command has no {frequency:g} Hz here")
     return given / asked
 
 
@@ -126,16 +123,14 @@ def find_crossing(signal: Array, rate: float, above: float | None, below: float 
     """Time of the first of three samples in a row above or below a level, s from the signal's start."""
     beyond = (signal > (inf if above is None else above)) | (signal < (-inf if below is None else below))
     in_a_row = np.flatnonzero(beyond[:-2] & beyond[1:-1] & beyond[2:])
-    if not len(in_a_row):
-        raise NotMeasurable("the level was never passed")
+    require_measurable(len(in_a_row), "the level was never passed")
     return float(in_a_row[0]) / rate
 
 
 def find_scale(unit: str, si: str) -> float:
     """How many of a signal's own unit, `si`, one `unit` is; InputError at the key `unit` for another quantity."""
     fitting = dict.fromkeys([*list_fitting_units(si), si])
-    if unit not in fitting:
-        raise InputError("unit", "unit", tables.list_choices(unit, fitting))
+    require(unit in fitting, "unit", "unit", tables.list_choices(unit, fitting))
     return float(require_unit(unit, si, "", "").factor)
 
 
@@ -156,10 +151,10 @@ class DriveFrames(NamedTuple):
     status: NDArray[np.int64]  # status word
     words: ProfileWords = CIA408  # what it means
 
-    def select_between(self, t0: float, t1: float) -> DriveFrames:
+    def select_between(self, t0: float, t1: float) -> Self:
         """Those with t0 <= t < t1."""
         chosen = (self.t >= t0 - 1e-9) & (self.t < t1 - 1e-9)  # times come from ns
-        return DriveFrames(self.t[chosen], self.current[chosen], self.status[chosen], self.words)
+        return self._replace(t=self.t[chosen], current=self.current[chosen], status=self.status[chosen])
 
     @property
     def states(self) -> NDArray[np.int64]:
@@ -197,11 +192,10 @@ class RunData:
         else:
             section = slice(0, rows) if window == MAIN else self.sections[window]
             first, last = section.start, section.stop
-        if last > rows:
-            raise NotMeasurable(f"the run ended at {rows / self.rate:g} s, the window at {last / self.rate:g} s")
+        require_measurable(
+            last <= rows, f"the run ended at {rows / self.rate:g} s, the window at {last / self.rate:g} s")
         first += round(skip * self.rate)
-        if first >= last:
-            raise NotMeasurable("the window is empty")
+        require_measurable(first < last, "the window is empty")
         return slice(first, last)
 
     def read_signal(self, name: str, span: slice, largest_missing_share: float = 0.01) -> Array:
@@ -210,11 +204,9 @@ class RunData:
         if name == "error" and name not in self.signals.names:
             return self.read_signal(command, span) - self.read_signal(controlled, span)
         if name == "speed" and name not in self.signals.names:
-            if span.stop - span.start < 2:
-                raise NotMeasurable("one sample has no speed")
+            require_measurable(span.stop - span.start >= 2, "one sample has no speed")
             return compute_speed(self.read_signal(controlled, span), self.rate)
-        if not hasattr(self.trace, name):
-            raise NotMeasurable(f"the plant has no signal {name}")
+        require_measurable(hasattr(self.trace, name), f"the plant has no signal {name}")
         return bridge_gaps(np.asarray(getattr(self.trace, name), float)[span], name, largest_missing_share)
 
     def count_missing(self, name: str, span: slice) -> int:
@@ -327,8 +319,7 @@ class Check:
     def _measure(self, run: RunData, span: slice) -> float:
         """The number, in the unit of the limits. Raises NotMeasurable."""
         measured = KINDS[self.kind].measure(self, run, span) / self.scale
-        if not isfinite(measured):
-            raise NotMeasurable(f"the measure came to {measured:g}")
+        require_measurable(isfinite(measured), f"the measure came to {measured:g}")
         return measured
 
     def _compute_uncertainty(self, run: RunData, span: slice, value: float) -> tuple[float, str]:
@@ -493,14 +484,12 @@ def _measure_python(check: PythonCheck, run: RunData, span: slice) -> float:
     columns = {**{name: np.array(getattr(run.trace, name)[span], dtype=np.float64) for name in run.signals.names},
                "t": np.arange(span.start, span.stop) / run.rate}
     value = check.function.call(Window(run.signals, columns), **check.arguments)
-    if value is None:
-        raise NotMeasurable(f"{check.python} returned no value")
+    require_measurable(value is not None, f"{check.python} returned no value")
     try:
         number = float(value)
     except (TypeError, ValueError):
         raise NotMeasurable(f"{check.python} returned {describe_value(value)}, not a number") from None
-    if not isfinite(number):
-        raise NotMeasurable(f"{check.python} returned {number:g}")
+    require_measurable(isfinite(number), f"{check.python} returned {number:g}")
     return number
 
 
@@ -510,8 +499,7 @@ def _measure_response(check: Response, run: RunData, span: slice) -> float:
         rest = run.find_rows((after, span.stop / run.rate))
         return find_crossing(run.read_signal(check.signal, rest), run.rate, check.above, check.below)
     events = run.find_events(check.event, after)
-    if not events:
-        raise NotMeasurable(f"no event {check.event!r} after {after:g} s")
+    require_measurable(events, f"no event {check.event!r} after {after:g} s")
     return float(events[0].t) - after
 
 
@@ -530,8 +518,7 @@ def _measure_shut_off(check: ShutOff, run: RunData, span: slice) -> float:
     left = [event.t for event in run.find_events(LEFT_OPERATIONAL, after, span.stop / run.rate)
             if not len(on) or event.t >= drives.t[on[-1]]]
     times = [*off[:1].tolist(), *left[:1]]
-    if not times:
-        raise NotMeasurable("the controller did not say zero current, nor did it leave OPERATIONAL")
+    require_measurable(times, "the controller did not say zero current, nor did it leave OPERATIONAL")
     return float(min(times)) - after
 
 
@@ -540,8 +527,7 @@ def _measure_recovery(check: Check, run: RunData, span: slice) -> float:
     drives = run.drives.select_between(start, np.inf)
     idle = np.flatnonzero(drives.states != State.ACTIVE)
     first = int(idle[-1]) + 1 if len(idle) else 0
-    if first >= len(drives.t):
-        raise NotMeasurable("the controller was not ACTIVE at the end of clean-up")
+    require_measurable(first < len(drives.t), "the controller was not ACTIVE at the end of clean-up")
     return float(drives.t[first]) - start
 
 

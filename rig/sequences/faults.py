@@ -4,13 +4,12 @@ The node that injects a fault asks the `Schedule` in every cycle, so everything 
 it is created; the same seed gives the same faults in the same cycles. Times in a fault are seconds from the start of
 the main phase; a fault ends when main ends, so that clean-up runs on a healthy plant.
 """
-from __future__ import annotations
 
 from abc import ABC
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from math import ceil
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -293,10 +292,10 @@ class Plan:
                 "rate": self.rate}
 
     @classmethod
-    def from_json(cls, data: object, plant: str = "eha") -> Plan:
+    def from_json(cls, data: object, plant: str = "eha") -> Self:
         """The plan that was sent, for this plant; InputError if it is none."""
         with name_signals_of(find_plant(plant).signals):
-            found: Plan = tables.build_dataclass(cls, data, tables.Place("scenario"), {Fault: KINDS})
+            found: Self = tables.build_dataclass(cls, data, tables.Place("scenario"), {Fault: KINDS})
         return replace(found, plant=plant)
 
 

@@ -1,5 +1,4 @@
 """The parts of a sequence that a user writes in Python: a segment, a check, and steps before and after the run."""
-from __future__ import annotations
 
 import contextlib
 import inspect
@@ -19,6 +18,24 @@ from plant.user_code import explain_errors
 Argument = float | str | bool
 _OWN = {"key": False}  # a field that the program fills in
 _NAME = re.compile(r"(\w[\w-]*\.py):([A-Za-z_]\w*)")
+
+
+@dataclass(frozen=True)
+class UserFunction:
+    """A function of a user's file; `file` is where messages say that it stands."""
+
+    file: str
+    name: str
+    function: Any
+
+    def call(self, *values: object, **arguments: Argument) -> Any:
+        """What the function returns.
+
+        Raises:
+            InputError: it raised an exception or ended the program; the error names file and line.
+        """
+        with explain_errors(self.file, self.name):
+            return self.function(*values, **arguments)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,24 +120,6 @@ def require_function_name(text: str) -> tuple[str, str]:
     if match is None:
         raise InputError("python", "python", f"FILE.py:FUNCTION, a file beside the sequence, not {text!r}")
     return match[1], match[2]
-
-
-@dataclass(frozen=True)
-class UserFunction:
-    """A function of a user's file; `file` is where messages say that it stands."""
-
-    file: str
-    name: str
-    function: Any
-
-    def call(self, *values: object, **arguments: Argument) -> Any:
-        """What the function returns.
-
-        Raises:
-            InputError: it raised an exception or ended the program; the error names file and line.
-        """
-        with explain_errors(self.file, self.name):
-            return self.function(*values, **arguments)
 
 
 def load_function(module: ModuleType, name: str, given: int, arguments: Mapping[str, Argument]) -> UserFunction:

@@ -250,8 +250,8 @@ def load_sequence(name_or_path: str | Path, rate: float = RATE, plant: str = "eh
         return parse_sequence(entry.read_text(encoding="utf-8"), entry.name, lambda name: tables.read_file(Path(name)),
                               rate, plant)
     path = Path(name_or_path)
-    if path.suffix != ".toml":
-        raise InputError(name_or_path, "", f"a .toml file, or {tables.list_choices(str(name_or_path), shipped)}")
+    require(path.suffix == ".toml", name_or_path, "",
+            f"a .toml file, or {tables.list_choices(str(name_or_path), shipped)}")
     return parse_sequence(tables.decode_text(tables.read_file(path), path), str(path),
                           lambda name: tables.read_file(path.parent / name), rate, plant)
 
@@ -277,8 +277,8 @@ def parse_sequence(text: str, name: str, read_file: ReadFile, rate: float = RATE
     _check_parameters(sequence, place)
     _check_checks(sequence, place.at("checks"))
     for key in ("sync", "feedback"):
-        if (limit := getattr(sequence.timing, key) or 0.0) * rate > 1.0 + 1e-9:
-            raise place.at("timing", key).refuse(f"at most a cycle, {1 / rate:g} s, not {limit:g}")
+        limit = getattr(sequence.timing, key) or 0.0
+        place.at("timing", key).require(limit * rate <= 1.0 + 1e-9, f"at most a cycle, {1 / rate:g} s, not {limit:g}")
     return sequence
 
 
@@ -379,8 +379,7 @@ def _check_phases(sequence: Sequence, place: Place) -> None:
 def _check_sizes(sequence: Sequence, place: Place) -> None:
     """No demand and no load of a size that can only be a slip of units."""
     start, signals = 0.0, find_plant(sequence.plant).signals
-    if sequence.load and signals.load is None:
-        raise place.at("load").refuse("no load: the plant has none")
+    place.at("load").require(not sequence.load or signals.load, "no load: the plant has none")
     for phase in PHASES:
         signal, begin = (signals.load or signals.command, 0.0) if phase == "load" else (signals.command, start)
         most, unit = signal.largest, signal.unit
@@ -392,8 +391,8 @@ def _check_sizes(sequence: Sequence, place: Place) -> None:
         for i, section in enumerate(sections):
             last = start if i == len(sections) - 1 else 0.0
             largest = np.abs((*values[section.start:section.stop], last)).max()
-            if not largest <= most:  # nor NaN
-                raise place.at(phase, i).refuse(f"at most {most:g} {unit} either way, not {largest:g}")
+            place.at(phase, i).require(largest <= most,  # nor NaN
+                                       f"at most {most:g} {unit} either way, not {largest:g}")
 
 
 def _check_faults(sequence: Sequence, place: Place) -> None:
@@ -450,16 +449,17 @@ def _check_checks(sequence: Sequence, place: Place) -> None:
     used = Counter(check.name for check in sequence.checks)
     for i, check in enumerate(sequence.checks):
         window, after = check.window, getattr(check, "after", 0.0)
-        if used[check.name] > 1:
-            raise place.at(i, "name").refuse(f"a name used once, not {used[check.name]} times {check.name!r}")
-        if isinstance(window, str) and window != MAIN and window not in sections:
-            raise place.at(i, "window").refuse(f"a section: {tables.list_choices(window, [MAIN, *sections])}")
+        place.at(i, "name").require(used[check.name] == 1,
+                                    f"a name used once, not {used[check.name]} times {check.name!r}")
+        is_known = not isinstance(window, str) or window == MAIN or window in sections
+        place.at(i, "window").require(is_known, f"a section: {tables.list_choices(window, [MAIN, *sections])}")
         if isinstance(window, tuple) and window[1] > sequence.duration + 0.5 / sequence.rate:
             raise place.at(i, "window").refuse(f"an end within main's {sequence.duration:g} s, not {window[1]:g}")
-        if (frequency := getattr(check, "frequency", 0.0)) >= sequence.rate / 2:
-            raise place.at(i, "frequency").refuse(f"below half the rate of {sequence.rate:g} Hz, not {frequency:g}")
-        if isinstance(after, str) and labels[after] != 1:
-            raise place.at(i, "after").refuse(f"a time or one fault: {tables.list_choices(after, labels)}")
+        frequency = getattr(check, "frequency", 0.0)
+        place.at(i, "frequency").require(frequency < sequence.rate / 2,
+                                         f"below half the rate of {sequence.rate:g} Hz, not {frequency:g}")
+        place.at(i, "after").require(not isinstance(after, str) or labels[after] == 1,
+                                     f"a time or one fault: {tables.list_choices(after, labels)}")
 
 
 def load_nominal_test(kind: Plant, period: float) -> tuple[Array, Array | None, str]:

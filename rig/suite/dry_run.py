@@ -1,5 +1,4 @@
 """A sequence before its run: command, load, and the run that a healthy actuator is predicted to make, as a report."""
-from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -91,6 +90,22 @@ class GuardTrip(NamedTuple):
 
     name: str
     t: float
+
+
+class PlannedFault(NamedTuple):
+    """A fault as the run will inject it; times in s of main."""
+
+    name: str
+    kind: str
+    target: str  # parameter, sensor, frame or node
+    t0: float
+    t1: float  # it no longer acts
+    size: str  # in words
+
+    @property
+    def duration(self) -> float:
+        """How long it acts, s."""
+        return self.t1 - self.t0
 
 
 class DryRun(NamedTuple):
@@ -231,22 +246,6 @@ def find_trips(guards: Sequence[Guard], columns: Columns, signals: Signals) -> I
         outside = np.convolve((values < low) | (values > high), np.ones(guard.cycles))[:len(values)] >= guard.cycles
         if outside.any():
             yield GuardTrip(guard.name, float(columns.t[int(np.argmax(outside))]))
-
-
-class PlannedFault(NamedTuple):
-    """A fault as the run will inject it; times in s of main."""
-
-    name: str
-    kind: str
-    target: str  # parameter, sensor, frame or node
-    t0: float
-    t1: float  # it no longer acts
-    size: str  # in words
-
-    @property
-    def duration(self) -> float:
-        """How long it acts, s."""
-        return self.t1 - self.t0
 
 
 def plan_faults(job: Job) -> list[PlannedFault]:

@@ -1,5 +1,4 @@
 """Several runs as one suite: the suite file, its cases, running them side by side, and one report of all."""
-from __future__ import annotations
 
 import contextlib
 import itertools
@@ -13,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Self
 from urllib.parse import quote
 
 from fdi.progress import ignore_progress
@@ -82,19 +81,6 @@ class SuiteFile:
     requirements: str | tuple[str, ...] | Mapping[str, str] = ()
 
 
-class Suite(NamedTuple):
-    """Cases, and the requirements that they shall cover: id to text."""
-
-    title: str
-    cases: list[Case]
-    requirements: Mapping[str, str]
-    source: str = ""  # the suite file
-
-    def put_into(self, folder: Path) -> Suite:
-        """The same suite with the folders of its cases in this one."""
-        return self._replace(cases=[case._replace(folder=folder / case.folder) for case in self.cases])
-
-
 class Case(NamedTuple):
     """One run of a suite; folder and checks are known when it has been tried (`build_suite`)."""
 
@@ -109,6 +95,19 @@ class Case(NamedTuple):
     def planned(self) -> JudgedRun:
         """What it will say about requirements."""
         return JudgedRun(self.name, "NOT_RUN", self.requirement, self.checks)
+
+
+class Suite(NamedTuple):
+    """Cases, and the requirements that they shall cover: id to text."""
+
+    title: str
+    cases: list[Case]
+    requirements: Mapping[str, str]
+    source: str = ""  # the suite file
+
+    def put_into(self, folder: Path) -> Self:
+        """The same suite with the folders of its cases in this one."""
+        return self._replace(cases=[case._replace(folder=folder / case.folder) for case in self.cases])
 
 
 def read_suite_file(path: Path, base: JobChoice, *, is_trusted: bool = False) -> tuple[SuiteFile, list[Case]]:

@@ -1,5 +1,4 @@
 """The bench for tests in Python: runs in lockstep on the embedded bus, and what they measured."""
-from __future__ import annotations
 
 import json
 import re
@@ -121,6 +120,10 @@ def describe_failure(check: CheckResult) -> str:
     return f"{check.name}: {', '.join(filter(None, (check.describe(), window, check.detail, requirement)))}"
 
 
+Table = Mapping[str, Any]
+Command = NDArray[np.float64] | Sequence[Table]
+
+
 @dataclass
 class Bench:
     """Runs sequences in lockstep on the embedded bus; the results of each run go to a folder below `folder`.
@@ -167,8 +170,6 @@ class Bench:
         return run
 
 
-Table = Mapping[str, Any]
-Command = NDArray[np.float64] | Sequence[Table]
 _COMMAND_FILE = "command.csv"
 
 
@@ -193,8 +194,7 @@ def build_sequence(sequence: str | None, command: Command | None, rate: float = 
             return named
         table, files, name = tomllib.loads(named.source), dict(named.files), named.name
     else:
-        if sequence is not None:
-            raise InputError("sequence", sequence, "either a sequence or a command")
+        require(sequence is None, "sequence", str(sequence), "either a sequence or a command")
         table, files = _make_table(command, rate, find_plant(plant).signals.command.name)
         name = "command.toml"
     table |= {key: [*table.get(key, []), *entries] for key, entries in added.items()}

@@ -1,5 +1,4 @@
 """The showing process, as the rig starts and ends it."""
-from __future__ import annotations
 
 import contextlib
 import importlib.util
@@ -17,6 +16,13 @@ from plant.errors import require
 from rig.interrupts import ignore_interrupts
 from rig.view.live_run import LivePlan
 from rig.view.viewer import is_listening, lacks_display
+
+
+class ViewerPlace(NamedTuple):
+    """Neither a port nor a file: a window of its own."""
+
+    port: int = 0  # of a viewer on 127.0.0.1
+    file: Path | None = None
 
 
 @contextlib.contextmanager
@@ -77,13 +83,6 @@ def _end_process(process: subprocess.Popen[bytes], *, is_on_screen: bool) -> Non
     if is_on_screen and process.returncode != 0 and sys.stderr.isatty():
         sys.stderr.write("\033[?1049l\033[?25h")  # leave the second screen, show the cursor
         sys.stderr.flush()
-
-
-class ViewerPlace(NamedTuple):
-    """Neither a port nor a file: a window of its own."""
-
-    port: int = 0  # of a viewer on 127.0.0.1
-    file: Path | None = None
 
 
 def find_viewer_place(text: str) -> ViewerPlace:

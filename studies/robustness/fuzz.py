@@ -12,7 +12,7 @@ import numpy as np
 
 from fdi.progress import Progress, ignore_progress
 from plant.model import load_model
-from rig.benches.profiles import Control, Status
+from rig.benches.profiles import CIA408
 from rig.network.bus import EmbeddedBus, EmbeddedWire
 from rig.network.frame import Frame, Node, Send, VirtualClock
 from rig.network.master import BusError
@@ -179,14 +179,14 @@ def _is_answering(target: str, node: Node, bus: EmbeddedBus, t_ns: int) -> bool:
     boots = (0x700 + number, b"\0") in ask(0x000, bytes((129, number)))
     identity = [data[:4] for cob_id, data in ask(0x600 + number, b"\x40\x00\x10\0\0\0\0\0") if cob_id == 0x580 + number]
     ask(0x000, bytes((1, number)))
-    ask(COMMAND, pack_frame(COMMAND, {"position_demand": 1e-3, "control_word": Control.ACTIVE, "cycle": 7}))
+    ask(COMMAND, pack_frame(COMMAND, {"position_demand": 1e-3, "control_word": CIA408.ladder[-1], "cycle": 7}))
     at_sync = [cob_id for cob_id, _ in ask(SYNC, b"")]
     if target == "plant":
         return boots and identity == [b"\x43\x00\x10\0"] and at_sync[:2] == [FEEDBACK, VALVE_STATE]
     answers = [data for cob_id, data in ask(FEEDBACK, pack_frame(FEEDBACK, {})) if cob_id == DRIVE]
     drive = unpack_frame(DRIVE, answers[0]) if len(answers) == 1 and len(answers[0]) == 8 else None
     return (boots and identity == [b"\x43\x00\x10\0"] and drive is not None
-            and (drive["cycle"], drive["status_word"]) == (7, Status.ACTIVE) and 0.0 < drive["current"] < 0.02)
+            and (drive["cycle"], drive["status_word"]) == (7, CIA408.mask) and 0.0 < drive["current"] < 0.02)
 
 
 class _Stranger:

@@ -1,8 +1,8 @@
 """The whole study: fuzz frames and datagrams, disturbed runs, long operation."""
 
 import os
-import socket
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -69,7 +69,7 @@ def fuzz_datagrams(count: int, seed: int, group: str, controller: str = "builtin
             with open_sender() as sender:
                 for number, frame in enumerate(invent_frames(count, seed)):
                     message = Message(arbitration_id=frame.cob_id, data=frame.data, is_extended_id=False)
-                    _send(sender, _change(rng, pack_message(message)), group)
+                    sender.sendto(_change(rng, pack_message(message)), (group, PORT))
                     if number % 1000 == 0:
                         progress("datagrams", number / count)
             verdict = _play(group, Path(place))
@@ -94,10 +94,6 @@ def _change(rng: np.random.Generator, datagram: bytes) -> bytes:
     if kind < 0.68:
         return (_NESTED, _HUGE)[int(rng.integers(2))] + rng.bytes(int(rng.integers(60_000)))
     return rng.bytes(int(rng.integers(100)))
-
-
-def _send(sender: socket.socket, datagram: bytes, group: str) -> None:
-    sender.sendto(datagram, (group, PORT))
 
 
 def _play(group: str, folder: Path) -> str:
@@ -249,12 +245,10 @@ def _summarise_trials(trials: list[Trial]) -> dict[str, Any]:
     """One row of the table: counts over the trials of a kind."""
     ends = [trial.end for trial in trials]
     zeros = [trial.zero for trial in trials if trial.zero >= 0]
-    statuses: dict[str, int] = {}
-    for trial in trials:
-        statuses[str(trial.status)] = statuses.get(str(trial.status), 0) + 1
     return {"action": trials[0].action, "victim": trials[0].victim, "trials": len(trials),
             "effective": sum(trial.is_effective for trial in trials),
-            "sound": sum(not trial.problems for trial in trials), "statuses": statuses,
+            "sound": sum(not trial.problems for trial in trials),
+            "statuses": dict(Counter(str(trial.status) for trial in trials)),
             "end_p50": float(np.median(ends)), "end_max": max(ends), "zero_max": max(zeros, default=None),
             "logs": sum(trial.cycles >= 0 for trial in trials)}
 
@@ -278,10 +272,10 @@ def build_robustness_report(figures: Mapping[str, Any]) -> Report:
 
 
 def _tabulate_frames(figures: Mapping[str, Any]) -> list[Item]:
-    rows: list[list[Cell | str]] = []
-    for count in figures["frames"]:
-        rows.append([count["target"], str(count["frames"]), str(len(count["failures"])),
-                     Cell("yes", "good") if count["works"] else Cell("NO", "bad"), f"{count['growth'] / 1e6:.1f}"])
+    rows: list[list[Cell | str]] = [
+        [count["target"], str(count["frames"]), str(len(count["failures"])),
+         Cell("yes", "good") if count["works"] else Cell("NO", "bad"), f"{count['growth'] / 1e6:.1f}"]
+        for count in figures["frames"]]
     datagrams = figures["datagrams"]
     if datagrams:
         rows.append(["UDP, datagrams", str(datagrams["datagrams"]), str(len(datagrams["problems"])),

@@ -1,6 +1,5 @@
 """The CiA 402 drive of examples/, as canopen sees it: objects, power states, current, faults."""
 
-import struct
 import subprocess
 from collections.abc import Iterator
 
@@ -13,7 +12,7 @@ from rig_command import rig
 
 from rig.firmware.build import build_device
 
-OFF, SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, RESET, HALT = 0x00, 0x06, 0x07, 0x0F, 0x02, 0x80, 0x10F
+OFF, SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, RESET = 0x00, 0x06, 0x07, 0x0F, 0x02, 0x80
 DISABLED, READY, SWITCHED_ON, ENABLED = "SWITCH ON DISABLED", "READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"
 STOPPED, REACTION, FAULT = "QUICK STOP ACTIVE", "FAULT REACTION ACTIVE", "FAULT"
 VALUE_RANGE = 0x06090030  # SDO abort code
@@ -43,17 +42,6 @@ def test_objects_after_power_on_are_those_of_the_data_sheet(where: str) -> None:
         assert numbers == [0x209, 0x309, 0x189, 0x289] and master.node.sdo[0x1014].raw == 0x89
 
 
-@on_each_bus
-def test_canopen_takes_it_through_its_states(drive: DriveMaster) -> None:
-    with drive.run_cycles():
-        drive.node.op_mode = "CYCLIC SYNCHRONOUS POSITION"
-        for state in (ENABLED, SWITCHED_ON, READY, ENABLED, DISABLED, READY):
-            drive.node.state = state
-            assert drive.node.state == state
-        assert drive.node.op_mode == "CYCLIC SYNCHRONOUS POSITION"
-        assert not drive.node.is_op_mode_supported("PROFILED POSITION")
-
-
 TRANSITIONS = [
     ([OFF], [DISABLED]),  # 0, 1
     ([SWITCH_ON, ENABLE], [DISABLED, DISABLED]),
@@ -78,16 +66,6 @@ def test_each_transition(drive: DriveMaster) -> None:
         assert ([drive.cycle(control).state for control in controls], controls) == (states, controls)
 
 
-def test_a_quick_stop_can_stay(drive: DriveMaster) -> None:
-    """Option code 6: until the voltage is disabled (12) or the operation is enabled again (16)."""
-    drive.node.sdo[0x605A].raw = 6
-    drive.enable(target=1000)
-    for control, state in ((QUICK_STOP, STOPPED), (QUICK_STOP, STOPPED), (ENABLE, ENABLED), (QUICK_STOP, STOPPED),
-                           (OFF, DISABLED)):  # fmt: skip
-        answer = drive.cycle(control)
-        assert (answer.state, answer.current != 0) == (state, state == ENABLED)
-
-
 def test_current_follows_the_error_up_to_its_limit(drive: DriveMaster) -> None:
     for target, position, current in (
         (1000, 0.5, 95),  # 3.8 A/m over 0.5 mm is 1.9 mA, 95 per mille of 20 mA
@@ -100,36 +78,6 @@ def test_current_follows_the_error_up_to_its_limit(drive: DriveMaster) -> None:
         answer = drive.enable(target, position)
         is_limited = bool(answer.status & 0x800)
         assert (answer.current, is_limited) == (current, abs(current) == 400)
-
-
-def test_current_flows_while_enabled_alone(drive: DriveMaster) -> None:
-    for control in (OFF, SHUTDOWN, SWITCH_ON, ENABLE, SWITCH_ON, ENABLE, SHUTDOWN, ENABLE, QUICK_STOP, OFF, ENABLE):
-        answer = drive.cycle(control, target=1000, position=0.5)
-        assert answer.current == (95 if answer.state == ENABLED else 0)
-
-
-def test_no_current_without_a_mode(where: str) -> None:
-    with run_drive(where) as master:
-        master.start(mode=0)
-        assert master.enable(target=1000)[:2] == (ENABLED, 0)
-        master.node.sdo[0x6060].raw = 8
-        assert master.cycle().current == 190
-
-
-def test_a_halt_holds_the_ram_where_it_was(drive: DriveMaster) -> None:
-    drive.enable(target=1000, position=0.5)
-    halted = drive.cycle(HALT)
-    moved = drive.cycle(HALT, target=5000, position=0.6)
-    again = drive.cycle(ENABLE)
-    assert (halted.state, halted.current, moved.current, again.current) == (ENABLED, 0, -19, 400)
-    follows = [bool(answer.status & 0x1000) for answer in (halted, moved, again)]
-    assert follows == [False, False, True]
-
-
-def test_current_limit_and_gain_are_objects(drive: DriveMaster) -> None:
-    drive.node.sdo[0x6073].raw, drive.node.sdo[0x2002][1].raw = 50, 1.0
-    assert drive.enable(target=500).current == 25
-    assert drive.cycle(target=2000).current == 50
 
 
 def test_what_it_does_not_know_is_refused(drive: DriveMaster) -> None:
@@ -169,24 +117,6 @@ def test_a_position_that_is_no_number_is_a_fault(drive: DriveMaster) -> None:
         assert [drive.cycle(control).state for control in (OFF, RESET)] == [FAULT, DISABLED]
 
 
-def test_it_is_not_enabled_without_a_measured_position(drive: DriveMaster) -> None:
-    answers = [drive.cycle(control, target=1000, silent=(2,)) for control in (SHUTDOWN, SWITCH_ON, ENABLE)]
-    assert [answer.state for answer in answers] == [READY, SWITCHED_ON, SWITCHED_ON]
-    assert drive.cycle()[:2] == (ENABLED, 190)
-
-
-def test_leaving_operational_with_the_power_on_is_a_fault(drive: DriveMaster) -> None:
-    for command in ("PRE-OPERATIONAL", "STOPPED"):
-        drive.enable(target=1000)
-        drive.node.nmt.state = command
-        drive.node.nmt.state = "OPERATIONAL"
-        assert drive.cycle()[:2] == (FAULT, 0)
-        assert [drive.cycle(control).state for control in (OFF, RESET)] == [FAULT, DISABLED]
-        drive.node.nmt.state = command
-        drive.node.nmt.state = "OPERATIONAL"
-        assert drive.cycle(OFF).state == DISABLED  # the power was off
-
-
 @on_each_bus
 def test_lost_sync_is_a_fault(where: str) -> None:
     with run_drive(where) as master:
@@ -218,20 +148,6 @@ def test_a_reset_ends_a_fault(drive: DriveMaster) -> None:
     drive.wait_until_ready()
     drive.start()
     assert drive.cycle(OFF, position=0.0).state == DISABLED
-
-
-def test_a_control_word_by_sdo_acts_at_once(drive: DriveMaster) -> None:
-    drive.enable(target=1000)
-    drive.node.sdo[0x6040].raw = OFF
-    assert drive.node.sdo[0x6078].raw == 0 and drive.node.sdo[0x6041].raw & 0x4F == 0x40
-
-
-def test_mode_and_position_are_in_the_second_tpdo(drive: DriveMaster) -> None:
-    drive.network.subscribe(0x285, lambda _, data, time: seen.append(bytes(data)))
-    seen: list[bytes] = []
-    drive.enable(position=-1.2304)
-    drive.node.sdo.upload(0x6041, 0)  # frames come in order: the TPDO was before this
-    assert struct.unpack("<bi", seen[-1]) == (8, -1230)
 
 
 @pytest.mark.parametrize(("fault", "off", "enabled"), [

@@ -27,13 +27,12 @@ from fdi.report.drawing import Drawing
 from fdi.report.report import Figure, Report, Section
 from fdi.trace.trace import Trace
 from plant import Model, simulate
-from plant.effects import CATALOGUE
 from plant.threads import map_in_threads
 
 PAGE = (Path(__file__).parents[2] / "docs" / "python.md").read_text()
 EXAMPLES = [re.sub(r"^    ", "", block, flags=re.MULTILINE) for block in
             re.findall(r"(?:^    .*\n|^\n(?=    ))+", PAGE.split("## Functions")[0], re.MULTILINE)]
-FEW = {"null_bias", "spool_friction", *(suspect.effect for suspect in SUSPECTS)}  # what `diagnose` needs
+FEW = ("null_bias", "spool_friction", *(suspect.effect for suspect in SUSPECTS))  # what `diagnose` needs
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +44,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def lines(runs: dict[str, Path]) -> Iterator[dict[str, Any]]:
     """The names that the six examples of docs/python.md leave, run beside short traces with a small catalogue."""
     names: dict[str, Any] = {}
-    with pytest.MonkeyPatch.context() as patch, restored_catalogue():
+    with pytest.MonkeyPatch.context() as patch, restored_catalogue(*FEW):
         patch.chdir(runs["est"].parent)
-        for name in set(CATALOGUE) - FEW:
-            del CATALOGUE[name]
         for name, source in (("run", "est"), ("run2", "repeat"), ("held", "holdout")):
             shutil.copy(runs[source], f"{name}.csv")
         names["printed"] = []

@@ -1,12 +1,11 @@
-"""Play a newcomer: the lines of README and tutorial in a fresh clone, of other pages, bad inputs, Ctrl-C.
+"""Play a newcomer: the lines of README and tutorial in a fresh clone, of other pages, and bad inputs.
 
-`make newcomer` runs all of it and prints a table; `make newcomer ARGS=inputs` a part: shown, pages, inputs or
-interruptions. Exit status 1 if something is wrong. The quick parts are tests as well (test_newcomer.py).
+`make newcomer` runs all of it and prints a table; `make newcomer ARGS=inputs` a part: shown, pages or inputs.
+Exit status 1 if something is wrong. The quick parts are tests as well (test_newcomer.py).
 """
 
 import argparse
 import os
-import random
 import shutil
 import subprocess
 import sys
@@ -17,7 +16,6 @@ from pathlib import Path
 
 import shown_commands
 from bad_inputs import BAD_INPUTS, find_faults, write_bad_files
-from interruption import LONG_COMMANDS, MOMENTS, interrupt_command
 from places import ROOT
 
 Row = tuple[str, str, str, str]  # what, status, time, result
@@ -36,7 +34,7 @@ def main() -> int:
         with tempfile.TemporaryDirectory(prefix="newcomer-") as folder:
             for what, status, duration, result in PARTS[part](Path(folder)):
                 rows.append(f"| {what} | {status} | {duration} | {result} |")
-                is_bad |= result not in ("ok", "not run", "done before Ctrl-C")
+                is_bad |= result not in ("ok", "not run")
                 print(rows[-1], flush=True)
     text = "\n".join(rows[1:]) + "\n"
     if args.out:
@@ -88,39 +86,8 @@ def play_inputs(folder: Path) -> Iterator[Row]:
                "; ".join(faults) or "ok")
 
 
-def play_interruptions(folder: Path) -> Iterator[Row]:
-    """Ctrl-C in every long command, at several moments."""
-    write_recordings(folder)
-    group = "239.74." + ".".join(str(random.SystemRandom().randrange(1, 255)) for _ in range(2))
-    for name, words in LONG_COMMANDS.items():
-        for moment in MOMENTS:
-            done = interrupt_command(name, words.format(group=group), moment, folder, make_environment())
-            status = "-" if done.status is None else str(done.status)
-            result = "; ".join(done.faults) or ("done before Ctrl-C" if done.status is None else "ok")
-            yield (f"Ctrl-C in {name} after {moment:g} s", status, f"{done.wall:.2f} s, CPU {done.cpu:.2f} s", result)
-            if done.status is None:
-                break
-
-
-def write_recordings(folder: Path, minutes: float = 13.0) -> None:
-    """Write the recordings that the long commands take."""
-    def rig(*words: str) -> None:
-        subprocess.run([sys.executable, "-m", "rig.cli.main", *words, "--quiet"], cwd=folder, check=True,
-                       env=make_environment())
-
-    rig("simulate", "--samples")
-    steps = "".join(f"{k},{2e-3 * (k % 3 - 1):g}\n{k + 0.5:g},{1e-3 * (k % 5 - 2):g}\n"
-                    for k in range(round(60 * minutes)))
-    (folder / "long_command.csv").write_text("t,com\n" + steps)
-    rig("simulate", "--command", "long_command.csv", "--set", "filter.clogging=0.2", "--out", "long.csv")
-    (folder / "unit").mkdir()
-    for month in range(1, 7):
-        rig("simulate", "--set", f"filter.clogging={0.02 * month:g}", "--seed", str(month), "--out",
-            f"unit/2026-{month:02}-01.csv")
-
-
 PARTS: dict[str, Callable[[Path], Iterator[Row]]] = {
-    "shown": play_shown, "pages": play_pages, "inputs": play_inputs, "interruptions": play_interruptions}
+    "shown": play_shown, "pages": play_pages, "inputs": play_inputs}
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -6,15 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 from effects_cases import EASY, QUIET_SPOOL, WHOLE, H, drive_plant, measure_speed, measure_spool
-from effects_reference import simulate_jack
 from hypothesis import given, settings, strategies as st
 from node_bench import FirmwareDesk
-from physics_cases import SILENT, SMOOTH
+from physics_cases import SMOOTH
 
 from plant import Actuator, Model, simulate
 from plant.compile import compile_function, interpret_function
 from plant.controller import compute_answers
-from plant.effects import CATALOGUE
 from plant.effects.current import coil_lag
 from plant.effects.sensors import Recoil, mount_compliance, sensor_lag
 from plant.effects.supply import Drawn, supply_droop
@@ -22,16 +20,10 @@ from plant.eha import State, compute_coefficients, compute_metering_line, step_a
 from plant.kernels import unpack_state
 from plant.plants import find_plant
 from plant.state import Input, Lag, Line
-from rig.benches.profiles import Control
+from rig.benches.profiles import CIA408
 
 MILLI = 1e-3
-FRICTIONLESS = {"jack.static_friction": 0.0, "jack.dynamic_friction": 0.0}
 ADVANCED = np.random.default_rng(1).uniform(-4e-3, 4e-3, 60)  # A, a new one each cycle
-
-
-def test_null_bias_shifts_position_and_not_pressure() -> None:
-    run = simulate(EASY.replace({"null_bias.current": 2e-4}), np.zeros(600))
-    assert run.xj[-1] == pytest.approx(2e-4 / EASY["controller.proportional_gain"], rel=1e-3) and abs(run.p12[-1]) < 1.0
 
 
 def test_hysteresis_is_a_loop_of_its_width_at_any_rate() -> None:
@@ -156,14 +148,6 @@ def test_ripple_is_a_line_in_the_speed() -> None:
     assert np.angle(line * 1j) == pytest.approx(0.5 + 2 * np.pi * 25 * 0.120 - 6 * np.pi, abs=0.05)
 
 
-def test_viscosity_moves_three_parameters_together() -> None:
-    thick = WHOLE.replace({"viscosity_drift.factor": 1.6})
-    by_hand = WHOLE.replace({"jack.damping": 1.6 * WHOLE["jack.damping"], "flapper.damping": 1.6 * 0.45,
-                             "jack.leakage": WHOLE["jack.leakage"] / 1.6})
-    found, expected = (drive_plant(model, ADVANCED)[1] for model in (thick, by_hand))
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-15)
-
-
 def _moved(flat, spool, load, record, h, out):
     """Metering edges and ram alone, the spool on a given path; rows XJ, P12."""
     p = record[0]
@@ -175,34 +159,6 @@ def _moved(flat, spool, load, record, h, out):
         x, v, p12, m = ram(s, m, u, p, k, line, load[i])
         s = State(0.0, 0.0, spool[i], 0.0, x, v, p12, x)
         out[0, i], out[1, i] = x, p12
-
-
-IMPLICIT = ("compressibility", "orifice_root", "presliding")
-
-
-@pytest.mark.parametrize("changes", [
-    FRICTIONLESS | {"orifice_root.share": 1.0}, FRICTIONLESS | {"orifice_root.share": 0.4},
-    FRICTIONLESS | {"compressibility.coefficient": 1e-9}, FRICTIONLESS | {"compressibility.coefficient": 1e-11},
-    FRICTIONLESS | {"compressibility.coefficient": 1e-9, "orifice_root.share": 1.0},
-    {"presliding.deflection": 5e-6}, {"presliding.deflection": 1e-4, "presliding.speed": 2e-3},
-    {"presliding.deflection": 2e-5, "compressibility.coefficient": 1e-9, "orifice_root.share": 1.0},
-], ids=lambda c: ", ".join(f"{k} {v:g}" for k, v in c.items() if v))
-@pytest.mark.parametrize(("h", "um", "bar"), [(1e-5, 0.3, 0.05), (5e-5, 1.5, 0.25)])
-def test_implicit_effects_against_an_explicit_integration(changes: dict[str, float], h: float, um: float,
-                                                          bar: float) -> None:
-    """Each alone and all together, at pressures up to 150 of 201 bar; RMS over 0.4 s, speeds to 90 mm/s."""
-    model, fine = SILENT.with_effects(IMPLICIT).replace(changes), 5e-7
-    paths = {}
-    for step in (h, fine):
-        t = np.arange(1, round(0.4 / step) + 1) * step
-        paths[step] = (4e-4 * np.sin(16 * np.pi * t) * (1 - np.exp(-t / 5e-3)) + 1e-4 * np.sin(120 * np.pi * t),
-                       22e3 * np.sin(6 * np.pi * t))
-    every = round(h / fine)
-    ours = np.empty((2, len(paths[h][0])))
-    run = compile_function(_moved, model.kind.bind_functions(model.effects))
-    run(model.build_flat_state(), *paths[h], model.build_record(), h, ours)
-    error = ours - simulate_jack(model.values, *paths[fine], fine)[:, every - 1::every]
-    assert (np.sqrt((error**2).mean(axis=1)) * [1e6, 1e-5] < [um, bar]).all()
 
 
 @pytest.mark.parametrize("h", [1e-5, 5e-5])
@@ -263,22 +219,6 @@ def test_pressure_at_constant_speed_is_friction_drag_and_load(model: Model, curr
     assert AREA * p12 == pytest.approx(dry(v) + model["jack.damping"] * v + load, rel=2e-3) and abs(v) > 1e-6
 
 
-def test_leakage_shows_as_speed_in_proportion_to_pressure() -> None:
-    """Valve closed, a load on the ram: GQ XS = 0 = QJ + GQ/GP P12, QJ = AJ XJ' + CLK P12."""
-    model = EASY.replace(LEAKY)
-    _, p12, _, _, v = drive_plant(model, np.zeros(60), 6e3)[1][:, -1]
-    conductance = LEAKY["jack.leakage"] + model["valve.flow_gain"] / model["valve.pressure_gain"]
-    assert AREA * v == pytest.approx(-conductance * p12, rel=1e-4)
-
-
-def test_moving_mass_is_pressure_in_proportion_to_acceleration() -> None:
-    model = EASY.replace({"jack.mass": 200.0, "jack.damping": 0.0})
-    _, p12, _, _, v = drive_plant(model, 2e-3 * np.sin(2 * np.pi * 20 * np.arange(200) * 1e-3))[1]
-    inner = slice(60, -1)
-    acceleration = np.gradient(v, 1e-3)[inner]
-    np.testing.assert_allclose(AREA * p12[inner], 200.0 * acceleration, atol=0.01 * 200 * abs(acceleration).max())
-
-
 def test_a_ram_with_asymmetric_friction_at_rest_holds_more_one_way() -> None:
     """Loads up to FS (1 - d) against extension and FS (1 + d) with it move nothing, more does."""
     model = WHOLE.replace({"friction_asymmetry.asymmetry": 0.3})
@@ -306,18 +246,6 @@ def test_backlash_loses_its_width_at_every_reversal() -> None:
     assert ((sensed - x).min(), (sensed - x).max()) == pytest.approx((-0.5e-4, 0.5e-4))
     standing = np.flatnonzero(np.diff(sensed[130:]) == 0.0) + 130
     assert np.ptp(x[standing[:5]]) < 1e-4 and len(standing) > 5
-
-
-def test_sensor_gain_and_offset() -> None:
-    model = EASY.replace({"sensor_gain.error": -0.02, "sensor_offset.offset": 50e-6})
-    sensed, _, _, x, _ = drive_plant(model, STEADY)[1]
-    np.testing.assert_allclose(sensed, 0.98 * x + 50e-6, rtol=1e-12)
-
-
-def test_two_effects_at_one_port_both_act() -> None:
-    load = {"constant_load.force": 1000.0, "aero_stiffness.stiffness": 5e5}
-    run = simulate(EASY.replace(load), np.full(600, 2e-3))
-    assert run.p12[-100:].mean() * AREA == pytest.approx(1000.0 + 5e5 * run.xj[-100:].mean(), rel=0.01)
 
 
 def test_constant_load_equals_the_load_of_the_command() -> None:
@@ -378,7 +306,7 @@ def test_the_rigs_own_firmware_limits_the_rate_too() -> None:
     desk = FirmwareDesk(Model().replace({"command_rate_limit.rate": 0.1}))
     wanted = [0.0, *(0.1e-3 * k for k in range(1, 6))]
     for _ in range(2):
-        drives = [desk.cycle(int(Control.ACTIVE), demand) for demand in (0.0, *[5e-3] * 5)]
+        drives = [desk.cycle(CIA408.ladder[-1], demand) for demand in (0.0, *[5e-3] * 5)]
         assert [drive and drive.current for drive in drives] == pytest.approx([3.8 * x for x in wanted], abs=1e-8)
         desk.cycle(0)
 
@@ -410,11 +338,6 @@ def test_friction_only_takes_energy(v: float, rise: float, speed: float, asymmet
         now = 0.5 * 100.0 * s.jack_speed**2 + 0.5 * stiffness * bent**2
         assert now <= last * (1 + 1e-9) + 1e-15
         last, (s, m) = now, moved(s, m, u, p, k)
-
-
-def test_the_order_of_the_sensors_chain_is_that_of_its_signal() -> None:
-    assert [e for e in CATALOGUE if CATALOGUE[e].port == "position"] == [
-        "mount_compliance", "rod_backlash", "sensor_lag", "sensor_gain", "sensor_offset"]
 
 
 def test_a_heavy_body_on_its_mount_rings_as_its_equation_says() -> None:

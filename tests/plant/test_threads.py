@@ -22,13 +22,6 @@ def test_answers_come_in_the_order_of_the_questions_and_an_error_reaches_who_ask
         map_in_threads(slow_first, [1, 0, 2], 2)
 
 
-def test_one_worker_or_one_item_stays_in_this_thread() -> None:
-    here = threading.get_ident()
-    assert map_in_threads(lambda _: threading.get_ident(), range(3), 1) == [here] * 3
-    assert map_in_threads(lambda _: threading.get_ident(), range(1), 4) == [here]
-    assert here not in map_in_threads(lambda _: threading.get_ident(), range(3), 2)
-
-
 def test_an_error_leaves_what_is_still_at_work() -> None:
     """Ctrl-C answers at once: work that has begun goes on by itself, work that has not is dropped."""
     begun, go_on, done = threading.Event(), threading.Event(), []
@@ -70,28 +63,6 @@ def test_requests_of_side_by_side_tasks_are_met_together_until_each_has_ended() 
     assert met == [[(0, 1), (0, 2), (0, 3)], [(1, 2), (1, 3)], [(2, 3)]]
     met.clear()
     assert map_together(make_requests, [2], 2) == [2] and met == [[(0, 2)], [(1, 2)]]  # nobody to wait for
-
-
-def test_requests_of_threads_within_tasks_are_met_together_too() -> None:
-    """Each task asks for two pieces of work at once, and goes on alone."""
-    met: list[list[str]] = []
-
-    def do(requests: Sequence[str], workers: int) -> None:
-        met.append(sorted(requests))
-
-    def make_requests(task: str) -> list[str]:
-        def ask(part: str) -> str:
-            do_together(task + part, do, 2)
-            return part
-
-        answers = map_in_threads(ask, "12", 2)
-        do_together(task, do, 2)
-        return answers
-
-    assert map_together(make_requests, "ab", 2) == [["1", "2"]] * 2
-    assert met[0] == ["a1", "a2", "b1", "b2"]
-    later = [name for together in met[1:] for name in together]  # whoever comes back first may be alone
-    assert sorted(later) == ["a", "b"]
 
 
 @pytest.mark.parametrize("fails_in_task", [True, False])

@@ -11,13 +11,9 @@ from typing import Any
 import pytest
 from scipy.stats import beta
 
-from fdi.sources import import_function
-from studies.hidden_effects import cases, score
+from studies.hidden_effects import score
 from studies.hidden_effects.__main__ import main
-from studies.hidden_effects.benchmark import answer_benchmark, describe_progress, make_benchmark
-from studies.hidden_effects.truth import has_compiler
 
-compiled = pytest.mark.skipif(not has_compiler(), reason="no gcc: the trial's simulator cannot be built")
 SCRIPT = Path(score.__file__)
 
 
@@ -97,42 +93,11 @@ def test_rates_count_what_they_say(folder: Path) -> None:
     assert scores["names_on_average"] == 1.5 and scores["seconds"] == {"median": 30.0, "longest": 30.0}
 
 
-def test_precision_recall_and_f1_are_those_of_the_cells(folder: Path) -> None:
-    """Blamed are four cells, two of them rightly; of seven visible cases with two cells each, and two with nothing."""
-    scores = json.loads(run_script(folder, folder / "answers.json", "--json").stdout)
-    where = scores["where"]["all"]
-    assert where["cases"] == 9
-    assert [where[name]["value"] for name in ("precision", "recall", "F1")] == pytest.approx([2 / 4, 2 / 14, 4 / 18])
-    assert where["F1"]["low"] < where["F1"]["value"] < where["F1"]["high"]
-    assert scores["where"]["xj"]["recall"]["value"] == pytest.approx(2 / 7)
-    assert scores["where"]["one"]["precision"]["value"] == pytest.approx(2 / 3)
-    assert scores["where"]["xs"] == {"cases": 9} and scores["where"]["outside"] == {"cases": 1}
-
-
 @pytest.mark.parametrize(("good", "of"), [(0, 5), (5, 5), (3, 7), (150, 200), (1, 1), (0, 0)])
 def test_intervals_are_those_of_clopper_and_pearson(good: int, of: int) -> None:
     low = beta.ppf(0.025, good, of - good + 1) if good else 0.0
     high = beta.ppf(0.975, good + 1, of - good) if good < of else 1.0
     assert score.compute_interval(good, of) == pytest.approx((low, high), abs=1e-9)
-
-
-def test_an_answer_in_csv_counts_as_in_json(folder: Path) -> None:
-    rows = ["case,verdict,effects,sizes,where", *(
-        f"{case},{given['verdict']},{';'.join(given['effects'])},{'20 19 21' if case == '00002' else ''},"
-        f"{';'.join(given.get('where', []))}" for case, (_, given) in PAIRS.items())]
-    (folder / "answers.csv").write_text("\n".join(rows) + "\n")
-    by_file = [json.loads(run_script(folder, folder / f"answers.{kind}", "--json").stdout) for kind in ("csv", "json")]
-    assert by_file[0]["where"] == by_file[1]["where"]
-    first, second = ({rate["name"]: rate for rate in scores["rates"]} for scores in by_file)
-    covered = first["one, named: true size in interval"]
-    assert first["one: named"] == second["one: named"] and (covered["good"], covered["of"]) == (1, 1)
-
-
-def test_the_text_says_rates_and_misses(folder: Path) -> None:
-    (folder / "answers.json").write_text(json.dumps({"00002": PAIRS["00002"][1]}))
-    shown = run_script(folder, folder / "answers.json").stdout
-    assert "1 of 11 cases answered" in shown and "one: named" in shown and "F1" in shown
-    assert "00004  spool_friction 1 (9.0 floors) -> failed" in shown
 
 
 @pytest.mark.parametrize(("text", "expected"), [
@@ -150,57 +115,6 @@ def test_bad_answers_are_refused_in_one_line(text: str, expected: str, folder: P
     assert done.stderr.startswith(f"score.py: {folder / 'answers.json'}: ") and expected in done.stderr
 
 
-def test_a_folder_without_truth_is_refused_in_one_line(tmp_path: Path) -> None:
-    done = run_script(tmp_path, tmp_path / "answers.json")
-    assert done.returncode == 2 and done.stderr == f"score.py: {tmp_path}: expected a folder with truth/CASE.json\n"
-
-
-def knowing(case: Path, plant: str, signals: str) -> dict[str, Any]:
-    """A method that looks up the truth, and keeps a tally."""
-    with (case.parent.parent / "tally").open("a") as tally:
-        tally.write(".")
-    hidden = json.loads((case.parent.parent / "truth" / f"{case.name}.json").read_text())
-    if hidden["kind"] == "outside":
-        raise ValueError("out of my depth")
-    names = [effect["name"] for effect in hidden["effects"]]
-    return {"verdict": "explained" if names else "nothing", "effects": names, "where": hidden["where"]}
-
-
-@compiled
-def test_a_benchmark_has_the_same_bytes_and_resumes(tmp_path: Path) -> None:
-    seeds = [next(s for s in range(99) if cases.sample_case(s).kind == kind) for kind in ("one", "outside")]
-    first, other, by = tmp_path / "first", tmp_path / "other", f"{__name__}:knowing"
-    make_benchmark(first, seeds[:1])
-    answer_benchmark(first, by)
-    make_benchmark(first, seeds)  # goes on
-    make_benchmark(other, seeds)
-    made = [sorted(path.relative_to(root) for path in root.rglob("*") if path.is_file() and "answers" not in path.name
-                   and path.name != "tally") for root in (first, other)]
-    assert made[0] == made[1] and len(made[0]) == 4 + 2 * 4
-    assert all((first / name).read_bytes() == (other / name).read_bytes() for name in made[0])
-    with next(first.glob("answers-*.jsonl")).open("a") as rows:
-        rows.write('{"case": 3, "cut')  # a process that was killed
-    told: list[str] = []
-    answers = json.loads(answer_benchmark(first, by, 1, lambda p: told.append(describe_progress(p))).read_text())
-    assert (first / "tally").read_text() == ".." and len(told) == 1 and told[0].startswith("2/2")
-    found = score.score_answers(score.read_truths(first), answers["answers"])
-    assert [answers["answers"][f"{seed:05d}"]["verdict"] for seed in seeds] == ["explained", "failed"]
-    assert found["answered"] == 2 and "out of my depth" in answers["answers"][f"{seeds[1]:05d}"]["error"]
-    described = json.loads((first / "benchmark.json").read_text())
-    assert len(described["catalogue"]) == 34 and described["sections"]["s02"]["command"] == "step to 5 mm"
-
-
-@compiled
-def test_the_command_makes_answers_and_scores(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    seed = next(s for s in range(99) if cases.sample_case(s).kind == "nothing")
-    made = ["--benchmark", str(tmp_path / "made")]
-    assert main([*made, "--cases", "1", "--seed", str(seed)]) == 0
-    assert main([*made, "--answer", f"{__name__}:knowing"]) == 0
-    assert "Every aim that was counted is reached." in (shown := capsys.readouterr().out) and "1 of 1 cases" in shown
-    assert main([*made, "--cases", "1", "--signals", "xj"]) == 2
-    assert "or one with cases of the same plant, signals and simulator" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(("options", "expected"), [
     (["--signals", "xj,pressure"], "--signals: xj,pressure: expected xj or xj,p12 or xj,p12,xs or drawn"),
     (["--cases", "0"], "--cases: 0: expected 1 or more"),
@@ -213,28 +127,3 @@ def test_bad_options_are_refused_in_one_line(options: list[str], expected: str, 
     said = capsys.readouterr().err
     assert said.startswith("studies.hidden_effects: ") and expected in said and said.count("\n") == 1
     assert not (tmp_path / "made").exists()
-
-
-@compiled
-@pytest.mark.parametrize(("module", "effect", "known"), [
-    ("regression", "null_bias", True), ("sindy", "compressibility", True), ("sindy", "rod_backlash", False)])
-def test_other_methods_name_an_effect_that_they_can_express(module: str, effect: str, known: bool, tmp_path: Path
-                                                                 ) -> None:
-    if module == "sindy":
-        pytest.importorskip("pysindy")
-    case = cases.sample_case(5, effects=[effect], level="exact", sizes=(0.5, 0.5), signals="xj,p12,xs")
-    cases.write_case(case, tmp_path)
-    method = import_function(f"studies.hidden_effects.{module}:answer_case", "", "")
-    given, hidden = method(tmp_path, "eha", "xj,p12,xs"), json.loads((tmp_path / "truth.json").read_text())
-    assert (effect in given["effects"][:score.NAMES]) is known
-    read = read_through_file({"00005": given}, tmp_path)
-    if known:
-        assert read["sizes"][effect]["value"] == pytest.approx(hidden["effects"][0]["value"], rel=0.5)
-        assert set(hidden["where"]) & set(read["where"])
-
-
-def read_through_file(answers: dict[str, Any], folder: Path) -> Any:
-    """The answer of the only case, as the scorer reads it from a file."""
-    (folder / "answers.json").write_text(json.dumps(answers, allow_nan=False))
-    (given,) = score.read_answers(folder / "answers.json", answers).values()
-    return given

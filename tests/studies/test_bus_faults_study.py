@@ -4,25 +4,15 @@ import pytest
 
 from fdi.report.report import render_html
 from rig.nodes import firmware
-from rig.sequences.sequence import parse_sequence
 from studies.bus_faults import (
     FAULTS,
     PHASES,
-    BusFault,
     build_bus_faults_report,
     collect_figures,
     study_bus_faults,
-    write_sequence,
 )
 
 LOST, TOLERATED = FAULTS[0], FAULTS[5]
-
-
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_every_cell_has_a_valid_sequence(fault: BusFault) -> None:
-    for phase in PHASES:
-        sequence = parse_sequence(write_sequence(fault, phase), "x.toml", lambda name: b"")
-        assert sequence.disturbs_bus and len(sequence.faults) == 1
 
 
 def test_the_figures_of_two_faults() -> None:

@@ -23,17 +23,6 @@ def test_it_finds_gains_and_delay_exactly(delay: int) -> None:
     assert found.asymmetry == pytest.approx(-0.3) and found.limit <= 1000.0
 
 
-def test_rounding_of_the_answer_is_what_it_leaves() -> None:
-    error = np.random.default_rng(2).uniform(-50.0, 50.0, 20000)
-    found = fit_directional_gains(error, np.round(3.3 * error), np.sign(error))
-    assert found.residual == pytest.approx(12**-0.5, rel=0.05) and found.out == pytest.approx(3.3, rel=1e-3)
-
-
-def test_it_refuses_a_side_without_rows() -> None:
-    with pytest.raises(ValueError, match="driven back"):
-        fit_directional_gains(np.ones(50), np.ones(50), np.ones(50))
-
-
 @real
 @pytest.mark.parametrize("run", ["1_1", "2_2"])
 def test_the_servos_firmware(run: str) -> None:

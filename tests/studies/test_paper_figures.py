@@ -4,13 +4,7 @@ import xml.etree.ElementTree as ElementTree
 from functools import cache
 
 from fdi import Trace
-from fdi.diagnosis.bands import find_excursions
-from fdi.diagnosis.faults import FAULTS
-from fdi.diagnosis.make_bands import choose_bands
-from fdi.diagnosis.rms_grid import search_grid
-from fdi.report.diagnosis_report import draw_maps
 from plant import Model, simulate
-from plant.segments import Chirp, Hold, Step, build_profile
 from rig.sequences import load_sequence
 from studies import paper_figures as figures
 
@@ -36,30 +30,3 @@ def test_either_fault_alone() -> None:
     for draw in (figures.draw_steps, figures.draw_ramps):
         assert set(runs) <= texts(draw(runs))
     assert "error [um]" in texts(figures.draw_ramps(runs, number=1))
-
-
-def test_a_trace_in_its_bands() -> None:
-    faulty = trace(0.4, 45.0)
-    bands = choose_bands(faulty.com, faulty.load, 1e-3, None, lambda *_: None)
-    found, shown, _ = find_excursions(faulty.com, faulty.xj, 1e-3, bands, faulty.sections())
-    for kind, signal, first in (("step", "position", "step of +5 mm at 0.5 s"),
-                                ("ramp", "position", "ramp of +1 mm at 4.001 s"),
-                                ("ramp", "speed", "ramp of -1 mm at 6.501 s")):
-        said = texts(figures.draw_bands(found, shown, bands, faulty, kind, signal))
-        assert {"measured", "MidBand", "MaxBand", "outside", first} <= said
-    assert figures.draw_bands(found, shown, bands, faulty, "step", "speed") == ""
-
-
-def test_the_maps() -> None:
-    grid = search_grid(trace(0.25, 30.0), sliding=(2.0 / 3.0,))
-    said = texts(draw_maps(grid, truth=(0.25, 30.0)))
-    assert {"A", "B", "C", "G", "injected", "between cells", "Kintas", "FSS [N]"} <= said
-    assert any(text.startswith("step sections: ") for text in said)
-    assert "injected" not in texts(draw_maps(grid))
-
-
-def test_maps_of_steps_alone() -> None:
-    com = build_profile([Hold(time=0.3), Step(to=2e-3, time=0.8), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
-    measured = Trace.from_columns(simulate(Model(), com)._asdict(), 1e-3, {})
-    said = texts(draw_maps(search_grid(measured, faults=FAULTS)))
-    assert {"A", "C"} <= said and not {"B", "G"} & said

@@ -2,29 +2,15 @@
 
 import shutil
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import pytest
 from physics_cases import PREFLIGHT
 
 from rig.bench import benchmarks
-from studies.peers import __main__ as command, grid_runs, many_runs, rivals
+from studies.peers import grid_runs, many_runs, rivals
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {benchmarks.GET_GCC}")
-
-
-def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(benchmarks.shutil, "which", lambda name: None)
-    monkeypatch.setattr(rivals.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr(command, "compare_many_runs", partial(many_runs.compare_many_runs, rounds=1, cycles=300))
-    monkeypatch.setattr(command, "compare_grid_runs", partial(grid_runs.compare_grid_runs, rounds=1))
-    assert command.main([]) == 0
-    words = " ".join(capsys.readouterr().out.split())
-    assert "C, one run after the other skipped, gcc is not installed; to get it: apt-get install gcc" in words
-    assert "C, OpenMP skipped, gcc is not installed" in words
-    assert "jax, vmap skipped, jax is not installed; to get it: pip install 'eha-rig[bench]'" in words
-    assert "ProgPy, vectorised skipped, progpy is not installed" in words
 
 
 def list_sound_rivals(compare: Callable[..., Sequence[rivals.Rival]], **options: Any) -> dict[str, rivals.Rival]:

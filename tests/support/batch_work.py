@@ -51,26 +51,6 @@ def run_process_without_signals(folder: str) -> None:
     run_sleeping_process(folder)
 
 
-def lose_first_signal(file: str) -> str:
-    """Drop the exception of the first signal, as Python does in a destructor, and write down how the second one ends.
-
-    The job "" is done at once.
-    """
-    if not file:
-        return ""
-    try:
-        Path(file).touch()
-        time.sleep(1200)
-    except SystemExit:
-        Path(file).write_text("lost")
-    try:
-        time.sleep(1200)
-    except SystemExit as error:
-        Path(file).write_text(f"lost, ended by {error.code}")
-        raise
-    return file
-
-
 def exit_at_import() -> None:
     """Ends a process that unpickles it."""
     raise SystemExit(3)

@@ -12,7 +12,6 @@ def print_answers(folder: Path) -> None:
     """One object on standard output: command to its JSON answer."""
     biased, repeat = folder / "biased.csv", folder / "repeat.csv"
     answers: dict[str, Any] = {
-        "compare": rig("compare", biased, "--repeat", repeat, "--json").json,
         "add": rig("add", "null_bias", biased, "--repeat", repeat, "--out", "model.toml", "--json").json,
         "fdi": rig("fdi", folder / "clogged.csv", "--json").json,
     }

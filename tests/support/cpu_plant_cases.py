@@ -2,10 +2,14 @@
 
 import hashlib
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from physics_cases import PREFLIGHT
+from rig_command import job, play
 
+from fdi.trace.mcap_log import open_log
 from plant import Actuator, Model, functions, simulate
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes
@@ -42,7 +46,15 @@ def print_hashes() -> None:
         "lanes, replay, effects": build_lanes(some, 20).replay(sample_values(20), 5.0 * SWING, LOAD, SWING, 2.0),
     }
     hashes = {name: hashlib.sha256(np.ascontiguousarray(x).tobytes()) for name, x in cases.items()}
+    hashes["log of a run"] = hashlib.sha256(repr(read_log(some)).encode())
     print(json.dumps({name: found.hexdigest() for name, found in hashes.items()}))
+
+
+def read_log(model: Model) -> list[tuple[int, int, bytes]]:
+    """The messages of a short run on the embedded bus but for the times of its cycles."""
+    play(replace(job(seed=3), model=model), Path("run"))
+    log = open_log(Path("run/trace.mcap"))
+    return [each for each in log.list_raw_messages() if log.channels[each[0]].topic != "/timing"]
 
 
 def build_command() -> np.ndarray:

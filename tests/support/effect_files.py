@@ -50,9 +50,11 @@ def wear(x, m, s, u, p):
 
 
 @contextmanager
-def restored_catalogue() -> Iterator[None]:
-    """Takes out again what was registered meanwhile."""
+def restored_catalogue(*kept: str) -> Iterator[None]:
+    """Takes out again what was registered meanwhile; with only the `kept` effects, if any are named: a short search."""
     before = dict(CATALOGUE)
+    for name in set(CATALOGUE) - set(kept or CATALOGUE):
+        del CATALOGUE[name]
     try:
         yield
     finally:

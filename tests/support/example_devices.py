@@ -2,7 +2,6 @@
 
 import contextlib
 import queue
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -63,11 +62,11 @@ class DriveMaster:
         while self.node.nmt.wait_for_heartbeat(LIMIT) != "PRE-OPERATIONAL":
             pass
 
-    def start(self, mode: int = 8, sync_us: int = 0) -> None:
+    def start(self, sync_us: int = 0) -> None:
         """Make it OPERATIONAL. `sync_us`: period of SYNC to watch, 0: do not watch."""
         self.node.setup_402_state_machine()
         self.node.sdo[0x1006].raw = sync_us
-        self.node.sdo[0x6060].raw = mode
+        self.node.sdo[0x6060].raw = 8  # cyclic synchronous position
         self.node.nmt.state = "OPERATIONAL"
         self.node.sdo.upload(0x1006, 0)  # the answer comes after the command took effect
 
@@ -93,23 +92,6 @@ class DriveMaster:
         for control in (0x06, 0x07, 0x0F):
             answer = self.cycle(control, target, position)
         return answer
-
-    @contextlib.contextmanager
-    def run_cycles(self, pause: float = 0.002) -> Iterator[None]:
-        """Cycles beside the test: for what waits for frames by itself."""
-        is_over = threading.Event()
-
-        def run() -> None:
-            while not is_over.wait(pause):
-                self.cycle()
-
-        thread = threading.Thread(target=run)
-        thread.start()
-        try:
-            yield
-        finally:
-            is_over.set()
-            thread.join()
 
     def wait_for_emergency(self, code: int) -> bytes:
         """The five bytes of information of the next EMCY with this code."""

@@ -1,8 +1,24 @@
-"""The rows of a run's log, byte for byte as they were written."""
+"""The rows of a run's log: byte for byte as they were written, or kept as the loop gives them."""
 
 from pathlib import Path
 
 from mcap.reader import make_reader
+
+from rig.recorder import Signals, Timing
+
+
+class CycleBook:
+    """A log that keeps the cycles it is told."""
+
+    def __init__(self) -> None:
+        self.times: list[int] = []
+        self.rows: list[Signals] = []
+        self.timings: list[Timing] = []
+
+    def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
+        self.times.append(t_ns)
+        self.rows.append(signals)
+        self.timings.append(timing)
 
 
 def read_row_bytes(folder: Path) -> list[bytes]:

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
+from effects_cases import LAWS
 from physics_cases import PREFLIGHT, QUIET
-from synthetic_run import build_command
 
 from fdi.trace.trace import Trace
 from plant import Actuator, Model
@@ -15,7 +15,7 @@ SENSED, PRESSURE, SPOOL = (State._fields.index(name) for name in ("sensed", "pre
 LEVELS = np.array([2e-6, 2e4, 1e-6])  # of the nominal transducers: m, Pa, m
 TURN = 0.78  # of one sample of coloured noise, what the next one keeps: a corner at 40 Hz, as on the practice bench
 HUM = 0.4  # amplitude over the level, 50 Hz
-SHORT = np.concatenate([build_command()[3800:5200], build_command()[9000:11600]])  # a ramp and a sine: 4 s
+SHORT = np.concatenate([PREFLIGHT[3800:5200], PREFLIGHT[9000:11600]])  # a ramp and a sine: 4 s
 
 
 def sample_noise(seed: int, rows: int, colour: str = "white") -> np.ndarray:
@@ -34,6 +34,7 @@ def record_plant(changes: dict[str, float] | None = None, com: np.ndarray = PREF
                  colour: str = "white", sensor: Callable[[float], float] | None = None, load: float = 0.0) -> Trace:
     """A trace of the nominal plant with some `changes`; `sensor` turns the ram's position into what is sensed."""
     model = Model().replace(QUIET | (changes or {}))
+    model = model.with_effects(LAWS) if model.effects else model  # one kernel for all effects
     plant, n = Actuator(model), sample_noise(seed, len(com), colour).tolist()
     state = plant._flat
     gain, limit = model["controller.proportional_gain"], model["controller.current_limit"]

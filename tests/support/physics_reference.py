@@ -1,17 +1,15 @@
 """The reference model once more, written from the equations alone, to hold the plant against.
 
-`simulate_explicit` is a plain 1 us integration with Karnopp's friction; `simulate_piecewise` an adaptive implicit
-solver (Radau) with the stops as events; `simulate_linear` the matrix exponential where nothing saturates. None of them
-shares code or scheme with plant/.
+`simulate_explicit` is a plain integration with Karnopp's friction, in steps of 1 us and less; `simulate_linear` the
+matrix exponential where nothing saturates. Neither shares code or scheme with plant/.
 """
 
 from collections import namedtuple
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 CYCLE = 1e-3  # s
@@ -94,23 +92,6 @@ def simulate_explicit(v: Mapping[str, float], com: Any, load: Any = None, measur
     return out
 
 
-class _Modes(NamedTuple):
-    flapper: float = 0.0  # +-1: held at that stop
-    spool: float = 0.0
-
-
-def simulate_piecewise(v: Mapping[str, float], com: Any) -> Any:
-    """Rows XJ, Cor, P12, XS without friction: Radau at tight tolerance, inelastic stops as events."""
-    p, out, y, current, modes = convert_parameters(v), np.empty((4, len(com))), np.zeros(6), 0.0, _Modes()
-    assert p.FSS == p.FSJ == 0
-    for k, demand in enumerate(com):
-        answer = float(np.clip(p.GAP * (demand - y[4]), -p.Imax, p.Imax))
-        out[:, k] = y[4], answer, _p12(p, y), y[2]
-        y, modes = _cycle(p, y, current, modes)
-        current = answer
-    return out
-
-
 def _p12(p: Plant, y: Any) -> float:
     line = (p.GP * y[2] - p.GP / p.GQ * p.AJ * y[5]) / (1 + p.GP / p.GQ * p.CLK)
     return float(np.clip(line, -p.PSR, p.PSR))
@@ -121,38 +102,6 @@ def _forces(p: Plant, y: Any, current: float) -> tuple[float, float, float]:
     p1 = float(np.clip(p.GPF1 * (xf - p.ASV * vs / p.GQF1), -p.PS1, p.PS1))
     return (p.GM * current - p.KSF * xs - p.KF * xf - p.BF * vf, p.ASV * p1 - p.CS * vs,
             p.AJ * _p12(p, y) - p.CJ * vj)
-
-
-def _cycle(p: Plant, y: Any, current: float, modes: _Modes) -> tuple[Any, _Modes]:
-    """One cycle, restarted at each arrival at a stop and each departure from one."""
-    t = 0.0
-    while t < CYCLE:
-        torque, push, _ = _forces(p, y, current)  # a body that is pushed away from its stop leaves it
-        modes = _Modes(0.0 if torque * modes.flapper < 0 else modes.flapper,
-                       0.0 if push * modes.spool < 0 else modes.spool)
-
-        def rates(_: float, y: Any, m: _Modes = modes) -> Any:
-            torque, push, pull = _forces(p, y, current)
-            flapper = (0.0, 0.0) if m.flapper else (y[1], torque / p.JF)
-            spool = (0.0, 0.0) if m.spool else (y[3], push / p.MS)
-            return (*flapper, *spool, y[5], pull / p.MJ)
-
-        events = [lambda _, y, m=modes: _forces(p, y, current)[0] * m.flapper if m.flapper else abs(y[0]) - p.XFM,
-                  lambda _, y, m=modes: _forces(p, y, current)[1] * m.spool if m.spool else abs(y[2]) - p.XSM]
-        for event, held in zip(events, modes, strict=True):
-            event.terminal, event.direction = True, -1 if held else 1
-        run = solve_ivp(rates, (t, CYCLE), y, "Radau", events=events, rtol=1e-9,
-                        atol=[1e-13, 1e-9, 1e-12, 1e-8, 1e-12, 1e-9], max_step=1e-4)
-        t, y = run.t[-1], run.y[:, -1].copy()
-        if run.status == 1:
-            at_flapper, at_spool = (len(hits) > 0 for hits in run.t_events)
-            if at_flapper:
-                modes = modes._replace(flapper=0.0 if modes.flapper else float(np.sign(y[0])))
-                y[1] = 0.0
-            if at_spool:
-                modes = modes._replace(spool=0.0 if modes.spool else float(np.sign(y[2])))
-                y[3] = 0.0
-    return y, modes
 
 
 def simulate_linear(v: Mapping[str, float], com: Any) -> Any:

@@ -94,41 +94,6 @@ class CanopenDevice(PythonDevice):
         return self._answers
 
 
-class RemappedDevice(CanopenDevice):
-    """A CANopen device of INTEGER16 and INTEGER32 whose PDOs lie as they were written to it.
-
-    It takes a mapping only as CiA 301 (7.5.2.36) lets it: while the PDO is off and the mapping empty. `counts`: name
-    and count of the objects that may be mapped into RPDO1; the current is in TPDO1.
-    """
-
-    def __init__(self, where: str, node: int, eds: str, counts: Mapping[int, tuple[str, float]],
-                 current: float) -> None:
-        super().__init__(where, node, eds, {}, (0, "<i", current))
-        self._counts = counts
-        self._local.add_write_callback(self._refuse_while_in_use)
-
-    def _refuse_while_in_use(self, *, index: int, subindex: int, **_: object) -> None:
-        if index in (0x1600, 0x1A00):
-            is_on = not self._read(index - 0x200, 1) >> 31
-            if is_on or (subindex and self._read(index, 0)):
-                raise canopen.SdoAbortedError(0x08000022)  # not in this state of the device
-
-    def _read(self, index: int, sub: int) -> int:
-        return int(self._local.sdo[index][sub].raw)
-
-    def take(self, message: can.Message) -> list[can.Message]:
-        if message.arbitration_id == 0 and message.data[0] == 1:
-            self._map()
-        return super().take(message)
-
-    def _map(self) -> None:
-        words = [self._read(0x1600, sub) for sub in range(1, self._read(0x1600, 0) + 1)]
-        code = "<" + "".join({16: "h", 32: "i"}[word & 0xFF] for word in words)
-        self._inputs = {self._read(0x1400, 1): (code, dict(self._counts[word >> 16] for word in words))}
-        word = self._read(0x1A00, 1)
-        self._output = (self._read(0x1800, 1), {16: "<h", 32: "<i"}[word & 0xFF], self._output[2])
-
-
 class CanDevice(PythonDevice):
     """A controller whose frames a DBC describes, encoded and decoded by cantools; it answers the message `on`.
 

@@ -1,11 +1,11 @@
 """A run to record without a bench: the plant over the preflight command (docs/physics.md), as frames and cycles."""
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
 import codec
 import numpy as np
+from physics_cases import PREFLIGHT
 
 from fdi.trace.check_result import CheckResult
 from plant import load_model, simulate
@@ -18,22 +18,10 @@ ATTACHMENTS = {"sequence.toml": ("application/toml", b"title = 'synthetic'\n"),
 METADATA = {"seed": "1", "bus": "embedded", "pace": "lockstep", "period": "0.001", "model": "eha"}
 
 
-def build_command() -> np.ndarray:
-    """The preflight command, shape (13500,), m; rounded, because NumPy's sin and exp differ by CPU in the last bit."""
-    def hold(level: float, seconds: float) -> np.ndarray:
-        return np.full(round(seconds * 1000), level)
-
-    ramp, t = np.arange(2000) / 2000, np.arange(2000) / 1000
-    chirp = np.sin(2 * math.pi * (t + 4.75 * t**2)) * (1 - np.exp(-20 * t))
-    return np.round(1e-3 * np.concatenate([
-        hold(0, 0.5), hold(5, 1), hold(0, 1), hold(1, 0.75), hold(0, 0.75), ramp, hold(1, 0.5), 1 - ramp, hold(0, 0.5),
-        3 * np.sin(2 * math.pi * t), chirp, hold(0, 0.5)]), 15)
-
-
 def build_cycles(seed: int = 1,
            settings: dict[str, float] | None = None) -> Iterator[tuple[int, list[Frame], Signals, Timing]]:
     """(t_ns, frames, signals, timing) of each cycle: 300 of set-up, the preflight command, 200 of clean-up."""
-    com = np.concatenate([np.zeros(300), build_command(), np.zeros(200)])
+    com = np.concatenate([np.zeros(300), PREFLIGHT, np.zeros(200)])
     run = simulate(load_model().replace(settings or {}), com, seed=seed)
     phase = np.concatenate([np.zeros(300), np.ones(len(com) - 500), np.full(200, 2)]).astype(int)
     rng = np.random.default_rng(seed)

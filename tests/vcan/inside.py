@@ -1,10 +1,10 @@
-"""What runs where a vcan0 is: the bus tests, one whole preflight run by three processes with candump listening, that of
-each controller in examples/, and a minute at 1 kHz with the C firmware.
+"""What runs where a vcan0 is: the bus tests, one whole preflight run by three processes with candump listening, and
+a short run of each controller in examples/.
 
-    python tests/vcan/inside.py OUT compile|bus|preflight|examples|minute ...
+    python tests/vcan/inside.py OUT compile|bus|preflight|examples ...
 
 Leaves in OUT: bus.xml (junit) from `bus`; run/, run.json, candump.log and one .log per process from `preflight`; NAME/
-and NAME.json of each of `examples`; minute/ and minute.json from `minute`. `compile` fills the cache of compiled code.
+and NAME.json of each of `examples`. `compile` fills the cache of compiled code.
 It is meant for the host, which does it ten times as fast as its guest: both have the same files and the same CPU.
 """
 
@@ -24,13 +24,6 @@ sys.path.append(str(TESTS / "support"))
 BUS = "socketcan:vcan0"
 RUN_LIMIT_S = 500
 NOT_JUDGED = ("ABORTED", "INVALID_TIMING")
-MINUTE = """
-title = "A minute at 1 kHz"
-setup = [{ kind = "hold", time = 0.2 }]
-main = [{ name = "sine", kind = "sine", amplitude = 2e-3, frequency = 1.0, time = 60.0 }]
-cleanup = [{ kind = "ramp", to = 0.0, time = 0.2 }]
-checks = [{ name = "no emergency", kind = "event_never", event = "EMCY" }]
-"""
 RIG = Path(sys.executable).with_name("rig")
 
 
@@ -145,23 +138,18 @@ def play_preflight(out: Path, attempt: int) -> int:
 
 
 def examples(out: Path) -> int:
-    """The preflight of each controller in examples/; the first status that is not 0."""
+    """A short run of each controller in examples/, whose preflight passes on UDP; the first status that is not 0."""
     from example_devices import DRIVE, ECU, PATIENT, run_device
+    from rig_command import SHORT, SLOW_START
 
+    (out / "short.toml").write_text(SHORT + SLOW_START)
     statuses = []
     for folder in (DRIVE, ECU):
-        words = ["run", "--bench", folder / "bench.toml", "--bus", BUS, "--json", "--out", out / folder.name]
+        words = ["run", out / "short.toml", "--bench", folder / "bench.toml", "--bus", BUS, "--json"]
+        words += ["--out", out / folder.name]
         with run_device(folder, BUS, *PATIENT[folder]), (out / f"{folder.name}.json").open("wb") as answer:
             statuses.append(subprocess.run([RIG, *words], stdout=answer, stdin=subprocess.DEVNULL).returncode)
     return next((status for status in statuses if status), 0)
-
-
-def minute(out: Path) -> int:
-    """60,000 cycles in lockstep with the C firmware; the run's exit status."""
-    (out / "minute.toml").write_text(MINUTE)
-    words = ["run", str(out / "minute.toml"), "--bus", BUS, "--controller", "c", "--json", "--out", str(out / "minute")]
-    with (out / "minute.json").open("wb") as answer:
-        return subprocess.run([RIG, *words], stdout=answer, stdin=subprocess.DEVNULL).returncode
 
 
 def main() -> int:
@@ -169,7 +157,7 @@ def main() -> int:
     out = Path(sys.argv[1]).resolve()
     out.mkdir(parents=True, exist_ok=True)
     os.chdir(TESTS.parent)
-    parts = {"compile": compile_all, "bus": bus_tests, "preflight": preflight, "examples": examples, "minute": minute}
+    parts = {"compile": compile_all, "bus": bus_tests, "preflight": preflight, "examples": examples}
     statuses = [parts[name](out) for name in sys.argv[2:]]
     return next((status for status in statuses if status), 0)
 

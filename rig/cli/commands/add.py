@@ -15,8 +15,7 @@ def run_command(args: argparse.Namespace) -> int:
     effects, trace = split_words(args.words, args.trace, model.plant)
     path = choose_model_file(args, trace)
     page = choose_file(str(path.with_suffix(".html")), (".html",), trace)
-    with show_progress(is_silent=args.json or args.quiet) as progress:
-        progress("reading", 0.0)
+    with show_progress(args, "reading") as progress:
         runs = find_runs(model, known, trace, args.repeat, args.holdout, list_signals(args))
         update = add_effects(effects, runs, model, known, format_command_line(), progress)
     report = build_model_report(update, path, write_model_file(update, path), page)

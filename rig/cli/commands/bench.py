@@ -11,7 +11,7 @@ from rig.cli.answer import Places, give_answer, show_progress
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 1 if a target of the cycle in real time that could be measured is not met."""
     is_realtime = args.what == "realtime"
-    with show_progress(is_silent=args.json or args.quiet, is_realtime=is_realtime) as progress:
+    with show_progress(args, is_realtime=is_realtime) as progress:
         report = measure_cycle(args, progress) if is_realtime else measure_plant(args, progress)
     is_missed = any(not each["is_met"] for each in report.data.get("targets", ()) if each["value"] is not None)
     return give_answer(report, args, int(is_missed), Places(answer=Path(args.out) if args.out else None))

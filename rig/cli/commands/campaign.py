@@ -44,7 +44,7 @@ def run_command(args: argparse.Namespace) -> int:
         return give_summary(read_campaign_rows(folder), folder, args)
     chosen, folder = choose_matrix(args)
     workers = Workers(args.jobs or len(os.sched_getaffinity(0)), args.scheduler or "", single_threaded=True)
-    with show_batch_progress(args.json or args.quiet) as report_progress:
+    with show_batch_progress(args) as report_progress:
         rows = run_campaign(chosen, folder, workers, report_progress, args.most, args.again)
     return give_summary(rows, folder, args)
 
@@ -124,17 +124,15 @@ def _parse_numbers(text: str) -> list[float]:
 
 
 @contextmanager
-def show_batch_progress(silent: bool, interval: float = 30.0) -> Iterator[Callable[[BatchProgress], None]]:
+def show_batch_progress(args: argparse.Namespace, interval: float = 30.0) -> Iterator[Callable[[BatchProgress], None]]:
     """Show progress as a bar on a terminal; elsewhere, for logs, as a line on standard error every `interval` s."""
     clock, printed = WallClock(), 0.0
-    with show_progress(is_silent=silent) as update:
-        update("starting the workers", 0.0)
-
+    with show_progress(args, "starting the workers") as update:
         def report_progress(progress: BatchProgress) -> None:
             nonlocal printed
             update(describe_progress(progress), progress.done / max(progress.total, 1))
             now = clock.now() * 1e-9
-            if not silent and not sys.stderr.isatty() and now - printed >= interval:
+            if not (args.json or args.quiet or sys.stderr.isatty()) and now - printed >= interval:
                 printed = now
                 print(describe_progress(progress), file=sys.stderr, flush=True)
 

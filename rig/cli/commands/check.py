@@ -30,8 +30,7 @@ def run_command(args: argparse.Namespace) -> int:
     places = choose_places(args, "", args.sequence if Path(args.sequence).is_file() else "")
     choice = JobChoice(args.sequence, args.model, parse_changes(args.set), args.seed, tuple(args.effects),
                        args.bench)
-    with show_progress(is_silent=args.json or args.quiet) as progress:
-        progress("simulating", 0.0)
+    with show_progress(args, "simulating"):
         dry = make_dry_run(build_job(choice, is_trusted=args.trust))
     report = build_dry_run_report(dry, places.files)
     if args.bench is not None:
@@ -48,8 +47,7 @@ def check_plant(args: argparse.Namespace) -> int:
     kind = model.kind
     require(kind.profile, args.sequence, "profile", "segments of a nominal test, over which the plant is checked")
     places, findings = choose_places(args, "", args.sequence), []
-    with show_progress(is_silent=args.json or args.quiet) as progress:
-        progress("compiling and simulating", 0.0)
+    with show_progress(args, "compiling and simulating") as progress:
         for found in check_behaviour(model):
             findings.append(found)
             progress(found.check, len(findings) / (len(kind.effects) + 6))

@@ -13,7 +13,7 @@ def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 if the residual is noise, 1 otherwise."""
     places = choose_places(args, "compare.html", args.trace)
     model = load_chosen_model(args)
-    with show_progress(is_silent=args.json or args.quiet) as progress:
+    with show_progress(args) as progress:
         trace, *repeats = (Trace.read(file, signals=model.kind.signals) for file in (args.trace, *args.repeat))
         comparison = compare(trace, model, repeats, list_signals(args), progress, args.trace)
         report = build_comparison_report(comparison, choose_next_command(args, comparison.verdict), places.files)

@@ -40,7 +40,7 @@ def run_command(args: argparse.Namespace) -> int:
     junit = choose_file(args.junit, (".xml",), sheet.path, "--junit")  # may be a file in the folder of --out
     bus, _ = choose_bus(args.bus)
     options = Options(may_write=args.write or is_own, timeout=args.timeout, tolerance=1e-3 * args.tolerance)
-    with open_wire(name, bus) as wire, show_progress(is_silent=args.json or args.quiet) as progress:
+    with open_wire(name, bus) as wire, show_progress(args) as progress:
         target = Target(wire, sheet, options)
         outcome = run_cases(target, cases, progress)
     files = [*places.files, *([("JUnit", str(junit))] if junit else [])]

@@ -15,7 +15,7 @@ from rig.cli.inputs import load_declared_model
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 if noise explains all differences and no check changed, 1 otherwise."""
     places = choose_places(args, "diff.html", args.others[0])
-    with show_progress(is_silent=args.json or args.quiet) as progress:
+    with show_progress(args) as progress:
         found = read_and_compare_runs([args.trace, *args.others], load_declared_model(args).kind.signals, progress)
         report = build_diff_report(found, places.files)
     return give_answer(report, args, int(found.verdict != "SAME"), places)

@@ -8,7 +8,7 @@ from fdi.output import require_new
 from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell, Column, Line, Report, Section, tabulate
 from fdi.report.run_report import MOODS
-from plant.errors import InputError, escape_control_characters, require
+from plant.errors import escape_control_characters, require
 from rig.cli.answer import give_answer, show_progress
 from rig.evidence.contents import BILL, add_index, collect_runs
 from rig.evidence.package import verify_package, write_package
@@ -28,8 +28,7 @@ def run_command(args: argparse.Namespace) -> int:
 
 def verify(args: argparse.Namespace) -> int:
     """Print a line for each file that was changed, is missing or was added."""
-    with show_progress(is_silent=args.json or args.quiet) as progress:
-        progress("verifying", 0.0)
+    with show_progress(args, "verifying"):
         found = verify_package(Path(args.verify), args.key or "")
     lines = [Line(word, escape_control_characters(name), "bad") for word in ("changed", "missing", "added")
              for name in getattr(found, word)]
@@ -47,12 +46,12 @@ def pack(args: argparse.Namespace) -> int:
     out = Path(args.out or "evidence.zip")
     if out.suffix == ".zip":
         require_new(out, is_forced=args.force)
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError("--out", str(out), "a FILE.zip, or a folder that is new or empty")
+    else:
+        require(not out.exists() or (out.is_dir() and not any(out.iterdir())), "--out", str(out),
+                "a FILE.zip, or a folder that is new or empty")
     require(not any(out.resolve().is_relative_to(Path(run).resolve()) for run in args.runs), "--out", str(out),
             "a place outside the runs that it packs")
-    with show_progress(is_silent=args.json or args.quiet) as progress:
-        progress("reading", 0.0)
+    with show_progress(args, "reading") as progress:
         package = collect_runs(args.runs)
         judged = [*(run.judged for run in package.runs), *package.lost]
         if args.requirements:

@@ -29,8 +29,7 @@ def run_command(args: argparse.Namespace) -> int:
     hidden = args.hide.split(",") if args.hide else []
     if hidden:
         split_words(hidden, args.trace, model.plant)  # refuses names that are no effects
-    with show_progress(is_silent=args.json or args.quiet) as progress:
-        progress("reading", 0.0)
+    with show_progress(args, "reading") as progress:
         runs = read_runs(model, args.trace, args.repeat, args.holdout, list_signals(args))
         law_file = None if places.page is None else places.page.with_name(f"{places.page.stem}_law.py")
         answer, pattern = explain_runs(runs, args.seed, args.write_effect, progress, law_file)

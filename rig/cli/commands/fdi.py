@@ -25,7 +25,7 @@ def run_command(args: argparse.Namespace) -> int:
     require(args.trace is not None, "TRACE", "", "a trace: trace.mcap, the folder of a run, or a CSV")
     places = choose_places(args, "", args.trace)
     model = load_chosen_model(args)
-    with show_progress(is_silent=args.json or args.quiet) as progress:
+    with show_progress(args) as progress:
         bands = None if args.bands is None else load_bands(Path(args.bands), model.kind)
         faults = choose_faults(args.faults, model.kind)
         found = diagnose(Trace.read(args.trace, signals=model.kind.signals), model, bands, progress, args.trace,
@@ -42,7 +42,7 @@ def learn_bands(args: argparse.Namespace) -> int:
     model = load_chosen_model(args)
     faults = choose_faults(args.faults, model.kind)
     com, _, name = load_command(args.command_file, model["controller.period"], model.kind)
-    with show_progress(is_silent=args.json or args.quiet) as progress:
+    with show_progress(args) as progress:
         made = make_bands_file(args.learn_bands, args.out, model, com, name, args.seed, progress, faults)
     return give_answer(build_bands_report(made), args)
 

@@ -28,8 +28,7 @@ def run_command(args: argparse.Namespace) -> int:
     page = choose_file(str(path.with_suffix(".html")), (".html",), args.runs[0])
     ranges = read_free_parameters(model, args.model)
     command = format_command_line()
-    with show_progress(is_silent=args.json or args.quiet) as progress:
-        progress("reading", 0.0)
+    with show_progress(args, "reading") as progress:
         runs = read_identification_runs(model, ranges, args.runs, args.holdout, list_signals(args))
         found = identify_model(runs.model, ranges, runs.fitted, runs.held_out, runs.sources, args.seed, progress)
     files, is_wanted, next_command = [("page", str(page))], found.verdict != "CANNOT_TELL", ""

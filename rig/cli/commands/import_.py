@@ -83,12 +83,7 @@ def write_guess(args: argparse.Namespace, source: Path, out: Path) -> int:
 def open_source(args: argparse.Namespace, source: Path, chosen: ImportMap | None) -> Measurement:
     """Open a recording; the map says how a text file is written."""
     if source.suffix in RAW_SUFFIXES:
-        return open_can_log(source, choose_dbc(args))
+        return open_can_log(source, Path(args.dbc or dbc.DBC))
     if chosen is None:
         return open_measurement(source)
     return open_measurement(source, chosen.separator, chosen.decimal, chosen.header)
-
-
-def choose_dbc(args: argparse.Namespace) -> Path:
-    """The DBC of --dbc, else that of the bench."""
-    return Path(args.dbc) if args.dbc else dbc.DBC

@@ -8,7 +8,7 @@ import time
 
 from fdi.output import require_writable
 from fdi.report.report import Report
-from plant.errors import InputError, RigError
+from plant.errors import InputError, RigError, require
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, give_answer
@@ -42,8 +42,9 @@ def run_command(args: argparse.Namespace) -> int:
     if args.node == "plant":
         PlantPlace.find(bench)  # refuses a bench without one
         args.model = args.model or bench.plant
-    elif not speaks_as_shipped(bench):
-        raise InputError("--bench", args.bench, "a bench with the frames of the shipped one, as our firmware has")
+    else:
+        require(speaks_as_shipped(bench), "--bench", args.bench,
+                "a bench with the frames of the shipped one, as our firmware has")
     if bus.partition(":")[0] in EMBEDDED_NAMES:
         given = "" if args.bus == "auto" else args.bus
         raise InputError("--bus", given, "a bus between programs, such as udp_multicast or socketcan:vcan0")

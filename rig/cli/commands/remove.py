@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fdi.discovery.update_model import find_runs, remove_effect_and_refit, write_model_file
 from fdi.report.explain_report import build_model_report
-from plant.errors import InputError, require
+from plant.errors import require
 from rig.cli.answer import Places, choose_file, give_answer, show_progress
 from rig.cli.discovery_inputs import choose_model_file, format_command_line, load_known_model, split_words
 from rig.cli.inputs import list_signals
@@ -17,12 +17,10 @@ def run_command(args: argparse.Namespace) -> int:
             "the model file to remove the effect from: --model FILE")
     model, known = load_known_model(args)
     effects, trace = split_words(args.words, args.trace, model.plant)
-    if len(effects) > 1:
-        raise InputError("effect", effects[1], "one effect at a time")
+    require(len(effects) == 1, "effect", effects[-1], "one effect at a time")
     path = choose_model_file(args, trace)
     page = choose_file(str(path.with_suffix(".html")), (".html",), trace) if trace else None
-    with show_progress(is_silent=args.json or args.quiet) as progress:
-        progress("reading", 0.0)
+    with show_progress(args, "reading") as progress:
         runs = find_runs(model, known, trace, args.repeat, args.holdout, list_signals(args)) if trace else None
         update = remove_effect_and_refit(effects[0], runs, model, known, format_command_line(), progress)
     return give_answer(build_model_report(update, path, write_model_file(update, path), page), args,

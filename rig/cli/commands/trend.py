@@ -31,7 +31,7 @@ def run_command(args: argparse.Namespace) -> int:
 def follow_traces(args: argparse.Namespace) -> UnitTrend:
     """The trends of the traces in a folder, or of the points in the JSON file of an earlier answer."""
     model, source = load_chosen_model(args), Path(args.folder)
-    with show_progress(is_silent=args.json or args.quiet) as progress:
+    with show_progress(args) as progress:
         if source.suffix == ".json" and not source.is_dir():
             return follow_unit(read_points(source, load_faults(args.faults, model.kind) if args.faults else None))
         table = None if args.dates is None else Path(args.dates)

@@ -14,7 +14,7 @@ from fdi.progress import Progress
 from fdi.report.numbers import join_words
 from fdi.report.report import Report
 from fdi.trace.trace import Trace
-from plant.errors import InputError, require
+from plant.errors import require
 from plant.model import Model
 from rig.cli.answer import give_answer, show_progress
 from rig.cli.commands.diff import read_and_compare_runs
@@ -31,7 +31,7 @@ def run_command(args: argparse.Namespace) -> int:
     rrd = choose_recording(args)
     if args.screenshot:
         require_writable(args.screenshot, "--screenshot", source=args.trace)
-    with show_progress(is_silent=args.json or args.quiet) as progress:
+    with show_progress(args) as progress:
         drawing = draw(args, progress)
         progress("writing the recording", 0.0)
         write_recording(drawing, rrd)
@@ -70,12 +70,11 @@ def require_options_that_fit(args: argparse.Namespace) -> None:
     require(args.screenshot or not args.headless, "--headless", "", "--screenshot FILE.png with it")
     require(not (args.theme and (args.screenshot or args.save or args.out)), "--theme", args.theme,
             "no --screenshot, --save or --out with it: they open no browser")
-    if args.compare and args.others:
-        raise InputError("--compare", args.others[0], "one trace; rig view A B holds traces against each other")
+    require(not (args.compare and args.others), "--compare", "".join(args.others[:1]),
+            "one trace; rig view A B holds traces against each other")
     for option in ("set", "effects", "seed", "repeat", "signals"):
         given = getattr(args, option)
-        if given not in (None, []) and given is not False and not args.compare:
-            raise InputError(f"--{option}", "", "--compare with it")
+        require(args.compare or given in (None, []), f"--{option}", "", "--compare with it")
 
 
 def choose_recording(args: argparse.Namespace) -> Path:

@@ -18,7 +18,8 @@ RIG = FOLDER.parent / "data/electrohydrostatic_rig"
 pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="no ../shared: no traces of an independent simulator")
 
 LIMIT = Model()["controller.current_limit"]
-TRUE: dict[str, dict[str, float]] = {  # of those without plant scatter: an offset, a force, two faults together
+TRUE: dict[str, dict[str, float]] = {  # without plant scatter: a friction, an offset, a force, two faults together
+    "00": {"spool.static_friction": 45.0, "spool.dynamic_friction": 30.0},
     "02": {"null_bias.current": 0.03 * LIMIT},
     "06": {"aero_stiffness.stiffness": 540e3},
     "10": {"spool.static_friction": 33.0, "spool.dynamic_friction": 22.0, "filter.clogging": 0.21},

@@ -1,5 +1,4 @@
 """Faults as data: the shipped lists, bad files in one line, levels of faults that fall or go both ways, groups."""
-from __future__ import annotations
 
 import json
 import re

@@ -1,5 +1,4 @@
 """The RMS grid: its maps are what they say, its minima are where the faults are, and its rules are the paper's."""
-from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
@@ -77,8 +76,8 @@ def test_maps_are_rms_of_the_monitor() -> None:
     assert grid.simulations == 441 + 21 * 13
 
 
-@pytest.mark.parametrize("scatter", [0, 1, 2])
-@pytest.mark.parametrize(("kintas", "fss"), [(0.25, 30.0), (0.17, 45.0), (0.0, 70.0), (0.35, 5.0)])
+@pytest.mark.parametrize(("kintas", "fss", "scatter"), [
+    (0.25, 30.0, 0), (0.0, 70.0, 0), (0.35, 5.0, 0), (0.25, 30.0, 1), (0.17, 45.0, 2)])
 def test_minimum_is_at_the_faults(kintas: float, fss: float, scatter: int) -> None:
     """Within the width of the valley: Kintas is weak, FSS is not."""
     grid = search_grid(trace(kintas, fss, scatter=scatter), sliding=(2.0 / 3.0,))
@@ -92,11 +91,10 @@ def test_both_worked_cases(kintas: float, fss: float, tmp_path: Path) -> None:
     """From runs on the rig, bus and all."""
     settings = [word for name, value in faulty(kintas, fss).items() for word in ("--set", f"{name}={value!r}")]
     rig("run", "--quiet", "--seed", "3", *settings, "--out", tmp_path)
-    for measured in (Trace.read(tmp_path), trace(kintas, fss)):  # and with another noise
-        grid = search_grid(measured)
-        for point in (grid.step.minimum, grid.joint.minimum, grid.best, grid.merged):
-            assert is_near(point, kintas, fss), point
-        assert grid.sliding == pytest.approx(2.0 / 3.0)
+    grid = search_grid(Trace.read(tmp_path))
+    for point in (grid.step.minimum, grid.joint.minimum, grid.best, grid.merged):
+        assert is_near(point, kintas, fss), point
+    assert grid.sliding == pytest.approx(2.0 / 3.0)
 
 
 def test_friction_that_is_static_alone() -> None:
@@ -126,8 +124,8 @@ def test_a_command_with_one_kind_of_section(which: str) -> None:
     assert there.minimum.sizes[1] == pytest.approx(40.0, abs=18.0)
 
 
-@pytest.mark.parametrize(("kintas", "fss"), [(0.0, 5.0), (0.25, 30.0)])
-@pytest.mark.parametrize("other", ["load", "null bias", "jack friction"])
+@pytest.mark.parametrize(("kintas", "fss", "other"), [
+    (0.25, 30.0, "load"), (0.0, 5.0, "null bias"), (0.25, 30.0, "jack friction")])
 def test_what_is_no_fault_of_these_does_not_lead_astray(kintas: float, fss: float, other: str) -> None:
     changed = {"load": {}, "null bias": {"null_bias.current": 1e-4},
                "jack friction": {"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}}[other]

@@ -1,5 +1,4 @@
 """The statistics behind `rig explain`: noise, likelihood, nulls, marks, shapes, last fits, candidates."""
-from __future__ import annotations
 
 from dataclasses import replace
 from importlib import import_module
@@ -149,9 +148,7 @@ def test_a_recorder_that_rounds_positions_is_no_effect() -> None:
     healthy = find_marks(Model(), [record_rounded({}, 3)])
     assert healthy.is_recorder and healthy.controller < 2.0 and not healthy.prints
     slow, again = (record_rounded({"sensor_lag.time": 1e-3}, seed) for seed in (1, 2))
-    with restored_catalogue():
-        for name in set(CATALOGUE) - {"sensor_lag", "coil_lag", "null_bias", "spool_friction"}:  # a short search
-            del CATALOGUE[name]
+    with restored_catalogue("sensor_lag", "coil_lag", "null_bias", "spool_friction"):
         found = explain(Model(), slow, [again])
     assert (found.verdict, found.effects) == ("EXPLAINED", ("sensor_lag",)) and found.marks.is_recorder
 

@@ -1,5 +1,4 @@
 """Laws outside the catalogue: terms that regressions propose, replays choose and a held-out run judges."""
-from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path

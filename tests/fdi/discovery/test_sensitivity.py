@@ -1,5 +1,4 @@
 """`rig explain --sensitivity`: what is hidden, in which unit, with which noise, and what is claimed after how many."""
-from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace

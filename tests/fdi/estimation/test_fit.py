@@ -1,5 +1,4 @@
 """Fits: last rounds, flat directions, a search by a population, and rows that hang on a level of friction."""
-from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace

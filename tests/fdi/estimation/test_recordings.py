@@ -1,5 +1,4 @@
 """Recordings as fits need them: rows of other lengths, gaps, dead sensors, repeats, part of a long one."""
-from __future__ import annotations
 
 import re
 from collections.abc import Callable

@@ -1,5 +1,4 @@
 """Statistics against known answers: noise floors, and shares with their exact intervals."""
-from __future__ import annotations
 
 import math
 
@@ -65,12 +64,6 @@ def test_hum_of_one_phase_is_found_and_counted() -> None:
     none, one, more = ([f for f, _ in find_hum_lines(runs, 1e-3)]
                        for runs in ([r, repeat], [r + hum, repeat + hum], [fast, fast]))
     assert (none, one) == ([], [50.0]) and 400.0 in more
-
-
-def test_more_repeats_say_the_same_with_less_doubt() -> None:
-    runs = [[sample_noise(10 * s + i, 2000)[:, 0] for i in range(6)] for s in range(20)]
-    few, many = (np.std([floor_from_repeats(r, repeats[:count]).value for r, *repeats in runs]) for count in (1, 5))
-    assert many < 0.8 * few
 
 
 def test_gaps_and_other_lengths() -> None:

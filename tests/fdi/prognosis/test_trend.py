@@ -24,15 +24,6 @@ from fdi.report.trend_report import explain_level
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
 from rig.recorder.schema import collect_provenance
-from studies.prognosis import (
-    LAWS,
-    Prediction,
-    Unit,
-    find_false_trends,
-    score_unit,
-    simulate_healthy_unit,
-    simulate_unit,
-)
 
 WEEKS = 7.0 * np.arange(14)
 RNG = np.random.default_rng(3)
@@ -173,38 +164,6 @@ def test_estimates_at_their_bound_only_say_not_more_than() -> None:
     weak, strong = (fit_trend(CLOGGING, list(WEEKS[:10]), [Estimate(0.0, low, 0.06)] * 10).laws["none"]
                     for low in (0.0, -0.06))
     assert weak < strong
-
-
-def test_the_metrics_on_predictors_that_are_known() -> None:
-    unit = simulate_unit("linear", 4)
-    end, middle = unit.time_of_size(unit.fault.maintenance), unit.time_of_size(unit.fault.acceptable)
-
-    def by(factor: float) -> Any:
-        def predict(u: Unit, n: int) -> Prediction:
-            spread = np.linspace(0.95, 1.05, 101) * factor
-            return Prediction(True, spread * (middle - u.t[n - 1]), spread * (end - u.t[n - 1]))
-        return predict
-
-    right, wrong = score_unit(unit, by(1.0)), score_unit(unit, by(1.5))
-    assert right.alpha_lambda == (1.0,) * 4 and wrong.alpha_lambda == (0.0,) * 4
-    assert set(right.held_most) == {1.0} and set(wrong.held_most) == {0.0} and set(wrong.below) == {1.0}
-    assert right.relative == pytest.approx([1.0] * 4) and wrong.relative == pytest.approx([0.5] * 4)
-    assert right.horizon > wrong.horizon > 0.0  # the error shrinks with the time left: good at last
-    assert wrong.horizon * (end - unit.onset) <= 0.4 * end
-
-
-def test_intervals_hold_the_truth() -> None:
-    """A quick part of `python -m studies.prognosis`: at half the life, all laws, those not fitted included."""
-    held = []
-    for i, law in enumerate(LAWS):
-        for k in range(2):
-            u = simulate_unit(law, 100 * i + k)
-            end = u.time_of_size(u.fault.maintenance)
-            n = int(np.searchsorted(u.t, (u.onset + end) / 2))
-            left = fit_trend(u.fault, list(u.t[:n]), u.sizes[:n]).remaining["non_nominal"]
-            held.append(left.low <= end - u.t[n - 1] <= left.high)
-    assert sum(held) >= 0.8 * len(held)
-    assert len(find_false_trends(simulate_healthy_unit(seed) for seed in range(6))) <= 1
 
 
 def points(path: Path, sizes: Sequence[float]) -> Path:

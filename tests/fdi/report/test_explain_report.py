@@ -15,10 +15,8 @@ from fdi.discovery.explain import Marks
 from fdi.discovery.explain_runs import Answer, Candidate, Suspicious
 from fdi.discovery.runs import Source
 from fdi.discovery.update_model import ModelUpdate, Provenance, Row
-from fdi.estimation.fit import Problem, Value
-from fdi.estimation.noise import white_noise
-from fdi.estimation.replay import prepare_trace
-from fdi.report import compare_report, explain_report
+from fdi.estimation.fit import Value
+from fdi.report import compare_report
 from fdi.report.compare_report import build_comparison_report
 from fdi.report.explain_report import (
     MOODS,
@@ -218,17 +216,3 @@ def test_a_comparison_shows_measured_minus_model() -> None:
 def test_a_dependence_has_the_sign_of_measured_minus_model() -> None:
     on = next(d for d in compare_offset().diagnoses["xs"].depends)
     assert np.nanmean(on.means) == pytest.approx(OFFSETS["xs"], rel=0.2)
-
-
-def test_explain_and_add_show_measured_minus_model() -> None:
-    trace = prepare_trace(record_offset(), Model())
-    problem = Problem(Model(), trace, tuple(white_noise(1e-6) for _ in trace.outputs))
-    predicted = problem.predict_outputs([], np.empty((1, 0)))
-    fit = SimpleNamespace(residuals=problem.subtract_measurements(predicted)[0])
-    fitted, p12 = cast(Any, SimpleNamespace(fit=fit)), trace.outputs.index("p12")
-    before, after = read_lines(explain_report.draw_change(trace, fitted, fitted, dict.fromkeys(trace.outputs, 1e-6))
-                               )[1 + p12]
-    expected = 1e-5 * (trace.mask_unusable("p12") - predicted[0, p12])
-    np.testing.assert_array_equal(before, after)
-    assert np.nanmean(before) == pytest.approx(np.nanmean(expected), rel=1e-6)
-    assert np.corrcoef(before[1:], expected[1:])[0, 1] > 0.99

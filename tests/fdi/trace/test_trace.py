@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from changed_logs import write_bomb
 from mcap.writer import CompressionType, IndexType, Writer
+from physics_cases import PREFLIGHT
 from places import SUPPORT
 from refusals import catch_refusal
 from rig_command import Said
-from synthetic_run import ATTACHMENTS, build_command, record_run
+from synthetic_run import ATTACHMENTS, record_run
 
 from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import find_sections
@@ -164,7 +165,7 @@ RAMP = np.concatenate([np.zeros(500), 0.33e-3 * TWO, np.full(500, 0.33e-3 * 2)])
     (STEPS, ["hold", "step", "step", "step"]), (np.rint(RAMP * 1e7) / 1e7, ["hold", "ramp", "hold"]),
     (np.where((np.arange(2000) >= 700) & (np.arange(2000) < 720), np.nan, STEPS), ["hold", "step", "step", "step"]),
     (np.concatenate([np.zeros(500), np.random.default_rng(0).normal(0, 1e-4, 1000)]), ["hold", "dynamic"]),
-    *((1e-3 * np.sin(2 * np.pi * hz * TWO), ["dynamic"]) for hz in (0.1, 1.0, 30.0)), (build_command(), KINDS)])
+    *((1e-3 * np.sin(2 * np.pi * hz * TWO), ["dynamic"]) for hz in (0.1, 1.0, 30.0)), (PREFLIGHT, KINDS)])
 def test_sections_of_any_command(command: np.ndarray, kinds: list[str]) -> None:
     found = find_sections(command)
     assert [s.kind for s in found] == kinds or {s.kind for s in found} == {"dynamic"} == set(kinds)
@@ -179,7 +180,7 @@ def test_a_ramp_has_its_rate_and_its_start() -> None:
 def test_sections_of_a_command_that_was_cut_off_anywhere() -> None:
     """As an abort leaves it: main breaks off, clean-up goes back from there."""
     for last in [*range(1, 60), *range(3900, 4100, 7), *range(5950, 6050, 3), *range(9000, 11000, 97)]:
-        cut = build_command()[:last]
+        cut = PREFLIGHT[:last]
         for com in (cut, np.concatenate([cut, np.linspace(cut[-1], 0, 300)]), cut[-15:]):
             cover = find_sections(com)
             assert [s.start for s in cover] == [0, *[s.stop for s in cover][:-1]] and cover[-1].stop == len(com)

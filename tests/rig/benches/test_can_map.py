@@ -12,11 +12,22 @@ from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from hypothesis import given, strategies as st
 
+from plant.compile import compile_function
 from plant.errors import InputError
 from rig.benches.bench import EXTENDED, FD, SWITCHED, Field, FrameSpec, Guard, Kind, Role, extract_bits, pack, unpack
 from rig.benches.bench_file import load_bench_from_files
 from rig.benches.checksums import compute_checksum, compute_crc8, load_checksum
-from rig.benches.packing import PAYLOAD, find_frame, list_frame_places, make_layout
+from rig.benches.packing import (
+    ACCEPTED,
+    FRAMES_AT,
+    PAYLOAD,
+    VALUES_AT,
+    find_frame,
+    list_frame_places,
+    make_layout,
+    pack_frame,
+    unpack_frame,
+)
 
 INPUTS = {"position_demand": ("mm", 1e-3), "ram_position": ("m", 1.0), "load_pressure": ("bar", 1e5),
           "load_force": ("kN", 1e3), "spool_position": ("um", 1e-6), "flags": ("%", 1e-2)}
@@ -76,6 +87,21 @@ def load_frames(message: Message, *lines: str) -> tuple[FrameSpec, ...]:
     return load_bench_from_files({"x.toml": bench.encode(), "x.dbc": text.encode("cp1252")}).frames.frames
 
 
+WRITE, READ = compile_function(pack_frame), compile_function(unpack_frame)
+
+
+def pack_compiled(spec: FrameSpec, values: dict[str, float]) -> tuple[bytes, dict[str, float]]:
+    """The bytes by the compiled tables of the sender, and the values that those of the receiver read."""
+    sent, received = (make_layout([spec], list(values), role) for role in (Role.RIG, Role.CONTROLLER))
+    places = slice(int(sent.words[VALUES_AT]), int(sent.words[VALUES_AT]) + len(values))
+    octets = slice(8 * PAYLOAD, 8 * PAYLOAD + spec.length)
+    sent.doubles[places] = list(values.values())
+    WRITE(sent, FRAMES_AT, 0)
+    received.octets[octets] = sent.octets[octets]
+    assert READ(received, FRAMES_AT, spec.length, 0) == ACCEPTED
+    return sent.octets[octets].tobytes(), dict(zip(values, received.doubles[places].tolist(), strict=True))
+
+
 @given(message=draw_message(), data=st.data())
 def test_frames_are_those_of_cantools(message: Message, data: st.DataObject) -> None:
     spec = load_frames(message)[0]
@@ -96,6 +122,11 @@ def test_frames_are_those_of_cantools(message: Message, data: st.DataObject) -> 
     for name, signal in names.items():
         if name in found:
             assert found[name] == pytest.approx(known[signal] * INPUTS[name][1], rel=1e-12, abs=1e-9 * INPUTS[name][1])
+    anything = st.one_of(st.sampled_from((0.0, 1.0, -1.5, 1e-3, 1e25, -1e25)), st.floats(-1e3, 1e3))
+    values = {name: data.draw(anything) for name in names if name in found}
+    packed = pack(spec, values)
+    read = unpack(spec, packed)
+    assert pack_compiled(spec, values) == (packed, {name: read[name] for name in values})
     exact = {each.name for each in spec.fields if each.length <= 48 and each.kind is not Kind.FLOAT}
     if all(each.name in exact or each.fixed is not None for each in spec.fields):
         assert pack(spec, found) == encoded

@@ -27,9 +27,8 @@ from plant import InputError, Model, RigError
 from plant.effects import CATALOGUE
 from rig.campaign import batch, judge, summary as campaign_summary
 from rig.campaign.batch import BatchProgress, RowFile, Workers, run_in_processes, run_jobs
-from rig.campaign.judge import plan_batch, run_campaign
+from rig.campaign.judge import run_campaign
 from rig.campaign.summary import build_campaign_report
-from studies.hidden_effects.truth import SYMBOLS, has_compiler
 
 pytest.importorskip("distributed", reason="the extra fleet is not installed")
 pytest.importorskip("pyarrow", reason="the extra fleet is not installed")
@@ -139,32 +138,11 @@ def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(
         assert again[f"{row['label']} {row['seed']}"] == 1
 
 
-class Dead:
-    """The future of a case that kills whoever tries it."""
-
-    status = "error"
-
-    def result(self) -> None:
-        raise type("KilledWorker", (Exception,), {})("Attempted to run task on 4 different workers")  # as Dask does
-
-    def cancelled(self) -> bool:
-        return False
-
-
 def test_processes_give_the_same_rows(environment: Path, local: Path, tmp_path: Path) -> None:
     whole = judge.read_matrix_of_folder(local)
     run_campaign(whole, tmp_path / "there", Workers(2, single_threaded=True), count=4)
     assert rows(tmp_path / "there") == rows(local)[:4]
     assert os.getpid() not in {pid for pid, _ in calls(environment)}
-
-
-def test_a_case_that_kills_every_worker_of_a_cluster_has_failed(local: Path) -> None:
-    whole = judge.read_matrix_of_folder(local)
-    plan = plan_batch(whole, judge.hash_campaign_sources())
-    row = batch.take_result(Dead(), whole.cases[3], plan.describe_failure)
-    assert row["reason"] == "KilledWorker: every worker that tried it died" and row["true_fss"] == 30.0
-    assert plan.is_failed(row) and plan.is_valid(row)
-    assert not plan_batch(whole, "", redo_failed=True).is_valid(row)
 
 
 def test_a_failed_case_is_kept_with_its_reason_and_judged_again_on_demand(local: Path, tmp_path: Path) -> None:
@@ -247,29 +225,7 @@ def test_a_case_depends_on_its_own_seed_alone_and_hides_what_it_says() -> None:
     broken = judge.add_faults(Model(), {"spool_friction": 45.0, "jack_friction": 1600.0, "stribeck": 0.3})
     assert broken["spool.dynamic_friction"] == pytest.approx(30.0) and broken["jack.dynamic_friction"] == 1000.0
     assert broken[CATALOGUE["stribeck"].fitted[0]] == 0.3 and broken[CATALOGUE["stribeck"].fitted[1]] > 0
-    chance = [judge.sample_random_parts(case._replace(seed=seed), 4000, 0.8, 0.0, Model()) for seed in range(60)]
-    noise = chance[0][1]
-    assert np.std([scatter[SYMBOLS["GQ"]] for scatter, _ in chance]) == pytest.approx(0.015, rel=0.3)
-    assert noise.std(0) == pytest.approx(np.ones(4), rel=0.1)
-    assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(0.8, abs=0.05)
     assert set(judge.simulate_case(case, {**spec, "signals": "xj"}, Model()).signals) == {"com", "xj", "cor", "load"}
-
-
-IN_C = "studies.hidden_effects.campaign_simulator:simulate_unit"
-
-
-@pytest.mark.skipif(not has_compiler(), reason="no gcc: the independent simulator cannot be built")
-def test_the_independent_simulator_makes_the_same_unit() -> None:
-    spec = judge.build_matrix({"case": [{}]}, Model(), "", "x").spec
-    case = judge.Case(0, "filter_clogging=0.3", {"filter_clogging": 0.3}, 0.015, 3)
-    simulators = (judge.OWN_SIMULATOR, IN_C)
-    ours, its = (judge.simulate_case(case, {**spec, "simulator": name}, Model()) for name in simulators)
-    healthy = judge.simulate_case(case._replace(sizes={}), spec, Model())
-    apart = [float(np.sqrt(((x.xj - its.xj) ** 2).mean())) for x in (ours, healthy)]
-    assert apart[0] < 15e-6 and apart[1] > 2 * apart[0]
-    line = catch_refusal(judge.simulate_case, case._replace(sizes={"moving_mass": 120.0}), {**spec, "simulator": IN_C},
-                         Model())
-    assert "an effect with a single size" in line
 
 
 def test_a_folder_of_traces_is_judged_and_a_changed_trace_is_another_campaign(tmp_path: Path) -> None:
@@ -419,15 +375,3 @@ def test_an_interruption_ends_the_workers_and_the_processes_they_started(work: s
     out, err = process.communicate(timeout=300)
     assert (out, err) == ("interrupted\n", "")
     assert not any(is_running(pid) for pid in pids)
-
-
-def test_a_signal_that_is_lost_in_a_job_comes_again(tmp_path: Path) -> None:
-    results = run_in_processes(batch_work.lose_first_signal, [str(tmp_path / "a"), str(tmp_path / "b"), ""], 3,
-                               fail_test, patience=300.0)
-    assert next(results)[0] == ""  # type: ignore[call-overload]
-    end = time.monotonic() + 600
-    while not ((tmp_path / "a").exists() and (tmp_path / "b").exists()):
-        assert time.monotonic() < end
-        time.sleep(0.05)
-    results.close()  # type: ignore[attr-defined]
-    assert (tmp_path / "a").read_text() == (tmp_path / "b").read_text() == "lost, ended by 143"

@@ -18,8 +18,6 @@ from rig.cli.command_list import COMMANDS, find_work
 from rig.network.master import Master
 
 LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 60')
-RUN_KEYS = {"verdict", "trace", "checks", "timing", "fdi"}
-TIMING_KEYS = {"cycles", "overruns", "lateness_us", "response_us", "scheduler"}
 
 
 @pytest.fixture
@@ -70,7 +68,6 @@ def test_results_stay_where_no_run_comes_about(short: Path, tmp_path: Path) -> N
 def test_a_run_that_passes(short: Path, tmp_path: Path) -> None:
     told = answer("run", short, "--out", tmp_path / "out")
     assert (told["verdict"], told["timing"]["cycles"]) == ("PASS", 450)
-    assert told.keys() >= RUN_KEYS and told["timing"].keys() >= TIMING_KEYS
     assert told["timing"]["response_us"].keys() == {"p50", "p99", "p99_9", "max"}
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["report.html", "trace.mcap", "verdict.json"]
 

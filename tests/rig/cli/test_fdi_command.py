@@ -85,6 +85,7 @@ def test_nothing_is_blamed_where_something_else_is_wrong() -> None:
     found = diagnose(record_plant({"sensor_lag.time": 3e-3}, SHORT))
     assert found.verdict == "SOMETHING_ELSE" and found.ruling is None
     assert all(each in (None, Level.ACCEPTABLE) for each in found.levels.values())
+    assert all(0.0 <= size.low <= size.value <= size.high for size in found.sizes.values())
     assert "Something else is wrong" in describe_verdict(found)
 
 

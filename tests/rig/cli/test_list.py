@@ -143,12 +143,9 @@ def test_json_is_one_object_and_nothing_else(tmp_path: Path) -> None:
 
 def test_percentiles_of_known_wake_ups() -> None:
     late = np.arange(1001) * 2000  # 0 to 2 ms in steps of 2 us
-    assert priority.summarise_lateness(late, 1_000_000) == pytest.approx((1000, 1980, 1998, 2000, 1001, 501))
-
-
-def test_timer_lateness_counts_its_periods() -> None:
-    late = priority.measure_timer_lateness(0.05)
-    assert late.periods == 50 and 0 <= late.p50 <= late.p99 <= late.p99_9 <= late.max
+    assert priority.compute_percentiles(late * 1e-9) == pytest.approx(
+        {"p50": 1000, "p99": 1980, "p99_9": 1998, "max": 2000})
+    assert doctor.grade_timer("timer", late, "").found.endswith("; 501 of 1001 periods missed")
 
 
 def test_fifo_ends_with_its_thread_and_is_none_without_the_right(monkeypatch: pytest.MonkeyPatch) -> None:

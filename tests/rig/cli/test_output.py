@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from physics_cases import PREFLIGHT
 from rig_command import answer, refuse, rig
 from synthetic_run import record_run
 
@@ -172,11 +171,3 @@ def test_a_ramp_and_a_step_keep_their_seconds(period: float, tmp_path: Path) -> 
     speed = np.polyfit(run["t"][late & (run["t"] < 0.3)], run["xj"][late & (run["t"] < 0.3)], 1)[0]
     assert speed == pytest.approx(5e-3, rel=0.02)
     assert run["xj"][-1] == pytest.approx(2.5e-3, abs=50e-6)
-
-
-@pytest.mark.parametrize(("period", "every"), [(0.001, 1), (0.002, 2), (0.01, 10)])
-def test_the_preflight_lasts_as_long_as_ever(period: float, every: int, tmp_path: Path) -> None:
-    run = simulated(tmp_path, f"--set=controller.period={period}")
-    assert len(run) == 13_500 // every
-    np.testing.assert_allclose(run["com"], PREFLIGHT[::every], atol=1e-15)
-    assert np.abs(run["com"][run["t"] < 0.5]).max() == 0.0 and run["com"][round(0.5 / period)] == 5e-3

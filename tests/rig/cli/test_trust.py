@@ -146,10 +146,6 @@ def test_a_log_does_not_choose_the_bus(log: Path, monkeypatch: pytest.MonkeyPatc
         assert said.status == 0 and said.json["run"]["bus"] == "embedded", said
 
 
-def test_a_limit_of_overruns_is_a_fraction_beside_from_too(log: Path) -> None:
-    assert "--max-overruns" in refuse("run", "--from", log, "--max-overruns", "nan", "--out", "out")
-
-
 def test_texts_of_a_log_do_not_command_the_terminal(log: Path) -> None:
     change_log(log, Path("sent.mcap"), settings={"bus": "\x1b[2J", "host": "\x1b]0;title\x07"})
     assert rig("report", "sent.mcap", "--out", "p.html").status == 0

@@ -1,7 +1,6 @@
 """Runs with the C firmware: it gives the numbers of the built-in one, and each fault built into it is caught."""
 
 import os
-import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -55,19 +54,6 @@ def test_what_the_firmware_cannot_do_is_one_line(tmp_path: Path, monkeypatch: py
     assert answer.status == 2 and said in answer.err and answer.err.count("\n") == 1
 
 
-def test_it_is_compiled_once_and_again_when_a_source_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    skip_without_compiler()
-    monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / "cache"))
-    program = build_controller()
-    first = program.stat()
-    assert build_controller() == program and program.stat().st_mtime_ns == first.st_mtime_ns
-    folder = tmp_path / "sources"
-    shutil.copytree(FOLDER, folder)
-    (folder / "control_law.c").write_text((folder / "control_law.c").read_text() + "/* changed */\n")
-    assert build_program("controller", sorted(folder.glob("*.c")), STRICT) != program
-    assert sorted(path.name[:11] for path in (tmp_path / "cache").iterdir()) == ["controller-"] * 2
-
-
 def test_an_error_of_the_compiler_is_one_line(tmp_path: Path) -> None:
     skip_without_compiler()
     (tmp_path / "bad.c").write_text("int main(void) { return x; }\n")
@@ -86,23 +72,15 @@ def test_the_program_says_what_it_needs(words: list[str]) -> None:
 
 CAUGHT_BY = {
     "late_frame": "drive frames of another cycle",
-    "late_current": "delay of the answer to a step",
     "stale_cycle": "drive frames of another cycle",
-    "frozen_output": "current follows the error",
-    "sign_error": "delay of the answer to a step",
-    "gain_high": "gain against 0x2110",
-    "gain_low": "gain against 0x2110",
     "missed_cycles": "drive frames missing or late",
-    "ignores_control": "no current unless ACTIVE",
-    "wrong_status": "status word follows the control word",
-    "missing_ready": "status word follows the control word",
     "no_heartbeat": "heartbeat period, controller",
     "nan_current": "current within its limit",
-    "saturated_current": "current within its limit",
     "leaks_state": "same answers after a reset",
 }
 
-# What a bus can change: frames and times. On a CAN interface the other faults are no others than on UDP.
+# What a program on a bus can change: frames, times and its memory. Other faults are those of firmware_variants.py,
+# and on a CAN interface they are no others than on UDP.
 CASES = [*(("udp_multicast", fault) for fault in CAUGHT_BY),
          *(("socketcan", fault) for fault in ("late_frame", "no_heartbeat"))]
 only_udp = pytest.mark.parametrize("bus_kind_with_plant", ["udp_multicast"], indirect=True)
@@ -158,18 +136,10 @@ def test_a_firmware_that_is_slow_to_start_is_caught(tmp_path: Path, bus_kind_wit
 
 
 @only_udp
-def test_a_sound_firmware_with_an_integral_part_passes(tmp_path: Path, bus_kind_with_plant: str) -> None:
-    """It is the firmware of "leaks_state" without the leak."""
-    with run_program(build_faulty(), "integral", bus_kind_with_plant):
-        outcome = play_short(tmp_path, bus_kind_with_plant, "integral")
-    assert (outcome.verdict, list_failed(outcome)) == ("PASS", [])
-
-
-@only_udp
-def test_ten_runs_against_one_sound_firmware_pass(tmp_path: Path, bus_kind_with_plant: str) -> None:
+def test_runs_against_one_sound_firmware_pass(tmp_path: Path, bus_kind_with_plant: str) -> None:
     """Without one false alarm, and without a restart of the firmware in between."""
     with run_program(build_controller(), bus_kind_with_plant):
-        for seed in range(10):
+        for seed in range(4):
             outcome = play_short(tmp_path, bus_kind_with_plant, "none", seed)
             assert (seed, outcome.verdict, list_failed(outcome)) == (seed, "PASS", [])
             assert set(outcome.counters.values()) == {0}

@@ -189,14 +189,6 @@ class TestServices:
         errors = [data for cob_id, data in desk.heard if cob_id == 0x083]
         assert errors == [struct.pack("<HB5s", 0x8250, 0x11, b"\x01"), bytes(8)]
 
-    def test_a_reset_begins_anew(self, desk: BusDesk) -> None:
-        for _ in range(4):
-            run_cycle(desk, 2e-3)
-        assert run_cycle(desk, 2e-3).spool != 0.0
-        desk.restart()
-        assert run_cycle(desk) == (0.0, 0, 0)
-        assert decode_cycle_record(desk.upload(0x2212)).cycle.tolist() == [0]
-
     def test_a_short_drive_is_an_emergency_and_counts_as_missing(self, desk: BusDesk) -> None:
         run_cycle(desk, None)
         desk.link.send(codec.DRIVE, b"123")

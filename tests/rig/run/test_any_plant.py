@@ -107,7 +107,7 @@ def test_from_a_plant_file_to_its_hidden_fault(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_plant_without_a_device_runs_with_its_own_controller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing but the plant file: run, repeat, and find what was hidden in the plant of the run."""
+    """Nothing but the plant file: run, and repeat."""
     monkeypatch.chdir(tmp_path)
     assert rig("new", "plant", "motor").status == 0
     slower = Path("motor.py").read_text().replace('high=0.1)] = 1e-3', 'high=0.1)] = 2e-3')
@@ -120,8 +120,6 @@ def test_a_plant_without_a_device_runs_with_its_own_controller(tmp_path: Path, m
     again = rig("run", "--from", "run", "--trust", "--out", "again")
     assert again.status == 0, again
     assert rig("diff", "run", "again", "--json").json["verdict"] == "SAME"
-    found = rig("explain", "run", "--trust", "--json").json
-    assert (found["verdict"], found["effects"]) == ("EXPLAINED", ["dry_friction"])
     assert "expected embedded" in refuse("run", "--model", "motor.py", "--bus", spec("udp_multicast"))
     assert "expected external" in refuse("run", "--model", "motor.py", "--controller", "c")
 

@@ -17,7 +17,6 @@ from rig.run.attribution import (
     Injected,
     Trouble,
     attribute,
-    count_most_in_a_row,
     find_injected,
     find_start_problem,
 )
@@ -220,11 +219,6 @@ def test_a_run_without_cycles() -> None:
                            Injected(mask, mask, mask), empty)
     found = attribute(records, [Trouble(0, CONTROLLER, "bring_up", 0, "slow")], POLICY, load_bench(), {PLANT: "gone"})
     assert found.cause is not None and found.cause.source == CONTROLLER and len(found.judged) == 0
-
-
-@pytest.mark.parametrize(("values", "most"), [([], 0), ([0, 0], 0), ([1, 1, 0, 1], 2), ([0, 7, 0], 7), ([2, 1], 3)])
-def test_overruns_in_a_row(values: list[int], most: int) -> None:
-    assert count_most_in_a_row(np.array(values, dtype=np.int64)) == most
 
 
 @pytest.mark.parametrize(("fault", "expected"), [

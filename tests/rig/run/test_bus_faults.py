@@ -33,6 +33,14 @@ def emergencies(outcome: Outcome) -> list[str]:
     return [event.text for event in outcome.events if event.kind == "emcy"]
 
 
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the run without faults."""
+    folder = tmp_path_factory.mktemp("sound")
+    play(job(seed=1), folder)
+    return folder
+
+
 @pytest.mark.parametrize("fault", [
     *(f'kind = "duplicated", frame = "{frame}", start = 0.05, end = 0.3, every = 3'
       for frame in ("command", "feedback", "valve_state", "drive", "sync")),
@@ -40,12 +48,11 @@ def emergencies(outcome: Outcome) -> list[str]:
     'kind = "foreign", start = 0.0, every = 2',
     'kind = "foreign", cob_id = 0x10, frames = 50, start = 0.1, end = 0.2, name = "babbling node"',
 ])
-def test_what_must_not_change_a_run(tmp_path: Path, fault: str) -> None:
-    play(job(seed=1), tmp_path / "sound")
-    outcome = play_fault(tmp_path / "faulty", fault)
+def test_what_must_not_change_a_run(sound: Path, tmp_path: Path, fault: str) -> None:
+    outcome = play_fault(tmp_path, fault)
     assert (outcome.verdict, emergencies(outcome)) == ("PASS", [])
-    assert np.array_equal(read_columns(tmp_path / "sound"), read_columns(tmp_path / "faulty"))
-    frames = [Counter(cob_id for cob_id, _ in read_frames(tmp_path / name)) for name in ("sound", "faulty")]
+    assert np.array_equal(read_columns(sound), read_columns(tmp_path))
+    frames = [Counter(cob_id for cob_id, _ in read_frames(folder)) for folder in (sound, tmp_path)]
     assert frames[0] != frames[1] or "jitter" in fault or "drive" in fault  # drives are doubled inside the plant
 
 
@@ -78,11 +85,10 @@ def test_a_short_valve_state_is_missing_in_the_log(tmp_path: Path) -> None:
     assert outcome.verdict == "PASS" and np.flatnonzero(np.isnan(trace.xs)).tolist() == [100, 101]
 
 
-def test_corrupted_feedback_reaches_controller_and_log(tmp_path: Path) -> None:
+def test_corrupted_feedback_reaches_controller_and_log(sound: Path, tmp_path: Path) -> None:
     outcome = play_fault(tmp_path, 'kind = "corrupted", frame = "feedback", bits = 2, start = 0.1, end = 0.11')
-    play(job(seed=1), tmp_path / "sound")
-    faulty, sound = Trace.read(tmp_path), Trace.read(tmp_path / "sound")
-    apart = np.flatnonzero((faulty.xj != sound.xj) | (faulty.p12 != sound.p12))
+    faulty, right = Trace.read(tmp_path), Trace.read(sound)
+    apart = np.flatnonzero((faulty.xj != right.xj) | (faulty.p12 != right.p12))
     assert apart[0] == 100 and outcome.safe is False
 
 

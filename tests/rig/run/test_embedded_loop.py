@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import other_cpus
 import pytest
 from rig_command import SHORT, job, play
 
@@ -110,22 +109,3 @@ def test_python_plays_the_cycles_in_which_a_fault_begins_acts_or_ends() -> None:
     busy = find_busy_cycles(plan, Schedule(plan, {"filter.clogging": 0.0}))
     assert busy.tolist() == [*range(149, 162), *range(249, 252), *range(349, 353), *range(359, 363), *range(369, 372),
                              *range(449, 453)]
-
-
-RUN = """
-import hashlib, json
-from pathlib import Path
-from rig_command import job, play
-from fdi.trace.mcap_log import open_log
-play(job(seed=3), Path("run"))
-log = open_log(Path("run/trace.mcap"))
-kept = [each for each in log.list_raw_messages() if log.channels[each[0]].topic != "/timing"]
-print(json.dumps(hashlib.sha256(repr(kept).encode()).hexdigest()))
-"""
-
-
-def test_the_log_is_the_same_on_every_cpu(tmp_path: Path) -> None:
-    program = tmp_path / "run.py"
-    program.write_text(RUN)
-    answers = other_cpus.run_on_each_cpu(str(program), folder=tmp_path)
-    assert len(answers) >= 2 and len(set(answers.values())) == 1

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from bus_stations import spec
 from device_files import Entry, Mapped, format_eds
-from python_devices import CanDevice, CanopenDevice, PythonDevice, RemappedDevice
+from python_devices import CanDevice, CanopenDevice, PythonDevice
 
 from fdi.progress import ignore_progress
 from fdi.trace.trace import Trace
@@ -144,26 +144,10 @@ def start_multiplexed(folder: Path, where: str) -> PythonDevice:
     return CanDevice(where, PAGES_DBC, "Feedback", 1e-6, 1e-3)
 
 
-def start_remapped(folder: Path, where: str) -> PythonDevice:
-    """A DCF puts demand and position, as shipped in no PDO, into one with another COB-ID; cycle of 0.5 ms."""
-    objects = {**IDENTITY, "2000": Entry(4), "2001": Entry(4), "2002": Entry(3, "ro"), "2003": Entry(3)}
-    sheet = format_eds(objects, [Mapped((0x2003_0010, 0x2003_0010), "$NODEID+0x200")],
-                       [Mapped((0x2003_0010,), "$NODEID+0x180")])
-    (folder / "device.eds").write_text(sheet)
-    for section, value in {"1400sub1": "0x3A2", "1600sub0": "2", "1600sub1": "0x20010020", "1600sub2": "0x20000020",
-                           "1800sub1": "0x2A2", "1A00sub0": "1", "1A00sub1": "0x20020010"}.items():
-        sheet = sheet.replace(f"[{section}]\n", f"[{section}]\nParameterValue={value}\n")
-    (folder / "device.dcf").write_text(sheet)
-    bench = CANOPEN.format(node=34, position="0.1 um", current="1 uA").replace("device.eds", "device.dcf")
-    (folder / "bench.toml").write_text(bench.replace("[controller]", 'cycle = "0.5 ms"\n[controller]', 1))
-    return RemappedDevice(where, 34, str(folder / "device.eds"),
-                          {0x2000: ("position_demand", 1e-7), 0x2001: ("ram_position", 1e-7)}, 1e-6)
-
-
-DEVICES = [start_event_driven, start_synchronous, start_every_second, start_can_fd, start_multiplexed, start_remapped]
+DEVICES = [start_event_driven, start_synchronous, start_every_second, start_can_fd, start_multiplexed]
 ON_CAN = [start_event_driven, start_can_fd, start_multiplexed]  # 11 bits, FD, 29 bits
-CASES = [*((start, bus, is_compiled) for start in DEVICES for bus, is_compiled in (
-    ("udp_multicast", True), ("udp_multicast", False))), *((start, "socketcan", True) for start in ON_CAN)]
+CASES = [*((start, "udp_multicast", True) for start in DEVICES), *((start, "socketcan", True) for start in ON_CAN),
+         *((start, "udp_multicast", False) for start in (start_every_second, start_multiplexed))]
 
 
 @contextlib.contextmanager

@@ -17,6 +17,7 @@ from typing import Any
 import codec
 import pytest
 from bus_stations import spec
+from log_rows import CycleBook
 from numba.core.event import install_recorder
 
 from plant import Model
@@ -28,7 +29,7 @@ from rig.network.master import Master
 from rig.network.raw_bus import RawBus
 from rig.network.udp import PORT, Turn
 from rig.nodes.scenario import Scenario
-from rig.recorder import Signals, Timing
+from rig.recorder import Signals
 from rig.run import hard_loop, loop
 from rig.run.hard_loop import HardLoop, compile_cycle
 from rig.run.loop import CycleInput, CycleLoop
@@ -102,17 +103,15 @@ class Nodes(threading.Thread):
         return names
 
 
-class Bench:
+class Bench(CycleBook):
     """A loop on a bus with nodes, and a log of all it says."""
 
     def __init__(self, where: str, realtime: bool, faults: tuple[Fault, ...], ahead: int) -> None:
+        super().__init__()
         clock = WallClock()
         self.where = where
         self.nodes = Nodes(where)
         self.wire = LinkWire(Link(open_can(where), clock.now), clock, 0.5)
-        self.rows: list[Signals] = []
-        self.timings: list[Timing] = []
-        self.times: list[int] = []
         self.frames: list[Frame] = []
         self.master = Master(self.wire, lambda: self.loop.now(), realtime, load_bench())
         self.master.hooks.on_frame = self.frames.append
@@ -122,11 +121,6 @@ class Bench:
         self.loop: Any = HardLoop(*parts, RawBus(where, bench.frames.identifiers), ahead) if realtime else CycleLoop(
             *parts, realtime=False)
         self._markers = 0
-
-    def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
-        self.times.append(t_ns)
-        self.rows.append(signals)
-        self.timings.append(timing)
 
     def play(self, *cycles: int, control: int = 7, phase: int = 1) -> None:
         """Give inputs whose demand is their number in 0.1 um."""

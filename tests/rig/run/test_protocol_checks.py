@@ -67,7 +67,7 @@ def test_a_faulty_controller_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert name in failures(outcome) and outcome.status == 1
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(4))
 def test_a_sound_controller_never_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
     outcome = play_with(variants.Sound, tmp_path, monkeypatch, MOVE if seed % 2 else HOLD, seed)
     assert outcome.verdict == "NOT_JUDGED" and failures(outcome) == set()  # no check of the sequence's own
@@ -85,33 +85,12 @@ def test_they_stand_in_a_section_of_their_own(tmp_path: Path) -> None:
 
 
 def test_limits_of_the_sequence_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lenient = HOLD + "[protocol]\nmissing = 0.03\ngain = 0.4\nemcy = [0x6000]\nstatus = 6e-3\nheartbeat = 0.2\n"
+    lenient = HOLD + ("[protocol]\nstep_delay = 1e-3\nmissing = 0.03\ngain = 0.4\nemcy = [0x6000]\nstatus = 6e-3\n"
+                      "heartbeat = 0.2\n")
     for make in (variants.OneOfFifty, variants.GainLow, variants.SlowStatus, variants.HalfTheHeartbeats):
         assert failures(play_with(make, tmp_path, monkeypatch, lenient)) == set(), make
+    assert DELAY not in failures(play_with(variants.OldCurrent, tmp_path, monkeypatch, lenient))
     assert EMCY not in failures(play_with(variants.StrangeEmcy, tmp_path, monkeypatch, lenient))
-
-
-class Filtered(Variant):
-    """A sound controller with a filter in its loop: the mean of the currents of the two cycles before."""
-
-    _last = (0.0, 0.0)
-
-    def answer(self, drive: variants.Drive) -> variants.Drive:
-        if drive.status & 7 != 7:
-            self._last = (0.0, 0.0)
-            return drive
-        mean, self._last = sum(self._last) / 2, (self._last[1], drive.current)
-        return drive._replace(current=mean)
-
-
-def test_a_controller_with_a_filter_passes_with_a_limit_of_its_own(tmp_path: Path,
-                                                                   monkeypatch: pytest.MonkeyPatch) -> None:
-    """It answers a step one cycle late, and its gain over the few cycles of the probe is lower."""
-    assert DELAY in failures(play_with(Filtered, tmp_path, monkeypatch))
-    lenient = HOLD + "[protocol]\nstep_delay = 1e-3\ngain = 0.9\n"
-    assert failures(play_with(Filtered, tmp_path, monkeypatch, lenient)) == set()
-    assert DELAY not in failures(play_with(variants.OldCurrent, tmp_path, monkeypatch,
-                                           HOLD + "[protocol]\nstep_delay = 1e-3\n"))
 
 
 def test_a_longer_probe_changes_no_row(tmp_path: Path) -> None:

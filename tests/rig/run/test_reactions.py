@@ -41,10 +41,9 @@ def find_failures(outcome: Outcome) -> set[str]:
     return {check.name for check in outcome.checks if not check.passed}
 
 
-@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("name", [*LOSSES, "reset_in_mid_run"])
-def test_the_reference_firmware_reacts_and_recovers(tmp_path: Path, name: str, seed: int) -> None:
-    outcome = play_sequence(name, tmp_path, seed=seed)
+def test_the_reference_firmware_reacts_and_recovers(tmp_path: Path, name: str) -> None:
+    outcome = play_sequence(name, tmp_path)
     assert (outcome.verdict, outcome.why) == ("PASS", "") and outcome.safe
 
 
@@ -66,29 +65,11 @@ def test_a_node_that_was_reset_is_watched_as_before(tmp_path: Path) -> None:
     assert outcome.verdict == "PASS"
 
 
-@pytest.mark.parametrize("name", [*LOSSES, "reset_in_mid_run"])
+@pytest.mark.parametrize("name", ["lost_feedback", "reset_in_mid_run"])
 def test_it_does_so_in_real_time(tmp_path: Path, name: str) -> None:
     """However late the machine is: the reaction is counted in cycles."""
     outcome = play_sequence(name, tmp_path, pace="realtime", max_overruns=1.0)
     assert {"reaction", "emergency"} & find_failures(outcome) == set() and outcome.safe, outcome.why
-
-
-@pytest.mark.parametrize("name", ["lost_command", "lost_feedback"])
-def test_a_controller_that_does_not_miss_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                                                    name: str) -> None:
-    monkeypatch.setattr(firmware, "LOST_AFTER", 10**9)
-    outcome = play_sequence(name, tmp_path)
-    assert outcome.verdict == "FAIL" and {"reaction", "emergency"} <= find_failures(outcome)
-
-
-@pytest.mark.parametrize(("name", "make", "failed"), [
-    ("lost_sync", NoSyncWatch, {"reaction", "emergency"}), ("lost_heartbeat", NoHeartbeatWatch, {"emergency"}),
-])
-def test_a_controller_that_does_not_watch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str,
-                                          make: type[Variant], failed: set[str]) -> None:
-    monkeypatch.setattr(participants, "Firmware", make)
-    outcome = play_sequence(name, tmp_path)
-    assert outcome.verdict == "FAIL" and failed <= find_failures(outcome)
 
 
 class StaysOn(Variant):
@@ -103,7 +84,15 @@ class StaysOn(Variant):
         return drive._replace(current=self._current)
 
 
-@pytest.mark.parametrize("name", ["lost_command", "lost_feedback"])
-def test_a_status_word_alone_is_no_reaction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    monkeypatch.setattr(participants, "Firmware", StaysOn)
-    assert "reaction" in find_failures(play_sequence(name, tmp_path))
+@pytest.mark.parametrize(("name", "patched", "value", "failed"), [
+    ("lost_command", (firmware, "LOST_AFTER"), 10**9, {"reaction", "emergency"}),
+    ("lost_feedback", (firmware, "LOST_AFTER"), 10**9, {"reaction", "emergency"}),
+    ("lost_sync", (participants, "Firmware"), NoSyncWatch, {"reaction", "emergency"}),
+    ("lost_heartbeat", (participants, "Firmware"), NoHeartbeatWatch, {"emergency"}),
+    ("lost_command", (participants, "Firmware"), StaysOn, {"reaction"}),  # a status word alone is no reaction
+    ("lost_feedback", (participants, "Firmware"), StaysOn, {"reaction"})])
+def test_a_controller_that_does_not_react_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str,
+                                                patched: tuple[object, str], value: object, failed: set[str]) -> None:
+    monkeypatch.setattr(*patched, value)
+    outcome = play_sequence(name, tmp_path)
+    assert outcome.verdict == "FAIL" and failed <= find_failures(outcome)

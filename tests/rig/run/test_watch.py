@@ -97,13 +97,10 @@ class Loop:
     """A loop at cycle `k` that was given the inputs up to `queued`."""
 
     def __init__(self, k: int, queued: int) -> None:
-        self.k, self.queued, self.words = k, queued, list[int]()
+        self.k, self.queued = k, queued
 
     def now(self) -> int:
         return self.k * 1_000_000
-
-    def override_control(self, word: int) -> None:
-        self.words.append(word)
 
 
 class Recorder:
@@ -141,19 +138,3 @@ def test_an_event_of_a_queued_cycle_waits_for_it_and_is_dropped_with_it() -> Non
     parts.journal.drop_unplayed()
     parts.journal.log_due(1000, 0)
     assert len(parts.journal.events) == 1
-
-
-@pytest.mark.parametrize(("kind", "tests_safe_state", "ends"), [
-    ("emcy", False, True), ("emcy", True, False), ("process", True, True), ("late", True, True)])
-def test_trouble_takes_the_current_away_and_ends_main_unless_that_is_tested(
-        kind: str, tests_safe_state: bool, ends: bool) -> None:
-    parts = Parts(tests_safe_state=tests_safe_state)
-    parts.stage.is_watching = parts.stage.is_playing = True
-    parts.stage.begun_ns = 1
-    parts.safety.handle(kind, "what", 2, 0x8250)
-    assert parts.safety.is_safe and parts.loop.words == [0]
-    assert (parts.safety.aborted == "what") is ends
-    assert [(trouble.kind, trouble.node) for trouble in parts.safety.troubles] == [(kind, 2)]
-    assert parts.safety.is_cut_short is (kind == "late")
-    parts.safety.handle(kind, "again", 3)
-    assert parts.loop.words == [0] and parts.safety.aborted in ("", "what")

@@ -17,7 +17,7 @@ from plant import Model, simulate
 from rig.cli.inputs import is_suite_file
 from rig.evidence.requirements import Evidence, JudgedCheck, trace_requirements
 from rig.run.job import JobChoice
-from rig.suite.dry_run import find_capabilities, make_dry_run, plan_faults, split_jumps
+from rig.suite.dry_run import find_capabilities, make_dry_run, plan_faults
 from rig.suite.suite import (
     Case,
     CaseResult,
@@ -308,16 +308,6 @@ def test_a_fault_fails_its_case_and_no_other(units: tuple[Path, Said]) -> None:
     assert all(check["passed"] for check in clogged["checks"])  # the fault alone fails it
 
 
-def test_a_case_is_diagnosed_as_a_single_run(units: tuple[Path, Said], tmp_path: Path) -> None:
-    (tmp_path / "steps.toml").write_text(STEPS)
-    alone = answer("run", tmp_path / "steps.toml", "--fdi", "--set", "filter.clogging=0.6", "--out", tmp_path / "run",
-                   status=1)["fdi"]
-    case = json.loads((units[0] / "suite.json").read_text())["cases"][1]["fdi"]
-    assert (alone["verdict"], alone["level"]) == (case["verdict"], case["level"])
-    assert alone["refined"]["kintas"] == pytest.approx(case["refined"]["kintas"], rel=1e-9)
-    assert Trace.read(tmp_path / "run").provenance["fdi.faults"].startswith("filter clogging non-nominal, Kintas 0.")
-
-
 def test_report_and_page_show_level_and_size(units: tuple[Path, Said]) -> None:
     folder, said = units
     table = said.out.split("Servovalve\n")[1].split("A fault beyond acceptable")[0]
@@ -353,18 +343,6 @@ def test_what_the_diagnosis_means_for_the_case(verdict: str, word: str, passed: 
     found = [[child.tag for child in case if child.tag != "system-out"]
              for case in read_valid_junit(tmp_path / "j.xml").iter("testcase")]
     assert found == [[each] if each else [] for each in problems] and result.reason == reason
-
-
-def test_the_option_holds_for_all_cases_and_the_key_for_one(tmp_path: Path) -> None:
-    (tmp_path / "steps.toml").write_text(STEPS)
-    (tmp_path / "short.toml").write_text(SHORT)
-    (tmp_path / "suite.toml").write_text(UNITS)
-    for base, expected in ((False, [True, True, False]), (True, [True] * 3)):
-        _, variants = read_suite_file(tmp_path / "suite.toml", JobChoice(is_diagnosed=base))
-        assert [variant.choice.is_diagnosed for variant in variants] == expected
-    (tmp_path / "suite.toml").write_text(UNITS.replace("fdi = true", "fdi = 1"))
-    line = refuse("run", tmp_path / "suite.toml", "--out", tmp_path / "out")
-    assert "case[0].fdi: expected true or false, not 1" in line
 
 
 FAR = """
@@ -467,16 +445,6 @@ def test_times_and_frames_of_the_list_are_those_of_the_run(tmp_path: Path) -> No
 def test_the_no_load_speed_is_that_of_the_simulated_ram() -> None:
     speed = float(np.diff(simulate(Model(), np.full(150, 0.035)).xj[60:110]).mean()) * 1000
     assert speed == pytest.approx(find_capabilities(Model())["no-load speed"], rel=0.05)
-
-
-def test_jumps_are_no_speed() -> None:
-    ramp = np.arange(10) * 1e-4
-    command = np.concatenate((ramp, np.full(10, 5e-3), 5e-3 + ramp))
-    speed, jumps = split_jumps(command, [0, 10, 20], 1000.0)
-    assert np.flatnonzero(jumps).tolist() == [10] and jumps[10] == pytest.approx(5e-3 - 9e-4)
-    assert speed.max() == pytest.approx(0.1)
-    speed, jumps = split_jumps(np.arange(30) * 1e-4, [0, 10, 20], 1000.0)  # a line through three sections
-    assert not jumps.any() and np.abs(speed[1:] - 0.1).max() < 1e-9
 
 
 @pytest.mark.parametrize(("words", "line"), [

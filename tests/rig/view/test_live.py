@@ -15,7 +15,6 @@ import sys
 import termios
 from collections.abc import Callable
 from dataclasses import replace
-from math import isnan
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +29,8 @@ from fdi.trace.trace import Trace
 from rig.benches.bench_file import load_bench
 from rig.recorder import Event, NmtState, Record, Recorder, Signals, Timing
 from rig.sequences import load_sequence
-from rig.view.live_process import find_viewer_place, show_live
-from rig.view.live_run import LiveRun, find_named_node, make_live_plan
+from rig.view.live_process import find_viewer_place
+from rig.view.live_run import LiveRun, make_live_plan
 from rig.view.live_show import describe_line, draw_screen, follow_log
 from rig.view.viewer import find_free_port, is_listening
 
@@ -70,24 +69,6 @@ def test_what_is_written_is_there_soon(tmp_path: Path) -> None:
 def test_a_log_that_cannot_be_read_is_the_end(tmp_path: Path) -> None:
     (tmp_path / "trace.mcap").mkdir()
     assert list(follow_log(tmp_path / "trace.mcap")) == []
-
-
-class LeavesFolder:
-    """What the Python of a sequence may do where the plan arrives."""
-
-    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
-        return os.chdir, ("/",)
-
-
-def test_log_in_a_relative_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                                  capfd: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.chdir(tmp_path)
-    record_run(Path("trace.mcap"), stop=1000)
-    plan = make_live_plan(load_sequence("preflight"), "lockstep", load_bench())
-    with show_live(plan._replace(title=LeavesFolder()), Path("trace.mcap"), last_cpu_is_taken=False) as begin:
-        begin()
-    said = capfd.readouterr().err
-    assert "Traceback" not in said and "live: 0.7 of 13.5 s" in said.splitlines()[-1]
 
 
 Records = list[tuple[int, Record]]
@@ -185,24 +166,6 @@ def test_screen_fits(preflight: Path, size: tuple[int, int]) -> None:
     dots = sum(0x2800 < ord(letter) < 0x2900 for letter in text)
     assert dots > size[0] // 2 > sum(0x2800 < ord(letter) < 0x2900 for letter in before)
     assert "3 plant its process" not in describe_line(run) and "3 its process was ended" in describe_line(run)
-
-
-def test_dead_node() -> None:
-    ecu, nodes = {1: "rig", 2: "controller"}, load_bench().list_participants()
-    for names, kind, text, node in ((nodes, "process", "node 2 controller: its process ended with exit status 1", 2),
-                                    (nodes, "heartbeat", "node 3 plant is silent", 3),
-                                    (nodes, "heartbeat", "node 3 plant is heard", 3),
-                                    (nodes, "emcy", "node 3 plant 0x8250", 0),
-                                    (ecu, "silence", "controller is heard", 2)):
-        assert find_named_node(kind, text, names) == node
-    run = LiveRun(make_live_plan(load_sequence("preflight"), "realtime", load_bench()))
-    for level, text in (("ERROR", "node 3 plant is silent"), ("INFO", "node 3 plant is heard")):
-        run.add(0, Event(level, "heartbeat", text))
-        assert (3 in run.troubles) == (level == "ERROR")
-    assert run.read_last("lateness", 10).tolist() == [] and isnan(run.t)
-    assert "bring-up" in describe_line(run)
-    run.add(0, CheckResult(value=1.0, passed=True, name="slip speed", signal="xj", unit="mm/s"))  # ends the waiting
-    assert (run.checks["slip speed"].word, run.checks["slip speed"].is_final) == ("PASS", True)
 
 
 COMMAND = [sys.executable, "-m", "rig.cli.main", "run"]
@@ -340,21 +303,6 @@ def test_what_arrives_is_what_the_log_holds(tmp_path: Path) -> None:
     assert "operational" in {state for _, state in rows["/node/2_controller"]}
     assert len(rows["/log/checks"]) == len(trace.checks) and len(rows["/log/events"]) == len(trace.events)
     assert not any(math.isnan(t) for t, _ in rows["/log/events"])
-
-
-@needs_rerun
-def test_a_run_that_ends_before_main_is_shown(tmp_path: Path) -> None:
-    """Its clock ends with the run."""
-    (tmp_path / "long.toml").write_text('setup = [{ kind = "hold", time = 600 }]\n' + LONG)
-    run = started("run", tmp_path / "long.toml", "--live", f"rerun:{tmp_path}/live.rrd", "--quiet", "--out",
-                  tmp_path / "run")
-    grown(tmp_path / "run" / "trace.mcap", 100_000)  # well into set-up
-    run.send_signal(signal.SIGINT)
-    assert finished(run).status == 130
-    rows, trace = read_recording(tmp_path / "live.rrd"), Trace.read(tmp_path / "run", all=True)
-    assert len(rows["/position/ram"]) == len(trace.xj) > 0
-    assert len(rows["/log/events"]) == len(trace.events) and len(rows["/log/checks"]) == len(trace.checks) > 0
-    assert max(t for entity in rows for t, _ in rows[entity] if not math.isnan(t)) == 0.0
 
 
 @needs_rerun

@@ -27,7 +27,7 @@ from fdi.trace.trace import Trace
 from plant import Model, simulate
 from plant.signals import EHA
 from rig.view import viewer
-from rig.view.recording import LANES, LIMITS, TEXTS, Lane, draw_run, list_plots, make_lane_path, write_recording
+from rig.view.recording import LANES, LIMITS, TEXTS, draw_run, list_plots, make_lane_path, write_recording
 from rig.view.viewer import ViewerError
 
 REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"  # forbids skips
@@ -149,14 +149,6 @@ def test_headless_screenshot_shows_everything(trace: Trace, tmp_path: Path,
         print("\nviewer:", ", ".join(f"{name} {count} px" for name, count in pixels.items()))
 
 
-@needs_driver
-def test_screenshot_misses_what_is_not_drawn(trace: Trace, tmp_path: Path) -> None:
-    drawing = draw_run(trace)
-    write_recording(drawing._replace(lanes=[Lane("run/x", [], {})], log=[]), tmp_path / "view.rrd")
-    with pytest.raises(ViewerError, match=f"empty views: {LANES}, {TEXTS}$"):
-        viewer.take_screenshot(drawing.shown, tmp_path / "view.rrd", tmp_path / "view.png")
-
-
 @pytest.fixture(scope="module")
 def short_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record_run(tmp_path_factory.mktemp("run") / "trace.mcap", stop=1000).parent
@@ -234,23 +226,6 @@ def test_before_the_change_is_the_model_without_the_added_effect(folder: Path, c
     assert (names["/residual_xj/1_before"], names["/xj/1_measured"]) == ("before the change", "XJ measured")
     assert "/error_over_floor/before" in rows
     assert text.startswith(f"```text\n{compared[1]}") and "Before the change:\n\n```text\nMODEL_INCOMPLETE" in text
-
-
-def test_before_a_model_file_is_the_file_without_its_effects(folder: Path, tmp_path: Path) -> None:
-    assert rig("add", "null_bias", folder / "run.csv", "--out", tmp_path / "better.toml").status == 0
-    answer("view", folder / "run.csv", "--compare", "--model", tmp_path / "better.toml", "--signals", "xs,p12",
-           "--save", tmp_path / "x.rrd")
-    rows = read_recording(tmp_path / "x.rrd")
-    before = compare(Trace.read(folder / "run.csv"), Model(), signals=["xs", "p12"])
-    np.testing.assert_allclose(read_values(rows, "/xs/2_before"), before.replay.model["xs"] * 1e6, atol=0.02)
-    left, earlier = (np.abs(read_values(rows, f"/residual_xs/{which}")).mean() for which in ("2_model", "1_before"))
-    assert left < 0.5 * earlier and not any(entity.startswith("/xj/") for entity in rows)
-
-
-def test_without_a_change_there_is_no_before(folder: Path, tmp_path: Path) -> None:
-    assert rig("view", folder / "healthy.csv", "--compare", "--save", tmp_path / "x.rrd").status == 0
-    rows = read_recording(tmp_path / "x.rrd")
-    assert not any("before" in entity for entity in rows) and "/residual_xj/1_model" in rows
 
 
 def test_runs_are_overlaid_and_subtracted_on_the_time_of_the_first(folder: Path, tmp_path: Path) -> None:

@@ -12,8 +12,8 @@
 #include "controller.h"
 #include "serve.h"
 
-enum { COMMAND = 0x202, DRIVE = 0x182, HEARTBEAT = 0x702, ACTIVE = 0x7 };
-enum { CURRENT = 0, STATUS = 4, CYCLE = 6 }; /* bytes in the drive frame */
+enum { DRIVE = 0x182, HEARTBEAT = 0x702 };
+enum { CURRENT = 0, CYCLE = 6 }; /* bytes in the drive frame */
 
 static struct controller controller;
 static const char *fault;
@@ -46,26 +46,10 @@ static bool spoil_drive(uint8_t *drive)
     drives++;
     if (has("late_frame"))
         memcpy(drive, previous, 8);
-    else if (has("late_current"))
-        memcpy(drive + CURRENT, previous + CURRENT, 4);
     else if (has("stale_cycle"))
         write_bytes(drive + CYCLE, read_bytes(drive + CYCLE, 2) - 1, 2);
-    else if (has("frozen_output") && is_active && drives > 150)
-        set_current(drive, 20000);
-    else if (has("sign_error"))
-        set_current(drive, -current_of(drive));
-    else if (has("gain_high"))
-        set_current(drive, 1.3 * current_of(drive));
-    else if (has("gain_low"))
-        set_current(drive, 0.7 * current_of(drive));
-    else if (has("wrong_status"))
-        write_bytes(drive + STATUS, 0xF, 2);
-    else if (has("missing_ready"))
-        write_bytes(drive + STATUS, read_bytes(drive + STATUS, 2) & ACTIVE, 2);
     else if (has("nan_current") && is_active && drives > 150)
         set_current(drive, INT32_MIN); /* what a conversion of NaN gives on x86 */
-    else if (has("saturated_current") && is_active && drives > 150)
-        set_current(drive, INT32_MAX);
     memcpy(previous, sound, 8);
     return !(has("missed_cycles") && drives % 50 == 0);
 }
@@ -83,17 +67,14 @@ static void send_spoiled(void *context, uint32_t cob_id, const uint8_t *data, ui
 
 static void receive(void *context, const struct frame *frame)
 {
-    struct frame seen = *frame;
     (void)context;
-    if (has("ignores_control") && frame->cob_id == COMMAND && frame->length == 8)
-        write_bytes(seen.data + 4, ACTIVE, 2);
     if (has("slow_start") && nmt_read_command(frame, CONTROLLER_NODE) == NMT_START && frame->cob_id == 0) {
         start = *frame;
         start_ns = now_ns + INT64_C(1500000000);
         return;
     }
     const struct control_law before = controller.law;
-    controller_receive(&controller, &seen);
+    controller_receive(&controller, frame);
     if (has("leaks_state") && controller.law.integral == 0.0) /* a reset and an open loop must clear it */
         controller.law.integral = before.integral;
 }

@@ -154,14 +154,6 @@ def test_guess_scales_counts_and_writes_their_step(tmp_path: Path, unit: str) ->
     assert guessed.left == {"Kraft [kN]": "always 0; by its name it would be load"}
 
 
-def test_guess_pairs_two_chambers(tmp_path: Path) -> None:
-    lines = ["time [s];target [mm];stroke [mm];p B [bar];p A [bar]"]
-    lines += [f"{k / 1000};{math.sin(k / 90)};{math.sin(k / 90 - 0.1)};{50 + k % 7};{60 + k % 5}" for k in range(500)]
-    guessed = guess(tmp_path, lines)
-    assert 'source = "p A [bar]"\nunit = "bar"\nminus = "p B [bar]"' in guessed.text
-    assert guessed.chosen["p12"] == ("p A [bar]", "likely")
-
-
 @pytest.mark.parametrize("suffix", [".mat", ".parquet"])
 def test_matlab_and_parquet(suffix: str, tmp_path: Path) -> None:
     columns = {"t": T, "com": XJ, "xj": XJ, "cor": XJ, "p12": 2.0 * XJ}
