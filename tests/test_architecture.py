@@ -91,8 +91,8 @@ CLOCK_FILES = (
 # Public names of each package: what `from package import *` gives.
 PUBLIC = {
     "plant": {"Actuator", "Columns", "InputError", "Model", "RigError", "load_model", "simulate"},
-    "plant.effects": {"CATALOGUE", "Annotated", "Any", "Drag", "Effect", "Held", "Lag", "Law", "Line", "NamedTuple",
-                      "Quantity", "clip", "combine_laws", "effect", "load_effects", "play", "register_base", "soften"},
+    "plant.effects": {"CATALOGUE", "Drag", "Effect", "Held", "Lag", "Law", "Line", "Quantity", "clip", "combine_laws",
+                      "effect", "load_effects", "play", "register_base", "soften"},
     "fdi": {"Trace", "add_effect", "compare", "diagnose", "explain", "identify", "read_trace"},
     "fdi.discovery": {"Explanation", "explain"},
     "rig.device": {

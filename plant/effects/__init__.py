@@ -18,7 +18,7 @@ import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any
 
 from plant.compile import Function
 from plant.errors import require
@@ -30,9 +30,9 @@ from plant.state import Drag, Held, Lag, Line, Memory
 from plant.tables import read_file
 from plant.user_code import run_file
 
-# some of them for files of effects: `from plant.effects import ...` has all names that one needs
-__all__ = ["CATALOGUE", "Annotated", "Any", "Drag", "Effect", "Held", "Lag", "Law", "Line", "NamedTuple", "Quantity",
-           "clip", "combine_laws", "effect", "load_effects", "play", "register_base", "soften"]
+# some of them for files of effects: this package has all names of ours that one needs
+__all__ = ["CATALOGUE", "Drag", "Effect", "Held", "Lag", "Law", "Line", "Quantity", "clip", "combine_laws", "effect",
+           "load_effects", "play", "register_base", "soften"]
 
 Law = Function
 

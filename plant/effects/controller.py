@@ -1,6 +1,8 @@
 """Effects in the firmware: they show in its answer against what it was told and what it sensed, without any noise."""
 
-from plant.effects import Annotated, Any, NamedTuple, Quantity, clip, effect
+from typing import Annotated, Any, NamedTuple
+
+from plant.effects import Quantity, clip, effect
 
 
 class AsymmetricGain(NamedTuple):

@@ -1,8 +1,9 @@
 """Effects on the way of the current, from the bus through driver, line and coil to the armature, in this order."""
 
 from math import inf, pi, sin
+from typing import Annotated, Any, NamedTuple
 
-from plant.effects import Annotated, Any, Held, Lag, NamedTuple, Quantity, clip, effect, play
+from plant.effects import Held, Lag, Quantity, clip, effect, play
 
 
 class TransportDelay(NamedTuple):

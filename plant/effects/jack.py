@@ -1,8 +1,9 @@
 """Forces on the ram and what resists it: loads, dry friction, a press. Positive force acts against extension."""
 
 from math import exp, pi, sqrt
+from typing import Annotated, Any, NamedTuple
 
-from plant.effects import Annotated, Any, Drag, Held, NamedTuple, Quantity, effect
+from plant.effects import Drag, Held, Quantity, effect
 
 
 class ConstantLoad(NamedTuple):

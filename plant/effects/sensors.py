@@ -1,10 +1,11 @@
 """Effects of the position transducer, in the order of its signal path."""
 
 from math import sqrt
+from typing import Annotated, Any, NamedTuple
 
 from numpy import floor
 
-from plant.effects import Annotated, Any, Held, Lag, NamedTuple, Quantity, effect, play
+from plant.effects import Held, Lag, Quantity, effect, play
 
 
 class MountCompliance(NamedTuple):

@@ -1,8 +1,9 @@
 """Effects of the pilot stage, of the spool, and of the oil between its metering edges and the piston."""
 
 from math import exp, log, sqrt
+from typing import Annotated, Any, NamedTuple
 
-from plant.effects import Annotated, Any, Line, NamedTuple, Quantity, clip, effect, soften
+from plant.effects import Line, Quantity, clip, effect, soften
 
 _LANDS = "lap of the spool's lands, Merritt 1967"
 

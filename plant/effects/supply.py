@@ -1,8 +1,9 @@
 """Effects of the hydraulic supply and of its oil."""
 
 from math import pi, sin
+from typing import Annotated, Any, NamedTuple
 
-from plant.effects import Annotated, Any, NamedTuple, Quantity, effect
+from plant.effects import Quantity, effect
 
 
 class SupplyRipple(NamedTuple):

@@ -10,8 +10,9 @@ the spool, rounding of its lands' corners, torque of the first stage, contaminat
 """
 
 from math import sqrt
+from typing import Annotated, Any, NamedTuple
 
-from plant.effects import Annotated, Any, Line, NamedTuple, Quantity, effect
+from plant.effects import Line, Quantity, effect
 
 NOWHERE = ("none",)  # plants in which rig explain tests them unasked
 
