@@ -10,36 +10,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from textwrap import shorten
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from fdi.comparison.compare import Comparison, compare as compare_trace
-from fdi.diagnosis.bands import load_bands
-from fdi.diagnosis.diagnosis import Diagnosis, diagnose as diagnose_trace
-from fdi.diagnosis.faults import choose_faults
-from fdi.discovery import update_model
-from fdi.discovery.explain_runs import Answer, explain_runs
-from fdi.discovery.runs import Runs, collect_runs
-from fdi.discovery.update_model import ModelUpdate, Provenance
 from fdi.foreign_code import load_effects_of_model, load_plant_of_model
-from fdi.identification.identify import (
-    Identification,
-    collect_identification_runs,
-    identify_model,
-    parse_free_parameters,
-    read_free_parameters,
-    write_identified_model,
-)
 from fdi.output import write_text
-from fdi.report.compare_report import build_comparison_report
-from fdi.report.diagnosis_report import build_diagnosis_report
 from fdi.report.drawing import Drawing, convert_figure, save_drawing
-from fdi.report.explain_report import build_explanation_report, build_model_report
-from fdi.report.identify_report import build_identification_report
 from fdi.report.report import Figure, Medium, Report, render_html, to_plain
-from fdi.report.terminal import format_report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
+
+if TYPE_CHECKING:
+    from fdi.comparison.compare import Comparison
+    from fdi.diagnosis.diagnosis import Diagnosis
+    from fdi.discovery.explain_runs import Answer
+    from fdi.discovery.runs import Runs
+    from fdi.discovery.update_model import ModelUpdate, Provenance
+    from fdi.identification.identify import Identification
 
 TraceOrPath = Trace | str | Path
 ModelOrPath = Model | str | Path
@@ -143,6 +130,7 @@ class Result:
 
     def to_text(self, width: int = 100) -> str:
         """The report as the terminal shows it, without colours; `width` in characters."""
+        from fdi.report.terminal import format_report
 
         return format_report(self.report, width)
 
@@ -167,6 +155,7 @@ class ComparisonResult(Result):
 @dataclass(frozen=True, eq=False, repr=False)
 class ExplanationResult(Result):
     """Which effect is missing from a model."""
+
     answer: Answer = field(repr=False)
 
     @property
@@ -197,7 +186,9 @@ class ModelResult(Result):
         Raises:
             InputError: a path that cannot be written.
         """
-        update_model.write_model_file(self.update, path)
+        from fdi.discovery.update_model import write_model_file
+
+        write_model_file(self.update, path)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -217,6 +208,8 @@ class IdentificationResult(Result):
         Raises:
             InputError: a path that cannot be written.
         """
+        from fdi.identification.identify import write_identified_model
+
         write_identified_model(self.identification, path, "fdi.identify")
 
 
@@ -250,6 +243,9 @@ def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
     Raises:
         InputError: a trace, a model or a signal that cannot be used.
     """
+    from fdi.comparison.compare import compare as compare_trace
+    from fdi.report.compare_report import build_comparison_report
+
     own_model = _load_model(model, trust)
     measured = _load_trace(trace, own_model)
     comparison = compare_trace(measured, own_model, [_load_trace(r, own_model) for r in repeats], signals,
@@ -275,6 +271,9 @@ def explain(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
     Raises:
         InputError: a trace, a model or a signal that cannot be used.
     """
+    from fdi.discovery.explain_runs import explain_runs
+    from fdi.report.explain_report import build_explanation_report
+
     own_model = _load_model(model, trust)
     runs = _collect_runs(own_model, trace, repeats, holdout, signals)
     answer, pattern = explain_runs(runs, seed, effect_file)
@@ -299,11 +298,14 @@ def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPa
     Raises:
         InputError: an effect that this model cannot take, or runs that cannot be used.
     """
+    from fdi.discovery import update_model
+    from fdi.discovery.update_model import add_effects
+    from fdi.report.explain_report import build_model_report
+
     effects = [effect] if isinstance(effect, str) else list(effect)
     own_model, known = _load_model_file(model, trust)
     runs = _collect_runs(update_model.remove_all_effects(own_model, known), trace, repeats, holdout, signals)
-    said = f"fdi.add_effect({', '.join(map(repr, effects))})"
-    update = update_model.add_effects(effects, runs, own_model, known, said)
+    update = add_effects(effects, runs, own_model, known, f"fdi.add_effect({', '.join(map(repr, effects))})")
     return ModelResult(build_model_report(update), update)
 
 
@@ -325,6 +327,14 @@ def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eh
     Raises:
         InputError: runs, a model, a signal or a range that cannot be used.
     """
+    from fdi.identification.identify import (
+        collect_identification_runs,
+        identify_model,
+        parse_free_parameters,
+        read_free_parameters,
+    )
+    from fdi.report.identify_report import build_identification_report
+
     own_model = _load_model(model, trust)
     source = None if isinstance(model, Model) else model
     ranges = read_free_parameters(own_model, source) if free is None else parse_free_parameters(free, own_model, "free")
@@ -349,6 +359,11 @@ def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Pat
     Raises:
         InputError: a trace, a model or bands that cannot be used.
     """
+    from fdi.diagnosis.bands import load_bands
+    from fdi.diagnosis.diagnosis import diagnose as diagnose_trace
+    from fdi.diagnosis.faults import choose_faults
+    from fdi.report.diagnosis_report import build_diagnosis_report
+
     own_model = _load_model(model, trust)
     known_bands = None if bands is None else load_bands(bands, own_model.kind)
     measured, own_faults = _load_trace(trace, own_model), choose_faults(faults, own_model.kind)
@@ -375,15 +390,18 @@ def _load_model(model: ModelOrPath, trust: bool) -> Model:
 
 def _load_model_file(model: ModelOrPath, trust: bool) -> tuple[Model, Provenance]:
     """A model and where it comes from, which only a model file knows."""
+    from fdi.discovery.update_model import Provenance, load_model_file
+
     if not isinstance(model, Model) and Path(model).suffix != ".py" and Path(model).is_file():
         load_plant_of_model(model, is_trusted=trust)
         load_effects_of_model(model, is_trusted=trust)
-        return update_model.load_model_file(Path(model))
+        return load_model_file(Path(model))
     return _load_model(model, trust), Provenance()
 
 
 def _collect_runs(model: Model, trace: TraceOrPath, repeats: Sequence[TraceOrPath], holdout: TraceOrPath | None,
                   signals: Sequence[str] | None) -> Runs:
+    from fdi.discovery.runs import collect_runs
 
     unseen = None if holdout is None else _load_trace(holdout, model)
     return collect_runs(model, _load_trace(trace, model), [_load_trace(r, model) for r in repeats], unseen, signals)

@@ -527,12 +527,13 @@ def find_marks(model: Model, traces: Sequence[Trace]) -> Marks:
         prints.append(Fingerprint("quantisation", sizes, step / FINEST_COMB, 0.0))
     error, firmware, unseen = 0.0, list[Fingerprint](), tuple[str, ...]()
     if model.kind.controller:
-        error = _measure_rms(model, traces) / resolution
+        answer = _measure_rms(model, traces)
+        error = float(np.nan_to_num(answer / resolution))
         offered = [e.name for e in model.kind.list_effects()
                    if e.firmware and e.name not in model.effects and len(e.fitted) == 1]
         tried = [_fit_size(model, traces, e, error, resolution) for e in offered if error > FIRMWARE_DIFFERS]
         firmware = sorted((f for f in tried if f.after < 0.7 * error), key=lambda f: f.after)
-        unseen = tuple(offered) if all(np.isnan(compute_firmware_residual(model, t)).all() for t in traces) else ()
+        unseen = tuple(offered) if np.isnan(answer) else ()
     return Marks(error, resolution, (*prints, *firmware[:1]), step, is_recorder, tuple(firmware[1:]), unseen)
 
 
@@ -560,8 +561,9 @@ def compute_firmware_residual(model: Model, trace: Trace) -> Floats:
 
 
 def _measure_rms(model: Model, traces: Sequence[Trace]) -> float:
+    """RMS of the firmware's residuals, A; NaN where it can be computed in none of the runs."""
     left = [compute_firmware_residual(model, r) for r in traces]
-    return float(np.sqrt(np.mean([float(np.nanmean(x**2)) for x in left if not np.isnan(x).all()] or [0.0])))
+    return float(np.sqrt(np.mean([float(np.nanmean(x**2)) for x in left if not np.isnan(x).all()] or [np.nan])))
 
 
 def _fit_size(model: Model, traces: Sequence[Trace], name: str, before: float, unit: float) -> Fingerprint:

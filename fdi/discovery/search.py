@@ -595,8 +595,8 @@ def _leave_out_worst(residuals: Floats, share: float = 0.15) -> Floats:
     A surface may stop for an instant in a slow motion.
     """
     sums = sum_blocks(np.nan_to_num(residuals))
-    compared = [np.quantile(each[each > 0.0], 1.0 - share) if each.any() else 0.0 for each in sums]
-    kept = sums <= np.array(compared)[:, None]
+    most = np.array([np.quantile(each[each > 0.0], 1.0 - share) if each.any() else 0.0 for each in sums])
+    kept = sums <= most[:, None]
     return np.where(np.repeat(kept, BLOCK, axis=1)[:, :residuals.shape[1]], residuals, np.nan)
 
 
@@ -660,11 +660,11 @@ def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: in
              for start in (*problem.model.find_effect(name).starts, *find_tones(problem, fit, name),
                            *_start_at_fit(problem, fit, name))]
     best = _keep_best(simulate_starts(problem, fit, first, workers))
-    for factors, count in zip(ZOOM, LOOKED_AT, strict=True):
-        near = [(t.effect, start, t.along) for t in best[:count] for start in _list_starts_around(problem, t, factors)]
-        best = _keep_best([*best, *simulate_starts(problem, fit, near, workers)])
+    passes = list(zip(ZOOM, LOOKED_AT, strict=True))
     if problem.model.kind.correct is not None:  # a backlash that is 2 % off bounces otherwise than the motor
-        near = [(t.effect, start, t.along) for t in best[:4] for start in _list_starts_around(problem, t, LINE)]
+        passes.append((LINE, 4))
+    for factors, count in passes:
+        near = [(t.effect, start, t.along) for t in best[:count] for start in _list_starts_around(problem, t, factors)]
         best = _keep_best([*best, *simulate_starts(problem, fit, near, workers)])
     beside = [(t.effect, start, t.along) for t in best[:LOOKED_AT[-1]] for start in _list_lines_beside(problem, t)]
     best = _keep_best([*best, *simulate_starts(problem, fit, beside, workers)])

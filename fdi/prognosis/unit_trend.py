@@ -9,7 +9,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -235,6 +234,7 @@ def _find_answer_file(file: Path, model: Model, faults: Sequence[Fault]) -> Path
 TABLE = "dates.csv"
 AXES = {"date": "days", "hours": "h", "flights": "flights"}  # axis: its unit
 _DATE = re.compile(r"(?<!\d)(\d{4})-?([01]\d)-?([0-3]\d)(?:[T_ ]([0-2]\d)[-:]?([0-5]\d)(?:[-:]?([0-5]\d))?)?(?!\d)")
+_OFFSET = re.compile(r"([T ].*)([+-])(\d\d):?(\d\d)$")  # behind a time of day
 
 
 class Row(NamedTuple):
@@ -251,11 +251,15 @@ def parse_date(text: str) -> float:
     >>> parse_date("1970-01-02"), parse_date("1970-01-01T12:00:00-12:00"), parse_date("soon")
     (1.0, 1.0, nan)
     """
+    text, late = text.strip().removesuffix("Z"), 0.0
+    if offset := _OFFSET.search(text):
+        late = float(f"{offset[2]}1") * (int(offset[3]) * 60 + int(offset[4])) / 1440
+        text = text[:offset.start(2)]
     try:
-        found = datetime.fromisoformat(text.strip())
+        found = np.datetime64(text.strip(), "s") if re.match(r"\d{4}-\d\d-\d\d", text) else np.datetime64("NaT")
     except ValueError:
         return math.nan
-    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp() / 86400
+    return math.nan if np.isnat(found) else float(found.astype(float)) / 86400 - late
 
 
 def format_day(day: float) -> str:
