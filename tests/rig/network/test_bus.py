@@ -59,8 +59,8 @@ class TestEveryBus:
             for n in range(10):
                 one.send(0x100, bytes([n]))
                 other.send(0x200, bytes([n]))
-            time.sleep(0.05)
-            assert contents(one.poll(0.0)) == [(0x200, bytes([n])) for n in range(10)]
+            assert contents(gather(one, 10)) == [(0x200, bytes([n])) for n in range(10)]
+            assert one.poll(0.05) == []
 
     def test_times_do_not_go_back_and_span_no_more_than_it_took(self, bus_kind: str) -> None:
         with stations(bus_kind, 2) as (sender, receiver):
@@ -180,7 +180,7 @@ class TestLink:
             many = 60_000  # more than the large receive buffer of a CAN socket holds
             for n in range(many):
                 sender.send(0x100, struct.pack("<I", n))
-            kept = len(receiver.poll())
+            kept = sum(len(frames) for frames in iter(lambda: receiver.poll(0.5), []))  # a busy kernel is late with some
             sender.send(0x101, b"")  # the count rides on the next frame
             gather(receiver, 1)
             assert kept > 0 and kept + receiver.overflows == many
@@ -194,7 +194,7 @@ class TestLink:
             sender.send(0x101, b"")
             sent = time.monotonic_ns() - begin
             time.sleep(0.1)
-            first, second = receiver.poll()
+            first, second = gather(receiver, 2)
             assert 0 <= second.t_ns - first.t_ns <= sent + 100_000
 
     def test_a_bus_that_is_gone_is_one_line(self) -> None:
