@@ -58,6 +58,7 @@ class StoredCode:
             with contextlib.suppress(Exception):  # another release of numba may name its inner parts otherwise
                 code = emit_object(run)
                 if code is not None and _gives_same_bits(code, run, make_arguments):
+                    self._engine = _link_object(code)
                     _write_object(self._path, code)
 
     def find_address(self) -> int:
@@ -92,9 +93,8 @@ def _gives_same_bits(code: bytes, run: Any, make_arguments: Callable[[], Sequenc
     engine, expected, found = _link_object(code), make_arguments(), make_arguments()
     run(*expected)
     status = _make_entry(engine, found)(*_list_places(found))
-    same = [one.tobytes() == other.tobytes() for one, other in zip(_list_arrays(expected), _list_arrays(found),
-                                                                   strict=True)]
-    return status == 0 and all(same)
+    arrays = zip(_list_arrays(expected), _list_arrays(found), strict=True)
+    return status == 0 and all(one.tobytes() == other.tobytes() for one, other in arrays)
 
 
 # The interpreter lock is kept: the call is short, and another thread that gets the lock may keep it for longer.
