@@ -12,7 +12,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdi.estimation.fit import Fit, Free, compute_misfit, evolve_fit, follow_population, scale_noise, scaled_bounds
+from fdi.estimation.fit import (
+    Fit,
+    Free,
+    compute_misfit,
+    evolve_fit,
+    fit_unknowns,
+    follow_population,
+    scale_noise,
+    scaled_bounds,
+)
 from fdi.estimation.unidentifiable import (
     BALANCED,
     LogFree,
@@ -25,7 +34,7 @@ from fdi.estimation.unidentifiable import (
 )
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.trace import Floats
-from plant.threads import map_in_threads
+from plant.threads import map_in_threads, map_together
 
 # factor on the noise, fits that go on, rounds of each, solver steps a cycle
 FIT_STAGES = ((100.0, 3, 3, 10), (30.0, 2, 4, 10), (6.0, 1, 5, 20), (1.0, 1, 8, 20))
@@ -36,6 +45,7 @@ SEARCH_STEPS = 10  # solver steps a cycle
 SEARCHES = 4  # pairs of such searches at most
 SEARCH_GAIN = 0.1  # share of the excess misfit that a pair must remove for another one to follow
 FITTED_SQUARE = 1.02  # mean square of whitened residuals up to which no other valley is looked for
+PROFILE_STEP = 0.05  # of the logarithm, or of the range
 SCATTERED = 48  # starts beside the regressions' values and the data sheet's
 GRID = (-0.3, -0.15, -0.07, -0.03, -0.01, 0.01, 0.03, 0.07, 0.15, 0.3)  # of the logarithm, or of half a range
 
@@ -177,6 +187,37 @@ def scan_unknowns(problem: LogProblem, fit: Fit, rounds: int = 2) -> Fit:
             break
         x = tried[best]
     return replace(fit, x=x)
+
+
+def profile_unknowns(problem: LogProblem, fit: Fit) -> Fit:
+    """The fit at the best place of all profiles: each wide unknown goes through its range, the others fitted along.
+
+    What rings after a step has a minimum for every number of turns that it may be off, and along a mass these lie in a
+    narrow valley: neither slopes nor a grid with the others held step from one to the next.
+    """
+    low, high = scaled_bounds(fit.free)
+
+    def follow(task: tuple[int, float]) -> Fit:
+        k, way = task
+        free, f = list(fit.free), fit.free[k]
+        step = PROFILE_STEP / f.scale if isinstance(f, LogFree) else PROFILE_STEP * (high[k] - low[k])
+        best = now = fit
+        for place in np.arange(fit.x[k] + way * step, high[k] if way > 0.0 else low[k], way * step):
+            value = f.centre + f.scale * place
+            free[k] = f._replace(low=value, high=value)
+            now = fit_unknowns(problem, free, put_unknown(now.x, k, place), 2)
+            best = min(best, now, key=lambda each: each.cost)
+        return replace(best, free=fit.free)
+
+    tasks = [(k, way) for k, f in enumerate(fit.free) if is_wide(f) for way in (-1.0, 1.0)]
+    return min(map_together(follow, tasks, problem.workers), key=lambda each: each.cost)
+
+
+def put_unknown(x: Floats, k: int, value: float) -> Floats:
+    """Scaled unknowns, (p,), with another value of unknown k."""
+    moved = x.copy()
+    moved[k] = value
+    return moved
 
 
 def find_flat(problem: LogProblem, free: Sequence[Free], x: Floats) -> Floats:

@@ -20,6 +20,7 @@ from fdi.discovery.runs import Source, hash_columns, read_source, require_distin
 from fdi.discovery.update_model import Provenance, format_model_file
 from fdi.estimation import noise as noises
 from fdi.estimation.fit import (
+    FIT_ROUNDS,
     Fit,
     Free,
     Problem,
@@ -29,6 +30,7 @@ from fdi.estimation.fit import (
     limit_friction_values,
     list_relative_tolerances,
     list_tolerance_unknowns,
+    scale_noise,
     scaled_bounds,
     silence_readings,
 )
@@ -40,6 +42,7 @@ from fdi.estimation.replay import (
     find_undecided_rows,
     hold_inputs,
     leave_out_rest,
+    leave_out_rows,
     match_period,
     prepare_trace,
 )
@@ -58,6 +61,8 @@ from fdi.identification.global_fit import (
     fit_from_afar,
     is_fitted,
     polish_fit,
+    profile_unknowns,
+    put_unknown,
     sample_starts,
     scale_values,
     search_other_valleys,
@@ -461,6 +466,7 @@ def _find_slope(free: Sequence[Free], k: int) -> Floats:
     return slope
 
 
+BEGINNING_NOISE = (30.0, 6.0)  # factors on the noise
 LAST_STEPS = 50  # solver steps a cycle, of the last rounds
 OPEN_MISFIT = 4.0  # -2 log likelihood by which a parameter may go to the end of its range and still not be seen
 
@@ -543,6 +549,22 @@ class Identification:
         return tuple(e for e in self.errors if e.is_held_out)
 
 
+class Settled(NamedTuple):
+    """A fit taken to its end, and what it leaves of the runs."""
+
+    problem: LogProblem
+    fit: Fit
+    hidden: Mapping[str, tuple[float, float, float]]  # of `find_hidden`
+    model: Model  # with what was found as its design
+    errors: tuple[RunError, ...]
+    residuals: tuple[tuple[Floats, Floats], ...]
+
+    @property
+    def worst_fitted(self) -> float:
+        """Error over the noise floor, in the worst signal of the worst run of the fit."""
+        return max(e.decided_ratio for e in self.errors if not e.is_held_out)
+
+
 def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace], held_out: Sequence[Trace],
                    sources: Sequence[Source], seed: int = 0, progress: Progress = ignore_progress,
                    workers: int | None = None) -> Identification:
@@ -581,16 +603,26 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
     problem = make_problem(model, parts, floor, workers or count_threads())
     notes += remarks
     starts = sample_starts(free, scale_values(free, {**model.values, **begun}), frozenset(begun), seed)
-    fit = fit_from_afar(problem, free, starts, progress)
-    progress("which parameters the runs show", 0.65)
-    hidden = find_hidden(problem, fit, {r.name: r for r in ranges})
-    problem, fit = hold_parameters(problem, fit, {name: value for name, (value, _, _) in hidden.items()})
-    progress("last fits, with finer steps", 0.7)
-    problem, fit = finish(problem, fit, scale_values(fit.free, {**model.values, **begun}), seed, progress)
-    progress("judging", 0.92)
-    found = build_model(model, problem, fit, gains)
+
+    def settle(problem: LogProblem, fit: Fit) -> Settled:
+        progress("which parameters the runs show", 0.65)
+        hidden = find_hidden(problem, fit, {r.name: r for r in ranges})
+        problem, fit = hold_parameters(problem, fit, {name: value for name, (value, _, _) in hidden.items()})
+        progress("last fits, with finer steps", 0.7)
+        problem, fit = finish(problem, fit, scale_values(fit.free, {**model.values, **begun}), seed, progress)
+        progress("judging", 0.92)
+        found = build_model(model, problem, fit, gains)
+        return Settled(problem, fit, hidden, found, *measure_errors(model, found, runs, sources, len(fitted), floor))
+
+    settled = settle(problem, fit_from_afar(problem, free, starts, progress))
+    if model.kind.correct is not None and settled.worst_fitted > FITTED_RUN_WORST:
+        progress("fitting the beginnings of motions", 0.6)
+        moving = [leave_out_rest(t, model, memory=0.0) for t in runs[:len(fitted)]]
+        parts, _ = cut_long_runs(moving, sources, first, floor)
+        begin = fit_beginnings(make_problem(settled.model, parts, floor, problem.workers), free, floor)
+        settled = min(settled, settle(*begin), key=lambda each: each.worst_fitted)
+    problem, fit, hidden, found, errors, residuals = settled
     estimates, covariance = estimate_parameters(model, ranges, fit, hidden)
-    errors, residuals = measure_errors(model, found, runs, sources, len(fitted), floor)
     verdict, reason = decide_verdict(estimates, errors)
     progress("which runs would show more", 0.95)
     unseen = [e.name for e in estimates if not e.is_identifiable]
@@ -640,8 +672,8 @@ def find_hidden(problem: LogProblem, fit: Fit, ranges: Mapping[str, Range]
         f = fit.free[k]
         low, high = ((end - f.centre) / f.scale for end in (f.low, f.high))
         near, inside = 1e-3 * (high - low), IDENTIFIABLE_SHARE * 0.5 * (high - low)
-        trials.append(_put(fit.x, k, low if fit.x[k] - low > near else low + inside))
-        trials.append(_put(fit.x, k, high if high - fit.x[k] > near else high - inside))
+        trials.append(put_unknown(fit.x, k, low if fit.x[k] - low > near else low + inside))
+        trials.append(put_unknown(fit.x, k, high if high - fit.x[k] > near else high - inside))
     costs = compute_misfit(problem.compute_white_residuals(fit.free, np.array(trials)))
     is_open = (np.abs(costs[1:] - costs[0]) < OPEN_MISFIT).reshape(-1, 2)
     found = {}
@@ -660,12 +692,6 @@ def find_hidden(problem: LogProblem, fit: Fit, ranges: Mapping[str, Range]
     return found
 
 
-def _put(x: Floats, k: int, value: float) -> Floats:
-    moved = x.copy()
-    moved[k] = value
-    return moved
-
-
 def _find_edge(problem: LogProblem, fit: Fit, k: int, end: float, rounds: int = 3, parts: int = 15) -> float:
     """The value of unknown k, SI, between a fit that is well and the `end` of its range where it is not, that divides
     both."""
@@ -674,7 +700,7 @@ def _find_edge(problem: LogProblem, fit: Fit, k: int, end: float, rounds: int = 
     for _ in range(rounds):
         line = np.linspace(good, bad, parts + 1)
         costs = compute_misfit(problem.compute_white_residuals(
-            fit.free, np.array([fit.x, *(_put(fit.x, k, place) for place in line)])))
+            fit.free, np.array([fit.x, *(put_unknown(fit.x, k, place) for place in line)])))
         seen = np.flatnonzero(costs[1:] - costs[0] >= OPEN_MISFIT)
         if not len(seen):
             break
@@ -712,6 +738,29 @@ def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress
         fine = replace(fine, noise=learnt, _lanes={})
         fit = descend(fine, fit, 5)
     return fine, fit
+
+
+def fit_beginnings(problem: LogProblem, free: Sequence[Free], floor: Mapping[str, float]) -> tuple[LogProblem, Fit]:
+    """A fit from the model's own values that takes in the beginnings of motions, as far as they are decided.
+
+    With an observer a fit first leaves them out: how a motion begins hangs on dry friction, and is soon forgotten. But
+    only there it shows what rings, and of a test in short steps little else is left.
+
+    Args:
+        problem: all rows of motion.
+        free: the unknowns.
+        floor: of each signal, SI.
+    """
+    fit = start_fit(free, scale_values(free, problem.model.values))
+    for factor in BEGINNING_NOISE:
+        fit = descend(problem, fit, FIT_ROUNDS, factor)
+        fit = descend(problem, profile_unknowns(scale_noise(problem, factor), fit), FIT_ROUNDS, factor)
+    at = problem.model.replace(problem.list_values(free, fit.x))
+    runs = [leave_out_rows(t, find_undecided_rows(Problem(at, t, problem.noise, steps=LAST_STEPS),
+                                                  start_fit((), np.empty(0)), floor))
+            for t in (problem.trace, *problem.also)]
+    decided = replace(problem, trace=runs[0], also=tuple(runs[1:]), _lanes={})
+    return decided, descend(decided, fit, FIT_ROUNDS)
 
 
 def build_model(model: Model, problem: LogProblem, fit: Fit, gains: ControllerGains | None) -> Model:

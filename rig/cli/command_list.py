@@ -401,8 +401,9 @@ COMMANDS = {
         "Plant and controller in closed loop; t and the signals of the plant go to --out (default: simulation.csv).",
         (*MODEL,
          option("--command", dest="command_file", metavar="FILE",
-                help="CSV with t,com and optionally load (default: the main phase of preflight). Of rows at most 1 ms "
-                     "apart a cycle takes the latest; others are joined by straight lines"),
+                help="CSV with t, the plant's command (com of the EHA) and optionally its load (default: the main "
+                     "phase of preflight). Of rows at most 1 ms apart a cycle takes the latest; others are joined by "
+                     "straight lines"),
          FORCE,
          option("--samples", action="store_true",
                 help="write recordings to try other commands on: run.csv, its repeat run2.csv, and held.csv of "

@@ -177,11 +177,11 @@ def test_long_run_is_fitted_by_parts_and_an_end_stop_that_it_never_met_is_not_at
     assert travel.low < 0.013 and travel.high == 0.05
 
 
-@pytest.mark.parametrize(("ramps", "verdict"), [(True, "IDENTIFIED"), (False, "UNEXPLAINED")])
-def test_motor_that_rests_is_identified_if_its_motions_show_it(ramps: bool, verdict: str) -> None:
-    """Dry friction at rest has any value, so rests are not compared; of short steps too little is left to find mass."""
+@pytest.mark.parametrize("moves_long", [True, False])
+def test_motor_that_rests_is_identified(moves_long: bool) -> None:
+    """Dry friction at rest has any value, so rests are not compared; of short steps the beginnings show the mass."""
     model, unit = load_model("ema"), {"surface.mass": 300.0, "surface.damping": 3500.0, "surface.friction": 180.0}
-    moved = [Chirp(amplitude=2e-3, f0=1.0, f1=15.0, fade=15.0, time=3.0)] if ramps else [Hold(time=1.0)]
+    moved = [Chirp(amplitude=2e-3, f0=1.0, f1=15.0, fade=15.0, time=3.0)] if moves_long else [Hold(time=1.0)]
     command = build_profile([Hold(time=0.5), Step(to=0.01, time=1.0), Ramp(to=-0.005, time=1.0), *moved,
                              Step(to=0.0, time=1.0)], rate=1000.0).command
     columns = simulate(model.replace(unit), command, seed=1)._asdict()
@@ -189,9 +189,9 @@ def test_motor_that_rests_is_identified_if_its_motions_show_it(ramps: bool, verd
     ranges = read_free_parameters(model, None)
     own = collect_identification_runs(model, ranges, [trace], [])
     found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources)
-    assert found.verdict == verdict and any("at rest" in note for note in found.notes)
+    assert found.verdict in ("IDENTIFIED", "PARTLY") and any("at rest" in note for note in found.notes)
     held = {e.name: e.low <= unit[e.name] <= e.high for e in found.estimates if e.name in unit}
-    assert not ramps or held == dict.fromkeys(unit, True)
+    assert held == dict.fromkeys(unit, True)
 
 
 def test_run_at_rest_identifies_nothing() -> None:
