@@ -8,6 +8,8 @@ from bus_stations import spec
 from example_devices import DRIVE, ECU, PATIENT, run_device
 from rig_command import SHORT, SLOW_START, Said, rig
 
+from rig.run import participants
+
 IN_TIME = """
 [protocol]
 missing = 0.1
@@ -76,17 +78,20 @@ def test_a_short_run_passes_in_real_time(tmp_path: Path, folder: Path) -> None:
 
 
 STEP = SHORT.replace("to = 1e-3", "to = 5e-3") + SLOW_START  # takes the current to its limit
-FOUND_BY = {  # fault: by what, and in which sequence; "" for preflight, where some faults begin after a second
+LATER = SHORT.replace("time = 0.1 }", "time = 1.5 }") + SLOW_START  # some faults begin after a second
+FOUND_BY = {  # fault: by what, and in which sequence; "" for preflight
     "wrong_sign": ("guard 'ram far out'", ""), "wrong_scaling": ("current within its limit", STEP),
-    "ignores_enable": ("no current unless", STEP), "stops_sending": ("no drive frame", ""),
-    "stuck_status": ("status word follows", STEP), "wrong_counter": ("no drive frame", "")}
+    "ignores_enable": ("no current unless", STEP), "stops_sending": ("no drive frame", LATER),
+    "stuck_status": ("status word follows", STEP), "wrong_counter": ("no drive frame", LATER)}
 
 
 @pytest.mark.parametrize(("folder", "fault"), [
     *((folder, fault) for folder in (DRIVE, ECU) for fault in (
         "wrong_sign", "wrong_scaling", "ignores_enable", "stops_sending")),
     (DRIVE, "stuck_status"), (ECU, "wrong_counter")])
-def test_a_faulty_controller_does_not_pass(tmp_path: Path, folder: Path, fault: str) -> None:
+def test_a_faulty_controller_does_not_pass(tmp_path: Path, folder: Path, fault: str,
+                                           monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(participants, "FRAME_TIMEOUT", 0.2)  # s: it is spent in each cycle without an answer
     found_by, text = FOUND_BY[fault]
     (tmp_path / "step.toml").write_text(text)
     words = (tmp_path / "step.toml",) if text else ()

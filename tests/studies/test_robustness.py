@@ -1,11 +1,9 @@
 """The robustness study in small: the same code as `python -m studies.robustness`, with fewer frames and runs."""
 
 import pytest
-from c_device import CFirmware
 
-from studies.robustness import fuzz
 from studies.robustness.disturb import disturb_run, find_processes, has_semaphores, judge_verdict
-from studies.robustness.fuzz import fuzz_node, invent_frames
+from studies.robustness.fuzz import invent_frames
 from studies.robustness.run_study import build_robustness_report, run_study
 
 
@@ -15,12 +13,6 @@ def test_a_seed_gives_the_same_frames_again() -> None:
     assert 400 < sum(frame.cob_id == 0x080 and not frame.data for frame in frames) < 900
     assert {len(frame.data) for frame in frames} == set(range(9))
     assert len({frame.cob_id for frame in frames}) > 300
-
-
-def test_fuzz_frames_into_the_firmware_in_c(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fuzz, "Firmware", CFirmware)
-    count = fuzz_node("controller", 5000, 5)
-    assert count.failures == () and count.works and count.answers > 100
 
 
 @pytest.mark.parametrize("victim", ["plant", "rig"])

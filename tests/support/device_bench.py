@@ -1,38 +1,27 @@
 """A device on an embedded bus, opposite a hand-made master: a test is a script of frames. Its EDS may be changed."""
 
-from collections.abc import Callable
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from c_device import CDevice
-
 from dbc import EDS
-from rig.device import Device, NmtCommand
+from rig.device import Device
 from rig.network.bus import EmbeddedBus
-from rig.network.frame import Frame, Send
+from rig.network.frame import Frame
 
 MS = 1_000_000  # ns
-IMPLEMENTATIONS: dict[str, Callable[[int, Path, Send], Device | CDevice]] = {"python": Device, "c": CDevice}
-chosen = "python"  # set by the fixture `implementation`
-
-
-def make_device(node_id: int, eds: Path, send: Send) -> Device | CDevice:
-    """A CANopen slave in the language that is under test."""
-    return IMPLEMENTATIONS[chosen](node_id, eds, send)
 
 
 class Rack:
     """Node 2 or 3, booted. What it sends is collected as (COB-ID, data) until `take`n."""
 
-    def __init__(self, node: int = 3, boot: bool = True, eds: Path | None = None) -> None:
+    def __init__(self, node: int = 3, eds: Path | None = None) -> None:
         self.node, self.t_ns = node, 0
         self.heard: list[tuple[int, bytes]] = []
         self.bus = EmbeddedBus()
         self._send = self.bus.attach(self._hear)
-        self.device = self.bus.add(lambda send: make_device(node, eds or EDS[node], send))
-        if boot:
-            self.wait(0)
-            self.take()
+        self.device = self.bus.add(lambda send: Device(node, eds or EDS[node], send))
+        self.wait(0)
+        self.take()
 
     def _hear(self, frame: Frame) -> None:
         self.heard.append((frame.cob_id, frame.data))
@@ -47,12 +36,6 @@ class Rack:
         self._send(cob_id, data)
         self.bus.deliver(self.t_ns)
         return self.take()
-
-    def nmt(self, command: NmtCommand, node: int | None = None) -> list[tuple[int, bytes]]:
-        return self.send(0x000, bytes((command, self.node if node is None else node)))
-
-    def sync(self) -> list[tuple[int, bytes]]:
-        return self.send(0x080)
 
     def wait(self, ms: float) -> list[tuple[int, bytes]]:
         """Let time pass in ticks of 1 ms; what the device sent meanwhile."""

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import codec
-from c_device import CFirmware
 from codec import Drive, Feedback, ValveState
 
 from plant import Model
@@ -15,15 +14,12 @@ from rig.nodes.firmware import Firmware
 from rig.nodes.scenario import Scenario
 
 MS = 1_000_000  # ns
-AnyNode = Emulator | Firmware | CFirmware
-FIRMWARES: dict[str, type[Firmware] | type[CFirmware]] = {"python": Firmware, "c": CFirmware}
-chosen = "python"  # the firmware of `FirmwareDesk`; a fixture of the firmware's tests sets it
 
 
 class Desk:
     """A node, booted. What it sends is collected in `heard` as (t_ns, COB-ID, data)."""
 
-    def __init__(self, make: Callable[[Send], AnyNode]) -> None:
+    def __init__(self, make: Callable[[Send], Emulator | Firmware]) -> None:
         self.t_ns = 0
         self.heard: list[tuple[int, int, bytes]] = []
         self._bus = EmbeddedBus()
@@ -104,10 +100,10 @@ class PlantDesk(Desk):
 class FirmwareDesk(Desk):
     """The reference firmware, fed with commands and feedback."""
 
-    node: Firmware | CFirmware
+    node: Firmware
 
     def __init__(self, model: Model | None = None) -> None:
-        super().__init__(lambda send: FIRMWARES[chosen](send, model=model))
+        super().__init__(lambda send: Firmware(send, model=model))
         self.k = 0
         self.nmt(1)
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import pytest
 from answer_schemas import check_answer
@@ -22,6 +23,7 @@ from fdi.progress import ignore_progress
 from plant import load_model
 from rig.cli.main import main
 from rig.network import master
+from rig.run import page_writer
 from rig.run.job import Job
 from rig.run.runner import Outcome, run_job
 from rig.sequences.sequence import parse_sequence
@@ -57,9 +59,10 @@ class Said(_Said):
 
 
 def rig(*words: object) -> Said:
-    """The command in this process."""
+    """The command in this process, also the page of a run: a second one would load all that this one has loaded."""
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    no_process = patch.object(page_writer, "_start_process", side_effect=OSError)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), no_process:
         try:
             status = main([str(word) for word in words])
         except SystemExit as end:

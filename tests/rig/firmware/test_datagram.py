@@ -5,7 +5,7 @@ from typing import Any
 
 import can
 import pytest
-from c_device import CFrame, load_library, skip_without_compiler
+from c_device import CFrame, load_datagrams, skip_without_compiler
 from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 from hypothesis import given, strategies as st
 
@@ -25,14 +25,14 @@ def make_message(frame: tuple[int, bytes], **fields: Any) -> can.Message:
 def compiler() -> None:
     """These tests need the firmware compiled."""
     skip_without_compiler()
-    load_library()
+    load_datagrams()
 
 
 def unpack(data: bytes) -> tuple[int, bytes] | None:
     """COB-ID and data that the firmware reads from a datagram; None for what it leaves out."""
     frame = CFrame()
     exact = (ctypes.c_uint8 * len(data))(*data)  # reading beyond the end would be another object's memory
-    if not load_library().datagram_unpack(exact, ctypes.c_size_t(len(data)), ctypes.byref(frame)):
+    if not load_datagrams().datagram_unpack(exact, ctypes.c_size_t(len(data)), ctypes.byref(frame)):
         return None
     return frame.cob_id, bytes(frame.data[: frame.length])
 
@@ -47,8 +47,7 @@ def test_it_reads_what_python_can_packs(frame: tuple[int, bytes], is_named: bool
 def test_python_can_reads_what_it_packs(frame: tuple[int, bytes]) -> None:
     cob_id, data = frame
     packed = (ctypes.c_uint8 * 256)()
-    load_library().datagram_pack.restype = ctypes.c_size_t
-    size = load_library().datagram_pack(
+    size = load_datagrams().datagram_pack(
         ctypes.byref(CFrame(0, cob_id, len(data), (ctypes.c_uint8 * 8)(*data))), packed)
     message = unpack_message(bytes(packed[:size]), check=True)
     expected = make_message(frame)

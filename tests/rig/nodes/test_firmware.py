@@ -1,32 +1,19 @@
-"""The reference firmware by scripts of frames: when current flows, how a fault is taken back, and that its law is the
-one the model has. All tests run on the firmware in Python and on the one in C.
+"""The reference firmware by scripts of frames: when current flows, and how a fault is taken back.
+
+The one in C sends the same (test_same_answers.py); that the law is the model's is asked of runs (test_run.py).
 """
 
 import struct
 
-import codec
-import node_bench
 import pytest
-from c_device import skip_without_compiler
 from node_bench import FirmwareDesk
 
-from plant.controller import Loop, compute_current
 from rig.benches.profiles import CIA408
-from rig.device import Abort, NmtState
-from rig.network.node_objects import GAINS, Gains
+from rig.device import Abort
+from rig.network.node_objects import GAINS
 from rig.nodes.firmware import LOST_AFTER
 
 ACTIVE, RESET = CIA408.ladder[-1], CIA408.reset
-GIVEN = Gains(2.0, 30.0, 1e-3, 8e-3, 1e-3)
-
-
-@pytest.fixture(params=list(node_bench.FIRMWARES), autouse=True)
-def implementation(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The language of the firmware."""
-    if request.param == "c":
-        skip_without_compiler()
-    monkeypatch.setattr(node_bench, "chosen", request.param)
-    return str(request.param)
 
 
 def pause(desk: FirmwareDesk) -> None:
@@ -62,38 +49,6 @@ def test_it_answers_each_feedback_with_the_cycle_it_belongs_to() -> None:
     assert [drive.cycle for _ in range(2) if (drive := desk.cycle(ACTIVE))] == [65_535, 0]
 
 
-def test_without_sync_and_out_of_operational_it_says_nothing() -> None:
-    desk = FirmwareDesk()
-    desk.nmt(128)
-    assert desk.cycle(ACTIVE) is None
-    desk.nmt(1)
-    assert desk.cycle(ACTIVE) is not None
-
-
-def test_the_law_is_the_models() -> None:
-    """Bit for bit, with limit and integral part, from positions as the bus has them."""
-    desk, loop = FirmwareDesk(), Loop()
-    for sub, value in enumerate(GIVEN, 1):
-        assert set_gain(desk, sub, value) == 0
-    pause(desk)
-    for k in range(60):
-        demand, position = 5e-3 * (k >= 10), 1e-4 * k
-        drive = desk.cycle(ACTIVE, demand, position)
-        heard = [codec.unpack_feedback(codec.pack_feedback(metres, 0.0)).position for metres in (demand, position)]
-        current, loop = compute_current(loop, *heard, GIVEN)
-        assert drive is not None and drive == codec.unpack_drive(codec.pack_drive(current, drive.status, k))
-
-
-def test_the_integral_part_starts_anew_with_each_activation() -> None:
-    desk = FirmwareDesk()
-    set_gain(desk, 2, 1.0)
-    pause(desk)
-    first = [desk.cycle(ACTIVE, 1e-3) for _ in range(5)]
-    desk.cycle(0)
-    again = [desk.cycle(ACTIVE, 1e-3) for _ in range(5)]
-    assert [d and d.current for d in again] == [d and d.current for d in first]
-
-
 def test_lost_feedback_is_a_fault_that_is_latched_until_its_cause_is_gone_and_reset_rises() -> None:
     desk = FirmwareDesk()
     desk.cycle(ACTIVE | RESET, 1e-3)  # a bit that is up already acknowledges nothing
@@ -118,16 +73,6 @@ def test_a_restart_takes_the_fault_but_not_the_error_that_stands() -> None:
     pause(desk)
     assert desk.status(ACTIVE, 1) == ACTIVE | 8
     assert desk.emergencies() == [0x8250, 0] and desk.node.device.emcy.active == []
-
-
-def test_a_silent_rig_is_a_fault() -> None:
-    """The heartbeat of node 1 stops: EMCY 0x8130, out of OPERATIONAL (0x1029), no drive any more."""
-    desk = FirmwareDesk()
-    desk.send(0x701, b"\x05")
-    desk.cycle(ACTIVE)
-    desk.wait(10**9)
-    assert desk.emergencies() == [0x8130] and desk.node.device.state is NmtState.PRE_OPERATIONAL
-    assert desk.cycle(ACTIVE) is None
 
 
 @pytest.mark.parametrize(("sub", "value", "is_taken"), [

@@ -19,7 +19,7 @@ from fdi.trace.trace import Trace
 from plant import simulate
 from rig.benches.bench import Bench, Role
 from rig.recorder.convert import export_trace, import_frames
-from rig.run import bring_up
+from rig.run import bring_up, participants
 from rig.run.job import JobChoice, build_job
 from rig.run.runner import run_job
 
@@ -213,8 +213,10 @@ class Mute(CanDevice):
 @pytest.mark.parametrize(("answers", "said"), [
     (0, "controller: no frame Drive (0x18F00005) for 5 cycles"), (1080, "controller stopped answering"),
 ])
-def test_a_controller_that_sends_no_frames_ends_the_run_with_a_line_that_names_them(answers: int, said: str,
-                                                                                   tmp_path: Path) -> None:
+def test_a_controller_that_sends_no_frames_ends_the_run_with_a_line_that_names_them(
+    answers: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(participants, "FRAME_TIMEOUT", 0.2)  # s: it is spent in each cycle without an answer
     where = spec("udp_multicast")
     (tmp_path / "device.dbc").write_text(PAGES_DBC)
     (tmp_path / "bench.toml").write_text(CAN.format(demand="Feedback.Position"))
