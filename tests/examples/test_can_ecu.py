@@ -105,17 +105,6 @@ def test_other_frames_are_not_its_own(ecu: EcuMaster) -> None:
     assert int(ecu.cycle()["Counter"]) == (int(before["Counter"]) + 1) % 16
 
 
-@pytest.mark.parametrize(("fault", "off", "on"), [
-    ("none", 0.0, 1.8), ("wrong_sign", 0.0, -1.8), ("wrong_scaling", 0.0, 3.6), ("ignores_enable", 1.8, 1.8),
-])
-def test_a_faulty_ecu(where: str, fault: str, off: float, on: float) -> None:
-    with run_ecu(where, "--fault", fault) as master:
-        master.start()
-        master.cycle(1.0, 0.5, enable=0)
-        assert [read(master.cycle(1.0, 0.5, enable)) for enable in (0, 1, 1)] == (
-            [(OPERATIONAL, off), (OPERATIONAL, on), (OPERATIONAL, on)])
-
-
 @pytest.mark.parametrize("words", [[], ["--timeout"], ["B", "--timeout", "0"], ["B", "--fault", "x"]])
 def test_a_wrong_command_line_is_one_line(words: list[str]) -> None:
     skip_without_compiler()

@@ -150,21 +150,6 @@ def test_a_reset_ends_a_fault(drive: DriveMaster) -> None:
     assert drive.cycle(OFF, position=0.0).state == DISABLED
 
 
-@pytest.mark.parametrize(("fault", "off", "enabled"), [
-    ("none", (DISABLED, 0), (ENABLED, 95)),
-    ("wrong_sign", (DISABLED, 0), (ENABLED, -95)),
-    ("wrong_scaling", (DISABLED, 0), (ENABLED, 190)),
-    ("ignores_enable", (DISABLED, 95), (ENABLED, 95)),
-    ("stuck_status", (ENABLED, 0), (ENABLED, 95)),
-])
-def test_a_faulty_drive(where: str, fault: str, off: tuple[str, int], enabled: tuple[str, int]) -> None:
-    with run_drive(where, "--fault", fault) as master:
-        master.start()
-        master.cycle(OFF, target=1000, position=0.5)
-        assert master.cycle(OFF)[:2] == off
-        assert master.enable(target=1000, position=0.5)[:2] == enabled
-
-
 def test_it_conforms_to_cia_301() -> None:
     where = spec("udp_multicast")
     with run_device(DRIVE, where, "--node", "17"):

@@ -1,9 +1,9 @@
-"""What runs where a vcan0 is: the bus tests, one whole preflight run by three processes with candump listening, and
-a short run of each controller in examples/.
+"""What runs where a vcan0 is: the bus tests, and short runs: by three processes with candump listening, and of each
+controller in examples/.
 
-    python tests/vcan/inside.py OUT compile|bus|preflight|examples ...
+    python tests/vcan/inside.py OUT compile|bus|three|examples ...
 
-Leaves in OUT: bus.xml (junit) from `bus`; run/, run.json, candump.log and one .log per process from `preflight`; NAME/
+Leaves in OUT: bus.xml (junit) from `bus`; run/, run.json, candump.log and one .log per process from `three`; NAME/
 and NAME.json of each of `examples`. `compile` fills the cache of compiled code.
 It is meant for the host, which does it ten times as fast as its guest: both have the same files and the same CPU.
 """
@@ -22,14 +22,12 @@ from pathlib import Path
 TESTS = Path(__file__).parent.parent
 sys.path.append(str(TESTS / "support"))
 BUS = "socketcan:vcan0"
-RUN_LIMIT_S = 500
 NOT_JUDGED = ("ABORTED", "INVALID_TIMING")
 RIG = Path(sys.executable).with_name("rig")
 
 
 def compile_all(out: Path) -> int:
     """Compile what the other parts use: cycles, plant, functions of the raw bus, C programs. Always 0."""
-    from c_device import build_faulty
     from example_devices import DRIVE, ECU
 
     from plant import Actuator, Model
@@ -40,7 +38,6 @@ def compile_all(out: Path) -> int:
     from rig.run.hard_loop import compile_cycle
 
     build_controller()
-    build_faulty()
     for folder in (DRIVE, ECU):
         build_device(folder)
     port = raw_bus.make_closed_port()
@@ -62,15 +59,6 @@ def bus_tests(out: Path) -> int:
     return subprocess.run([sys.executable, *words, f"--basetemp={out / 'tmp'}"], cwd=TESTS.parent).returncode
 
 
-def finish(process: subprocess.Popen[bytes], seconds: float) -> int:
-    """Wait for a process, kill it when the time is over; its status."""
-    try:
-        return process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        return process.wait()
-
-
 @contextlib.contextmanager
 def background(out: Path, name: str, *command: str | Path) -> Iterator[subprocess.Popen[bytes]]:
     """A process beside the run, its output in NAME.log, interrupted (as by Ctrl-C) at the end."""
@@ -81,18 +69,33 @@ def background(out: Path, name: str, *command: str | Path) -> Iterator[subproces
             yield process
         finally:
             process.send_signal(signal.SIGINT)
-            finish(process, 20)
+            try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
-def preflight(out: Path) -> int:
-    """The preflight by three processes; the last run's exit status.
+def play(out: Path, name: str, *words: str | Path) -> int:
+    """The short sequence on vcan0, in this process; its results in folder `name`, its answer in `name`.json."""
+    from rig_command import SHORT, SLOW_START, rig
+
+    (out / "short.toml").write_text(SHORT + SLOW_START)
+    shutil.rmtree(out / name, ignore_errors=True)
+    said = rig("run", out / "short.toml", "--bus", BUS, "--json", "--out", out / name, *words)
+    (out / f"{name}.json").write_text(said.out)
+    (out / f"{name}.log").write_text(said.err)
+    return said.status
+
+
+def three(out: Path) -> int:
+    """The run by three processes; the last one's exit status.
 
     A run that the bench itself could not judge, because the machine stood still or a program got no turn, is played
     again, twice at most; the test tells how often.
     """
     for attempt in range(1, 4):
-        shutil.rmtree(out / "run", ignore_errors=True)
-        status = play_preflight(out, attempt)
+        status = play_by_three(out, attempt)
         facts = json.loads((out / "facts.json").read_text())
         is_a_node_gone = any(status is not None for status in facts["before_interrupt"].values())
         if is_a_node_gone or read_verdict(out) not in NOT_JUDGED:
@@ -107,8 +110,8 @@ def read_verdict(out: Path) -> str:
     return str(json.loads(text)["verdict"]) if text else ""
 
 
-def play_preflight(out: Path, attempt: int) -> int:
-    """Plant, C firmware and sequencer as processes of their own; the run's exit status."""
+def play_by_three(out: Path, attempt: int) -> int:
+    """Plant and C firmware as processes of their own, the sequencer in this one; the run's exit status."""
     from standing_nodes import wait_for_node
 
     from rig.firmware.build import build_controller
@@ -120,19 +123,11 @@ def play_preflight(out: Path, attempt: int) -> int:
         commands = {"plant": [RIG, "node", "plant", "--bus", BUS], "controller": [build_controller(), BUS]}
         nodes = {name: stack.enter_context(background(out, name, *words)) for name, words in commands.items()}
         wait_for_node(BUS, PLANT)  # on a slow machine a node needs ten seconds to load
-        words = ["run", "preflight", "--bus", BUS, "--controller", "external", "--plant", "external"]
-        words += ["--pace", "lockstep"]
-        with (out / "run.json").open("wb") as answer, (out / "run.log").open("wb") as log:
-            begin = time.monotonic()
-            words += ["--json", "--out", str(out / "run")]
-            run = subprocess.Popen([RIG, *words], stdout=answer, stderr=log, stdin=subprocess.DEVNULL)
-            status = finish(run, RUN_LIMIT_S)
-            seconds = time.monotonic() - begin
+        status = play(out, "run", "--controller", "external", "--plant", "external", "--pace", "lockstep")
         alive = {name: process.poll() for name, process in nodes.items()}
         time.sleep(0.5)  # the last frames still go to candump
     ended = {name: process.returncode for name, process in nodes.items()}
-    facts = {"attempt": attempt, "status": status, "seconds": seconds}
-    facts |= {"before_interrupt": alive, "after_interrupt": ended}
+    facts = {"attempt": attempt, "status": status, "before_interrupt": alive, "after_interrupt": ended}
     (out / "facts.json").write_text(json.dumps(facts))
     return status
 
@@ -140,15 +135,11 @@ def play_preflight(out: Path, attempt: int) -> int:
 def examples(out: Path) -> int:
     """A short run of each controller in examples/, whose preflight passes on UDP; the first status that is not 0."""
     from example_devices import DRIVE, ECU, PATIENT, run_device
-    from rig_command import SHORT, SLOW_START
 
-    (out / "short.toml").write_text(SHORT + SLOW_START)
     statuses = []
     for folder in (DRIVE, ECU):
-        words = ["run", out / "short.toml", "--bench", folder / "bench.toml", "--bus", BUS, "--json"]
-        words += ["--out", out / folder.name]
-        with run_device(folder, BUS, *PATIENT[folder]), (out / f"{folder.name}.json").open("wb") as answer:
-            statuses.append(subprocess.run([RIG, *words], stdout=answer, stdin=subprocess.DEVNULL).returncode)
+        with run_device(folder, BUS, *PATIENT[folder]):
+            statuses.append(play(out, folder.name, "--bench", folder / "bench.toml"))
     return next((status for status in statuses if status), 0)
 
 
@@ -157,7 +148,7 @@ def main() -> int:
     out = Path(sys.argv[1]).resolve()
     out.mkdir(parents=True, exist_ok=True)
     os.chdir(TESTS.parent)
-    parts = {"compile": compile_all, "bus": bus_tests, "preflight": preflight, "examples": examples}
+    parts = {"compile": compile_all, "bus": bus_tests, "three": three, "examples": examples}
     statuses = [parts[name](out) for name in sys.argv[2:]]
     return next((status for status in statuses if status), 0)
 

@@ -10,7 +10,7 @@ from cantools.autosar.end_to_end import compute_profile2_crc
 from cantools.database import Database, load_string
 from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 
 from plant.compile import compile_function
 from plant.errors import InputError
@@ -102,6 +102,7 @@ def pack_compiled(spec: FrameSpec, values: dict[str, float]) -> tuple[bytes, dic
     return sent.octets[octets].tobytes(), dict(zip(values, received.doubles[places].tolist(), strict=True))
 
 
+@settings(max_examples=50)
 @given(message=draw_message(), data=st.data())
 def test_frames_are_those_of_cantools(message: Message, data: st.DataObject) -> None:
     spec = load_frames(message)[0]

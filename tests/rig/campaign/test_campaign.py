@@ -138,13 +138,6 @@ def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(
         assert again[f"{row['label']} {row['seed']}"] == 1
 
 
-def test_processes_give_the_same_rows(environment: Path, local: Path, tmp_path: Path) -> None:
-    whole = judge.read_matrix_of_folder(local)
-    run_campaign(whole, tmp_path / "there", Workers(2, single_threaded=True), count=4)
-    assert rows(tmp_path / "there") == rows(local)[:4]
-    assert os.getpid() not in {pid for pid, _ in calls(environment)}
-
-
 def test_a_failed_case_is_kept_with_its_reason_and_judged_again_on_demand(local: Path, tmp_path: Path) -> None:
     failed = [row for row in rows(local) if row["status"] == "failed"]
     assert [(row["label"], row["seed"], row["reason"]) for row in failed] == [
@@ -257,11 +250,11 @@ def test_rig_fdi_in_a_campaign_finds_both_faults_and_the_statistics_are_written(
 
 
 def test_a_plant_file_is_judged_by_worker_processes_and_resumed_only_with_trust(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     rig("new", "plant", "my_motor")
     rig("campaign", "--model", "my_motor.py", "--fault", "healthy", "--seeds", 3, "--out", "two", "--jobs", 2,
-        "--most", 2)
+        "--most", 2, "--work", "campaign_work:count_rows")
     found = rows(tmp_path / "two")
     fault, = judge.restore_faults(judge.read_matrix_of_folder("two").spec)
     assert [row["status"] for row in found] == ["ok", "ok"]

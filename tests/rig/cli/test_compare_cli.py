@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from effect_files import STIFF, restored_catalogue
 from noisy_traces import record_healthy, record_plant
 from rig_command import Said, answer, refuse, rig
 from synthetic_run import record_run
@@ -107,14 +106,6 @@ def test_a_run_of_the_bench(preflight: Path) -> None:
     """The log of a whole run over the bus, quantised as its frames are."""
     told = answer("compare", preflight)
     assert told["verdict"] == "WITHIN_FLOOR" and told["blocks"]["controller"] < 1.2
-
-
-def test_a_users_own_effect(folder: Path) -> None:
-    """It is in the model under test like any other: here a spring that the measured ram does not have."""
-    (folder / "mine.py").write_text(STIFF.format(scale=1.0))
-    with restored_catalogue():
-        words = ["--effects", folder / "mine.py", "--set=spring.stiffness=2e5"]
-        assert answer("compare", folder / "est.csv", *words, status=1)["disagree"] == ["jack"]
 
 
 def test_few_rows_still_have_a_page(tmp_path: Path) -> None:

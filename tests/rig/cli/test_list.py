@@ -7,9 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from unittest.mock import Mock
 
-import numpy as np
 import pytest
 from rig_command import answer, refuse, rig
 
@@ -20,7 +18,6 @@ from rig.cli import completion
 from rig.cli.command_list import COMMANDS
 from rig.cli.commands.list import KINDS
 from rig.cli.main import FIRST_STEPS
-from rig.run import priority
 from rig.sequences import checks, load_sequence
 
 
@@ -112,13 +109,6 @@ def test_each_finding_is_there_once_and_says_what_it_is_for_and_how_to_get_it(fi
         "compiled code", "disk", "kernel", "priority", "memory lock", "clock", "timer at 1 kHz"}
 
 
-def test_versions_are_the_installed_ones(findings: list[doctor.Finding]) -> None:
-    assert any(finding.name == "packages" and f"numpy {np.__version__}" in finding.found for finding in findings)
-    extras = {"view", "dev", "fleet", "learn", "bench", "measure", "plots", "shell", "docs", "fmu"}
-    assert set(doctor.read_requirements()) == {""} | extras
-    assert doctor.read_versions(["no-such-distribution"]) == {"no-such-distribution": ""}
-
-
 def test_a_missing_package_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(doctor, "read_requirements", lambda: {"": ["numpy", "no-such-distribution"]})
@@ -139,17 +129,3 @@ def test_json_is_one_object_and_nothing_else(tmp_path: Path) -> None:
     assert told == json.loads((tmp_path / "doctor.json").read_text()) and told["verdict"] == "PASS"
     assert {"area", "name", "status", "found", "purpose", "remedy", "needed"} == set(told["findings"][0])
     assert rig("doctor", "--seconds", "0", "--quiet") == (0, "", "")
-
-
-def test_percentiles_of_known_wake_ups() -> None:
-    late = np.arange(1001) * 2000  # 0 to 2 ms in steps of 2 us
-    assert priority.compute_percentiles(late * 1e-9) == pytest.approx(
-        {"p50": 1000, "p99": 1980, "p99_9": 1998, "max": 2000})
-    assert doctor.grade_timer("timer", late, "").found.endswith("; 501 of 1001 periods missed")
-
-
-def test_fifo_ends_with_its_thread_and_is_none_without_the_right(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert priority.run_under_fifo(lambda: os.sched_getscheduler(0)) in (None, os.SCHED_FIFO)
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER
-    monkeypatch.setattr("os.sched_setscheduler", Mock(side_effect=PermissionError))
-    assert priority.run_under_fifo(lambda: True) is None

@@ -41,7 +41,7 @@ def test_a_late_tester_does_not_blame_the_node() -> None:
     assert (list_cases(outcome), outcome.verdict) == ([], "INVALID_TIMING")
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_node_that_answers_nonsense_does_not_stop_the_tester(seed: int) -> None:
     """One frame in ten is cut, changed, doubled or lost: cases fail, the test comes to its end."""
     chance = random.Random(seed)

@@ -15,8 +15,8 @@ from rig.device import Abort, Device, NmtState
 from rig.network.bus import EmbeddedBus
 from rig.network.frame import Frame
 
-TOGGLE, COMMAND, STATE = "00000305", "01000405", "22000008"  # abort codes, as an abort carries them
-TOO_LONG, TOO_SHORT, MEMORY = "12000706", "13000706", "05000405"
+TOGGLE, COMMAND = "00000305", "01000405"  # abort codes, as an abort carries them
+TOO_LONG, TOO_SHORT = "12000706", "13000706"
 START, STOP, RESET = "000 0103 ->", "000 0203 ->", "000 8203 -> 703 00"
 # Requests and answers, each script for a node. 2110:1 is a REAL64, 2210 a DOMAIN.
 SDO = {

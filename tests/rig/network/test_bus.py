@@ -54,25 +54,6 @@ class TestEveryBus:
             heard = contents(gather(listening, 40))
         assert heard == [(cob_id, bytes([n])) for n in range(20) for cob_id in (0x600, 0x580)]
 
-    def test_own_frames_do_not_hide_those_of_others(self, bus_kind: str) -> None:
-        with stations(bus_kind, 2) as (one, other):
-            for n in range(10):
-                one.send(0x100, bytes([n]))
-                other.send(0x200, bytes([n]))
-            assert contents(gather(one, 10)) == [(0x200, bytes([n])) for n in range(10)]
-            assert one.poll(0.05) == []
-
-    def test_times_do_not_go_back_and_span_no_more_than_it_took(self, bus_kind: str) -> None:
-        with stations(bus_kind, 2) as (sender, receiver):
-            begin = time.monotonic_ns()
-            for n in range(5):
-                sender.send(n, b"")
-                time.sleep(0.002)
-            times = [frame.t_ns for frame in gather(receiver, 5)]
-            span = time.monotonic_ns() - begin
-            assert len(times) == 5 and times == sorted(times) and times[0] >= 0
-            assert times[-1] - times[0] <= span + 1_000_000  # the kernel's wall clock may be slewed
-
     def test_silent_bus_gives_nothing(self, bus_kind: str) -> None:
         with stations(bus_kind, 2) as (station, _):
             assert station.poll(0.0) == [] == station.poll(0.05)
@@ -213,11 +194,6 @@ class TestUdpMulticast:
             assert bus._tx.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == 0
             assert bus._tx.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, 4) == socket.inet_aton("127.0.0.1")
             assert bus._tx.getsockname()[0] == "127.0.0.1"
-
-    def test_groups_do_not_hear_each_other(self, bus_kind: str) -> None:
-        with stations(bus_kind, 1) as (one,), stations(bus_kind, 1) as (other,):
-            one.send(0x80, b"")
-            assert other.poll(0.05) == []
 
     def test_strangers_datagram_is_an_error_frame(self, bus_kind: str) -> None:
         where = spec(bus_kind)

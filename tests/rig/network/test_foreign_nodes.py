@@ -4,7 +4,6 @@ The device is canopen's local node, on the embedded bus with a virtual clock.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -208,23 +207,3 @@ def test_the_rig_gives_way_to_a_device_with_its_number(tmp_path: Path) -> None:
     place.master.configure(b"", None, 0)
     assert place.bench.rig_node == 127 and (0x1016, 1, 127 << 16 | 300) in place.device.writes
     assert Frame(place.sent[-1].t_ns, 0x77F, b"\0").cob_id in {frame.cob_id for frame in place.sent}
-
-
-def test_on_plain_can_nothing_about_nodes_is_sent() -> None:
-    shipped = load_bench()
-    bench = replace(shipped, nodes={}, frames=replace(shipped.frames, sync=None))
-    wire = EmbeddedWire(VirtualClock(), [])
-    master = Master(wire, wire.clock.now, False, bench)
-    sent: list[Frame] = []
-    master.hooks.on_frame = sent.append
-    master.boot()
-    master.reset()
-    master.configure(b"", None, 8000)
-    master.start()
-    assert master.wait_for_operational(1.0) == {} and master.find_silent(1.0) == [] and master.states == {}
-    for _ in range(1000):
-        wire.run_until(wire.clock.now() + 1_000_000)
-        master.tick()
-    assert master.read_parameters() == {} and master.read_plant_record() is None and master.list_errors() == []
-    master.stop()
-    assert master.restore() == master.configure_again() == [] and not master.is_behind() and sent == []

@@ -11,7 +11,7 @@ from bus_stations import spec
 from plant import Model
 from rig.benches.bench_file import load_bench
 from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, open_can, serve_node
-from rig.network.frame import Frame, VirtualClock, WallClock
+from rig.network.frame import VirtualClock, WallClock
 from rig.network.master import BusError, Master
 from rig.network.node_objects import CONTROLLER, PLANT
 from rig.nodes.emulator import Emulator
@@ -54,41 +54,6 @@ def wire(bus_kind: str) -> Iterator[Wire]:
         link = LinkWire(Link(open_can(where), clock.now), clock)
         yield link
         link.close()
-
-
-def test_boot_ups_are_not_lost_among_the_frames_of_others(bus_kind: str) -> None:
-    """2,000 foreign frames a second, and nobody polls between two resets: by default the kernel keeps 477 frames."""
-    if bus_kind in ("embedded", "virtual"):
-        pytest.skip("a bus between programs is needed")
-    where, clock, over = spec(bus_kind), WallClock(), threading.Event()
-    stranger = Link(open_can(where), clock.now)
-
-    def flood() -> None:
-        while not over.wait(0.01):
-            for k in range(20):
-                stranger.send(0x190 + k, bytes(8))
-            stranger.poll(0.0)
-
-    wire = LinkWire(Link(open_can(where), clock.now), clock)
-    wire.link.select_nodes(3)
-    thread = threading.Thread(target=flood)
-    with served(where, Emulator, Firmware):
-        thread.start()
-        try:
-            master = Master(wire, clock.now, False, load_bench())
-            frames: list[Frame] = []
-            master.hooks.on_frame = frames.append
-            for _ in range(3):
-                over.wait(0.5)  # 1000 frames
-                master.reset()
-            assert {frame.cob_id & 0x7F for frame in frames} <= {0, 1, 2, 3}
-            wire.hear_all()
-            assert wire.wait(lambda: any(frame.cob_id >= 0x190 for frame in frames), 60.0)
-        finally:
-            over.set()
-            thread.join()
-            stranger.close()
-            wire.close()
 
 
 def alone() -> Master:
@@ -156,26 +121,6 @@ def test_nobody_there() -> None:
     assert not master.is_present(PLANT, 0.1)
 
 
-@pytest.mark.parametrize("end", [Frame(0, 0x083, bytes(8)), Frame(0, 0x703, bytes(1))], ids=["EMCY", "boot-up"])
-def test_emergencies_come_and_go(end: Frame) -> None:
-    """An EMCY without an error ends them, and so does a boot-up: no EMCY says so."""
-    master = alone()
-    master.receive(Frame(0, 0x083, bytes.fromhex("5082110100000000")))
-    assert master.list_errors() == [3]
-    master.receive(end)
-    assert master.list_errors() == []
-
-
-@pytest.mark.parametrize("cob_id", [0x000, 0x080, 0x202, 0x701])
-def test_another_rig_is_noticed_once(cob_id: int) -> None:
-    master = alone()
-    heard: list[int] = []
-    master.hooks.on_rival = heard.append
-    for _ in range(3):
-        master.receive(Frame(0, cob_id, b""))
-    assert heard == [cob_id] and master.hears_rival(0.0)
-
-
 def test_heartbeats_are_watched_from_the_first_on() -> None:
     clock = VirtualClock()
     master = Master(EmbeddedWire(clock, [Emulator, Firmware]), clock.now, False, load_bench())
@@ -190,12 +135,3 @@ def test_heartbeats_are_watched_from_the_first_on() -> None:
     clock.sleep_until(clock.now() + 10**9)  # the nodes are not asked meanwhile
     master.tick()
     assert sorted(lost) == [CONTROLLER, PLANT]
-
-
-def test_every_frame_is_seen_once() -> None:
-    master = Master(EmbeddedWire(VirtualClock(), [Emulator, Firmware]), lambda: 7, False, load_bench())
-    frames: list[Frame] = []
-    master.hooks.on_frame = frames.append
-    master.reset()
-    boots = [(7, 0x703, b"\0"), (7, 0x702, b"\0")]
-    assert frames == [*boots, (7, 0x000, b"\x82\x03"), (7, 0x000, b"\x82\x02"), *boots]  # each node by its number

@@ -24,7 +24,6 @@ from rig.network import raw_bus
 from rig.network.bus import can_open, open_can
 from rig.network.frame import FD_LENGTHS, IDENTIFIER, find_cob_id, has_valid_length, make_message
 from rig.network.raw_bus import (
-    FAILED,
     FRAME,
     NEVER,
     PAYLOAD_IN,
@@ -113,12 +112,6 @@ class TestFrames:
                         other.send(make_message(number, b""))
                     assert receive_all(bus.port) == [EXTENDED | 0x12345678, 0x80]
 
-    def test_a_length_that_no_such_frame_has_fails(self, where: str) -> None:
-        with RawBus(where, (), fd=True) as bus:
-            for cob_id, length in ((0x80, 9), (EXTENDED | 0x80, 12), (FD | 0x80, 9), (FD | 0x80, 65)):
-                status = function("send_payload")(bus.port, cob_id, length)
-                assert status == FAILED and "Invalid argument" in str(bus.explain_failure(status))
-
     def test_only_the_frames_asked_for_arrive_and_none_of_its_own(self, where: str, other: can.BusABC) -> None:
         wanted = [0x000, 0x050, 0x0FF, 0x183, 0x7FF]  # each length of an identifier in msgpack
         with RawBus(where, wanted) as bus, RawBus(where) as python:
@@ -132,19 +125,6 @@ class TestFrames:
             assert (len(receive_all(python.port)), python.dropped) == (0x800 + 1, 16)
             with pytest.raises(RigError, match="513 frames to receive; at most 512 are possible"):
                 bus.set_filter(range(EXTENDED, EXTENDED + 513))
-
-    def test_time_is_that_of_reception(self, where: str) -> None:
-        receive, send = function("receive_frame"), function("send_frame")
-        with RawBus(where) as bus, RawBus(where) as sender:
-            receive(bus.port, 0)
-            before = time.monotonic_ns()
-            send(sender.port, 0x80, 0, 0)
-            send(sender.port, 0x81, 0, 0)
-            after = time.monotonic_ns()
-            time.sleep(0.05)
-            first, second = receive(bus.port, soon())[1], receive(bus.port, soon())[1]
-            slewed = 100_000  # the wall clock may be corrected meanwhile
-            assert before - slewed <= first <= second <= after + slewed
 
     def test_waits_until_its_deadline_or_until_it_is_woken(self, where: str) -> None:
         receive = function("receive_frame")
@@ -223,7 +203,7 @@ messages = st.builds(  # some contradict themselves
 
 
 class TestDatagrams:
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=100, deadline=None)
     @given(messages, st.randoms(use_true_random=False))
     def test_reads_what_python_can_packs_in_any_order(self, message: can.Message, random: Any) -> None:
         data = pack_message(message)
@@ -262,7 +242,7 @@ class TestDatagrams:
             expected = (1,)
         assert read_compiled(data) == read_compiled(data.replace(b"\xc4\x08", b"\xc5\x00\x08")) == expected
 
-    @settings(max_examples=500, deadline=None)
+    @settings(max_examples=150, deadline=None)
     @given(messages, st.integers(0, 400), st.binary(min_size=1, max_size=9), st.sampled_from(["cut", "bad", "more"]))
     def test_damaged_bytes_never_give_a_frame_that_python_can_does_not_see(
             self, message: can.Message, place: int, bad: bytes, way: str) -> None:

@@ -12,7 +12,6 @@ from rig.network.frame import Frame, Send, VirtualClock
 from rig.network.master import CheckedSdoClient, ConfirmationError, Master, repeat_transfer
 from rig.network.node_objects import PLANT
 
-TYPE = bytes.fromhex("4300100000000000")  # of 0x1000
 Script = Sequence[str | None]
 
 
@@ -142,12 +141,6 @@ def test_refusal_by_the_server_keeps_its_code() -> None:
     assert len(server.requests) == 2  # nothing is sent after an abort
 
 
-def test_response_left_over_from_an_earlier_transfer_is_dropped() -> None:
-    sdo, _ = client("4300100092010000")
-    sdo.on_response(0x583, bytes.fromhex("4301100000000000"), 0.0)
-    assert upload(sdo) == bytes.fromhex("92010000")
-
-
 def test_silence_is_told_from_a_wrong_answer() -> None:
     sdo, server = client(None)
     with pytest.raises(SdoCommunicationError, match="No SDO response received"):
@@ -165,18 +158,3 @@ def test_a_wrong_confirmation_is_no_object_that_is_not_implemented() -> None:
     line = r"node 3, SDO of object 0x2210 sub 0: confirmation of object 0x2211 sub 0"
     with pytest.raises(ConfirmationError, match=line):
         master.configure(b"12345678", None, 0)
-
-
-def test_at_the_end_a_wrong_confirmation_is_a_failure_to_set_back() -> None:
-    """The other objects are still set back."""
-    servers: list[Server] = []
-
-    def make(send: Send) -> Server:
-        servers.append(Server(send, ["6007100000000000", "6016100100000000"]))
-        return servers[0]
-
-    master = Master(EmbeddedWire(VirtualClock(), [make]), lambda: 0, False, load_bench())
-    master._before = {(PLANT, 0x1006, 0): bytes(4), (PLANT, 0x1016, 1): bytes(4)}
-    assert master.restore() == ["node 3 plant: 0x1006 was not set back (node 3, SDO of object 0x1006 sub 0: "
-                                "confirmation of object 0x1007 sub 0)"]
-    assert [request[:8] for request in servers[0].requests] == ["23061000", "80061000", "23161001"]

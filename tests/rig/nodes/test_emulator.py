@@ -10,12 +10,10 @@ import pytest
 from node_bench import MS, PlantDesk
 
 from plant import Actuator, Model
-from rig.benches.bench import Flags
 from rig.device import Abort, NmtState
 from rig.network.node_objects import COUNTERS
-from rig.nodes.scenario import FaultyPlant, Scenario
+from rig.nodes.scenario import Scenario
 from rig.sequences.faults import (
-    BusOff,
     Fault,
     Late,
     Lost,
@@ -131,19 +129,6 @@ def test_a_parameter_ramps_cycle_by_cycle_and_returns_when_main_ends() -> None:
     assert seen[:15] == [0.0] * 15 and seen[20:25] == [0.4] * 5 and seen[25:] == [0.0] * 5
 
 
-def test_a_sensors_parameter_changes_in_the_sample_of_its_cycle() -> None:
-    fault = Parameter(parameter="sensors.pressure_noise", value=1e6, start=0.005, end=0.010)
-    desk = PlantDesk(Scenario(QUIET_MODEL, Plan(faults=(fault,), stop=25)))
-    assert [abs(desk.cycle()[0].pressure) > 10.0 for _ in range(15)] == [5 <= k < 10 for k in range(15)]
-
-
-def test_the_load_is_that_of_the_cycle() -> None:
-    desk, alone = PlantDesk(scenario(load=(0, 0, 5_000_000, 5_000_000))), Actuator(QUIET_MODEL)
-    for k in range(6):
-        assert desk.cycle()[0].position == codec.unpack_feedback(codec.pack_feedback(alone.sample()[0], 0.0)).position
-        alone.advance(0.0, 5000.0 if 2 <= k < 4 else 0.0)
-
-
 def test_after_a_pause_the_cycle_is_that_of_the_bus_and_no_fault_was_slept_through() -> None:
     """A fault that ended meanwhile has ended; one that began has begun; the first cycle is nobody's miss."""
     desk = PlantDesk(Scenario(QUIET_MODEL, Plan(faults=(
@@ -222,47 +207,3 @@ def test_a_plant_without_a_number_says_so_and_stops() -> None:
     desk.nmt(1)
     desk.k = 0
     assert desk.cycle()[1] == (0.0, 0, 0)
-
-
-def test_a_lost_sync_does_not_stop_the_plant() -> None:
-    """Two SYNCs are lost, and what was to be latched then comes too late: three in a row, and the cycles go on."""
-    desk = PlantDesk(scenario(Lost(frame="sync", start=0.004, end=0.006)))
-    other = PlantDesk(scenario())
-    for k in range(10):
-        if k in (4, 5):
-            desk.k += 1
-            desk.wait(MS)
-            other.cycle(None)
-        else:
-            said, expected = desk.cycle(5e-3), other.cycle(5e-3)
-            assert (said[1].cycle, said[1].flags) == (k, Flags.DRIVE_LATE | Flags.CURRENT_ZEROED if k == 6 else 0)
-            assert k > 6 or said[0] == expected[0]  # the current in force was the same up to there
-    assert counters(desk) == (2, 1)
-
-
-def test_a_plant_that_is_bus_off_moves_without_current_and_comes_back() -> None:
-    desk = PlantDesk(scenario(BusOff(node="plant", start=0.010, end=0.030)))
-    for _ in range(40):
-        desk.send(codec.SYNC)
-        if len(desk.frames(codec.FEEDBACK)) > desk.k - 20 * (desk.k >= 30):
-            desk.drive(5e-3, desk.k)
-        desk.k += 1
-        desk.wait(MS)
-    cycles = [codec.unpack_valve_state(data).cycle for data in desk.frames(codec.VALVE_STATE)]
-    assert cycles == [*range(10), *range(30, 40)]
-    assert desk.node.plant.drive == 5e-3 and desk.node._od[COUNTERS, 1] >= 20
-    assert not [t_ns for t_ns, _, _ in desk.heard if 10 * MS <= t_ns < 30 * MS]
-
-
-def test_the_transducers_say_the_same_when_they_are_asked_again() -> None:
-    """While the controller is being enabled the cycle does not go on: no noise is drawn for it twice."""
-    faults = (Noise(signal="p12", start=0.003, value=1e5), Stuck(signal="xj", start=0.005))
-    scenario = Scenario(Model(), Plan(faults=faults, stop=20), seed=3)
-    once, often = FaultyPlant(scenario), FaultyPlant(scenario)
-    for k in range(20):
-        said = once.read(k)
-        assert [often.read(k) for _ in range(1 + k % 3)] == [said] * (1 + k % 3)
-        for each in (once, often):
-            each.drive = 1e-3
-            each.move(k)
-    assert once.actuator.state == often.actuator.state

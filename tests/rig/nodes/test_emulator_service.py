@@ -15,15 +15,14 @@ from bus_stations import spec
 from node_bench import MS
 
 from plant import Model
-from plant.compile import compile_function
 from rig.benches.bench_file import load_bench
 from rig.device import NmtState
 from rig.network.bus import Link, open_can, serve_node
 from rig.network.frame import Frame, WallClock
 from rig.network.node_objects import decode_cycle_record
-from rig.network.raw_bus import RawBus, make_closed_port
+from rig.network.raw_bus import RawBus
 from rig.nodes import emulator_cycle as ec
-from rig.nodes.emulator import Emulator, PlantPlace
+from rig.nodes.emulator import Emulator
 from rig.nodes.emulator_service import EmulatorService, compile_loop, list_unheard
 from rig.nodes.scenario import Scenario
 from rig.run.priority import enter_loop_thread
@@ -260,24 +259,3 @@ class TestServices:
             desk.link.send(0x192, codec.pack_drive(0.0, 15, k))
         assert flags == [0] * 6
         assert sum(cob_id == codec.FEEDBACK for cob_id, _ in desk.heard) == 3
-
-
-def test_a_wake_up_does_not_end_the_wait_for_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The services wake the loop to stop it for a new scenario; the loop seldom takes that wake-up before its run."""
-    monkeypatch.setattr(ec, "_ANSWER_LIMIT", 10_000_000_000)
-    place = PlantPlace.find(load_bench())
-    memory = ec.make_memory(Model(), [], Schedule(Plan(stop=0)), frames=place.frames)
-    words = memory.words
-    words[ec.STATE], words[ec.DRIVE_ID], words[ec.DRIVE_TYPE] = ec.OPERATIONAL, codec.DRIVE, 1
-    where = spec("udp_multicast")
-    await_drive = compile_function(ec._await_drive)
-    await_drive(make_closed_port(), ec.make_memory(Model(), [], Schedule(Plan(stop=0)), frames=place.frames))
-    with RawBus(where, [codec.DRIVE]) as raw:
-        link = Link(open_can(where), lambda: 0)
-        raw.wake()
-        timer = threading.Timer(0.05, link.send, (codec.DRIVE, codec.pack_drive(0.0, 15, 7)))
-        timer.start()
-        await_drive(raw.port, memory)
-        timer.join()
-        link.close()
-    assert words[ec.WAITING] == 1

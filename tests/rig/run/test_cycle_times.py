@@ -84,14 +84,6 @@ checks = [
     assert {event.t for event in outcome.events if event.text == "gone begins"} == {0.104}
 
 
-def test_limits_follow_the_cycle() -> None:
-    """Half a cycle of lateness; two cycles for the status word; 0x1006 in cycles."""
-    timing, limits = PREFLIGHT.timing, PREFLIGHT.protocol
-    assert [timing.find_limits(period) for period in (1e-3, 2e-3)] == [(0.5e-3, 0.5e-3), (1e-3, 1e-3)]
-    assert [timing.choose_sync_period(period) for period in (0.5e-3, 1e-3, 10e-3)] == [4000, 8000, 80_000]
-    assert limits.response_max is None
-
-
 def test_a_bench_in_a_test_has_its_own_cycle(tmp_path: Path) -> None:
     command = np.linspace(0.0, 1e-3, 60)
     run = Bench(tmp_path / "runs").run(command=command, bench=write_bench(tmp_path, "5"))

@@ -30,7 +30,6 @@ from rig.network.raw_bus import RawBus
 from rig.network.udp import PORT, Turn
 from rig.nodes.scenario import Scenario
 from rig.recorder import Signals
-from rig.run import hard_loop, loop
 from rig.run.hard_loop import HardLoop, compile_cycle
 from rig.run.loop import CycleInput, CycleLoop
 from rig.sequences.faults import (
@@ -44,7 +43,6 @@ from rig.sequences.faults import (
     Plan,
     Schedule,
     Short,
-    Silent,
 )
 
 PERIOD = 10_000_000  # ns: ten times the bench's, because the nodes of this test are Python on a busy machine
@@ -284,28 +282,6 @@ def test_commands_and_syncs_changed_by_faults(bus_kind: str) -> None:
 
 
 @only_udp
-@paces
-def test_the_rigs_heartbeat_can_be_dropped(bus_kind: str, realtime: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is off in the cycles of the fault and in no other; the nodes hear those that are in the log."""
-    with bench(bus_kind, realtime, Silent(node="rig", start=0.1, end=0.13)) as one:
-        asked: list[tuple[int, bool]] = []  # cycle by whose faults the rig goes, and whether its heartbeat is off
-        set_faults = loop.set_rig_faults
-
-        def note_faults(master: Master, faults: Schedule, k: int) -> None:
-            set_faults(master, faults, k)
-            asked.append((k, one.master.silent))
-
-        monkeypatch.setattr(hard_loop if realtime else loop, "set_rig_faults", note_faults)
-        one.master._beat.configure(1, one.wire.clock.now())
-        one.play(*range(160))
-        one.loop.finish()
-        one.loop.close()
-        one.settle()
-        assert [silent for _, silent in asked] == [100 <= k < 130 for k, _ in asked] and asked[-1][0] >= 130
-        assert sum(frame.cob_id == 0x701 for frame in one.nodes.heard) == len(one.logged(0x701)) > 0
-
-
-@only_udp
 def test_an_empty_queue_holds_the_last_demand(bus_kind: str) -> None:
     """And each such cycle counts as an overrun: the bench left its sequence."""
     with bench(bus_kind, True, ahead=10) as one:
@@ -383,33 +359,6 @@ def test_a_late_cycle_drops_due_times_and_counts_them(bus_kind: str) -> None:
         one.check_demands(list(range(20)))
         sent = [frame.t_ns for frame in one.frames if frame.cob_id == codec.SYNC]
         assert len(sent) == len(one.rows)
-
-
-@only_udp
-def test_nodes_that_are_gone_do_not_hold_up_lockstep_for_long(bus_kind: str) -> None:
-    """Five cycles wait for half a second, the others for a tenth of that."""
-    with bench(bus_kind, False) as one:
-        one.nodes.mute = True
-        before = one.wire.clock.now()
-        one.play(*range(25))
-        assert one.wire.clock.now() - before < 10e9
-        one.nodes.mute = False
-        played = 25
-        while played < 400 and (not one.rows or isnan(one.rows[-1].xj)):
-            one.play(played)
-            played += 1
-        one.loop.finish()
-        answers = [row.xj for row in one.rows if not isnan(row.xj)]
-        assert answers and 24.5e-6 < answers[0] < (played - 0.5) * 1e-6
-
-
-@only_udp
-def test_lockstep_waits_for_the_answer_to_a_second_sync(bus_kind: str) -> None:
-    """Else its feedback, which has no number, would be that of the next cycle."""
-    with bench(bus_kind, False, Duplicated(frame="sync", start=0.002, end=0.003)) as one:
-        one.play(*range(4))
-        one.loop.finish()
-    assert [round(row.xj * 1e6) for row in one.rows] == [0, 1, 2, 4]
 
 
 @raw_kinds

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from rig_command import is_running
 
-from plant.errors import InputError
 from rig.run.page_writer import PageWriter
 
 OWNER = """
@@ -69,22 +68,6 @@ def test_a_second_process_that_dies_or_cannot_start_costs_no_page(
             pages._process.kill()
         pages.wait_until_loaded()
         write_page(pages, preflight / "trace.mcap", tmp_path / "page.html")
-
-
-@pytest.mark.parametrize("trace_is_missing", [False, True])
-def test_bad_input_is_an_error_here(trace_is_missing: bool, preflight: Path, tmp_path: Path) -> None:
-    source = tmp_path / "missing.mcap" if trace_is_missing else preflight / "trace.mcap"
-    out = tmp_path / "page.html" if trace_is_missing else tmp_path / "missing" / "page.html"
-    with PageWriter() as pages, pytest.raises(InputError) as caught:
-        write_page(pages, source, out)
-    assert str(source if trace_is_missing else out) in str(caught.value)
-
-
-def test_without_a_page_no_process_is_left() -> None:
-    with PageWriter() as pages:
-        process = pages._process
-        assert process is not None and process.poll() is None
-    assert process.returncode is not None
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])

@@ -99,15 +99,6 @@ def read_locked_kilobytes() -> int:
     return int(status.partition("VmLck:")[2].split()[0])
 
 
-def test_without_the_right_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise PermissionError
-
-    monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    with raise_priority():
-        assert name_scheduler() == "SCHED_OTHER"
-
-
 @pytest.mark.parametrize("collecting", [True, False])
 def test_collection_comes_back_as_it_was(collecting: bool) -> None:
     if not collecting:

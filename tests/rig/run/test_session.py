@@ -64,12 +64,6 @@ def control_words(folder: Path) -> list[int]:
     return [message.control for _, _, message in open_log(folder / "trace.mcap").read_messages("/signals")]
 
 
-def test_without_set_up_and_clean_up_and_a_main_of_one_cycle(tmp_path: Path) -> None:
-    one = job('title = "shortest"\nmain = [{ kind = "hold", time = 0.001 }]')
-    assert play(one, tmp_path).verdict == "NOT_JUDGED"  # it has no checks
-    assert phases(tmp_path) == [0, 1, 0]
-
-
 def test_a_guard_ends_main_and_clean_up_runs(tmp_path: Path) -> None:
     text = SHORT + 'guards = [{ name = "too far", signal = "xj", high = 0.5, unit = "mm" }]'
     outcome = play(job(text), tmp_path)
@@ -300,13 +294,6 @@ def test_a_bench_that_is_late_in_bring_up_is_not_the_controllers_fault(
     assert (outcome.verdict, outcome.status) == ("INVALID_TIMING", 3)
     assert "the bench was late in bring-up: both nodes must be OPERATIONAL" in outcome.why
     assert outcome.to_json()["cause"]["source"] == "bench" and set(control_words(tmp_path)) == {0}
-
-
-def test_bring_up_begins_with_the_rigs_boot_up_and_addresses_its_own_nodes(tmp_path: Path) -> None:
-    play(job(), tmp_path)
-    frames = [(m.cob_id, m.data) for _, _, m in open_log(tmp_path / "trace.mcap").read_messages("/can")]
-    assert frames[0] == (0x701, b"\0") and (0x701, b"\0") not in frames[1:]
-    assert {data[1] for cob_id, data in frames if cob_id == 0} == {2, 3}
 
 
 def test_who_the_nodes_are(tmp_path: Path) -> None:

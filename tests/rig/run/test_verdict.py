@@ -59,6 +59,17 @@ def test_a_signal_just_inside_its_limit_is_not_reported() -> None:
     assert (limit.signal, limit.t, limit.seconds) == ("cor", 0.0, 1e-3)
 
 
+STEPS = """
+title = "Steps and a ramp"
+setup = [{ kind = "hold", time = 0.1 }]
+main = [
+  { kind = "step", to = 5e-3, time = 0.4 }, { kind = "ramp", to = 3e-3, time = 0.6 },
+  { kind = "step", to = 0.0, time = 0.4 },
+]
+checks = [{ name = "error", kind = "never_exceeds", signal = "xj", unit = "mm", high = 9.0 }]
+"""
+
+
 def diagnosis(verdict: str) -> dict[str, object]:
     return {"verdict": verdict, "sentence": f"The sentence of {verdict}."}
 
@@ -85,7 +96,8 @@ def test_without_checks_only_an_acceptable_diagnosis_is_a_pass(tmp_path: Path) -
 
 
 def test_a_clogged_filter_fails_a_run_with_fdi(tmp_path: Path) -> None:
-    answer = rig("run", "--fdi", "--set", "filter.clogging=0.28", "--seed", "1", "--out", str(tmp_path / "run"))
+    (tmp_path / "steps.toml").write_text(STEPS)
+    answer = rig("run", tmp_path / "steps.toml", "--fdi", "--set", "filter.clogging=0.28", "--out", tmp_path / "run")
     assert answer.status == 1
     lines = answer.out.rstrip().splitlines()
     assert lines[1].startswith("FAIL  rig fdi: Filter clogging requires maintenance")

@@ -6,9 +6,7 @@ from typing import Any
 
 import pytest
 
-from rig.network.frame import VirtualClock
-from rig.recorder import Event, Timing
-from rig.run.state import Journal, SafeState, Stage
+from rig.recorder import Timing
 from rig.run.watch import OverrunWatch, SilenceWatch
 from rig.sequences.sequence import TimingPolicy
 
@@ -91,50 +89,3 @@ def test_a_cycle_on_time_ends_the_row_and_one_that_a_fault_disturbs_does_not() -
 @pytest.mark.parametrize("policy", [{"grace": 1.0, "tolerate": None}, {"overruns": "count", "tolerate": 0}])
 def test_overruns_are_not_watched_within_the_grace_or_when_they_are_only_counted(policy: dict[str, Any]) -> None:
     assert not watch([make_timing(200, lateness=5e-3)], **policy)
-
-
-class Loop:
-    """A loop at cycle `k` that was given the inputs up to `queued`."""
-
-    def __init__(self, k: int, queued: int) -> None:
-        self.k, self.queued = k, queued
-
-    def now(self) -> int:
-        return self.k * 1_000_000
-
-
-class Recorder:
-    """Keeps what is recorded."""
-
-    def __init__(self) -> None:
-        self.records: list[tuple[int, str]] = []
-
-    def put(self, t_ns: int, record: object) -> None:
-        assert isinstance(record, Event)
-        self.records.append((t_ns, record.text))
-
-
-class Parts:
-    """Stage, journal and safe state of a run whose main begins at cycle 50."""
-
-    def __init__(self, k: int = 60, queued: int = 60, tests_safe_state: bool = False) -> None:
-        self.stage, self.recorder, self.loop = Stage(VirtualClock(), 50, 1000.0), Recorder(), Loop(k, queued)
-        self.stage.loop = self.loop  # type: ignore[assignment]
-        self.journal = Journal(self.stage, self.recorder)  # type: ignore[arg-type]
-        self.safety = SafeState(self.stage, self.journal, tests_safe_state)
-
-
-def test_an_event_of_a_queued_cycle_waits_for_it_and_is_dropped_with_it() -> None:
-    parts = Parts(k=60, queued=80)
-    parts.journal.announce("INFO", "section", "sine")
-    assert parts.journal.events == []
-    parts.journal.log_due(79, 79_000_000)
-    assert parts.journal.events == []
-    parts.journal.log_due(80, 80_000_000)
-    assert parts.recorder.records == [(80_000_000, "sine")]
-    assert [event.t for event in parts.journal.events] == [pytest.approx(0.030)]
-    parts.journal.announce("INFO", "section", "ramp")
-    parts.loop.queued = 70
-    parts.journal.drop_unplayed()
-    parts.journal.log_due(1000, 0)
-    assert len(parts.journal.events) == 1

@@ -5,7 +5,7 @@ checks blame no node for a late rig.
 import datetime
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from math import atan2, degrees, exp, inf, isnan, log, nan, pi, sqrt
+from math import exp, inf, isnan, log, nan, pi, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.run import Columns
-from plant.segments import Array, Hold, Ramp, Segment, Sine, Step, build_profile
+from plant.segments import Array, Hold, Ramp, Segment, Step, build_profile
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.benches.calibration import SensorCalibration
@@ -58,17 +58,6 @@ def noise(n: int, seed: int = 0) -> Array:
     return np.random.default_rng(seed).standard_normal(n) * NOISE
 
 
-def second_order(damping: float, omega: float, size: float = 5e-3) -> tuple[Columns, dict[str, slice]]:
-    """The textbook answer of a second-order system to a step at 0.1 s, noise added."""
-    command, sections, _ = build_profile([Hold(time=0.1, name="rest"), Step(to=size, time=1.0, name="step")])
-    t = np.arange(len(command)) / 1000
-    after = np.maximum(t - 0.1, 0)
-    wd = omega * sqrt(1 - damping**2)
-    answer = 1 - np.exp(-damping * omega * after) * (
-        np.cos(wd * after) + damping / sqrt(1 - damping**2) * np.sin(wd * after))
-    return make_run(command, size * answer + noise(len(t))), {s.name: slice(s.start, s.stop) for s in sections}
-
-
 def follower(*segments: Segment, tau: float = LAG) -> tuple[Columns, dict[str, slice]]:
     """A first-order lag with unit gain, sampled exactly for a command held over each cycle, noise added."""
     command, sections, _ = build_profile(segments)
@@ -89,31 +78,6 @@ def judged(run: Columns, sections: dict[str, slice], kind: str, events: tuple[Ev
     return result
 
 
-@pytest.mark.parametrize("damping", [0.3, 0.5, 0.7])
-@pytest.mark.parametrize("size", [5e-3, -1e-3])
-def test_overshoot_of_a_second_order_step(damping: float, size: float) -> None:
-    run, sections = second_order(damping, 120.0, size)
-    expected = 100 * exp(-pi * damping / sqrt(1 - damping**2))
-    assert judged(run, sections, "overshoot", window="step").value == pytest.approx(expected, abs=1.2)
-
-
-def test_settling_time_of_a_second_order_step() -> None:
-    run, sections = second_order(0.5, 60.0)
-    after = np.arange(0, 1, 1e-5)
-    wd = 60 * sqrt(0.75)
-    deviation = np.abs(np.exp(-30 * after) * (np.cos(wd * after) + 0.5 / sqrt(0.75) * np.sin(wd * after)))
-    expected = after[np.flatnonzero(deviation > 0.02)[-1]]
-    result = judged(run, sections, "settling_time", window="step", band=2.0, unit="ms")
-    assert result.value == pytest.approx(expected * 1000, abs=2.0) and result.unit == "ms"
-
-
-def test_ramp_error_is_rate_times_lag_in_either_direction() -> None:
-    run, sections = follower(Hold(time=0.1), Ramp(to=1e-3, time=2.0, name="out"), Ramp(to=0.0, time=2.0, name="in"))
-    for window in ("out", "in"):
-        value = judged(run, sections, "ramp_error", window=window, skip=0.2, unit="um").value
-        assert value == pytest.approx(0.5e-3 * (LAG + 0.5e-3) / MICRON, abs=0.35)  # half a cycle: the command is held
-
-
 def test_break_away_is_half_the_band_of_a_triangle() -> None:
     command, sections, _ = build_profile([Ramp(to=1e-3, time=2.0, name="ramp")])
     t = np.arange(len(command)) / 1000
@@ -131,16 +95,6 @@ def test_errors_of_a_known_offset() -> None:
                         ("rms_error", pytest.approx(sqrt(900 + 4), abs=0.3))):
         assert judged(run, {}, kind, unit="um").value == value
     assert judged(run, {}, "never_exceeds", signal="error", unit="um").value == np.abs(run.xj).max() / MICRON
-
-
-@pytest.mark.parametrize("frequency", [1.0, 10.0])
-def test_gain_and_phase_of_a_first_order_lag(frequency: float) -> None:
-    run, sections = follower(Sine(amplitude=3e-3, frequency=frequency, time=2.0, name="sine"))
-    zoh = exp(-1e-3 / LAG)
-    h = (1 - zoh) / (np.exp(2j * pi * frequency / 1000) - zoh)  # of the sampled lag
-    keys: dict[str, Any] = {"window": "sine", "frequency": frequency, "skip": 0.5}
-    assert judged(run, sections, "amplitude_ratio", **keys).value == pytest.approx(abs(h), abs=1e-3)
-    assert judged(run, sections, "phase_lag", **keys).value == pytest.approx(-degrees(atan2(h.imag, h.real)), abs=0.1)
 
 
 def test_response_to_a_fault_by_event_and_by_signal() -> None:

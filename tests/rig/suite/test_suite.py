@@ -9,15 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from junit_schema import read_valid_junit
-from rig_command import SHORT, Said, answer, finished, job, play, refuse, rig, started
+from rig_command import SHORT, Said, answer, finished, job, refuse, rig, started
 
 from fdi.trace.check_result import CheckResult
-from fdi.trace.trace import Trace
-from plant import Model, simulate
 from rig.cli.inputs import is_suite_file
 from rig.evidence.requirements import Evidence, JudgedCheck, trace_requirements
 from rig.run.job import JobChoice
-from rig.suite.dry_run import find_capabilities, make_dry_run, plan_faults
+from rig.suite.dry_run import make_dry_run
 from rig.suite.suite import (
     Case,
     CaseResult,
@@ -292,7 +290,7 @@ def units(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Said]:
     (folder / "steps.toml").write_text(STEPS)
     (folder / "short.toml").write_text(SHORT)
     (folder / "suite.toml").write_text(UNITS)
-    return folder / "out", rig("run", folder / "suite.toml", "--out", folder / "out", "--jobs", 2,
+    return folder / "out", rig("run", folder / "suite.toml", "--out", folder / "out", "--jobs", 1,
                                "--junit", folder / "out" / "junit.xml")
 
 
@@ -392,17 +390,6 @@ def test_what_is_beyond_the_limits(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["far.html", "far.toml"]
 
 
-def test_changes_of_the_model_count_and_faults_are_not_predicted(tmp_path: Path) -> None:
-    fault = 'faults = [{ kind = "parameter", parameter = "filter.clogging", value = 0.9, start = 0.0 }]'
-    (tmp_path / "s.toml").write_text(f"{SHORT}\n{fault}\n")
-    said = rig("check", tmp_path / "s.toml")
-    assert said.status == 0 and "the prediction is without the faults of the sequence" in " ".join(said.out.split())
-    told = answer("check", tmp_path / "s.toml", "--set", "jack.travel=5e-4", status=1)
-    assert told["verdict"] == "BEYOND_LIMITS"
-    assert told["problems"][0].startswith("position 1 mm beyond 0.5 mm (jack.travel) in 'step'")
-    assert told["differences"] == "jack.travel = 0.0005 m; fault 'parameter filter.clogging' from 0 s"
-
-
 FAULTS = """
 faults = [
   { kind = "parameter", parameter = "filter.clogging", value = 0.9, start = 0.05, end = 0.25, ramp = 0.1 },
@@ -429,22 +416,6 @@ def test_the_faults_of_a_sequence_are_listed_and_drawn(tmp_path: Path) -> None:
     assert "biased sensor xj 0.300 0.350 100 um" in text and "ends with main at 0.35 s, not at 9 s" in text
     page = (tmp_path / "s.html").read_text()
     assert page.count("#ffd8a8") > 5 and all(f">{name}" in page.replace("> ", ">") for name in listed)
-
-
-def test_times_and_frames_of_the_list_are_those_of_the_run(tmp_path: Path) -> None:
-    """The events of a run tell when each fault began and ended."""
-    text = SHORT + FAULTS.replace("{ kind = \"reset\", start = 0.125 },", "")  # which would end the run
-    play(job(text), tmp_path)
-    planned = {each.name: (each.t0, each.t1) for each in plan_faults(job(text))}
-    found = {event.text: event.t for event in Trace.read(tmp_path, all=True).events if event.kind == "fault"}
-    assert len(planned) == 4
-    for name, times in planned.items():
-        assert (found[f"{name} begins"], found[f"{name} ends"]) == pytest.approx(times, abs=2e-3), found
-
-
-def test_the_no_load_speed_is_that_of_the_simulated_ram() -> None:
-    speed = float(np.diff(simulate(Model(), np.full(150, 0.035)).xj[60:110]).mean()) * 1000
-    assert speed == pytest.approx(find_capabilities(Model())["no-load speed"], rel=0.05)
 
 
 @pytest.mark.parametrize(("words", "line"), [

@@ -15,7 +15,7 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 import pytest
 from recording_rows import Rows, read_names, read_recording
-from rig_command import answer, finished, refuse, rig, started
+from rig_command import answer, finished, refuse, started
 from short_runs import build_command
 from synthetic_run import record_run
 
@@ -90,26 +90,6 @@ def test_recording_holds_every_lane(trace: Trace, rows: dict[str, list[tuple[flo
         (text,) = {str(word) for _, word in states} - {"", "PASS"}  # beside a short window, in a long one
         assert text.startswith(f"PASS {check.value:.4g}") and "≤" in text
         assert (str(states[window][1]) == text) == (check.t1 - check.t0 > 0.5 * (trace.t[-1] - trace.t[0]))
-
-
-def test_recording_holds_faults_and_load(tmp_path: Path) -> None:
-    (tmp_path / "faults.toml").write_text("""title = "Faults"
-setup = [{ kind = "hold", time = 0.1 }]
-main = [{ kind = "hold", time = 0.5 }]
-load = [{ kind = "ramp", to = 500.0, time = 0.2 }]
-faults = [{ name = "offset of XS / small", kind = "offset", signal = "xs", value = 1e-6, start = 0.1, end = 0.3 },
-          { kind = "parameter", parameter = "filter.clogging", value = 0.4, start = 0.2 }]
-""")
-    rig("run", tmp_path / "faults.toml", "--out", tmp_path / "run")
-    trace = Trace.read(tmp_path / "run", all=True)
-    rows = _rows(trace, tmp_path / "x.rrd")
-    assert {entity: [(round(t, 6), word) for t, word in states] for entity, states in rows.items()
-            if entity.startswith("/fault/")} == {
-        "/fault/offset_of_XS_small": [(0.1, "active"), (0.3, "")],
-        "/fault/parameter_filter.clogging": [(0.2, "active")]}
-    np.testing.assert_allclose([value for _, value in rows["/load/load"]], trace.load / 1e3, atol=1e-9)
-    assert trace.load.max() == 500.0
-    assert "External force on the ram [kN]" in {view.title for view in draw_run(trace).shown}
 
 
 def test_recording_holds_every_event_and_check(trace: Trace, rows: dict[str, list[tuple[float, object]]]) -> None:
