@@ -253,17 +253,18 @@ def test_a_plant_file_is_judged_by_worker_processes_and_resumed_only_with_trust(
         environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     rig("new", "plant", "my_motor")
+    work = ("--work", "campaign_work:count_rows")
     rig("campaign", "--model", "my_motor.py", "--fault", "healthy", "--seeds", 3, "--out", "two", "--jobs", 2,
-        "--most", 2, "--work", "campaign_work:count_rows")
+        "--most", 2, *work)
     found = rows(tmp_path / "two")
     fault, = judge.restore_faults(judge.read_matrix_of_folder("two").spec)
     assert [row["status"] for row in found] == ["ok", "ok"]
     truth = {row[f"true_{fault.key}"] for row in found}
     assert len(truth) == 2 and fault.healthy not in truth  # the parameter of the fault scatters as well
-    assert "expected --trust" in refuse("campaign", "two")
+    assert "expected --trust" in refuse("campaign", "two", *work)
     with Path("my_motor.py").open("a") as file:
         file.write("# changed\n")
-    said = rig("campaign", "two", "--trust")
+    said = rig("campaign", "two", *work, "--trust")
     assert said.status == 2 and "is not the plant file with which the campaign was started" in said.err
 
 

@@ -1,16 +1,13 @@
 """Exported units: valid by FMPy, the bits of `rig simulate` in both versions, states, parameters, wrong calls."""
 
-import ctypes
 import re
 import shutil
 import subprocess
-import sys
 import zipfile
 from collections.abc import Callable
-from ctypes import byref, c_bool, c_double, c_int32, c_size_t, c_uint32, c_void_p
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -103,155 +100,114 @@ def test_a_unit_needs_no_interpreter_and_two_exports_are_one_file(
     assert rows.tobytes() == np.column_stack([expected.xj, expected.p12, expected.xs]).tobytes()
 
 
-# ---------------------------------------------------------------------------------- the interface itself, by ctypes
+class Instance:
+    """An instance of a unit, by FMPy, whose functions have other names in version 2 than in 3."""
 
+    def __init__(self, path: Path, folder: Path, token: str = "") -> None:
+        from fmpy import fmi2, fmi3
 
-class Bare(NamedTuple):
-    """A loaded library: its functions by name without fmi2 or fmi3, and what it needs to be used."""
+        about = fmpy.read_model_description(str(path))
+        self.is_old = about.fmiVersion == "2.0"
+        make: Any = fmi2.FMU2Slave if self.is_old else fmi3.FMU3Slave
+        self.fmu = make(guid=token or about.guid, unzipDirectory=fmpy.extract(str(path), str(folder)),
+                        modelIdentifier=about.coSimulation.modelIdentifier, instanceName="unit")
+        self.fmu.instantiate()
+        self.places = {variable.name: variable.valueReference for variable in about.modelVariables}
+        self.restore = self.fmu.deSerializeFMUstate if self.is_old else self.fmu.deserializeFMUState
 
-    library: Any
-    version: str
-    token: bytes
-    places: dict[str, int]  # value references
-
-    def call(self, name: str, *words: Any) -> int:
-        """The status of a function."""
-        function = getattr(self.library, f"fmi{self.version}{name}")
-        function.restype = ctypes.c_int
-        return int(function(*words))
-
-    def create(self, token: bytes | None = None, name: bytes | None = b"unit", kind: int = 1) -> c_void_p:
-        """An instance, or a null pointer."""
-        if self.version == "2":
-            function = self.library.fmi2Instantiate
-            words: tuple[Any, ...] = (name, kind, token or self.token, None, None, 0, 1)
-        else:
-            function = self.library.fmi3InstantiateCoSimulation
-            words = (name, token or self.token, None, c_bool(False), c_bool(True), c_bool(kind != 1), c_bool(False),
-                     None, c_size_t(0), None, None, None)
-        function.restype = c_void_p
-        return c_void_p(function(*words))
-
-    def start(self, c: c_void_p) -> None:
+    def start(self) -> None:
         """Through initialisation."""
-        if self.version == "2":
-            assert self.call("SetupExperiment", c, 0, c_double(0), c_double(0), 0, c_double(0)) == 0
-            assert self.call("EnterInitializationMode", c) == 0
-        else:
-            assert self.enter(c) == 0
-        assert self.call("ExitInitializationMode", c) == 0
+        if self.is_old:
+            self.fmu.setupExperiment()
+        self.fmu.enterInitializationMode()
+        self.fmu.exitInitializationMode()
 
-    def enter(self, c: c_void_p, t: float = 0.0) -> int:
-        """Enter the initialisation of version 3."""
-        return self.call("EnterInitializationMode", c, c_bool(False), c_double(0), c_double(t), c_bool(False),
-                         c_double(0))
-
-    def step(self, c: c_void_p, t: float, length: float = 1e-3) -> int:
-        """One communication step."""
-        if self.version == "2":
-            return self.call("DoStep", c, c_double(t), c_double(length), 1)
-        answers = [byref(c_bool()), byref(c_bool()), byref(c_bool()), byref(c_double())]
-        return self.call("DoStep", c, c_double(t), c_double(length), c_bool(True), *answers)
-
-    def _access(self, verb: str, c: c_void_p, name: str, value: Any, kind: str) -> int:
-        word = {"real": "Real", "integer": "Integer", "boolean": "Boolean"}[kind]
-        if self.version == "3":
-            word = {"real": "Float64", "integer": "Int32", "boolean": "Boolean"}[kind]
-        place = c_uint32(self.places.get(name, 9999))
-        more = (c_size_t(1),) if self.version == "3" else ()
-        return self.call(verb + word, c, byref(place), c_size_t(1), byref(value), *more)
-
-    def set(self, c: c_void_p, name: str, value: float) -> int:
+    def set(self, name: str, value: float) -> None:
         """Set a real variable."""
-        return self._access("Set", c, name, c_double(value), "real")
+        (self.fmu.setReal if self.is_old else self.fmu.setFloat64)([self.places.get(name, 9999)], [value])
 
-    def set_seed(self, c: c_void_p, value: int) -> int:
+    def set_seed(self, value: int) -> None:
         """Set the parameter `seed`."""
-        return self._access("Set", c, "seed", c_int32(value), "integer")
+        (self.fmu.setInteger if self.is_old else self.fmu.setInt32)([self.places["seed"]], [value])
 
-    def get(self, c: c_void_p, name: str) -> float | None:
-        """A real variable; None where the unit refuses."""
-        value = c_double()
-        return value.value if self._access("Get", c, name, value, "real") == 0 else None
+    def get(self, name: str) -> float:
+        """A real variable."""
+        found = (self.fmu.getReal if self.is_old else self.fmu.getFloat64)([self.places[name]])
+        return float(found[0])
 
-    def run(self, c: c_void_p, first: int, cycles: int) -> list[float | None]:
+    def run(self, first: int, cycles: int) -> list[float]:
         """XJ of some cycles under a current that changes."""
         found = []
         for k in range(first, first + cycles):
-            assert self.set(c, "cor", 2e-3 * np.sin(k / 9)) == 0 and self.step(c, k * 1e-3) == 0
-            found.append(self.get(c, "xj"))
+            self.set("cor", 2e-3 * np.sin(k / 9))
+            self.fmu.doStep(k * 1e-3, 1e-3)
+            found.append(self.get("xj"))
         return found
 
 
-@pytest.fixture(scope="module", params=["2", "3"])
-def bare(request: pytest.FixtureRequest, unit: Callable[[str, str], Path], tmp_path_factory: Any) -> Bare:
-    """The library of a unit with effects that remember."""
-    folder = tmp_path_factory.mktemp("bare")
-    with zipfile.ZipFile(unit([*MODELS][1], request.param)) as archive:
-        archive.extractall(folder)
-    description = (folder / "modelDescription.xml").read_text()
-    (token,) = re.findall(r'(?:guid|instantiationToken)="([^"]+)"', description)
-    places = {name: int(place) for name, place in re.findall(r'name="([^"]+)" valueReference="(\d+)"', description)}
-    (path,) = [path for path in folder.rglob("*.so") if ("aarch64" in path.parent.name) == ("aarch64" in sys.platform)]
-    return Bare(ctypes.CDLL(str(path)), request.param, token.encode(), places)
+def is_refused(call: Callable[..., object], *words: object) -> bool:
+    from fmpy.fmi1 import FMICallException
+
+    try:
+        call(*words)
+    except FMICallException:
+        return True
+    return False
 
 
-def test_states_are_saved_restored_and_serialised(bare: Bare) -> None:
-    name = "FMUstate" if bare.version == "2" else "FMUState"
-    deserialize = "DeSerialize" if bare.version == "2" else "Deserialize"
-    c, other = bare.create(), bare.create()
-    for each in (c, other):
-        bare.start(each)
-    bare.run(c, 0, 50)
-    saved, size = c_void_p(), c_size_t()
-    assert bare.call(f"Get{name}", c, byref(saved)) == 0
-    onward = bare.run(c, 50, 50)
-    assert bare.call(f"Set{name}", c, saved) == 0 and bare.run(c, 50, 50) == onward
-    assert bare.call(f"Serialized{name}Size", c, saved, byref(size)) == 0
-    data = ctypes.create_string_buffer(size.value)
-    assert bare.call(f"Serialize{name}", c, saved, data, size) == 0
-    moved = c_void_p()
-    assert bare.call(f"{deserialize}{name}", other, data, size, byref(moved)) == 0
-    assert bare.call(f"Set{name}", other, moved) == 0 and bare.run(other, 50, 50) == onward
-    assert bare.call(f"{deserialize}{name}", other, data, c_size_t(size.value - 1), byref(c_void_p())) == 3
-    assert bare.call(f"{deserialize}{name}", other, b"\0" * size.value, size, byref(c_void_p())) == 3
-    assert bare.call(f"Free{name}", c, byref(saved)) == 0 and saved.value is None
-    assert bare.call(f"Free{name}", c, byref(saved)) == 0  # freeing none is allowed
-    assert bare.call(f"Set{name}", c, saved) == 3
-    assert bare.call("Reset", c) == 0
-    bare.start(c)
-    first = bare.run(c, 0, 50)
-    assert bare.call("Reset", c) == 0 and bare.set_seed(c, 8) == 0
-    bare.start(c)
-    assert bare.run(c, 0, 50) != first
-    for each in (c, other):
-        bare.call("FreeInstance", each)
+@pytest.fixture(params=["2", "3"])
+def make_instance(request: pytest.FixtureRequest, unit: Callable[[str, str], Path], tmp_path: Path) -> Any:
+    """Instances of a unit with effects that remember."""
+    return partial(Instance, unit([*MODELS][1], request.param), tmp_path)
 
 
-def test_wrong_calls_are_refused_and_the_unit_goes_on(bare: Bare) -> None:
-    assert not bare.create(b"{other}") and not bare.create(name=b"") and not bare.create(kind=0)
-    none = c_void_p()
-    assert (bare.step(none, 0.0), bare.set(none, "load", 1.0), bare.call("Terminate", none)) == (3, 3, 3)
-    c = bare.create()
-    assert bare.step(c, 0.0) == 3 and bare.get(c, "xj") is None and bare.call("ExitInitializationMode", c) == 3
-    if bare.version == "3":
-        assert bare.enter(c, float("nan")) == 3
-    assert bare.set(c, "spool.mass", 0.09) == 0
+def test_states_are_saved_restored_and_serialised(make_instance: Callable[[], Instance]) -> None:
+    one, other = make_instance(), make_instance()
+    one.start()
+    other.start()
+    one.run(0, 50)
+    saved = one.fmu.getFMUState()
+    onward = one.run(50, 50)
+    one.fmu.setFMUState(saved)
+    assert one.run(50, 50) == onward
+    data = one.fmu.serializeFMUState(saved)
+    other.fmu.setFMUState(other.restore(data))
+    assert other.run(50, 50) == onward
+    assert is_refused(other.restore, data[:-1]) and is_refused(other.restore, bytes(len(data)))
+    one.fmu.freeFMUState(saved)
+    one.fmu.reset()
+    one.start()
+    first = one.run(0, 50)
+    one.fmu.reset()
+    one.set_seed(8)
+    one.start()
+    assert one.run(0, 50) != first
+
+
+def test_wrong_calls_are_refused_and_the_unit_goes_on(make_instance: Callable[..., Instance]) -> None:
+    with pytest.raises(Exception, match="instantiate"):
+        make_instance("{other}")
+    one = make_instance()
+    step = one.fmu.doStep
+    assert is_refused(step, 0.0, 1e-3) and is_refused(one.get, "xj") and is_refused(one.fmu.exitInitializationMode)
+    one.set("spool.mass", 0.09)
     for name, value in (("spool.mass", -1.0), ("spool.mass", float("nan")), ("xj", 0.0), ("time", 1.0), ("none", 0.0),
                         ("filter.clogging", 1.0), ("load", float("inf"))):
-        assert bare.set(c, name, value) == 3, name
-    assert bare.set_seed(c, -1) == 3
-    bare.start(c)
-    assert bare.get(c, "spool.mass") == 0.09
-    assert bare.set(c, "controller.period", 2e-3) == 3 and bare.set_seed(c, 1) == 3  # fixed
+        assert is_refused(one.set, name, value), name
+    assert is_refused(one.set_seed, -1)
+    one.start()
+    assert one.get("spool.mass") == 0.09
+    assert is_refused(one.set, "controller.period", 2e-3) and is_refused(one.set_seed, 1)  # fixed
     for t, length in ((0.5, 1e-3), (0.0, 1.5e-3), (0.0, 0.0), (0.0, -1e-3), (float("nan"), 1e-3), (0.0, 1e30)):
-        assert bare.step(c, t, length) == 3, (t, length)
-    assert bare.step(c, 0.0, 3e-3) == 0 and bare.get(c, "time") == 3e-3
-    assert bare.call("EnterInitializationMode", c) == 3 if bare.version == "2" else bare.enter(c) == 3
-    assert bare.call("Reset", c) == 0 and bare.get(c, "xj") is None
-    bare.start(c)
-    assert bare.step(c, 0.0) == 0 and bare.call("Terminate", c) == 0 and bare.step(c, 1e-3) == 3
-    bare.call("FreeInstance", c)
+        assert is_refused(step, t, length), (t, length)
+    step(0.0, 3e-3)
+    assert one.get("time") == 3e-3 and is_refused(one.fmu.enterInitializationMode)
+    one.fmu.reset()
+    assert is_refused(one.get, "xj")
+    one.start()
+    step(0.0, 1e-3)
+    one.fmu.terminate()
+    assert is_refused(step, 1e-3, 1e-3)
 
 
 def test_messages_reach_the_logger(unit: Callable[[str, str], Path], tmp_path: Path) -> None:

@@ -98,12 +98,6 @@ def test_another_device_is_refused(tmp_path: Path, held: dict[tuple[int, int], i
     assert str(raised.value) == said
 
 
-def test_a_device_is_taken_for_what_it_says(tmp_path: Path) -> None:
-    """A vendor of 0 in the data sheet is none."""
-    for objects, held in ((ALL, {}), ({**ALL, "1018sub1": Entry(7, "ro", "0")}, {(0x1018, 1): 0x99})):
-        Place(tmp_path, objects, held=held).master.require_identity(Role.CONTROLLER)
-
-
 @pytest.mark.parametrize(("held", "said"), [
     ({(0x1800, 1): 0x8000_0185}, "0x1800:1: expected 0x185, but node 5 controller has 0x80000185"),
     ({(0x1401, 2): 1}, "0x1401:2: expected 0xFF, but node 5 controller has 0x1"),
@@ -199,11 +193,3 @@ def test_parameters_are_written_to_our_own_firmware_and_read_from_a_foreign_one(
     place.master.configure(b"", {"controller.proportional_gain": 1.0}, 0)
     assert (0x2110, 1, 0x3F80_0000) in place.device.writes
     assert place.master.read_parameters() == {"controller.proportional_gain": 1.0}
-
-
-def test_the_rig_gives_way_to_a_device_with_its_number(tmp_path: Path) -> None:
-    place = Place(tmp_path, node=1)
-    place.master.boot()
-    place.master.configure(b"", None, 0)
-    assert place.bench.rig_node == 127 and (0x1016, 1, 127 << 16 | 300) in place.device.writes
-    assert Frame(place.sent[-1].t_ns, 0x77F, b"\0").cob_id in {frame.cob_id for frame in place.sent}

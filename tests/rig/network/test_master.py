@@ -119,19 +119,3 @@ def test_nobody_there() -> None:
     with pytest.raises(BusError, match=r"node 3 plant, object 0x2210"):
         master.configure(SCENARIO, None, 0)
     assert not master.is_present(PLANT, 0.1)
-
-
-def test_heartbeats_are_watched_from_the_first_on() -> None:
-    clock = VirtualClock()
-    master = Master(EmbeddedWire(clock, [Emulator, Firmware]), clock.now, False, load_bench())
-    lost: list[int] = []
-    master.hooks.on_lost = lost.append
-    master.reset()
-    master.configure(SCENARIO, Model().values, 0)
-    for _ in range(10):
-        master.wire.wait(lambda: False, 0.1)
-        master.tick()
-    assert lost == []
-    clock.sleep_until(clock.now() + 10**9)  # the nodes are not asked meanwhile
-    master.tick()
-    assert sorted(lost) == [CONTROLLER, PLANT]

@@ -147,14 +147,3 @@ def test_silence_is_told_from_a_wrong_answer() -> None:
         upload(sdo)
     flush(sdo)
     assert server.requests[-1] == "8000100000000405"  # the abort 0x05040000
-
-
-def test_a_wrong_confirmation_is_no_object_that_is_not_implemented() -> None:
-    """A foreign controller may refuse an object, or not answer; it may not confirm another one."""
-    def make(send: Send) -> Server:
-        return Server(send, ["6011220000000000"])
-
-    master = Master(EmbeddedWire(VirtualClock(), [make]), lambda: 0, False, load_bench())
-    line = r"node 3, SDO of object 0x2210 sub 0: confirmation of object 0x2211 sub 0"
-    with pytest.raises(ConfirmationError, match=line):
-        master.configure(b"12345678", None, 0)

@@ -102,20 +102,6 @@ def test_recording_holds_every_event_and_check(trace: Trace, rows: dict[str, lis
     assert "- sequence: Preflight" in str(rows["/log/provenance"][0][1])
 
 
-def test_recording_of_an_aborted_run(aborted: Path, tmp_path: Path) -> None:
-    rows = _rows(Trace.read(aborted, all=True), tmp_path / "x.rrd")
-    assert rows["/run/verdict"] == [(-0.3, "ABORTED: guard 'ram far out' was passed by xj")]
-    failed = {entity.removeprefix("/check/FAIL/"): [(round(t, 3), word) for t, word in values]
-              for entity, values in rows.items() if entity.startswith("/check/FAIL/")}
-    assert failed == {
-        "ramp_error": [(0, "FAIL not measurable: the run ended at 2.271 s, the window at 3.5 s"), (2.271, "")],
-        "gain_1_Hz": [(0, "FAIL not measurable: the run ended at 2.271 s, the window at 5.5 s"), (2.271, "")],
-        "lag_1_Hz": [(0, "FAIL not measurable: the run ended at 2.271 s, the window at 5.5 s"), (2.271, "")],
-        "spool": [(0, "FAIL not measurable: 300 of 2271 samples of xs are missing"), (2.271, "")]}
-    assert np.isnan([float(str(value)) for _, value in rows["/spool/spool"]]).sum() == 300
-    assert not any("nan" in str(text) for _, text in rows["/log/checks"])
-
-
 @needs_driver
 def test_headless_screenshot_shows_everything(trace: Trace, tmp_path: Path,
                                               capsys: pytest.CaptureFixture[str]) -> None:
