@@ -103,13 +103,13 @@ def test_a_unit_needs_no_interpreter_and_two_exports_are_one_file(
 class Instance:
     """An instance of a unit, by FMPy, whose functions have other names in version 2 than in 3."""
 
-    def __init__(self, path: Path, folder: Path, token: str = "") -> None:
+    def __init__(self, folder: str, token: str = "") -> None:
         from fmpy import fmi2, fmi3
 
-        about = fmpy.read_model_description(str(path))
+        about = fmpy.read_model_description(folder)
         self.is_old = about.fmiVersion == "2.0"
         make: Any = fmi2.FMU2Slave if self.is_old else fmi3.FMU3Slave
-        self.fmu = make(guid=token or about.guid, unzipDirectory=fmpy.extract(str(path), str(folder)),
+        self.fmu = make(guid=token or about.guid, unzipDirectory=folder,
                         modelIdentifier=about.coSimulation.modelIdentifier, instanceName="unit")
         self.fmu.instantiate()
         self.places = {variable.name: variable.valueReference for variable in about.modelVariables}
@@ -158,7 +158,7 @@ def is_refused(call: Callable[..., object], *words: object) -> bool:
 @pytest.fixture(params=["2", "3"])
 def make_instance(request: pytest.FixtureRequest, unit: Callable[[str, str], Path], tmp_path: Path) -> Any:
     """Instances of a unit with effects that remember."""
-    return partial(Instance, unit([*MODELS][1], request.param), tmp_path)
+    return partial(Instance, fmpy.extract(str(unit([*MODELS][1], request.param)), str(tmp_path)))
 
 
 def test_states_are_saved_restored_and_serialised(make_instance: Callable[[], Instance]) -> None:
