@@ -438,5 +438,5 @@ COMMANDS = {
                 help="show it in a web browser in this theme until Ctrl-C (the viewer's window has a setting for it)"),
          option("--headless", action="store_true", help="open no window (together with --screenshot)"),
          option("--screenshot", metavar="FILE.png",
-                help="draw without a display, check that every view shows its lines, and save the picture"))),
+                help="draw without a display, and save the picture"))),
 }

@@ -26,7 +26,7 @@ from fdi.trace.trace import MAIN, Floats, Trace
 from plant.signals import Signal, Signals
 from plant.units import UNITS
 from rig.network.node_objects import NAMES
-from rig.view.viewer import ShownView, import_rerun
+from rig.view.viewer import import_rerun
 
 TIMELINE = "run"
 # on black and on white
@@ -75,8 +75,8 @@ class LogText(NamedTuple):
 class Drawing(NamedTuple):
     """A recording for the viewer. Lanes of the group "check" have a view of their own, beside the plots.
 
-    `document` is a title with a text in Markdown, `shown` what a picture must show, `log` the texts of events and
-    checks, None where there are no such views.
+    `document` is a title with a text in Markdown, `log` the texts of events and checks, None where there are no such
+    views.
     """
 
     name: str
@@ -84,7 +84,6 @@ class Drawing(NamedTuple):
     lanes_title: str
     lanes: Sequence[Lane]
     document: tuple[str, str]
-    shown: Sequence[ShownView] = ()
     log: Sequence[LogText] | None = None
     verdict: str = ""
 
@@ -237,9 +236,7 @@ PHASES = {"set-up": NEUTRAL, "main": MEASURED, "clean-up": NEUTRAL}
 SECTIONS = {"hold": NEUTRAL, "step": MEASURED, "ramp": 0x2A8C82FF, "dynamic": 0x8E5BBFFF}
 ACTIVE = {"active": FAIL}  # state of a fault
 VALUE = 0x2B3138FF  # of the words beside the window of a check
-LEVEL_COLOURS = (0x00DA7EFF, 0xAB0115FF)  # the viewer's colours of INFO and ERROR; WARN's stands in its menu too
 LANES = "Faults, nodes, run"  # title of a view that is no plot
-LIMITS = "limits"  # no view: the lines of the limits in all plots, of which some may lie behind a signal
 LIMITS_OF = {"never_exceeds", "max_error"}  # kinds of check whose limits are limits of the plotted line
 
 
@@ -290,15 +287,8 @@ def draw_run(trace: Trace) -> Drawing:
     plots = [plot._replace(curves=[*plot.curves, *_list_limits(plot.origin, trace.checks, layout)])
              for plot in draw_signals(list_columns(trace), layout)]
     facts = "\n".join(f"- {key}: {value}" for key, value in trace.provenance.items())
-    log = _list_texts(trace)
-    lanes = {PASS, *SECTIONS.values(), *STATES.values(), *VERDICTS.values()}
-    shown = [*(ShownView(plot.title, tuple(curve.colour for curve in plot.curves if curve.colour != LIMIT))
-               for plot in plots),
-             ShownView(LANES, tuple(lanes), is_lanes=True),
-             *([ShownView(TEXTS, LEVEL_COLOURS, 40)] if log else []),  # one level in the list of events has some 60
-             ShownView(LIMITS, (LIMIT,), 0)]
     name = trace.provenance.get("sequence", trace.provenance.get("source", "trace"))
-    return Drawing(name, plots, LANES, [*_list_lanes(trace)], ("Provenance", facts), shown, log)
+    return Drawing(name, plots, LANES, [*_list_lanes(trace)], ("Provenance", facts), _list_texts(trace))
 
 
 def list_columns(trace: Trace) -> dict[str, tuple[Floats, Floats]]:
@@ -444,7 +434,6 @@ def format_document(report: Report) -> str:
 
 REFERENCE, NOISE = COMMAND, 0x7FD46BFF
 COLOURS = (0xE8A33DFF, 0xD96BA0FF, 0x45B8ACFF, 0xB57EDCFF, 0x3D8FE0FF)  # of the runs after the first, in rotation
-SIGNALS, RUN_LANES = "signals and differences", "Runs"  # the first is all plots together
 
 
 def draw_runs(found: RunDifferences) -> Drawing:
@@ -455,12 +444,8 @@ def draw_runs(found: RunDifferences) -> Drawing:
         plots += [Plot(name, label_signal(signal), _draw_signal(found, name, signal.shown_scale)),
                   Plot(f"difference_{name}", f"{signal.symbol} minus that of A [{unit}]",
                        _draw_difference(found, name, 1.0 / size))]
-    # a run has one colour in all plots, so they are counted together
-    colours = {curve.colour for plot in plots for curve in plot.curves} - {NOISE, REFERENCE}
-    lanes = {PASS, NEUTRAL, *SECTIONS.values(), *VERDICTS.values()}
-    views = [ShownView(SIGNALS, tuple(colours)), ShownView(RUN_LANES, tuple(lanes), is_lanes=True)]
-    return Drawing(join_words([run.source for run in found.runs]), plots, RUN_LANES, [*_list_lanes_of_runs(found)],
-                   ("Result", format_document(build_diff_report(found))), views, verdict=found.verdict)
+    return Drawing(join_words([run.source for run in found.runs]), plots, "Runs", [*_list_lanes_of_runs(found)],
+                   ("Result", format_document(build_diff_report(found))), verdict=found.verdict)
 
 
 def _draw_signal(found: RunDifferences, name: str, scale: float) -> list[Curve]:
@@ -506,10 +491,8 @@ def _list_lanes_of_runs(found: RunDifferences) -> Iterator[Lane]:
 
 
 BEFORE, FLOOR = 0xE5534BFF, MEASURED
-# each plot has a colour of its own, so that a picture shows which one is empty
 MODELS = (0xE8A33DFF, 0x45B8ACFF, 0xD96BA0FF, 0x9ACD5BFF, 0x6FA8DCFF)
 RESIDUALS = (0xC2A83EFF, 0x7FD46BFF, 0xB57EDCFF, 0x5FAF8FFF, 0x8FA3D9FF)
-COMMAND_AND_ERROR = "Command and error"
 NOT_JUDGED = "not judged"
 
 
@@ -518,14 +501,11 @@ def draw_comparison(c: Comparison, before: Comparison | None) -> Drawing:
     models = ([("before", before)] if before else []) + [("model", c)]
     plots = [draw(name, [(word, found) for word, found in models if name in found.signals])
              for name in c.signals for draw in (_draw_replay, _draw_residual)]
-    own = {*MODELS, *RESIDUALS}
-    shown = [*(ShownView(plot.title, tuple({curve.colour for curve in plot.curves} & own)) for plot in plots),
-             ShownView(COMMAND_AND_ERROR, (PASS, FAIL, *SECTIONS.values()), is_lanes=True)]
     lanes = [make_command_lane(c.trace, "run", 0.0), *(_make_error_lane(word, found) for word, found in models),
              *_list_left_out(c)]
     was = f"\n\nBefore the change:\n\n{format_document(build_comparison_report(before))}" if before else ""
     text = format_document(build_comparison_report(c)) + was
-    return Drawing(f"{c.source}, {c.model.name}", plots, COMMAND_AND_ERROR, lanes, ("Result", text), shown,
+    return Drawing(f"{c.source}, {c.model.name}", plots, "Command and error", lanes, ("Result", text),
                    verdict=c.verdict)
 
 

@@ -38,8 +38,8 @@ def run_command(args: argparse.Namespace) -> int:
         data: dict[str, object] = {"rrd": str(rrd), **({"verdict": drawing.verdict} if drawing.verdict else {})}
         if args.screenshot:
             progress("the viewer draws the picture", 0.0)
-            pixels = viewer.take_screenshot(drawing.shown, rrd, Path(args.screenshot))
-            data |= {"screenshot": args.screenshot, "pixels": pixels}
+            viewer.take_screenshot(rrd, Path(args.screenshot))
+            data |= {"screenshot": args.screenshot}
         elif not (args.save or args.out or args.theme):
             progress("opening the viewer", 0.0)
             viewer.open_viewer(rrd)

@@ -14,10 +14,10 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 from recording_rows import Rows, read_names, read_recording
 from rig_command import answer, finished, refuse, started
 from short_runs import build_command
-from synthetic_run import record_run
 
 from fdi.comparison.compare import compare
 from fdi.comparison.run_differences import compare_runs
@@ -25,9 +25,8 @@ from fdi.report.numbers import format_ratio
 from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace.trace import Trace
 from plant import Model, simulate
-from plant.signals import EHA
 from rig.view import viewer
-from rig.view.recording import LANES, LIMITS, TEXTS, draw_run, list_plots, make_lane_path, write_recording
+from rig.view.recording import COMMAND, DRIVE, LIMIT, MEASURED, OUTPUTS, draw_run, make_lane_path, write_recording
 from rig.view.viewer import ViewerError
 
 REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"  # forbids skips
@@ -103,28 +102,19 @@ def test_recording_holds_every_event_and_check(trace: Trace, rows: dict[str, lis
 
 
 @needs_driver
-def test_headless_screenshot_shows_everything(trace: Trace, tmp_path: Path,
-                                              capsys: pytest.CaptureFixture[str]) -> None:
+def test_headless_screenshot_shows_lines_limits_and_lanes(trace: Trace, tmp_path: Path) -> None:
     write_recording(draw_run(trace), tmp_path / "view.rrd")
-    pixels = viewer.take_screenshot(draw_run(trace).shown, tmp_path / "view.rrd", tmp_path / "view.png")
-    assert {*pixels} == {*(title for origin, title in list_plots(EHA) if origin != "load"), LANES, TEXTS, LIMITS}
-    assert (tmp_path / "view.png").stat().st_size > 50_000
-    # of the limits at least the two lines of the position
-    assert pixels[LANES] > 20_000 and pixels[TEXTS] > 200 and pixels[LIMITS] > 600
-    with capsys.disabled():
-        print("\nviewer:", ", ".join(f"{name} {count} px" for name, count in pixels.items()))
+    viewer.take_screenshot(tmp_path / "view.rrd", tmp_path / "view.png")
+    shades = (imread(tmp_path / "view.png")[..., :3] * 255).astype(int)
+    for colour in (COMMAND, MEASURED, LIMIT, DRIVE, *OUTPUTS[1:3]):
+        channels = np.array([colour >> shift & 0xFF for shift in (24, 16, 8)])
+        assert (np.abs(shades - channels).max(axis=2) < 24).sum() > 500, f"{colour:08X}"
 
 
-@pytest.fixture(scope="module")
-def short_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record_run(tmp_path_factory.mktemp("run") / "trace.mcap", stop=1000).parent
-
-
-def test_viewer_that_cannot_draw_says_so(short_run: Path, tmp_path: Path) -> None:
+def test_viewer_that_cannot_draw_says_so(tmp_path: Path) -> None:
     (tmp_path / "x.rrd").write_bytes(b"")
-    shown = draw_run(Trace.read(short_run)).shown
     with pytest.raises(ViewerError, match="does not draw"):
-        viewer.take_screenshot(shown, tmp_path / "x.rrd", tmp_path / "x.png", patience=3)
+        viewer.take_screenshot(tmp_path / "x.rrd", tmp_path / "x.png", patience=3)
 
 
 def test_without_a_display_one_line_says_so_and_the_viewer_listens_on_this_machine_only(
