@@ -16,7 +16,8 @@ from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 
 INVALID = 1 << 31  # in a COB-ID: the PDO is switched off
 LONG = 1 << 29  # in a COB-ID: the identifier has 29 bits
-RPDO, TPDO, MAPPING = 0x1400, 0x1800, 0x200
+RPDO, TPDO, MAPPING = 0x1400, 0x1800, 0x200  # communication parameters; the mapping is MAPPING further on
+PARAMETERS = frozenset((*range(RPDO, RPDO + MAPPING), *range(TPDO, TPDO + MAPPING)))
 _LONGEST = 64  # bits of a PDO
 _EVENT = (254, 255)  # transmission types
 _KINDS = {datatypes.BOOLEAN: Kind.UNSIGNED, datatypes.REAL32: Kind.FLOAT, datatypes.REAL64: Kind.FLOAT,
@@ -64,7 +65,7 @@ def name_object(index: int, sub: int) -> str:
     return f"0x{index:04X}:{sub}" if sub else f"0x{index:04X}"
 
 
-@cache  # bench, master and conformance tests ask for the same, and nobody changes it; to read it takes some ms
+@cache  # bench, master, nodes and conformance tests ask for the same, and nobody changes it; to read it takes some ms
 def read_dictionary(name: str, text: str, node: int) -> Any:
     """The object dictionary of an EDS or DCF for a node-ID, as canopen reads it.
 
@@ -81,7 +82,7 @@ def read_dictionary(name: str, text: str, node: int) -> Any:
     own = read_node(text)
     require(own in (None, node), name, "NodeID", f"{node}, the node of the bench file, not {own}")
     if own is None and not name.lower().endswith(".dcf"):
-        for variable in _list_variables(dictionary):
+        for variable in list_variables(dictionary):
             variable.value = None  # in an EDS it is a slip of its tool: the device is not to be configured so
     return dictionary
 
@@ -249,7 +250,7 @@ def list_values(dictionary: Any) -> tuple[tuple[int, int, bytes], ...]:
     its COB-ID (CiA 301, 7.5.2.36).
     """
     given: dict[tuple[int, int], bytes] = {}
-    for variable in _list_variables(dictionary):
+    for variable in list_variables(dictionary):
         if variable.value is not None and variable.writable and variable.index >= 0x1000:
             try:
                 given[variable.index, variable.subindex] = variable.encode_raw(variable.value)
@@ -272,7 +273,8 @@ def list_values(dictionary: Any) -> tuple[tuple[int, int, bytes], ...]:
     return tuple(ordered)
 
 
-def _list_variables(dictionary: Any) -> Iterator[ODVariable]:
+def list_variables(dictionary: Any) -> Iterator[ODVariable]:
+    """All variables of a dictionary, in order."""
     for index in sorted(dictionary):
         item = dictionary[index]
         if isinstance(item, ODVariable):

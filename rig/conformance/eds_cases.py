@@ -6,11 +6,10 @@ from itertools import combinations
 from canopen.objectdictionary import datatypes
 from canopen.objectdictionary.datatypes import UNSIGNED8, UNSIGNED16, UNSIGNED32, VISIBLE_STRING
 
+from rig.benches.canopen_map import INVALID, PARAMETERS
 from rig.conformance.pdo_cases import describe_mapping, split_entry
 from rig.conformance.target import (
     HISTORY,
-    INVALID,
-    PDO_PARAMETERS,
     SIZES,
     Case,
     CaseFailed,
@@ -129,7 +128,7 @@ def check_type(t: Target, variable: Variable) -> None:
 def find_standard(variable: Variable) -> tuple[int, str]:
     """Type and access that CiA 301 gives this variable, (0, "") if it gives none."""
     index, sub = variable.key
-    if index in PDO_PARAMETERS and sub in PDO_TYPES:
+    if index in PARAMETERS and sub in PDO_TYPES:
         return PDO_TYPES[sub], "rw ro const"
     if variable.is_mapping:
         return (UNSIGNED32 if sub else UNSIGNED8), "rw ro const"

@@ -186,13 +186,6 @@ def check_name(t: Target, index: int) -> str:
     return data.decode("ascii")
 
 
-def check_error_register(t: Target) -> str:
-    """A node that is in error from the start cannot be judged further on."""
-    register = t.read(0x1001)
-    require(register == 0, f"0x{register:02X}")
-    return "0x00"
-
-
 CASES = (
     Case("2.1", "every object can be read", "7.2.4.2", "an upload of each readable object is answered with its value",
          for_each(list_readable, check_readable, "object", "{} read")),
@@ -230,6 +223,4 @@ CASES = (
     Case("2.14", "device name and versions", "7.5.2.8 to 7.5.2.10",
          "0x1008, 0x1009 and 0x100A are texts of printable characters",
          for_each(lambda t: [index for index in (0x1008, 0x1009, 0x100A) if t.sheet.find(index)], check_name)),
-    Case("2.15", "error register", "7.5.2.2", "0x1001 is 0 after a reset: the node reports no error",
-         check_error_register),
 )

@@ -4,10 +4,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
+from rig.benches.canopen_map import INVALID
 from rig.conformance.target import (
     CANNOT_MAP,
     COMMANDS,
-    INVALID,
     NO_OBJECT,
     OPERATIONAL,
     PDO_TOO_LONG,

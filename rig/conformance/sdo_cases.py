@@ -9,7 +9,6 @@ from canopen.objectdictionary.datatypes import DOMAIN
 from rig.conformance.object_cases import read_values
 from rig.conformance.target import (
     COMMAND,
-    HEAD,
     TIMED_OUT,
     TOGGLE,
     TOO_LONG,
@@ -22,11 +21,11 @@ from rig.conformance.target import (
     for_each,
     format_abort,
     join_labels,
-    pack_segment,
     require,
     require_abort,
     require_applicable,
 )
+from rig.network.sdo_client import ABORT, HEAD, pack_segment
 
 Change = tuple[str, Callable[[bytes], bytes]]  # what is done to the data of a download
 READ_TYPE = HEAD.pack(0x40, 0x1000, 0) + bytes(4)
@@ -68,7 +67,7 @@ def check_segmented_download(t: Target) -> str:
     if variable is None:
         variable = find_harmless(t)
         require_abort(begin_download(t, variable, variable.size), (0,), "the transfer was refused")
-        t.send(t.request_id, HEAD.pack(0x80, *variable.key) + bytes(4))
+        t.send(t.request_id, HEAD.pack(ABORT, *variable.key) + bytes(4))
     data = t.upload(*variable.key)
     t.download(*variable.key, data, segmented=True)
     t.require_value(variable, data, "holds another value then")
@@ -109,7 +108,7 @@ def check_block_transfer(t: Target, request: tuple[str, bytes]) -> str:
     what, frame = request
     code = t.try_demand(frame)
     if not code:
-        t.send(t.request_id, HEAD.pack(0x80, *HEAD.unpack_from(frame)[1:]) + bytes(4))
+        t.send(t.request_id, HEAD.pack(ABORT, *HEAD.unpack_from(frame)[1:]) + bytes(4))
         t.wait(0.01)
     require_abort(code, (0, COMMAND), f"block {what}")
     t.upload(0x1000)  # normal requests are still answered
@@ -119,7 +118,7 @@ def check_block_transfer(t: Target, request: tuple[str, bytes]) -> str:
 def check_client_abort(t: Target) -> str:
     """In the middle of an upload."""
     variable, _ = begin_upload(t)
-    answer = t.ask(HEAD.pack(0x80, *variable.key) + (0x08000000).to_bytes(4, "little"), 0.1)
+    answer = t.ask(HEAD.pack(ABORT, *variable.key) + (0x08000000).to_bytes(4, "little"), 0.1)
     require(answer is None, f"an abort was answered with {(answer or b'').hex(' ')}")
     return "no answer; the next segment: " + require_abort(t.try_demand(b"\x60"), (COMMAND,), "the next segment")
 
@@ -171,7 +170,7 @@ def check_abort_object(t: Target, key: tuple[int, int]) -> str:
     label = f"0x{key[0]:04X}:{key[1]:X}"
     require(t.try_upload(*key), f"{label} was not refused")
     answer = t.heard(0, t.response_id)[-1].data
-    require(answer[:4] == HEAD.pack(0x80, *key), f"asked {label}: {answer.hex(' ')}")
+    require(answer[:4] == HEAD.pack(ABORT, *key), f"asked {label}: {answer.hex(' ')}")
     return label
 
 

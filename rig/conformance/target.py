@@ -1,23 +1,24 @@
 """A test case, the EDS of the node under test (CiA 306), and the node seen from the bus: frames, SDO by hand, NMT."""
 from __future__ import annotations
 
-import logging
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from configparser import Error as ConfigError, RawConfigParser
+from configparser import RawConfigParser
 from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
-import canopen
 from canopen.objectdictionary import ODVariable, datatypes
 
 from fdi.report.numbers import count_nouns
-from plant.errors import InputError
+from plant.tables import read_file
+from rig.benches.bench import decode_device_text
+from rig.benches.canopen_map import INVALID, MAPPING, PARAMETERS, RPDO, TPDO, list_variables, read_dictionary
 from rig.network.bus import Wire
 from rig.network.frame import Frame
 from rig.network.node_objects import NmtCommand, NmtState
+from rig.network.sdo_client import ABORT, SdoProblem, download_object, require_confirmation, upload_object
 
 Item = TypeVar("Item")
 CHAPTERS = {
@@ -155,8 +156,6 @@ WRITE_ONLY, READ_ONLY, NO_OBJECT, NO_SUB = 0x06010001, 0x06010002, 0x06020000, 0
 TOO_LONG, TOO_SHORT, WRONG_LENGTH = 0x06070012, 0x06070013, 0x06070010
 VALUE, TOO_HIGH, TOO_LOW, STATE, NO_DATA = 0x06090030, 0x06090031, 0x06090032, 0x08000022, 0x08000024
 CANNOT_MAP, PDO_TOO_LONG, INCOMPATIBLE = 0x06040041, 0x06040042, 0x06040043
-INVALID = 1 << 31  # in a COB-ID: the PDO or EMCY is off
-HEAD = struct.Struct("<BHB")
 
 
 class Options(NamedTuple):
@@ -282,43 +281,24 @@ class Target:
             raise CaseFailed(f"no response to {request.hex(' ')} within {self.options.timeout:g} s")
         if len(data) != 8:
             raise CaseFailed(f"a response of {len(data)} bytes to {request.hex(' ')}: {data.hex(' ')}")
-        if data[0] == 0x80:
+        if data[0] == ABORT:
             raise Refusal(int.from_bytes(data[4:], "little"), int.from_bytes(data[1:3], "little"), data[3])
         return data
 
     def upload(self, index: int, sub: int = 0) -> bytes:
         """Read an object. Raises Refusal; Problem for a malformed transfer."""
-        name = f"upload of 0x{index:04X}:{sub:X}"
-        response = self.demand(HEAD.pack(0x40, index, sub))
-        command = response[0]
-        require(command >> 5 == 2 and response[1:4] == HEAD.pack(command, index, sub)[1:],
-                f"{name} was answered with {response.hex(' ')}")
-        if command & 2:
-            return response[4:8 - (command >> 2 & 3 if command & 1 else 0)]
-        announced = int.from_bytes(response[4:], "little") if command & 1 else None
-        data, toggle, is_last = b"", 0, False
-        while not is_last:
-            response = self.demand(bytes((0x60 | toggle,)))
-            require(response[0] & 0xF0 == toggle, f"{name}: segment {response.hex(' ')}, expected toggle {toggle >> 4}")
-            data += response[1:8 - (response[0] >> 1 & 7)]
-            toggle ^= 0x10
-            is_last = bool(response[0] & 1)
-            require(len(data) <= (1 << 24 if announced is None else announced), f"{name}: more bytes than announced")
-        require(announced in (None, len(data)), f"{name}: {len(data)} bytes came, {announced} were announced")
-        return data
+        with name_problem(f"upload of 0x{index:04X}:{sub:X}"):
+            return upload_object(self._exchange, index, sub)[0]
 
     def download(self, index: int, sub: int, data: bytes, segmented: bool = False) -> None:
         """Write an object. Raises Refusal; Problem for a malformed transfer."""
-        name, size = f"download to 0x{index:04X}:{sub:X}", len(data)
-        is_expedited = 0 < size <= 4 and not segmented
-        response = self.demand(HEAD.pack(0x23 | (4 - size) << 2, index, sub) + data if is_expedited else
-                               HEAD.pack(0x21, index, sub) + size.to_bytes(4, "little"))
-        require(response[:4] == HEAD.pack(0x60, index, sub), f"{name} was answered with {response.hex(' ')}")
-        toggle = 0
-        for start in range(0, 0 if is_expedited else max(size, 1), 7):
-            response = self.demand(pack_segment(data[start:start + 7], start + 7 >= size, toggle))
-            require(response[0] == 0x20 | toggle, f"{name}: a segment was answered with {response.hex(' ')}")
-            toggle ^= 0x10
+        with name_problem(f"download to 0x{index:04X}:{sub:X}"):
+            download_object(self._exchange, index, sub, data, segmented)
+
+    def _exchange(self, request: bytes) -> bytes:
+        response = self.demand(request)
+        require_confirmation(request, response)
+        return response
 
     def read(self, index: int, sub: int = 0) -> int:
         """An unsigned integer object. Raises Refusal, Problem."""
@@ -460,9 +440,13 @@ def require_abort(code: int, accepted: Sequence[int], what: str = "") -> str:
     return text
 
 
-def pack_segment(part: bytes, is_last: bool, toggle: int = 0) -> bytes:
-    """A segment of a download with up to 7 bytes."""
-    return bytes((toggle | (7 - len(part)) << 1 | is_last,)) + part.ljust(7, b"\0")
+@contextmanager
+def name_problem(transfer: str) -> Iterator[None]:
+    """Raises Problem, which names the transfer, for one that is malformed."""
+    try:
+        yield
+    except SdoProblem as problem:
+        raise Problem(f"{transfer}: {problem}") from None
 
 
 def read_error_code(frame: Frame) -> int:
@@ -474,7 +458,6 @@ Number = int | float
 SIZES = {data_type: each.size for data_type, each in ODVariable.STRUCT_TYPES.items()} | {
     datatypes.TIME_OF_DAY: 6, datatypes.TIME_DIFFERENCE: 6}  # data type (CiA 301, table 44) -> bytes
 FLOATS = {datatypes.REAL32: "<f", datatypes.REAL64: "<d"}
-RPDO, TPDO, MAPPING = 0x1400, 0x1800, 0x200  # communication parameters; the mapping is MAPPING further on
 HISTORY = 0x1003
 # Objects that start something when they are written: store, restore, verify, commands, programs, network management.
 _ACTIVE = (range(0x1010, 0x1012), range(0x1020, 0x1029), range(0x1F00, 0x2000))
@@ -533,12 +516,12 @@ class Variable(NamedTuple):
     @property
     def has_valid_bit(self) -> bool:
         """Whether it is a COB-ID that bit 31 switches off: of a PDO or of EMCY."""
-        return self.key == (0x1014, 0) or (self.index in PDO_PARAMETERS and self.sub == 1)
+        return self.key == (0x1014, 0) or (self.index in PARAMETERS and self.sub == 1)
 
     @property
     def is_mapping(self) -> bool:
         """Whether it belongs to the mapping of a PDO."""
-        return self.index - MAPPING in PDO_PARAMETERS
+        return self.index - MAPPING in PARAMETERS
 
     def is_inside(self, value: Number) -> bool:
         """Whether a value keeps to its limits."""
@@ -592,9 +575,6 @@ class Variable(NamedTuple):
         return self.default if isinstance(self.default, bytes) else self.encode(self.default)
 
 
-PDO_PARAMETERS = frozenset((*range(RPDO, RPDO + MAPPING), *range(TPDO, TPDO + MAPPING)))
-
-
 class Pdo(NamedTuple):
     """One PDO that the EDS describes."""
 
@@ -612,26 +592,17 @@ class DataSheet:
 
     def __init__(self, path: Path, node: int) -> None:
         self.path, self.node = path, node
+        text = decode_device_text(read_file(path))
+        od = read_dictionary(str(path), text, node)
         self.text = RawConfigParser(inline_comment_prefixes=(";",))
         self.text.optionxform = str  # type: ignore[assignment, method-assign]
-        warnings = logging.getLogger("canopen.objectdictionary.eds")
-        warnings.disabled = True  # test 1.1 says what it would warn of
-        try:
-            with path.open(encoding="latin-1") as file:
-                self.text.read_file(file)
-            od: Any = canopen.import_od(str(path), node)
-        except (OSError, ValueError, KeyError, TypeError, ConfigError) as error:
-            logging.getLogger(__name__).debug("EDS %s", path, exc_info=True)
-            raise InputError(path, "", f"an electronic data sheet (CiA 306): {error}".replace("\n", " ")) from None
-        finally:
-            warnings.disabled = False
-        self.objects: dict[int, list[Variable]] = {
-            index: [_read_variable(each) for each in ([od[index]] if isinstance(od[index], ODVariable)
-                                                      else [od[index][sub] for sub in sorted(od[index])])]
-            for index in sorted(od) if index >= 0x1000}
-        self.variables = [variable for each in self.objects.values() for variable in each]
-        if not self.variables:
-            raise InputError(path, "", "an electronic data sheet (CiA 306) with objects")
+        self.text.read_string(text)
+        self.objects: dict[int, list[Variable]] = {}
+        self.variables = [Variable(each.index, each.subindex, each.data_type or 0, (each.access_type or "").lower(),
+                                   each.default, each.min, each.max, bool(each.pdo_mappable))
+                          for each in list_variables(od) if each.index >= 0x1000]
+        for variable in self.variables:
+            self.objects.setdefault(variable.index, []).append(variable)
         self._by_key = {variable.key: variable for variable in self.variables}
         self.pdos = [Pdo(f"{kind}{index - base + 1}", kind == "TPDO", index, index + MAPPING)
                      for kind, base in (("RPDO", RPDO), ("TPDO", TPDO))
@@ -660,11 +631,6 @@ class DataSheet:
     def name(self) -> str:
         """The product, as the EDS names it."""
         return self.text.get("DeviceInfo", "ProductName", fallback="").strip() or self.path.name
-
-
-def _read_variable(each: ODVariable) -> Variable:
-    return Variable(each.index, each.subindex, each.data_type or 0, (each.access_type or "").lower(), each.default,
-                    each.min, each.max, bool(each.pdo_mappable))
 
 
 _RESTRICTED = (

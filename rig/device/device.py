@@ -3,10 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from rig.benches.canopen_map import PARAMETERS
 from rig.device.dictionary import Dictionary, Value, check_consumer_entry, check_switchable, check_sync
 from rig.device.emcy import HISTORY, Emcy, EmcyCode, ErrorRegister
 from rig.device.nmt import Nmt
-from rig.device.pdo import PARAMETERS, Pdos
+from rig.device.pdo import Pdos
 from rig.device.sdo import Abort, SdoAbort, SdoServer, abort_unless
 from rig.device.sync import SyncConsumer
 from rig.network.frame import Frame, Send

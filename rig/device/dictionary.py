@@ -1,15 +1,15 @@
 """Object dictionary: the entries of an EDS (CiA 306) and their values in use."""
 
-import logging
 import struct
-from configparser import Error as ConfigError
 from pathlib import Path
 from typing import NamedTuple, cast
 
-import canopen
 from canopen.objectdictionary import ODVariable, datatypes
 
 from plant.errors import InputError
+from plant.tables import read_file
+from rig.benches.bench import decode_device_text
+from rig.benches.canopen_map import list_variables, read_dictionary
 from rig.device.sdo import Abort, SdoAbort, abort_unless
 
 Value = int | float | bytes
@@ -98,18 +98,8 @@ class Dictionary:
 
 def _load(path: Path, node_id: int) -> dict[tuple[int, int], Entry]:
     """Read the EDS. Raises InputError if it cannot be read or holds a type this core does not know."""
-    try:
-        od = canopen.import_od(str(path), node_id)
-    except (OSError, ValueError, KeyError, ConfigError) as error:
-        logging.getLogger(__name__).debug("EDS %s", path, exc_info=True)
-        raise InputError(path, "", f"an electronic data sheet (CiA 306): {error}".replace("\n", " ")) from None
-    variables = [
-        variable
-        for item in od.values()
-        for variable in ([item] if isinstance(item, ODVariable) else item.values())
-        if item.index >= 0x1000  # below: the dummy types
-    ]
-    return {(variable.index, variable.subindex): _entry(path, variable) for variable in variables}
+    od = read_dictionary(str(path), decode_device_text(read_file(path)), node_id)
+    return {(each.index, each.subindex): _entry(path, each) for each in list_variables(od) if each.index >= 0x1000}
 
 
 def _entry(path: Path, variable: ODVariable) -> Entry:

@@ -7,13 +7,12 @@ import struct
 from collections.abc import Callable
 
 from plant.errors import InputError, require
+from rig.benches.canopen_map import MAPPING, RPDO, TPDO
 from rig.device.dictionary import INVALID, Dictionary, check_switchable
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
 from rig.device.sdo import Abort, abort_unless
 from rig.network.frame import Frame, Send
 
-RPDO, TPDO, MAPPING = 0x1400, 0x1800, 0x200  # communication parameters; the mapping is MAPPING further on
-PARAMETERS = frozenset((*range(RPDO, RPDO + MAPPING), *range(TPDO, TPDO + MAPPING)))
 _LAST_SYNCHRONOUS = 240
 _EVENT_DRIVEN = (254, 255)
 

@@ -97,7 +97,7 @@ def test_times_that_could_not_be_measured_make_the_timing_invalid() -> None:
     (["firmware"], "rig conformance: NODE: firmware: expected a node-ID"),
     (["5"], "--eds: expected the electronic data sheet of node 5"),
     (["5", "--eds", EDS[2]], "--bus: embedded: expected a bus that the node is on"),
-    (["plant", "--eds", "none.eds"], "none.eds: expected an electronic data sheet"),
+    (["plant", "--eds", "none.eds"], "none.eds: expected a file that can be read"),
     (["plant", "--chapter", "9"], "--chapter: 9: expected the number of a chapter"),
     (["plant", "--junit", "x.txt"], "--junit: x.txt: expected FILE.xml"),
     (["plant", "--tolerance", "nan"], "--tolerance: nan: expected a number from 0"),

@@ -9,8 +9,9 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from rig.benches.bench_file import load_bench
 from rig.network.bus import EmbeddedWire
 from rig.network.frame import Frame, Send, VirtualClock
-from rig.network.master import CheckedSdoClient, ConfirmationError, Master, repeat_transfer
+from rig.network.master import Master
 from rig.network.node_objects import PLANT
+from rig.network.sdo_client import CheckedSdoClient, ConfirmationError, repeat_transfer
 
 Script = Sequence[str | None]
 
