@@ -34,16 +34,15 @@ from plant.solve import run_closed_loop
 from rig.benches.bench import Role
 from rig.benches.bench_file import load_bench
 from rig.firmware.build import build_device
-from rig.network.bus import Link, LinkWire, can_open, open_can, serve_node
+from rig.network.bus import Link, LinkWire, can_open, open_can
 from rig.network.frame import WallClock
 from rig.network.master import Master
 from rig.network.raw_bus import RawBus
-from rig.nodes.emulator import Emulator
 from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.bring_up import open_loop
 from rig.run.hard_loop import compile_cycle
-from rig.run.loop import CycleInput, CycleLoop, History, Loop
+from rig.run.loop import CycleInput, History
 from rig.run.priority import (
     LOOP_PRIORITY,
     compute_percentiles,
@@ -189,12 +188,6 @@ def _pack(bus: str, cob_id: int) -> bytes:
     return cob_id.to_bytes(4, sys.byteorder) + bytes([8, 0, 0, 0]) + _PAYLOAD  # struct can_frame
 
 
-def run_emulator(bus: str, is_compiled: bool) -> AbstractContextManager[Peer]:
-    """Run the plant emulator on a bus while the context lasts."""
-    module = ["rig.cli.main", "node", "plant", "--quiet", "--bus"] if is_compiled else ["rig.bench.benchmarks"]
-    return _run_process([sys.executable, "-m", *module, bus])
-
-
 @contextlib.contextmanager
 def _run_process(words: list[str], *descriptors: int) -> Iterator[Peer]:
     process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, pass_fds=descriptors)
@@ -205,15 +198,7 @@ def _run_process(words: list[str], *descriptors: int) -> Iterator[Peer]:
         process.communicate()
 
 
-def serve_python_emulator(bus: str) -> None:
-    """Run the plant emulator on a bus until the process is ended."""
-    clock = WallClock()
-    link = Link(open_can(bus), clock.now)
-    with raise_priority():
-        serve_node(Emulator(link.send), link, clock, lambda: False)
-
-
-CYCLICTEST, COMPILED, IN_C, PYTHON = "cyclictest", "compiled", "C", "Python"
+CYCLICTEST, COMPILED, IN_C = "cyclictest", "compiled", "C"
 MAPPED = {"CiA 402": "cia402_drive", "plain CAN": "can_ecu"}  # foreign controllers: folders of examples/
 _QUANTITIES = ("lateness", "feedback_response", "valve_response", "execution")
 _SETTLING = 100  # cycles at the beginning of a block that are not counted
@@ -236,36 +221,33 @@ def list_contenders(bus: str) -> dict[str, Callable[[float], Times]]:
     def measure_cyclictest(seconds: float) -> Times:
         return {"lateness": run_cyclictest(seconds, choose_priority(), list_cpus()[-1])}
 
-    def measure_cycle(seconds: float, run_peer: Callable[[], AbstractContextManager[Peer | None]], **options: Any
-                      ) -> Times:
+    def measure_cycle(seconds: float, run_peer: Callable[[], AbstractContextManager[Peer | None]],
+                      bench: Path | None = None) -> Times:
         with run_peer() as peer:
-            return play_block(bus, seconds, peer, **options)
+            return play_block(bus, seconds, peer, bench)
 
     def run_example(folder: Path) -> AbstractContextManager[Peer]:
         return _run_process([str(build_device(folder)), bus])
 
+    emulator = [sys.executable, "-m", "rig.cli.main", "node", "plant", "--quiet", "--bus", bus]
     examples = Path(__file__).parents[2] / "examples"  # of a checkout
     rows: list[tuple[str, object, Callable[[float], Times]]] = [
         (CYCLICTEST, find_cyclictest(), measure_cyclictest),
-        (COMPILED, True, partial(measure_cycle, run_peer=partial(run_emulator, bus, is_compiled=True))),
+        (COMPILED, True, partial(measure_cycle, run_peer=partial(_run_process, emulator))),
         (IN_C, find_gcc(), partial(measure_cycle, run_peer=partial(run_c_responder, bus))),
-        (PYTHON, True, partial(measure_cycle, run_peer=partial(run_emulator, bus, is_compiled=False),
-                               is_compiled=False)),
         *((name, find_gcc() and (examples / folder).is_dir(), partial(
             measure_cycle, run_peer=partial(run_example, examples / folder), bench=examples / folder / "bench.toml"))
           for name, folder in MAPPED.items())]
     return {name: measure for name, is_there, measure in rows if is_there}
 
 
-def play_block(bus: str, seconds: float, peer: Peer | None = None, is_compiled: bool = True,
-               bench: Path | None = None) -> Times:
+def play_block(bus: str, seconds: float, peer: Peer | None = None, bench: Path | None = None) -> Times:
     """Times of the rig's cycle of 1 ms on a bus, with its log, without the first cycles; NaN where no answer came.
 
     Args:
         bus: where the cycle and its peer are.
         seconds: how long.
         peer: the process of a node that is to boot and to be started; None: nothing to start.
-        is_compiled: whether the cycle is compiled code.
         bench: the bench file of the peer, a foreign controller; None: the peer is the plant of the shipped bench.
 
     Raises:
@@ -289,10 +271,9 @@ def play_block(bus: str, seconds: float, peer: Peer | None = None, is_compiled: 
         log = _Log(history, recorder)
         plan = Plan(stop=0)
         scenario, faults = Scenario(Model(), plan), Schedule(plan)
-        loop: Loop = (open_loop(master, chosen, scenario, faults, log, bus, True) if is_compiled else
-                      CycleLoop(master, chosen, scenario, faults, log, True))
+        loop = open_loop(master, chosen, scenario, faults, log, bus, True)
         stack.callback(loop.close)
-        for right in (raise_priority(1 if is_compiled else LOOP_PRIORITY), lock_memory(), prevent_deep_sleep(),
+        for right in (raise_priority(1), lock_memory(), prevent_deep_sleep(),
                       suspend_garbage_collection()):  # as a run in real time takes them
             stack.enter_context(right)
         for _ in range(round(seconds * 1000)):
@@ -322,7 +303,6 @@ def summarise_contenders(times: Mapping[str, Times]) -> dict[str, Any]:
     tables: dict[str, dict[str, dict[str, float]]] = {
         quantity: {name: compute_percentiles(found[quantity]) for name, found in times.items() if quantity in found}
         for quantity in _QUANTITIES}
-    tables["execution"].pop(PYTHON, None)  # it is another quantity there: up to SYNC
     lost = {name: int(np.isnan(found["feedback_response"]).sum()) for name, found in times.items()
             if "feedback_response" in found}
     return {"times_us": tables, "lost": lost, "cycles": {name: len(found["lateness"]) for name, found in times.items()},
@@ -391,9 +371,8 @@ def parse_histogram(text: str) -> Floats:
 _OF_PLANT = {name: f"rig with its plant ({name} controller)" for name in MAPPED}
 _NAMES = {
     "lateness": {CYCLICTEST: "cyclictest", COMPILED: "rig, compiled cycle", IN_C: "rig, compiled cycle (C answers)",
-                 PYTHON: "rig, cycle in Python", **_OF_PLANT},
-    "feedback_response": {COMPILED: "plant emulator, compiled", IN_C: "responder in C",
-                          PYTHON: "plant emulator in Python"},
+                 **_OF_PLANT},
+    "feedback_response": {COMPILED: "plant emulator, compiled", IN_C: "responder in C"},
     "execution": {COMPILED: "rig, compiled cycle", IN_C: "rig, compiled cycle (C answers)", **_OF_PLANT},
 }
 _NAMES["valve_response"] = _NAMES["feedback_response"]
@@ -623,7 +602,3 @@ def _tabulate_accuracy(accuracy: Sequence[Mapping[str, float]]) -> list[Table]:
         (Column("friction on: RMS", "um", "right"), lambda row: f"{row['rms_friction']:.2f}"),
         (Column("max", "um", "right"), lambda row: f"{row['largest_friction']:.2f}"),
         caption="Error of XJ over the closed-loop preflight, against steps of 0.2 us.")]
-
-
-if __name__ == "__main__":
-    serve_python_emulator(sys.argv[1])
