@@ -6,7 +6,7 @@ packing.py, which hold the same.
 """
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, IntFlag
 from fractions import Fraction
@@ -186,38 +186,6 @@ class FrameSpec:
         return any(each.name in names for each in self.fields)
 
 
-_CODES = {(8, 0): "B", (8, 1): "b", (16, 0): "H", (16, 1): "h", (32, 0): "I", (32, 1): "i", (64, 0): "Q", (64, 1): "q",
-          (32, 2): "f", (64, 2): "d"}
-
-Writer = Callable[[Mapping[str, float], int, int], bytes]
-
-
-def make_writer(spec: FrameSpec) -> Writer:
-    """A function of values, cycle and count of frames sent that packs a frame; a fast one as in `make_reader`."""
-    code = _find_code(spec)
-    if code is None:
-        return lambda values, cycle, count: pack(spec, {**values, "cycle": cycle}, count)
-    write, fields = struct.Struct(code.upper().replace("F", "I").replace("D", "Q")).pack, spec.fields
-    return lambda values, cycle, count: write(*[_choose_bits(each, values, cycle) for each in fields])
-
-
-def _choose_bits(each: Field, values: Mapping[str, float], cycle: int) -> int:
-    if each.fixed is not None:
-        return each.fixed
-    return each.wrap_number(cycle) if each.name == "cycle" else each.encode(values.get(each.name, 0.0))
-
-
-def _find_code(spec: FrameSpec) -> str | None:
-    """Format of `struct` for a frame whose values are whole bytes, little endian and in order; None for another."""
-    code, place = "<", 0
-    for each in spec.fields:
-        letter = _CODES.get((each.length, int(each.kind)))
-        if letter is None or each.is_big_endian or each.lowest != place or each.guard is not Guard.NONE:
-            return None
-        code, place = code + letter, place + each.length
-    return code if place == 8 * spec.length else None
-
-
 def check_guards(spec: FrameSpec, data: bytes, last: int) -> tuple[str, int]:
     """What is wrong with checksum and alive counter of a frame, and its counter.
 
@@ -235,17 +203,6 @@ def check_guards(spec: FrameSpec, data: bytes, last: int) -> tuple[str, int]:
     if counter is None or last < 0 or number == (last + 1) % counter.modulus:
         return "", number
     return "repeated" if number == last else "jump", number
-
-
-def make_reader(spec: FrameSpec) -> Callable[[bytes], dict[str, float]]:
-    """A function like `unpack` for one frame; a fast one where its values are whole bytes, little endian, in order."""
-    code = _find_code(spec)
-    if code is None:
-        return lambda data: unpack(spec, data)
-    rows = [(each.name, each.count.numerator, each.count.denominator, float(each.offset)) for each in spec.fields]
-    read = struct.Struct(code).unpack
-    return lambda data: {name: counts * high / low + offset
-                         for counts, (name, high, low, offset) in zip(read(data), rows, strict=True)}
 
 
 def locate_bits(each: Field, length: int) -> tuple[str, int]:
@@ -343,11 +300,15 @@ def pack(spec: FrameSpec, values: Mapping[str, float], counter: int = 0) -> byte
 
     data = bytes(spec.length)
     for each in spec.fields:
-        if each.guard is Guard.NONE:
-            data = insert_bits(each, data, _choose_bits(each, values, int(values.get("cycle", 0.0))))
+        if each.fixed is not None:
+            data = insert_bits(each, data, each.fixed)
         elif each.guard is Guard.COUNTER:
             counter %= each.modulus
             data = insert_bits(each, data, counter)
+        elif each.name == "cycle":
+            data = insert_bits(each, data, int(values.get("cycle", 0)))
+        elif each.guard is Guard.NONE:
+            data = insert_bits(each, data, each.encode(values.get(each.name, 0.0)))
     for each in spec.fields:
         if each.guard is Guard.CHECKSUM:  # over all else
             data = insert_bits(each, data, compute_checksum(each, data, counter))

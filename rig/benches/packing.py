@@ -74,8 +74,7 @@ def find_frame(m: Layout, identifier: int) -> int:
 def pack_frame(m: Layout, at: int, cycle: int) -> None:
     """Write the payload of the frame at `at` from the values, which become what the receiver will read."""
     words = m.words
-    for i in range(8):
-        words[PAYLOAD + i] = 0
+    words[PAYLOAD:PAYLOAD + 8] = 0
     checksum, number = -1, words[at + COUNT]
     for field in range(words[at + _FIRST], words[at + _END], _FIELD_WORDS):
         rule = words[field + _RULE]

@@ -402,23 +402,13 @@ class Wire(ABC):
 
 
 class EmbeddedWire(Wire):
-    """All nodes in this process and thread. With a virtual clock a run repeats bit for bit."""
+    """All nodes in this process and thread, on a `bus`. With a virtual clock a run repeats bit for bit."""
 
     def __init__(self, clock: Clock, makers: Sequence[Callable[[Send], Node]], period_ns: int = MS) -> None:
         super().__init__()
-        self.clock, self._period = clock, period_ns
-        self._bus = EmbeddedBus()
-        self.send = self._bus.attach(lambda frame: self.receive(frame))
-        self.nodes = [self._bus.add(make) for make in makers]
-
-    def deliver(self, t_ns: int) -> None:
-        """Deliver the frames that wait; no timer runs."""
-        self._bus.deliver(t_ns)
-
-    @property
-    def is_idle(self) -> bool:
-        """Whether no frame waits to be delivered."""
-        return self._bus.is_empty
+        self.clock, self._period, self.bus = clock, period_ns, EmbeddedBus()
+        self.send = self.bus.attach(lambda frame: self.receive(frame))
+        self.nodes = [self.bus.add(make) for make in makers]
 
     def wait(self, done: Done, seconds: float) -> bool:
         """See `Wire`; the time waited is the clock's."""
@@ -446,10 +436,10 @@ class EmbeddedWire(Wire):
 
     def _deliver(self, t_ns: int) -> None:
         """Deliver what is there, run the nodes' timers, deliver what came of them."""
-        self._bus.deliver(t_ns)
+        self.bus.deliver(t_ns)
         for node in self.nodes:
             node.tick(t_ns)
-        self._bus.deliver(t_ns)
+        self.bus.deliver(t_ns)
 
 
 class LinkWire(Wire):

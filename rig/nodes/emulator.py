@@ -5,21 +5,20 @@ the answer to cycle k acts from cycle k+1. All faults are loaded before the star
 bus time and begins exactly in the cycle that the sequence gives.
 """
 
-import heapq
 from collections.abc import Callable
-from typing import NamedTuple, Self, cast
+from functools import partial
+from typing import cast
 
 from plant import load_model
 from plant.errors import InputError, require
-from plant.signals import Signals
-from rig.benches.bench import Bench, CanopenNode, Flags, FrameSpec
+from rig.benches.bench import Bench, CanopenNode, Flags
 from rig.benches.bench_file import load_bench
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
 from rig.network import heartbeat
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import COUNTERS, PLANT, SCENARIO
 from rig.nodes.scenario import FaultyPlant, Scenario
-from rig.sequences.faults import DELAY, DOUBLE, Plan, apply_action
+from rig.sequences.faults import DOUBLE, LateFrames, Plan
 
 _NO_FLAGS = Flags(0)  # made once: an operation on an IntFlag takes a microsecond
 
@@ -38,57 +37,35 @@ def accept_scenario(device: Device, data: bytes, load: Callable[[Scenario], None
         raise SdoAbort(Abort.VALUE) from error
 
 
-class PlantPlace(NamedTuple):
-    """The plant node of a bench: its objects, the frames that it sends and the one that it awaits."""
+def find_plant_node(bench: Bench) -> CanopenNode:
+    """The plant node of a bench.
 
-    node: CanopenNode
-    sync: int
-    feedback: FrameSpec
-    valve_state: FrameSpec
-    drive: FrameSpec
-    most_missed: int  # drive frames in a row until the plant is not driven any more
-    signals: Signals  # of the plant
-    plant: str  # model of it
+    Raises:
+        InputError: the bench has none, or one that lacks a signal or frame of our emulator.
+    """
+    require(PLANT in bench.nodes, bench.name, "plant_node",
+            "a table with the plant as a node; the rig itself moves the plant of this bench")
+    node, roles = bench.nodes[PLANT], [role for each in bench.frames.frames for role in each.roles]
+    needed = ((("feedback", "valve_state", "drive"), roles),
+              ((*(s.word for s in bench.signals.outputs), "flags", "cycle"), node.outputs),
+              ((bench.signals.drive.word, "cycle"), node.inputs))
+    lacking = [word for words, known in needed for word in words if word not in known]
+    require(not lacking, bench.name, "plant_node", "frames of feedback and valve state, which carry all outputs of the "
+                                                   f"plant, flags and cycle, not one without {', '.join(lacking)}")
+    return node
 
-    @property
-    def frames(self) -> tuple[FrameSpec, FrameSpec, FrameSpec]:
-        """In the order of the compiled loop."""
-        return self.drive, self.feedback, self.valve_state
 
-    @classmethod
-    def find(cls, bench: Bench) -> Self:
-        """That of a bench.
+def make_scenario(bench: Bench) -> Scenario:
+    """The plant of a bench without faults and loads, for as long as no rig has sent another scenario."""
+    return Scenario(load_model(bench.plant), Plan(stop=0))
 
-        Raises:
-            InputError: the bench has none, or one that lacks a signal or frame of our emulator.
-        """
-        require(PLANT in bench.nodes, bench.name, "plant_node",
-                "a table with the plant as a node; the rig itself moves the plant of this bench")
-        readings, node = [s.word for s in bench.signals.outputs], bench.nodes[PLANT]
-        try:
-            found = cls(node, bench.frames.sync or 0, bench.frames.find_role("feedback"),
-                        bench.frames.find_role("valve_state"), bench.frames.drive, bench.most_missed, bench.signals,
-                        bench.plant)
-            for signals, known in (((*readings, "flags", "cycle"), node.outputs),
-                                   ((bench.signals.drive.word, "cycle"), node.inputs)):
-                for signal in signals:
-                    known[signal]
-        except (KeyError, StopIteration) as error:
-            raise InputError(bench.name, "plant_node", "a frame of feedback and one of valve state, which carry all "
-                             f"outputs of the plant, flags and cycle ({error})") from error
-        return found
 
-    def make_scenario(self) -> Scenario:
-        """The plant of the bench without faults and loads, for as long as no rig has sent another scenario."""
-        return Scenario(load_model(self.plant), Plan(stop=0))
-
-    def require_plant(self, scenario: Scenario) -> None:
-        """Refuse a scenario of a plant with other signals than those of the bench. Raises InputError."""
-        named = [(s.word, s.unit) for s in (*self.signals.outputs, self.signals.drive)]
-        own = scenario.model.kind.signals
-        if [(s.word, s.unit) for s in (*own.outputs, own.drive)] != named:
-            words = ", ".join(f"{word} ({unit})" for word, unit in named)
-            raise InputError("--model", scenario.model.name, f"a plant with the signals of the bench: {words}")
+def require_plant(bench: Bench, scenario: Scenario) -> None:
+    """Refuse a scenario of a plant with other signals than those of the bench. Raises InputError."""
+    own, named = ([(s.word, s.unit) for s in (*signals.outputs, signals.drive)]
+                  for signals in (scenario.model.kind.signals, bench.signals))
+    require(own == named, "--model", scenario.model.name, "a plant with the signals of the bench: "
+            f"{', '.join(f'{word} ({unit})' for word, unit in named)}")
 
 
 class Emulator:
@@ -96,21 +73,21 @@ class Emulator:
 
     def __init__(self, send: Send, scenario: Scenario | None = None, bench: Bench | None = None) -> None:
         self._send = send
-        self._place = place = PlantPlace.find(bench or load_bench())
-        self._heartbeat = place.node.find_cob_id(heartbeat.COB_ID)
-        self._names = {place.feedback.identifier: "feedback", place.valve_state.identifier: "valve_state"}
-        self._written = [place.node.outputs[s.word] for s in place.signals.outputs]
-        self._flags, self._number = (place.node.outputs[signal] for signal in ("flags", "cycle"))
-        self._driving, self._answered = (place.node.inputs[word] for word in (place.signals.drive.word, "cycle"))
-        self.device = Device(place.node.node, place.node.eds, self._transmit)
+        self._bench = bench = bench or load_bench()
+        node, frames, signals = find_plant_node(bench), bench.frames, bench.signals
+        self._heartbeat = node.find_cob_id(heartbeat.COB_ID)
+        self._names = {frames.find_role(name).identifier: name for name in ("feedback", "valve_state")}
+        self._written = [node.outputs[s.word] for s in signals.outputs]
+        self._flags, self._number = (node.outputs[signal] for signal in ("flags", "cycle"))
+        self._driving, self._answered = (node.inputs[word] for word in (signals.drive.word, "cycle"))
+        self._drive_id, self._sync_id, self._most_missed = frames.drive.identifier, frames.sync, bench.most_missed
+        self.device = Device(node.node, node.eds, self._transmit)
         self.device.on_sync = self._on_sync
         self.device.on_write = self._on_write
         self.device.on_nmt = self._on_nmt
         self._od = self.device.od.values
-        self._drive = next(pdo for pdo in self.device.pdo.rpdos.values() if pdo.cob_id == place.drive.identifier)
-        self._held: list[tuple[int, int, int, bytes]] = []  # late frames: due, order, COB-ID, data
-        self._late: list[tuple[int, int, Frame]] = []
-        self.load_scenario(scenario or place.make_scenario())
+        self._drive = next(pdo for pdo in self.device.pdo.rpdos.values() if pdo.cob_id == self._drive_id)
+        self.load_scenario(scenario or make_scenario(bench))
 
     def load_scenario(self, scenario: Scenario) -> None:
         """Load a plant with its faults and loads; it is compiled now, not in the first cycle.
@@ -118,7 +95,7 @@ class Emulator:
         Raises:
             InputError: a scenario that cannot be run; the previous one stays.
         """
-        self._place.require_plant(scenario)
+        require_plant(self._bench, scenario)
         self._begin(scenario, FaultyPlant(scenario))
 
     def _begin(self, scenario: Scenario, plant: FaultyPlant) -> None:
@@ -129,22 +106,18 @@ class Emulator:
         self._moved = True
         self._missed = 0  # drive frames missing in a row
         self._synced = -1  # the cycle of the last SYNC
-        self._held.clear()
-        self._late.clear()
+        self._received, self._sent = LateFrames(), LateFrames()
         for sub in (1, 2):
             self._od[COUNTERS, sub] = 0
 
     def receive(self, frame: Frame) -> None:
         """A frame of another node arrived: a fault may delay or drop it."""
-        if frame.cob_id == self._place.drive.identifier:
+        if frame.cob_id == self._drive_id:
             action = self._faults.find_action("drive", self._cycle - 1)
-            if action.code == DELAY:
-                heapq.heappush(self._late, (frame.t_ns + action.argument, len(self._late), frame))
-                return
-            for data in apply_action(action, frame.data):
-                self.device.receive(frame._replace(data=data))
+            self._received.pass_on(action, frame.data, frame.t_ns,
+                                   lambda data: self.device.receive(frame._replace(data=data)))
             return
-        is_sync = frame.cob_id == self._place.sync
+        is_sync = frame.cob_id == self._sync_id
         is_cycle = is_sync and self._begun
         if self._faults.is_bus_off("plant", self._cycle if is_sync else self._cycle - 1):
             if is_cycle:  # it receives nothing, but its plant goes on
@@ -182,7 +155,7 @@ class Emulator:
         """Whether the SYNC to come is that of cycle k, and nothing else is under way: no frame is late or missing."""
         is_steady = self._moved and not self._first and not self._missed and self._synced == self._cycle - 1
         return (is_steady and self._cycle == k and self.device.state is NmtState.OPERATIONAL
-                and not self._held and not self._late and self._drive.is_waiting)
+                and not self._received and not self._sent and self._drive.is_waiting)
 
     def pass_quiet(self, cycles: int, drive: bytes) -> None:
         """So many cycles were simulated elsewhere, on the state of `plant`; the last was answered by `drive`."""
@@ -193,22 +166,15 @@ class Emulator:
 
     def tick(self, t_ns: int) -> None:
         """Deliver the delayed frames that are due at `t_ns`."""
-        while self._late and self._late[0][0] <= t_ns:
-            self.device.receive(heapq.heappop(self._late)[2])
-        while self._held and self._held[0][0] <= t_ns:
-            _, _, cob_id, data = heapq.heappop(self._held)
-            self._send(cob_id, data)
+        self._received.release(t_ns + 1)
+        self._sent.release(t_ns + 1)
         self.device.tick(t_ns)
 
     def _transmit(self, cob_id: int, data: bytes) -> None:
         """Send a frame unless a fault drops or delays it."""
         if (name := self._names.get(cob_id)) is not None:
-            action = self._faults.find_action(name, self._cycle)
-            if action.code == DELAY:
-                heapq.heappush(self._held, (self.device.t_ns + action.argument, self._cycle, cob_id, data))
-                return
-            for what in apply_action(action, data):
-                self._send(cob_id, what)
+            self._sent.pass_on(self._faults.find_action(name, self._cycle), data, self.device.t_ns,
+                               partial(self._send, cob_id))
             return
         if cob_id == self._heartbeat and not self._first and not self._faults.is_heartbeat_alive("plant", self._cycle):
             return  # before the first SYNC there is no cycle: bring-up needs the heartbeat
@@ -252,7 +218,7 @@ class Emulator:
         fresh = self._drive.fresh
         if fresh and self._od[self._answered.key] == self._answered.field.wrap_number(k - 1):
             self.plant.drive = self._driving.field.compute_value(cast(float, self._od[self._driving.key]))
-            if self._missed >= self._place.most_missed:
+            if self._missed >= self._most_missed:
                 self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
             self._missed = 0
             return _NO_FLAGS
@@ -262,7 +228,7 @@ class Emulator:
         """No answer to the last cycle; the flag if it was one too many: then there is no current."""
         self._missed += 1
         self._od[COUNTERS, counter] = cast(int, self._od[COUNTERS, counter]) + 1
-        if self._missed < self._place.most_missed:
+        if self._missed < self._most_missed:
             return _NO_FLAGS
         self.plant.drive = 0.0
         self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, bytes((self._drive.n,)))

@@ -687,14 +687,13 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
     parameters: list[tuple[int, ...]] = []
     signals: list[tuple[int, ...]] = []
     values: list[float] = []
-    for changes in schedule.parameters.values():
-        first, last = min(change.first for change in changes), max(change.last for change in changes)
-        course = np.full(last - first + 1, changes[0].base)
-        for change in reversed(changes):  # of several in a cycle the first counts
-            t = np.arange(change.last - change.first) / schedule.rate
-            growth = np.divide(t, change.ramp, out=np.ones_like(t), where=t < change.ramp)
-            course[change.first - first: change.last - first] = change.base + (change.value - change.base) * growth
-        parameters.append((names[changes[0].name], first, len(course), len(values)))
+    for name, changes in schedule.parameters.items():
+        first = min(begin for begin, _ in changes)
+        last = max(begin + len(changed) for begin, changed in changes)
+        course = np.full(last - first + 1, model[name])
+        for begin, changed in reversed(changes):  # of several in a cycle the first counts
+            course[begin - first: begin - first + len(changed)] = changed
+        parameters.append((names[name], first, len(course), len(values)))
         values += course.tolist()
     for number, output in enumerate(model.kind.signals.outputs):
         for fault in schedule.signals.get(output.name, ()):

@@ -24,14 +24,14 @@ from plant.run import find_direct_readings, load_stored_advance, report_law_erro
 from plant.solve import read_flat_sensors
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
+from rig.benches.canopen_map import RPDO, TPDO
 from rig.benches.packing import VALUES_AT
 from rig.device import Device, EmcyCode, ErrorRegister, NmtState
-from rig.device.pdo import RPDO, TPDO
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import COUNTERS, CYCLE_RECORD, RING, SCENARIO, CycleRecord, encode_cycle_record
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
-from rig.nodes.emulator import PlantPlace, accept_scenario
+from rig.nodes.emulator import accept_scenario, find_plant_node, make_scenario, require_plant
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import Plan, Schedule
 
@@ -63,18 +63,20 @@ class EmulatorService:
         self._booking = False  # an error whose EMCY the loop has sent
         self._scenario: Scenario | None = None
         self._seen = self._last_sync = 0
-        self._place = place = PlantPlace.find(bench or load_bench())
-        self._emcy, self._sdo, self._reply, self._heartbeat = map(place.node.find_cob_id, (0x080, 0x600, 0x580, 0x700))
-        self._unheard = list_unheard(bench or load_bench())
-        self.device = Device(place.node.node, place.node.eds, self._transmit)
+        self._bench = bench = bench or load_bench()
+        self._node = node = find_plant_node(bench)
+        self._frames = [bench.frames.find_role(role) for role in ("drive", "feedback", "valve_state")]
+        self._emcy, self._sdo, self._reply, self._heartbeat = map(node.find_cob_id, (0x080, 0x600, 0x580, 0x700))
+        self._unheard = list_unheard(bench)
+        self.device = Device(node.node, node.eds, self._transmit)
         pdo = self.device.pdo
-        self._drive = next(each for each in pdo.rpdos.values() if each.cob_id == place.drive.identifier)
-        self._tpdos = [next(each for each in pdo.tpdos.values() if each.cob_id == spec.identifier)
-                       for spec in (place.feedback, place.valve_state)]
+        self._drive, *self._tpdos = (
+            next(each for each in (*pdo.rpdos.values(), *pdo.tpdos.values()) if each.cob_id == spec.identifier)
+            for spec in self._frames)
         self.device.on_write = self._on_write
         self.device.on_nmt = self._on_nmt
         self._od = self.device.od.values
-        self.load_scenario(scenario or place.make_scenario())
+        self.load_scenario(scenario or make_scenario(bench))
 
     def load_scenario(self, scenario: Scenario) -> None:
         """Load a plant with its faults and loads; it is compiled now, not in the first cycle.
@@ -82,18 +84,17 @@ class EmulatorService:
         Raises:
             InputError: a scenario that cannot be run; the previous one stays.
         """
-        self._place.require_plant(scenario)
+        require_plant(self._bench, scenario)
         self._begin(scenario, None if self._scenario else ec.INITIALISING)
 
     def _begin(self, scenario: Scenario, state: int | None) -> None:
         """Make new memory for the loop, whose next SYNC is the first; `state`: None for the one it is in."""
         schedule = Schedule(scenario.plan, scenario.model.values)
-        place = self._place
         memory = ec.make_memory(scenario.model, scenario.load(), schedule, *compile_plant(scenario.model),
-                                place.frames)
-        answered = place.node.inputs["cycle"].field
-        memory.words[ec.NODE: ec.MISSED_LIMIT + 1] = (place.node.node, self._drive.n, answered.wrap_number(-1),
-                                                      place.most_missed)
+                                self._frames)
+        answered = self._node.inputs["cycle"].field
+        memory.words[ec.NODE: ec.MISSED_LIMIT + 1] = (self._node.node, self._drive.n, answered.wrap_number(-1),
+                                                      self._bench.most_missed)
         with self._stop_loop():
             words = memory.words
             words[ec.STATE] = self._memory.words[ec.STATE] if state is None else state
@@ -243,7 +244,7 @@ class EmulatorService:
             if event >= ec.COMMANDED:
                 self._obey(int(event) - ec.COMMANDED)
             elif event == ec.SYNC_MALFORMED:
-                self.device.sync.receive(Frame(t_ns, self._place.sync, b"\0"))
+                self.device.sync.receive(Frame(t_ns, self._bench.frames.sync or 0, b"\0"))
             elif event in _RAISED:
                 emcy.raise_error(*_RAISED[event], b"\x03" if event == ec.DIVERGED else number)
             else:
@@ -257,8 +258,8 @@ class EmulatorService:
     def _show_values(self, request: bytes) -> None:
         """Put the loop's values into the dictionary, which an SDO request is about to read."""
         shared, od = self._memory.words, self._od
-        node, frames = self._place.node, self._memory.frames
-        values = dict(zip(ec.list_channels(self._place.signals), frames.doubles[frames.words[VALUES_AT]:],
+        node, frames = self._node, self._memory.frames
+        values = dict(zip(ec.list_channels(self._bench.signals), frames.doubles[frames.words[VALUES_AT]:],
                           strict=False))
         for places, cycle in ((node.outputs, ec.FRAME_CYCLE), (node.inputs, ec.ANSWERED)):
             for signal, (key, field) in places.items():

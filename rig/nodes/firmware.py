@@ -11,7 +11,7 @@ from plant import Model
 from plant.compile import interpret_function
 from plant.controller import Loop, compute_current
 from plant.run import Demand, report_law_errors
-from rig.benches.bench import Bench, Role, SignalObject, make_reader, make_writer
+from rig.benches.bench import Bench, Role, SignalObject, pack, unpack
 from rig.benches.bench_file import load_bench
 from rig.benches.profiles import CIA408, State
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
@@ -159,24 +159,23 @@ class StandIn:
         parts = model.kind.bind_functions(model.effects)
         self._law = interpret_function(parts["control_plant"], parts)
         self._memory = model.kind.build_control_memory()
-        self._readers = {spec.identifier: make_reader(spec) for spec in bench.frames.list_from(Role.RIG)}
-        self._last = tuple(self._readers)[-1]
+        self._heard = {spec.identifier: spec for spec in bench.frames.list_from(Role.RIG)}
+        self._last = tuple(self._heard)[-1]
         self._answer, = bench.frames.list_from(Role.CONTROLLER)
-        self._write = make_writer(self._answer)
         self._command, self._drive = bench.signals.command.word, bench.signals.drive.word
         self._outputs = [s.word for s in bench.signals.outputs]
         self._values = dict.fromkeys((self._command, *self._outputs), nan)
 
     def receive(self, frame: Frame) -> None:
         """See `rig.network.frame.Node`."""
-        if frame.cob_id not in self._readers:
+        if frame.cob_id not in self._heard:
             return
-        self._values |= self._readers[frame.cob_id](frame.data)
+        self._values |= unpack(self._heard[frame.cob_id], frame.data)
         if frame.cob_id == self._last:
             readings = tuple(self._values[word] for word in self._outputs)
             with report_law_errors(self._model):
                 drive, self._memory = self._law(self._memory, self._values[self._command], readings, self._record)
-            self._send(self._answer.identifier, self._write({self._drive: drive}, 0, 0))
+            self._send(self._answer.identifier, pack(self._answer, {self._drive: drive}))
 
     def tick(self, t_ns: int) -> None:
         """See `rig.network.frame.Node`; it has no clock of its own."""

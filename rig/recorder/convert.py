@@ -32,7 +32,7 @@ from rig.benches.bench import (
     Role,
     decode_device_text,
     describe_identifier,
-    make_reader,
+    unpack,
 )
 from rig.benches.can_map import read_database
 from rig.network.frame import Frame, find_cob_id, make_message
@@ -298,7 +298,7 @@ def _load_messages(dbc: Path) -> dict[tuple[int, bool], Any]:
 def _find_readers(bench: Bench, dbc: Path | None) -> Readers:
     """What decodes each frame of a bench: the bench itself, or a DBC that must have all its signals."""
     if dbc is None:
-        return {spec: make_reader(spec) for spec in bench.frames.frames}
+        return {spec: partial(unpack, spec) for spec in bench.frames.frames}
     found = _load_messages(dbc)
     own: dict[FrameSpec, Callable[[bytes], Mapping[str, float]]] = {}
     for spec in bench.frames.frames:

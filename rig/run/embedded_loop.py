@@ -276,8 +276,8 @@ class EmbeddedLoop(CycleLoop):
 
     def _count_quiet(self, emulator: Emulator, firmware: Firmware, control: int, most: int) -> int:
         """How many of the cycles to come are quiet, at most `most`; the last may be one in which a timer runs out."""
-        if (self._open is None or self._seen.came != self._roles or self._held or self.problem
-                or not self._embedded.is_idle or not emulator.is_quiet(self.k) or not firmware.is_quiet(control)):
+        if (self._open is None or self._seen.came != self._roles or self._late or self.problem
+                or not self._embedded.bus.is_empty or not emulator.is_quiet(self.k) or not firmware.is_quiet(control)):
             return 0
         due = min(self._master.find_due(), *(node.device.find_due() for node in (emulator, firmware)))
         busy = self._busy[np.searchsorted(self._busy, self.k):][:1]
@@ -313,7 +313,7 @@ class EmbeddedLoop(CycleLoop):
         self.outputs.update({name: float(column[-1]) for name, column in values.items()})
         self._step = CycleInput(phase, float(b.inputs[played - 1, 0]), float(b.inputs[played - 1, 1]), control)
         self._open = int(block.t_ns[-1]), *block.make_row(-1)
-        self._sent[self._mine[0][0]] += played
+        self._sent[self._frames[0]] += played
         self._begun += played
         self._played += played
         for answer in self._answers.values():
@@ -329,7 +329,7 @@ class EmbeddedLoop(CycleLoop):
         self._master.tick()
         self.k += 1
         self._t_ns += self._period
-        self._embedded.deliver(self._t_ns)  # the heartbeat of the rig
+        self._embedded.bus.deliver(self._t_ns)  # the heartbeat of the rig
 
 
 def find_busy_cycles(plan: Plan, schedule: Schedule) -> NDArray[np.int64]:

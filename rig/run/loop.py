@@ -6,12 +6,11 @@ Lockstep: the next cycle begins when this one's frames are in. Real time: it beg
 fixed grid, and a cycle that is late by whole periods drops the due times it has missed (and counts them) instead of
 firing a burst. Either way the plant moves one period a SYNC, so a run that was late is late, not wrong."""
 
-import heapq
 from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from itertools import count
+from functools import partial
 from math import isnan, nan
 from operator import attrgetter
 from typing import Any, NamedTuple, Protocol
@@ -22,14 +21,13 @@ from plant import signals as plant_signals
 from plant.segments import Array
 from rig.benches.bench import (
     RIG_OUTPUTS,
-    SWITCHED,
     Bench,
     Flags,
     FrameSpec,
     Role,
     check_guards,
-    make_reader,
-    make_writer,
+    pack,
+    unpack,
 )
 from rig.network.bus import LinkWire
 from rig.network.frame import Frame, WallClock
@@ -46,6 +44,7 @@ from rig.sequences.faults import (
     NORMAL,
     SENT_NORMALLY,
     Action,
+    LateFrames,
     Schedule,
     apply_action,
 )
@@ -207,7 +206,7 @@ class _Answer:
     """A frame that comes in: what it says, and the last one of it."""
 
     def __init__(self, spec: FrameSpec) -> None:
-        self.spec, self.read, self.roles = spec, make_reader(spec), set(spec.roles)
+        self.spec, self.roles = spec, set(spec.roles)
         self.cycle_mask = max(((1 << each.length) - 1 for each in spec.fields if each.name == "cycle"), default=0)
         self.is_guarded = any(each.guard for each in spec.fields)
         self.last = -1  # the cycle in which it came
@@ -244,8 +243,7 @@ class CycleLoop(Loop):
         self._link = None if realtime or not isinstance(master.wire, LinkWire) else master.wire  # lockstep of programs
         self._faults, self._log, self._period, self._realtime = faults, log, bench.cycle_ns, realtime
         self._values, self._bench = CyclicValues(bench), bench
-        self._mine = [(each, make_writer(each), make_reader(each)) for each in bench.frames.list_from(Role.RIG)]
-        self._sent = dict.fromkeys((each for each, _, _ in self._mine), 0)
+        self._sent = dict.fromkeys(bench.frames.list_from(Role.RIG), 0)
         self._answers = {each: _Answer(each) for each in bench.frames.frames if each.sender is not Role.RIG}
         self._plant = None if bench.has_plant_node else FaultyPlant(scenario)
         self._emulators = [node for node in getattr(self._wire, "nodes", ()) if isinstance(node, Emulator)]
@@ -260,8 +258,7 @@ class CycleLoop(Loop):
         # when the cycle under way, or to come, is due
         self._t_ns = max(self._wire.clock.now(), master.played_until) + self._period
         self._sync = 0
-        self._held: list[tuple[int, int, int, bytes]] = []  # late frames: due, order, identifier, payload
-        self._order = count()
+        self._late = LateFrames()
         master.hooks.on_cyclic.update({each.identifier: self._receive_answer for each in self._answers})
 
     def now(self) -> int:
@@ -309,7 +306,7 @@ class CycleLoop(Loop):
         if not self._realtime:
             self._wait_for_answers(delay)
             self._wait_for_report(reported)
-            self._release_held(self._t_ns + self._period)
+            self._late.release(self._t_ns + self._period)
         master.tick()
         for emulator in self._emulators:
             self.problem = self.problem or emulator.plant.problem
@@ -326,10 +323,10 @@ class CycleLoop(Loop):
         """The next cycle is due; by how much it is late, ns. Lockstep is never late."""
         if not self._realtime:
             return 0
-        while self._held and self._held[0][0] < self._t_ns:
-            due = self._held[0][0]
+        while self._late and self._late.due < self._t_ns:
+            due = self._late.due
             self._wire.run_until(due)
-            self._release_held(due + 1)
+            self._late.release(due + 1)
         self._wire.run_until(self._t_ns)
         late = self._wire.clock.now() - self._t_ns
         lost = late // self._period
@@ -380,17 +377,12 @@ class CycleLoop(Loop):
 
     def _send_frames(self, *, is_before_sync: bool) -> None:
         """Send the frames of this cycle that go before SYNC, or those that follow it."""
-        for spec, write, read in self._mine:
+        for spec, sent in self._sent.items():
             if spec.is_before_sync is is_before_sync and self._played % spec.every == 0:
-                data = write(self.outputs, self.k, self._sent[spec])
+                data = pack(spec, {**self.outputs, "cycle": self.k}, sent)
                 self._sent[spec] += 1
-                self.outputs.update(read(data))  # what the receiver will read
-                action = self._find_fault(spec)
-                if action.code == DELAY:
-                    self._hold(self._t_ns + action.argument, spec.sent_as, data)
-                    continue
-                for what in apply_action(action, data):
-                    self._master.send(spec.sent_as, what)
+                self.outputs.update(unpack(spec, data))  # what the receiver will read
+                self._late.pass_on(self._find_fault(spec), data, self._t_ns, partial(self._master.send, spec.sent_as))
 
     def _find_fault(self, spec: FrameSpec) -> Action:
         """What a fault does to a frame that the rig sends: to the command, or to the feedback of its own plant."""
@@ -398,19 +390,6 @@ class CycleLoop(Loop):
         if action.code == SENT_NORMALLY and self._plant is not None and "feedback" in spec.roles:
             return self._faults.find_action("feedback", self.k)
         return action
-
-    def _hold(self, due: int, identifier: int, data: bytes) -> None:
-        heapq.heappush(self._held, (due, next(self._order), identifier, data))
-
-    def _release_held(self, before_ns: int) -> None:
-        """Late frames whose time has come; those of the controller are taken in now."""
-        while self._held and self._held[0][0] < before_ns:
-            _, _, identifier, data = heapq.heappop(self._held)
-            spec = self._bench.frames.find(identifier & ~SWITCHED, data)
-            if spec in self._answers:
-                self._take_answer(self._answers[spec], data, self._wire.clock.now())
-            else:
-                self._master.send(identifier, data)
 
     # ------------------------------------------------------------------------------------ frames in
 
@@ -487,11 +466,9 @@ class CycleLoop(Loop):
         action = self._faults.find_action("drive", self._open[1].cycle)
         if self._faults.is_bus_off("plant", self._open[1].cycle):
             return
-        if action.code == DELAY:
-            self._hold((frame.t_ns if self._realtime else self._t_ns) + action.argument, frame.cob_id, frame.data)
-            return
-        for data in apply_action(action, frame.data):
-            self._take_answer(answer, data, frame.t_ns)
+        is_late = action.code == DELAY
+        self._late.pass_on(action, frame.data, frame.t_ns if self._realtime else self._t_ns, lambda data:
+                           self._take_answer(answer, data, self._wire.clock.now() if is_late else frame.t_ns))
 
     def _take_answer(self, answer: _Answer, data: bytes, t_ns: int) -> None:
         """Take the values of an answer: the first feedback, and of the others the last of this cycle."""
@@ -501,7 +478,7 @@ class CycleLoop(Loop):
         is_first = answer.last != self._begun - 1
         if not (answer.cycle_mask or is_first or "drive" in answer.roles) or not answer.is_sound(data):
             return
-        values = answer.read(data)
+        values = unpack(answer.spec, data)
         if answer.cycle_mask and values["cycle"] != row.cycle & answer.cycle_mask:
             self._seen.is_late |= "drive" in answer.roles
             return

@@ -17,7 +17,7 @@ import numpy as np
 from fdi.progress import Progress
 from plant.pid import control_by_pid
 from plant.segments import Array, Hold, Profile, build_profile
-from rig.benches.bench import make_reader
+from rig.benches.bench import unpack
 from rig.benches.profiles import PROFILES, State
 from rig.network.bus import EmbeddedWire, Wire
 from rig.network.frame import Frame
@@ -108,8 +108,7 @@ class CycleLog:
 
     def read_drives(self) -> DriveFrames:
         """The drive frames of a run with faults on the bus; times count cycles, as those of events do."""
-        read = make_reader(self._drive)
-        drives = [read(frame.data) for frame in self._drives]
+        drives = [unpack(self._drive, frame.data) for frame in self._drives]
         came, due = np.array([frame.t_ns for frame in self._drives], np.int64), np.array(self.due_ns, np.int64)
         cycle = np.searchsorted(due, came, "right") - 1
         since = np.clip(came - due[np.maximum(cycle, 0)], 0, self._period_ns - 1) if len(due) else came

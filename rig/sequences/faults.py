@@ -6,8 +6,10 @@ the main phase; a fault ends when main ends, so that clean-up runs on a healthy 
 """
 
 from abc import ABC
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from heapq import heappop, heappush
+from itertools import count
 from math import ceil
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
@@ -21,7 +23,7 @@ from plant.model import Model, find_quantity
 from plant.parameters import check_combinations, parse_value
 from plant.plants import find_plant
 from plant.quantity import Quantity
-from plant.segments import RATE, Second
+from plant.segments import RATE, Array, Second
 from rig.benches.bench import Bench, Role
 from rig.sequences.signals import Sensed, name_signals_of
 
@@ -250,12 +252,42 @@ def change_frame(code: int, argument: int, length: int, data: int) -> tuple[int,
 
 
 def apply_action(action: Action, data: bytes) -> tuple[bytes, ...]:
-    """What arrives of a frame, at once; a delayed frame is the caller's business and arrives unchanged."""
+    """What arrives of a frame at once; one that `LateFrames` delays arrives unchanged."""
     if action.code == SENT_NORMALLY:
         return (data,)
     length, word = change_frame(*action, len(data), int.from_bytes(data, "little"))
     frame = (word & (1 << 64) - 1).to_bytes(8, "little")[:length]
     return {DROP: (), DOUBLE: (frame, frame)}.get(action.code, (frame,))
+
+
+class LateFrames:
+    """The frames that faults delay, each with what passes it on: the one that is due first goes first."""
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[int, int, Callable[[bytes], None], bytes]] = []
+        self._order = count()  # of frames that are due at the same time
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting)
+
+    @property
+    def due(self) -> int:
+        """When the first of them is due, ns; there must be one."""
+        return self._waiting[0][0]
+
+    def pass_on(self, action: Action, data: bytes, now_ns: int, put: Callable[[bytes], None]) -> None:
+        """Let `put` have what a fault makes of a frame: at once, or when a delay from `now_ns` on is over."""
+        if action.code == DELAY:
+            heappush(self._waiting, (now_ns + action.argument, next(self._order), put, data))
+            return
+        for what in apply_action(action, data):
+            put(what)
+
+    def release(self, before_ns: int) -> None:
+        """Pass on the frames that are due before a time."""
+        while self._waiting and self.due < before_ns:
+            _, _, put, data = heappop(self._waiting)
+            put(data)
 
 
 class Edge(NamedTuple):
@@ -299,17 +331,6 @@ class Plan:
         return replace(found, plant=plant)
 
 
-class ParameterChange(NamedTuple):
-    """A fault of a parameter in numbers: `value` is reached within `ramp` s in the cycles first <= k < last."""
-
-    name: str
-    first: int
-    last: int
-    base: float
-    value: float
-    ramp: Second
-
-
 @dataclass
 class SignalChange:
     """A fault of a sensor in the cycles first <= k < last, called with each cycle and reading in order.
@@ -342,7 +363,8 @@ class Schedule:
 
     def __init__(self, plan: Plan, base: Mapping[str, float] | None = None) -> None:
         self._base, self._stop, self.rate, self._plant = base or {}, plan.stop, plan.rate, plan.plant
-        self.parameters: dict[str, list[ParameterChange]] = {}  # of several faults in a cycle the first counts
+        # from which cycle on, and the value in each; of several faults in a cycle the first counts
+        self.parameters: dict[str, list[tuple[int, Array]]] = {}
         self.signals: dict[str, list[SignalChange]] = {}  # in the order in which they act
         self._frames: dict[str, list[tuple[int, Table]]] = {}  # from which cycle on, and code and argument in each
         self._nodes: dict[tuple[str, str], list[range]] = {}  # when a node is silent or bus_off
@@ -362,13 +384,14 @@ class Schedule:
             case Parameter():
                 if fault.parameter not in self._base:
                     raise InputError("faults", fault.parameter, tables.list_choices(fault.parameter, self._base))
+                base = self._base[fault.parameter]
                 target = fault.find_target(find_quantity(fault.parameter, "faults", self._plant))
-                self.parameters.setdefault(fault.parameter, []).append(ParameterChange(
-                    fault.parameter, first, last, self._base[fault.parameter], target, fault.ramp))
+                values = base + (target - base) * self._compute_growth(cycles, fault.ramp)
+                self.parameters.setdefault(fault.parameter, []).append((first, values))
             case Offset():  # or noise
                 shape = rng.standard_normal(cycles) if isinstance(fault, Noise) else np.ones(cycles)
-                added = [fault.value * _grow(k / self.rate, fault.ramp) * float(unit) for k, unit in enumerate(shape)]
-                self.signals.setdefault(fault.signal, []).append(SignalChange(first, last, added))
+                added = fault.value * self._compute_growth(cycles, fault.ramp) * shape
+                self.signals.setdefault(fault.signal, []).append(SignalChange(first, last, added.tolist()))
             case Stuck():
                 self.signals.setdefault(fault.signal, []).append(SignalChange(first, last, value=fault.value))
             case Frames():
@@ -391,6 +414,11 @@ class Schedule:
                         self._put(frame, first, np.tile(np.array((DROP, 0)), (cycles, 1)))
         return last
 
+    def _compute_growth(self, cycles: int, ramp: Second) -> Array:
+        """Share of its full size that a fault has in its cycles, 0..1."""
+        t = np.arange(cycles) / self.rate
+        return np.divide(t, ramp, out=np.ones_like(t), where=t < ramp)
+
     def _put(self, name: str, first: int, hits: Table) -> None:
         self._frames.setdefault(name, []).append((first, hits))
 
@@ -401,10 +429,9 @@ class Schedule:
                 if (value := self._parameter(name, cycle)) != self._parameter(name, before)}
 
     def _parameter(self, name: str, cycle: int) -> float:
-        for change in self.parameters[name]:
-            if change.first <= cycle < change.last:
-                share = _grow((cycle - change.first) / self.rate, change.ramp)
-                return change.base + (change.value - change.base) * share
+        for first, values in self.parameters[name]:
+            if 0 <= cycle - first < len(values):
+                return float(values[cycle - first])
         return self._base[name]
 
     def list_parameters(self, cycle: int) -> dict[str, float]:
@@ -476,11 +503,6 @@ class Schedule:
 
 
 _FRAMES_OF = {"rig": ("command", "sync"), "plant": ("feedback", "valve_state", "drive")}  # none with a node bus-off
-
-
-def _grow(t: Second, ramp: Second) -> float:
-    """Share of its full size that a fault has at a time after its start, 0..1."""
-    return 1.0 if t >= ramp else t / ramp
 
 
 def _choose_hits(fault: Frames, cycles: int, rng: np.random.Generator) -> Table:

@@ -18,7 +18,7 @@ from rig.network.bus import Link, can_open, choose_bus, open_can, serve_node
 from rig.network.frame import Node, WallClock
 from rig.network.node_objects import CONTROLLER, PLANT, read_gains
 from rig.network.raw_bus import RawBus
-from rig.nodes.emulator import Emulator, PlantPlace
+from rig.nodes.emulator import Emulator, find_plant_node
 from rig.nodes.emulator_service import EmulatorService, list_unheard
 from rig.nodes.firmware import Firmware
 from rig.nodes.scenario import Scenario
@@ -40,7 +40,7 @@ def run_command(args: argparse.Namespace) -> int:
     bus, _ = choose_bus(args.bus)
     bench = load_bench(args.bench or "eha", is_trusted=args.trust)
     if args.node == "plant":
-        PlantPlace.find(bench)  # refuses a bench without one
+        find_plant_node(bench)  # refuses a bench without one
         args.model = args.model or bench.plant
     else:
         require(speaks_as_shipped(bench), "--bench", args.bench,
