@@ -1,11 +1,12 @@
 """A run as data: everything that determines its result, from the command line or from an earlier run's log."""
 
 import hashlib
+import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from fdi.foreign_code import (
     Announce,
@@ -26,7 +27,9 @@ from plant.model import find_plant_of_model, find_quantity, parse_model
 from plant.parameters import parse_toml
 from plant.plant_files import read_named_plant
 from plant.plants import find_plant, load_plant
+from plant.quantity import Quantity
 from plant.signals import EHA, Signals
+from plant.tables import Choice, Place, build_dataclass
 from rig.benches.bench import Bench
 from rig.benches.bench_file import is_plant_bench, load_bench, load_bench_from_files, make_plant_bench
 from rig.nodes.scenario import Scenario
@@ -34,14 +37,25 @@ from rig.run.choices import CONTROLLERS, PACES, PLANTS
 from rig.sequences import Sequence, load_sequence
 from rig.sequences.faults import require_possible
 
-_REQUIRED_SETTINGS = {"seed", "bus", "pace", "controller", "plant", "max_overruns"}
 # folders of the attachments
 _EFFECT_FOLDER, _SEQUENCE_FOLDER, _BENCH_FOLDER, _PLANT_FOLDER = "effects/", "sequence/", "bench/", "plant/"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
-    """One run. `plant` and `controller`: "builtin", "external", for the plant "auto", for the controller "c".
+class RunSettings:
+    """How a run is to be played; a log has the same as metadata, as texts."""
+
+    seed: Annotated[int, Quantity("1", low=0)] = 0
+    bus: str = "embedded"
+    pace: Annotated[str, Choice(lambda: PACES)] = "lockstep"
+    controller: Annotated[str, Choice(lambda: CONTROLLERS)] = "builtin"
+    plant: Annotated[str, Choice(lambda: PLANTS)] = "auto"
+    max_overruns: Annotated[float, Quantity("1", low=0.0, high=1.0)] = 1e-3  # of all cycles, in real time
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job(RunSettings):
+    """One run.
 
     The sequence is sampled at the rate of the bench, whose cycle is the period of the model's controller.
 
@@ -52,13 +66,7 @@ class Job:
     sequence: Sequence
     model: Model
     bench: Bench = field(default_factory=load_bench)
-    seed: int = 0
-    bus: str = "embedded"
-    pace: str = "lockstep"
-    controller: str = "builtin"
-    plant: str = "auto"
     effects: tuple[Path, ...] = ()
-    max_overruns: float = 1e-3  # of all cycles, in real time
 
     def __post_init__(self) -> None:
         kind = self.model.kind
@@ -106,10 +114,9 @@ class Job:
 
     def list_settings(self) -> dict[str, object]:
         """The settings of the run, for the log's metadata."""
-        return {"seed": self.seed, "bus": self.bus, "pace": self.pace, "controller": self.controller,
-                "plant": self.plant, "bench": next(iter(self.bench.files), self.bench.name),
-                "model": self.model.name, "sequence": self.sequence.title,
-                "period": self.period_ns / 1e9, "max_overruns": self.max_overruns}
+        return {**{each.name: getattr(self, each.name) for each in fields(RunSettings)},
+                "bench": next(iter(self.bench.files), self.bench.name), "model": self.model.name,
+                "sequence": self.sequence.title, "period": self.period_ns / 1e9}
 
 
 def replace_settings(job: Job, **given: object) -> Job:
@@ -144,7 +151,8 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
     attachments, said = trace.attachments, trace.provenance
     bundle = {name.removeprefix(_SEQUENCE_FOLDER): data for name, data in attachments.items()
               if name.startswith(_SEQUENCE_FOLDER)}
-    require("model.toml" in attachments and bundle and said.keys() >= _REQUIRED_SETTINGS, path, "attachments",
+    settings = {each.name: said[each.name] for each in fields(RunSettings) if each.name in said}
+    require("model.toml" in attachments and bundle and len(settings) == len(fields(RunSettings)), path, "attachments",
             "the sequence and the model of a run; only logs of `rig run` have them")
     effect_codes = [ForeignCode(name, content) for name, content in attachments.items()
                     if name.startswith(_EFFECT_FOLDER)]
@@ -154,7 +162,8 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
                                             for name, content in bundle.items() if name.endswith(".py"))]
     for name in (*(code.name for code in codes), *(_SEQUENCE_FOLDER + name for name in bundle if name[-5:] == ".toml")):
         _require_file_name(path, name)
-    settings = _read_settings(path, said)
+    chosen = build_dataclass(RunSettings, {name: _read_number(text) for name, text in settings.items()},
+                             Place(f"{path}: metadata run"))
     require_trust(path, codes, is_trusted=is_trusted, announce=announce)
     where = f"{path}: model.toml"
     try:
@@ -170,7 +179,7 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
     bench = _read_bench(attachments, said.get("bench", ""), model.kind.signals, is_trusted=is_trusted)
     require_bench_cycle(model, bench, where)
     sequence = Sequence.from_bundle(bundle, bench.rate, model.plant)
-    return Job(sequence=sequence, model=model, bench=bench, effects=effects, **settings)
+    return Job(sequence=sequence, model=model, bench=bench, effects=effects, **asdict(chosen))
 
 
 def load_plant_of_log(path: Path, *, is_trusted: bool = False, announce: Announce = print_on_standard_error) -> str:
@@ -237,25 +246,12 @@ def _require_file_name(log: Path, name: str) -> None:
         raise InputError(log, f"attachment {shown!r}", "the name of a file, without folders, of at most 100 characters")
 
 
-def _read_settings(log: Path, said: Mapping[str, str]) -> dict[str, Any]:
-    """The settings of a run from its metadata.
-
-    Raises:
-        InputError: a value that no run can have.
-    """
-    for name, known in (("pace", PACES), ("controller", CONTROLLERS), ("plant", PLANTS)):
-        require(said[name] in known, log, f"metadata run.{name}", f"{' or '.join(known)}, not {said[name][:100]!r}")
-    require(said["seed"].isascii() and said["seed"].isdigit() and len(said["seed"]) <= 100, log, "metadata run.seed",
-            f"a whole number from 0, not {said['seed'][:100]!r}")
-    overruns = said["max_overruns"]
+def _read_number(text: str) -> object:
+    """The number that a text of the metadata is; the text itself if it is none."""
     try:
-        share = float(overruns)
+        return json.loads(text)
     except ValueError:
-        share = -1.0
-    # the bounds hold for no NaN
-    require(0.0 <= share <= 1.0, log, "metadata run.max_overruns", f"a fraction from 0 to 1, not {overruns[:100]!r}")
-    return {**{name: said[name] for name in ("bus", "pace", "controller", "plant")}, "seed": int(said["seed"]),
-            "max_overruns": share}
+        return text
 
 
 def _store_code(codes: list[ForeignCode]) -> Iterator[Path]:
