@@ -5,7 +5,7 @@ import contextlib
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from itertools import count
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from rig.cli.inputs import is_suite_file, parse_changes
 from rig.interrupts import catch_signals
 from rig.network.bus import choose_bus
 from rig.network.frame import WallClock
-from rig.recorder import Event, Observer, Record
+from rig.recorder import Event, Observer
 from rig.run.job import Job, JobChoice, build_job, find_differences, read_job, replace_settings
 from rig.run.page_writer import PageWriter
 from rig.run.participants import EMBEDDED_NAMES
@@ -85,41 +85,37 @@ def choose_bus_of_run(args: argparse.Namespace, wanted: str, controller: str | N
 
 @contextlib.contextmanager
 def choose_observer(job: Job, log: Path, place: ViewerPlace | None, *, is_live: bool) -> Iterator[Observer]:
-    """What looks at the records of a run: the screen or the viewer of --live, and the lines about dead nodes."""
+    """What hears of the events of a run: the screen or the viewer of --live, and the lines about dead nodes."""
+    announce = partial(announce_dead_node, job.bench.list_participants())
     if not is_live:
-        yield Observer(partial(announce_dead_node, job.bench.list_participants()), sees_rows=False)
+        yield announce
         return
-    kept: list[Record] = []  # while a screen covers the terminal
+    kept: list[Event] = []  # while a screen covers the terminal
     with show_live(make_live_plan(job.sequence, job.pace, job.bench), log, job.realtime, place) as begin:
-        def observe(t_ns: int, record: Record) -> None:
+        def observe(event: Event) -> None:
             begin()  # now the log is there
-            if place is not None:
-                announce_dead_node(job.bench.list_participants(), t_ns, record)
-            elif isinstance(record, Event):
-                kept.append(record)
+            (kept.append if place is None else announce)(event)
 
-        yield Observer(observe)
-    for record in kept:
-        announce_dead_node(job.bench.list_participants(), 0, record)
+        yield observe
+    for event in kept:
+        announce(event)
 
 
-def announce_dead_node(nodes: Mapping[int, str], t_ns: int, record: Record) -> None:
+def announce_dead_node(nodes: Mapping[int, str], event: Event) -> None:
     """Print a line on standard error, at once, when one of the nodes has died."""
-    if isinstance(record, Event) and record.level == "ERROR" and find_named_node(record.kind, record.text, nodes):
+    if event.level == "ERROR" and find_named_node(event.kind, event.text, nodes):
         clear = "\r\033[K" if sys.stderr.isatty() else ""
-        print(f"{clear}rig run: {record.text}", file=sys.stderr, flush=True)
+        print(f"{clear}rig run: {event.text}", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
 def announce_run(args: argparse.Namespace, job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
     """Show the progress bar of a run, and say on standard output what runs on which bus and `why` on that."""
-    is_announced = is_silent
+    say = cache(partial(print_settings, job, why))  # only once
     with show_progress(args, is_silent=is_silent, is_realtime=job.realtime) as update:
         def announce(stage: str, share: float) -> None:
-            nonlocal is_announced
-            if not is_announced:  # not before there is a bus and a place for the results: an error is one line
-                is_announced = True
-                print_settings(job, why)
+            if not is_silent:  # and not before there is a bus and a place for the results: an error is one line
+                say()
             update(stage, share)
 
         yield announce

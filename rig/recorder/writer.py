@@ -14,7 +14,7 @@ import time
 import zlib
 from array import array
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from datetime import UTC, datetime
 from functools import cache, partial
@@ -51,6 +51,7 @@ from rig.recorder.schema import (
     CHANNELS,
     TOPICS,
     CanFrame,
+    Event,
     Record,
     Signals,
     Timing,
@@ -83,11 +84,6 @@ class CycleBlock(NamedTuple):
         timing: Any = Timing
         signals, timing = (kind(*map(row.get, _list_names(kind))) for kind in (self.record, timing))
         return signals, timing
-
-    def list_rows(self) -> Iterator[tuple[int, Signals | Timing]]:
-        """Time and record of each row."""
-        for i, t_ns in enumerate(self.t_ns[:-1].tolist()):
-            yield from ((t_ns, record) for record in self.make_row(i))
 
 
 @cache
@@ -152,13 +148,7 @@ MOST_BLOCKS = 300  # waiting, of up to 500 cycles
 QUEUE_LIMIT = 2_000_000  # items; a disk that hangs must not eat the memory
 LIBRARY = "eha-rig"
 _make_index = partial(array, "Q")
-
-
-class Observer(NamedTuple):
-    """Who looks at the records of a run but raw frames, in the writing thread, 10 ms behind the run."""
-
-    see: Callable[[int, Record], None]  # time, ns, and record
-    sees_rows: bool = True  # False: only events, states and checks
+Observer = Callable[[Event], None]  # gets the events of a run in the writing thread, 10 ms behind the run
 
 
 class RecorderError(RigError):
@@ -227,11 +217,8 @@ class Recorder:
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
         """Record one cycle; raises RecorderError once when the log is lost."""
-        append = self._queue.append
-        append((t_ns, signals))
-        append((t_ns, timing))
-        if self._failure is not None:
-            self._tell()
+        self._queue.append((t_ns, signals))
+        self.put(t_ns, timing)
 
     def cycles(self, block: CycleBlock) -> None:
         """Record cycles that were played together; raises RecorderError once when the log is lost.
@@ -308,11 +295,8 @@ class Recorder:
                 self._file.write_metadata(*record)
             else:
                 self._add(t_ns + epoch_ns, CHANNELS[type(record)], pack(t_ns + epoch_ns, record))
-                self._show(t_ns, record)
-
-    def _show(self, t_ns: int, record: Record) -> None:
-        if self._observer is not None and (self._observer.sees_rows or type(record) not in (Signals, Timing)):
-            self._observer.see(t_ns, record)
+                if self._observer is not None and isinstance(record, Event):
+                    self._observer(record)
 
     def _add(self, t_ns: int, channel: int, raw: bytes) -> None:
         self._make_room(t_ns, t_ns)
@@ -329,9 +313,6 @@ class Recorder:
                 self._index[channel].frombytes(pairs.tobytes())
         self._parts.append(raw)
         self._size += len(raw)
-        if self._observer is not None and self._observer.sees_rows:
-            for t_ns, record in block.list_rows():
-                self._show(t_ns, record)
 
     def _make_room(self, first_ns: int, last_ns: int) -> None:
         """Close the chunk if it is full, or too old for records of these times."""

@@ -389,7 +389,7 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
         prepare: called when the nodes are there and nothing has moved: it may compute or wait, the run will not.
         diagnose: gives the answer of `rig fdi --json` on the main phase, called when the run has ended; None: not asked
             for.
-        observer: who looks at the records of the log.
+        observer: who hears of the events, as they are written.
 
     Raises:
         RigError: bad input, an error in the user's Python code, a missing bus or node, or a log that cannot be

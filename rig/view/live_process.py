@@ -8,6 +8,7 @@ import select
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,18 +46,16 @@ def show_live(plan: LivePlan, log: Path, last_cpu_is_taken: bool, place: ViewerP
         process = subprocess.Popen([sys.executable, "-m", "rig.view.live_show", *words], stdin=subprocess.PIPE,
                                    stdout=subprocess.PIPE)
     assert process.stdin is not None and process.stdout is not None
-    stdin, is_begun = process.stdin, False
+    stdin = process.stdin
 
     def send(data: bytes) -> None:
         with contextlib.suppress(BrokenPipeError):  # it has ended
             stdin.write(data)
             stdin.flush()
 
+    @cache  # only once
     def begin() -> None:
-        nonlocal is_begun
-        if not is_begun:
-            is_begun = True
-            send(b"\n")
+        send(b"\n")
 
     try:
         cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.check_result import CheckResult
+from fdi.trace.trace import Event
 from plant.run import make_columns_type
 from plant.signals import EHA, Signals
 from rig import recorder
@@ -21,16 +22,6 @@ from rig.sequences.checks import MAIN, Check, RunData
 PHASES = ("set-up", "main", "clean-up")
 _AFTER_RUN = ("shut_off", "recovers")  # kinds that need all drive frames
 _GROWS = ("never_exceeds", "max_error", "event_never")  # kinds whose number only grows: a limit passed stays passed
-
-
-class Event(NamedTuple):
-    """An event, `t` in s of main; NaN as long as main has not begun."""
-
-    t: float
-    level: str
-    kind: str
-    text: str
-    t_ns: int  # log time
 
 
 class LivePlan(NamedTuple):
@@ -107,7 +98,7 @@ class LiveRun:
         self.states = {number: "operational" if name.endswith("rig") else "unknown"
                        for number, name in plan.nodes.items()}
         self.troubles: dict[int, str] = {}  # nodes that are gone, and how that is known
-        self.events: deque[Event] = deque(maxlen=5000)
+        self._events: deque[tuple[int, recorder.Event]] = deque(maxlen=5000)  # with their log times
         waiting = {check.name for check in plan.checks if check.kind not in _AFTER_RUN}
         self.checks = {name: CheckState(name, "waits" if name in waiting else "after the run")
                        for name in plan.check_names}
@@ -125,7 +116,7 @@ class LiveRun:
         elif isinstance(record, CheckResult):
             self.checks[record.name] = CheckState(record.name, record.verdict, record, True)
         else:
-            self.events.append(Event(self._find_time(t_ns), record.level, record.kind, record.text, t_ns))
+            self._events.append((t_ns, record))
             node = find_named_node(record.kind, record.text, self.plan.nodes)
             if node and record.level == "ERROR":
                 self.troubles[node] = record.text.partition(": ")[2] or "is silent"
@@ -147,8 +138,6 @@ class LiveRun:
                                     timing.response, timing.overrun)
         if self._main_from < 0 and row.phase >= 1:
             self._main_from, self.zero_ns = self.cycles, t_ns
-            self.events = deque((event._replace(t=self._find_time(event.t_ns)) for event in self.events),
-                                self.events.maxlen)
         if self._main_until < 0 and row.phase >= 2:
             self._main_until = self.cycles
         self.cycles += 1
@@ -163,9 +152,14 @@ class LiveRun:
         return self._table[max(self.cycles - cycles, 0):self.cycles, self._column[name]]
 
     @property
+    def events(self) -> list[Event]:
+        """What has happened, `t` in s of main; NaN as long as main has not begun."""
+        return [Event(self._find_time(t_ns), each.level, each.kind, each.text) for t_ns, each in self._events]
+
+    @property
     def is_over(self) -> bool:
         """Whether the last cycle has been played."""
-        return any(event.kind == "phase" and event.text == "end" for event in self.events)
+        return any(each.kind == "phase" and each.text == "end" for _, each in self._events)
 
     @property
     def t(self) -> float:
@@ -191,7 +185,7 @@ class LiveRun:
         signals = self.plan.signals
         columns = [table[:, self._column[name]] for name in signals.names]
         data = RunData(make_columns_type(signals)(np.arange(rows) / self.plan.rate, *columns), self.plan.sections,
-                       tuple(self.events), self.plan.starts, rate=self.plan.rate, signals=signals)
+                       self.events, self.plan.starts, rate=self.plan.rate, signals=signals)
         for check in self.plan.checks:
             state = self.checks[check.name]
             if state.is_judged or state.word == "after the run":
