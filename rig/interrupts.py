@@ -1,26 +1,30 @@
-"""Ctrl-C and SIGTERM: a run is asked to stop, so that its clean-up can bring the machine to rest."""
+"""Ctrl-C and SIGTERM: a run is asked to stop, so that its clean-up can bring the machine to rest. Ends of processes."""
 
 import contextlib
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
 from typing import Any
 
 
 @contextlib.contextmanager
-def ignore_interrupts() -> Iterator[None]:
-    """Processes started inside ignore Ctrl-C, which the terminal sends to them as well; who starts them ends them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def handle_signals(handlers: Mapping[int, Any]) -> Iterator[None]:
+    """Handle signals so within, and as before afterwards; in another thread than the main one nothing changes."""
+    is_main = threading.current_thread() is threading.main_thread()  # Python delivers signals to that one only
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items() if is_main}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def ignore_interrupts() -> contextlib.AbstractContextManager[None]:
+    """Processes started inside ignore Ctrl-C, which the terminal sends to them as well; who starts them ends them."""
+    return handle_signals({signal.SIGINT: signal.SIG_IGN})
 
 
 def repeat_lost_interrupts() -> None:
@@ -61,12 +65,19 @@ def catch_signals() -> Iterator[Callable[[], bool]]:
         is_listening = True
         return is_asked
 
-    if threading.current_thread() is not threading.main_thread():  # Python delivers signals to the main thread only
-        yield lambda: False
-        return
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with handle_signals({signal.SIGINT: handle, signal.SIGTERM: handle}):
         yield is_to_stop
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
+
+
+def describe_exit(status: int) -> str:
+    """An exit status in words.
+
+    >>> describe_exit(-9)
+    'its process was ended by SIGKILL'
+    >>> describe_exit(1)
+    'its process ended with exit status 1'
+    """
+    if status >= 0:
+        return f"its process ended with exit status {status}"
+    known = {number.value: number.name for number in signal.Signals}
+    return f"its process was ended by {known.get(-status, f'signal {-status}')}"

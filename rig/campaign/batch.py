@@ -23,7 +23,7 @@ from types import FrameType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from plant.errors import InputError, RigError, report_system_error
-from rig.interrupts import ignore_interrupts
+from rig.interrupts import describe_exit, ignore_interrupts
 from rig.network.frame import WallClock
 
 Job = TypeVar("Job")
@@ -303,7 +303,8 @@ def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], process
                     waiting.append((job, attempt + 1))
                     continue
                 if state == _DIED:
-                    result = describe_failure(job, describe_deaths(attempts, worker.process.exitcode))
+                    result = describe_failure(job, describe_exit(worker.process.exitcode or 0) if attempts == 1 else
+                                              f"each of {attempts} worker processes that tried it died")
                 elif state == _LATE:
                     result = describe_failure(job, f"it took longer than {choose_limit(job):g} s")
                 yield job, result
@@ -313,15 +314,6 @@ def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], process
         deadline = clock.now() + round(1e9 * patience)
         for worker in workers:
             worker.stop(max(0.0, 1e-9 * (deadline - clock.now())))
-
-
-def describe_deaths(attempts: int, exit_code: int | None) -> str:
-    """Why a job has no result whose workers died; `exit_code` is that of the last one, negative for a signal."""
-    if attempts > 1:
-        return f"each of {attempts} worker processes that tried it died"
-    if exit_code is not None and exit_code < 0:
-        return f"its process was ended by signal {-exit_code} ({signal.Signals(-exit_code).name})"
-    return f"its process ended with status {exit_code}"
 
 
 _STARTED, _DONE, _RAISED, _DIED, _LATE = range(5)  # what becomes of a worker: the first three it says itself

@@ -7,14 +7,13 @@ Programs are kept under a hash of their sources and of the compiler.
 """
 
 import hashlib
-import os
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from fdi.output import write_text, write_whole
 from plant.compile import find_cache_folder
 from plant.errors import InputError, RigError, require
 from rig.firmware.object_table import write_object_table
@@ -52,15 +51,9 @@ def build_device(folder: Path, flags: Sequence[str] = (*FLAGS, "-Werror")) -> Pa
 def _write_generated(texts: dict[str, str]) -> Path:
     """A folder of the cache with these files."""
     folder = find_cache_folder() / f"generated-{hashlib.sha256(repr(texts).encode()).hexdigest()[:16]}"
-    if not folder.exists():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", dir=folder.parent))
-        for name, text in texts.items():
-            (unfinished / name).write_text(text)
-        try:
-            unfinished.rename(folder)
-        except OSError:  # another build was faster
-            shutil.rmtree(unfinished)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        write_text(folder / name, text)
     return folder
 
 
@@ -80,7 +73,7 @@ def build_program(name: str, sources: Sequence[Path], flags: Sequence[str]) -> P
     program = find_cache_folder() / f"{name}-{digest.hexdigest()[:16]}"
     if not program.exists():
         program.parent.mkdir(parents=True, exist_ok=True)
-        _compile(compiler, [*flags, *(f"-I{folder}" for folder in folders), *map(str, sources)], program)
+        compile_c(compiler, [*flags, *(f"-I{folder}" for folder in folders), *map(str, sources)], program)
     return program
 
 
@@ -92,19 +85,18 @@ def find_compiler(where: str = "--controller", use: str = "to build the firmware
     raise InputError(where, "", f"a C compiler {use}: apt-get install gcc libc6-dev")
 
 
-def _compile(compiler: str, words: Sequence[str], program: Path) -> None:
-    """Run the compiler; the finished program takes its name in one step, because two runs may build at once."""
-    handle, unfinished = tempfile.mkstemp(prefix=f"{program.name}.", dir=program.parent)
-    os.close(handle)
-    try:
-        done = subprocess.run([compiler, *words, "-o", unfinished, "-lm"], capture_output=True, text=True, check=False)
+def compile_c(compiler: str, words: Sequence[str], program: Path) -> None:
+    """Run the compiler; the finished program takes its name in one step, because two runs may build at once.
+
+    Raises:
+        RigError: with the first error that the compiler reports.
+    """
+    with write_whole(program) as part:
+        done = subprocess.run([compiler, *words, "-o", str(part), "-lm"], capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            lines = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()
+            said = done.stderr.splitlines()
+            lines = [line for line in said if "error" in line or "undefined" in line] or said
             raise RigError(f"{compiler}: {(lines or ['no message'])[0]}")
-        Path(unfinished).chmod(0o755)
-        Path(unfinished).replace(program)
-    finally:
-        Path(unfinished).unlink(missing_ok=True)
 
 
 if __name__ == "__main__":

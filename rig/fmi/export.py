@@ -9,7 +9,6 @@ import math
 import platform
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import zipfile
@@ -29,7 +28,7 @@ from plant.kernels import list_state_values
 from plant.machine_code import emit_object
 from plant.model import Model, build_kernel, find_quantity
 from plant.run import report_law_errors
-from rig.firmware.build import find_compiler
+from rig.firmware.build import compile_c, find_compiler
 from rig.fmi.unit_cycle import INPUTS, advance_unit
 
 FOLDER = Path(__file__).parent
@@ -118,13 +117,13 @@ def _build_libraries(model: Model, run: Any, tables: str, sources: Sequence[Path
             if emitted is None:
                 raise InputError("effects", ", ".join(model.effects), "laws that need nothing but arithmetic")
             code.write_bytes(emitted)
-            words = [compiler, *_FLAGS, *machine.flags, f"-I{folder}", f"-I{FOLDER}", *map(str, sources), str(code)]
-            done = subprocess.run([*words, "-o", str(library), "-lm"], capture_output=True, text=True, check=False)
-            if done.returncode == 0:
+            words = [*_FLAGS, *machine.flags, f"-I{folder}", f"-I{FOLDER}", *map(str, sources), str(code)]
+            try:
+                compile_c(compiler, words, library)
                 made[machine] = library.read_bytes()
-            elif not made:  # this machine; a compiler for another one may lack its C library
-                lines = [line for line in done.stderr.splitlines() if "error" in line or "undefined" in line]
-                raise RigError(f"{compiler}: {(lines or ['no message'])[0]}")
+            except RigError:
+                if not made:  # this machine; a compiler for another one may lack its C library
+                    raise
     return made
 
 

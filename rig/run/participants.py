@@ -4,7 +4,6 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -233,17 +232,3 @@ class NodeProcesses:
                 child.wait()
             if child.stdout is not None:
                 child.stdout.close()
-
-
-def describe_exit(status: int) -> str:
-    """An exit status in words.
-
-    >>> describe_exit(-9)
-    'its process was ended by SIGKILL'
-    >>> describe_exit(1)
-    'its process ended with exit status 1'
-    """
-    if status >= 0:
-        return f"its process ended with exit status {status}"
-    known = {number.value: number.name for number in signal.Signals}
-    return f"its process was ended by {known.get(-status, f'signal {-status}')}"

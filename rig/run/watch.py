@@ -8,11 +8,12 @@ from canopen.emcy import EmcyError
 
 from rig.benches.bench import Bench, Flags, Role, describe_identifier
 from rig.device.emcy import EmcyCode
+from rig.interrupts import describe_exit
 from rig.network.master import HEARTBEAT_LIMIT, Master
 from rig.network.node_objects import CONTROLLER, PLANT, RIG, NmtState
 from rig.recorder import NmtState as NmtRecord, Signals, Timing
 from rig.run.attribution import NO_DRIVE
-from rig.run.participants import FRAME_TIMEOUT, NodeProcesses, describe_exit
+from rig.run.participants import FRAME_TIMEOUT, NodeProcesses
 from rig.run.state import Journal, SafeState, Stage
 from rig.sequences.protocol import Emergency, Heartbeat
 from rig.sequences.sequence import TimingPolicy

@@ -33,6 +33,7 @@ from rig.evidence.requirements import (
     tabulate_requirements,
     trace_requirements,
 )
+from rig.interrupts import handle_signals
 from rig.network.frame import WallClock
 from rig.run.job import JobChoice, build_job, find_differences, load_tested_sequence
 from rig.run.participants import EMBEDDED_NAMES
@@ -340,13 +341,11 @@ def catch_termination(bus: str, patience: float = 1.0) -> Iterator[Callable[[], 
     def end(number: int, frame: FrameType | None) -> None:
         raise SystemExit(128 + signal.SIGTERM)
 
-    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, ask), signal.SIGALRM: signal.signal(signal.SIGALRM, end)}
-    try:
-        yield lambda: is_asked
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with handle_signals({signal.SIGTERM: ask, signal.SIGALRM: end}):
+        try:
+            yield lambda: is_asked
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 MOODS: dict[str, Mood] = {**RUN_MOODS, "ERROR": "bad", "NOT_RUN": "doubtful"}

@@ -93,7 +93,7 @@ def test_each_case_has_its_verdict_and_the_worst_is_that_of_the_suite(suite: tup
     assert [(case["verdict"], case["seed"]) for case in cases.values()] == [
         ("PASS", 1), ("PASS", 2), ("FAIL", 0), ("FAIL", 0), ("ERROR", 0), ("ERROR", 0), ("ERROR", 0)], said
     assert (said.status, told["verdict"], told["jobs"]) == (1, "ERROR", 2)
-    for name, why in (("crash", r"its process was ended by signal 9 \(SIGKILL\)"), ("hang", "it took longer than 1 s"),
+    for name, why in (("crash", r"its process was ended by SIGKILL"), ("hang", "it took longer than 1 s"),
                       ("fail", r".*own\.py:13: fail: expected .*AttributeError.*")):
         assert re.fullmatch(why, cases[name]["why"])
     assert cases["weak, jack.mass=90"]["set"] == {"filter.clogging": 0.9, "jack.mass": 90.0}
