@@ -81,7 +81,7 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
     e, page = a.explanation, Medium.PAGE
     trace, marks = e.search.problem.trace, e.marks
     after = None if a.best is e.base else a.best
-    notes = [*dict.fromkeys([*notes, *e.search.run.notes]), *([e.excerpt] if e.excerpt else [])]
+    notes = [*dict.fromkeys([*notes, *trace.notes]), *([e.excerpt] if e.excerpt else [])]
     if marks.is_recorder:
         d = trace.declared
         notes.append(f"{d.controlled.symbol} is recorded in steps of {format_amount(marks.step, d.controlled.unit)}, "
