@@ -46,9 +46,10 @@ def candidate(effect: str, *beside: str, word: str = "explains") -> Candidate:
 def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, is_at_floor: bool = False,
            **fields: Any) -> Answer:
     base = SimpleNamespace(is_at_floor=is_at_floor, is_far=False, effects=(), ratio={"xj": 22.5, "p12": 15.0})
+    trace = SimpleNamespace(declared=EHA, notes=())
     explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, marks=Marks(1.0, 1e-6, ()),
                                   ledger=[base], unseen={}, excerpt="",
-                                  search=SimpleNamespace(problem=SimpleNamespace(trace=SimpleNamespace(declared=EHA, notes=()))))
+                                  search=SimpleNamespace(problem=SimpleNamespace(trace=trace)))
     baseline = {"error": ERROR, "floor": FLOOR, "holdout": {"xj": 44e-6, "p12": 3e5}}
     blind = (Blind("sensor_gain", "sensor_gain.error", 0.02, "1", "a stop"),
              Blind("sensor_offset", "sensor_offset.offset", 1e-4, "m", "a stop"))
