@@ -5,6 +5,9 @@ from contextlib import contextmanager
 
 from plant.effects import CATALOGUE
 
+# A short search: what `rig fdi` needs, and two lags. One kernel serves all tests that search these.
+SEARCHED = ("null_bias", "constant_load", "coil_lag", "sensor_lag", "filter_clogging", "spool_friction",
+            "jack_friction", "viscous_drag", "moving_mass", "internal_leakage")
 HEAD = """
 from math import pi, sin
 from typing import Annotated, NamedTuple
@@ -34,7 +37,7 @@ def spring(x, s, u, p):
     return x + SCALE * p.spring.stiffness * s.jack_position
 '''
 
-MEMORY = HEAD + '''
+MEMORY = "from __future__ import annotations\n" + HEAD + '''
 class Wear(NamedTuple):
     rate: Annotated[float, Quantity("N/m", low=0)] = 0.0
 

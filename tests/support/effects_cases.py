@@ -1,5 +1,7 @@
 """What the tests of effects share: plants that have the whole catalogue, so that one kernel serves all of them."""
 
+from typing import Any
+
 import numpy as np
 from physics_cases import SILENT, SMOOTH
 
@@ -13,9 +15,9 @@ EASY = SMOOTH.with_effects(LAWS)  # nor dry friction
 H = 1e-5
 
 
-def drive_plant(model: Model, current: np.ndarray, load: float = 0.0) -> tuple[Actuator, np.ndarray]:
+def drive_plant(model: Model, current: np.ndarray, load: float = 0.0, **options: Any) -> tuple[Actuator, np.ndarray]:
     """The plant after the current (n,) A, one a cycle, and its rows XJ as sensed, P12, XS, XJ, XJ' at each sample."""
-    plant, out = Actuator(model), np.empty((len(current), 5))
+    plant, out = Actuator(model, **options), np.empty((len(current), 5))
     for k, amperes in enumerate(current):
         s = plant.state
         out[k] = *plant.sample(), s.jack_position, s.jack_speed

@@ -57,7 +57,7 @@ def list_environment() -> dict[str, str]:
 
 
 def run_on_each_cpu(program: str, *words: object, folder: Path, timeout_s: float = 600,
-                    cpus: Sequence[str] = (THIS, AVX2, OLDEST)) -> dict[str, Any]:
+                    cpus: Sequence[str] = (THIS, OLDEST)) -> dict[str, Any]:
     """What the program of this folder prints as JSON, by CPU; all processes at the same time, outputs in `folder`."""
     began = {}
     for name, changes in list_cpu_settings().items():

@@ -17,16 +17,12 @@ FOLDER = SHARED / "practice"
 RIG = FOLDER.parent / "data/electrohydrostatic_rig"
 pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="no ../shared: no traces of an independent simulator")
 
-LIMIT = Model()["controller.current_limit"]
-TRUE: dict[str, dict[str, float]] = {  # without plant scatter: a friction, an offset, a force, two faults together
+TRUE: dict[str, dict[str, float]] = {  # without plant scatter: a friction, two faults together
     "00": {"spool.static_friction": 45.0, "spool.dynamic_friction": 30.0},
-    "02": {"null_bias.current": 0.03 * LIMIT},
-    "06": {"aero_stiffness.stiffness": 540e3},
     "10": {"spool.static_friction": 33.0, "spool.dynamic_friction": 22.0, "filter.clogging": 0.21},
 }
 LEVELS = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
-BLOCK = {"00": "servovalve", "01": "servovalve", "02": "servovalve", "03": "jack", "04": "jack", "05": "sensor",
-         "06": "jack", "07": "servovalve", "09": "jack", "10": "servovalve"}
+BLOCK = {"01": "servovalve", "04": "jack", "05": "sensor", "06": "jack", "07": "servovalve"}
 
 
 @cache
@@ -107,7 +103,7 @@ def measure_errors(model: str, run: str, is_driven: bool = True) -> dict[str, fl
 
 @real
 @pytest.mark.parametrize(("run", "position", "pressure"), [
-    ("3_4", 0.40, 0.2), ("1_1", 0.50, 0.4), ("1_4", 0.42, 0.4), ("2_2", 0.42, 0.3), ("4_3", 0.42, 0.2)])
+    ("3_4", 0.40, 0.2), ("1_1", 0.50, 0.4), ("2_2", 0.42, 0.3)])
 def test_the_error_beside_that_of_the_bare_integrator(run: str, position: float, pressure: float) -> None:
     """Fitted to 3_4 alone; the other runs were never fitted."""
     bare, servo = measure_errors("ehs", run), measure_errors("servo", run)
@@ -129,9 +125,3 @@ def test_compare_finds_the_shipped_model_by_its_name() -> None:
     assert found["xj"]["error"] == pytest.approx(measure_errors("servo", "1_1")["xj"], rel=0.03)
     bare = replay_command(read_run("1_1"), load_model("ehs"), STEPS)
     assert found["xj"]["closed_loop_error"] < 0.8 * rms(bare["xj"])
-
-
-def test_the_shipped_model_says_where_it_comes_from() -> None:
-    model = load_model("servo")
-    assert model.plant == "ehs" and model.name == "servo"
-    assert {"undissolved_air", "flow_delay", "one_way_load"} <= set(model.effects)

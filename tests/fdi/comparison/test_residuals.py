@@ -9,15 +9,11 @@ from noisy_traces import LEVELS, record_healthy, sample_noise
 from fdi.comparison.residuals import (
     WHITE,
     Motion,
-    apply_whitener,
     bin_residual,
-    combine_residuals,
     correlate_with_input,
-    cumulate_periodogram,
     describe_motion,
     examine_residuals,
     find_condition,
-    fit_whitener,
     locate_error,
     map_deviation,
     name_shape,
@@ -74,11 +70,6 @@ def test_sections_with_their_shares(c: Trace, m: Motion) -> None:
     assert {"motion within 3 mm", "step to 5 mm"} <= {p.section for p in found}
 
 
-def test_signals_are_weighed_by_their_floors() -> None:
-    z2 = combine_residuals({"xj": np.array([2e-6, np.nan]), "p12": np.array([4e4, np.nan])}, {"xj": 2e-6, "p12": 2e4})
-    assert z2[0] == pytest.approx((1 + 4) / 2) and np.isnan(z2[1])
-
-
 def test_white_noise_stays_within_its_bands(c: Trace, m: Motion) -> None:
     found = [examine_residuals(c, {"xj": sample_noise(seed, len(c))[:, 0]}, {}, m)["xj"]
              for seed in range(100, 120)]  # not that of the trace, whose noise is in its own XJ
@@ -93,13 +84,6 @@ def test_coloured_noise_is_white_when_a_repeat_shows_its_colour(c: Trace, m: Mot
     d = examine_residuals(c, {"xj": r}, {"xj": (r - repeat) / np.sqrt(2)}, m)["xj"]
     assert alone.departs > 5 * alone.allowed and d.departs < 3 * d.allowed
     assert d.memory == pytest.approx(d.noise_memory, abs=1.5e-3)
-
-
-def test_a_colour_is_taken_out() -> None:
-    x = sample_noise(1, 13_500, "hum")[:, 0]
-    e = apply_whitener(x, fit_whitener(x))
-    assert np.abs(np.corrcoef(e[1:], e[:-1])[0, 1]) < 0.03 < np.corrcoef(x[1:], x[:-1])[0, 1]
-    assert (fit_whitener(np.zeros(100)) == WHITE).all() and np.isfinite(fit_whitener(np.sin(np.arange(500.0)))).all()
 
 
 @pytest.mark.parametrize("lag", [1, 7, 30])
@@ -127,13 +111,6 @@ def test_dependence_on_speed_and_its_shape(m: Motion, law: object, word: str) ->
     assert name_shape(np.array([-1.0, 0.0, 1.0]), np.array([1.0, -2.0, 1.5]), np.ones(3)) != "proportional to"
 
 
-def test_the_cumulative_periodogram_of_a_line() -> None:
-    x = np.sin(2 * np.pi * 0.1 * np.arange(5000))
-    frequencies, power, departs, allowed = cumulate_periodogram(x, 1e-3)
-    assert power[np.searchsorted(frequencies, 99.0)] < 0.01 and power[np.searchsorted(frequencies, 101.0)] > 0.99
-    assert departs > 10 * allowed and allowed == pytest.approx(1.358 / np.sqrt(len(power)), rel=1e-3)
-
-
 def make_trace(amplitude: float, frequency: float, rows: int = 4000) -> Trace:
     t = np.arange(rows) / 1000
     xj = amplitude * np.sin(2 * np.pi * frequency * t)
@@ -152,12 +129,3 @@ def test_the_error_of_a_fast_motion_stands_in_its_cell() -> None:
     column = int(found.speeds.searchsorted(45e-3)) - 1
     assert found.ratio["xj"][rows[1], column] == pytest.approx(7.0)
     assert found.rows.sum() > 7900 and found.ratio["xj"].shape == (len(found.amplitudes) - 1, len(found.speeds) - 1)
-
-
-def test_missing_rows_do_not_count_and_an_empty_map_is_none() -> None:
-    trace = make_trace(1e-3, 1.0)
-    residual = np.full(4000, np.nan)
-    assert map_deviation(trace, {"xj": residual}, {"xj": 1e-6}) is None
-    residual[100:140] = 3e-6
-    found = map_deviation(trace, {"xj": residual}, {"xj": 1e-6})
-    assert found is not None and found.rows.sum() == 40 and np.nanmax(found.ratio["xj"]) == pytest.approx(3.0)

@@ -42,13 +42,6 @@ def compare_two(other: Trace, first: Trace | None = None
     return found, found.pairs[0], {s.name: s for s in found.pairs[0].signals}
 
 
-def test_equal_runs_are_the_same_to_the_last_digit() -> None:
-    found, _, signals = compare_two(make_run())
-    assert found.verdict == "SAME" and set(signals) == {"xj", "p12", "cor"}
-    assert all(s.is_equal and s.rms == 0.0 for s in signals.values())
-    assert "every sample is equal" in build_diff_report(found).sentence
-
-
 def test_noise_of_another_seed_is_the_same_and_a_bump_is_found_with_its_size_sign_and_time() -> None:
     (found, _, signals), (other, _, bumped) = compare_two(make_run(1)), compare_two(make_run(1, bump=-300e-6))
     xj, bump = signals["xj"], bumped["xj"]

@@ -12,8 +12,6 @@ from short_runs import STEPS, build_command
 from fdi.comparison.compare import Comparison, compare
 from fdi.trace.sensor_dynamics import (
     SensorDynamics,
-    find_comb,
-    is_rounding_left,
     measure_resolution,
     read_sensors,
     write_sensors,
@@ -109,18 +107,3 @@ def test_resolution_of_a_column() -> None:
     for column, resolution in ((np.round(x, 3), 1e-3), (np.round(x * 1e5) * 1e-8, 1e-8), (six, 1e-5)):
         assert measure_resolution(column) == pytest.approx(resolution, rel=0.01)
     assert measure_resolution(x) < 1e-10 and measure_resolution(np.tile([5e-3, -5e-3], 500)) == 0.0
-
-
-def test_a_comb_is_found_to_a_part_in_ten_thousand() -> None:
-    x = np.random.default_rng(1).standard_normal(3000)
-    found = find_comb(0.073 * np.round(x / 0.073))
-    assert found is not None and found.step == pytest.approx(0.073, rel=1e-4)
-    assert find_comb(x) is None and find_comb(np.round(x / 0.073) * 0.073, finest=0.1) is None
-    assert find_comb(np.array([0.0, 1.0, np.nan])) is None
-
-
-def test_rounding_leaves_half_a_step_at_most_and_not_much_less() -> None:
-    left = np.random.default_rng(2).uniform(-0.5, 0.5, 5000)
-    # in turn: rounding, another firmware, the steps themselves went in, nothing
-    for residual, expected in ((left, True), (3.0 * left, False), (0.01 * left, False), (np.full(3, np.nan), False)):
-        assert is_rounding_left(residual, 1.0, 0.01) == expected

@@ -29,15 +29,9 @@ from fdi.diagnosis.faults import (
     load_faults,
 )
 from fdi.diagnosis.refine import (
-    find_alike,
-    list_coarse_starts,
     list_unknowns,
-    make_start,
-    place_value,
-    slide_along,
 )
 from fdi.estimation.fit import Free
-from fdi.estimation.unidentifiable import LogFree, LogFrictionRatio, PowerFree, compute_values
 from plant.faults import Fault, place_fault
 from plant.model import load_model
 from plant.plants import find_plant
@@ -156,42 +150,6 @@ def test_faults_that_only_show_as_a_sum_are_a_group(x: float, total: float, grou
         assert all(size.low == 0.0 for size in cut.values())
 
 
-def test_of_many_faults_two_together_have_to_be_further_off_than_one() -> None:
-    found = pair(0.2, 0.08, 5.0)  # both absent: 3.5 standard deviations
-    assert find_groups(found, dict.fromkeys("ab"))
-    third = tuple(replace(CLOGGING, name=name, parameter=f"{name}.size", range=(0.0, 1.0)) for name in "cd")
-    found.faults += third
-    found.fit.free += tuple(Free(f.parameter, 0.0, 1.0, 10.0, 0.0, 1.0, 0.02) for f in third)
-    found.fit.x, wide = np.append(found.fit.x, (0.0, 0.0)), np.eye(4)
-    wide[:2, :2] = found.fit.covariance
-    found.fit.covariance = wide
-    levels = {"a": None, "b": None, "c": Level.ACCEPTABLE, "d": Level.ACCEPTABLE}
-    assert find_groups(found, levels)
-    found.fit.covariance = wide * np.where(np.outer((1, 1, 0, 0), (1, 1, 0, 0)), 1.1**2, 1.0)  # 3.2
-    assert not find_groups(found, levels)
-
-
-def test_a_fault_and_a_suspect_that_look_alike_change_places() -> None:
-    """One of the bias's unknown shifts the signals as half of the fault's does."""
-    rng = np.random.default_rng(0)
-    free = (Free("one.size", 0.0, 0.1, 10.0, 0.0, 1.0, 0.02), Free("null_bias.current", 0.0, 1.0, 1.0, -9.0, 9.0, 0.02),
-            Free("constant_load.force", 0.0, 1.0, 1.0, -9.0, 9.0, 0.02))
-    shift, other = rng.standard_normal((2, 1, 400))
-    fit: Any = SimpleNamespace(free=free, x=np.array([1.0, 2.0, 0.0]), white=np.ones((1, 400)),
-                               jacobian=np.array([2.0 * shift, shift, other]))
-    [way] = find_alike(fit, ["one.size"], ["null_bias.current", "constant_load.force"])
-    assert list(way) == ["one.size", "null_bias.current"]
-    assert slide_along(fit, way, "null_bias.current", 0.0) == pytest.approx([2.0, 0.0, 0.0])
-    assert slide_along(fit, way, "one.size", 0.0) == pytest.approx([0.0, 4.0, 0.0])
-
-
-def test_a_logarithm_keeps_its_bounds_in_a_group() -> None:
-    found = pair(0.2, 0.02, 5.0)
-    found.fit.free = (found.fit.free[0], LogFree("two.size", -1.6, 1.0, 1.0, -4.0, 0.0, 1.0))
-    assert find_groups(found, dict.fromkeys("ab", Level.ACCEPTABLE)) == ()
-    assert [g.names for g in find_groups(found, {"a": None, "b": Level.ACCEPTABLE})] == [("a", "b")]
-
-
 def test_a_healthy_unit_within_its_tolerances_is_in_no_group() -> None:
     found = pair(0.215, 0.01, 5.0)
     found.faults = tuple(replace(fault, healthy=0.2) for fault in found.faults)
@@ -214,34 +172,9 @@ def test_a_fault_may_be_an_effect_without_starts() -> None:
     assert list_unknowns(model.with_effects(["dry_friction"]), [fault])[0].name == "dry_friction.torque"
 
 
-def test_unknowns_are_what_laws_go_with() -> None:
-    """Leakage goes with the cube of a clearance; of the ram's frictions the ratio is known."""
-    faults = [f for f in load_faults("wider") if f.name in ("spool_clearance", "jack_friction")]
-    free = list_unknowns(load_model().with_effects(["land_clearance"]), faults)
-    known = {f.name: f for f in free}
-    clearance = known["land_clearance.clearance"]
-    assert isinstance(clearance, PowerFree) and isinstance(known["jack.dynamic_friction"], LogFrictionRatio)
-    x = (place_value(clearance, 3e-5) - clearance.centre) / clearance.scale
-    assert x == pytest.approx(1.0) and clearance.value(x) == pytest.approx(3e-5)
-    sizes = {"spool_clearance": 2e-5, "jack_friction": 1800.0}
-    start = make_start(free, faults, [sizes[f.name] for f in faults])
-    values = dict(zip(known, compute_values(free, start), strict=True))
-    jack = next(f for f in faults if f.name == "jack_friction")
-    assert values["jack.dynamic_friction"] == pytest.approx(jack.list_changes(1800.0)["jack.dynamic_friction"])
-    assert values["land_clearance.clearance"] == pytest.approx(2e-5)
-
-
-def test_fits_begin_beyond_every_limit() -> None:
-    for kind in ("eha", "ema"):
-        faults = load_faults("wider") if kind == "eha" else choose_faults(None, find_plant(kind))
-        starts = np.array(list_coarse_starts(faults))
-        for fault, tried in zip(faults, starts.T, strict=True):
-            assert max(map(fault.measure_departure, tried)) > fault.limits[2]
-
-
 def test_backlash_is_measured_although_rows_hang_on_its_impacts() -> None:
     model = load_model("ema")
-    faults = choose_faults(None, model.kind)
+    faults = [fault for fault in choose_faults(None, model.kind) if fault.name == "backlash"]
     drawn = build_matrix({"case": [{"backlash": 8e-5}], "seeds": 1}, model, "", "test", faults)
     found = diagnose(simulate_case(drawn.cases[0], drawn.spec, model), model, faults=faults)
     assert found.verdict == "MAINTENANCE" and found.ruling == "backlash"
@@ -251,7 +184,7 @@ def test_backlash_is_measured_although_rows_hang_on_its_impacts() -> None:
 def test_a_plant_and_faults_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`rig fdi`, `rig campaign` and `rig trend` with both; bands and maps speak of this plant and of no other."""
     monkeypatch.chdir(tmp_path)
-    assert rig("new", "plant", "motor").status == 0
+    assert rig("new", "plant", "new_plant").status == 0
     Path("faults.toml").write_text("""
 [faults.bearing]
 title = "friction of the bearings"
@@ -274,23 +207,21 @@ range = [0.02, 0.05]
 acceptable = 0.045
 maintenance = 0.04
 """)
-    own = ["--model", "motor.py", "--trust", "--faults", "faults.toml"]
+    own = ["--model", "new_plant.py", "--trust", "--faults", "faults.toml"]
     Path("unit").mkdir()
-    for month in range(1, 4):
-        rig("simulate", *own[:3], "--set", f"dry_friction.torque={0.4 * month}", "--seed", month, "--out",
-            f"unit/2026-{month:02}-01.csv")
+    run = "unit/2026-03-01.csv"
+    rig("simulate", *own[:3], "--set", "dry_friction.torque=1.2", "--seed", "3", "--out", run)
     made = rig("fdi", "--learn-bands", *own, "--out", "bands.toml", "--json").json
     assert made["judges"] == ["bearing"]
-    found = rig("fdi", "unit/2026-03-01.csv", *own, "--bands", "bands.toml", "--json").json
+    found = rig("fdi", run, *own, "--bands", "bands.toml", "--out", "page.html", "--json").json
     assert (found["ruling"], found["bands"]["ruling"]) == ("bearing", "bearing")
     assert found["events"] and {event["section"] for event in found["events"]} == {"step to 0.5 rad"}
     assert [set(grid["faults"]) for grid in found["grids"]] and "bearing" in found["grids"][0]["faults"]
-    page = tmp_path / "page.html"
-    rig("fdi", "unit/2026-03-01.csv", *own, "--bands", "bands.toml", "--out", page)
-    assert not re.search(r"\b(ram|jack|spool|valve|servo|XJ|XS|Kintas|FSS)\b", re.sub("<[^>]*>", " ", page.read_text()))
-    assert "--bands: of bearing" in refuse("fdi", "unit/2026-03-01.csv", *own[:3], "--bands", "bands.toml")
+    said = re.sub("<[^>]*>", " ", Path("page.html").read_text())
+    assert not re.search(r"\b(ram|jack|spool|valve|servo|XJ|XS|Kintas|FSS)\b", said)
+    assert "--bands: of bearing" in refuse("fdi", run, *own[:3], "--bands", "bands.toml")
     trend = rig("trend", "unit", *own, "--json").json
     assert [fault["name"] for fault in trend["faults"]] == ["bearing", "winding", "magnet"]
-    cases = ["--fault", "healthy", "--fault", "bearing=1", "--seeds", "1", "--jobs", "1", "--out", "campaign"]
+    cases = ["--fault", "bearing=1", "--seeds", "1", "--jobs", "1", "--out", "campaign"]
     counted = rig("campaign", *own, *cases, "--json").json
-    assert counted["status"] == {"ok": 2} and counted["faults"] == trend["faults"]
+    assert counted["status"] == {"ok": 1} and counted["faults"] == trend["faults"]

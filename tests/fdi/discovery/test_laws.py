@@ -11,7 +11,6 @@ from short_runs import STEPS, build_command, build_other_command
 
 from fdi.discovery.laws.find_law import (
     LawSearch,
-    describe_balance,
     evaluate_columns,
     find_dependences,
     find_law,
@@ -95,15 +94,6 @@ def test_what_the_residual_follows_is_tested_on_rows_that_the_curve_never_saw() 
     assert found[0].holdout is not None and found[0].holdout > 0.4 and found[0].p_value < 0.02
     coloured = np.convolve(noise, np.ones(200), "same")
     assert find_dependences(coloured, there, None)[0].p_value > 0.05, "slow noise follows nothing"
-
-
-def test_a_balance_without_smooth_rows_depends_on_nothing() -> None:
-    n = len(sample_states()["time"])
-    rough = Balance("force", "N", np.ones(n), 0.1, 10.0, np.zeros(n, bool))
-    smooth = rough._replace(smooth=np.ones(n, bool), missing=sample_states()["position"])
-    states = States(**sample_states())
-    assert describe_balance(rough, states, ([smooth], states)).dependences == ()
-    assert describe_balance(smooth, states, ([rough], states)).dependences
 
 
 SIZES = {"cogging": 400.0, "cogging_length": 2e-3, "cogging_phase": 0.3, "drag_square": 3e5, "friction_run_in": 200.0,

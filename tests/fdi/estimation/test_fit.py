@@ -9,26 +9,21 @@ import numpy as np
 import pytest
 from noisy_traces import record_plant
 
-from fdi.discovery.explain import judge_left_out_rows
 from fdi.discovery.search import Search, scan_effects
 from fdi.discovery.update_model import refit_effects
 from fdi.estimation.fit import (
     Fit,
     Problem,
-    compute_typical_rms,
-    evolve_population,
+    complete_model,
     linearise,
     list_all_unknowns,
-    list_effect_unknowns,
 )
-from fdi.estimation.noise import WINDOW, white_noise
+from fdi.estimation.noise import white_noise
 from fdi.estimation.replay import (
     compute_residuals,
-    extend_until_noise,
     find_rest_rows,
     find_undecided_rows,
     hold_inputs,
-    leave_out_rest,
     replay_current,
 )
 from fdi.estimation.unidentifiable import (
@@ -36,51 +31,13 @@ from fdi.estimation.unidentifiable import (
     JACK_PRESSURE,
     POSITION_SCALE,
     SPOOL_WAY,
-    TRIED,
-    TRIED_SHARES,
     VISCOSITY,
-    confirm_flat,
     find_tangents,
-    invert_hessian,
 )
 from fdi.trace.trace import Floats, Trace, rms
 from plant import Model, load_model, simulate
 from plant.declare import Chirp, Hold, Ramp, Step
 from plant.segments import build_profile
-
-
-@pytest.mark.parametrize("steep", [1e6, 1e15, 1e18])
-def test_a_steep_slope_leaves_what_only_a_prior_holds_as_wide_as_the_prior(steep: float) -> None:
-    """Two unknowns that make up for each other, each with a prior of one; a third one with an enormous slope."""
-    slopes = np.array([[1e3, -1e3, 0.0], [0.0, 0.0, np.sqrt(steep)]])
-    covariance = invert_hessian(slopes.T @ slopes + np.diag([1.0, 1.0, 0.0]))
-    assert covariance[0, 0] == pytest.approx(0.5, rel=1e-3)  # both priors count along their common direction
-    assert covariance[2, 2] == pytest.approx(1.0 / steep, rel=1e-3)
-
-
-def test_a_direction_that_nothing_holds_gets_no_width() -> None:
-    assert invert_hessian(np.diag([4.0, 0.0])).tolist() == [[0.25, 0.0], [0.0, 0.0]]
-
-
-class SteppedResiduals:
-    """Residuals (m, 1, 2) that a second unknown moves, and that jump once the first one passes 0.005."""
-
-    def compute_white_residuals(self, free: object, x: Floats) -> Floats:
-        """Whitened residuals of scaled unknowns (m, 2)."""
-        return np.stack([10.0 * (x[:, 0] > 0.005), 1e5 * x[:, 1]], axis=-1)[:, None, :]
-
-
-@pytest.mark.parametrize(("tried", "limits", "expected"), [
-    ([1, 1, 1, 1], [1.0, 1.0], [True, False]),  # a jump in one trial does not hide a flat direction
-    ([0, 0, 0, 0], [1.0, 1.0], [False, False]),  # a bound stopped all of them
-    ([1, 0, 0, 0], [1.0, 1.0], [False, False]),  # the full length forwards, where the jump is
-    ([1, 1, 1, 1], [1.0, 2.1e6], [True, True]), ([1, 1, 1, 1], [2.1e6, 1.0], [True, False])])  # each its own limit
-def test_trials_confirm_a_flat_direction(tried: list[int], limits: list[float], expected: list[bool]) -> None:
-    trials = np.array([TRIED * share * np.eye(2) for share in TRIED_SHARES])
-    is_tried = np.repeat(np.array(tried, bool)[:, None], 2, axis=1)
-    found = confirm_flat(cast(Any, SteppedResiduals()), (), np.zeros(2), trials, is_tried, np.array(limits))
-    assert found.tolist() == expected
-
 
 T = 1e-3 * np.arange(1500)
 GENTLE = 5e-4 * np.sin(2.0 * np.pi * 1.5 * T) * (1.0 - np.exp(-5.0 * T))  # m, neither flapper nor spool stops
@@ -135,43 +92,12 @@ def test_tolerances_make_up_for_viscosity_and_for_the_scale_of_the_position(
     assert direction in find_flat(changes, "xj,p12,xs")
 
 
-LOWEST = np.array([0.4, -1.2, 2.0, 0.0, -0.7, 1.1])
-TURN = np.linalg.qr(np.random.default_rng(3).standard_normal((6, 6)))[0]
-SCALES = np.array([1.0, 3.0, 10.0, 30.0, 100.0, 300.0])
-
-
-def measure_costs(x: np.ndarray) -> np.ndarray:
-    """A narrow valley across the axes, with ridges 40 high in it: at a far place slopes show the ridges alone."""
-    along = (x - LOWEST) @ TURN * SCALES
-    costs: np.ndarray = (along**2).sum(axis=1) + 20.0 * (1.0 - np.cos(5.0 * along)).sum(axis=1) / 6.0
-    return costs
-
-
-def search(seed: int, low: float = -5.0, high: float = 5.0) -> tuple[np.ndarray, float]:
-    begin = np.zeros(6)
-    found = evolve_population(measure_costs, begin, np.eye(6), np.full(6, low), np.full(6, high), 200, seed)
-    return found.x, found.cost
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_lowest_place_of_a_rough_valley_is_found_and_again_by_the_same_seed(seed: int) -> None:
-    (x, cost), (again, _) = search(seed), search(seed)
-    assert cost < 10.0 < 0.01 * measure_costs(np.zeros((1, 6)))[0] and (x == again).all()
-    assert cost == pytest.approx(measure_costs(x[None])[0])
-    assert np.abs((x - LOWEST) @ TURN * SCALES).max() < 3.0
-
-
-def test_trials_stay_within_the_bounds() -> None:
-    x, _ = search(0, -1.0, 1.0)
-    assert np.abs(x).max() <= 1.0 and (np.abs(x) == 1.0).any()
-
-
 FLOOR = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
 
 
 def _find(changes: dict[str, float], com: np.ndarray) -> np.ndarray:
-    model = Model().with_effects(["compressibility"]).replace(changes)
-    trace = hold_inputs(Trace.from_columns(simulate(model, com, seed=1)._asdict(), 1e-3, {}))
+    model = complete_model(Model()).replace(changes)
+    trace = hold_inputs(record_plant(changes, com, seed=1))
     problem = Problem(model, trace, tuple(white_noise(FLOOR[s]) for s in trace.outputs), steps=20)
     return find_undecided_rows(problem, cast(Fit, cast(Any, SimpleNamespace(free=(), values={}))), FLOOR)
 
@@ -202,19 +128,6 @@ def test_an_observer_does_not_take_the_steps_of_a_position_for_motion() -> None:
     assert coarse < 0.06 < plain  # rad/s; the sensor has 0.05
 
 
-def test_rows_in_which_a_motor_bounces_in_its_backlash_are_left_out_of_last_fits() -> None:
-    trace, model = _record_motor({"screw.backlash": 2e-4}), load_model("ema")
-    search = Search(model, trace, [], ["backlash"], 1)
-    usable = search.problem.trace.usable
-    free = (*list_all_unknowns(model), *list_effect_unknowns(model.find_effect("backlash"), model))
-    x = np.array([(2e-4 - f.centre) / f.scale if f.name == "screw.backlash" else 0.0 for f in free])
-    true = search.judge_fit(("backlash",), linearise(search.problem, free, x))
-    assert search.leave_out_undecided(true) and not usable[:300].any()  # at rest
-    kept = search.problem.trace.usable
-    assert kept[700:1200].all() and usable[-1000:].all() and kept[-1000:].mean() < 0.5
-    assert not Search(Model(), hold_inputs(record_plant({}, np.zeros(200))), [], [], 1).leave_out_undecided(true)
-
-
 def test_scan_of_a_step_test_finds_the_size_at_which_a_backlash_bounces_like_the_motor() -> None:
     """Two percent beside it a replay bounces otherwise; most of the run is at rest and is not compared."""
     model = load_model("ema")
@@ -236,38 +149,6 @@ def test_error_that_is_watched_while_a_backlash_is_added_falls_to_the_noise() ->
     assert found.last.hypothesis.fit.values["screw.backlash"] == pytest.approx(1e-4, rel=0.05)
 
 
-def test_what_is_missing_in_rows_that_a_search_left_out_is_no_noise() -> None:
-    """A larger mass, and a search that keeps nothing but the ramp: what it left out may hang on an impact or not."""
-    model, ramp = load_model("ema"), slice(700, 1250)
-    for changes, is_noise in (({}, True), ({"surface.mass": 260.0}, False)):
-        search = Search(model, _record_motor(changes), [], [], 1)
-        usable = np.zeros(len(search.run), bool)
-        usable[ramp] = True
-        search.problem = replace(search.problem, trace=search.run.with_columns({}, usable=usable), _lanes={})
-        base = search.judge_fit((), linearise(search.problem, list_all_unknowns(model), np.zeros(4)))
-        assert base.is_at_floor
-        assert judge_left_out_rows(search, base, search.estimate_floor(base)).is_at_floor == is_noise
-
-
-def test_an_extension_ends_where_friction_cannot_have_made_the_residual() -> None:
-    n = 10 * WINDOW
-    undecided = np.arange(n) < WINDOW
-    ratios, reach = np.full((1, n), 3.0), np.full((1, n), 5.0)
-    ratios[:, 8 * WINDOW:] = 1.0
-    assert extend_until_noise(undecided, ratios).mean() == 0.8
-    assert extend_until_noise(undecided, ratios, reach).mean() == 0.8
-    ratios[:, 4 * WINDOW:6 * WINDOW] = 7.0
-    assert extend_until_noise(undecided, ratios, reach).mean() == 0.4
-
-
-def test_missing_samples_do_not_make_the_typical_block_smaller() -> None:
-    residuals = np.random.default_rng(0).standard_normal((2, 4000))
-    there = compute_typical_rms(residuals[:, :2000])
-    residuals[:, 2000:] = np.nan
-    assert compute_typical_rms(residuals).tolist() == there.tolist()
-    assert compute_typical_rms(np.full((1, 300), np.nan)).tolist() == [0.0]
-
-
 def test_a_rest_hangs_on_stops_and_a_reversal_does_not() -> None:
     t = np.arange(0.0, 3.0, 1e-3)
     x = np.where(t < 1.0, 0.0, 3e-3 * np.sin(2.0 * np.pi * np.clip(t - 1.0, 0.0, 1.5)))  # rests, two reversals, rests
@@ -276,11 +157,3 @@ def test_a_rest_hangs_on_stops_and_a_reversal_does_not() -> None:
     x[500:520] = np.nan
     rest = find_rest_rows(x, 1e-3, 1e-6)
     assert rest[:1150].all() and not rest[1300:2490].any() and rest[2550:].all()  # and until a replay has forgotten it
-
-
-def test_rows_at_rest_are_left_out_where_a_plant_has_an_observer_and_a_note_says_so() -> None:
-    trace = _record_motor({})
-    moving = leave_out_rest(trace, load_model("ema"))
-    assert not moving.usable[:300].any() and moving.usable[700:1200].all() and "at rest" in moving.notes[-1]
-    ram = hold_inputs(record_plant({}, np.zeros(200)))
-    assert leave_out_rest(ram, Model()) is ram

@@ -21,13 +21,12 @@ from fdi.estimation.replay import (
     FEWEST_ROWS,
     PERIODS,
     align_columns,
-    align_repeat,
     find_repeat,
     hold_inputs,
     match_period,
     read_cycles,
 )
-from fdi.trace.trace import Trace, bridge_gaps, hold_last, shift_rows
+from fdi.trace.trace import Trace
 from plant import Model
 from plant.lanes import Lanes
 from plant.model import find_quantity
@@ -43,14 +42,6 @@ def columns(**changes: np.ndarray) -> dict[str, np.ndarray]:
 
 def made(period: float = 1e-3, **changes: np.ndarray) -> Trace:
     return Trace.from_columns(columns(**changes), period, {})
-
-
-def test_a_plain_trace_stays_as_it_is() -> None:
-    trace = record_healthy()
-    (c,), (less,) = read_cycles(trace, MODEL), read_cycles(trace, MODEL, ["xs", "xj"])
-    assert (c.outputs, c.notes, len(c)) == (("xj", "p12", "xs"), (), len(trace)) and c.usable.all()
-    assert not c.filled.any() and (c.cor == trace.cor).all() and (c.mask_unusable("xs") == trace.xs).all()
-    assert less.outputs == ("xj", "xs") and np.isnan(less.p12).all()
 
 
 @pytest.mark.parametrize(("changes", "field", "words"), [
@@ -130,22 +121,6 @@ def test_a_trace_that_starts_in_motion() -> None:
     assert not c.usable[:300].any() and c.usable[300] and "already moves" in c.notes[0]
 
 
-def test_times_that_jitter_are_cycles_still() -> None:
-    rng = np.random.default_rng(0)
-    (c,) = read_cycles(made(t=columns()["t"] + rng.uniform(-2e-4, 2e-4, 13_500)), MODEL)
-    assert len(c) == 13_500 and "off an even grid" in c.notes[0]
-
-
-def test_cubics_fill_gaps_and_long_gaps_are_held() -> None:
-    k = np.arange(60.0)
-    curve = 0.01 * (k - 20) ** 3 - k
-    filled, marked = bridge_gaps(np.where(np.isin(k, [0, 1, 10, 30, 31, *range(40, 50)]), np.nan, curve), 5)
-    assert filled[[10, 30, 31]] == pytest.approx(curve[[10, 30, 31]]) and (filled[40:50] == curve[39]).all()
-    assert np.flatnonzero(marked).tolist() == [0, 1, *range(40, 50)]
-    assert hold_last(np.array([np.nan, 1.0, np.nan, 2.0])).tolist() == [0.0, 1.0, 1.0, 2.0]
-    assert [shift_rows(np.arange(4), by).tolist() for by in (1, -1)] == [[0, 0, 1, 2], [1, 2, 3, 3]]
-
-
 def test_a_repeat_is_found_by_its_command() -> None:
     (c,), (spool,) = read_cycles(record_healthy(), MODEL), read_cycles(record_healthy(), MODEL, ["xs"])
     repeat = find_repeat(c, cut(slice(100, None)), MODEL, 1)
@@ -158,18 +133,6 @@ def test_a_repeat_is_found_by_its_command() -> None:
             (c, cut(slice(None, None, 3), 2.5e-3), "rows as in the trace")):
         line = catch_refusal(find_repeat, first, other, MODEL, 1)
         assert line.startswith("--repeat") and words in line
-
-
-def test_rows_that_the_check_of_the_firmware_leaves_out() -> None:
-    """Rows as recorded: those without Com, XJ or Cor. Rows moved or resampled: those without XJ, or outside the run."""
-    holes = spoil("cor", 5000) | spoil("com", 6000) | spoil("xj", 7000)
-    (c,), (first,) = read_cycles(made(**holes), MODEL), read_cycles(record_healthy(), MODEL)
-    moved = align_repeat(find_repeat(first, cut(slice(20, None), **holes), MODEL, 1), len(first))
-    assert np.flatnonzero(c.incomplete).tolist() == [5000, 6000, 7000]
-    assert np.flatnonzero(moved.incomplete).tolist() == [*range(20), 7000]
-    slow = cut(slice(None, None, 2), 2e-3, **holes)
-    spread = read_cycles(slow, MODEL)[-1]
-    assert len(spread) == 2 * len(slow) - 1 and (spread.incomplete == np.isnan(spread.xj)).all()
 
 
 def test_a_period_that_no_controller_has_is_refused_in_one_line() -> None:

@@ -8,7 +8,7 @@ from noisy_traces import LEVELS, sample_noise
 from scipy.stats import binomtest
 
 from fdi.estimation.binomial import clopper_pearson_interval, measure_share
-from fdi.estimation.noise import find_floors, find_hum_lines, floor_from_data, floor_from_repeats, measure_quiet_level
+from fdi.estimation.noise import find_hum_lines, floor_from_data, floor_from_repeats
 
 ROWS = 13_500
 
@@ -64,16 +64,6 @@ def test_hum_of_one_phase_is_found_and_counted() -> None:
     none, one, more = ([f for f, _ in find_hum_lines(runs, 1e-3)]
                        for runs in ([r, repeat], [r + hum, repeat + hum], [fast, fast]))
     assert (none, one) == ([], [50.0]) and 400.0 in more
-
-
-def test_gaps_and_other_lengths() -> None:
-    r, repeat = pair(1, "white")
-    r[2000:3000], repeat[500:600] = np.nan, np.nan
-    ((name, found),) = find_floors({"xj": r, "p12": r}, [{"xj": repeat[:9000]}]).items()
-    assert (name, found.source, found.lower_bound) == ("xj", "repeats", False)
-    assert found.value == pytest.approx(1.0, abs=0.03) and found.freedom == pytest.approx(1.0, abs=0.1)
-    assert floor_from_repeats(r[:50], [repeat[:50]]).value == pytest.approx(1.0, abs=0.4)  # too short for windows
-    assert measure_quiet_level([np.full(500, np.nan)])[0] == 0.0 and measure_quiet_level([np.zeros(500)])[0] == 0.0
 
 
 def test_second_differences_are_a_lower_bound() -> None:

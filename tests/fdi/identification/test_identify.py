@@ -10,23 +10,17 @@ from rig_command import answer, refuse, rig
 
 from fdi.discovery.update_model import read_provenance
 from fdi.estimation import long_recordings
-from fdi.estimation.fit import scaled_bounds
-from fdi.estimation.unidentifiable import compute_values
 from fdi.identification import global_fit
 from fdi.identification.identify import (
     Identification,
     collect_identification_runs,
     decide_verdict,
-    estimate_by_regressions,
     identify_model,
-    list_unknowns,
     parse_free_parameters,
-    read_controller,
     read_free_parameters,
     write_identified_model,
 )
-from fdi.report.identify_report import build_identification_report, describe_identification
-from fdi.report.terminal import format_report
+from fdi.report.identify_report import describe_identification
 from fdi.trace.trace import Trace
 from plant import simulate
 from plant.declare import Chirp, Hold, Ramp, Step
@@ -99,12 +93,6 @@ def test_stops_at_the_wrong_moment_in_a_fitted_run_leave_doubt(found: Identifica
     assert held.is_held_out and decide_verdict(found.estimates, [first, *others[:-1], held])[0] == "IDENTIFIED"
 
 
-def test_no_value_counts_as_identified_where_the_model_fails(found: Identification) -> None:
-    failed = replace(found, verdict="UNEXPLAINED", reason="too much is left")
-    words = " ".join(format_report(build_identification_report(failed, "eha")).split())
-    assert "these values and intervals may be wrong" in words
-
-
 def test_range_that_is_too_narrow_gives_no_model_file(runs: tuple[Trace, Trace, Trace], tmp_path: Path,
                                                       monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -141,14 +129,6 @@ def test_model_file_is_read_by_every_command(found: Identification, runs: tuple[
     assert answer("compare", held, "--model", path)["verdict"] == "WITHIN_FLOOR"
     diagnosed = answer("fdi", held, "--model", path)
     assert diagnosed["verdict"] == "ACCEPTABLE" and any("no bands" in note for note in diagnosed["notes"])
-
-
-def test_report_shows_every_parameter_and_run(found: Identification) -> None:
-    report = build_identification_report(found, "eha", "rig identify")
-    shown = format_report(report, 100)
-    assert all(e.name in shown for e in found.estimates) and "may be wrong" not in shown
-    assert set(report.data["parameters"]) == {e.name for e in found.estimates}
-    assert [run["held_out"] for run in report.data["runs"]] == [False, False, True]
 
 
 def test_area_needs_a_known_load(runs: tuple[Trace, Trace, Trace]) -> None:
@@ -202,19 +182,6 @@ def test_run_at_rest_identifies_nothing() -> None:
     assert {a.parameter for a in found.advice} == {e.name for e in found.estimates}
 
 
-def test_regressions_find_size_and_controller(runs: tuple[Trace, Trace, Trace]) -> None:
-    model = load_model()
-    own = collect_identification_runs(model, parse_free_parameters(FREE, model, "test"), runs[:2], [])
-    begun, truth = estimate_by_regressions(own.fitted, model), sample_plant()
-    for name, symbol in (("jack.area", "AJ"), ("valve.flow_gain", "GQ"), ("jack.travel", "XJM")):
-        assert begun[name] == pytest.approx(truth[symbol], rel=0.15), name
-    lagged = np.convolve(runs[0].cor, np.full(40, 1.0 / 40.0))[:len(runs[0])]
-    gains, other = read_controller(own.fitted), read_controller([runs[0].with_inputs(drive=lagged)])
-    assert gains is not None and gains.is_proportional
-    assert gains.limit == pytest.approx(model["controller.current_limit"])
-    assert other is not None and not other.is_proportional and not other.values  # another law is left alone
-
-
 @pytest.mark.parametrize(("table", "field"), [
     ({"jack": {"area": 0.5}}, "identify.jack.area"), ({"jack": {"area": [2.0, 1.0]}}, "identify.jack.area"),
     ({"jack": {"area": "wide"}}, "identify.jack.area"), ({"filter": {"clogging": 3}}, "identify.filter.clogging"),
@@ -232,26 +199,6 @@ def test_ranges_of_a_model_file(tmp_path: Path) -> None:
     assert (area.centre, area.low, area.high) == pytest.approx((3e-3, 2e-3, 4.5e-3))
     assert (leakage.low, leakage.high) == (1e-13, 1e-11)
     assert len(read_free_parameters(load_model(), None)) > 10
-
-
-def test_every_unknown_changes_the_model_wherever_a_fit_may_be() -> None:
-    """Where dynamic friction could go above static friction, no signal depended on it, and a fit stayed there."""
-    model = load_model()
-    free = list_unknowns(model, read_free_parameters(model, None))
-    low, high = scaled_bounds(free)
-    for seed in range(20):
-        x = np.random.default_rng(seed).uniform(np.maximum(low, -2.0), np.minimum(high, 2.0))
-        for k, (name, *_) in enumerate(free):
-            moved = x + np.where(x + 0.1 < high, 0.1, -0.1) * (np.arange(len(free)) == k)
-            assert (compute_values(free, moved) != compute_values(free, x)).any(), name
-
-
-def test_dynamic_friction_that_no_run_shows_takes_the_static_one_with_it(
-        runs: tuple[Trace, Trace, Trace], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(global_fit, "SEARCHES", 0)  # no other valley is deeper
-    table = {"spool": {"static_friction": [1e-6, 2e-5], "dynamic_friction": [1e-6, 1e-5]}, **FREE}
-    found = {e.name: e.is_identifiable for e in identify([runs[1]], [], table).estimates}
-    assert not found["spool.static_friction"] and not found["spool.dynamic_friction"]
 
 
 def test_design_survives_the_model_file(tmp_path: Path) -> None:

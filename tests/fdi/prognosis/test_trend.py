@@ -12,18 +12,15 @@ import numpy as np
 import pytest
 from refusals import catch_refusal
 from rig_command import refuse, rig
-from scipy.integrate import quad
-from scipy.stats import halfnorm, multivariate_normal
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
-from fdi.prognosis import trend, unit_trend
-from fdi.prognosis.trend import Trend, evaluate_shapes, fit_trend, list_shapes
+from fdi.prognosis import unit_trend
+from fdi.prognosis.trend import Trend, fit_trend
 from fdi.prognosis.unit_trend import Row, find_date_in_name, find_row, format_day, parse_date, read_dates_table
 from fdi.progress import ignore_progress
 from fdi.report.trend_report import explain_level
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
-from rig.recorder.schema import collect_provenance
 
 WEEKS = 7.0 * np.arange(14)
 RNG = np.random.default_rng(3)
@@ -61,32 +58,6 @@ def test_a_table_of_dates(tmp_path: Path) -> None:
                         ("file,hours\na.csv,x\n", "hours"), ("file,date\na,2026-01-01\na,2026-01-02\n", "file")):
         table.write_text(text)
         assert f": {field}: " in catch_refusal(read_dates_table, table)
-
-
-def test_the_evidence_is_that_of_the_model_integrated_by_brute_force() -> None:
-    data = trend.Scaled(np.array([0.0, 0.3, 0.6, 1.0]), np.array([0.02, 0.1, 0.3, 0.5]), np.full(4, 0.03),
-                             steps=(2,))
-    every, _ = list_shapes()
-    found = trend.fit_growth(data)
-    for part in (found.parts[9], found.parts[25]):
-        cov = trend.compute_covariance(data, part.noise, part.wander)
-        for k in (1, 60, 130):
-            column = evaluate_shapes((every[k],), data.u)[:, 0]
-
-            def likelihood(rise: float, column: Any = column, cov: Any = cov, k: int = k) -> float:
-                chance = halfnorm.pdf(rise, scale=every[k].rise)
-                return float(chance * multivariate_normal.pdf(data.y, rise * column, cov))
-
-            exact = math.log(quad(likelihood, 0.0, 4.0, epsabs=0.0, limit=200, points=[0.2, 0.5, 1.0])[0])
-            prior = trend.compute_shape_log_priors(part.noise, part.wander)[k]
-            ours = part.evidence[k] - prior - 2.0 * math.log(2.0 * math.pi)
-            assert ours == pytest.approx(exact, abs=1e-6)
-
-
-def test_reaching_a_limit() -> None:
-    rising = 0.5 + 0.1 * trend.AHEAD
-    paths = trend.Paths(np.array([rising, np.full_like(rising, 0.5), rising + 1.0]), np.zeros(3))
-    assert trend.find_first_passage(paths, 1.0) == pytest.approx([5.0, math.inf, 0.0])
 
 
 @pytest.mark.parametrize("law", ["linear", "exponential", "power"])
@@ -244,7 +215,3 @@ def test_a_trace_is_diagnosed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert sorted(path.name for path in (tmp_path / "unit").iterdir()) == ["2026-01-05.csv"]
     monkeypatch.setattr("fdi.diagnosis.diagnosis.diagnose", lambda *a, **k: pytest.fail("a second time"))
     assert rig("trend", tmp_path / "unit", "--json").json == first.json
-
-
-def test_a_log_of_the_rig_tells_its_date() -> None:
-    assert parse_date(collect_provenance()["started"]) > parse_date("2026-01-01")
