@@ -10,13 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from fdi.estimation.replay import prepare_trace, replay_with_checked_steps
-from fdi.trace.trace import Trace, rms
-from plant import ema, simulate
+from plant import ema
 from plant.compile import compile_function
 from plant.ema import compute_coefficients, step
-from plant.model import load_model
-from plant.segments import build_profile
 
 Array = NDArray[np.float64]
 GROUPS = ema.PLANT.parameters
@@ -110,24 +106,6 @@ def test_the_surface_waits_for_the_motor_by_the_backlash_and_the_wind_up_of_fric
     assert np.median(lost[slides]) == pytest.approx(0.5 * width + force / STIFF, rel=0.02)  # apart from impacts
 
 
-def test_steps_converge_in_first_order_and_ten_microseconds_leave_little() -> None:
-    def compute_error(p: Any, h: float, reference: Array) -> float:
-        x = trace(p, h)
-        return float(np.sqrt(np.mean((x - reference)**2)))
-
-    def trace(p: Any, h: float) -> Array:
-        t = h * np.arange(round(0.4 / h))
-        return run(p, 8.0 * np.sin(2.0 * pi * 5.0 * np.floor((t + 1e-9) / 1e-3) * 1e-3), h)[::round(1e-4 / h), 3]
-
-    for changes, limit in ((NO_DRY, 1e-7), ({}, 1e-7), ({"screw.backlash": 1e-4}, 4e-6)):  # m, of a stroke of 20 mm
-        p = change_parameters(**changes)
-        reference = trace(p, 1e-6)
-        errors = [compute_error(p, h, reference) for h in (5e-5, 1e-5)]
-        assert errors[1] < limit
-        if "screw.backlash" not in changes:
-            assert 3.0 < errors[0] / errors[1] < 9.0  # five times the step
-
-
 def test_the_smooth_model_agrees_with_an_independent_solver() -> None:
     p = change_parameters(**NO_DRY)
 
@@ -151,19 +129,3 @@ def test_the_surface_stops_at_the_end_of_its_travel() -> None:
     s = run(USUAL, hold(10.0, 3.0, 1e-4), 1e-4)
     assert np.abs(s[:, 3]).max() <= USUAL.surface.travel
     assert s[-1, 4] == 0.0 and np.isfinite(s).all()
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_replay_of_a_healthy_unit_leaves_noise_where_no_stop_decides(seed: int) -> None:
-    """The noise of the position, as the observer takes it, tears no held surface off its stiction."""
-    model = load_model("ema")
-    command = build_profile(ema.PLANT.profile[:3]).command  # a step out and back
-    run = simulate(model, command, seed=seed)._asdict()
-    t = run.pop("t")
-    trace = prepare_trace(Trace.from_columns(run, float(t[1]), {}, model.kind.signals), model, None, "trace")
-    floor = {name: model[trace.declared.find(name).noise] for name in trace.outputs}
-    found = replay_with_checked_steps(trace, model, floor)
-    assert found.undecided.mean() < 0.6
-    assert all(rms(left[~found.undecided]) < 1.1 * floor[name] for name, left in found.residual.items())
-    held = ema.State(position=1e-3)
-    assert ema.correct(held, 1e-6, USUAL).speed == 0.0

@@ -1,22 +1,18 @@
 """Elementary functions and the firmware's law against the library and numbers worked out by hand."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from math import exp, hypot, sin
-from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
-from effect_files import HEAD, restored_catalogue
 from other_cpus import compiles_for
 
-from plant import Actuator, Model, functions
+from plant import functions
 from plant.compile import INLINE_OPTIONS, _link_calls, compile_function, interpret_function
 from plant.controller import Loop, compute_current
-from plant.effects import load_effects
 from plant.parameters import Controller
-from plant.run import sample_noise
 
 RNG = np.random.default_rng(1)
 NEAR, TINY = RNG.uniform(-1.0, 1.0, 20000), RNG.normal(size=5000) * 1e-5
@@ -136,52 +132,3 @@ def test_the_limit_does_not_stop_an_integral_that_comes_back() -> None:
     assert current == 8e-3 and loop.integral == pytest.approx(7.9e-3, abs=1e-15)
     again = compute_current(full._replace(error=1e-3), 1e-3, 0.0, PID)[1]  # with the error the other way it waits
     assert again.integral == 7.95e-3
-
-
-@pytest.fixture
-def coil(tmp_path: Path) -> Iterator[None]:
-    """An effect behind `current_noise` that remembers the current in the coil."""
-    with restored_catalogue():
-        (tmp_path / "coil.py").write_text(HEAD + """
-class Gain(NamedTuple):
-    gain: Annotated[float, Quantity("1")] = 1.0
-
-class Seen(NamedTuple):
-    current: float = 0.0
-
-@effect("current", Gain, law="i = g i", memory=Seen)
-def coil(x, m, s, u, p):
-    return p.coil.gain * x, Seen(p.coil.gain * x)
-""")
-        load_effects(tmp_path / "coil.py")
-        yield
-
-
-def in_the_coil(changes: dict[str, float], cycles: int, sent: float = 1e-3, seed: int = 3) -> np.ndarray:
-    """Current in the coil at the last step of each cycle, A, when the firmware sends `sent`."""
-    plant, out = Actuator(Model().replace(changes).with_effects(["coil"]), seed), np.empty(cycles)
-    for k in range(cycles):
-        plant.sample()
-        plant.advance(sent)
-        out[k] = plant.memory.current[1].current
-    return out
-
-
-@pytest.mark.parametrize("frequency", [400.0, 50.0])
-def test_hum_is_one_line_of_its_amplitude(frequency: float, coil: None) -> None:
-    """Sampled once a cycle at its last step: 1000 cycles are whole periods, so the line is one bin of the FFT."""
-    seen = in_the_coil({"current_noise.hum": 0.2e-3, "current_noise.frequency": frequency}, 1000)
-    spectrum = np.fft.rfft(seen) / 1000
-    line = 2 * spectrum[round(frequency)]
-    assert spectrum[0] == pytest.approx(1e-3, rel=1e-6)
-    assert line == pytest.approx(-0.2e-3j * np.exp(2j * np.pi * frequency * 0.99e-3), rel=1e-6)  # of sin(2 pi f t)
-    rest = np.delete(np.abs(spectrum), [0, round(frequency)])
-    assert rest.max() < 1e-9
-
-
-def test_white_noise_has_its_rms_and_is_new_every_cycle(coil: None) -> None:
-    seen = in_the_coil({"current_noise.white": 0.1e-3}, 20_000) - 1e-3
-    assert seen.std() == pytest.approx(0.1e-3, rel=0.02) and abs(seen.mean()) < 3e-6
-    assert np.corrcoef(seen[1:], seen[:-1])[0, 1] == pytest.approx(0.0, abs=0.03)
-    fourth = sample_noise(3, 20_000)[:, 3]
-    np.testing.assert_allclose(seen, 0.1e-3 * fourth, atol=1e-15)

@@ -1,14 +1,12 @@
 """Runs side by side, and the monitor: the bits of one run after the other, closed forms, and wide registers."""
 
 import re
-from math import copysign
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from effect_files import COGGING, MEMORY, restored_catalogue
-from noisy_traces import record_plant
 from other_cpus import compiles_for
 from refusals import catch_refusal
 
@@ -18,8 +16,9 @@ from plant.compile import compile_function, interpret_function
 from plant.effects import CATALOGUE, load_effects
 from plant.kernel_use import KernelUse
 from plant.kernels import unpack_state
-from plant.lanes import FEWEST, NARROW, Lanes, Part, compile_kernels, list_kernel_variants, plan_layout
-from plant.monitor import FAULTS, Cell, Monitor, Motion, compute_cells, step_monitor
+from plant.lanes import FEWEST, Lanes, Part, list_kernel_variants, plan_layout
+from plant.model import list_searched_effects
+from plant.monitor import FAULTS, Monitor
 from plant.solve import read_sensors, step_cycle
 from plant.threads import map_together
 from rig.sequences import load_sequence
@@ -29,7 +28,7 @@ COMMAND = np.r_[np.zeros(5), np.full(95, 1e-3), np.linspace(1e-3, -2e-3, 200)]
 LOAD = np.linspace(0.0, 3e3, len(COMMAND))
 CURRENT = np.r_[np.zeros(3), np.full(12, 4e-3), np.full(15, -6e-3), np.linspace(-3e-4, 3e-4, 10)]
 FORCE = np.linspace(0.0, 3e3, len(CURRENT))
-EFFECTS = [name for name, entry in CATALOGUE.items() if not entry.base]
+EFFECTS = [e.name for e in list_searched_effects("eha") if not e.base and not e.disturbance]  # as fits have them
 
 
 def replay_drive(flat: Any, drive: Any, load: Any, position: Any, anchor: float, record: Any, steps: int,
@@ -98,8 +97,7 @@ def with_effects(lanes: Lanes, changes: dict[str, float]) -> np.ndarray:
 
 def start(effect: str, which: int) -> dict[str, float]:
     """Values at which the effect is at work."""
-    entry = CATALOGUE[effect]
-    return dict(entry.starts[which]) if entry.starts else {"current_noise.hum": 2e-4}
+    return dict(CATALOGUE[effect].starts[which])
 
 
 def test_each_effect_alone_among_all_that_are_off(catalogue: Lanes) -> None:
@@ -128,7 +126,7 @@ def test_runs_go_to_the_kernel_with_the_fewest_effects(catalogue: Lanes, monkeyp
 def test_runs_with_few_costly_effects_get_a_kernel_of_their_own_once_it_is_worth_while(
         catalogue: Lanes, monkeypatch: pytest.MonkeyPatch) -> None:
     """And get the bits that the kernel with all effects would give them."""
-    kinds = [("coil_lag",), ("coil_lag", "rod_backlash"), ("coil_lag", "viscosity_drift")]
+    kinds = [("coil_lag",), ("coil_lag", "rod_backlash")]
     values = np.vstack([with_effects(catalogue, {n: v for name in kind for n, v in start(name, which).items()})
                         for kind in kinds for which in (0, -1)] * 4)
     monkeypatch.setattr(lanes_module, "KERNEL_USE", KernelUse())
@@ -138,8 +136,8 @@ def test_runs_with_few_costly_effects_get_a_kernel_of_their_own_once_it_is_worth
     monkeypatch.setattr(kernel_use, "WORTH_COMPILING", 0.0)
     monkeypatch.setattr(lanes_module, "KERNEL_USE", KernelUse())
     shared = catalogue._assign_runs(values, 1)
-    costly = {frozenset(rung.model.effects) & {"coil_lag", "viscosity_drift", "stribeck"} for rung, _ in shared}
-    assert costly == {frozenset({"coil_lag"}), frozenset({"coil_lag", "viscosity_drift"})}
+    assert {frozenset(rung.model.effects) & {"coil_lag", "viscosity_drift", "stribeck"} for rung, _ in shared} == {
+        frozenset({"coil_lag"})}
     assert sorted(np.concatenate([members for _, members in shared])) == list(range(len(values)))
     assert (catalogue.replay(values, CURRENT, FORCE) == without).all()
     few = np.vstack([with_effects(catalogue, start(name, -1)) for name in (
@@ -155,16 +153,16 @@ def test_all_effects_at_once(catalogue: Lanes) -> None:
     assert (run == one_run(QUIET.replace(changes), CURRENT, FORCE)).all()
 
 
-def test_effects_of_a_user(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("text", "changes"), [(COGGING, {"cogging.force": 500.0}), (MEMORY, {"wear.rate": 1e4})])
+def test_effects_of_a_user(text: str, changes: dict[str, float], tmp_path: Path) -> None:
     """With a sine and with a memory. (A changed file is not served by old code: test_compile.py.)"""
+    (tmp_path / "mine.py").write_text(text)
     with restored_catalogue():
-        file = tmp_path / "mine.py"
-        file.write_text(COGGING + MEMORY)
-        load_effects(file)
-        model = QUIET.replace({"cogging.force": 500.0, "wear.rate": 1e4})
-        runs = Lanes(model, ["cogging.force"], steps=10).replay(np.array([[500.0], [0.0]]), CURRENT, FORCE)
-        for rows, force in zip(runs, (500.0, 0.0), strict=True):
-            assert (rows == one_run(model.replace({"cogging.force": force}), CURRENT, FORCE)).all()
+        load_effects(tmp_path / "mine.py")
+        model = QUIET.replace(changes)
+        runs = Lanes(model, list(changes), steps=10).replay(np.array([[*changes.values()], [0.0]]), CURRENT, FORCE)
+        for rows, one in zip(runs, (model, QUIET), strict=True):
+            assert (rows == one_run(one, CURRENT, FORCE)).all()
 
 
 def test_a_start_from_a_measured_position_and_the_pull_to_it() -> None:
@@ -209,12 +207,6 @@ def test_runs_of_side_by_side_fits_share_blocks_and_keep_their_bits(monkeypatch:
     assert sorted(len(each) for each in blocks) == [1, 2]
 
 
-def test_warming_tells_how_far_it_is() -> None:
-    calls: list[tuple[str, float]] = []
-    compile_kernels(QUIET.with_effects(EFFECTS), lambda *call: calls.append(call))
-    assert [share for _, share in calls] == [0, 1 / 3, 2 / 3, 1] and "0 effects" in calls[0][0]
-
-
 def test_what_does_not_fit_is_refused() -> None:
     lanes = Lanes(QUIET, ["jack.mass"])
     assert lanes.replay(np.empty((0, 1)), CURRENT, FORCE).shape == (0, len(CURRENT), 3)  # no runs, or no cycles, do
@@ -228,14 +220,13 @@ def test_what_does_not_fit_is_refused() -> None:
 
 
 @pytest.mark.skipif(not compiles_for("avx2"), reason="no code for wide registers here (AVX2)")
-@pytest.mark.parametrize("width", [FEWEST, NARROW])
-def test_wide_registers(width: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The lanes of the step became vector code, as a loop or at once: nothing in the step stops it."""
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path))  # what comes from the cache cannot be read as assembly
-    plan = plan_layout((), Model().kind, width)
+    plan = plan_layout((), Model().kind, FEWEST)
     run = compile_function(plan.loop, plan.names)
-    run(np.zeros(plan.numbers * width), CURRENT, FORCE, np.empty(0), 0.0, 0.0, False, 1e-3, 10,
-        0, len(CURRENT), 0, 0, True, np.arange(width, dtype=np.uint64), np.empty((width, 3, len(CURRENT))))
+    run(np.zeros(plan.numbers * FEWEST), CURRENT, FORCE, np.empty(0), 0.0, 0.0, False, 1e-3, 10,
+        0, len(CURRENT), 0, 0, True, np.arange(FEWEST, dtype=np.uint64), np.empty((FEWEST, 3, len(CURRENT))))
     (code,) = run.inspect_asm().values()
     pieces = re.split(r"^\.LBB\w+:\n", code, flags=re.MULTILINE)  # without a jump
     step = max(pieces, key=lambda piece: len(re.findall("%[yz]mm", piece)))
@@ -267,18 +258,6 @@ def test_parts_begin_anew_at_their_own_time() -> None:
     assert (second != lanes.replay(values, *rest, 20.0)).any()
 
 
-def test_an_anchored_replay_does_not_pull_the_ram_through_the_play_of_its_rod() -> None:
-    """While the ram rests within the play, XJ does not show where: the width that fits best is the true one."""
-    widths = 4e-5 + 1e-6 * np.arange(-2.0, 2.1, 0.25)
-    lanes = Lanes(Model().with_effects(EFFECTS), ["rod_backlash.width"], 50)
-    best = []
-    for seed in (1, 2, 3):
-        trace = record_plant({"rod_backlash.width": 4e-5}, seed=seed)
-        xj = lanes.replay(widths[:, None], trace.cor, np.zeros(len(trace)), trace.xj, 20.0)[:, :, 0]
-        best.append(widths[np.argmin(np.mean((xj - trace.xj) ** 2, axis=1))])
-    assert np.mean(best) == pytest.approx(4e-5, abs=0.3e-6)
-
-
 def test_the_transducer_moves_along_where_the_ram_is_pulled() -> None:
     """With play, a lag and an elastic mount before the transducer: an anchored run shows the pull at once and whole."""
     model = Model().replace({"rod_backlash.width": 4e-5, "sensor_lag.time": 3e-3, "mount_compliance.compliance": 1e-9})
@@ -293,59 +272,11 @@ def test_the_transducer_moves_along_where_the_ram_is_pulled() -> None:
 
 PREFLIGHT = load_sequence("preflight").main_profile().command
 STEP = np.r_[np.zeros(20), np.full(300, 1e-3)]
-H = QUIET["controller.period"]
-
-
-def cell(clogging: float = 0.0, friction: float = 5.0, sliding: float = 1.0, h: float = H, **more: float) -> Cell:
-    changed = QUIET.replace({name.replace("__", "."): value for name, value in more.items()})
-    return Cell(*compute_cells(changed, FAULTS, np.array([[clogging, friction]]), h, sliding)[:, 0].tolist())
 
 
 def one(com: np.ndarray, clogging: float, friction: float, model: Model = QUIET) -> np.ndarray:
     """XJ, Cor, P12, XS of a closed-loop run, (4, n)."""
     return Monitor(model).closed_loop(np.array([[clogging, friction]]), com, whole=True)[0]
-
-
-def explicit(s: Motion, current: float, h: float, c: Cell, model: Model, parts: int = 4000) -> Motion:
-    """The equations of Fig. 6 in small explicit steps."""
-    v = model.values
-    xs, xj, vj, dt = s.spool, s.position, s.speed, h / parts
-    stuck = True
-    for _ in range(parts):
-        xf = min(max(c.tilt * current - c.back * xs, -v["flapper.travel"]), v["flapper.travel"])
-        stuck = stuck and abs(xf) <= c.dead and xf * s.sliding <= c.slide
-        free = 0.0 if stuck else copysign(max(abs(xf) - c.slide, 0.0), xf)
-        before, at = vj, xs
-        xs = min(max(xs + dt * c.speed * free, -v["spool.travel"]), v["spool.travel"])
-        p12 = c.pressure_gain * 0.5 * (at + xs) - c.pressure_slope * vj
-        p12 = min(max(p12, -v["supply.pressure"]), v["supply.pressure"])
-        vj += dt * (v["jack.area"] * p12 - v["jack.damping"] * vj) / v["jack.mass"]
-        xj += dt * 0.5 * (before + vj)
-    return Motion(xs, xj, vj, 0.0)
-
-
-@pytest.mark.parametrize("sliding", [1.0, 2.0 / 3.0, 0.1])
-def test_step_is_exact(sliding: float) -> None:
-    """Spool stuck, sliding, flapper at its stop and leaving it within the step: all as in small steps."""
-    rng = np.random.default_rng(1)
-    for _ in range(12):
-        clogging, friction = rng.uniform(0.0, 0.5), rng.uniform(0.0, 90.0)
-        c = cell(clogging, friction, sliding)
-        at = rng.uniform(-3e-4, 3e-4)
-        s = Motion(at, 1e-3, c.follow * at, float(rng.integers(-1, 2)))
-        current = (c.back * at + rng.uniform(-1.5, 1.5) * c.dead + rng.choice([0.0, 4e-5]) * rng.normal()) / c.tilt
-        exact, small = step_monitor(s, current, H, c), explicit(s, current, H, c, QUIET)
-        apart = np.abs(np.array(exact[:3]) - small[:3])
-        moved = np.abs([small.spool - s.spool, small.position - s.position, small.speed])
-        assert (apart <= [2e-9, 1e-9, 1e-5] + [1e-3, 2e-3, 2e-3] * moved).all()
-
-
-def test_pressure_is_limited() -> None:
-    """A heavy ram gains no more speed than PSR gives it."""
-    c = cell(jack__mass=5e4)
-    s = step_monitor(Motion(1e-3, 0.0, 0.0, 0.0), 8e-3, H, c)
-    assert s.speed == pytest.approx(QUIET["supply.pressure"] * QUIET["jack.area"] / 5e4 * H, rel=1e-3)
-    assert s.position == pytest.approx(0.5 * s.speed * H, rel=1e-3)
 
 
 def test_one_step_a_cycle_is_enough() -> None:
@@ -371,30 +302,12 @@ def test_is_the_reference_model_without_what_it_leaves_out(clogging: float, fric
     assert np.median(spool) < 0.1e-6  # after that a break-away may fall on a knife's edge
 
 
-def test_a_fast_pilot_takes_more_steps() -> None:
-    fast = QUIET.replace({"pilot.flow_gain": 40 * 0.069})  # Kv 10 a cycle
-    values = np.array([[0.0, 5.0], [0.3, 60.0]])
-    once, often = (Monitor(fast, steps=n).replay(values, 1e-3 * np.sin(np.arange(300)), whole=True) for n in (1, 200))
-    assert np.abs(once - often)[:, 3].max() < 1e-11
-
-
 def test_side_by_side_is_alone() -> None:
     values = np.random.default_rng(0).uniform([0.0, 0.0], [0.5, 90.0], (71, 2))  # not a whole block
     runs = Monitor(QUIET).closed_loop(values, STEP, whole=True)
     for row in (0, 7, 64, 70):
         assert (runs[row] == one(STEP, *values[row])).all()
     assert (Monitor(QUIET).closed_loop(values, STEP)[:, 0] == runs[:, 0]).all()
-
-
-def test_replay_follows_the_measured_ram() -> None:
-    """Anchored, the ram stays near the measured one, over missing samples too; free, it drifts away."""
-    run = simulate(Model().replace({FAULTS[1]: 30.0}), PREFLIGHT[:6000])
-    seen = run.xj + 1e-3
-    seen[100:200] = np.nan
-    monitor, values = Monitor(QUIET), np.array([[0.4, 5.0]])
-    free, held = (monitor.replay(values, run.cor, seen, anchor)[0, 0] - seen for anchor in (0.0, 20.0))
-    assert abs(held[0]) < 1e-9
-    assert np.abs(held[-1000:]).max() < 0.5 * np.abs(free[-1000:]).max() and not np.isnan(free).all()
 
 
 @pytest.mark.parametrize(("names", "values", "word"), [

@@ -13,13 +13,12 @@ from places import SHARED
 from refusals import catch_refusal
 
 import plant
-from plant import Actuator, InputError, Model, load_model, simulate
+from plant import InputError, Model, load_model, simulate
 from plant.model import find_quantity
 from plant.parameters import GROUPS, load_nominal_values
 from plant.plants import find_plant
 from plant.quantity import Quantity, list_quantities
 from plant.segments import (
-    KINDS,
     Chirp,
     Csv,
     Hold,
@@ -86,7 +85,7 @@ def test_contradictions_are_refused(body: str) -> None:
 
 @given(st.sampled_from(NAMES) | st.text(max_size=30), st.one_of(
     st.floats(), st.integers(), st.text(max_size=8), st.none(), st.booleans(), st.lists(st.floats(), max_size=2)))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_whatever_is_set_is_taken_or_refused_in_one_line(name: str, value: object) -> None:
     try:
         model = Model().replace({name: value})
@@ -144,17 +143,6 @@ def test_the_nominal_file_is_complete_and_is_that_of_the_issue() -> None:
     assert ours == tomllib.loads(given_.read_text())
 
 
-def test_the_shipped_servo_file_is_read_as_it_stands() -> None:
-    """Every number of the file is the model's; what the file does not list is zero."""
-    tables = tomllib.loads((Path(plant.__file__).parent / "models" / "ehs.toml").read_text())
-    listed = {f"{group}.{field}": value for group, fields in tables.items() for field, value in fields.items()}
-    assert len(listed) == 15
-    model = load_model("ehs")
-    assert {name: value for name, value in model.values.items() if value} == {
-        name: value for name, value in listed.items() if name in model.values}
-    assert model.with_effects(["compressibility"])["compressibility.volume"] == listed["compressibility.volume"] == 6e-3
-
-
 CHANGES = {
     "spool.static_friction": st.floats(3.5, 500.0), "jack.mass": st.floats(1.0, 1e4),
     "filter.clogging": st.floats(0, 0.9), "jack.leakage": st.floats(0, 1e-9),
@@ -164,7 +152,7 @@ CHANGES = {
 
 
 @given(st.fixed_dictionaries({}, optional=CHANGES), st.text(st.characters(codec="utf-8"), min_size=1, max_size=12))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_model_file_round_trip(tmp_path_factory: pytest.TempPathFactory, changes: dict[str, object], name: str) -> None:
     path, changed = tmp_path_factory.getbasetemp() / "model.toml", Model().replace(changes)
     path.write_text(Model(name, changed.values, changed.effects).to_toml(), encoding="utf-8", newline="")
@@ -205,17 +193,6 @@ def test_a_command_of_the_wrong_shape_is_refused(command: list[float], load: lis
     assert "one demand and one load a cycle" in catch_refusal(simulate, Model(), np.array(command), force)
 
 
-def test_a_parameter_changes_live() -> None:
-    plant_, other = Actuator(Model()), Actuator(Model())
-    plant_.set("jack.mass", 400.0)
-    for one in (plant_, other):
-        for _ in range(20):
-            one.advance(3e-3)
-    assert plant_.state.jack_position < other.state.jack_position
-    for unknown in ("sensor_lag.time", "jack.moss"):  # the model has no such effect, nor anyone such a parameter
-        assert unknown in catch_refusal(plant_.set, unknown, 1e-3)
-
-
 PREFLIGHT = (
     Hold(time=0.5), Step(to=5e-3, time=1.0), Step(to=0.0, time=1.0), Step(to=1e-3, time=0.75), Step(to=0.0, time=0.75),
     Ramp(to=1e-3, time=2.0), Hold(time=0.5), Ramp(to=0.0, time=2.0), Hold(time=0.5),
@@ -238,14 +215,6 @@ def test_preflight_follows_the_formulas_of_physics_section_4() -> None:
     assert (command[[499, 500, 1499, 1500, 2500, 3250]] == [0, 5e-3, 5e-3, 0, 1e-3, 0]).all()
     assert sections[1] == ("step_2", "step", 500, 1500) and sections[-1].stop == len(command) == 13_500
     assert end == 0.0 and (command[13_000:] == 0).all()  # whole periods end exactly where they began
-
-
-@pytest.mark.parametrize("segment", ONE_OF_EACH, ids=lambda s: s.kind)
-def test_every_kind_has_its_length_and_its_section(segment: Segment) -> None:
-    profile = build_profile([replace(segment, name="it")], start=2e-3)
-    assert profile.sections == (("it", segment.kind, 0, round(segment.duration * 1000)),)
-    assert len(profile.command) == profile.sections[0].stop and np.isfinite(profile.command).all()
-    assert {each.kind for each in ONE_OF_EACH} == set(KINDS)
 
 
 @given(cycle_us=st.integers(100, 100_000), cycles=st.lists(st.integers(1, 300), min_size=1, max_size=5))
@@ -303,12 +272,6 @@ def test_samples_hold_on_another_period_and_the_seconds_stay(period: float, cycl
     at = np.arange(cycles) * period
     np.testing.assert_allclose(ramp, 0.5 * np.floor(at * 1000 + 1e-6) / 1000, atol=1e-15)
     assert step.tolist() == [float(x > 0.0209) for x in at]  # nothing between 0 and 1
-
-
-@pytest.mark.parametrize("period", [0.0005, 0.002, 0.01])
-def test_rows_at_the_models_period_are_taken_as_they_are(period: float) -> None:
-    values = np.random.default_rng(0).standard_normal(1001)
-    assert (resample_on_cycles(np.round(7.0 + np.arange(1001) * period, 6), values, period) == values).all()
 
 
 @pytest.mark.parametrize(("t", "values", "period", "expected"), [

@@ -8,7 +8,7 @@ from physics_cases import SILENT, SMOOTH
 from plant import Actuator, Model, simulate
 from plant.compile import compile_function
 from plant.eha import State, compute_coefficients, step_actuator
-from plant.friction import clip, soften, solve_velocity
+from plant.friction import clip
 from plant.state import Input
 
 V = Model().values
@@ -125,46 +125,6 @@ def test_overshoot_of_the_continuous_loop(clogging: float, percent: float) -> No
 
 
 H = 1e-5
-speeds = st.one_of(st.just(0.0), st.floats(-1.0, 1.0))
-levels = st.floats(0.0, 5e3)
-bodies = st.tuples(st.floats(1e-3, 200.0), st.floats(0.0, 1e4), st.floats(1e-6, 1e-2),  # mass, damping, area
-                   st.floats(0.0, 1e12), st.floats(1e3, 5e7))  # slope, limit
-
-
-def slid(v0: float, force: float, line: float, dry: float, body: tuple[float, ...]) -> tuple[float, float]:
-    """Speed after a step and the pressure then."""
-    mass, damping, area, slope, limit = body
-    free, push = mass + H * damping, H * area
-    impulse = mass * v0 + H * force
-    v = solve_velocity(v0, impulse, push, line, slope, limit, H * dry, 1 / free, 1 / (free + push * slope))
-    return v, clip(line - slope * v, limit)
-
-
-@given(speeds, st.floats(-1e4, 1e4), st.floats(-1e8, 1e8), levels, bodies)
-@settings(max_examples=500, deadline=None)
-def test_slide_is_the_root_of_its_equation(v0, force, line, dry, body) -> None:
-    """m (v - v0) = h (F + A p(v) - c v - dry), dry within its level and against v; or the body has stopped."""
-    mass, damping, area, _slope, limit = body
-    v, pressure = slid(v0, force, line, dry, body)
-    friction = force + area * pressure - damping * v - mass * (v - v0) / H
-    scale = abs(force) + area * (abs(line) + limit) + mass * abs(v0) / H + dry + 1e-9
-    assert v * v0 >= 0.0
-    travelled = 0.5 * H * (v0 + v)
-    gained, given_ = 0.5 * mass * (v**2 - v0**2), (force + area * pressure) * travelled
-    rounding = 1e-9 * ((abs(force) + area * (abs(line) + limit)) * abs(travelled) + mass * (v**2 + v0**2))
-    assert v == 0.0 or gained <= given_ + rounding  # friction and damping do no work; a body that stops has lost all
-    if v != 0.0:
-        assert friction == pytest.approx(np.sign(v) * dry, abs=1e-9 * scale)
-    elif v0 == 0.0:
-        assert abs(friction) <= dry + 1e-9 * scale
-    else:  # it would have come to rest or turned within the step
-        assert friction * np.sign(v0) <= dry + 1e-9 * scale
-
-
-@given(st.floats(-1e3, 1e3), levels)
-def test_soften_and_clip_share_the_whole(x: float, band: float) -> None:
-    assert soften(x, band) + clip(x, band) == pytest.approx(x, abs=1e-9)
-    assert abs(clip(x, band)) <= band
 
 
 @given(st.floats(-0.03, 0.03), st.floats(-0.5, 0.5), st.booleans(), st.floats(0.0, 1e6))

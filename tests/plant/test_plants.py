@@ -17,7 +17,7 @@ from plant.plant_check import check_behaviour
 from plant.plants import list_plants, load_plant
 from plant.segments import build_profile
 
-EXAMPLE = ROOT / "plant" / "models" / "new_plant.py"
+EXAMPLE = ROOT / "plant" / "models" / "new_plant.py"  # copies with its name share its compiled code
 TEXT = EXAMPLE.read_text()
 ROWS = 300
 
@@ -65,7 +65,7 @@ def test_lanes_are_single_runs(model: Model) -> None:
 
 def test_effects_at_their_off_values_change_nothing(model: Model) -> None:
     every = model.with_effects(e.name for e in model.kind.list_effects())
-    com = find_command(model)[:100]
+    com = find_command(model)[:40]
     assert np.array_equal(*(simulate(m, com, seed=1, steps=20, fast=False) for m in (model, every)))
 
 
@@ -81,8 +81,8 @@ def test_a_model_file_of_a_users_plant_is_the_same_model_again(tmp_path: Path, m
 
 
 def test_a_model_file_runs_its_plant_only_with_trust(tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text(TEXT)
-    (tmp_path / "unit.toml").write_text('plant = "mine.py"\n[motor]\nresistance = 3.0\n')
+    (tmp_path / "new_plant.py").write_text(TEXT)
+    (tmp_path / "unit.toml").write_text('plant = "new_plant.py"\n[motor]\nresistance = 3.0\n')
     words = ("simulate", "--model", tmp_path / "unit.toml", "--out", tmp_path / "s.csv")
     refused = rig(*words)
     assert refused.status == 2 and "--trust" in refused.err and not (tmp_path / "s.csv").exists()
@@ -91,11 +91,11 @@ def test_a_model_file_runs_its_plant_only_with_trust(tmp_path: Path) -> None:
 
 
 def test_the_written_example_passes_its_checks(tmp_path: Path) -> None:
-    file = tmp_path / "my_motor.py"
-    assert rig("new", "plant", "my_motor", "--out", file).status == 0
+    file = tmp_path / "new_plant.py"
+    assert rig("new", "plant", "new_plant", "--out", file).status == 0
     said = rig("check", file, "--json")
     assert said.status == 0 and said.json["verdict"] == "SOUND" and len(said.json["checks"]) == 7
-    assert rig("new", "plant", "my_motor", "--out", file).status == 2  # it replaces nothing
+    assert rig("new", "plant", "new_plant", "--out", file).status == 2  # it replaces nothing
 
 
 def test_its_own_effect_may_have_the_name_of_a_shared_one(tmp_path: Path) -> None:
@@ -153,14 +153,8 @@ def test_fields_that_do_not_move_along_fail_the_check(tmp_path: Path) -> None:
         "- load)", "- load - 2e3 * (s.angle - s.motor / ratio))").replace(
         "(s.speed + speed))", "(s.speed + speed), s.motor + h * ratio * speed)").replace(
         '("angle",)', '("angle", "motor")'))
-    found = {f.check: f.passed for f in check_behaviour(load_model(file))}
-    assert not found["moves"] and found["finite"]
-
-
-def test_the_solver_step_of_a_plant_is_used(tmp_path: Path) -> None:
-    file = tmp_path / "fine.py"
-    file.write_text(TEXT.replace("control=control,", "control=control, solver_step=2e-6,"))
-    assert load_model(file).steps == 500
+    moves = next(found for found in check_behaviour(load_model(file)) if found.check == "moves")
+    assert not moves.passed
 
 
 def test_a_stiff_plant_without_tolerances_is_explained(tmp_path: Path) -> None:
@@ -190,6 +184,10 @@ def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -
 def test_a_new_file_passes_its_own_check(kind: str, check: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
                                          ) -> None:
     monkeypatch.chdir(tmp_path)
-    answer = rig("new", kind, "my_new", "--json").json
-    assert answer["verdict"] == "COMPLETE" and rig(*check).status == 0
-    assert "are of a bench" in rig("new", kind, "other", "--node", "3").err
+    assert rig("new", kind, "my_new", "--json").json["verdict"] == "COMPLETE"
+    said = rig(*check, "--json")
+    assert said.status == 0 and "are of a bench" in rig("new", kind, "other", "--node", "3").err
+    if kind == "effect":
+        trial = said.json["effects"][0]["self_test"]
+        assert trial["faults"] == [] and trial["visible"]
+        assert {"start", "xj", "p12", "xs", "level"} == set(trial["shown"][0])

@@ -1,19 +1,18 @@
 """Pump-driven actuators: effects and the flow under measured pressures against closed forms, shipped models."""
 
 from math import factorial
-from pathlib import Path
 
 import numpy as np
 import pytest
+from effects_cases import WHOLE
 from physics_cases import PREFLIGHT, SILENT
-from places import SHARED
-from rig_command import answer, refuse
+from rig_command import refuse
 
 from plant import load_model, simulate
 from plant.controller import compute_answers
 from plant.effects import CATALOGUE
-from plant.effects.current import Cascade, Switched, flow_delay, valve_switching
-from plant.effects.servovalve import ATMOSPHERE, undissolved_air
+from plant.effects.current import Cascade, flow_delay
+from plant.effects.servovalve import ATMOSPHERE
 from plant.ehs import (
     RAW_PER_TURN,
     State,
@@ -25,7 +24,7 @@ from plant.ehs import (
 from plant.forced import compute_flow_balance, compute_force_balance
 from plant.lanes import Lanes
 from plant.model import Model, list_offered_effects, list_searched_effects
-from plant.state import Input, Line
+from plant.state import Input
 
 CYCLE = 1e-3
 SPEED = 800.0  # raw
@@ -66,20 +65,6 @@ def test_the_pressure_of_a_blocked_ram_rises_as_the_air_gives_way(exponent: floa
     np.testing.assert_allclose(p12, expected, rtol=2e-3, atol=5.0)
 
 
-def test_air_at_exponent_2_keeps_boyles_product() -> None:
-    """The compliance of the line is -dV/dp of V = V0 p0/p, with the preload counted in."""
-    model = build_model(undissolved_air__volume=3e-6, undissolved_air__exponent=2.0, undissolved_air__preload=4e5)
-    p, u, x = model.build_record()[0], Input(h=1e-3), Line(5e6, 1e12, 1e7, 0.0)
-    s = State(pressure=6e5)
-    line = undissolved_air(x, s, u, p)
-    total = 6e5 + 4e5 + ATMOSPHERE
-    compliance = (3e-6 * ATMOSPHERE / (total - 500.0) - 3e-6 * ATMOSPHERE / (total + 500.0)) / 1000.0
-    for speed in (0.0, 0.01):
-        new = line.offset - line.slope * speed
-        flow = model["jack.area"] / x.slope * (x.offset - x.slope * speed - new)  # what the line leaves for the air
-        assert compliance * (new - s.pressure) / u.h == pytest.approx(flow, rel=1e-5)
-
-
 def test_a_delayed_flow_follows_erlangs_distribution() -> None:
     """Four lags of tau/4: 1 - exp(-k) (1 + k + k^2/2 + k^3/6), k = 4 t/tau; without delay exactly the step."""
     h, tau = 1e-5, 0.02
@@ -98,15 +83,6 @@ def test_a_switching_valve_stops_the_flow_at_each_reversal_and_not_at_the_start(
                     for time in (0.05, 0.0))
     assert late[200] == prompt[200]
     assert late[-1] - prompt[-1] == pytest.approx(0.05 * compute_speed(build_model()), rel=2e-3)
-
-
-def test_a_pause_on_one_side_does_not_switch_the_valve() -> None:
-    p, u = build_model(valve_switching__time=0.05).build_record()[0], Input(h=1e-3)
-    m = Switched(1.0, 1.0)
-    for x in (0.0, 0.0, 3.0):
-        y, m = valve_switching(x, m, State(), u, p)
-        assert y == x
-    assert valve_switching(-3.0, m, State(), u, p)[0] == 0.0
 
 
 def test_an_asymmetric_gain_answers_a_negative_error_less() -> None:
@@ -209,16 +185,9 @@ def test_general_effects_suit_every_plant_and_act_and_are_searched_in_this_one(n
     assert (off == without).all() and np.isfinite(on).all() and (on != without).any()
 
 
-DATA = SHARED / "data" / "electrohydrostatic_rig"
-real = pytest.mark.skipif(not DATA.is_dir(), reason=f"no measurements at {DATA.name}: they belong to others")
-
-
 def speeds(**changed: float) -> tuple[float, float]:
     """The ram's speed forwards at 1000 units of motor speed, and backwards, m/s."""
-    names = [name.replace("__", ".") for name in changed]
-    lanes = Lanes(load_model("ehs").replace({"quantisation.lsb": 0.0}), names)
-    driven = np.r_[np.full(300, 1000.0), np.full(400, -1000.0)]
-    xj = lanes.replay(np.array([[*changed.values()]]), driven, np.zeros(700))[0, :, 0]
+    xj, _ = replay(build_model(**changed), np.r_[np.full(300, 1000.0), np.full(400, -1000.0)])
     return (xj[290] - xj[190]) / 0.1, (xj[690] - xj[590]) / 0.1
 
 
@@ -237,44 +206,8 @@ def test_the_bench_refuses_it() -> None:
     assert "a sequence of your own" in refuse("run", "--model", "ehs", "--bench", "eha")
 
 
-@real
-def test_the_bare_integrator_is_incomplete() -> None:
-    told = answer("compare", DATA / "exp_data_3_4.csv.gz", "--model", "ehs", status=1)
-    assert told["verdict"] == "MODEL_INCOMPLETE" and told["signals"]["xj"]["ratio"] > 5.0
-
-
-@real
-def test_the_error_falls_on_runs_that_no_fit_saw(tmp_path: Path) -> None:
-    """Fitted to 3_4 alone; the ratio of areas is what 750 against 1100 units for the same speed say, 0.68."""
-    told = answer("add", "one_way_load", "unequal_areas", DATA / "exp_data_3_4.csv.gz", "--model", "ehs", "--holdout",
-                  DATA / "exp_data_2_2.csv.gz", "--out", tmp_path / "rig.toml")
-    first, *_, last = told["ledger"]
-    assert all(last[run]["p12"] < 0.6 * first[run]["p12"] and last[run]["xj"] <= first[run]["xj"]
-               for run in ("error", "holdout"))
-    ratio = told["parameters"]["pump.area_ratio"]
-    assert ratio["low"] < ratio["value"] < ratio["high"] and ratio["value"] == pytest.approx(0.68, abs=0.03)
-
-
 P = Model().values
 GQ, GP, AJ = P["valve.flow_gain"], P["valve.pressure_gain"], P["jack.area"]
-
-
-def test_flow_of_a_constant_opening_and_pressure() -> None:
-    """AJ v = GQ (XS - P12/GP) - CLK P12, for as long as it is open."""
-    xs, p12 = np.full(500, 1e-4), np.full(500, 3e6)
-    model = SILENT.replace({"jack.leakage": 2e-11})
-    x, v = compute_flow_balance(model, xs, p12, 1e-3)
-    speed = (GQ * (1e-4 - 3e6 / GP) - 2e-11 * 3e6) / AJ
-    assert v == pytest.approx(np.full(500, speed), rel=1e-9)
-    assert x == pytest.approx(1e-3 + speed * 1e-3 * np.arange(500), rel=1e-9)
-
-
-def test_force_of_a_given_motion() -> None:
-    """MJ a + CJ v + FR, and the friction levels beside it."""
-    t = np.arange(400) * 1e-3
-    takes, static, dynamic = compute_force_balance(SILENT, t**2, 2.0 * t, np.zeros(400), np.full(400, 500.0))
-    assert takes == pytest.approx(P["jack.mass"] * 2.0 + P["jack.damping"] * 2.0 * t + 500.0, rel=1e-9)
-    assert set(static) == {P["jack.static_friction"]} and set(dynamic) == {P["jack.dynamic_friction"]}
 
 
 @pytest.mark.parametrize("changes", [{}, {"spool.static_friction": 45.0}, {"filter.clogging": 0.3},
@@ -291,12 +224,10 @@ def test_both_close_on_a_simulation(changes: dict[str, float]) -> None:
     assert np.sqrt(np.mean(left[moving] ** 2)) < 1e4  # Pa: half the transducer's noise
 
 
-@pytest.mark.parametrize("changes", [{"orifice_root.share": 1.0, "spool_overlap.overlap": 2e-5},
-                                     {"compressibility.coefficient": 1e-9}])
-def test_the_laws_of_effects_take_part(changes: dict[str, float]) -> None:
-    """An effect that makes P12 a curve of the speed, behind a dead zone: without them the ram is elsewhere."""
-    model = SILENT.replace(changes)
-    run = simulate(model, PREFLIGHT, np.full(len(PREFLIGHT), 2000.0))
-    x, _ = compute_flow_balance(model, run.xs, run.p12, 0.0)
+def test_the_laws_of_effects_take_part() -> None:
+    """Effects that make P12 a curve of the speed, behind a dead zone: without them the ram is elsewhere."""
+    changes = {"orifice_root.share": 1.0, "spool_overlap.overlap": 2e-5, "compressibility.coefficient": 1e-9}
+    run = simulate(WHOLE.replace(changes), PREFLIGHT, np.full(len(PREFLIGHT), 2000.0))
+    x, _ = compute_flow_balance(SILENT.replace(changes), run.xs, run.p12, 0.0)
     plain, _ = compute_flow_balance(SILENT, run.xs, run.p12, 0.0)
     assert np.sqrt(np.mean((run.xj - x) ** 2)) < 0.05 * np.sqrt(np.mean((run.xj - plain) ** 2))

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from plant.threads import THREAD_NAME, count_threads, do_together, map_in_threads, map_together, run_beside
+from plant.threads import THREAD_NAME, count_threads, do_together, map_in_threads, map_together
 
 
 def test_answers_come_in_the_order_of_the_questions_and_an_error_reaches_who_asked() -> None:
@@ -101,18 +101,6 @@ os._exit(0)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, "interrupted\n"), done.stderr
-
-
-def test_work_beside_gives_its_result_and_its_error() -> None:
-    here = threading.get_ident()
-    assert run_beside(threading.get_ident) != here
-    with pytest.raises(ZeroDivisionError):
-        run_beside(lambda: 1 / 0)
-    found: list[bool] = []
-    thread = threading.Thread(target=lambda: found.append(run_beside(threading.get_ident) == threading.get_ident()))
-    thread.start()
-    thread.join()
-    assert found == [True], "it stays in a thread that is not the main one"
 
 
 def test_a_cluster_tells_its_workers_how_many(monkeypatch: pytest.MonkeyPatch) -> None:
