@@ -22,12 +22,8 @@ import fdi
 from fdi.analysis import Plot, Result
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.refine import SUSPECTS
-from fdi.progress import Stage
-from fdi.report.drawing import Drawing
-from fdi.report.report import Figure, Report, Section
 from fdi.trace.trace import Trace
 from plant import Model, simulate
-from plant.threads import map_in_threads
 
 PAGE = (Path(__file__).parents[2] / "docs" / "python.md").read_text()
 EXAMPLES = [re.sub(r"^    ", "", block, flags=re.MULTILINE) for block in
@@ -134,18 +130,6 @@ def test_every_result_prints_shows_plots_and_converts(name: str, lines: dict[str
     assert json.loads(json.dumps(told, allow_nan=False)) == told
     assert isinstance(drawn, Plot) and drawn.startswith("<svg") and drawn.caption in page
     assert f"one of {result.figures[0]}" in catch_refusal(result.plot, "nothing of this name")
-    plots = [str(result.plot(title)) for title in result.figures if name != "diagnosis"]
-    assert len(set(plots)) == len(plots) and (len(plots) > 1 or name in ("explanation", "diagnosis"))
-
-
-def test_a_figure_without_data_is_an_error() -> None:
-    empty = Figure("caption", lambda: "")
-    result = Result(Report("compare", "run 7", sections=[Section("Empty", [empty])]))
-    assert "for which the trace has data" in catch_refusal(result.plot)
-    drawn = Figure("a line", lambda: Drawing("<svg></svg>"))
-    result = Result(Report("compare", "run 7", sections=[Section("Empty", [empty, drawn])]))
-    assert result.figures == ("Empty", "Empty 2")
-    assert result.plot() == result.plot("Empty 2") == "<svg></svg>" and result.plot().caption == "a line"
 
 
 def test_the_dictionary_is_the_answer_of_the_command(lines: dict[str, Any], runs: dict[str, Path]) -> None:
@@ -175,14 +159,6 @@ def test_importing_fdi_loads_neither_numba_nor_matplotlib() -> None:
     code = "import sys, fdi; print([m for m in ('numba', 'matplotlib', 'numpy', 'rich', 'jinja2') if m in sys.modules])"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert said.stdout.strip() == "[]"
-
-
-def test_a_stage_goes_from_its_begin_to_its_end_and_no_further() -> None:
-    seen: list[tuple[str, float]] = []
-    stage = Stage(lambda name, share: seen.append((name, share)), "fits", 0.2, 0.6, 4)
-    map_in_threads(lambda _: stage.finish_step(), range(6), 3)
-    assert {name for name, _ in seen} == {"fits"} and seen[0][1] == 0.2
-    assert np.allclose(sorted(share for _, share in seen), [0.2, 0.3, 0.4, 0.5, 0.6, 0.6, 0.6])
 
 
 def test_the_bar_of_a_diagnosis_moves_within_its_long_stage() -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from scipy.stats import beta
 
 from studies.hidden_effects import score
 from studies.hidden_effects.__main__ import main
@@ -91,13 +90,6 @@ def test_rates_count_what_they_say(folder: Path) -> None:
         "outside, any size: not explained": (1, 2, ["00007"]),
         "all: answered within 20 s": (1, 2, ["00000"])}
     assert scores["names_on_average"] == 1.5 and scores["seconds"] == {"median": 30.0, "longest": 30.0}
-
-
-@pytest.mark.parametrize(("good", "of"), [(0, 5), (5, 5), (3, 7), (150, 200), (1, 1), (0, 0)])
-def test_intervals_are_those_of_clopper_and_pearson(good: int, of: int) -> None:
-    low = beta.ppf(0.025, good, of - good + 1) if good else 0.0
-    high = beta.ppf(0.975, good + 1, of - good) if good < of else 1.0
-    assert score.compute_interval(good, of) == pytest.approx((low, high), abs=1e-9)
 
 
 @pytest.mark.parametrize(("text", "expected"), [

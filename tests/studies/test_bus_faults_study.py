@@ -3,7 +3,6 @@
 import pytest
 
 from fdi.report.report import render_html
-from rig.nodes import firmware
 from studies.bus_faults import (
     FAULTS,
     PHASES,
@@ -28,10 +27,3 @@ def test_the_figures_of_two_faults() -> None:
     assert report.data == collect_figures(cells, 1) and report.data["verdict"] == "PASS"
     page = render_html(report)
     assert LOST.name in page and "tolerated" in page and "Activation" in page
-
-
-def test_a_controller_that_does_not_react_fails_its_cells(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(firmware, "LOST_AFTER", 10**9)
-    cells = study_bus_faults(0, (LOST,))
-    figures = collect_figures(cells, 0)
-    assert figures["verdict"] == "FAIL" and len(figures["failed"]) == 4

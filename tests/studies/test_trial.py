@@ -21,7 +21,7 @@ from studies.hidden_effects.truth import SYMBOLS, has_compiler, nominal_symbols,
 
 PRACTICE = SHARED / "practice"
 EXACT: dict[str, dict[str, float]] = {
-    "00": {"FSS": 45.0, "FDS": 30.0}, "01": {"Kintas": 0.3}, "02": {"bias": 0.03 * 8e-3}, "06": {"aero": 5.4e5},
+    "01": {"Kintas": 0.3}, "02": {"bias": 0.03 * 8e-3}, "06": {"aero": 5.4e5},
     "09": {"cog": 2750.0, "cog_l": 2.5e-3}, "10": {"FSS": 33.0, "FDS": 22.0, "Kintas": 0.21},
 }
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="no gcc: the trial's simulator cannot be built")
@@ -39,7 +39,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
 
 
 @shared
-@pytest.mark.parametrize(("case", "name"), [*((case, "est") for case in EXACT), ("02", "holdout"), ("09", "holdout")])
+@pytest.mark.parametrize(("case", "name"), [*((case, "est") for case in EXACT), ("09", "holdout")])
 def test_the_simulator_leaves_sensor_noise_of_an_independent_trace(case: str, name: str) -> None:
     trace = read(PRACTICE / case / f"{name}.csv.gz")
     run = simulate_truth(trace["com"], EXACT[case], load=trace["load"], cor=trace["cor"])
@@ -83,7 +83,7 @@ def test_the_plants_effects_are_what_the_table_says_as_written_twice() -> None:
     drawn = [hidden.sample_hidden_effect(name, nominal_symbols(), np.random.default_rng(seed), 0.7, 0.7)
              for seed in (1, 2) for name, law in hidden.CATALOGUE.items() if seed == 1 or law.signed]
     drawn = [effect for effect in drawn if effect.name != "command_rate_limit"]  # not in the plant
-    model = Model().with_effects(effect.name for effect in drawn)
+    model = complete_model(Model())  # the kernels of `rig explain`
     names = sorted({name for effect in drawn for name in plants(effect)})
     rows = [[plants(effect).get(name, model[name]) for name in names] for effect in drawn]
     ours = Lanes(model, names, 100).replay(np.array(rows), drive, load)

@@ -39,7 +39,6 @@ LONG_TESTS = (
     "plant/test_plant_on_other_cpus.py",
     "plant/test_plants.py",
     "plant/test_servo.py",
-    "plant/test_wear_laws.py",
     "rig/bench/test_bench.py",
     "rig/campaign/test_campaign.py",
     "rig/cli/test_cli.py",

@@ -12,7 +12,7 @@ from noisy_traces import SHORT, record_plant
 from fdi.comparison.compare import Comparison, compare
 from fdi.discovery.detectable import Blind
 from fdi.discovery.explain import Marks
-from fdi.discovery.explain_runs import Answer, Candidate, Suspicious
+from fdi.discovery.explain_runs import Answer, Candidate
 from fdi.discovery.runs import Source
 from fdi.discovery.update_model import ModelUpdate, Provenance, Row
 from fdi.estimation.fit import Value
@@ -23,9 +23,7 @@ from fdi.report.explain_report import (
     build_explanation_report,
     build_model_report,
     describe_findings,
-    describe_suspicious,
     describe_verdict,
-    list_sources,
 )
 from fdi.report.report import Figure, Report, Table, render_html, to_plain
 from fdi.report.terminal import format_report
@@ -85,18 +83,6 @@ def test_a_size_has_its_interval(case: str, words: str) -> None:
     assert words in describe_verdict(CASES[case][0])
 
 
-def test_another_firmware_and_an_explanation_by_an_unlikely_unit_are_said_to_be_so() -> None:
-    given = answer("PARTLY", ("a",), candidate("a", word="part"))
-    best = SimpleNamespace(effects=("a",), is_at_floor=True, is_far=True)
-    cast(Any, given.explanation).ledger = [given.explanation.base, best]
-    assert describe_verdict(given).startswith(
-        "a explains the residual only with tolerances that fewer than one healthy unit in 1,000 has: current 150 uA")
-    unseen = answer("UNEXPLAINED", (), is_at_floor=True)
-    assert describe_verdict(unseen).startswith("The model fits this run, but not the held-out run")
-    cast(Any, unseen.explanation).marks = Marks(4.0, 1e-6, ())
-    assert describe_verdict(unseen).startswith("The output of the controller differs from the model's")
-
-
 def test_findings() -> None:
     by = {"by": "measure XS too", "between": ("a", "b")}
     told = answer("AMBIGUOUS", ("a", "b"), candidate("a"), candidate("b"), separate=by, pattern="a force")
@@ -115,11 +101,6 @@ def test_an_actuator_far_from_the_model_is_to_be_identified(verdict: str) -> Non
     far = answer(verdict, (), candidate("a", word="no"))
     cast(Any, far.explanation.base).is_far = True
     assert any("rig identify" in line.text for line in describe_findings(far)) == (verdict == "UNEXPLAINED")
-
-
-def test_long_lists_name_four_and_count_the_rest() -> None:
-    text = describe_suspicious([Suspicious(f"group.field_{i}", 1.0, "N", 4.0 + i) for i in range(6)])
-    assert text.startswith("group.field_5 1.00 N (+9.0 tolerances)") and " and 2 more: outside the range" in text
 
 
 def render_without_figures(report: Report) -> str:
@@ -142,14 +123,6 @@ def test_the_report_of_an_explanation_in_all_forms() -> None:
     assert "ledger" in build_explanation_report(CASES["EXPLAINED by two"][0], "est.csv", "eha", sources).data
 
 
-@pytest.mark.parametrize(("count", "has_holdout", "roles"), [
-    (0, False, []), (1, False, ["trace"]), (1, True, ["trace"]), (2, False, ["trace", "repeat"]),
-    (2, True, ["trace", "held-out run"]), (3, True, ["trace", "repeat", "held-out run"])])
-def test_roles_of_runs(count: int, has_holdout: bool, roles: list[str]) -> None:
-    sources = [Source(f"{i}.csv", str(i)) for i in range(count)]
-    assert [role for role, _ in list_sources(sources, has_holdout)] == roles
-
-
 def update(helps: bool) -> ModelUpdate:
     steps = [SimpleNamespace(error=by, holdout=by, hypothesis=None) for by in (ERROR, FLOOR)]
     refit = SimpleNamespace(helps=helps, steps=steps, last=steps[-1], floor=FLOOR,
@@ -170,13 +143,6 @@ def test_the_report_of_a_model_update_in_all_forms(tmp_path: Any) -> None:
     assert not [words for words in ("model as it was", "+ a", "noise floor", "150 uA (140 .. 160)", "m.toml.bak",
                                     "m.html") if words not in text.replace("\n", "")]
     assert "held-out" in page and "22.5" in page and to_plain(report.data)["helps"] is True
-
-
-def test_a_removal_without_a_run_has_nothing_to_show() -> None:
-    report = build_model_report(ModelUpdate(Model(), Provenance(), (), "a", None, {}, (), ("the rest stays",)))
-    assert (report.verdict, report.sentence, report.data["helps"]) == ("", "a removed.", None)
-    assert report.data["model"] is None
-    assert "<svg" not in render_html(report)
 
 
 OFFSETS = {"xj": 0.0, "p12": 3e5, "xs": 8e-6}  # of the sensors; XJ is drawn to the measurement, so it has none
@@ -212,8 +178,3 @@ def test_a_comparison_shows_measured_minus_model() -> None:
     captions = [item.caption for section in build_comparison_report(found).sections for item in section.items
                 if isinstance(item, Figure | Table) and "esidual" in item.caption]
     assert captions and all("measured minus model" in text for text in captions[:2])
-
-
-def test_a_dependence_has_the_sign_of_measured_minus_model() -> None:
-    on = next(d for d in compare_offset().diagnoses["xs"].depends)
-    assert np.nanmean(on.means) == pytest.approx(OFFSETS["xs"], rel=0.2)

@@ -21,7 +21,6 @@ from synthetic_run import ATTACHMENTS, record_run
 from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import find_sections
 from fdi.trace.trace import Gap, Trace
-from plant.unpacking import UnpackingError, limit_unpacked_size, unpack_gzip
 from rig.recorder import U32, Event, NmtState, Recorder, Signals, Timing, schema
 
 KINDS = ["hold", "step", "step", "step", "step", "ramp", "hold", "ramp", "hold", "dynamic", "hold"]  # of preflight
@@ -172,11 +171,6 @@ def test_sections_of_any_command(command: np.ndarray, kinds: list[str]) -> None:
     assert [s.start for s in found] == [0, *[s.stop for s in found][:-1]] and found[-1].stop == len(command)
 
 
-def test_a_ramp_has_its_rate_and_its_start() -> None:
-    slope = find_sections(RAMP)[1]
-    assert slope.rate == pytest.approx(0.33e-3, rel=1e-3) and abs(slope.start - 500) < 3
-
-
 def test_sections_of_a_command_that_was_cut_off_anywhere() -> None:
     """As an abort leaves it: main breaks off, clean-up goes back from there."""
     for last in [*range(1, 60), *range(3900, 4100, 7), *range(5950, 6050, 3), *range(9000, 11000, 97)]:
@@ -202,15 +196,14 @@ def rewrite(log: Log, path: Path, index_types: IndexType) -> Log:
 
 
 @pytest.mark.parametrize("index_types", [IndexType.ALL, IndexType.ALL & ~IndexType.MESSAGE], ids=["index", "no index"])
-def test_columns_equal_the_parsed_messages_whoever_wrote_them(run: Path, tmp_path: Path, index_types: IndexType
-                                                              ) -> None:
+def test_columns_equal_the_parsed_messages_whoever_wrote_them(tmp_path: Path, index_types: IndexType) -> None:
     """Columns read through the chunk index equal those that protobuf's own parser reads."""
-    log = open_log(run / "trace.mcap")
+    log = open_log(record_run(tmp_path / "trace.mcap", stop=3000))
     other = rewrite(log, tmp_path / "other.mcap", index_types)
     for topic in ("/signals", "/timing", "/events"):
         columns, same = log.read_columns(topic), other.read_columns(topic)
         messages = [(time_ns, message) for _, time_ns, message in log.read_messages(topic)]
-        assert len(messages) > 3 and columns.keys() == same.keys()
+        assert len(messages) > 1 and columns.keys() == same.keys()
         assert columns["time_ns"].tolist() == same["time_ns"].tolist() == [time_ns for time_ns, _ in messages]
         for name in columns.keys() - {"time_ns"}:
             np.testing.assert_array_equal(columns[name], [getattr(message, name) for _, message in messages])
@@ -271,13 +264,13 @@ def assert_refused(*commands: tuple[object, ...]) -> None:
         assert "Memory" not in said.err
 
 
-@pytest.mark.parametrize("kind", ["attachment", "record", "one chunk", "lying chunk", "many chunks",
-                                  "one chunk indexed often"])
-def test_a_small_log_does_not_take_gigabytes(kind: str, tmp_path: Path) -> None:
-    log = write_bomb(tmp_path / "trace.mcap", kind)
-    assert_refused(("report", log), ("export", log, "--out", tmp_path / "x.log"))  # messages by topic, and one by one
-    said, = rig_with_little_memory(("recover", log))  # keeps what is sound, if there is anything
-    assert said.status in (0, 2), said
+def test_a_small_log_does_not_take_gigabytes(tmp_path: Path) -> None:
+    kinds = ("attachment", "record", "one chunk", "lying chunk", "many chunks", "one chunk indexed often")
+    logs = [write_bomb(tmp_path / f"{kind}.mcap", kind) for kind in kinds]
+    for log in logs:  # messages by topic, and one by one
+        assert_refused(("report", log), ("export", log, "--out", tmp_path / "x.log"))
+    for said in rig_with_little_memory(*(("recover", log) for log in logs)):  # keeps what is sound, if there is any
+        assert said.status in (0, 2), said
 
 
 def test_a_packed_table_does_not_take_gigabytes(tmp_path: Path) -> None:
@@ -285,9 +278,8 @@ def test_a_packed_table_does_not_take_gigabytes(tmp_path: Path) -> None:
     long_line.write_bytes(gzip.compress(b"t,com,xj,cor" + b" " * (1 << 27)))
     row = b"".join(b"%d.0,%s,0,0\n" % (k, b"0" * 2000) for k in range(100_000))
     long_table.write_bytes(gzip.compress(b"t,com,xj,cor\n" + row))
-    for table in (long_line, long_table):
-        assert table.stat().st_size < 1_000_000
-        assert_refused(("report", table), ("simulate", "--command", table))
+    assert max(long_line.stat().st_size, long_table.stat().st_size) < 1_000_000
+    assert_refused(("report", long_line), ("simulate", "--command", long_line), ("report", long_table))
 
 
 def test_numbers_of_cycles_do_not_take_gigabytes(tmp_path: Path) -> None:
@@ -305,13 +297,3 @@ def test_brackets_do_not_end_the_program(tmp_path: Path) -> None:
     assert_refused(*(tuple(tmp_path / word if "." in word else word for word in words) for words in (
         ("simulate", "--model", "m.toml"), ("run", "s.toml"), ("run", "keys.toml"), ("trend", "a.json"),
         ("fdi", "t.csv", "--bands", "m.toml"), ("campaign", "m.toml"))))
-
-
-def test_gzip_is_unpacked_up_to_its_limit() -> None:
-    assert unpack_gzip(gzip.compress(b"one") + gzip.compress(b"two") + bytes(20)) == b"onetwo"
-    most = limit_unpacked_size(100_000)
-    with pytest.raises(UnpackingError, match="more than"):
-        unpack_gzip(gzip.compress(bytes(most + 20_000_000), 9))
-    for damaged in (gzip.compress(b"abc")[:-3], b"\x1f\x8bnothing"):
-        with pytest.raises(UnpackingError):
-            unpack_gzip(damaged)
