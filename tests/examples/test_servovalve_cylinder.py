@@ -109,7 +109,7 @@ def press(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("press")
     (place / "cylinder.py").write_bytes(PLANT.read_bytes())
     (place / "press.toml").write_text(OTHER)
-    volts = np.repeat([0.0, 3.0, 0.0, -3.0, 1.0, -2.0, 0.0], [100, 600, 200, 500, 300, 600, 100])
+    volts = np.repeat([0.0, 3.0, 0.0, -3.0, 1.0, -2.0, 0.0], [50, 300, 100, 250, 150, 300, 50])
     np.savetxt(place / "command.csv", np.column_stack([np.arange(len(volts)) * 1e-3, volts]), delimiter=",",
                header="t,demand", comments="")
     rig("simulate", "--model", place / "press.toml", "--trust", "--set", "cylinder.friction=400",

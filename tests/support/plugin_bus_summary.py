@@ -16,7 +16,6 @@ from rig.network.bus import explain_socketcan_problem
 
 BUSES = ("embedded", "virtual", "udp_multicast", "socketcan")
 GUEST_TESTS = "socketcan tests passed in the guest"  # property of a test: their number
-NOTE = "note for the summary"  # property of a test: a sentence, such as what the dissector found
 LEFT_TO_GUEST = pytest.StashKey[int]()  # socketcan tests taken out of this session
 RUNNER = "tests/vcan/test_vcan_guest.py"
 
@@ -54,12 +53,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """The notes, the tests passed per bus, and what it takes where none ran on a real CAN interface."""
+    """The tests passed per bus, and what it takes where none ran on a real CAN interface."""
     passed = terminalreporter.stats.get("passed", [])
     properties = [(name, value) for report in passed for name, value in report.user_properties]
-    for name, value in properties:
-        if name == NOTE:
-            terminalreporter.write_line(value)
     counts = Counter(bus for report in passed if (bus := bus_of(report.nodeid)))
     in_guest = sum(value for name, value in properties if name == GUEST_TESTS)
     if not counts and not in_guest:

@@ -92,10 +92,10 @@ def three(out: Path) -> int:
     """The run by three processes; the last one's exit status.
 
     A run that the bench itself could not judge, because the machine stood still or a program got no turn, is played
-    again, twice at most; the test tells how often.
+    again, twice at most.
     """
     for attempt in range(1, 4):
-        status = play_by_three(out, attempt)
+        status = play_by_three(out)
         facts = json.loads((out / "facts.json").read_text())
         is_a_node_gone = any(status is not None for status in facts["before_interrupt"].values())
         if is_a_node_gone or read_verdict(out) not in NOT_JUDGED:
@@ -110,7 +110,7 @@ def read_verdict(out: Path) -> str:
     return str(json.loads(text)["verdict"]) if text else ""
 
 
-def play_by_three(out: Path, attempt: int) -> int:
+def play_by_three(out: Path) -> int:
     """Plant and C firmware as processes of their own, the sequencer in this one; the run's exit status."""
     from standing_nodes import wait_for_node
 
@@ -127,7 +127,7 @@ def play_by_three(out: Path, attempt: int) -> int:
         alive = {name: process.poll() for name, process in nodes.items()}
         time.sleep(0.5)  # the last frames still go to candump
     ended = {name: process.returncode for name, process in nodes.items()}
-    facts = {"attempt": attempt, "status": status, "before_interrupt": alive, "after_interrupt": ended}
+    facts = {"status": status, "before_interrupt": alive, "after_interrupt": ended}
     (out / "facts.json").write_text(json.dumps(facts))
     return status
 

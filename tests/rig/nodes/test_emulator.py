@@ -68,15 +68,6 @@ def test_missing_and_late_drives(drives: str, flags: list[int], counted: tuple[i
     assert (counters(desk), desk.emergencies(), desk.node.plant.drive) == (counted, emergencies, current)
 
 
-def test_the_cycle_number_wraps_without_a_miss() -> None:
-    desk = PlantDesk(scenario())
-    desk.node._cycle = desk.k = 65_534
-    desk.node._first = True
-    for _ in range(4):
-        desk.cycle(1e-3, answers=desk.k & 0xFFFF)
-    assert desk.last()[1].cycle == 1 and counters(desk) == (0, 0)
-
-
 def test_lost_and_late_drive_as_the_plan_says() -> None:
     for fault, two, counted in (
             (Lost(frame="drive", start=0.003, count=1), [1, 0], (1, 0)),

@@ -65,13 +65,6 @@ def test_a_node_that_was_reset_is_watched_as_before(tmp_path: Path) -> None:
     assert outcome.verdict == "PASS"
 
 
-@pytest.mark.parametrize("name", ["lost_feedback", "reset_in_mid_run"])
-def test_it_does_so_in_real_time(tmp_path: Path, name: str) -> None:
-    """However late the machine is: the reaction is counted in cycles."""
-    outcome = play_sequence(name, tmp_path, pace="realtime", max_overruns=1.0)
-    assert {"reaction", "emergency"} & find_failures(outcome) == set() and outcome.safe, outcome.why
-
-
 class StaysOn(Variant):
     """Sends the current on, whatever has happened, and says so in the status word."""
 

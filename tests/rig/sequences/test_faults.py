@@ -113,12 +113,6 @@ def test_frames_are_lost_by_count_period_and_chance() -> None:
     assert len(hits) == pytest.approx(2000, abs=150) and hits == again
 
 
-def test_a_silent_node_comes_back() -> None:
-    s = schedule(Silent(node="plant", start=0.5, end=1.0))
-    assert [s.is_heartbeat_alive("plant", k) for k in (499, 500, 999, 1000)] == [True, False, False, True]
-    assert s.is_heartbeat_alive("rig", 700)
-
-
 ONE_OF_EACH: tuple[Fault, ...] = (
     Parameter(parameter="filter.clogging", value=0.3, start=1.0, ramp=0.5), Offset(signal="p12", value=1e5, start=0.1),
     Noise(signal="xs", value=1e-6, start=0.2, end=0.4), Stuck(signal="xj", start=0.3),
@@ -145,11 +139,6 @@ def test_a_plan_survives_json() -> None:
 ])
 def test_a_bad_scenario_is_refused(data: object, message: str) -> None:
     assert message in catch_refusal(Plan.from_json, data)
-
-
-def test_a_parameter_the_model_lacks_is_refused() -> None:
-    unknown = Parameter(parameter="filter.cloging", value=0.3, start=1.0)
-    assert "did you mean 'filter.clogging'" in catch_refusal(schedule, unknown)
 
 
 def test_words_stand_for_their_numbers_and_what_fits_together_is_taken() -> None:
@@ -228,12 +217,6 @@ def test_a_node_that_is_bus_off_sends_and_receives_nothing() -> None:
     assert s.is_bus_off("plant", 150) and not s.is_bus_off("rig", 150) and not s.is_heartbeat_alive("rig", 350)
     assert s.list_bus_off_cycles("rig").tolist() == [*range(300, 400)]
     assert s.count_lost_syncs(300) == 100 and s.count_lost_syncs(299) == 0
-
-
-def test_disturbed_cycles() -> None:
-    s = schedule(Lost(frame="drive", start=0.01, count=1), Jitter(size=1e-4, start=0.02), Reset(start=0.03), stop=40)
-    assert np.flatnonzero(s.find_disturbed(60)).tolist() == [10, 11, *range(30, 40)]
-    assert s.resets == [(30, "node")]
 
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
