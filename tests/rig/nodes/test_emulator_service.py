@@ -1,7 +1,6 @@
 """The compiled emulator on a bus: the same numbers as the emulator on the embedded bus, whatever the faults."""
 from __future__ import annotations
 
-import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -174,19 +173,6 @@ class TestServices:
         assert counts[:5] == [1, 0, 22, 0, 0]
         assert abs(counts[7] - int((record.done - record.sync).max()) // 1000) <= 1
         assert counts[8] & 1  # compiled
-
-    def test_three_missing_drives_are_an_error_of_the_services_too(self, desk: BusDesk) -> None:
-        run_cycle(desk, 1e-3)
-        assert [run_cycle(desk, None).flags for _ in range(4)] == [0, 1, 1, 5]
-        while desk.upload(0x1001) != b"\x11":  # the services take it over within a tick
-            time.sleep(0.001)
-        assert desk.upload(0x1003, 1)[:2] == b"\x50\x82"
-        desk.drive(1e-3, 4)
-        run_cycle(desk, 1e-3)
-        while desk.upload(0x1001) != b"\0":
-            time.sleep(0.001)
-        errors = [data for cob_id, data in desk.heard if cob_id == 0x083]
-        assert errors == [struct.pack("<HB5s", 0x8250, 0x11, b"\x01"), bytes(8)]
 
     def test_a_short_drive_is_an_emergency_and_counts_as_missing(self, desk: BusDesk) -> None:
         run_cycle(desk, None)
