@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from plant import signals
-from plant.effects.sensors import Quantisation
-from plant.effects.servovalve import Compressibility
+from plant.effects.sensors import QUANTISATION
+from plant.effects.servovalve import COMPRESSIBILITY
 from plant.eha import step_jack, update_compliance
 from plant.friction import clip
 from plant.parameters import GROUPS, convert_group_unit, read_shipped_model
@@ -19,7 +18,7 @@ from plant.plants import MeasuredPressures, Plant, Table, Term, base_effect
 from plant.ports import at_position, at_valve, port
 from plant.quantity import Quantity, make_group
 from plant.segments import Array
-from plant.signals import Signals
+from plant.signals import EHA, Signals
 from plant.state import Input, Line, Memory
 
 ROD_SIDE = 0.686  # area of the rod side over that of the piston side; a 50 mm piston usually has a 28 mm rod
@@ -181,8 +180,10 @@ PARAMETER_GROUPS: dict[str, type[Any]] = {
     "sensors": GROUPS["sensors"],
     "pressure_sensors": PressureSensors,
 }
-EFFECT_GROUPS = {"quantisation": Quantisation, "compressibility": Compressibility}  # the model file has values for them
-NOMINAL = read_shipped_model("ehs.toml", {**PARAMETER_GROUPS, **EFFECT_GROUPS})
+# the model file has values for these effects
+EFFECT_GROUPS = {"quantisation": QUANTISATION, "compressibility": COMPRESSIBILITY}
+NOMINAL = read_shipped_model("ehs.toml", {
+    **PARAMETER_GROUPS, **{name: make_group(name, "", fields, __name__) for name, fields in EFFECT_GROUPS.items()}})
 
 # The pressures in the file are means of the last 20 and 60 rows: `Term.later` shifts them back by half of that.
 PROCESSED_COLUMNS = {
@@ -203,7 +204,7 @@ LOGGER_SOURCES = ("time", "ADC1_Channel_2", "ADC1_Channel_3", "ADC1_Channel_6", 
 PLANT = Plant(
     title="electrohydrostatic servo: a pump moves the ram",
     signals=Signals(*(s._replace(unit="raw", quantity="speed of the motor", noun="motor") if s.role == "drive" else s
-                      for s in signals.EHA[1:])),
+                      for s in EHA[1:])),
     parameters=PARAMETER_GROUPS,
     state=State,
     step=step_servo,

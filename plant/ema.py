@@ -316,15 +316,11 @@ base_effect("torque_gain", Motor, "torque_constant", law="T = Kt i", symptoms="a
             starts=(0.18, 0.14, 0.22), source="loss of magnetisation by heat")
 
 
-class FrictionAsymmetry(NamedTuple):
-    """By what fraction the friction is higher in extension, and lower in retraction."""
-
-    asymmetry: Annotated[float, Quantity("1", low=-1, high=1, typical="0.1-0.5")] = 0.0
-
-
-@effect("friction", FrictionAsymmetry, law="(FD + C |x'|) (1 + d sign(x'))", starts=(0.1, -0.1, 0.4, -0.4),
-        symptoms="more current one way than the other, the more the faster", confused_with=("constant_load",),
-        source="a worn screw: Janot, Gautier and Brunot, EMPS, 2019")
+@effect("friction", {  # By what fraction the friction is higher in extension, and lower in retraction.
+    "asymmetry": Quantity("1", low=-1, high=1, typical="0.1-0.5"),
+}, law="(FD + C |x'|) (1 + d sign(x'))", starts=(0.1, -0.1, 0.4, -0.4),
+    symptoms="more current one way than the other, the more the faster", confused_with=("constant_load",),
+    source="a worn screw: Janot, Gautier and Brunot, EMPS, 2019")
 def friction_asymmetry(x: Friction, s: Any, u: Any, p: Any) -> Friction:
     """The flanks of nut and screw are not worn alike: dry and viscous friction depend on the direction."""
     level = x.static if s.speed == 0.0 else x.dynamic
@@ -332,16 +328,12 @@ def friction_asymmetry(x: Friction, s: Any, u: Any, p: Any) -> Friction:
     return Friction(x.force + more, x.static, x.dynamic)
 
 
-class Stribeck(NamedTuple):
-    """Rise of the friction towards standstill, as a fraction of FS, and the speed over which it is lost."""
-
-    rise: Annotated[float, Quantity("1", low=0, high=10, typical="0.2-1")] = 0.0
-    speed: Annotated[float, Quantity("m/s", above=0, high=10, typical="1-50 mm/s")] = 0.01
-
-
-@effect("friction", Stribeck, law="FD + rise FS exp(-(x'/speed)^2); at rest no less than that",
-        symptoms="more current at creep speed; stick-slip", starts=((0.3, 0.01), (1.0, 0.003), (1.0, 0.03)),
-        source="Stribeck 1902; " + _FRICTION)
+@effect("friction", {  # Rise of friction towards standstill, a fraction of FS, and the speed over which it is lost.
+    "rise": Quantity("1", low=0, high=10, typical="0.2-1"),
+    "speed": Quantity("m/s", above=0, high=10, typical="1-50 mm/s"),
+}, off={"speed": 0.01}, law="FD + rise FS exp(-(x'/speed)^2); at rest no less than that",
+    symptoms="more current at creep speed; stick-slip", starts=((0.3, 0.01), (1.0, 0.003), (1.0, 0.03)),
+    source="Stribeck 1902; " + _FRICTION)
 def stribeck(x: Friction, s: Any, u: Any, p: Any) -> Friction:
     """Boundary lubrication: the film in screw and seals carries more the faster they move."""
     g, v = p.stribeck, s.speed / p.stribeck.speed
@@ -356,49 +348,37 @@ def compute_angle(s: Any, p: Any) -> Any:
     return s.motor_position * (2.0 * pi * p.screw.ratio) / p.screw.lead
 
 
-class Cogging(NamedTuple):
-    """Amplitude and phase of a torque that does not need a current, and its periods per turn (slots and poles)."""
-
-    torque: Annotated[float, Quantity("N m", low=0, high=100, typical="0.5-5 % of the rated torque")] = 0.0
-    phase: Annotated[float, Quantity("rad", low=-10, high=10)] = 0.0
-    periods: Annotated[float, Quantity("1", low=1, high=1000, typical="12-72")] = 12.0
-
-
-@effect("torque", Cogging, fitted=("torque", "phase"), law="T - torque cos(periods theta + phase)",
-        starts=((0.02, 0.0), (0.02, 2.0), (0.02, -2.0), (0.1, 0.0), (0.1, 2.0), (0.1, -2.0)),
-        symptoms="a wave of current along the stroke, at rest as well", source="Hanselman, Brushless Motors, 2012")
+@effect("torque", {  # Amplitude and phase of a torque without current, and its periods per turn (slots and poles).
+    "torque": Quantity("N m", low=0, high=100, typical="0.5-5 % of the rated torque"),
+    "phase": Quantity("rad", low=-10, high=10),
+    "periods": Quantity("1", low=1, high=1000, typical="12-72"),
+}, off={"periods": 12.0}, fitted=("torque", "phase"), law="T - torque cos(periods theta + phase)",
+    starts=((0.02, 0.0), (0.02, 2.0), (0.02, -2.0), (0.1, 0.0), (0.1, 2.0), (0.1, -2.0)),
+    symptoms="a wave of current along the stroke, at rest as well", source="Hanselman, Brushless Motors, 2012")
 def cogging(x: float, s: Any, u: Any, p: Any) -> Any:
     """The magnets prefer some angles."""
     g = p.cogging
     return x - g.torque * cos(g.periods * compute_angle(s, p) + g.phase)
 
 
-class Eccentricity(NamedTuple):
-    """Static eccentricity of the rotor over the air gap, and where the gap is narrowest."""
-
-    share: Annotated[float, Quantity("1", low=0, high=0.9, typical="0.05-0.4")] = 0.0
-    phase: Annotated[float, Quantity("rad", low=-10, high=10)] = 0.0
-
-
-@effect("torque", Eccentricity, law="T (1 + share cos(theta + phase))",
-        starts=((0.1, 0.0), (0.1, 2.0), (0.1, -2.0), (0.3, 0.0), (0.3, 2.0), (0.3, -2.0)),
-        symptoms="the torque of a current varies once a turn of the motor", source=_FAULTS)
+@effect("torque", {  # Static eccentricity of the rotor over the air gap, and where the gap is narrowest.
+    "share": Quantity("1", low=0, high=0.9, typical="0.05-0.4"),
+    "phase": Quantity("rad", low=-10, high=10),
+}, law="T (1 + share cos(theta + phase))",
+    starts=((0.1, 0.0), (0.1, 2.0), (0.1, -2.0), (0.3, 0.0), (0.3, 2.0), (0.3, -2.0)),
+    symptoms="the torque of a current varies once a turn of the motor", source=_FAULTS)
 def eccentricity(x: float, s: Any, u: Any, p: Any) -> Any:
     """Worn bearings let the rotor sit off the middle: the flux that links a phase depends on the angle."""
     g = p.eccentricity
     return x * (1.0 + g.share * cos(compute_angle(s, p) + g.phase))
 
 
-class WindingShort(NamedTuple):
-    """Share of the turns of one phase of three that are shorted, and pole pairs of the motor."""
-
-    share: Annotated[float, Quantity("1", low=0, high=1, typical="0.05-0.5")] = 0.0
-    pole_pairs: Annotated[float, Quantity("1", low=1, high=100)] = 4.0
-
-
-@effect("torque", WindingShort, fitted=("share",), starts=(0.1, 0.4), source=_FAULTS,
-        law="T (1 - share/3 (1 - cos(2 p theta))) - share/3 Kt^2/R theta'",
-        symptoms="less torque, which pulsates at twice the electrical frequency, and a drag that grows with speed")
+@effect("torque", {  # Share of the turns of one phase of three that are shorted, and pole pairs of the motor.
+    "share": Quantity("1", low=0, high=1, typical="0.05-0.5"),
+    "pole_pairs": Quantity("1", low=1, high=100),
+}, off={"pole_pairs": 4.0}, fitted=("share",), starts=(0.1, 0.4), source=_FAULTS,
+    law="T (1 - share/3 (1 - cos(2 p theta))) - share/3 Kt^2/R theta'",
+    symptoms="less torque, which pulsates at twice the electrical frequency, and a drag that grows with speed")
 def winding_short(x: float, s: Any, u: Any, p: Any) -> Any:
     """Turn-to-turn short: the turns carry no torque; the current that their voltage drives through them brakes."""
     third = p.winding_short.share * (1.0 / 3.0)

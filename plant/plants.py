@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from plant.compile import Function, find_called_functions, find_fields_of, raise_unbound, rebind_names
-from plant.effects import CATALOGUE, Effect, build_base_effect, build_effect, combine_laws
+from plant.effects import CATALOGUE, Effect, Group, build_base_effect, build_effect, combine_laws
 from plant.errors import InputError, require
 from plant.faults import Fault
 from plant.foreign import Program
@@ -389,7 +389,7 @@ def make_noise_group(levels: Mapping[str, float], units: Mapping[str, str]) -> t
                       map(float, levels.values()))
 
 
-def effect(port: str, group: type[Any], **more: Any) -> Callable[[Function], Function]:
+def effect(port: str, group: Group, **more: Any) -> Callable[[Function], Function]:
     """`plant.effects.effect` in a plant file: the effect belongs to that plant, and its port is one of the file's.
 
     `more`: law, symptoms, memory, fitted, starts, source, ..., see there.

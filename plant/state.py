@@ -1,5 +1,6 @@
 """What every step gets: its inputs; and records that laws of effects remember, or exchange at their ports."""
 
+from collections import namedtuple
 from typing import Any, NamedTuple
 
 Memory = Any  # of a port: 0.0 for none, else what its effects keep, nested tuples of floats
@@ -22,17 +23,11 @@ class Sampled(NamedTuple):
     sensed: float = 0.0  # the controlled signal as it was read
 
 
-class Held(NamedTuple):
-    """Where something has been dragged to: the memory of a play."""
+# memory of a play: where something has been dragged to
+Held = namedtuple("Held", "held", defaults=(0.0,))
 
-    held: float = 0.0
-
-
-class Lag(NamedTuple):
-    """What a lag remembers: how far it is behind, and its last input."""
-
-    behind: float = 0.0
-    last: float = 0.0
+# memory of a lag: how far it is behind, and its last input
+Lag = namedtuple("Lag", "behind last", defaults=(0.0, 0.0))
 
 
 class Line(NamedTuple):

@@ -4,12 +4,11 @@ An effect is a law at one port of the signal path (`plant.ports`): it gets the p
 start of the step, the inputs and the parameters, and returns the signal changed. Several effects at one port act in the
 order of the catalogue. A law that remembers something also gets and returns its memory, a NamedTuple of floats.
 
-    class NullBias(NamedTuple):
-        current: Annotated[float, Quantity("A")] = 0.0  # default = off value: the law then changes nothing
-
-    @effect("current", NullBias, law="i = i + i0")
+    @effect("current", {"current": Quantity("A")}, law="i = i + i0")  # at 0 A the law changes nothing
     def null_bias(x, s, u, p):
         return x + p.null_bias.current
+
+In files of users the parameters may be a NamedTuple of `Annotated[float, Quantity("A")]` as well.
 
 The effects of `base` are parameters of the reference model itself; they have no law of their own.
 """
@@ -25,7 +24,7 @@ from plant.errors import require
 from plant.friction import clip, play, soften
 from plant.parameters import GROUPS
 from plant.ports import PORTS, chain_laws
-from plant.quantity import Quantity, list_quantities
+from plant.quantity import Quantity, list_quantities, make_group
 from plant.state import Drag, Held, Lag, Line, Memory
 from plant.tables import read_file
 from plant.user_code import run_file
@@ -108,16 +107,18 @@ CATALOGUE = Catalogue()
 
 
 Start = float | tuple[float, ...]  # values of the fitted parameters, in their order
+Group = type[Any] | Mapping[str, Quantity]
 
 
-def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory: type[Any] | None = None,
-           disturbance: bool = False, fitted: Sequence[str] | None = None, starts: Sequence[Start] = (),
-           **more: Any) -> Callable[[Law], Law]:
+def effect(port: str, group: Group, *, off: Mapping[str, float] = {}, law: str, symptoms: str = "",
+           memory: type[Any] | None = None, disturbance: bool = False, fitted: Sequence[str] | None = None,
+           starts: Sequence[Start] = (), **more: Any) -> Callable[[Law], Law]:
     """Register a law at `port` with the parameters `group`; the function's name is the effect's.
 
     Args:
         port: where it acts.
-        group: its parameters, a NamedTuple; a default is the off value.
+        group: its parameters: a table, or a NamedTuple whose defaults are the off values.
+        off: values of the table's fields at which the effect is absent, where that is not 0.
         law: the formula, for people.
         symptoms: what tells it apart, for people.
         memory: what it remembers, a NamedTuple of floats with defaults.
@@ -137,22 +138,24 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
         known = CATALOGUE.list_all().get(name := function.__name__)
         if name in GROUPS or (known and known.file != Path(function.__code__.co_filename)):
             raise ValueError(f"{name}: the name is taken")
-        CATALOGUE.add_effect(build_effect(function, port, group, law=law, symptoms=symptoms, memory=memory,
+        CATALOGUE.add_effect(build_effect(function, port, group, off=off, law=law, symptoms=symptoms, memory=memory,
                                           disturbance=disturbance, fitted=fitted, starts=starts, **more))
         return function
 
     return register
 
 
-def build_effect(function: Law, port: str, group: type[Any], *, law: str, symptoms: str = "",
-                 memory: type[Any] | None = None, disturbance: bool = False, fitted: Sequence[str] | None = None,
-                 starts: Sequence[Start] = (), **more: Any) -> Effect:
+def build_effect(function: Law, port: str, group: Group, *, off: Mapping[str, float] = {}, law: str,
+                 symptoms: str = "", memory: type[Any] | None = None, disturbance: bool = False,
+                 fitted: Sequence[str] | None = None, starts: Sequence[Start] = (), **more: Any) -> Effect:
     """The effect of a law, with the arguments of `effect`.
 
     Raises:
         ValueError: an unknown field, or a parameter without default.
     """
     name = function.__name__
+    if isinstance(group, Mapping):
+        group = make_group(name, law, group, function.__module__, {**dict.fromkeys(group, 0.0), **off}.values())
     free = group._fields if fitted is None else tuple(fitted)
     if disturbance:
         free = ()
@@ -161,9 +164,9 @@ def build_effect(function: Law, port: str, group: type[Any], *, law: str, sympto
     if set(group._fields) - set(group._field_defaults):
         raise ValueError(f"{name}: every parameter needs a default, its off value")
     meaning = {f"{name}.{field}": q for field, q in list_quantities(group).items()}
-    off = {f"{name}.{field}": float(x) for field, x in group._field_defaults.items()}
+    absent = {f"{name}.{field}": float(x) for field, x in group._field_defaults.items()}
     names = tuple(f"{name}.{field}" for field in free)
-    return Effect(name, port, law, symptoms, meaning, off, group, function, memory, disturbance, names,
+    return Effect(name, port, law, symptoms, meaning, absent, group, function, memory, disturbance, names,
                   _name_starts(names, starts), **more)
 
 

@@ -1,57 +1,43 @@
 """Forces on the ram and what resists it: loads, dry friction, a press. Positive force acts against extension."""
 
+from collections import namedtuple
 from math import exp, pi, sqrt
-from typing import Annotated, Any, NamedTuple
+from typing import Any
 
 from plant.effects import Drag, Held, Quantity, effect
 
 
-class ConstantLoad(NamedTuple):
-    """A steady external force."""
-
-    force: Annotated[float, Quantity("N", low=-1e6, high=1e6, typical="0.2-5 kN")] = 0.0
-
-
-@effect("load", ConstantLoad, law="FR = FR + F", symptoms="mean P12", starts=(400.0, -400.0, 3000.0, -3000.0),
-        confused_with=("friction_asymmetry", "null_bias"), source="a steady air load or weight")
+@effect("load", {  # A steady external force.
+    "force": Quantity("N", low=-1e6, high=1e6, typical="0.2-5 kN"),
+}, law="FR = FR + F", symptoms="mean P12", starts=(400.0, -400.0, 3000.0, -3000.0),
+    confused_with=("friction_asymmetry", "null_bias"), source="a steady air load or weight")
 def constant_load(x: float, s: Any, u: Any, p: Any) -> float:
     """A weight or a steady air load."""
     return x + p.constant_load.force
 
 
-class AeroStiffness(NamedTuple):
-    """Hinge moment of the surface per unit of ram position."""
-
-    stiffness: Annotated[float, Quantity("N/m", low=0, high=1e9, typical="1e5-1e6 N/m")] = 0.0
-
-
-@effect("load", AeroStiffness, law="FR = FR + K XJ", symptoms="P12 proportional to position, at rest too",
-        starts=(1e5, 3e5, 1e6), source="hinge moment of a surface against its deflection")
+@effect("load", {  # Hinge moment of the surface per unit of ram position.
+    "stiffness": Quantity("N/m", low=0, high=1e9, typical="1e5-1e6 N/m"),
+}, law="FR = FR + K XJ", symptoms="P12 proportional to position, at rest too", starts=(1e5, 3e5, 1e6),
+    source="hinge moment of a surface against its deflection")
 def aero_stiffness(x: float, s: Any, u: Any, p: Any) -> float:
     """The air stream pushes the surface back to neutral."""
     return x + p.aero_stiffness.stiffness * (s.jack_position + 0.5 * u.h * s.jack_speed)
 
 
-class StructuralResonance(NamedTuple):
-    """A mass that the ram moves through a spring with damping; its frequency and damping ratio with the ram held."""
-
-    mass: Annotated[float, Quantity("kg", low=0, high=1e4, typical="10-200 kg")] = 0.0
-    frequency: Annotated[float, Quantity("Hz", low=1, high=1e3, typical="20-200 Hz")] = 60.0
-    damping_ratio: Annotated[float, Quantity("1", low=0, high=10, typical="0.01-0.1")] = 0.03
+# how far the mass is ahead of the ram if that keeps its speed, the mass's speed, the ram's before the step
+Swing = namedtuple("Swing", "ahead speed ram_speed", defaults=(0.0, 0.0, 0.0))
 
 
-class Swing(NamedTuple):
-    """How far the mass is ahead of the ram if that keeps its speed, the mass's speed, and the ram's before the step."""
-
-    ahead: float = 0.0
-    speed: float = 0.0
-    ram_speed: float = 0.0
-
-
-@effect("load", StructuralResonance, law="FR = FR + M z', z' = w^2 (XJ - z0) + 2 D w (XJ' - z), z = z0', w = 2 pi f",
-        symptoms="P12 rings after each move; the ram stands still at f and moves most above it", memory=Swing,
-        starts=((20.0, 30.0, 0.03), (20.0, 80.0, 0.03), (60.0, 60.0, 0.03), (100.0, 150.0, 0.03)),
-        source="two masses on a spring: Den Hartog, Mechanical Vibrations, 1956")
+@effect("load", {  # A mass that the ram moves through a spring with damping; the last two are with the ram held.
+    "mass": Quantity("kg", low=0, high=1e4, typical="10-200 kg"),
+    "frequency": Quantity("Hz", low=1, high=1e3, typical="20-200 Hz"),
+    "damping_ratio": Quantity("1", low=0, high=10, typical="0.01-0.1"),
+}, off={"frequency": 60.0, "damping_ratio": 0.03},
+    law="FR = FR + M z', z' = w^2 (XJ - z0) + 2 D w (XJ' - z), z = z0', w = 2 pi f",
+    symptoms="P12 rings after each move; the ram stands still at f and moves most above it", memory=Swing,
+    starts=((20.0, 30.0, 0.03), (20.0, 80.0, 0.03), (60.0, 60.0, 0.03), (100.0, 150.0, 0.03)),
+    source="two masses on a spring: Den Hartog, Mechanical Vibrations, 1956")
 def structural_resonance(x: float, m: Swing, s: Any, u: Any, p: Any) -> tuple[float, Swing]:
     """The surface, or its structure, swings on the ram.
 
@@ -67,16 +53,12 @@ def structural_resonance(x: float, m: Swing, s: Any, u: Any, p: Any) -> tuple[fl
     return x + g.mass * acceleration, Swing(ahead + u.h * (0.5 * (m.speed + speed) - s.jack_speed), speed, s.jack_speed)
 
 
-class Stribeck(NamedTuple):
-    """Rise of the friction towards standstill, as a fraction of FSJ, and the speed over which it is lost."""
-
-    rise: Annotated[float, Quantity("1", low=0, high=10, typical="0.2-1")] = 0.0
-    speed: Annotated[float, Quantity("m/s", above=0, high=10, typical="1-50 mm/s")] = 0.01
-
-
-@effect("jack_drag", Stribeck, law="FDJ + rise FSJ exp(-(XJ'/speed)^2); at rest no less than that",
-        symptoms="saw-tooth P12 while the spool moves", starts=((0.2, 0.01), (1.0, 0.003), (1.0, 0.03)),
-        source="Stribeck 1902; Armstrong-Helouvry, Dupont and Canudas de Wit 1994")
+@effect("jack_drag", {  # Rise of friction towards standstill, a fraction of FSJ, and the speed over which it is lost.
+    "rise": Quantity("1", low=0, high=10, typical="0.2-1"),
+    "speed": Quantity("m/s", above=0, high=10, typical="1-50 mm/s"),
+}, off={"speed": 0.01}, law="FDJ + rise FSJ exp(-(XJ'/speed)^2); at rest no less than that",
+    symptoms="saw-tooth P12 while the spool moves", starts=((0.2, 0.01), (1.0, 0.003), (1.0, 0.03)),
+    source="Stribeck 1902; Armstrong-Helouvry, Dupont and Canudas de Wit 1994")
 def stribeck(x: Drag, s: Any, u: Any, p: Any) -> Drag:
     """Boundary lubrication: the film under the seal carries more the faster it moves."""
     g, v = p.stribeck, s.jack_speed / p.stribeck.speed
@@ -86,40 +68,28 @@ def stribeck(x: Drag, s: Any, u: Any, p: Any) -> Drag:
     return Drag(x.force, x.damping, top if raised else x.static, x.dynamic + rise * exp(-v * v))
 
 
-class FrictionAsymmetry(NamedTuple):
-    """By what fraction the friction is higher in extension, and lower in retraction."""
-
-    asymmetry: Annotated[float, Quantity("1", low=-1, high=1, typical="0.1-0.5")] = 0.0
-
-
-@effect("jack_drag", FrictionAsymmetry, law="F (1 + d sign(XJ'))", symptoms="same as a constant load while sliding",
-        starts=(0.1, -0.1, 0.5, -0.5), confused_with=("constant_load", "null_bias"),
-        source="a rod seal that grips more one way")
+@effect("jack_drag", {  # By what fraction the friction is higher in extension, and lower in retraction.
+    "asymmetry": Quantity("1", low=-1, high=1, typical="0.1-0.5"),
+}, law="F (1 + d sign(XJ'))", symptoms="same as a constant load while sliding", starts=(0.1, -0.1, 0.5, -0.5),
+    confused_with=("constant_load", "null_bias"), source="a rod seal that grips more one way")
 def friction_asymmetry(x: Drag, s: Any, u: Any, p: Any) -> Drag:
     """Levels F(1 + d) and F(1 - d) are a symmetric level F and a force d F."""
     level = x.static if s.jack_speed == 0.0 else x.dynamic
     return Drag(x.force + p.friction_asymmetry.asymmetry * level, x.damping, x.static, x.dynamic)
 
 
-class Presliding(NamedTuple):
-    """Deflection of the bristles at the static level, z = FSJ/s0, and the speed over which that level is lost."""
-
-    deflection: Annotated[float, Quantity("m", low=0, high=1e-2, typical="5-100 um")] = 0.0
-    speed: Annotated[float, Quantity("m/s", low=0, high=10, typical="1-50 mm/s; 0: at once")] = 0.0
+# deflection of the bristles, and what of it and of the way a step leaves
+Bristle = namedtuple("Bristle", "deflection kept", defaults=(0.0, 0.0))
 
 
-class Bristle(NamedTuple):
-    """Deflection of the bristles, and what of it and of the way a step leaves."""
-
-    deflection: float = 0.0
-    kept: float = 0.0
-
-
-@effect("jack_drag", Presliding, memory=Bristle, starts=((5e-6, 1e-3), (2e-5, 1e-3), (1e-4, 1e-3), (2e-5, 1e-2)),
-        law="LuGre: z' = XJ' - s0 |XJ'| z/g, F = s0 z + s1 z', g = FDJ + (FSJ - FDJ) exp(-(XJ'/speed)^2), "
-            "s0 = FSJ/deflection, s1 = 0.02 sqrt(s0 MJ)",
-        symptoms="P12-position spring loop at each reversal, no true stop",
-        source="LuGre: Canudas de Wit, Olsson, Astrom and Lischinsky 1995")
+@effect("jack_drag", {  # Deflection of bristles at the static level, z = FSJ/s0; speed over which that level is lost.
+    "deflection": Quantity("m", low=0, high=1e-2, typical="5-100 um"),
+    "speed": Quantity("m/s", low=0, high=10, typical="1-50 mm/s; 0: at once"),
+}, memory=Bristle, starts=((5e-6, 1e-3), (2e-5, 1e-3), (1e-4, 1e-3), (2e-5, 1e-2)),
+    law="LuGre: z' = XJ' - s0 |XJ'| z/g, F = s0 z + s1 z', g = FDJ + (FSJ - FDJ) exp(-(XJ'/speed)^2), "
+        "s0 = FSJ/deflection, s1 = 0.02 sqrt(s0 MJ)",
+    symptoms="P12-position spring loop at each reversal, no true stop",
+    source="LuGre: Canudas de Wit, Olsson, Astrom and Lischinsky 1995")
 def presliding(x: Drag, m: Bristle, s: Any, u: Any, p: Any) -> tuple[Drag, Bristle]:
     """Bristles bend before they slip, in place of stick-slip.
 
@@ -147,17 +117,13 @@ def presliding(x: Drag, m: Bristle, s: Any, u: Any, p: Any) -> tuple[Drag, Brist
                  0.0 if on else x.dynamic), Bristle(z if on else 0.0, kept if on else 0.0))
 
 
-class OneWayLoad(NamedTuple):
-    """How much of the given load resists as a press does, the way until it touches, and that until it is all there."""
-
-    share: Annotated[float, Quantity("1", low=0, high=2, typical="1")] = 0.0
-    slack: Annotated[float, Quantity("m", low=0, high=1, typical="0-5 mm")] = 0.0
-    travel: Annotated[float, Quantity("m", low=1e-6, high=1, typical="0.1-10 mm")] = 5e-3
-
-
-@effect("jack_drag", OneWayLoad, law="FR, against extension only, after a slack and over a travel; it never drives",
-        symptoms="no P12 from the load but in extension", memory=Held, plant="ehs",
-        starts=((0.5, 0.0, 5e-3), (1.0, 0.0, 1e-3), (1.0, 1e-3, 4e-3)), source="a press cylinder and its relief valve")
+@effect("jack_drag", {  # Part of the load that resists as a press does, way until it touches, and until all is there.
+    "share": Quantity("1", low=0, high=2, typical="1"),
+    "slack": Quantity("m", low=0, high=1, typical="0-5 mm"),
+    "travel": Quantity("m", low=1e-6, high=1, typical="0.1-10 mm"),
+}, off={"travel": 5e-3}, law="FR, against extension only, after a slack and over a travel; it never drives",
+    symptoms="no P12 from the load but in extension", memory=Held, plant="ehs",
+    starts=((0.5, 0.0, 5e-3), (1.0, 0.0, 1e-3), (1.0, 1e-3, 4e-3)), source="a press cylinder and its relief valve")
 def one_way_load(x: Drag, m: Held, s: Any, u: Any, p: Any) -> tuple[Drag, Held]:
     """A press yields at its load. As friction that acts one way: half of it a level, half of it a force.
 

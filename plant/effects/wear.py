@@ -9,47 +9,39 @@ Sorli, "A Prognostic Model for Electrohydraulic Servovalves", PHM 2009: friction
 the spool, rounding of its lands' corners, torque of the first stage, contamination of the filter.
 """
 
+from collections import namedtuple
 from math import sqrt
-from typing import Annotated, Any, NamedTuple
+from typing import Any
 
 from plant.effects import Line, Quantity, effect
 
 NOWHERE = ("none",)  # plants in which rig explain tests them unasked
 
 
-class MagnetLoss(NamedTuple):
-    """Share of the torque that the magnets of the torque motor have lost."""
-
-    share: Annotated[float, Quantity("1", "d", low=0, below=1, typical="0.05-0.3")] = 0.0
-
-
-@effect("current", MagnetLoss, law="Tact = GM (1 - d) Cor - KSF XS", symptoms="same as a smaller GM",
-        starts=(0.05, 0.2), confused_with=("torque_motor.gain",), searched_in=NOWHERE,
-        revealed_by="a torque or flux measurement of the motor alone",
-        source="torque of a polarised motor in proportion to its magnets' flux, Merritt 1967")
+@effect("current", {  # Share of the torque that the magnets of the torque motor have lost.
+    "share": Quantity("1", "d", low=0, below=1, typical="0.05-0.3"),
+}, law="Tact = GM (1 - d) Cor - KSF XS", symptoms="same as a smaller GM", starts=(0.05, 0.2),
+    confused_with=("torque_motor.gain",), searched_in=NOWHERE,
+    revealed_by="a torque or flux measurement of the motor alone",
+    source="torque of a polarised motor in proportion to its magnets' flux, Merritt 1967")
 def magnet_loss(x: float, s: Any, u: Any, p: Any) -> float:
     """Demagnetised magnets: less torque for the same current."""
     return x * (1.0 - p.magnet_loss.share)
 
 
-class CoilShort(NamedTuple):
-    """Share of the turns that is shorted, and inductance over resistance of the whole coil."""
-
-    share: Annotated[float, Quantity("1", "s", low=0, below=1, typical="0.05-0.3")] = 0.0
-    time_constant: Annotated[float, Quantity("s", "L/R", low=0, high=1, typical="1-5 ms")] = 3e-3
+# the current that the flux stands for
+Flux = namedtuple("Flux", "current", defaults=(0.0,))
 
 
-class Flux(NamedTuple):
-    """The current that the flux stands for."""
-
-    current: float = 0.0
-
-
-@effect("current", CoilShort, memory=Flux, fitted=("share",), starts=(0.05, 0.2), confused_with=("torque_motor.gain",),
-        law="s L/R i' + i = (1 - s) Cor: the turns left drive the flux, the shorted ones slow it down",
-        symptoms="less gain, and a lag that grows with it", searched_in=NOWHERE,
-        revealed_by="the coil's resistance, R (1 - s)",
-        source="transformer with a shorted secondary of s N turns and resistance s R, whose time constant is s L/R")
+@effect("current", {  # Share of the turns that is shorted, and inductance over resistance of the whole coil.
+    "share": Quantity("1", "s", low=0, below=1, typical="0.05-0.3"),
+    "time_constant": Quantity("s", "L/R", low=0, high=1, typical="1-5 ms"),
+}, off={"time_constant": 3e-3}, memory=Flux, fitted=("share",), starts=(0.05, 0.2),
+    confused_with=("torque_motor.gain",),
+    law="s L/R i' + i = (1 - s) Cor: the turns left drive the flux, the shorted ones slow it down",
+    symptoms="less gain, and a lag that grows with it", searched_in=NOWHERE,
+    revealed_by="the coil's resistance, R (1 - s)",
+    source="transformer with a shorted secondary of s N turns and resistance s R, whose time constant is s L/R")
 def coil_short(x: float, m: Flux, s: Any, u: Any, p: Any) -> tuple[float, Flux]:
     """Shorted turns are missing from the coil and are a ring around its core (implicit; without them exactly x).
 
@@ -63,36 +55,28 @@ def coil_short(x: float, m: Flux, s: Any, u: Any, p: Any) -> tuple[float, Flux]:
     return y, Flux(y)
 
 
-class NozzleBlock(NamedTuple):
-    """Share of one nozzle's opening that dirt blocks; the sign tells which nozzle."""
-
-    share: Annotated[float, Quantity("1", "b", low=-1, high=1, typical="0.05-0.5")] = 0.0
-
-
-@effect("nozzle", NozzleBlock, law="XF = XF (1 - |b|/2) + b/2 XFM", symptoms="a null shift, and less pilot gain",
-        starts=(0.1, -0.1, 0.3, -0.3), confused_with=("null_bias",), searched_in=NOWHERE,
-        revealed_by="pressures of both nozzles at null",
-        source="bridge of two nozzles with openings XFM - XF and XFM + XF, Merritt 1967; one of them times 1 - b")
+@effect("nozzle", {  # Share of one nozzle's opening that dirt blocks; the sign tells which nozzle.
+    "share": Quantity("1", "b", low=-1, high=1, typical="0.05-0.5"),
+}, law="XF = XF (1 - |b|/2) + b/2 XFM", symptoms="a null shift, and less pilot gain", starts=(0.1, -0.1, 0.3, -0.3),
+    confused_with=("null_bias",), searched_in=NOWHERE, revealed_by="pressures of both nozzles at null",
+    source="bridge of two nozzles with openings XFM - XF and XFM + XF, Merritt 1967; one of them times 1 - b")
 def nozzle_block(x: float, s: Any, u: Any, p: Any) -> float:
     """What drives the spool is half the difference of the openings: ((XFM + XF) - (1 - b) (XFM - XF))/2."""
     b = p.nozzle_block.share
     return x * (1.0 - 0.5 * abs(b)) + 0.5 * b * p.flapper.travel
 
 
-class LandClearance(NamedTuple):
-    """Radial clearance of the spool in its sleeve, circumference and length of its lands, viscosity of the oil."""
-
-    clearance: Annotated[float, Quantity("m", "c", low=0, high=1e-3, typical="3-40 um; new 6 um")] = 6e-6
-    circumference: Annotated[float, Quantity("m", "w", low=0, high=1)] = 0.013  # of a spool with the nominal ends
-    length: Annotated[float, Quantity("m", "L", above=0, high=1)] = 1e-3
-    viscosity: Annotated[float, Quantity("Pa s", "mu", above=0, high=10)] = 0.015
-    new: Annotated[float, Quantity("m", low=0, high=1e-3)] = 6e-6  # clearance that the nominal leakage includes
-
-
-@effect("valve", LandClearance, fitted=("clearance",), starts=(1.5e-5, 3e-5), confused_with=("jack.leakage",),
-        law="Q = w c^3 P12/(12 mu L), less that of a new spool", symptoms="same as leakage across the piston",
-        searched_in=NOWHERE, revealed_by="flow of the valve at null with its control ports blocked",
-        source="laminar flow through an annular gap, Merritt 1967; 6 um new and the lands are choices")
+@effect("valve", {  # Radial clearance of the spool, circumference and length of its lands, viscosity of the oil.
+    "clearance": Quantity("m", "c", low=0, high=1e-3, typical="3-40 um; new 6 um"),
+    "circumference": Quantity("m", "w", low=0, high=1),  # of a spool with the nominal ends
+    "length": Quantity("m", "L", above=0, high=1),
+    "viscosity": Quantity("Pa s", "mu", above=0, high=10),
+    "new": Quantity("m", low=0, high=1e-3),  # clearance that the nominal leakage includes
+}, off={"clearance": 6e-6, "circumference": 0.013, "length": 1e-3, "viscosity": 0.015, "new": 6e-6},
+    fitted=("clearance",), starts=(1.5e-5, 3e-5), confused_with=("jack.leakage",),
+    law="Q = w c^3 P12/(12 mu L), less that of a new spool", symptoms="same as leakage across the piston",
+    searched_in=NOWHERE, revealed_by="flow of the valve at null with its control ports blocked",
+    source="laminar flow through an annular gap, Merritt 1967; 6 um new and the lands are choices")
 def land_clearance(x: Line, s: Any, u: Any, p: Any) -> Line:
     """Four worn lands leak from the supply to both chambers and from these to the return: in sum in proportion to P12.
 
@@ -110,18 +94,15 @@ def leak_more(x: Line, flow: float, p: Any) -> Line:
     return Line(x.offset * kept, x.slope * kept, x.limit, x.drive * kept)
 
 
-class EdgeRounding(NamedTuple):
-    """Radius of the corners of the metering edges."""
-
-    radius: Annotated[float, Quantity("m", "r", low=0, high=1e-3, typical="1-50 um; new 1 um")] = 1e-6
-    new: Annotated[float, Quantity("m", low=0, high=1e-3)] = 1e-6  # radius that the nominal gains include
-
-
-@effect("valve", EdgeRounding, fitted=("radius",), starts=(5e-6, 2e-5), searched_in=NOWHERE,
-        law="edges open by a = sqrt(max(XS, 0)^2 + r^2) and b = sqrt(max(-XS, 0)^2 + r^2): XS = a - b, and they leak "
-            "GQ (a + b)/(2 PSR) P12", symptoms="soft around null: less flow and less pressure gain",
-        confused_with=("spool_overlap",), revealed_by="pressure gain and leakage at null on a valve test bench",
-        source="opening of a corner, sqrt(x^2 + c^2), Merritt 1967; r 1 um new is a choice")
+@effect("valve", {  # Radius of the corners of the metering edges.
+    "radius": Quantity("m", "r", low=0, high=1e-3, typical="1-50 um; new 1 um"),
+    "new": Quantity("m", low=0, high=1e-3),  # radius that the nominal gains include
+}, off={"radius": 1e-6, "new": 1e-6}, fitted=("radius",), starts=(5e-6, 2e-5), searched_in=NOWHERE,
+    law="edges open by a = sqrt(max(XS, 0)^2 + r^2) and b = sqrt(max(-XS, 0)^2 + r^2): XS = a - b, and they leak "
+        "GQ (a + b)/(2 PSR) P12",
+    symptoms="soft around null: less flow and less pressure gain", confused_with=("spool_overlap",),
+    revealed_by="pressure gain and leakage at null on a valve test bench",
+    source="opening of a corner, sqrt(x^2 + c^2), Merritt 1967; r 1 um new is a choice")
 def edge_rounding(x: Line, s: Any, u: Any, p: Any) -> Line:
     """Both edges of a chamber are a bridge: Q = GQ ((a - b) - (a + b)/2 P12/PSR), less that of new edges."""
     g, gain = p.edge_rounding, p.valve.pressure_gain
