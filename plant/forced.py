@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from plant.anchor import rest_at_reading
 from plant.eha import Coefficients, State, apply_oil, compute_coefficients, compute_metering_line, sense_ram
 from plant.kernels import unpack_state
 from plant.model import Model, build_kernel
 from plant.ports import at_jack_drag, at_load
 from plant.segments import Array
+from plant.solve import rest_at_reading
 from plant.state import Drag, Input, Memory
 
 STEPS, FINE = 5, 100  # a cycle: what was stiff is given here, only effects that remember want many

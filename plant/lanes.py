@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.anchor import pull_plant, rest_at_reading, show_start
 from plant.compile import (
     Function,
     compile_function,
@@ -26,7 +25,6 @@ from plant.compile import (
     raise_unbound,
     rebind_names,
 )
-from plant.controller import take_demand
 from plant.effects import Effect
 from plant.errors import require
 from plant.foreign import run_foreign
@@ -42,11 +40,11 @@ from plant.kernels import (
 )
 from plant.model import Model, build_bare_model
 from plant.plants import MeasuredPressures, Plant
-from plant.solve import read_controlled
+from plant.segments import Array
+from plant.solve import pull_plant, read_controlled, rest_at_reading, show_start, take_demand
 from plant.state import Input
 from plant.threads import count_threads, do_together, map_in_threads
 
-Array = NDArray[np.float64]
 STEPS = 20  # steps a cycle: 50 us
 FEW = 6  # effects that a model may have and still get one kernel for all its runs
 FEW_COSTLY = 2  # costly effects that a kernel of their own may have

@@ -13,23 +13,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plant import plants
-from plant.anchor import show_start
 from plant.compile import Function, compile_function, interpret_function
 from plant.effects import Effect
 from plant.errors import InputError, require, suggest_name
 from plant.kernels import list_state_values
 from plant.parameters import check_combinations, find_field, flatten_tables, parse_value
 from plant.plant_files import READERS, read_model_tables, read_named_plant
-from plant.plants import Plant
+from plant.plants import Plant, find_loaded_plant, find_plant, is_known, list_plants, load_plant
 from plant.quantity import Quantity
+from plant.solve import show_start
 
 SHIPPED_MODELS = ("servo", "emps")  # plant/models/NAME.toml, beside the nominal values of the plants
 
 
 def list_offered_effects(plant: str = "eha") -> list[Effect]:
     """The effects of the catalogue that suit a plant."""
-    return plants.find_plant(plant).list_effects()
+    return find_plant(plant).list_effects()
 
 
 def list_searched_effects(plant: str = "eha") -> list[Effect]:
@@ -46,7 +45,7 @@ def find_quantity(name: str, where: object = "--set", plant: str = "eha") -> Qua
     own = {e.name: e.fitted for e in list_offered_effects(plant) if e.base}.get(name.partition(".")[0])
     if own and name not in own:
         raise InputError(where, name, f"{' or '.join(own)}: the parameter that this effect is in this plant")
-    return find_field(where, name, plants.find_plant(plant).list_groups())
+    return find_field(where, name, find_plant(plant).list_groups())
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Model:
     """A plant with parameter `values` ("group.field" to SI number) and `effects`, in catalogue order."""
 
     name: str = "eha"
-    values: Mapping[str, float] = field(default_factory=lambda: dict(plants.find_plant("eha").nominal))
+    values: Mapping[str, float] = field(default_factory=lambda: dict(find_plant("eha").nominal))
     effects: tuple[str, ...] = ()
     plant: str = "eha"
     design: Mapping[str, float] = field(default_factory=dict)  # nominal values of an actuator of another size
@@ -78,7 +77,7 @@ class Model:
     @property
     def kind(self) -> Plant:
         """The plant that the values belong to."""
-        return plants.find_plant(self.plant)
+        return find_plant(self.plant)
 
     def find_effect(self, name: str) -> Effect:
         """The effect of that name, as the plant has it. Raises KeyError."""
@@ -171,9 +170,9 @@ def load_model(source: str | Path = "eha") -> Model:
         InputError: no such file, or an unknown group, field, effect or impossible value in it.
     """
     if Path(source).suffix == ".py":
-        plants.load_plant(Path(source))
-    if str(source) in plants.list_plants() or Path(source).suffix == ".py":
-        return build_bare_model(str(source)).with_effects(plants.find_plant(str(source)).has)
+        load_plant(Path(source))
+    if str(source) in list_plants() or Path(source).suffix == ".py":
+        return build_bare_model(str(source)).with_effects(find_plant(str(source)).has)
     path = _find_model_file(source)
     return parse_model(read_model_tables(path), path, path.stem)
 
@@ -181,7 +180,7 @@ def load_model(source: str | Path = "eha") -> Model:
 def _find_model_file(source: str | Path) -> Path:
     path = find_shipped_model(str(source)) or Path(source)
     if not path.is_file():
-        names = ", ".join((*plants.list_plants(), *SHIPPED_MODELS))
+        names = ", ".join((*list_plants(), *SHIPPED_MODELS))
         missing = "; it does not exist" if path.suffix in READERS else ""
         raise InputError(source, "", f"a model file, or one of {names}{missing}")
     return path
@@ -193,7 +192,7 @@ def find_plant_of_model(source: str | Path) -> str:
     Raises:
         InputError: no such file, or a plant that is not known or loaded.
     """
-    if str(source) in plants.list_plants() or Path(source).suffix == ".py":
+    if str(source) in list_plants() or Path(source).suffix == ".py":
         return str(source)
     path = _find_model_file(source)
     return _find_plant(read_model_tables(path).get("plant", "eha"), path)
@@ -201,10 +200,10 @@ def find_plant_of_model(source: str | Path) -> str:
 
 def _find_plant(named: Any, where: object) -> str:
     plant = read_named_plant(named, where)
-    loaded = plants.find_loaded_plant(plant, where) if isinstance(plant, str) and plant.endswith(".py") else None
-    if loaded is None and not (isinstance(plant, str) and plants.is_known(plant)):
+    loaded = find_loaded_plant(plant, where) if isinstance(plant, str) and plant.endswith(".py") else None
+    if loaded is None and not (isinstance(plant, str) and is_known(plant)):
         more = "an FMU, or a plant file (.py), which runs with --trust"
-        raise InputError(where, "plant", f"one of {', '.join(plants.list_plants())}, or {more}, not {plant!r}")
+        raise InputError(where, "plant", f"one of {', '.join(list_plants())}, or {more}, not {plant!r}")
     return str(plant) if loaded is None else loaded.key
 
 
@@ -215,7 +214,7 @@ def find_shipped_model(name: str) -> Path | None:
 
 def build_bare_model(plant: str, name: str = "") -> Model:
     """A plant at its nominal values, without effects."""
-    kind = plants.find_plant(plant)
+    kind = find_plant(plant)
     own = {n: v for n, v in kind.nominal.items() if n.partition(".")[0] in kind.parameters}
     return Model(name or plant, own, (), plant)
 
@@ -240,8 +239,8 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
         hint = suggest_name(str(unknown[0]), known)
         raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown[0]!r}{hint}")
     require(isinstance(design, Mapping), where, "design", "tables [design.GROUP] of nominal values")
-    values = flatten_tables(where, tables, plants.find_plant(plant).list_groups())
-    usual = flatten_tables(where, design, plants.find_plant(plant).list_groups(()))
+    values = flatten_tables(where, tables, find_plant(plant).list_groups())
+    usual = flatten_tables(where, design, find_plant(plant).list_groups(()))
     bare = build_bare_model(plant, name)
     sized = replace(bare, values={**bare.values, **usual}, design=usual)
     check_combinations(where, sized.values)
@@ -277,12 +276,12 @@ def build_kernel(function: Function, effects: tuple[str, ...], fast: bool = True
     """`function`, which calls the physics, for a plant with `effects`.
 
     Args:
-        function: of `plant.solve`, `plant.controller` or the like, on floats, tuples and arrays.
+        function: of `plant.solve` or the like, on floats, tuples and arrays.
         effects: names, in catalogue order.
         fast: compiled, once for each set of effects; False runs the same source in plain Python.
         plant: whose step it takes.
     """
-    kind = plants.find_plant(plant)
+    kind = find_plant(plant)
     if fast:
         kind.require_equations()
     return _build_kernel(function, effects, kind.list_laws(effects), fast, kind)

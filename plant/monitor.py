@@ -18,13 +18,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from plant.compile import Function, compile_function, raise_unbound
-from plant.controller import Loop, compute_current
 from plant.errors import require
 from plant.friction import clip, soften
 from plant.kernels import make_lane_packers
-from plant.lanes import Array, Drive
+from plant.lanes import Drive
 from plant.model import Model
 from plant.parameters import Controller
+from plant.pid import Loop, compute_current
+from plant.segments import Array
 from plant.threads import count_threads, map_in_threads
 
 Reduction = Callable[[Array], Array]

@@ -16,11 +16,9 @@ from plant.errors import InputError, require, show_value, suggest_name
 from plant.quantity import Quantity, list_quantities, make_group
 from plant.tables import decode_text, parse_table, read_file
 
+# Exponent of (1 - Kintas) on the pilot flow gain; pressures scale with (1 - Kintas) in all three. "sqrt": an orifice
+# bridge fed through a filter; "linear": flow in proportion; "pressure": flow gain untouched.
 FILTER_LAWS = {"sqrt": 0.5, "linear": 1.0, "pressure": 0.0}
-"""Exponent of (1 - Kintas) on the pilot flow gain; pressures scale with (1 - Kintas) in all three.
-
-"sqrt": an orifice bridge fed through a filter; "linear": flow in proportion; "pressure": flow gain untouched.
-"""
 
 
 # group: what it is, and its fields

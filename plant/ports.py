@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from itertools import count
 from typing import Any, NamedTuple
 
-from plant.compile import Function, bind_later, rebind_names
+from plant.compile import Function, bind_later, raise_unbound, rebind_names
 from plant.state import Input, Memory
 
 _NUMBERS = count()
@@ -59,8 +59,8 @@ at_load = port("N", "external force FR on the ram, positive against extension")
 at_jack_drag = port("N, N s/m", "Drag, all that resists the ram in the jack")
 at_position = port("m", "ram position as its transducer feels it")
 
+# by name: the shared ones, and those of plants that have been loaded
 PORTS: dict[str, Port] = {name[3:]: value.port for name, value in list(globals().items()) if name.startswith("at_")}
-"""Ports by name: the shared ones, and those of plants that have been loaded."""
 
 
 def make_memory_type(names: Sequence[str]) -> type[Any]:
@@ -122,9 +122,7 @@ def chain_shifts(shifts: Iterable[Function | None]) -> Function:
     return whole or keep_memory
 
 
-law: Function = pass_signal
-first: Function = pass_signal
-second: Function = pass_signal  # these three are bound in each link of a chain
+law = first = second = raise_unbound  # bound in each link of a chain
 
 
 def _apply_without_memory(x: Any, m: Memory, s: Any, u: Input, p: Any) -> tuple[Any, Memory]:

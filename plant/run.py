@@ -12,7 +12,6 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from plant.compile import compute_fingerprint, find_cache_folder, interpret_function
-from plant.controller import take_demand
 from plant.errors import InputError, RigError, require
 from plant.foreign import run_foreign_loop
 from plant.kernels import make_packers, write_reader
@@ -21,7 +20,15 @@ from plant.model import Model, build_kernel
 from plant.plants import Plant, find_plant
 from plant.segments import Array
 from plant.signals import EHA, Signals
-from plant.solve import advance_flat_state, read_flat_sensors, run_closed_loop, step_cycle
+from plant.solve import (
+    advance_flat_state,
+    fill_needed_drive,
+    read_flat_sensors,
+    run_closed_loop,
+    run_controller,
+    step_cycle,
+    take_demand,
+)
 from plant.threads import run_beside
 
 NOISES = len(EHA.outputs) + 1  # standard normal numbers a cycle of the EHA: position, pressure, spool, effects
@@ -115,6 +122,34 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
     given = {"time": t, "command": com, "load": force}
     columns = (found[s.name] if s.name in found else given[s.role] for s in signals)
     return cast(Columns, make_columns_type(signals)(*columns))
+
+
+def compute_answers(model: Model, com: Array, readings: Array) -> Array:
+    """The drive, (n,), that the model's controller answers to demands `com`, (n,).
+
+    `readings` are those of all outputs, (n, outputs), or of the controlled one alone, (n,): others are NaN then.
+    """
+    out = np.empty(len(com))
+    if readings.ndim == 1:
+        others = np.full((len(com), len(model.kind.signals.outputs) - 1), np.nan)
+        readings = np.column_stack([readings, others])
+    run = build_kernel(run_controller, model.effects, plant=model.plant)
+    run(model.build_flat_state(), com, np.ascontiguousarray(readings), model.build_record(), out)
+    return out
+
+
+def compute_needed_drive(model: Model, motion: Array, load: Array) -> Array:
+    """The drive that a motion needs, (n,), in its unit.
+
+    Args:
+        model: of a plant with `inverse`.
+        motion: (n, 3) controlled signal, its rate and the rate of that, SI.
+        load: (n,) external load.
+    """
+    out = np.empty(len(motion))
+    run = build_kernel(fill_needed_drive, model.effects, plant=model.plant)
+    run(model.build_start()[1], np.ascontiguousarray(motion), np.ascontiguousarray(load), model.build_record(), out)
+    return out
 
 
 @contextmanager

@@ -31,7 +31,6 @@ Radian = Annotated[float, "rad"]
 PerSecond = Annotated[float, "1/s"]
 
 RATE = 1000.0  # cycles a second where nothing else is said; times are k / rate because k * 1e-3 is not exact
-FARTHEST, STRONGEST = 1.0, 1e6  # m of demand, N of load, either way: beyond them, somebody wrote mm or kN for SI
 LONGEST = 3600.0  # s, of one segment or file: beyond it, somebody wrote milliseconds
 
 

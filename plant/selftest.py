@@ -4,15 +4,14 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plant.effects import Effect
 from plant.model import build_bare_model
 from plant.plants import find_plant
 from plant.run import simulate
+from plant.segments import Array
 from plant.starts import compute_changes, compute_levels, compute_rms, find_starts
 
-Array = NDArray[np.float64]
 # what plain Python runs, over the largest demand of the command
 SHORT = np.concatenate([np.zeros(5), np.full(25, 1.0), np.linspace(1.0, -0.5, 20)])
 

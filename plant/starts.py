@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from plant.controller import compute_answers
 from plant.effects import Effect
 from plant.lanes import Lanes
 from plant.model import Model, build_bare_model
 from plant.plants import Plant, find_plant
 from plant.quantity import Quantity
-from plant.run import report_law_errors, simulate
+from plant.run import compute_answers, report_law_errors, simulate
 from plant.segments import Array
 
 VISIBLE = (3.0, 30.0, 300.0)  # noise levels that starts are to show

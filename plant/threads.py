@@ -53,8 +53,8 @@ MOST_TOGETHER = 16  # threads of one `map_together`
 _thread = threading.local()  # `.meeting`: of a thread of `map_together`
 
 
+# work that a thread waits for, and what tells it that the work is running or done
 Request = tuple[Any, Future[None]]
-"""Work that a thread waits for, and what tells it that the work is running or done."""
 
 
 class _Meeting:

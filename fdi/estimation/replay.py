@@ -45,11 +45,11 @@ from fdi.thresholds import (
 )
 from fdi.trace.sensor_dynamics import find_comb
 from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, hold_last, hold_next, rms
-from plant.controller import compute_answers
 from plant.errors import InputError
 from plant.lanes import Lanes
 from plant.model import Model
 from plant.plants import MODULES
+from plant.run import compute_answers
 from plant.signals import EHA
 
 Columns = dict[str, Floats]  # by signal, (n,)

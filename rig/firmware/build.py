@@ -20,7 +20,7 @@ from rig.firmware.object_table import write_object_table
 
 FOLDER = Path(__file__).parent
 REFERENCE = ("controller.c", "main.c", "object_table.c")  # the reference firmware; the rest is for any device
-# Without fused multiply-add, so that the control law gives the bits of plant/controller.py.
+# Without fused multiply-add, so that the control law gives the bits of plant/pid.py.
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic")
 
 

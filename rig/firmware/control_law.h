@@ -21,7 +21,7 @@ struct control_law {
 };
 
 /* Current for the next cycle, A, from demand and sensed position, m. A positive current extends the ram.
- * The bits equal those of plant/controller.py, on any processor with IEEE 754 doubles, if the compiler does not fuse
+ * The bits equal those of plant/pid.py, on any processor with IEEE 754 doubles, if the compiler does not fuse
  * multiply and add (-ffp-contract=off). */
 double compute_current(struct control_law *law, double demand, double position, const struct gains *gains);
 

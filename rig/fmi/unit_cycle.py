@@ -2,8 +2,6 @@
 
 from typing import Any
 
-from plant.anchor import show_start
-from plant.controller import take_demand
 from plant.kernels import (
     control_plant,
     load_control,
@@ -13,7 +11,7 @@ from plant.kernels import (
     store_readings,
     unpack_state,
 )
-from plant.solve import read_sensors, step_cycle
+from plant.solve import read_sensors, show_start, step_cycle, take_demand
 
 CYCLES, ANSWER, CONTROL = 0, 1, 2  # of `loop`: cycles of the plant, -1: not started; answer, memory of the controller
 INPUTS = 5

@@ -9,7 +9,7 @@ from typing import cast
 
 from plant import Model
 from plant.compile import interpret_function
-from plant.controller import Loop, compute_current
+from plant.pid import Loop, compute_current
 from plant.run import Demand, report_law_errors
 from rig.benches.bench import Bench, Role, SignalObject, pack, unpack
 from rig.benches.bench_file import load_bench

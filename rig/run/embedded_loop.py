@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.compile import ForeignCall, compile_function, compute_fingerprint, find_cache_folder, interpret_function
-from plant.controller import Loop, compute_current
 from plant.machine_code import ADVANCE_CALL, StoredCode
 from plant.model import Model
+from plant.pid import Loop, compute_current
 from plant.run import Actuator, LentPlant, sample_noise
 from plant.segments import Array
 from plant.signals import Signals

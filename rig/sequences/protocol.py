@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.check_result import PROTOCOL, CheckResult
-from plant.controller import Loop, compute_current
+from plant.pid import Loop, compute_current
 from plant.quantity import Quantity
 from plant.segments import Array, Second
 from plant.signals import Signal

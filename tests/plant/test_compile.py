@@ -36,7 +36,7 @@ import json, sys
 from pathlib import Path
 import numpy as np
 from plant import Model
-from plant.controller import compute_answers
+from plant.run import compute_answers
 from plant.effects import load_effects
 
 file = Path(sys.argv[1])

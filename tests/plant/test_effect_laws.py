@@ -11,12 +11,12 @@ from physics_cases import SMOOTH
 
 from plant import Actuator, Model, simulate
 from plant.compile import interpret_function
-from plant.controller import compute_answers
 from plant.effects.current import coil_lag, current_noise
 from plant.effects.sensors import Recoil, mount_compliance, sensor_lag
 from plant.effects.supply import Drawn, supply_droop
 from plant.eha import State, compute_coefficients, compute_metering_line, step_jack as ram
 from plant.kernels import unpack_state
+from plant.run import compute_answers
 from plant.state import Input, Lag, Line
 from rig.benches.profiles import CIA408
 

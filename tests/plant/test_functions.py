@@ -11,8 +11,8 @@ from other_cpus import compiles_for
 
 from plant import functions
 from plant.compile import INLINE_OPTIONS, _link_calls, compile_function, interpret_function
-from plant.controller import Loop, compute_current
 from plant.parameters import Controller
+from plant.pid import Loop, compute_current
 
 RNG = np.random.default_rng(1)
 NEAR, TINY = RNG.uniform(-1.0, 1.0, 20000), RNG.normal(size=5000) * 1e-5

@@ -11,7 +11,6 @@ from other_cpus import compiles_for
 from refusals import catch_refusal
 
 from plant import Actuator, Model, kernel_use, lanes as lanes_module, simulate
-from plant.anchor import pull_plant, rest_at_reading, show_start
 from plant.compile import compile_function, interpret_function
 from plant.effects import CATALOGUE, load_effects
 from plant.kernel_use import KernelUse
@@ -19,7 +18,7 @@ from plant.kernels import unpack_state
 from plant.lanes import FEWEST, Lanes, Part, list_kernel_variants, plan_layout
 from plant.model import list_searched_effects
 from plant.monitor import FAULTS, Monitor
-from plant.solve import read_sensors, step_cycle
+from plant.solve import pull_plant, read_sensors, rest_at_reading, show_start, step_cycle
 from plant.threads import map_together
 from rig.sequences import load_sequence
 

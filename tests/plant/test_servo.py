@@ -9,7 +9,6 @@ from physics_cases import PREFLIGHT, SILENT
 from rig_command import refuse
 
 from plant import load_model, simulate
-from plant.controller import compute_answers
 from plant.effects import CATALOGUE
 from plant.effects.current import Cascade, flow_delay
 from plant.effects.servovalve import ATMOSPHERE
@@ -24,6 +23,7 @@ from plant.ehs import (
 from plant.forced import compute_flow_balance, compute_force_balance
 from plant.lanes import Lanes
 from plant.model import Model, list_offered_effects, list_searched_effects
+from plant.run import compute_answers
 from plant.state import Input
 
 CYCLE = 1e-3
