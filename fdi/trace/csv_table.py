@@ -11,15 +11,13 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.output import write_whole
+from fdi.trace.sections import Floats
 from plant.errors import InputError, report_system_error, require
 from plant.plants import Plant, Table, Term, find_plant, list_plants
 from plant.signals import Signals
 from plant.unpacking import LimitedGzip, UnpackingError
-
-Floats = NDArray[np.float64]
 
 
 def read_csv(path: Path, signals: Signals) -> tuple[dict[str, Floats], tuple[str, ...], str, Signals]:

@@ -11,12 +11,10 @@ from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.thresholds import ROUNDED_SHARE
+from fdi.trace.sections import Floats
 from plant.errors import InputError
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,8 @@ from fdi.trace.declaration import DECLARATION, read_declaration
 from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.sensor_dynamics import SensorDynamics, read_sensors
-from plant import signals as plant_signals
 from plant.errors import InputError, escape_control_characters, require
-from plant.signals import Signal, Signals
+from plant.signals import EHA, Signal, Signals
 
 if TYPE_CHECKING:
     from plant.lanes import Part  # a bench that reads its own log does not load the compiler
@@ -135,7 +134,7 @@ class Trace:
         return self.columns[name]
 
     @classmethod
-    def read(cls, path: str | Path, *, all: bool = False, signals: Signals = plant_signals.EHA) -> Trace:
+    def read(cls, path: str | Path, *, all: bool = False, signals: Signals = EHA) -> Trace:
         """Read trace.mcap (its main phase, or every phase with `all`), a run's folder, .csv or .csv.gz.
 
         `signals` are those of the plant whose columns a CSV file has; a log that says which it holds does not need
@@ -155,7 +154,7 @@ class Trace:
 
     @classmethod
     def from_columns(cls, columns: Mapping[str, Floats], period: float, provenance: Mapping[str, str],
-                     signals: Signals = plant_signals.EHA) -> Trace:
+                     signals: Signals = EHA) -> Trace:
         """A trace from columns of shape (n,): at least command, controlled signal and drive of the `signals`; and t."""
         rows = len(columns[signals.command.name])
         grid = {"t": np.round(np.arange(rows) * period, 9), **columns}

@@ -125,24 +125,16 @@ class RowKeys:
 
 
 @dataclass(frozen=True)
-class MapTables:
-    """The tables of a map."""
+class ImportMap:
+    """A whole map: its tables, and where they are from."""
 
+    path: Path = field(metadata={"key": False})
+    text: str = field(metadata={"key": False})
+    declared: Signals = field(metadata={"key": False})  # of the plant that was recorded
     file: TextKeys = TextKeys()
     trace: RowKeys = RowKeys()
     time: TimeBase | None = None
-    signals: Any = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImportMap(TextKeys, RowKeys):
-    """A whole map."""
-
-    path: Path
-    text: str
-    declared: Signals  # of the plant that was recorded
-    signals: Mapping[str, SignalMap]
-    time: TimeBase | None
+    signals: Any = field(default_factory=dict)  # `SignalMap` by name
 
 
 def read_map(path: Path, declared: Signals = EHA) -> ImportMap:
@@ -162,10 +154,10 @@ def parse_map(text: str, path: Path, declared: Signals = EHA) -> ImportMap:
             signals.
     """
     table, place = parse_table(text, str(path))
-    top = build_dataclass(MapTables, table, place)
-    place.at("signals").require(isinstance(top.signals, dict), "a table of signals")
+    found = build_dataclass(ImportMap, table, place, path=path, text=text, declared=declared)
+    place.at("signals").require(isinstance(found.signals, dict), "a table of signals")
     signals = {name: _parse_signal(name, own, place.at("signals", name), declared)
-               for name, own in top.signals.items()}
+               for name, own in found.signals.items()}
     for name in declared.required:
         needed = declared.find(name)
         place.at("signals", name).require(
@@ -179,8 +171,7 @@ def parse_map(text: str, path: Path, declared: Signals = EHA) -> ImportMap:
             f"a column of its own; signals.{other} has {signal.source!r} already")
     # in an open loop the drive is the command
     signals.setdefault(declared.command.name, signals[declared.drive.name])
-    return ImportMap(path=path, text=text, declared=declared, signals=signals, time=top.time, **vars(top.file),
-                     **vars(top.trace))
+    return replace(found, signals=signals)
 
 
 def _parse_signal(name: str, table: Any, place: Place, declared: Signals) -> SignalMap:
@@ -317,7 +308,7 @@ def import_measurement(measurement: Measurement, chosen: ImportMap, cycle: float
     """
     channels = _read_channels(measurement, chosen)
     samples = {name: _scale(measurement, chosen, name, channels) for name in chosen.signals}
-    period = chosen.period or _measure_cycle(samples[chosen.declared.controlled.name], cycle)
+    period = chosen.trace.period or _measure_cycle(samples[chosen.declared.controlled.name], cycle)
     rows = _make_rows(chosen, samples, period)
     columns, done, sensors, signals = {}, [], {}, chosen.declared
     for name, signal in chosen.signals.items():
@@ -424,8 +415,8 @@ def _measure_cycle(own: Samples, cycle: float) -> float:
 def _make_rows(chosen: ImportMap, samples: Mapping[str, Samples], period: float) -> Floats:
     """Times of the rows: from the first sample that all required signals share to the last, on the controlled one's."""
     needed = [samples[name] for name in chosen.declared.required]
-    first = max(-math.inf if chosen.start is None else chosen.start, *(s.t[0] for s in needed))
-    last = min(math.inf if chosen.end is None else chosen.end, *(s.t[-1] for s in needed))
+    first = max(-math.inf if chosen.trace.start is None else chosen.trace.start, *(s.t[0] for s in needed))
+    last = min(math.inf if chosen.trace.end is None else chosen.trace.end, *(s.t[-1] for s in needed))
     origin = _find_origin(samples[chosen.declared.controlled.name], samples[chosen.declared.drive.name], period)
     start = origin + period * math.ceil((first - origin) / period - 0.5)
     count = math.floor((last - start) / period + 0.5) + 1

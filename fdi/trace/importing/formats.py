@@ -4,7 +4,6 @@ from __future__ import annotations
 import codecs
 import csv
 import importlib
-import itertools
 import math
 import re
 from array import array
@@ -12,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -215,7 +214,7 @@ def open_text_table(path: Path, separator: str | None = None, decimal: str | Non
     with report_unreadable(path, ENCODINGS):
         encoding = _find_encoding(path)
         with open_text(path, encoding) as stream:
-            lines = [line.rstrip("\r\n") for line in itertools.islice(stream, SAMPLE_LINES)]
+            lines = [line.rstrip("\r\n") for line in islice(stream, SAMPLE_LINES)]
         separator, decimal = _find_separators(path, lines, separator, decimal)
         parse = _make_number_parser(decimal)
         rows = [[] if _is_comment(line) and number != name_line else _split_line(line, separator)

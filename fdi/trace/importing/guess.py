@@ -289,18 +289,17 @@ def _rate_column(signal: Signal, signals: Signals, column: str, columns: Columns
     x = columns.data[column]
     size = float(np.percentile(np.abs(x - np.median(x)), 99))
     fitting = [u for u in units if known and low <= size * float(UNITS[u].factor) <= high]
-    if unit is not None:
-        guess.note(2.0, f"its unit is {said}")
-    elif said:
-        guess.note(-2.0, f"its unit {said!r} needs scale and offset")
-    elif not known:
-        guess.note(0.0, "no unit given")
-    elif fitting:
+    suits = f"no unit given, its range of {size:.3g} suits {' or '.join(fitting)}"
+    findings = (
+        (unit is not None, 2.0, f"its unit is {said}"),
+        (said, -2.0, f"its unit {said!r} needs scale and offset"),
+        (not known, 0.0, "no unit given"),
+        (len(fitting) == 1, 1.0, suits),
+        (fitting, 0.0, suits),
+        (True, -1.0, f"no unit given, and its range of {size:.3g} suits none: counts?"))
+    guess.note(*next((points, reason) for holds, points, reason in findings if holds))
+    if fitting and not said:
         guess.unit = UNITS[fitting[0]]
-        guess.note(1.0 if len(fitting) == 1 else 0.0,
-                   f"no unit given, its range of {size:.3g} suits {' or '.join(fitting)}")
-    else:
-        guess.note(-1.0, f"no unit given, and its range of {size:.3g} suits none: counts?")
     amplitude = size * float(guess.unit.factor)
     if known and low <= amplitude <= high:
         guess.note(0.5, "its range is plausible")

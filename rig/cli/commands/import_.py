@@ -86,4 +86,4 @@ def open_source(args: argparse.Namespace, source: Path, chosen: ImportMap | None
         return open_can_log(source, Path(args.dbc or dbc.DBC))
     if chosen is None:
         return open_measurement(source)
-    return open_measurement(source, chosen.separator, chosen.decimal, chosen.header)
+    return open_measurement(source, chosen.file.separator, chosen.file.decimal, chosen.file.header)
