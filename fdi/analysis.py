@@ -298,13 +298,12 @@ def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPa
     Raises:
         InputError: an effect that this model cannot take, or runs that cannot be used.
     """
-    from fdi.discovery import update_model
-    from fdi.discovery.update_model import add_effects
+    from fdi.discovery.update_model import add_effects, remove_all_effects
     from fdi.report.explain_report import build_model_report
 
     effects = [effect] if isinstance(effect, str) else list(effect)
     own_model, known = _load_model_file(model, trust)
-    runs = _collect_runs(update_model.remove_all_effects(own_model, known), trace, repeats, holdout, signals)
+    runs = _collect_runs(remove_all_effects(own_model, known), trace, repeats, holdout, signals)
     update = add_effects(effects, runs, own_model, known, f"fdi.add_effect({', '.join(map(repr, effects))})")
     return ModelResult(build_model_report(update), update)
 

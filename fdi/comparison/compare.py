@@ -95,8 +95,7 @@ LAGS = range(-8, 21)  # cycles that command or controlled signal may be late in 
 class ControllerBlock(NamedTuple):
     """The controller's block."""
 
-    residual: Floats  # (n,) drive less what the model answers, in its unit; NaN where it cannot be told
-    error: float  # RMS
+    error: float  # RMS of the drive less what the model answers, in its unit
     floor: float  # RMS of the rounding in file or bus
     com_lag: int = 0  # cycles: drive k answers the command of cycle k - com_lag
     xj_lag: int = 0  # and the controlled signal of cycle k - xj_lag
@@ -113,7 +112,7 @@ def compare_controller(trace: Trace, model: Model) -> ControllerBlock:
     """Compare; where it does not fit, look for the cycles that columns are late. NaN where firmware is unknown."""
     limit = model.values.get(model.kind.signals.drive.limit, math.inf)
     if not model.kind.controller:
-        return ControllerBlock(np.full(len(trace), np.nan), math.nan, math.nan, limit=limit)
+        return ControllerBlock(math.nan, math.nan, limit=limit)
     found = _compare_at_lags(trace, model, 0, 0)
     if not found.ratio > CONTROLLER_ERROR_RATIO:  # or it cannot be told
         return found
@@ -147,7 +146,7 @@ def _compare_at_lags(trace: Trace, model: Model, com: int, xj: int) -> Controlle
         # the controller reads the signal finer than the recording holds it
         floor = math.hypot(floor, gain * comb.step / math.sqrt(12.0))
     error = float(np.sqrt(np.nanmean(residual**2))) if not unknown.all() else math.nan
-    return ControllerBlock(residual, error, floor, com, xj, limit=limit)
+    return ControllerBlock(error, floor, com, xj, limit=limit)
 
 
 def find_lags(trace: Trace, limit: float, most_rows: int = 60_000) -> tuple[int, int, float]:

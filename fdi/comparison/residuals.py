@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.special import kolmogi, ndtri
 
@@ -362,13 +361,12 @@ class DeviationMap(NamedTuple):
     """Error over noise floor of each signal in cells of speed and amplitude; NaN where there are too few rows.
 
     `speeds` (m + 1,) m/s and `amplitudes` (n + 1,) m are the edges of the cells that hold rows; each array of `ratio`
-    has shape (n, m), and so has `rows`.
+    has shape (n, m).
     """
 
     speeds: Floats
     amplitudes: Floats
     ratio: Mapping[str, Floats]
-    rows: NDArray[np.int64]
 
 
 def map_deviation(trace: Trace, residual: Mapping[str, Floats], floor: Mapping[str, float],
@@ -392,8 +390,7 @@ def map_deviation(trace: Trace, residual: Mapping[str, Floats], floor: Mapping[s
     cells = (np.digitize(amplitude, amplitudes) - 1) * (len(CELL_SPEEDS) - 1) + np.digitize(speed, speeds) - 1
     shape, size = (len(AMPLITUDES) - 1, len(CELL_SPEEDS) - 1), (len(AMPLITUDES) - 1) * (len(CELL_SPEEDS) - 1)
     judged = ~np.all([np.isnan(r) for r in residual.values()], axis=0)
-    rows = np.bincount(cells[judged], minlength=size).reshape(shape)
-    enough = rows >= fewest
+    enough = np.bincount(cells[judged], minlength=size).reshape(shape) >= fewest
     if not enough.any():
         return None
     ratio = {}
@@ -405,4 +402,4 @@ def map_deviation(trace: Trace, residual: Mapping[str, Floats], floor: Mapping[s
     down, across = (slice(np.flatnonzero(enough.any(axis))[0], np.flatnonzero(enough.any(axis))[-1] + 1)
                     for axis in (1, 0))
     return DeviationMap(speeds[across.start:across.stop + 1], amplitudes[down.start:down.stop + 1],
-                        {name: r[down, across] for name, r in ratio.items()}, rows[down, across])
+                        {name: r[down, across] for name, r in ratio.items()})

@@ -12,7 +12,6 @@ The posterior is one at a point, so unknowns are what laws go with (gains by log
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -24,11 +23,7 @@ from fdi.estimation.fit import scaled_bounds
 from fdi.thresholds import GROUP_CORRELATION, INTERVAL_95_SD, SUSPECT_HEALTHY_TOLERANCES
 from fdi.trace.trace import Floats
 
-
-class Group(NamedTuple):
-    """Faults of which at least one has grown, and may have reached MidBand."""
-
-    names: tuple[str, ...]
+Group = tuple[str, ...]  # names of faults of which at least one has grown, and may have reached MidBand
 
 
 class _Region:
@@ -124,7 +119,7 @@ def find_groups(found: Refinement, levels: Mapping[str, Level | None], tolerance
         for i in group:
             region.limit_to_healthy(low, high, i, (tolerances or {}).get(found.faults[i].parameter, 0.0))
         if len(group) > 1 and region.measure_distance(low, high) > _exclude_all(len(group), len(found.faults)):
-            groups.append(Group(tuple(found.faults[i].name for i in group)))
+            groups.append(tuple(found.faults[i].name for i in group))
     return tuple(groups)
 
 

@@ -60,20 +60,13 @@ LEVELS = {"middle": Level.MAINTENANCE, "most": Level.NON_NOMINAL}  # of a signal
 # Bands of one command
 # ---------------------------------------------------------------------------------------------------------------------
 
-class BandFault(NamedTuple):
-    """What bands know of a fault."""
+@dataclass(frozen=True, eq=False)
+class BandFault(Fault):
+    """A fault that bands judge. Their file leaves out which sizes are possible."""
 
-    name: str
-    parameter: str
-    symbol: str
-    unit: str
-    acceptable: float  # MidBand
-    maintenance: float  # MaxBand
-    follow: Mapping[str, float]  # factors on the size
-    both_ways: bool = False  # it moves a response by as much the other way
     middle_share: float = 1.0  # of what MidBand adds to a step, where its limit is
     most_share: float = 1.0  # of what MaxBand adds
-    amounts: Floats = np.empty(0)  # (F,) of a friction, rising, the healthy one first; else (0,)
+    amounts: Floats = field(default_factory=lambda: np.empty(0))  # (F,) of a friction, rising from sound
 
     @property
     def dynamic(self) -> float:
@@ -249,16 +242,16 @@ def is_loaded(load: Floats, kind: Plant) -> bool:
     return bool((np.abs(np.nan_to_num(load)) > most).any())
 
 
-def list_design(model: Model, faults: Iterable[Fault | BandFault]) -> dict[str, float]:
+def list_design(model: Model, faults: Iterable[Fault]) -> dict[str, float]:
     """The parameters in which a healthy unit of the model differs from a nominal one, SI: not those of faults or noise.
     """
-    own = {name for fault in faults for name in (fault.parameter, *fault.follow)}
+    own = {name for fault in faults for name in fault.parameters}
     noise = {signal.noise for signal in model.kind.signals}
     return {name: value for name, value in sorted(model.list_changes().items())
             if name not in own and name not in noise and not name.startswith("sensors.")}
 
 
-def format_design(model: Model, faults: Iterable[Fault | BandFault]) -> str:
+def format_design(model: Model, faults: Iterable[Fault]) -> str:
     """`list_design` as the text that bands remember their model by."""
     return json.dumps(list_design(model, faults))
 
@@ -516,7 +509,8 @@ def format_bands(bands: Bands) -> str:
                for s in bands.sections), "]"]
     for fault in bands.faults:
         lines += ["", f"[faults.{fault.name}]",
-                  *(f"{key} = {json.dumps(getattr(fault, key))}" for key in BandFault._fields[1:6]),
+                  *(f"{key} = {json.dumps(getattr(fault, key))}"
+                    for key in ("parameter", "symbol", "unit", "acceptable", "maintenance")),
                   *(f"follow.{json.dumps(name)} = {by!r}" for name, by in fault.follow.items()),
                   *(["both_ways = true"] if fault.both_ways else [])]
         if len(fault.amounts):
@@ -575,7 +569,7 @@ def _read_bands(table: Mapping[str, Any], kind: Plant) -> Bands:
         amounts = np.array(values.pop("amounts", ()), float)
         if not (np.diff(amounts) > 0.0).all():
             raise ValueError("amounts: rising values")
-        known.append(BandFault(name, amounts=amounts, **{"follow": {}, **values}))
+        known.append(BandFault(name, name.replace("_", " "), range=(-math.inf, math.inf), amounts=amounts, **values))
     places = {part: [i for i, s in enumerate(parts) if s.kind == part] for part in ("step", "ramp")}
     by_name = {fault.name: fault for fault in known}
     steps = tuple(_read_step(step, period, by_name, places["step"], per_unit) for step in table.get("step", ()))

@@ -189,12 +189,11 @@ def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: fl
              "command_hash": hashlib.sha256(text.encode()).hexdigest()[:16], "software": name_software()}
     if np.abs(load).max() > 0.0:
         facts["load"] = f"up to {np.abs(load).max():.4g} {signals.load.unit if signals.load else ''}"
-    known = tuple(BandFault(f.name, f.parameter, f.symbol, f.unit, f.acceptable, f.maintenance, dict(f.follow),
-                            f.both_ways, amounts=np.array(amounts.get(f.name, ()))) for f in faults)
+    known = tuple(BandFault(**vars(f), amounts=np.array(amounts.get(f.name, ()))) for f in faults)
     bands = Bands(model.kind, tuple(parts), period, scale, known, stepped, tuple(ramped), facts,
                   _measure_sensitivities(tables, healthy, com, period, parts, signals.controlled.unit, scale))
     shares = {f.name: [*_find_limit_shares(bands, com, f, faulted[f.name])] for f in known if f.name in faulted}
-    return replace(bands, faults=tuple(f._replace(middle_share=shares[f.name][0], most_share=shares[f.name][1])
+    return replace(bands, faults=tuple(replace(f, middle_share=shares[f.name][0], most_share=shares[f.name][1])
                                        if f.name in shares else f for f in known))
 
 

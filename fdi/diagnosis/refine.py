@@ -103,10 +103,9 @@ from plant.starts import ensure_starts
 from plant.threads import R, T, map_in_threads
 
 SMALLEST_SHARE = 0.01  # of the healthy size, bound of a fit by logarithms
-Sizes = tuple[float, ...]
-"""One size for each fault, SI."""
+Sizes = tuple[float, ...]  # one for each fault, SI
+# values of starts: shapes of effects, what does not follow a fault, bias and load; parameter to SI value
 Way = tuple[Mapping[str, float], Mapping[str, float], Mapping[str, float]]
-"""Values of starts: shapes of effects, what does not follow a fault, bias and load; parameter to SI value."""
 # (factor on the noise, rounds): small stops of the ram count only once the fit is near
 NOISE_SCHEDULE = ((30.0, 4), (6.0, 4), (1.0, 8))
 FINE_STEPS = 20  # solver steps a cycle of the last fit
@@ -838,8 +837,7 @@ def _explain(effects: tuple[str, ...], fit: Fit, problem: CountedProblem, whole:
 # factor on the noise and generations of a search by a population
 POPULATION_STAGES = ((100.0, 30), (30.0, 40), (6.0, 40), (1.0, 40))
 
-Named = tuple[tuple[str, ...], Fit]
-"""Effects beside the faults, and the fit with them."""
+Named = tuple[tuple[str, ...], Fit]  # effects beside the faults, and the fit with them
 
 
 class JointSearch:

@@ -19,11 +19,10 @@ from fdi.estimation.fit import silence_readings
 from fdi.estimation.replay import has_known_start, read_cycles, replay_lanes
 from fdi.thresholds import ANCHOR_RATE
 from fdi.trace.trace import Flags, Floats, Trace
-from plant import monitor
 from plant.errors import require
 from plant.lanes import Lanes
 from plant.model import Model
-from plant.monitor import Monitor
+from plant.monitor import FAULTS as MONITORED, Monitor
 
 CELLS = 21  # along each axis
 SLIDING_RATIOS = (2.0 / 3.0, 1.0, 1.0 / 3.0, 1.0 / 15.0)  # FDS/FSS of the monitor, the nominal plant's first
@@ -64,8 +63,6 @@ class Grid:
     joint: Map
     merged: Merged
     best: Point  # between the cells: the joint map is a valley narrower than they are
-    sliding: float  # of the monitor: FDS/FSS for which the grid fits best; else 1
-    drive: str
     simulations: int
     unit: str  # of the RMS
 
@@ -106,7 +103,7 @@ def search_grid(trace: Trace, model: Model | None = None, faults: Sequence[Fault
     require(rows, "trace", trace.declared.command.name, "steps or ramps, for the RMS grid")
     axes = np.linspace(*first.axis, CELLS), np.linspace(*second.axis, CELLS)
     values = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
-    has_monitor = model.kind.name == "eha" and (first.parameter, second.parameter) == monitor.FAULTS
+    has_monitor = model.kind.name == "eha" and (first.parameter, second.parameter) == MONITORED
     runs = _Runs(trace, model, (first, second), drive, rows, workers, has_monitor)
     tried = {ratio: runs.compute_maps(values, ratio) for ratio in (sliding if has_monitor else (1.0,))}
     joint = {ratio: runs.join_maps(maps) for ratio, maps in tried.items()}
@@ -117,7 +114,7 @@ def search_grid(trace: Trace, model: Model | None = None, faults: Sequence[Fault
     finer = runs.join_maps(runs.compute_maps(near, ratio))
     deepest = int(finer.argmin())
     best = Point((float(near[deepest, 0]), float(near[deepest, 1])), float(finer[deepest]))
-    return Grid((first, second), axes, step, ramp, both, merge_minima(step, ramp, (first, second)), best, ratio, drive,
+    return Grid((first, second), axes, step, ramp, both, merge_minima(step, ramp, (first, second)), best,
                 len(values) * len(tried) + len(near), trace.declared.controlled.unit)
 
 

@@ -18,7 +18,6 @@ import numpy as np
 
 from fdi.discovery.runs import Source, hash_columns, read_source, require_distinct
 from fdi.discovery.update_model import Provenance, format_model_file
-from fdi.estimation import noise as noises
 from fdi.estimation.fit import (
     FIT_ROUNDS,
     Fit,
@@ -35,7 +34,7 @@ from fdi.estimation.fit import (
     silence_readings,
 )
 from fdi.estimation.long_recordings import can_be_cut, choose_excerpt, cut_excerpt, is_long
-from fdi.estimation.noise import sensor_floors
+from fdi.estimation.noise import fit_noise, sensor_floors, white_noise
 from fdi.estimation.replay import (
     SAME_PERIOD,
     differentiate,
@@ -414,7 +413,7 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: LogProblem, 
     missing = [s for s in outputs if s.name not in problem.trace.outputs]
     if missing and fit is not None and all(s.noise for s in outputs):
         runs = [_simulate(model, t.command, t.load, problem.trace.output_names) for t in (problem.trace, *problem.also)]
-        noise = tuple(noises.white_noise(model[s.noise]) for s in outputs)
+        noise = tuple(white_noise(model[s.noise]) for s in outputs)
         sensed = replace(present, trace=runs[0], also=tuple(runs[1:]), noise=noise, _lanes={})
         found["sensors"] = np.diag([f.prior**-2 for f in free]) + _measure_information(sensed, free, x)
         what["sensors"] = f"the same runs with {' and '.join(s.symbol for s in missing)} measured"
@@ -653,7 +652,7 @@ def cut_long_runs(runs: Sequence[Trace], sources: Sequence[Source], model: Model
 
 def make_problem(model: Model, fitted: Sequence[Trace], floor: Mapping[str, float], workers: int) -> LogProblem:
     """The runs to fit with white noise of the floor's size; a signal that a run lacks counts nothing in it."""
-    noise = tuple(noises.white_noise(level) for level in floor.values())
+    noise = tuple(white_noise(level) for level in floor.values())
     first, *others = (replace(t, outputs=tuple(floor)) for t in fitted)
     return LogProblem(silence_readings(model), first, noise, workers=workers, also=tuple(others))
 
@@ -733,7 +732,7 @@ def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress
     fit = polish_fit(fine, fit, seed)
     size = np.sqrt(np.nanmean(fit.residuals**2, axis=1))
     if (size <= RESIDUAL_HELD_OUT * np.array([n.level for n in fine.noise])).all():
-        learnt = tuple(noises.fit_noise(r) if s > 0.0 else old  # a signal that the model gives exactly tells none
+        learnt = tuple(fit_noise(r) if s > 0.0 else old  # a signal that the model gives exactly tells none
                        for r, s, old in zip(fit.residuals, size, fine.noise, strict=True))
         fine = replace(fine, noise=learnt, _lanes={})
         fit = descend(fine, fit, 5)
@@ -826,7 +825,7 @@ def measure_errors(before: Model, after: Model, runs: Sequence[Trace], sources: 
     errors, residuals = [], []
     for number, (trace, source) in enumerate(zip(runs, sources, strict=True)):
         trace = leave_out_rest(trace, after, memory=0.0)
-        noise = tuple(noises.white_noise(1.0) for _ in trace.outputs)
+        noise = tuple(white_noise(1.0) for _ in trace.outputs)
         first, last = (Problem(silence_readings(model), trace, noise, steps=LAST_STEPS) for model in (before, after))
         left = [problem.compute_residuals((), np.empty((1, 0)))[0] for problem in (first, last)]
         sizes = [{s: rms(r) for s, r in zip(trace.outputs, each, strict=True)} for each in left]

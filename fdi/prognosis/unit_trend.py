@@ -137,7 +137,7 @@ def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | Non
             notes.append(f"{names[file]} left out: {str(error).removeprefix(f'{file}: ')}")
             continue
         sizes = {f.name: Estimate(*answer["sizes"][f.name]) for f in faults}
-        points.append(Point(names[file], row[list(AXES).index(axis)], sizes, answer["note"]))
+        points.append(Point(names[file], row[axis], sizes, answer["note"]))
     progress("trend", 1.0)
     if not points:
         raise InputError(folder, "", f"traces that can be judged; {notes[0]}" + (" ..." if notes[1:] else ""))
@@ -159,16 +159,16 @@ def list_traces(folder: Path) -> list[Path]:
 
 def _date_trace(folder: Path, name: str, own: str, row: Row | None) -> Row:
     """The place of a trace on each axis: by the table, else by its own start time, else by its name."""
-    row = row or Row(math.nan, math.nan, math.nan)
-    if not math.isnan(row.date):
+    row = row or dict.fromkeys(AXES, math.nan)
+    if not math.isnan(row["date"]):
         return row
     day = parse_date(own)
-    return row._replace(date=day if not math.isnan(day) else find_date_in_name(Path(folder.resolve().name) / name))
+    return {**row, "date": find_date_in_name(Path(folder.resolve().name) / name) if math.isnan(day) else day}
 
 
 def _choose_axis(folder: Path, rows: Mapping[Path, Row], wanted: str | None) -> str:
     """The axis asked for, or the first on which every trace has a place."""
-    without = {axis: [file for file, row in rows.items() if math.isnan(row[i])] for i, axis in enumerate(AXES)}
+    without = {axis: [file for file, row in rows.items() if math.isnan(row[axis])] for axis in AXES}
     for axis in (wanted,) if wanted else AXES:
         if not without[axis]:
             return axis
@@ -233,16 +233,9 @@ def _find_answer_file(file: Path, model: Model, faults: Sequence[Fault]) -> Path
 
 TABLE = "dates.csv"
 AXES = {"date": "days", "hours": "h", "flights": "flights"}  # axis: its unit
+Row = dict[str, float]  # places of a trace, by axis; a date in days since 1970-01-01, UTC; NaN where it has none
 _DATE = re.compile(r"(?<!\d)(\d{4})-?([01]\d)-?([0-3]\d)(?:[T_ ]([0-2]\d)[-:]?([0-5]\d)(?:[-:]?([0-5]\d))?)?(?!\d)")
 _OFFSET = re.compile(r"([T ].*)([+-])(\d\d):?(\d\d)$")  # behind a time of day
-
-
-class Row(NamedTuple):
-    """The table's entries for a file; NaN where it has none."""
-
-    date: float  # days since 1970-01-01, UTC
-    hours: float
-    flights: float
 
 
 def parse_date(text: str) -> float:
@@ -301,7 +294,7 @@ def read_dates_table(path: Path) -> dict[str, Row]:
         if not name:
             continue
         require(name not in found, f"{path}: line {number}", "file", f"each file once, not {name} again")
-        found[name] = Row(*(_read_cell(f"{path}: line {number}", axis, cells.get(axis, "")) for axis in AXES))
+        found[name] = {axis: _read_cell(f"{path}: line {number}", axis, cells.get(axis, "")) for axis in AXES}
     return found
 
 

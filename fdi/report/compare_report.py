@@ -40,7 +40,6 @@ from fdi.report.numbers import (
     format_digits,
     format_percent,
     format_ratio,
-    format_signal,
     join_words,
     list_first,
 )
@@ -119,8 +118,8 @@ def describe_verdict(c: Comparison) -> str:
 
 def _error_and_floor(s: SignalError) -> str:
     bound = "at least " if s.floor.lower_bound else ""
-    return (f"{s.signal.symbol} error {format_signal(s.error, s.signal)}, "
-            f"noise floor {bound}{format_signal(s.floor.value, s.signal)}")
+    return (f"{s.signal.symbol} error {format_amount(s.error, s.signal.unit)}, "
+            f"noise floor {bound}{format_amount(s.floor.value, s.signal.unit)}")
 
 
 def _describe_blocks(c: Comparison) -> str:
@@ -142,14 +141,15 @@ def _tabulate_signals(c: Comparison) -> Table:
     return tabulate(
         c.signals.values(),
         (Column("signal"), lambda s: s.signal.symbol),
-        (Column("error", align="right"), lambda s: Cell(format_signal(s.error, s.signal), is_strong=True)),
+        (Column("error", align="right"), lambda s: Cell(format_amount(s.error, s.signal.unit), is_strong=True)),
         (Column("noise floor", align="right"),
-         lambda s: (">= " if s.floor.lower_bound else "") + format_signal(s.floor.value, s.signal)),
+         lambda s: (">= " if s.floor.lower_bound else "") + format_amount(s.floor.value, s.signal.unit)),
         (Column("ratio", align="right"), lambda s: Cell(format_ratio(s.ratio), "bad" if s.ratio > s.limit else "good")),
         (Column("floor from", medium=page), lambda s: Cell(s.floor.source, "muted")),
-        (Column("error from the command alone", align="right"), lambda s: format_signal(s.closed_loop_error, s.signal)),
+        (Column("error from the command alone", align="right"),
+         lambda s: format_amount(s.closed_loop_error, s.signal.unit)),
         (Column("solver error", align="right", medium=page),
-         lambda s: Cell(format_signal(s.solver_error, s.signal), "muted")),
+         lambda s: Cell(format_amount(s.solver_error, s.signal.unit), "muted")),
         caption="Error: RMS of the residual (measured minus model) with the measured "
                 f"{c.trace.declared.drive.called} as input. Noise floor: "
                 "RMS that noise alone leaves. A perfect model has ratio 1.")
@@ -231,7 +231,8 @@ def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6
     is_wrong = c.verdict != "WITHIN_FLOOR"
     changes = [f"{name} = {value:g}" for name, value in sorted(c.model.list_changes().items())
                if c.model.design.get(name) != value]
-    errors = ", ".join(f"{s.signal.symbol} by {format_signal(s.solver_error, s.signal)}" for s in c.signals.values())
+    errors = ", ".join(f"{s.signal.symbol} by {format_amount(s.solver_error, s.signal.unit)}"
+                       for s in c.signals.values())
     return [
         Line("floor", _describe_floor(c)),
         Line("solver", f"halving the step to {1e6 * c.trace.period / c.replay.steps:g} us changes {errors}"),
@@ -290,7 +291,7 @@ def _describe_scatter(c: Comparison) -> str:
     worst = max(s.ratio, key=lambda name: s.ratio[name])
     signal = c.signals[worst].signal
     return (f"scatter between units does not explain it: with all parameters refitted within their tolerances the "
-            f"{signal.symbol} error is still {format_signal(s.error[worst], signal)}, "
+            f"{signal.symbol} error is still {format_amount(s.error[worst], signal.unit)}, "
             f"{format_ratio(s.ratio[worst])} times the floor")
 
 
@@ -309,7 +310,7 @@ def _describe_residual(signal: Signal, d: ResidualTests, strong: float = 0.15, l
     if d.depends and d.depends[0].share > DEPENDENCE_SHARE:
         first = d.depends[0]
         found.append(f"{format_percent(first.share)} of its power depends on {first.on}{SHAPE_WORDS[first.shape]}, "
-                     f"up to {format_signal(abs(first.size), signal)}")
+                     f"up to {format_amount(abs(first.size), signal.unit)}")
     return f"{signal.symbol}: {'; '.join(found)}" if found else ""
 
 
@@ -325,8 +326,7 @@ def collect_data(c: Comparison) -> dict[str, Any]:
             "hum": s.floor.hum, "difference": s.floor.difference} for name, s in c.signals.items()},
         "solver_error": controlled.solver_error if controlled else None,
         "steps": c.replay.steps,
-        "where": [{"section": p.section, "t0": p.t0, "t1": p.t1, "share": p.share, "ratio": p.ratio,
-                   "condition": p.condition} for p in c.where],
+        "where": [p._asdict() for p in c.where],
         "condition": c.condition, "blocks": dict(c.blocks), "disagree": list(c.named), "parts": dict(c.parts),
         "controller": {"error": c.answer.error, "floor": c.answer.floor, "com_lag": c.answer.com_lag,
                        "xj_lag": c.answer.xj_lag, "gain": c.answer.gain},

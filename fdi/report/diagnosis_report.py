@@ -134,7 +134,7 @@ def describe_verdict(d: Diagnosis) -> str:
     """The verdict in a sentence or two."""
     whole, each = ("neither fault", "the two faults") if len(d.faults) == 2 else ("no fault", "the faults")
     titles = {fault.name: fault.title for fault in d.faults}
-    grouped = {name for group in d.groups for name in group.names}
+    grouped = {name for group in d.groups for name in group}
     names = join_words(titles[name] for name, level in d.levels.items() if level is None and name not in grouped)
     is_disputed = d.beside is not None and d.beside.disputed
     groups = " ".join(describe_group(d, group) for group in d.groups)
@@ -164,7 +164,7 @@ def describe_verdict(d: Diagnosis) -> str:
             rest = _describe_rest(d, worst)
             middle, most = format_limits_of_fault(worst)
             sentence = (f"{worst.title.capitalize()} {need}: {worst.symbol} "
-                        f"{format_size(worst, d.sizes[worst.name])}, MidBand {middle}, MaxBand {most}")
+                        f"{format_interval(*d.sizes[worst.name], worst.unit)}, MidBand {middle}, MaxBand {most}")
             sentence += f"; {rest}." if rest else "."
             sentence += f" {groups}" if groups else ""
     if d.beside is not None and d.beside.is_explained and d.beside.effects:
@@ -184,7 +184,7 @@ def _describe_rest(d: Diagnosis, worst: Fault) -> str:
 
 def describe_group(d: Diagnosis, group: Group) -> str:
     """Faults that a trace does not tell apart, and what would."""
-    titles = join_words((f.title for f in d.faults if f.name in group.names), "or")
+    titles = join_words((f.title for f in d.faults if f.name in group), "or")
     return (f"At least one of these has grown, and may have reached MidBand: {titles}. This trace does not tell which; "
             f"{describe_separation(d, group)}.")
 
@@ -194,7 +194,7 @@ def describe_separation(d: Diagnosis, group: Group) -> str:
     unmeasured = [s.symbol for s in d.model.kind.signals.outputs if s.name not in d.trace.outputs]
     ways = [*([f"a recording with {join_words(unmeasured)}"] if unmeasured else []),
             *(f"{e.name}: {e.revealed_by}" for e in d.model.kind.list_effects() for f in d.faults
-              if f.name in group.names and f.parameter in e.fitted and e.revealed_by)]
+              if f.name in group and f.parameter in e.fitted and e.revealed_by)]
     return f"to find out, try {'; '.join(ways)}" if ways else "another test, or an inspection, has to"
 
 
@@ -206,15 +206,6 @@ def describe_correlation(d: Diagnosis) -> str:
     i, j = np.unravel_index(int(table.argmax()), table.shape)
     which = "the two sizes" if len(d.faults) == 2 else f"{d.faults[i].symbol} and {d.faults[j].symbol}"
     return f"{'' if len(d.faults) == 2 else 'largest '}correlation of {which} {d.refinement.correlation:+.2f}"
-
-
-def format_size(fault: Fault, size: Estimate) -> str:
-    """A fault size with its 95 % interval, in the fault's unit.
-
-    >>> format_size(FAULTS[1], Estimate(45.01, 42.02, 48.2))
-    '45 N (42 .. 48)'
-    """
-    return format_interval(size.value, size.low, size.high, fault.unit)
 
 
 class FoundFault(NamedTuple):
@@ -285,8 +276,9 @@ def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
             parts = [f"{words} {format_digits(g.find_size(fault, part.minimum))}"
                      for words, part in (("steps", g.step), ("ramps", g.ramp)) if part is not None]
             at = f"{fault.symbol} {attach_unit(format_digits(found), fault.unit)}"
-            sentence = (f"The grid gives {at} (minima: {', '.join(parts)}), the fit {format_size(fault, size)}: the "
-                        "grid matches the position alone with a plant that has only these two faults")
+            sentence = (f"The grid gives {at} (minima: {', '.join(parts)}), the fit "
+                        f"{format_interval(*size, fault.unit)}: the grid matches the position alone with a plant that "
+                        "has only these two faults")
             if d.others:
                 sentence += f", here with {_list_others(d)}"
             if (left := d.refinement.errors.get(controlled)) is not None:
@@ -339,7 +331,7 @@ def _tabulate_faults(d: Diagnosis) -> Table:
         d.faults, (Column("fault"), lambda f: f.title + (" *" if d.ruling == f.name else "")),
         (Column("level"), lambda f: Cell(LEVEL_NAMES[d.levels[f.name]], LEVEL_MOODS[d.levels[f.name]])),
         (Column("size (95 % interval)", align="right"),
-         lambda f: Cell(format_size(f, d.sizes[f.name]), is_strong=True)),
+         lambda f: Cell(format_interval(*d.sizes[f.name], f.unit), is_strong=True)),
         (Column("MidBand", align="right", medium=Medium.PAGE), lambda f: format_limits_of_fault(f)[0]),
         (Column("MaxBand", align="right", medium=Medium.PAGE), lambda f: format_limits_of_fault(f)[1]),
         (Column("grid", align="right"), show_grid), (Column("by bands"), show_bands),
@@ -359,7 +351,8 @@ def _show_effects(d: Diagnosis) -> list[Item]:
             level = e.levels[fault.name] if d.refinement.is_explained else None
             return Cell(LEVEL_NAMES[level], LEVEL_MOODS[level])
 
-        return ((Column(fault.symbol, align="right"), lambda e: format_size(fault, e.refinement.sizes[fault.name])),
+        return ((Column(fault.symbol, align="right"),
+                 lambda e: format_interval(*e.refinement.sizes[fault.name], fault.unit)),
                 (Column("level"), show_level))
 
     caption = ("Explanations that fit the trace about equally well; the sizes above are averaged over them." if
@@ -506,7 +499,7 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
         if d.bands else "As measured; without bands there are no healthy units to compare with.")]
 
 
-def _name_limit(fault: BandFault | Fault) -> str:
+def _name_limit(fault: Fault) -> str:
     """MidBand of a fault: "FSS 35 N"."""
     scale, unit = choose_unit(fault.unit, abs(fault.acceptable))
     return f"{fault.symbol} {fault.acceptable / scale:g} {unit}".rstrip()
@@ -521,7 +514,7 @@ def collect_data(d: Diagnosis) -> dict[str, Any]:
         "ruling": d.ruling,
         "severity": {f.name: compute_severity(f, d.sizes[f.name].value) for f in d.faults},
         "faults": _collect_faults(d.faults),
-        "groups": [list(group.names) for group in d.groups],
+        "groups": d.groups,
         "events": [e._asdict() for e in d.events],
         "bands": {"level": {name: level.word for name, level in d.band_verdict.levels.items()},
                   "ruling": d.band_verdict.ruling} if d.band_verdict else None,

@@ -45,7 +45,6 @@ from fdi.report.numbers import (
     format_interval,
     format_p_value,
     format_ratio,
-    format_signal,
     join_words,
     list_first,
     name_parameter,
@@ -204,7 +203,7 @@ def _describe_change(a: Answer, c: Candidate) -> str:
 
 
 def _format(by_signal: BySignal, name: str, signals: Signals) -> str:
-    return format_signal(by_signal.get(name, math.nan), signals.find(name))
+    return format_amount(by_signal.get(name, math.nan), signals.find(name).unit)
 
 
 def describe_findings(a: Answer) -> list[Line]:

@@ -23,7 +23,6 @@ from fdi.report.numbers import (
     format_interval,
     format_percent,
     format_ratio,
-    format_signal,
     join_words,
 )
 from fdi.report.report import Cell, Column, Figure, Line, Listing, Medium, Mood, Report, Section, Table, tabulate
@@ -81,8 +80,8 @@ def describe_identification(found: Identification) -> str:
     count = f"All {len(seen)}" if found.verdict == "IDENTIFIED" else f"{len(seen)} of {len(found.estimates)}"
     but = f" But {found.reason}." if found.verdict == "PARTLY" and len(seen) == len(found.estimates) else ""
     return (f"{count} free parameters are identified: {'held-out run, ' if chosen.is_held_out else ''}{s.symbol} error "
-            f"{format_signal(chosen.before[name], s)} -> {format_signal(chosen.after[name], s)}, noise floor "
-            f"{format_signal(chosen.floor[name], s)}.{but}")
+            f"{format_amount(chosen.before[name], s.unit)} -> {format_amount(chosen.after[name], s.unit)}, noise floor "
+            f"{format_amount(chosen.floor[name], s.unit)}.{but}")
 
 
 def _tabulate_parameters(found: Identification) -> Table:
@@ -119,8 +118,8 @@ def _tabulate_errors(errors: Sequence[RunError], signals: Signals) -> Table:
                Column("over floor", align="right")]
     rows: list[list[Cell | str]] = [
         [*((e.source.file, Cell("held-out" if e.is_held_out else "fitted", "muted")) if number == 0 else ("", "")),
-         s.symbol, Cell(format_signal(e.before[s.name], s), "muted"), format_signal(e.after[s.name], s),
-         Cell(format_signal(e.floor[s.name], s), "muted"),
+         s.symbol, Cell(format_amount(e.before[s.name], s.unit), "muted"), format_amount(e.after[s.name], s.unit),
+         Cell(format_amount(e.floor[s.name], s.unit), "muted"),
          Cell(format_ratio(ratio), "good" if ratio <= RESIDUAL_HELD_OUT else "bad")]
         for e in errors for number, s in enumerate(map(signals.find, e.after))
         for ratio in [e.after[s.name] / e.floor[s.name]]]

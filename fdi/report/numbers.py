@@ -6,8 +6,6 @@ Every printed estimate goes through here, so that it has the same digits and uni
 import math
 from collections.abc import Iterable, Sequence
 
-from plant.signals import Signal
-
 READABLE_UNITS = {  # SI unit to the units that people use, the smallest first
     "m": ((1e-6, "um"), (1e-3, "mm")), "A": ((1e-6, "uA"), (1e-3, "mA")), "s": ((1e-6, "us"), (1e-3, "ms"), (1.0, "s")),
     "N": ((1.0, "N"), (1e3, "kN")), "Pa": ((1e5, "bar"),), "m/s": ((1e-3, "mm/s"),), "m/N": ((1e-9, "nm/N"),),
@@ -28,15 +26,6 @@ def format_amount(value: float, unit: str, digits: int = 3) -> str:
         return NO_NUMBER
     scale, name = choose_unit(unit, abs(value))
     return f"{format_digits(value / scale, digits)} {name}".rstrip()
-
-
-def format_signal(value: float, signal: Signal) -> str:
-    """A value of one of the signals of a plant.
-
-    >>> format_signal(1.8e-5, Signal("x", "X", "m", "position"))
-    '18.0 um'
-    """
-    return format_amount(value, signal.unit)
 
 
 def format_interval(value: float, low: float, high: float, unit: str, most_digits: int = 6) -> str:

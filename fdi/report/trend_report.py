@@ -1,13 +1,14 @@
 """The report of a trend: growth of both fault sizes, the time left to each limit, the traces behind it."""
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from fdi.diagnosis.faults import Estimate, Level, judge_size
+from fdi.diagnosis.faults import Estimate, Fault, Level, judge_size
 from fdi.prognosis.trend import Break, Remaining, Trend
 from fdi.prognosis.unit_trend import LIMIT_NAMES, Point, UnitTrend, format_day
 from fdi.report.drawing import (
@@ -42,8 +43,10 @@ def build_trend_report(unit: UnitTrend) -> Report:
     points = g.points
     ends = dict.fromkeys(_format_place(point.t, unit) for point in (points[0], points[-1]))
     worst = max(unit.trends, key=lambda trend: trend.level)
-    sizes = ((Column(fault.symbol),
-              lambda point, fault=fault: _format_size(point.sizes[fault.name], fault.unit)) for fault in g.faults)
+
+    def show_size(fault: Fault) -> tuple[Column, Callable[[Point], str]]:
+        return Column(fault.symbol), lambda point: format_interval(*point.sizes[fault.name], fault.unit)
+
     sections = [
         *(_build_fault_section(trend, unit) for trend in unit.trends),
         Section("Sizes over time", [Figure(
@@ -52,7 +55,7 @@ def build_trend_report(unit: UnitTrend) -> Report:
             partial(draw_trends, unit))]),
         Section("Traces", [tabulate(
             points, (Column("trace"), lambda point: point.trace),
-            (Column("when"), lambda point: _format_place(point.t, unit)), *sizes,
+            (Column("when"), lambda point: _format_place(point.t, unit)), *map(show_size, g.faults),
             (Column("remark"), lambda point: Cell(point.note, "muted")),
             caption="Fault sizes of each trace with their 95 % intervals.")], medium=Medium.PAGE)]
     return Report("trend", unit.gathered.source, unit.level.name.replace("_", " "), MOODS[unit.level],
@@ -66,7 +69,7 @@ def explain_level(trend: Trend) -> str:
     healthy, middle, most = (attach_unit(f"{x:g}", fault.unit)
                              for x in (fault.healthy, fault.acceptable, fault.maintenance))
     name = fault.title.capitalize()
-    words = f"{name} is {level.word.replace('_', '-')}: {_format_size(trend.now, fault.unit)} now"
+    words = f"{name} is {level.word.replace('_', '-')}: {format_interval(*trend.now, fault.unit)} now"
     reasons = (
         (judge_size(fault, trend.now) is None,
          f"; the interval holds both a healthy unit ({healthy}) and MidBand ({middle}), so the value alone decides"),
@@ -128,7 +131,7 @@ def _describe_trend(trend: Trend, unit: UnitTrend) -> list[str]:
 
 
 def _describe_growth(trend: Trend, unit: UnitTrend) -> str:
-    state = f"{trend.fault.symbol} {_format_size(trend.now, trend.fault.unit)} now"
+    state = f"{trend.fault.symbol} {format_interval(*trend.now, trend.fault.unit)} now"
     if trend.verdict == "TOO_FEW":
         reasons = {1: "one trace shows no growth", 2: "two traces fit every growth law"}
         reason = reasons.get(int(trend.used.sum()), "all traces have the same date")
@@ -137,7 +140,7 @@ def _describe_growth(trend: Trend, unit: UnitTrend) -> str:
         return f"{state}; no trend: the probability that nothing grows is {100 * trend.laws['none']:.0f} %"
     period, length = {"days": ("month", 30.44), "h": ("100 h", 100.0), "flights": ("100 flights", 100.0)}[unit.unit]
     rate = Estimate(*(length * x for x in trend.rate))
-    return f"{state}; grows by {_format_size(rate, trend.fault.unit)} per {period}"
+    return f"{state}; grows by {format_interval(*rate, trend.fault.unit)} per {period}"
 
 
 def _describe_break(found: Break, point: Point, size_unit: str, unit: UnitTrend) -> str:
@@ -177,10 +180,6 @@ def _format_date(t: float, unit: UnitTrend) -> str:
 def _format_place(t: float, unit: UnitTrend) -> str:
     """A date, or hours or flights; `t` is on the axis of the traces."""
     return format_day(t) if unit.gathered.axis == "date" else f"{t:g} {unit.unit}"
-
-
-def _format_size(size: Estimate, unit: str) -> str:
-    return format_interval(size.value, size.low, size.high, unit)
 
 
 def _collect_data(unit: UnitTrend) -> dict[str, Any]:

@@ -439,7 +439,7 @@ def judge_by_fdi(trace: Trace, model: Model, faults: Sequence[Fault] = FAULTS) -
     for grid in found.grids[:1]:
         row |= {f"grid_{fault.key}": grid.find_size(fault, grid.merged) for fault in grid.faults}
     if found.groups:
-        row["groups"] = [list(group.names) for group in found.groups]
+        row["groups"] = [list(group) for group in found.groups]
     return row | {
         "events": [event._asdict() for event in found.events], "event_count": len(found.events),
         "correlation": found.refinement.correlation, "left_over": max(found.refinement.ratio.values()),

@@ -128,4 +128,4 @@ def test_the_error_of_a_fast_motion_stands_in_its_cell() -> None:
     assert np.nanmax(found.ratio["xj"][rows[0], :1]) == pytest.approx(1.0, abs=0.01)
     column = int(found.speeds.searchsorted(45e-3)) - 1
     assert found.ratio["xj"][rows[1], column] == pytest.approx(7.0)
-    assert found.rows.sum() > 7900 and found.ratio["xj"].shape == (len(found.amplitudes) - 1, len(found.speeds) - 1)
+    assert found.ratio["xj"].shape == (len(found.amplitudes) - 1, len(found.speeds) - 1)

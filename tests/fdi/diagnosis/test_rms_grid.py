@@ -93,14 +93,13 @@ def test_a_worked_case(tmp_path: Path) -> None:
     grid = search_grid(Trace.read(tmp_path))
     for point in (grid.step.minimum, grid.joint.minimum, grid.best, grid.merged):
         assert is_near(point, 0.25, 30.0), point
-    assert grid.sliding == pytest.approx(2.0 / 3.0)
 
 
 def test_friction_that_is_static_alone() -> None:
     """`--set spool.static_friction=70` leaves FDS as it was; the grid finds FSS, as it tries how the spool slides."""
     measured = trace(0.0, 70.0, ratio=10.0 / 3.0 / 70.0)
     found, paper = search_grid(measured), search_grid(measured, sliding=(1.0,))
-    assert found.joint.minimum.sizes[1] == pytest.approx(70.0, abs=9.0) and found.sliding < 0.1
+    assert found.joint.minimum.sizes[1] == pytest.approx(70.0, abs=9.0)
     assert found.joint.minimum.rms < 0.9 * paper.joint.minimum.rms
 
 

@@ -16,7 +16,7 @@ from rig_command import refuse, rig
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
 from fdi.prognosis import unit_trend
 from fdi.prognosis.trend import Trend, fit_trend
-from fdi.prognosis.unit_trend import Row, find_date_in_name, find_row, format_day, parse_date, read_dates_table
+from fdi.prognosis.unit_trend import find_date_in_name, find_row, format_day, parse_date, read_dates_table
 from fdi.progress import ignore_progress
 from fdi.report.trend_report import explain_level
 from fdi.trace.trace import Trace
@@ -52,7 +52,8 @@ def test_a_table_of_dates(tmp_path: Path) -> None:
     table = tmp_path / "dates.csv"
     table.write_text("file,date,hours\na.csv,2026-01-01,10\nrun/,2026-02-01,\n")
     rows = read_dates_table(table)
-    assert find_row(rows, "sub/a.csv") == Row(parse_date("2026-01-01"), 10.0, pytest.approx(math.nan, nan_ok=True))
+    row = {"date": parse_date("2026-01-01"), "hours": 10.0, "flights": pytest.approx(math.nan, nan_ok=True)}
+    assert find_row(rows, "sub/a.csv") == row
     assert find_row(rows, "b.csv") is None
     for text, field in (("name,date\n", "header"), ("", "header"), ("file,date\na.csv,soon\n", "date"),
                         ("file,hours\na.csv,x\n", "hours"), ("file,date\na,2026-01-01\na,2026-01-02\n", "file")):
