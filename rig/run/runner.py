@@ -421,7 +421,7 @@ def _play_steps(job: Job, folder: Path, when: str, verdict: str) -> None:
     run = StepRun(job.sequence.title, folder, job.seed, job.list_settings(), verdict)
     for step in job.sequence.steps:
         if step.when == when:
-            step.play(run)
+            step.call(run)
 
 
 def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progress: Progress,

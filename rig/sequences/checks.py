@@ -25,7 +25,7 @@ from plant.units import list_fitting_units, require_unit
 from rig.benches.bench import Bench
 from rig.benches.profiles import CIA408, ProfileWords, State, find_state
 from rig.sequences.faults import Time
-from rig.sequences.python_parts import Argument, UserFunction, describe_value, require_function_name
+from rig.sequences.python_parts import OWN, PythonPart, describe_value, require_function_name
 from rig.sequences.signals import DERIVED, Controlled, Guarded, Measured, find_controlled, find_tested, find_unit
 from rig.sequences.uncertainty import NO_METROLOGY, Metrology, compute_expanded_uncertainty, decide
 
@@ -245,7 +245,7 @@ class SkippedCheck(NamedTuple):
 class Check:
     """A measured number and its limits. `window`: a section's name, [t0, t1] in s of main, or "main" for all of it."""
 
-    kind: str = field(metadata={"key": False})
+    kind: str = field(metadata=OWN)
     name: str
     window: str | tuple[Time, Time] = MAIN
     skip: Annotated[float, Quantity("s", low=0.0, high=LONGEST)] = 0.0  # left out at the window's beginning
@@ -253,7 +253,7 @@ class Check:
     high: InUnit | None = None
     unit: str = ""
     requirement: str | tuple[str, ...] = ()  # id of the requirement that it verifies, or several
-    signals: Signals = field(default_factory=find_tested, metadata={"key": False}, repr=False)  # of the plant
+    signals: Signals = field(default_factory=find_tested, metadata=OWN, repr=False)  # of the plant
 
     def __post_init__(self) -> None:
         require(self.low is not None or self.high is not None, "check", "", "a low, a high, or both")
@@ -445,12 +445,8 @@ class NoEvent(OfEvent):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PythonCheck(Check):
+class PythonCheck(PythonPart, Check):
     """With the function that measures the number."""
-
-    python: str
-    arguments: Mapping[str, Argument] = field(default_factory=dict)
-    function: UserFunction | None = field(default=None, repr=False, compare=False, metadata={"key": False})
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -480,10 +476,9 @@ class Window:
 
 
 def _measure_python(check: PythonCheck, run: RunData, span: slice) -> float:
-    assert check.function is not None
     columns = {**{name: np.array(getattr(run.trace, name)[span], dtype=np.float64) for name in run.signals.names},
                "t": np.arange(span.start, span.stop) / run.rate}
-    value = check.function.call(Window(run.signals, columns), **check.arguments)
+    value = check.call(Window(run.signals, columns))
     require_measurable(value is not None, f"{check.python} returned no value")
     try:
         number = float(value)
@@ -619,7 +614,7 @@ class Guard:
     high: float | None = None
     unit: str = ""
     cycles: Annotated[int, Quantity("1", low=1)] = 3  # one noisy sample is no excursion
-    signals: Signals = field(default_factory=find_tested, metadata={"key": False}, repr=False)  # of the plant
+    signals: Signals = field(default_factory=find_tested, metadata=OWN, repr=False)  # of the plant
 
     def __post_init__(self) -> None:
         low, high = self.compute_limits()

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from plant.segments import Array, Timed
 from plant.user_code import explain_errors
 
 Argument = float | str | bool
-_OWN = {"key": False}  # a field that the program fills in
+OWN = {"key": False}  # a field that the program fills in
 _NAME = re.compile(r"(\w[\w-]*\.py):([A-Za-z_]\w*)")
 
 
@@ -39,7 +39,22 @@ class UserFunction:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PythonSegment(Timed):
+class PythonPart:
+    """What calls a function of the user's: `python` is FILE.py:FUNCTION."""
+
+    given: ClassVar[int] = 1  # values that the function gets besides its `arguments`
+    python: str
+    arguments: Mapping[str, Argument] = field(default_factory=dict)
+    function: UserFunction | None = field(default=None, repr=False, compare=False, metadata=OWN)
+
+    def call(self, *values: object) -> Any:
+        """What the function returns. Raises InputError with file and line if it raises an exception."""
+        assert self.function is not None
+        return self.function.call(*values, **self.arguments)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PythonSegment(PythonPart, Timed):
     """A demand that a function computes: f(t, start, **arguments).
 
     The function gets the times of the cycles in s from the segment's start, and the demand where it starts; it returns
@@ -47,11 +62,9 @@ class PythonSegment(Timed):
     """
 
     kind = "python"
-    python: str
-    arguments: Mapping[str, Argument] = field(default_factory=dict)
-    function: UserFunction | None = field(default=None, repr=False, compare=False, metadata=_OWN)
+    given = 2
     # what it returned, by start and number of times: a profile is built several times and must be the same each time
-    known: dict[tuple[float, int], Array] = field(default_factory=dict, repr=False, compare=False, metadata=_OWN)
+    known: dict[tuple[float, int], Array] = field(default_factory=dict, repr=False, compare=False, metadata=OWN)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,8 +76,7 @@ class PythonSegment(Timed):
         return self.known[last, len(t)].copy()
 
     def _compute(self, t: Array, last: float) -> Array:
-        assert self.function is not None
-        returned = self.function.call(t, last, **self.arguments)
+        returned = self.call(t, last)
         try:
             values = np.asarray(returned, dtype=np.float64)
         except (TypeError, ValueError):
@@ -86,21 +98,13 @@ class StepRun(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Step:
+class Step(PythonPart):
     """A function that runs before the bus is opened, or after the log is closed: f(run, **arguments)."""
 
-    python: str
     when: Literal["before", "after"]
-    arguments: Mapping[str, Argument] = field(default_factory=dict)
-    function: UserFunction | None = field(default=None, repr=False, compare=False, metadata=_OWN)
 
     def __post_init__(self) -> None:
         require_function_name(self.python)
-
-    def play(self, run: StepRun) -> None:
-        """Call the function. Raises InputError with file and line if it raises an exception."""
-        assert self.function is not None
-        self.function.call(run, **self.arguments)
 
 
 def describe_value(value: object) -> str:

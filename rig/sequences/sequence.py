@@ -46,10 +46,10 @@ from plant.user_code import run_file
 from rig.benches.calibration import Decision
 from rig.network.node_objects import Identity
 from rig.sequences import checks, faults
-from rig.sequences.checks import MAIN, Check, Guard, PythonCheck
+from rig.sequences.checks import MAIN, Check, Guard
 from rig.sequences.faults import Fault, Parameter, Plan, find_contradiction
 from rig.sequences.protocol import ProtocolLimits
-from rig.sequences.python_parts import PythonSegment, Step, load_function, require_function_name
+from rig.sequences.python_parts import OWN, PythonPart, PythonSegment, Step, load_function, require_function_name
 from rig.sequences.signals import find_tested, name_signals_of
 
 InCycle = Annotated[float, Quantity("s", above=0.0, high=0.1)]
@@ -104,7 +104,6 @@ ReadFile = Callable[[str], bytes]
 
 SEGMENT_KINDS: dict[str, type[Segment]] = {**segments.KINDS, PythonSegment.kind: PythonSegment}
 _KINDS: tables.Kinds = {Segment: SEGMENT_KINDS, Fault: faults.KINDS, Check: checks.KEYS}
-_OWN = {"key": False}  # a field that the program fills in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,10 +139,10 @@ class Sequence:
     protocol: ProtocolLimits = field(default_factory=ProtocolLimits)
     timing: TimingPolicy = field(default_factory=TimingPolicy)
     firmware: Identity = field(default_factory=Identity)  # what the controller must say about itself
-    name: str = field(default="", metadata=_OWN)  # the file's, without folders
-    source: str = field(default="", metadata=_OWN, repr=False)
-    files: Mapping[str, bytes] = field(default_factory=dict, metadata=_OWN, repr=False)  # CSV and Python files, by name
-    rate: float = field(default=RATE, metadata=_OWN)  # cycles a second
+    name: str = field(default="", metadata=OWN)  # the file's, without folders
+    source: str = field(default="", metadata=OWN, repr=False)
+    files: Mapping[str, bytes] = field(default_factory=dict, metadata=OWN, repr=False)  # CSV and Python files, by name
+    rate: float = field(default=RATE, metadata=OWN)  # cycles a second
     plant: str = "eha"  # whose signals and parameters it names; default: that of the bench or model
 
     @property
@@ -329,13 +328,12 @@ def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Seq
         if isinstance(part, Csv):
             return replace(part, values=_read_column(part.file, read, key, here.at("file"), 1 / sequence.rate),
                            rate=sequence.rate)
-        if isinstance(part, PythonSegment | PythonCheck | Step):
+        if isinstance(part, PythonPart):
             file, name = require_function_name(part.python)
             source = read(file, here.at("python"), "a Python file beside the sequence")
             if file not in modules:
                 modules[file] = run_file(Path(place.file).parent / file, source)
-            given = 2 if isinstance(part, PythonSegment) else 1  # values that the function gets
-            return replace(part, function=load_function(modules[file], name, given, part.arguments))
+            return replace(part, function=load_function(modules[file], name, part.given, part.arguments))
         return part
 
     filled: dict[str, Any] = {

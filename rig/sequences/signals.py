@@ -45,20 +45,7 @@ def _list_aliases() -> Mapping[str, str]:
     return find_tested().aliases
 
 
-def _list_measured() -> tuple[str, ...]:
-    names = find_tested().names
-    return (*names, *(word for word in DERIVED if word not in names))
-
-
-def _list_guarded() -> tuple[str, ...]:
-    return tuple(dict.fromkeys((*find_tested().names, "error")))
-
-
-def _list_outputs() -> tuple[str, ...]:
-    return tuple(s.name for s in find_tested().outputs)
-
-
 Controlled = Annotated[str, Choice(lambda: (find_controlled(),), _list_aliases)]
-Measured = Annotated[str, Choice(_list_measured, _list_aliases)]
-Guarded = Annotated[str, Choice(_list_guarded, _list_aliases)]
-Sensed = Annotated[str, Choice(_list_outputs, _list_aliases)]
+Measured = Annotated[str, Choice(lambda: tuple(dict.fromkeys((*find_tested().names, *DERIVED))), _list_aliases)]
+Guarded = Annotated[str, Choice(lambda: tuple(dict.fromkeys((*find_tested().names, "error"))), _list_aliases)]
+Sensed = Annotated[str, Choice(lambda: tuple(s.name for s in find_tested().outputs), _list_aliases)]
