@@ -218,11 +218,12 @@ class FrameMap:
 
     frames: tuple[FrameSpec, ...]
     sync: int | None = None  # identifier of SYNC; None: there is none
-    by_identifier: dict[int, list[FrameSpec]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
-        for each in self.frames:
-            self.by_identifier.setdefault(each.identifier, []).append(each)
+    @cached_property
+    def by_identifier(self) -> dict[int, list[FrameSpec]]:
+        """The frames of each identifier."""
+        return {name: [each for each in self.frames if each.identifier == name]
+                for name in dict.fromkeys(each.identifier for each in self.frames)}
 
     @property
     def identifiers(self) -> list[int]:

@@ -20,12 +20,15 @@ UserChecksum = Callable[[bytes, int], int]
 @cache
 def _list_remainders(polynomial: int) -> tuple[int, ...]:
     """The CRC-8 of each byte."""
-    found = []
-    for value in range(256):
-        for _ in range(8):
-            value = (value << 1 ^ polynomial) & 0xFF if value & 0x80 else value << 1
-        found.append(value)
-    return tuple(found)
+    return tuple(add_byte(0, byte, polynomial) for byte in range(256))
+
+
+def add_byte(crc: int, byte: int, polynomial: int) -> int:
+    """The CRC-8 with one more byte, most significant bit first. Compiled loops call it."""
+    crc ^= byte
+    for _ in range(8):
+        crc = (crc << 1 ^ polynomial) & 0xFF if crc & 0x80 else crc << 1
+    return crc
 
 
 def compute_crc8(data: bytes, polynomial: int, start: int = 0xFF, inversion: int = 0xFF) -> int:

@@ -15,7 +15,7 @@ from plant.compile import ForeignCall, compile_function, keep_apart, raise_unbou
 from plant.errors import InputError
 from plant.machine_code import find_function_address
 from rig.benches.bench import Field, FrameSpec, Guard, Kind, Role
-from rig.benches.checksums import CHECKSUMS, USERS_CHECKSUMS
+from rig.benches.checksums import CHECKSUMS, USERS_CHECKSUMS, add_byte
 
 # Words of the layout: a scratch word, the payload, then counts and places of the tables
 _SCRATCH, PAYLOAD = 0, 8
@@ -250,23 +250,15 @@ def _compute_checksum(m: Layout, at: int, field: int, counter: int) -> int:
         return _integer(words[_SCRATCH]) & _find_mask(words[field + _BITS])
     crc, polynomial, own = words[field + _START], words[field + _POLYNOMIAL], words[field + _LOWEST] // 8
     if words[field + _DATA_ID] >= 0:
-        crc = _add_byte(crc, words[field + _DATA_ID] & 0xFF, polynomial)
-        crc = _add_byte(crc, words[field + _DATA_ID] >> 8, polynomial)
+        crc = add_byte(crc, words[field + _DATA_ID] & 0xFF, polynomial)
+        crc = add_byte(crc, words[field + _DATA_ID] >> 8, polynomial)
     for i in range(length):
         if i != own:
-            crc = _add_byte(crc, _integer(m.octets[8 * PAYLOAD + i]), polynomial)
+            crc = add_byte(crc, _integer(m.octets[8 * PAYLOAD + i]), polynomial)
     if words[field + _DATA_IDS_AT]:
         ids = words[field + _DATA_IDS_AT]
-        crc = _add_byte(crc, words[ids + 1 + counter % words[ids]], polynomial)
+        crc = add_byte(crc, words[ids + 1 + counter % words[ids]], polynomial)
     return _integer(crc ^ words[field + _INVERSION])
-
-
-def _add_byte(crc: int, byte: int, polynomial: int) -> int:
-    """The CRC-8 with one more byte, most significant bit first."""
-    crc ^= byte
-    for _ in range(8):
-        crc = (crc << 1 ^ polynomial) & 0xFF if crc & 0x80 else crc << 1
-    return crc
 
 
 # ---------------------------------------------------------------------------------------- made before the start

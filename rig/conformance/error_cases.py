@@ -32,14 +32,13 @@ from rig.conformance.target import (
     Pdo,
     Target,
     for_each,
-    name_state,
     read_error_code,
     require,
     require_abort,
     require_applicable,
 )
 from rig.network.frame import Frame
-from rig.network.node_objects import NmtState
+from rig.network.node_objects import NmtState, name_state
 
 CONSUMER, CYCLE, BEHAVIOUR = (0x1016, 1), (0x1006, 0), (0x1029, 1)
 HEARTBEAT_LOST, SYNC_LENGTH = 0x8130, 0x8240

@@ -19,11 +19,10 @@ from rig.conformance.target import (
     Variable,
     for_each,
     join_labels,
-    name_state,
     require,
     require_applicable,
 )
-from rig.network.node_objects import NmtCommand, NmtState
+from rig.network.node_objects import NmtCommand, NmtState, name_state
 
 RESETS = (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
 QUIET = 0.2  # s: the time in which a frame that is not expected would come

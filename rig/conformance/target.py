@@ -17,7 +17,7 @@ from rig.benches.bench import decode_device_text
 from rig.benches.canopen_map import INVALID, MAPPING, PARAMETERS, RPDO, TPDO, list_variables, read_dictionary
 from rig.network.bus import Wire
 from rig.network.frame import Frame
-from rig.network.node_objects import NmtCommand, NmtState
+from rig.network.node_objects import NmtCommand, NmtState, name_state
 from rig.network.sdo_client import ABORT, SdoProblem, download_object, require_confirmation, upload_object
 
 Item = TypeVar("Item")
@@ -182,15 +182,6 @@ def format_abort(code: int) -> str:
     ('0x06020000 no such object', 'accepted')
     """
     return f"0x{code:08X} {ABORT_TEXTS.get(code, '')}".rstrip() if code else "accepted"
-
-
-def name_state(state: int) -> str:
-    """An NMT state as the standard writes it.
-
-    >>> name_state(127), name_state(9)
-    ('PRE-OPERATIONAL', '9')
-    """
-    return NmtState(state).name.replace("_", "-") if state in list(NmtState) else str(state)
 
 
 class Target:

@@ -45,6 +45,16 @@ class NmtState(IntEnum):
     PRE_OPERATIONAL = 127
 
 
+def name_state(state: int) -> str:
+    """What a heartbeat says, as the standard writes it.
+
+    >>> name_state(127), name_state(0), name_state(9)
+    ('PRE-OPERATIONAL', 'BOOT-UP', 'STATE 9')
+    """
+    names = {each.value: each.name.replace("_", "-") for each in NmtState} | {0: "BOOT-UP"}
+    return names.get(state, f"STATE {state}")
+
+
 class NmtCommand(IntEnum):
     """Command specifiers of the frame 0x000."""
 

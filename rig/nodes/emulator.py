@@ -23,12 +23,14 @@ from rig.sequences.faults import DOUBLE, LateFrames, Plan
 _NO_FLAGS = Flags(0)  # made once: an operation on an IntFlag takes a microsecond
 
 
-def accept_scenario(device: Device, data: bytes, load: Callable[[Scenario], None]) -> None:
-    """Load a scenario that was downloaded to object 0x2210.
+def accept_scenario(device: Device, load: Callable[[Scenario], None], index: int, sub: int, data: bytes) -> None:
+    """Load what was downloaded, if it was object 0x2210, the scenario.
 
     Raises:
         SdoAbort: the node is OPERATIONAL, or the bytes are no scenario that can be run.
     """
+    if index != SCENARIO:
+        return
     if device.state is NmtState.OPERATIONAL:
         raise SdoAbort(Abort.STATE)
     try:
@@ -83,7 +85,7 @@ class Emulator:
         self._drive_id, self._sync_id, self._most_missed = frames.drive.identifier, frames.sync, bench.most_missed
         self.device = Device(node.node, node.eds, self._transmit)
         self.device.on_sync = self._on_sync
-        self.device.on_write = self._on_write
+        self.device.on_write = partial(accept_scenario, self.device, self.load_scenario)
         self.device.on_nmt = self._on_nmt
         self._od = self.device.od.values
         self._drive = next(pdo for pdo in self.device.pdo.rpdos.values() if pdo.cob_id == self._drive_id)
@@ -187,10 +189,6 @@ class Emulator:
             self._begun = self._first = True
         elif new is NmtState.INITIALISING:
             self._begin(self._scenario, FaultyPlant(self._scenario))
-
-    def _on_write(self, index: int, sub: int, data: bytes) -> None:
-        if index == SCENARIO:
-            accept_scenario(self.device, data, self.load_scenario)
 
     def _on_sync(self) -> None:
         """The drive that came last is latched: judge it, read the transducers, leave the rest until they are sent."""

@@ -10,7 +10,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from rig.benches.canopen_map import RPDO, TPDO
 from rig.benches.packing import VALUES_AT
 from rig.device import Device, EmcyCode, ErrorRegister, NmtState
 from rig.network.frame import Frame, Send
-from rig.network.node_objects import COUNTERS, CYCLE_RECORD, RING, SCENARIO, CycleRecord, encode_cycle_record
+from rig.network.node_objects import COUNTERS, CYCLE_RECORD, RING, CycleRecord, encode_cycle_record
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator import accept_scenario, find_plant_node, make_scenario, require_plant
@@ -73,7 +73,7 @@ class EmulatorService:
         self._drive, *self._tpdos = (
             next(each for each in (*pdo.rpdos.values(), *pdo.tpdos.values()) if each.cob_id == spec.identifier)
             for spec in self._frames)
-        self.device.on_write = self._on_write
+        self.device.on_write = partial(accept_scenario, self.device, self.load_scenario)
         self.device.on_nmt = self._on_nmt
         self._od = self.device.od.values
         self.load_scenario(scenario or make_scenario(bench))
@@ -206,10 +206,6 @@ class EmulatorService:
         elif not self._obeying and old is NmtState.OPERATIONAL:  # an error of the services: 0x1029
             self._memory.words[ec.DEMOTED] = new
             self._bus.wake()
-
-    def _on_write(self, index: int, sub: int, data: bytes) -> None:
-        if index == SCENARIO:
-            accept_scenario(self.device, data, self.load_scenario)
 
     def _share_settings(self) -> None:
         """What SDO may change, and the error register without the loop's own error."""

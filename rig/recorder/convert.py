@@ -36,7 +36,7 @@ from rig.benches.bench import (
 )
 from rig.benches.can_map import read_database
 from rig.network.frame import Frame, find_cob_id, make_message
-from rig.network.node_objects import NmtState as State
+from rig.network.node_objects import name_state
 from rig.recorder.schema import Event, NmtState, Record, Signals, collect_provenance, make_row_record
 from rig.recorder.writer import Recorder
 
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
 
 RAW_SUFFIXES = (".log", ".blf", ".asc", ".trc")
-_STATES = {state.value: state.name.lower().replace("_", "-") for state in State}
 
 
 def export_trace(source: Path, out: Path, everything: bool = False) -> int:
@@ -216,7 +215,7 @@ class _CycleBuilder:
         elif (self._is_canopen and 0x700 < cob_id < 0x780 and len(frame.data) == 1
               and self._nmt.get(node) != frame.data[0]):
             state = self._nmt[node] = frame.data[0]
-            return [NmtState(node, state, _STATES.get(state, f"state {state}"))]
+            return [NmtState(node, state, name_state(state).lower())]
         elif self._is_canopen and 0x080 < cob_id < 0x100 and len(frame.data) == 8:
             code = int.from_bytes(frame.data[:2], "little")
             return [Event("ERROR" if code else "INFO", "emcy", f"node {node}: 0x{code:04X}")]
@@ -257,15 +256,12 @@ class _CycleBuilder:
 
 
 def _read_frames(source: Path) -> Iterator[Frame]:
-    first = None
-    for message in list_can_messages(source):
-        first = message.timestamp if first is None else first
-        t_ns = max(0, round((message.timestamp - first) * 1e9))
-        yield Frame(t_ns, find_cob_id(message), bytes(message.data))
+    for t, message in list_can_messages(source):
+        yield Frame(max(0, round(t * 1e9)), find_cob_id(message), bytes(message.data))
 
 
-def list_can_messages(source: Path) -> Iterator[can.Message]:
-    """The data frames of a CAN log (.log of candump, .blf, .asc, .trc), one by one.
+def list_can_messages(source: Path) -> Iterator[tuple[float, can.Message]]:
+    """The data frames of a CAN log (.log of candump, .blf, .asc, .trc) and their times since the first of them, s.
 
     Raises:
         InputError: a file that cannot be read or is no such log.
@@ -273,12 +269,14 @@ def list_can_messages(source: Path) -> Iterator[can.Message]:
     import can
     from can.io.blf import BLFParseError
 
+    first = None
     try:
         with can.LogReader(source) as reader:
             for message in reader:
                 is_remote = message.is_remote_frame and not message.is_fd  # of .asc: an empty frame
                 if not (message.is_error_frame or is_remote):
-                    yield message
+                    first = message.timestamp if first is None else first
+                    yield message.timestamp - first, message
     except OSError as error:
         raise InputError(source, "", f"a readable file ({error.strerror})") from error
     except (ValueError, IndexError, can.CanError, BLFParseError) as error:
@@ -322,9 +320,7 @@ def _read_signals(path: Path, messages: Mapping[tuple[int, bool], Any], names: C
     """
     wanted = {name.rpartition(".")[0] for name in names}
     columns = {name: (array("d"), array("d")) for name in names}  # values, times
-    first: float | None = None
-    for frame in list_can_messages(path):
-        first = frame.timestamp if first is None else first
+    for t, frame in list_can_messages(path):
         known = messages.get((frame.arbitration_id, frame.is_extended_id))
         if known is None or known.name not in wanted or len(frame.data) < known.length:
             continue
@@ -332,7 +328,7 @@ def _read_signals(path: Path, messages: Mapping[tuple[int, bool], Any], names: C
             name = f"{known.name}.{signal}"
             if name in columns:
                 columns[name][0].append(float(value))
-                columns[name][1].append(frame.timestamp - first)
+                columns[name][1].append(t)
     for name, (values, _) in columns.items():
         require(values, path, name, "at least one frame of this message")
     return {name: Channel(*map(np.frombuffer, column)) for name, column in columns.items()}

@@ -10,7 +10,7 @@ from rig.benches.bench import Bench, Flags, Role, describe_identifier
 from rig.device.emcy import EmcyCode
 from rig.interrupts import describe_exit
 from rig.network.master import HEARTBEAT_LIMIT, Master
-from rig.network.node_objects import CONTROLLER, PLANT, RIG, NmtState
+from rig.network.node_objects import CONTROLLER, PLANT, RIG, NmtState, name_state
 from rig.recorder import NmtState as NmtRecord, Signals, Timing
 from rig.run.attribution import NO_DRIVE
 from rig.run.participants import FRAME_TIMEOUT, NodeProcesses
@@ -110,8 +110,7 @@ class NodeWatch:
             self._safety.handle("emcy", what, node, error.code, round(error.timestamp * 1e9))
 
     def _note_state(self, node: Role, state: int) -> None:
-        known = {s.value: s.name.lower().replace("_", "-") for s in NmtState}
-        name = known.get(state, f"state {state}") if state else "boot-up"
+        name = name_state(state).lower()
         self._journal.recorder.put(self._stage.now(), NmtRecord(self._bench.find_number(node), state, name))
         if state == NmtState.OPERATIONAL:
             self._operational.add(node)

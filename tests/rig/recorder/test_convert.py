@@ -67,7 +67,7 @@ def test_every_kind_of_frame_there_and_back(tmp_path: Path, suffix: str) -> None
     out = tmp_path / f"x{suffix}"
     assert export_trace(tmp_path / "x.mcap", out) == len(frames)
     heard = list(list_can_messages(out))
-    for frame, message in zip(frames, heard, strict=True):
+    for frame, (_, message) in zip(frames, heard, strict=True):
         if not message.is_fd or frame.data:
             assert message.equals(make_message(*frame[1:]), timestamp_delta=None, check_channel=False)
     import_frames(out, tmp_path / "back.mcap", load_bench())
