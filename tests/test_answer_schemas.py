@@ -4,6 +4,7 @@ Every test that reads an answer with `rig_command.Said.json` checks it against i
 """
 
 import json
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -137,8 +138,9 @@ def test_the_answers_of_runs(preflight: Path, aborted: Path) -> None:
 def test_the_answers_of_small_commands(preflight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("command.csv").write_text("t,com\n0,0\n0.001,1e-3\n0.002,1e-3\n")
-    simulated = rig("simulate", "--command", "command.csv", "--out", "run.csv", "--json").json
-    samples = {"traces": ["run.csv", "run2.csv", "held.csv"]}
+    simulated = rig("simulate", "--command", "command.csv", "--out", "short.csv", "--json").json
+    samples = rig("simulate", "--samples", "--json").json
+    assert samples["traces"] == ["run.csv", "run2.csv", "held.csv"] and {*samples["traces"]} <= {*os.listdir()}
     assert_all_seen("simulate", simulated, samples)
     kinds = ("parameters", "signals", "sequences", "effects", "checks", "models", "benches", "faults")
     assert_all_seen("list", *(rig("list", kind, "--json").json for kind in kinds))

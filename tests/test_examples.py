@@ -9,6 +9,7 @@ import pytest
 from effect_files import restored_catalogue
 from places import ROOT
 from rig_command import rig
+from short_runs import HIDDEN, write_measured_runs
 
 EXAMPLES = ROOT / "examples"
 
@@ -41,9 +42,17 @@ def test_tests_of_a_controller(tmp_path: Path) -> None:
 
 def test_missing_physics_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                                   capsys: pytest.CaptureFixture[str]) -> None:
-    """The program as it stands; among all effects its search takes a minute."""
+    """The program on shorter recordings than those of `rig simulate --samples`; among all effects its search takes a
+    minute.
+    """
+    def write_samples(words: list[str], cwd: Path, check: bool) -> None:
+        assert words[-3:] == ["simulate", "--samples", "--quiet"]
+        for file, name in zip(write_measured_runs(cwd, HIDDEN).values(), ("run", "run2", "held"), strict=True):
+            file.rename(cwd / f"{name}.csv")
+
     program = str(EXAMPLES / "find_missing_physics.py")
     monkeypatch.setattr(sys, "argv", [program, str(tmp_path)])
+    monkeypatch.setattr(subprocess, "run", write_samples)
     with restored_catalogue("null_bias", "constant_load", "spool_friction", "jack_friction"):
         runpy.run_path(program, run_name="__main__")
     said = capsys.readouterr().out
