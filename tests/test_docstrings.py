@@ -25,14 +25,14 @@ def split_source(source: str) -> tuple[str, set[str]]:
     """Docstrings and comments of a file, and the words of its code and of its other texts, such as keys of files."""
     nodes = list(ast.walk(ast.parse(source)))
     documented = [node for node in nodes if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module)]
-    texts = [ast.get_docstring(node, clean=False) or "" for node in documented]
-    words: set[str] = set()
+    docstrings = [text for node in documented if (text := ast.get_docstring(node, clean=False))]
+    comments, words = list[str](), set[str]()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
-            texts.append(token.string)
-        elif token.type == tokenize.NAME or not any(text and text in token.string for text in texts):
+            comments.append(token.string)
+        elif token.type != tokenize.STRING or not any(text in token.string for text in docstrings):
             words |= set(re.split(r"\W+", token.string))
-    return "\n".join(texts), words
+    return "\n".join((*docstrings, *comments)), words
 
 
 @cache
