@@ -167,7 +167,7 @@ def diagnosis(kintas: float, explained: bool = True, others: dict[str, Estimate]
 
     axes = np.linspace(0.0, 0.5, 21), np.linspace(0.0, 90.0, 21)
     grid = Grid(FAULTS, axes, point(2 * kintas), point(0.0), point(kintas), Merged((kintas, 5.0), 0.5, 0.0),
-                Point((kintas, 5.0), 54e-6), 1.0, "current", 441, "m")
+                Point((kintas, 5.0), 54e-6), 441, "m")
     sizes = {CLOGGING.name: Estimate(0.001, 0.0, 0.02), FRICTION.name: Estimate(5.0, 4.0, 6.0)}
     refinement = SimpleNamespace(errors={"xj": 2e-6}, is_explained=explained)
     return cast(Any, SimpleNamespace(grids=(grid,), sizes=sizes, others=others or {}, refinement=refinement,
