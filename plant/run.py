@@ -14,10 +14,10 @@ import numpy as np
 from plant.compile import compute_fingerprint, find_cache_folder, interpret_function
 from plant.errors import InputError, RigError, require
 from plant.foreign import run_foreign_loop
-from plant.kernels import make_packers, write_reader
+from plant.kernels import list_state_values, make_packers, write_reader
 from plant.machine_code import Call, StoredCode
 from plant.model import Model, build_kernel
-from plant.plants import Plant, find_plant
+from plant.plants import CONTROL_AT, Plant, find_plant
 from plant.segments import Array
 from plant.signals import EHA, Signals
 from plant.solve import (
@@ -124,18 +124,26 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
     return cast(Columns, make_columns_type(signals)(*columns))
 
 
-def compute_answers(model: Model, com: Array, readings: Array) -> Array:
+def compute_answers(model: Model, com: Array, readings: Array, memory: Array | None = None) -> Array:
     """The drive, (n,), that the model's controller answers to demands `com`, (n,).
 
     `readings` are those of all outputs, (n, outputs), or of the controlled one alone, (n,): others are NaN then.
+    `memory` is what its law remembers at the start; default: as at rest.
     """
+    memory = rest_controller(model) if memory is None else memory
     out = np.empty(len(com))
     if readings.ndim == 1:
         others = np.full((len(com), len(model.kind.signals.outputs) - 1), np.nan)
         readings = np.column_stack([readings, others])
     run = build_kernel(run_controller, model.effects, plant=model.plant)
-    run(model.build_flat_state(), com, np.ascontiguousarray(readings), model.build_record(), out)
+    control = np.concatenate([np.zeros(CONTROL_AT), memory])
+    run(model.build_flat_state(), control, com, np.ascontiguousarray(readings), model.build_record(), out)
     return out
+
+
+def rest_controller(model: Model) -> Array:
+    """The numbers, (k,), that the law of the model's controller remembers at rest."""
+    return np.array(list_state_values(model.kind.build_control_memory()))
 
 
 def compute_needed_drive(model: Model, motion: Array, load: Array) -> Array:

@@ -14,6 +14,7 @@ from plant.kernels import (
     correct_plant,
     get_readings,
     invert_plant,
+    load_control,
     keep_row,
     measure_plant,
     move_plant,
@@ -101,11 +102,12 @@ def run_closed_loop(flat: Any, com: Any, load: Any, noise: Any, record: Any, ste
     pack_state((s, m), flat)
 
 
-def run_controller(flat: Any, com: Any, readings: Any, record: Any, out: Any) -> None:
+def run_controller(flat: Any, control: Any, com: Any, readings: Any, record: Any, out: Any) -> None:
     """The controller alone over demands and readings; fills out[k] with its drive.
 
     Args:
         flat: state of the plant at the start; only its memories are used.
+        control: what the law remembers at the start, from `CONTROL_AT` on.
         com: (n,) demand.
         readings: (n, outputs).
         record: (1,) parameters of the model.
@@ -113,7 +115,7 @@ def run_controller(flat: Any, com: Any, readings: Any, record: Any, out: Any) ->
     """
     p = record[0]
     m = unpack_state(flat)[1]
-    c = start_control()
+    c = load_control(control)
     for k in range(len(com)):
         y = get_readings(readings, k)
         demand, m = take_demand(com[k], m, y[0], k * p.controller.period, p)

@@ -49,7 +49,7 @@ from plant.errors import InputError
 from plant.lanes import Lanes
 from plant.model import Model
 from plant.plants import MODULES
-from plant.run import compute_answers
+from plant.run import compute_answers, rest_controller
 from plant.signals import EHA
 
 Columns = dict[str, Floats]  # by signal, (n,)
@@ -58,6 +58,7 @@ REPLAY_STEPS, FINEST_REPLAY_STEPS = 50, 800  # a cycle
 SCATTER_DIFFERENCE = 0.3  # tolerances, of the differences that the Jacobian is made of
 MEMORY = 4.0 / ANCHOR_RATE  # s, until an anchored replay is back on the recording
 NEAR_NOISE = 2.0  # floors, in the better half of a run: else physics is missing, and no stop matters
+START_ROWS = 50  # in which the controller's answers tell what it remembered before
 ALIKE = 20  # neighbouring samples that say the same thing
 
 
@@ -383,10 +384,31 @@ def answer_readings(model: Model, trace: Trace, command: Floats, controlled: Flo
     The other readings are those of the trace; NaN where the law needs one that was not measured.
     """
     others = [trace.column(name) for name in trace.output_names[1:]]
-    low, high = (compute_answers(model, command, np.column_stack(
+    low, high = (_answer_from_the_middle(model, trace, command, np.column_stack(
         [controlled, *(np.full(len(x), guess) if np.isnan(x).all() else hold_last(x) for x in others)]))
         for guess in (-1e9, 1e9))  # so far apart that a limit of the drive does not make them alike
     return np.where(low == high, low, np.nan)
+
+
+def _answer_from_the_middle(model: Model, trace: Trace, command: Floats, readings: Floats) -> Floats:
+    """The same from all outputs, (n, outputs), where a recording may begin while the law remembers what came before.
+
+    What it then remembers is that with which it answers as the measured controller does in the first rows, if there it
+    is ten times nearer than from rest: another law has other answers later on.
+    """
+    answers, first = compute_answers(model, command, readings), slice(0, START_ROWS)
+    if not has_controller_memory(model) or trace.incomplete[first].any():
+        return answers
+
+    def miss(memory: Floats) -> Floats:
+        return trace.drive[first] - compute_answers(model, command[first], readings[first], memory)
+
+    rest = rest_controller(model)
+    slopes = np.array([miss(rest) - miss(rest + 1e-6 * unit) for unit in np.eye(len(rest))]).T / 1e-6
+    memory = rest + np.linalg.lstsq(slopes, miss(rest), rcond=None)[0]
+    if not rms(miss(memory)) < 0.1 * rms(miss(rest)):
+        return answers
+    return compute_answers(model, command, readings, memory)
 
 
 def find_controller_gain(model: Model, period: float) -> tuple[float, float]:
@@ -679,10 +701,11 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
             seconds = float(frozen.sum()) * rows.period
             notes.append(f"{name} is frozen for {seconds:.2f} s, first at {first:.2f} s: left out there")
             usable &= ~frozen
-    if _starts_in_motion(rows):
+    d, works = rows.declared, abs(float(drive[:10].mean())) > abrupt * float(np.abs(drive).max())
+    if works or _starts_in_motion(rows):  # a replay begins at rest, without drive
         start = round(recovery / rows.period)
-        notes.append(f"the {rows.declared.controlled.phrase} already moves in the first row: the first "
-                     f"{start * rows.period:g} s are not judged")
+        what = f"{d.drive.phrase} is at work" if works else f"{d.controlled.phrase} already moves"
+        notes.append(f"the {what} in the first row: the first {start * rows.period:g} s are not judged")
         usable[:start] = False
     if usable.sum() < FEWEST_ROWS:
         raise InputError(source, rows.declared.drive.name,

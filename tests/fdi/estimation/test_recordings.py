@@ -21,15 +21,18 @@ from fdi.estimation.replay import (
     FEWEST_ROWS,
     PERIODS,
     align_columns,
+    answer_readings,
     find_repeat,
     hold_inputs,
     match_period,
     read_cycles,
 )
 from fdi.trace.trace import Trace
-from plant import Model
+from plant import Model, simulate
+from plant.declare import Hold, Step
 from plant.lanes import Lanes
-from plant.model import find_quantity
+from plant.model import find_quantity, load_model
+from plant.segments import build_profile
 
 MODEL = Model()
 NAMES = ("t", "com", "xj", "cor", "p12", "xs", "load")
@@ -224,3 +227,17 @@ def test_compare_of_a_long_recording() -> None:
     assert (right.verdict, wrong.verdict) == ("WITHIN_FLOOR", "MODEL_INCOMPLETE")
     assert len(right.replay.residual["xj"]) == 40_000
     assert wrong.scatter is not None and wrong.scatter.ratio["xj"] > 1.15
+
+
+def test_what_a_law_remembers_is_found_where_a_recording_begins_in_the_middle() -> None:
+    """From rest the integral of the motor's controller would be wrong for good; another law stays another one."""
+    model = load_model("ema")
+    command = build_profile([Hold(time=0.2), Step(to=5e-3, time=0.4), Step(to=-3e-3, time=0.5)], rate=1000.0).command
+    columns = {name: column[700:] for name, column in simulate(model, command, seed=2)._asdict().items()}
+    run = Trace.from_columns(columns, 1e-3, {}, model.kind.signals)
+
+    def miss(model: Model) -> float:
+        return float(np.abs(answer_readings(model, run, run.command, run.controlled) - run.drive).max())
+
+    assert miss(model) < 1e-6 * np.abs(run.drive).max()
+    assert miss(model.replace({"controller.speed_gain": 610.0})) > 1e-3 * np.abs(run.drive).max()
