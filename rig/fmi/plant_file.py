@@ -145,6 +145,8 @@ def _map_signal(about: Description, name: str, entry: Entry, place: Place, causa
     """A signal and its variable."""
     eha = {s.name: s for s in find_plant("eha").signals}
     signal = eha.get(_COLUMNS.get(name, name))
+    if signal is not None and (signal.role == "output") != (causality == "output"):
+        signal = None  # a measured current is not that of the servovalve, which drives it
     worth, unit = _find_worth(about, entry, "" if signal is None else signal.unit, place)
     port = Port(name, find_variable(about, entry.variable, (causality,), place), worth)
     noise = _parse(entry.noise, unit, place.at("noise")) if entry.noise else ""

@@ -313,7 +313,11 @@ def build_dry_run_report(dry: DryRun, files: Sequence[tuple[str, str]] = ()) -> 
     """Report on a dry run; `files` are (label, path) of the files written."""
     sequence = dry.job.sequence
     problems, data = dry.problems, collect_data(dry)
-    sentence = "; ".join(problems) if problems else "The actuator can follow this sequence."
+    sentence = "The actuator can follow this sequence."
+    if problems:
+        sentence = "; ".join(problems)
+    elif all(demand.limit is None for demand in dry.demands):
+        sentence = "The plant declares no limit of its motion: the predicted error tells whether it can follow."
     parts = [f"{name} {seconds:g} s" for name, seconds in dry.durations.items() if seconds]
     duration = f"{sum(dry.durations.values()):g} s: {', '.join(parts)}"
     facts = [("model", dry.job.model.name), ("differs from nominal", data["differences"]),

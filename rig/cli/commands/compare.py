@@ -2,7 +2,7 @@
 
 import argparse
 
-from fdi.comparison.compare import compare
+from fdi.comparison.compare import Comparison, compare
 from fdi.report.compare_report import build_comparison_report
 from fdi.trace.trace import Trace
 from rig.cli.answer import choose_places, give_answer, show_progress
@@ -16,13 +16,14 @@ def run_command(args: argparse.Namespace) -> int:
     with show_progress(args) as progress:
         trace, *repeats = (Trace.read(file, signals=model.kind.signals) for file in (args.trace, *args.repeat))
         comparison = compare(trace, model, repeats, list_signals(args), progress, args.trace)
-        report = build_comparison_report(comparison, choose_next_command(args, comparison.verdict), places.files)
+        report = build_comparison_report(comparison, choose_next_command(args, comparison), places.files)
     return give_answer(report, args, int(comparison.verdict != "WITHIN_FLOOR"), places)
 
 
-def choose_next_command(args: argparse.Namespace, verdict: str) -> str:
+def choose_next_command(args: argparse.Namespace, comparison: Comparison) -> str:
     """What to type next; "" if there is nothing left to do."""
-    if verdict == "MODEL_INCOMPLETE":
+    verdict = comparison.verdict
+    if verdict == "MODEL_INCOMPLETE" and comparison.model.kind.foreign is None:  # an FMU cannot be explained
         return f"rig explain {format_arguments(args)}"
     if verdict == "CANNOT_TELL" and not args.repeat:
         return f"rig compare {format_arguments(args)} --repeat SECOND_RUN"

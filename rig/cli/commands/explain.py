@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fdi.discovery.explain_runs import Answer, explain_runs
+from fdi.discovery.residual_pattern import can_balance
 from fdi.discovery.runs import Runs, read_runs
 from fdi.discovery.sensitivity import Claim, describe_unit
 from fdi.progress import Progress
@@ -77,6 +78,6 @@ def choose_next_command(args: argparse.Namespace, answer: Answer, effect_file: s
         return f"rig add {' '.join(chosen)} {arguments}"
     if answer.verdict == "UNEXPLAINED" and args.write_effect:
         return f"rig explain {arguments} --effects {args.write_effect}"
-    if answer.verdict == "UNEXPLAINED" and answer.pattern:
+    if answer.verdict == "UNEXPLAINED" and answer.pattern and can_balance(answer.explanation.search.model):
         return f"rig explain {arguments} --write-effect missing.py"
     return ""

@@ -12,6 +12,7 @@ from fdi.identification.identify import (
     write_identified_model,
 )
 from fdi.report.identify_report import build_identification_report
+from plant.plants import list_plants
 from rig.cli.answer import Places, choose_file, give_answer, show_progress
 from rig.cli.discovery_inputs import format_command_line, load_known_model
 from rig.cli.inputs import list_signals
@@ -37,7 +38,8 @@ def run_command(args: argparse.Namespace) -> int:
                 "no model file: these parameters do not explain the runs; --out FILE.toml writes them all the same")
         found, is_wanted = replace(found, notes=(*found.notes, note)), bool(args.out)
     elif is_wanted:
-        next_command = "rig compare " + shlex.join([(args.holdout or args.runs)[0], "--model", str(path)])
+        trust = [] if model.plant in list_plants() else ["--trust"]  # the model file names code
+        next_command = "rig compare " + shlex.join([(args.holdout or args.runs)[0], "--model", str(path), *trust])
     if is_wanted:
         found = replace(found, model=replace(found.model, name=path.stem))
         backup = write_identified_model(found, path, command, date.today().isoformat())
