@@ -701,9 +701,10 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
             seconds = float(frozen.sum()) * rows.period
             notes.append(f"{name} is frozen for {seconds:.2f} s, first at {first:.2f} s: left out there")
             usable &= ~frozen
-    d, works = rows.declared, abs(float(drive[:10].mean())) > abrupt * float(np.abs(drive).max())
+    d, start = rows.declared, round(recovery / rows.period)
+    works = (abs(float(drive[:10].mean())) > abrupt * float(np.abs(drive).max())
+             and usable[start:].sum() >= FEWEST_ROWS)  # a short recording at rest may have such a drive as well
     if works or _starts_in_motion(rows):  # a replay begins at rest, without drive
-        start = round(recovery / rows.period)
         what = f"{d.drive.phrase} is at work" if works else f"{d.controlled.phrase} already moves"
         notes.append(f"the {what} in the first row: the first {start * rows.period:g} s are not judged")
         usable[:start] = False

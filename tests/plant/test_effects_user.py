@@ -78,7 +78,7 @@ def test_the_users_effect_with_memory(file: Path) -> None:
     ("effect(", ":1: expected Python ("),
     ("import no_such_module", ":1: expected code that runs without an exception, not ModuleNotFoundError"),
     ("x = 1 / 0", "ZeroDivisionError"),
-    ("x = 1", "at least one function marked @effect"),
+    ("x = 1", "at least one function marked with @effect"),
     (COGGING.replace('"load"', '"laod"'), "no port 'laod'"),
     (COGGING.replace('Quantity("N")] = 0.0', 'Quantity("N")]'), "needs a default"),
     (COGGING.replace("def cogging", "def null_bias"), "the name is taken"),
