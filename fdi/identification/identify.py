@@ -50,6 +50,7 @@ from fdi.estimation.unidentifiable import (
     LogFrictionRatio,
     LogProblem,
     compute_values,
+    estimate_smooth_covariance,
     remove_slope,
     start_fit,
     take_logarithm,
@@ -736,7 +737,12 @@ def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress
                        for r, s, old in zip(fit.residuals, size, fine.noise, strict=True))
         fine = replace(fine, noise=learnt, _lanes={})
         fit = descend(fine, fit, 5)
-    return fine, fit
+    flat = find_flat(fine, fit.free, fit.x)
+    if flat.size or not fit.free:
+        return fine, fit
+    # of an actuator whose laws of similarity nobody has declared: what no run shows seems known by a jump at a stop
+    coarse = replace(fine, steps=problem.steps, _lanes={})
+    return fine, replace(fit, covariance=estimate_smooth_covariance(coarse, fit, flat))
 
 
 def fit_beginnings(problem: LogProblem, free: Sequence[Free], floor: Mapping[str, float]) -> tuple[LogProblem, Fit]:

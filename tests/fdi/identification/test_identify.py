@@ -174,6 +174,25 @@ def test_motor_that_rests_is_identified(moves_long: bool) -> None:
     assert held == dict.fromkeys(unit, True)
 
 
+def test_what_no_known_force_shows_has_a_wide_interval() -> None:
+    """All forces of a motor scale together, and no law of similarity is declared: only tolerances tie them."""
+    model, names = load_model("ema"), ("motor.torque_constant", "motor.inertia", "surface.mass", "surface.damping",
+                                       "surface.friction", "screw.compliance")
+    command = build_profile([Hold(time=0.5), Step(to=0.01, time=1.0), Ramp(to=-0.005, time=1.0), Chirp(
+        amplitude=2e-3, f0=1.0, f1=15.0, fade=15.0, time=3.0), Step(to=0.0, time=1.0)], rate=1000.0).command
+    unit = model.replace({"surface.friction": 130.0})
+    columns = simulate(unit, command, seed=3)._asdict()
+    trace = Trace.from_columns(columns, 1e-3, {"source": "motor"}, model.kind.signals)
+    table: dict[str, dict[str, float]] = {}
+    for group, _, field in (name.partition(".") for name in names):
+        table.setdefault(group, {})[field] = 2.0
+    ranges = parse_free_parameters(table, model, "test")
+    own = collect_identification_runs(model, ranges, [trace], [])
+    found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources)
+    assert found.verdict in ("PARTLY", "IDENTIFIED")
+    assert all(e.low < unit[e.name] < e.high and e.share > 0.05 for e in found.estimates)
+
+
 def test_run_at_rest_identifies_nothing() -> None:
     still = measure(np.zeros(800), np.zeros(800), 4, "still")
     found = identify([still], [])
