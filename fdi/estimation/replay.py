@@ -403,10 +403,10 @@ def _answer_from_the_middle(model: Model, trace: Trace, command: Floats, reading
     def miss(memory: Floats) -> Floats:
         return trace.drive[first] - compute_answers(model, command[first], readings[first], memory)
 
-    rest = rest_controller(model)
-    slopes = np.array([miss(rest) - miss(rest + 1e-6 * unit) for unit in np.eye(len(rest))]).T / 1e-6
-    memory = rest + np.linalg.lstsq(slopes, miss(rest), rcond=None)[0]
-    if not rms(miss(memory)) < 0.1 * rms(miss(rest)):
+    rest, from_rest = rest_controller(model), trace.drive[first] - answers[first]
+    slopes = np.array([from_rest - miss(rest + 1e-6 * unit) for unit in np.eye(len(rest))]).T / 1e-6
+    memory = rest + np.linalg.lstsq(slopes, from_rest, rcond=None)[0]
+    if not rms(miss(memory)) < 0.1 * rms(from_rest):
         return answers
     return compute_answers(model, command, readings, memory)
 

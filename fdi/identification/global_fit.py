@@ -177,9 +177,8 @@ def scan_unknowns(problem: LogProblem, fit: Fit, rounds: int = 2) -> Fit:
         for k, f in enumerate(free):
             if is_wide(f):
                 for way in GRID:
-                    trial = x.copy()
-                    trial[k] += way / f.scale if isinstance(f, LogFree) else way
-                    trials.append(np.clip(trial, low, high))
+                    step = way / f.scale if isinstance(f, LogFree) else way
+                    trials.append(np.clip(put_unknown(x, k, x[k] + step), low, high))
         tried = np.array(trials)
         costs = compute_misfit(problem.compute_white_residuals(free, tried)) + tried**2 @ prior
         best = int(np.argmin(costs))

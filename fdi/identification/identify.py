@@ -46,6 +46,7 @@ from fdi.estimation.replay import (
     prepare_trace,
 )
 from fdi.estimation.unidentifiable import (
+    BALANCED,
     LogFree,
     LogFrictionRatio,
     LogProblem,
@@ -737,11 +738,10 @@ def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress
                        for r, s, old in zip(fit.residuals, size, fine.noise, strict=True))
         fine = replace(fine, noise=learnt, _lanes={})
         fit = descend(fine, fit, 5)
-    flat = find_flat(fine, fit.free, fit.x)
-    if flat.size or not fit.free:
+    if not fit.free or problem.model.values.keys() >= BALANCED:  # `find_flat` knows what no run shows
         return fine, fit
-    # of an actuator whose laws of similarity nobody has declared: what no run shows seems known by a jump at a stop
-    coarse = replace(fine, steps=problem.steps, _lanes={})
+    # of an actuator whose laws of similarity nobody has declared it seems known by a jump at a stop
+    coarse, flat = replace(fine, steps=problem.steps, _lanes={}), np.empty((len(fit.free), 0))
     return fine, replace(fit, covariance=estimate_smooth_covariance(coarse, fit, flat))
 
 

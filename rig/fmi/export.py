@@ -24,10 +24,9 @@ import numpy as np
 from fdi.output import write_whole
 from plant.compile import read_normal_tables
 from plant.errors import InputError, RigError, require
-from plant.kernels import list_state_values
 from plant.machine_code import emit_object
 from plant.model import Model, build_kernel, find_quantity
-from plant.run import report_law_errors
+from plant.run import report_law_errors, rest_controller
 from rig.firmware.build import compile_c, find_compiler
 from rig.fmi.unit_cycle import INPUTS, advance_unit
 
@@ -154,7 +153,7 @@ def _compile_cycle(model: Model) -> Any:
 
 def _list_loop_start(model: Model) -> list[float]:
     """The state of the sampled loop of a unit that has not started: `rig.fmi.unit_cycle.advance_unit`."""
-    return [-1.0, 0.0, *list_state_values(model.kind.build_control_memory())]
+    return [-1.0, 0.0, *rest_controller(model).tolist()]
 
 
 def list_variables(model: Model) -> list[Variable]:
