@@ -12,6 +12,8 @@ WORKERS ?= $(shell expr $$(nproc) + 1)
 BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip --disable-pip-version-check install -qq
 MADE   := $(VENV)/.made
+# with it each program that a test starts would compile the whole rig again (1.5 s)
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: env env-test preflight quick lint pytest test newcomer bench clean help
 .DELETE_ON_ERROR:

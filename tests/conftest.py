@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import light_can  # noqa: F401  before anything else loads python-can
 import pytest
 from hypothesis import HealthCheck, settings
 from long_tests import LONG_TESTS, LONGEST

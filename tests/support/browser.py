@@ -47,12 +47,13 @@ class PageSize(NamedTuple):
 
 
 def find_browser() -> str | None:
-    """Chromium, if this machine has one."""
-    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    """Chromium, if this machine has one; the one without a screen first, which starts in half of the time."""
+    names = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
+    return next(filter(None, map(shutil.which, names)), None)
 
 
 needs_browser = pytest.mark.skipif(find_browser() is None and not os.environ.get("EHA_RIG_REQUIRE_BROWSER"),
-                                   reason="no chromium (Debian: apt-get install chromium)")
+                                   reason="no chromium (Debian: apt-get install chromium-headless-shell)")
 
 
 def call_browser(*arguments: str, seconds: float = 120.0) -> str:
