@@ -2,14 +2,17 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
 
 from fdi.report.report import Report
 from plant.errors import RigError
-from rig.campaign.batch import BatchProgress
+from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
 from rig.cli.answer import Places, choose_file, give_answer
 from rig.cli.command_list import parse_whole_number
+
+Job = TypeVar("Job")
 
 
 def run_study_command(name: str, text: str | None, arguments: Sequence[str] | None,
@@ -46,6 +49,27 @@ def report_progress(stage: str, share: float) -> None:
     if report_progress.__dict__.get("last") != done:
         report_progress.__dict__["last"] = done
         print(f"{stage}: {100 * share:.0f} %" if share else stage, file=sys.stderr, flush=True)
+
+
+def run_cases(jobs: Mapping[int, Job], judge: Callable[[Job], Row], describe: Callable[[Job], Row], sources: str,
+              file: Path, report_progress: Callable[[BatchProgress], None]) -> list[Row]:
+    """The rows of all cases; those that the file has from the same sources stay, but for crashed ones.
+
+    Args:
+        jobs: the cases by number.
+        judge: from a case to its row, with the `sources`.
+        describe: what a row says of a case that crashed.
+        sources: hash of the code that the rows depend on.
+        file: where the rows go.
+        report_progress: called with each row.
+    """
+    def describe_failure(job: Job, reason: str) -> Row:
+        return {**describe(job), "verdict": "CRASHED", "error": reason, "sources": sources}
+
+    batch = Batch(jobs, judge, "case", describe_failure, lambda row: bool(row["sources"] == sources),
+                  lambda row: bool(row["verdict"] == "CRASHED"))
+    with RowFile(file) as rows:
+        return list(run_batch(batch, rows, Workers(1), report_progress).values())
 
 
 def make_row_progress(describe: Callable[[BatchProgress], str]) -> Callable[[Any], None]:

@@ -23,8 +23,9 @@ from fdi.progress import Progress, ignore_progress
 from fdi.sources import hash_sources
 from plant.effects import CATALOGUE
 from plant.model import Model
-from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
+from rig.campaign.batch import BatchProgress, Row, Workers
 from rig.campaign.sensitivity import measure_sensitivity
+from studies.command import report_progress as report_claims, run_cases
 from studies.hidden_effects import cases, hidden
 from studies.hidden_effects.hidden import Hidden
 from studies.hidden_effects.rig_answer import run_rig_explain
@@ -80,15 +81,9 @@ def run_study(count: int, folder: Path, report_progress: Callable[[BatchProgress
     plan = [(effect, factor) for factor in FACTORS for effect in effects]
     jobs = {number: (number, *plan[number % len(plan)]) for number in range(count)}
     sources = hash_sources("plant", "fdi", "studies/hidden_effects", "studies/detectable_sizes.py")
-
-    def describe_failure(job: tuple[int, str, float], reason: str) -> Row:
-        return {"case": job[0], "effect": job[1], "factor": job[2], "verdict": "CRASHED", "found": False,
-                "error": reason, "sources": sources}
-
-    batch = Batch(jobs, partial(judge_size, folder=folder, sources=sources, claimed=sizes), "case", describe_failure,
-                  lambda row: bool(row["sources"] == sources), lambda row: bool(row["verdict"] == "CRASHED"))
-    with RowFile(folder / "sizes.jsonl") as file:
-        return list(run_batch(batch, file, Workers(1), report_progress).values())
+    return run_cases(jobs, partial(judge_size, folder=folder, sources=sources, claimed=sizes),
+                     lambda job: {"case": job[0], "effect": job[1], "factor": job[2], "found": False}, sources,
+                     folder / "sizes.jsonl", report_progress)
 
 
 def judge_size(job: tuple[int, str, float], folder: Path, sources: str, claimed: Mapping[str, float]) -> Row:
@@ -159,11 +154,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         row = progress.row
         print(f"{progress.done} of {progress.total}: {row['effect']} {row['factor']:g} {row['verdict']}", flush=True)
 
-    def show_claims(stage: str, share: float) -> None:
-        print(f"claims: {stage}", flush=True)
-
     effects = given.effects.split(",")
-    claimed = claim_sizes(given.out, effects, Workers(given.jobs, single_threaded=True), show_claims)
+    claimed = claim_sizes(given.out, effects, Workers(given.jobs, single_threaded=True), report_claims)
     print(format_table(run_study(given.cases or 2 * len(effects), given.out, show, effects, claimed)))
     return 0
 

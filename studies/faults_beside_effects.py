@@ -10,7 +10,6 @@ random order, so that the first ones are a fair sample of all.
 """
 
 import argparse
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -25,7 +24,8 @@ from fdi.sources import hash_sources
 from fdi.trace.trace import Trace
 from plant.model import load_model
 from plant.threads import count_threads
-from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
+from rig.campaign.batch import BatchProgress, Row
+from studies.command import run_cases
 from studies.hidden_effects import cases, hidden
 from studies.hidden_effects.hidden import Hidden
 from studies.hidden_effects.truth import nominal_symbols
@@ -63,15 +63,8 @@ def run_study(jobs: Sequence[Job], folder: Path, report_progress: Callable[[Batc
         InputError: no C compiler, or the folder cannot be made.
     """
     sources = hash_sources("plant", "fdi", "studies/hidden_effects", "studies/faults_beside_effects.py")
-
-    def describe_failure(job: Job, reason: str) -> Row:
-        return {"case": job.number, "verdict": "CRASHED", "error": reason, "sources": sources}
-
-    batch = Batch({job.number: job for job in jobs}, partial(judge_job, signals=signals, sources=sources), "case",
-                  describe_failure, lambda row: bool(row["sources"] == sources),
-                  lambda row: bool(row["verdict"] == "CRASHED"))
-    with RowFile(folder / "beside.jsonl") as file:
-        return list(run_batch(batch, file, Workers(1), report_progress).values())
+    return run_cases({job.number: job for job in jobs}, partial(judge_job, signals=signals, sources=sources),
+                     lambda job: {"case": job.number}, sources, folder / "beside.jsonl", report_progress)
 
 
 def make_case(job: Job) -> cases.Case:
@@ -175,7 +168,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
               f"{row['verdict']} {' '.join(row.get('effects', ()))}", flush=True)
 
     jobs = list_jobs(given.repeats, given.seed)[:given.most]
-    print(f"process {os.getpid()}", flush=True)
     print(format_table(run_study(jobs, given.out, show, given.signals.split(","))))
     return 0
 

@@ -25,6 +25,7 @@ from studies.hidden_effects.cases import sample_healthy_plant
 from studies.hidden_effects.truth import SYMBOLS, nominal_symbols, simulate_truth
 
 Array = NDArray[np.float64]
+GAIN = "controller.proportional_gain"
 
 FACTORS = {"AJ": (1.7, 2.4), "XJM": (0.5, 0.8), "GQ": (1.3, 2.5), "GQF": (0.7, 1.5), "GM": (0.8, 1.3),
            "KSF": (0.8, 1.3), "PSR": (0.8, 1.6), "MJ": (1.0, 3.0), "CJ": (0.7, 2.5), "CLK": (0.7, 3.0),
@@ -94,16 +95,12 @@ def judge_unit(seed: int, workers: int | None = None) -> dict[str, Any]:
     rows = {e.name: {"true": truth[e.name], "value": e.value, "low": e.low, "high": e.high,
                      "identifiable": e.is_identifiable, "inside": e.low <= truth[e.name] <= e.high}
             for e in found.estimates}
-    return {"seed": seed, "verdict": found.verdict, "parameters": rows, "gain_error": _compare_gain(found, truth),
+    return {"seed": seed, "verdict": found.verdict, "parameters": rows,
+            "gain_error": found.model[GAIN] / truth[GAIN] - 1.0,
             "fitted": max(e.ratio for e in found.errors if not e.is_held_out),
             "held_out": max(e.ratio for e in found.holdouts),
             "decided": max(e.decided_ratio for e in found.holdouts),
             "undecided": max(e.undecided for e in found.holdouts)}
-
-
-def _compare_gain(found: Any, truth: Mapping[str, float]) -> float:
-    name = "controller.proportional_gain"
-    return float(found.model[name] / truth[name] - 1.0)
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:

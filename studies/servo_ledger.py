@@ -173,16 +173,13 @@ def print_row(row: LedgerRow) -> None:
 def write_model(rows: Sequence[LedgerRow], trace: Path, out: Path) -> None:
     """Write the model of the last row, with the run it was fitted to and the ledger."""
     model = replace(rows[-1].model, name="servo")
-    ledger = tuple(Row(row.step.effect if row.step else None, select_signals(row.errors[FITTED]), {}) for row in rows)
+    signals = ("xj", "p12")
+    ledger = tuple(Row(row.step.effect if row.step else None, {name: row.errors[FITTED][name] for name in signals}, {})
+                   for row in rows)
     source = read_source(str(trace))._replace(file=trace.name)
-    known = Provenance(name_software(), ("python -m studies.servo_ledger FOLDER",), (), signals=("xj", "p12"),
+    known = Provenance(name_software(), ("python -m studies.servo_ledger FOLDER",), (), signals=signals,
                        trace=source, ledger=ledger)
     out.write_text(HEAD + format_model_file(model, {}, known), encoding="utf-8")
-
-
-def select_signals(errors: Mapping[str, float]) -> dict[str, float]:
-    """The errors of the signals that a trace has."""
-    return {name: errors[name] for name in ("xj", "p12")}
 
 
 def identify_controller(files: Mapping[str, Path]) -> float:
@@ -209,7 +206,6 @@ class DirectionalGains(NamedTuple):
     residual: float  # RMS of what the law leaves of the answer
     answer: float  # RMS of the answer
     exact: float  # share of the rows whose answer is the rounded gain times the error, to half a unit
-    limit: float  # largest answer that was recorded; the law's limit is there or above
 
     @property
     def asymmetry(self) -> float:
@@ -227,10 +223,8 @@ def fit_directional_gains(error: Floats, answer: Floats, side: Floats, longest_d
         longest_delay: rows that are tried.
 
     Raises:
-        ValueError: columns of different lengths, or a side without rows.
+        ValueError: a side without rows.
     """
-    if not error.shape == answer.shape == side.shape:
-        raise ValueError(f"columns of one length, not {error.shape}, {answer.shape} and {side.shape}")
     return min((_fit_at_delay(error, answer, side, delay) for delay in range(longest_delay + 1)),
                key=lambda found: found.residual)
 
@@ -246,7 +240,7 @@ def _fit_at_delay(error: Floats, answer: Floats, side: Floats, delay: int) -> Di
     whole = np.concatenate([y[rows] - round(gain[name]) * e[rows] for name, rows in ways.items()])
     driven = y[ways["out"] | ways["back"]]
     return DirectionalGains(gain["out"], gain["back"], delay, rms(left), rms(driven),
-                            float(np.mean(np.abs(whole) <= 0.5)), float(np.abs(driven).max()))
+                            float(np.mean(np.abs(whole) <= 0.5)))
 
 
 def draw_steps(rows: Sequence[LedgerRow], trace: Trace, folder: Path) -> None:

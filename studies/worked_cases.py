@@ -63,7 +63,6 @@ def format_scatter(kintas: float, fss: float, command: np.ndarray) -> str:
 
 def main() -> None:
     """Make six runs, draw eight figures, print two tables."""
-    HERE.mkdir(exist_ok=True)
 
     def save(number: str, text: str) -> None:
         (HERE / f"fig{number}.svg").write_text(shorten_svg(text), encoding="utf-8")

@@ -18,7 +18,19 @@ from plant import Model, simulate
 from plant.lanes import Lanes
 from plant.monitor import FAULTS, Cell, Monitor, compute_cells
 from rig.bench.benchmarks import FLAGS, build_library, measure_median_duration
-from studies.peers.rivals import Race, Replay, Rival, explain_missing, explain_missing_gcc, race_rivals, skip_rival
+from studies.peers.rivals import (
+    Maker,
+    Race,
+    Replay,
+    Rival,
+    clip,
+    explain_missing,
+    explain_missing_gcc,
+    make_progpy_plant,
+    make_replays,
+    race_rivals,
+    skip_rival,
+)
 
 Array = NDArray[np.float64]
 OURS = "ours, a thread a core"
@@ -50,7 +62,7 @@ def compare_grid_runs(command: Array, progress: Progress = ignore_progress, roun
     work = Work(command)
     with tempfile.TemporaryDirectory() as folder:
         progress("the RMS grid: compiling the rivals", 0.0)
-        replays, skipped = _make_rivals(work, Path(folder))
+        replays, skipped = make_replays(_list_makers(work, Path(folder)))
         progress("the RMS grid", 0.0)
         race = race_rivals(replays, OURS, len(work.values) * len(command), rounds, _compare_maps)
     note = "another model: what the monitor leaves out is the difference"
@@ -63,22 +75,15 @@ def _compare_maps(errors: Array, reference: Array) -> float:
     return float(np.abs(errors - reference).max())
 
 
-def _make_rivals(work: Work, folder: Path) -> tuple[dict[str, Replay], list[Rival]]:
-    """The rivals that can be measured here, and the others with the reason."""
-    replays: dict[str, Replay] = {OURS: _make_own_replay(work, None), "ours, one thread": _make_own_replay(work, 1)}
-    skipped = []
+def _list_makers(work: Work, folder: Path) -> dict[str, Maker]:
+    """What makes each rival, by name."""
     in_c = {"C, one thread": FLAGS, "C, OpenMP": OPENMP, "C, OpenMP, 32 cells side by side, -ffast-math": LOOSE}
-    for number, (name, flags) in enumerate(in_c.items()):
-        if reason := explain_missing_gcc():
-            skipped.append(skip_rival(name, reason))
-        else:
-            replays[name] = _make_c_replay(work, flags, folder / f"{number}.so")
-    if reason := explain_missing("jax"):
-        skipped.append(skip_rival("jax, vmap", reason))
-    else:
-        replays["jax, vmap"] = _make_jax_replay(work)
-    replays[REFERENCE] = _make_reference_replay(work)
-    return replays, skipped
+    return {OURS: ("", partial(_make_own_replay, work, None)),
+            "ours, one thread": ("", partial(_make_own_replay, work, 1)),
+            **{name: (explain_missing_gcc(), partial(_make_c_replay, work, flags, folder / f"{number}.so"))
+               for number, (name, flags) in enumerate(in_c.items())},
+            "jax, vmap": (explain_missing("jax"), partial(_make_jax_replay, work)),
+            REFERENCE: ("", partial(_make_reference_replay, work))}
 
 
 def _make_own_replay(work: Work, workers: int | None) -> Replay:
@@ -167,51 +172,33 @@ def _measure_progpy(work: Work, race: Race, cycles: int = 12) -> Rival:
 
 
 def _define_progpy_plant(work: Work) -> Any:
-    from progpy import PrognosticsModel
+    """The monitor without its controller."""
+    cell = Cell(*work.cells())
+    start = {name: np.zeros(len(work.values)) for name in ("xs", "xj", "v", "sliding")}
+    start["xj"] += work.position[0]
 
-    cell, names = Cell(*work.cells()), ["xs", "xj", "v", "sliding"]
+    def advance(x: Any, u: Any) -> Any:
+        drawn = x["xj"] + ANCHOR * work.h * (u["measured"] - x["xj"])
+        return step_monitor(np, (x["xs"], drawn, x["v"], x["sliding"]), u["current"], work.h, cell)
 
-    class Plant(PrognosticsModel):  # type: ignore[misc]
-        """The monitor without its controller."""
-
-        is_vectorized = True
-        inputs, states, outputs = ["current", "measured"], names, ["xj"]
-        events: list[str] = []  # noqa: RUF012  (the library's own way)
-
-        def initialize(self, u: Any = None, z: Any = None) -> Any:
-            rest = {name: np.zeros(len(work.values)) for name in names}
-            return self.StateContainer(rest | {"xj": np.full(len(work.values), work.position[0])})
-
-        def next_state(self, x: Any, u: Any, dt: float) -> Any:
-            drawn = x["xj"] + ANCHOR * work.h * (u["measured"] - x["xj"])
-            after = step_monitor(np, (x["xs"], drawn, x["v"], x["sliding"]), u["current"], work.h, cell)
-            return self.StateContainer(dict(zip(names, after, strict=True)))
-
-        def output(self, x: Any) -> Any:
-            return self.OutputContainer({"xj": x["xj"]})
-
-    return Plant(process_noise=0, measurement_noise=0)
+    return make_progpy_plant(start, ("current", "measured"), ("xj",), advance)
 
 
 def step_monitor(xp: Any, s: Any, current: Any, h: float, c: Any) -> tuple[Any, ...]:
     """`plant.monitor.step_monitor` on arrays of the library `xp`: XS, XJ, XJ', which way the spool slides."""
     xs, xj, v0, sliding = s
     tilt = c.tilt * current - c.back * xs
-    asked = tilt - _clip(xp, tilt, c.slide)
+    asked = tilt - clip(xp, tilt, c.slide)
     asked = xp.where((asked * sliding > 0.0) | (xp.abs(tilt) > c.dead), asked, 0.0)
-    begin = _clip(xp, asked, c.most)
+    begin = clip(xp, asked, c.most)
     wait = xp.minimum(xp.abs(asked - begin) * c.wait, h)
     end = begin * xp.exp(c.rate * (wait - h))
     line, curve, left = c.speed * begin * wait, (begin - end) * c.unback, h - wait
-    spool = _clip(xp, xs + line + curve, c.spool_travel)
+    spool = clip(xp, xs + line + curve, c.spool_travel)
     area = line * (0.5 * wait + left) + (begin * left - (begin - end) * c.unrate) * c.unback
-    total = _clip(xp, h * xs + area, h * c.spool_travel)
+    total = clip(xp, h * xs + area, h * c.spool_travel)
     before = xs - c.lag * c.speed * begin
     free = c.follow * (spool - c.lag * c.speed * end) + (v0 - c.follow * before) * c.fade
     v = xp.minimum(xp.maximum(free, c.coast * v0 - c.push), c.coast * v0 + c.push)
     x = xj + xp.where(v == free, c.follow * total - c.lag * (v - v0), 0.5 * h * (v0 + v))
-    return spool, _clip(xp, x, c.jack_travel), xp.where(xp.abs(x) <= c.jack_travel, v, 0.0), xp.sign(asked)
-
-
-def _clip(xp: Any, x: Any, limit: Any) -> Any:
-    return xp.maximum(xp.minimum(x, limit), -limit)
+    return spool, clip(xp, x, c.jack_travel), xp.where(xp.abs(x) <= c.jack_travel, v, 0.0), xp.sign(asked)

@@ -3,6 +3,7 @@
 import ctypes
 import tempfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -15,7 +16,19 @@ from plant import Model, simulate
 from plant.eha import compute_coefficients
 from plant.lanes import STEPS, Lanes
 from rig.bench.benchmarks import FLAGS, SAME_ROUNDING, build_library, measure_median_duration
-from studies.peers.rivals import Race, Replay, Rival, explain_missing, explain_missing_gcc, race_rivals, skip_rival
+from studies.peers.rivals import (
+    Maker,
+    Race,
+    Replay,
+    Rival,
+    clip,
+    explain_missing,
+    explain_missing_gcc,
+    make_progpy_plant,
+    make_replays,
+    race_rivals,
+    skip_rival,
+)
 
 Array = NDArray[np.float64]
 
@@ -111,29 +124,15 @@ def make_progpy_replay(task: Task) -> Replay:
 
 
 def _define_progpy_plant(task: Task) -> Any:
-    from progpy import PrognosticsModel
-
-    p, h, names = _make_namespaces(task.parameters), task.h, ["xf", "vf", "xs", "vs", "xj", "vj", "p12"]
+    """The reference model without its controller."""
+    p, h = _make_namespaces(task.parameters), task.h
     k = compute_coefficients(p, h)
+    start = {name: np.zeros(len(task.values)) for name in ("xf", "vf", "xs", "vs", "xj", "vj", "p12")}
 
-    class Plant(PrognosticsModel):  # type: ignore[misc]
-        """The reference model without its controller."""
+    def advance(x: Any, u: Any) -> Any:
+        return step_bare_model(np, [x[name] for name in start], u["current"], u["load"], p, k, h)
 
-        is_vectorized = True
-        inputs, states, outputs = ["current", "load"], names, ["xj", "p12", "xs"]
-        events: list[str] = []  # noqa: RUF012  (the library's own way)
-
-        def initialize(self, u: Any = None, z: Any = None) -> Any:
-            return self.StateContainer({name: np.zeros(len(task.values)) for name in names})
-
-        def next_state(self, x: Any, u: Any, dt: float) -> Any:
-            after = step_bare_model(np, [x[name] for name in names], u["current"], u["load"], p, k, h)
-            return self.StateContainer(dict(zip(names, after, strict=True)))
-
-        def output(self, x: Any) -> Any:
-            return self.OutputContainer({name: x[name] for name in self.outputs})
-
-    return Plant(process_noise=0, measurement_noise=0)
+    return make_progpy_plant(start, ("current", "load"), ("xj", "p12", "xs"), advance)
 
 
 def _make_namespaces(groups: Mapping[str, Mapping[str, Any]]) -> Any:
@@ -156,29 +155,25 @@ def step_bare_model(xp: Any, s: Any, current: Any, load: Any, p: Any, k: Any, h:
     v = _slide(xp, vj, p.jack.mass * vj - h * load, h * p.jack.area, line, k.valve_slope, k.valve_limit, dry,
                k.jack_free, k.jack_coupled)
     xj, vj = _travel(xp, xj, vj, v, h, p.jack.travel)
-    return xf, vf, xs, vs, xj, vj, _clip(xp, line - k.valve_slope * vj, k.valve_limit)
-
-
-def _clip(xp: Any, x: Any, limit: Any) -> Any:
-    return xp.maximum(xp.minimum(x, limit), -limit)
+    return xf, vf, xs, vs, xj, vj, clip(xp, line - k.valve_slope * vj, k.valve_limit)
 
 
 def _soften(xp: Any, x: Any, band: Any) -> Any:
-    return x - _clip(xp, x, band)
+    return x - clip(xp, x, band)
 
 
 def _slide(xp: Any, v0: Any, impulse: Any, push: Any, line: Any, slope: Any, limit: Any, dry: Any, free: Any,
            coupled: Any) -> Any:
     v = _soften(xp, coupled * impulse + coupled * push * line, coupled * dry)
     wanted = line - slope * v
-    held = _clip(xp, wanted, limit)
+    held = clip(xp, wanted, limit)
     v = xp.where(held == wanted, v, _soften(xp, impulse + push * held, dry) * free)
     return xp.minimum(xp.maximum(v, xp.where(v0 > 0.0, 0.0, -xp.inf)), xp.where(v0 < 0.0, 0.0, xp.inf))
 
 
 def _travel(xp: Any, x0: Any, v0: Any, v: Any, h: float, limit: Any) -> tuple[Any, Any]:
     x = (x0 + 0.5 * h * v0) + 0.5 * h * v
-    return _clip(xp, x, limit), xp.where(xp.abs(x) <= limit, v, 0.0)
+    return clip(xp, x, limit), xp.where(xp.abs(x) <= limit, v, 0.0)
 
 
 OURS = "ours, one thread"
@@ -191,7 +186,7 @@ def compare_many_runs(command: Array, progress: Progress = ignore_progress, roun
     task = _make_task(command, runs, cycles)
     with tempfile.TemporaryDirectory() as folder:
         progress("many runs at once: compiling the rivals", 0.0)
-        replays, skipped = _make_rivals(task, Path(folder))
+        replays, skipped = make_replays(_list_makers(task, Path(folder)))
         progress("many runs at once", 0.0)
         race = race_rivals(replays, OURS, runs * cycles * task.steps, rounds, _compare_positions)
     progress("many runs at once: ProgPy", 0.0)
@@ -206,24 +201,16 @@ def _make_task(command: Array, runs: int, cycles: int, first: int = 500) -> Task
     return Task(model, NAMES, spread * [1.0, model[NAMES[1]]], current, np.zeros(cycles), STEPS)
 
 
-def _make_rivals(task: Task, folder: Path) -> tuple[dict[str, Replay], list[Rival]]:
-    """The rivals that can be measured here, and the others with the reason."""
-    replays: dict[str, Replay] = {OURS: _make_own_replay(task, 1),
-                                  "ours, a thread a core": _make_own_replay(task, None)}
-    skipped = []
+def _list_makers(task: Task, folder: Path) -> dict[str, Maker]:
+    """What makes each rival, by name."""
     in_c = {"C, one run after the other": ("replay_each", FLAGS), "C, 16 runs side by side": ("replay_lanes", FLAGS),
             "C, 64 runs side by side": ("replay_lanes", (*FLAGS, "-DWIDTH=64")),
             "C, 16 runs, -ffp-contract=off": ("replay_lanes", SAME_ROUNDING)}
-    for number, (name, (function, flags)) in enumerate(in_c.items()):
-        if reason := explain_missing_gcc():
-            skipped.append(skip_rival(name, reason))
-        else:
-            replays[name] = make_c_replay(task, function, flags, folder / f"{number}.so")
-    if reason := explain_missing("jax"):
-        skipped.append(skip_rival("jax, vmap", reason))
-    else:
-        replays["jax, vmap"] = make_jax_replay(task)
-    return replays, skipped
+    return {OURS: ("", partial(_make_own_replay, task, 1)),
+            "ours, a thread a core": ("", partial(_make_own_replay, task, None)),
+            **{name: (explain_missing_gcc(), partial(make_c_replay, task, function, flags, folder / f"{number}.so"))
+               for number, (name, (function, flags)) in enumerate(in_c.items())},
+            "jax, vmap": (explain_missing("jax"), partial(make_jax_replay, task))}
 
 
 def _make_own_replay(task: Task, workers: int | None) -> Replay:

@@ -1,8 +1,8 @@
 """What both comparisons share: compilers, optional libraries, and rivals measured in alternating rounds."""
 
 import importlib.util
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,10 @@ from rig.bench.benchmarks import GET_GCC, find_gcc, measure_durations
 Array = NDArray[np.float64]
 Replay = Callable[[], Array]
 """A rival's runs; each call makes all of them and returns their results."""
+
+Maker = tuple[str, Callable[[], Replay]]
+"""Why a rival cannot be measured here, "" if it can be; and what makes its replay."""
+
 
 GET_EXTRA = "pip install 'eha-rig[bench]'"
 
@@ -52,6 +56,12 @@ def race_rivals(replays: Mapping[str, Replay], reference: str, steps: int, round
     return Race(rivals, results[reference], steps / float(np.median(seconds[reference])))
 
 
+def make_replays(makers: Mapping[str, Maker]) -> tuple[dict[str, Replay], list[Rival]]:
+    """The rivals that can be measured here, and the others with the reason."""
+    replays = {name: make() for name, (reason, make) in makers.items() if not reason}
+    return replays, [skip_rival(name, reason) for name, (reason, _) in makers.items() if reason]
+
+
 def skip_rival(name: str, reason: str) -> Rival:
     """A rival that could not be measured."""
     return Rival(name, None, None, None, f"skipped, {reason}")
@@ -65,3 +75,39 @@ def explain_missing_gcc() -> str:
 def explain_missing(module: str) -> str:
     """Why a rival from the extra `bench` cannot be measured; "" if it is installed."""
     return "" if importlib.util.find_spec(module) else f"{module} is not installed; to get it: {GET_EXTRA}"
+
+
+def make_progpy_plant(start: Mapping[str, Array], given: Sequence[str], read: Sequence[str],
+                      advance: Callable[[Any, Any], Sequence[Any]]) -> Any:
+    """A model of ProgPy, vectorised over the runs, without noise.
+
+    Args:
+        start: the states, (m,) each.
+        given: the inputs.
+        read: the states that are outputs.
+        advance: from states and inputs to the next states.
+    """
+    from progpy import PrognosticsModel
+
+    class Plant(PrognosticsModel):  # type: ignore[misc]
+        """The plant without its controller."""
+
+        is_vectorized = True
+        inputs, states, outputs = list(given), list(start), list(read)
+        events: list[str] = []  # noqa: RUF012  (the library's own way)
+
+        def initialize(self, u: Any = None, z: Any = None) -> Any:
+            return self.StateContainer(dict(start))
+
+        def next_state(self, x: Any, u: Any, dt: float) -> Any:
+            return self.StateContainer(dict(zip(start, advance(x, u), strict=True)))
+
+        def output(self, x: Any) -> Any:
+            return self.OutputContainer({name: x[name] for name in read})
+
+    return Plant(process_noise=0, measurement_noise=0)
+
+
+def clip(xp: Any, x: Any, limit: Any) -> Any:
+    """An array of the library `xp` within +- limit."""
+    return xp.maximum(xp.minimum(x, limit), -limit)

@@ -19,7 +19,7 @@ def test_it_finds_gains_and_delay_exactly(delay: int) -> None:
     found = fit_directional_gains(error[delay:], answer[delay:], side[delay:])
     assert (found.out, found.back, found.delay) == pytest.approx((10.0, 7.0, delay))
     assert found.residual == pytest.approx(0.0, abs=1e-9) and found.exact == 1.0
-    assert found.asymmetry == pytest.approx(-0.3) and found.limit <= 1000.0
+    assert found.asymmetry == pytest.approx(-0.3)
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no measurements at {DATA.name}: they belong to others")
