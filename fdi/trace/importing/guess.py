@@ -42,7 +42,6 @@ WORDS: Mapping[str, Sequence[tuple[str, float]]] = {
 }
 OWN_WORD = 3.0  # points of a signal's own name or symbol
 TIME_WORDS = r"t|time|zeit|temps|tiempo|tempo|timestamp|timestamps|seconds|sec|uhrzeit|exp time"
-COUNTER_WORDS = r"cnt|count|counter|cycle|tick|ticks|zahler|zaehler|compteur|contador|frame|sample|seq"
 # SI: smallest and largest amplitude that an actuator has; units that are tried, the usual ones first. By SI unit; of a
 # length by role, as a valve's is shorter.
 RANGES: Mapping[str, tuple[float, float, tuple[str, ...]]] = {
@@ -178,56 +177,24 @@ def _guess_time(measurement: Measurement, columns: Columns) -> tuple[list[str], 
                     f"source = {_quote(date)}", 'unit = "iso"'], date, "likely"
         return ["[time]  # unsure: no column grows from row to row; put in the true rate",
                 "rate = 1000.0  # rows a second"], None, "unsure"
-    name, x = best.source, columns.data[best.source]
-    lines = [f"[time]  # {best.confidence}: {', '.join(best.reasons)}", f"source = {_quote(name)}"]
-    bits, has_unit = _find_bits(x), columns.measures(name, "s")
-    if not bits:
-        return [*lines, _guess_time_unit(columns.units[name], x)], name, best.confidence
-    rate = _guess_count_rate(columns.units[name] if has_unit else "", x)
-    return [*lines, f"bits = {bits}", rate], name, best.confidence if has_unit else "unsure"
+    name = best.source
+    return [f"[time]  # {best.confidence}: {', '.join(best.reasons)}", f"source = {_quote(name)}",
+            _guess_time_unit(columns.units[name], columns.data[name])], name, best.confidence
 
 
 def _rate_time(name: str, x: Floats, columns: Columns) -> Guess:
     """How well a column does as the time; no points for one that cannot be."""
     guess, steps = Guess(name, UNITS["s"]), np.diff(x)
-    if (steps > 0).all():
-        guess.note(2.0, "it grows in every row")
-        if float(np.median(np.abs(steps - np.median(steps)))) <= 0.01 * float(np.median(steps)):
-            guess.note(1.0, "evenly")
-    elif _find_bits(x):
-        guess.note(1.5, "it counts up and starts again")
-    else:
+    if not (steps > 0).all():
         return guess
+    guess.note(2.0, "it grows in every row")
+    if float(np.median(np.abs(steps - np.median(steps)))) <= 0.01 * float(np.median(steps)):
+        guess.note(1.0, "evenly")
     if _has_word(name, TIME_WORDS):
         guess.note(2.0, "its name says time")
-    elif _has_word(name, COUNTER_WORDS):
-        guess.note(0.5, "its name says counter")
     if columns.measures(name, "s"):
         guess.note(2.0, f"its unit is {columns.units[name]}")
     return guess
-
-
-def _find_bits(x: Floats) -> int | None:
-    """Bits of a counter that wraps: whole numbers that grow and fall back by nearly a power of two."""
-    steps = np.diff(x)
-    if (x != np.floor(x)).any() or (x < 0).any() or not (steps < 0).any() or (steps == 0).any():
-        return None
-    bits = max(1, math.ceil(math.log2(float(x.max()) + 1)))
-    usual = float(np.median(steps))
-    back = steps[steps < 0] + 2.0**bits
-    is_wrap = usual > 0 and bool((np.abs(back - usual) < 0.1 * 2.0**bits).all()) and (steps < 0).mean() < 0.2
-    return bits if is_wrap else None
-
-
-def _guess_count_rate(said: str, x: Floats) -> str:
-    """The line of a counter's rate; `said`: the unit of time that the header gives, "" for none."""
-    steps = np.diff(x)
-    step = float(np.median(steps[steps > 0]))
-    unit = find_unit(said)
-    if unit is None:
-        return f"rate = {1000.0 * step:.15g}  # counts a second: put in the true one (rows every 1 ms were assumed)"
-    counts = float(1 / unit.factor)
-    return f"rate = {counts:.15g}  # counts a second, as the header says ({said}): {counts / step:g} rows a second"
 
 
 def _guess_time_unit(said: str, x: Floats) -> str:

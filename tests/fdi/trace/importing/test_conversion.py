@@ -120,20 +120,6 @@ def test_guess_of_a_table_without_names(tmp_path: Path) -> None:
     assert "# [signals.cor]" in guessed.text and "every analysis needs it" in guessed.text
 
 
-@pytest.mark.parametrize(("name", "step", "size", "said"), [
-    ("cnt", 1, 256, 'source = "cnt"\nbits = 8\nrate = 1000  # counts a second: put in the true one'),
-    ("cnt [us]", 500, 65536, "bits = 16\nrate = 1000000  # counts a second, as the header says (us): 2000 rows")])
-def test_guess_finds_a_counter_and_takes_its_rate_from_its_unit(name: str, step: int, size: int, said: str,
-                                                                tmp_path: Path) -> None:
-    """A counter of microseconds that wraps counts 1e6 a second: 500 counts a row are 2000 rows a second."""
-    lines = [f"{name};Sollwert_mm;Istwert_mm;i_mA"]
-    lines += [f"{step * (250 + k) % size};{math.sin(k / 90):.5f};{-math.sin(k / 90 - 0.1):.5f};{k % 3}"
-              for k in range(2000)]
-    guessed = guess(tmp_path, lines)
-    assert said in guessed.text and "sign = -1" in guessed.text
-    assert (guessed.chosen["time"][1] == "unsure") == (name == "cnt")
-
-
 @pytest.mark.parametrize("unit", ["counts", "V"])  # no unit, and that of another quantity
 def test_guess_scales_counts_and_writes_their_step(tmp_path: Path, unit: str) -> None:
     """Counts of 5 um, offset 1000, of a ram that lags and meets an end stop: scale from Com and Cor; Cor not reversed.
