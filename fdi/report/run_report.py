@@ -33,6 +33,7 @@ from fdi.report.drawing import (
     label_signal,
     legend,
     level,
+    levels,
     line,
     shade,
     spans,
@@ -394,7 +395,7 @@ def _draw_checks(trace: Trace) -> Panel:
 
 
 UNIT_SIZES = {name: float(unit.factor) for name, unit in UNITS.items()}
-BOTH = (1.0, -1.0)  # sides of zero
+Place = Callable[[float, str, str, float, str], Sequence[Mark]]  # of a number: colour, label, width and style of lines
 
 
 class _View(NamedTuple):
@@ -423,10 +424,6 @@ class _View(NamedTuple):
     def known(self) -> tuple[str, ...]:
         return (*self.trace.declared.names, "error", "speed")
 
-    @property
-    def symbol(self) -> str:
-        return self.trace.declared.controlled.symbol
-
     def find_unit(self, name: str) -> str:
         """The unit in which a signal, `error` or `speed` is shown."""
         d = self.trace.declared
@@ -441,16 +438,22 @@ class _View(NamedTuple):
         before = float(command[self.rows.start - 1] if self.rows.start else self.trace.controlled[0])
         return before, float(command[self.rows.stop - 1]) - before
 
-    def compute_share(self) -> Floats:
-        """How much of the step the plant has done, %; filtered as the checks do it."""
-        before, size = self.step
-        return 100.0 * (filter_median(self.shown.controlled, 1.0 / self.trace.period) - before) / size
+    def to_seconds(self, value: float) -> float:
+        """A time in the unit of the check."""
+        return value * UNIT_SIZES.get(self.check.unit, 1.0)
+
+    @property
+    def longest(self) -> float:
+        """The longest of the measured time and its limits, s; 0 without any."""
+        known = (x for x in (self.check.value, self.check.high, self.check.low) if not math.isnan(x))
+        return max((abs(self.to_seconds(x)) for x in known), default=0.0)
 
 
 def draw_failed_check(trace: Trace, check: CheckResult, salt: str = "check") -> str:
     """The window of a check with its limits and what was measured; "" for a check without window or signal.
 
-    `salt` keeps the ids of the figure apart from those of other figures of the page.
+    Sizes are horizontal lines in the unit of the check, times are vertical ones after the instant from which they
+    count. `salt` keeps the ids of the figure apart from those of other figures of the page.
     """
     draw = DRAWERS.get(check.kind)
     if draw is None or math.isnan(check.t0):
@@ -460,167 +463,95 @@ def draw_failed_check(trace: Trace, check: CheckResult, salt: str = "check") -> 
     if stop - first < 2 or (draw is not _draw_reaction and check.signal and (
             check.signal not in view.known or np.isnan(view.read(check.signal)).all())):
         return ""
-    is_still = abs(view.step[1]) <= 1e-6 * trace.scale
-    if draw in STEP_DRAWERS and (is_still or (draw is _draw_overshoot and math.isnan(check.value))):
+    if draw is _draw_step and abs(view.step[1]) <= 1e-6 * trace.scale:
         draw = _draw_response
     return draw_panels(salt, [[[axes(xlim=(check.t0, check.t1), xlabel="time [s]"), *draw(view), legend(6)]]], 2.3)
 
 
-def _draw_overshoot(view: _View) -> Panel:
-    """Beyond the target, % of the step; from 20 ms before the step until four times the time to the peak."""
-    check, t, beyond = view.check, view.shown.t, view.compute_share() - 100.0
-    peak = t[int(np.nanargmax(beyond))]
-    high = 1.5 * max(check.value, np.nan_to_num(check.high))
-    return [line(t, beyond, BLUE, f"{view.symbol} beyond the target", 1.2), *_draw_limits(check),
-            dot(peak, check.value, RED, _name_value(check)),
-            axes(ylim=(-high, high), xlim=(t[0], min(t[-1], t[0] + max(0.06, 4.0 * (peak - t[0])))),
-                 ylabel="beyond the\ntarget [%]")]
-
-
-def _draw_rise_time(view: _View) -> Panel:
-    """Share of the step that is done, with the times of 10 % and 90 %."""
-    t, done = view.shown.t, view.compute_share()
-    start = next(iter(t[done >= 10.0]), math.nan)
-    return [line(t, done, BLUE, f"{view.symbol}, share of the step", 1.2),
-            *(level(share, COMMAND, width=0.8, style=":") for share in (10.0, 90.0)),
-            *([] if math.isnan(start) else [instant(start, COMMAND, width=0.8, style=":"), *_draw_times(view, start)]),
-            axes(ylim=(-10.0, 125.0), ylabel="done [%]")]
-
-
-def _draw_settling_time(view: _View) -> Panel:
-    """Distance from the target; the position has to stay near it after the time limit."""
-    check, t = view.check, view.shown.t
-    beyond = math.copysign(1.0, view.step[1]) * (view.compute_share() - 100.0)
-    panel = [line(t, beyond, BLUE, f"{view.symbol} less the target", 1.2), *_draw_times(view, float(t[0]))]
-    size = 110.0
-    if check.value > 0.0:
-        last_outside = round(_to_seconds(check, check.value) / view.trace.period) - 1
-        band = abs(float(beyond[min(max(last_outside, 0), len(beyond) - 1)]))
-        panel += _draw_sides(band, COMMAND, "band", BOTH, style=":", width=0.8)
-        size = min(6.0 * band, 110.0)
-    return [*panel, axes(ylim=(-size, size), ylabel="off the target\n[% of the step]")]
+def _draw_step(view: _View) -> Panel:
+    """What is left of a step, % of it: the overshoot at its peak, or the times of rising and of settling."""
+    check, t, (before, size) = view.check, view.shown.t, view.step
+    beyond = 100.0 * ((filter_median(view.shown.controlled, 1.0 / view.trace.period) - before) / size - 1.0)
+    panel = [line(t, beyond, BLUE, f"{view.trace.declared.controlled.symbol} beyond the target", 1.2),
+             axes(ylabel="beyond the\ntarget [%]")]
+    if check.kind == "overshoot":
+        row = int(np.nanargmax(beyond))
+        high = 1.5 * max(float(beyond[row]), np.nan_to_num(check.high))
+        return [*panel, *_draw_lines(check, lambda y, *style: [level(y, *style)]), dot(t[row], beyond[row], RED),
+                axes(ylim=(-high, high), xlim=(t[0], min(t[-1], t[0] + max(0.06, 4.0 * (t[row] - t[0])))))]
+    is_rise = check.kind == "rise_time"
+    start = next(iter(t[beyond >= -90.0]), t[0]) if is_rise else t[0]
+    return [*panel, *_draw_times(view, start), axes(ylim=(-110.0 if is_rise else -25.0, 25.0), xlim=(
+        t[0], min(t[-1], start + 3.0 * view.longest)))]
 
 
 def _draw_size(view: _View) -> Panel:
     """Position error or a signal with its limits and the measured mean, RMS, band or largest size.
 
-    Limits stand on both sides of zero where the size counts; around the middle of the band at break-away.
+    They stand on both sides of zero; around the middle of the band at break-away.
     """
-    check, is_error = view.check, view.check.kind != "never_exceeds"
+    check, is_error, d, t = view.check, view.check.kind != "never_exceeds", view.trace.declared, view.shown.t
     name = "error" if is_error else check.signal
     values = view.read(name) / UNIT_SIZES.get(check.unit, 1.0)
     filtered = filter_median(values, 1.0 / view.trace.period) if is_error else values
-    middle = 0.0
-    sides: tuple[float, ...] = BOTH
-    if check.kind == "break_away":
-        values, middle = filtered, 0.5 * float(np.nanpercentile(filtered, (1, 99)).sum())
-    elif check.kind in ("steady_error", "ramp_error"):
-        com = view.shown.command
-        sides = (float(np.sign(com[-1] - com[0] if check.kind == "ramp_error" else np.nanmean(values))),)
-    d, t = view.trace.declared, view.shown.t
-    words = f"error, {d.command.symbol} - {d.controlled.symbol}" if is_error else name
-    panel = [line(t, values, BLUE, words, 0.9),
-             axes(ylabel=f"{name} [{check.unit}]"), *_draw_limits(check, sides, middle)]
-    if check.kind in ("max_error", "never_exceeds"):
-        row = int(np.nanargmax(np.abs(filtered)))
-        return [*panel, dot(t[row], filtered[row], RED, _name_value(check))]
-    return [*panel, *_draw_sides(check.value, RED, _name_value(check), sides, middle)]
+    middle = 0.5 * float(np.nanpercentile(filtered, (1, 99)).sum()) if check.kind == "break_away" else 0.0
+    row = int(np.nanargmax(np.abs(filtered)))
+    return [line(t, values, BLUE, f"error, {d.command.symbol} - {d.controlled.symbol}" if is_error else name, 0.9),
+            *_draw_lines(check, partial(levels, middle=middle)), axes(ylabel=f"{name} [{check.unit}]"),
+            *([dot(t[row], filtered[row], RED)] if check.kind in ("max_error", "never_exceeds") else [])]
 
 
 def _draw_response(view: _View) -> Panel:
-    """Demand and position; for a gain also the amplitudes that the limits allow."""
-    d, shown = view.trace.declared, view.shown
-    scale, command, unit = d.controlled.shown_scale, d.command.symbol, d.controlled.shown_unit
-    com, check = scale * shown.command, view.check
+    """Demand and position; for a gain also the amplitudes that the limits allow, and the measured one."""
+    d, shown, is_gain = view.trace.declared, view.shown, view.check.kind == "amplitude_ratio"
+    scale, com = d.controlled.shown_scale, d.controlled.shown_scale * shown.command
     middle, amplitude = 0.5 * (np.nanmax(com) + np.nanmin(com)), 0.5 * (np.nanmax(com) - np.nanmin(com))
-    limits = (check.low, check.high) if check.kind == "amplitude_ratio" else ()
-    return [line(shown.t, com, COMMAND, command, 1.6),
+    return [line(shown.t, com, COMMAND, d.command.symbol, 1.6),
             line(shown.t, scale * shown.controlled, BLUE, d.controlled.symbol),
-            *(mark for limit in limits
-              for mark in _draw_sides(limit * amplitude, AMBER, f"{limit:g} of {command}", BOTH, middle, "--")),
-            _write_in_legend(_name_value(check)),
-            axes(ylabel=f"{'position' if d.controlled.unit == 'm' else d.controlled.symbol} [{unit}]")]
+            *_draw_lines(view.check, lambda y, *style: levels(y * amplitude, *style, middle=middle) if is_gain else [
+                line([], [], style[0], style[1], ls=style[3])]),
+            axes(ylabel=f"{'position' if d.controlled.unit == 'm' else d.controlled.symbol} "
+                        f"[{d.controlled.shown_unit}]")]
 
 
 def _draw_reaction(view: _View) -> Panel:
     """The signal, or the current where the check is about none, around the instant from which the reaction counts.
 
-    Vertical lines: that instant, the latest time that the limits allow, and when the reaction came. Of a log without
-    the instant, which earlier versions wrote, the window is drawn.
-    """
-    check = view.check
-    name = check.signal if check.signal in view.known else view.trace.declared.drive.name
-    unit = view.find_unit(name)
-    size = UNIT_SIZES.get(unit, 1.0)
-    if not math.isnan(check.after):
-        view = view._replace(rows=_find_reaction_rows(view))
-    t = view.shown.t
-    panel = [line(t, view.read(name) / size, BLUE, name, 1.2), axes(ylabel=f"{name} [{unit}]")]
-    if math.isnan(check.after):
-        return [*panel, _write_in_legend(f"{_name_value(check)}; limits in the table")]
-    unmeasured = [_write_in_legend(_name_value(check))] if math.isnan(check.value) else []
-    begin = "clean-up begins" if check.kind == "recovers" else f"from {check.after:g} s"
-    bounds = ((x / size, word) for x, word in ((check.above, "above"), (check.below, "below")))
-    return [*panel, instant(check.after, COMMAND, begin, 1.2, ":"),
-            *(level(x, COMMAND, f"{word} {x:g} {unit}", 1.2, "--") for x, word in bounds if not math.isnan(x)),
-            *_draw_times(view, check.after), *unmeasured, axes(xlim=(t[0], t[-1]))]
-
-
-def _find_reaction_rows(view: _View, least: float = 0.02) -> slice:
-    """The rows around a reaction: from half its longest time before the instant to three times that after it.
-
-    Where it did not come, ten times the limit is shown. `least`: s after the instant.
+    From half its longest time before that instant to three times that after it; where it did not come, ten times.
     """
     check, trace = view.check, view.trace
-    times = [_to_seconds(check, x) for x in (check.value, check.high, check.low) if not math.isnan(x)]
-    longest = max([abs(t) for t in times], default=0.0)
-    after = max((10.0 if math.isnan(check.value) else 3.0) * longest, least)
-    first, stop = np.searchsorted(trace.t, [check.after - max(0.5 * longest, 0.5 * least), check.after + after])
-    return slice(int(first), int(stop)) if stop - first > 1 else view.rows
+    name = check.signal if check.signal in view.known else trace.declared.drive.name
+    unit, least = view.find_unit(name), 0.02  # s after the instant that are shown
+    size = UNIT_SIZES.get(unit, 1.0)
+    after = max((10.0 if math.isnan(check.value) else 3.0) * view.longest, least)
+    first, stop = np.searchsorted(trace.t, [check.after - 0.5 * max(view.longest, least), check.after + after])
+    rows = slice(int(first), int(stop)) if stop - first > 1 else view.rows
+    t = trace.t[rows]
+    begin = "clean-up begins" if check.kind == "recovers" else f"from {check.after:g} s"
+    bounds = ((x / size, word) for x, word in ((check.above, "above"), (check.below, "below")))
+    return [line(t, view._replace(rows=rows).read(name) / size, BLUE, name, 1.2),
+            instant(check.after, COMMAND, begin, 1.2, ":"),
+            *(level(x, COMMAND, f"{word} {x:g} {unit}", 1.2, "--") for x, word in bounds if not math.isnan(x)),
+            *_draw_times(view, check.after), axes(xlim=(t[0], t[-1]), ylabel=f"{name} [{unit}]")]
 
 
 def _draw_times(view: _View, start: float) -> list[Mark]:
-    """Vertical lines at the time limits and at the measured time, s after `start`.
-
-    The panel then shows three times the longest of these; the whole window if nothing was measured.
-    """
-    check = view.check
-    marks = [instant(start + _to_seconds(check, limit), AMBER, f"{word} {limit:g} {check.unit}", 1.4, "--")
-             for limit, word in ((check.low, "least"), (check.high, "most")) if not math.isnan(limit)]
-    if math.isnan(check.value):
-        return marks
-    longest = _to_seconds(check, float(np.nanmax([check.value, check.high, check.low])))
-    return [*marks, instant(start + _to_seconds(check, check.value), RED, _name_value(check), 1.4),
-            axes(xlim=(view.shown.t[0], min(float(view.shown.t[-1]), start + 3.0 * longest)))]
+    """The limits and the measured time as vertical lines, s after `start`."""
+    return _draw_lines(view.check, lambda x, *style: [instant(start + view.to_seconds(x), *style)])
 
 
-def _to_seconds(check: CheckResult, value: float) -> float:
-    return value * UNIT_SIZES.get(check.unit, 1.0)
+def _draw_lines(check: CheckResult, place: Place) -> list[Mark]:
+    """The limits, dashed, and the measured value where `place` puts them; a word where nothing was measured."""
+    lines = ((check.low, AMBER, f"least {check.low:g}{check.unit_behind}", "--"),
+             (check.high, AMBER, f"most {check.high:g}{check.unit_behind}", "--"),
+             (check.value, RED, f"measured {check.measured}", "-"))
+    unmeasured = [line([], [], INK, check.measured, ls="")] if math.isnan(check.value) else []
+    return [*(mark for x, colour, label, style in lines if not math.isnan(x)
+              for mark in place(x, colour, label, 1.4, style)), *unmeasured]
 
 
-def _draw_sides(size: float, colour: str, label: str, sides: Sequence[float], middle: float = 0.0, style: str = "-",
-                width: float = 1.4) -> list[Mark]:
-    """A level on each of these sides of `middle`, with one label; none for NaN."""
-    return [level(middle + side * size, colour, label if side == sides[0] else None, width, style)
-            for side in sides if not math.isnan(size)]
-
-
-def _draw_limits(check: CheckResult, sides: Sequence[float] = (1.0,), middle: float = 0.0) -> list[Mark]:
-    return [mark for limit, word in ((check.low, "least"), (check.high, "most"))
-            for mark in _draw_sides(limit, AMBER, f"{word} {limit:g}{check.unit_behind}", sides, middle, "--")]
-
-
-def _write_in_legend(text: str) -> Mark:
-    return line([], [], INK, text, ls="")
-
-
-def _name_value(check: CheckResult) -> str:
-    return check.measured if math.isnan(check.value) else f"measured {check.measured}"
-
-
-STEP_DRAWERS = (_draw_overshoot, _draw_rise_time, _draw_settling_time)
 DRAWERS: Mapping[str, Callable[[_View], Panel]] = {
-    "overshoot": _draw_overshoot, "rise_time": _draw_rise_time, "settling_time": _draw_settling_time,
+    **dict.fromkeys(("overshoot", "rise_time", "settling_time"), _draw_step),
     **dict.fromkeys(("steady_error", "ramp_error", "max_error", "rms_error"), _draw_size),
     **dict.fromkeys(("break_away", "never_exceeds"), _draw_size),
     **dict.fromkeys(("amplitude_ratio", "phase_lag"), _draw_response),
