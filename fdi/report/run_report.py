@@ -508,7 +508,8 @@ def _draw_response(view: _View) -> Panel:
     middle, amplitude = 0.5 * (np.nanmax(com) + np.nanmin(com)), 0.5 * (np.nanmax(com) - np.nanmin(com))
     return [line(shown.t, com, COMMAND, d.command.symbol, 1.6),
             line(shown.t, scale * shown.controlled, BLUE, d.controlled.symbol),
-            *_draw_lines(view.check, lambda y, *style: levels(y * amplitude, *style, middle=middle) if is_gain else [
+            *_draw_lines(view.check, lambda y, *style: [
+                level(middle + way * y * amplitude, *style) for way in (1.0, -1.0)] if is_gain else [
                 line([], [], style[0], style[1], ls=style[3])]),
             axes(ylabel=f"{'position' if d.controlled.unit == 'm' else d.controlled.symbol} "
                         f"[{d.controlled.shown_unit}]")]
