@@ -27,7 +27,6 @@ from fdi.diagnosis.faults import Fault, Level
 from fdi.diagnosis.precursors import (
     STEP_JUDGED_FROM,
     compute_half_range,
-    compute_speed,
     find_lasting_peak,
     find_stays,
     read_columns,
@@ -45,6 +44,7 @@ from fdi.thresholds import (
     SAME_COMMAND_TIME,
     SECTION_MEASURED_SHARE,
 )
+from fdi.trace.check_result import compute_speed
 from fdi.trace.sections import Section, describe_section, find_sections
 from fdi.trace.trace import Flags, Floats, Trace
 from plant.errors import InputError, require
@@ -381,7 +381,7 @@ def find_excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts:
     place = place_sections(bands, parts)
     notes: list[str] = []
     out: list[Excursion] = []
-    velocity = compute_speed(xj, period)
+    velocity = compute_speed(xj, 1.0 / period)
     shown: dict[str, list[tuple[float, float]]] = {fault.name: [] for fault in bands.faults if len(fault.amounts)}
     lost: dict[int, bool] = {}
     for ramp in bands.ramps:

@@ -34,7 +34,6 @@ from fdi.diagnosis.precursors import (
     STEP_JUDGED_UNTIL,
     compute_features,
     compute_half_range,
-    compute_speed,
     find_lasting_peak,
     is_slow_ramp,
     measure_step,
@@ -57,6 +56,7 @@ from fdi.thresholds import (
     RAMP_HEALTHY_SHARE,
     STEP_FAULT_LEAVES_SD,
 )
+from fdi.trace.check_result import compute_speed
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Floats, Trace, measure_scale
 from plant.errors import InputError, require
@@ -239,7 +239,7 @@ def _make_step_band(number: int, s: Section, period: float, sound: Floats, rubbi
 def _measure_ramp(x: Floats, com: Floats, s: Section, period: float) -> tuple[Floats, Floats]:
     """Following error, and speed beyond the demand's, of runs `x` (m, n) on a ramp, in its direction."""
     rows, way = select_ramp_rows(s, period), np.sign(s.rate)
-    return way * (com[rows] - x[:, rows]), way * compute_speed(x, period)[:, rows] - abs(s.rate)
+    return way * (com[rows] - x[:, rows]), way * compute_speed(x, 1.0 / period)[:, rows] - abs(s.rate)
 
 
 def _make_ramp_band(number: int, s: Section, com: Floats, period: float, fault: str, runs: Sequence[Floats]

@@ -3,7 +3,7 @@
 The mean error on a slow ramp is the classic sign of friction, but it does not depend on friction while the plant slides
 (docs/physics.md); the signal-to-noise ratios show which precursors are worth looking at. Each precursor is a mean over
 the sections of its kind. Noise of the position decides none of them: peaks are taken from running medians, ranges are
-between percentiles, and a reversal counts when it passes a quarter of the usual range.
+between percentiles.
 """
 
 import math
@@ -11,9 +11,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.thresholds import BAND_EVENT_SAMPLES, POSITION_MISSING_SHARE
+from fdi.trace.check_result import compute_speed, filter_median
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Flags, Floats, Trace, hold_last
 
@@ -40,18 +40,6 @@ def find_lasting_peak(x: Floats, lasting: int = BAND_EVENT_SAMPLES) -> Floats:
     """The highest level that x (.., n), time last, keeps for `lasting` rows in a row; NaN is below all levels."""
     windows = np.lib.stride_tricks.sliding_window_view(np.where(np.isnan(x), -np.inf, x), lasting, axis=-1)
     out: Floats = windows.min(axis=-1).max(axis=-1)
-    return out
-
-
-def compute_speed(x: Floats, period: float, span: float = 0.02) -> Floats:
-    """Speed, m/s, of a position (.., n) m, time last: difference over `span` s; NaN at the ends and beside gaps.
-
-    Over 20 ms, 2 um of noise become 0.14 mm/s. A spike of one sample becomes two of one sample each, so it does not
-    last either.
-    """
-    half = max(1, round(span / period / 2))
-    out = np.full(np.shape(x), np.nan)
-    out[..., half:-half] = (x[..., 2 * half:] - x[..., :-2 * half]) / (2 * half * period)
     return out
 
 
@@ -84,21 +72,14 @@ class Meaning(NamedTuple):
 MEANINGS = {
     "overshoot": Meaning("first overshoot", "%", 1.0),
     "undershoot": Meaning("undershoot after the overshoot", "%", 1.0),
-    "rise_time": Meaning("rise from 10 to 90 %", "ms", 1e3),
-    "peak_time": Meaning("time of the first peak", "ms", 1e3),
     "settling_time": Meaning("settling within 5 %", "ms", 1e3),
     "rest_error": Meaning("error at rest, RMS", "um", 1e6),
     "mean_ramp_error": Meaning("mean error on the ramp", "um", 1e6),
-    "ramp_asymmetry": Meaning("ramp error out less in, half", "um", 1e6),
     "break_away": Meaning("error at break-away", "um", 1e6),
-    "stick_slip_amplitude": Meaning("stick-slip amplitude", "um", 1e6),
-    "stick_slip_frequency": Meaning("stick-slip frequency", "Hz", 1.0),
     "speed_ripple": Meaning("speed ripple, s.d.", "mm/s", 1e3),
-    "slip_speed": Meaning("fastest slip", "mm/s", 1e3),
-    "stuck_share": Meaning("share of the ramp at rest", "%", 100.0),
     "tracking_error": Meaning("RMS error in motion", "um", 1e6),
 }
-OF_STEPS = ("overshoot", "undershoot", "rise_time", "peak_time", "settling_time")
+OF_STEPS = ("overshoot", "undershoot", "settling_time")
 
 
 class Precursor(NamedTuple):
@@ -187,7 +168,6 @@ def compute_features(com: Floats, x: Floats, period: float, parts: Sequence[Sect
     show are missing; those that a run does not show (an oscillation that never settles) are NaN.
     """
     out: dict[str, list[Floats]] = {}
-    ramps: dict[float, list[Floats]] = {1.0: [], -1.0: []}
     for s in parts:
         rows = slice(s.start, s.stop)
         if s.kind == "step" and abs(s.last - s.first) >= least_step * scale:
@@ -198,11 +178,8 @@ def compute_features(com: Floats, x: Floats, period: float, parts: Sequence[Sect
         elif is_slow_ramp(s, period, scale):
             for word, values in _measure_ramp_response(com, x, period, s):
                 out.setdefault(word, []).append(values)
-            ramps[float(np.sign(s.rate))].append(out["mean_ramp_error"][-1])
         elif s.kind == "dynamic":
             out.setdefault("tracking_error", []).append(np.sqrt(np.nanmean((com[rows] - x[:, rows])**2, axis=1)))
-    if ramps[1.0] and ramps[-1.0]:
-        out["ramp_asymmetry"] = [(np.mean(ramps[1.0], axis=0) - np.mean(ramps[-1.0], axis=0)) / 2]
     order = {word: i for i, word in enumerate(MEANINGS)}
     return {word: np.mean(out[word], axis=0) for word in sorted(out, key=lambda w: (order[find_kind(w)], w))}
 
@@ -223,7 +200,7 @@ def measure_step(x: Floats, s: Section, period: float, settling_band: float = 0.
     A run has settled once it stays within `settling_band` of the step for `settled_for` s, as an oscillation passes
     through the band now and then. `at_rest_after` s after the step it should be at rest.
     """
-    y = (smooth_spikes(x) - s.first) / (s.last - s.first)  # as a fraction of the step
+    y = (filter_median(x, 1.0 / period) - s.first) / (s.last - s.first)  # as a fraction of the step
     rows, horizon = y.shape[1], min(y.shape[1], round(STEP_JUDGED_UNTIL / period))
     if np.median(y[:, :horizon].max(axis=1)) < 0.9:  # a slow plant
         horizon = rows
@@ -231,8 +208,6 @@ def measure_step(x: Floats, s: Section, period: float, settling_band: float = 0.
     yield "overshoot", 100 * (y[np.arange(len(y)), peak] - 1)
     lowest = np.where(np.arange(horizon) > peak[:, None], y[:, :horizon], np.inf).min(axis=1)
     yield "undershoot", np.where(np.isfinite(lowest), 100 * (1 - lowest), np.nan)
-    yield "rise_time", period * (_find_crossing(y, 0.9) - _find_crossing(y, 0.1))
-    yield "peak_time", period * _find_vertex(y, peak)
     outside = np.abs(y - 1) > settling_band
     last = rows - 1 - np.argmax(outside[:, ::-1], axis=1)
     needed = settled_for / period if rows > 2 * settled_for / period else 1
@@ -242,59 +217,10 @@ def measure_step(x: Floats, s: Section, period: float, settling_band: float = 0.
         yield "rest_error", np.sqrt(np.nanmean((x[:, resting:] - s.last)**2, axis=1))
 
 
-def _measure_ramp_response(com: Floats, x: Floats, period: float, s: Section, stuck_below: float = 0.3
-                  ) -> Iterator[tuple[str, Floats]]:
-    """Response to a slow ramp; the plant sticks while it is slower than `stuck_below` of the ramp's rate."""
+def _measure_ramp_response(com: Floats, x: Floats, period: float, s: Section) -> Iterator[tuple[str, Floats]]:
+    """Response of (m, n) to a slow ramp, on which the plant sticks and slips."""
     rows = select_ramp_rows(s, period)
     error = np.sign(s.rate) * (com[rows] - x[:, rows])
-    velocity = np.sign(s.rate) * compute_speed(x[:, s.start:s.stop], period)[:, rows.start - s.start:]
     yield "mean_ramp_error", np.nanmean(error, axis=1)
-    half = compute_half_range(error)
-    yield "break_away", half
-    amplitude, frequency = _measure_oscillation(smooth_spikes(error), half, period)
-    yield "stick_slip_amplitude", amplitude
-    yield "stick_slip_frequency", frequency
-    yield "speed_ripple", np.nanstd(velocity, axis=1)
-    yield "slip_speed", np.nanpercentile(velocity, 99.5, axis=1)
-    yield "stuck_share", np.nanmean(velocity < stuck_below * abs(s.rate), axis=1)
-
-
-def _measure_oscillation(error: Floats, half: Floats, period: float) -> tuple[Floats, Floats]:
-    """Amplitude, m (RMS about the mean times sqrt 2), and frequency, Hz (turns with a hysteresis of `half`/2)."""
-    centred = error - np.nanmean(error, axis=1, keepdims=True)
-    side = np.where(np.abs(centred) > half[:, None] / 2, np.sign(centred), 0.0)
-    last = np.maximum.accumulate(np.where(side != 0.0, np.arange(side.shape[1]), 0), axis=1)
-    latest_side = np.take_along_axis(side, last, axis=1)
-    turns = ((latest_side[:, 1:] * latest_side[:, :-1]) < 0).sum(axis=1) / 2
-    return np.sqrt(2 * np.nanmean(centred**2, axis=1)), turns / (side.shape[1] * period)
-
-
-def smooth_spikes(x: Floats, samples: int = 5) -> Floats:
-    """Running median over `samples`, the ends repeated: (m, n) in and out; a single spike leaves no trace."""
-    half = samples // 2
-    padded = np.pad(x, ((0, 0), (half, half)), mode="edge")
-    return np.median(np.lib.stride_tricks.sliding_window_view(padded, samples, axis=1), axis=2)
-
-
-def _find_crossing(y: Floats, level: float) -> Floats:
-    """Row, between samples, at which each run first passes a level; NaN if it never does."""
-    beyond = y >= level
-    k = np.argmax(beyond, axis=1)
-    before = np.maximum(k - 1, 0)
-    lines = np.arange(len(y))
-    low, high = y[lines, before], y[lines, k]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        part = np.where(high > low, (level - low) / (high - low), 0.0)
-    return np.where(beyond.any(axis=1), before + part, np.nan)
-
-
-def _find_vertex(y: Floats, peak: NDArray[np.int64]) -> Floats:
-    """Row of each run's peak between samples: of the parabola through the five samples around it, by least squares."""
-    k = np.clip(peak, 2, y.shape[1] - 3)
-    near = y[np.arange(len(y))[:, None], k[:, None] + np.arange(-2, 3)]
-    slope = near @ np.array([-2.0, -1.0, 0.0, 1.0, 2.0]) / 10
-    bend = near @ np.array([2.0, -1.0, -2.0, -1.0, 2.0]) / 7
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shift = np.where(bend < 0, -slope / bend, 0.0)
-    row: Floats = k + np.clip(shift, -2.0, 2.0)
-    return row
+    yield "break_away", compute_half_range(error)
+    yield "speed_ripple", np.nanstd(compute_speed(x, 1.0 / period)[:, rows], axis=1)

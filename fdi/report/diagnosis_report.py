@@ -15,7 +15,6 @@ from fdi.diagnosis.faults import FAULTS, Estimate, Fault, Level, compute_severit
 from fdi.diagnosis.precursors import (
     Precursor,
     compute_half_range,
-    compute_speed,
     find_lasting_peak,
     format_precursor,
     read_columns,
@@ -71,6 +70,7 @@ from fdi.report.report import (
 )
 from fdi.sources import name_software
 from fdi.thresholds import BAND_NEAREST_LIMIT_SD
+from fdi.trace.check_result import compute_speed
 from fdi.trace.sections import Section as CommandSection, find_sections
 from fdi.trace.trace import Trace
 from plant.model import Model, find_quantity
@@ -631,7 +631,7 @@ def _draw_ramp(trace: Trace, ramp: RampBand, s: CommandSection, judged: BandVerd
     _, (small, factor), (speed, speed_factor) = _choose_axes(trace.declared.controlled)
     events = [e for e in judged.events if e.fault == ramp.fault]
     error = way * (trace.command[rows] - x[rows])
-    fast = way * compute_speed(x, trace.period)[rows] - abs(s.rate)
+    fast = way * compute_speed(x, 1.0 / trace.period)[rows] - abs(s.rate)
     scale = ramp.compute_scale(float(compute_half_range(error)), float(find_lasting_peak(fast)))
     limits = (float(trace.t[rows.start]), float(trace.t[rows.stop - 1]))
     above = axes(title=f"ramp at {s.rate * speed_factor:+.3g} {speed}, judged from {limits[0]:.4g} s",

@@ -332,7 +332,7 @@ def measure_features(com: np.ndarray, xj: np.ndarray) -> dict[str, float]:
 
 @pytest.mark.parametrize(("zeta", "omega"), [(0.3, 100.0), (0.5, 80.0), (0.7, 150.0)])
 def test_a_step_of_second_order(zeta: float, omega: float) -> None:
-    """Overshoot exp(-pi zeta / root), its square back, peak at pi / omega_d; rise and settling as on a fine grid."""
+    """Overshoot exp(-pi zeta / root), its square back; settling as on a fine grid."""
     com = np.r_[np.zeros(300), np.full(700, 2e-3)]
     x = np.r_[np.zeros(300), second_order(zeta, omega, 700, 2e-3)]
     found = measure_features(com, x)
@@ -343,27 +343,22 @@ def test_a_step_of_second_order(zeta: float, omega: float) -> None:
     for name, expected in {
             "overshoot_2mm": pytest.approx(100 * over, abs=0.6),
             "undershoot_2mm": pytest.approx(100 * over**2, abs=0.3),
-            "peak_time_2mm": pytest.approx(math.pi / (omega * root), abs=4e-4),
-            "rise_time_2mm": pytest.approx(fine[np.argmax(y > 0.9)] - fine[np.argmax(y > 0.1)], abs=5e-4),
             "settling_time_2mm": pytest.approx(fine[np.flatnonzero(np.abs(y - 1) > 0.05)[-1]], abs=1.5e-3),
             "rest_error": pytest.approx(0.0, abs=1e-6)}.items():
         assert found[name] == expected, name
 
 
 def test_an_oscillation_on_a_ramp() -> None:
-    """A sine of 8 Hz and 50 um about a lag of 7 um gives back just that; a shift of both ramps is the asymmetry."""
+    """A sine of 8 Hz and 50 um about a lag of 7 um gives back just that."""
     ramp = 5e-4 * np.arange(2000) * MS
     com = np.r_[np.zeros(300), ramp, np.full(300, 1e-3), 1e-3 - ramp, np.zeros(300)]
     wave = 5e-5 * np.sin(2 * np.pi * 8 * np.arange(len(com)) * MS)
     way = np.repeat([0.0, 1.0, 0.0, -1.0, 0.0], [300, 2000, 300, 2000, 300])
-    found, loaded = (measure_features(com, com - 7e-6 * way + more) for more in (wave, -4e-5))
+    found = measure_features(com, com - 7e-6 * way + wave)
     for name, expected in {
-            "stick_slip_frequency": pytest.approx(8.0, abs=0.4), "stick_slip_amplitude": pytest.approx(5e-5, rel=0.02),
             "break_away": pytest.approx(5e-5, rel=0.02), "mean_ramp_error": pytest.approx(7e-6, abs=1.5e-6),
-            "ramp_asymmetry": pytest.approx(0.0, abs=2e-6),
             "speed_ripple": pytest.approx(2 * np.pi * 8 * 5e-5 / math.sqrt(2), rel=0.06)}.items():
         assert found[name] == expected, name
-    assert loaded["ramp_asymmetry"] == pytest.approx(4e-5, rel=0.03)
 
 
 def test_what_a_command_does_not_show() -> None:
