@@ -273,15 +273,6 @@ SAME_COMMAND_TIME = 0.004
 # Relative difference up to which two ramps have the same rate; the bus rounds the rate of a 1 mm ramp by 0.01 %.
 SAME_COMMAND_RATE = 0.002
 
-# Slip speed over the one that goes with the static friction; faster slips are noted as low dynamic friction.
-#
-# The speed of a slip goes with static less dynamic friction, a third of the static one as a rule; 1.5 times that speed
-# is a dynamic friction of half the static one.
-FAST_SLIP_RATIO = 1.5
-
-# Friction over the healthy one above which a note names it as the reason why a fault is not judged at the steps.
-FRICTION_HIDES_RATIO = 2.0
-
 # Healthy traces that bands of a fleet need at least; bands of 5, 8 and 12 traces find 58, 94 and 96 % of 96 units with
 # Kintas 0.25 (docs/statistics.md).
 FLEET_FEWEST_TRACES = 5

@@ -37,8 +37,6 @@ from fdi.thresholds import (
     BAND_FAULT_CLEARANCE_SD,
     BAND_LARGEST_LOAD,
     BAND_NEAREST_LIMIT_SD,
-    FAST_SLIP_RATIO,
-    FRICTION_HIDES_RATIO,
     SAME_COMMAND_POSITION,
     SAME_COMMAND_RATE,
     SAME_COMMAND_TIME,
@@ -328,25 +326,14 @@ def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: F
             severity[fault.name] = max(0.0, *(found[i].measure_peak() for i in own))
             levels[fault.name] = max((LEVELS[event.band] for i in own for event in events[i]), default=Level.ACCEPTABLE)
         else:
-            notes.append(f"{fault.name} is not judged by bands: {_explain_no_level(fault, found, shown, bands)}")
-        slip = max((e.measure_peak() for e in found if (e.fault, e.signal) == (fault.name, "speed")), default=0.0)
-        if own and len(fault.amounts) and slip > FAST_SLIP_RATIO * max(1.0, severity[fault.name]):
-            notes.append(f"{fault.name}: the plant slips faster than {fault.symbol} accounts for, so dynamic friction "
-                         "is low")
+            units = "units with the friction that the ramps show" if shown else "healthy units"
+            notes.append(f"{fault.name} is not judged by bands: " + (
+                f"a fault at MidBand is within the scatter of {units}"
+                if any(e.fault == fault.name for e in found) else "no section of the trace shows it"))
     gone = {f: (levels[f], severity[f]) for f in levels if levels[f] > Level.ACCEPTABLE}
     ruling = max(gone, key=lambda f: gone[f]) if gone else None
     every = sorted(chain.from_iterable(events.values()), key=lambda event: event.t_in)
     return BandVerdict(levels, ruling, tuple(every), severity, shown, tuple(notes))
-
-
-def _explain_no_level(fault: BandFault, found: list[Excursion], shown: Mapping[str, Sequence[float]], bands: Bands
-                      ) -> str:
-    if not any(e.fault == fault.name and e.signal == "position" for e in found):
-        return "no section of the trace shows it"
-    hiding = [f"{amounts[0]:.3g} {friction.unit}" for friction in map(bands.find, shown) for amounts in
-              [shown[friction.name]] if amounts[0] > FRICTION_HIDES_RATIO * float(friction.amounts[0])]
-    return (f"{hiding[0]} of friction hide it" if hiding and not len(fault.amounts) else
-            "a fault at MidBand is within the scatter of healthy units")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

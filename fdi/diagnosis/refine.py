@@ -33,6 +33,7 @@ from fdi.estimation.fit import (
     Fit,
     Free,
     Problem,
+    Value,
     complete_model,
     compute_misfit,
     compute_typical_rms,
@@ -818,19 +819,20 @@ def make_joint_problem(model: Model, trace: Trace, floor: Mapping[str, float], w
 
 
 def _read_marks(model: Model, trace: Trace, floor: Mapping[str, float]
-                ) -> tuple[dict[str, dict[str, Estimate]], dict[str, float]]:
+                ) -> tuple[dict[str, dict[str, Value]], dict[str, float]]:
     """Effects that are read off without noise, and the floors with the rounding of the position among them."""
     marks, floor = find_marks(model, [trace]), dict(floor)
     if marks.step and "quantisation" not in model.effects:
         controlled = trace.declared.controlled
         rounded = float(np.hypot(model.values.get(controlled.noise, 0.0), marks.rounding))
         floor[controlled.name] = max(floor[controlled.name], rounded)
-    return {p.effect: {name: Estimate(*of) for name, of in p.parameters.items()} for p in marks.prints}, floor
+    return {p.effect: {name: Value(*interval, find_quantity(name, plant=model.plant).unit)
+                       for name, interval in p.parameters.items()} for p in marks.prints}, floor
 
 
 def _explain(effects: tuple[str, ...], fit: Fit, problem: CountedProblem, whole: Trace | None) -> Explanation:
-    values = {name: Estimate(v.value, v.low, v.high) for effect in effects
-              for name, v in list_fitted_parameters(effect, fit, problem.model).items()}
+    values = {name: value for effect in effects
+              for name, value in list_fitted_parameters(effect, fit, problem.model).items()}
     return Explanation(effects, values, replace(report_fit(fit, problem, whole), worst=FITTED_RUN_WORST))
 
 
@@ -1068,7 +1070,7 @@ class Explanation:
     """The faults fitted beside some other effects."""
 
     effects: tuple[str, ...]  # () for the faults alone
-    parameters: Mapping[str, Estimate]  # of these effects, by name, SI
+    parameters: Mapping[str, Value]  # of these effects, by name
     refinement: Refinement
     weight: float = 1.0  # probability among all explanations
 
@@ -1085,7 +1087,7 @@ class Beside:
 
     explanations: tuple[Explanation, ...]  # best first; those that are not much less likely than the best
     sizes: Mapping[str, Estimate]  # of the faults, by name, averaged
-    marks: Mapping[str, Mapping[str, Estimate]]  # effects that leave a mark without noise, with their parameters
+    marks: Mapping[str, Mapping[str, Value]]  # effects that leave a mark without noise, with their parameters
     disputed: tuple[str, ...]  # faults whose level depends on which explanation is right
 
     @property
@@ -1109,7 +1111,7 @@ class Beside:
         return len(self.explanations) > 1
 
 
-def average_explanations(found: Sequence[Explanation], marks: Mapping[str, Mapping[str, Estimate]] | None = None
+def average_explanations(found: Sequence[Explanation], marks: Mapping[str, Mapping[str, Value]] | None = None
                          ) -> Beside:
     """The explanations with their probabilities, and the sizes averaged over them.
 

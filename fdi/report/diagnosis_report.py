@@ -22,6 +22,7 @@ from fdi.diagnosis.precursors import (
 )
 from fdi.diagnosis.refine import Beside, Explanation
 from fdi.diagnosis.rms_grid import Grid, Map, Merged, Point, find_corners
+from fdi.estimation.fit import Value
 from fdi.report.drawing import (
     BLUE,
     COMMAND,
@@ -73,7 +74,6 @@ from fdi.thresholds import BAND_NEAREST_LIMIT_SD
 from fdi.trace.check_result import compute_speed
 from fdi.trace.sections import Section as CommandSection, find_sections
 from fdi.trace.trace import Trace
-from plant.model import Model, find_quantity
 from plant.signals import Signal
 
 LEVEL_NAMES = {Level.ACCEPTABLE: "acceptable", Level.MAINTENANCE: "maintenance", Level.NON_NOMINAL: "non-nominal",
@@ -116,7 +116,7 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
             sorted(provenance.items()), (Column(""), lambda row: Cell(row[0], "muted")),
             (Column(""), lambda row: row[1]), is_list=True)], medium=page)]
     return Report("fdi", d.source, d.verdict, VERDICT_MOODS.get(d.verdict, "doubtful"), describe_verdict(d), facts,
-                  [*describe_overruled_bands(d), *explain_grid(d), *d.notes], sections, data=collect_data(d))
+                  [*list_overruled(d), *d.notes], sections, data=collect_data(d))
 
 
 def build_bands_report(made: Mapping[str, Any]) -> Report:
@@ -247,46 +247,30 @@ def describe_residual(d: Diagnosis) -> str:
     return f"{ratios} times the noise floor"
 
 
-def describe_overruled_bands(d: Diagnosis) -> list[str]:
-    """A sentence for each fault that the fit judges better than the bands do: which result to trust, and why."""
-    by_bands = d.band_verdict.levels if d.band_verdict else {}
-    alike: dict[tuple[Level, Level], list[str]] = {}
-    for fault in d.faults:
-        found, level = by_bands.get(fault.name), d.levels[fault.name]
-        if found is not None and level is not None and found > level:
-            alike.setdefault((found, level), []).append(fault.title)
-    cause = f", with {_list_others(d)}" if d.others else ""
-    return [f"The bands call {join_words(titles)} {LEVEL_NAMES[found]}; the fit, which models the whole plant, finds "
-            f"{'it' if len(titles) == 1 else 'them'} {LEVEL_NAMES[level]}{cause}. Trust the fit."
-            for (found, level), titles in alike.items()]
-
-
-def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
-    """A sentence for each fault whose size in the grid contradicts the fit, with the reason.
+def list_overruled(d: Diagnosis, far: float = 2.0) -> Iterator[str]:
+    """A sentence for each fault that bands or grid judge otherwise than the fit: which result to trust.
 
     `far`: cells of the grid outside the interval of the fit.
     """
-    sentences: dict[str, str] = {}
-    controlled = d.trace.declared.controlled.name
-    for g in d.grids:
-        for fault, axis in zip(g.faults, g.axes, strict=True):
-            size, found = d.sizes[fault.name], g.find_size(fault, g.merged)
-            if max(size.low - found, found - size.high) <= far * float(axis[1] - axis[0]):
-                continue
-            parts = [f"{words} {format_digits(g.find_size(fault, part.minimum))}"
-                     for words, part in (("steps", g.step), ("ramps", g.ramp)) if part is not None]
-            at = f"{fault.symbol} {attach_unit(format_digits(found), fault.unit)}"
-            sentence = (f"The grid gives {at} (minima: {', '.join(parts)}), the fit "
-                        f"{format_interval(*size, fault.unit)}: the grid matches the position alone with a plant that "
-                        "has only these two faults")
-            if d.others:
-                sentence += f", here with {_list_others(d)}"
-            if (left := d.refinement.errors.get(controlled)) is not None:
-                sentence += (f"; its best cell leaves {format_amount(g.joint.minimum.rms, g.unit)} of the position, "
-                             f"the fit {format_amount(left, g.unit)}")
-            trust = "Trust the fit" if d.refinement.is_explained else "The fit does not explain the trace either"
-            sentences.setdefault(fault.name, f"{sentence}. {trust}.")
-    return list(sentences.values())
+    by_bands = d.band_verdict.levels if d.band_verdict else {}
+    beside = f", beside {_list_others(d)}" if d.others else ""
+    trust = "Trust the fit" if d.refinement.is_explained else "The fit does not explain the trace either"
+    for fault in d.faults:
+        size, level, said = d.sizes[fault.name], d.levels[fault.name], []
+        if level is not None and by_bands.get(fault.name, level) > level:
+            said.append(f"the bands call it {LEVEL_NAMES[by_bands[fault.name]]}")
+        if (grid := _find_grid(d.grids, fault)) is not None:
+            found, axis = grid.find_size(fault, grid.merged), grid.axes[grid.faults.index(fault)]
+            if max(size.low - found, found - size.high) > far * float(axis[1] - axis[0]):
+                said.append(f"the grid gives {attach_unit(format_digits(found), fault.unit)}")
+        if said:
+            yield (f"{fault.title}: {' and '.join(said)}; the fit, which alone models the whole plant, finds "
+                   f"{fault.symbol} {format_interval(*size, fault.unit)}{beside}. {trust}.")
+
+
+def _find_grid(grids: Sequence[Grid], fault: Fault) -> Grid | None:
+    """The first grid that has the fault."""
+    return next((grid for grid in grids if fault in grid.faults), None)
 
 
 def _list_others(d: Diagnosis) -> str:
@@ -319,7 +303,7 @@ def _tabulate_faults(d: Diagnosis) -> Table:
     by_bands = d.band_verdict.levels if d.band_verdict else {}
 
     def show_grid(fault: Fault) -> str:
-        grid = next((g for g in d.grids if fault in g.faults), None)
+        grid = _find_grid(d.grids, fault)
         return NO_NUMBER if grid is None else format_amount(grid.find_size(fault, grid.merged), fault.unit)
 
     def show_bands(fault: Fault) -> Cell:
@@ -362,20 +346,18 @@ def _show_effects(d: Diagnosis) -> list[Item]:
     return [tabulate(
         b.explanations, (Column("beside the faults"), name_explanation),
         (Column("probability", "%", "right"), lambda e: f"{100 * e.weight:.0f}"),
-        (Column("size (95 % interval)"), lambda e: _format_parameters(e.parameters, d.model) or NO_NUMBER),
+        (Column("size (95 % interval)"), lambda e: _format_parameters(e.parameters) or NO_NUMBER),
         *(column for fault in d.faults for column in show_fault(fault)),
         (Column("residual / noise", align="right", medium=Medium.PAGE),
          lambda e: format_ratio(max(e.refinement.ratio.values()))), caption=caption),
-            *(Line(effect, f"{_format_parameters(own, d.model)}, read off without noise")
+            *(Line(effect, f"{_format_parameters(own)}, read off without noise")
               for effect, own in b.marks.items()),
             *(Paragraph(f"The level of {fault.title} depends on which of these is right: cannot be judged.")
               for fault in d.faults if fault.name in b.disputed)]
 
 
-def _format_parameters(sizes: Mapping[str, Any], model: Model) -> str:
-    units = {name: find_quantity(name, plant=model.plant).unit for name in sizes}
-    return "; ".join(f"{name} {format_interval(size.value, size.low, size.high, units[name])}"
-                     for name, size in sizes.items())
+def _format_parameters(sizes: Mapping[str, Value]) -> str:
+    return "; ".join(f"{name} {format_interval(*size)}" for name, size in sizes.items())
 
 
 def _show_bands(d: Diagnosis) -> list[Item]:
@@ -554,8 +536,7 @@ def _collect_beside(d: Diagnosis, b: Beside) -> dict[str, Any]:
         "marks": {effect: {name: e._asdict() for name, e in own.items()} for effect, own in b.marks.items()},
         "explanations": [
             {"effects": list(e.effects), "probability": e.weight,
-             "parameters": {name: {**v._asdict(), "unit": find_quantity(name, plant=d.model.plant).unit}
-                            for name, v in e.parameters.items()},
+             "parameters": {name: v._asdict() for name, v in e.parameters.items()},
              **{f.key: e.refinement.sizes[f.name]._asdict() for f in d.faults},
              "level": {name: level.word if level is not None and e.refinement.is_explained else None
                        for name, level in e.levels.items()},
@@ -668,7 +649,7 @@ def draw_sizes(faults: Sequence[Fault], sizes: Mapping[str, Estimate], grids: Se
     panels = []
     for fault in faults:
         found = []
-        for grid in [g for g in grids if fault in g.faults][:1]:
+        if (grid := _find_grid(grids, fault)) is not None:
             points = (("grid, merged", grid.merged), ("grid, steps", grid.step and grid.step.minimum),
                       ("grid, ramps", grid.ramp and grid.ramp.minimum))
             found += [(label, grid.find_size(fault, point)) for label, point in points if point]

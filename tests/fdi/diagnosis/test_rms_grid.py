@@ -22,11 +22,10 @@ from fdi.diagnosis.rms_grid import (
     search_grid,
 )
 from fdi.estimation.replay import read_cycles
-from fdi.report.diagnosis_report import explain_grid
+from fdi.report.diagnosis_report import list_overruled
 from plant import Model, simulate
 from plant.monitor import Monitor
 from plant.segments import Chirp, Hold, Ramp, Step, build_profile
-from plant.signals import EHA
 from rig.sequences import load_sequence
 
 PREFLIGHT = load_sequence("preflight").main_profile()
@@ -169,15 +168,16 @@ def diagnosis(kintas: float, explained: bool = True, others: dict[str, Estimate]
     grid = Grid(FAULTS, axes, point(2 * kintas), point(0.0), point(kintas), Merged((kintas, 5.0), 0.5, 0.0),
                 Point((kintas, 5.0), 54e-6), 441, "m")
     sizes = {CLOGGING.name: Estimate(0.001, 0.0, 0.02), FRICTION.name: Estimate(5.0, 4.0, 6.0)}
-    refinement = SimpleNamespace(errors={"xj": 2e-6}, is_explained=explained)
-    return cast(Any, SimpleNamespace(grids=(grid,), sizes=sizes, others=others or {}, refinement=refinement,
-                                     trace=SimpleNamespace(declared=EHA)))
+    refinement = SimpleNamespace(is_explained=explained)
+    return cast(Any, SimpleNamespace(faults=FAULTS, grids=(grid,), sizes=sizes, levels=dict.fromkeys(sizes),
+                                     others=others or {}, refinement=refinement, band_verdict=None))
 
 
-def test_a_grid_that_contradicts_the_fit_says_why() -> None:
-    (text,) = explain_grid(diagnosis(0.175, others={"null_bias.current": Estimate(2.4e-4, 2.3e-4, 2.5e-4)}))
-    assert text.startswith("The grid gives Kintas 0.175 (minima: steps 0.350, ramps 0), the fit 0.001 (0 .. 0.020)")
-    assert "null bias 0.24 mA" in text and "leaves 54.0 um of the position, the fit 2.00 um. Trust the fit." in text
-    (text,) = explain_grid(diagnosis(0.175, explained=False))
+def test_a_grid_that_contradicts_the_fit_is_named() -> None:
+    (text,) = list_overruled(diagnosis(0.175, others={"null_bias.current": Estimate(2.4e-4, 2.3e-4, 2.5e-4)}))
+    assert text.startswith("filter clogging: the grid gives 0.175; the fit, which alone models the whole plant, finds "
+                           "Kintas 0.001 (0 .. 0.020)")
+    assert text.endswith("null bias 0.24 mA (0.23 .. 0.25). Trust the fit.")
+    (text,) = list_overruled(diagnosis(0.175, explained=False))
     assert text.endswith("The fit does not explain the trace either.")
-    assert explain_grid(diagnosis(0.05)) == []  # it agrees
+    assert [*list_overruled(diagnosis(0.05))] == []  # it agrees
