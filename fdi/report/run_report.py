@@ -55,7 +55,7 @@ from fdi.report.report import (
     write_html,
 )
 from fdi.trace.check_result import CheckResult, compute_speed, filter_median
-from fdi.trace.trace import Event, Floats, Trace
+from fdi.trace.trace import Event, Floats, Trace, bridge_gaps
 from plant.signals import EHA, Signals
 from plant.units import UNITS
 
@@ -347,13 +347,9 @@ def draw_timing(trace: Trace) -> str:
 
 
 def _bridge_short_gaps(values: Floats) -> Floats:
-    """Straight lines over up to BRIDGED missing samples: single samples between gaps would be invisible."""
-    known = np.flatnonzero(~np.isnan(values))
-    rows = np.arange(len(values))
-    after = known[np.minimum(np.searchsorted(known, rows), len(known) - 1)]
-    before = known[np.maximum(np.searchsorted(known, rows, side="right") - 1, 0)]
-    near = (after >= rows) & (before <= rows) & (after - before <= BRIDGED + 1)
-    return np.where(near, np.interp(rows, known, values[known]), values)
+    """Gaps of up to BRIDGED samples filled, longer ones left: single samples between gaps would be invisible."""
+    bridged, is_long = bridge_gaps(values, BRIDGED)
+    return np.where(is_long, math.nan, bridged)
 
 
 def _mark_missing(trace: Trace, values: Floats, columns: int = 1400) -> Mark:
@@ -472,7 +468,7 @@ def _draw_step(view: _View) -> Panel:
     """What is left of a step, % of it: the overshoot at its peak, or the times of rising and of settling."""
     check, t, (before, size) = view.check, view.shown.t, view.step
     beyond = 100.0 * ((filter_median(view.shown.controlled, 1.0 / view.trace.period) - before) / size - 1.0)
-    panel = [line(t, beyond, BLUE, f"{view.trace.declared.controlled.symbol} beyond the target", 1.2),
+    panel = [line(t, beyond, BLUE, f"{view.trace.declared.controlled.symbol} less the target", 1.2),
              axes(ylabel="beyond the\ntarget [%]")]
     if check.kind == "overshoot":
         row = int(np.nanargmax(beyond))

@@ -285,8 +285,10 @@ def _is_padded(fields: list[str], width: int) -> bool:
 def _make_number_parser(decimal: str) -> Callable[[str], float]:
     """Text to number, NaN for a missing one; raises ValueError for any other text and for infinity."""
     def parse(text: str) -> float:
+        if decimal == "," and "." in text:
+            raise ValueError
         try:
-            value = float(text if decimal == "." else text.replace(",", "."))
+            value = float(text.replace(decimal, "."))
         except ValueError:
             if text.lower() in MISSING:
                 return math.nan
@@ -295,12 +297,7 @@ def _make_number_parser(decimal: str) -> Callable[[str], float]:
             raise ValueError
         return value
 
-    def parse_comma(text: str) -> float:
-        if "." in text:
-            raise ValueError
-        return parse(text)
-
-    return parse if decimal == "." else parse_comma
+    return parse
 
 
 def _parse_date(text: str) -> float:
