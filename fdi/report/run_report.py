@@ -55,7 +55,7 @@ from fdi.report.report import (
     write_html,
 )
 from fdi.trace.check_result import CheckResult, compute_speed, filter_median
-from fdi.trace.trace import Event, Floats, Trace, bridge_gaps
+from fdi.trace.trace import Event, Floats, Trace
 from plant.signals import EHA, Signals
 from plant.units import UNITS
 
@@ -347,9 +347,13 @@ def draw_timing(trace: Trace) -> str:
 
 
 def _bridge_short_gaps(values: Floats) -> Floats:
-    """Gaps of up to BRIDGED samples filled, longer ones left: single samples between gaps would be invisible."""
-    bridged, is_long = bridge_gaps(values, BRIDGED)
-    return np.where(is_long, math.nan, bridged)
+    """Straight lines over up to BRIDGED missing samples: single samples between gaps would be invisible."""
+    known = np.flatnonzero(~np.isnan(values))
+    rows = np.arange(len(values))
+    after = known[np.minimum(np.searchsorted(known, rows), len(known) - 1)]
+    before = known[np.maximum(np.searchsorted(known, rows, side="right") - 1, 0)]
+    near = (after >= rows) & (before <= rows) & (after - before <= BRIDGED + 1)
+    return np.where(near, np.interp(rows, known, values[known]), values)
 
 
 def _mark_missing(trace: Trace, values: Floats, columns: int = 1400) -> Mark:

@@ -8,7 +8,7 @@ import contextlib
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -67,19 +67,8 @@ class Log:
             factory = DecoderFactory()
             decode = {number: (c.topic, factory.decoder_for(c.message_encoding, self.schemas.get(c.schema_id)))
                       for number, c in self.channels.items() if c.topic in topics}
-            out = []
-            with self.path.open("rb") as stream:
-                for index in self._chunks:
-                    there = index.message_index_offsets
-                    if there and not decode.keys() & there.keys():
-                        continue
-                    places = [_message_offsets(stream, index, number) for number in decode if number in there]
-                    starts = np.sort(np.concatenate(places)).astype(np.uint64).tolist() if places else None
-                    for channel, time_ns, _, data in scan_messages(_read_chunk(self.path, stream, index), starts):
-                        if channel in decode:
-                            out.append((time_ns - self.epoch_ns, channel, data))
-            out.sort(key=lambda item: item[0])
-            for time_ns, channel, data in out[:most]:
+            found = sorted(self.list_raw_messages(set(decode)), key=lambda message: message[1])
+            for channel, time_ns, data in found[:most]:
                 topic, parse = decode[channel]
                 if parse is None:
                     raise InputError(self.path, topic, "protobuf messages")
@@ -109,17 +98,11 @@ class Log:
             return None
         dtype, tags = layout
         parts = []
-        with self.path.open("rb") as stream:
-            for index in self._chunks:
-                if numbers[0] not in index.message_index_offsets:
-                    if index.message_index_offsets:
-                        continue
-                    return None  # a chunk without an index
-                offsets = _message_offsets(stream, index, numbers[0])
-                rows = _decode_rows(_read_chunk(self.path, stream, index), offsets, dtype)
-                if rows is None:
-                    return None
-                parts.append(rows)
+        for raw, offsets in self._unpack_chunks({numbers[0]}):
+            rows = None if offsets is None else _decode_rows(raw, offsets, dtype)
+            if rows is None:
+                return None
+            parts.append(rows)
         if not parts:
             return None
         table = np.concatenate(parts)
@@ -129,16 +112,29 @@ class Log:
         table = table[np.argsort(table["time_ns"], kind="stable")]
         return {name: table[name].copy() for name in dtype.names or () if not name.startswith(".")}
 
-    def list_raw_messages(self) -> Iterator[tuple[int, int, bytes]]:
-        """(channel, log time in ns, data) of every message, in the order of the file.
+    def list_raw_messages(self, channels: Set[int] | None = None) -> Iterator[tuple[int, int, bytes]]:
+        """(channel, log time in ns, data) of every message, or of those of some channels, in the order of the file.
 
         Raises:
             InputError: a chunk that is damaged.
         """
+        for raw, offsets in self._unpack_chunks(channels):
+            # unsigned, so that no offset of a damaged index counts from the end
+            starts = None if offsets is None else offsets.astype(np.uint64).tolist()
+            for channel, time_ns, _, data in scan_messages(raw, starts):
+                if channels is None or channel in channels:
+                    yield channel, time_ns - self.epoch_ns, data
+
+    def _unpack_chunks(self, channels: Set[int] | None) -> Iterator[tuple[bytes, NDArray[np.int64] | None]]:
+        """The chunks that hold messages of these channels, unpacked, and where these begin; None: no index says it."""
         with self.path.open("rb") as stream:
             for index in self._chunks:
-                for channel, time_ns, _, data in scan_messages(_read_chunk(self.path, stream, index)):
-                    yield channel, time_ns - self.epoch_ns, data
+                there = index.message_index_offsets
+                own = sorted(there.keys() & (channels or ()))
+                if there and channels is not None and not own:
+                    continue
+                starts = [_message_offsets(stream, index, number) for number in own]
+                yield _read_chunk(self.path, stream, index), np.sort(np.concatenate(starts)) if starts else None
 
     def read_units(self, topic: str) -> dict[str, str]:
         """Field -> unit, from the channel's metadata."""
