@@ -74,7 +74,7 @@ def test_a_fault_that_only_the_bands_blame_is_explained(folder: Path, tmp_path: 
     page = (tmp_path / "biased.html").read_text()
     assert said.status == 0 and said.out.startswith("ACCEPTABLE")
     for text in (" ".join(said.out.split()), page):
-        bias = re.search(r"filter clogging: the bands call it non-nominal; .* beside null bias ([\d.]+) mA", text)
+        bias = re.search(r"filter clogging: the bands call it non-nominal.* beside null bias ([\d.]+) mA", text)
         assert bias and float(bias[1]) == pytest.approx(0.24, rel=0.05)
     assert len(re.findall(r"<td[^>]*>step to 0 mm</td>", page)) > 1  # two steps, two lines
     assert "eha-rig" in page and "mathdefault" not in page
