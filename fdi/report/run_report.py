@@ -490,14 +490,17 @@ def _draw_size(view: _View) -> Panel:
 
 def _draw_response(view: _View) -> Panel:
     """Demand and position; for a gain also the amplitudes that the limits allow, and the measured one."""
-    d, shown, is_gain = view.trace.declared, view.shown, view.check.kind == "amplitude_ratio"
+    d, shown = view.trace.declared, view.shown
     scale, com = d.controlled.shown_scale, d.controlled.shown_scale * shown.command
     middle, amplitude = 0.5 * (np.nanmax(com) + np.nanmin(com)), 0.5 * (np.nanmax(com) - np.nanmin(com))
+
+    def place(value: float, colour: str, label: str, width: float, style: str) -> list[Mark]:
+        if view.check.kind != "amplitude_ratio":  # all others have no height here
+            return [line([], [], colour, label, ls=style)]
+        return levels(value * amplitude, colour, label, width, style, middle)
+
     return [line(shown.t, com, COMMAND, d.command.symbol, 1.6),
-            line(shown.t, scale * shown.controlled, BLUE, d.controlled.symbol),
-            *_draw_lines(view.check, lambda y, *style: [
-                level(middle + way * y * amplitude, *style) for way in (1.0, -1.0)] if is_gain else [
-                line([], [], style[0], style[1], ls=style[3])]),
+            line(shown.t, scale * shown.controlled, BLUE, d.controlled.symbol), *_draw_lines(view.check, place),
             axes(ylabel=f"{'position' if d.controlled.unit == 'm' else d.controlled.symbol} "
                         f"[{d.controlled.shown_unit}]")]
 
