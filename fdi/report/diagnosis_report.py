@@ -74,7 +74,6 @@ from fdi.thresholds import BAND_NEAREST_LIMIT_SD
 from fdi.trace.check_result import compute_speed
 from fdi.trace.sections import Section as CommandSection, find_sections
 from fdi.trace.trace import Trace
-from plant.signals import Signal
 
 LEVEL_NAMES = {Level.ACCEPTABLE: "acceptable", Level.MAINTENANCE: "maintenance", Level.NON_NOMINAL: "non-nominal",
                None: "cannot be judged"}
@@ -549,18 +548,11 @@ MAP_CONTOURS = 7
 MS = 1e3
 
 
-def _choose_axes(signal: Signal) -> tuple[tuple[str, float], ...]:
-    """Units of the axes of a controlled signal, of its departures and its speed; each with how many make one SI unit.
-    """
-    return (("mm", 1e3), ("um", 1e6), ("mm/s", 1e3)) if signal.unit == "m" else (
-        (signal.unit, 1.0), (signal.unit, 1.0), (f"{signal.unit}/s", 1.0))
-
-
 def draw_overview(trace: Trace, judged: BandVerdict) -> str:
     """Command and position of the whole trace, times outside the bands shaded."""
     limits = (float(trace.t[0]), float(trace.t[-1]) + trace.period)
     command, controlled = trace.declared.command, trace.declared.controlled
-    unit, scale = _choose_axes(controlled)[0]
+    unit, scale = controlled.shown_unit, controlled.shown_scale
     return draw_panels("overview", [[[
         line(trace.t, trace.command * scale, COMMAND, f"{command.symbol}, command", 2.2),
         line(trace.t, trace.mask_unusable(controlled.name) * scale, BLUE, f"{controlled.symbol}, measured"),
@@ -582,20 +574,21 @@ def draw_steps(trace: Trace, bands: Bands, judged: BandVerdict, fault: BandFault
 def _draw_step(trace: Trace, bands: Bands, step: StepBand, s: CommandSection, judged: BandVerdict, fault: BandFault
                ) -> Panel:
     controlled = trace.declared.controlled
-    (unit, scale), (small, factor), _ = _choose_axes(controlled)
+    fine, small = choose_unit(controlled.unit, 0.0)
     t, begin, side = step.t * MS, float(trace.t[s.start]), np.sign(step.middle[fault.name])
     centre, spread = step.compute_centres(judged.shown, bands)[0]
     middle, most, there = step.compute_margins(fault, spread)
     rows = np.minimum(s.start + np.rint(step.t / trace.period).astype(int), s.stop - 1)
-    healthy = BAND_NEAREST_LIMIT_SD * spread * factor
+    healthy = BAND_NEAREST_LIMIT_SD * spread / fine
     events = [e for e in judged.events if e.fault == fault.name]
+    title = f"step of {(s.last - s.first) * controlled.shown_scale:+.3g} {controlled.shown_unit} at {begin:.4g} s"
     return [area(t, -healthy, healthy, GREEN, "healthy", 0.15),
-            *(line(t, np.where(there, side * limit, np.nan) * factor, colour, label, 1.6)
+            *(line(t, np.where(there, side * limit, np.nan) / fine, colour, label, 1.6)
               for limit, colour, label in ((middle, ORANGE, "MidBand"), (most, RED, "MaxBand"))),
-            line(t, (trace.mask_unusable(controlled.name)[rows] - centre) * factor, INK, "measured"),
+            line(t, (trace.mask_unusable(controlled.name)[rows] - centre) / fine, INK, "measured"),
             *_shade_events(events, (0.0, float(t[-1])), "position", MS, begin),
-            axes(xlim=(0.0, float(t[-1])), title=f"step of {(s.last - s.first) * scale:+.3g} {unit} at {begin:.4g} s",
-                 xlabel="time from the step [ms]", ylabel=f"off the healthy\nresponse [{small}]")]
+            axes(xlim=(0.0, float(t[-1])), title=title, xlabel="time from the step [ms]",
+                 ylabel=f"off the healthy\nresponse [{small}]")]
 
 
 def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict, fault: BandFault) -> str:
@@ -608,19 +601,20 @@ def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict, fault: BandFault
 
 def _draw_ramp(trace: Trace, ramp: RampBand, s: CommandSection, judged: BandVerdict, is_first: bool) -> Iterator[Panel]:
     rows, way = select_ramp_rows(s, trace.period), np.sign(s.rate)
-    x = trace.mask_unusable(trace.declared.controlled.name)
-    _, (small, factor), (speed, speed_factor) = _choose_axes(trace.declared.controlled)
+    controlled = trace.declared.controlled
+    x, speed = trace.mask_unusable(controlled.name), f"{controlled.shown_unit}/s"
+    fine, small = choose_unit(controlled.unit, 0.0)
     events = [e for e in judged.events if e.fault == ramp.fault]
     error = way * (trace.command[rows] - x[rows])
     fast = way * compute_speed(x, 1.0 / trace.period)[rows] - abs(s.rate)
     scale = ramp.compute_scale(float(compute_half_range(error)), float(find_lasting_peak(fast)))
     limits = (float(trace.t[rows.start]), float(trace.t[rows.stop - 1]))
-    above = axes(title=f"ramp at {s.rate * speed_factor:+.3g} {speed}, judged from {limits[0]:.4g} s",
+    above = axes(title=f"ramp at {s.rate * controlled.shown_scale:+.3g} {speed}, judged from {limits[0]:.4g} s",
                  ylabel=f"error [{small}]" if is_first else "")
     below = axes(xlabel="time [s]", ylabel=f"speed beyond the\ndemand's [{speed}]" if is_first else "")
     for values, width, unit, nearer, name, labels in (
-            (error, ramp.position, factor, 1 / scale, "position", above),
-            (fast, ramp.speed, speed_factor, 1.0, "speed", below)):
+            (error, ramp.position, 1.0 / fine, 1 / scale, "position", above),
+            (fast, ramp.speed, controlled.shown_scale, 1.0, "speed", below)):
         middle, healthy = width.centre * unit, width.healthy * unit
         yield [
             band(middle - healthy, middle + healthy, GREEN, "healthy", 0.15),
