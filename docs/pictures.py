@@ -35,7 +35,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([*RIG, "run", "preflight", "--quiet", "--out", folder], check=True)
         picture = Path(folder, "viewer.png")
-        subprocess.run([*RIG, "view", folder, "--headless", "--screenshot", str(picture)], check=True)
+        subprocess.run([*RIG, "view", folder, "--out", str(picture)], check=True)
         with Image.open(picture) as image:  # a palette does for a user interface, at a quarter of the size
             small = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
             small.save(HERE / "viewer.png", optimize=True)

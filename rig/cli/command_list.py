@@ -134,7 +134,7 @@ COMMANDS = {
         (option("words", nargs="+", metavar="EFFECT|TRACE",
                 help="effects to add, and the measured run to fit (default: the run that the model file was fitted "
                      "to)"),
-         option("--trace", metavar="TRACE", help="same as the positional TRACE"), *RUNS, *MODEL)),
+         *RUNS, *MODEL)),
     "bench": Command(
         "measure the speed of the plant, or the cycle in real time",
         "Without an argument: the speed of the plant, compared with C.",
@@ -310,8 +310,8 @@ COMMANDS = {
          option("--guess", action="store_true",
                 help="write a first map (FILE.map.toml, or --out), with its reasons"),
          option("--force", action="store_true", help="let --guess replace a map that exists"),
-         option("--dbc", metavar="FILE", help="DBC that decodes the raw frames (default: the bench; with --map "
-                                                     "the shipped eha.dbc)"),
+         option("--dbc", metavar="FILE", help="with --map or --guess: DBC that decodes the raw frames (default: the "
+                                              "shipped eha.dbc)"),
          BENCH, option("--model", metavar="FILE|NAME",
                        help="whose signals were recorded: model file, plant file or model name (default eha)"), TRUST)),
     "list": Command(
@@ -358,7 +358,7 @@ COMMANDS = {
         "The model goes to --out (default: the file of --model, in place).",
         (option("words", nargs="+", metavar="EFFECT|TRACE",
                 help="the effect, and the measured run to fit the rest to"),
-         option("--trace", metavar="TRACE", help="same as the positional TRACE"), *RUNS, *MODEL)),
+         *RUNS, *MODEL)),
     "report": Command(
         "write one HTML file about a trace; it needs no network",
         "The page goes to --out (default: report.html beside the trace).",
@@ -425,7 +425,8 @@ COMMANDS = {
          option("--again", action="store_true", help="diagnose every trace again, even if its sizes are stored"))),
     "view": Command(
         "open the rerun viewer on a trace, or save its recording or a picture of it",
-        "The viewer listens on 127.0.0.1 only.",
+        "The viewer listens on 127.0.0.1 only. --out FILE.rrd writes its recording and opens nothing; --out FILE.png "
+        "also draws a picture, without a display.",
         (option("trace", metavar="TRACE", help=ANY_TRACE),
          option("others", metavar="B", nargs="*",
                 help="runs to draw over it and to subtract it from, as rig diff does"),
@@ -433,10 +434,6 @@ COMMANDS = {
                 help="the trace beside the model's replay, with residual and noise floor, as rig compare does; if "
                      "--model or --set adds effects or values, before and after that"),
          Group("with --compare; --model alone says whose signals a CSV has", (*PLANT, SEED_IF_GIVEN, REPEAT, SIGNALS)),
-         option("--save", metavar="FILE.rrd", help="write the recording of the viewer and do not open it"),
          option("--theme", choices=("light", "dark"),
-                help="show it in a web browser in this theme until Ctrl-C (the viewer's window has a setting for it)"),
-         option("--headless", action="store_true", help="open no window (together with --screenshot)"),
-         option("--screenshot", metavar="FILE.png",
-                help="draw without a display, and save the picture"))),
+                help="show it in a web browser in this theme until Ctrl-C (the window has a setting for it)"))),
 }

@@ -28,8 +28,8 @@ def load_known_model(args: argparse.Namespace) -> tuple[Model, Provenance]:
     return model.replace(parse_changes(args.set)), replace(known, effect_files=files)
 
 
-def split_words(words: Sequence[str], trace: str | None, plant: str) -> tuple[list[str], str | None]:
-    """The effects of a plant, and the trace, among the words of a command.
+def split_words(words: Sequence[str], plant: str, trace: str | None = None) -> tuple[list[str], str | None]:
+    """The effects of a plant among the words of a command, and the trace: one of them if none is known.
 
     Raises:
         InputError: a word that is neither an effect nor a trace; it offers the nearest effect.

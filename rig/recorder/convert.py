@@ -24,7 +24,6 @@ from plant import signals as plant_signals
 from plant.errors import InputError, report_system_error, require
 from plant.tables import read_file
 from rig.benches.bench import (
-    EXTENDED,
     FD,
     SWITCHED,
     Bench,
@@ -155,14 +154,13 @@ def _write_log(out: Path, attachments: Mapping[str, tuple[str, bytes]], metadata
         recorder.close()
 
 
-def import_frames(source: Path, out: Path, bench: Bench, dbc: Path | None = None) -> int:
+def import_frames(source: Path, out: Path, bench: Bench) -> int:
     """Make a log from the raw frames of a bench, cut into cycles at each SYNC or demand; -> cycles.
 
-    Row k holds the demand of cycle k, what the plant sensed in it and the drive frame that answers it. `dbc` decodes
-    the frames in place of the bench.
-    Raises InputError for a file or DBC that cannot be read, and when there is no cycle in it.
+    Row k holds the demand of cycle k, what the plant sensed in it and the drive frame that answers it.
+    Raises InputError for a file that cannot be read, and when there is no cycle in it.
     """
-    cycles = _CycleBuilder(bench, _find_readers(bench, dbc))
+    cycles = _CycleBuilder(bench)
     items: list[Frame | tuple[int, Record]] = []
     for frame in _read_frames(source):
         items += [frame, *((frame.t_ns, record) for record in cycles.feed(frame))]
@@ -175,22 +173,20 @@ def import_frames(source: Path, out: Path, bench: Bench, dbc: Path | None = None
     middle = float(spans[len(spans) // 2]) if len(spans) else bench.cycle_ns
     period = bench.cycle_ns / 1e9 if 0.9 < middle / bench.cycle_ns < 1.1 else round(middle / 1e9, 4)  # another speed
     items = sorted([*items, *cycles.rows], key=lambda item: item[0])
-    decoding = {} if dbc is None else {dbc.name: dbc.read_bytes()}
-    _write_log(out, {name: ("text/plain", data) for name, data in {**bench.files, **decoding}.items()},
+    _write_log(out, {name: ("text/plain", data) for name, data in bench.files.items()},
                collect_provenance(imported=source.name, period=period, pace="imported"), items, bench.signals)
     return len(starts)
 
 
 _WORDS = {"control_word": "control", "status_word": "status", "flags": "flags"}
-Readers = Mapping[FrameSpec, Callable[[bytes], Mapping[str, float]]]
 
 
 class _CycleBuilder:
     """Frames in, one Signals a cycle out; heartbeats and emergencies become records on the way."""
 
-    def __init__(self, bench: Bench, readers: Readers) -> None:
+    def __init__(self, bench: Bench) -> None:
         self.rows: list[tuple[int, Signals]] = []
-        self._frames, self._is_canopen, self._readers = bench.frames, bool(bench.nodes), readers
+        self._frames, self._is_canopen = bench.frames, bool(bench.nodes)
         # without SYNC a cycle begins with the first frame of the rig, of those that it sends most often
         self.begin = min(bench.frames.list_from(Role.RIG), key=lambda each: each.every)
         self._record: Any = make_row_record(bench.signals)
@@ -211,7 +207,7 @@ class _CycleBuilder:
             if len(frame.data) < spec.length:
                 return [Event("WARN", "frame",
                               f"{describe_identifier(cob_id)}: {len(frame.data)} bytes instead of {spec.length}")]
-            self._take(frame.t_ns, spec, self._readers[spec](frame.data[:spec.length]))
+            self._take(frame.t_ns, spec, unpack(spec, frame.data[:spec.length]))
         elif (self._is_canopen and 0x700 < cob_id < 0x780 and len(frame.data) == 1
               and self._nmt.get(node) != frame.data[0]):
             state = self._nmt[node] = frame.data[0]
@@ -291,22 +287,6 @@ def _load_messages(dbc: Path) -> dict[tuple[int, bool], Any]:
     """
     return {(m.frame_id, m.is_extended_frame): m
             for m in read_database(str(dbc), decode_device_text(read_file(dbc))).messages}
-
-
-def _find_readers(bench: Bench, dbc: Path | None) -> Readers:
-    """What decodes each frame of a bench: the bench itself, or a DBC that must have all its signals."""
-    if dbc is None:
-        return {spec: partial(unpack, spec) for spec in bench.frames.frames}
-    found = _load_messages(dbc)
-    own: dict[FrameSpec, Callable[[bytes], Mapping[str, float]]] = {}
-    for spec in bench.frames.frames:
-        message = found.get((spec.identifier & 0x1FFF_FFFF, bool(spec.identifier & EXTENDED)))
-        known = () if message is None else [each.name for each in message.signals]
-        missing = [each.name for each in spec.fields if each.name and each.name not in known]
-        if message is None or missing:
-            raise InputError(dbc, f"frame {describe_identifier(spec.identifier)}", f"the signal {', '.join(missing)}")
-        own[spec] = partial(message.decode, decode_choices=False)
-    return own
 
 
 def _read_signals(path: Path, messages: Mapping[tuple[int, bool], Any], names: Collection[str],

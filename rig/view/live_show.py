@@ -16,7 +16,7 @@ import select
 import struct
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 from io import BytesIO
 from math import isnan, nan
@@ -53,8 +53,11 @@ from rig.view.recording import (
     Drawing,
     Lane,
     LogText,
+    Plot,
     Recording,
     build_blueprint,
+    describe_check,
+    describe_event,
     draw_signals,
     list_plots,
     name_node_lane,
@@ -286,80 +289,71 @@ def _list_signals(plan: LivePlan) -> list[str]:
 
 
 class LiveView:
-    """Sends what is new of a run to a recording. Nothing is sent before main begins, where t = 0 is, or it ends."""
+    """Draws what is new of a run, piece by piece. Nothing is sent before main begins, where t = 0 is, or it ends."""
 
     def __init__(self, recording: Recording, plan: LivePlan) -> None:
         """Use the recording of the drawing of this plan."""
         self._recording, self._plan, self._signals = recording, plan, _list_signals(plan)
         self._rows = 0
         self._waiting: list[tuple[int, Record]] = []
-        self._shown: dict[str, str] = {}  # lane -> state
+        self._shown = {f"check/{name}": "waits" for name in plan.check_names}  # lane -> state
 
-    def update(self, run: LiveRun, new: Sequence[tuple[int, Record]]) -> None:
-        """Send the records that have come since the last call, once main has begun."""
+    def update(self, run: LiveRun, new: Sequence[tuple[int, Record]], *, is_over: bool = False) -> None:
+        """Send what has come since the last call; t = 0 of a run that ended before main is its last record."""
         self._waiting += new
-        if run.zero_ns is not None:
-            self._send_all(run, run.zero_ns)
-
-    def finish(self, run: LiveRun) -> None:
-        """Send what a run that ended before main has left waiting; t = 0 is its last record."""
-        if run.zero_ns is None and self._waiting:
-            self._send_all(run, self._waiting[-1][0])
-
-    def _send_all(self, run: LiveRun, zero_ns: int) -> None:
-        for t_ns, record in self._waiting:
-            self._send_record(record, (t_ns - zero_ns) / 1e9)
+        zero_ns = self._waiting[-1][0] if is_over and self._waiting and run.zero_ns is None else run.zero_ns
+        if zero_ns is None:
+            return
+        records = [((t_ns - zero_ns) / 1e9, record) for t_ns, record in self._waiting]
         self._waiting.clear()
         rows = run.read_rows_from(self._rows)
         self._rows += len(rows)
-        if len(rows):
-            self._send_rows(rows, run, zero_ns)
+        plots, lanes = self._draw_rows(rows, run, zero_ns) if len(rows) else ([], [])
+        self._recording.send(plots, [*self._list_lanes(records), *lanes], [*_list_texts(records)])
 
-    def _send_rows(self, rows: NDArray[np.float64], run: LiveRun, zero_ns: int) -> None:
-        signals = run.plan.signals
-        columns = dict(zip(run.plan.columns, rows.T, strict=True))
+    def _draw_rows(self, rows: NDArray[np.float64], run: LiveRun, zero_ns: int) -> tuple[list[Plot], list[Lane]]:
+        signals = self._plan.signals
+        columns = dict(zip(self._plan.columns, rows.T, strict=True))
         columns["error"] = columns[signals.command.name] - columns[signals.controlled.name]
         t = (columns["t_ns"] - (zero_ns - run.first_ns)) / 1e9
-        for (origin, _), lines in list_plots(signals).items():
-            for line in lines:
-                if line.signal in self._signals:
-                    self._recording.send_values(f"{origin}/{line.path}", t, columns[line.signal] * line.scale)
-        phases = columns["phase"].astype(int)
-        for row in np.flatnonzero(np.diff(phases, prepend=-1)):
-            self._send_state("run/phase", float(t[row]), [*PHASES][min(phases[row], 2)])
-        self._send_state("run/command", float(t[-1]), run.section)
-        for state in run.checks.values():
-            if not state.is_final:
-                self._send_check(state, float(t[-1]))
+        plots = draw_signals({name: (t, columns[name]) for name in self._signals}, list_plots(signals))
+        phases, now = columns["phase"].astype(int), float(t[-1])
+        lanes = [self._turn("run/phase", float(t[row]), [*PHASES][min(phases[row], 2)])
+                 for row in np.flatnonzero(np.diff(phases, prepend=-1))]
+        lanes += [self._turn("run/command", now, run.section),
+                  *(self._turn_check(state, now) for state in run.checks.values() if not state.is_final)]
+        return plots, [lane for turned in lanes for lane in turned]
 
-    def _send_record(self, record: Record, t: float) -> None:
-        if isinstance(record, NmtState):
-            self._send_state(name_node_lane(record.node, self._plan.nodes.get(record.node)), t, record.name)
-        elif isinstance(record, CheckResult):
-            state = CheckState(record.name, record.verdict, record, True)
-            self._send_check(state, t)
-            self._recording.send_text(LogText(
-                "log/checks", t, f"{state.word} {state.name}:{state.measured} {record.detail}".rstrip(),
-                "INFO" if record.passed else "ERROR"))
+    def _list_lanes(self, records: Sequence[tuple[float, Record]]) -> Iterator[Lane]:
+        """The states that records report at their times."""
+        for t, record in records:
+            if isinstance(record, NmtState):
+                yield from self._turn(name_node_lane(record.node, self._plan.nodes.get(record.node)), t, record.name)
+            elif isinstance(record, CheckResult):
+                yield from self._turn_check(CheckState(record.name, record.verdict, record, True), t)
+            elif isinstance(record, Event) and record.kind == "fault" and (fault := read_fault_event(record.text)):
+                yield from self._turn(f"fault/{fault[0]}", t, fault[1])
+
+    def _turn_check(self, state: CheckState, t: float) -> list[Lane]:
+        """The protocol checks have no lane: they are judged after the run and have no window."""
+        word = state.word + state.measured if state.is_judged else state.word
+        is_shown = state.name in self._plan.check_names
+        return self._turn(f"check/{state.name}", t, word, {**_WORDS, word: _WORDS[state.word]}) if is_shown else []
+
+    def _turn(self, lane: str, t: float, state: str, colours: Mapping[str, int] | None = None) -> list[Lane]:
+        """The lane from its new state on; nothing if it has this state already."""
+        if self._shown.get(lane) == state:
+            return []
+        self._shown[lane] = state
+        return [Lane(lane, [(t, state)], colours or {})]
+
+
+def _list_texts(records: Sequence[tuple[float, Record]]) -> Iterator[LogText]:
+    for t, record in records:
+        if isinstance(record, CheckResult):
+            yield describe_check(record, t)
         elif isinstance(record, Event):
-            text = f"{t:8.3f} s  {record.kind}: {record.text}"
-            self._recording.send_text(LogText("log/events", t, text, record.level))
-            fault = read_fault_event(record.text) if record.kind == "fault" else None
-            if fault:
-                self._send_state(f"fault/{fault[0]}", t, fault[1])
-
-    def _send_check(self, state: CheckState, t: float) -> None:
-        if state.name not in self._plan.check_names:
-            return  # the protocol checks are judged after the run: they have no window
-        lane, word = f"check/{state.name}", state.word + state.measured if state.is_judged else state.word
-        if self._shown.get(lane, "waits") != word:
-            self._recording.declare_lane(Lane(lane, [], {**_WORDS, word: _WORDS[state.word]}))
-            self._send_state(lane, t, word)
-
-    def _send_state(self, lane: str, t: float, state: str) -> None:
-        if self._shown.get(lane) != state:
-            self._shown[lane] = state
-            self._recording.send_state(lane, t, state)
+            yield describe_event(t, record.level, record.kind, record.text)
 
 
 _EVERY = 0.1  # s between two frames, or pieces
@@ -447,7 +441,7 @@ def show_in_viewer(log: Path, plan: LivePlan, port: int, file: str) -> None:
             if viewer.poll() is not None if viewer else not is_listening(port):
                 print("rig run: the viewer was closed; the run goes on", file=sys.stderr, flush=True)
                 os._exit(0)  # its library would wait for the viewer
-    view.finish(run)
+    view.update(run, (), is_over=True)
     stream.flush()
     stream.disconnect()
 

@@ -92,7 +92,7 @@ class Recording:
     """A stream of the viewer, which takes curves, states and texts of a drawing at once or piece by piece."""
 
     def __init__(self, stream: Any, drawing: Drawing) -> None:
-        """Declare name and colour of each curve and lane of a drawing, and send its document."""
+        """Declare name and colour of each curve of a drawing, and send the drawing with its document."""
         self._rr, self._stream = import_rerun(), stream
         stream.send_recording_name(drawing.name)
         for plot in drawing.plots:
@@ -100,32 +100,28 @@ class Recording:
                 stream.log(f"{plot.origin}/{curve.path}", self._rr.SeriesLines(
                     colors=[curve.colour], widths=[curve.width], names=[curve.name], aggregation_policy="MinMax"),
                     static=True)
-        for lane in drawing.lanes:
-            self.declare_lane(lane)
         title, text = drawing.document
         stream.log(f"log/{title.lower()}", self._rr.TextDocument(text, media_type="text/markdown"), static=True)
+        self.send(drawing.plots, drawing.lanes, drawing.log or ())
 
-    def declare_lane(self, lane: Lane) -> None:
-        """Set the colours of a lane, and what is shown in place of its states."""
-        if lane.colours:
-            self._stream.log(make_lane_path(lane.path), self._rr.StateConfiguration(
-                values=[*lane.colours], labels=[lane.labels.get(value, value) for value in lane.colours],
-                colors=np.array([*lane.colours.values()], np.uint32)), static=True)
-
-    def send_values(self, path: str, t: Floats, values: Floats) -> None:
-        """Send samples of a curve."""
-        self._rr.send_columns(path, [self._rr.TimeColumn(TIMELINE, duration=t)],
-                              self._rr.Scalars.columns(scalars=values), recording=self._stream)
-
-    def send_state(self, lane: str, t: float, state: str) -> None:
-        """Send a state of a lane."""
-        self._stream.set_time(TIMELINE, duration=t)
-        self._stream.log(make_lane_path(lane), self._rr.StateChange(state=state))
-
-    def send_text(self, text: LogText) -> None:
-        """Send a line of the log."""
-        self._stream.set_time(TIMELINE, duration=text.t)
-        self._stream.log(text.path, self._rr.TextLog(text.text, level=text.level))
+    def send(self, plots: Sequence[Plot], lanes: Sequence[Lane], texts: Sequence[LogText]) -> None:
+        """Send samples of curves, colours and states of lanes, and lines of the log."""
+        for plot in plots:
+            for curve in plot.curves:
+                self._rr.send_columns(f"{plot.origin}/{curve.path}", [self._rr.TimeColumn(TIMELINE, duration=curve.t)],
+                                      self._rr.Scalars.columns(scalars=curve.values), recording=self._stream)
+        for lane in lanes:
+            path = make_lane_path(lane.path)
+            if lane.colours:
+                self._stream.log(path, self._rr.StateConfiguration(
+                    values=[*lane.colours], labels=[lane.labels.get(value, value) for value in lane.colours],
+                    colors=np.array([*lane.colours.values()], np.uint32)), static=True)
+            for t, state in lane.states:
+                self._stream.set_time(TIMELINE, duration=t)
+                self._stream.log(path, self._rr.StateChange(state=state))
+        for text in texts:
+            self._stream.set_time(TIMELINE, duration=text.t)
+            self._stream.log(text.path, self._rr.TextLog(text.text, level=text.level))
 
 
 def write_recording(drawing: Drawing, path: Path) -> None:
@@ -139,15 +135,7 @@ def write_recording(drawing: Drawing, path: Path) -> None:
     require_writable(path, "the recording")
     with rr.RecordingStream("eha-rig", recording_id=path.stem) as stream:
         stream.save(path, default_blueprint=build_blueprint(drawing))
-        recording = Recording(stream, drawing)
-        for plot in drawing.plots:
-            for curve in plot.curves:
-                recording.send_values(f"{plot.origin}/{curve.path}", curve.t, curve.values)
-        for lane in drawing.lanes:
-            for t, state in lane.states:
-                recording.send_state(lane.path, t, state)
-        for text in drawing.log or ():
-            recording.send_text(text)
+        Recording(stream, drawing)
         stream.flush()
 
 
@@ -288,7 +276,9 @@ def draw_run(trace: Trace) -> Drawing:
              for plot in draw_signals(list_columns(trace), layout)]
     facts = "\n".join(f"- {key}: {value}" for key, value in trace.provenance.items())
     name = trace.provenance.get("sequence", trace.provenance.get("source", "trace"))
-    return Drawing(name, plots, LANES, [*_list_lanes(trace)], ("Provenance", facts), _list_texts(trace))
+    return Drawing(name, plots, LANES, [*_list_lanes(trace)], ("Provenance", facts), [
+        *(describe_event(event.t, event.level, event.kind, event.text) for event in trace.events),
+        *(describe_check(check, float(trace.t[-1])) for check in trace.checks)])
 
 
 def list_columns(trace: Trace) -> dict[str, tuple[Floats, Floats]]:
@@ -416,15 +406,16 @@ def _describe_measurement(check: CheckResult) -> str:
     return check.measured + (f" (limit {limits})" if limits else "")
 
 
-def _list_texts(trace: Trace) -> list[LogText]:
-    texts = [LogText("log/events", event.t, f"{event.t:8.3f} s  {event.kind}: {event.text}", event.level)
-             for event in trace.events]
-    for check in trace.checks:
-        t = float(trace.t[-1]) if math.isnan(check.t0) else check.t0
-        word, level = check.verdict, "INFO" if check.passed else "ERROR"
-        text = f"{t:8.3f} s  {word} {check.name}: {_describe_measurement(check)} {check.detail}".rstrip()
-        texts.append(LogText("log/checks", t, text, level))
-    return texts
+def describe_event(t: float, level: str, kind: str, text: str) -> LogText:
+    """The line about an event at `t` s."""
+    return LogText("log/events", t, f"{t:8.3f} s  {kind}: {text}", level)
+
+
+def describe_check(check: CheckResult, otherwise: float) -> LogText:
+    """The line about a check, where its window begins or, if it has none, `otherwise` s."""
+    t = otherwise if math.isnan(check.t0) else check.t0
+    text = f"{t:8.3f} s  {check.verdict} {check.name}: {_describe_measurement(check)} {check.detail}".rstrip()
+    return LogText("log/checks", t, text, "INFO" if check.passed else "ERROR")
 
 
 def format_document(report: Report) -> str:

@@ -38,7 +38,7 @@ def open_viewer(rrd: Path) -> None:
     """
     import_rerun()
     if lacks_display():
-        raise ViewerError(f"no display here for a window; {rrd} is written: open it elsewhere, or ask for --screenshot")
+        raise ViewerError(f"no display here for a window; {rrd} is written: open it elsewhere, or --out FILE.png")
     subprocess.Popen(make_viewer_command("auto", str(rrd)), start_new_session=True)
 
 

@@ -12,7 +12,7 @@ from rig.cli.inputs import list_signals
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 if the effects help."""
     model, known = load_known_model(args)
-    effects, trace = split_words(args.words, args.trace, model.plant)
+    effects, trace = split_words(args.words, model.plant)
     path = choose_model_file(args, trace)
     page = choose_file(str(path.with_suffix(".html")), (".html",), trace)
     with show_progress(args, "reading") as progress:

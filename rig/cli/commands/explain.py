@@ -29,7 +29,7 @@ def run_command(args: argparse.Namespace) -> int:
     model, known = load_known_model(args)
     hidden = args.hide.split(",") if args.hide else []
     if hidden:
-        split_words(hidden, args.trace, model.plant)  # refuses names that are no effects
+        split_words(hidden, model.plant, args.trace)  # refuses names that are no effects
     with show_progress(args, "reading") as progress:
         runs = read_runs(model, args.trace, args.repeat, args.holdout, list_signals(args))
         law_file = None if places.page is None else places.page.with_name(f"{places.page.stem}_law.py")

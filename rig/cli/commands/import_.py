@@ -27,6 +27,8 @@ def run_command(args: argparse.Namespace) -> int:
             "--bench", args.bench, "a CAN log without --map or --guess")
     require(not args.dbc or source.suffix in RAW_SUFFIXES, "--dbc", args.dbc,
             "a CAN log to decode; a CSV of signals has no frames")
+    require(not args.dbc or args.map or args.guess, "--dbc", args.dbc,
+            "--map or --guess with it; without them the frames are those of --bench")
     suffix = ".map.toml" if args.guess else ".mcap"
     out = source.with_name(source.name.split(".")[0] + suffix) if args.out is None else Path(args.out)
     if args.guess:
@@ -44,7 +46,7 @@ def import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
     """
     if source.suffix in RAW_SUFFIXES:
         bench = load_bench(args.bench or "eha", is_trusted=args.trust)
-        cycles = import_frames(source, out, bench, Path(args.dbc) if args.dbc else None)
+        cycles = import_frames(source, out, bench)
     elif source.name.endswith((".csv", ".csv.gz")):
         try:
             cycles = import_csv(source, out, load_declared_model(args).kind.signals)

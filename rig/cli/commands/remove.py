@@ -16,7 +16,7 @@ def run_command(args: argparse.Namespace) -> int:
     require(args.model and Path(args.model).is_file(), "--model", str(args.model or ""),
             "the model file to remove the effect from: --model FILE")
     model, known = load_known_model(args)
-    effects, trace = split_words(args.words, args.trace, model.plant)
+    effects, trace = split_words(args.words, model.plant)
     require(len(effects) == 1, "effect", effects[-1], "one effect at a time")
     path = choose_model_file(args, trace)
     page = choose_file(str(path.with_suffix(".html")), (".html",), trace) if trace else None

@@ -9,14 +9,13 @@ from pathlib import Path
 
 from fdi.comparison.compare import Comparison, compare
 from fdi.discovery.update_model import remove_all_effects
-from fdi.output import require_writable
 from fdi.progress import Progress
 from fdi.report.numbers import join_words
 from fdi.report.report import Report
 from fdi.trace.trace import Trace
 from plant.errors import require
 from plant.model import Model
-from rig.cli.answer import give_answer, show_progress
+from rig.cli.answer import choose_file, give_answer, show_progress
 from rig.cli.commands.diff import read_and_compare_runs
 from rig.cli.discovery_inputs import load_known_model
 from rig.cli.inputs import list_signals, load_declared_model
@@ -28,22 +27,21 @@ from rig.view.recording import Drawing, draw_comparison, draw_run, draw_runs, wr
 def run_command(args: argparse.Namespace) -> int:
     """The viewer listens on 127.0.0.1 only."""
     require_options_that_fit(args)
-    rrd = choose_recording(args)
-    if args.screenshot:
-        require_writable(args.screenshot, "--screenshot", source=args.trace)
+    out = choose_file(args.out, (".rrd", ".png"), args.trace)
+    rrd = place_recording(args) if out is None else out.with_suffix(".rrd")
     with show_progress(args) as progress:
         drawing = draw(args, progress)
         progress("writing the recording", 0.0)
         write_recording(drawing, rrd)
         data: dict[str, object] = {"rrd": str(rrd), **({"verdict": drawing.verdict} if drawing.verdict else {})}
-        if args.screenshot:
+        if out is not None and out.suffix == ".png":
             progress("the viewer draws the picture", 0.0)
-            viewer.take_screenshot(rrd, Path(args.screenshot))
-            data |= {"screenshot": args.screenshot}
-        elif not (args.save or args.out or args.theme):
+            viewer.take_screenshot(rrd, out)
+            data |= {"screenshot": args.out}
+        elif not (out or args.theme):
             progress("opening the viewer", 0.0)
             viewer.open_viewer(rrd)
-    written = "\n".join(str(path) for path in (rrd, args.screenshot) if path)
+    written = "\n".join(dict.fromkeys(str(path) for path in (rrd, out) if path))
     report = Report("view", join_words([args.trace, *args.others]), sentence=written, data=data)
     return show_in_browser(report, rrd, args) if args.theme else give_answer(report, args)
 
@@ -67,9 +65,7 @@ def require_options_that_fit(args: argparse.Namespace) -> None:
     Raises:
         InputError: such options.
     """
-    require(args.screenshot or not args.headless, "--headless", "", "--screenshot FILE.png with it")
-    require(not (args.theme and (args.screenshot or args.save or args.out)), "--theme", args.theme,
-            "no --screenshot, --save or --out with it: they open no browser")
+    require(not (args.theme and args.out), "--theme", args.theme, "no --out with it: it opens no browser")
     require(not (args.compare and args.others), "--compare", "".join(args.others[:1]),
             "one trace; rig view A B holds traces against each other")
     for option in ("set", "effects", "seed", "repeat", "signals"):
@@ -77,20 +73,9 @@ def require_options_that_fit(args: argparse.Namespace) -> None:
         require(args.compare or given in (None, []), f"--{option}", "", "--compare with it")
 
 
-def choose_recording(args: argparse.Namespace) -> Path:
-    """--save or --out, else beside the picture, else beside the last trace.
-
-    Raises:
-        InputError: a place that cannot be written, or the trace itself.
-    """
-    source = Path(args.trace)
-    for option, place in (("--save", args.save), ("--out", args.out)):
-        if place:
-            return require_writable(place, option, source=source)
-    if args.screenshot:
-        return require_writable(Path(args.screenshot).with_suffix(".rrd"), "--screenshot", source=source)
-    if args.others:
-        source = Path(args.others[0])
+def place_recording(args: argparse.Namespace) -> Path:
+    """The recording without --out: beside the last trace."""
+    source = Path([args.trace, *args.others[:1]][-1])
     folder = source if source.is_dir() else source.parent
     name = "compare" if args.compare else "diff" if args.others else source.name.split(".")[0]
     return folder / f"{name}.rrd"

@@ -9,7 +9,6 @@ import pytest
 from rig_command import rig
 from synthetic_run import record_run
 
-import dbc
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from rig.benches.bench import EXTENDED, FD, SWITCHED
@@ -35,8 +34,8 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_raw_frames_there_and_back(log: Path, tmp_path: Path, suffix: str) -> None:
     out = tmp_path / f"x{suffix}"
     assert export_trace(log, out) == 6500
-    bench, decoding = load_bench(), dbc.DBC if suffix == ".blf" else None
-    assert import_frames(out, tmp_path / "back.mcap", bench, decoding) == 1300
+    bench = load_bench()
+    assert import_frames(out, tmp_path / "back.mcap", bench) == 1300
     before, after = list(read_raw_frames(log)), list(read_raw_frames(tmp_path / "back.mcap"))
     assert [f[1:] for f in before] == [f[1:] for f in after]
     worst = max(abs(a.t_ns - b.t_ns) for a, b in zip(before, after, strict=True))
@@ -45,7 +44,7 @@ def test_raw_frames_there_and_back(log: Path, tmp_path: Path, suffix: str) -> No
     for name, resolution in {"com": 1e-7, "xj": 1e-7, "cor": 1e-8, "p12": 10.0, "xs": 1e-9}.items():
         np.testing.assert_allclose(got.column(name), want.column(name), atol=0.51 * resolution)
     assert np.isnan(got.load).all() and not got.gaps
-    assert {*bench.files, *(["eha.dbc"] if decoding else [])} <= got.attachments.keys()
+    assert {*bench.files} <= got.attachments.keys()
     assert got.provenance["imported"] == out.name
 
 
@@ -134,7 +133,8 @@ FILES = {"x.csv": b"t,com,xj,cor\n0,0,0,0\n0.001,0,0,0\n", "bad.log": b"hello\n"
     ("export {log} --out x.xlsx", "ends in .csv"), ("export x.csv --out x.blf", "raw frames"),
     ("export x.mcap --out x.blf", "at least one raw frame"), ("import bad.log", "CAN frames as .log"),
     ("import bad.blf", "CAN frames as .blf"), ("import silent.log", "SYNC"),
-    ("import silent.log --dbc bad.dbc", "expected a DBC ("), ("import silent.log --dbc other.dbc", "frame 0x202")])
+    ("import silent.log --guess --dbc bad.dbc", "expected a DBC ("),
+    ("import silent.log --dbc other.dbc", "--map or --guess with it")])
 def test_refusals(log: Path, words: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name, content in FILES.items():

@@ -329,7 +329,7 @@ def test_the_run_goes_on_when_the_viewer_is_closed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("status", "words"), [(2, ["run", "--live", "rerun", "--out", "run"]),
-                                               (1, ["view", "trace.mcap", "--save", "x.rrd"])])
+                                               (1, ["view", "trace.mcap", "--out", "x.rrd"])])
 def test_without_the_viewer_one_line_says_how_to_get_it(status: int, words: list[str], tmp_path: Path,
                                                         monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

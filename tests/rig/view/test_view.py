@@ -152,7 +152,7 @@ def read_values(rows: Rows, entity: str) -> np.ndarray:
 @pytest.fixture(scope="module")
 def compared(folder: Path) -> tuple[Path, str]:
     """The recording of `rig view --compare` with an added effect, and the verdict."""
-    told = answer("view", folder / "run.csv", "--compare", "--set", BIAS, "--save", folder / "compare.rrd")
+    told = answer("view", folder / "run.csv", "--compare", "--set", BIAS, "--out", folder / "compare.rrd")
     return folder / "compare.rrd", told["verdict"]
 
 
@@ -186,7 +186,7 @@ def test_before_the_change_is_the_model_without_the_added_effect(folder: Path, c
 
 def test_runs_are_overlaid_and_subtracted_on_the_time_of_the_first(folder: Path, tmp_path: Path) -> None:
     sources = [str(folder / f"{name}.csv") for name in ("healthy", "run", "late")]
-    assert answer("view", *sources, "--save", tmp_path / "x.rrd")["verdict"] == "DIFFERENT"
+    assert answer("view", *sources, "--out", tmp_path / "x.rrd")["verdict"] == "DIFFERENT"
     rows, names = read_recording(tmp_path / "x.rrd"), read_names(tmp_path / "x.rrd")
     traces = [Trace.read(source) for source in sources]
     found = compare_runs(sources, traces)
@@ -203,12 +203,10 @@ def test_runs_are_overlaid_and_subtracted_on_the_time_of_the_first(folder: Path,
 
 
 @pytest.mark.parametrize(("words", "message"), [
-    (["--compare", "--headless"], "--headless: expected --screenshot FILE.png with it"),
+    (["--out", "x.mcap"], "--out: x.mcap: expected FILE.rrd or FILE.png"),
     (["other.csv", "--compare"], "--compare: other.csv: expected one trace; rig view A B holds traces against each "
                                  "other"),
-    (["--headless"], "--headless: expected --screenshot FILE.png with it"),
-    (["--theme", "light", "--save", "x.rrd"], "--theme: light: expected no --screenshot, --save or --out with it: they "
-                                              "open no browser"),
+    (["--theme", "light", "--out", "x.rrd"], "--theme: light: expected no --out with it: it opens no browser"),
     (["--set", BIAS], "--set: expected --compare with it"),
     (["--repeat", "other.csv"], "--repeat: expected --compare with it"),
     (["--signals", "xj"], "--signals: expected --compare with it"),
