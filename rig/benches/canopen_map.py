@@ -37,6 +37,11 @@ class Pdo(NamedTuple):
     entries: tuple[tuple[int, int, int], ...]  # index, sub, bits
 
     @property
+    def mapping(self) -> int:
+        """Index of its mapping."""
+        return self.parameter + MAPPING
+
+    @property
     def length(self) -> int:
         """Bits."""
         return sum(bits for _, _, bits in self.entries)
@@ -201,7 +206,7 @@ def _describe_unmapped(dictionary: Any, pdos: list[Pdo], key: str, use: Use) -> 
 
 def _map_pdo(name: str, dictionary: Any, pdo: Pdo, own: set[str], *, is_answer: bool) -> DeviceFrame:
     """The frame of a PDO; only `own` objects keep their names."""
-    where = f"0x{pdo.parameter + MAPPING:04X}"
+    where = f"0x{pdo.mapping:04X}"
     require(0 < pdo.length <= _LONGEST, name, where, f"at most 8 bytes in {pdo.name}, not {pdo.length} bits")
     require(0 <= pdo.kind <= 240 or pdo.kind in (254, 255), name, f"0x{pdo.parameter:04X}:2",
             f"a transmission type 0 to 240, 254 or 255 for {pdo.name}, not {pdo.kind}")

@@ -7,6 +7,7 @@ Options that several commands share stand first.
 import argparse
 import keyword
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,17 +44,8 @@ def add_options(parser: argparse._ActionsContainer, options: Sequence[Option | G
             parser.add_argument(*each.names, **each.settings)
 
 
-def parse_whole_number(text: str) -> int:
-    """Parse a whole number from 0, as an argparse type."""
-    return _parse_integer(text, 0)
-
-
-def parse_count(text: str) -> int:
-    """Parse a whole number from 1, as an argparse type."""
-    return _parse_integer(text, 1)
-
-
-def _parse_integer(text: str, least: int) -> int:
+def parse_integer(text: str, least: int) -> int:
+    """Parse a whole number from `least` on, as an argparse type."""
     try:
         value = int(text)
     except ValueError:
@@ -63,6 +55,7 @@ def _parse_integer(text: str, least: int) -> int:
     return value
 
 
+parse_whole_number, parse_count = partial(parse_integer, least=0), partial(parse_integer, least=1)
 OF_EVERY_COMMAND = (
     option("--json", action="store_true", help="print one JSON object on standard output, nothing else"),
     option("--out", metavar="PATH", help="where to write the result"),

@@ -6,14 +6,13 @@ from itertools import combinations
 from canopen.objectdictionary import datatypes
 from canopen.objectdictionary.datatypes import UNSIGNED8, UNSIGNED16, UNSIGNED32, VISIBLE_STRING
 
-from rig.benches.canopen_map import INVALID, PARAMETERS
+from rig.benches.canopen_map import INVALID, PARAMETERS, Pdo
 from rig.conformance.pdo_cases import describe_mapping, split_entry
 from rig.conformance.target import (
     HISTORY,
     SIZES,
     Case,
     CaseFailed,
-    Pdo,
     Target,
     Variable,
     for_each,
@@ -148,8 +147,8 @@ def check_pdo_parameters(t: Target) -> str:
     """Communication and mapping parameters come in pairs."""
     pdos = t.sheet.pdos
     known = {pdo.mapping for pdo in pdos}
-    counts = [(key, read_number(t, "DeviceInfo", key, -1), sum(pdo.is_sent is is_sent for pdo in pdos))
-              for key, is_sent in (("NrOfRXPDO", False), ("NrOfTXPDO", True))]
+    counts = [(key, read_number(t, "DeviceInfo", key, -1), sum(pdo.is_received is is_received for pdo in pdos))
+              for key, is_received in (("NrOfRXPDO", True), ("NrOfTXPDO", False))]
     problems = [
         *(f"{pdo.name} has no 0x{pdo.parameter:04X}:{sub}" for pdo in pdos for sub in (0, 1, 2)
           if t.sheet.find(pdo.parameter, sub) is None),
@@ -166,8 +165,8 @@ def check_pdo_mapping(t: Target, pdo: Pdo) -> str:
     subs = range(1, (t.sheet.default(pdo.mapping) or 0) + 1)
     words = [t.sheet.default(pdo.mapping, sub) or 0 for sub in subs]
     for mapped in filter(None, (t.sheet.find(*split_entry(word)[:2]) for word in words)):
-        can_be_carried = mapped.is_readable if pdo.is_sent else mapped.is_writable
-        require(can_be_carried and mapped.is_mappable and mapped.access != ("rww" if pdo.is_sent else "rwr"),
+        can_be_carried = mapped.is_writable if pdo.is_received else mapped.is_readable
+        require(can_be_carried and mapped.is_mappable and mapped.access != ("rwr" if pdo.is_received else "rww"),
                 f"{pdo.name} maps {mapped.label}, which is {mapped.access} with PDOMapping={mapped.is_mappable:d}")
     return describe_mapping(t, pdo, words)
 
@@ -187,7 +186,7 @@ def check_identity(t: Target) -> str:
 
 def check_identifiers(t: Target) -> str:
     """COB-IDs as they are after a reset."""
-    words = [*((pdo.name, t.sheet.default(pdo.parameter, 1), pdo.is_sent) for pdo in t.sheet.pdos),
+    words = [*((pdo.name, t.sheet.default(pdo.parameter, 1), not pdo.is_received) for pdo in t.sheet.pdos),
              ("SYNC", t.sheet.default(0x1005), False), ("EMCY", t.sheet.default(0x1014), True)]
     used = [(name, word & 0x7FF, is_sent) for name, word, is_sent in words
             if word is not None and (name == "SYNC" or not word & INVALID)]

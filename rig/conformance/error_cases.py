@@ -4,6 +4,7 @@ from functools import partial
 from itertools import pairwise
 from statistics import fmean
 
+from rig.benches.canopen_map import Pdo
 from rig.conformance.pdo_cases import (
     EXTENDED,
     list_received,
@@ -29,7 +30,6 @@ from rig.conformance.target import (
     TOO_LOW,
     VALUE,
     Case,
-    Pdo,
     Target,
     for_each,
     read_error_code,

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
-from rig.benches.canopen_map import INVALID
+from rig.benches.canopen_map import INVALID, Pdo
 from rig.conformance.target import (
     CANNOT_MAP,
     COMMANDS,
@@ -17,7 +17,6 @@ from rig.conformance.target import (
     VALUE,
     Case,
     CaseSkipped,
-    Pdo,
     Problem,
     Target,
     for_each,
@@ -129,10 +128,10 @@ def check_extended(t: Target, pdo: Pdo) -> str:
 
 def check_switching(t: Target, pdo: Pdo, phases: Sequence[tuple[str, str, bool]]) -> str:
     """A PDO is on, off or moved to another COB-ID, and works under the old and the new one as a phase says."""
-    if pdo.is_sent:
-        require_type(t, pdo, 1)
-    else:
+    if pdo.is_received:
         require_emcy(t)
+    else:
+        require_type(t, pdo, 1)
     word, free, values = t.read(pdo.parameter, 1), t.find_free_identifier(), read_mapped(t, pdo)
     cob_ids = {"old": word & 0x7FF, "new": free}
     moved = word & ~0x7FF | free
@@ -143,7 +142,7 @@ def check_switching(t: Target, pdo: Pdo, phases: Sequence[tuple[str, str, bool]]
                 t.write(pdo.parameter, 1, value)
             require(works_as(t, pdo, values, cob_ids[name], is_expected),
                     f"{pdo.name} is {action}, its {name} COB-ID is {'not used' if is_expected else 'used'}")
-        if not pdo.is_sent:
+        if pdo.is_received:
             send_values(t, pdo, values)
     return f"{pdo.name} " + ", ".join(f"{action} 0x{cob_ids[name]:03X} {'used' if is_expected else 'silent'}"
                                       for action, name, is_expected in phases)
@@ -154,8 +153,8 @@ def works_as(t: Target, pdo: Pdo, values: list[bytes], cob_id: int, is_expected:
 
     The wrong length changes nothing.
     """
-    return (len(answer_syncs(t, cob_id, 3, 3 * is_expected)) == 3 * is_expected if pdo.is_sent else
-            bool(send_short(t, pdo, values, cob_id, is_expected)) is is_expected)
+    return (bool(send_short(t, pdo, values, cob_id, is_expected)) is is_expected if pdo.is_received else
+            len(answer_syncs(t, cob_id, 3, 3 * is_expected)) == 3 * is_expected)
 
 
 def check_short_rpdo(t: Target, pdo: Pdo) -> str:
@@ -333,12 +332,12 @@ def answer_syncs(t: Target, cob_id: int, count: int, expected: int) -> list[Fram
     return t.heard(mark, cob_id)
 
 
-def list_valid(t: Target, is_sent: bool | None = None, is_changeable: bool = False) -> list[Pdo]:
+def list_valid(t: Target, is_received: bool | None = None, is_changeable: bool = False) -> list[Pdo]:
     """The PDOs, of one direction or both, that are on and map something, with a COB-ID that can be written if need be.
 
     Raises CaseNotApplicable if there is none.
     """
-    chosen = [pdo for pdo in t.sheet.pdos if is_sent in (None, pdo.is_sent)
+    chosen = [pdo for pdo in t.sheet.pdos if is_received in (None, pdo.is_received)
               and not t.read(pdo.parameter, 1) & INVALID and t.read(pdo.mapping, 0)
               and (not is_changeable or t.sheet.is_writable(pdo.parameter, 1))]
     require_applicable(chosen, f"no such PDO is valid{' and can get another COB-ID' if is_changeable else ''}")
@@ -400,7 +399,7 @@ def require_type(t: Target, pdo: Pdo, *kinds: int) -> None:
                        f"no TPDO accepts transmission type {' or '.join(map(str, kinds))}")
 
 
-list_received, list_sent = partial(list_valid, is_sent=False), partial(list_valid, is_sent=True)
+list_received, list_sent = partial(list_valid, is_received=True), partial(list_valid, is_received=False)
 list_changeable = partial(list_valid, is_changeable=True)
 
 CASES = (
@@ -427,10 +426,10 @@ CASES = (
          for_each(list_changeable, check_extended)),
     Case("4.10", "a TPDO is switched off and on", "7.5.2.37",
          "not sent while bit 31 is set; sent again afterwards",
-         for_each(partial(list_changeable, is_sent=True), partial(check_switching, phases=(
+         for_each(partial(list_changeable, is_received=False), partial(check_switching, phases=(
              ("on", "old", True), ("off", "old", False), ("on", "old", True))))),
     Case("4.11", "a TPDO gets another COB-ID", "7.5.2.37", "off, changed, on: it is sent under the new one only",
-         for_each(partial(list_changeable, is_sent=True), partial(check_switching, phases=(
+         for_each(partial(list_changeable, is_received=False), partial(check_switching, phases=(
              ("moved", "new", True), ("moved", "old", False))))),
     Case("4.12", "received PDO too short", "7.2.2.5, table 26", "EMCY 0x8210, and the values stay as they were",
          for_each(list_received, check_short_rpdo, text="EMCY 0x8210 for {}")),
@@ -438,7 +437,7 @@ CASES = (
          "the first bytes are used or not; EMCY, if any, is 0x8220", for_each(list_received, check_long_rpdo)),
     Case("4.14", "an RPDO is switched off, moved and on", "7.5.2.35",
          "a frame that is too short is noticed (EMCY 0x8210) only under the COB-ID in force",
-         for_each(partial(list_changeable, is_sent=False), partial(check_switching, phases=(
+         for_each(partial(list_changeable, is_received=True), partial(check_switching, phases=(
              ("off", "old", False), ("moved", "old", False), ("moved", "new", True))))),
     Case("4.15", "values of a received PDO", "7.2.2.2, 7.5.2.35",
          "type 0 to 240: in the dictionary after the next SYNC, not before; 254 and 255: at once",

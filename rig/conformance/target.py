@@ -14,7 +14,7 @@ from canopen.objectdictionary import ODVariable, datatypes
 from fdi.report.numbers import count_nouns
 from plant.tables import read_file
 from rig.benches.bench import decode_device_text
-from rig.benches.canopen_map import INVALID, MAPPING, PARAMETERS, RPDO, TPDO, list_variables, read_dictionary
+from rig.benches.canopen_map import INVALID, MAPPING, PARAMETERS, list_pdos, list_variables, read_dictionary
 from rig.network.bus import Wire
 from rig.network.frame import Frame
 from rig.network.node_objects import NmtCommand, NmtState, name_state
@@ -566,15 +566,6 @@ class Variable(NamedTuple):
         return self.default if isinstance(self.default, bytes) else self.encode(self.default)
 
 
-class Pdo(NamedTuple):
-    """One PDO that the EDS describes."""
-
-    name: str  # RPDO1
-    is_sent: bool  # by the node under test: a TPDO
-    parameter: int  # index of its communication parameters
-    mapping: int  # index of its mapping
-
-
 class DataSheet:
     """An EDS for one node-ID. `text` is the file section by section, `variables` what it describes.
 
@@ -595,9 +586,7 @@ class DataSheet:
         for variable in self.variables:
             self.objects.setdefault(variable.index, []).append(variable)
         self._by_key = {variable.key: variable for variable in self.variables}
-        self.pdos = [Pdo(f"{kind}{index - base + 1}", kind == "TPDO", index, index + MAPPING)
-                     for kind, base in (("RPDO", RPDO), ("TPDO", TPDO))
-                     for index in self.objects if base <= index < base + MAPPING]
+        self.pdos = list(list_pdos(od, node))
 
     def find(self, index: int, sub: int = 0) -> Variable | None:
         """The variable, None if the EDS has none there."""

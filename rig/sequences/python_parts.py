@@ -3,7 +3,7 @@
 import contextlib
 import inspect
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -20,24 +20,6 @@ OWN = {"key": False}  # a field that the program fills in
 _NAME = re.compile(r"(\w[\w-]*\.py):([A-Za-z_]\w*)")
 
 
-@dataclass(frozen=True)
-class UserFunction:
-    """A function of a user's file; `file` is where messages say that it stands."""
-
-    file: str
-    name: str
-    function: Any
-
-    def call(self, *values: object, **arguments: Argument) -> Any:
-        """What the function returns.
-
-        Raises:
-            InputError: it raised an exception or ended the program; the error names file and line.
-        """
-        with explain_errors(self.file, self.name):
-            return self.function(*values, **arguments)
-
-
 @dataclass(frozen=True, kw_only=True)
 class PythonPart:
     """What calls a function of the user's: `python` is FILE.py:FUNCTION."""
@@ -45,12 +27,12 @@ class PythonPart:
     given: ClassVar[int] = 1  # values that the function gets besides its `arguments`
     python: str
     arguments: Mapping[str, Argument] = field(default_factory=dict)
-    function: UserFunction | None = field(default=None, repr=False, compare=False, metadata=OWN)
+    function: Callable[..., Any] | None = field(default=None, repr=False, compare=False, metadata=OWN)
 
     def call(self, *values: object) -> Any:
         """What the function returns. Raises InputError with file and line if it raises an exception."""
         assert self.function is not None
-        return self.function.call(*values, **self.arguments)
+        return self.function(*values, **self.arguments)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,8 +108,10 @@ def require_function_name(text: str) -> tuple[str, str]:
     return match[1], match[2]
 
 
-def load_function(module: ModuleType, name: str, given: int, arguments: Mapping[str, Argument]) -> UserFunction:
+def load_function(module: ModuleType, name: str, given: int, arguments: Mapping[str, Argument]) -> Callable[..., Any]:
     """A function of a user's module that takes so many values and these named arguments.
+
+    Where it raises an exception or ends the program, it raises InputError, which names file and line.
 
     Raises:
         InputError: the module has no such function.
@@ -143,4 +127,9 @@ def load_function(module: ModuleType, name: str, given: int, arguments: Mapping[
             named = f" and the arguments {', '.join(arguments)}" if arguments else ""
             raise InputError(f"{file}:{line}", name, f"a function of {given} value{'s' if given > 1 else ''}{named} "
                                                      f"({error})") from error
-    return UserFunction(file, name, function)
+
+    def call(*values: object, **named: Argument) -> Any:
+        with explain_errors(file, name):
+            return function(*values, **named)
+
+    return call

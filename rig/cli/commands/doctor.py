@@ -33,29 +33,30 @@ def build_listening_report(bench: Bench, spec: str, seconds: float) -> Report:
     """Report on the frames of a bench that are heard on a bus."""
     heard, others = doctor.count_frames(bench, doctor.listen(bench, spec, seconds))
     findings = list(doctor.judge_frames(bench, heard, others, seconds))
-    theirs = [each for each in findings if each.purpose.startswith("controller")]
-    is_there = any(each.status == "ok" for each in theirs)
-    sentence = (f"The controller is on {spec}." if is_there else
-                f"Nothing of the controller is heard on {spec}.")
-    verdict = "PASS" if is_there else "FAIL"
-    return Report("doctor", bench.name, verdict, "good" if is_there else "bad", sentence,
-                  sections=[Section("", [tabulate_findings(findings)])],
-                  data={"verdict": verdict, "findings": [finding._asdict() for finding in findings]})
+    is_there = any(each.status == "ok" for each in findings if each.purpose.startswith("controller"))
+    sentence = f"The controller is on {spec}." if is_there else f"Nothing of the controller is heard on {spec}."
+    return build_report(bench.name, findings, sentence, is_good=is_there)
 
 
 def build_doctor_report(findings: Sequence[doctor.Finding]) -> Report:
-    """Report on the findings: a table with one row each, below the name of its area."""
+    """Report on what a machine can do."""
     blocking = [finding.name for finding in findings if finding.needed and finding.status == "missing"]
-    data = {"verdict": "FAIL" if blocking else "PASS", "findings": [finding._asdict() for finding in findings]}
-    section = Section("", [tabulate_findings(findings)])
     if blocking:
-        return Report("doctor", "this machine", "FAIL", "bad", f"The bench cannot run without: {', '.join(blocking)}.",
-                      sections=[section], conclusion="the bench cannot run on this machine", data=data)
+        return build_report("this machine", findings, f"The bench cannot run without: {', '.join(blocking)}.",
+                            "the bench cannot run on this machine", is_good=False)
     counts = Counter(finding.status for finding in findings)
-    return Report("doctor", "this machine", "PASS", "good", "The embedded bench runs on this machine.",
-                  sections=[section], data=data, conclusion=(
-                      f"the embedded bench runs on this machine; {counts['ok']} capabilities ok, {counts['limited']} "
-                      f"limited, {counts['missing']} missing (optional)"))
+    return build_report("this machine", findings, "The embedded bench runs on this machine.",
+                        f"the embedded bench runs on this machine; {counts['ok']} capabilities ok, {counts['limited']} "
+                        f"limited, {counts['missing']} missing (optional)", is_good=True)
+
+
+def build_report(title: str, findings: Sequence[doctor.Finding], sentence: str, conclusion: str = "", *,
+                 is_good: bool) -> Report:
+    """Report on findings: a table with a row each."""
+    verdict = "PASS" if is_good else "FAIL"
+    return Report("doctor", title, verdict, "good" if is_good else "bad", sentence, conclusion=conclusion,
+                  sections=[Section("", [tabulate_findings(findings)])],
+                  data={"verdict": verdict, "findings": [finding._asdict() for finding in findings]})
 
 
 def tabulate_findings(findings: Sequence[doctor.Finding]) -> Table:
