@@ -2,40 +2,24 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi.report.drawing import (
-    BLUE,
-    COMMAND,
-    FAULT,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    RED,
-    Mark,
-    axes,
-    call,
-    draw_panels,
-    legend,
-    levels,
-    line,
-    shade,
-)
 from fdi.report.numbers import count_nouns, format_amount
-from fdi.report.report import Cell, Column, Figure, Line, Medium, Report, Section, Table, tabulate, to_plain
+from fdi.report.report import Cell, Column, Line, Medium, Report, Section, Table, tabulate, to_plain
+from fdi.report.run_report import build_run_report
 from fdi.trace.check_result import CheckResult
+from fdi.trace.trace import MAIN, Event, Trace
 from plant import Model, simulate
 from plant.model import find_quantity
 from plant.plants import Plant
-from plant.run import Columns, make_columns_type
+from plant.run import make_columns_type
 from plant.segments import Array
-from plant.signals import Signals
 from rig.run.job import Job, find_differences
 from rig.run.runner import LimitReached, find_limits
-from rig.sequences.checks import Guard, evaluate_checks
+from rig.sequences.checks import Guard, GuardWatch, RunData
 from rig.sequences.faults import (
     Corrupted,
     Fault,
@@ -55,8 +39,6 @@ from rig.sequences.faults import (
 from rig.sequences.sequence import Sequence as TestSequence
 
 OF_EVENTS = ("response_within", "shut_off", "recovers", "event_occurs", "event_never")  # without a bus no events
-
-
 
 
 class Demand(NamedTuple):
@@ -114,11 +96,8 @@ class DryRun(NamedTuple):
     job: Job
     durations: dict[str, float]  # s, of setup, main and cleanup
     demands: list[Demand]
-    t: Array  # s of main
-    speed: Array  # SI, of the command; 0 where it jumps
-    load: Array  # SI
     faults: list[PlannedFault]  # that the run will inject
-    predicted: Columns  # of setup, main and cleanup, without the faults
+    predicted: Trace  # of setup, main and cleanup, without the faults; its events say when they act
     limits: tuple[LimitReached, ...]  # that the predicted run reaches
     checks: list[CheckResult]  # on the predicted run, those that need no events
     not_predicted: list[str]  # the other checks
@@ -154,20 +133,22 @@ def make_dry_run(job: Job) -> DryRun:
     t = (np.arange(len(command)) - first) / rate
     predicted = simulate(model, command, load, job.seed)
     sections = name_rows(sequence, (setup.command, main.command, cleanup.command))
-    columns = make_columns_type(model.kind.signals)(np.arange(last - first) / rate,
-                                                    *(column[first:last] for column in predicted[1:]))
-    chosen = [check for check in sequence.checks if check.kind not in OF_EVENTS]
+    signals = model.kind.signals
+    columns = make_columns_type(signals)(np.arange(last - first) / rate,
+                                         *(column[first:last] for column in predicted[1:]))
+    run = RunData(columns, sequence.sections(), starts=sequence.fault_starts(), rate=rate, signals=signals)
+    checks = [check.judge(run) for check in sequence.checks if check.kind not in OF_EVENTS]
+    events = [Event(at, "INFO", "fault", f"{fault.name} {word}") for fault in faults
+              for at, word in ((fault.t0, "begins"), (fault.t1, "ends"))]
+    trace = replace(Trace.from_columns(predicted._asdict(), 1 / rate, {}, signals), t=t, checks=tuple(checks),
+                    phase=np.searchsorted((first, last), np.arange(len(t)), side="right"), events=tuple(events))
     return DryRun(
         job=job, durations={"setup": first / rate, "main": (last - first) / rate,
                             "cleanup": (len(command) - last) / rate},
-        demands=measure_demands(command, load, t, sections, model, rate), t=t,
-        speed=split_jumps(command, [row for row, _ in sections], rate)[0], load=load, faults=faults,
-        predicted=predicted,
-        limits=find_limits(lambda name: getattr(predicted, name), model, first),
-        checks=evaluate_checks(chosen, columns, sequence.sections(), (), sequence.fault_starts(), rate=rate,
-                               signals=model.kind.signals),
+        demands=measure_demands(command, load, t, sections, model, rate), faults=faults, predicted=trace,
+        limits=find_limits(lambda name: getattr(predicted, name), model, first), checks=checks,
         not_predicted=[check.name for check in sequence.checks if check.kind in OF_EVENTS],
-        trips=[] if sequence.faults else [*find_trips(sequence.guards, columns, model.kind.signals)])
+        trips=[] if sequence.faults else [*find_trips(sequence.guards, run)])
 
 
 def name_rows(sequence: TestSequence, commands: Sequence[Array]) -> list[tuple[int, str]]:
@@ -237,15 +218,13 @@ def find_capabilities(model: Model) -> dict[str, float]:
     return found
 
 
-def find_trips(guards: Sequence[Guard], columns: Columns, signals: Signals) -> Iterator[GuardTrip]:
+def find_trips(guards: Sequence[Guard], run: RunData) -> Iterator[GuardTrip]:
     """The guards that the predicted main phase violates."""
     for guard in guards:
-        low, high = guard.compute_limits()
-        values = compute_error(columns, signals) if guard.signal not in signals.names else getattr(
-            columns, guard.signal)
-        outside = np.convolve((values < low) | (values > high), np.ones(guard.cycles))[:len(values)] >= guard.cycles
-        if outside.any():
-            yield GuardTrip(guard.name, float(columns.t[int(np.argmax(outside))]))
+        watch, values = GuardWatch([guard]), run.read_signal(guard.signal, slice(0, len(run.trace.t))).tolist()
+        passed = [watch.find_passed({guard.signal: value}) is not None for value in values]
+        if any(passed):
+            yield GuardTrip(guard.name, float(run.trace.t[passed.index(True)]))
 
 
 def plan_faults(job: Job) -> list[PlannedFault]:
@@ -324,19 +303,14 @@ def build_dry_run_report(dry: DryRun, files: Sequence[tuple[str, str]] = ()) -> 
              ("checks", str(len(sequence.checks))), ("guards", str(len(sequence.guards))),
              *([("steps in Python", ", ".join(f"{step.python} {step.when}" for step in sequence.steps))]
                if sequence.steps else [])]
-    coloured = " Orange: the faults of the sequence." if dry.faults else ""
-    picture = Figure("Position and speed of the command; position, following error and current of the predicted run of "
-                     "a healthy actuator. Steps have no speed. Red: limits of the actuator. The bars are the windows "
-                     "of the checks, green for a check that passes on the predicted run and red for one that does not."
-                     + coloured, lambda: draw_dry_run(dry))
+    shown = {section.title: section for section in build_run_report(dry.predicted).sections}
     return Report(
         command="check", title=f"Dry run: {sequence.title}", verdict=data["verdict"],
         mood="bad" if problems else "good", sentence=sentence, facts=facts, notes=_list_notes(dry),
         sections=[Section("Command and load", [Line("duration", duration), *_tabulate_demands(dry.demands)]),
                   Section("Faults", _tabulate_faults(dry.faults)),
                   Section("Predicted run", [Line(name, text) for name, text in describe_prediction(dry)]),
-                  Section("Checks", _tabulate_checks(dry.checks)),
-                  Section("Picture", [picture])],
+                  *(shown[title] for title in ("Checks", "Failed checks", "Signals"))],
         files=files, data=data)
 
 
@@ -378,50 +352,22 @@ def _tabulate_faults(faults: Sequence[PlannedFault]) -> list[Table]:
 
 def describe_prediction(dry: DryRun) -> list[tuple[str, str]]:
     """The figures of the predicted run: drive, following error, limits that it reaches."""
-    signals = dry.job.model.kind.signals
-    error, drive, limit = compute_error(dry.predicted, signals), signals.drive, find_drive_limit(dry)
+    run, signals = dry.predicted, dry.job.model.kind.signals
+    error, drive = (run.command - run.controlled)[run.phase == MAIN], signals.drive
+    limit = dry.job.model.values.get(drive.limit)
     scale, unit = drive.shown_scale, drive.shown_unit
-    largest = float(np.abs(getattr(dry.predicted, drive.name)).max())
-    text = f"largest {scale * largest:.3g} {unit}" + (f" of {scale * limit:.3g} {unit}" if limit else "")
-    main = (dry.t >= 0.0) & (dry.t < dry.durations["main"])
+    most = f" of {scale * limit:.3g} {unit}" if limit else ""
+    text = f"largest {scale * np.abs(run.drive).max():.3g} {unit}{most}"
     scale, unit = signals.controlled.shown_scale, signals.controlled.shown_unit
     return [(drive.phrase, text),
-            ("error", f"largest {scale * np.abs(error[main]).max():.4g} {unit}, RMS "
-                      f"{scale * math.sqrt(float(np.mean(error[main] ** 2))):.4g} {unit} in main"),
+            ("error", f"largest {scale * np.abs(error).max():.4g} {unit}, RMS "
+                      f"{scale * math.sqrt(float(np.mean(error ** 2))):.4g} {unit} in main"),
             *([("reaches", "; ".join(each.describe(signals) for each in dry.limits))] if dry.limits else [])]
-
-
-def find_drive_limit(dry: DryRun) -> float | None:
-    """The limit of the drive, SI; None where the plant declares none."""
-    return dry.job.model.values.get(dry.job.model.kind.signals.drive.limit)
-
-
-def compute_error(columns: Columns, signals: Signals) -> Array:
-    """Command less controlled signal, SI, (n,)."""
-    error: Array = getattr(columns, signals.command.name) - getattr(columns, signals.controlled.name)
-    return error
-
-
-def _tabulate_checks(checks: Sequence[CheckResult]) -> list[Table]:
-    def show_value(check: CheckResult) -> Cell:
-        text = "none" if math.isnan(check.value) else f"{check.value:.4g}"
-        return Cell(text, "good" if check.passed else "bad", True)
-
-    return [tabulate(
-        checks,
-        (Column("check"), lambda check: check.name),
-        (Column("window", "s"), lambda check: "-" if math.isnan(check.t0) else f"{check.t0:.3f} .. {check.t1:.3f}"),
-        (Column("predicted", align="right"), show_value),
-        (Column("limits", align="right"), lambda check: check.shown_limits),
-        (Column("unit"), lambda check: check.unit_behind.strip()),
-        (Column("remark"), lambda check: check.detail))]
 
 
 def collect_data(dry: DryRun) -> dict[str, Any]:
     """The JSON answer of a dry run."""
-    signals = dry.job.model.kind.signals
-    error, drive = compute_error(dry.predicted, signals), signals.drive
-    largest = float(np.abs(getattr(dry.predicted, drive.name)).max())
+    run = dry.predicted
     return {
         "verdict": "BEYOND_LIMITS" if dry.problems else "WITHIN_LIMITS", "problems": dry.problems,
         "sequence": dry.job.sequence.title, "model": dry.job.model.name,
@@ -429,62 +375,8 @@ def collect_data(dry: DryRun) -> dict[str, Any]:
         "faults": [{**each._asdict(), "duration": each.duration} for each in dry.faults],
         "demands": [{key: value for key, value in each._asdict().items() if key != "shown"}
                     | {"violated": each.is_violated} for each in dry.demands],
-        "predicted": {"current": largest, "error": float(np.abs(error).max()),
+        "predicted": {"current": float(np.abs(run.drive).max()),
+                      "error": float(np.abs(run.command - run.controlled).max()),
                       "limits": [each._asdict() for each in dry.limits],
                       "guards": [trip._asdict() for trip in dry.trips]},
         "checks": [to_plain(check.collect_data()) for check in dry.checks], "not_predicted": dry.not_predicted}
-
-
-def draw_dry_run(dry: DryRun) -> str:
-    """Position, speed, following error, current and load over time, with limits in red; faults, windows of checks."""
-    demands = {each.name: each for each in dry.demands}
-    signals, first = dry.job.model.kind.signals, dry.demands[0]
-    run, start, end = dry.predicted, float(dry.t[0]), float(dry.t[-1]) + 1.0 / dry.job.sequence.rate
-    command, controlled, drive = (getattr(run, s.name) for s in (signals.command, signals.controlled, signals.drive))
-    unit, scale = first.shown
-    shown: list[tuple[str, list[tuple[Array, str, str | None]], float, float | None]] = [
-        (f"{first.name} [{unit}]", [(command, COMMAND, "command"), (controlled, BLUE, "predicted")], scale,
-         first.limit),
-        (f"speed [{unit}/s]", [(dry.speed, GREY, None)], scale, demands["speed"].limit),
-        (f"error [{unit}]", [(command - controlled, ORANGE, None)], scale, None),
-        (f"{signals.drive.phrase} [{signals.drive.shown_unit}]", [(drive, "#8250df", None)], signals.drive.shown_scale,
-         find_drive_limit(dry))]
-    if dry.load.any():
-        load = demands["load"]
-        shown.append((f"load [{load.shown[0]}]", [(dry.load, GREY, None)], load.shown[1], load.limit))
-    faults = [shade(each.t0, each.t1, FAULT, 0.5) for each in dry.faults]
-    panels: list[list[Mark]] = [[
-        *(line(dry.t, values * scale, colour, name, 1.2) for values, colour, name in lines),
-        *_draw_limit(limit, max(float(np.nanmax(np.abs(values))) for values, _, _ in lines), scale), *faults,
-        call("set_ylabel", label, fontsize=8)] for label, lines, scale, limit in shown]
-    panels[0].append(legend(2))
-    groups = {"faults": [(each.name, each.t0, each.t1, FAULT) for each in dry.faults],
-              "checks": [(check.name, check.t0, check.t1, GREEN if check.passed else RED) for check in dry.checks
-                         if check.t0 == check.t0]}
-    bars = {label: group for label, group in groups.items() if group}
-    panels += [[*_draw_bars(group, start, end), call("set_ylabel", label, fontsize=8)] for label, group in bars.items()]
-    panels[-1].append(axes(xlim=(start, end), xlabel="time from the start of the main phase [s]"))
-    heights = [1.6] * len(shown) + [0.15 * len(group) + 0.3 for group in bars.values()]
-    return draw_panels("dry run", [[panel] for panel in panels], sum(heights) + 0.6, sharex=True, height_ratios=heights)
-
-
-def _draw_limit(limit: float | None, largest: float, scale: float) -> list[Mark]:
-    """A limit on both sides of zero; its value above the panel where lines would flatten the curve."""
-    if limit is None:
-        return []
-    if largest > 0.3 * limit:
-        return levels(limit * scale, RED, None, 0.9, "--")
-    return [lambda ax: ax.text(0.0, 1.02, f"limit {limit * scale:.4g}", transform=ax.transAxes, color=RED, fontsize=8)]
-
-
-def _draw_bars(bars: Sequence[tuple[str, float, float, str]], start: float, end: float, least: float = 0.004
-               ) -> Iterator[Mark]:
-    """A bar in a row of its own for each (name, t0, t1, colour); the name stands where there is room.
-
-    `least`: share of the axis that a bar covers, so that a fault of one cycle can be seen.
-    """
-    for row, (name, t0, t1, colour) in enumerate(bars):
-        yield call("barh", -row, max(t1 - t0, least * (end - start)), 0.7, t0, color=colour, alpha=0.75)
-        text, side = (f"{name} ", "right") if t0 > 0.5 * (start + end) else (f" {name}", "left")
-        yield call("text", t0, -row, text, ha=side, va="center", fontsize=6.5, color=INK, clip_on=True)
-    yield axes(yticks=[])

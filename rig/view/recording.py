@@ -17,7 +17,7 @@ from fdi.report.diff_report import build_diff_report, choose_difference_units
 from fdi.report.drawing import choose_drawn_unit, label_signal
 from fdi.report.numbers import choose_unit, format_ratio, join_words
 from fdi.report.report import Report
-from fdi.report.run_report import read_verdict
+from fdi.report.run_report import list_faults, read_verdict
 from fdi.report.terminal import format_report
 from fdi.thresholds import NOISE_BAND_RATIO, SIGNAL_ERROR_RATIO
 from fdi.trace.check_result import CheckResult
@@ -342,12 +342,8 @@ def make_command_lane(trace: Trace, group: str, offset: float) -> Lane:
 
 def list_fault_lanes(trace: Trace, prefix: str, offset: float) -> list[Lane]:
     """When each fault begins and ends, from the events of the run, `offset` s later than in the trace."""
-    found: dict[str, list[tuple[float, str]]] = {}
-    for event in trace.events:
-        fault = read_fault_event(event.text) if event.kind == "fault" else None
-        if fault:
-            found.setdefault(fault[0], []).append((event.t + offset, fault[1]))
-    return [Lane(f"{prefix}{label}", states, ACTIVE) for label, states in found.items()]
+    return [Lane(f"{prefix}{label}", [(t0 + offset, "active"), (t1 + offset, "")], ACTIVE)
+            for label, t0, t1 in list_faults(trace)]
 
 
 def name_node_lane(node: int, name: str | None = None) -> str:
@@ -401,9 +397,7 @@ def _describe_section(section: Section, command: Signal) -> str:
 
 
 def _describe_measurement(check: CheckResult) -> str:
-    limits = " and ".join(f"{sign} {limit:.4g}" for sign, limit in (("≥", check.low), ("≤", check.high))
-                          if not math.isnan(limit))
-    return check.measured + (f" (limit {limits})" if limits else "")
+    return f"{check.measured} (limit {check.shown_limits})"
 
 
 def describe_event(t: float, level: str, kind: str, text: str) -> LogText:

@@ -40,7 +40,7 @@ def test_the_preflight_is_predicted_at_any_cycle(cycle: str, tmp_path: Path) -> 
     dry, usual = make_dry_run(build_job(choice)), make_dry_run(build_job(choice._replace(bench=None)))
     assert dry.durations == usual.durations and dry.job.period_ns == round(1e6 * float(cycle))
     fine, coarse = sorted((dry.predicted, usual.predicted), key=lambda run: -len(run.t))
-    same = np.array([column[::round(len(fine.t) / len(coarse.t))] for column in fine[1:3]])
+    same = [column[::round(len(fine.t) / len(coarse.t))] for column in (fine.com, fine.xj)]
     np.testing.assert_allclose(coarse.com, same[0], rtol=1e-9, atol=1e-12)
     assert float(np.sqrt(np.mean((coarse.xj - same[1]) ** 2))) < 0.1e-3 * max(1.0, float(cycle))
     for found, expected in zip(dry.checks, usual.checks, strict=True):

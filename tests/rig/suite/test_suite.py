@@ -385,7 +385,7 @@ def test_what_is_beyond_the_limits(tmp_path: Path) -> None:
         "speed 333.3 mm/s beyond 250 mm/s (no-load speed) in 'out'", "load 40 kN beyond 30.15 kN (stall force)",
         "guard 'far out' violated at t = 0.0", "check 'steps': the command does not step here")
         if words not in text] == []
-    assert [words for words in ("BEYOND_LIMITS", "<svg", "stall force", "position [mm]", "speed [mm/s]", "load [kN]",
+    assert [words for words in ("BEYOND_LIMITS", "<svg", "stall force", "position [mm]", "no-load speed", "load [kN]",
                                 "current [mA]") if words not in page] == []
     assert sorted(path.name for path in tmp_path.iterdir()) == ["far.html", "far.toml"]
 
