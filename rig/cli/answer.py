@@ -5,7 +5,7 @@ import argparse
 import contextlib
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from threading import Thread, Timer
 from typing import TYPE_CHECKING, NamedTuple
@@ -25,6 +25,7 @@ class Places(NamedTuple):
 
     page: Path | None = None
     answer: Path | None = None  # JSON
+    junit: Path | None = None
 
     @property
     def files(self) -> list[tuple[str, str]]:
@@ -86,10 +87,11 @@ def make_folder(path: Path) -> Path:
     return path
 
 
-def give_answer(report: Report, args: argparse.Namespace, status: int = 0, places: Places = NOWHERE) -> int:
+def give_answer(report: Report, args: argparse.Namespace, status: int = 0, places: Places = NOWHERE,
+                format_junit: Callable[[], str] = str) -> int:
     """Write the files of a report, print it as --json and --quiet ask, and return the exit status.
 
-    --json comes before --quiet.
+    --json comes before --quiet. `format_junit` makes the text of --junit.
 
     Raises:
         InputError: a file that cannot be written.
@@ -98,6 +100,8 @@ def give_answer(report: Report, args: argparse.Namespace, status: int = 0, place
 
     if places.answer is not None:
         write_text(places.answer, reports.to_json(report.data) + "\n")
+    if places.junit is not None:
+        write_text(places.junit, format_junit(), "--junit")
     if places.page is not None:
         with show_progress(args, "writing"):
             reports.write_html(report, places.page)

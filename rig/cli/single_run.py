@@ -9,13 +9,12 @@ from functools import cache, partial
 from itertools import count
 from pathlib import Path
 
-from fdi.output import write_text
 from fdi.progress import Progress
 from fdi.report.report import Line, Medium, Report, Section
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Trace
 from plant.errors import InputError, require
-from rig.cli.answer import choose_file, give_answer, open_console, show_progress
+from rig.cli.answer import Places, choose_file, give_answer, open_console, show_progress
 from rig.cli.command_list import LIVE_ON_TERMINAL
 from rig.cli.inputs import is_suite_file, parse_changes
 from rig.interrupts import catch_signals
@@ -63,13 +62,17 @@ def run_sequence(args: argparse.Namespace, pages: PageWriter) -> int:
         if is_on_screen and not is_silent:
             print_settings(job, why)
         with contextlib.suppress(BrokenPipeError):  # whether somebody reads the output does not change the verdict
-            give_answer(add_outcome(report, outcome), args)  # the page may take longer than the operator wants to wait
-        pages.finish_page()
-    if junit is not None:
-        from rig.suite.suite import write_junit_of_run
-
-        write_text(junit, write_junit_of_run(outcome, 1e-9 * clock.now()), "--junit")
+            give_answer(add_outcome(report, outcome), args, places=Places(junit=junit),
+                        format_junit=partial(format_junit, outcome, clock))
+        pages.finish_page()  # it may take longer than the operator wants to wait for the answer
     return outcome.status
+
+
+def format_junit(outcome: Outcome, clock: WallClock) -> str:
+    """The JUnit XML of a run that began with the clock."""
+    from rig.suite.suite import write_junit_of_run  # here: a run needs no suites
+
+    return write_junit_of_run(outcome, 1e-9 * clock.now())
 
 
 def choose_bus_of_run(args: argparse.Namespace, wanted: str, controller: str | None) -> tuple[str, str]:

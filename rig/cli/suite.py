@@ -3,11 +3,11 @@
 import argparse
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from rich.text import Text
 
-from fdi.output import write_text
 from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell
 from fdi.report.terminal import style_of
@@ -54,14 +54,11 @@ def run_suite(args: argparse.Namespace) -> int:
     clock = WallClock()
     with catch_signals():  # Ctrl-C and SIGTERM both break it off
         results, is_interrupted = run_cases(suite.cases, processes, show, 5.0 if base.bus == "embedded" else 30.0)
-    files = [("results", f"{folder}/ suite.html, suite.json, a folder for each case"),
-             *([("JUnit", str(junit))] if junit else [])]
+    files = [("results", f"{folder}/ suite.html, suite.json, a folder for each case"), *Places(junit=junit).files]
     report = build_suite_report(suite, results, 1e-9 * clock.now(), processes, folder, files)
-    status = give_answer(report, args, find_status(results, is_interrupted=is_interrupted),
-                         Places(folder / "suite.html", folder / "suite.json"))
-    if junit is not None:
-        write_text(junit, write_junit(suite.title, results), "--junit")
-    return status
+    return give_answer(report, args, find_status(results, is_interrupted=is_interrupted),
+                       Places(folder / "suite.html", folder / "suite.json", junit),
+                       partial(write_junit, suite.title, results))
 
 
 def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:

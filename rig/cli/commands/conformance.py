@@ -3,9 +3,9 @@
 import argparse
 import contextlib
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
-from fdi.output import write_text
 from plant.errors import InputError, RigError, require
 from rig.benches.bench import Role
 from rig.benches.bench_file import load_bench
@@ -36,19 +36,16 @@ def run_command(args: argparse.Namespace) -> int:
                 "the number of a chapter, such as 3, or of a test, such as 3.6")
     for option, value, least in (("--tolerance", args.tolerance, 0.0), ("--timeout", args.timeout, 0.01)):
         require(least <= value <= 60_000, option, f"{value:g}", f"a number from {least:g}")
-    places = choose_places(args.out)
-    junit = choose_file(args.junit, (".xml",), sheet.path, "--junit")  # may be a file in the folder of --out
+    places = choose_places(args.out)  # first: the file of --junit may lie in the folder
+    places = places._replace(junit=choose_file(args.junit, (".xml",), sheet.path, "--junit"))
     bus, _ = choose_bus(args.bus)
     options = Options(may_write=args.write or is_own, timeout=args.timeout, tolerance=1e-3 * args.tolerance)
     with open_wire(name, bus) as wire, show_progress(args) as progress:
         target = Target(wire, sheet, options)
         outcome = run_cases(target, cases, progress)
-    files = [*places.files, *([("JUnit", str(junit))] if junit else [])]
     status = {"PASS": 0, "FAIL": 1, "INVALID_TIMING": 3}[outcome.verdict]
-    status = give_answer(build_conformance_report(outcome, target, bus, files), args, status, places)
-    if junit is not None:
-        write_text(junit, write_junit(outcome, node), "--junit")
-    return status
+    return give_answer(build_conformance_report(outcome, target, bus, places.files), args, status, places,
+                       partial(write_junit, outcome, node))
 
 
 def find_node_of_bench(args: argparse.Namespace) -> tuple[str, Path]:
