@@ -106,15 +106,16 @@ class LiveRun:
         self._signals: recorder.Signals | None = None
 
     def add(self, t_ns: int, record: recorder.Record) -> None:
-        """Take in a record of the log: `Signals` with the `Timing` that follows are a row."""
-        if isinstance(record, recorder.Signals):
-            self._signals = record
-        elif isinstance(record, recorder.Timing):
+        """Take in a record of the log: the signals of a cycle, of any plant, with the `Timing` that follows are a row.
+        """
+        if isinstance(record, recorder.Timing):
             self._add_row(t_ns, record)
         elif isinstance(record, recorder.NmtState):
             self.states[record.node] = record.name
         elif isinstance(record, CheckResult):
             self.checks[record.name] = CheckState(record.name, record.verdict, record, True)
+        elif not isinstance(record, recorder.Event):
+            self._signals = record
         else:
             self._events.append((t_ns, record))
             node = find_named_node(record.kind, record.text, self.plan.nodes)

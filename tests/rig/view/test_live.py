@@ -26,8 +26,10 @@ from synthetic_run import build_cycles, record_run
 
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
+from plant.plants import find_plant
 from rig.benches.bench_file import load_bench
 from rig.recorder import Event, NmtState, Record, Recorder, Signals, Timing
+from rig.recorder.schema import make_row_record
 from rig.sequences import load_sequence
 from rig.view.live_process import find_viewer_place
 from rig.view.live_run import LiveRun, make_live_plan
@@ -116,6 +118,15 @@ def test_a_limit_that_is_passed_fails_at_once(preflight: Path) -> None:
     assert (run.checks["position"].word, run.checks["position"].measured) == ("FAIL", " 7 mm")
     assert run.checks["pressure, unloaded"].word == "measures"
     assert run.read_rows_from(0).shape == (4000, len(run.plan.columns)) and run.read_last("xj", 2000)[0] == 7e-3
+
+
+def test_rows_of_another_plant_are_shown() -> None:
+    """Their records are of a type of its own."""
+    signals = find_plant("ema").signals
+    run = LiveRun(make_live_plan(load_sequence("preflight"), "lockstep", load_bench())._replace(signals=signals))
+    run.add(0, make_row_record(signals)(0, 1, *[0.5] * (len(signals.names)), 0, 0, 0))
+    run.add(0, Timing(0, False, 0.0, 0.0, 0.0))
+    assert run.cycles == 1 and run.read_last(signals.controlled.name, 1)[0] == 0.5
 
 
 EVENTS = """title = "Events"
