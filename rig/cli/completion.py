@@ -56,9 +56,9 @@ def complete_model(prefix: str, **_: Any) -> Iterable[str]:
 
 def complete_sequence(prefix: str, **_: Any) -> Iterable[str]:
     """Shipped sequences and sequence files."""
-    from rig.cli.inputs import list_shipped_sequences
+    from rig.sequences.sequence import list_shipped
 
-    return [name for name in list_shipped_sequences() if name.startswith(prefix)] + _list_files(prefix, (".toml",))
+    return [name for name in list_shipped() if name.startswith(prefix)] + _list_files(prefix, (".toml",))
 
 
 def complete_effect(prefix: str, **_: Any) -> Iterable[str]:

@@ -4,7 +4,6 @@ import argparse
 import shlex
 import tomllib
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 
 from fdi import foreign_code
@@ -100,11 +99,6 @@ def format_arguments(args: argparse.Namespace) -> str:
     words = [word for name, values in given.items() for value in (values if isinstance(values, list) else [values])
              for word in (f"--{name}", str(value))]
     return shlex.join([args.trace, *words, *(["--trust"] if args.trust else [])])
-
-
-def list_shipped_sequences() -> list[str]:
-    """Names of the sequences that come with the rig."""
-    return sorted(Path(entry.name).stem for entry in files("rig.sequences").iterdir() if entry.name.endswith(".toml"))
 
 
 def is_suite_file(name: str) -> bool:

@@ -13,8 +13,6 @@ from typing import Any
 
 Variable = tuple[int, str]  # value reference, and type in the names of FMPy's functions: Real, Float64, Boolean, ..
 Settings = Sequence[tuple[Variable, float]]
-_STATE_CALLS = {"2": ("getFMUstate", "setFMUstate", "freeFMUstate"),
-                "3": ("getFMUState", "setFMUState", "freeFMUState")}
 
 
 Groups = dict[str, tuple[list[int], list[int]]]  # by type: places in a list of values, and value references
@@ -51,8 +49,6 @@ class Host:
         self._inputs, self._outputs = _group(inputs), _group(outputs)
         self._count = len(outputs)
         self._description = fmpy.read_model_description(folder, validate=False)
-        self._version = self._description.fmiVersion[0]
-        self._get_state, self._set_state, self._free_state = _STATE_CALLS[self._version]
         self._unit: Any = None
         self._start: Any = None  # its state after initialisation
         self._settings: Settings = ()  # the parameters of that state
@@ -64,20 +60,20 @@ class Host:
         """
         self._k = 0
         if self._start is not None and self._settings == settings:
-            getattr(self._unit, self._set_state)(self._start)
+            self._unit.setFMUState(self._start)
             return self._read()
         if self._unit is not None and self._description.coSimulation.canBeInstantiatedOnlyOncePerProcess:
             self._unit.reset()
         else:
             self._instantiate()
-        if self._version == "2":
+        if self._description.fmiVersion.startswith("2"):
             self._unit.setupExperiment(startTime=0.0)
         self.change(settings)
         self._unit.enterInitializationMode()
         self._unit.exitInitializationMode()
         if self._description.coSimulation.canGetAndSetFMUstate:
             with contextlib.suppress(Exception):  # FMPy's; without a state to go back to, each run starts anew
-                self._start, self._settings = getattr(self._unit, self._get_state)(), settings
+                self._start, self._settings = self._unit.getFMUState(), settings
         return self._read()
 
     def change(self, settings: Settings) -> None:
@@ -116,7 +112,7 @@ class Host:
         fmi1.cdll = ctypes.LibraryLoader(Library)
         if self._unit is not None:
             if self._start is not None:
-                getattr(self._unit, self._free_state)(self._start)
+                self._unit.freeFMUState(self._start)
             self._unit.freeInstance()
         self._unit = self._start = None
         folder, library = self._place

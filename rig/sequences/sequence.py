@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from math import ceil
 from pathlib import Path
 from types import ModuleType
@@ -223,6 +224,12 @@ class Sequence:
         return parse_sequence(tables.decode_text(bundle[sources[0]], sources[0]), sources[0], read_file, rate, plant)
 
 
+def list_shipped() -> dict[str, Traversable]:
+    """The sequences that come with the rig, by name."""
+    found = sorted(files("rig.sequences").iterdir(), key=lambda entry: entry.name)
+    return {Path(entry.name).stem: entry for entry in found if entry.name.endswith(".toml")}
+
+
 def load_sequence(name_or_path: str | Path, rate: float = RATE, plant: str = "eha") -> Sequence:
     """Read a sequence: a TOML file, or the name of one that comes with the rig.
 
@@ -235,8 +242,7 @@ def load_sequence(name_or_path: str | Path, rate: float = RATE, plant: str = "eh
     Raises:
         InputError: no such sequence, or the file, line and key that cannot be used and what was expected there.
     """
-    found = files("rig.sequences").iterdir()
-    shipped = {Path(entry.name).stem: entry for entry in found if entry.name.endswith(".toml")}
+    shipped = list_shipped()
     if str(name_or_path) in shipped:
         entry, kind = shipped[str(name_or_path)], find_plant(plant)
         is_eha = kind.key == "eha" or (kind.foreign and kind.signals.controlled.name == EHA.controlled.name)

@@ -16,7 +16,7 @@ from plant import Model, simulate
 from plant.model import find_quantity
 from plant.plants import Plant
 from plant.run import make_columns_type
-from plant.segments import Array
+from plant.segments import Array, Profile
 from rig.run.job import Job, find_differences
 from rig.run.runner import LimitReached, find_limits
 from rig.sequences.checks import Guard, GuardWatch, RunData
@@ -36,7 +36,6 @@ from rig.sequences.faults import (
     Stuck,
     require_sensible,
 )
-from rig.sequences.sequence import Sequence as TestSequence
 
 OF_EVENTS = ("response_within", "shut_off", "recovers", "event_occurs", "event_never")  # without a bus no events
 
@@ -124,15 +123,14 @@ def make_dry_run(job: Job) -> DryRun:
     faults = plan_faults(job)
     sequence, model = job.sequence, job.model
     setup, main = sequence.setup_profile(), sequence.main_profile()
-    cleanup = sequence.cleanup_profile(main.end)
-    command = np.concatenate((setup.command, main.command, cleanup.command))
+    phases = {"setup": setup, "main": main, "cleanup": sequence.cleanup_profile(main.end)}
+    command = np.concatenate([profile.command for profile in phases.values()])
     first, last = len(setup.command), len(setup.command) + len(main.command)
     load = np.zeros(len(command))
     load[first:last] = sequence.load_profile()
     rate = sequence.rate
     t = (np.arange(len(command)) - first) / rate
     predicted = simulate(model, command, load, job.seed)
-    sections = name_rows(sequence, (setup.command, main.command, cleanup.command))
     signals = model.kind.signals
     columns = make_columns_type(signals)(np.arange(last - first) / rate,
                                          *(column[first:last] for column in predicted[1:]))
@@ -143,22 +141,20 @@ def make_dry_run(job: Job) -> DryRun:
     trace = replace(Trace.from_columns(predicted._asdict(), 1 / rate, {}, signals), t=t, checks=tuple(checks),
                     phase=np.searchsorted((first, last), np.arange(len(t)), side="right"), events=tuple(events))
     return DryRun(
-        job=job, durations={"setup": first / rate, "main": (last - first) / rate,
-                            "cleanup": (len(command) - last) / rate},
-        demands=measure_demands(command, load, t, sections, model, rate), faults=faults, predicted=trace,
+        job=job, durations={phase: len(profile.command) / rate for phase, profile in phases.items()},
+        demands=measure_demands(command, load, t, name_rows(phases), model, rate), faults=faults, predicted=trace,
         limits=find_limits(lambda name: getattr(predicted, name), model, first), checks=checks,
         not_predicted=[check.name for check in sequence.checks if check.kind in OF_EVENTS],
         trips=[] if sequence.faults else [*find_trips(sequence.guards, run)])
 
 
-def name_rows(sequence: TestSequence, commands: Sequence[Array]) -> list[tuple[int, str]]:
+def name_rows(phases: Mapping[str, Profile]) -> list[tuple[int, str]]:
     """First row of each section of setup, main and cleanup, and its name."""
-    profiles = (sequence.setup_profile(), sequence.main_profile(), sequence.cleanup_profile(0.0))
     found, start = [], 0
-    for phase, profile, command in zip(("setup", "main", "cleanup"), profiles, commands, strict=True):
+    for phase, profile in phases.items():
         found += [(start + section.start, section.name if phase == "main" else f"{phase}: {section.name}")
                   for section in profile.sections]
-        start += len(command)
+        start += len(profile.command)
     return found
 
 

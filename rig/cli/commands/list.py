@@ -17,7 +17,7 @@ from plant.model import (
 from plant.plants import list_plants
 from plant.quantity import Quantity
 from rig.cli.answer import give_answer
-from rig.cli.inputs import list_shipped_sequences, load_chosen_model
+from rig.cli.inputs import load_chosen_model
 
 Rows = list[dict[str, Any]]
 
@@ -79,9 +79,9 @@ def list_signals(model: Model) -> Rows:
 
 def list_sequences(model: Model) -> Rows:
     """The shipped sequences."""
-    from rig.sequences import load_sequence  # here: only this list and that of the checks need the bench
+    from rig.sequences import load_sequence, sequence  # here: only this list and that of the checks need the bench
 
-    found = [(name, load_sequence(name)) for name in list_shipped_sequences()]
+    found = [(name, load_sequence(name)) for name in sequence.list_shipped()]
     return [{"name": name, "title": s.title, "main, s": s.duration, "checks": len(s.checks), "faults": len(s.faults)}
             for name, s in found]
 
