@@ -13,7 +13,7 @@ from fdi.progress import Progress
 from fdi.report.report import Line, Medium, Report, Section
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Trace
-from plant.errors import InputError, require
+from plant.errors import report_system_error, require
 from rig.cli.answer import Places, choose_file, give_answer, open_console, show_progress
 from rig.cli.command_list import LIVE_ON_TERMINAL
 from rig.cli.inputs import is_suite_file, parse_changes
@@ -205,11 +205,8 @@ def make_new_folder(parent: Path, name: str) -> Path:
     """
     for number in count(1):
         folder = parent / (name if number == 1 else f"{name}-{number}")
-        try:
+        with (report_system_error("--out", str(folder), "a place that can be written"),
+              contextlib.suppress(FileExistsError)):
             folder.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise InputError("--out", str(folder), f"a place that can be written ({error.strerror})") from error
-        return folder
+            return folder
     raise AssertionError

@@ -221,8 +221,7 @@ def _sign(manifest: bytes, key: str) -> tuple[str, bytes]:
     """Name and content of the signature. Raises InputError for a key, or a program, that is not there."""
     tool = "minisign" if Path(key).is_file() else "gpg"
     said, signature = _call(tool, SIGNERS[tool].sign, key, manifest, b"")
-    if said is None or not signature:
-        raise InputError("--sign", key, f"a key with which {tool} signs{_describe_absence(said)}")
+    require(signature, "--sign", key, f"a key with which {tool} signs{_describe_absence(said)}")
     return SIGNERS[tool].file, signature
 
 

@@ -73,9 +73,9 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str) 
     inputs, outputs, parameters = (
         dict(_list_entries(table[name], place.at(name))) if name in table else _guess_entries(about, name, place)
         for name in known[2:])
-    if not inputs or not outputs:
-        has = ", ".join(f"{v.causality} {n}" for n, v in about.variables.items() if v.causality in ("input", "output"))
-        raise place.refuse(f"tables [plant.inputs] and [plant.outputs], SIGNAL = VARIABLE; the unit has {has}")
+    has = ", ".join(f"{v.causality} {n}" for n, v in about.variables.items() if v.causality in ("input", "output"))
+    place.require(inputs and outputs,
+                  f"tables [plant.inputs] and [plant.outputs], SIGNAL = VARIABLE; the unit has {has}")
     given = [_map_signal(about, name, *entry, "input") for name, entry in inputs.items()]
     shown = [_map_signal(about, name, *entry, "output") for name, entry in outputs.items()]
     place.at("inputs").require(sorted(s.role for s, _ in given) in (["drive"], ["drive", "load"]),

@@ -165,10 +165,9 @@ def import_frames(source: Path, out: Path, bench: Bench) -> int:
     for frame in _read_frames(source):
         items += [frame, *((frame.t_ns, record) for record in cycles.feed(frame))]
     starts = [t_ns for t_ns, _ in cycles.rows]
-    if not starts:
-        sync = bench.frames.sync
-        begin = f"{cycles.begin.name} frame" if sync is None else f"SYNC frame (0x{sync:03X})"
-        raise InputError(source, "", f"at least one {begin}")
+    sync = bench.frames.sync
+    begin = f"{cycles.begin.name} frame" if sync is None else f"SYNC frame (0x{sync:03X})"
+    require(starts, source, "", f"at least one {begin}")
     spans = np.sort(np.diff(starts))
     middle = float(spans[len(spans) // 2]) if len(spans) else bench.cycle_ns
     period = bench.cycle_ns / 1e9 if 0.9 < middle / bench.cycle_ns < 1.1 else round(middle / 1e9, 4)  # another speed

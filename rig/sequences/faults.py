@@ -382,8 +382,8 @@ class Schedule:
         cycles = last - first
         match fault:
             case Parameter():
-                if fault.parameter not in self._base:
-                    raise InputError("faults", fault.parameter, tables.list_choices(fault.parameter, self._base))
+                require(fault.parameter in self._base, "faults", fault.parameter,
+                        tables.list_choices(fault.parameter, self._base))
                 base = self._base[fault.parameter]
                 target = fault.find_target(find_quantity(fault.parameter, "faults", self._plant))
                 values = base + (target - base) * self._compute_growth(cycles, fault.ramp)

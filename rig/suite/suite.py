@@ -16,7 +16,7 @@ from typing import Annotated, Any, NamedTuple, Self
 from urllib.parse import quote
 
 from fdi.progress import ignore_progress
-from fdi.report.numbers import count_nouns
+from fdi.report.numbers import count_nouns, list_first
 from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table, tabulate, to_plain
 from fdi.report.run_report import MOODS as RUN_MOODS, write_run_page
 from fdi.trace.check_result import CheckResult
@@ -232,12 +232,11 @@ class CaseResult(NamedTuple):
         """
         if self.verdict == "PASS" and self.fdi.get("verdict") == "CANNOT_TELL":
             return "rig fdi cannot tell"
-        failed = self.failed
+        failed = [check.name for check in self.failed]
         if self.verdict != "FAIL" or (len(failed) < 2 and not self.has_fault):
             return self.why
-        more = f" and {len(failed) - 1} more" if len(failed) > 1 else ""
-        checks = [f"{failed[0].name}{more}"] if failed else []
-        return "; ".join([*checks, describe_finding(self.fdi)] if self.has_fault else checks)
+        reasons = (list_first(failed, 1), describe_finding(self.fdi) if self.has_fault else "")
+        return "; ".join(filter(None, reasons))
 
     @property
     def has_fault(self) -> bool:
@@ -392,9 +391,8 @@ def _describe(results: Sequence[CaseResult], most: int = 3) -> str:
         unjudged = sum(result.verdict == "NOT_JUDGED" for result in results)
         without = f", {unjudged} of them without checks" if unjudged else ""
         return f"{count_nouns(len(results), 'case')}, none failed{without}."
-    named = ", ".join(result.case.name for result in bad[:most])
-    more = f" and {len(bad) - most} more" if len(bad) > most else ""
-    return f"{len(bad)} of {count_nouns(len(results), 'case')} did not pass: {named}{more}."
+    named = list_first([result.case.name for result in bad], most)
+    return f"{len(bad)} of {count_nouns(len(results), 'case')} did not pass: {named}."
 
 
 def _tabulate_cases(results: Sequence[CaseResult], folder: Path) -> list[Table]:

@@ -108,10 +108,9 @@ def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
     tables = read_matrix(args.what) if args.what else {}
     listed, more = tables.get("case", []), parse_faults(args.fault)
     tables = {**tables, **changed, "case": [*listed, *more] if isinstance(listed, list) else listed}
-    if not tables["case"]:
-        shipped = " or ".join(list_shipped_matrices())
-        raise InputError("MATRIX.toml|FOLDER", "", f"a matrix file, the shipped matrix {shipped}, a folder of "
-                                                   "traces, or --fault EFFECT=SIZE,..")
+    require(tables["case"], "MATRIX.toml|FOLDER", "",
+            f"a matrix file, the shipped matrix {' or '.join(list_shipped_matrices())}, a folder of traces, or --fault "
+            "EFFECT=SIZE,..")
     return (build_matrix(tables, model, work, args.what or "--fault", faults),
             Path(args.out or campaigns / Path(args.what or "options").stem))
 

@@ -8,7 +8,7 @@ import time
 
 from fdi.output import require_writable
 from fdi.report.report import Report
-from plant.errors import InputError, RigError, require
+from plant.errors import RigError, require
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, give_answer
@@ -45,9 +45,8 @@ def run_command(args: argparse.Namespace) -> int:
     else:
         require(speaks_as_shipped(bench), "--bench", args.bench,
                 "a bench with the frames of the shipped one, as our firmware has")
-    if bus.partition(":")[0] in EMBEDDED_NAMES:
-        given = "" if args.bus == "auto" else args.bus
-        raise InputError("--bus", given, "a bus between programs, such as udp_multicast or socketcan:vcan0")
+    require(bus.partition(":")[0] not in EMBEDDED_NAMES, "--bus", "" if args.bus == "auto" else args.bus,
+            "a bus between programs, such as udp_multicast or socketcan:vcan0")
     places = Places(answer=None if args.out is None else require_writable(args.out, "--out"))
     is_compiled = args.node == "plant" and can_open(bus) and load_chosen_model(args).kind.foreign is None
     clock = WallClock()
