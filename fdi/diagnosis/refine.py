@@ -921,7 +921,7 @@ class JointSearch:
     def scan(self, fit: Fit, effects: Sequence[str], most: float) -> list[Prospect]:
         """The effects that promise to gain on this fit and to come below the cost `most`, best first."""
         least = min(fit.cost, most) - GAIN_WORTH_A_FIT
-        return [p for p in scan_effects(self.problem, fit, effects, self.problem.workers) if p.cost < least]
+        return [p for p in scan_effects(self.problem, [fit], effects, self.problem.workers) if p.cost < least]
 
     def scan_with_more_noise(self, fit: Fit, effects: Sequence[str], factor: float = 30.0, rounds: int = 4
                              ) -> list[Prospect]:

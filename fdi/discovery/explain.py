@@ -42,7 +42,7 @@ import numpy as np
 
 from fdi.discovery.detectable import Blind, find_hidden_effects
 from fdi.discovery.residual_pattern import is_periodic_in_position
-from fdi.discovery.search import FINE, TRUEST, Hypothesis, Search, Sensitivity, compute_sensitivity
+from fdi.discovery.search import FINE, TRUEST, Hypothesis, Search, Sensitivity
 from fdi.estimation.fit import Problem, compute_typical_rms, fit_unknowns, replay_fit
 from fdi.estimation.replay import (
     answer_readings,
@@ -252,7 +252,7 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
         named = tuple(f.effect for f in marks.prints)
         verdict = "PARTLY" if named else "UNEXPLAINED"
     explained = close[0] if close and verdict == "EXPLAINED" else base
-    blind = compute_sensitivity(search.problem, explained.fit, search.effects)
+    blind = search.compare_signatures(explained.fit)
     progress("what this test cannot see", 0.94)
     doubtful = [*blind.list_unseen_effects(GAIN_DETECTED),
                 *(e for e in search.effects if search.model.find_effect(e).revealed_by)]

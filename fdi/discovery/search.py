@@ -30,6 +30,7 @@ from fdi.estimation.fit import (
     list_effect_unknowns,
     name_sine,
     place_in_healthy_unit,
+    replay_fit,
     scale_noise,
     scaled_bounds,
     silence_readings,
@@ -54,6 +55,7 @@ from fdi.thresholds import (
     QUIETEST_NOISE,
     RESIDUAL_IS_NEAR_NOISE,
     RESIDUAL_IS_NOISE,
+    SOLVER_ERROR_SHARE,
     TOLERANCES_FAR_SHARE,
     WHITE_SQUARE_POOR,
 )
@@ -193,7 +195,7 @@ class Search:
 
         Near its end a fit steps over ridges by luck: what is left there without the effect is not the effect's gain.
         """
-        left = linearise(self.fine or self.problem, base.fit.free, _place_base(base, h))
+        left = replay_fit(self.fine or self.problem, base.fit, _place_base(base, h))
         return min(base, self.judge_fit((), left), key=lambda each: each.cost)
 
     def list_further_effects(self, present: Sequence[str]) -> list[str]:
@@ -208,8 +210,7 @@ class Search:
         begun = [start.fit]
         if not start.effects:  # a fit that had to do without a large effect may sit in a wrong basin
             begun.append(linearise(self.problem, start.fit.free, np.zeros(len(start.fit.free))))
-        scans = map_together(lambda fit: scan_effects(self.problem, fit, effects, self.workers), begun, self.workers)
-        prospects = _keep_best(p for scan in scans for p in scan)
+        prospects = scan_effects(self.problem, begun, effects, self.workers)
         worth = [p for p in prospects if p.cost < start.cost - GAIN_WORTH_A_FIT][:fitted]
         fits = list(zip([p.effect for p in worth], self.map_parallel(self._begin_fit, worth), strict=True))
         for rounds, kept in RACE:
@@ -233,7 +234,7 @@ class Search:
         """
         loud = scale_noise(self.problem, EASED[0])
         begun = fit_unknowns(loud, start.fit.free, place_in_healthy_unit(start.fit.free, start.fit.x), 4)
-        prospects = scan_effects(loud, begun, self.list_further_effects(start.effects), self.workers)
+        prospects = scan_effects(loud, [begun], self.list_further_effects(start.effects), self.workers)
         known = {h.effects[-1] for h in tried[:2]}
         least = GAIN_WORTH_A_FIT / EASED[0] ** 2  # gains shrink with the square of the noise
         starts = [p for rank, p in enumerate(p for p in prospects if p.cost < begun.cost - least)
@@ -496,6 +497,8 @@ class Search:
         is_misled = h.is_poor or (h.is_far and h.is_at_floor)
         if not is_misled or not (h.is_at_floor or self.model.kind.correct is not None):
             return h
+        if self.measure_solver_error(h, self.estimate_floor(h)) > SOLVER_ERROR_SHARE:  # the steps mislead it
+            return h
         return min(h, self.finish_hypothesis(self.search_widely(h)), key=lambda each: each.cost)
 
     def begin_beside(self, best: Hypothesis, rival: Hypothesis, rounds: int = 4) -> Hypothesis:
@@ -523,9 +526,7 @@ class Search:
             best: with one effect.
             known: effects that need not be tried.
         """
-        coarse = self.make_problem(self.problem.trace, Problem.steps)  # enough for cosines
-        of_run = replace(base.fit, jacobian=base.fit.jacobian[:, :, :len(self.problem.trace)])
-        told = compute_sensitivity(coarse, of_run, self.effects)
+        told = self.compare_signatures(base.fit)
         own = [effect == best.effects[0] for effect in told.names]
         alike = {effect for effect, cosines in zip(told.names, np.abs(told.gram), strict=True)
                  if max(cosines[own], default=0.0) > LOOKS_ALIKE} - {best.effects[0], *known}
@@ -533,12 +534,19 @@ class Search:
             return []
         return self.begin_effects(linearise(self.problem, base.fit.free, _place_base(base, best)), sorted(alike))
 
+    def compare_signatures(self, fit: Fit) -> Sensitivity:
+        """What the effects would change at a fit; repeats of the same command would show the same once more."""
+        coarse = self.make_problem(self.problem.trace, Problem.steps)  # enough for cosines
+        of_run = replace(fit, jacobian=fit.jacobian[:, :, :len(self.problem.trace)])
+        found = compute_sensitivity(coarse, of_run, self.effects)
+        return found._replace(gains=(1 + len(self.problem.also)) * found.gains)
+
     def begin_effects(self, base: Fit, effects: Sequence[str], rounds: int = 4) -> list[Hypothesis]:
         """Those of the effects, each alone, that gain over a base and leave only noise, taken to the end."""
         def begin(p: Prospect) -> Hypothesis:
             return self.judge_fit((p.effect,), fit_unknowns(self.problem, p.free, p.x, rounds))
 
-        prospects = scan_effects(self.problem, base, effects, self.workers)
+        prospects = scan_effects(self.problem, [base], effects, self.workers)
         found = self.map_parallel(begin, [p for p in prospects if p.cost < base.cost - GAIN_WORTH_A_FIT])
         worth = [h for h in found if h.is_near_floor and h.cost < base.cost - GAIN_SEEN]
         finished = self.map_parallel(self.finish_hypothesis, worth)
@@ -637,7 +645,8 @@ class Trial(NamedTuple):
     start: Start
     cost: float
     x: Floats
-    along: bool = False  # what goes with the effect has moved first
+    along: bool  # what goes with the effect has moved first
+    fit: Fit
 
 
 class Prospect(NamedTuple):
@@ -649,26 +658,36 @@ class Prospect(NamedTuple):
     x: Floats  # (p,), those of the fit scanned from first
 
 
-def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: int = 1) -> list[Prospect]:
-    """Expected cost of each effect on top of `fit`, best first, by so many threads.
+def scan_effects(problem: Problem, fits: Sequence[Fit], effects: Iterable[str], workers: int = 1) -> list[Prospect]:
+    """Expected cost of each effect on top of the fit where it does better, best first, by so many threads.
 
     Every start of an effect is simulated; the fit's own unknowns then move linearly, within their bounds and priors, to
     take up what they can. Further passes try sizes around the best start, closer each time, and the last one
     frequencies.
     """
-    first = [(name, start, along) for name in effects for along in ((False, True) if name in GOES_WITH else (False,))
-             for start in (*problem.model.find_effect(name).starts, *find_tones(problem, fit, name),
-                           *_start_at_fit(problem, fit, name))]
-    best = _keep_best(simulate_starts(problem, fit, first, workers))
+    best: list[Trial] = []
+
+    def try_starts(starts: Sequence[tuple[Fit, str, Start, bool]]) -> list[Trial]:
+        def simulate_own(fit: Fit) -> list[Trial]:
+            return simulate_starts(problem, fit, [(name, start, along) for each, name, start, along in starts if each is fit], workers)
+
+        tried = map_together(simulate_own, fits, workers)
+        return _keep_best([*best, *(trial for several in tried for trial in several)])
+
+    best = try_starts([
+        (fit, name, start, along) for fit in fits for name in effects
+        for along in ((False, True) if name in GOES_WITH else (False,))
+        for start in (*problem.model.find_effect(name).starts, *find_tones(problem, fit, name),
+                      *_start_at_fit(problem, fit, name))])
     passes = list(zip(ZOOM, LOOKED_AT, strict=True))
     if problem.model.kind.correct is not None:  # a backlash that is 2 % off bounces otherwise than the motor
         passes.append((LINE, 4))
     for factors, count in passes:
-        near = [(t.effect, start, t.along) for t in best[:count] for start in _list_starts_around(problem, t, factors)]
-        best = _keep_best([*best, *simulate_starts(problem, fit, near, workers)])
-    beside = [(t.effect, start, t.along) for t in best[:LOOKED_AT[-1]] for start in _list_lines_beside(problem, t)]
-    best = _keep_best([*best, *simulate_starts(problem, fit, beside, workers)])
-    return [_make_prospect(problem, fit, t) for t in best]
+        best = try_starts([(t.fit, t.effect, start, t.along) for t in best[:count]
+                           for start in _list_starts_around(problem, t, factors)])
+    best = try_starts([(t.fit, t.effect, start, t.along) for t in best[:LOOKED_AT[-1]]
+                       for start in _list_lines_beside(problem, t)])
+    return [_make_prospect(problem, t) for t in best]
 
 
 def _start_at_fit(problem: Problem, fit: Fit, effect: str) -> list[Start]:
@@ -679,11 +698,11 @@ def _start_at_fit(problem: Problem, fit: Fit, effect: str) -> list[Start]:
     return [{name: fit.values[name] for name in entry.fitted}]
 
 
-def _make_prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
+def _make_prospect(problem: Problem, t: Trial) -> Prospect:
     mine = {u.name: u for u in list_effect_unknowns(problem.model.find_effect(t.effect), problem.model)}
-    kept = tuple(mine.get(f.name, f) for f in fit.free)  # a suspect of the reference model loses its tolerance
-    own = tuple(u for name, u in mine.items() if name not in {f.name for f in fit.free})
-    found = {f.name: f.centre + f.scale * float(v) for f, v in zip(fit.free, t.x, strict=True)}
+    kept = tuple(mine.get(f.name, f) for f in t.fit.free)  # a suspect of the reference model loses its tolerance
+    own = tuple(u for name, u in mine.items() if name not in {f.name for f in t.fit.free})
+    found = {f.name: f.centre + f.scale * float(v) for f, v in zip(t.fit.free, t.x, strict=True)}
     values = {**found, **t.start}
     free = (*kept, *own)
     return Prospect(t.effect, t.cost, free, np.array([(values[f.name] - f.centre) / f.scale for f in free]))
@@ -798,7 +817,7 @@ def simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Star
         white = problem.whiten_predictions(problem.predict_outputs(names, rows[part]))
         own = [starts[i] for i in part]
         costs, x = absorb_shifts(fit, white, [start for _, start, _ in own], np.array([begun[i] for i in part]))
-        return [Trial(effect, start, float(cost), at, along)
+        return [Trial(effect, start, float(cost), at, along, fit)
                 for (effect, start, along), cost, at in zip(own, costs, x, strict=True)]
 
     parts = np.array_split(np.arange(len(rows)), min(len(rows), max(workers, -(-len(rows) // TOGETHER))))

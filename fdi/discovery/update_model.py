@@ -197,7 +197,7 @@ def _add_effect(search: Search, before: Hypothesis, name: str) -> Hypothesis:
     """
     fit = before.fit
     healthy = linearise(search.problem, fit.free, place_in_healthy_unit(fit.free, fit.x))
-    found = [*scan_effects(search.problem, fit, [name]), *scan_effects(search.problem, healthy, [name])]
+    found = [each for start in (fit, healthy) for each in scan_effects(search.problem, [start], [name])]
     best = search.judge_fit((*before.effects, name), _fit_best(search, _begin_fits(search, found)))
     if best.is_at_floor:
         return best

@@ -238,6 +238,8 @@ def relax_fit(problem: Problem, found: Fit, directions: Sequence[Direction]) -> 
                 break
         else:
             break
+    if found.x**2 @ prior - x**2 @ prior < CONVERGED_GAIN:  # not worth a replay
+        return found
     moved = replay_fit(problem, found, x)
     return moved if moved.cost < found.cost else found
 

@@ -152,7 +152,7 @@ def test_a_scan_finds_a_frequency_from_a_line_beside_it(monkeypatch: pytest.Monk
     beside = [{**ripple, "supply_ripple.frequency": 36.64 - 2.3 * turn, "supply_ripple.phase": phase}
               for phase in (0.0, 1.57, 3.14, 4.71)]
     monkeypatch.setattr("fdi.discovery.search.find_tones", lambda *_: beside)
-    (found,) = scan_effects(search.problem, search.fit_base().fit, ["supply_ripple"])
+    (found,) = scan_effects(search.problem, [search.fit_base().fit], ["supply_ripple"])
     values = {f.name: f.centre + f.scale * x for f, x in zip(found.free, found.x, strict=True)}
     assert values["supply_ripple.frequency"] == pytest.approx(36.64, abs=0.3 * turn)
 

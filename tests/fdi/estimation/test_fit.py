@@ -138,7 +138,7 @@ def test_scan_of_a_step_test_finds_the_size_at_which_a_backlash_bounces_like_the
     search = Search(model, trace, [], ["backlash"], 1)
     assert 200 <= search.problem.trace.usable.sum() < 0.3 * len(trace)
     healthy = linearise(search.problem, list_all_unknowns(search.model), np.zeros(4))
-    found = scan_effects(search.problem, healthy, ["backlash"])[0]
+    found = scan_effects(search.problem, [healthy], ["backlash"])[0]
     u = [f.name for f in found.free].index("screw.backlash")
     assert found.free[u].centre + found.free[u].scale * found.x[u] == pytest.approx(1e-4, rel=0.3)  # else a tenth of it
 
