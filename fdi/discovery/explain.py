@@ -7,17 +7,17 @@ the thresholds.
 | stage | acts if | what it does |
 |---|---|---|
 | marks | Cor differs by more than {FIRMWARE_DIFFERS:g} roundings, or all positions are multiples of one step | names the effect of the firmware or the converter |
-| base | always | fits the tolerances; learns the noise if at most {RESIDUAL_IS_NOISE:g} floors are left, and fits again with a population if the mean square is then above {WHITE_SQUARE_POOR:g} |
+| base | always | fits the tolerances; learns the noise if at most {RESIDUAL_IS_NOISE:g} floors are left, and fits with a population if the mean square is above {WHITE_SQUARE_POOR:g} |
 | first effect | always | fits the eight effects that promise to gain more than {GAIN_WORTH_A_FIT:g}, in stages, the best two to the end; the base again from there, if the best gains more than {GAIN_SEEN:g} |
 | noise | the base leaves more than noise | learns the noise under the best first effect; fits the base and the best four again |
 | second effect | the first leaves more than noise and gains more than {GAIN_SEEN:g} | fits the four most promising effects beside each of the best two |
 | third effect | so does the second, which also removes {FURTHER_EFFECT_SHARE:g} of the excess cost, and leaves at most {ERROR_PARTLY_EXPLAINED:g} of the excess on the held-out run | the same |
 | finer steps | the best leaves at most {RESIDUAL_IS_NEAR_NOISE:g} floors | asks whether 20 steps a cycle leave only noise |
-| missed stops | that holds for the first effect, and the second gains at most {GAIN_SEEN:g} | fits the first again with a population; no second effect is missing |
+| missed stops | that holds for the first effect, and the second gains at most {GAIN_SEEN:g} | fits the first with a population; no second effect is missing |
 | more noise | the best leaves more than noise, or its tolerances are those of {TOLERANCES_FAR_SHARE:.2%} of healthy units | searches again from a nominal unit with 30 and 6 times the noise |
-| other valleys | two effects remove {FURTHER_EFFECT_SHARE:g} of the excess cost and still leave more than noise | fits the best two pairs again with a population |
+| other valleys | two effects remove {FURTHER_EFFECT_SHARE:g} of the excess cost and still leave more than noise | fits the best two pairs with a population |
 | number of effects | always | keeps the effects that gain more than {GAIN_SEEN:g}, of several only those whose removal costs more than {GAIN_CONVINCES:g} |
-| last fits | always | finishes the base and the best four with finer steps, on the repeats too; begins again those of the best two that leave a mean square above {WHITE_SQUARE_POOR:g} or have far tolerances; with a population these and the base, if they leave only noise and still such a mean square or far tolerances |
+| last fits | always | finishes the base and the best four with finer steps, on the repeats too; begins again those of the best two that leave a mean square above {WHITE_SQUARE_POOR:g} or have far tolerances; with a population these and the base, if they leave only noise and still such a mean square or far tolerances, unless the solver errs |
 | intervals | the base leaves only noise | drops effects whose 95 % interval holds the off value |
 | small gain | the gain is below {GAIN_DOUBTFUL:g} | fits the base again from there; a single effect that then gains at most {GAIN_SEEN:g} begins again from the base |
 | rivals | the best one leaves only noise | begins the others that do so too, and effects whose signature has a cosine of {LOOKS_ALIKE:g} with its own, from its tolerances |
