@@ -667,15 +667,15 @@ def scan_effects(problem: Problem, fits: Sequence[Fit], effects: Iterable[str], 
     """
     best: list[Trial] = []
 
-    def try_starts(starts: Sequence[tuple[Fit, str, Start, bool]]) -> list[Trial]:
+    def try_starts(starts: Sequence[tuple[Fit, tuple[str, Start, bool]]]) -> list[Trial]:
         def simulate_own(fit: Fit) -> list[Trial]:
-            return simulate_starts(problem, fit, [(name, start, along) for each, name, start, along in starts if each is fit], workers)
+            return simulate_starts(problem, fit, [own for each, own in starts if each is fit], workers)
 
         tried = map_together(simulate_own, fits, workers)
         return _keep_best([*best, *(trial for several in tried for trial in several)])
 
     best = try_starts([
-        (fit, name, start, along) for fit in fits for name in effects
+        (fit, (name, start, along)) for fit in fits for name in effects
         for along in ((False, True) if name in GOES_WITH else (False,))
         for start in (*problem.model.find_effect(name).starts, *find_tones(problem, fit, name),
                       *_start_at_fit(problem, fit, name))])
@@ -683,9 +683,9 @@ def scan_effects(problem: Problem, fits: Sequence[Fit], effects: Iterable[str], 
     if problem.model.kind.correct is not None:  # a backlash that is 2 % off bounces otherwise than the motor
         passes.append((LINE, 4))
     for factors, count in passes:
-        best = try_starts([(t.fit, t.effect, start, t.along) for t in best[:count]
+        best = try_starts([(t.fit, (t.effect, start, t.along)) for t in best[:count]
                            for start in _list_starts_around(problem, t, factors)])
-    best = try_starts([(t.fit, t.effect, start, t.along) for t in best[:LOOKED_AT[-1]]
+    best = try_starts([(t.fit, (t.effect, start, t.along)) for t in best[:LOOKED_AT[-1]]
                        for start in _list_lines_beside(problem, t)])
     return [_make_prospect(problem, t) for t in best]
 
