@@ -82,17 +82,6 @@ class Device:
         """When the next timer runs out, ns; `tick` has nothing to do before, as long as SYNC comes."""
         return 0 if self.sdo.is_busy else min(self.heartbeat.due, self.consumer.find_due())
 
-    def read(self, index: int, sub: int = 0) -> Value:
-        """An object's raw value. Raises KeyError if there is none."""
-        return self.od.values[index, sub]
-
-    def write(self, index: int, sub: int, value: Value) -> None:
-        """Set an object's raw value from inside, read-only ones too. Raises KeyError if there is none."""
-        if (index, sub) not in self.od:
-            raise KeyError(f"node {self.node_id} has no object {index:04X}sub{sub:X}")
-        self.od.values[index, sub] = value
-        self._configure(index)
-
     def transmit(self, n: int) -> None:
         """Send TPDO `n`, because the application has new values; nothing is sent unless OPERATIONAL."""
         if self.nmt.state is NmtState.OPERATIONAL:

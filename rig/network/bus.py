@@ -55,8 +55,7 @@ class EmbeddedBus:
 
     def __init__(self) -> None:
         self._receivers: list[Receive] = []
-        self._others: list[list[Receive]] = []  # for each node, everybody else
-        self._queue: deque[tuple[list[Receive], int, bytes]] = deque()
+        self._queue: deque[tuple[Receive, int, bytes]] = deque()  # with the receiver of the node that has sent it
 
     @property
     def is_empty(self) -> bool:
@@ -65,15 +64,11 @@ class EmbeddedBus:
 
     def attach(self, receive: Receive) -> Send:
         """Connect a node: `receive` gets every frame of the other nodes; the returned function sends."""
-        others = list(self._receivers)
-        for each in self._others:
-            each.append(receive)
         self._receivers.append(receive)
-        self._others.append(others)
         enqueue = self._queue.append
 
         def send(cob_id: int, data: bytes) -> None:
-            enqueue((others, cob_id, data))
+            enqueue((receive, cob_id, data))
 
         return send
 
@@ -83,19 +78,15 @@ class EmbeddedBus:
         nodes.append(make(self.attach(lambda frame: nodes[0].receive(frame))))
         return nodes[0]
 
-    def deliver(self, t_ns: int) -> int:
-        """Deliver the queued frames, with time `t_ns`, to all nodes but their senders until no node sends any more.
-
-        Returns the number of frames.
-        """
-        queue, count = self._queue, 0
+    def deliver(self, t_ns: int) -> None:
+        """Deliver the queued frames, with time `t_ns`, to all nodes but their senders until no node sends any more."""
+        queue = self._queue
         while queue:
-            others, cob_id, data = queue.popleft()
+            own, cob_id, data = queue.popleft()
             frame = Frame(t_ns, cob_id & ~SWITCHED, data)
-            for receive in others:
-                receive(frame)
-            count += 1
-        return count
+            for receive in self._receivers:
+                if receive is not own:
+                    receive(frame)
 
 
 def choose_bus(spec: str = "auto") -> tuple[str, str]:

@@ -73,12 +73,6 @@ class HeartbeatConsumer:
         return min(self._deadlines.values(), default=NEVER - 1) + 1
 
     def tick(self, t_ns: int) -> None:
-        for deadline in self._deadlines.values():
-            if t_ns > deadline:
-                break
-        else:
-            return  # nearly every tick: no list is made
-        for node, deadline in list(self._deadlines.items()):
-            if t_ns > deadline:
-                del self._deadlines[node]
-                self._lost(node)
+        for node in [node for node, deadline in self._deadlines.items() if t_ns > deadline]:
+            del self._deadlines[node]
+            self._lost(node)

@@ -68,7 +68,7 @@ class Rack:
             if first == "write":
                 found = self.download(int(index, 16), int(sub, 16), bytes.fromhex(rest[1]))
             elif sub:
-                found = str(self.device.read(int(index, 16), int(sub, 16)))
+                found = str(self.device.od.values[int(index, 16), int(sub, 16)])
             else:
                 heard = (self.wait(float(rest[0])) if first == "wait" else
                          self.send(int(first, 16), bytes.fromhex("".join(rest))))

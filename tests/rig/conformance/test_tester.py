@@ -72,7 +72,7 @@ def test_what_a_reset_does_not_restore_is_set_back_and_reported() -> None:
     outcome = examine(remember, chapters=("5",))
     assert any(note.startswith("0x1016:1 held 0x100FA before and ") and note.endswith("it was set back.")
                for note in outcome.notes)
-    assert nodes[0].read(0x1016, 1) == 0x000100FA and nodes[0].read(0x1017) == 100
+    assert (nodes[0].od.values[0x1016, 1], nodes[0].od.values[0x1017, 0]) == (0x000100FA, 100)
 
 
 class Talker:

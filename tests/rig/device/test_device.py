@@ -318,6 +318,7 @@ def test_every_service_answers_as_canopen_expects(node: int) -> None:
     master = Master(bus)
     remote = master.add_node(node, str(EDS[node]))
     device = bus.add(lambda send: Device(node, EDS[node], send))
+    values = device.od.values
 
     def deliver(t_ns: int = 0) -> None:
         device.tick(t_ns)
@@ -333,7 +334,7 @@ def test_every_service_answers_as_canopen_expects(node: int) -> None:
                 variable.raw  # noqa: B018
         elif entry.readable:
             value = variable.raw
-            assert (value.encode() if isinstance(value, str) else value) == device.read(index, sub)
+            assert (value.encode() if isinstance(value, str) else value) == values[index, sub]
     remote.tpdo.read()  # the configuration of the PDOs, by SDO
     remote.rpdo.read()
     remote.nmt.state = "OPERATIONAL"
@@ -348,12 +349,12 @@ def test_every_service_answers_as_canopen_expects(node: int) -> None:
     assert log == [(0x8250, 0x11, b"\1\2\0\0\0"), (0, 0, bytes(5))] and remote.emcy.active == []
     if node == 2:
         remote.sdo[0x2110]["Proportional gain"].raw = 4.25
-        assert device.read(0x2110, 1) == 4.25
+        assert values[0x2110, 1] == 4.25
         return
     scenario = bytes(range(256)) * 20
     remote.sdo[0x2210].raw = scenario
-    assert device.read(0x2210) == scenario
-    device.on_sync = lambda: (device.write(0x2200, 0, -5), device.write(0x2204, 0, device.read(0x2207)))
+    assert values[0x2210, 0] == scenario
+    device.on_sync = lambda: values.update({(0x2200, 0): -5, (0x2204, 0): values[0x2207, 0]})
     remote.rpdo[1]["Cycle answered by the controller"].raw = 41
     remote.rpdo[1].transmit()
     master.sync.transmit()

@@ -35,8 +35,8 @@ def scenario(*faults: Fault, model: Model = QUIET_MODEL, load: tuple[int, ...] =
 
 
 def counters(desk: PlantDesk) -> tuple[Any, Any]:
-    device = desk.node.device
-    return device.read(COUNTERS, 1), device.read(COUNTERS, 2)
+    values = desk.node.device.od.values
+    return values[COUNTERS, 1], values[COUNTERS, 2]
 
 
 def test_the_answer_to_cycle_k_acts_from_cycle_k_plus_1() -> None:
