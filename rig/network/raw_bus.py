@@ -19,12 +19,11 @@ to 64 bytes, of which `data` is the first 8. All bytes of the frame that came la
 PAYLOAD_IN + length]; `send_payload` sends those at PAYLOAD_OUT, which `send_frame` overwrites.
 
 All times are those of CLOCK_MONOTONIC, ns (`time.monotonic_ns()`); `receive_frame` gives the time at which the kernel
-received the frame. A port belongs to one thread. `bus.wake()` from another thread makes `receive_frame` return WOKEN
-once.
+received the frame. A port belongs to one thread.
 
 Filters: the kernel drops frames with other identifiers (CAN_RAW_FILTER; on UDP a socket filter, which also drops the
 bus's own frames); it does not tell CAN FD from classical frames, which compiled code does. What still arrives and was
-not asked for is dropped; remote frames, frames with 29 bits and CAN FD frames are counted then.
+not asked for is dropped, as remote frames, error frames and damaged datagrams are.
 
 System calls cost most of the time that a loop takes. `await_frame` waits inside the call that receives, which makes one
 call a frame; `receive_frame` needs three where it has to wait, and keeps its deadline to the microsecond.
@@ -37,7 +36,7 @@ import socket
 import struct
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import can
 import msgpack  # type: ignore[import-untyped]
@@ -54,25 +53,24 @@ from rig.network.frame import IDENTIFIER, has_valid_length
 from rig.network.udp import GIVE, SO_RXQ_OVFL, SO_TIMESTAMPNS, TAKE, TURN_LIMIT_NS, Turn, set_receive_options
 
 # status of receive_frame
-TIMEOUT, FRAME, WOKEN = 0, 1, 2
+TIMEOUT, FRAME = 0, 1
 # status of send_frame
 SENT, QUEUE_FULL = 0, 1
 # of both: FAILED, the kernel refused (errno in the port); of send_frame: the turn to send did not come
 FAILED, NO_TURN = -1, -2
-NEVER = 2**63 - 1  # a deadline that does not come
 
 SOCKETCAN, UDP = 0, 1
 KINDS = {"socketcan": SOCKETCAN, "udp_multicast": UDP}
 
 # The port's memory, as words of 8 bytes. First single numbers ..
 _KIND, _RX, _TX, _TURN, _ERROR = range(5)
-_IN_KERNEL, _IN_CONTROLLER, _ERROR_FRAMES, _DROPPED, _UNSENT = range(5, 10)
-_LATEST = 10  # time of the last frame: of two frames in a queue the second is not the earlier one
-_OWN, _COUNTS_LOSSES = 11, 12  # UDP: own port, network order; whether the kernel's count is of losses alone
-_STAMPED, _LISTED = 13, 14  # whether kernel times are used; how many COB-IDs beyond the classical ones are received
+_IN_KERNEL, _IN_CONTROLLER = 5, 6  # frames lost on the way in
+_LATEST = 7  # time of the last frame: of two frames in a queue the second is not the earlier one
+_OWN, _COUNTS_LOSSES = 8, 9  # UDP: own port, network order; whether the kernel's count is of losses alone
+_STAMPED, _LISTED = 10, 11  # whether kernel times are used; how many COB-IDs beyond the classical ones are received
 # .. then what the kernel reads and writes (asm-generic, 64 bit), as byte offsets
 _MESSAGE, _VECTOR, _POLL, _TIME, _ERRNO, _LIMIT = 256, 320, 336, 352, 368, 384
-_TAKE, _GIVE, _EVENT, _SENDER = 400, 416, 424, 432
+_TAKE, _GIVE, _SENDER = 400, 416, 432
 _CONTROL, _ALLOWED, _FRAME_IN, _FRAME_OUT = 512, 1024, 1280, 1360  # _FRAME: struct can_frame, canfd_frame
 _IN, _OUT, _WIDE_OUT, _LIST = 2048, 4096, 4608, 5120  # datagrams: in; out, with 11 and with 29 bits
 _CONTROL_SIZE, _IN_SIZE, _OUT_SIZE, _SENDER_SIZE, _LIST_SIZE = 256, 2048, 512, 16, 4096
@@ -89,7 +87,6 @@ _REALTIME, _MONOTONIC, _ABSOLUTE = 0, 1, 1
 _recvmsg = ForeignCall("qiqi", "recvmsg")
 _send = ForeignCall("qiqqi", "send")
 _ppoll = ForeignCall("iqqqq", "ppoll")
-_read = ForeignCall("qiqq", "read")
 _semtimedop = ForeignCall("iiqqq", "semtimedop")
 _clock_gettime = ForeignCall("iiq", "clock_gettime")
 _clock_nanosleep = ForeignCall("iiiqq", "clock_nanosleep")
@@ -105,7 +102,7 @@ class Port(NamedTuple):
     octets: NDArray[np.uint8]
 
 
-def _integer(value: Any) -> int:
+def to_integer(value: Any) -> int:
     """A number of an array as the integer that compiled code and Python calculate alike with: 64 bits, signed."""
     return int(np.int64(value))
 
@@ -116,7 +113,7 @@ def _integer(value: Any) -> int:
 def read_clock(port: Port) -> int:
     """CLOCK_MONOTONIC, ns."""
     _clock_gettime(_MONOTONIC, port.octets.ctypes.data + _TIME)
-    return _integer(port.words[_TIME // 8] * 1_000_000_000 + port.words[_TIME // 8 + 1])
+    return to_integer(port.words[_TIME // 8] * 1_000_000_000 + port.words[_TIME // 8 + 1])
 
 
 def sleep_until(port: Port, t_ns: int) -> None:
@@ -129,7 +126,7 @@ def sleep_until(port: Port, t_ns: int) -> None:
 
 def _read_wall_clock(port: Port) -> int:
     _clock_gettime(_REALTIME, port.octets.ctypes.data + _TIME)
-    return _integer(port.words[_TIME // 8] * 1_000_000_000 + port.words[_TIME // 8 + 1])
+    return to_integer(port.words[_TIME // 8] * 1_000_000_000 + port.words[_TIME // 8 + 1])
 
 
 # ---------------------------------------------------------------------------------------- receive
@@ -137,9 +134,9 @@ def _read_wall_clock(port: Port) -> int:
 
 @keep_apart
 def receive_frame(port: Port, deadline_ns: int) -> tuple[int, int, int, int, int]:
-    """The next frame; if none is waiting, wait for one until `deadline_ns` (absolute; 0: do not wait, NEVER).
+    """The next frame; if none is waiting, wait for one until `deadline_ns` (absolute; 0: do not wait).
 
-    Returns (status, t_ns, cob_id, length, data): FRAME; or TIMEOUT, WOKEN or FAILED with zeros.
+    Returns (status, t_ns, cob_id, length, data): FRAME; or TIMEOUT or FAILED with zeros.
     """
     while True:
         status, t_ns, cob_id, length, data = _take_frame(port, _DONTWAIT)
@@ -152,9 +149,7 @@ def receive_frame(port: Port, deadline_ns: int) -> tuple[int, int, int, int, int
 
 @keep_apart
 def await_frame(port: Port) -> tuple[int, int, int, int, int]:
-    """The next frame, as `receive_frame` returns it; TIMEOUT when none has come for 20 ms. `RawBus.wake` does not end
-    the wait.
-    """
+    """The next frame, as `receive_frame` returns it; TIMEOUT when none has come for 20 ms."""
     return _take_frame(port, 0)
 
 
@@ -165,24 +160,15 @@ def _take_frame(port: Port, flags: int) -> tuple[int, int, int, int, int]:
     while True:
         size = _take_datagram(port, flags)
         if size >= 0:
-            if words[_OWN] and words[_OWN] == _integer(port.halves[_SENDER // 4]) >> 16 & 0xFFFF:
+            if words[_OWN] and words[_OWN] == to_integer(port.halves[_SENDER // 4]) >> 16 & 0xFFFF:
                 continue
-            kind, cob_id, length, data = _decode(port, size)
-            if kind == _DATA:
-                if _is_allowed(port, cob_id):
-                    return FRAME, _find_time(port), cob_id, length, data
-                words[_DROPPED] += cob_id > 0x7FF
-            elif kind == _ERROR_FRAME:
-                words[_ERROR_FRAMES] += 1
-            else:
-                words[_DROPPED] += 1
+            cob_id, length, data = _decode(port, size)
+            if cob_id >= 0 and _is_allowed(port, cob_id):
+                return FRAME, _find_time(port), cob_id, length, data
         elif words[_ERROR] == _EAGAIN:
             return TIMEOUT, 0, 0, 0, 0
         elif words[_ERROR] != _EINTR:
             return FAILED, 0, 0, 0, 0
-
-
-_DATA, _ERROR_FRAME, _OTHER = 0, 1, 2  # what came
 
 
 def _is_allowed(port: Port, cob_id: int) -> bool:
@@ -213,25 +199,18 @@ def _note_errno(port: Port) -> None:
 
 
 def _wait_for_input(port: Port, deadline_ns: int) -> int:
-    """FRAME when there is something to read, TIMEOUT, WOKEN or FAILED."""
-    left = deadline_ns
-    if deadline_ns != NEVER:
-        left = deadline_ns - read_clock(port)
-        if left <= 0:
-            return TIMEOUT
+    """FRAME when there is something to read, TIMEOUT or FAILED."""
+    left = deadline_ns - read_clock(port)
+    if left <= 0:
+        return TIMEOUT
     base = port.octets.ctypes.data
     port.words[_TIME // 8] = left // 1_000_000_000
     port.words[_TIME // 8 + 1] = left % 1_000_000_000
-    count = _ppoll(base + _POLL, 2, base + _TIME, 0)
+    count = _ppoll(base + _POLL, 1, base + _TIME, 0)
     if count < 0:
         _note_errno(port)
         return FRAME if port.words[_ERROR] == _EINTR else FAILED
-    if port.halves[_POLL // 4 + 1] >> 16:  # revents of the socket
-        return FRAME
-    if count:
-        _read(port.halves[_POLL // 4 + 2], base + _EVENT, 8)
-        return WOKEN
-    return TIMEOUT
+    return FRAME if count else TIMEOUT
 
 
 def _find_time(port: Port) -> int:
@@ -249,22 +228,22 @@ def _find_time(port: Port) -> int:
             if port.halves[place // 4 + 3] == SO_TIMESTAMPNS:
                 wall = words[place // 8 + 2] * 1_000_000_000 + words[place // 8 + 3]
             elif port.halves[place // 4 + 3] == SO_RXQ_OVFL and words[_COUNTS_LOSSES]:
-                words[_IN_KERNEL] = _integer(port.halves[place // 4 + 4]) & 0xFFFFFFFF
+                words[_IN_KERNEL] = to_integer(port.halves[place // 4 + 4]) & 0xFFFFFFFF
         if size < 16:
             break
         place += (size + 7) // 8 * 8
     now = read_clock(port)
     t_ns = now
     if wall >= 0 and words[_STAMPED]:
-        t_ns = _integer(wall) - _find_clock_distance(port)
-    t_ns = max(min(t_ns, now), _integer(words[_LATEST]))
+        t_ns = to_integer(wall) - _find_clock_distance(port)
+    t_ns = max(min(t_ns, now), to_integer(words[_LATEST]))
     words[_LATEST] = t_ns
     return t_ns
 
 
 def _find_clock_distance(port: Port) -> int:
     """Wall clock minus monotonic clock, ns. A thread that is interrupted between the two readings reads them again."""
-    distance, shortest = 0, NEVER
+    distance, shortest = 0, 1 << 62
     for _ in range(5):
         before = read_clock(port)
         wall = _read_wall_clock(port)
@@ -276,24 +255,23 @@ def _find_clock_distance(port: Port) -> int:
     return distance
 
 
-def _decode(port: Port, size: int) -> tuple[int, int, int, int]:
-    """(kind, COB-ID, length, payload) of what came."""
+def _decode(port: Port, size: int) -> tuple[int, int, int]:
+    """(COB-ID, length, payload) of what came; -1 for what is no data frame."""
     if port.words[_KIND] == UDP:
         return decode_datagram(port, size)
-    cob_id = _integer(port.halves[_FRAME_IN // 4]) & 0xFFFFFFFF
+    cob_id = to_integer(port.halves[_FRAME_IN // 4]) & 0xFFFFFFFF
     if cob_id & _ERR:
         port.words[_IN_CONTROLLER] += cob_id & _CONTROLLER != 0 and port.octets[PAYLOAD_IN + 1] & _RX_OVERFLOW != 0
-        return _ERROR_FRAME, 0, 0, 0
-    if cob_id & _RTR or size not in (_CAN_SIZE, _CANFD_SIZE):
-        return _OTHER, 0, 0, 0
+    if cob_id & (_ERR | _RTR) or size not in (_CAN_SIZE, _CANFD_SIZE):
+        return -1, 0, 0
     most = 8
     if size == _CANFD_SIZE:
         cob_id, most = cob_id | FD, 64
-    length = min(_integer(port.octets[_FRAME_IN + 4]), most)
-    data = _integer(port.words[PAYLOAD_IN // 8])
+    length = min(to_integer(port.octets[_FRAME_IN + 4]), most)
+    data = to_integer(port.words[PAYLOAD_IN // 8])
     if length < 8:
         data &= (1 << 8 * length) - 1
-    return _DATA, cob_id, length, data
+    return cob_id, length, data
 
 
 # ---------------------------------------------------------------------------------------- send
@@ -301,9 +279,9 @@ def _decode(port: Port, size: int) -> tuple[int, int, int, int]:
 
 @keep_apart
 def send_frame(port: Port, cob_id: int, length: int, data: int) -> int:
-    """Put a frame of up to 8 bytes on the bus: SENT; QUEUE_FULL, the frame is lost and counted; FAILED or NO_TURN."""
+    """Put a frame of up to 8 bytes on the bus: SENT; QUEUE_FULL, the frame is lost; FAILED or NO_TURN."""
     port.words[PAYLOAD_OUT // 8] = data
-    return _send_payload(port, cob_id, length)
+    return send_payload(port, cob_id, length)
 
 
 @keep_apart
@@ -311,10 +289,6 @@ def send_payload(port: Port, cob_id: int, length: int) -> int:
     """Put a frame on the bus whose bytes stand at PAYLOAD_OUT, as `send_frame` does. A length that no frame of this
     kind has is FAILED; so is CAN FD on a SocketCAN bus that was not opened for it.
     """
-    return _send_payload(port, cob_id, length)
-
-
-def _send_payload(port: Port, cob_id: int, length: int) -> int:
     if not has_valid_length(cob_id, length):
         port.words[_ERROR] = errno.EINVAL
         return FAILED
@@ -346,7 +320,6 @@ def _transmit(port: Port, start: int, size: int) -> int:
     while _send(words[_TX], port.octets.ctypes.data + start, size, _DONTWAIT) < 0:
         _note_errno(port)
         if words[_ERROR] == _EAGAIN or words[_ERROR] == _ENOBUFS:
-            words[_UNSENT] += 1
             return QUEUE_FULL
         if words[_ERROR] != _EINTR:
             return FAILED
@@ -398,34 +371,33 @@ def encode_datagram(port: Port, cob_id: int, length: int) -> tuple[int, int]:
     if cob_id & FD:
         octets[place + _FD_AT] = _TRUE
         octets[place + _SWITCH_AT] += cob_id & SWITCHED != 0
-    return start, _integer(place + _TAIL - start)
+    return start, to_integer(place + _TAIL - start)
 
 
 @keep_apart
-def decode_datagram(port: Port, size: int) -> tuple[int, int, int, int]:
-    """(kind, COB-ID, length, data) of `size` bytes in the port's buffer, as python-can's udp_multicast packs them; the
-    payload goes to PAYLOAD_IN.
+def decode_datagram(port: Port, size: int) -> tuple[int, int, int]:
+    """(COB-ID, length, data) of `size` bytes in the port's buffer, as python-can's udp_multicast packs them; -1 for
+    what is no data frame, no such map, or contradicts itself. The payload goes to PAYLOAD_IN.
 
     The keys may come in any order, and those that have a default may be missing: other programs pack the map otherwise.
-    What is no such map, or contradicts itself, counts as an error frame, as in `UdpBus`.
     """
     octets, place, end = port.octets, _IN + 1, _IN + size
     cob_id, dlc, payload, length, flags = -1, _ABSENT, 0, 0, _EXTENDED
     if octets[_IN] & 0xF0 != 0x80:
-        return _ERROR_FRAME, 0, 0, 0
+        return -1, 0, 0
     for guess in range(octets[_IN] & 0x0F):
         key, place = _read_key(octets, place, end, guess)
         if key < 0 or place >= end:
-            return _ERROR_FRAME, 0, 0, 0
-        first = _integer(octets[place])
+            return -1, 0, 0
+        first = to_integer(octets[place])
         place += 1
-        count = _integer(_SIZES[first])
+        count = to_integer(_SIZES[first])
         if first in _SIZED:
             width = 1 if first in (_BYTES, _TEXT) else 2
             count = _read_number(octets, _UNSIGNED, place, width) if place + width <= end else -1
             place += width
         if count < 0 or place + count > end:
-            return _ERROR_FRAME, 0, 0, 0
+            return -1, 0, 0
         if key == _ID:
             cob_id = _read_number(octets, first, place, count)
         elif key == _DLC and first != _NOTHING:
@@ -438,20 +410,18 @@ def decode_datagram(port: Port, size: int) -> tuple[int, int, int, int]:
     if dlc == _ABSENT:
         dlc = length
     is_valid = place == end and 0 <= cob_id <= (IDENTIFIER if flags & _EXTENDED else 0x7FF) and length >= 0
-    contradiction = _REMOTE if flags & _FD else _SWITCH | _PASSIVE
-    if not is_valid or flags & (_IS_ERROR | contradiction):
-        return _ERROR_FRAME, 0, 0, 0
-    if flags & _REMOTE:
-        return _OTHER, 0, 0, 0
+    refused = _IS_ERROR | _REMOTE if flags & _FD else _IS_ERROR | _REMOTE | _SWITCH | _PASSIVE
+    if not is_valid or flags & refused:
+        return -1, 0, 0
     if flags & _EXTENDED:
         cob_id |= EXTENDED
     if flags & _FD:
         cob_id |= FD
     if dlc != length or not has_valid_length(cob_id, length):
-        return _ERROR_FRAME, 0, 0, 0
+        return -1, 0, 0
     port.words[PAYLOAD_IN // 8] = 0
     _memcpy(octets.ctypes.data + PAYLOAD_IN, octets.ctypes.data + payload, length)
-    return _DATA, cob_id, length, _integer(port.words[PAYLOAD_IN // 8])
+    return cob_id, length, to_integer(port.words[PAYLOAD_IN // 8])
 
 
 def _read_key(octets: NDArray[np.uint8], place: int, end: int, guess: int) -> tuple[int, int]:
@@ -461,7 +431,7 @@ def _read_key(octets: NDArray[np.uint8], place: int, end: int, guess: int) -> tu
     """
     for turn in range(len(_KEY_LENGTHS)):
         key = (guess + turn) % len(_KEY_LENGTHS)
-        at, length, same = _integer(_KEY_STARTS[key]), _integer(_KEY_LENGTHS[key]), 0
+        at, length, same = to_integer(_KEY_STARTS[key]), to_integer(_KEY_LENGTHS[key]), 0
         while same < length and place + length <= end and octets[place + same] == _KEY_BYTES[at + same]:
             same += 1
         if same == length:
@@ -477,21 +447,20 @@ def _read_number(octets: NDArray[np.uint8], first: int, place: int, count: int) 
         return -1
     value = 0
     for i in range(count):
-        value = value << 8 | _integer(octets[place + i])
+        value = value << 8 | to_integer(octets[place + i])
     return value
 
 
 # ---------------------------------------------------------------------------------------- opening
 
 
-class RawBus:
+class RawBus(contextlib.AbstractContextManager["RawBus"]):
     """`socketcan:INTERFACE` or `udp_multicast[:GROUP]` for compiled loops, as a context or to be closed.
 
     `port` is what the loops get.
 
-    Counted, to be read at any time: `error_frames`; `overflows`, frames lost on the way in; `dropped`, remote frames,
-    and frames of 29 bits and CAN FD frames that nobody asked for; `unsent`, frames the full transmit queue refused. On
-    UDP with a filter `overflows` stays as it is: the kernel counts a frame that the filter drops as one that was lost.
+    `overflows` counts the frames that were lost on the way in. On UDP with a filter it stays as it is: the kernel
+    counts a frame that the filter drops as one that was lost.
     """
 
     def __init__(self, spec: str, cob_ids: Sequence[int] | None = None, fd: bool = False) -> None:
@@ -513,8 +482,6 @@ class RawBus:
         words[_STAMPED] = words[_COUNTS_LOSSES] = True
         try:
             with contextlib.ExitStack() as stack:
-                self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-                stack.callback(os.close, self._wake)
                 is_fd = fd or any(cob_id & FD for cob_id in cob_ids or ())
                 if kind == "socketcan":
                     self._rx = tx = _open_socketcan(channel, is_fd, stack)
@@ -522,7 +489,7 @@ class RawBus:
                 else:
                     self._rx, tx = self._open_udp(channel, stack)
                 words[_RX], words[_TX] = self._rx.fileno(), tx.fileno()
-                self.port.halves[_POLL // 4: _POLL // 4 + 4] = self._rx.fileno(), _POLLIN, self._wake, _POLLIN
+                self.port.halves[_POLL // 4: _POLL // 4 + 2] = self._rx.fileno(), _POLLIN
                 self._allow(range(0x800))
                 if cob_ids is not None:
                     self.set_filter(cob_ids)
@@ -531,9 +498,6 @@ class RawBus:
                 self._opened = stack.pop_all()
         except OSError as error:
             raise RigError(f"{spec}: {error.strerror}") from error
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -545,25 +509,8 @@ class RawBus:
         return int(self.port.words[_RX]), int(self.port.words[_TX]), turn
 
     @property
-    def error_frames(self) -> int:
-        return int(self.port.words[_ERROR_FRAMES])
-
-    @property
     def overflows(self) -> int:
         return int(self.port.words[_IN_KERNEL] + self.port.words[_IN_CONTROLLER])
-
-    @property
-    def dropped(self) -> int:
-        return int(self.port.words[_DROPPED])
-
-    @property
-    def unsent(self) -> int:
-        return int(self.port.words[_UNSENT])
-
-    def wake(self) -> None:
-        """Make the `receive_frame` that waits, or the next one, return WOKEN."""
-        with contextlib.suppress(BlockingIOError):  # full: it will wake anyway
-            os.eventfd_write(self._wake, 1)
 
     def explain_failure(self, status: int) -> RigError:
         """The error behind the status FAILED or NO_TURN that the last call returned."""
@@ -575,7 +522,7 @@ class RawBus:
     def close(self) -> None:
         """Give the bus back. No thread may be using the port any more."""
         self._opened.close()
-        self._turn, self._wake = None, -1
+        self._turn = None
 
     def _open_udp(self, group: str, stack: contextlib.ExitStack) -> tuple[socket.socket, socket.socket]:
         """Sockets that receive and send."""

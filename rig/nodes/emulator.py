@@ -5,7 +5,7 @@ the answer to cycle k acts from cycle k+1. All faults are loaded before the star
 bus time and begins exactly in the cycle that the sequence gives.
 """
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from functools import partial
 from typing import cast
 
@@ -18,25 +18,9 @@ from rig.network import heartbeat
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import COUNTERS, PLANT, SCENARIO
 from rig.nodes.scenario import FaultyPlant, Scenario
-from rig.sequences.faults import DOUBLE, LateFrames, Plan
+from rig.sequences.faults import DOUBLE, LateFrames, Plan, Schedule
 
 _NO_FLAGS = Flags(0)  # made once: an operation on an IntFlag takes a microsecond
-
-
-def accept_scenario(device: Device, load: Callable[[Scenario], None], index: int, sub: int, data: bytes) -> None:
-    """Load what was downloaded, if it was object 0x2210, the scenario.
-
-    Raises:
-        SdoAbort: the node is OPERATIONAL, or the bytes are no scenario that can be run.
-    """
-    if index != SCENARIO:
-        return
-    if device.state is NmtState.OPERATIONAL:
-        raise SdoAbort(Abort.STATE)
-    try:
-        load(Scenario.from_bytes(data))
-    except InputError as error:
-        raise SdoAbort(Abort.VALUE) from error
 
 
 def find_plant_node(bench: Bench) -> CanopenNode:
@@ -57,51 +41,91 @@ def find_plant_node(bench: Bench) -> CanopenNode:
     return node
 
 
-def make_scenario(bench: Bench) -> Scenario:
-    """The plant of a bench without faults and loads, for as long as no rig has sent another scenario."""
-    return Scenario(load_model(bench.plant), Plan(stop=0))
+class PlantNode(ABC):
+    """The plant as a CANopen node, whatever runs its cycle. Its interface is `receive` and `tick`."""
+
+    _scenario: Scenario | None = None
+
+    def __init__(self, send: Send, bench: Bench | None) -> None:
+        """`bench`: whose plant it is; default: the shipped one."""
+        self._send, self._bench = send, bench or load_bench()
+        self._node = node = find_plant_node(self._bench)
+        self._heartbeat = node.find_cob_id(heartbeat.COB_ID)
+        self.device = Device(node.node, node.eds, self._transmit)
+        self.device.on_write, self.device.on_nmt = self._on_write, self._on_nmt
+        self._od = self.device.od.values
+        drive = self._bench.frames.drive.identifier
+        self._drive = next(pdo for pdo in self.device.pdo.rpdos.values() if pdo.cob_id == drive)
+
+    def load_scenario(self, scenario: Scenario | None) -> None:
+        """Load a plant with its faults and loads; it is compiled now, not in the first cycle. None: that of the bench.
+
+        Raises:
+            InputError: a scenario that cannot be run, or of a plant with other signals than those of the bench; the
+                previous one stays.
+        """
+        scenario = scenario or Scenario(load_model(self._bench.plant), Plan(stop=0))
+        own, named = ([(s.word, s.unit) for s in (*signals.outputs, signals.drive)]
+                      for signals in (scenario.model.kind.signals, self._bench.signals))
+        require(own == named, "--model", scenario.model.name, "a plant with the signals of the bench: "
+                f"{', '.join(f'{word} ({unit})' for word, unit in named)}")
+        self._begin(scenario)
+
+    def _on_write(self, index: int, sub: int, data: bytes) -> None:
+        """Load what was downloaded, if it was object 0x2210, the scenario.
+
+        Raises:
+            SdoAbort: the node is OPERATIONAL, or the bytes are no scenario that can be run.
+        """
+        if index != SCENARIO:
+            return
+        if self.device.state is NmtState.OPERATIONAL:
+            raise SdoAbort(Abort.STATE)
+        try:
+            self.load_scenario(Scenario.from_bytes(data))
+        except InputError as error:
+            raise SdoAbort(Abort.VALUE) from error
+
+    def _pass_on(self, cob_id: int, data: bytes, faults: Schedule, k: int, is_running: bool) -> None:
+        """Send a frame of the services unless a fault keeps it back. `k` is the cycle of the SYNC to come.
+
+        `is_running`: there was a SYNC. Before it there is no cycle, and bring-up needs the heartbeat.
+        """
+        is_silent = cob_id == self._heartbeat and is_running and not faults.is_heartbeat_alive("plant", k)
+        if not is_silent and not faults.is_bus_off("plant", k - 1):
+            self._send(cob_id, data)
+
+    @abstractmethod
+    def _begin(self, scenario: Scenario) -> None:
+        """Begin anew with this scenario; the SYNC to come is that of cycle 0."""
+
+    @abstractmethod
+    def _transmit(self, cob_id: int, data: bytes) -> None:
+        """A frame of the device."""
+
+    @abstractmethod
+    def _on_nmt(self, old: NmtState, new: NmtState) -> None:
+        """The state has changed."""
 
 
-def require_plant(bench: Bench, scenario: Scenario) -> None:
-    """Refuse a scenario of a plant with other signals than those of the bench. Raises InputError."""
-    own, named = ([(s.word, s.unit) for s in (*signals.outputs, signals.drive)]
-                  for signals in (scenario.model.kind.signals, bench.signals))
-    require(own == named, "--model", scenario.model.name, "a plant with the signals of the bench: "
-            f"{', '.join(f'{word} ({unit})' for word, unit in named)}")
-
-
-class Emulator:
-    """The plant node. Its interface is `receive` and `tick`; `scenario` is used until the rig loads another."""
+class Emulator(PlantNode):
+    """The plant node in Python; `scenario` is used until the rig loads another."""
 
     def __init__(self, send: Send, scenario: Scenario | None = None, bench: Bench | None = None) -> None:
-        self._send = send
-        self._bench = bench = bench or load_bench()
-        node, frames, signals = find_plant_node(bench), bench.frames, bench.signals
-        self._heartbeat = node.find_cob_id(heartbeat.COB_ID)
+        super().__init__(send, bench)
+        node, frames, signals = self._node, self._bench.frames, self._bench.signals
         self._names = {frames.find_role(name).identifier: name for name in ("feedback", "valve_state")}
         self._written = [node.outputs[s.word] for s in signals.outputs]
         self._flags, self._number = (node.outputs[signal] for signal in ("flags", "cycle"))
         self._driving, self._answered = (node.inputs[word] for word in (signals.drive.word, "cycle"))
-        self._drive_id, self._sync_id, self._most_missed = frames.drive.identifier, frames.sync, bench.most_missed
-        self.device = Device(node.node, node.eds, self._transmit)
+        self._drive_id, self._sync_id = frames.drive.identifier, frames.sync
+        self._most_missed = self._bench.most_missed
         self.device.on_sync = self._on_sync
-        self.device.on_write = partial(accept_scenario, self.device, self.load_scenario)
-        self.device.on_nmt = self._on_nmt
-        self._od = self.device.od.values
-        self._drive = next(pdo for pdo in self.device.pdo.rpdos.values() if pdo.cob_id == self._drive_id)
-        self.load_scenario(scenario or make_scenario(bench))
+        self.load_scenario(scenario)
 
-    def load_scenario(self, scenario: Scenario) -> None:
-        """Load a plant with its faults and loads; it is compiled now, not in the first cycle.
-
-        Raises:
-            InputError: a scenario that cannot be run; the previous one stays.
-        """
-        require_plant(self._bench, scenario)
-        self._begin(scenario, FaultyPlant(scenario))
-
-    def _begin(self, scenario: Scenario, plant: FaultyPlant) -> None:
-        self._scenario, self.plant, self._faults = scenario, plant, plant.faults
+    def _begin(self, scenario: Scenario) -> None:
+        self.plant = FaultyPlant(scenario)
+        self._scenario, self._faults = scenario, self.plant.faults
         self._cycle = 0  # of the SYNC to come
         self._begun = False  # SYNCs are counted from the first start
         self._first = True  # of the cycles after a start: no drive can have answered yet
@@ -178,17 +202,15 @@ class Emulator:
             self._sent.pass_on(self._faults.find_action(name, self._cycle), data, self.device.t_ns,
                                partial(self._send, cob_id))
             return
-        if cob_id == self._heartbeat and not self._first and not self._faults.is_heartbeat_alive("plant", self._cycle):
-            return  # before the first SYNC there is no cycle: bring-up needs the heartbeat
-        if not self._faults.is_bus_off("plant", self._cycle - 1):
-            self._send(cob_id, data)
+        self._pass_on(cob_id, data, self._faults, self._cycle, not self._first)
 
     def _on_nmt(self, old: NmtState, new: NmtState) -> None:
         """The first start begins a run; after a pause the plant continues from its last state."""
         if new is NmtState.OPERATIONAL:
             self._begun = self._first = True
         elif new is NmtState.INITIALISING:
-            self._begin(self._scenario, FaultyPlant(self._scenario))
+            assert self._scenario is not None
+            self._begin(self._scenario)
 
     def _on_sync(self) -> None:
         """The drive that came last is latched: judge it, read the transducers, leave the rest until they are sent."""

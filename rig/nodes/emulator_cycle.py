@@ -37,15 +37,14 @@ from rig.benches.packing import (
 from rig.network.node_objects import RING
 from rig.network.raw_bus import (
     FRAME,
-    NEVER,
     SENT,
-    WOKEN,
     Port,
     await_frame,
     read_clock,
     receive_frame,
     send_frame,
     sleep_until,
+    to_integer,
 )
 from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, Schedule, change_frame
 
@@ -53,6 +52,7 @@ NOISE_RING = 1 << 16  # cycles of noise drawn ahead
 EVENT_RING = 256
 _HELD_FRAMES = 4096  # late frames that can wait: two a cycle for the longest delay, and as many drives
 _ANSWER_LIMIT = 80_000_000  # ns: in lockstep the answer to a late feedback frame is waited for this long
+_LONGEST_WAIT = 20_000_000  # ns: then the loop looks whether it is to stop, as after `await_frame`
 
 # NMT states (CiA 301), as in the heartbeat
 INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
@@ -141,7 +141,8 @@ def run_emulator(port: Port, m: Memory) -> int:
             status, t_ns, cob_id = FRAME, words[PUSHED_TIME], words[PUSHED_ID]
             length, data = words[PUSHED_LENGTH], words[PUSHED_DATA]
         elif words[HELD] and words[PERIOD]:
-            status, t_ns, cob_id, length, data = receive_frame(port, _find_next_due(m))
+            deadline = min(_find_next_due(m), read_clock(port) + _LONGEST_WAIT)
+            status, t_ns, cob_id, length, data = receive_frame(port, deadline)
         else:
             status, t_ns, cob_id, length, data = await_frame(port)
         if status == FRAME:
@@ -158,11 +159,6 @@ def run_emulator(port: Port, m: Memory) -> int:
             _release_until(port, m, read_clock(port), True)
         if words[FAILURE]:
             return BROKEN
-
-
-def _integer(value: Any) -> int:
-    """A word as the integer that compiled code and Python calculate alike with."""
-    return int(np.int64(value))
 
 
 # ------------------------------------------------------------------------------------ NMT
@@ -523,10 +519,10 @@ def _hold_frame(m: Memory, what: int, due: int, length: int, data: int) -> None:
 
 
 def _find_next_due(m: Memory) -> int:
-    """When the next of the late frames is due, in real time."""
-    due = NEVER
-    for i in range(m.words[HELD]):
-        due = min(due, _integer(m.words[_HELD_AT + 4 * i + 1]))
+    """When the next of the late frames is due, in real time; there is one."""
+    due = to_integer(m.words[_HELD_AT + 1])
+    for i in range(1, m.words[HELD]):
+        due = min(due, to_integer(m.words[_HELD_AT + 4 * i + 1]))
     return due
 
 
@@ -586,15 +582,9 @@ def _send_late_feedback(port: Port, m: Memory, k: int, is_fed: bool) -> None:
 
 @keep_apart
 def _await_drive(port: Port, m: Memory) -> None:
-    """Take the next drive frame; another frame ends the wait and comes up again in the loop.
-
-    A wake-up does not end it: the one that stopped the loop before this run may still be waiting.
-    """
+    """Take the next drive frame; another frame ends the wait and comes up again in the loop."""
     words = m.words
-    limit = read_clock(port) + _ANSWER_LIMIT
-    status, t_ns, cob_id, length, data = receive_frame(port, limit)
-    while status == WOKEN and not words[STOP]:
-        status, t_ns, cob_id, length, data = receive_frame(port, limit)
+    status, t_ns, cob_id, length, data = receive_frame(port, read_clock(port) + _ANSWER_LIMIT)
     if status < 0:
         words[FAILURE] = status
     elif status == FRAME and cob_id == words[DRIVE_ID]:
@@ -614,7 +604,7 @@ def find_action(m: Memory, what: int, k: int) -> tuple[int, int]:
     low, end = words[HITS_AT + what], words[HITS_AT + what + 1]
     at = low + 3 * np.searchsorted(words[low:end:3], k)
     if at < end and words[at] == k:
-        return _integer(words[at + 1]), _integer(words[at + 2])
+        return to_integer(words[at + 1]), to_integer(words[at + 2])
     return SENT_NORMALLY, 0
 
 

@@ -10,7 +10,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -23,15 +23,14 @@ from plant.model import build_kernel
 from plant.run import find_direct_readings, load_stored_advance, report_law_errors
 from plant.solve import read_flat_sensors
 from rig.benches.bench import Bench
-from rig.benches.bench_file import load_bench
 from rig.benches.canopen_map import RPDO, TPDO
 from rig.benches.packing import VALUES_AT
-from rig.device import Device, EmcyCode, ErrorRegister, NmtState
+from rig.device import EmcyCode, ErrorRegister, NmtState
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import COUNTERS, CYCLE_RECORD, RING, CycleRecord, encode_cycle_record
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
-from rig.nodes.emulator import accept_scenario, find_plant_node, make_scenario, require_plant
+from rig.nodes.emulator import PlantNode
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import Plan, Schedule
 
@@ -44,8 +43,8 @@ _CLEARED = {ec.TIMEOUT_CLEARED: EmcyCode.RPDO_TIMEOUT, ec.DRIVE_WHOLE: EmcyCode.
 _STOP_LIMIT = 5.0  # s: the longest that the loop waits inside a cycle is 1 s, for its turn to send
 
 
-class EmulatorService:
-    """The plant node on a bus of its own. Its interface is `receive` and `tick`, as that of `Emulator`, and `close`.
+class EmulatorService(PlantNode):
+    """The plant node whose cycle is compiled, on a bus of its own; to be closed.
 
     `send` is for the services; the loop uses `bus`. `enter_thread` gives the loop's thread its priority and its CPU and
     yields the name of the scheduler. `is_locked`: the memory of the process is locked.
@@ -55,40 +54,23 @@ class EmulatorService:
 
     def __init__(self, send: Send, bus: RawBus, enter_thread: Callable[[], AbstractContextManager[str]],
                  scenario: Scenario | None = None, is_locked: bool = False, bench: Bench | None = None) -> None:
-        self._send, self._bus, self._enter_thread, self._is_locked = send, bus, enter_thread, is_locked
+        super().__init__(send, bench)
+        self._bus, self._enter_thread, self._is_locked = bus, enter_thread, is_locked
         self._thread: threading.Thread | None = None
         self._kind = _COMPILED
         self._obeying = False  # an NMT command, which the loop obeys by itself
         self._run = compile_loop()
         self._booking = False  # an error whose EMCY the loop has sent
-        self._scenario: Scenario | None = None
         self._seen = self._last_sync = 0
-        self._bench = bench = bench or load_bench()
-        self._node = node = find_plant_node(bench)
-        self._frames = [bench.frames.find_role(role) for role in ("drive", "feedback", "valve_state")]
-        self._emcy, self._sdo, self._reply, self._heartbeat = map(node.find_cob_id, (0x080, 0x600, 0x580, 0x700))
-        self._unheard = list_unheard(bench)
-        self.device = Device(node.node, node.eds, self._transmit)
-        pdo = self.device.pdo
-        self._drive, *self._tpdos = (
-            next(each for each in (*pdo.rpdos.values(), *pdo.tpdos.values()) if each.cob_id == spec.identifier)
-            for spec in self._frames)
-        self.device.on_write = partial(accept_scenario, self.device, self.load_scenario)
-        self.device.on_nmt = self._on_nmt
-        self._od = self.device.od.values
-        self.load_scenario(scenario or make_scenario(bench))
+        self._frames = [self._bench.frames.find_role(role) for role in ("drive", "feedback", "valve_state")]
+        self._emcy, self._sdo, self._reply = map(self._node.find_cob_id, (0x080, 0x600, 0x580))
+        self._unheard = list_unheard(self._bench)
+        sent = self.device.pdo.tpdos.values()
+        self._tpdos = [next(pdo for pdo in sent if pdo.cob_id == spec.identifier) for spec in self._frames[1:]]
+        self.load_scenario(scenario)
 
-    def load_scenario(self, scenario: Scenario) -> None:
-        """Load a plant with its faults and loads; it is compiled now, not in the first cycle.
-
-        Raises:
-            InputError: a scenario that cannot be run; the previous one stays.
-        """
-        require_plant(self._bench, scenario)
-        self._begin(scenario, None if self._scenario else ec.INITIALISING)
-
-    def _begin(self, scenario: Scenario, state: int | None) -> None:
-        """Make new memory for the loop, whose next SYNC is the first; `state`: None for the one it is in."""
+    def _begin(self, scenario: Scenario) -> None:
+        """Make new memory for the loop, whose next SYNC is the first; it stays in its NMT state."""
         schedule = Schedule(scenario.plan, scenario.model.values)
         memory = ec.make_memory(scenario.model, scenario.load(), schedule, *compile_plant(scenario.model),
                                 self._frames)
@@ -97,7 +79,7 @@ class EmulatorService:
                                                       self._bench.most_missed)
         with self._stop_loop():
             words = memory.words
-            words[ec.STATE] = self._memory.words[ec.STATE] if state is None else state
+            words[ec.STATE] = self._memory.words[ec.STATE] if self._scenario else ec.INITIALISING
             words[ec.BEGUN] = words[ec.FIRST] = words[ec.STATE] == ec.OPERATIONAL
             self._scenario, self._memory, self._schedule = scenario, memory, schedule
             self._rng = np.random.default_rng(scenario.seed)
@@ -107,7 +89,8 @@ class EmulatorService:
 
     def receive(self, frame: Frame) -> None:
         """A frame for the services arrived."""
-        if frame.cob_id in self._unheard or self._is_bus_off():
+        is_bus_off = self._schedule.is_bus_off("plant", int(self._memory.words[ec.CYCLE]) - 1)
+        if frame.cob_id in self._unheard or is_bus_off:
             return
         self._book_events()
         if frame.cob_id == self._sdo:
@@ -153,7 +136,6 @@ class EmulatorService:
         if self._thread is None:
             return
         self._memory.words[ec.STOP] = 1
-        self._bus.wake()
         self._thread.join(_STOP_LIMIT)
         if self._thread.is_alive():
             raise RigError(f"{self._bus.spec}: the emulator's loop did not stop within {_STOP_LIMIT:g} s")
@@ -188,24 +170,15 @@ class EmulatorService:
         if cob_id == self._heartbeat and data == bytes(1) and not self._memory.words[ec.STATE]:  # the first boot-up
             self._memory.words[ec.STATE] = ec.PRE_OPERATIONAL
         words = self._memory.words
-        is_begun = words[ec.BEGUN] and not words[ec.FIRST]  # before the first SYNC there is no cycle
-        if cob_id == self._heartbeat and is_begun and not self._schedule.is_heartbeat_alive("plant",
-                                                                                          int(words[ec.CYCLE])):
-            return
-        if not self._is_bus_off():
-            self._send(cob_id, data)
-
-    def _is_bus_off(self) -> bool:
-        """Whether a fault has the node bus-off: it neither sends nor receives."""
-        return self._schedule.is_bus_off("plant", int(self._memory.words[ec.CYCLE]) - 1)
+        self._pass_on(cob_id, data, self._schedule, int(words[ec.CYCLE]), bool(words[ec.BEGUN] and not words[ec.FIRST]))
 
     def _on_nmt(self, old: NmtState, new: NmtState) -> None:
         if new is NmtState.INITIALISING:
             assert self._scenario is not None
-            self._begin(self._scenario, ec.PRE_OPERATIONAL)
+            self._memory.words[ec.STATE] = ec.PRE_OPERATIONAL
+            self._begin(self._scenario)
         elif not self._obeying and old is NmtState.OPERATIONAL:  # an error of the services: 0x1029
             self._memory.words[ec.DEMOTED] = new
-            self._bus.wake()
 
     def _share_settings(self) -> None:
         """What SDO may change, and the error register without the loop's own error."""
