@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant import Model
 from plant.compile import ForeignCall, keep_apart
 from plant.machine_code import ADVANCE_CALL, READ_CALL
 from plant.run import find_direct_readings
@@ -46,7 +45,8 @@ from rig.network.raw_bus import (
     sleep_until,
     to_integer,
 )
-from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, Schedule, change_frame
+from rig.nodes.scenario import Scenario
+from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, change_frame
 
 NOISE_RING = 1 << 16  # cycles of noise drawn ahead
 EVENT_RING = 256
@@ -82,8 +82,6 @@ TIMES_AT = _HELD_AT + 4 * _HELD_FRAMES
 _TABLES_AT = TIMES_AT + 6 * RING
 IN_FORCE, _PERIOD, _RESULT, _FAILURE, NOISE_AT = 0, 1, 4, 8, 16  # in the real numbers
 
-# what the loop returns
-ENDED, RESET, BROKEN = 0, 1, 2
 # events for the services
 TIMEOUT_RAISED, TIMEOUT_CLEARED, DRIVE_SHORT, DRIVE_WHOLE, DIVERGED, SYNC_MALFORMED = range(1, 7)
 COMMANDED = 256  # + the NMT command
@@ -126,12 +124,12 @@ class Memory(NamedTuple):
     frames: Layout
 
 
-def run_emulator(port: Port, m: Memory) -> int:
-    """Serve the bus until the services stop it (ENDED), an NMT reset comes (RESET) or the bus fails (BROKEN)."""
+def run_emulator(port: Port, m: Memory) -> None:
+    """Serve the bus until the services stop it, an NMT reset comes (RESET_COMMAND) or the bus fails (FAILURE)."""
     words = m.words
     while True:
         if words[STOP]:
-            return ENDED
+            return
         if words[DEMOTED]:
             if words[STATE] == OPERATIONAL:
                 _leave_operational(m, words[DEMOTED])
@@ -152,13 +150,13 @@ def run_emulator(port: Port, m: Memory) -> int:
             elif cob_id == words[DRIVE_ID]:
                 _take_drive(m, t_ns, length, data)
             elif cob_id == 0 and length == 2 and not _is_bus_off(m, words[CYCLE] - 1) and _take_command(m, data):
-                return RESET
+                return
         elif status < 0:
             words[FAILURE] = status
         if words[HELD] and words[PERIOD]:
             _release_until(port, m, read_clock(port), True)
         if words[FAILURE]:
-            return BROKEN
+            return
 
 
 # ------------------------------------------------------------------------------------ NMT
@@ -665,14 +663,14 @@ def fill_noise(m: Memory, rng: np.random.Generator, least: int = 1024) -> None:
     m.words[NOISE_FILLED] = filled + free
 
 
-def make_memory(model: Model, load: list[float], schedule: Schedule, advance: int = 0, read: int = 0,
-                frames: Sequence[FrameSpec] = ()) -> Memory:
-    """Memory of the loop for a plant at rest, its load (one a cycle) and its faults; no noise is drawn yet.
+def make_memory(scenario: Scenario, advance: int = 0, read: int = 0, frames: Sequence[FrameSpec] = ()) -> Memory:
+    """Memory of the loop for a plant at rest with its load and its faults; no noise is drawn yet.
 
     `advance`, `read`: addresses of the compiled `plant.solve.advance_flat_state` and, for a model whose readings are
     not direct (`find_direct_readings`), `read_flat_sensors`. `frames`: drive, feedback and valve state, for a plant
     that is a node of its own.
     """
+    model, load, schedule = scenario.model, scenario.load(), scenario.make_schedule()
     names = {name: i for i, name in enumerate(model.list_names())}
     parameters: list[tuple[int, ...]] = []
     signals: list[tuple[int, ...]] = []

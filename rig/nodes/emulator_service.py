@@ -32,7 +32,7 @@ from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator import PlantNode
 from rig.nodes.scenario import Scenario
-from rig.sequences.faults import Plan, Schedule
+from rig.sequences.faults import Plan
 
 _COMPILED, _FIFO, _LOCKED, _PINNED = 1, 2, 4, 8  # 0x2211 sub 9
 _RAISED = {  # events of the loop: the errors that they raise
@@ -71,9 +71,7 @@ class EmulatorService(PlantNode):
 
     def _begin(self, scenario: Scenario) -> None:
         """Make new memory for the loop, whose next SYNC is the first; it stays in its NMT state."""
-        schedule = Schedule(scenario.plan, scenario.model.values)
-        memory = ec.make_memory(scenario.model, scenario.load(), schedule, *compile_plant(scenario.model),
-                                self._frames)
+        memory = ec.make_memory(scenario, *compile_plant(scenario.model), self._frames)
         answered = self._node.inputs["cycle"].field
         memory.words[ec.NODE: ec.MISSED_LIMIT + 1] = (self._node.node, self._drive.n, answered.wrap_number(-1),
                                                       self._bench.most_missed)
@@ -81,7 +79,7 @@ class EmulatorService(PlantNode):
             words = memory.words
             words[ec.STATE] = self._memory.words[ec.STATE] if self._scenario else ec.INITIALISING
             words[ec.BEGUN] = words[ec.FIRST] = words[ec.STATE] == ec.OPERATIONAL
-            self._scenario, self._memory, self._schedule = scenario, memory, schedule
+            self._scenario, self._memory, self._schedule = scenario, memory, scenario.make_schedule()
             self._rng = np.random.default_rng(scenario.seed)
             self._seen = self._last_sync = 0
             ec.fill_noise(self._memory, self._rng)
@@ -280,7 +278,7 @@ def compile_plant(model: Model) -> tuple[int, int]:
 def compile_loop() -> Any:
     """The loop, for any plant: some seconds on a new machine, half a second afterwards."""
     run = compile_function(ec.run_emulator)
-    memory = ec.make_memory(Model(), [], Schedule(Plan(stop=0)))
+    memory = ec.make_memory(Scenario(Model(), Plan(stop=0)))
     memory.words[ec.STOP] = 1
     run(make_closed_port(), memory)  # compiles it; the loop ends at once
     return run

@@ -43,6 +43,10 @@ class Scenario(NamedTuple):
         worth = find_load_count(self.model)
         return [count * worth for count in self.load_counts]
 
+    def make_schedule(self) -> Schedule:
+        """The faults by cycle."""
+        return Schedule(self.plan, self.model.values)
+
     def to_bytes(self) -> bytes:
         """JSON, compressed. Loads are second differences: constant and ramp are zeros.
 
@@ -106,9 +110,9 @@ class FaultyPlant:
 
     def __init__(self, scenario: Scenario) -> None:
         """A plant at rest. Raises InputError for an effect that cannot be compiled: it is, now."""
-        self.faults = Schedule(scenario.plan, scenario.model.values)
+        self.faults = scenario.make_schedule()
         self.drive = 0.0  # in force until the next cycle
-        self._load = scenario.load()
+        self.loads = scenario.load()  # one a cycle
         self.actuator = Actuator(scenario.model, scenario.seed)
         self.actuator.warm()
         self._names = [s.name for s in scenario.model.kind.signals.outputs]
@@ -139,7 +143,7 @@ class FaultyPlant:
         """Advance by cycle k under its load and the drive in force."""
         if not self.problem:
             try:
-                self.actuator.advance(self.drive, self._load[k] if k < len(self._load) else 0.0)
+                self.actuator.advance(self.drive, self.loads[k] if k < len(self.loads) else 0.0)
             except RigError as error:  # another program moves the plant: its run ends, this one ends with a verdict
                 self.problem = str(error)
 
@@ -148,10 +152,6 @@ class FaultyPlant:
         self._change_parameters(k)
         self.actuator.sample()
         self.move(k)
-
-    def list_loads(self, k: int, cycles: int) -> list[float]:
-        """The load in the cycles from k on, N; those behind its end have none and are left out."""
-        return self._load[k:k + cycles]
 
     def pass_quiet(self, cycles: int) -> None:
         """So many cycles were simulated elsewhere, on the state of the actuator; no fault changed in them."""

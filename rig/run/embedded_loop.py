@@ -228,7 +228,7 @@ class EmbeddedLoop(CycleLoop):
         step = CycleInput(phase, 0.0, 0.0, control)
         self.outputs.update(zip(self._values.given[2:], self._values.list_given(step)[2:], strict=True))
         b.words[FIRST], b.words[PLANT_CYCLE] = k, emulator.plant.actuator.cycle
-        on_plant = emulator.plant.list_loads(k, most)
+        on_plant = emulator.plant.loads[k:k + most]  # none after the last
         b.inputs[:most, 0], b.inputs[:most, 1], b.inputs[:most, 2] = demands[:most], loads[:most], 0.0
         b.inputs[:len(on_plant), 2] = on_plant
         b.noise[:most] = emulator.plant.actuator.noise.look_ahead(most)

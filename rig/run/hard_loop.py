@@ -39,34 +39,18 @@ from rig.sequences.faults import Plan, Schedule
 _US = 1000  # ns
 
 
+_AT_REST = Scenario(Model(), Plan(stop=0))  # of a plant that nobody moves
+
+
 @cache
 def compile_cycle() -> Any:
     """Compile the cycle: some seconds on a new machine, half a second afterwards."""
     play = compile_function(hc.play_cycles)
     buffers = hc.make_buffers(1, 1, 1, 1, 1, 1, is_fd=False)
     buffers.words[hc.PERIOD], buffers.words[hc.SYNC_ID] = 1, 0x080
-    plant = ec.make_memory(Model(), [], Schedule(Plan(stop=0)))
     # fails at once, on a bus that is not there
-    play(make_closed_port(), buffers, packing.make_layout((), (), Role.RIG), plant)
+    play(make_closed_port(), buffers, packing.make_layout((), (), Role.RIG), ec.make_memory(_AT_REST))
     return play
-
-
-class _LoopPlant:
-    """The plant that the compiled cycle moves; where the plant is a node of its own, memory of one that never moves."""
-
-    def __init__(self, bench: Bench, scenario: Scenario) -> None:
-        self._rng = None if bench.has_plant_node else np.random.default_rng(scenario.seed)
-        if self._rng is None:
-            self.memory = ec.make_memory(Model(), [], Schedule(Plan(stop=0)))
-            return
-        schedule = Schedule(scenario.plan, scenario.model.values)
-        self.memory = ec.make_memory(scenario.model, scenario.load(), schedule, *compile_plant(scenario.model))
-        self.draw_noise()
-
-    def draw_noise(self) -> None:
-        """Draw the noise of the cycles to come, a minute ahead."""
-        if self._rng is not None:
-            ec.fill_noise(self.memory, self._rng)
 
 
 class HardLoop(Loop):
@@ -86,7 +70,11 @@ class HardLoop(Loop):
         self._faults, self._log, self._period, self._ahead = faults, log, bench.cycle_ns, ahead
         self._origin = wire.clock.origin_ns
         self._values = CyclicValues(bench)
-        self._plant = _LoopPlant(bench, scenario)
+        # where the plant is a node of its own, the cycle does not move this one
+        code = () if bench.has_plant_node else compile_plant(scenario.model)
+        self._plant = ec.make_memory(_AT_REST if bench.has_plant_node else scenario, *code)
+        self._noise = np.random.default_rng(scenario.seed)
+        ec.fill_noise(self._plant, self._noise)
         self._play = compile_cycle()
         channels, is_fd = len(self._values.names), any(each.identifier & FD for each in bench.frames.frames)
         self._buffers = hc.make_buffers(ahead, 8 * ahead, 64 * ahead, 1100, len(self._values.given), channels, is_fd)
@@ -150,7 +138,7 @@ class HardLoop(Loop):
         # at the end of the queue the next input must come within a period
         self._wire.poll(self._period * (0.1e-9 if self.waiting <= 2 else 1e-9))
         self._drain()
-        self._plant.draw_noise()
+        ec.fill_noise(self._plant, self._noise)  # a minute ahead
         set_rig_faults(self._master, self._faults, self.k)
         self._master.tick()
         self._require_bus()
@@ -216,7 +204,7 @@ class HardLoop(Loop):
 
     def _run_thread(self) -> None:
         with enter_loop_thread(from_last=1) as self.scheduler:
-            self._play(self._bus.port, self._buffers, self._layout, self._plant.memory)
+            self._play(self._bus.port, self._buffers, self._layout, self._plant)
 
     def _is_running(self) -> bool:
         return self._thread is not None and self._thread.is_alive()
@@ -238,7 +226,7 @@ class HardLoop(Loop):
             self._push(CycleInput(0, 0.0, 0.0, 0, is_counted=False))
             words[hc.DUE] = self._origin + self._wire.clock.now() + period
         words[hc.FINISH] = 1
-        self._play(self._bus.port, self._buffers, self._layout, self._plant.memory)
+        self._play(self._bus.port, self._buffers, self._layout, self._plant)
         words[:] = 0
         self._prepare_cycle()
 

@@ -48,7 +48,6 @@ from rig.run.priority import (
 )
 from rig.run.session import MAIN, Session
 from rig.sequences.checks import SkippedCheck, evaluate_checks, find_skipped
-from rig.sequences.faults import Schedule
 from rig.sequences.protocol import HEARTBEAT, Mask, judge_protocol
 from rig.sequences.python_parts import StepRun
 from rig.sequences.uncertainty import NO_METROLOGY, Metrology, collect_metrology
@@ -516,7 +515,7 @@ def attribute_run(job: Job, session: Session) -> Attribution:
         times = [np.where(np.isnan(values), values, 0.0) for values in times]
     lateness, feedback, valve, response = times
     plan = job.scenario.plan
-    injected = find_injected(plan, Schedule(plan, job.scenario.model.values), len(history))
+    injected = find_injected(plan, session.faults, len(history))
     records = CycleRecords(np.array(session.log.due_ns, dtype=np.int64), lateness, feedback, valve, response,
                            history.column("flags").astype(np.int64), injected,
                            select_plant_delays(session.plant_record, len(history)), job.period_ns / 1e9)

@@ -42,7 +42,6 @@ from rig.run.participants import NodeProcesses, find_firmware_parameters
 from rig.run.state import Journal, SafeState, Stage
 from rig.run.watch import PATIENCE, NodeWatch, OverrunWatch
 from rig.sequences.checks import DriveFrames, Guard, GuardWatch
-from rig.sequences.faults import Schedule
 from rig.sequences.protocol import Mask, ProtocolRecord, Rows
 
 SETUP, MAIN, CLEANUP = 0, 1, 2
@@ -137,7 +136,7 @@ class Session:
         self.scenario = job.scenario
         plan = self.scenario.plan
         self._loads = np.array(self.scenario.load())
-        self._faults = Schedule(plan, self.scenario.model.values)
+        self.faults = self.scenario.make_schedule()
         self._is_embedded = isinstance(wire, EmbeddedWire)
         self.stage = Stage(wire.clock, plan.start, plan.rate)
         self.journal = Journal(self.stage, recorder)
@@ -146,12 +145,12 @@ class Session:
         patience = round(job.sequence.timing.operational * plan.rate) if job.realtime else PATIENCE
         self.nodes = NodeWatch(self.stage, self.journal, self.safety, self._master, processes, job.bench,
                                looks_for_silence=not job.realtime and not self._is_embedded, patience=patience)
-        injected = find_injected(plan, self._faults, plan.stop)
+        injected = find_injected(plan, self.faults, plan.stop)
         self._overruns = OverrunWatch(job.sequence.timing, job.period_ns * 1e-9,
                                       set(np.flatnonzero(injected.sync | injected.plant).tolist()))
         self.log = CycleLog(job, self.journal, self.nodes, self._overruns)
         self._master.hooks.on_frame = self.log.keep_drive if job.sequence.disturbs_bus else recorder.frame
-        self._edges, self._resets = sorted(self._faults.edges), list(self._faults.resets)  # those to come
+        self._edges, self._resets = sorted(self.faults.edges), list(self.faults.resets)  # those to come
         self._injected = 0  # cycles whose frames of other nodes are sent
         self.starter = BringUp(job, self.stage, self.journal, self.safety, self._master, stop)
         self.plant_record: CycleRecord | None = None  # the plant's own, read after a real-time run with trouble
@@ -186,7 +185,7 @@ class Session:
         if not self.safety.aborted:
             self.starter.start_nodes(self.scenario, is_run=True)
         self._master.wire.hear_all()
-        self.stage.loop = open_loop(self._master, self.job.bench, self.scenario, self._faults, self.log, self.job.bus,
+        self.stage.loop = open_loop(self._master, self.job.bench, self.scenario, self.faults, self.log, self.job.bus,
                                     self.job.realtime, self.log.guarded)
         self._enablings.append((0, Enabling(self.job.bench, self.stage.loop, self.job.realtime, self._must_end)))
         self.nodes.begin()
@@ -282,9 +281,7 @@ class Session:
         loads, known = np.zeros(len(demands)), self._loads[k:k + len(demands)]
         if phase == MAIN:
             loads[:len(known)] = known
-        played = self.stage.playing.play_many(phase, demands, loads, control)
-        self._injected += max(played - 1, 0)  # in these cycles no frames of other nodes were due
-        return played
+        return self.stage.playing.play_many(phase, demands, loads, control)
 
     def _must_end(self) -> bool:
         """Before each cycle of set-up and main: whether something ends main."""
@@ -316,7 +313,7 @@ class Session:
         while self._resets and self._resets[0][0] <= k:
             self._master.reset_controller(self._resets.pop(0)[1])
         for cycle in range(self._injected, k + 1):
-            for cob_id, data in self._faults.foreign_frames(cycle):
+            for cob_id, data in self.faults.foreign_frames(cycle):
                 self._master.send(cob_id, data)
         self._injected = k + 1
 
@@ -390,13 +387,13 @@ class Session:
         history, after = self.log.history, self.log.after
         return ProtocolRecord(
             enabling=[(cycle, each.rows) for cycle, each in self._enablings],
-            run=read_rows(history, judged & start.find_on_time_of(history, self._faults)),
+            run=read_rows(history, judged & start.find_on_time_of(history, self.faults)),
             probes=[Rows._make(column[-cycles:] for column in read(probe)) for probe in start.probes if len(probe)],
             after=read(after) if len(after) else None, emergencies=self.nodes.emergencies,
             heartbeats={NAMES[node]: times for node, times in self.nodes.heartbeats.items()},
             heard=(self.stage.begun_ns * 1e-9, self.stage.clock.now() * 1e-9),
             deaf=(self._master.wire.stalled_ns - self._stalled_ns) * 1e-9,
-            deaf_cycles=self._faults.list_bus_off_cycles("rig").tolist(), heartbeat_period=HEARTBEAT * 1e-3,
+            deaf_cycles=self.faults.list_bus_off_cycles("rig").tolist(), heartbeat_period=HEARTBEAT * 1e-3,
             bench=job.bench,
             drive_limit=model.values.get(model.kind.signals.drive.limit, np.nan) if start.gains is None
             else start.gains.current_limit,
