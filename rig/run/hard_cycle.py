@@ -73,8 +73,8 @@ from rig.nodes.emulator_cycle import (
 from rig.sequences.faults import DELAY, DOUBLE, DROP, change_frame
 
 # Words that Python writes; the cycle sets CANCEL back
-(PERIOD, LEAD, SPIN, SPINS_ALWAYS, TAIL, CANCEL, OVERRIDE_LIMIT, FINISH, DRY, FRAMES_READ, ROWS_READ, MAY_IDLE_AT,
- SYNC_ID, MOVES_PLANT, MISSED_LIMIT, SLACK, DRIVEN, SENT_CHANNELS, SENSED_AT, DRIVE_VALUE_AT, FLAGS_AT) = range(21)
+(PERIOD, LEAD, SPIN, SPINS_ALWAYS, TAIL, CANCEL, OVERRIDE_LIMIT, FINISH, FRAMES_READ, ROWS_READ, MAY_IDLE_AT,
+ SYNC_ID, MOVES_PLANT, MISSED_LIMIT, SLACK, DRIVEN, SENT_CHANNELS, SENSED_AT, DRIVE_VALUE_AT, FLAGS_AT) = range(20)
 # Words that the cycle writes; DUE is set by Python before the start. FAILURE is the status of a bus that failed
 (DUE, HEAD, CYCLES, OVERRUNS, UNDERRUNS, ROWS, FRAMES_DONE, COMPLETE_UNTIL, FAILURE, DIVERGED) = range(24, 34)
 # Words of the cycle alone; from COUNTED on the input under way, column by column
@@ -296,10 +296,10 @@ def _release_first_held(port: Port, buffers: Buffers, m: Layout) -> None:
 
 @keep_apart
 def _send(port: Port, buffers: Buffers, m: Layout, identifier: int, length: int, count: int) -> None:
-    """Send the payload so many times and record it. A full transmit queue loses it, which the port counts."""
+    """Send the payload so many times and record it. A full transmit queue loses it."""
     words = buffers.words
     for _ in range(count):
-        if not (words[DRY] or words[FAILURE]):
+        if not words[FAILURE]:
             _record_frame(buffers, m, read_clock(port), identifier | length << 32 | 1 << 40)
             if identifier & FD:
                 for i in range(64):

@@ -90,7 +90,7 @@ class HardLoop(Loop):
         self._write_frame, master.hooks.on_frame = master.hooks.on_frame, self._keep_frame
         self._receive, wire.receive = wire.receive, self._receive_service
         wire.link.leave_out(bench.frames.identifiers)  # those that the rig sends itself may come from a second rig
-        self._warm_up()
+        self._prepare_cycle()
 
     # ------------------------------------------------------------------------------------ what the session sees
 
@@ -216,19 +216,6 @@ class HardLoop(Loop):
             raise self._bus.explain_failure(int(self._words[hc.FAILURE]))
         if self._thread is not None and not self._words[hc.FINISH]:
             raise RigError("internal error: the cycle thread ended by itself")
-
-    def _warm_up(self) -> None:
-        """Play some cycles without sending, then set the cycle's times: code and memory are in place at the start."""
-        words, period = self._words, self._period
-        self._prepare_cycle()
-        words[hc.DRY] = 1
-        for _ in range(10):
-            self._push(CycleInput(0, 0.0, 0.0, 0, is_counted=False))
-            words[hc.DUE] = self._origin + self._wire.clock.now() + period
-        words[hc.FINISH] = 1
-        self._play(self._bus.port, self._buffers, self._layout, self._plant)
-        words[:] = 0
-        self._prepare_cycle()
 
     def _prepare_cycle(self) -> None:
         """The words of a cycle that has not begun, and the tables of its frames."""
