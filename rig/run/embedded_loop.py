@@ -25,6 +25,7 @@ from plant.model import Model
 from plant.pid import Loop, compute_current
 from plant.run import Actuator, LentPlant, sample_noise
 from plant.segments import Array
+from plant.signals import Signals
 from rig.benches.bench import Bench, FrameSpec, Role
 from rig.benches.bench_file import load_bench
 from rig.benches.packing import PAYLOAD, VALUES_AT, Layout, list_frame_places, make_layout, pack_frame
@@ -46,7 +47,10 @@ SENSORS = 14  # transducers of the plant
 DEMAND, LOAD, READINGS, DRIVE_VALUE = range(15, 19)  # places among the values; the readings stand together
 SENSORS_AT = 20  # for each transducer: place of what it shows in the state, and of its noise among the parameters
 COMMAND, FEEDBACK, VALVE, DRIVE = range(4)  # frames, columns of the payloads
-LOOP, GAINS, PERIOD, _SCRATCH, _READ_AT = 0, 3, 8, 9, 12  # reals: the controller's loop and gains; readings of a cycle
+# Reals: the controller's loop and gains, period, scratch; then the readings of a cycle, and for each signal with limits
+# (readings, demand, drive, load, error) its value, the lower and the upper limit
+LOOP, GAINS, PERIOD, _SCRATCH, _READ_AT = 0, 3, 8, 9, 12
+_LIMITED = 4  # signals with limits beside the readings
 BEGUN_AT, SYNC_AT, PLANT_AT, DRIVE_AT = range(4)  # columns of the times
 
 MOST = 500  # cycles a call
@@ -68,7 +72,7 @@ class Buffers(NamedTuple):
 
 
 def play_quiet_cycles(b: Buffers, flat: NDArray[np.float64], live: NDArray[np.float64]) -> None:
-    """Play the cycles asked for, but none of a plant that diverges.
+    """Play the cycles asked for, but none after one whose values are outside a guard, nor one of a plant that diverges.
 
     `flat`: state of the plant; `live`: its parameters.
     """
@@ -84,7 +88,7 @@ def play_quiet_cycles(b: Buffers, flat: NDArray[np.float64], live: NDArray[np.fl
             place = SENSORS_AT + 2 * j
             reals[_READ_AT + j] = flat[words[place]] + live[words[place + 1]] * b.noise[i, j]
             is_finite &= bool(np.isfinite(reals[_READ_AT + j]))
-        if not is_finite:
+        if _is_outside(b) or not is_finite:
             break
         in_force = m.doubles[at + words[DRIVE_VALUE]]  # what the controller answered to the cycle before
         m.doubles[at + words[DEMAND]], m.doubles[at + words[LOAD]] = b.inputs[i, 0], b.inputs[i, 1]
@@ -110,6 +114,23 @@ def play_quiet_cycles(b: Buffers, flat: NDArray[np.float64], live: NDArray[np.fl
     reals[LOOP], reals[LOOP + 1], reals[LOOP + 2] = loop.integral, loop.error, loop.cycles
 
 
+def _is_outside(b: Buffers) -> bool:
+    """Whether a value of the cycle before is outside the limits of the guards."""
+    words, reals, at = b.words, b.reals, b.layout.words[VALUES_AT]
+    sensors, first = words[SENSORS], _READ_AT + words[SENSORS]
+    for i in range(sensors):
+        reals[first + 3 * i] = b.layout.doubles[at + words[READINGS] + i]
+    rest = first + 3 * sensors
+    reals[rest] = b.layout.doubles[at + words[DEMAND]]
+    reals[rest + 3] = b.layout.doubles[at + words[DRIVE_VALUE]]
+    reals[rest + 6] = b.layout.doubles[at + words[LOAD]]
+    reals[rest + 9] = reals[rest] - reals[first]
+    for place in range(first, rest + 3 * _LIMITED, 3):
+        if not reals[place + 1] <= reals[place] <= reals[place + 2]:
+            return True
+    return False
+
+
 def _pack(b: Buffers, i: int, what: int) -> None:
     """Pack a frame of cycle i; its values become what the receiver reads."""
     pack_frame(b.layout, b.words[FRAMES_AT + what], b.words[FIRST] + i)
@@ -126,19 +147,28 @@ def _note_time(b: Buffers, i: int, column: int) -> None:
 # ---------------------------------------------------------------------------------------- made before the start
 
 
-def make_buffers(bench: Bench, names: Sequence[str]) -> Buffers:
-    """Buffers for a bench whose values have these names."""
-    m, sensors = make_layout(bench.frames.list_of(Role.RIG), names, Role.RIG), len(bench.signals.outputs)
-    b = Buffers(np.zeros(SENSORS_AT + 2 * sensors, np.int64), np.zeros(_READ_AT + sensors), m, np.zeros((MOST, 3)),
-                np.zeros((MOST, sensors + 1)), np.zeros((MOST, len(names))), np.zeros((MOST, 4), np.int64),
-                np.zeros((MOST, 4), np.int64))
+def make_buffers(bench: Bench, names: Sequence[str], guards: Mapping[str, tuple[float, float]]) -> Buffers:
+    """Buffers for a bench whose values have these names. `guards`: limits by signal, SI."""
+    m = make_layout(bench.frames.list_of(Role.RIG), names, Role.RIG)
+    guarded, sensors = list_guarded(bench.signals), len(bench.signals.outputs)
+    first = _READ_AT + sensors
+    b = Buffers(np.zeros(SENSORS_AT + 2 * sensors, np.int64), np.zeros(first + 3 * len(guarded)), m,
+                np.zeros((MOST, 3)), np.zeros((MOST, sensors + 1)), np.zeros((MOST, len(names))),
+                np.zeros((MOST, 4), np.int64), np.zeros((MOST, 4), np.int64))
     b.words[SENSORS] = sensors
     places = dict(zip((each.identifier for each in bench.frames.list_of(Role.RIG)), list_frame_places(m), strict=True))
     b.words[FRAMES_AT:FRAMES_AT + 4] = [places[each.identifier] for each in list_frames(bench)]
     values = CyclicValues(bench)
     b.words[DEMAND:DRIVE_VALUE + 1] = [names.index(name) for name in (values.command, values.load, values.readings[0],
                                                                       values.drive)]
+    b.reals[first:].reshape(-1, 3)[:, 1:] = [guards.get(signal, (-np.inf, np.inf)) for signal in guarded]
     return b
+
+
+def list_guarded(signals: Signals) -> tuple[str, ...]:
+    """What may have limits, in the order of the compiled code."""
+    load = "load" if signals.load is None else signals.load.name
+    return (*(s.name for s in signals.outputs), signals.command.name, signals.drive.name, load, "error")
 
 
 def list_frames(bench: Bench) -> list[FrameSpec]:
@@ -172,7 +202,7 @@ def make_trial() -> tuple[Buffers, Any, Any]:
     """Arguments of some cycles of the shipped bench, without times."""
     bench, actuator = load_bench(), Actuator(Model())
     actuator.warm()
-    b = make_buffers(bench, CyclicValues(bench).names)
+    b = make_buffers(bench, CyclicValues(bench).names, {})
     plant = _lend_plant(b, actuator)
     assert plant is not None
     b.words[ASKED], b.inputs[:, 0], b.noise[:20] = 20, 1e-3, sample_noise(0, 20)
@@ -205,13 +235,12 @@ class EmbeddedLoop(CycleLoop):
         assert isinstance(master.wire, EmbeddedWire)
         self._embedded = master.wire
         self._busy = find_busy_cycles(scenario.plan, faults)
-        self._buffers, self._guards = make_buffers(bench, self._values.names), guards
+        self._buffers = make_buffers(bench, self._values.names, guards)
         # address of that of the C library
         self._buffers.words[CLOCK] = ctypes.cast(ctypes.CDLL(None).clock_gettime, ctypes.c_void_p).value or 0
         self._frames, self._sync_id = list_frames(bench), bench.frames.sync or 0
-        self._borrower: object = None  # the actuator that the compiled code works on
-        self._lent: LentPlant | None = None
-        self._run: Callable[[], object] = lambda: None
+        self._lent: object = None  # the actuator that the compiled code works on
+        self._run: Callable[[], object] | None = None
         self._roles = {role for answer in self._answers.values() for role in answer.roles}
 
     def play_many(self, phase: int, demands: Array, loads: Array, control: int) -> int:
@@ -220,79 +249,60 @@ class EmbeddedLoop(CycleLoop):
         assert isinstance(emulator, Emulator)
         assert isinstance(firmware, Firmware)
         most = self._count_quiet(emulator, firmware, control, min(len(demands), MOST))
-        plant = self._bind(emulator) if most > 1 else None
-        if plant is None:
+        run = self._bind(emulator) if most > 1 else None
+        if run is None:
             return 0
         self._close()
         b, k = self._buffers, self.k
         step = CycleInput(phase, 0.0, 0.0, control)
         self.outputs.update(zip(self._values.given[2:], self._values.list_given(step)[2:], strict=True))
-        b.words[FIRST], b.words[PLANT_CYCLE] = k, emulator.plant.actuator.cycle
+        at = b.layout.words[VALUES_AT]  # of the cycle before, SI
+        b.layout.doubles[at:at + len(self._values.names)] = [self.outputs[name] for name in self._values.names]
+        b.words[ASKED], b.words[FIRST], b.words[PLANT_CYCLE] = most, k, emulator.plant.actuator.cycle
+        b.reals[LOOP:GAINS], b.reals[GAINS:PERIOD] = firmware.loop, firmware.gains
         on_plant = emulator.plant.loads[k:k + most]  # none after the last
         b.inputs[:most, 0], b.inputs[:most, 1], b.inputs[:most, 2] = demands[:most], loads[:most], 0.0
         b.inputs[:len(on_plant), 2] = on_plant
         b.noise[:most] = emulator.plant.actuator.noise.look_ahead(most)
-        state = plant.flat.copy()
-        values = self._run_cycles(firmware, most)
-        last = int(np.append(self._find_outside(values), most)[0])  # the cycle after it is played alone
-        if last + 1 < b.words[DONE]:
-            plant.flat[:] = state
-            values = self._run_cycles(firmware, last + 1)
+        run()
         played = int(b.words[DONE])
         if played:
             firmware.loop = Loop(*b.reals[LOOP:GAINS].tolist())
             emulator.pass_quiet(played, int(b.payloads[played - 1, DRIVE]).to_bytes(8, "little", signed=True))
-            self._take_cycles(phase, control, values)
+            self._take_cycles(phase, control, played)
             self._run_timers(emulator, firmware)
         return played
-
-    def _run_cycles(self, firmware: Firmware, most: int) -> dict[str, Array]:
-        """Play up to so many cycles; the values of the bench in each, by name."""
-        b, names = self._buffers, self._values.names
-        at = b.layout.words[VALUES_AT]  # of the cycle before, SI
-        b.layout.doubles[at:at + len(names)] = [self.outputs[name] for name in names]
-        b.reals[LOOP:GAINS], b.reals[GAINS:PERIOD] = firmware.loop, firmware.gains
-        b.words[ASKED] = most
-        self._run()
-        return dict(zip(names, b.values[:b.words[DONE]].T.copy(), strict=True))
-
-    def _find_outside(self, values: Mapping[str, Any]) -> NDArray[np.int64]:
-        """The cycles in which a signal is outside its limits."""
-        signals = self._bench.signals
-        said = {s.name: values[s.word] for s in signals[1:]}
-        said["error"] = said[signals.command.name] - said[signals.controlled.name]
-        return np.flatnonzero(np.any([(said[name] < low) | (said[name] > high)
-                                      for name, (low, high) in self._guards.items()], axis=0))
 
     def _count_quiet(self, emulator: Emulator, firmware: Firmware, control: int, most: int) -> int:
         """How many of the cycles to come are quiet, at most `most`; the last may be one in which a timer runs out."""
         if (self._open is None or self._seen.came != self._roles or self._late or self.problem
-                or not self._embedded.bus.is_empty or not emulator.is_quiet(self.k) or not firmware.is_quiet(control)
-                or len(self._find_outside(self.outputs))):
+                or not self._embedded.bus.is_empty or not emulator.is_quiet(self.k) or not firmware.is_quiet(control)):
             return 0
         due = min(self._master.find_due(), *(node.device.find_due() for node in (emulator, firmware)))
         busy = self._busy[np.searchsorted(self._busy, self.k):][:1]
         return int(min(most, max(due - self._t_ns, 0) // self._period + 1, *(busy - self.k).tolist()))
 
-    def _bind(self, emulator: Emulator) -> LentPlant | None:
-        """Let the compiled code work on the plant of the emulator, which is another one after each reset."""
+    def _bind(self, emulator: Emulator) -> Callable[[], object] | None:
+        """The compiled code on the plant of the emulator, which is another one after each reset."""
         actuator = emulator.plant.actuator
-        if self._borrower is not actuator:
-            self._borrower, self._lent = actuator, _lend_plant(self._buffers, actuator)
-            if self._lent is not None:
-                self._run = load_code().bind((self._buffers, self._lent.flat, self._lent.live))
-        return self._lent
+        if self._lent is not actuator:
+            self._lent, plant = actuator, _lend_plant(self._buffers, actuator)
+            self._run = None if plant is None else load_code().bind((self._buffers, plant.flat, plant.live))
+        return self._run
 
-    def _take_cycles(self, phase: int, control: int, values: Mapping[str, Array]) -> None:
+    def _take_cycles(self, phase: int, control: int, played: int) -> None:
         """Log the cycles that were played, all but the last, which is the cycle under way now."""
-        b, first, signals, played = self._buffers, self.k, self._bench.signals, int(self._buffers.words[DONE])
+        b, names, first, signals = self._buffers, self._values.names, self.k, self._bench.signals
         begun, sync, plant, drive = b.times[:played].T
+        values = dict(zip(names, b.values[:played].T.copy(), strict=True))
         fed, answered = (plant - sync) * 1e-9, (drive - sync) * 1e-9
         columns = {
-            "cycle": first + np.arange(played), "phase": phase, **{s.name: values[s.word] for s in signals[1:]},
-            "control": control, "status": values["status_word"].astype(np.int64),
-            "flags": values["flags"].astype(np.int64), "overrun": False, "lateness": 0.0, "response": answered,
-            "work": answered, "feedback_response": fed, "valve_response": fed, "execution": (sync - begun) * 1e-9}
+            "cycle": first + np.arange(played), "phase": phase,
+            **{s.name: values[s.word] for s in signals[1:] if s.role != "load"},
+            **({signals.load.name: b.inputs[:played, 1].copy()} if signals.load else {}), "control": control,
+            "status": values["status_word"].astype(np.int64), "flags": values["flags"].astype(np.int64),
+            "overrun": False, "lateness": 0.0, "response": answered, "work": answered, "feedback_response": fed,
+            "valve_response": fed, "execution": (sync - begun) * 1e-9}
         payloads = iter(b.payloads[:played].T.copy())
         command = next(payloads)
         answers = ((frame.identifier, payload) for frame, payload in zip(self._frames[1:], payloads, strict=True))
