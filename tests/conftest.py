@@ -3,11 +3,12 @@
 import fcntl
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import light_can  # noqa: F401  before anything else loads python-can
 import pytest
+from effect_files import restored_catalogue
 from hypothesis import HealthCheck, settings
 from long_tests import LONG_TESTS, LONGEST
 from plugin_bus_summary import require_bus_kind
@@ -39,6 +40,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         long = [item for item in items if item.path.relative_to(root).as_posix().startswith(LONG_TESTS)]
         config.hook.pytest_deselected(items=long)
         items[:] = [item for item in items if item not in set(long)]
+
+
+@pytest.fixture(autouse=True)
+def forget_effects() -> Iterator[None]:
+    """Effects that a test registers are forgotten after it: a search among others compiles kernels of its own."""
+    with restored_catalogue():
+        yield
 
 
 @pytest.fixture(params=["embedded", "virtual", "udp_multicast", "socketcan"])

@@ -16,7 +16,7 @@ import pytest
 from rig_command import rig
 
 from plant import Model, load_model, simulate
-from plant.effects import CATALOGUE, effect, load_effects
+from plant.effects import effect, load_effects
 from plant.eha import State
 from plant.parameters import GROUPS
 from plant.quantity import list_quantities
@@ -80,24 +80,20 @@ def test_the_effects_in_the_manual_work(tmp_path: Path) -> None:
     code = [block for block in indented_blocks(text) if re.match(r"# my_effects\.py|class ", block)]
     assert all(len(block.splitlines()) <= 25 for block in code)
     (tmp_path / "my_effects.py").write_text("\n".join(code))
-    try:
-        assert load_effects(tmp_path / "my_effects.py") == ["seal_drag", "rod_play"]
-        said = rig("effects", "--effects", tmp_path / "my_effects.py", "seal_drag")
-        assert said.status == 0 and "seal_drag: exact at its off value" in said.out
-        for row in re.findall(r"^    (level = .*)", text, re.MULTILINE):
-            assert " ".join(row.split()) in " ".join(said.out.split())
-        command = np.full(100, 1e-3)
-        plain, loose = (simulate(model, command).xj for model in (Model(), Model().replace({"rod_play.width": 1e-4})))
-        assert np.abs(plain - loose).max() > 1e-5
-        for port in load_model().kind.ports:
-            assert f"| `{port}` |" in text
-        for field in (*State._fields, *Input._fields):
-            assert f"`{field}`" in text
-        for argument in inspect.signature(effect).parameters.keys() - {"port", "group", "law", "memory", "more"}:
-            assert f"| `{argument}` |" in text
-    finally:
-        for name in ("seal_drag", "rod_play"):
-            CATALOGUE.pop(name, None)
+    assert load_effects(tmp_path / "my_effects.py") == ["seal_drag", "rod_play"]
+    said = rig("effects", "--effects", tmp_path / "my_effects.py", "seal_drag")
+    assert said.status == 0 and "seal_drag: exact at its off value" in said.out
+    for row in re.findall(r"^    (level = .*)", text, re.MULTILINE):
+        assert " ".join(row.split()) in " ".join(said.out.split())
+    command = np.full(100, 1e-3)
+    plain, loose = (simulate(model, command).xj for model in (Model(), Model().replace({"rod_play.width": 1e-4})))
+    assert np.abs(plain - loose).max() > 1e-5
+    for port in load_model().kind.ports:
+        assert f"| `{port}` |" in text
+    for field in (*State._fields, *Input._fields):
+        assert f"`{field}`" in text
+    for argument in inspect.signature(effect).parameters.keys() - {"port", "group", "law", "memory", "more"}:
+        assert f"| `{argument}` |" in text
 
 
 def test_the_readme_names_only_commands_that_exist_and_all_of_them() -> None:

@@ -20,8 +20,7 @@ def test_the_page_lists_every_program() -> None:
 
 
 def test_an_effect_of_ones_own() -> None:
-    with restored_catalogue():
-        said = rig("effects", "--effects", EXAMPLES / "cogging.py", "cogging")
+    said = rig("effects", "--effects", EXAMPLES / "cogging.py", "cogging")
     assert said.status == 0 and "F sin(2 pi XJ / pitch)" in said.out
 
 

@@ -1,13 +1,13 @@
 """A user's own effects: found, compiled, tried, given starts; and told in one line what is wrong with them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from effect_files import COGGING, HEAD, MEMORY, restored_catalogue
+from effect_files import COGGING, HEAD, MEMORY
 from effects_cases import WHOLE
 from physics_cases import PREFLIGHT, SILENT
 from refusals import catch_refusal
@@ -36,10 +36,9 @@ def rounding(x, s, u, p):
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Iterator[Path]:
-    """A place for an effect file; what it registers is forgotten afterwards."""
-    with restored_catalogue():
-        yield tmp_path / "mine.py"
+def file(tmp_path: Path) -> Path:
+    """A place for an effect file."""
+    return tmp_path / "mine.py"
 
 
 def columns(model: Model, **options) -> np.ndarray:

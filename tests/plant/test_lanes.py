@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from effect_files import COGGING, MEMORY, restored_catalogue
+from effect_files import COGGING, MEMORY
 from other_cpus import compiles_for
 from refusals import catch_refusal
 
@@ -156,12 +156,11 @@ def test_all_effects_at_once(catalogue: Lanes) -> None:
 def test_effects_of_a_user(text: str, changes: dict[str, float], tmp_path: Path) -> None:
     """With a sine and with a memory. (A changed file is not served by old code: test_compile.py.)"""
     (tmp_path / "mine.py").write_text(text)
-    with restored_catalogue():
-        load_effects(tmp_path / "mine.py")
-        model = QUIET.replace(changes)
-        runs = Lanes(model, list(changes), steps=10).replay(np.array([[*changes.values()], [0.0]]), CURRENT, FORCE)
-        for rows, one in zip(runs, (model, QUIET), strict=True):
-            assert (rows == one_run(one, CURRENT, FORCE)).all()
+    load_effects(tmp_path / "mine.py")
+    model = QUIET.replace(changes)
+    runs = Lanes(model, list(changes), steps=10).replay(np.array([[*changes.values()], [0.0]]), CURRENT, FORCE)
+    for rows, one in zip(runs, (model, QUIET), strict=True):
+        assert (rows == one_run(one, CURRENT, FORCE)).all()
 
 
 def test_a_start_from_a_measured_position_and_the_pull_to_it() -> None:

@@ -134,14 +134,13 @@ def test_what_is_discovered_becomes_an_effect_that_runs(shape: str, tmp_path: Pa
     at = np.linspace(-0.1, 0.1, 9)
     found = Pattern("force", "N", 500.0, "position" if shape == "wave" else "speed", 0.9, at, 1e4 * at, at * 0 + 1.0,
                     (700.0, 2.5e-3, 0.3) if shape == "wave" else None, np.zeros(10), ("load", "x + {0}"))
-    with restored_catalogue():
-        write_effect(found, tmp_path / "found.py")
-        assert len((tmp_path / "found.py").read_text().splitlines()) < 40
-        assert load_effects(tmp_path / "found.py") == ["discovered"]
-        start = CATALOGUE["discovered"].starts[-1]
-        com = 3e-3 * np.sin(2 * np.pi * np.arange(300) * 1e-3)
-        moved, still = (simulate(model, com, steps=20, fast=False).p12 for model in (Model().replace(start), Model()))
-        assert np.abs(moved - still).max() > 2e4  # Pa, the sensor's noise
+    write_effect(found, tmp_path / "found.py")
+    assert len((tmp_path / "found.py").read_text().splitlines()) < 40
+    assert load_effects(tmp_path / "found.py") == ["discovered"]
+    start = CATALOGUE["discovered"].starts[-1]
+    com = 3e-3 * np.sin(2 * np.pi * np.arange(300) * 1e-3)
+    moved, still = (simulate(model, com, steps=20, fast=False).p12 for model in (Model().replace(start), Model()))
+    assert np.abs(moved - still).max() > 2e4  # Pa, the sensor's noise
 
 
 def test_a_scan_finds_a_frequency_from_a_line_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:

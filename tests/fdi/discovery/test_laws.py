@@ -109,7 +109,7 @@ def test_a_written_law_is_what_the_library_replayed(place: str, tmp_path: Path) 
     terms = [BY_NAME[name] for name in LAWS[place]]
     values = {field: SIZES[field] for term in terms for field in term.fields}
     states = sample_states(7, 300)
-    with registered_library(), restored_catalogue():
+    with registered_library():
         (tmp_path / "law.py").write_text(write_effects({place: "own_law"}, terms, values, "A law."))
         assert load_effects(tmp_path / "law.py") == ["own_law"]
         library = Model().with_effects([LIBRARY[place]]).replace(
@@ -180,16 +180,15 @@ OUTSIDE: Mapping[str, Outside] = {
 QUICK = ("cogging",)
 
 
-def find_hidden(port: str, law: str, size: float, tmp_path: Path) -> LawSearch:
-    """The search for a law on short runs of a plant with a law of our own; white noise of the sensors."""
-    (tmp_path / "hidden.py").write_text(HIDDEN.format(port=port, law=law))
-    with restored_catalogue():
-        load_effects(tmp_path / "hidden.py")
-        model = Model().replace({"hidden_law.size": size})
-        traces = []
-        for seed, com in enumerate((build_command(), build_command(), build_other_command()), 1):
-            columns = simulate(model, com, None, seed, STEPS)
-            traces.append(Trace.from_columns(columns._asdict(), 1e-3, {}))
+def record_runs(model: Model) -> list[Trace]:
+    """Short runs of a plant, the last one with another command; white noise of the sensors."""
+    commands = build_command(), build_command(), build_other_command()
+    return [Trace.from_columns(simulate(model, com, None, seed, STEPS)._asdict(), 1e-3, {})
+            for seed, com in enumerate(commands, 1)]
+
+
+def search_law(traces: list[Trace]) -> LawSearch:
+    """The search for a law that the nominal plant lacks."""
     runs = collect_runs(Model(), traces[0], traces[1:2], traces[2])
     search = Search(runs.model, runs.est, runs.repeats, [], holdout=runs.holdout)
     base = search.fit_base()
@@ -203,7 +202,11 @@ def find_hidden(port: str, law: str, size: float, tmp_path: Path) -> LawSearch:
                                   for name in OUTSIDE])
 def test_a_hidden_law_is_found_named_and_written(name: str, tmp_path: Path) -> None:
     outside = OUTSIDE[name]
-    found = find_hidden(outside.port, outside.law, outside.size, tmp_path)
+    (tmp_path / "hidden.py").write_text(HIDDEN.format(port=outside.port, law=outside.law))
+    with restored_catalogue():
+        load_effects(tmp_path / "hidden.py")
+        traces = record_runs(Model().replace({"hidden_law.size": outside.size}))
+    found = search_law(traces)
     law = found.law
     print(name, describe_search(found))
     assert law is not None and law.holds and [term.name for term in law.terms] == [outside.term], law
@@ -211,10 +214,9 @@ def test_a_hidden_law_is_found_named_and_written(name: str, tmp_path: Path) -> N
     worst = max(found.floor, key=lambda s: found.base.errors[s] / found.floor[s])
     assert law.hypothesis.errors[worst] < 0.5 * found.base.errors[worst]
     assert law.values[outside.term].low < outside.size < law.values[outside.term].high
-    with restored_catalogue():
-        names = write_law_file(tmp_path / "law.py", law.terms, law.values, law.reason)
-        assert load_effects(tmp_path / "law.py") == list(names.values()) == [f"missing_{law.terms[0].place}"]
-        assert CATALOGUE[names[law.terms[0].place]].starts
+    names = write_law_file(tmp_path / "law.py", law.terms, law.values, law.reason)
+    assert load_effects(tmp_path / "law.py") == list(names.values()) == [f"missing_{law.terms[0].place}"]
+    assert CATALOGUE[names[law.terms[0].place]].starts
 
 
 def describe_search(found: LawSearch) -> str:
@@ -229,6 +231,6 @@ def describe_search(found: LawSearch) -> str:
             f"{values}; holds {found.law.holds}: {found.law.reason}")
 
 
-def test_a_healthy_run_has_no_law(tmp_path: Path) -> None:
-    found = find_hidden("load", "x + size", 0.0, tmp_path)
+def test_a_healthy_run_has_no_law() -> None:
+    found = search_law(record_runs(Model()))
     assert found.law is None and not any(m.visible for m in found.missing)

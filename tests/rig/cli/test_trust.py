@@ -1,12 +1,11 @@
 """Data is not code: what a log or a model file brings along runs only with --trust, and after it was listed."""
 
 import hashlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from changed_logs import change_log
-from effect_files import HEAD, restored_catalogue
+from effect_files import HEAD
 from refusals import catch_refusal
 from rig_command import SHORT, job, play, refuse, rig
 
@@ -38,11 +37,9 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The test works in its own folder; the catalogue forgets its effects afterwards."""
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The test works in its own folder."""
     monkeypatch.chdir(tmp_path)
-    with restored_catalogue():
-        yield
 
 
 @pytest.fixture

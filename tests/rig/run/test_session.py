@@ -2,7 +2,7 @@
 
 import json
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from effect_files import restored_catalogue
 from rig_command import SHORT, job, kinds, play, rig, stop_after
 
 from fdi.progress import ignore_progress
@@ -344,13 +343,6 @@ faults = [
 ]
 """
 SIGNALS = ("com", "xj", "cor", "p12", "xs", "load")
-
-
-@pytest.fixture(autouse=True)
-def catalogue() -> Iterator[None]:
-    """Each test has the shipped effects only, as a new process does."""
-    with restored_catalogue():
-        yield
 
 
 def same(a: Path, b: Path) -> bool:
