@@ -173,11 +173,10 @@ def print_row(row: LedgerRow) -> None:
 def write_model(rows: Sequence[LedgerRow], trace: Path, out: Path) -> None:
     """Write the model of the last row, with the run it was fitted to and the ledger."""
     model = replace(rows[-1].model, name="servo")
-    signals = ("xj", "p12")
-    ledger = tuple(Row(row.step.effect if row.step else None, {name: row.errors[FITTED][name] for name in signals}, {})
+    ledger = tuple(Row(row.step.effect if row.step else None, {name: row.errors[FITTED][name] for name in UNITS}, {})
                    for row in rows)
     source = read_source(str(trace))._replace(file=trace.name)
-    known = Provenance(name_software(), ("python -m studies.servo_ledger FOLDER",), (), signals=signals,
+    known = Provenance(name_software(), ("python -m studies.servo_ledger FOLDER",), (), signals=tuple(UNITS),
                        trace=source, ledger=ledger)
     out.write_text(HEAD + format_model_file(model, {}, known), encoding="utf-8")
 

@@ -85,9 +85,8 @@ def make_jax_replay(task: Task) -> Replay:
     jax.config.update("jax_enable_x64", True)
     h, numbers = task.h, jax.numpy
 
-    def replay_run(parameters: Any, current: Any, load: Any) -> Any:
+    def replay_run(parameters: Any, k: Any, current: Any, load: Any) -> Any:
         p = _make_namespaces(parameters)
-        k = compute_coefficients(p, h)
 
         def cycle(s: Any, held: Any) -> Any:
             def forward(s: Any, _: None) -> tuple[Any, None]:
@@ -98,9 +97,9 @@ def make_jax_replay(task: Task) -> Replay:
 
         return jax.lax.scan(cycle, (numbers.zeros(()),) * 7, (current, load))[1]
 
-    compiled = jax.jit(jax.vmap(replay_run, (0, None, None)))
-    acting = np.r_[0.0, task.current[:-1]]
-    return lambda: np.asarray(compiled(task.parameters, acting, task.load))
+    compiled = jax.jit(jax.vmap(replay_run, (0, 0, None, None)))
+    acting, k = np.r_[0.0, task.current[:-1]], _stack_coefficients(task)
+    return lambda: np.asarray(compiled(task.parameters, k, acting, task.load))
 
 
 def make_progpy_replay(task: Task) -> Replay:
@@ -125,14 +124,21 @@ def make_progpy_replay(task: Task) -> Replay:
 
 def _define_progpy_plant(task: Task) -> Any:
     """The reference model without its controller."""
-    p, h = _make_namespaces(task.parameters), task.h
-    k = compute_coefficients(p, h)
+    p, k, h = _make_namespaces(task.parameters), _stack_coefficients(task), task.h
     start = {name: np.zeros(len(task.values)) for name in ("xf", "vf", "xs", "vs", "xj", "vj", "p12")}
 
     def advance(x: Any, u: Any) -> Any:
         return step_bare_model(np, [x[name] for name in start], u["current"], u["load"], p, k, h)
 
     return make_progpy_plant(start, ("current", "load"), ("xj", "p12", "xs"), advance)
+
+
+def _stack_coefficients(task: Task) -> Any:
+    """The coefficients of the step, (m,) each: `plant.eha` computes those of one run, and chooses by numbers."""
+    runs = [compute_coefficients(_make_namespaces({group: {field: values[run] for field, values in fields.items()}
+                                                   for group, fields in task.parameters.items()}), task.h)
+            for run in range(len(task.values))]
+    return type(runs[0])(*np.array(runs).T)
 
 
 def _make_namespaces(groups: Mapping[str, Mapping[str, Any]]) -> Any:
