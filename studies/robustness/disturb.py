@@ -148,7 +148,8 @@ def disturb_run(action: str, victim: str, seed: int, pace: str = "lockstep", con
         seed: decides the moment, the length of a pause and the size of the disk.
         pace: of the run.
         controller: firmware of the run, "builtin" or "c".
-        limit: s in which the run must have ended after a kill; four times that where it may go on.
+        limit: s in which the run must have ended after a kill; four times that where it may go on, and until it begins;
+            a third of it until nothing is left of the run.
     """
     rng = np.random.default_rng([seed, ACTIONS.index(action), PROCESSES.index(victim)])
     is_early, delay = rng.random() < 0.15, float(rng.uniform(0.0, 2.0))  # some before the first SYNC
@@ -169,10 +170,10 @@ def disturb_run(action: str, victim: str, seed: int, pace: str = "lockstep", con
         most = int(rng.integers(4_000, 600_000)) if action == "fill disk" else None
         rig = _start_rig(place, group, pace, controller, most)
         if is_early:
-            wait_until(lambda: rig.poll() is not None or victim in dict(find_processes(group)).values(), 120.0)
+            wait_until(lambda: rig.poll() is not None or victim in dict(find_processes(group)).values(), 4.0 * limit)
             threading.Event().wait(delay)
         else:
-            wait_until(lambda: watcher.syncs >= cycle or rig.poll() is not None, 120.0, step=0.002)
+            wait_until(lambda: watcher.syncs >= cycle or rig.poll() is not None, 4.0 * limit, step=0.002)
         if action == "kill" and victim != "rig" and watcher.syncs:
             watcher.hear_nodes(victim)
         moment = (clock.now() - watcher.first_sync) * 1e-9 if watcher.first_sync else float("nan")
@@ -183,7 +184,7 @@ def disturb_run(action: str, victim: str, seed: int, pace: str = "lockstep", con
         if not wait_until(lambda: rig.poll() is not None, patience):
             problems.append(f"the rig has not ended {patience:g} s later")
         status = -1 if rig.poll() is None else rig.returncode
-        if not wait_until(lambda: not find_processes(group), 10.0):
+        if not wait_until(lambda: not find_processes(group), limit / 3.0):
             problems.append(f"left: {', '.join(name for _, name in find_processes(group))}")
         end = (clock.now() - disturbed) * 1e-9
         for process, _ in find_processes(group):
@@ -202,7 +203,7 @@ def disturb_run(action: str, victim: str, seed: int, pace: str = "lockstep", con
         verdict, cause = _read_verdict(folder / "verdict.json")
         if is_effective and syncs and not (action == "kill" and victim == "rig"):
             problems += judge_verdict(action, victim, pause, status, f"{verdict} {cause} {message}")
-        if not wait_until(lambda: not _find_heirs(temporary), 10.0):
+        if not wait_until(lambda: not _find_heirs(temporary), limit / 3.0):
             problems.append(f"left: {', '.join(_find_heirs(temporary))}")
         problems += [f"temporary file {path.name}" for path in sorted(temporary.iterdir())[:3]]
     if has_semaphores(group):

@@ -1,13 +1,16 @@
 """The rig tests the controllers of examples/ by their bench files: the sound ones pass, and none of the faulty ones."""
 
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
 from bus_stations import spec
+from c_device import skip_without_compiler
 from example_devices import DRIVE, ECU, PATIENT, run_device
 from rig_command import SHORT, SLOW_START, Said, rig
 
+from rig.firmware.build import build_device
 from rig.run import participants
 
 IN_TIME = """
@@ -99,6 +102,15 @@ def test_a_faulty_controller_does_not_pass(tmp_path: Path, folder: Path, fault: 
     cause = (said.json.get("cause") or {}).get("text", "")
     assert said.status == 1 and said.json["verdict"] in ("FAIL", "ABORTED")
     assert any(re.search(found_by, text) for text in [*list_failed(said), cause]), (list_failed(said), cause)
+
+
+@pytest.mark.parametrize(("folder", "line"), [
+    *((DRIVE, line) for line in ("", "--node", "B --node 0", "B --node 128", "B --fault x", "B --other 1")),
+    *((ECU, line) for line in ("", "--timeout", "B --timeout 0", "B --fault x"))])
+def test_a_wrong_command_line_is_one_line(folder: Path, line: str) -> None:
+    skip_without_compiler()
+    done = subprocess.run([build_device(folder), *line.split()], capture_output=True, text=True, timeout=20)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
 
 
 def test_the_page_names_each_fault() -> None:

@@ -1,15 +1,11 @@
 """The ECU of examples/, as cantools sees it: states, current, counters and checksums."""
 
-import subprocess
 from collections.abc import Iterator
 from itertools import product
 
 import can
 import pytest
-from c_device import skip_without_compiler
-from example_devices import ECU, EcuMaster, compute_crc, on_each_bus, run_ecu
-
-from rig.firmware.build import build_device
+from example_devices import EcuMaster, compute_crc, on_each_bus, run_ecu
 
 INIT, SYNCHRONISING, OPERATIONAL, FAULT = 1, 2, 3, 4
 
@@ -103,10 +99,3 @@ def test_other_frames_are_not_its_own(ecu: EcuMaster) -> None:
     ecu.bus.send(can.Message(arbitration_id=identifier, is_extended_id=False, data=data))
     before = ecu.cycle()
     assert int(ecu.cycle()["Counter"]) == (int(before["Counter"]) + 1) % 16
-
-
-@pytest.mark.parametrize("words", [[], ["--timeout"], ["B", "--timeout", "0"], ["B", "--fault", "x"]])
-def test_a_wrong_command_line_is_one_line(words: list[str]) -> None:
-    skip_without_compiler()
-    done = subprocess.run([build_device(ECU), *words], capture_output=True, text=True, timeout=20)
-    assert done.returncode == 2 and done.stderr.count("\n") == 1

@@ -1,16 +1,12 @@
 """The CiA 402 drive of examples/, as canopen sees it: objects, power states, current, faults."""
 
-import subprocess
 from collections.abc import Iterator
 
 import canopen
 import pytest
 from bus_stations import spec
-from c_device import skip_without_compiler
 from example_devices import DRIVE, DriveMaster, on_each_bus, run_device, run_drive
 from rig_command import rig
-
-from rig.firmware.build import build_device
 
 OFF, SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, RESET = 0x00, 0x06, 0x07, 0x0F, 0x02, 0x80
 DISABLED, READY, SWITCHED_ON, ENABLED = "SWITCH ON DISABLED", "READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"
@@ -156,11 +152,3 @@ def test_it_conforms_to_cia_301() -> None:
         said = rig("conformance", 17, "--eds", DRIVE / "drive.eds", "--bus", where, "--write", "--json")
     assert [case for case in said.json["tests"] if case["verdict"] == "fail"] == []
     assert said.status == 0
-
-
-@pytest.mark.parametrize("words", [[], ["--node"], ["B", "--node", "0"], ["B", "--node", "128"], ["B", "--fault", "x"],
-                                   ["B", "--other", "1"]])
-def test_a_wrong_command_line_is_one_line(words: list[str]) -> None:
-    skip_without_compiler()
-    done = subprocess.run([build_device(DRIVE), *words], capture_output=True, text=True, timeout=20)
-    assert done.returncode == 2 and done.stderr.count("\n") == 1

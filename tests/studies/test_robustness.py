@@ -6,6 +6,8 @@ from studies.robustness.disturb import disturb_run, find_processes, has_semaphor
 from studies.robustness.fuzz import invent_frames
 from studies.robustness.run_study import build_robustness_report, run_study
 
+LIMIT = 600.0  # s: it only ends a test that hangs
+
 
 def test_a_seed_gives_the_same_frames_again() -> None:
     frames = list(invent_frames(5000, 3))
@@ -17,7 +19,7 @@ def test_a_seed_gives_the_same_frames_again() -> None:
 
 @pytest.mark.parametrize(("victim", "seed"), [("plant", 13), ("rig", 15)])  # soon after the first cycles
 def test_a_killed_process(victim: str, seed: int) -> None:
-    trial = disturb_run("kill", victim, seed)
+    trial = disturb_run("kill", victim, seed, limit=LIMIT)
     assert trial.problems == () and trial.cycles > 0, trial
 
 
@@ -42,7 +44,7 @@ def test_what_the_verdict_of_a_disturbed_run_must_be(action: str, victim: str, p
 
 
 def test_a_log_that_cannot_be_written() -> None:
-    trial = disturb_run("fill disk", "rig", 12)
+    trial = disturb_run("fill disk", "rig", 12, limit=LIMIT)
     assert trial.problems == () and trial.status == 2 and "log" in trial.message, trial
 
 
