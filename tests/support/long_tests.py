@@ -2,10 +2,15 @@
 
 # Those of half a minute and more begin first and in this order: none is left to one worker at the end.
 LONGEST = (
-    "vcan/", "studies/test_robustness.py", "rig/campaign/", "examples/", "rig/run/test_hard_loop.py",
-    "rig/run/test_session.py", "rig/view/", "fdi/diagnosis/test_refine.py", "fdi/identification/",
-    "fdi/discovery/test_discovery.py", "fdi/comparison/test_compare.py", "studies/", "rig/run/", "plant/test_lanes.py",
-    "plant/test_plant_on_other_cpus.py", "test_docs_site.py", "test_examples.py", "rig/firmware/", "rig/suite/",
+    "vcan/", "studies/test_robustness.py", "rig/fmi/test_import.py", "plant/test_plants.py",
+    "fdi/discovery/test_laws.py", "rig/run/test_run.py", "fdi/diagnosis/test_refine.py", "fdi/identification/",
+    "fdi/test_analysis.py", "rig/cli/test_fdi_command.py", "rig/campaign/", "examples/test_bench_runs.py",
+    "fdi/trace/test_trace.py", "rig/view/test_live.py", "fdi/report/test_report.py", "fdi/discovery/test_discovery.py",
+    "fdi/estimation/test_fits_on_other_cpus.py", "rig/conformance/test_conformance_command.py",
+    "fdi/discovery/test_sensitivity.py", "rig/suite/", "rig/fmi/", "examples/", "fdi/comparison/",
+    "rig/run/test_hard_loop.py", "rig/firmware/", "rig/cli/test_explain_command.py", "test_examples.py",
+    "plant/test_plant_on_other_cpus.py", "rig/view/", "plant/test_lanes.py", "rig/run/", "studies/",
+    "test_docs_site.py",
 )
 LONG_TESTS = (
     "examples/",
