@@ -195,7 +195,8 @@ def test_a_model_with_a_users_effect_finds_its_file_or_asks_for_it(tmp_path: Pat
         interval = {"spring.stiffness": Value(1e5, 9e4, 1.1e5, "N/m")}
         file.write_text(update_model.format_model_file(model, interval, known))
         assert update_model.load_model_file(file) == (model, known)
-    said = rig("compare", run, "--model", file, "--trust")
+    with restored_catalogue():
+        said = rig("compare", run, "--model", file, "--trust")
     assert said.status == 0 and str(own) in said.err, said.err
     own.rename(tmp_path / "elsewhere.py")
     for words in (["add", "null_bias", run], ["explain", run]):
