@@ -230,22 +230,3 @@ def _check_limits(f: Fault, q: Any, check: Callable[[object, str, str], None]) -
     check(math.isnan(f.axis[0]) or low <= f.axis[0] < f.axis[1] <= high, "axis",
           f"[least, largest] within the range {whole}, not {list(f.axis)}")
     check(0.1 <= f.interval_factor <= 10.0, "interval_factor", f"a factor from 0.1 to 10, not {f.interval_factor:g}")
-
-
-EXAMPLE = """\
-# A fault of your own for `rig fdi TRACE --faults {file}`; add tables [faults.NAME] to look for several at once.
-# `rig check {file}` tests this file, `rig list parameters` lists what a fault may change. All numbers are SI.
-
-[faults.{name}]
-title = "backlash of the feedback spring"           # for people
-parameter = "feedback_gap.gap"                      # of the plant or of an effect; unit and symbol come from it
-range = [0, 5e-4]                                   # sizes that are possible, a healthy unit's among them
-acceptable = 4e-5                                   # MidBand: up to here acceptable
-maintenance = 9e-5                                  # MaxBand: up to here maintenance is due, above it non-nominal
-source = "3 and 7 % of the spool's half stroke"     # where the limits come from
-# symbol = "gap"                                    # of the size, in tables and as its key in JSON
-# healthy = 0                                       # size of a new unit; default: the nominal value of the parameter
-# both_ways = true                                  # the limits are distances from the healthy size, either way
-# axis = [0, 1.3e-4]                                # of the RMS maps; default: from a new unit to beyond MaxBand
-# follow = ["group.field"]                          # grow in proportion; or a table, {{ "group.field" = factor }}
-"""

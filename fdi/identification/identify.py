@@ -468,7 +468,8 @@ def _find_slope(free: Sequence[Free], k: int) -> Floats:
 
 
 BEGINNING_NOISE = (30.0, 6.0)  # factors on the noise
-LAST_STEPS = 50  # solver steps a cycle, of the last rounds
+LAST_STEPS = 50  # solver steps a cycle, of the last rounds; of a plant without balances at least its own: a lag looks
+# shorter by half a step, and no tolerance allows for it
 OPEN_MISFIT = 4.0  # -2 log likelihood by which a parameter may go to the end of its range and still not be seen
 
 
@@ -720,13 +721,18 @@ def hold_parameters(problem: LogProblem, fit: Fit, held: Mapping[str, float]) ->
             start_fit([fit.free[k] for k in kept], fit.x[kept]))
 
 
+def count_last_steps(model: Model) -> int:
+    """Solver steps a cycle of the last rounds."""
+    return LAST_STEPS if model.values.keys() >= BALANCED else max(LAST_STEPS, model.steps)
+
+
 def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress: Progress = ignore_progress
            ) -> tuple[LogProblem, Fit]:
     """The last rounds, with finer steps; then with the noise that is left, where only noise is left.
 
     `begin`: the unknowns (p,) where regressions put them, at which a search begins if the fit ended in a local minimum.
     """
-    fine = replace(problem, steps=LAST_STEPS, _lanes={})
+    fine = replace(problem, steps=count_last_steps(problem.model), _lanes={})
     fit = descend(fine, fit, 8)
     if not is_fitted(fit):
         fit = search_other_valleys(fine, fit, begin, seed, progress)
@@ -761,7 +767,7 @@ def fit_beginnings(problem: LogProblem, free: Sequence[Free], floor: Mapping[str
         fit = descend(problem, fit, FIT_ROUNDS, factor)
         fit = descend(problem, profile_unknowns(scale_noise(problem, factor), fit), FIT_ROUNDS, factor)
     at = problem.model.replace(problem.list_values(free, fit.x))
-    runs = [leave_out_rows(t, find_undecided_rows(Problem(at, t, problem.noise, steps=LAST_STEPS),
+    runs = [leave_out_rows(t, find_undecided_rows(Problem(at, t, problem.noise, steps=count_last_steps(at)),
                                                   start_fit((), np.empty(0)), floor))
             for t in (problem.trace, *problem.also)]
     decided = replace(problem, trace=runs[0], also=tuple(runs[1:]), _lanes={})
@@ -832,7 +838,8 @@ def measure_errors(before: Model, after: Model, runs: Sequence[Trace], sources: 
     for number, (trace, source) in enumerate(zip(runs, sources, strict=True)):
         trace = leave_out_rest(trace, after, memory=0.0)
         noise = tuple(white_noise(1.0) for _ in trace.outputs)
-        first, last = (Problem(silence_readings(model), trace, noise, steps=LAST_STEPS) for model in (before, after))
+        first, last = (Problem(silence_readings(model), trace, noise, steps=count_last_steps(model))
+                       for model in (before, after))
         left = [problem.compute_residuals((), np.empty((1, 0)))[0] for problem in (first, last)]
         sizes = [{s: rms(r) for s, r in zip(trace.outputs, each, strict=True)} for each in left]
         own = {s: floor[s] for s in trace.outputs}

@@ -328,7 +328,7 @@ COMMANDS = {
          option("--dbc", type=Path, metavar="FILE", help="DBC of a device on plain CAN"),
          option("--node", type=parse_count, metavar="N", help="node-ID of the CANopen device (default: the DCF's, or "
                                                               "2)"),
-         option("--model", metavar="FILE|NAME", help="plant of the bench (default: eha)"),
+         option("--model", metavar="FILE|NAME", help="plant that the file is for (default: eha)"),
          FORCE)),
     "node": Command(
         "run the plant emulator or the reference firmware alone on a CAN bus, opposite a rig or real hardware",

@@ -54,14 +54,16 @@ def load_fmu_plant(path: Path) -> Plant:
     if path.suffix == ".fmu":
         return declare_plant(path, {}, Place(str(path), {}), str(path))
     tables, place = parse_table(decode_text(read_file(path), path), str(path))
-    table = tables.get("plant")
+    table, controller = tables.get("plant"), tables.get("controller")
     if not isinstance(table, dict) or not isinstance(table.get("file"), str):
         raise place.at("plant").refuse('a table [plant] with file = "NAME.fmu"')
-    return declare_plant(path.parent / table["file"], table, place.at("plant"), str(path))
+    period = controller.get("period") if isinstance(controller, dict) else None  # its range is checked with the model's
+    return declare_plant(path.parent / table["file"], table, place.at("plant"), str(path),
+                         period if isinstance(period, float) else None)
 
 
-def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str) -> Plant:
-    """The plant of the unit in `file` as `table` maps it; `key` is what models call it.
+def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, period: float | None = None) -> Plant:
+    """The plant of the unit in `file` as `table` maps it; `key` is what models call it, `period` its cycle, s.
 
     Raises:
         InputError: see `load_fmu_plant`.
@@ -101,6 +103,7 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str) 
     types["controller"] = Controller if is_usual else convert_group_unit(Controller, usual.unit, drive.unit, inf)
     values |= {name: value for name, value in usual.nominal.items()
                if name == "controller.period" or (is_usual and name.startswith("controller."))}
+    values["controller.period"] = period or values["controller.period"]
     values.setdefault("controller.current_limit", 1e9)  # of a drive in another unit none is known
     state = make_state_type(tuple(signal.name for signal, _ in shown))
     columns = (command, first, drive, *(s for s, _ in shown[1:]), *(s for s, _ in given[1:]))

@@ -179,15 +179,17 @@ def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -
     assert not first.passed and "t = 0.1" in first.text
 
 
-@pytest.mark.parametrize(("kind", "check"), [("sequence", ["check", "my_new.toml"]),
+@pytest.mark.parametrize("plant", ["eha", "ema", "mine.py"])
+@pytest.mark.parametrize(("kind", "check"), [("sequence", ["check", "my_new.toml"]), ("fault", ["check", "my_new.toml"]),
                                              ("effect", ["effects", "--effects", "my_new.py", "my_new"])])
-def test_a_new_file_passes_its_own_check(kind: str, check: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-                                         ) -> None:
+def test_a_new_file_passes_its_own_check(kind: str, check: list[str], plant: str, tmp_path: Path,
+                                         monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert rig("new", kind, "my_new", "--json").json["verdict"] == "COMPLETE"
-    said = rig(*check, "--json")
+    (tmp_path / "mine.py").write_text(TEXT)
+    assert rig("new", kind, "my_new", "--model", plant, "--json").json["verdict"] == "COMPLETE"
+    said = rig(*check, "--model", plant, "--json")
     assert said.status == 0 and "are of a bench" in rig("new", kind, "other", "--node", "3").err
     if kind == "effect":
         trial = said.json["effects"][0]["self_test"]
         assert trial["faults"] == [] and trial["visible"]
-        assert {"start", "xj", "p12", "xs", "level"} == set(trial["shown"][0])
+        assert {"start", "level", *(s.name for s in load_model(plant).kind.signals.outputs)} == set(trial["shown"][0])

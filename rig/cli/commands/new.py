@@ -8,14 +8,17 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from fdi.diagnosis.faults import load_faults
 from fdi.output import require_new, require_writable, write_text
 from fdi.report.report import Line, Report, Section
 from plant.effects import load_effects
 from plant.errors import InputError, require
-from plant.faults import EXAMPLE, WORD
+from plant.faults import WORD
 from plant.model import load_model
-from plant.plants import load_plant
+from plant.plants import Plant, load_plant
+from plant.segments import build_profile
 from plant.tables import read_file
 from rig.benches.bench import decode_device_text
 from rig.benches.bench_file import load_bench
@@ -26,36 +29,57 @@ from rig.sequences import load_sequence
 
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 also where the file is to be completed."""
-    suffix, write, read, check = KINDS[args.kind]
-    path = Path(args.out or f"{args.name.removesuffix(suffix)}{suffix}")
-    require(path.suffix == suffix, "--out", str(path), f"FILE{suffix}")
+    kind = KINDS[args.kind]
+    path = Path(args.out or f"{args.name.removesuffix(kind.suffix)}{kind.suffix}")
+    require(path.suffix == kind.suffix, "--out", str(path), f"FILE{kind.suffix}")
     require_new(require_writable(path, "--out"), is_forced=args.force)
-    text = write(path, args)
+    check = kind.check.format(path=path) + (f" --model {args.model}" if args.model and args.kind != "bench" else "")
+    plant = load_model(args.model or "eha").kind
+    text = kind.write(path, args, plant, check)
     write_text(path, text)
     try:
-        read(path)
+        kind.read(path, plant)
         problem = ""
     except InputError as error:
         problem = str(error)
     report = build_new_report(path, text, problem)
-    return give_answer(replace(report, next_command=check.format(path=path), files=[(args.kind, str(path))]), args)
+    return give_answer(replace(report, next_command=check, files=[(args.kind, str(path))]), args)
 
 
-def write_example(path: Path, args: argparse.Namespace) -> str:
-    """The text of a file of the kinds that need no device: a shipped example, with the name of the file in it."""
+def write_example(path: Path, args: argparse.Namespace, plant: Plant, check: str) -> str:
+    """The text of a file of the kinds that need no device: a shipped example, with names and sizes of the plant."""
     kind = args.kind
-    require(not (args.eds or args.dbc or args.node or args.model), f"rig new {kind}", "",
-            "no device: --eds, --dbc, --node and --model are of a bench")
+    require(not (args.eds or args.dbc or args.node or (args.model and kind == "plant")), f"rig new {kind}", "",
+            "no device: --eds, --dbc and --node are of a bench, --model is of all but a plant")
     require(kind not in ("fault", "effect") or WORD.fullmatch(path.stem), "NAME", path.stem,
             f"small letters, digits and _ : the name is also that of the {kind}")
-    if kind == "fault":
-        return EXAMPLE.format(file=path, name=path.stem)
+    if kind == "effect":
+        plant.require_equations()
     package, *place = EXAMPLES[kind]
     text = files(package).joinpath(*place).read_text(encoding="utf-8")
-    return text if kind == "plant" else text.format(file=path, name=path.stem)
+    if kind == "plant":
+        return text
+    return text.format(file=path, name=path.stem, check=check, **list_plant_words(plant))
 
 
-def write_bench(path: Path, args: argparse.Namespace) -> str:
+def list_plant_words(kind: Plant) -> dict[str, Any]:
+    """What the examples say of a plant: a port, fields of its state, a parameter, and sizes of a demand."""
+    ports = {name: port for name, port in kind.ports.items() if name not in ("command", "reading")}
+    port = "load" if "load" in ports else next(iter(ports), "reading")
+    moving = kind.moves if isinstance(kind.moves, tuple) else kind.state._fields
+    parameter, healthy = next((name, value) for name, value in kind.nominal.items()
+                              if value > 0.0 and name.partition(".")[0] != "controller")
+    largest = float(np.abs(build_profile(kind.profile).command).max(initial=0.0)) or 5e-3
+    step = float(f"{0.4 * largest:.1g}")
+    return {"port": port, "unit": kind.ports[port].unit,
+            "ports": "\n".join(f"#   {name} [{p.unit}]: {p.meaning}" for name, p in kind.ports.items()),
+            "field": next(iter(moving), ""), "fields": ", ".join(kind.state._fields),
+            "parameter": parameter, "healthy": healthy, "acceptable": 1.2 * healthy, "maintenance": 1.4 * healthy,
+            "range": 2.0 * healthy, "controlled": kind.signals.controlled.unit,
+            "signal": kind.signals.controlled.name, "step": step, "sine": 0.5 * step, "limit": 0.25 * step}
+
+
+def write_bench(path: Path, args: argparse.Namespace, plant: Plant, check: str) -> str:
     """The text of a bench file at `path`, from the EDS, DCF or DBC that the options name."""
     require((args.eds is None) != (args.dbc is None), "rig new bench", "",
             "--eds FILE (EDS or DCF of a CANopen device), or --dbc FILE")
@@ -65,8 +89,7 @@ def write_bench(path: Path, args: argparse.Namespace) -> str:
     text, name = decode_device_text(read_file(source)), _name_from(path, source)
     wanted = Wanted()
     if args.model:
-        kind = load_model(args.model).kind
-        wanted = Wanted(_name_from(path, args.model) if Path(args.model).is_file() else kind.key, kind.signals)
+        wanted = Wanted(_name_from(path, args.model) if Path(args.model).is_file() else plant.key, plant.signals)
     if args.dbc:
         return guess_can(path.stem, name, text, wanted)
     return guess_canopen(path.stem, name, text, args.node, wanted)
@@ -89,22 +112,24 @@ def build_new_report(path: Path, text: str, problem: str) -> Report:
 
 
 EXAMPLES = {"plant": ("plant", "models", "new_plant.py"), "effect": ("rig.cli", "new_effect.txt"),
-            "sequence": ("rig.cli", "new_sequence.toml")}
+            "sequence": ("rig.cli", "new_sequence.toml"), "fault": ("rig.cli", "new_fault.txt")}
 
 
 class Kind(NamedTuple):
     """A kind of file."""
 
     suffix: str
-    write: Callable[[Path, argparse.Namespace], str]
-    read: Callable[[Path], Any]  # refuses what cannot be used
+    write: Callable[[Path, argparse.Namespace, Plant, str], str]  # the last argument is the command that checks it
+    read: Callable[[Path, Plant], Any]  # refuses what cannot be used
     check: str  # the command that checks it
 
 
 KINDS: Mapping[str, Kind] = {
-    "bench": Kind(".toml", write_bench, lambda path: load_bench(str(path)), "rig check --bench {path}"),
-    "plant": Kind(".py", write_example, load_plant, "rig check {path}"),
-    "sequence": Kind(".toml", write_example, load_sequence, "rig check {path}"),
-    "effect": Kind(".py", write_example, load_effects, "rig effects --effects {path} {path.stem}"),
-    "fault": Kind(".toml", write_example, lambda path: load_faults(str(path)), "rig check {path}"),
+    "bench": Kind(".toml", write_bench, lambda path, _: load_bench(str(path)), "rig check --bench {path}"),
+    "plant": Kind(".py", write_example, lambda path, _: load_plant(path), "rig check {path}"),
+    "sequence": Kind(".toml", write_example, lambda path, plant: load_sequence(
+        path, round(1.0 / plant.nominal["controller.period"]), plant.key), "rig check {path}"),
+    "effect": Kind(".py", write_example, lambda path, _: load_effects(path),
+                   "rig effects --effects {path} {path.stem}"),
+    "fault": Kind(".toml", write_example, load_faults, "rig check {path}"),
 }

@@ -99,7 +99,7 @@ def test_bad_files_and_lists(tmp_path: Path) -> None:
 def test_a_new_fault_passes_its_own_checks_and_is_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert rig("new", "fault", "my_gap", "--json").json["verdict"] == "COMPLETE"
-    assert rig("list", "faults", "--faults", "my_gap.toml", "--json").json["faults"][0]["maintenance"] == 9e-5
+    assert rig("list", "faults", "--faults", "my_gap.toml", "--json").json["faults"][0]["maintenance"] == 3.178
     assert rig("check", "my_gap.toml").status == 0
 
 
