@@ -301,6 +301,12 @@ RESIDUAL_HOPELESS = 7.0
 # The same of the position of a valve, which follows the drive without a load.
 RESIDUAL_HOPELESS_VALVE = 2.0
 
+# Error of the best explanation over the noise floor from which the recording may be of another plant or in other units.
+#
+# Recordings of other plants left more than 10,000 floors, one in radians of a plant in degrees 49; a unit with an
+# effect that the catalogue lacks left 5.
+RESIDUAL_FOREIGN = 30.0
+
 # RMS residual over noise above which a fit says nothing of any size: neither a level nor a suspect is reported.
 RESIDUAL_JUDGES_NOTHING = 1.5
 

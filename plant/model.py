@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.compile import Function, compile_function, interpret_function
-from plant.effects import Effect
+from plant.effects import CATALOGUE, Effect
 from plant.errors import InputError, require, suggest_name
 from plant.kernels import list_state_values
 from plant.parameters import check_combinations, find_field, flatten_tables, parse_value
@@ -268,6 +268,7 @@ def find_effect(name: str, plant: str = "eha") -> Effect:
     known = {e.name: e for e in list_offered_effects(plant)}
     if name not in known:
         hint = suggest_name(name, known) or " (rig effects lists them)"
+        hint = f" that suits the plant {plant}" if name in CATALOGUE.list_all() else hint
         raise InputError("effect", name, f"an effect of the catalogue{hint}")
     return known[name]
 

@@ -224,7 +224,8 @@ class Plant:
 
     def offers(self, e: Effect) -> bool:
         """Whether a shared effect suits it: it has the port, in the same unit, and what else the law names."""
-        if e.plant not in ("", self.name) or e.name in self.lacks or self.foreign is not None:
+        is_elsewhere = e.plant not in ("", self.name) or (self.file is not None and e.searched_in)
+        if is_elsewhere or e.name in self.lacks or self.foreign is not None:
             return False
         if e.base:
             return all(name in self.nominal for name in e.fitted)

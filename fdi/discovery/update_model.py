@@ -79,7 +79,8 @@ class Refit:
         if self.original.find_effect(name).port in UNREPLAYED:
             return True  # it was found without noise, or it would not be here
         worse = any(x > 1.02 * before.holdout[s] for s, x in after.holdout.items() if x > 1.15 * self.floor[s])
-        return measure_gain(before.hypothesis, after.hypothesis) > GAIN_SEEN and not worse
+        lower = any(x < before.error[s] for s, x in after.error.items())
+        return measure_gain(before.hypothesis, after.hypothesis) > GAIN_SEEN and lower and not worse
 
 
 def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: Sequence[Trace] = (),

@@ -255,13 +255,13 @@ def parse_date(text: str) -> float:
     return math.nan if np.isnat(found) else float(found.astype(float)) / 86400 - late
 
 
-def format_day(day: float) -> str:
-    """The date of a day since 1970-01-01.
+def format_day(day: float, with_time: bool = False) -> str:
+    """The date of a day since 1970-01-01, with or without hours and minutes.
 
-    >>> format_day(20454.7)
-    '2026-01-01'
+    >>> format_day(20454.7), format_day(20454.7, with_time=True)
+    ('2026-01-01', '2026-01-01 16:48')
     """
-    return str(np.datetime64(math.floor(day), "D"))
+    return str(np.datetime64(round(day * 1440.0), "m")).replace("T", " ")[:16 if with_time else 10]
 
 
 def find_date_in_name(path: Path) -> float:

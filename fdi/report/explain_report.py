@@ -50,6 +50,7 @@ from fdi.report.numbers import (
     name_parameter,
 )
 from fdi.report.report import Cell, Column, Figure, Line, Listing, Medium, Mood, Report, Section, Table, tabulate
+from fdi.thresholds import RESIDUAL_FOREIGN
 from fdi.trace.trace import Floats, Trace
 from plant.signals import Signals
 
@@ -215,11 +216,14 @@ def describe_findings(a: Answer) -> list[Line]:
     elif a.verdict == "AMBIGUOUS":
         separation = "no sensor and no command that was tried discriminates between them"
     is_another = a.verdict in ("PARTLY", "UNEXPLAINED") and a.best.is_far
+    left = max(a.best.ratio.values())
+    doubt = (f"The best leaves {format_ratio(left)} noise floors: is this recording from this plant, in its units? "
+             if left > RESIDUAL_FOREIGN else "")
     return [Line("to discriminate", separation), Line("residual", a.pattern),
             *([] if a.law is None else [Line("law", _describe_law(a.law)), *(
                 Line("not observable", f"{PLACES[place]}: {why}") for place, why in a.law.hidden.items())]),
             Line("suspicious", describe_suspicious(a.suspicious)),
-            Line("another actuator?", OTHER_ACTUATOR if is_another else ""),
+            Line("another actuator?", doubt + OTHER_ACTUATOR if is_another else ""),
             Line("held-out run", _describe_undecided(a)), Line("not detectable", describe_blind(a))]
 
 

@@ -170,16 +170,19 @@ def _describe_time_left(remaining: Remaining, trend: Trend, unit: UnitTrend) -> 
 
 
 def _format_date(t: float, unit: UnitTrend) -> str:
-    """A date, or hours or flights; `t` counts from the last trace."""
+    """As `_format_place`; `t` counts from the last trace."""
     if not math.isfinite(t):
         return "never"
     at = unit.gathered.points[-1].t + t
-    return format_day(at) if unit.gathered.axis == "date" else f"{at:.0f} {unit.unit}"
+    return _format_place(at, unit) if unit.gathered.axis == "date" else f"{at:.0f} {unit.unit}"
 
 
 def _format_place(t: float, unit: UnitTrend) -> str:
-    """A date, or hours or flights; `t` is on the axis of the traces."""
-    return format_day(t) if unit.gathered.axis == "date" else f"{t:g} {unit.unit}"
+    """A date, with the time where the traces cover less than two days, or hours or flights; `t` is on their axis."""
+    if unit.gathered.axis != "date":
+        return f"{t:g} {unit.unit}"
+    points = unit.gathered.points
+    return format_day(t, with_time=points[-1].t - points[0].t < 2.0)
 
 
 def _collect_data(unit: UnitTrend) -> dict[str, Any]:

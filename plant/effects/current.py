@@ -91,7 +91,7 @@ def current_limit(x: float, s: Any, u: Any, p: Any) -> float:
     "hum": Quantity("A", low=0, high=20, typical="amplitude"),
     "frequency": Quantity("Hz", low=0, high=1e6),
 }, off={"frequency": 400.0}, law="i = i + white n_k + hum sin(2 pi f t), n_k new every cycle",
-    symptoms="the current the coil feels differs from the one sent; a line at f in P12", disturbance=True,
+    symptoms="the current the coil feels differs from the one sent; a line at f in what it drives", disturbance=True,
     source="the source paper: disturbances of the current line")
 def current_noise(x: float, s: Any, u: Any, p: Any) -> float:
     """Aircraft supply hum and white noise couple into the current line."""
@@ -115,8 +115,9 @@ def coil_lag(x: float, m: Lag, s: Any, u: Any, p: Any) -> tuple[float, Lag]:
 
 @effect("current", {  # Current offset.
     "current": Quantity("A", low=-20, high=20, typical="0.2-4 % of Imax"),
-}, law="i = i + i0", symptoms="constant error i0/GAP with P12 unchanged", starts=(3e-5, -3e-5, 3e-4, -3e-4),
-    confused_with=("constant_load", "friction_asymmetry"), source="null shift of servovalves, SAE ARP490")
+}, law="i = i + i0", symptoms="constant error at rest, i0 over the gain, without a force",
+    starts=(3e-5, -3e-5, 3e-4, -3e-4), confused_with=("constant_load", "friction_asymmetry"),
+    source="null shift of servovalves, SAE ARP490")
 def null_bias(x: float, s: Any, u: Any, p: Any) -> float:
     """The valve's null is not at zero current."""
     return x + p.null_bias.current
@@ -124,8 +125,8 @@ def null_bias(x: float, s: Any, u: Any, p: Any) -> float:
 
 @effect("current", {  # Width of the loop, current up against current down.
     "width": Quantity("A", low=0, high=20, typical="1-5 % of Imax"),
-}, law="i = play(i, width)", symptoms="loop in current against spool, rate free; the spool keeps moving", memory=Held,
-    starts=(8e-5, 2e-4, 4e-4), source="play operator, Krasnosel'skii and Pokrovskii 1989")
+}, law="i = play(i, width)", symptoms="loop in current against what it drives, rate free; no part of it sticks",
+    memory=Held, starts=(8e-5, 2e-4, 4e-4), source="play operator, Krasnosel'skii and Pokrovskii 1989")
 def torque_motor_hysteresis(x: float, m: Held, s: Any, u: Any, p: Any) -> tuple[float, Held]:
     """Magnetic hysteresis and friction of the armature: after a reversal the torque waits for the play."""
     held = play(x, m.held, 0.5 * p.torque_motor_hysteresis.width)

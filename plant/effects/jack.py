@@ -9,8 +9,9 @@ from plant.effects import Drag, Held, Quantity, effect
 
 @effect("load", {  # A steady external force.
     "force": Quantity("N", low=-1e6, high=1e6, typical="0.2-5 kN"),
-}, law="FR = FR + F", symptoms="mean P12", starts=(400.0, -400.0, 3000.0, -3000.0),
-    confused_with=("friction_asymmetry", "null_bias"), source="a steady air load or weight")
+}, law="FR = FR + F", symptoms="mean of what makes the force: P12 of a jack, current of a motor",
+    starts=(400.0, -400.0, 3000.0, -3000.0), confused_with=("friction_asymmetry", "null_bias"),
+    source="a steady air load or weight")
 def constant_load(x: float, s: Any, u: Any, p: Any) -> float:
     """A weight or a steady air load."""
     return x + p.constant_load.force

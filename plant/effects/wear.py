@@ -20,7 +20,7 @@ NOWHERE = ("none",)  # plants in which rig explain tests them unasked
 
 @effect("current", {  # Share of the torque that the magnets of the torque motor have lost.
     "share": Quantity("1", "d", low=0, below=1, typical="0.05-0.3"),
-}, law="Tact = GM (1 - d) Cor - KSF XS", symptoms="same as a smaller GM", starts=(0.05, 0.2),
+}, law="Tact = GM (1 - d) Cor - KSF XS", symptoms="same as a smaller gain of the motor", starts=(0.05, 0.2),
     confused_with=("torque_motor.gain",), searched_in=NOWHERE,
     revealed_by="a torque or flux measurement of the motor alone",
     source="torque of a polarised motor in proportion to its magnets' flux, Merritt 1967")

@@ -291,8 +291,10 @@ def _find_plant(table: Mapping[str, Any], place: Place) -> str:
     """The plant that a sequence names, or that of its model, or ""; a model that cannot be read is refused later."""
     chosen, named = table.get("model"), table.get("plant", "")
     if named:
+        place.at("plant").require(isinstance(named, str),
+                                  "the name of a plant: a table belongs into a model file, for --model")
         with place.at("plant").locate():
-            return find_plant(str(named)).key
+            return find_plant(named).key
     name = chosen.get("name") if isinstance(chosen, dict) else None
     with suppress(InputError):
         return load_model(name).plant if isinstance(name, str) else ""

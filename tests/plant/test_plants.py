@@ -180,7 +180,8 @@ def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("plant", ["eha", "ema", "mine.py"])
-@pytest.mark.parametrize(("kind", "check"), [("sequence", ["check", "my_new.toml"]), ("fault", ["check", "my_new.toml"]),
+@pytest.mark.parametrize(("kind", "check"), [("sequence", ["check", "my_new.toml"]),
+                                             ("fault", ["check", "my_new.toml"]),
                                              ("effect", ["effects", "--effects", "my_new.py", "my_new"])])
 def test_a_new_file_passes_its_own_check(kind: str, check: list[str], plant: str, tmp_path: Path,
                                          monkeypatch: pytest.MonkeyPatch) -> None:

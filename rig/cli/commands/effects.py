@@ -1,6 +1,7 @@
 """`rig effects`: the catalogue of physical effects, one effect in detail, and the self-test of an effect."""
 
 import argparse
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,8 @@ def build_effects_report(chosen: Sequence[Effect], plant: str, tests: Mapping[st
     if is_detailed:
         law = ((chosen[0].function.__doc__ if chosen[0].function else "") or "").partition("\n")[0]
         title, sentence = chosen[0].name, ": ".join(filter(None, (chosen[0].name, law)))
-    sections = [Section("", _list_properties(chosen[0], rows[0], plant) if is_detailed else _tabulate_effects(chosen)),
+    first = _list_properties(chosen[0], rows[0], plant) if is_detailed else _tabulate_effects(chosen, rows)
+    sections = [Section("", first),
                 *(Section(f"self-test of {name}", [*_show_test(test, plant)]) for name, test in tests.items())]
     return Report("effects", title, sentence=sentence, sections=sections, data={"effects": rows})
 
@@ -67,16 +69,24 @@ def describe_effect(e: Effect, plant: str = "eha") -> dict[str, Any]:
     base = find_plant(plant).nominal
     parameters = {name: {"unit": q.unit, "off": e.off.get(name, base.get(name)), "expected": q.expected,
                          "typical": q.typical, "fitted": name in e.fitted} for name, q in e.parameters.items()}
-    return {"effect": e.name, "port": e.port, "in_reference_model": e.base, "in_firmware": e.firmware, "law": e.law,
-            "symptoms": e.symptoms, "confused_with": list(e.confused_with), "excludes": list(e.excludes),
-            "source": e.source, "parameters": parameters, "starts": [dict(start) for start in e.starts]}
+    return {"effect": e.name, "port": e.port, "in_reference_model": e.base, "in_firmware": e.firmware,
+            "law": _name_signals(e.law, plant), "symptoms": _name_signals(e.symptoms, plant),
+            "confused_with": list(e.confused_with), "excludes": list(e.excludes), "source": e.source,
+            "parameters": parameters, "starts": [dict(start) for start in e.starts]}
 
 
-def _tabulate_effects(chosen: Sequence[Effect]) -> list[Item]:
+def _name_signals(text: str, plant: str) -> str:
+    """A text of the catalogue, which has the symbols of the EHA, with those of the plant."""
+    own = find_plant(plant).signals
+    symbols = {"Com": own.command.symbol, "XJ": own.controlled.symbol, "Cor": own.drive.symbol}
+    return re.sub("|".join(symbols), lambda found: symbols[found[0]], text)
+
+
+def _tabulate_effects(chosen: Sequence[Effect], described: Sequence[Mapping[str, Any]]) -> list[Item]:
     rows: list[list[Cell | str]] = [[
         Cell(e.name, is_strong=True), e.port or "(reference)",
-        "\n".join(f"{name.removeprefix(e.name + '.')} [{q.unit}]" for name, q in e.parameters.items()), e.symptoms]
-        for e in chosen]
+        "\n".join(f"{name.removeprefix(e.name + '.')} [{q.unit}]" for name, q in e.parameters.items()), row["symptoms"]]
+        for e, row in zip(chosen, described, strict=True)]
     columns = [Column(title) for title in ("effect", "acts on", "parameters", "how to recognise it")]
     return [Table(columns, rows), Paragraph(
         "Give a model an effect with --set EFFECT.PARAMETER=VALUE; effects of the reference model have their own "
@@ -85,7 +95,7 @@ def _tabulate_effects(chosen: Sequence[Effect]) -> list[Item]:
 
 def _list_properties(e: Effect, row: Mapping[str, Any], plant: str) -> list[Item]:
     port = f"{e.port} ({find_plant(plant).ports[e.port].unit})" if e.port else "the reference model itself"
-    properties = [("law", e.law), ("acts on", port), ("symptoms", e.symptoms), ("source", e.source),
+    properties = [("law", row["law"]), ("acts on", port), ("symptoms", row["symptoms"]), ("source", e.source),
                   ("confused with", ", ".join(e.confused_with)), ("excludes", ", ".join(e.excludes))]
     parameters = [(f"{name} in {p['unit']}", filter(None, (
         p["expected"], f"off at {p['off']:g}", p["typical"] and f"typically {p['typical']}",
