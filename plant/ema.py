@@ -226,12 +226,6 @@ def measure(s: State, p: Any) -> tuple[float, float, float]:
     return s.sensed, s.motor_speed * (2.0 * pi) * p.screw.ratio / p.screw.lead, s.current
 
 
-def follow(s: State, distance: float, p: Any) -> State:
-    """The whole actuator moved by a distance, m."""
-    return State(s.current, s.integral, s.motor_position + distance, s.motor_speed, s.position + distance, s.speed,
-                 s.sensed)
-
-
 def correct(s: State, distance: float, p: Any) -> State:
     """The actuator after a correction of a replay: an observer of position and speed with both poles at its rate w.
 
@@ -409,7 +403,8 @@ PLANT = Plant(
         Signal("load", "load", "N", "external force on the surface", "load", largest=1e6)),
     parameters={"motor": Motor, "drive": Drive, "screw": Screw, "surface": Surface, "controller": Controller,
                 "observer": Observer},
-    state=State, step=step, coefficients=compute_coefficients, measure=measure, moves=follow, correct=correct,
+    state=State, step=step, coefficients=compute_coefficients, measure=measure, moves=("motor_position", "position"),
+    correct=correct,
     inverse=compute_needed_current, sense=sense,
     control=control, control_memory=Loops,
     lacks=("sensor_gain", "torque_motor_hysteresis", "coil_lag", "flow_delay", "valve_switching", "asymmetric_gain"),

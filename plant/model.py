@@ -267,7 +267,7 @@ def find_effect(name: str, plant: str = "eha") -> Effect:
     """
     known = {e.name: e for e in list_offered_effects(plant)}
     if name not in known:
-        hint = suggest_name(name, known) or " (rig effects lists them)"
+        hint = suggest_name(name, known, 0.5) or " (rig effects lists them)"
         hint = f" that suits the plant {plant}" if name in CATALOGUE.list_all() else hint
         raise InputError("effect", name, f"an effect of the catalogue{hint}")
     return known[name]

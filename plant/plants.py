@@ -187,11 +187,6 @@ class Plant:
         """The type of the memories of effects."""
         return make_memory_type(list(self.ports))
 
-    @property
-    def unit(self) -> str:
-        """Unit of what drives it."""
-        return self.signals.drive.unit
-
     def require_equations(self) -> None:
         """Refuse a plant whose equations are another program's. Raises InputError."""
         require(self.foreign is None, self.file, "", "a plant with equations for this; those of an FMU cannot be read")

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from fdi.discovery.update_model import Provenance, load_model_file
-from plant.errors import InputError, require, suggest_name
-from plant.model import Model, load_model
+from plant.errors import require
+from plant.model import Model, find_effect, load_model
 from plant.plants import find_plant
 from rig.cli.answer import choose_file
 from rig.cli.inputs import load_chosen_effects, parse_changes
@@ -37,13 +37,10 @@ def split_words(words: Sequence[str], plant: str, trace: str | None = None) -> t
     effects, known = [], [e.name for e in find_plant(plant).list_effects()]
     for word in words:
         is_file = word.endswith((".csv", ".csv.gz", ".mcap")) or Path(word).exists()
-        if word in known:
-            effects.append(word)
-        elif trace is None and is_file:
+        if trace is None and is_file and word not in known:
             trace = word
         else:
-            hint = suggest_name(word, known, 0.5) or " (rig effects lists them)"
-            raise InputError("effect", word, f"an effect of the catalogue{hint}")
+            effects.append(find_effect(word, plant).name)
     require(effects, "effect", "", "at least one effect (rig effects lists them)")
     return effects, trace
 

@@ -2,14 +2,14 @@
 
 import argparse
 import shlex
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
 from fdi import foreign_code
 from plant.effects import load_effects
-from plant.errors import require
+from plant.errors import InputError, require
 from plant.model import Model, load_model
+from plant.parameters import read_toml
 
 
 def parse_changes(pairs: Sequence[str]) -> dict[str, str]:
@@ -103,10 +103,7 @@ def format_arguments(args: argparse.Namespace) -> str:
 
 def is_suite_file(name: str) -> bool:
     """Whether a file is a suite and no sequence: it has the key `case`. False for what cannot be read."""
-    path = Path(name)
-    if path.suffix != ".toml" or not path.is_file():
-        return False
     try:
-        return "case" in tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):  # whoever reads it as a sequence says what is wrong
+        return name.endswith(".toml") and "case" in read_toml(Path(name))
+    except InputError:  # whoever reads it as a sequence says what is wrong
         return False

@@ -13,7 +13,6 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Iterable, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 from uuid import UUID
@@ -95,7 +94,6 @@ def export_fmu(model: Model, out: Path, version: str = "2", seed: int = 0) -> li
     platforms = [name.split("/")[1] for name in files]
     describe = {"2": _describe_fmi2, "3": _describe_fmi3}[version]
     files |= {"modelDescription.xml": describe(model, variables, identifier, token, seed).encode(),
-              "documentation/index.html": _write_page(model, variables).encode(),
               "resources/model.toml": model.to_toml().encode()}
     with write_whole(out) as unfinished, zipfile.ZipFile(unfinished, "w") as archive:
         for name in sorted(files):
@@ -221,42 +219,11 @@ def write_tables(model: Model, variables: Sequence[Variable], seed: int) -> str:
 
 # -------------------------------------------------------------------------------------------- modelDescription.xml
 
-_BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-_DERIVED = {"N": {"kg": 1, "m": 1, "s": -2}, "Pa": {"kg": 1, "m": -1, "s": -2}, "J": {"kg": 1, "m": 2, "s": -2},
-            "W": {"kg": 1, "m": 2, "s": -3}, "V": {"kg": 1, "m": 2, "s": -3, "A": -1},
-            "Ohm": {"kg": 1, "m": 2, "s": -3, "A": -2}, "H": {"kg": 1, "m": 2, "s": -2, "A": -2}, "Hz": {"s": -1}}
-
-
-def find_exponents(unit: str) -> dict[str, int] | None:
-    """Exponents of the SI units in `unit`, such as "N m s2/m"; None where it has a part that is not SI.
-
-    >>> find_exponents("A/(m s)"), find_exponents("raw/m")
-    ({'m': -1, 's': -1, 'A': 1}, None)
-    """
-    total = dict.fromkeys(_BASE_UNITS, 0)
-    above, *below = unit.replace("rms", "").replace("(", "").replace(")", "").split("/")
-    for sign, words in ((1, above), *((-1, words) for words in below)):
-        for word in words.split():
-            name = word.rstrip("0123456789")
-            parts = {name: 1} if name in _BASE_UNITS else _DERIVED.get(name)
-            if parts is None and word != "1":
-                return None
-            for base, exponent in (parts or {}).items():
-                total[base] += sign * exponent * int(word[len(name):] or 1)
-    return {base: exponent for base, exponent in total.items() if exponent}
-
 
 def _tag(name: str, attributes: dict[str, object], inner: Iterable[str] = ()) -> str:
     words = "".join(f" {key}={quoteattr(str(value))}" for key, value in attributes.items())
     content = list(inner)
     return f"<{name}{words}>\n{''.join(content)}</{name}>\n" if content else f"<{name}{words}/>\n"
-
-
-def _write_units(variables: Sequence[Variable]) -> str:
-    units = {v.unit: find_exponents(v.unit) for v in variables}
-    return _tag("UnitDefinitions", {}, (
-        _tag("Unit", {"name": name}, [] if base is None else [_tag("BaseUnit", dict(base))])
-        for name, base in units.items()))
 
 
 _OTHERS = (("seed", "seed of the sensors' noise"),
@@ -282,7 +249,9 @@ def _describe(version: str, model: Model, token: dict[str, object], parts: Itera
 
 def _list_common(model: Model, variables: Sequence[Variable]) -> list[str]:
     period = model["controller.period"]
-    return [_write_units(variables), _tag("LogCategories", {}, [_tag("Category", {"name": "logStatusError"})]),
+    units = (_tag("Unit", {"name": name}) for name in dict.fromkeys(v.unit for v in variables))
+    return [_tag("UnitDefinitions", {}, units),
+            _tag("LogCategories", {}, [_tag("Category", {"name": "logStatusError"})]),
             _tag("DefaultExperiment", {"startTime": 0.0, "stopTime": 1000 * period, "stepSize": period})]
 
 
@@ -319,15 +288,3 @@ def _describe_fmi3(model: Model, variables: Sequence[Variable], identifier: str,
         *_list_common(model, variables), _tag("ModelVariables", {}, scalars),
         _tag("ModelStructure", {}, [_tag(name, {"valueReference": i})
                                     for name in ("Output", "InitialUnknown") for i in outputs])])
-
-
-def _write_page(model: Model, variables: Sequence[Variable]) -> str:
-    """The documentation in the file: what the variables are."""
-    rows = "".join(f"<tr><td>{escape(v.name)}<td>{_CAUSALITY[v.role][0]}<td>{escape(v.unit)}<td>{v.start:g}"
-                   f"<td>{escape(v.description)}" for v in variables)
-    return (f"<!DOCTYPE html><meta charset='utf-8'><title>{escape(model.name)}</title><h1>{escape(model.name)}</h1>"
-            f"<p>{escape(repr(model)[1:-1])}</p><p>A step is a whole number of cycles of the controller. Step k starts "
-            "with the outputs of row k of <code>rig simulate</code>: with closed_loop true and com[k] as demand the "
-            "unit gives its rows bit for bit; with closed_loop false it is driven by cor[k - 1], 0 in the first step. "
-            "The noise is that of <code>--seed</code>; set the parameters sensors.* to 0 to be without.</p>"
-            f"<table><tr><th>variable<th>causality<th>unit<th>start<th>description{rows}</table>\n")

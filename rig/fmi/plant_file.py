@@ -13,6 +13,7 @@
 """
 
 import re
+from collections import namedtuple
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -100,7 +101,8 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, 
         group: NamedTuple(group.title().replace("_", ""), list(fields.items()))
         for group, fields in groups.items()}
     is_usual = drive.name == usual.signals.drive.name
-    types["controller"] = Controller if is_usual else convert_group_unit(Controller, usual.unit, drive.unit, inf)
+    types["controller"] = Controller if is_usual else convert_group_unit(
+        Controller, usual.signals.drive.unit, drive.unit, inf)
     values |= {name: value for name, value in usual.nominal.items()
                if name == "controller.period" or (is_usual and name.startswith("controller."))}
     values["controller.period"] = period or values["controller.period"]
@@ -116,9 +118,8 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, 
 
 def make_state_type(names: tuple[str, ...]) -> type[Any]:
     """The state of the plant as far as it is known: what the unit has shown last."""
-    made: Any = NamedTuple("Held", [(name, float) for name in names])  # type: ignore[misc]
-    made.__new__.__defaults__ = (0.0,) * len(names)
-    return cast("type[Any]", made)
+    make: Any = namedtuple
+    return cast("type[Any]", make("Held", names, defaults=(0.0,) * len(names)))
 
 
 def _list_entries(table: object, place: Place, prefix: str = "") -> Iterator[tuple[str, tuple[Entry, Place]]]:

@@ -232,7 +232,8 @@ def list_recorded(signals: Signals) -> list[Signal]:
 def _list_words(signal: Signal, signals: Signals) -> list[tuple[str, float]]:
     """The words that speak for a signal, each set with its points."""
     by_role = {signals.command: "command", signals.controlled: "controlled", signals.load: "load"}
-    first, *others = WORDS.get(by_role.get(signal, signal.unit), ()) or ((None, 0.0),)
+    unit = find_unit(signal.unit)  # a plant may declare degrees
+    first, *others = WORDS.get(by_role.get(signal, unit.si if unit else signal.unit), ()) or ((None, 0.0),)
     own = "|".join(dict.fromkeys(re.escape(word.strip()) for word in map(_simplify_name, (signal.name, signal.symbol))
                                  if word.strip()))
     return [(own, OWN_WORD) if first[0] is None else (f"{own}|{first[0]}", first[1]), *others]

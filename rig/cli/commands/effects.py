@@ -11,7 +11,6 @@ from fdi.report.report import Cell, Column, Item, Line, Paragraph, Report, Secti
 from plant.effects import Effect
 from plant.model import find_effect, load_model
 from plant.plants import find_plant, load_plant
-from plant.segments import build_profile
 from plant.selftest import Report as SelfTest, check_effect
 from rig.cli.answer import Places, give_answer
 from rig.cli.inputs import load_user_effects
@@ -36,13 +35,10 @@ def run_command(args: argparse.Namespace) -> int:
 
 def test_effect(e: Effect, plant: str = "eha") -> SelfTest:
     """Test an effect on the nominal test of its plant, of the EHA the preflight."""
-    kind = find_plant(plant)
-    if kind.profile:
-        rate = round(1.0 / kind.nominal["controller.period"])
-        return check_effect(e.name, build_profile(kind.profile, rate=rate).command, plant=plant)
-    from rig.sequences import load_sequence  # here: it takes half a second
+    from rig.sequences.sequence import load_nominal_test  # here: it takes half a second
 
-    return check_effect(e.name, load_sequence("preflight").main_profile().command, plant=plant)
+    kind = find_plant(plant)
+    return check_effect(e.name, load_nominal_test(kind, kind.nominal["controller.period"])[0], plant=plant)
 
 
 def build_effects_report(chosen: Sequence[Effect], plant: str, tests: Mapping[str, SelfTest], *,

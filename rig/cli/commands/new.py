@@ -64,8 +64,7 @@ def write_example(path: Path, args: argparse.Namespace, plant: Plant, check: str
 
 def list_plant_words(kind: Plant) -> dict[str, Any]:
     """What the examples say of a plant: a port, fields of its state, a parameter, and sizes of a demand."""
-    ports = {name: port for name, port in kind.ports.items() if name not in ("command", "reading")}
-    port = "load" if "load" in ports else next(iter(ports), "reading")
+    port = "load" if "load" in kind.ports else [*kind.ports][1]  # behind "command"
     moving = kind.moves if isinstance(kind.moves, tuple) else kind.state._fields
     parameter, healthy = next((name, value) for name, value in kind.nominal.items()
                               if value > 0.0 and name.partition(".")[0] != "controller")
