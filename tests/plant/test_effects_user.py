@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from effect_files import COGGING, HEAD, MEMORY
 from effects_cases import WHOLE
 from physics_cases import PREFLIGHT, SILENT
 from refusals import catch_refusal
-from rig_command import answer
+from rig_command import answer, refuse
 
 from plant import Actuator, InputError, Model, simulate
 from plant.effects import CATALOGUE, load_effects
@@ -168,3 +169,12 @@ def test_the_catalogue_is_told_for_machines() -> None:
     assert rows["coil_lag"]["confused_with"] == ["transport_delay", "sensor_lag"]
     assert rows["spool_overlap"]["excludes"] == ["spool_underlap"] and rows["spool_overlap"]["starts"]
     assert rows["command_rate_limit"]["in_firmware"] and "self_test" not in rows["command_rate_limit"]
+
+
+def test_the_catalogue_of_a_users_plant_has_its_signals(tmp_path: Path) -> None:
+    wheel, slide = files("plant").joinpath("models", "new_plant.py").read_text(), tmp_path / "slide.py"
+    slide.write_text(wheel.replace('"rad"', '"m"').replace('"V/rad"', '"V/m"'))
+    rows = {row["effect"]: row for row in answer("effects", "--model", slide)["effects"]}
+    assert set(rows) == {"command_rate_limit", "dry_friction", "quantisation"}
+    assert "theta = LSB" in rows["quantisation"]["law"] and "theta_c'" in rows["command_rate_limit"]["law"]
+    assert "suits the plant" in refuse("effects", "null_bias", "--model", slide)

@@ -101,6 +101,8 @@ def test_an_actuator_far_from_the_model_is_to_be_identified(verdict: str) -> Non
     far = answer(verdict, (), candidate("a", word="no"))
     cast(Any, far.explanation.base).is_far = True
     assert any("rig identify" in line.text for line in describe_findings(far)) == (verdict == "UNEXPLAINED")
+    cast(Any, far.explanation.base).ratio["xj"] = 400.0
+    assert any("400 noise floors" in line.text for line in describe_findings(far)) == (verdict == "UNEXPLAINED")
 
 
 def render_without_figures(report: Report) -> str:

@@ -190,6 +190,13 @@ def test_a_drive_of_its_own_has_no_limit_of_the_shipped_actuator(folder: Path) -
     assert load_model("own.toml")["controller.current_limit"] > 1e6
 
 
+def test_a_run_has_the_period_of_the_model_file(folder: Path) -> None:
+    build_fmu(Path("slide.fmu"))
+    own = SLIDE.replace("current =", "torque =").replace("1 mA", "1 N m").replace("ram_position", "angle")
+    Path("own.toml").write_text(own.replace("[controller]", "[controller]\nperiod = 2e-3"))
+    assert rig("run", "short.toml", "--model", "own.toml", "--out", "run").status == 0
+
+
 def test_without_a_map_the_answer_lists_the_variables(folder: Path) -> None:
     build_fmu(Path("slide.fmu"))
     assert "the unit has input u, input F, output slide.x" in refuse("simulate", "--model", "slide.fmu")
