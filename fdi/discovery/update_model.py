@@ -75,8 +75,7 @@ class Refit:
         if len(self.steps) < 2:
             return True
         before, after = self.steps[-2:]
-        name = str(after.effect)
-        if self.original.find_effect(name).port in UNREPLAYED:
+        if self.original.find_effect(str(after.effect)).port in UNREPLAYED:
             return True  # it was found without noise, or it would not be here
         worse = any(x > 1.02 * before.holdout[s] for s, x in after.holdout.items() if x > 1.15 * self.floor[s])
         lower = any(x < before.error[s] for s, x in after.error.items())
