@@ -3,7 +3,7 @@
 The mean error on a slow ramp is the classic sign of friction, but it does not depend on friction while the plant slides
 (docs/physics.md); the signal-to-noise ratios show which precursors are worth looking at. Each precursor is a mean over
 the sections of its kind. Noise of the position decides none of them: peaks are taken from running medians, ranges are
-between percentiles.
+between percentiles, and a reversal counts when it passes a quarter of the usual range.
 """
 
 import math
@@ -76,6 +76,8 @@ MEANINGS = {
     "rest_error": Meaning("error at rest, RMS", "um", 1e6),
     "mean_ramp_error": Meaning("mean error on the ramp", "um", 1e6),
     "break_away": Meaning("error at break-away", "um", 1e6),
+    "stick_slip_amplitude": Meaning("stick-slip amplitude", "um", 1e6),
+    "stick_slip_frequency": Meaning("stick-slip frequency", "Hz", 1.0),
     "speed_ripple": Meaning("speed ripple, s.d.", "mm/s", 1e3),
     "tracking_error": Meaning("RMS error in motion", "um", 1e6),
 }
@@ -222,5 +224,19 @@ def _measure_ramp_response(com: Floats, x: Floats, period: float, s: Section) ->
     rows = select_ramp_rows(s, period)
     error = np.sign(s.rate) * (com[rows] - x[:, rows])
     yield "mean_ramp_error", np.nanmean(error, axis=1)
-    yield "break_away", compute_half_range(error)
+    half = compute_half_range(error)
+    yield "break_away", half
+    amplitude, frequency = _measure_oscillation(filter_median(error, 1.0 / period), half, period)
+    yield "stick_slip_amplitude", amplitude
+    yield "stick_slip_frequency", frequency
     yield "speed_ripple", np.nanstd(compute_speed(x, 1.0 / period)[:, rows], axis=1)
+
+
+def _measure_oscillation(error: Floats, half: Floats, period: float) -> tuple[Floats, Floats]:
+    """Amplitude, m (RMS about the mean times sqrt 2), and frequency, Hz (turns with a hysteresis of `half`/2)."""
+    centred = error - np.nanmean(error, axis=1, keepdims=True)
+    side = np.where(np.abs(centred) > half[:, None] / 2, np.sign(centred), 0.0)
+    last = np.maximum.accumulate(np.where(side != 0.0, np.arange(side.shape[1]), 0), axis=1)
+    latest_side = np.take_along_axis(side, last, axis=1)
+    turns = ((latest_side[:, 1:] * latest_side[:, :-1]) < 0).sum(axis=1) / 2
+    return np.sqrt(2 * np.nanmean(centred**2, axis=1)), turns / (side.shape[1] * period)
