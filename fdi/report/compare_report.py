@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fdi.comparison.compare import Comparison, SignalError
-from fdi.comparison.residuals import Depends, ResidualTests
+from fdi.comparison.residuals import Depends, ResidualTests, map_deviation
 from fdi.estimation.replay import find_controller_gain
 from fdi.report.drawing import (
     BLUE,
@@ -78,6 +78,10 @@ def build_comparison_report(c: Comparison, next_command: str = "", files: Sequen
         Section("Where", [_tabulate_places(c), Figure(
             "Share of each section in the squared error. The longest bar shows where to look first.",
             partial(draw_error_shares, c))] if c.where else [], medium=Medium.PAGE),
+        Section("By speed and amplitude", [Figure(
+            f"Error over noise floor by speed of the {t.declared.controlled.called} (over 20 rows) and by amplitude "
+            "(half its range within 0.25 s before and after). 1 is noise; dark cells show at which motion the model "
+            "fails. Empty: fewer than 30 rows.", partial(draw_deviation_map, c))]),
         Section("Is the residual noise", [Figure(
             "From the left: autocorrelation, cumulative periodogram, correlation with an input. Noise stays within "
             "green: the 99 % band of the correlations and Bartlett's 95 % band of the periodogram. Where a repeat "
@@ -383,6 +387,31 @@ def draw_error_shares(c: Comparison) -> str:
         *(call("text", share, row, f" {format_ratio(place.ratio)} times the floor", va="center", fontsize=8)
           for row, (share, place) in enumerate(zip(shares, places, strict=True))),
         axes(xlabel="share of the squared error [%]", xlim=(0, 1.25 * max(shares)))]]], 0.7 + 0.27 * len(places))
+
+
+def draw_deviation_map(c: Comparison) -> str:
+    """Error over noise floor of each signal by speed and amplitude of the ram; "" without rows enough."""
+    from matplotlib.colors import LogNorm
+
+    floor = {name: s.floor.value for name, s in c.signals.items() if s.floor.value > 0.0}
+    found = map_deviation(c.trace, {name: c.replay.residual[name] for name in floor}, floor) if floor else None
+    if found is None:
+        return ""
+    controlled = c.trace.declared.controlled
+    unit = controlled.shown_unit
+    norm = LogNorm(1.0, max(10.0, *(float(np.nanmax(ratio)) for ratio in found.ratio.values())))
+    speeds, amplitudes = ([["" if np.isinf(edge) else f"{controlled.shown_scale * edge:g}" for edge in edges]
+                           for edges in (found.speeds, found.amplitudes)])
+    return draw_panels("map", [[[
+        call("pcolormesh", np.ma.masked_invalid(ratio), cmap="YlOrRd", norm=norm, edgecolors="white", linewidth=1.0),
+        *(call("text", column + 0.5, row + 0.5, format_ratio(float(value)), ha="center", va="center", fontsize=8,
+               color="white" if norm(value) > 0.6 else INK)
+          for (row, column), value in np.ndenumerate(ratio) if np.isfinite(value)),
+        call("set_xticks", range(len(speeds)), speeds), call("set_yticks", range(len(amplitudes)), amplitudes),
+        axes(title=c.signals[name].signal.symbol, xlabel=f"speed [{unit}/s]",
+             ylabel="" if number else f"amplitude [{unit}]"),
+        call("grid", False)] for number, (name, ratio) in enumerate(found.ratio.items())]],
+        1.2 + 0.42 * len(found.amplitudes), sharey=True)
 
 
 def draw_whiteness(c: Comparison) -> str:

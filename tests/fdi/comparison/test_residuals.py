@@ -15,6 +15,7 @@ from fdi.comparison.residuals import (
     examine_residuals,
     find_condition,
     locate_error,
+    map_deviation,
     name_shape,
 )
 from fdi.estimation.replay import read_cycles
@@ -108,3 +109,23 @@ def test_dependence_on_speed_and_its_shape(m: Motion, law: object, word: str) ->
     assert inside.mean() > 0.8
     assert bin_residual("speed", np.zeros(100), left[:100]) is None
     assert name_shape(np.array([-1.0, 0.0, 1.0]), np.array([1.0, -2.0, 1.5]), np.ones(3)) != "proportional to"
+
+
+def make_trace(amplitude: float, frequency: float, rows: int = 4000) -> Trace:
+    t = np.arange(rows) / 1000
+    xj = amplitude * np.sin(2 * np.pi * frequency * t)
+    return Trace.from_columns({"com": xj, "xj": xj, "cor": 0 * t}, 1e-3, {})
+
+
+def test_the_error_of_a_fast_motion_stands_in_its_cell() -> None:
+    slow, fast = make_trace(0.2e-3, 2.0), make_trace(2e-3, 4.0)
+    trace = Trace.from_columns({name: np.concatenate([slow.column(name), fast.column(name)])
+                                for name in ("com", "xj", "cor")}, 1e-3, {})
+    residual = np.where(np.arange(8000) < 4000, 1e-6, 7e-6)
+    found = map_deviation(trace, {"xj": residual}, {"xj": 1e-6})
+    assert found is not None
+    rows = found.amplitudes.searchsorted([0.2e-3, 2e-3]) - 1
+    assert np.nanmax(found.ratio["xj"][rows[0], :1]) == pytest.approx(1.0, abs=0.01)
+    column = int(found.speeds.searchsorted(45e-3)) - 1
+    assert found.ratio["xj"][rows[1], column] == pytest.approx(7.0)
+    assert found.ratio["xj"].shape == (len(found.amplitudes) - 1, len(found.speeds) - 1)
