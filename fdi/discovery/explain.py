@@ -13,10 +13,10 @@ the thresholds.
 | second effect | the first leaves more than noise and gains more than {GAIN_SEEN:g} | fits the four most promising effects beside each of the best two |
 | third effect | so does the second, which also removes {FURTHER_EFFECT_SHARE:g} of the excess cost, and leaves at most {ERROR_PARTLY_EXPLAINED:g} of the excess on the held-out run | the same |
 | finer steps | the best leaves at most {RESIDUAL_IS_NEAR_NOISE:g} floors | asks whether 20 steps a cycle leave only noise |
-| missed stops | that holds for the first effect, and the second gains at most {GAIN_SEEN:g} | fits the first with a population; no second effect is missing |
+| missed stops | that holds for the first effect, and the second gains at most {GAIN_SEEN:g} | fits the first with a population |
 | more noise | the best leaves more than noise, or its tolerances are those of {TOLERANCES_FAR_SHARE:.2%} of healthy units | searches again from a nominal unit with 30 and 6 times the noise |
 | other valleys | two effects remove {FURTHER_EFFECT_SHARE:g} of the excess cost and still leave more than noise | fits the best two pairs with a population |
-| number of effects | always | keeps the effects that gain more than {GAIN_SEEN:g}, of several only those whose removal costs more than {GAIN_CONVINCES:g} |
+| number of effects | always | keeps the effects that gain more than {GAIN_SEEN:g}, of several only those whose removal costs more than {GAIN_CONVINCES:g}; or that gain {GAIN_DOUBTFUL:g} on the run and alone leave only noise |
 | last fits | always | finishes the base and the best four with finer steps, on the repeats too; begins again those of the best two that leave a mean square above {WHITE_SQUARE_POOR:g} or have far tolerances; with a population these and the base, if they leave only noise and still such a mean square or far tolerances, unless the solver errs |
 | intervals | the base leaves only noise | drops effects whose 95 % interval holds the off value |
 | small gain | the gain is below {GAIN_DOUBTFUL:g} | fits the base again from there; a single effect that then gains at most {GAIN_SEEN:g} begins again from the base |
@@ -224,6 +224,15 @@ def measure_gain(parent: Hypothesis, h: Hypothesis) -> float:
     return min(own, nearer + 2.0 * (parent.repeat_cost - h.repeat_cost)) if h.others else own
 
 
+def helps_explain(before: Hypothesis, after: Hypothesis, least: float) -> bool:
+    """Whether a further effect gains more than `least`, or leaves only noise where more was left.
+
+    Of a repeat even the right effect may miss another stop, which costs hundreds.
+    """
+    is_first_at_floor = after.is_at_floor and not before.is_at_floor
+    return measure_gain(before, after) > least or (is_first_at_floor and before.cost - after.cost > GAIN_DOUBTFUL)
+
+
 def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, progress: Progress) -> Explanation:
     depth = _choose_depth(search, levels)
     search.refine_steps(FINE)
@@ -267,7 +276,7 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
 def _choose_depth(search: Search, levels: list[list[Hypothesis]]) -> int:
     """How many effects the last fits have; `_prune_level` may put a better hypothesis first in that level."""
     firsts = [level[0] for level in levels]
-    depth = max((i for i in range(1, len(levels)) if measure_gain(firsts[i - 1], firsts[i]) > GAIN_SEEN
+    depth = max((i for i in range(1, len(levels)) if helps_explain(firsts[i - 1], firsts[i], GAIN_SEEN)
                  and (i == 1 or _takes_fair_share(search, firsts[i - 1], firsts[i]))), default=0)
     if depth > 1 and firsts[1].is_at_floor and measure_gain(firsts[1], firsts[depth]) <= GAIN_CONVINCES:
         depth = 1
@@ -365,7 +374,7 @@ def _prune_level(search: Search, levels: list[list[Hypothesis]], depth: int) -> 
     """The depth, after what was added first and is no longer wanted has gone: a later effect may do alone."""
     while depth > 1:
         best = search.drop_each_effect(levels[depth][0])[0]
-        if measure_gain(best, levels[depth][0]) > GAIN_CONVINCES:
+        if helps_explain(best, levels[depth][0], GAIN_CONVINCES):
             break
         depth -= 1
         levels[depth] = _drop_duplicates([best, *levels[depth]])

@@ -21,6 +21,7 @@ from fdi.discovery.explain import (
     decide_verdict,
     explain,
     find_marks,
+    helps_explain,
     shows_effect,
 )
 from fdi.discovery.explain_runs import Answer, Candidate
@@ -204,6 +205,15 @@ def make_judged(effects: tuple[str, ...], cost: float, at_floor: bool | None = N
     """As far as `decide_verdict` looks at it; at the floor if it has effects, unless told."""
     return cast(Any, SimpleNamespace(effects=effects, cost=cost, repeat_cost=cost, tolerance_cost=10.0, others=(),
                                      is_at_floor=bool(effects) if at_floor is None else at_floor, is_far=is_far))
+
+
+@pytest.mark.parametrize(("cost", "at_floor", "helps"), [
+    (40_200.0, True, True), (40_200.0, False, False), (42_300.0, True, False)])
+def test_a_further_effect_may_miss_another_stop_of_the_repeat(cost: float, at_floor: bool, helps: bool) -> None:
+    """It helps nevertheless if it alone leaves only noise, and gains much on the run."""
+    before, after = make_judged(("null_bias",), 42_450.0, False), make_judged(("null_bias", "stribeck"), cost, at_floor)
+    before.repeat_cost, after.repeat_cost, after.others = 44_020.0, 44_240.0, ("a repeat",)
+    assert helps_explain(before, after, 30.0) is helps
 
 
 @pytest.mark.parametrize(("costs", "unseen", "verdict"), [

@@ -58,6 +58,15 @@ def test_effects_that_hide_in_the_tolerances_are_listed_with_what_would_reveal_t
     assert "command_rate_limit" in found.json["seen_without_noise"]
 
 
+@pytest.mark.slow
+def test_both_effects_of_the_readme_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A repeat on which the right second effect misses another stop is no evidence against it."""
+    monkeypatch.chdir(tmp_path)
+    assert rig("simulate", "--samples", "--quiet").status == 0
+    said = rig("explain", "run.csv", "--repeat", "run2.csv", "--holdout", "held.csv", "--json").json
+    assert (said["verdict"], {*said["effects"]}) == ("EXPLAINED", {"null_bias", "jack_friction"})
+
+
 def test_the_page_of_a_search_needs_no_network(found: Said, runs: dict[str, Path]) -> None:
     page = runs["est"].with_name("page.html").read_text()
     assert "null_bias explains the residual" in page and page.count("<svg") == 1
