@@ -288,11 +288,12 @@ CHECK_COLOURS = {"PASS": GREEN, "FAIL": RED, "CANNOT_TELL": AMBER}
 def draw_signals(trace: Trace) -> str:
     """Command and controlled signal, error, drive, other outputs and load over one time axis, with sections and checks.
     """
-    d, t = trace.declared, trace.t
+    d, t, error, half = trace.declared, trace.t, trace.command - trace.controlled, _choose_close_up(trace)
     what = "position" if d.controlled.unit == "m" else d.controlled.symbol
     size, fine = choose_unit(d.controlled.unit, 0.0)
     shown = [(trace.controlled, f"{what} [{d.controlled.shown_unit}]", d.controlled.shown_scale, BLUE),
-             (trace.command - trace.controlled, f"error [{fine}]", 1.0 / size, ORANGE),
+             (error, f"error [{fine}]", 1.0 / size, ORANGE),
+             (error if half else np.full_like(error, math.nan), f"error, close up [{fine}]", 1.0 / size, ORANGE),
              (trace.drive, f"{d.drive.called} [{d.drive.shown_unit}]", d.drive.shown_scale, VIOLET),
              *((trace.column(s.name), label_signal(s), s.shown_scale, choose_colour(d, s.name)) for s in d.outputs[1:]),
              *([(trace.load, label_signal(d.load), d.load.shown_scale, GREY)]
@@ -301,7 +302,7 @@ def draw_signals(trace: Trace) -> str:
     legends = f"{d.controlled.symbol}, {d.controlled.called}", f"{d.command.symbol}, command"
     panels = [[line(t, _bridge_short_gaps(values) * scale, colour, None if number else legends[0]),
                _mark_missing(trace, values), *(shade(t0, t1, FAULT, 0.5) for _, t0, t1 in faults),
-               axes(ylabel=label)]
+               axes(ylabel=label, **{"ylim": (-half * scale, half * scale)} if number == 2 else {})]
               for number, (values, label, scale, colour) in enumerate(shown) if not np.isnan(values).all()]
     panels[0] = [line(t, trace.command * d.command.shown_scale, COMMAND, legends[1], 2.4), *panels[0], legend(2),
                  *(call("annotate", f" {fault}", (t0, 0.07), xycoords=("data", "axes fraction"), fontsize=7)
@@ -364,21 +365,33 @@ def _mark_missing(trace: Trace, values: Floats, columns: int = 1400) -> Mark:
     return spans(ends, RED, 0.04, lw=0.5, zorder=3)
 
 
+def _choose_close_up(trace: Trace) -> float:
+    """Half the height, SI, that shows the error on the ramps well; 0 without ramps. Steps dwarf it."""
+    ramps = [np.abs(trace.command - trace.controlled)[s.start:s.stop] for s in trace.sections() if s.kind == "ramp"]
+    error = np.concatenate([np.empty(0), *ramps])
+    return 0.0 if np.isnan(error).all() else 2.0 * float(np.nanpercentile(error, 99))
+
+
 def _draw_checks(trace: Trace) -> Panel:
-    """A bar for each check over its window, in the colour of its verdict, behind its name; only a name without window.
-    """
-    checks, first, last = trace.sequence_checks, float(trace.t[0]), float(trace.t[-1])
-    panel = [axes(ylim=(len(checks) - 0.4, -0.6), yticks=[], ylabel="checks")]
-    for row, check in enumerate(checks):
-        name, colour = check.name, INK
+    """A bar for each check over its window, green or red, with its name beside it; only a name where there is none."""
+    first, last = float(trace.t[0]), float(trace.t[-1])
+    room, far = 0.005 * (last - first), 0.25 * (last - first)
+    panel = [axes(ylim=(len(trace.sequence_checks) - 0.4, -0.6), yticks=[], ylabel="checks")]
+    bars: list[tuple[float, float, float, str]] = []
+    for row, check in enumerate(trace.sequence_checks):
+        t0, t1 = (first, last) if math.isnan(check.t0) else (check.t0, check.t1)
+        name, x, side, colour = check.name, t0 + room, "left", "white"
         if math.isnan(check.t0) and math.isnan(check.value):
             name, colour = f"{check.name}: not measured", RED
         else:
-            t0, t1 = (first, last) if math.isnan(check.t0) else (check.t0, check.t1)
-            panel.append(call("barh", row, t1 - t0, left=t0, height=0.7, color=CHECK_COLOURS[check.verdict], alpha=0.5))
-        panel.append(call("text", first + 0.005 * (last - first), row, name, va="center", color=colour, fontsize=7,
-                          clip_on=True))
-    return panel
+            bars.append((row, t1 - t0, t0, CHECK_COLOURS[check.verdict]))
+            if last - t1 > far:
+                x, colour = t1 + room, INK
+            elif t0 - first > far:
+                x, side, colour = t0 - room, "right", INK
+        panel.append(call("text", x, row, name, va="center", ha=side, color=colour, fontsize=7, clip_on=True))
+    rows, widths, lefts, colours = zip(*bars, strict=True) if bars else ((),) * 4
+    return [*panel, call("barh", rows, widths, left=lefts, height=0.7, color=colours)]
 
 
 UNIT_SIZES = {name: float(unit.factor) for name, unit in UNITS.items()}
