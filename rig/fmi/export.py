@@ -219,11 +219,42 @@ def write_tables(model: Model, variables: Sequence[Variable], seed: int) -> str:
 
 # -------------------------------------------------------------------------------------------- modelDescription.xml
 
+_BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+_DERIVED = {"N": {"kg": 1, "m": 1, "s": -2}, "Pa": {"kg": 1, "m": -1, "s": -2}, "J": {"kg": 1, "m": 2, "s": -2},
+            "W": {"kg": 1, "m": 2, "s": -3}, "V": {"kg": 1, "m": 2, "s": -3, "A": -1},
+            "Ohm": {"kg": 1, "m": 2, "s": -3, "A": -2}, "H": {"kg": 1, "m": 2, "s": -2, "A": -2}, "Hz": {"s": -1}}
+
+
+def find_exponents(unit: str) -> dict[str, int] | None:
+    """Exponents of the SI units in `unit`, such as "N m s2/m"; None where it has a part that is not SI.
+
+    >>> find_exponents("A/(m s)"), find_exponents("raw/m")
+    ({'m': -1, 's': -1, 'A': 1}, None)
+    """
+    total = dict.fromkeys(_BASE_UNITS, 0)
+    above, *below = unit.replace("rms", "").replace("(", "").replace(")", "").split("/")
+    for sign, words in ((1, above), *((-1, words) for words in below)):
+        for word in words.split():
+            name = word.rstrip("0123456789")
+            parts = {name: 1} if name in _BASE_UNITS else _DERIVED.get(name)
+            if parts is None and word != "1":
+                return None
+            for base, exponent in (parts or {}).items():
+                total[base] += sign * exponent * int(word[len(name):] or 1)
+    return {base: exponent for base, exponent in total.items() if exponent}
+
 
 def _tag(name: str, attributes: dict[str, object], inner: Iterable[str] = ()) -> str:
     words = "".join(f" {key}={quoteattr(str(value))}" for key, value in attributes.items())
     content = list(inner)
     return f"<{name}{words}>\n{''.join(content)}</{name}>\n" if content else f"<{name}{words}/>\n"
+
+
+def _write_units(variables: Sequence[Variable]) -> str:
+    units = {v.unit: find_exponents(v.unit) for v in variables}
+    return _tag("UnitDefinitions", {}, (
+        _tag("Unit", {"name": name}, [] if base is None else [_tag("BaseUnit", dict(base))])
+        for name, base in units.items()))
 
 
 _OTHERS = (("seed", "seed of the sensors' noise"),
@@ -249,9 +280,7 @@ def _describe(version: str, model: Model, token: dict[str, object], parts: Itera
 
 def _list_common(model: Model, variables: Sequence[Variable]) -> list[str]:
     period = model["controller.period"]
-    units = (_tag("Unit", {"name": name}) for name in dict.fromkeys(v.unit for v in variables))
-    return [_tag("UnitDefinitions", {}, units),
-            _tag("LogCategories", {}, [_tag("Category", {"name": "logStatusError"})]),
+    return [_write_units(variables), _tag("LogCategories", {}, [_tag("Category", {"name": "logStatusError"})]),
             _tag("DefaultExperiment", {"startTime": 0.0, "stopTime": 1000 * period, "stepSize": period})]
 
 

@@ -16,7 +16,7 @@ from effect_files import HEAD, restored_catalogue
 from rig_command import answer, refuse
 
 from plant import Model, load_model, simulate
-from rig.fmi.export import export_fmu
+from rig.fmi.export import export_fmu, find_exponents
 
 fmpy = pytest.importorskip("fmpy")
 
@@ -270,3 +270,9 @@ def root(x, s, u, p):
 def test_without_a_compiler_one_line_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(shutil, "which", lambda name: None)
     assert "a C compiler to link the FMU with" in refuse("export", "--fmu", tmp_path / "a.fmu")
+
+
+def test_units_are_split_into_si_units() -> None:
+    assert find_exponents("N m s2/m") == {"kg": 1, "m": 1}
+    assert find_exponents("m3/s/Pa") == {"kg": -1, "m": 4, "s": 1}
+    assert find_exponents("m rms") == {"m": 1} and find_exponents("1") == {} and find_exponents("raw/m") is None
