@@ -179,7 +179,7 @@ def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -
     assert not first.passed and "t = 0.1" in first.text
 
 
-@pytest.mark.parametrize("plant", ["eha", "ema", "mine.py"])
+@pytest.mark.parametrize("plant", ["eha", pytest.param("ema", marks=pytest.mark.slow), "mine.py"])
 @pytest.mark.parametrize(("kind", "check"), [("sequence", ["check", "my_new.toml"]),
                                              ("fault", ["check", "my_new.toml"]),
                                              ("effect", ["effects", "--effects", "my_new.py", "my_new"])])

@@ -59,7 +59,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("version", ["2", "3"])
+@pytest.mark.parametrize("version", [pytest.param("2", marks=pytest.mark.slow), "3"])
 def test_the_exported_eha_gives_its_own_rows_again(folder: Path, version: str) -> None:
     export_fmu(load_model(), Path("eha.fmu"), version)
     own, again = load_model(), load_model("eha.fmu")
