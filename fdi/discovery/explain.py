@@ -156,7 +156,7 @@ def _search_levels(search: Search, base: Hypothesis, progress: Progress) -> list
             levels[0] = [search.refit_base(base, tried[0])]
         done = search.reaches_floor(tried[0])
         if not done and count == 2 and levels[1][0].is_near_floor and measure_gain(levels[1][0], tried[0]) <= GAIN_SEEN:
-            # no second effect is missing, but stops that the fit of the first one missed
+            # either no second effect is missing but stops that the first fit missed, or one whose gain such stops hide
             levels[1] = _drop_duplicates([search.search_widely(levels[1][0]), *levels[1]])
             levels.append(tried)
             break
