@@ -13,8 +13,8 @@ from fdi.report.report import Cell
 from fdi.report.terminal import style_of
 from plant.errors import require
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, open_console
+from rig.cli.commands.run import build_choice, choose_bus_of_run, make_new_folder
 from rig.cli.inputs import is_suite_file
-from rig.cli.single_run import build_choice, choose_bus_of_run, make_new_folder
 from rig.evidence.requirements import read_requirements, require_listed
 from rig.interrupts import catch_signals
 from rig.network.frame import WallClock

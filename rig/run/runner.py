@@ -376,8 +376,7 @@ Diagnose = Callable[[Trace], dict[str, Any]]
 
 
 def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool],
-            prepare: Callable[[], object] = lambda: None, diagnose: Diagnose | None = None,
-            observer: Observer | None = None) -> Outcome:
+            diagnose: Diagnose | None = None, observer: Observer | None = None) -> Outcome:
     """Run a job; its log and verdict are written to `folder`, before the nodes that it started are stopped.
 
     Args:
@@ -385,7 +384,6 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
         folder: of the results.
         progress: called with each stage and the share done, 0 to 1.
         stop: whether the operator asks to stop.
-        prepare: called when the nodes are there and nothing has moved: it may compute or wait, the run will not.
         diagnose: gives the answer of `rig fdi --json` on the main phase, called when the run has ended; None: not asked
             for.
         observer: who hears of the events, as they are written.
@@ -401,7 +399,6 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
         try:
             _play_steps(job, folder, "before", "")
             with open_participants(job) as (wire, processes):
-                prepare()
                 epoch_ns = read_epoch_ns() - wire.clock.now()
                 with (open_recorder(job, folder, epoch_ns, observer) as recorder,
                       contextlib.closing(Session(job, wire, processes, recorder, progress, stop)) as session):

@@ -69,7 +69,6 @@ LONG_TESTS = (
     "rig/run/test_embedded_loop.py",
     "rig/run/test_foreign_devices.py",
     "rig/run/test_hard_loop.py",
-    "rig/run/test_page_writer.py",
     "rig/run/test_reactions.py",
     "rig/run/test_run.py",
     "rig/run/test_session.py",
