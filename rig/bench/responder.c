@@ -2,8 +2,9 @@
  *
  *   responder RECEIVE SEND TURN CPU PRIORITY CYCLE_AT FEEDBACK VALVE_STATE
  *
- * RECEIVE and SEND are open sockets on which only SYNC arrives, TURN the semaphores of the UDP bus (udp.py) or -1. The
- * two frames are given in hexadecimal as they go out; CYCLE_AT is the place of the cycle counter in VALVE_STATE.
+ * RECEIVE and SEND are open sockets on which only SYNC arrives, TURN the file whose lock is the turn on the UDP bus
+ * (udp.py) or -1. The two frames are given in hexadecimal as they go out; CYCLE_AT is the place of the cycle counter in
+ * VALVE_STATE.
  */
 #define _GNU_SOURCE
 #include <errno.h>
@@ -11,8 +12,8 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/file.h>
 #include <sys/mman.h>
-#include <sys/sem.h>
 #include <sys/socket.h>
 
 struct frame {
@@ -31,10 +32,9 @@ static struct frame read_frame(const char *text) {
 }
 
 static int send_frame(int socket, int turn, const struct frame *frame) {
-    struct sembuf take[2] = {{0, 0, 0}, {0, 1, SEM_UNDO}}, give = {0, -1, SEM_UNDO};
-    if (turn >= 0 && semop(turn, take, 2) != 0) return -1;
+    if (turn >= 0 && flock(turn, LOCK_EX) != 0) return -1;
     ssize_t sent = send(socket, frame->bytes, frame->size, 0);
-    if (turn >= 0) semop(turn, &give, 1);
+    if (turn >= 0) flock(turn, LOCK_UN);
     return sent < 0 ? -1 : 0;
 }
 

@@ -1,76 +1,45 @@
-#define _GNU_SOURCE /* semtimedop */
 #include "turn.h"
 
-#include <errno.h>
+#include <fcntl.h>
 #include <stdio.h>
-#include <string.h>
-#include <sys/sem.h>
+#include <sys/file.h>
 #include <time.h>
+#include <unistd.h>
 
-/* REMOVED: the last program removes the set. MARK: by this value the rig knows a set whose programs were killed. */
-enum { TURN, USERS, REMOVED, MARK, SEMAPHORES };
-enum { MARK_VALUE = 0x4548 };
+#include "wait.h"
 
-static int set = -1; /* of semaphores */
+static const int64_t LIMIT = 1000000000; /* ns; a turn takes 20 us */
+static const struct timespec PAUSE = {0, 20000};
 
-/* CRC-32 as in zlib: the key must be the same in all programs. */
-static uint32_t compute_crc(const char *text)
-{
-    uint32_t crc = UINT32_MAX;
-    for (; *text != '\0'; text++) {
-        crc ^= (uint8_t)*text;
-        for (int bit = 0; bit < 8; bit++)
-            crc = crc & 1 ? crc >> 1 ^ 0xEDB88320u : crc >> 1;
-    }
-    return ~crc;
-}
-
-static bool operate(struct sembuf *operations, size_t count, const struct timespec *limit)
-{
-    int done;
-    do
-        done = semtimedop(set, operations, count, limit);
-    while (done != 0 && errno == EINTR);
-    return done == 0;
-}
+static int file = -1; /* whose lock is the turn; the kernel gives back that of a program that ends */
 
 bool turn_join(const char *group, uint16_t port)
 {
-    struct sembuf join[] = {{REMOVED, 0, IPC_NOWAIT}, {USERS, 1, SEM_UNDO}};
     char name[64];
-    snprintf(name, sizeof name, "eha-rig %s %u %d", group, (unsigned)port, SEMAPHORES);
-    const key_t key = (key_t)(compute_crc(name) & 0x7FFFFFFF);
-    do {
-        set = semget(key, SEMAPHORES, IPC_CREAT | 0666);
-        if (set < 0)
-            return false;
-        if (operate(join, 2, NULL)) {
-            semctl(set, MARK, SETVAL, MARK_VALUE);
-            return true;
-        }
-    } while (errno == EAGAIN || errno == EIDRM || errno == EINVAL); /* the set is being removed */
-    return false;
+    snprintf(name, sizeof name, "/dev/shm/eha-rig-%s-%u", group, (unsigned)port);
+    file = open(name, O_RDONLY | O_CLOEXEC); /* to make it again may be refused where another user has it */
+    if (file < 0)
+        file = open(name, O_RDONLY | O_CLOEXEC | O_CREAT, 0666);
+    return file >= 0;
 }
 
 bool turn_take(void)
 {
-    struct sembuf take[] = {{TURN, 0, 0}, {TURN, 1, SEM_UNDO}};
-    const struct timespec limit = {1, 0}; /* a turn takes 20 us */
-    return operate(take, 2, &limit);
+    const int64_t give_up = read_clock() + LIMIT;
+    while (flock(file, LOCK_EX | LOCK_NB) != 0) {
+        if (read_clock() > give_up)
+            return false;
+        nanosleep(&PAUSE, NULL);
+    }
+    return true;
 }
 
 void turn_give(void)
 {
-    struct sembuf give = {TURN, -1, SEM_UNDO};
-    operate(&give, 1, NULL);
+    flock(file, LOCK_UN);
 }
 
 void turn_leave(void)
 {
-    struct sembuf leave_last[] = {{USERS, -1, SEM_UNDO}, {USERS, 0, IPC_NOWAIT}, {REMOVED, 1, 0}};
-    struct sembuf restore = {REMOVED, -1, IPC_NOWAIT};
-    if (!operate(leave_last, 3, NULL))
-        operate(leave_last, 1, NULL);
-    else if (semctl(set, 0, IPC_RMID) != 0)
-        operate(&restore, 1, NULL); /* those of another user stay */
+    close(file);
 }

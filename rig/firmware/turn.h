@@ -5,7 +5,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-/* Join the programs that use a group and port. False if the kernel gives no semaphores. */
+/* Join the programs that use a group and port. False if the file whose lock it is cannot be made. */
 bool turn_join(const char *group, uint16_t port);
 
 /* Wait up to a second for the turn. False if another program held it for longer. */
@@ -14,7 +14,7 @@ bool turn_take(void);
 /* Let the next one send. */
 void turn_give(void);
 
-/* Leave; the last program removes the semaphores. */
+/* Leave, and give the turn. */
 void turn_leave(void);
 
 #endif

@@ -31,6 +31,7 @@ call a frame; `receive_frame` needs three where it has to wait, and keeps its de
 
 import contextlib
 import errno
+import fcntl
 import os
 import socket
 import struct
@@ -50,7 +51,7 @@ from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.network import udp
 from rig.network.bus import can_open, parse_spec, require_interface
 from rig.network.frame import IDENTIFIER, has_valid_length
-from rig.network.udp import GIVE, SO_RXQ_OVFL, SO_TIMESTAMPNS, TAKE, TURN_LIMIT_NS, Turn, set_receive_options
+from rig.network.udp import SO_RXQ_OVFL, SO_TIMESTAMPNS, TURN_LIMIT_NS, TURN_PAUSE_NS, Turn, set_receive_options
 
 # status of receive_frame
 TIMEOUT, FRAME = 0, 1
@@ -69,8 +70,7 @@ _LATEST = 7  # time of the last frame: of two frames in a queue the second is no
 _OWN, _COUNTS_LOSSES = 8, 9  # UDP: own port, network order; whether the kernel's count is of losses alone
 _STAMPED, _LISTED = 10, 11  # whether kernel times are used; how many COB-IDs beyond the classical ones are received
 # .. then what the kernel reads and writes (asm-generic, 64 bit), as byte offsets
-_MESSAGE, _VECTOR, _POLL, _TIME, _ERRNO, _LIMIT = 256, 320, 336, 352, 368, 384
-_TAKE, _GIVE, _SENDER = 400, 416, 432
+_MESSAGE, _VECTOR, _POLL, _TIME, _ERRNO, _SENDER = 256, 320, 336, 352, 368, 432
 _CONTROL, _ALLOWED, _FRAME_IN, _FRAME_OUT = 512, 1024, 1280, 1360  # _FRAME: struct can_frame, canfd_frame
 _IN, _OUT, _WIDE_OUT, _LIST = 2048, 4096, 4608, 5120  # datagrams: in; out, with 11 and with 29 bits
 _CONTROL_SIZE, _IN_SIZE, _OUT_SIZE, _SENDER_SIZE, _LIST_SIZE = 256, 2048, 512, 16, 4096
@@ -87,7 +87,7 @@ _REALTIME, _MONOTONIC, _ABSOLUTE = 0, 1, 1
 _recvmsg = ForeignCall("qiqi", "recvmsg")
 _send = ForeignCall("qiqqi", "send")
 _ppoll = ForeignCall("iqqqq", "ppoll")
-_semtimedop = ForeignCall("iiqqq", "semtimedop")
+_flock = ForeignCall("iii", "flock")
 _clock_gettime = ForeignCall("iiq", "clock_gettime")
 _clock_nanosleep = ForeignCall("iiiqq", "clock_nanosleep")
 _errno_location = ForeignCall("q", "__errno_location")
@@ -305,13 +305,16 @@ def send_payload(port: Port, cob_id: int, length: int) -> int:
 
 def _send_datagram(port: Port, cob_id: int, length: int) -> int:
     start, size = encode_datagram(port, cob_id, length)
-    base = port.octets.ctypes.data
-    while _semtimedop(port.words[_TURN], base + _TAKE, 2, base + _LIMIT) != 0:
-        _note_errno(port)
-        if port.words[_ERROR] != _EINTR:
+    give_up = 0
+    while _flock(port.words[_TURN], fcntl.LOCK_EX | fcntl.LOCK_NB) != 0:
+        now = read_clock(port)
+        if give_up == 0:
+            give_up = now + TURN_LIMIT_NS
+        if now > give_up:
             return NO_TURN
+        sleep_until(port, now + TURN_PAUSE_NS)
     status = _transmit(port, start, size)
-    _semtimedop(port.words[_TURN], base + _GIVE, 1, 0)
+    _flock(port.words[_TURN], fcntl.LOCK_UN)
     return status
 
 
@@ -504,8 +507,8 @@ class RawBus(contextlib.AbstractContextManager["RawBus"]):
 
     @property
     def descriptors(self) -> tuple[int, int, int]:
-        """File descriptors of the sockets that receive and send, and the identifier of the turn's semaphores or -1."""
-        turn = -1 if self._turn is None else self._turn.identifier
+        """File descriptors of the sockets that receive and send, and that of the turn or -1."""
+        turn = -1 if self._turn is None else self._turn.descriptor
         return int(self.port.words[_RX]), int(self.port.words[_TX]), turn
 
     @property
@@ -514,10 +517,9 @@ class RawBus(contextlib.AbstractContextManager["RawBus"]):
 
     def explain_failure(self, status: int) -> RigError:
         """The error behind the status FAILED or NO_TURN that the last call returned."""
-        number = int(self.port.words[_ERROR])
         if status == NO_TURN and self._turn is not None:
-            return self._turn.explain_failure(number)
-        return RigError(f"{self.spec}: {os.strerror(number)}")
+            return self._turn.explain_failure()
+        return RigError(f"{self.spec}: {os.strerror(int(self.port.words[_ERROR]))}")
 
     def close(self) -> None:
         """Give the bus back. No thread may be using the port any more."""
@@ -529,7 +531,7 @@ class RawBus(contextlib.AbstractContextManager["RawBus"]):
         rx, tx, self._turn = udp.open_sockets(group, udp.PORT, stack)
         self.port.words[_OWN] = socket.htons(tx.getsockname()[1])
         tx.connect((group, udp.PORT))
-        self.port.words[_TURN] = self._turn.identifier
+        self.port.words[_TURN] = self._turn.descriptor
         return rx, tx
 
     def set_filter(self, cob_ids: Sequence[int]) -> None:
@@ -588,9 +590,7 @@ def _make_port() -> Port:
     # struct msghdr: name, its length, vectors, their number, control data, its length, flags
     words[_MESSAGE // 8: _MESSAGE // 8 + 7] = base + _SENDER, 0, base + _VECTOR, 1, base + _CONTROL, _CONTROL_SIZE, 0
     words[_VECTOR // 8: _VECTOR // 8 + 2] = base + _IN, _IN_SIZE
-    words[_LIMIT // 8: _LIMIT // 8 + 2] = TURN_LIMIT_NS // 1_000_000_000, TURN_LIMIT_NS % 1_000_000_000
-    for place, data in ((_TAKE, TAKE.tobytes()), (_GIVE, GIVE.tobytes()),
-                        (_OUT, _EXAMPLE), (_WIDE_OUT, _WIDE_EXAMPLE)):  # the last two for `encode_datagram` to fill in
+    for place, data in ((_OUT, _EXAMPLE), (_WIDE_OUT, _WIDE_EXAMPLE)):  # for `encode_datagram` to fill in
         port.octets[place: place + len(data)] = np.frombuffer(data, np.uint8)
     port.octets[_OUT + _OUT_SIZE - _TAIL: _OUT + _OUT_SIZE] = np.frombuffer(_EXAMPLE[-_TAIL:], np.uint8)
     return port

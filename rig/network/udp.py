@@ -10,16 +10,14 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import errno
+import fcntl
 import ipaddress
 import os
 import socket
 import struct
-import zlib
+import time
 from collections.abc import Collection
 from pathlib import Path
-
-import numpy as np
 
 from plant.errors import RigError
 from rig.benches.bench import FD
@@ -116,119 +114,47 @@ def set_receive_options(raw: socket.socket) -> None:
 
 
 TURN_LIMIT_NS = 1_000_000_000  # a turn takes 20 us; one that takes a second is held by a stopped or foreign program
-_TURN, _USERS, _REMOVED, _MARK, _SEMAPHORES = range(5)
-_MARK_VALUE = 0x4548
-_NOWAIT, _UNDO = 0o4000, 0x1000  # linux/ipc.h, linux/sem.h
-_CREATE = 0o1000
-_REMOVE, _GET_PID, _GET_VALUE, _SET_VALUE = 0, 11, 12, 16
-_OPERATION = np.dtype([("number", np.uint16), ("change", np.int16), ("flags", np.int16)])  # struct sembuf
-
-# Waiting for zero and counting up is one operation to the kernel, so a new set needs no first value.
-TAKE = np.array([(_TURN, 0, 0), (_TURN, 1, _UNDO)], _OPERATION)
-GIVE = np.array([(_TURN, -1, _UNDO)], _OPERATION)
-_JOIN = np.array([(_REMOVED, 0, _NOWAIT), (_USERS, 1, _UNDO)], _OPERATION)
-_LEAVE = np.array([(_USERS, -1, _UNDO)], _OPERATION)
-_LEAVE_LAST = np.array([(_USERS, -1, _UNDO), (_USERS, 0, _NOWAIT), (_REMOVED, 1, 0)], _OPERATION)
-_RESTORE = np.array([(_REMOVED, -1, _NOWAIT)], _OPERATION)
-_CLAIM_UNUSED = np.array([(_USERS, 0, _NOWAIT), (_REMOVED, 1, 0)], _OPERATION)
-
-
-def find_key(group: str, port: int) -> int:
-    """Key of the semaphores of a group and port; rig/firmware/turn.c calculates the same.
-
-    The number is that of the semaphores: a set of another layout has another key.
-    """
-    return zlib.crc32(f"eha-rig {group} {port} {_SEMAPHORES}".encode()) & 0x7FFFFFFF
+TURN_PAUSE_NS = 20_000  # between two attempts to take it
 
 
 class Turn:
-    """The turn of one group and port. `identifier` is the kernel's, for compiled code (`semtimedop`).
+    """The turn of one group and port: a lock on a file, of which the kernel relieves a program that ends.
 
-    Raises OSError when the kernel gives no semaphores.
+    `descriptor` is that of the file, for compiled code (`flock`). The programs in C take the same one
+    (rig/firmware/turn.c). Raises OSError where the file cannot be made.
     """
 
     def __init__(self, group: str, port: int) -> None:
-        self._where = f"udp_multicast {group}:{port}"
-        self._key = find_key(group, port)
-        self._library = ctypes.CDLL(None, use_errno=True)
-        self.identifier = self._join()
+        self._where, path = f"udp_multicast {group}:{port}", f"/dev/shm/eha-rig-{group}-{port}"
+        try:
+            self.descriptor = os.open(path, os.O_RDONLY)  # to make it again may be refused where another user has it
+        except FileNotFoundError:
+            self.descriptor = os.open(path, os.O_RDONLY | os.O_CREAT, 0o666)
 
-    def take(self, limit_ns: int = TURN_LIMIT_NS) -> None:
-        """Wait for the turn.
-
-        Raises:
-            RigError: another program held it for longer than `limit_ns`, or the set was removed.
-        """
-        limit = np.array([limit_ns // 1_000_000_000, limit_ns % 1_000_000_000], np.int64)
-        if number := self._operate(TAKE, limit):
-            raise self.explain_failure(number, limit_ns)
+    def take(self) -> None:
+        """Wait for the turn. Raises RigError: another program has held it for longer than a second."""
+        give_up = time.monotonic_ns() + TURN_LIMIT_NS
+        while True:
+            try:
+                fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            except BlockingIOError:
+                if time.monotonic_ns() > give_up:
+                    raise self.explain_failure() from None
+                time.sleep(TURN_PAUSE_NS * 1e-9)
 
     def give(self) -> None:
         """Let the next one send."""
-        self._operate(GIVE)
+        fcntl.flock(self.descriptor, fcntl.LOCK_UN)
 
-    def explain_failure(self, number: int, limit_ns: int = TURN_LIMIT_NS) -> RigError:
-        """The error for `number` (errno) of a wait for the turn."""
-        if number == errno.EAGAIN:
-            return RigError(f"{self._where}: the turn to send was held for more than {limit_ns * 1e-9:g} s by "
-                            f"{self._name_holder()}; stop that program, or take another group")
-        return RigError(f"{self._where}: the turn to send was lost ({os.strerror(number)}); somebody removed the "
-                        f"semaphores 0x{self._key:08x} (ipcs -s)")
+    def explain_failure(self) -> RigError:
+        """The error for a turn that did not come."""
+        file = f":{os.fstat(self.descriptor).st_ino} "
+        locks = Path("/proc/locks").read_text().splitlines()
+        holders = [f"process {line.split()[4]}" for line in locks if file in line]
+        return RigError(f"{self._where}: the turn to send was held for more than {TURN_LIMIT_NS * 1e-9:g} s by "
+                        f"{' and '.join(holders) or 'another program'}; stop that program, or take another group")
 
     def close(self) -> None:
-        """Leave; the last program removes the semaphores."""
-        if self.identifier < 0:
-            return
-        if self._operate(_LEAVE_LAST):
-            self._operate(_LEAVE)
-        elif self._library.semctl(self.identifier, 0, _REMOVE):
-            self._operate(_RESTORE)  # those of another user stay
-        self.identifier = -1
-
-    def _join(self) -> int:
-        while True:
-            self._remove_unused()
-            identifier = int(self._library.semget(self._key, _SEMAPHORES, _CREATE | 0o666))
-            if identifier < 0:
-                number = ctypes.get_errno()
-                raise OSError(number, f"no semaphores for the turn to send: {os.strerror(number)}")
-            number = self._operate(_JOIN, identifier=identifier)
-            if number == 0:
-                self._library.semctl(identifier, _MARK, _SET_VALUE, _MARK_VALUE)
-                return identifier
-            if number not in (errno.EAGAIN, errno.EIDRM, errno.EINVAL):  # else: being removed just now
-                raise OSError(number, f"no semaphores for the turn to send: {os.strerror(number)}")
-
-    def _remove_unused(self) -> None:
-        """Remove our sets that nobody uses: their programs were killed.
-
-        A program that is about to join such a set finds it gone, and makes a new one.
-        """
-        try:
-            lines = Path("/proc/sysvipc/sem").read_text().splitlines()[1:]
-        except OSError:
-            return
-        for line in lines:
-            _, identifier, _, count, owner = map(int, line.split()[:5])
-            if (count == _SEMAPHORES and owner == os.geteuid()
-                    and self._library.semctl(identifier, _MARK, _GET_VALUE) == _MARK_VALUE
-                    and self._operate(_CLAIM_UNUSED, identifier=identifier) == 0):
-                self._library.semctl(identifier, 0, _REMOVE)
-
-    def _operate(self, operations: np.ndarray, limit: np.ndarray | None = None, identifier: int = -1) -> int:
-        """semtimedop; errno, 0 when done."""
-        where = self.identifier if identifier < 0 else identifier
-        time = None if limit is None else limit.ctypes.data
-        while self._library.semtimedop(where, ctypes.c_void_p(operations.ctypes.data), ctypes.c_size_t(len(operations)),
-                                       ctypes.c_void_p(time)):
-            if (number := ctypes.get_errno()) != errno.EINTR:
-                return number
-        return 0
-
-    def _name_holder(self) -> str:
-        """The process that took the turn last, with its name where it can be read."""
-        process = self._library.semctl(self.identifier, _TURN, _GET_PID)
-        try:
-            return f"process {process} ({Path(f'/proc/{process}/comm').read_text().strip()})"
-        except OSError:
-            return f"process {process}"
+        """Give the file back, and the turn with it."""
+        os.close(self.descriptor)

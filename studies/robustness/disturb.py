@@ -31,7 +31,6 @@ from rig.benches.bench import Flags
 from rig.firmware.build import build_controller
 from rig.network.bus import Link, open_can
 from rig.network.frame import Frame, WallClock
-from rig.network.udp import PORT, find_key
 from rig.recorder.recover import recover_log
 from studies.robustness.fuzz import PAGE
 from studies.shipped_frames import COMMAND, DRIVE, FEEDBACK, SYNC, VALVE_STATE, unpack_frame
@@ -206,8 +205,6 @@ def disturb_run(action: str, victim: str, seed: int, pace: str = "lockstep", con
         if not wait_until(lambda: not _find_heirs(temporary), limit / 3.0):
             problems.append(f"left: {', '.join(_find_heirs(temporary))}")
         problems += [f"temporary file {path.name}" for path in sorted(temporary.iterdir())[:3]]
-    if has_semaphores(group):
-        problems.append("semaphores are left")
     return Trial(action, victim, is_effective, moment, syncs, pause, status, end, zero, cycles, verdict, cause, message,
                  tuple(problems))
 
@@ -365,13 +362,6 @@ def find_processes(group: str) -> list[tuple[int, str]]:
                     name = "plant" if b"plant" in words else "rig" if b"run" in words else "controller"
                     found.append((int(entry.name), name))
     return found
-
-
-def has_semaphores(group: str) -> bool:
-    """Whether the turn to send on a group still has its semaphores (rig/network/udp.py)."""
-    key = find_key(group, PORT)
-    lines = Path("/proc/sysvipc/sem").read_text().splitlines()[1:]
-    return any(int(line.split()[0]) == key for line in lines)
 
 
 class Usage(NamedTuple):

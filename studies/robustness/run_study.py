@@ -29,7 +29,6 @@ from studies.robustness.disturb import (
     Usage,
     disturb_run,
     find_processes,
-    has_semaphores,
     read_usage,
     start_nodes,
     wait_until,
@@ -77,8 +76,6 @@ def fuzz_datagrams(count: int, seed: int, group: str, controller: str = "builtin
             growth = {name: after[name].memory - before[name].memory for name in own}
         except (RigError, OSError) as error:  # OSError: a node has ended, its /proc entry is gone
             problems.append(f"{type(error).__name__}: {error}")
-    if has_semaphores(group):
-        problems.append("semaphores are left")
     return DatagramCount(count, verdict, growth, tuple(problems))
 
 
@@ -166,8 +163,6 @@ def soak_bench(minutes: float, group: str, pace: str = "lockstep", controller: s
         problems.append(f"in {verdicts[NO_ANSWER]} of {runs} runs the nodes did not answer in time")
     if find_processes(group):
         problems.append("processes are left")
-    if has_semaphores(group):
-        problems.append("semaphores are left")
     return soak._replace(problems=tuple(problems))
 
 

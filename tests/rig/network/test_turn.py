@@ -1,7 +1,5 @@
-"""The turn to send on a group of the UDP bus: who holds it, and what is left when its programs end or are killed."""
+"""The turn to send on a group of the UDP bus: who holds it, and that it ends with its holder."""
 
-import ctypes
-import signal
 import subprocess
 import sys
 
@@ -12,8 +10,7 @@ from bus_stations import spec
 from plant.compile import compile_function
 from rig.network.bus import open_can
 from rig.network.raw_bus import NO_TURN, SENT, RawBus, send_frame
-from rig.network.udp import PORT, Turn
-from studies.robustness.disturb import has_semaphores
+from rig.network.udp import PORT
 
 TAKE = "import sys; from rig.network.udp import Turn; turn = Turn(sys.argv[1], int(sys.argv[2])); turn.take(); "
 
@@ -38,25 +35,3 @@ def test_a_turn_that_is_held_is_one_line_and_ends_with_its_holder() -> None:
             holder.kill()
         assert send(bus.port, 1, 0, 0) == SENT
         other.send(message)
-
-
-def test_the_semaphores_of_killed_programs_are_removed_by_the_next_one() -> None:
-    """Those of programs at work stay, and sets of the same size that are not ours; the last one leaves nothing."""
-    killed, used, following = (find_group() for _ in range(3))
-    code = TAKE + "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
-    assert subprocess.run([sys.executable, "-c", code, killed, str(PORT)], check=False).returncode == -signal.SIGKILL
-    library = ctypes.CDLL(None)
-    foreign = library.semget(0, 4, 0o1000 | 0o666)  # IPC_PRIVATE
-    turn, same = Turn(used, PORT), Turn(used, PORT)
-    assert turn.identifier == same.identifier
-    turn.close()
-    try:
-        other = Turn(following, PORT)
-        assert [has_semaphores(group) for group in (killed, used, following)] == [False, True, True]
-        assert library.semctl(foreign, 0, 12) == 0  # GETVAL
-        other.close()
-        other.close()
-    finally:
-        same.close()
-        library.semctl(foreign, 0, 0)  # IPC_RMID
-    assert not any(map(has_semaphores, (killed, used, following)))
