@@ -177,9 +177,9 @@ class FrameSpec:
         return self.identifier | SWITCHED * self.is_switched
 
     @cached_property
-    def selectors(self) -> tuple[Field, ...]:
-        """The fields that tell frames with the same identifier apart; several where multiplexers are nested."""
-        return tuple(each for each in self.fields if each.fixed is not None and each.name)
+    def selector(self) -> Field | None:
+        """The field that tells the pages of a multiplexed frame apart."""
+        return next((each for each in self.fields if each.fixed is not None and each.name), None)
 
     def has(self, *names: str) -> bool:
         """Whether the frame carries one of these values."""
@@ -257,10 +257,10 @@ class FrameMap:
         return self.list_from(role) + tuple(each for each in self.frames if each.sender is not role)
 
     def find(self, identifier: int, data: bytes) -> FrameSpec | None:
-        """The frame with this identifier and, if it is multiplexed, with the selectors of `data`; None: not mapped."""
+        """The frame with this identifier and, if it is multiplexed, with the page of `data`; None: not mapped."""
         for each in self.by_identifier.get(identifier, ()):
-            if not each.selectors or (len(data) == each.length and all(
-                    extract_bits(chosen, data) == chosen.fixed for chosen in each.selectors)):
+            chosen = each.selector
+            if chosen is None or (len(data) == each.length and extract_bits(chosen, data) == chosen.fixed):
                 return each
         return None
 

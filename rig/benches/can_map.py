@@ -5,11 +5,10 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from fractions import Fraction
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from plant.errors import InputError, require, suggest_name
-from plant.tables import list_choices
+from plant.tables import Place, list_choices
 from rig.benches.bench import EXTENDED, FD, MOST_FRAMES, Field, FrameSpec, Kind, Role
 from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 
@@ -90,72 +89,47 @@ def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns:
     is_fd = message.is_fd or message.length > 8
     identifier = message.frame_id | (EXTENDED if message.is_extended_frame else 0) | (FD if is_fd else 0)
     slots = {signal.name: _read_slot(name, message, signal) for signal in message.signals}
-    signals = {signal.name: signal for signal in message.signals}
     chosen = [signal for signal in message.signals if f"{message.name}.{signal.name}" in uses]
-    pages = list(islice(_list_pages(message, chosen, is_received=True in ways), MOST_FRAMES + 1))
-    for selector in sorted({selector for page in pages for selector in page}):
-        if (own := f"{message.name}.{selector}") in uses:
-            raise uses[own].place.refuse(f"signals with no other use; {own} is the multiplexer of used ones")
+    selector = _find_selector(message, chosen, place)
+    if (own := f"{message.name}.{selector}") in uses:
+        raise uses[own].place.refuse(f"signals with no other use; {own} is the multiplexer of used ones")
+    pages = _list_pages(message, chosen, selector, is_received=True in ways)
     for page in pages:
-        on_page = [replace(slots[signal.name], start=page[signal.name], is_selector=True) if signal.name in page else
-                   slots[signal.name] for signal in message.signals if _is_on_page(signals, signal.name, page)]
+        on_page = [replace(slots[signal.name], start=page, is_selector=True) if signal.name == selector else
+                   slots[signal.name] for signal in message.signals if _is_on_page(message, signal, selector, page)]
         is_needed = any(slot.name in uses and uses[slot.name].is_needed for slot in on_page)
         yield DeviceFrame(slots=tuple(on_page), spec=FrameSpec(
-            name=f"{message.name}[{'.'.join(map(str, page.values()))}]" if page else message.name,
+            name=f"{message.name}[{page}]" if selector else message.name,
             identifier=identifier, length=message.length, sender=Role.RIG if True in ways else Role.CONTROLLER,
             every=_find_period(name, message, cycle_ns), is_switched=is_fd and is_switched,
             is_answer=True in ways or is_needed or (len(pages) == 1 and bool(message.cycle_time))))
 
 
-Page = Mapping[str, int]  # values of selectors
+def _find_selector(message: Message, chosen: list[Signal], place: Place) -> str:
+    """The multiplexer of the used signals, "" where there is none; several, or nested ones, are refused."""
+    found = {str(signal.multiplexer_signal) for signal in chosen if signal.multiplexer_signal}
+    outer = {signal.name for signal in message.signals if signal.name in found and signal.multiplexer_signal}
+    place.require(len(found) <= 1 and not outer,
+                  f"signals of one multiplexer; {message.name} has {' and '.join(sorted(found))}"
+                  f"{', a nested one' if outer else ''}")
+    return next(iter(found), "")
 
 
-def _list_pages(message: Message, chosen: list[Signal], *, is_received: bool) -> Iterator[Page]:
-    """The pages with a used signal; of those that the device sends also the others on which it stands.
-
-    Selectors that tell no used signals apart are signals as others are.
+def _list_pages(message: Message, chosen: list[Signal], selector: str, *, is_received: bool) -> list[int]:
+    """The values of the selector with a used signal; of a message that the device sends also the others on which one
+    stands. Without a selector there is one page.
     """
-    signals = {signal.name: signal for signal in message.signals}
-    ancestors = {signal.name: _list_ancestors(signals, signal.name) for signal in message.signals}
-    telling = {name for signal in chosen for name in ancestors[signal.name]}
-    near = [*chosen, *(signals[name] for name in telling)]
-
-    def extend(page: Page, rest: list[str]) -> Iterator[Page]:
-        if not rest:
-            own = {signal.multiplexer_signal for signal in chosen if _is_on_page(signals, signal.name, page)}
-            ends = {name for name in page if not any(signals[other].multiplexer_signal == name for other in page)}
-            if own and (not is_received or own >= ends):
-                yield page
-            return
-        name, later = rest[0], rest[1:]
-        if not _is_on_page(signals, name, page):
-            yield from extend(page, later)
-            return
-        stands_beside = not is_received and any(
-            name not in ancestors[signal.name] and _is_on_page(signals, signal.name, page) for signal in chosen)
-        for number in sorted({number for each in (message.signals if stands_beside else near)
-                              if each.multiplexer_signal == name for number in each.multiplexer_ids or ()}):
-            yield from extend({**page, name: number}, later)
-
-    return extend({}, sorted(telling, key=lambda name: (len(ancestors[name]), name)))
+    stands_beside = not is_received and any(not signal.multiplexer_signal for signal in chosen)
+    found = {number for signal in (message.signals if stands_beside else chosen)
+             if selector and signal.multiplexer_signal == selector for number in signal.multiplexer_ids or ()}
+    return sorted(found)[:MOST_FRAMES + 1] if selector else [0]
 
 
-def _list_ancestors(signals: Mapping[str, Signal], name: str) -> list[str]:
-    """The selectors on which a signal depends."""
-    found: list[str] = []
-    while (parent := signals[name].multiplexer_signal) in signals and parent not in found:
-        found.append(name := str(parent))
-    return found
-
-
-def _is_on_page(signals: Mapping[str, Signal], name: str, page: Page) -> bool:
-    """Whether a page has a signal; a selector that the page leaves open has its start value."""
-    for each in (signals[one] for one in (name, *_list_ancestors(signals, name))):
-        parent = str(each.multiplexer_signal)
-        if parent in signals and page.get(parent, int(signals[parent].raw_initial or 0)) not in (
-                each.multiplexer_ids or ()):
-            return False
-    return True
+def _is_on_page(message: Message, signal: Signal, selector: str, page: int) -> bool:
+    """Whether a page has a signal; a multiplexer other than the selector has its start value."""
+    parent = next((each for each in message.signals if each.name == signal.multiplexer_signal), None)
+    return parent is None or (page if parent.name == selector else int(parent.raw_initial or 0)) in (
+        signal.multiplexer_ids or ())
 
 
 def _find_period(name: str, message: Message, cycle_ns: int) -> int:

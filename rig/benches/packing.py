@@ -34,7 +34,6 @@ _FIRST_OWN_BIT = 8
 # Columns of a field; the last five are doubles
 (_CHANNEL, _LOWEST, _BITS, _IS_BIG, _KIND, _RULE, _FIXED, _NUMERATOR, _DENOMINATOR, _OFFSET, _LOW, _HIGH) = range(12)
 _FIELD_WORDS = 12
-_NEXT = _CHANNEL  # of a selector: the next one of its frame, or -1
 # A checksum has its numbers in place of count and range; its _FIXED is the address of a user's function, or 0
 _POLYNOMIAL, _START, _INVERSION, _DATA_ID, _DATA_IDS_AT = range(7, 12)
 _VALUE, _CONSTANT, _COUNTER, _CHECKSUM, _CYCLE = range(5)  # rules: what a field holds
@@ -63,9 +62,7 @@ def find_frame(m: Layout, identifier: int) -> int:
         at = FRAMES_AT + FRAME_WORDS * number
         if words[at + IDENTIFIER] == identifier:
             chosen = words[at + _SELECTOR]
-            while chosen >= 0 and _read_bits(m, chosen) == words[chosen + _FIXED]:
-                chosen = words[chosen + _NEXT]
-            if chosen < 0:
+            if chosen < 0 or _read_bits(m, chosen) == words[chosen + _FIXED]:
                 return at
     return -1
 
@@ -289,8 +286,7 @@ def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], mine: Role
             field + _FIELD_WORDS * len(each.fields), -1, 0 if is_mine else -1, 0, 0, -1, each.sent_as)
         for one, rule in zip(each.fields, rules, strict=True):
             _fill_field(m, field, one, rule, places.get(one.name, -1))
-            if one in each.selectors:
-                words[field + _NEXT] = words[at + _SELECTOR]
+            if one is each.selector:
                 words[at + _SELECTOR] = field
             if rule == _CHECKSUM and one.data_ids:
                 words[field + _DATA_IDS_AT] = ids

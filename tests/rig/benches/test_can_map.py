@@ -170,7 +170,7 @@ def load_pages(*lines: str) -> Any:
 
 def list_pages(bench: Any) -> Iterator[tuple[str, bool, int | None]]:
     for spec in bench.frames.list_from(Role.CONTROLLER):
-        yield spec.name, spec.is_answer, spec.selectors[0].fixed if spec.selectors else None
+        yield spec.name, spec.is_answer, spec.selector.fixed if spec.selector else None
 
 
 def test_a_page_is_a_frame_and_what_stands_on_all_pages_is_read_from_each() -> None:
@@ -191,52 +191,48 @@ def test_a_signal_that_the_bench_file_does_not_use_has_its_start_value() -> None
     assert math.isclose(unpack(spec, data)["ram_position"], -1e-5)
 
 
-NESTED = """VERSION ""
+MULTIPLEXED = """VERSION ""
 BU_: Rig Ecu
 BO_ 10 Demand: 16 Rig
  SG_ Kind M : 7|8@0+ (1,0) [0|0] "" Ecu
- SG_ Part m0M : 8|4@1+ (1,0) [0|0] "" Ecu
  SG_ Position m2 : 16|16@1- (0.001,0.5) [0|0] "mm" Ecu
  SG_ Ram m4 : 16|16@1- (0.01,0) [0|0] "mm" Ecu
 BO_ 11 Drive: 8 Ecu
  SG_ Kind M : 0|8@1+ (1,0) [0|0] "" Rig
- SG_ Part m0M : 8|4@1+ (1,0) [0|0] "" Rig
  SG_ Current m5 : 31|16@0- (0.02,0) [0|0] "mA" Rig
  SG_ State m3 : 16|8@1+ (1,0) [0|0] "" Rig
- SG_ Side m0 : 48|8@1+ (1,0) [0|0] "" Rig
  SG_ Heat m1 : 16|16@1- (1,0) [0|0] "" Rig
 BA_DEF_ BO_ "CANFD_BRS" ENUM "0","1";
 BA_DEF_DEF_ "CANFD_BRS" "1";
-SG_MUL_VAL_ 10 Part Kind 0-0;
-SG_MUL_VAL_ 10 Position Part 2-3;
+SG_MUL_VAL_ 10 Position Kind 2-3;
 SG_MUL_VAL_ 10 Ram Kind 4-4;
-SG_MUL_VAL_ 11 Part Kind 0-0;
-SG_MUL_VAL_ 11 Current Part 5-5;
-SG_MUL_VAL_ 11 State Part 3-3;
-SG_MUL_VAL_ 11 Side Kind 0-0;
+SG_MUL_VAL_ 11 Current Kind 5-5;
+SG_MUL_VAL_ 11 State Kind 3-3;
 SG_MUL_VAL_ 11 Heat Kind 1-1;
 """
 
 
-@pytest.mark.parametrize("state, pages", [
-    ("State", ["Demand[0.2]", "Demand[0.3]", "Demand[4]", "Drive[0.3]", "Drive[0.5]"]),
-    ("Side", ["Demand[0.2]", "Demand[0.3]", "Demand[4]", "Drive[0.3]", "Drive[0.5]"]),
-    ("Heat", ["Demand[0.2]", "Demand[0.3]", "Demand[4]", "Drive[0.5]", "Drive[1]"])])
-def test_pages_of_nested_multiplexers_are_those_of_cantools(state: str, pages: list[str]) -> None:
-    """Each page is known by all its selectors, also in the compiled tables; CANFD_BRS counts for CAN FD."""
+def load_multiplexed(dbc: str, state: str) -> Any:
     text = "\n".join(['name = "x"', "[controller]", 'protocol = "can"', 'dbc = "x.dbc"', "[controller.inputs]",
                       'position_demand = "Demand.Position"', 'ram_position = "Demand.Ram"', "[controller.outputs]",
                       'current = "Drive.Current"', "[controller.ready]", f'"Drive.{state}" = 3'])
-    frames = load_bench_from_files({"x.toml": text.encode(), "x.dbc": NESTED.encode()}).frames
-    database = cast(Database, load_string(NESTED, "dbc"))
+    return load_bench_from_files({"x.toml": text.encode(), "x.dbc": dbc.encode()})
+
+
+@pytest.mark.parametrize("state, pages", [
+    ("State", ["Demand[2]", "Demand[3]", "Demand[4]", "Drive[3]", "Drive[5]"]),
+    ("Heat", ["Demand[2]", "Demand[3]", "Demand[4]", "Drive[1]", "Drive[5]"])])
+def test_pages_of_a_multiplexer_are_those_of_cantools(state: str, pages: list[str]) -> None:
+    """Each page is known by its selector, also in the compiled tables; CANFD_BRS counts for CAN FD."""
+    frames = load_multiplexed(MULTIPLEXED, state).frames
+    database = cast(Database, load_string(MULTIPLEXED, "dbc"))
     assert sorted(spec.name for spec in frames.frames) == pages
     layout = make_layout(frames.frames, [], Role.RIG)
     for place, spec in zip(list_frame_places(layout), frames.frames, strict=True):
         message = database.get_message_by_name(spec.name.partition("[")[0])
         data = pack(spec, {"position_demand": 1e-3, "ram_position": -2e-4, "current": 4e-3})
         known: Any = message.decode(data)
-        selectors = ".".join(str(known[name]) for name in ("Kind", "Part") if name in known)
-        assert spec.name == f"{message.name}[{selectors}]" and bytes(message.encode(known)) == data
+        assert spec.name == f"{message.name}[{known['Kind']}]" and bytes(message.encode(known)) == data
         scales = {"Position": (1e-3, "position_demand"), "Ram": (1e-3, "ram_position"), "Current": (1e-3, "current")}
         for name, (scale, signal) in scales.items():
             if name in known:
@@ -245,6 +241,14 @@ def test_pages_of_nested_multiplexers_are_those_of_cantools(state: str, pages: l
         assert frames.find(spec.identifier, data) is spec and find_frame(layout, spec.identifier) == place
         is_fd = message.length > 8
         assert spec.sent_as == message.frame_id | (FD | SWITCHED if is_fd else 0)
+
+
+def test_nested_multiplexers_are_refused() -> None:
+    part = "SG_ Part m3M : 40|8@1+ (1,0) [0|0] \"\" Rig"
+    nested = MULTIPLEXED.replace("SG_ State m3 :", f"{part}\n SG_ State m3 :").replace(
+        "SG_MUL_VAL_ 11 State Kind 3-3;", "SG_MUL_VAL_ 11 Part Kind 3-3;\nSG_MUL_VAL_ 11 State Part 3-3;")
+    with pytest.raises(InputError, match="signals of one multiplexer; Drive has Kind and Part, a nested one"):
+        load_multiplexed(nested, "State")
 
 
 def test_a_selector_has_no_other_use() -> None:
