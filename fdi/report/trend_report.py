@@ -31,7 +31,7 @@ from fdi.report.drawing import (
     line,
 )
 from fdi.report.numbers import attach_unit, count_nouns, format_digits, format_interval
-from fdi.report.report import Cell, Column, Figure, Item, Line, Listing, Medium, Mood, Report, Section, tabulate
+from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Mood, Report, Section, tabulate
 from fdi.thresholds import TREND_FEWEST_TRACES, TREND_MOST_TRACES
 
 MOODS: dict[Level, Mood] = {Level.ACCEPTABLE: "good", Level.MAINTENANCE: "doubtful", Level.NON_NOMINAL: "bad"}
@@ -87,7 +87,6 @@ def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
     def show_date(level: str, limit: str) -> str:
         return "–" if left[level].high == 0.0 else _format_date(getattr(left[level], limit), unit)
 
-    chart = _draw_chart(trend, unit)
     items: list[Item] = [
         Line("level", explain_level(trend)),
         *(Line("" if i else "size", text) for i, text in enumerate(_describe_trend(trend, unit))),
@@ -103,8 +102,7 @@ def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
             (Column("probability", align="right"),
              lambda level: f"{100 * left[level].compute_probability_within(span):.0f} %"),
             caption="Probability: that the limit is reached within a time as long as the traces cover.",
-            medium=Medium.PAGE),
-        *([Listing(chart, medium=Medium.TERMINAL)] if chart else [])]
+            medium=Medium.PAGE)]
     return Section(fault.title, items,
                    badge=Cell(trend.verdict.replace("_", " "), MOODS[trend.level]), title_medium=Medium.BOTH)
 
@@ -219,50 +217,6 @@ def _collect_trend(trend: Trend, unit: UnitTrend) -> dict[str, Any]:
 def _collect_place(t: float, unit: UnitTrend) -> str | float:
     """A place on the axis: an ISO date, or the number itself."""
     return format_day(t) if unit.gathered.axis == "date" else round(t, 3)
-
-
-WIDTH, HEIGHT = 72, 11  # characters
-
-
-def _draw_chart(trend: Trend, unit: UnitTrend, future_share: float = 0.35) -> str:
-    """Lines of text with the sizes (● and their intervals │), the course (·) and the forecast (░); "" for one date.
-
-    `future_share` is the smallest share of the width that shows the future.
-    """
-    start, end = float(trend.t[0]), float(trend.t[-1])
-    if end == start:
-        return ""
-    until = end + future_share / (1.0 - future_share) * (end - start)
-    if trend.future is not None:
-        until = min(max(until, float(trend.future.t[-1])), end + 1.5 * (end - start))
-    top = 1.15 * max(trend.fault.maintenance, *(size.value for size in trend.sizes))
-
-    def find_column(t: Any) -> Any:
-        return np.rint((np.asarray(t) - start) / (until - start) * (WIDTH - 1)).astype(int)
-
-    def find_row(size: float) -> int:
-        return HEIGHT - 1 - min(max(round(size / top * (HEIGHT - 1)), 0), HEIGHT - 1)
-
-    cells = np.full((HEIGHT, WIDTH), " ")
-    names = {find_row(trend.fault.acceptable): "MidBand", find_row(trend.fault.maintenance): "MaxBand"}
-    cells[list(names)] = "-"
-    curves = ((trend.past, WIDTH), (trend.future, find_column(end) + 1))
-    for curve, shaded_from in ((curve, begin) for curve, begin in curves if curve is not None):
-        columns = find_column(curve.t)
-        for x in range(max(columns[0], 0), min(columns[-1], WIDTH - 1) + 1):
-            low, middle, high = (find_row(np.interp(x, columns, y)) for y in (curve.low, curve.middle, curve.high))
-            if x >= shaded_from:
-                cells[high:low + 1, x] = "░"
-            cells[middle, x] = "·"
-    for x, size, is_used in zip(find_column(trend.t), trend.sizes, trend.used, strict=True):
-        cells[find_row(size.high):find_row(size.low) + 1, x] = "│"
-        cells[find_row(size.value), x] = "●" if is_used else "○"
-    lines = [f"{top * (HEIGHT - 1 - y) / (HEIGHT - 1):>6.3g} {''.join(row)} {names.get(y, '')}".rstrip()
-             for y, row in enumerate(cells)]
-    # below: dates of the first trace, of the last one and of the end of the chart, each below its column
-    first, last, final = (_format_date(t - end, unit) for t in (start, end, until))
-    at = min(max(find_column(end) - len(last) // 2, len(first) + 1), WIDTH - len(final) - len(last) - 1)
-    return "\n".join([*lines, f"{'':7}{first.ljust(at)}{last}".ljust(7 + WIDTH - len(final)) + final])
 
 
 def draw_trends(unit: UnitTrend) -> Drawing:
