@@ -349,7 +349,7 @@ _FLAGS = _EXTENDED | _REMOTE | _IS_ERROR | _FD | _SWITCH | _PASSIVE
 _KEY_STARTS = np.cumsum(_KEY_LENGTHS) - _KEY_LENGTHS
 _NOTHING, _TRUE = 0xC0, 0xC3  # msgpack's first byte of a value
 _OFF = (0x00, _NOTHING, 0xC2)  # 0, nothing and false
-_UNSIGNED, _ABSENT = 0xCC, -2
+_UNSIGNED, _MAP = 0xCC, _EXAMPLE[0]
 _BYTES, _TEXT = 0xC4, 0xD9  # a length of one byte follows; after the next number one of two bytes
 _SIZED = (_BYTES, _BYTES + 1, _TEXT, _TEXT + 1)
 _SIZES = np.full(256, -1)  # bytes after the first byte
@@ -381,16 +381,14 @@ def encode_datagram(port: Port, cob_id: int, length: int) -> tuple[int, int]:
 def decode_datagram(port: Port, size: int) -> tuple[int, int, int]:
     """(COB-ID, length, data) of `size` bytes in the port's buffer, as python-can's udp_multicast packs them; -1 for
     what is no data frame, no such map, or contradicts itself. The payload goes to PAYLOAD_IN.
-
-    The keys may come in any order, and those that have a default may be missing: other programs pack the map otherwise.
     """
     octets, place, end = port.octets, _IN + 1, _IN + size
-    cob_id, dlc, payload, length, flags = -1, _ABSENT, 0, 0, _EXTENDED
-    if octets[_IN] & 0xF0 != 0x80:
+    cob_id, dlc, payload, length, flags = -1, -1, 0, 0, 0
+    if octets[_IN] != _MAP:
         return -1, 0, 0
-    for guess in range(octets[_IN] & 0x0F):
-        key, place = _read_key(octets, place, end, guess)
-        if key < 0 or place >= end:
+    for key in range(len(_KEY_LENGTHS)):
+        place = _skip_key(octets, place, end, key)
+        if place < 0 or place >= end:
             return -1, 0, 0
         first = to_integer(octets[place])
         place += 1
@@ -403,15 +401,13 @@ def decode_datagram(port: Port, size: int) -> tuple[int, int, int]:
             return -1, 0, 0
         if key == _ID:
             cob_id = _read_number(octets, first, place, count)
-        elif key == _DLC and first != _NOTHING:
+        elif key == _DLC:
             dlc = _read_number(octets, first, place, count)
         elif key == _PAYLOAD:
             payload, length = place, count if first in (_BYTES, _BYTES + 1, _NOTHING) else -1
-        elif _FLAGS >> key & 1:
-            flags = flags | 1 << key if first not in _OFF else flags & ~(1 << key)
+        elif _FLAGS >> key & 1 and first not in _OFF:
+            flags |= 1 << key
         place += count
-    if dlc == _ABSENT:
-        dlc = length
     is_valid = place == end and 0 <= cob_id <= (IDENTIFIER if flags & _EXTENDED else 0x7FF) and length >= 0
     refused = _IS_ERROR | _REMOTE if flags & _FD else _IS_ERROR | _REMOTE | _SWITCH | _PASSIVE
     if not is_valid or flags & refused:
@@ -427,19 +423,15 @@ def decode_datagram(port: Port, size: int) -> tuple[int, int, int]:
     return cob_id, length, to_integer(port.words[PAYLOAD_IN // 8])
 
 
-def _read_key(octets: NDArray[np.uint8], place: int, end: int, guess: int) -> tuple[int, int]:
-    """(number in `_NAMES`, place behind the key); -1 for a key that python-can does not know.
-
-    `guess` is tried first: python-can's own order costs one comparison a key.
-    """
-    for turn in range(len(_KEY_LENGTHS)):
-        key = (guess + turn) % len(_KEY_LENGTHS)
-        at, length, same = to_integer(_KEY_STARTS[key]), to_integer(_KEY_LENGTHS[key]), 0
-        while same < length and place + length <= end and octets[place + same] == _KEY_BYTES[at + same]:
-            same += 1
-        if same == length:
-            return key, place + length
-    return -1, place
+def _skip_key(octets: NDArray[np.uint8], place: int, end: int, key: int) -> int:
+    """The place behind a key, which python-can's order puts here; -1 where something else stands."""
+    at, length = to_integer(_KEY_STARTS[key]), to_integer(_KEY_LENGTHS[key])
+    if place + length > end:
+        return -1
+    for i in range(length):
+        if octets[place + i] != _KEY_BYTES[at + i]:
+            return -1
+    return place + length
 
 
 def _read_number(octets: NDArray[np.uint8], first: int, place: int, count: int) -> int:

@@ -52,10 +52,10 @@ def open_sender() -> socket.socket:
 
 
 def attach_filter(rx: socket.socket, own_port: int, cob_ids: Collection[int], left_out: bool = False) -> None:
-    """A socket filter (classic BPF): no datagram from `own_port`, and of python-can's layout only these COB-IDs.
+    """A socket filter (classic BPF): no datagram from `own_port`, and only these COB-IDs, in python-can's layout.
 
-    `left_out`: all but these COB-IDs. A datagram of another layout passes; who reads it decodes it. At most 64 COB-IDs
-    are filtered, else all pass. Whether a frame is CAN FD makes no difference here. Raises OSError.
+    `left_out`: all but these COB-IDs. At most 64 COB-IDs are filtered, else all pass; who reads a datagram decodes it.
+    Whether a frame is CAN FD makes no difference here. Raises OSError.
     """
     load_half, load_byte, load_word = 0x28, 0x30, 0x20  # at an absolute place, counted from the UDP header
     equal, at_least, always, give = 0x15, 0x35, 0x05, 0x06
@@ -64,16 +64,12 @@ def attach_filter(rx: socket.socket, own_port: int, cob_ids: Collection[int], le
     program = [(load_half, 0, 0, 0), (equal, 0, 1, own_port), (give, 0, 0, drop)]
     if len(cob_ids) <= 64:
         listed, others = (drop, accept) if left_out else (accept, drop)
-        text = [(8, 0x8BA97469), (8 + 20, 0xAE617262), (8 + 31, 0x6E5F6964)]  # map of 11, "ti.."; "arb..", "n_id"
-        for place, word in text:
-            program += [(load_word, 0, 0, place), (equal, 1, 0, word), (give, 0, 0, accept)]
         # The identifier stands here itself, or 0xCC, 0xCD or 0xCE and 1, 2 or 4 bytes; behind it "is_extended_id" and
         # a truth value, whose last bit goes where the COB-ID has it.
         branches = [(give, 0, 0, accept)]
         for first, load, at, flag in ((0xCE, load_word, 1, 20), (0xCD, load_half, 1, 18), (0xCC, load_byte, 1, 17),
                                       (0x80, load_byte, 0, 16)):
-            body = [(load_word, 0, 0, 8 + 35 + flag - 4), (equal, 1, 0, 0x645F6964), (give, 0, 0, accept),  # "d_id"
-                    (load_byte, 0, 0, 8 + 35 + flag), (keep_bits, 0, 0, 1), (shift_left, 0, 0, 31), (copy, 0, 0, 0),
+            body = [(load_byte, 0, 0, 8 + 35 + flag), (keep_bits, 0, 0, 1), (shift_left, 0, 0, 31), (copy, 0, 0, 0),
                     (load, 0, 0, 8 + 35 + at), (add_copy, 0, 0, 0), (always, 0, 0, len(branches))]
             taken = (equal, 0, len(body), first) if at else (at_least, len(body), 0, first)
             branches = [(load_byte, 0, 0, 8 + 35), taken, *body, *branches]

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from plant.errors import InputError, RigError, require
+from plant.errors import InputError, require
 from rig.benches.bench import Role
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, show_progress
@@ -14,9 +14,16 @@ from rig.conformance.run_cases import build_conformance_report, choose_cases, ru
 from rig.conformance.target import DataSheet, Options, Target
 from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, choose_bus, open_can
 from rig.network.frame import VirtualClock, WallClock
+from rig.network.master import Master
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
-from rig.run.participants import EMBEDDED_NAMES, NodeProcesses, make_node_command, require_firmware_bus
+from rig.run.participants import (
+    EMBEDDED_NAMES,
+    NodeProcesses,
+    is_replaced,
+    make_node_command,
+    require_firmware_bus,
+)
 
 OWN_NODES = {"controller": Role.CONTROLLER, "plant": Role.PLANT, "c": Role.CONTROLLER}  # c: in C
 
@@ -119,19 +126,12 @@ def start_node(name: str, bus: str, wire: Wire, processes: NodeProcesses) -> Non
 
     Raises:
         InputError: the controller in C on a bus that it has no port for, or without a C compiler.
-        RigError: it does not boot.
+        BusError: it does not boot.
     """
-    booted: list[int] = []
-    node, boot_up = OWN_NODES[name], 0x700 + OWN_NODES[name]
-    wire.receive = lambda frame: booted.append(frame.cob_id) if frame.data == b"\0" else None
-    wire.send(0x000, bytes((130, node)))
-    if wire.wait(lambda: boot_up in booted, 0.7):
+    role, master = OWN_NODES[name], Master(wire, wire.clock.now, False, load_bench())
+    if master.is_present(role, 0.7):
         return
     if name == "c":
         require_firmware_bus(bus)
-    processes.start(node, make_node_command(node, bus, is_in_c=name == "c"))
-    for _ in range(120):  # s: it may have to compile the plant first
-        if wire.wait(lambda: boot_up in booted, 1.0) or processes.find_ended():
-            break
-    if boot_up not in booted:
-        raise RigError(f"our own node {node} ({name}) did not start")
+    processes.start(role, make_node_command(role, bus, is_in_c=name == "c"), announces=name != "c")
+    is_replaced(master, role, processes)
