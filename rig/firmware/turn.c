@@ -1,3 +1,4 @@
+#define _GNU_SOURCE /* flock, nanosleep */
 #include "turn.h"
 
 #include <fcntl.h>
