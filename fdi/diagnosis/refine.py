@@ -24,9 +24,9 @@ import numpy as np
 
 from fdi.comparison.jack import P12
 from fdi.diagnosis.faults import CLOGGING, FAULTS, Estimate, Fault, Level, compute_severity, judge_size
-from fdi.discovery.explain import find_marks
+from fdi.discovery.explain import drop_duplicates, find_marks, sort_by_cost, takes_fair_share
 from fdi.discovery.explain_runs import list_fitted_parameters
-from fdi.discovery.search import Prospect, scan_effects
+from fdi.discovery.search import Hypothesis, Prospect, list_compatible_effects, scan_effects
 from fdi.estimation import noise as noises
 from fdi.estimation.fit import (
     UNREPLAYED,
@@ -38,7 +38,6 @@ from fdi.estimation.fit import (
     compute_misfit,
     compute_typical_rms,
     compute_weights,
-    follow_population,
     list_all_unknowns,
     list_effect_unknowns,
     replay_fit,
@@ -65,6 +64,7 @@ from fdi.estimation.unidentifiable import (
     LogOpenFilter,
     LogProblem,
     PowerFree,
+    descend,
     descend_valley,
     estimate_smooth_covariance,
     find_flat_directions,
@@ -72,15 +72,15 @@ from fdi.estimation.unidentifiable import (
     guess_covariance,
     linearise_across,
     list_directions_of_faults,
+    search_widely,
     start_fit,
     take_logarithm,
 )
-from fdi.progress import NO_STAGE, Progress, Stage, ignore_progress
+from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (
     FAULT_BLAMED_SHARE,
     FITTED_RUN_WORST,
     FRICTION_UNCERTAINTY,
-    FURTHER_EFFECT_SHARE,
     GAIN_CONVINCES,
     GAIN_TIE,
     GAIN_WORTH_A_FIT,
@@ -339,12 +339,17 @@ class CountedProblem(LogProblem):
 
     faults: tuple[Fault, ...] = FAULTS
     counts: list[int] = field(default_factory=list)  # shared by the problem's copies and threads
-    stage: Stage = NO_STAGE  # takes a step with each round of a fit
 
     @property
     def fault_parameters(self) -> set[str]:
         """The parameters of the faults, and those that follow."""
         return {name for fault in self.faults for name in fault.parameters}
+
+    def find_flat(self, free: Sequence[Free], x: Floats) -> Floats:
+        """Directions (p, k) at `x` (p,) that no signal shows, with what of the effects and of the faults goes along."""
+        faults = list_directions_of_faults(self.list_values(free, x))
+        others = [each for each in faults if next(iter(each)) in self.fault_parameters]
+        return find_flat_directions(self, free, x, (FLAPPER, *others), allowed=PRIORS_KNOW_MORE_MISFIT)
 
     def predict_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
         self.counts.append(len(values))
@@ -417,7 +422,7 @@ def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequenc
         undecided = find_undecided_rows(problem, replay_fit(problem, start_fit(free, begin[0]), begin[0]),
                                         list_floors(problem))
         problem = replace(problem, trace=leave_out_rows(problem.trace, undecided), _lanes={})
-    alone = replace(problem, workers=1, _lanes={})
+    alone = problem.alone
     healthy = make_healthy_start(problem, free)
     if _blames_a_fault(problem, free, begin[0]):
         begin.append(healthy)
@@ -465,7 +470,7 @@ def _fit_finely(problem: CountedProblem, first: Fit) -> Fit:
     fine = replace(problem, steps=FINE_STEPS, _lanes={})
     last = first
     for rounds in (4, 8):
-        last = descend_valley(fine, last, rounds, find_flat(problem, first.free, last.x), problem.stage)
+        last = descend_valley(fine, last, rounds, problem.find_flat(first.free, last.x), problem.stage)
         if is_noise_left(problem, last):
             return last
     signals = problem.trace.outputs
@@ -483,11 +488,11 @@ def _restart_fit(problem: CountedProblem, found: Fit, parts: Sequence[float], ro
     `parts` of that line lie between the fit, 0, and the other unit, 1. Stops of the ram make ridges: tolerances that
     lie behind one of them are found from the other side, or never.
     """
-    free, home, alone = found.free, place_home(problem, found), replace(problem, workers=1, _lanes={})
+    free, home, alone = found.free, place_home(problem, found), problem.alone
 
     def fit_from(part: float) -> Fit:
         begun = descend(alone, start_fit(free, found.x + part * (home - found.x)), NOISE_SCHEDULE)
-        flat = find_flat(alone, free, begun.x)
+        flat = alone.find_flat(free, begun.x)
         return descend_valley(replace(alone, steps=FINE_STEPS, _lanes={}), begun, rounds, flat, problem.stage)
 
     return min(found, *map_in_threads(fit_from, parts, problem.workers), key=lambda f: f.cost)
@@ -501,12 +506,12 @@ def _retry_without(problem: CountedProblem, found: Fit, most: int = 2) -> Fit:
     fault that looks like the suspect in its place.
     """
     fine = replace(problem, workers=1, steps=FINE_STEPS, _lanes={})
-    alone = replace(problem, workers=1, _lanes={})
+    alone = problem.alone
 
     def fit_from(starts: Floats) -> Fit:
         best = starts[int(np.argmin(problem.compute_costs(found.free, starts)))]
         begun = descend(alone, start_fit(found.free, best), NOISE_SCHEDULE[1:])
-        return descend_valley(fine, begun, 8, find_flat(alone, found.free, begun.x))
+        return descend_valley(fine, begun, 8, alone.find_flat(found.free, begun.x))
 
     suspects = [s.parameter for s in list_suspects(problem.model, problem.faults)]
     names = [f.name for f in found.free]
@@ -572,9 +577,9 @@ def polish_fit(problem: CountedProblem, found: Fit) -> Fit:
     Slopes are those of coarser steps, at a fifth of the time.
     """
     exact, coarse = (replace(problem, steps=steps, _lanes={}) for steps in (problem.model.steps, FINE_STEPS))
-    flat = find_flat(problem, found.free, found.x)
+    flat = problem.find_flat(found.free, found.x)
     for factor, rounds in POLISH:
-        begun = replace(found, covariance=guess_first_covariance(found.free))
+        begun = replace(found, covariance=guess_covariance(found.free))
         found = descend_valley(scale_noise(exact, factor), begun, rounds, flat, problem.stage,
                                scale_noise(coarse, factor))
     return replace(found, covariance=estimate_smooth_covariance(coarse, found, flat))
@@ -591,35 +596,6 @@ def set_sizes(found: Fit, fault: Fault, size: float) -> Floats:
 
 def _blames(fault: Fault, found: Fit) -> bool:
     return fault.measure_departure(found.values[fault.parameter]) > FAULT_BLAMED_SHARE * fault.limits[1]
-
-
-def descend(problem: CountedProblem, found: Fit, schedule: Sequence[tuple[float, int]],
-            shown_by: CountedProblem | None = None) -> Fit:
-    """The fit after (factor, rounds) each: the noise so many times as large, so that small stops of the ram count late.
-
-    Its covariance begins anew each time. `shown_by` tells which directions no signal shows, by default the problem.
-    """
-    for factor, rounds in schedule:
-        begun = replace(found, covariance=guess_first_covariance(found.free))
-        flat = find_flat(shown_by or problem, found.free, found.x)
-        found = descend_valley(scale_noise(problem, factor), begun, rounds, flat, problem.stage)
-    return found
-
-
-def guess_first_covariance(free: Sequence[Free]) -> Floats:
-    """A first covariance, (p, p): an effect's parameter, which has no prior, by the width of its first difference."""
-    guess = guess_covariance(free)
-    for k, f in enumerate(free):
-        if not np.isfinite(f.prior):
-            guess[k, k] = (f.step / 3.0) ** 2
-    return guess
-
-
-def find_flat(problem: CountedProblem, free: Sequence[Free], x: Floats) -> Floats:
-    """Directions (p, k) at `x` (p,) that no signal shows, with what of the effects and of the faults goes along."""
-    at = problem.list_values(free, x)
-    others = [each for each in list_directions_of_faults(at) if next(iter(each)) in problem.fault_parameters]
-    return find_flat_directions(problem, free, x, (FLAPPER, *others), allowed=PRIORS_KNOW_MORE_MISFIT)
 
 
 def _blames_a_fault(problem: CountedProblem, free: Sequence[Free], x: Floats) -> bool:
@@ -651,7 +627,7 @@ def measure_ratios(problem: Problem, found: Fit) -> list[float]:
 
 def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence[Sizes]) -> Floats:
     """The start, (p,) scaled, with the smallest misfit, searched on ever finer grids around the best one."""
-    loud = scale_noise(replace(problem, workers=1, _lanes={}), NOISE_SCHEDULE[0][0])
+    loud = scale_noise(problem.alone, NOISE_SCHEDULE[0][0])
     known_offsets, faults = estimate_offsets(problem), problem.faults
     usual = {name: problem.model[name] for fault in faults for name in fault.follow}
 
@@ -799,8 +775,8 @@ def find_effects_beside(model: Model, trace: Trace, alone: Refinement, floor: Ma
     for name in (e.name for e in list_searched_effects(model.plant) if e.fitted and e.port not in UNREPLAYED):
         ensure_starts(name, trace.command, trace.load, model.plant)  # where the file of a user's plant gives none
     search = JointSearch(problem, list_other_effects(model, faults), progress)
-    fits = search.find_explanations(alone.fit)
-    return average_explanations([_explain(effects, fit, search.problem, whole) for effects, fit in fits], marks)
+    found = search.find_explanations(alone.fit)
+    return average_explanations([_explain(h, search.problem, whole) for h in found], marks)
 
 
 def list_other_effects(model: Model, faults: Sequence[Fault] = FAULTS) -> list[str]:
@@ -830,73 +806,71 @@ def _read_marks(model: Model, trace: Trace, floor: Mapping[str, float]
                        for name, interval in p.parameters.items()} for p in marks.prints}, floor
 
 
-def _explain(effects: tuple[str, ...], fit: Fit, problem: CountedProblem, whole: Trace | None) -> Explanation:
-    values = {name: value for effect in effects
-              for name, value in list_fitted_parameters(effect, fit, problem.model).items()}
-    return Explanation(effects, values, replace(report_fit(fit, problem, whole), worst=FITTED_RUN_WORST))
+def _explain(h: Hypothesis, problem: CountedProblem, whole: Trace | None) -> Explanation:
+    values = {name: value for effect in h.effects
+              for name, value in list_fitted_parameters(effect, h.fit, problem.model).items()}
+    return Explanation(h.effects, values, replace(report_fit(h.fit, problem, whole), worst=FITTED_RUN_WORST))
 
 
 # factor on the noise and generations of a search by a population
 POPULATION_STAGES = ((100.0, 30), (30.0, 40), (6.0, 40), (1.0, 40))
 
-Named = tuple[tuple[str, ...], Fit]  # effects beside the faults, and the fit with them
-
 
 class JointSearch:
-    """The state of one search: the problem with its noise, and the effects to try."""
+    """The state of one search: the problem with its noise, and the effects to try beside the faults."""
 
     def __init__(self, problem: CountedProblem, effects: Sequence[str], progress: Progress) -> None:
         self.problem, self.effects, self.progress = problem, list(effects), progress
 
-    def find_explanations(self, alone: Fit, most_effects: int = 2) -> list[Named]:
+    def find_explanations(self, alone: Fit, most_effects: int = 2) -> list[Hypothesis]:
         """Fits with 0, 1 .. other effects that may be the answer, taken to the end with one noise.
 
         Fits are compared only when they have gone equally far: one that has just begun has the cost of the stops that
         it still misses, and a rival that has been fitted to the end beats it although it is wrong.
         """
-        parents: list[Named] = [((), self.descend(replace(alone, free=self.list_unknowns()), ((1.0, 2),)))]
+        faults_alone = Hypothesis((), replace(alone, free=self.list_unknowns()), {})
+        parents = self.continue_fits([faults_alone], ((1.0, 2),))
         found = self.deepen(parents)
         for count in range(1, most_effects + 1):
             self.progress(f"looking for effect {count} beside the faults", 0.3 * count - 0.1)
-            is_enough = is_noise_left(self.problem, found[0][1])
+            is_enough = is_noise_left(self.problem, found[0].fit)
             tried = [each for parent in parents for each in self.add_effects(parent, count, is_enough)]
             if not tried:
                 break
-            parents = sorted(tried, key=_get_cost)[:4]
-            self.progress(f"fitting {', '.join(_describe(effects) for effects, _ in parents)} further", 0.3 * count)
-            deep = sorted(self.deepen(parents), key=_get_cost)
-            if count > 1 and not _takes_fair_share(min(found, key=_get_cost)[1], deep[0][1]):
+            parents = sort_by_cost(tried)[:4]
+            self.progress(f"fitting {', '.join(map(_describe, parents))} further", 0.3 * count)
+            deep = sort_by_cost(self.deepen(parents))
+            if count > 1 and not takes_fair_share(self.problem, sort_by_cost(found)[0], deep[0]):
                 break
             found += deep
-            if is_noise_left(self.problem, deep[0][1]):
+            if is_noise_left(self.problem, deep[0].fit):
                 break
-            parents = self.map_alone(lambda each: (each[0], self.descend(each[1], ((1.0, 2),))), deep[:2])
+            parents = self.continue_fits(deep[:2], ((1.0, 2),))
         return self.finish(found)
 
     def list_unknowns(self) -> tuple[Free, ...]:
         """What the fits of the faults alone change."""
         return list_unknowns((self.problem.bare or self.problem.model), self.problem.faults)
 
-    def deepen(self, found: Sequence[Named], rounds: int = 8) -> list[Named]:
+    def continue_fits(self, hypotheses: Sequence[Hypothesis], schedule: Sequence[tuple[float, int]]
+                      ) -> list[Hypothesis]:
+        """The hypotheses after further rounds of their fits: see `descend`."""
+        return self.map_alone(lambda h: replace(h, fit=self.descend(h.fit, schedule)), hypotheses)
+
+    def deepen(self, found: Sequence[Hypothesis], rounds: int = 8) -> list[Hypothesis]:
         """The fits taken further with finer steps; while the best leaves more than noise, they also begin elsewhere."""
         fine = self._refine_steps()
-        deep = self.map_alone(lambda each: (each[0], fine.descend(each[1], ((1.0, rounds),))), found)
-        if is_noise_left(self.problem, min(deep, key=_get_cost)[1]):
+        deep = fine.continue_fits(found, ((1.0, rounds),))
+        if is_noise_left(self.problem, sort_by_cost(deep)[0].fit):
             return deep
-
-        def begin_again(each: Named) -> Named:
-            again = fine.restart(each[1], 1.0) if fine.is_near(each[1]) else each[1]
-            return each[0], min(each[1], again, key=lambda f: f.cost)
-
-        return self.map_alone(begin_again, deep)
+        return self.map_alone(lambda h: fine.restart(h, (1.0,)) if fine.is_near(h) else h, deep)
 
     def _refine_steps(self) -> JointSearch:
         return JointSearch(replace(self.problem, steps=FINE_STEPS, _lanes={}), self.effects, self.progress)
 
-    def add_effects(self, parent: Named, count: int, is_enough: bool) -> list[Named]:
+    def add_effects(self, parent: Hypothesis, count: int, is_enough: bool) -> list[Hypothesis]:
         """The parent with one more effect each: the promising ones fitted; `is_enough`: the faults leave noise only."""
-        present, fit = parent
-        effects = [e for e in self.effects if e not in present and not _excludes(self.problem.model, e, present)]
+        fit, effects = parent.fit, list_compatible_effects(self.problem.model, self.effects, parent.effects)
         prospects = [self.scan(fit, effects, fit.cost)]
         if count == 1:
             # The forecast from a start that nobody has fitted is poor beside a finished fit. Where that fit leaves more
@@ -911,12 +885,10 @@ class JointSearch:
         if not worth:
             return []
         self.progress(f"fitting {', '.join(dict.fromkeys(p.effect for p in worth))}", 0.3 * count - 0.05)
-        begun = sorted(self.map_alone(self._begin_fit, worth), key=lambda f: f.cost)[:4]
-        fits = self.map_alone(lambda f: self.descend(f, ((3.0, 3), (1.0, 6))), begun)
-        best: dict[str, Named] = {}
-        for each in sorted(fits, key=lambda f: f.cost):
-            best.setdefault(self._name_added(each, present), ((*present, self._name_added(each, present)), each))
-        return list(best.values())
+        # at the scan's linear forecast, with the noise first taken for larger
+        begun = [Hypothesis((*parent.effects, p.effect), start_fit(p.free, p.x), {}) for p in worth]
+        promising = sort_by_cost(self.continue_fits(begun, (NOISE_SCHEDULE[1], (1.0, 3))))[:4]
+        return drop_duplicates(self.continue_fits(promising, ((3.0, 3), (1.0, 6))))
 
     def scan(self, fit: Fit, effects: Sequence[str], most: float) -> list[Prospect]:
         """The effects that promise to gain on this fit and to come below the cost `most`, best first."""
@@ -937,41 +909,36 @@ class JointSearch:
         """A unit with the best sizes of the faults and no other deviation: an effect may lead fits astray."""
         free = self.list_unknowns()
         x = choose_start(self.problem, free, list_coarse_starts(self.problem.faults))
-        return linearise_across(self.problem, free, x, guess_first_covariance(free), find_flat(self.alone, free, x))
+        return linearise_across(self.problem, free, x, guess_covariance(free), self.problem.alone.find_flat(free, x))
 
-    def finish(self, found: Sequence[Named]) -> list[Named]:
+    def finish(self, found: Sequence[Hypothesis]) -> list[Hypothesis]:
         """The likely ones to the end with finer steps, under the noise that the best one leaves."""
-        ranked = sorted(found, key=lambda each: each[1].cost + GAIN_CONVINCES * len(each[0]))
+        ranked = sorted(found, key=_compute_charged_cost)
         near = 60.0 * GAIN_TIE  # such fits are not done: beginning again has gained a few hundred
-        close = [each for each in ranked if each[1].cost < ranked[0][1].cost + near][:4]
-        self.progress(f"last fits, {', '.join(_describe(effects) for effects, _ in close)}", 0.75)
-        self.problem = learn_left_noise(self._refine_steps().problem, ranked[0][1])
-        done = self.map_alone(lambda each: (each[0], self.descend(each[1], ((1.0, 8),))), close)
-        best = min(done, key=_get_cost)
-        if len(best[0]) > 1:
-            self.progress(f"last fits without one of {_describe(best[0])}", 0.85)
-            done += self.map_alone(lambda effect: self._leave_out(best, effect), best[0])
-        alike: dict[frozenset[str], Named] = {}
-        for each in sorted(done, key=_get_cost):
-            alike.setdefault(frozenset(each[0]), each)
-        return self._search_other_valleys(self._begin_again(list(alike.values())))
+        close = [h for h in ranked if h.cost < ranked[0].cost + near][:4]
+        self.progress(f"last fits, {', '.join(map(_describe, close))}", 0.75)
+        self.problem = learn_left_noise(self._refine_steps().problem, ranked[0].fit)
+        done = self.continue_fits(close, ((1.0, 8),))
+        best = sort_by_cost(done)[0]
+        if len(best.effects) > 1:
+            self.progress(f"last fits without one of {_describe(best)}", 0.85)
+            done += self.map_alone(partial(self._leave_out, best), best.effects)
+        return self._search_other_valleys(self._begin_again(drop_duplicates(done)))
 
-    def _search_other_valleys(self, done: Sequence[Named], most: int = 2) -> list[Named]:
+    def _search_other_valleys(self, done: Sequence[Hypothesis], most: int = 2) -> list[Hypothesis]:
         """The fits, the likeliest of them also from searches by populations while none leaves only noise.
 
         Where static friction of the ram ends far off, no start on the way to a healthy unit leads out of that valley:
         the frictions have to move together (`fdi.estimation.fit`).
         """
         done = list(done)
-        ranked = sorted(done, key=lambda each: each[1].cost + GAIN_CONVINCES * len(each[0]))
+        ranked = sorted(done, key=_compute_charged_cost)
         worst = 1.5  # times the least cost, above which no valley is looked for
-        for each in [one for one in ranked if one[1].cost < worst * ranked[0][1].cost][:most]:
-            if any(is_noise_left(self.problem, fit) for _, fit in done):
+        for h in [one for one in ranked if one.cost < worst * ranked[0].cost][:most]:
+            if any(is_noise_left(self.problem, each.fit) for each in done):
                 break
-            effects, fit = each
-            self.progress(f"search of other valleys, {_describe(effects)}", 0.95)
-            found = self.map_alone(partial(self.search_widely, fit), (0, 1))
-            done[done.index(each)] = (effects, min(fit, *found, key=lambda f: f.cost))
+            self.progress(f"search of other valleys, {_describe(h)}", 0.95)
+            done[done.index(h)] = _keep_best(h, self.map_alone(partial(self.search_widely, h.fit), (0, 1)))
         return done
 
     def search_widely(self, fit: Fit, seed: int, steps: int = 10) -> Fit:
@@ -979,90 +946,61 @@ class JointSearch:
 
         The population takes so many solver steps a cycle; its end is fitted with those of the problem.
         """
-        def descend_coarsely(problem: CountedProblem, fit: Fit, rounds: int, factor: float = 1.0) -> Fit:
-            return descend(problem, fit, ((factor, rounds),), self.alone)
-
-        coarse = replace(self.alone, steps=steps)
-        home = place_home(self.problem, fit)
-        begun = descend_coarsely(coarse, replace(fit, x=home), 3, POPULATION_STAGES[0][0])
         width = 0.1  # of a population's first trials along a friction of ram or spool, of its logarithm
-        frictions = np.array([width / f.scale if f.name.endswith("_friction") and f.name.startswith(("jack.", "spool."))
-                              else 0.0 for f in fit.free])
-        spread = 9.0 * begun.covariance + np.diag(frictions**2)
-        begun = replace(begun, x=np.where(frictions > 0.0, home, begun.x))
-        end = follow_population(coarse, begun, spread, POPULATION_STAGES, seed, descend_coarsely)
+        widths = np.array([width / f.scale if f.name.endswith("_friction") and f.name.startswith(("jack.", "spool."))
+                           else 0.0 for f in fit.free])
+        alone, home = self.problem.alone, replace(fit, x=place_home(self.problem, fit))
+        end = search_widely(replace(alone, steps=steps), alone, home, widths, POPULATION_STAGES, seed)
         return self.descend(end, ((1.0, 8),))
 
-    def _begin_again(self, done: Sequence[Named], most: int = 2) -> list[Named]:
+    def _begin_again(self, done: Sequence[Hypothesis], most: int = 2) -> list[Hypothesis]:
         """The fits, the best of them also from other places; again as long as that changes which is best."""
         done, tried = list(done), set[tuple[str, ...]]()
         while len(tried) < most:
-            best = min(done, key=lambda each: each[1].cost + GAIN_CONVINCES * len(each[0]))
-            if best[0] in tried or not self.is_near(best[1]):
+            best = min(done, key=_compute_charged_cost)
+            if best.effects in tried or not self.is_near(best):
                 break
-            tried.add(best[0])
-            self.progress(f"another start, {_describe(best[0])}", 0.85 + 0.05 * len(tried))
-            again = self.map_alone(partial(self.restart, best[1]), (1.0, 0.5))
-            done[done.index(best)] = (best[0], min([best[1], *again], key=lambda f: f.cost))
+            tried.add(best.effects)
+            self.progress(f"another start, {_describe(best)}", 0.85 + 0.05 * len(tried))
+            done[done.index(best)] = self.restart(best, (1.0, 0.5))
         return done
 
-    def _leave_out(self, named: Named, effect: str) -> Named:
+    def _leave_out(self, h: Hypothesis, effect: str) -> Hypothesis:
         """The fit without one of its effects: the search may have needed it only to leave a local minimum."""
-        effects, fit = named
         dropped = set(self.problem.model.find_effect(effect).fitted)
-        kept = [k for k, f in enumerate(fit.free) if f.name not in dropped]
-        begun = start_fit([fit.free[k] for k in kept], fit.x[kept])
-        return tuple(e for e in effects if e != effect), self.descend(begun, ((3.0, 4), (1.0, 8)))
+        kept = [k for k, f in enumerate(h.fit.free) if f.name not in dropped]
+        begun = start_fit([h.fit.free[k] for k in kept], h.fit.x[kept])
+        return Hypothesis(tuple(e for e in h.effects if e != effect), self.descend(begun, ((3.0, 4), (1.0, 8))), {})
 
-    def is_near(self, fit: Fit, far: float = 7.0) -> bool:
+    def is_near(self, h: Hypothesis, far: float = 7.0) -> bool:
         """Whether a fit leaves so little that beginning again elsewhere may help."""
-        return max(measure_ratios(self.problem, fit)) < far
+        return max(measure_ratios(self.problem, h.fit)) < far
 
-    def restart(self, fit: Fit, part: float) -> Fit:
-        """The fit from a point on the line to a unit with these faults and effects and no other deviation."""
-        begun = start_fit(fit.free, fit.x + part * (place_home(self.problem, fit) - fit.x))
-        return self.descend(begun, ((6.0, 4), (1.0, 8)))
+    def restart(self, h: Hypothesis, parts: Sequence[float]) -> Hypothesis:
+        """The best of a fit and those from points on the line to a unit with its faults and effects, otherwise healthy.
 
-    @property
-    def alone(self) -> CountedProblem:
-        """The problem for one thread."""
-        return replace(self.problem, workers=1, _lanes={})
+        `parts` of that line lie between the fit, 0, and the other unit, 1.
+        """
+        way = place_home(self.problem, h.fit) - h.fit.x
+        return _keep_best(h, self.map_alone(lambda part: self.descend(
+            start_fit(h.fit.free, h.fit.x + part * way), ((6.0, 4), (1.0, 8))), parts))
 
     def descend(self, fit: Fit, schedule: Sequence[tuple[float, int]]) -> Fit:
         """The fit after rounds with the noise so many times as large: (factor, rounds) each."""
-        return descend(self.alone, fit, schedule)
+        return descend(self.problem.alone, fit, schedule)
 
     def map_alone(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
         """By all threads; each fit keeps to one of them."""
         return map_in_threads(do, items, self.problem.workers)
 
-    def _begin_fit(self, p: Prospect) -> Fit:
-        """Begin at the scan's linear forecast, with the noise first taken for larger."""
-        return self.descend(start_fit(p.free, p.x), (NOISE_SCHEDULE[1], (1.0, 3)))
 
-    def _name_added(self, fit: Fit, present: Sequence[str]) -> str:
-        names = {f.name for f in fit.free}
-        return next(e for e in self.effects if e not in present
-                    and set(self.problem.model.find_effect(e).fitted) & names)
+def _keep_best(h: Hypothesis, others: Iterable[Fit]) -> Hypothesis:
+    """The hypothesis with the best of its fit and some others."""
+    return replace(h, fit=min(h.fit, *others, key=lambda fit: fit.cost))
 
 
-def _get_cost(each: Named) -> float:
-    return each[1].cost
-
-
-def _describe(effects: Sequence[str]) -> str:
-    return " and ".join(effects) or "the faults alone"
-
-
-def _excludes(model: Model, effect: str, present: Sequence[str]) -> bool:
-    own = model.find_effect(effect)
-    return any(effect in model.find_effect(e).excludes or e in own.excludes for e in present)
-
-
-def _takes_fair_share(before: Fit, after: Fit) -> bool:
-    """Whether an effect takes away a fair part of what was left: less is what fits win by luck."""
-    noise = float(np.count_nonzero(before.white))
-    return before.cost - after.cost >= FURTHER_EFFECT_SHARE * (before.cost - noise)
+def _describe(h: Hypothesis) -> str:
+    return " and ".join(h.effects) or "the faults alone"
 
 
 @dataclass(frozen=True, eq=False)
@@ -1073,6 +1011,11 @@ class Explanation:
     parameters: Mapping[str, Value]  # of these effects, by name
     refinement: Refinement
     weight: float = 1.0  # probability among all explanations
+
+    @property
+    def cost(self) -> float:
+        """-2 log likelihood."""
+        return self.refinement.fit.cost
 
     @property
     def levels(self) -> dict[str, Level | None]:
@@ -1138,9 +1081,9 @@ def weigh_costs(costs: Sequence[float]) -> list[float]:
     return [each / sum(likely) for each in likely]
 
 
-def _compute_charged_cost(e: Explanation) -> float:
+def _compute_charged_cost(e: Explanation | Hypothesis) -> float:
     """-2 log likelihood, and for each effect what it has to gain to be named."""
-    return e.refinement.fit.cost + GAIN_CONVINCES * len(e.effects)
+    return e.cost + GAIN_CONVINCES * len(e.effects)
 
 
 def mix_estimates(estimates: Sequence[Estimate], weights: Sequence[float]) -> Estimate:

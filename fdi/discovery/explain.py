@@ -141,7 +141,7 @@ def _search_levels(search: Search, base: Hypothesis, progress: Progress) -> list
         search.stage = Stage(progress, f"looking for effect {count}", shares[count - 1], shares[count], fits)
         tried: list[Hypothesis] = []
         for parent in beam:
-            tried = _drop_duplicates([*tried, *search.add_each_effect(parent, 8 if count == 1 else 4)])
+            tried = drop_duplicates([*tried, *search.add_each_effect(parent, 8 if count == 1 else 4)])
             if tried and tried[0].is_at_floor:
                 break  # the other ways would have to get there as well, from further off
         if not tried and count == 1 and not base.is_at_floor:  # the fit of the base hides the way to any effect
@@ -157,13 +157,13 @@ def _search_levels(search: Search, base: Hypothesis, progress: Progress) -> list
         done = search.reaches_floor(tried[0])
         if not done and count == 2 and levels[1][0].is_near_floor and measure_gain(levels[1][0], tried[0]) <= GAIN_SEEN:
             # either no second effect is missing but stops that the first fit missed, or one whose gain such stops hide
-            levels[1] = _drop_duplicates([search.search_widely(levels[1][0]), *levels[1]])
+            levels[1] = drop_duplicates([search.search_widely(levels[1][0]), *levels[1]])
             levels.append(tried)
             break
         if not done or tried[0].is_far or (levels[0][0].is_at_floor and levels[0][0].is_far):
             # a fit in a local minimum leads the scan astray, and far tolerances may stand in for an effect
-            tried = _drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)])
-        if count == 2 and not done and _takes_fair_share(search, levels[1][0], tried[0]) and not \
+            tried = drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)])
+        if count == 2 and not done and takes_fair_share(search.problem, levels[1][0], tried[0]) and not \
                 search.reaches_floor(tried[0]):
             tried = _search_other_valleys(search, levels, tried)
         levels.append(tried)
@@ -171,7 +171,8 @@ def _search_levels(search: Search, base: Hypothesis, progress: Progress) -> list
         if done or tried[0].is_at_floor or measure_gain(before, tried[0]) <= GAIN_SEEN:
             break
         # the first effect is no such way: two large effects each help little alone
-        if count > 1 and not (_takes_fair_share(search, before, tried[0]) and _improves(search, before, tried[0])):
+        if count > 1 and not (takes_fair_share(search.problem, before, tried[0])
+                              and _improves(search, before, tried[0])):
             break
         beam = [h for h in tried[:2] if h.cost < tried[0].cost + 0.5 * (levels[0][0].cost - tried[0].cost)]
     return levels
@@ -185,13 +186,13 @@ def _search_other_valleys(search: Search, levels: list[list[Hypothesis]], tried:
     """
     singles = [h for h in levels[1][:1] if h.is_near_floor]
     found = search.map_parallel(search.search_widely, [*singles, *tried[:2]])
-    levels[1] = _drop_duplicates([*found[:len(singles)], *levels[1]])
-    return _drop_duplicates([*found[len(singles):], *tried])
+    levels[1] = drop_duplicates([*found[:len(singles)], *levels[1]])
+    return drop_duplicates([*found[len(singles):], *tried])
 
 
-def _takes_fair_share(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
+def takes_fair_share(problem: Problem, before: Hypothesis, after: Hypothesis) -> bool:
     """Whether an effect takes away a fair part of what was left: less is what fits win by luck."""
-    noise = float(np.isfinite(search.problem.trace.measurements).sum())
+    noise = float(np.isfinite(problem.trace.measurements).sum())
     return before.cost - after.cost >= FURTHER_EFFECT_SHARE * (before.cost - noise)
 
 
@@ -206,10 +207,10 @@ def _improves(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
     return excess[1] < ERROR_PARTLY_EXPLAINED * excess[0]
 
 
-def _drop_duplicates(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
+def drop_duplicates(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best hypothesis of each set of effects, best first."""
     best: dict[frozenset[str], Hypothesis] = {}
-    for h in _sort_by_cost(tried):
+    for h in sort_by_cost(tried):
         best.setdefault(frozenset(h.effects), h)
     return list(best.values())
 
@@ -277,7 +278,7 @@ def _choose_depth(search: Search, levels: list[list[Hypothesis]]) -> int:
     """How many effects the last fits have; `_prune_level` may put a better hypothesis first in that level."""
     firsts = [level[0] for level in levels]
     depth = max((i for i in range(1, len(levels)) if helps_explain(firsts[i - 1], firsts[i], GAIN_SEEN)
-                 and (i == 1 or _takes_fair_share(search, firsts[i - 1], firsts[i]))), default=0)
+                 and (i == 1 or takes_fair_share(search.problem, firsts[i - 1], firsts[i]))), default=0)
     if depth > 1 and firsts[1].is_at_floor and measure_gain(firsts[1], firsts[depth]) <= GAIN_CONVINCES:
         depth = 1
     if depth == 0 and len(levels) > 1 and (levels[0][0].is_far or not levels[0][0].is_at_floor):
@@ -301,22 +302,22 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
     is_cut = search.leave_out_undecided(levels[depth][0])
     base, *close = search.map_parallel(lambda work: search.finish_hypothesis(*work),
                                        [(levels[0][0], rounds), *((h, 5) for h in close)])
-    close = _sort_by_cost(close)
+    close = sort_by_cost(close)
     best = (close or [base])[0]
     if search.leave_out_undecided(best) or is_cut:  # of the size that it has without these rows, further ones
         search.learn_noise(best)
         base, *close = search.map_parallel(partial(search.finish_hypothesis, rounds=2), [base, *close])
-        close = _sort_by_cost(close)
-    close = _sort_by_cost([*search.map_parallel(search.begin_again, close[:2]), *close[2:]])
+        close = sort_by_cost(close)
+    close = sort_by_cost([*search.map_parallel(search.begin_again, close[:2]), *close[2:]])
     base, *close = [*search.map_parallel(search.leave_valley, [base, *close[:2]]), *close[2:]]
-    close = _sort_by_cost(close)
+    close = sort_by_cost(close)
     if is_cut and close and search.leave_out_undecided(close[0]):
         base, *close = search.map_parallel(partial(search.finish_hypothesis, rounds=2), [base, *close])
     known = [h.effects[0] for h in close]
     base, close = _doubt_small_gain(search, base, close, depth)
     if known and not close:  # an effect may yet do more from where the base is now than by its own fit
         near = fit_unknowns(search.problem, base.fit.free, base.fit.x, 4)
-        close = _sort_by_cost(search.begin_effects(near, known))
+        close = sort_by_cost(search.begin_effects(near, known))
     return _doubt_small_gain(search, base, _compare_rivals(search, base, close), depth)
 
 
@@ -333,7 +334,7 @@ def _compare_rivals(search: Search, base: Hypothesis, close: list[Hypothesis]) -
             break
         best, known = close[0], {h.effects[0] for h in close if h.is_at_floor}
         more = search.begin_look_alikes(base, best, known) if len(best.effects) == 1 else []
-        close = _drop_duplicates([*search.map_parallel(partial(begin, best=best), close), *more])
+        close = drop_duplicates([*search.map_parallel(partial(begin, best=best), close), *more])
         if close[0] is best:
             break
     return close
@@ -366,7 +367,7 @@ def shows_effect(model: Model, h: Hypothesis) -> bool:
                > INTERVAL_95_SD * h.fit.spread(name) for name in entry.fitted)
 
 
-def _sort_by_cost(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
+def sort_by_cost(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
     return sorted(hypotheses, key=lambda h: h.cost + h.repeat_cost)
 
 
@@ -377,7 +378,7 @@ def _prune_level(search: Search, levels: list[list[Hypothesis]], depth: int) -> 
         if helps_explain(best, levels[depth][0], GAIN_CONVINCES):
             break
         depth -= 1
-        levels[depth] = _drop_duplicates([best, *levels[depth]])
+        levels[depth] = drop_duplicates([best, *levels[depth]])
     return depth
 
 

@@ -200,9 +200,7 @@ class Search:
 
     def list_further_effects(self, present: Sequence[str]) -> list[str]:
         """The effects of the search that may stand beside these."""
-        excluded = {name for e in present for name in self.model.find_effect(e).excludes}
-        return [e for e in self.effects if e not in present and e not in excluded
-                and not set(self.model.find_effect(e).excludes) & set(present)]
+        return list_compatible_effects(self.model, self.effects, present)
 
     def add_each_effect(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
         """`start` with one more effect: the promising ones fitted, best first."""
@@ -566,6 +564,13 @@ class Search:
         self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.trace for p in self.repeats))
         self.fine = replace(self.problem, steps=finest, _lanes={})
         self.repeats = [replace(p, steps=finest, _lanes={}) for p in self.repeats]
+
+
+def list_compatible_effects(model: Model, effects: Iterable[str], present: Sequence[str]) -> list[str]:
+    """The effects that may stand beside those that are `present`."""
+    excluded = {name for e in present for name in model.find_effect(e).excludes}
+    return [e for e in effects if e not in present and e not in excluded
+            and not set(model.find_effect(e).excludes) & set(present)]
 
 
 def learn_noise(h: Hypothesis, trace: Trace, before: Sequence[Noise]) -> list[Noise]:

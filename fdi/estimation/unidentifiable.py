@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,11 @@ from fdi.estimation.fit import (
     compute_weights,
     cut_at_bounds,
     find_best_trial,
+    follow_population,
     form_normal_equations,
     limit_dynamic_friction,
     replay_fit,
+    scale_noise,
     scaled_bounds,
     step_within_bounds,
     weigh_priors,
@@ -385,12 +387,25 @@ def compute_values(free: Sequence[Free], x: Floats) -> Floats:
 class LogProblem(Problem):
     """A problem whose unknowns may be logarithms, a friction by its ratio to the other one of the same body."""
 
+    stage: Stage = NO_STAGE  # takes a step with each round of a fit
+
+    @property
+    def alone(self) -> Self:
+        """The same for one thread."""
+        return replace(self, workers=1, _lanes={})
+
+    def find_flat(self, free: Sequence[Free], x: Floats) -> Floats:
+        """Directions (p, k) of scaled unknowns at `x` (p,) that no signal shows."""
+        return find_flat_directions(self, free, x)
+
     def convert_unknowns(self, free: Sequence[Free], x: Floats) -> Floats:
         return np.array([compute_values(free, row) for row in x])
 
     def list_values(self, free: Sequence[Free], x: Floats) -> dict[str, float]:
         return dict(zip([f.name for f in free], compute_values(free, x).tolist(), strict=True))
 
+
+L = TypeVar("L", bound=LogProblem)
 
 PATIENCE = 3  # rounds without a gain, in which the covariance still grows to what it is
 DIRECTION_WIDTH_SD = 3.0  # of a difference, standard deviations
@@ -556,4 +571,43 @@ def start_fit(free: Sequence[Free], x: Floats) -> Fit:
 
 def guess_covariance(free: Sequence[Free], across: float = 1e-3) -> Floats:
     """A covariance, (p, p), that gives differences across the valley their first width."""
-    return np.diag([min(across / f.scale, 0.1) ** 2 if type(f) is not Free else 1e-4 for f in free])
+    def guess_variance(f: Free) -> float:
+        if not np.isfinite(f.prior):  # a parameter of an effect
+            return (f.step / 3.0) ** 2
+        return min(across / f.scale, 0.1) ** 2 if type(f) is not Free else 1e-4
+
+    return np.diag([guess_variance(f) for f in free])
+
+
+def descend(problem: LogProblem, found: Fit, schedule: Sequence[tuple[float, int]],
+            shown_by: LogProblem | None = None) -> Fit:
+    """The fit after (factor, rounds) each: the noise so many times as large, so that small stops of the ram count late.
+
+    Its covariance begins anew each time. `shown_by` tells which directions no signal shows, by default the problem.
+    """
+    for factor, rounds in schedule:
+        begun = replace(found, covariance=guess_covariance(found.free))
+        flat = (shown_by or problem).find_flat(found.free, found.x)
+        found = descend_valley(scale_noise(problem, factor), begun, rounds, flat, problem.stage)
+    return found
+
+
+def search_widely(problem: L, shown_by: LogProblem, home: Fit, widths: Floats, stages: Sequence[tuple[float, int]],
+                  seed: int) -> Fit:
+    """The fit at which a population ends that begins about `home`.
+
+    Args:
+        problem: the run, with steps that suffice for a population.
+        shown_by: tells which directions no signal shows.
+        home: where the search begins.
+        widths: (p,) of the first trials, scaled, of unknowns that slopes lead astray: these begin at home.
+        stages: factor on the noise and generations, each.
+        seed: of the trials.
+    """
+    def slide(problem: L, fit: Fit, rounds: int, factor: float) -> Fit:
+        return descend(problem, fit, ((factor, rounds),), shown_by)
+
+    begun = slide(problem, home, 3, stages[0][0])
+    spread = 9.0 * begun.covariance + np.diag(widths**2)
+    begun = replace(begun, x=np.where(widths > 0.0, home.x, begun.x))
+    return follow_population(problem, begun, spread, stages, seed, slide)

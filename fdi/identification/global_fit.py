@@ -23,13 +23,11 @@ from fdi.estimation.fit import (
     scaled_bounds,
 )
 from fdi.estimation.unidentifiable import (
-    BALANCED,
     LogFree,
     LogFrictionRatio,
     LogProblem,
-    descend_valley,
-    find_flat_directions,
-    guess_covariance,
+    descend,
+    search_widely,
     start_fit,
 )
 from fdi.progress import Progress, ignore_progress
@@ -94,7 +92,7 @@ def fit_from_afar(problem: LogProblem, free: Sequence[Free], starts: Floats, pro
 
         def advance(fit: Fit, stage: LogProblem = stage, rounds: int = rounds, factor: float = factor) -> Fit:
             alone = replace(stage, _lanes={})
-            return descend(alone, scan_unknowns(scale_noise(alone, factor), fit), rounds, factor)
+            return descend(alone, scan_unknowns(scale_noise(alone, factor), fit), ((factor, rounds),))
 
         fits = sorted(map_in_threads(advance, fits[:count], problem.workers), key=lambda fit: fit.cost)
     return fits[0]
@@ -115,10 +113,11 @@ def search_other_valleys(problem: LogProblem, found: Fit, begin: Floats, seed: i
         progress(f"search of other valleys, {attempt + 1} of at most {SEARCHES}", 0.75 + 0.15 * attempt / SEARCHES)
 
         def search(is_wide_search: bool, best: Fit = best, number: int = attempt) -> Fit:
-            coarse = replace(problem, workers=1, steps=SEARCH_STEPS, _lanes={})
-            end = (_search_widely(coarse, best.free, begin, seed + number) if is_wide_search
-                   else _search_narrowly(coarse, best, seed + number))
-            return descend(replace(problem, workers=1, _lanes={}), end, 8)
+            coarse = replace(problem.alone, steps=SEARCH_STEPS)
+            widths = _widen_frictions(best.free, 0.3, 0.2)
+            end = (search_widely(coarse, coarse, start_fit(best.free, begin), widths, WIDE_STAGES, seed + number)
+                   if is_wide_search else _search_narrowly(coarse, best, seed + number))
+            return descend(problem.alone, end, ((1.0, 8),))
 
         before = best.misfit - np.count_nonzero(best.white)
         best = min(best, *map_in_threads(search, (False, True), problem.workers), key=lambda fit: fit.cost)
@@ -128,17 +127,12 @@ def search_other_valleys(problem: LogProblem, found: Fit, begin: Floats, seed: i
 
 
 def _search_narrowly(problem: LogProblem, best: Fit, seed: int) -> Fit:
-    begun = descend(problem, start_fit(best.free, best.x), 3, NARROW_STAGES[0][0])
+    def slide(problem: LogProblem, fit: Fit, rounds: int, factor: float) -> Fit:
+        return descend(problem, fit, ((factor, rounds),))
+
+    begun = slide(problem, start_fit(best.free, best.x), 3, NARROW_STAGES[0][0])
     spread = 4.0 * begun.covariance + np.diag(_widen_frictions(best.free, 0.15, 0.0) ** 2)
-    return follow_population(problem, begun, spread, NARROW_STAGES, seed, descend)
-
-
-def _search_widely(problem: LogProblem, free: Sequence[Free], begin: Floats, seed: int) -> Fit:
-    begun = descend(problem, start_fit(free, begin), 3, WIDE_STAGES[0][0])
-    widths = _widen_frictions(free, 0.3, 0.2)
-    spread = 9.0 * begun.covariance + np.diag(widths**2)
-    home = replace(begun, x=np.where(widths > 0.0, begin, begun.x))
-    return follow_population(problem, home, spread, WIDE_STAGES, seed, descend)
+    return follow_population(problem, begun, spread, NARROW_STAGES, seed, slide)
 
 
 def _widen_frictions(free: Sequence[Free], static: float, dynamic: float) -> Floats:
@@ -151,20 +145,12 @@ def polish_fit(problem: LogProblem, fit: Fit, seed: int, generations: int = 25) 
     """The fit at the lowest place near it: slopes stop at the first ridge of a rough valley, a population does not."""
     spread = 4.0 * fit.covariance + np.diag(_widen_frictions(fit.free, 0.02, 0.0) ** 2)
     found = evolve_fit(problem, fit, spread, generations, seed)
-    return min(fit, descend(problem, found, 4), key=lambda each: each.cost)
+    return min(fit, descend(problem, found, ((1.0, 4),)), key=lambda each: each.cost)
 
 
 def is_fitted(fit: Fit) -> bool:
     """Whether only noise is left, by its known size."""
     return bool(fit.misfit <= FITTED_SQUARE * np.count_nonzero(fit.white))
-
-
-def descend(problem: LogProblem, fit: Fit, rounds: int, factor: float = 1.0) -> Fit:
-    """A fit after so many rounds from where it is, with a covariance that begins anew; the noise `factor` times as
-    large.
-    """
-    begun = replace(fit, covariance=guess_covariance(fit.free))
-    return descend_valley(scale_noise(problem, factor), begun, rounds, find_flat(problem, fit.free, fit.x))
 
 
 def scan_unknowns(problem: LogProblem, fit: Fit, rounds: int = 2) -> Fit:
@@ -217,18 +203,3 @@ def put_unknown(x: Floats, k: int, value: float) -> Floats:
     moved = x.copy()
     moved[k] = value
     return moved
-
-
-def find_flat(problem: LogProblem, free: Sequence[Free], x: Floats) -> Floats:
-    """Directions (p, k) of scaled unknowns at `x` (p,) along which no signal changes."""
-    v = {**problem.model.values, **problem.list_values(free, x)}
-    if not v.keys() >= BALANCED:
-        return np.empty((len(free), 0))
-    leaking = {"valve.pressure_gain": 1.0}
-    if v["jack.leakage"] > 0.0:  # only 1/GP + CLK/GQ counts
-        leaking["jack.leakage"] = v["valve.flow_gain"] / (v["valve.pressure_gain"] * v["jack.leakage"])
-    flapper = {"flapper.travel": -1.0, "flapper.stiffness": 1.0, "flapper.damping": 1.0,
-               "flapper.inertia": 1.0, "pilot.flow_gain": 1.0, "pilot.pressure_gain": 1.0}
-    sticking = {"pilot.pressure_gain": 1.0, "spool.static_friction": 1.0, "spool.dynamic_friction": 1.0}
-    turning = {"flapper.inertia": 1.0}  # its time constant, JF/BF, is 25 us: slopes by it are the solver's
-    return find_flat_directions(problem, free, x, (leaking, flapper, sticking, turning))

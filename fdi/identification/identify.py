@@ -51,14 +51,14 @@ from fdi.estimation.unidentifiable import (
     LogFrictionRatio,
     LogProblem,
     compute_values,
+    descend,
     estimate_smooth_covariance,
+    find_flat_directions,
     remove_slope,
     start_fit,
     take_logarithm,
 )
 from fdi.identification.global_fit import (
-    descend,
-    find_flat,
     fit_from_afar,
     is_fitted,
     polish_fit,
@@ -441,7 +441,7 @@ def _measure_information(problem: LogProblem, free: Sequence[Free], x: Floats) -
     steps = np.array([DIFFERENCE / f.scale if isinstance(f, LogFree) else DIFFERENCE for f in free])
     steps = np.where(x + steps > high, -steps, steps)
     white = problem.compute_white_residuals(free, np.vstack([x, np.clip(x + np.diag(steps), low, high)]))
-    jacobian = remove_slope((white[1:] - white[0]) / steps[:, None, None], find_flat(problem, free, x))
+    jacobian = remove_slope((white[1:] - white[0]) / steps[:, None, None], problem.find_flat(free, x))
     rows = jacobian.reshape(len(free), -1)
     return rows @ rows.T
 
@@ -653,11 +653,29 @@ def cut_long_runs(runs: Sequence[Trace], sources: Sequence[Source], model: Model
     return tuple(parts), remarks
 
 
+@dataclass
+class ScaledProblem(LogProblem):
+    """The runs of an actuator of any size, which show less of it than those of a healthy unit of a known one."""
+
+    def find_flat(self, free: Sequence[Free], x: Floats) -> Floats:
+        v = {**self.model.values, **self.list_values(free, x)}
+        if not v.keys() >= BALANCED:
+            return np.empty((len(free), 0))
+        leaking = {"valve.pressure_gain": 1.0}
+        if v["jack.leakage"] > 0.0:  # only 1/GP + CLK/GQ counts
+            leaking["jack.leakage"] = v["valve.flow_gain"] / (v["valve.pressure_gain"] * v["jack.leakage"])
+        flapper = {"flapper.travel": -1.0, "flapper.stiffness": 1.0, "flapper.damping": 1.0,
+                   "flapper.inertia": 1.0, "pilot.flow_gain": 1.0, "pilot.pressure_gain": 1.0}
+        sticking = {"pilot.pressure_gain": 1.0, "spool.static_friction": 1.0, "spool.dynamic_friction": 1.0}
+        turning = {"flapper.inertia": 1.0}  # its time constant, JF/BF, is 25 us: slopes by it are the solver's
+        return find_flat_directions(self, free, x, (leaking, flapper, sticking, turning))
+
+
 def make_problem(model: Model, fitted: Sequence[Trace], floor: Mapping[str, float], workers: int) -> LogProblem:
     """The runs to fit with white noise of the floor's size; a signal that a run lacks counts nothing in it."""
     noise = tuple(white_noise(level) for level in floor.values())
     first, *others = (replace(t, outputs=tuple(floor)) for t in fitted)
-    return LogProblem(silence_readings(model), first, noise, workers=workers, also=tuple(others))
+    return ScaledProblem(silence_readings(model), first, noise, workers=workers, also=tuple(others))
 
 
 def find_hidden(problem: LogProblem, fit: Fit, ranges: Mapping[str, Range]
@@ -733,7 +751,7 @@ def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress
     `begin`: the unknowns (p,) where regressions put them, at which a search begins if the fit ended in a local minimum.
     """
     fine = replace(problem, steps=count_last_steps(problem.model), _lanes={})
-    fit = descend(fine, fit, 8)
+    fit = descend(fine, fit, ((1.0, 8),))
     if not is_fitted(fit):
         fit = search_other_valleys(fine, fit, begin, seed, progress)
     progress("last rounds", 0.9)
@@ -743,8 +761,8 @@ def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress
         learnt = tuple(fit_noise(r) if s > 0.0 else old  # a signal that the model gives exactly tells none
                        for r, s, old in zip(fit.residuals, size, fine.noise, strict=True))
         fine = replace(fine, noise=learnt, _lanes={})
-        fit = descend(fine, fit, 5)
-    if not fit.free or problem.model.values.keys() >= BALANCED:  # `find_flat` knows what no run shows
+        fit = descend(fine, fit, ((1.0, 5),))
+    if not fit.free or problem.model.values.keys() >= BALANCED:  # its `find_flat` knows what no run shows
         return fine, fit
     # of an actuator whose laws of similarity nobody has declared it seems known by a jump at a stop
     coarse, flat = replace(fine, steps=problem.steps, _lanes={}), np.empty((len(fit.free), 0))
@@ -764,14 +782,15 @@ def fit_beginnings(problem: LogProblem, free: Sequence[Free], floor: Mapping[str
     """
     fit = start_fit(free, scale_values(free, problem.model.values))
     for factor in BEGINNING_NOISE:
-        fit = descend(problem, fit, FIT_ROUNDS, factor)
-        fit = descend(problem, profile_unknowns(scale_noise(problem, factor), fit), FIT_ROUNDS, factor)
+        schedule = ((factor, FIT_ROUNDS),)
+        fit = descend(problem, fit, schedule)
+        fit = descend(problem, profile_unknowns(scale_noise(problem, factor), fit), schedule)
     at = problem.model.replace(problem.list_values(free, fit.x))
     runs = [leave_out_rows(t, find_undecided_rows(Problem(at, t, problem.noise, steps=count_last_steps(at)),
                                                   start_fit((), np.empty(0)), floor))
             for t in (problem.trace, *problem.also)]
     decided = replace(problem, trace=runs[0], also=tuple(runs[1:]), _lanes={})
-    return decided, descend(decided, fit, FIT_ROUNDS)
+    return decided, descend(decided, fit, ((1.0, FIT_ROUNDS),))
 
 
 def build_model(model: Model, problem: LogProblem, fit: Fit, gains: ControllerGains | None) -> Model:
