@@ -327,10 +327,10 @@ def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eh
         InputError: runs, a model, a signal or a range that cannot be used.
     """
     from fdi.identification.identify import (
-        collect_identification_runs,
         identify_model,
         parse_free_parameters,
         read_free_parameters,
+        read_identification_runs,
     )
     from fdi.report.identify_report import build_identification_report
 
@@ -338,7 +338,7 @@ def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eh
     source = None if isinstance(model, Model) else model
     ranges = read_free_parameters(own_model, source) if free is None else parse_free_parameters(free, own_model, "free")
     fitted = [runs] if isinstance(runs, Trace | str | Path) else list(runs)
-    own = collect_identification_runs(own_model, ranges, [_load_trace(r, own_model) for r in fitted],
+    own = read_identification_runs(own_model, ranges, [_load_trace(r, own_model) for r in fitted],
                                       [_load_trace(r, own_model) for r in holdouts], signals)
     found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources, seed)
     return IdentificationResult(build_identification_report(found, own_model.name), found)
@@ -400,7 +400,7 @@ def _load_model_file(model: ModelOrPath, trust: bool) -> tuple[Model, Provenance
 
 def _collect_runs(model: Model, trace: TraceOrPath, repeats: Sequence[TraceOrPath], holdout: TraceOrPath | None,
                   signals: Sequence[str] | None) -> Runs:
-    from fdi.discovery.runs import collect_runs
+    from fdi.discovery.runs import read_runs
 
     unseen = None if holdout is None else _load_trace(holdout, model)
-    return collect_runs(model, _load_trace(trace, model), [_load_trace(r, model) for r in repeats], unseen, signals)
+    return read_runs(model, _load_trace(trace, model), [_load_trace(r, model) for r in repeats], unseen, signals)

@@ -114,8 +114,8 @@ class Model:
         base = self.kind.nominal
         return {name: value for name, value in self.values.items() if base.get(name) != value}
 
-    def to_toml(self) -> str:
-        """The text of a model file, which `load_model` reads."""
+    def to_toml(self, remarks: Mapping[str, str] | None = None) -> str:
+        """The text of a model file, which `load_model` reads; `remarks` stand beside parameters, by "group.field"."""
         effects = ", ".join(f'"{e}"' for e in self.effects)
         name = json.dumps(self.name, ensure_ascii=False).replace("\x7f", "\\u007f")  # a JSON text is TOML but for this
         plant = [] if self.plant == "eha" else [f"plant = {json.dumps(self.plant, ensure_ascii=False)}"]
@@ -132,7 +132,8 @@ class Model:
                     lines += ["", f"[{heading}{group}]"]
                 quantity = find_quantity(name, plant=self.plant)
                 word = next((f'"{w}"' for w, number in quantity.words.items() if number == value), repr(value))
-                lines.append(f"{tail} = {word}" + (f"  # {quantity.unit}" if quantity.unit != "1" else ""))
+                notes = [note for note in (quantity.unit, (remarks or {}).get(name, "")) if note not in ("", "1")]
+                lines.append(f"{tail} = {word}" + (f"  # {', '.join(notes)}" if notes else ""))
         return "\n".join(lines) + "\n"
 
     def list_names(self) -> list[str]:

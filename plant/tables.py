@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import re
 import tomllib
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType, UnionType
@@ -43,22 +44,21 @@ class Choice(NamedTuple):
 
 @dataclass(frozen=True)
 class Place:
-    """Where a value stands: a file, the keys that lead to it ("main[3].time"), and the lines of all keys."""
+    """Where a value stands: a file with its text, and the keys that lead to it ("main[3].time")."""
 
     file: str
-    lines: Mapping[str, int] = field(default_factory=dict, repr=False)
+    text: str = field(default="", repr=False)
     keys: str = ""
 
     def at(self, *keys: str | int) -> Place:
         """The place below this one."""
-        return Place(self.file, self.lines, _join_keys(self.keys, keys))
+        path = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
+        return replace(self, keys=(self.keys + path).lstrip("."))
 
     def refuse(self, expected: str) -> InputError:
         """The error to raise for the value at this place, with the line of the nearest key that has one."""
-        known = self.keys
-        while known and known not in self.lines:
-            known = known[:max(known.rfind("."), known.rfind("["), 0)]
-        return InputError(f"{self.file}:{self.lines[known]}" if known else self.file, self.keys, expected)
+        line = find_line(self.text, self.keys)
+        return InputError(f"{self.file}:{line}" if line else self.file, self.keys, expected)
 
     def require(self, holds: object, expected: str) -> None:
         """Refuse the value at this place unless what it must be `holds`. Raises InputError."""
@@ -73,10 +73,6 @@ class Place:
         except InputError as error:
             place = self.at(error.field) if has_field and error.field else self
             raise place.refuse(error.expected) from error
-
-
-def _join_keys(path: str, keys: Iterable[str | int]) -> str:
-    return (path + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)).lstrip(".")
 
 
 def read_file(path: Path) -> bytes:
@@ -96,7 +92,10 @@ def decode_text(data: bytes, name: object) -> str:
 def parse_table(text: str, file: str) -> tuple[dict[str, Any], Place]:
     """The tables of a TOML text and the place of its root; InputError with the line if it is not TOML."""
     try:
-        return tomllib.loads(text), Place(file, find_lines(text))
+        tables = tomllib.loads(text)
+        if _measure_depth(tables) > DEEPEST:
+            raise RecursionError
+        return tables, Place(file, text)
     except tomllib.TOMLDecodeError as error:
         found = re.fullmatch(r"(.*) \(at (?:line (\d+), column \d+|end of document)\)", str(error), re.DOTALL)
         message, line = (found[1], found[2] or text.count("\n") + 1) if found else (str(error), 1)
@@ -171,8 +170,8 @@ def _convert(value: Any, hint: Any, place: Place, kinds: Kinds) -> Any:
         if len(members) == 1:
             return _convert(value, members[0], place, kinds)
         for member in members:
-            with suppress(InputError):
-                return _convert(value, member, place, kinds)
+            with suppress(InputError):  # so nobody asks for the line
+                return _convert(value, member, Place(place.file), kinds)
     elif origin is tuple:
         parts = args[:1] * len(value) if isinstance(value, list) and args[-1] is Ellipsis else args
         if isinstance(value, list) and len(value) == len(parts):
@@ -227,69 +226,41 @@ def describe_annotation(hint: Any) -> str:
     return _SCALARS.get(hint, "a table")
 
 
-_MOST_PARTS = 100  # of a key, with those of the tables that it is in
-_TOKEN = re.compile(
-    r"""
-    (?P<skip> [ \t\r]+ | \#[^\n]* )
-  | (?P<mark> [\n\[\]{},=] )
-  | (?P<string> \"\"\"(?:\\.|[^\\])*?\"{3,5} | '''.*?'{3,5} | "(?:\\.|[^"\\])*" | '[^']*' )
-  | (?P<bare> [^\s\[\]{},="'\#]+ )
-    """,
-    re.DOTALL | re.VERBOSE,
-)
+DEEPEST = 100  # tables and arrays within each other
+ENDS = ("", "]", "]]", "}]", "]}]", '"""', "'''")  # of what may be open at the end of a line
 
 
-def find_lines(text: str) -> dict[str, int]:
-    """Line number, from 1, of every key, array element and table header of a text that is TOML.
+def find_line(text: str, keys: str) -> int:
+    """The line, from 1, in which a TOML text has the value of these keys, or the nearest one above it; 0: it has none.
 
-    Raises RecursionError for keys of too many parts.
-
-    >>> find_lines("a.b = [\\n1]\\n[[c]]")
-    {'a': 1, 'a.b': 1, 'a.b[0]': 2, 'c': 3, 'c[0]': 3}
+    >>> find_line("a.b = [\\n1]\\n[[c]]", "a.b[0]"), find_line("a = 1\\n[[c]]", "c[0].d"), find_line("a = 1", "b")
+    (2, 2, 0)
     """
-    found: dict[str, int] = {}
-    counts: dict[str, int] = {}  # elements so far of each array of tables
-    open_: list[tuple[str, int]] = [("", -1)]  # tables and arrays that are open, with the element; -1 in a table
-    key: list[str] = []
-    state, path, line = "key", "", 1
-    for match in _TOKEN.finditer(f"{text}\n"):
-        kind, token = match.lastgroup, match.group()
-        above, element = open_[-1]
-        if state == "value" and element >= 0 and kind != "skip" and token not in ("\n", ",", "]"):
-            path = f"{above}[{element}]"
-            found.setdefault(path, line)
-        if kind in ("string", "bare") and state != "value":
-            key += [token[1:-1]] if kind == "string" else [part for part in token.split(".") if part]
-        elif token == "[" and state == "key":
-            state = "header"
-        elif token == "[" and state == "header":
-            state = "array header"
-        elif token in ("[", "{"):
-            open_.append((path, 0 if token == "[" else -1))
-            state = "value" if token == "[" else "key"
-        elif token == "=" or (token == "\n" and "header" in state):
-            path = above if token == "=" else ""
-            if len(key) + path.count(".") > _MOST_PARTS:
-                raise RecursionError
-            for part in key:
-                if path in counts and token == "\n":
-                    path = f"{path}[{counts[path] - 1}]"
-                path = _join_keys(path, (part,))
-                found.setdefault(path, line)
-            if state == "array header":
-                counts[path] = counts.get(path, 0) + 1
-            if path in counts:
-                path = f"{path}[{counts[path] - 1}]"
-                found[path] = line
-            if token == "\n":
-                open_ = [(path, -1)]
-            state, key = "value" if token == "=" else "key", []
-        elif token in ("]", "}") and "header" not in state:
-            open_.pop()
-            state = "value"
-        elif token == "," and element >= 0:
-            open_[-1] = above, element + 1
-        elif token in (",", "\n") and element < 0:
-            state = "key"
-        line += token.count("\n")
-    return found
+    tables, lines = tomllib.loads(text), text.split("\n")
+    while not _has_value(tables, keys):
+        keys = keys[:max(keys.rfind("."), keys.rfind("["), 0)]
+
+    def is_read(count: int) -> bool:
+        """Whether the value is in so many lines; where an array or text goes on behind them, it is read as if ended."""
+        for stop in range(count, 0, -1):
+            for end in ENDS:
+                with suppress(tomllib.TOMLDecodeError):
+                    return _has_value(tomllib.loads("\n".join([*lines[:stop], end])), keys)
+        return False
+
+    return bisect_left(range(1, len(lines) + 1), True, key=is_read) + 1 if keys else 0
+
+
+def _has_value(value: Any, keys: str) -> bool:
+    """Whether a value of TOML holds one that these keys lead to. A key may have dots and brackets in it."""
+    if not keys:
+        return True
+    names = {f"[{i}]": item for i, item in enumerate(value)} if isinstance(value, list) else value
+    return isinstance(names, dict) and any(
+        _has_value(item, keys[len(name):].removeprefix(".")) for name, item in names.items()
+        if keys == name or keys.startswith((f"{name}.", f"{name}[")))
+
+
+def _measure_depth(value: Any) -> int:
+    inner = list(value.values()) if isinstance(value, dict) else value
+    return 1 + max(map(_measure_depth, inner), default=0) if isinstance(inner, list) else 0

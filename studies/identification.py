@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.binomial import measure_share
-from fdi.identification.identify import collect_identification_runs, identify_model, read_free_parameters
+from fdi.identification.identify import identify_model, read_free_parameters, read_identification_runs
 from fdi.trace.trace import Trace
 from plant.model import load_model
 from plant.segments import RATE
@@ -89,7 +89,7 @@ def judge_unit(seed: int, workers: int | None = None) -> dict[str, Any]:
     """The result of one trial as JSON values."""
     unit, model = simulate_unit(seed), load_model()
     ranges = read_free_parameters(model, None)
-    runs = collect_identification_runs(model, ranges, unit.fitted, [unit.held_out])
+    runs = read_identification_runs(model, ranges, unit.fitted, [unit.held_out])
     found = identify_model(runs.model, ranges, runs.fitted, runs.held_out, runs.sources, workers=workers)
     truth = unit.values
     rows = {e.name: {"true": truth[e.name], "value": e.value, "low": e.low, "high": e.high,

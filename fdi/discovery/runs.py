@@ -40,40 +40,20 @@ class Runs(NamedTuple):
     notes: tuple[str, ...]  # what reading had to leave out or put right
 
 
-def read_runs(model: Model, trace: str, repeats: Sequence[str] = (), holdout: str | None = None,
-              signals: Sequence[str] | None = None) -> Runs:
-    """Read the files of a search.
+def read_runs(model: Model, trace: str | Trace, repeats: Sequence[str | Trace] = (),
+              holdout: str | Trace | None = None, signals: Sequence[str] | None = None) -> Runs:
+    """The runs of a search, from files or traces.
 
     Raises:
-        InputError: a file that cannot be used, a repeat of another command, or a run given twice.
+        InputError: a file or trace that cannot be used, a repeat of another command, or a run given twice.
     """
-    files = [trace, *repeats, *([holdout] if holdout else [])]
-    sources = [read_source(file) for file in files]
-    traces = [Trace.read(file, signals=model.kind.signals) for file in files]
-    return _prepare_runs(model, traces, sources, len(repeats), signals)
-
-
-def collect_runs(model: Model, trace: Trace, repeats: Sequence[Trace] = (), holdout: Trace | None = None,
-                 signals: Sequence[str] | None = None) -> Runs:
-    """The runs of a search, from traces that have been read or simulated.
-
-    Raises:
-        InputError: a trace that cannot be used, a repeat of another command, or a run given twice.
-    """
-    traces = [trace, *repeats, *([holdout] if holdout is not None else [])]
-    sources = [Source(t.provenance.get("source", "trace"), hash_columns(t)) for t in traces]
-    return _prepare_runs(model, traces, sources, len(repeats), signals)
-
-
-def _prepare_runs(model: Model, traces: Sequence[Trace], sources: Sequence[Source], repeats: int,
-                  signals: Sequence[str] | None) -> Runs:
-    """The runs of a search: the one to explain, so many repeats, and a held-out one if there is one more."""
-    require_distinct(sources, "--repeat", "the same command run again", 1 + repeats)
+    traces, sources = read_traces([trace, *repeats, *([] if holdout is None else [holdout])], model)
+    require_distinct(sources, "--repeat", "the same command run again", 1 + len(repeats))
     names = [s.file for s in sources]
     est = _prepare_run(traces[0], model, signals, names[0])
     model = match_period(model, est, SAME_PERIOD)
-    others = tuple(_prepare_repeat(est, traces[n], model, names[n], n) for n in range(1, 1 + repeats))
-    unseen = _prepare_holdout(est, traces[-1], model, names[0], names[-1]) if len(traces) > 1 + repeats else None
+    others = tuple(_prepare_repeat(est, traces[n], model, names[n], n) for n in range(1, 1 + len(repeats)))
+    unseen = None if holdout is None else _prepare_holdout(est, traces[-1], model, names[0], names[-1])
     doubt = ""
     if others and model.kind.controller:  # an error of the model is the same in all of them and does not matter here
         first, *left = (compute_residuals(run, replay_current(run, model)) for run in (est, *others))
@@ -82,7 +62,19 @@ def _prepare_runs(model: Model, traces: Sequence[Trace], sources: Sequence[Sourc
     return Runs(model, est, others, unseen, tuple(sources), (*est.notes, *([doubt] if doubt else [])))
 
 
-def hash_columns(trace: Trace) -> str:
+def read_traces(given: Sequence[str | Trace], model: Model) -> tuple[list[Trace], list[Source]]:
+    """Traces of the plant of a model, those that are files read, and where they come from.
+
+    Raises:
+        InputError: a file that cannot be used.
+    """
+    sources = [Source(each.provenance.get("source", "trace"), _hash_columns(each)) if isinstance(each, Trace)
+               else read_source(each) for each in given]
+    signals = model.kind.signals
+    return [each if isinstance(each, Trace) else Trace.read(each, signals=signals) for each in given], sources
+
+
+def _hash_columns(trace: Trace) -> str:
     """SHA-256 of the columns of a trace, which tells it from any other."""
     content = hashlib.sha256()
     d = trace.declared

@@ -22,7 +22,7 @@ import numpy as np
 
 from fdi.discovery.detectable import Direction, VirtualTest, list_directions, move_effect
 from fdi.discovery.explain_runs import Answer, explain_recording, prepare_effects
-from fdi.discovery.runs import Runs, collect_runs
+from fdi.discovery.runs import Runs, read_runs
 from fdi.estimation.binomial import Share, measure_share
 from fdi.estimation.fit import limit_friction_values
 from fdi.estimation.noise import Noise
@@ -160,7 +160,7 @@ def hide_effect(unit: Unit, injection: Injection) -> Runs:
     est, unseen, *repeats = (np.random.default_rng(seed) for seed in seeds)
     runs = [_simulate_run(unit, hidden, unit.play, rng) for rng in (est, *repeats)]
     holdout = None if unit.holdout is None else _simulate_run(unit, hidden, unit.holdout, unseen)
-    return collect_runs(unit.model, runs[0], runs[1:], holdout, list(unit.noise))
+    return read_runs(unit.model, runs[0], runs[1:], holdout, list(unit.noise))
 
 
 def _simulate_run(unit: Unit, model: Model, play: Play, rng: np.random.Generator) -> Trace:

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -522,21 +522,11 @@ def remove_effect(model: Model, p: Provenance, name: str) -> tuple[Model, Proven
     return found, replace(p, effects=tuple(e for e in p.effects if e != name))
 
 
-def format_model_file(model: Model, intervals: Mapping[str, Value], p: Provenance) -> str:
-    """The model file's text, 95 % intervals beside what was fitted."""
-    return "\n".join([*_with_intervals(model.to_toml().splitlines(), intervals), "", *_format_provenance(p)]) + "\n"
-
-
-def _with_intervals(lines: Iterable[str], intervals: Mapping[str, Value]) -> Iterable[str]:
-    group = ""
-    for line in lines:
-        if line.startswith("["):
-            group = line.strip("[]").removeprefix("design.")
-        found = intervals.get(f"{group}.{line.partition(' = ')[0]}")
-        if found:
-            mark = "," if "#" in line else "  #"
-            line += f"{mark} {found.low:.6g} .. {found.high:.6g} (95 %)"
-        yield line
+def format_model_file(model: Model, intervals: Mapping[str, Value], p: Provenance,
+                      remarks: Mapping[str, str] | None = None) -> str:
+    """The model file's text, 95 % intervals beside what was fitted, and further remarks beside other parameters."""
+    said = {name: f"{v.low:.6g} .. {v.high:.6g} (95 %)" for name, v in intervals.items()}
+    return "\n".join([model.to_toml({**said, **(remarks or {})}), *_format_provenance(p)]) + "\n"
 
 
 def _format_provenance(p: Provenance) -> list[str]:

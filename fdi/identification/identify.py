@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi.discovery.runs import Source, hash_columns, read_source, require_distinct
+from fdi.discovery.runs import Source, read_traces, require_distinct
 from fdi.discovery.update_model import Provenance, format_model_file
 from fdi.estimation.fit import (
     FIT_ROUNDS,
@@ -237,44 +237,22 @@ class IdentificationRuns(NamedTuple):
     sources: tuple[Source, ...]  # of all of them, the held-out ones last
 
 
-def read_identification_runs(model: Model, ranges: Sequence[Range], fitted: Sequence[str], held_out: Sequence[str],
-                             signals: Sequence[str] | None = None) -> IdentificationRuns:
-    """Read and prepare the files of an identification.
+def read_identification_runs(model: Model, ranges: Sequence[Range], fitted: Sequence[str | Trace],
+                             held_out: Sequence[str | Trace], signals: Sequence[str] | None = None
+                             ) -> IdentificationRuns:
+    """The runs of an identification, from files or traces, made ready for replay.
 
     Raises:
-        InputError: a file that cannot be used, or a run given twice.
-    """
-    files = [*fitted, *held_out]
-    sources = [read_source(file) for file in files]
-    return prepare_runs(model, ranges, [Trace.read(file, signals=model.kind.signals) for file in files], sources,
-                        len(fitted), signals)
-
-
-def collect_identification_runs(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace],
-                                held_out: Sequence[Trace], signals: Sequence[str] | None = None) -> IdentificationRuns:
-    """The runs of an identification from traces that have been read or simulated.
-
-    Raises:
-        InputError: a trace that cannot be used, or a run given twice.
-    """
-    traces = [*fitted, *held_out]
-    sources = [Source(t.provenance.get("source", "trace"), hash_columns(t)) for t in traces]
-    return prepare_runs(model, ranges, traces, sources, len(fitted), signals)
-
-
-def prepare_runs(model: Model, ranges: Sequence[Range], traces: Sequence[Trace], sources: Sequence[Source], fitted: int,
-                 signals: Sequence[str] | None) -> IdentificationRuns:
-    """The runs made ready for replay: the first `fitted` to fit, the others held out.
-
-    Raises:
-        InputError: a trace that cannot be used, or a run given twice.
+        InputError: a file or trace that cannot be used, or a run given twice.
     """
     require(fitted, "RUN", "", "at least one run to fit")
-    require_distinct(sources, "RUN", "other runs", fitted)
+    traces, sources = read_traces([*fitted, *held_out], model)
+    count = len(fitted)
+    require_distinct(sources, "RUN", "other runs", count)
     outputs = tuple(s.name for s in model.kind.signals.outputs)
     for name in signals or ():
         require(name in outputs, "--signals", name, f"some of {','.join(outputs)}")
-    chosen = [s for s in outputs if any(s in t.signals for t in traces[:fitted]) and (signals is None or s in signals)]
+    chosen = [s for s in outputs if any(s in t.signals for t in traces[:count]) and (signals is None or s in signals)]
     require(chosen, sources[0].file, ", ".join(signals or outputs), "a signal that a run to fit has")
     limits = {s.limit for s in model.kind.signals if s.limit}
     widest = replace(model, values={**model.values, **{r.name: r.high for r in ranges if r.name in limits}})
@@ -285,7 +263,7 @@ def prepare_runs(model: Model, ranges: Sequence[Range], traces: Sequence[Trace],
     for trace, source in zip(prepared, sources, strict=True):
         require(abs(trace.period / period - 1.0) <= SAME_PERIOD, source.file, "t",
                 f"rows {period:g} s apart, as in {sources[0].file}")
-    return IdentificationRuns(model, tuple(prepared[:fitted]), tuple(prepared[fitted:]), tuple(sources))
+    return IdentificationRuns(model, tuple(prepared[:count]), tuple(prepared[count:]), tuple(sources))
 
 
 def _prepare(trace: Trace, model: Model, outputs: Sequence[str], source: Source) -> Trace:
@@ -943,21 +921,9 @@ def format_identified_model(found: Identification, command: str = "", date: str 
         "not_identifiable": [e.name for e in found.estimates if not e.is_identifiable]}
     known = Provenance(name_software(), (command,) if command else (), floor=found.floor, signals=tuple(found.floor),
                        identification=origin)
-    text = format_model_file(found.model, intervals, known)
-    return _mark_unseen(text, {e.name: f"{e.low:.3g} .. {e.high:.3g}" for e in found.estimates
-                               if not e.is_identifiable})
-
-
-def _mark_unseen(text: str, unseen: Mapping[str, str]) -> str:
-    """The text with a remark beside each parameter that the runs do not show."""
-    group, lines = "", []
-    for line in text.splitlines():
-        if line.startswith("["):
-            group = line.strip("[]").removeprefix("design.")
-        if (name := f"{group}.{line.partition(' = ')[0]}") in unseen:
-            line += f"{',' if '#' in line else '  #'} not identifiable from the runs, {unseen[name]}"
-        lines.append(line)
-    return "\n".join(lines) + "\n"
+    unseen = {e.name: f"not identifiable from the runs, {e.low:.3g} .. {e.high:.3g}" for e in found.estimates
+              if not e.is_identifiable}
+    return format_model_file(found.model, intervals, known, unseen)
 
 
 class ControllerGains(NamedTuple):

@@ -53,7 +53,7 @@ def load_fmu_plant(path: Path) -> Plant:
         InputError: the FMU cannot run here, or a key that cannot be used, and what was expected.
     """
     if path.suffix == ".fmu":
-        return declare_plant(path, {}, Place(str(path), {}), str(path))
+        return declare_plant(path, {}, Place(str(path)), str(path))
     tables, place = parse_table(decode_text(read_file(path), path), str(path))
     table, controller = tables.get("plant"), tables.get("controller")
     if not isinstance(table, dict) or not isinstance(table.get("file"), str):

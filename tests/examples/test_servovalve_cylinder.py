@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.io import savemat
 
 from fdi.estimation.replay import prepare_trace
-from fdi.identification.identify import collect_identification_runs, make_problem
+from fdi.identification.identify import make_problem, read_identification_runs
 from fdi.trace.trace import Trace
 from plant import simulate
 from plant.model import Model, load_model
@@ -128,7 +128,7 @@ def test_runs_with_different_sensors_are_fitted_together(press: Path) -> None:
     model = load_model(str(press / "press.toml"))
     run = Trace.read(press / "run.csv", signals=model.kind.signals)
     nothing = np.full(len(run), np.nan)
-    runs = collect_identification_runs(model, (), [run.with_columns({"pressure_b": nothing}),
+    runs = read_identification_runs(model, (), [run.with_columns({"pressure_b": nothing}),
                                                    run.with_columns({"pressure_a": nothing})], ())
     assert [t.outputs for t in runs.fitted] == [("position", "pressure_a"), ("position", "pressure_b")]
     floor = {"position": 2e-4, "pressure_a": 2.5e4, "pressure_b": 2.5e4}

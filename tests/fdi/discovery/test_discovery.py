@@ -26,7 +26,7 @@ from fdi.discovery.explain import (
 )
 from fdi.discovery.explain_runs import Answer, Candidate
 from fdi.discovery.residual_pattern import Pattern, fit_curve, fit_wave, write_effect
-from fdi.discovery.runs import collect_runs
+from fdi.discovery.runs import read_runs
 from fdi.discovery.search import (
     Hypothesis,
     Search,
@@ -259,11 +259,11 @@ def run() -> Trace:
 
 
 def test_a_repeat_from_another_unit_is_a_note(run: Trace) -> None:
-    runs = collect_runs(Model(), run, [record_unit(HIDDEN | {"filter.clogging": 0.3}, 2)])
+    runs = read_runs(Model(), run, [record_unit(HIDDEN | {"filter.clogging": 0.3}, 2)])
     assert len(runs.notes) == 1 and runs.notes[0].startswith("the repeats differ by more than the noise of the sensors")
     assert "XS by" in runs.notes[0] and "same unit" in runs.notes[0]
 
 
 def test_a_true_repeat_needs_no_note_although_the_model_is_wrong(run: Trace) -> None:
-    assert collect_runs(Model(), run, [record_unit(HIDDEN, 2)]).notes == ()
-    assert collect_runs(Model(), run).notes == ()
+    assert read_runs(Model(), run, [record_unit(HIDDEN, 2)]).notes == ()
+    assert read_runs(Model(), run).notes == ()

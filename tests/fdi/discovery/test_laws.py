@@ -31,7 +31,7 @@ from fdi.discovery.laws.terms import (
     write_law_file,
 )
 from fdi.discovery.residual_pattern import Balance, States, measure_way
-from fdi.discovery.runs import collect_runs
+from fdi.discovery.runs import read_runs
 from fdi.discovery.search import Search
 from fdi.trace.trace import Trace
 from plant import Model, simulate
@@ -189,7 +189,7 @@ def record_runs(model: Model) -> list[Trace]:
 
 def search_law(traces: list[Trace]) -> LawSearch:
     """The search for a law that the nominal plant lacks."""
-    runs = collect_runs(Model(), traces[0], traces[1:2], traces[2])
+    runs = read_runs(Model(), traces[0], traces[1:2], traces[2])
     search = Search(runs.model, runs.est, runs.repeats, [], holdout=runs.holdout)
     base = search.fit_base()
     search.learn_noise(base)

@@ -13,7 +13,7 @@ from physics_cases import QUIET
 from refusals import catch_refusal
 
 from fdi.comparison.compare import compare
-from fdi.discovery.runs import collect_runs
+from fdi.discovery.runs import read_runs
 from fdi.estimation.fit import Fit, Problem, linearise, list_tolerance_unknowns
 from fdi.estimation.long_recordings import PIECE, choose_excerpt, cut_excerpt, is_long, judge_on_all, make_excerpt
 from fdi.estimation.noise import white_noise
@@ -167,7 +167,7 @@ def record_mostly_at_rest() -> Trace:
 
 @cache
 def prepare_long() -> Trace:
-    return collect_runs(Model(), record_mostly_at_rest()).est
+    return read_runs(Model(), record_mostly_at_rest()).est
 
 
 def make_problem(trace: Trace) -> Problem:

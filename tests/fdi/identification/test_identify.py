@@ -13,11 +13,11 @@ from fdi.estimation import long_recordings
 from fdi.identification import global_fit
 from fdi.identification.identify import (
     Identification,
-    collect_identification_runs,
     decide_verdict,
     identify_model,
     parse_free_parameters,
     read_free_parameters,
+    read_identification_runs,
     write_identified_model,
 )
 from fdi.report.identify_report import describe_identification
@@ -65,7 +65,7 @@ def runs() -> tuple[Trace, Trace, Trace]:
 def identify(fitted: list[Trace], held_out: list[Trace], free: object = FREE) -> Identification:
     model = load_model()
     ranges = parse_free_parameters(free, model, "test")
-    own = collect_identification_runs(model, ranges, fitted, held_out)
+    own = read_identification_runs(model, ranges, fitted, held_out)
     return identify_model(own.model, ranges, own.fitted, own.held_out, own.sources)
 
 
@@ -167,7 +167,7 @@ def test_motor_that_rests_is_identified(moves_long: bool) -> None:
     columns = simulate(model.replace(unit), command, seed=1)._asdict()
     trace = Trace.from_columns(columns, 1e-3, {"source": "motor"}, model.kind.signals)
     ranges = read_free_parameters(model, None)
-    own = collect_identification_runs(model, ranges, [trace], [])
+    own = read_identification_runs(model, ranges, [trace], [])
     found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources)
     assert found.verdict in ("IDENTIFIED", "PARTLY") and any("at rest" in note for note in found.notes)
     held = {e.name: e.low <= unit[e.name] <= e.high for e in found.estimates if e.name in unit}
@@ -187,7 +187,7 @@ def test_what_no_known_force_shows_has_a_wide_interval() -> None:
     for group, _, field in (name.partition(".") for name in names):
         table.setdefault(group, {})[field] = 2.0
     ranges = parse_free_parameters(table, model, "test")
-    own = collect_identification_runs(model, ranges, [trace], [])
+    own = read_identification_runs(model, ranges, [trace], [])
     found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources)
     assert found.verdict in ("PARTLY", "IDENTIFIED")
     assert all(e.low < unit[e.name] < e.high and e.share > 0.05 for e in found.estimates)
@@ -236,5 +236,5 @@ def test_runs_that_cannot_be_used(runs: tuple[Trace, Trace, Trace], tmp_path: Pa
     for fitted, held_out, signals, option in (([runs[0]], [runs[0]], None, "--holdout"),
                                               ([runs[0], runs[0]], [], None, "other runs"),
                                               ([runs[0]], [], ["speed"], "--signals")):
-        assert option in catch_refusal(collect_identification_runs, load_model(), ranges, fitted, held_out, signals)
+        assert option in catch_refusal(read_identification_runs, load_model(), ranges, fitted, held_out, signals)
     assert "none.csv" in refuse("identify", tmp_path / "none.csv")

@@ -204,7 +204,7 @@ def test_without_a_map_the_answer_lists_the_variables(folder: Path) -> None:
 
 def test_a_run_begins_anew_and_steps_are_those_of_a_whole_run(folder: Path) -> None:
     about = read_description(build_fmu(Path("slide.fmu")))
-    ports = {name: find_variable(about, name, (kind,), Place("map", {}))
+    ports = {name: find_variable(about, name, (kind,), Place("map"))
              for name, kind in (("u", "input"), ("slide.x", "output"), ("k", "parameter"), ("is_big", "parameter"))}
     unit = Unit(about, [Port("u", ports["u"])], [Port("x", ports["slide.x"])],
                 [Port("k", ports["k"]), Port("big", ports["is_big"])], 1e-3)

@@ -265,9 +265,8 @@ def test_a_bad_sequence_is_refused_in_one_line(text: str, message: str) -> None:
 def test_lines_of_keys() -> None:
     text = ('a = "x [ {"\nb = [\n  { c = 1 }, # ]\n  { c = [1,\n 2] },\n]\n["d e".f]\ng.h = """\n\n"""\n'
             "[[i]]\n[[i]]\nj = 2024-01-01 10:00:00\nk = 1\n")
-    found = tables.find_lines(text)
     expected = {"b[1].c[1]": 5, "b[0].c": 3, "d e.f.g.h": 8, "i[1]": 12, "i[1].k": 14}
-    assert {path: found[path] for path in expected} == expected
+    assert {path: tables.find_line(text, path) for path in expected} == expected
 
 
 @pytest.mark.parametrize("name", SHIPPED)
