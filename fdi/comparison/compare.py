@@ -21,10 +21,8 @@ from fdi.estimation.fit import list_tolerance_sizes
 from fdi.estimation.noise import Floor, describe_doubtful_repeats, find_floors, sensor_floors
 from fdi.estimation.replay import (
     Columns,
-    Repeat,
     Replay,
     Scatter,
-    align_columns,
     answer_readings,
     compute_residuals,
     find_controller_gain,
@@ -238,8 +236,8 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     noise = sensor_floors(trace, model)
     replay = replay_with_checked_steps(trace, model, {name: f.value for name, f in noise.items()})
     progress("repeats", 2 / STAGES)
-    runs = [(other, replay_current(other.trace, model, replay.steps)) for other in others]
-    theirs = [align_columns(compute_residuals(other.trace, run), other.late, len(trace)) for other, run in runs]
+    runs = [(other, replay_current(other, model, replay.steps)) for other in others]
+    theirs = [compute_residuals(other, run) for other, run in runs]
     # without repeats, the floor holds what a current that was not recorded leaves open
     widened = {name: f._replace(value=math.hypot(f.value, replay.blind[name])) for name, f in noise.items()}
     floor = widened | find_floors(replay.residual, theirs, trace.period)
@@ -305,7 +303,7 @@ def _describe_cycles(n: int) -> str:
     return f"{abs(n)} {cycles} {direction}"
 
 
-def _judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],
+def _judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, Columns]],
                   table: Mapping[str, SignalError], found: ControllerBlock,
                   noise: Mapping[str, Floor]) -> tuple[dict[str, float | None], dict[str, float | None]]:
     """Ratios of the blocks, None where nothing measured can tell, and the parts of those that have some.

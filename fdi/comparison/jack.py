@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.estimation.noise import Floor, find_floors, floor_from_data, simulate_reading_noise
-from fdi.estimation.replay import BRIDGED_ROWS, Columns, Repeat, align_columns, differentiate, extend_flags
+from fdi.estimation.replay import BRIDGED_ROWS, Columns, differentiate, extend_flags
 from fdi.thresholds import BLOCK_EXCESS_LEAST, NOISY_SENSOR_RATIO, SHAPE_TIE_GAIN, SPOOL_FITS_RATIO
 from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, rms
 from plant.forced import compute_flow_balance, compute_force_balance
@@ -181,9 +181,9 @@ class Jack(NamedTuple):
     gain: float | None = None  # by which the ram moves further than the flow says, as a fraction
 
 
-def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, int, Columns]],
+def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, Columns]],
                level: Mapping[str, float]) -> Jack:
-    """The jack and the sensor of a trace; repeats with their shift in rows, `run` and theirs the replays they go with.
+    """The jack and the sensor of a trace and its repeats; `run` and theirs are the replays they go with.
 
     Nothing is told where too few rows hang together.
 
@@ -193,8 +193,8 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     b = compute_balance(trace, model, run)
     found = {"way": b.way, "force": b.force}
     if repeats:
-        others = [(late, compute_balance(other, model, theirs)) for other, late, theirs in repeats]
-        pairs = [align_columns({"way": o.way, "force": o.force}, late, len(trace)) for late, o in others]
+        others = [compute_balance(other, model, theirs) for other, theirs in repeats]
+        pairs = [{"way": other.way, "force": other.force} for other in others]
         floor = {name: f.value for name, f in find_floors(found, pairs, trace.period).items()}
     else:
         again = compute_balance(add_noise(trace, level), model, run)
@@ -221,7 +221,7 @@ def add_noise(trace: Trace, level: Mapping[str, float]) -> Trace:
     return trace.with_columns(noisy)
 
 
-def judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],
+def judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, Columns]],
                  signal: Mapping[str, float], noise: Mapping[str, Floor]
                  ) -> tuple[dict[str, float | None], dict[str, float | None]]:
     """Ratios of servovalve, jack and sensor, None where nothing measured can tell, and the parts of the jack's.
@@ -231,11 +231,10 @@ def judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tup
     Without a measured spool the servovalve is judged with its metering edges, as current to flow, and the jack by its
     forces alone; a sensor cannot be told from a valve then.
     """
-    pairs = [(other.trace, other.late, theirs) for other, theirs in repeats]
     level = {XJ: simulate_reading_noise(model, trace.controlled)} | {name: f.value for name, f in noise.items()}
     # the balances of flow and force take the measured signals as the true ones
     is_balanced = bool({P12, XS} & set(trace.outputs)) and not trace.filtered
-    j = judge_jack(trace, model, run, pairs, level) if is_balanced else Jack()
+    j = judge_jack(trace, model, run, repeats, level) if is_balanced else Jack()
     ratios = {"servovalve": j.flow, "jack": j.force, "sensor": None}
     if XS in trace.outputs:
         known = [x for x in (j.flow, j.force) if x is not None]

@@ -21,7 +21,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.fit import Fit, Problem, compute_misfit, compute_weights, fit_unknowns, scaled_bounds, weigh_priors
-from fdi.estimation.replay import hold_inputs
+from fdi.estimation.replay import simulate_trace
 from fdi.estimation.unidentifiable import VISCOSITY, list_powers, scale_together
 from fdi.thresholds import GAIN_DETECTED, MISFIT_DISCRIMINATES
 from fdi.trace.trace import Floats, Trace
@@ -331,12 +331,8 @@ def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tu
     period = problem.model.values["controller.period"]
     com, load = play(np.arange(0.0, SECONDS, period))
     names = [f.name for f in h.fit.free]
-    lanes = Lanes(problem.model, names, problem.steps, 1)
-    out = lanes.closed_loop(np.array([[h.fit.values[n] for n in names]]), com, load)[0]
-    d = problem.trace.declared
-    columns = {d.command.name: com, **{s.name: x for s, x in zip(d.columns, out.T, strict=True)}}
-    columns |= {d.load.name: load} if d.load else {}
-    return hold_inputs(Trace.from_columns(columns, period, {}, d), signals)
+    return simulate_trace(Lanes(problem.model, names, problem.steps, 1), np.array([h.fit.values[n] for n in names]),
+                          com, load, signals)
 
 
 def _measure_misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Trace) -> float:

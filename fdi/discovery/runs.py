@@ -9,7 +9,6 @@ from typing import NamedTuple
 from fdi.estimation.noise import describe_doubtful_repeats, find_floors, sensor_floors
 from fdi.estimation.replay import (
     SAME_PERIOD,
-    align_repeat,
     compute_residuals,
     find_repeat,
     hold_inputs,
@@ -127,10 +126,7 @@ def _prepare_repeat(est: Trace, trace: Trace, model: Model, source: str, number:
         raise InputError(source, missing[0], f"the signals of the run it repeats ({', '.join(est.outputs)})")
     if not model.kind.controller:
         return hold_inputs(trace, est.outputs, source)
-    repeat = find_repeat(est, trace, model, number)
-    if repeat.late == 0 and len(repeat.trace) == len(trace):
-        return repeat.trace
-    return align_repeat(repeat, len(est))
+    return find_repeat(est, trace, model, number)
 
 
 def _prepare_holdout(est: Trace, trace: Trace, model: Model, fitted: str, source: str) -> Trace:

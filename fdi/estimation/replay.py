@@ -532,6 +532,23 @@ def hold_inputs(trace: Trace, outputs: Sequence[str] | None = None, source: obje
                              slack=_find_slack(trace))
 
 
+def simulate_trace(lanes: Lanes, values: Floats, command: Floats, load: Floats, outputs: Sequence[str]) -> Trace:
+    """A run in closed loop as a recording without noise, of which these outputs are compared.
+
+    Args:
+        lanes: runs of a model.
+        values: (len(lanes.names),) their parameters, SI.
+        command: (n,) demand.
+        load: (n,) external load.
+        outputs: names.
+    """
+    d = lanes.model.kind.signals
+    out = lanes.closed_loop(values[None], command, load)[0]
+    columns = {d.command.name: command, **{s.name: x for s, x in zip(d.columns, out.T, strict=True)},
+               **({d.load.name: load} if d.load else {})}
+    return hold_inputs(Trace.from_columns(columns, lanes.model["controller.period"], {}, d), outputs)
+
+
 def match_period(model: Model, trace: Trace, tolerance: float = 0.0) -> Model:
     """The model with the recording's period as its controller's; the model itself within a relative `tolerance`.
 
@@ -780,15 +797,8 @@ def _starts_in_motion(trace: Trace, rows: int = 16, fast: float = 2e-3) -> bool:
     return abs(float(parabola[1] @ first)) > max(fast * trace.scale * trace.period, certain)
 
 
-class Repeat(NamedTuple):
-    """A prepared repeat and its place: its row k corresponds to row k + `late` of the first run."""
-
-    trace: Trace
-    late: int
-
-
-def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_share: float = 0.98) -> Repeat:
-    """Prepare a repeat of the prepared run `first`, and find its place by its command.
+def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_share: float = 0.98) -> Trace:
+    """A repeat of the prepared run `first`, prepared too and on its rows, which are found by the command.
 
     Args:
         first: the prepared run.
@@ -810,7 +820,7 @@ def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_shar
     repeat = ways[0]
     for late in (0, _find_first_move(first) - _find_first_move(repeat)):
         if _measure_agreement(first, repeat, late) >= same_share:
-            return Repeat(repeat, late)
+            return _align_repeat(repeat, late, len(first))
     raise InputError(source, first.declared.command.name,
                      "the command of the trace it repeats; another command is no repeat")
 
@@ -832,20 +842,14 @@ def _measure_agreement(one: Trace, other: Trace, late: int, overlap: float = 0.5
     return float(np.mean(same))
 
 
-def align_columns(columns: Mapping[str, Floats], late: int, rows: int) -> dict[str, Floats]:
-    """A repeat's columns on the `rows` of the first run, NaN where it has none."""
-    out = {}
-    for name, column in columns.items():
-        out[name] = np.full(rows, np.nan)
-        first, last = max(0, late), min(rows, len(column) + late)
-        out[name][first:last] = column[first - late:last - late]
-    return out
+def _align_repeat(trace: Trace, late: int, rows: int) -> Trace:
+    """A repeat on the `rows` of the first run, its own being so many rows `late`.
 
-
-def align_repeat(repeat: Repeat, rows: int) -> Trace:
-    """A repeat on the `rows` of the first run; before its own first row the ram rests, and nothing was measured."""
-    trace = repeat.trace
-    wanted = np.arange(rows) - repeat.late
+    Before its own first row the ram rests, and nothing was measured.
+    """
+    if late == 0 and len(trace) == rows:
+        return trace
+    wanted = np.arange(rows) - late
     place = np.clip(wanted, 0, len(trace) - 1)
     usable = (wanted == place) & trace.usable[place]
     return trace.take_rows(place, usable=usable, incomplete=np.isnan(trace.controlled[place]) | ~usable)

@@ -44,6 +44,7 @@ from fdi.estimation.replay import (
     leave_out_rows,
     match_period,
     prepare_trace,
+    simulate_trace,
 )
 from fdi.estimation.unidentifiable import (
     BALANCED,
@@ -405,12 +406,7 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: LogProblem, 
 
 
 def _simulate(model: Model, com: Floats, load: Floats, outputs: Sequence[str]) -> Trace:
-    """The closed loop on a command, as a recording without noise."""
-    out = Lanes(silence_readings(model), (), STEPS).closed_loop(np.empty((1, 0)), com, load)[0]
-    d = model.kind.signals
-    columns = {d.command.name: com, **{s.name: x for s, x in zip(d.columns, out.T, strict=True)},
-               **({d.load.name: load} if d.load else {})}
-    return hold_inputs(Trace.from_columns(columns, model["controller.period"], {}, d), tuple(outputs))
+    return simulate_trace(Lanes(silence_readings(model), (), STEPS), np.empty(0), com, load, tuple(outputs))
 
 
 def _measure_information(problem: LogProblem, free: Sequence[Free], x: Floats) -> Floats:
@@ -905,11 +901,6 @@ def write_identified_model(found: Identification, path: str | Path, command: str
     Raises:
         InputError: a file that cannot be written.
     """
-    return replace_text(path, format_identified_model(found, command, date))
-
-
-def format_identified_model(found: Identification, command: str = "", date: str = "") -> str:
-    """The text of the model file."""
     intervals = {e.name: Value(e.value, e.low, e.high, e.unit) for e in found.estimates if e.is_identifiable}
     errors = found.errors
     origin: dict[str, str | list[str]] = {
@@ -923,7 +914,7 @@ def format_identified_model(found: Identification, command: str = "", date: str 
                        identification=origin)
     unseen = {e.name: f"not identifiable from the runs, {e.low:.3g} .. {e.high:.3g}" for e in found.estimates
               if not e.is_identifiable}
-    return format_model_file(found.model, intervals, known, unseen)
+    return replace_text(path, format_model_file(found.model, intervals, known, unseen))
 
 
 class ControllerGains(NamedTuple):

@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -235,7 +236,6 @@ TABLE = "dates.csv"
 AXES = {"date": "days", "hours": "h", "flights": "flights"}  # axis: its unit
 Row = dict[str, float]  # places of a trace, by axis; a date in days since 1970-01-01, UTC; NaN where it has none
 _DATE = re.compile(r"(?<!\d)(\d{4})-?([01]\d)-?([0-3]\d)(?:[T_ ]([0-2]\d)[-:]?([0-5]\d)(?:[-:]?([0-5]\d))?)?(?!\d)")
-_OFFSET = re.compile(r"([T ].*)([+-])(\d\d):?(\d\d)$")  # behind a time of day
 
 
 def parse_date(text: str) -> float:
@@ -244,15 +244,11 @@ def parse_date(text: str) -> float:
     >>> parse_date("1970-01-02"), parse_date("1970-01-01T12:00:00-12:00"), parse_date("soon")
     (1.0, 1.0, nan)
     """
-    text, late = text.strip().removesuffix("Z"), 0.0
-    if offset := _OFFSET.search(text):
-        late = float(f"{offset[2]}1") * (int(offset[3]) * 60 + int(offset[4])) / 1440
-        text = text[:offset.start(2)]
     try:
-        found = np.datetime64(text.strip(), "s") if re.match(r"\d{4}-\d\d-\d\d", text) else np.datetime64("NaT")
+        found = datetime.fromisoformat(text.strip())
     except ValueError:
         return math.nan
-    return math.nan if np.isnat(found) else float(found.astype(float)) / 86400 - late
+    return found.replace(microsecond=0, tzinfo=found.tzinfo or UTC).timestamp() / 86400
 
 
 def format_day(day: float, with_time: bool = False) -> str:

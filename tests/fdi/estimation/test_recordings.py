@@ -20,7 +20,6 @@ from fdi.estimation.noise import white_noise
 from fdi.estimation.replay import (
     FEWEST_ROWS,
     PERIODS,
-    align_columns,
     answer_readings,
     find_repeat,
     hold_inputs,
@@ -126,9 +125,9 @@ def test_a_trace_that_starts_in_motion() -> None:
 
 def test_a_repeat_is_found_by_its_command() -> None:
     (c,), (spool,) = read_cycles(record_healthy(), MODEL), read_cycles(record_healthy(), MODEL, ["xs"])
-    repeat = find_repeat(c, cut(slice(100, None)), MODEL, 1)
-    assert (find_repeat(c, record_healthy(1), MODEL, 1).late, repeat.late) == (0, 100)
-    rows = align_columns({"xj": repeat.trace.xj}, repeat.late, len(c))["xj"]
+    repeat, same = find_repeat(c, cut(slice(100, None)), MODEL, 1), find_repeat(c, record_healthy(1), MODEL, 1)
+    assert len(repeat) == len(same) == len(c) and (same.xj == record_healthy(1).xj).all()
+    rows = repeat.mask_unusable("xj")
     assert np.isnan(rows[:100]).all() and (rows[100:] == c.xj[100:]).all()
     for first, other, words in (
             (c, made(com=-c.com), "com: expected the command of the trace it repeats"),
