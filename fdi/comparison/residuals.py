@@ -19,7 +19,7 @@ from scipy.special import kolmogi, ndtri
 from fdi.estimation.replay import Columns, differentiate
 from fdi.thresholds import CONDITION_DENSITY, CONDITION_EXCESS_LEAST, CONDITION_SHARE, RESIDUAL_TEST_CONFIDENCE
 from fdi.trace.sections import describe_section
-from fdi.trace.trace import Flags, Floats, Trace, hold_last
+from fdi.trace.trace import Flags, Floats, Trace, fill_gaps, hold_last
 from plant.signals import Signal, Signals
 
 SMOOTH = 0.021  # s of measured position that a speed is taken from
@@ -380,8 +380,7 @@ def map_deviation(trace: Trace, residual: Mapping[str, Floats], floor: Mapping[s
         floor: noise floor of each signal, > 0, in the unit of its residual.
         fewest: rows that a cell needs.
     """
-    known = np.flatnonzero(~np.isnan(trace.controlled))
-    position = np.interp(np.arange(len(trace)), known, trace.controlled[known])
+    position = fill_gaps(trace.controlled)
     speeds, amplitudes = (np.array(edges) * trace.scale for edges in (CELL_SPEEDS, AMPLITUDES))
     speed = np.abs(position[np.minimum(np.arange(len(position)) + 10, len(position) - 1)]
                    - position[np.maximum(np.arange(len(position)) - 10, 0)]) / (20 * trace.period)

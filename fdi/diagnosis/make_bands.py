@@ -58,7 +58,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.check_result import compute_speed
 from fdi.trace.sections import Section, find_sections
-from fdi.trace.trace import Floats, Trace, measure_scale
+from fdi.trace.trace import Floats, Trace, fill_gaps, measure_scale
 from plant.errors import InputError, require
 from plant.lanes import NARROW, Lanes
 from plant.model import Model, load_model
@@ -358,17 +358,16 @@ def _align_trace(base: Bands, trace: Trace, name: str) -> tuple[Floats, Floats]:
     """Command and position of a trace on the rows of the base's command, gaps interpolated."""
     com, xj, load, period, _ = read_columns(trace)
     require(not is_loaded(load, base.kind), name, "load", "none: bands are learned from an unloaded plant")
-    missing = np.isnan(xj)
-    require(missing.mean() <= POSITION_MISSING_SHARE, name, base.kind.signals.controlled.name,
-            f"a whole position, not one with {100 * missing.mean():.0f} % missing")
+    missing = float(np.isnan(xj).mean())
+    require(missing <= POSITION_MISSING_SHARE, name, base.kind.signals.controlled.name,
+            f"a whole position, not one with {100 * missing:.0f} % missing")
     require(abs(period / base.period - 1) <= 0.01, name, "t",
             f"one row per {1e3 * base.period:g} ms as the others, not {1e3 * period:g} ms")
     parts = find_sections(com, period, base.scale)
     require_same_command(base, parts, period, name)
     own, usual = (next(s.start for s in p if s.kind in ("step", "ramp")) for p in (parts, base.sections))
     at = np.clip(np.arange(base.sections[-1].stop) + own - usual, 0, len(xj) - 1)
-    rows = np.arange(len(xj))
-    return com[at], np.interp(rows, rows[~missing], xj[~missing])[at]
+    return com[at], fill_gaps(xj)[at]
 
 
 class _Fleet:

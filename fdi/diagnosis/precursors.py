@@ -15,7 +15,7 @@ import numpy as np
 from fdi.thresholds import BAND_EVENT_SAMPLES, POSITION_MISSING_SHARE
 from fdi.trace.check_result import compute_speed, filter_median
 from fdi.trace.sections import Section, find_sections
-from fdi.trace.trace import Flags, Floats, Trace, hold_last
+from fdi.trace.trace import Flags, Floats, Trace, fill_gaps, hold_last
 
 STEP_JUDGED_FROM = 0.004  # s; the command has to come through a cycle of the bus and the pilot stage
 STEP_JUDGED_UNTIL = 0.1  # s after a step at least; later the EHA only sticks and slips, which ramps show better
@@ -117,13 +117,10 @@ def measure_precursors(source: Trace, known: Mapping[str, Mapping[str, float]] |
         known: `Bands.precursors`: of healthy units and by fault.
     """
     com, xj, _, period, _ = read_columns(source)
-    missing = np.isnan(xj)
-    if missing.mean() > POSITION_MISSING_SHARE:
+    if np.isnan(xj).mean() > POSITION_MISSING_SHARE:
         return {}
-    rows = np.arange(len(xj))
-    whole = np.interp(rows, rows[~missing], xj[~missing])
     unit, scale = source.declared.controlled.unit, source.scale
-    found = compute_features(com, whole[None], period, find_sections(com, period, scale), unit, scale)
+    found = compute_features(com, fill_gaps(xj)[None], period, find_sections(com, period, scale), unit, scale)
     return {name: _make_precursor(name, float(values[0]), unit, (known or {}).get(name, {}))
             for name, values in found.items()}
 

@@ -44,7 +44,7 @@ from fdi.thresholds import (
     SOLVER_ERROR_SHARE,
 )
 from fdi.trace.sensor_dynamics import find_comb
-from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, hold_last, hold_next, rms
+from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, fill_gaps, hold_last, hold_next, rms
 from plant.errors import InputError
 from plant.lanes import Lanes
 from plant.model import Model
@@ -740,10 +740,8 @@ def _find_slack(trace: Trace) -> float:
 
 def _fill_demand(com: Floats, step: float) -> Floats:
     """Com where it is missing: on straight lines, but held before a change by more than `step`: a step."""
-    rows, missing = np.arange(len(com)), np.isnan(com)
     before, behind = hold_last(com), hold_next(com)
-    line = np.interp(rows, rows[~missing], com[~missing])
-    return np.where(missing & (np.abs(behind - before) > step), before, line)
+    return np.where(np.isnan(com) & (np.abs(behind - before) > step), before, fill_gaps(com))
 
 
 def extend_flags(flagged: Flags, rows: int) -> Flags:

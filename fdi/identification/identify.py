@@ -85,7 +85,7 @@ from fdi.thresholds import (
     RESIDUAL_WORST,
     STATIC_FRICTION_SYSTEMATIC_SD,
 )
-from fdi.trace.trace import Floats, Trace, rms, shift_rows
+from fdi.trace.trace import Floats, Trace, fill_gaps, rms, shift_rows
 from plant.errors import InputError, require
 from plant.lanes import Lanes
 from plant.model import Model, find_quantity, find_shipped_model
@@ -1024,7 +1024,7 @@ def _estimate_spool(runs: Sequence[Trace], model: Model) -> dict[str, float]:
               "torque_motor.gain": model["torque_motor.gain"] * np.sqrt(ratio)}
     if float(np.nanmax(np.abs(every))) > 0.98 * model["spool.travel"] or _dwells(every, limit):
         found["spool.travel"] = limit
-    speeds = [np.abs(differentiate(_fill(x), 5, 1)) / t.period for t, x in zip(runs, spool, strict=True)]
+    speeds = [np.abs(differentiate(fill_gaps(x), 5, 1)) / t.period for t, x in zip(runs, spool, strict=True)]
     found["pilot.flow_gain"] = _find_limit(np.concatenate(speeds)) * model["spool.end_area"] / model["flapper.travel"]
     return found
 
@@ -1081,16 +1081,11 @@ def _smooth_speed(trace: Trace) -> Floats:
 
 
 def _fill_position(trace: Trace) -> Floats:
-    return _fill(trace.mask_unusable(trace.declared.controlled.name))
-
-
-def _fill(x: Floats) -> Floats:
-    rows, there = np.arange(len(x)), ~np.isnan(x)
-    return np.interp(rows, rows[there], x[there]) if there.any() else np.zeros(len(x))
+    return fill_gaps(trace.mask_unusable(trace.declared.controlled.name))
 
 
 def _average(x: Floats, size: int) -> Floats:
-    return np.convolve(np.pad(_fill(x), size // 2, "edge"), np.full(size, 1.0 / size), "valid")
+    return np.convolve(np.pad(fill_gaps(x), size // 2, "edge"), np.full(size, 1.0 / size), "valid")
 
 
 def _regress(y: Sequence[Floats], columns: Sequence[Sequence[Floats]], largest: float = 1.0, rounds: int = 6

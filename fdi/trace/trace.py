@@ -506,6 +506,12 @@ def hold_next(x: Floats) -> Floats:
     return hold_last(x[::-1])[::-1]
 
 
+def fill_gaps(x: Floats) -> Floats:
+    """`x` with straight lines over its missing samples, the end values beyond the first and the last; else zeros."""
+    rows, there = np.arange(len(x)), ~np.isnan(x)
+    return np.interp(rows, rows[there], x[there]) if there.any() else np.zeros(len(x))
+
+
 def shift_rows(x: Floats, rows: int) -> Floats:
     """`x` delayed by so many rows (negative: advanced); the end values are repeated.
 
