@@ -172,20 +172,12 @@ def apply_play(x: Floats, width: float) -> Floats:
     return np.array(out)
 
 
-class Jack(NamedTuple):
-    """Ratios to their floors of the parts that flow and force decide; None where they cannot be told."""
-
-    flow: float | None = None
-    force: float | None = None
-    sensor: float | None = None
-    gain: float | None = None  # by which the ram moves further than the flow says, as a fraction
-
-
 def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, Columns]],
-               level: Mapping[str, float]) -> Jack:
+               level: Mapping[str, float]) -> dict[str, float | None]:
     """The jack and the sensor of a trace and its repeats; `run` and theirs are the replays they go with.
 
-    Nothing is told where too few rows hang together.
+    Ratios of flow, force and sensor to their floors, None where one cannot be told, and the gain by which the ram moves
+    further than the flow says, as a fraction; nothing where too few rows hang together.
 
     The floor comes from the repeats, as everywhere; without them the noise `level` of each signal, SI, is put in once
     more, and what that changes is what noise does.
@@ -203,7 +195,7 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     known = [trace.column(name) if name in trace.outputs else run[name] for name in (XS, P12)]
     xs, p12 = (bridge_gaps(column, BRIDGED_ROWS)[0] for column in known)
     if (~np.isnan(b.way)).sum() < FEWEST_FORCE_ROWS or not floor.get("way", 0.0) > 0.0:
-        return Jack()
+        return {}
     is_noisy = (XJ in level
                 and floor_from_data(trace.mask_unusable(XJ)).value > NOISY_SENSOR_RATIO * level[XJ])
     flow, sensor = share_error(trace, b, xs, p12, floor["way"], is_noisy)
@@ -211,7 +203,8 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     most_missing = 0.2  # of the rows; where more are missing, accelerations are guesses
     is_enough = (~np.isnan(b.force)).sum() >= FEWEST_FORCE_ROWS and trace.filled.mean() < most_missing
     is_told = is_enough and floor.get("force", 0.0) > 0.0
-    return Jack(flow, rms(b.force) / floor["force"] if is_told else None, sensor, b.gain)
+    return {"flow": flow, "force": rms(b.force) / floor["force"] if is_told else None, "sensor": sensor,
+            "gain": b.gain}
 
 
 def add_noise(trace: Trace, level: Mapping[str, float]) -> Trace:
@@ -234,11 +227,12 @@ def judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tup
     level = {XJ: simulate_reading_noise(model, trace.controlled)} | {name: f.value for name, f in noise.items()}
     # the balances of flow and force take the measured signals as the true ones
     is_balanced = bool({P12, XS} & set(trace.outputs)) and not trace.filtered
-    j = judge_jack(trace, model, run, repeats, level) if is_balanced else Jack()
-    ratios = {"servovalve": j.flow, "jack": j.force, "sensor": None}
+    own = judge_jack(trace, model, run, repeats, level) if is_balanced else {}
+    parts = {name: own.get(name) for name in ("flow", "force", "gain")}
+    ratios = {"servovalve": parts["flow"], "jack": parts["force"], "sensor": None}
     if XS in trace.outputs:
-        known = [x for x in (j.flow, j.force) if x is not None]
+        known = [x for x in (parts["flow"], parts["force"]) if x is not None]
         if known and P12 in signal and signal[XS] < SPOOL_FITS_RATIO:
             known.append(signal[P12])
-        ratios |= {"servovalve": signal[XS], "jack": max(known, default=None), "sensor": j.sensor}
-    return ratios, {"flow": j.flow, "force": j.force, "gain": j.gain}
+        ratios |= {"servovalve": signal[XS], "jack": max(known, default=None), "sensor": own.get("sensor")}
+    return ratios, parts

@@ -600,8 +600,7 @@ def _blames(fault: Fault, found: Fit) -> bool:
 
 def _blames_a_fault(problem: CountedProblem, free: Sequence[Free], x: Floats) -> bool:
     """Whether scaled unknowns, (p,), hold one of the faults for far gone."""
-    here = replace(start_fit(free, x), x=x)
-    return any(_blames(fault, here) for fault in problem.faults)
+    return any(_blames(fault, start_fit(free, x)) for fault in problem.faults)
 
 
 def make_healthy_start(problem: CountedProblem, free: Sequence[Free]) -> Floats:
@@ -771,7 +770,8 @@ def find_effects_beside(model: Model, trace: Trace, alone: Refinement, floor: Ma
     """
     marks, floor = _read_marks(model, whole or trace, floor)
     faults = alone.faults
-    problem = make_joint_problem(model, trace, floor, workers, faults)
+    problem = make_problem(model, trace, floor, workers, faults)
+    problem = replace(problem, bare=problem.model, model=complete_model(problem.model), _lanes={})
     for name in (e.name for e in list_searched_effects(model.plant) if e.fitted and e.port not in UNREPLAYED):
         ensure_starts(name, trace.command, trace.load, model.plant)  # where the file of a user's plant gives none
     search = JointSearch(problem, list_other_effects(model, faults), progress)
@@ -785,13 +785,6 @@ def list_other_effects(model: Model, faults: Sequence[Fault] = FAULTS) -> list[s
     always = {*(s.effect for s in SUSPECTS), *model.effects}
     return [e.name for e in list_searched_effects(model.plant)
             if e.name not in always and e.port not in UNREPLAYED and e.starts and not own & set(e.fitted)]
-
-
-def make_joint_problem(model: Model, trace: Trace, floor: Mapping[str, float], workers: int = 2,
-                       faults: Sequence[Fault] = FAULTS) -> CountedProblem:
-    """The run, and the model with the whole catalogue ready in it."""
-    problem = make_problem(model, trace, floor, workers, faults)
-    return replace(problem, bare=problem.model, model=complete_model(problem.model), _lanes={})
 
 
 def _read_marks(model: Model, trace: Trace, floor: Mapping[str, float]

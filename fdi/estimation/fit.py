@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -574,30 +574,22 @@ def cut_at_bounds(free: Sequence[Free], x: Floats, move: Floats) -> Floats:
     return max(ways, key=lambda way: float(way @ way))
 
 
-class Population(NamedTuple):
-    """Where a search ended: the best trial, (p,), its cost, and the covariance, (p, p), of the last trials."""
-
-    x: Floats
-    cost: float
-    covariance: Floats
-
-
-def evolve_population(measure_costs: Callable[[Floats], Floats], x: Floats, covariance: Floats, low: Floats,
-                      high: Floats, generations: int, seed: int, size: int = 64, patience: int = 15) -> Population:
-    """The best trial found by a population that starts about `x` (p,).
+def evolve_fit(problem: Problem, fit: Fit, spread: Floats, generations: int, seed: int, patience: int = 15) -> Fit:
+    """The fit at the best trial of a population that begins at it; its covariance is that of the last trials.
 
     Args:
-        measure_costs: costs (m,) of trials (m, p).
-        x: centre of the first trials.
-        covariance: of the first trials, (p, p).
-        low: bounds (p,) that no trial passes.
-        high: the same.
+        problem: the run.
+        fit: centre of the first trials.
+        spread: their covariance, (p, p).
         generations: at most.
         seed: of the trials.
-        size: trials of a generation.
         patience: generations without a gain after which the search ends.
     """
-    rng, n = np.random.default_rng(seed), len(x)
+    if not fit.free:  # a plant without tolerances
+        return fit
+    size = min(64, 16 * -(-len(fit.x) // 4))  # trials of a generation, whole blocks of lanes; few unknowns need few
+    low, high = scaled_bounds(fit.free)
+    rng, n = np.random.default_rng(seed), len(fit.x)
     kept = size // 2
     weights = np.log(kept + 0.5) - np.log(np.arange(1, kept + 1))
     weights /= weights.sum()
@@ -608,14 +600,14 @@ def evolve_population(measure_costs: Callable[[Floats], Floats], x: Floats, cova
     rank_many = min(1.0 - rank_one, 2.0 * (effective - 2.0 + 1.0 / effective) / ((n + 2.0) ** 2 + effective))
     damping = 1.0 + 2.0 * max(0.0, float(np.sqrt((effective - 1.0) / (n + 1.0))) - 1.0) + step_rate
     usual_length = np.sqrt(n) * (1.0 - 1.0 / (4.0 * n) + 1.0 / (21.0 * n * n))
-    centre, spread, step = x.copy(), covariance.copy(), 1.0
+    centre, step = fit.x, 1.0
     path, step_path = np.zeros(n), np.zeros(n)
-    best, best_cost, idle = x.copy(), np.inf, 0
+    best, best_cost, idle = fit.x, np.inf, 0
     for generation in range(1, generations + 1):
         variances, axes = np.linalg.eigh(0.5 * (spread + spread.T))
         lengths = np.sqrt(np.maximum(variances, 1e-24))
         trials = np.clip(centre + step * (rng.standard_normal((size, n)) * lengths) @ axes.T, low, high)
-        costs = measure_costs(trials)
+        costs = problem.compute_costs(fit.free, trials)
         order = np.argsort(costs)
         gain = best_cost - float(costs[order[0]])
         idle = 0 if gain > max(CONVERGED_GAIN, CONVERGED_SHARE * float(costs[order[0]])) else idle + 1
@@ -638,19 +630,7 @@ def evolve_population(measure_costs: Callable[[Floats], Floats], x: Floats, cova
         step *= float(np.exp(min(1.0, step_rate / damping * (length / usual_length - 1.0))))
         if idle >= patience:
             break
-    return Population(best, best_cost, step**2 * spread)
-
-
-def evolve_fit(problem: Problem, fit: Fit, spread: Floats, generations: int, seed: int) -> Fit:
-    """The fit at the best trial of a population that begins at it with the covariance `spread` (p, p); its covariance
-    is that of the last trials.
-    """
-    if not fit.free:  # a plant without tolerances
-        return fit
-    size = min(64, 16 * -(-len(fit.x) // 4))  # whole blocks of lanes; few unknowns need few trials
-    end = evolve_population(partial(problem.compute_costs, fit.free), fit.x, spread, *scaled_bounds(fit.free),
-                            generations, seed, size)
-    return replace(fit, x=end.x, cost=end.cost, covariance=end.covariance)
+    return replace(fit, x=best, cost=best_cost, covariance=step**2 * spread)
 
 
 def follow_population(problem: P, begun: Fit, spread: Floats, stages: Sequence[tuple[float, int]], seed: int,
