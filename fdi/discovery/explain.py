@@ -368,6 +368,7 @@ def shows_effect(model: Model, h: Hypothesis) -> bool:
 
 
 def sort_by_cost(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
+    """The hypotheses, best first: by what they leave of their own runs and of the repeats."""
     return sorted(hypotheses, key=lambda h: h.cost + h.repeat_cost)
 
 
