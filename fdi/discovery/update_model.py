@@ -45,11 +45,10 @@ LAST_FIT_STEPS = 50  # a cycle, of the last fits' residuals; their slopes make d
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """The model after one more effect: RMS error on the fit's run and on the held-out one, by signal, SI."""
+    """The model after one more effect, with its RMS error on the held-out run, by signal, SI."""
 
     effect: str | None
     hypothesis: Hypothesis
-    error: Mapping[str, float]
     holdout: Mapping[str, float]
 
 
@@ -78,7 +77,7 @@ class Refit:
         if self.original.find_effect(str(after.effect)).port in UNREPLAYED:
             return True  # it was found without noise, or it would not be here
         worse = any(x > 1.02 * before.holdout[s] for s, x in after.holdout.items() if x > 1.15 * self.floor[s])
-        lower = any(x < before.error[s] for s, x in after.error.items())
+        lower = any(x < before.hypothesis.errors[s] for s, x in after.hypothesis.errors.items())
         return measure_gain(before.hypothesis, after.hypothesis) > GAIN_SEEN and lower and not worse
 
 
@@ -246,10 +245,10 @@ def _read_marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -
 def _list_steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hypothesis]) -> tuple[Step, ...]:
     """One for the start and one for each effect; one that a replay does not show leaves its errors as they are."""
     held = search.measure_holdout(chain)
-    steps, at = [Step(effects[done - 1] if done else None, chain[0], chain[0].errors, held[0])], 0
+    steps, at = [Step(effects[done - 1] if done else None, chain[0], held[0])], 0
     for name in effects[done:]:
         at += search.model.find_effect(name).port not in UNREPLAYED
-        steps.append(Step(name, chain[at], chain[at].errors, held[at]))
+        steps.append(Step(name, chain[at], held[at]))
     return tuple(steps)
 
 
@@ -257,11 +256,6 @@ def list_fitted_values(r: Refit) -> dict[str, float]:
     """What was fitted, "group.field" to SI value, to six digits."""
     values = {name: float(f"{v:.6g}") for name, v in r.last.hypothesis.fit.values.items()}
     return limit_friction_values(values | {name: float(f"{v[0]:.6g}") for name, v in r.marks.items()})
-
-
-def build_fitted_model(r: Refit) -> Model:
-    """The model with what was fitted."""
-    return r.original.replace(list_fitted_values(r), "fit")
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,7 +345,7 @@ def add_effects(effects: Sequence[str], runs: Runs, model: Model, known: Provena
     continues = _continues_ledger(known, runs)
     done = len(known.effects) if continues else 0
     r = refit_effects(runs.model, every, runs.est, runs.repeats, runs.holdout, progress, model.values, done)
-    rows = [Row(s.effect, s.error, s.holdout) for s in r.steps]
+    rows = [Row(s.effect, s.hypothesis.errors, s.holdout) for s in r.steps]
     kept = list(known.ledger) if continues else []
     notes = (*runs.notes, *([r.excerpt] if r.excerpt else []))
     if known.ledger and not continues:
@@ -375,11 +369,11 @@ def remove_effect_and_refit(name: str, runs: Runs | None, model: Model, known: P
     if not rows:
         before = refit_effects(runs.model, known.effects, runs.est, runs.repeats, runs.holdout, progress, model.values,
                                len(known.effects)).last
-        rows = [Row(before.effect, before.error, before.holdout)]
+        rows = [Row(before.effect, before.hypothesis.errors, before.holdout)]
     start = runs.model if name in known.effects else remove_effect(runs.model, known, name)[0]
     left = known_without.effects
     r = refit_effects(start, left, runs.est, runs.repeats, runs.holdout, progress, model.values, len(left))
-    rows.append(Row(name, r.last.error, r.last.holdout, True))
+    rows.append(Row(name, r.last.hypothesis.errors, r.last.holdout, True))
     return _make_update(r, runs, known_without, left, rows, runs.notes, command, removed=name)
 
 
@@ -392,7 +386,7 @@ def _continues_ledger(known: Provenance, runs: Runs) -> bool:
 
 def _make_update(r: Refit, runs: Runs, known: Provenance, effects: Sequence[str], rows: Sequence[Row],
                  notes: tuple[str, ...], command: str, added: tuple[str, ...] = (), removed: str = "") -> ModelUpdate:
-    model, fit = build_fitted_model(r), r.last.hypothesis.fit
+    model, fit = r.original.replace(list_fitted_values(r), "fit"), r.last.hypothesis.fit
     parameters = {name: v for e in effects for name, v in list_fitted_parameters(e, fit, runs.model).items()}
     parameters |= {name: Value(*of, find_quantity(name, plant=model.plant).unit) for name, of in r.marks.items()}
     before = {name: runs.model[name] for name in fit.values if name in runs.model.values}

@@ -591,10 +591,11 @@ def describe_update(update: ModelUpdate) -> str:
         s = max(later.error, key=lambda name: later.error[name] / floor[name])
         return f"{update.removed} removed: {_describe_step(s, earlier.error, later.error, floor, signals)}."
     before, after = update.refit.steps[-1 - len(update.added)], update.refit.last
-    s = max(before.error, key=lambda name: before.error[name] / floor[name])
+    was, now = before.hypothesis.errors, after.hypothesis.errors
+    s = max(was, key=lambda name: was[name] / floor[name])
     held_out = "" if s not in after.holdout else (
         f"; held-out run {_format(before.holdout, s, signals)} -> {_format(after.holdout, s, signals)}")
-    step = _describe_step(s, before.error, after.error, floor, signals)
+    step = _describe_step(s, was, now, floor, signals)
     sentence = f"{join_words(update.added)} added: {step}{held_out}"
     return f"{sentence}." if update.helps else f"{sentence}. {update.added[-1]} explains nothing but noise."
 

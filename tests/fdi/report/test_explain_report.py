@@ -126,7 +126,7 @@ def test_the_report_of_an_explanation_in_all_forms() -> None:
 
 
 def update(helps: bool) -> ModelUpdate:
-    steps = [SimpleNamespace(error=by, holdout=by, hypothesis=None) for by in (ERROR, FLOOR)]
+    steps = [SimpleNamespace(holdout=by, hypothesis=SimpleNamespace(errors=by)) for by in (ERROR, FLOOR)]
     refit = SimpleNamespace(helps=helps, steps=steps, last=steps[-1], floor=FLOOR,
                             search=SimpleNamespace(problem=SimpleNamespace(trace=SimpleNamespace(declared=EHA))))
     known = Provenance(trace=Source("est.csv", "1"), holdout=Source("holdout.csv", "2"), floor=FLOOR,
