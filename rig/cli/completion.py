@@ -6,8 +6,7 @@ happens.
 
 import argparse
 import os
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from rig.cli.main import build_parser
@@ -27,52 +26,51 @@ def build_completion_parser(line: str) -> argparse.ArgumentParser:
     name = [*line.split(), "", ""][1]
     parser = build_parser(name)
     commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
-    own = {"set": complete_parameter, "model": complete_model, "sequence": complete_sequence}
+    own = {"set": offer(list_parameters), "model": offer(list_models, "toml", "py"),
+           "sequence": offer(list_sequences, "toml")}
     for action in commands.choices[name]._actions if name in commands.choices else ():
         if action.dest in own:
             action.completer = own[action.dest]
         elif name in ("add", "remove", "effects") and not action.option_strings:
-            action.completer = complete_effect
+            action.completer = offer(list_effects, "mcap", "csv", "csv.gz", "toml")
     return parser
 
 
-def complete_parameter(prefix: str, **_: Any) -> Iterable[str]:
+def offer(list_names: Callable[[], Iterable[str]], *suffixes: str) -> Callable[..., list[str]]:
+    """What argcomplete asks for names, and for files of these suffixes; it chooses those that begin as typed."""
+    def complete(prefix: str, **_: Any) -> list[str]:
+        from argcomplete.completers import FilesCompleter
+
+        return [*list_names(), *(FilesCompleter(suffixes)(prefix) if suffixes else ())]
+
+    return complete
+
+
+def list_parameters() -> list[str]:
     """Parameters for --set, with the equals sign."""
     from plant.plants import find_plant
 
     groups = find_plant("eha").list_groups()
-    names = (f"{group}.{field}=" for group, fields in groups.items() for field in fields._fields)
-    return [name for name in names if name.startswith(prefix)]
+    return [f"{group}.{field}=" for group, fields in groups.items() for field in fields._fields]
 
 
-def complete_model(prefix: str, **_: Any) -> Iterable[str]:
-    """Shipped models, model files and plant files."""
+def list_models() -> list[str]:
+    """Shipped models and plants."""
     from plant.model import SHIPPED_MODELS
     from plant.plants import list_plants
 
-    shipped = (*list_plants(), *SHIPPED_MODELS)
-    return [name for name in shipped if name.startswith(prefix)] + _list_files(prefix, (".toml", ".py"))
+    return [*list_plants(), *SHIPPED_MODELS]
 
 
-def complete_sequence(prefix: str, **_: Any) -> Iterable[str]:
-    """Shipped sequences and sequence files."""
+def list_sequences() -> list[str]:
+    """Shipped sequences."""
     from rig.sequences.sequence import list_shipped
 
-    return [name for name in list_shipped() if name.startswith(prefix)] + _list_files(prefix, (".toml",))
+    return [*list_shipped()]
 
 
-def complete_effect(prefix: str, **_: Any) -> Iterable[str]:
-    """Effects of the catalogue; the traces and model files that follow them."""
+def list_effects() -> list[str]:
+    """Effects of the catalogue."""
     from plant.plants import find_plant
 
-    names = [e.name for e in find_plant("eha").list_effects() if e.name.startswith(prefix)]
-    return names + _list_files(prefix, (".mcap", ".csv", ".csv.gz", ".toml"))
-
-
-def _list_files(prefix: str, suffixes: tuple[str, ...]) -> list[str]:
-    """Folders and files of these suffixes that begin with what was typed."""
-    folder = Path(prefix).parent if not prefix.endswith("/") else Path(prefix)
-    if not folder.is_dir():
-        return []
-    found = [f"{path}/" if path.is_dir() else str(path) for path in sorted(folder.iterdir())]
-    return [path for path in found if path.startswith(prefix) and path.endswith(("/", *suffixes))]
+    return [effect.name for effect in find_plant("eha").list_effects()]

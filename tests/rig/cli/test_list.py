@@ -65,26 +65,16 @@ def test_the_first_steps_are_commands_that_exist() -> None:
     assert len(named) >= 5 and set(named) <= set(COMMANDS)
 
 
-@pytest.mark.parametrize(("kind", "begin", "names"), [
-    ("parameter", "filter.c", ["filter.clogging="]), ("effect", "null_b", ["null_bias"]),
-    ("model", "", ["eha", "ehs", "ema", "servo", "emps", "own.py", "own.toml", "ownfolder/"]),
-    ("sequence", "pre", ["preflight", "preflight_ema"]),
-    ("sequence", "own", ["own.toml", "ownfolder/"])])
-def test_names_that_options_take(kind: str, begin: str, names: list[str], tmp_path: Path,
-                                 monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("ownfolder").mkdir()
-    for name in ("own.toml", "own.py", "own.txt"):
-        Path(name).touch()
-    assert getattr(completion, f"complete_{kind}")(begin) == names
-    assert {name.rstrip("=") for name in completion.complete_parameter("")} >= set(Model().values)
-
-
 @pytest.mark.skipif(importlib.util.find_spec("argcomplete") is None, reason="no argcomplete (extra shell)")
 @pytest.mark.parametrize(("line", "expected"), [
     ("rig con", {"conformance"}), ("rig run --set filter.c", {"filter.clogging="}),
-    ("rig compare --rep", {"--repeat", "--report"})])
+    ("rig compare --rep", {"--repeat", "--report"}), ("rig effects null_b", {"null_bias"}),
+    ("rig run --model ", {"eha", "ehs", "ema", "servo", "emps", "own.py", "own.toml", "ownfolder/"}),
+    ("rig check pre", {"preflight", "preflight_ema"}), ("rig check own", {"own.toml", "ownfolder/"})])
 def test_the_answer_to_the_shell(line: str, expected: set[str], tmp_path: Path) -> None:
+    (tmp_path / "ownfolder").mkdir()
+    for name in ("own.toml", "own.py", "own.txt"):
+        (tmp_path / name).touch()
     answer = tmp_path / "answer"
     environment = {**os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)),
                    "_ARGCOMPLETE_STDOUT_FILENAME": str(answer), "_ARGCOMPLETE_SUPPRESS_SPACE": "1",
@@ -92,6 +82,10 @@ def test_the_answer_to_the_shell(line: str, expected: set[str], tmp_path: Path) 
     subprocess.run([sys.executable, "-m", "rig.cli.main"], env=environment, cwd=tmp_path, check=False,
                    capture_output=True, timeout=60)
     assert {word.strip() for word in answer.read_text().split("\n")} == expected
+
+
+def test_completion_knows_all_parameters() -> None:
+    assert {name.rstrip("=") for name in completion.list_parameters()} >= set(Model().values)
 
 
 @pytest.fixture(scope="module")
