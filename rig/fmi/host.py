@@ -4,7 +4,6 @@ A unit is somebody else's machine code. If it crashes or hangs, only this proces
 arguments, the first one `load`; answers are ("done", result) or ("failed", what went wrong). rig/fmi/foreign.py asks.
 """
 
-import contextlib
 import ctypes
 import sys
 from collections.abc import Sequence
@@ -50,18 +49,12 @@ class Host:
         self._count = len(outputs)
         self._description = fmpy.read_model_description(folder, validate=False)
         self._unit: Any = None
-        self._start: Any = None  # its state after initialisation
-        self._settings: Settings = ()  # the parameters of that state
         self._k = 0
         self.said = ""  # its last message
 
     def begin(self, settings: Settings) -> list[float]:
-        """Start anew with these parameters; the outputs at time 0. The state of the last start is used where it can be.
-        """
+        """Start anew with these parameters; the outputs at time 0."""
         self._k = 0
-        if self._start is not None and self._settings == settings:
-            self._unit.setFMUState(self._start)
-            return self._read()
         if self._unit is not None and self._description.coSimulation.canBeInstantiatedOnlyOncePerProcess:
             self._unit.reset()
         else:
@@ -71,9 +64,6 @@ class Host:
         self.change(settings)
         self._unit.enterInitializationMode()
         self._unit.exitInitializationMode()
-        if self._description.coSimulation.canGetAndSetFMUstate:
-            with contextlib.suppress(Exception):  # FMPy's; without a state to go back to, each run starts anew
-                self._start, self._settings = self._unit.getFMUState(), settings
         return self._read()
 
     def change(self, settings: Settings) -> None:
@@ -111,10 +101,8 @@ class Host:
 
         fmi1.cdll = ctypes.LibraryLoader(Library)
         if self._unit is not None:
-            if self._start is not None:
-                self._unit.freeFMUState(self._start)
             self._unit.freeInstance()
-        self._unit = self._start = None
+        self._unit = None
         folder, library = self._place
         self._unit = instantiate_fmu(folder, self._description, "CoSimulation", logger=self._log, library_path=library,
                                      require_functions=False)
