@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from threading import Thread, Timer
+from threading import Timer
 from typing import TYPE_CHECKING, NamedTuple
 
 from fdi.output import require_writable, write_text
@@ -65,15 +65,7 @@ def choose_places(args: argparse.Namespace, page_name: str, source: str) -> Plac
     elif page_name and args.report:
         folder = Path(source) if Path(source).is_dir() else Path(source).parent
         page = choose_file(str(folder / page_name), (".html",), source, "--report")
-    if page is not None:  # while kernels compute, another core can load what draws the page: half a second
-        Thread(target=load_drawing, daemon=True).start()
     return Places(page, out)
-
-
-def load_drawing() -> None:
-    """Load what pages are drawn with, before one is."""
-    import matplotlib.backends.backend_svg
-    import matplotlib.figure  # noqa: F401
 
 
 def make_folder(path: Path) -> Path:
