@@ -305,9 +305,6 @@ class Link:
                 yield Frame(self._clock(), cob_id, bytes(message.data))
 
     def _take_messages(self, timeout: float) -> Iterator[can.Message]:
-        if isinstance(self._bus, UdpBus):
-            yield from self._bus.receive_waiting(timeout)
-            return
         message = self._bus.recv(timeout)
         while message is not None:
             yield message

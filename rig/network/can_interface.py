@@ -70,20 +70,6 @@ class UdpBus(can.BusABC):
             timeout = 0.0  # what is behind our own frame has come already; recv() waits again if nothing has
         return None, False
 
-    def receive_waiting(self, timeout: float) -> list[can.Message]:
-        """All messages that are waiting; if there are none, wait up to `timeout` seconds for the first.
-
-        One wait for all of them: python-can waits, and asks the clock, for each. Raises OSError when the bus is gone.
-        """
-        messages: list[can.Message] = []
-        if timeout > 0 and not select.select([self._rx], [], [], timeout)[0]:
-            return messages
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                if (message := self._take_message()) is not None:
-                    messages.append(message)
-        return messages
-
     def _take_message(self) -> can.Message | None:
         """The next datagram as a message, None for one of our own; one without a valid frame is an error frame.
 
