@@ -37,6 +37,6 @@ def explain_errors(file: str, name: str = "") -> Iterator[None]:
         if isinstance(error, SyntaxError) and error.filename == file:
             raise InputError(f"{file}:{error.lineno}", name, f"Python ({error.msg})") from error
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-        text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        text = ": ".join(filter(None, (type(error).__name__, " ".join(str(error).split()))))
         raise InputError(f"{file}:{lines[-1]}" if lines else file, name,
                          f"code that runs without an exception, not {text}") from error

@@ -1,6 +1,7 @@
 """Other formats to and from a log: CSV of the signals; raw frames as candump .log, Vector .blf/.asc or PEAK .trc."""
 from __future__ import annotations
 
+import struct
 import time
 from array import array
 from collections import deque
@@ -274,7 +275,7 @@ def list_can_messages(source: Path) -> Iterator[tuple[float, can.Message]]:
                     yield message.timestamp - first, message
     except OSError as error:
         raise InputError(source, "", f"a readable file ({error.strerror})") from error
-    except (ValueError, IndexError, can.CanError, BLFParseError) as error:
+    except (ValueError, IndexError, struct.error, can.CanError, BLFParseError) as error:
         raise InputError(source, "", f"CAN frames as {source.suffix} ({error})") from error
 
 
