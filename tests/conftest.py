@@ -8,13 +8,14 @@ from pathlib import Path
 
 import light_can  # noqa: F401  before anything else loads python-can
 import pytest
+from bus_stations import spec
 from effect_files import restored_catalogue
 from hypothesis import HealthCheck, settings
 from long_tests import LONG_TESTS, LONGEST
-from plugin_bus_summary import require_bus_kind
+from plugin_bus import require_bus_kind
 from rig_command import rig
 
-pytest_plugins = ["plugin_bus_summary", "pytester"]
+pytest_plugins = ["plugin_bus", "pytester"]
 
 # An example that took longer than hypothesis expects tells of the machine and not of the code.
 settings.register_profile("shared machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -53,6 +54,12 @@ def forget_effects() -> Iterator[None]:
 def bus_kind(request: pytest.FixtureRequest) -> str:
     """The back end a bus test runs on. Without vcan0 the socketcan ones skip, or fail with EHA_RIG_REQUIRE_VCAN=1."""
     return require_bus_kind(request.param)
+
+
+@pytest.fixture
+def where(bus_kind: str) -> str:
+    """A bus of that back end that nobody else uses."""
+    return spec(bus_kind)
 
 
 @pytest.fixture(scope="session")

@@ -1,34 +1,49 @@
-"""The documentation is complete, its links have targets, and its examples work."""
+"""The documentation is complete and true, its examples work, it becomes a site; the schemas of the JSON answers."""
 
 import argparse
 import ast
-import importlib
+import importlib.util
 import inspect
+import json
 import re
 import runpy
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from answer_schemas import build_validator, check_answer, load_schemas, name_schema
+from build_site import NAVIGATION, build_site, compare_navigation
+from check_site import find_faults
+from effect_files import restored_catalogue
+from jsonschema import Draft202012Validator
+from notebook_page import RunCell, check_format, run_notebook
+from places import ROOT
+from reference_pages import write_reference
 from rig_command import rig
+from short_runs import HIDDEN, write_measured_runs
 
 from plant import Model, load_model, simulate
 from plant.effects import effect, load_effects
 from plant.eha import State
+from plant.model import list_offered_effects
 from plant.parameters import GROUPS
+from plant.plants import list_plants
 from plant.quantity import list_quantities
 from plant.state import Input
 from rig.cli import main
 from rig.cli.command_list import COMMANDS
+from rig.conformance.run_cases import CASES
 from rig.sequences import faults
-from rig.sequences.checks import KEYS, Guard
+from rig.sequences.checks import KEYS, KINDS, Guard
 from rig.sequences.python_parts import Step
 from rig.sequences.sequence import SEGMENT_KINDS, Sequence, parse_sequence
 
-ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 PAGES = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").glob("*.md"))]
 SEQUENCES = (ROOT / "docs" / "sequences.md").read_text()
@@ -101,11 +116,6 @@ def test_the_readme_names_only_commands_that_exist_and_all_of_them() -> None:
     assert {*typed, *re.findall(r"`rig ([a-z]+)", README)} == set(COMMANDS)
 
 
-def test_every_page_is_linked() -> None:
-    text = README + (ROOT / "ARCHITECTURE.md").read_text()
-    assert [page.name for page in (ROOT / "docs").glob("*.md") if f"docs/{page.name}" not in text] == []
-
-
 def test_every_link_has_a_target() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
@@ -150,24 +160,6 @@ def parse_command(line: str) -> argparse.Namespace:
     return main.build_command_parser(name).parse_intermixed_args(words)
 
 
-def values(args: argparse.Namespace, *names: str) -> list[str]:
-    found = [getattr(args, name, None) for name in names]
-    words = [word for value in found if value for word in (value if isinstance(value, list) else [value])]
-    return [str(word) for word in words]
-
-
-def test_a_command_of_the_tutorial_uses_only_what_is_there_by_then() -> None:
-    there = {path.name for path in (ROOT / "docs" / "tutorial").iterdir()}
-    effects = {"null_bias", "jack_friction", "missing_force"}
-    typed = commands_shown(ROOT / "docs" / "tutorial.md")
-    assert len(typed) > 10
-    for line in typed:
-        args = parse_command(line)
-        used = values(args, "trace", "words", "repeat", "holdout", "effects", "model", "command_file")
-        assert set(used) - effects - {"eha"} <= there, line
-        there |= set(values(args, "out", "write_effect"))
-
-
 @pytest.mark.parametrize("script", sorted((ROOT / "docs").glob("*.py")), ids=lambda path: path.name)
 def test_the_scripts_of_the_pages_can_be_imported(script: Path) -> None:
     """They take minutes to run; a name that has moved shows in their imports and in what they use of a module."""
@@ -201,8 +193,291 @@ def test_the_glossary_has_every_verdict() -> None:
     assert not [word for word in verdicts if not re.search(rf"\b{word}\b", glossary)]
 
 
-def test_the_glossary_explains_a_term_once() -> None:
-    glossary = (ROOT / "docs" / "glossary.md").read_text().split("## Verdict words")[0]
-    terms = [term.strip() for row in re.findall(r"^- \*\*(.+?)\*\*: ", glossary, re.MULTILINE)
-             for term in row.split(",")]
-    assert len(terms) > 100 and len(terms) == len(set(terms))
+EXAMPLES = ROOT / "examples"
+
+
+def test_the_page_lists_every_program() -> None:
+    page = (EXAMPLES / "README.md").read_text()
+    assert [path.name for path in EXAMPLES.glob("*.py") if f"({path.name})" not in page] == []
+
+
+def test_an_effect_of_ones_own() -> None:
+    said = rig("effects", "--effects", EXAMPLES / "cogging.py", "cogging")
+    assert said.status == 0 and "F sin(2 pi XJ / pitch)" in said.out
+
+
+def test_a_sequence_with_own_profile_and_measure(tmp_path: Path) -> None:
+    said = rig("run", EXAMPLES / "growing_sine.toml", "--out", tmp_path / "run", "--json")
+    assert said.status == 0 and said.json["verdict"] == "PASS"
+    checks = {check["name"]: check for check in said.json["checks"]}
+    assert 0.0 < checks["RMS error"]["value"] < 500.0 and checks["no emergency"]["passed"]
+
+
+def test_tests_of_a_controller(tmp_path: Path) -> None:
+    words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", str(EXAMPLES / "test_controller.py")]
+    done = subprocess.run([sys.executable, *words,
+                           "--rig-out", str(tmp_path / "results")], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    assert "3 passed" in done.stdout
+
+
+def test_missing_physics_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                  capsys: pytest.CaptureFixture[str]) -> None:
+    """The program on shorter recordings than those of `rig simulate --samples`; among all effects its search takes a
+    minute.
+    """
+    def write_samples(words: list[str], cwd: Path, check: bool) -> None:
+        assert words[-3:] == ["simulate", "--samples", "--quiet"]
+        for file, name in zip(write_measured_runs(cwd, HIDDEN).values(), ("run", "run2", "held"), strict=True):
+            file.rename(cwd / f"{name}.csv")
+
+    program = str(EXAMPLES / "find_missing_physics.py")
+    monkeypatch.setattr(sys, "argv", [program, str(tmp_path)])
+    monkeypatch.setattr(subprocess, "run", write_samples)
+    with restored_catalogue("null_bias", "constant_load", "spool_friction", "jack_friction"):
+        runpy.run_path(program, run_name="__main__")
+    said = capsys.readouterr().out
+    assert "null_bias" in said and said.rstrip().endswith("WITHIN_FLOOR")
+    assert "<svg" in (tmp_path / "residual.svg").read_text() and (tmp_path / "better.toml").exists()
+
+
+NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
+SITE_PAGES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").glob("*.md")}
+MADE = {f"docs/{NOTEBOOK.stem}.md", "ARCHITECTURE.md", "CHANGELOG.md",
+        *(path.relative_to(ROOT).as_posix() for name in ("examples", "studies")
+          for path in (ROOT / name).rglob("README.md"))}
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made") / "reference"
+    write_reference(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def cells() -> list[RunCell]:
+    """The notebook, run with a few effects to search among."""
+    with restored_catalogue("null_bias", "constant_load", "spool_friction", "jack_friction"):
+        return run_notebook(NOTEBOOK)
+
+
+def test_every_page_is_in_the_navigation(reference: Path) -> None:
+    known = SITE_PAGES | MADE | {path.relative_to(reference.parent).as_posix() for path in reference.rglob("*.md")}
+    assert compare_navigation(known) == []
+    assert compare_navigation(known | {"docs/new.md"}) == ["docs/new.md: not in docs/site/navigation.toml"]
+    assert compare_navigation(known - {"docs/bus.md"}) == [
+        "docs/bus.md: in docs/site/navigation.toml, but there is no such page"]
+    assert [part["title"] for part in NAVIGATION] == ["Tutorial", "How-to", "Reference", "Explanation"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_page_of_a_command_has_what_its_help_has(
+        command: str, reference: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from rig.cli.main import main
+
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    page = (reference / "commands" / f"{command}.md").read_text()
+    options = set(re.findall(r"^ +(?:-\w, )?(--[a-z][\w-]+)", capsys.readouterr().out, re.MULTILINE))
+    assert {"--help", "--json", "--out"} <= options
+    assert {option for option in options if f"`{option}" not in page} == set()
+
+
+def test_the_reference_has_every_effect_key_and_kind(reference: Path) -> None:
+    sections = re.findall(r"^##+ (.*)", (reference / "effects.md").read_text(), re.MULTILINE)
+    assert {effect.name for plant in list_plants() for effect in list_offered_effects(plant)} == set(sections)
+    sections = re.findall(r"^##+ (.*)", (reference / "sequences.md").read_text(), re.MULTILINE)
+    for word, kinds in (("Segment", SEGMENT_KINDS), ("Fault", faults.KINDS), ("Check", KINDS)):
+        assert {f"{word} {name}" for name in kinds} <= set(sections)
+    assert "| `filter.clogging` |" in (reference / "parameters.md").read_text()
+    page = (reference / "conformance.md").read_text()
+    assert [each.number for each in CASES] == re.findall(r"^\| (\d+\.\d+) \|", page, re.MULTILINE)
+    keys = (reference / "json.md").read_text()
+    assert all(f"## {path.name}" in keys for path in (ROOT / "docs" / "schema").glob("*.json"))
+    assert "| `signals.*.floor_source` | `repeats`, `model`, `data`" in keys
+    assert "```{py:function} compare(trace: TraceOrPath" in (reference / "python.md").read_text()
+
+
+def test_the_site_is_whole_and_needs_no_network(cells: list[RunCell], tmp_path: Path) -> None:
+    missing = [name for name in ("sphinx", "myst_parser", "pydata_sphinx_theme") if not importlib.util.find_spec(name)]
+    if missing:
+        pytest.skip(f"not installed: {', '.join(missing)} (pip install 'eha-rig[docs]')")
+    site = tmp_path / "site"
+    assert build_site(site, {NOTEBOOK: cells}) == []
+    pages = {path.relative_to(site).with_suffix(".md").as_posix() for path in site.rglob("*.html")}
+    assert pages >= SITE_PAGES | MADE | {"index.md", "search.md",
+                                       *(page for part in NAVIGATION for page in part["pages"])}
+    index = (site / "searchindex.js").read_text()
+    assert '"stribeck"' in index and "Search.setIndex(" in index
+    shown = (site / "docs" / f"{NOTEBOOK.stem}.html").read_text()
+    assert shown.count('.svg"') == 2 and "truth 50 uA" in shown
+
+
+def test_what_is_wrong_with_a_site_is_found(tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text(
+        '<link rel="stylesheet" href="//cdn.example.org/a.css"><script src="https://example.org/a.js"></script>'
+        '<a href="other.html#there">a</a><a href="other.html#gone">b</a><a href="gone.html">c</a>'
+        '<a href="https://example.org">leads out</a><img src="gone.svg">')
+    (tmp_path / "other.html").write_text('<p id="there"></p>')
+    (tmp_path / "a.css").write_text("@font-face {src: url('https://example.org/f.woff2')}")
+    assert find_faults(tmp_path) == [
+        "index.html: loads //cdn.example.org/a.css from a network",
+        "index.html: loads https://example.org/a.js from a network",
+        "index.html: other.html#gone: no such anchor", "index.html: gone.html: no such file",
+        "index.html: gone.svg: no such file", "a.css: loads https://example.org/f.woff2 from a network"]
+
+
+def test_the_notebook_finds_the_effect_and_the_error_falls(cells: list[RunCell]) -> None:
+    said = "".join(cell.printed for cell in cells)
+    assert "EXPLAINED null_bias explains the residual" in said
+    ratios = [float(value) for value in re.findall(r"([\d.]+) times the noise floor", said)]
+    assert len(ratios) == 2 and ratios[0] > 20.0 and 0.8 < ratios[1] < 1.2
+    ((value, low, high),) = (map(float, found) for found in
+                             re.findall(r"null bias ([\d.]+) uA \(([\d.]+) \.\. ([\d.]+)\)", said))
+    assert low < 50.0 < high and abs(value - 50.0) < 1.0
+    assert sum(str(cell.value).startswith("<svg") for cell in cells) == 2
+
+
+def test_the_notebook_is_stored_without_results() -> None:
+    assert check_format(json.loads(NOTEBOOK.read_text())) == []
+
+
+PAGE = (ROOT / "docs" / "json.md").read_text()
+SCHEMAS = load_schemas()
+
+PROMISED = {  # keys that other programs rely on
+    "run": "verdict trace checks timing fdi",
+    "compare": "verdict signals solver_error where blocks",
+    "explain": "verdict effects candidates baseline blind_to separate pattern",
+    "add": "model ledger floor",
+    "fdi": "level ruling events precursors grid refined",
+}
+PROMISED_BELOW = {
+    ("run", "timing"): "cycles overruns lateness_us response_us scheduler",
+    ("compare", "signals"): "unit error floor ratio closed_loop_error",
+    ("compare", "where"): "section t0 t1 share condition",
+    ("compare", "blocks"): "controller servovalve jack sensor",
+    ("explain", "candidates"): "effect parameters error holdout ratio evidence p_value word",
+    ("explain", "baseline"): "error holdout floor",
+    ("explain", "blind_to"): "effect smallest_visible unit",
+    ("add", "ledger"): "effect error holdout",
+    ("fdi", "events"): "band signal t_in t_out",
+    ("fdi", "grid"): "step ramp merged",
+}
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_a_schema_is_valid_named_in_the_page_and_refers_to_what_is_there(name: str) -> None:
+    Draft202012Validator.check_schema(SCHEMAS[name])
+    assert SCHEMAS[name]["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+    assert f"schema/{name}" in PAGE
+    for reference in re.findall(r'"\$ref": "([^"]+)"', json.dumps(SCHEMAS[name])):
+        file, _, place = reference.partition("#")
+        found: Any = SCHEMAS[file or name]
+        for key in place.strip("/").split("/") if place else []:
+            found = found[key]
+        assert found["type"], reference
+
+
+def test_every_command_that_answers_in_json_has_a_schema() -> None:
+    words = [[command] for command in COMMANDS] + [["bench", "realtime"]]
+    more = {"common.json", "evidence_verify.json", "fdi_learn_bands.json", "suite.json", "check_bench.json",
+            "check_plant.json"}
+    assert {name_schema(each) for each in words} | more == set(SCHEMAS)
+
+
+@pytest.mark.parametrize("command", PROMISED)
+def test_the_promised_keys_are_required(command: str) -> None:
+    schema = SCHEMAS[f"{command}.json"]
+    assert set(PROMISED[command].split()) <= set(schema["required"])
+    for (owner, key), keys in PROMISED_BELOW.items():
+        if owner == command:
+            inner = schema["properties"][key]
+            inner = next((each for each in inner.get("anyOf", []) if "properties" in each), inner)
+            inner = inner.get("items") or inner.get("additionalProperties") or inner
+            assert set(keys.split()) <= set(inner["required"]), key
+
+
+def list_keys(schema: Any) -> Iterator[str]:
+    """Every key that a schema describes, at any depth; not the keys of its references."""
+    if isinstance(schema, dict):
+        properties = schema.get("properties")
+        if isinstance(properties, dict) and "type" in schema:
+            yield from properties
+        for value in schema.values():
+            yield from list_keys(value)
+    elif isinstance(schema, list):
+        for value in schema:
+            yield from list_keys(value)
+
+
+def keys_of(answer: Any) -> set[str]:
+    if isinstance(answer, dict):
+        return {*answer} | {key for value in answer.values() for key in keys_of(value)}
+    return {key for value in answer for key in keys_of(value)} if isinstance(answer, list) else set()
+
+
+def assert_all_seen(name: str, *answers: Any) -> None:
+    """No key of a schema is one that no answer has."""
+    for answer in answers:
+        check_answer([name], answer)
+    assert set(list_keys(SCHEMAS[f"{name}.json"])) <= keys_of(list(answers))
+
+
+def test_the_answers_of_runs(preflight: Path, aborted: Path) -> None:
+    answers = [json.loads((folder / "verdict.json").read_text()) for folder in (preflight, aborted)]
+    assert answers[1]["cause"] is not None and answers[1]["nodes"].keys() == {"2", "3"}
+    # what these two runs do not have; the tests of real-time runs check it in their answers
+    answers[1]["consequences"] = [{"t": 0.0, "source": "node 2 controller", "kind": "stopped", "text": "silent"}]
+    answers[1]["fdi"] = {"verdict": "CANNOT_TELL", "sentence": "not judged: too short"}
+    answers[1]["judged"]["lateness"] = [{"t": 0.0, "cycle": 1, "last": 1, "source": "rig", "text": "late"}]
+    answers[1]["limits"] = [{"parameter": "p", "signal": "xj", "limit": 1.0, "t": 0.0, "seconds": 1.0}]
+    answers[1]["calibration"] = {"xj": {
+        "signal": "xj", "unit": "m", "identifier": "K-118", "date": "2026-03-01", "expiry": "2027-03-01", "u": 1e-6,
+        "distribution": "normal", "gain": 0.0, "noise": 0.0, "problem": ""}}
+    assert_all_seen("run", *answers)
+
+
+def test_the_answers_of_small_commands(preflight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("command.csv").write_text("t,com\n0,0\n0.001,1e-3\n0.002,1e-3\n")
+    simulated = rig("simulate", "--command", "command.csv", "--out", "short.csv", "--json").json
+    samples = rig("simulate", "--samples", "--json").json
+    traces = [Path(name) for name in ("run.csv", "run2.csv", "held.csv")]
+    assert samples["traces"] == [*map(str, traces)] and all(trace.exists() for trace in traces)
+    assert_all_seen("simulate", simulated, samples)
+    kinds = ("parameters", "signals", "sequences", "effects", "checks", "models", "benches", "faults")
+    assert_all_seen("list", *(rig("list", kind, "--json").json for kind in kinds))
+    assert_all_seen("report", rig("report", preflight, "--out", "page.html", "--json").json)
+    assert_all_seen("export", rig("export", preflight, "--out", "run.csv", "--force", "--json").json,
+                    rig("export", "--fmu", "eha.fmu", "--json").json)
+    assert_all_seen("recover", rig("recover", preflight / "trace.mcap", "--out", "again.mcap", "--json").json)
+    imported = rig("import", "run.csv", "--out", "run.mcap", "--json").json
+    check_answer(["import"], imported)
+    check_answer(["check"], rig("check", "preflight", "--json").json)
+    assert_all_seen("diff", rig("diff", preflight, "run.csv", "--json").json)
+    assert_all_seen("doctor", rig("doctor", "--json").json)
+
+
+def test_the_answer_of_a_diagnosis(preflight: Path) -> None:
+    answer = rig("fdi", preflight, "--json").json
+    assert answer["events"] == []
+    event = {"band": "most", "fault": "spool_friction", "signal": "speed", "section": "step", "t_in": 0.0,
+             "t_out": 0.1, "excess": 1e-3}
+    explanation = {"effects": ["null_bias"], "probability": 1.0, "parameters": {}, "ratio": {"xj": 1.0},
+                   "level": answer["level"], **{key: answer["refined"][key] for key in ("kintas", "fss")}}
+    beside = {"effects": [], "explained": True, "ambiguous": False, "disputed": [], "marks": {},
+              "explanations": [explanation]}  # of --with-effects, whose search takes a minute
+    assert_all_seen("fdi", answer, {**answer, "events": [event], "with_effects": beside})
+
+
+def test_the_answer_of_a_comparison(tmp_path: Path) -> None:
+    runs = write_measured_runs(tmp_path, HIDDEN)
+    assert_all_seen("compare", rig("compare", runs["est"], "--repeat", runs["repeat"], "--json").json)
+
+
+def test_a_newer_version_may_add_keys() -> None:
+    """The published schema accepts what the tests refuse."""
+    Draft202012Validator(SCHEMAS["report.json"]).validate({"report": "report.html", "pages": 1})
+    assert not build_validator("report.json").is_valid({"report": "report.html", "pages": 1})

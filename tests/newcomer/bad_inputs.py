@@ -1,10 +1,11 @@
-"""What a newcomer gets wrong: 120 command lines and files, and what the one line of the answer has to name."""
+"""What a newcomer gets wrong: some 180 command lines and files, and what the one line of the answer has to name."""
 
 from pathlib import Path
 from typing import NamedTuple
 
 from rig_command import SHORT
 
+from dbc import EDS
 from fdi.trace.trace import Trace
 from plant import Model, simulate
 
@@ -23,6 +24,7 @@ FILES = {
     "empty.csv": "",
     "no_rows.csv": HEADER,
     "no_com.csv": "t,xj,cor\n" + "0,0,0\n0.001,0,0\n",
+    "no_cor.csv": "t,com,xj\n" + "0,0,0\n0.001,0,0\n",
     "word.csv": HEADER + "0,0,0,0\n0.001,0,zero,0\n" + ROWS[200:],
     "ragged.csv": HEADER + "0,0,0,0\n0.001,0\n",
     "backwards.csv": HEADER + "0,0,0,0\n0.002,0,0,0\n0.001,0,0,0\n0.003,0,0,0\n",
@@ -37,6 +39,9 @@ FILES = {
                                   'kind = "hold" },\n  { name = "step"'),
     "other_window.toml": SHORT.replace('window = "step"', 'window = "leap"'),
     "word_time.toml": SHORT.replace("to = 1e-3, time = 0.2", 'to = 1e-3, time = "long"'),
+    "late.toml": f'{SHORT}faults = [{{ kind = "lost", frame = "drive", start = 9.0 }}]\n',
+    "biased.toml": "[null_bias]\ncurrent = 1e-4\n",
+    "node2.eds": EDS[2].read_text(),
     "new_group.toml": 'name = "x"\nplant = "eha"\n[rocket]\nthrust = 1.0\n',
     "new_field.toml": 'name = "x"\nplant = "eha"\n[spool]\nstatic_fricton = 35.0\n',
     "negative.toml": 'name = "x"\nplant = "eha"\n[spool]\nstatic_friction = -3.0\n',
@@ -50,6 +55,12 @@ FILES = {
     "matrix.toml": '[[case]]\nfault = "gremlin"\nsizes = [1.0]\n',
     "slip.py": SLIP, "raises.py": "1 / 0", "nocom.csv": "t,x\n0,1\n", "nan.csv": "t,com\n0,1\n0.001,nan\n",
     "binary.toml": "\xff\xfe\0",
+    "bad.log": "hello\n", "bad.blf": "hello\n", "silent.log": "(0.000000) can0 702#05\n",
+    "bad.dbc": "BO_ nonsense", "other.dbc": 'VERSION ""\n', "short.toml": SHORT,
+    "suite.toml": 'title = "s"\n[[case]]\nsequence = "short.toml"\n',
+    "bad.json": "{}",
+    "nan.json": '{"axis": "date", "points": [{"trace": "a.csv", "t": NaN, "fss": SIZE, "kintas": SIZE}]}'.replace(
+        "SIZE", '{"value": 1, "low": 0, "high": 2}'),
     "dates/dates.csv": "file,date\nrun.csv,yesterday\n",
 }
 
@@ -81,6 +92,7 @@ BAD_INPUTS = [
     bad("run --set filter.clogging=nan", "filter.clogging", "nan"),
     bad("run --model boeing", "boeing", "eha"),
     bad("run --model absent.toml", "absent.toml", "model file", "does not exist"),
+    bad("run --model binary.toml", "binary.toml", "UTF-8"),
     bad("run --bus socketcan:can9", "can9"),
     bad("run --bus carrier_pigeon:1", "carrier_pigeon"),
     bad("run --out notes.txt", "notes.txt", "folder"),
@@ -93,8 +105,22 @@ BAD_INPUTS = [
     bad("doctor now", "now"),
     bad("node pilot", "pilot", "plant"),
     bad("bench warp", "warp", "realtime"),
+    bad("bench realtime --bus virtual:x", "--bus: virtual:x: expected socketcan:INTERFACE"),
+    bad("bench realtime --blocks 0", "--blocks"),
+    bad("bench realtime --seconds 0.1", "--seconds"),
+    bad("bench realtime --seconds nan", "--seconds"),
     bad("conformance controller --bus virtual --eds absent.eds", "absent.eds", "No such file"),
     bad("conformance 200 --bus virtual", "200", "127"),
+    bad("conformance 128", "NODE: 128: expected a node-ID from 1 to 127, controller, plant or c"),
+    bad("conformance firmware", "NODE: firmware: expected a node-ID"),
+    bad("conformance 5", "--eds: expected the electronic data sheet of node 5"),
+    bad("conformance 5 --eds node2.eds", "--bus: embedded: expected a bus that the node is on"),
+    bad("conformance plant --eds absent.eds", "absent.eds: expected a file that can be read"),
+    bad("conformance plant --chapter 9", "--chapter: 9: expected the number of a chapter"),
+    bad("conformance plant --junit x.txt", "--junit: x.txt: expected FILE.xml"),
+    bad("conformance plant --tolerance nan", "--tolerance: nan: expected a number from 0"),
+    bad("conformance plant --timeout 0", "--timeout: 0: expected a number from 0.01"),
+    bad("conformance plant --chapter 1 --out page.html", "--out: page.html: expected a folder"),
     bad("effects null_bais", "null_bais", "null_bias"),
     bad("simulate --out s.txt", "--out", "s.txt", ".csv"),
     bad("simulate --out run.csv", "--out", "run.csv", "--force"),
@@ -132,7 +158,10 @@ BAD_INPUTS = [
     bad("export absent.mcap --out x.csv", "absent.mcap"),
     bad("import run.csv --dbc x.dbc", "a CSV of signals has no frames"),
     bad("import absent.blf --out x.mcap", "absent.blf"),
-    # sequences
+    # sequences and suites
+    bad("run suite.toml --seed 1", "--seed: expected in the suite file"),
+    bad("run short.toml short.toml --junit x.txt", "expected FILE.xml"),
+    bad("run short.toml short.toml --pace realtime --jobs 2", "--jobs: 2: expected 1 in"),
     bad("run folder.toml", "folder.toml"),
     bad("run binary.toml", "UTF-8"),
     bad("run absent.toml", "absent.toml", "No such file"),
@@ -143,6 +172,11 @@ BAD_INPUTS = [
     bad("new bench drive --dbc binary.toml", "binary.toml"),
     bad("run --bench absent.toml", "absent.toml", "No such file"),
     bad("check absent.toml", "absent.toml", "No such file"),
+    bad("check nothing", "expected a .toml file"),
+    bad("check preflight --out x.png", "FILE.html"),
+    bad("check preflight --set jack.mas=1", "did you mean mass"),
+    bad("check preflight --model servo", "preflight: expected a sequence of your own: electrohydrostatic servo"),
+    bad("check late.toml", "late.toml:14: faults[0].start: expected a time within main's 0.35 s, not 9"),
     bad("check new_kind.toml", "new_kind.toml", "main[1]", "jump"),
     bad("run preflite", "preflite", "preflight"),
     bad("run broken.toml", "broken.toml:1", "TOML"),
@@ -174,44 +208,99 @@ BAD_INPUTS = [
     bad("compare notes.txt", "notes.txt", ".csv"),
     bad("compare dates", "dates", "trace.mcap"),
     bad("compare run.csv --signals xj,speed", "--signals", "speed", "xj"),
+    bad("compare run.csv --signals=", "--signals", "expected some of xj,p12,xs"),
+    bad("compare run.csv --set spool.fiction=1", "spool.fiction: expected a field of spool; did you mean"),
+    bad("compare no_cor.csv", "no_cor.csv: line 1: cor: expected a column of this name"),
     bad("diff run.csv", "B", "required"),
     bad("diff run.csv absent.csv", "absent.csv", "does not exist"),
     bad("compare run.csv --repeat other.csv", "other.csv", "com"),
-    bad("explain run.csv --repeat run.csv", "--repeat", "run.csv", "again"),
-    bad("explain run.csv --holdout run.csv", "--holdout", "run.csv"),
+    bad("explain run.csv --repeat run.csv", "--repeat", "run.csv", "the same command run again"),
+    bad("explain run.csv --repeat other.csv", "another command is no repeat"),
+    bad("explain run.csv --holdout run.csv", "--holdout", "run.csv", "a run that no fit has seen"),
+    bad("explain run.csv --holdout absent.csv", "a trace that can be read"),
+    bad("explain run.csv --signals xj,q", "--signals: q: expected some of xj,p12,xs"),
+    bad("explain run.csv --out x.txt", "FILE.html for a page, or FILE.json"),
+    bad("explain run.csv --write-effect x.txt", "FILE.py"),
+    bad("explain no_cor.csv", "cor"),
+    bad("explain run.csv --sensitivity --hide coil_log", "coil_lag"),
+    bad("explain run.csv --sensitivity --workers 0", "1 or more processes"),
+    bad("explain run.csv --hide coil_lag", "--sensitivity beside it"),
+    bad("explain run.csv --workers 2", "--sensitivity beside it"),
     bad("add run.csv", "effect", "rig effects"),
-    bad("add null_bais run.csv", "null_bais", "null_bias"),
-    bad("add null_bias", "TRACE", "rig add"),
-    bad("add null_bias run.csv --out model.txt", "model.txt", ".toml"),
-    bad("remove null_bias", "--model"),
+    bad("add null_bais run.csv", "null_bais", "did you mean null_bias?"),
+    bad("add null_bias", "TRACE", "rig add", "the measured run to fit"),
+    bad("add null_bias run.csv --out model.txt", "model.txt", "FILE.toml"),
+    bad("add null_bias run.csv --model biased.toml", "one that is not in the model already"),
+    bad("add null_bias null_bias run.csv", "one that is not in the model already"),
+    bad("add spool_overlap spool_underlap run.csv", "spool_underlap or spool_overlap in a model, not both"),
+    bad("add current_noise run.csv", "this is noise of the bench"),
+    bad("add command_rate_limit run.csv", "a difference between Cor and the model's firmware"),
+    bad("add quantisation run.csv", "steps in the measured positions"),
+    bad("add null_bias run.csv --holdout run2.csv --repeat run2.csv", "a run that no fit has seen"),
+    bad("remove null_bias", "--model", "the model file to remove the effect from"),
     bad("remove null_bias --model unit.toml", "null_bias", "it has none"),
+    bad("remove coil_lag --model biased.toml", "one that the model has (null_bias)"),
+    bad("remove null_bias coil_lag --model biased.toml", "one effect at a time"),
     bad("identify", "RUN", "required"),
+    bad("fdi", "TRACE"),
+    bad("fdi no_cor.csv", "cor"),
+    bad("fdi rest.csv", "moves"),
+    bad("fdi run.csv --out x.txt", "x.txt"),
+    bad("fdi run.csv --model ehs", "ehs"),
     bad("fdi run.csv --bands absent.toml", "absent.toml", "No such file"),
     bad("fdi run.csv --bands unit.toml", "unit.toml"),
     bad("trend absent", "absent"),
     bad("trend dates", "dates.csv", "yesterday"),
+    bad("trend bad.json", "bad.json"),
+    bad("trend nan.json", "nan.json"),
+    bad("trend run.csv --out x.txt", "x.txt"),
+    bad("trend", "FOLDER"),
     bad("campaign absent.toml", "absent.toml", "No such file"),
     bad("campaign --fault gremlin=1", "--fault", "gremlin"),
+    bad("campaign --fault spool_frction=3", "an effect of the catalogue; did you mean spool_friction?"),
+    bad("campaign --fault filter_clogging=1.5", "filter_clogging: expected a number"),
+    bad("campaign --fault filter_clogging", "--fault: filter_clogging: expected healthy"),
+    bad("campaign --fault healthy --tolerance 0.5", "tolerance: expected a number from 0 to 0.2"),
+    bad("campaign --fault healthy --seeds 0", "seeds: expected a whole number from 1"),
+    bad("campaign --fault healthy --model ehs", "--faults: expected a fault file: the plant ehs brings no faults"),
+    bad("campaign --fault healthy --signals xs", "signals: expected one of xj,p12,xs or xj,p12 or xj, not 'xs'"),
+    bad("campaign --fault healthy --jobs 0", "--jobs: expected a whole number from 1"),
+    *(bad(f"campaign --fault healthy --work {work}", f"--work: {work}: expected module:function")
+      for work in ("nothing:here", ".:x", "math:pi")),
+    bad("campaign", "expected a matrix file, the shipped matrix statistics, a folder of traces, or --fault"),
     bad("campaign matrix.toml", "matrix.toml", "fault", "rig effects"),
     bad("import absent.dat", "absent.dat", "does not exist"),
     bad("import run.csv --map map.toml", "Sollweg"),
     bad("import notes.txt", "notes.txt"),
+    bad("import nocom.csv", "line 1: com", "for other columns: rig import --guess nocom.csv"),
+    bad("import bad.log", "bad.log", "CAN frames as .log"),
+    bad("import bad.blf", "bad.blf", "CAN frames as .blf"),
+    bad("import silent.log", "silent.log", "SYNC"),
+    bad("import silent.log --guess --dbc bad.dbc", "bad.dbc", "expected a DBC ("),
+    bad("import silent.log --dbc other.dbc", "--map or --guess with it"),
+    bad("export run.csv --out x.xlsx", "x.xlsx", "ends in .csv"),
+    bad("export run.csv --out x.blf", "raw frames"),
     bad("export run.csv --out run.pdf", "run.pdf", ".csv"),
     bad("view absent.mcap", "absent.mcap", "does not exist"),
+    bad("view run.csv --out x.mcap", "--out: x.mcap: expected FILE.rrd or FILE.png"),
+    bad("view run.csv other.csv --compare", "--compare: other.csv: expected one trace; rig view A B holds traces"),
+    bad("view run.csv --theme light --out x.rrd", "--theme: light: expected no --out with it: it opens no browser"),
+    *(bad(f"view run.csv {option}", f"{option.split()[0]}: expected --compare with it") for option in (
+        "--set null_bias.current=1.5e-4", "--repeat other.csv", "--signals xj", "--seed 0")),
     bad("report absent.mcap", "absent.mcap", "does not exist"),
     bad("recover notes.txt", "notes.txt"),
 ]
 
 
 def write_bad_files(folder: Path) -> None:
-    """Write the files of these command lines, and run.csv and other.csv, which are right, into a folder."""
+    """Write the files of these command lines into a folder; right ones are run.csv, run2.csv and other.csv."""
     (folder / "dates").mkdir()
     (folder / "folder.toml").mkdir()
     for name, text in FILES.items():
         (folder / name).write_text(text, encoding="latin-1")
-    for name, size in (("run.csv", 1e-3), ("other.csv", -2e-3), ("dates/run.csv", 1e-3)):
-        command = [size * (k > 50) for k in range(400)]
-        columns = simulate(Model(), command, None, 1, 20)
+    for seed, (name, size) in enumerate((("run.csv", 1e-3), ("run2.csv", 1e-3), ("other.csv", -2e-3), ("rest.csv", 0.0),
+                                         ("dates/run.csv", 1e-3))):
+        columns = simulate(Model(), [size * (k > 50) for k in range(400)], None, seed, 20)
         Trace.from_columns(columns._asdict(), 1e-3, {}).write_csv(folder / name)
 
 

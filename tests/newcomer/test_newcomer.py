@@ -24,17 +24,18 @@ from rig.cli.command_list import COMMANDS
 def test_bad_input_gets_one_line_that_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_bad_files(tmp_path)
     monkeypatch.chdir(tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     found = {}
     for case in BAD_INPUTS:
         said = rig(*case.words.split())
         CATALOGUE.pop("slip", None)  # of one of them
         found[case.words] = find_faults(case, said.status, said.out, said.err)
     assert {words: faults for words, faults in found.items() if faults} == {}
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_bad_inputs_are_of_every_command() -> None:
     assert {case.words.split()[0] for case in BAD_INPUTS} == {*COMMANDS, "fly"}
-    assert len(BAD_INPUTS) >= 60
 
 
 def test_ctrl_c_ends_a_search_and_leaves_nothing(tmp_path: Path) -> None:

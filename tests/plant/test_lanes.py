@@ -144,14 +144,6 @@ def test_runs_with_few_costly_effects_get_a_kernel_of_their_own_once_it_is_worth
     assert len(catalogue._assign_runs(few, 1)) == 1  # a block takes as long for one run as for sixteen
 
 
-def test_all_effects_at_once(catalogue: Lanes) -> None:
-    together = [effect for i, effect in enumerate(EFFECTS) if not set(EFFECTS[:i]) & set(CATALOGUE[effect].excludes)]
-    changes = {name: value for effect in together for name, value in start(effect, 0).items()}
-    assert len(together) > 20
-    run = catalogue.replay(with_effects(catalogue, changes), CURRENT, FORCE)[0]
-    assert (run == one_run(QUIET.replace(changes), CURRENT, FORCE)).all()
-
-
 @pytest.mark.parametrize(("text", "changes"), [(COGGING, {"cogging.force": 500.0}), (MEMORY, {"wear.rate": 1e4})])
 def test_effects_of_a_user(text: str, changes: dict[str, float], tmp_path: Path) -> None:
     """With a sine and with a memory. (A changed file is not served by old code: test_compile.py.)"""

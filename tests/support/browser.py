@@ -1,4 +1,4 @@
-"""A headless browser for pages: how wide they come out, pictures of them, and their print as PDF.
+"""A headless browser for pages: how wide they come out, and what their scripts do.
 
 Without chromium `find_browser` is None; what needs it is skipped, or fails with EHA_RIG_REQUIRE_BROWSER=1.
 """
@@ -72,32 +72,11 @@ def measure_page(page: Path, width: int, script: str = "") -> PageSize:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, "page.html")
         copy.write_text(page.read_text(encoding="utf-8").replace("<head>", f"<head>{run}{PROBE}", 1), encoding="utf-8")
-        frame = write_frame(Path(folder), width, 900, TELL_PARENT)
+        frame = Path(folder, "frame.html")  # a window is never narrower than 500 pixels
+        frame.write_text(f'<body style="margin:0"><iframe src="page.html" style="border:0;width:{width}px;height:900px"'
+                         f"></iframe>{TELL_PARENT}", encoding="utf-8")
         dom = call_browser("--allow-file-access-from-files", "--virtual-time-budget=10000",
                            f"--window-size={max(width, 500)},900", "--dump-dom", frame.as_uri())
     found = re.search(r'<pre id="probe">(.*?)</pre>', dom, re.DOTALL)
     assert found, f"{page}: the page did not load"
     return PageSize(**json.loads(unescape(found[1])))
-
-
-def take_picture(page: Path, width: int, out: Path, most: int = 12000) -> None:
-    """A picture of the whole page (its first `most` pixels) in a window of `width` pixels."""
-    height = min(measure_page(page, width).height + 20, most)
-    with tempfile.TemporaryDirectory() as folder:
-        shutil.copy(page, Path(folder, "page.html"))
-        frame = write_frame(Path(folder), width, height)
-        call_browser(f"--window-size={max(width, 500)},{height}", f"--screenshot={out}", frame.as_uri())
-
-
-def write_frame(folder: Path, width: int, height: int, script: str = "") -> Path:
-    """A page that shows page.html of the same folder in a frame: a window is never narrower than 500 pixels."""
-    style = f"border:0;background:#fff;width:{width}px;height:{height}px"
-    frame = folder / "frame.html"
-    text = f'<body style="margin:0;background:#888"><iframe src="page.html" style="{style}"></iframe>{script}'
-    frame.write_text(text, encoding="utf-8")
-    return frame
-
-
-def print_page(page: Path, out: Path) -> None:
-    """The print of a page as PDF."""
-    call_browser("--no-pdf-header-footer", f"--print-to-pdf={out}", page.resolve().as_uri())

@@ -1,14 +1,19 @@
-"""Stations on one bus of any back end, with the same few calls: what the bus tests are written in."""
+"""Stations on one bus of any back end, with the same few calls; nodes that stay on a bus for the tests of a file."""
 
+import contextlib
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import count
 from typing import Protocol
 
+from c_device import run_program
+
 from rig.network.bus import EmbeddedBus, Link, open_can
 from rig.network.frame import Frame
+from rig.network.node_objects import NAMES
 
 _SERIAL = count()
 
@@ -42,6 +47,11 @@ def spec(kind: str) -> str:
     return {"virtual": f"virtual:test-{serial}", "udp_multicast": f"udp_multicast:{group}"}.get(kind, "socketcan:vcan0")
 
 
+def find_group() -> str:
+    """A multicast group that nobody else uses."""
+    return spec("udp_multicast").partition(":")[2]
+
+
 @contextmanager
 def stations(kind: str, number: int = 3, fd: bool = False) -> Iterator[list[Station]]:
     """`number` stations on one new bus, all on one clock that starts at 0; `fd`: also for CAN FD frames."""
@@ -69,3 +79,24 @@ def gather(station: Station, number: int, timeout: float = 60.0) -> list[Frame]:
     while len(frames) < number and time.monotonic() < end:
         frames += station.poll(0.05)
     return frames
+
+
+@contextlib.contextmanager
+def stand_nodes(where: str, *nodes: int) -> Iterator[None]:
+    """`rig node` on a bus for each of the node numbers, all started at once."""
+    with contextlib.ExitStack() as stack:
+        for node in nodes:
+            words = ("-m", "rig.cli.main", "node", NAMES[node], "--bus", where, "--quiet")
+            stack.enter_context(run_program(sys.executable, *words))
+        for node in nodes:
+            wait_for_node(where, node)
+        yield
+
+
+def wait_for_node(where: str, node: int, seconds: float = 300.0) -> None:
+    """Until a node has sent a heartbeat: the plant may compile its model and its cycle before."""
+    link, heard, end = Link(open_can(where), time.monotonic_ns), set[int](), time.monotonic() + seconds
+    while 0x700 + node not in heard and time.monotonic() < end:
+        heard |= {frame.cob_id for frame in link.poll(0.1)}
+    link.close()
+    assert 0x700 + node in heard

@@ -82,11 +82,7 @@ def _saturate(counts: float) -> int:
 
     Raises ValueError for NaN.
     """
-    if counts >= _HIGH:
-        return _HIGH
-    if counts <= _LOW:
-        return _LOW
-    return round(counts)
+    return round(min(max(counts, _LOW), _HIGH))
 
 
 # Counts per unit are whole numbers in binary while 1e-7 is not: multiply to encode and divide to decode, so that a raw

@@ -1,4 +1,4 @@
-"""A program: the answer of `rig add` about a folder's traces, as JSON. Run by test_fits_on_other_cpus.py."""
+"""A program: the answer of `rig add` about a folder's traces, as JSON. Run by test_other_cpus.py."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""A program: hashes of what the plant computes, one a case, as JSON. Run by test_plant_on_other_cpus.py."""
+"""A program: hashes of what the plant computes, one a case, as JSON. Run by test_other_cpus.py."""
 
 import hashlib
 import json

@@ -3,54 +3,24 @@
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+from node_bench import MS, Desk
+
 from dbc import EDS
 from rig.device import Device
-from rig.network.bus import EmbeddedBus
-from rig.network.frame import Frame
-
-MS = 1_000_000  # ns
 
 
-class Rack:
-    """Node 2 or 3, booted. What it sends is collected as (COB-ID, data) until `take`n."""
+class Rack(Desk):
+    """Node 2 or 3, which does nothing of its own."""
+
+    node: Device
 
     def __init__(self, node: int = 3, eds: Path | None = None) -> None:
-        self.node, self.t_ns = node, 0
-        self.heard: list[tuple[int, bytes]] = []
-        self.bus = EmbeddedBus()
-        self._send = self.bus.attach(self._hear)
-        self.device = self.bus.add(lambda send: Device(node, eds or EDS[node], send))
-        self.wait(0)
-        self.take()
-
-    def _hear(self, frame: Frame) -> None:
-        self.heard.append((frame.cob_id, frame.data))
-
-    def take(self) -> list[tuple[int, bytes]]:
-        """What the device sent since the last call."""
-        heard, self.heard = self.heard, []
-        return heard
-
-    def send(self, cob_id: int, data: bytes = b"") -> list[tuple[int, bytes]]:
-        """Send one frame to the device; what it answers at once."""
-        self._send(cob_id, data)
-        self.bus.deliver(self.t_ns)
-        return self.take()
-
-    def wait(self, ms: float) -> list[tuple[int, bytes]]:
-        """Let time pass in ticks of 1 ms; what the device sent meanwhile."""
-        end = self.t_ns + round(ms * MS)
-        while True:
-            self.device.tick(self.t_ns)
-            self.bus.deliver(self.t_ns)
-            if self.t_ns >= end:
-                return self.take()
-            self.t_ns = min(self.t_ns + MS, end)
+        super().__init__(lambda send: Device(node, eds or EDS[node], send))
 
     def download(self, index: int, sub: int, data: bytes) -> str:
         """Expedited SDO download; "ok", or the abort code in hexadecimal."""
         head = bytes((0x23 | (4 - len(data)) << 2,)) + index.to_bytes(2, "little") + bytes((sub,))
-        answer = self.send(0x600 + self.node, head + data.ljust(4, b"\0"))[0][1]
+        answer = self.send(0x600 + self.node.node_id, head + data.ljust(4, b"\0"))[0]
         return "ok" if answer[0] == 0x60 else f"{int.from_bytes(answer[4:], 'little'):08X}"
 
     def play(self, script: str) -> None:
@@ -65,14 +35,18 @@ class Rack:
             action, _, expected = (part.strip() for part in line.partition("->" if "->" in line else "="))
             first, *rest = action.split()
             index, _, sub = (rest if first == "write" else [first])[0].partition(":")
+            before = len(self.heard)
             if first == "write":
                 found = self.download(int(index, 16), int(sub, 16), bytes.fromhex(rest[1]))
             elif sub:
-                found = str(self.device.od.values[int(index, 16), int(sub, 16)])
+                found = str(self.node.od.values[int(index, 16), int(sub, 16)])
             else:
-                heard = (self.wait(float(rest[0])) if first == "wait" else
-                         self.send(int(first, 16), bytes.fromhex("".join(rest))))
-                found = ", ".join(f"{cob_id:03X} {data.hex()}" for cob_id, data in heard)
+                if first == "wait":
+                    for _ in range(int(rest[0])):
+                        self.wait(MS)
+                else:
+                    self.send(int(first, 16), bytes.fromhex("".join(rest)))
+                found = ", ".join(f"{cob_id:03X} {data.hex()}" for _, cob_id, data in self.heard[before:])
             assert fnmatchcase(found, expected), (line, found)
 
 

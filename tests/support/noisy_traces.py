@@ -5,11 +5,12 @@ from functools import cache
 
 import numpy as np
 from effects_cases import LAWS
-from physics_cases import PREFLIGHT, QUIET
+from physics_cases import PREFLIGHT
 
 from fdi.trace.trace import Trace
 from plant import Actuator, Model
 from plant.eha import State
+from rig.bench.benchmarks import QUIET
 
 SENSED, PRESSURE, SPOOL = (State._fields.index(name) for name in ("sensed", "pressure", "spool_position"))
 LEVELS = np.array([2e-6, 2e4, 1e-6])  # of the nominal transducers: m, Pa, m

@@ -1,12 +1,9 @@
 """What the physics tests share: the preflight command, and plants without noise or friction."""
 
 from plant import Model
-from plant.segments import build_profile
 from rig.bench.benchmarks import FRICTIONLESS, QUIET
 from rig.sequences.sequence import load_sequence
 
 PREFLIGHT = load_sequence("preflight").main_profile().command
 SILENT = Model().replace(QUIET)
 SMOOTH = SILENT.replace(FRICTIONLESS)  # no dry friction
-
-__all__ = ["FRICTIONLESS", "PREFLIGHT", "QUIET", "SILENT", "SMOOTH", "build_profile"]

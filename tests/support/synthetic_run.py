@@ -49,12 +49,8 @@ def record_run(path: Path, seed: int = 1, settings: dict[str, float] | None = No
     for t_ns, frames, signals, timing in build_cycles(seed, settings):
         if signals.cycle == stop:
             break
-        if signals.cycle == 300:
-            recorder.put(t_ns, Event("INFO", "phase", "main"))
-        if signals.cycle == 6300:
-            recorder.put(t_ns, Event("WARN", "fault", "sensors.position_offset: ramps in"))
-        if signals.cycle == 13800:
-            recorder.put(t_ns, Event("INFO", "phase", "clean-up"))
+        if signals.cycle in EVENTS:
+            recorder.put(t_ns, EVENTS[signals.cycle])
         for frame in frames:
             recorder.frame(frame)
         recorder.cycle(t_ns, signals, timing)
@@ -65,6 +61,8 @@ def record_run(path: Path, seed: int = 1, settings: dict[str, float] | None = No
     return path
 
 
+EVENTS = {300: Event("INFO", "phase", "main"), 6300: Event("WARN", "fault", "sensors.position_offset: ramps in"),
+          13800: Event("INFO", "phase", "clean-up")}  # by their cycle
 CHECKS = [
     CheckResult(name="overshoot of the 5 mm step", kind="overshoot", signal="xj", value=2.4, unit="%", high=5.0,
                 passed=True, t0=0.5, t1=1.5),

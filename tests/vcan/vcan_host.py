@@ -14,7 +14,7 @@ from rig.network.bus import explain_socketcan_problem
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parent.parent
 GUEST = FOLDER / "guest.sh"
-APT_LINE = "apt-get install user-mode-linux kmod iproute2 can-utils tshark gcc libc6-dev"
+APT_LINE = "apt-get install user-mode-linux kmod iproute2 can-utils gcc libc6-dev"
 REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VCAN") == "1"  # then nothing about vcan may be skipped
 
 

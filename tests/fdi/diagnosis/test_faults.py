@@ -1,19 +1,37 @@
-"""Faults as data: the shipped lists, bad files in one line, levels of faults that fall or go both ways, groups."""
+"""Faults as data: lists, bad files, levels, groups; bands and precursors: what leaves them, limits, files, the page."""
 
 import json
+import math
 import re
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from noisy_traces import SHORT as RAMP_AND_SINE, record_plant
+from physics_cases import PREFLIGHT
 from places import ROOT
 from refusals import catch_refusal
-from rig_command import refuse, rig
+from rig_command import answer, refuse, rig
 
+from fdi.diagnosis import make_bands
 from fdi.diagnosis.ambiguity import cut_intervals, find_groups
+from fdi.diagnosis.bands import (
+    Bands,
+    BandVerdict,
+    describe_other_model,
+    format_bands,
+    judge_position,
+    judge_trace,
+    list_design,
+    load_bands,
+    load_default_bands,
+    matches_command,
+    parse_bands,
+)
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.faults import (
     CLOGGING,
@@ -28,13 +46,17 @@ from fdi.diagnosis.faults import (
     list_fault_files,
     load_faults,
 )
-from fdi.diagnosis.refine import (
-    list_unknowns,
-)
+from fdi.diagnosis.make_bands import choose_bands, learn_bands, make_bands_by_simulation, simulate_units
+from fdi.diagnosis.precursors import compute_features, format_precursor, measure_precursors
+from fdi.diagnosis.refine import list_unknowns
 from fdi.estimation.fit import Free
+from fdi.thresholds import BAND_EVENT_SAMPLES
+from fdi.trace.sections import Section, find_sections
+from fdi.trace.trace import Trace
+from plant import Model, load_model, simulate
 from plant.faults import Fault, place_fault
-from plant.model import load_model
 from plant.plants import find_plant
+from plant.segments import Hold, Ramp, Step, build_profile as profile
 from rig.campaign.judge import build_matrix, simulate_case
 
 GAP = {"title": "play", "parameter": "feedback_gap.gap", "range": [0.0, 5e-4], "acceptable": 4e-5, "maintenance": 9e-5}
@@ -225,3 +247,323 @@ maintenance = 0.04
     cases = ["--fault", "bearing=1", "--seeds", "1", "--jobs", "1", "--out", "campaign"]
     counted = rig("campaign", *own, *cases, "--json").json
     assert counted["status"] == {"ok": 1} and counted["faults"] == trend["faults"]
+
+
+CLOGGED, RUBBED = "filter_clogging", "spool_friction"
+NAN = math.nan
+
+
+@cache
+def parts() -> list[Section]:
+    return find_sections(PREFLIGHT)
+
+
+@cache
+def units(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5, count: int = 16) -> np.ndarray:
+    com = PREFLIGHT
+    kind = make_kind(clogging, friction, sliding)
+    return simulate_units(load_model(), com, np.zeros_like(com), kind, count, seed=4321)
+
+
+def make_kind(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5) -> dict[str, float]:
+    """Units with these faults, NaN for none."""
+    clogged = {} if math.isnan(clogging) else CLOGGING.list_changes(clogging)
+    rubbing = {FRICTION.parameter: friction, "spool.dynamic_friction": sliding * friction}
+    return clogged | ({} if math.isnan(friction) else rubbing)
+
+
+def judged(x: np.ndarray, bands: Bands | None = None) -> BandVerdict:
+    return judge_position(PREFLIGHT, x, 1e-3, bands or load_default_bands(), parts=parts())
+
+
+def levels(found: list[BandVerdict], fault: str) -> list[Level]:
+    return [j.levels[fault] for j in found]
+
+
+def test_healthy_units_stay_within() -> None:
+    """Tolerances, coloured noise, hum, stuck where the last move left them: no event, no level, nothing rules."""
+    acceptable = {CLOGGED: Level.ACCEPTABLE, RUBBED: Level.ACCEPTABLE}
+    for j in map(judged, units()):
+        assert (j.events, j.ruling, j.levels, j.notes) == ((), None, acceptable, ())
+
+
+@pytest.mark.parametrize(("size", "expected", "other"), [((0.35, NAN), CLOGGED, RUBBED),
+                                                         ((NAN, 40.0), RUBBED, CLOGGED)])
+def test_a_fault_is_named(size: tuple[float, float], expected: str, other: str) -> None:
+    """A single fault past MidBand rules, and the other is left in peace."""
+    found = [judged(x) for x in units(*size)]
+    assert {j.ruling for j in found} == {expected} and min(levels(found, expected)) >= Level.MAINTENANCE
+    assert set(levels(found, other)) == {Level.ACCEPTABLE}
+    assert all(e.t_out - e.t_in >= 0.9 * BAND_EVENT_SAMPLES * 1e-3 and e.excess > 0 for j in found for e in j.events)
+
+
+@pytest.mark.parametrize(("size", "fault", "share", "least", "most"), [
+    ((0.25, NAN), CLOGGED, 0.9, Level.MAINTENANCE, None), ((0.40, NAN), CLOGGED, 1.0, Level.NON_NOMINAL, None),
+    ((NAN, 35.0), RUBBED, 0.97, Level.MAINTENANCE, None), ((NAN, 70.0), RUBBED, 0.97, Level.NON_NOMINAL, None),
+    ((0.1, NAN), CLOGGED, 0.9, None, Level.ACCEPTABLE), ((NAN, 25.0), RUBBED, 1.0, None, Level.ACCEPTABLE),
+    *(((NAN, size), CLOGGED, 1.0, None, Level.ACCEPTABLE) for size in (20.0, 35.0, 60.0))])
+def test_limits_stand_where_table_2_says(size: tuple[float, float], fault: str, share: float, least: Level | None,
+                                         most: Level | None) -> None:
+    """Nearly every unit with a fault of that size leaves its band, and with a smaller one stays.
+
+    Friction delays a step as clogging does; the ramps tell how much of that is friction's.
+    """
+    found = levels([judged(x) for x in units(*size, count=48 if least else 16)], fault)
+    assert np.mean([(least or have) <= have <= (most or have) for have in found]) >= share
+
+
+def test_spikes_do_not_count() -> None:
+    """One or two samples beyond are no event, wherever they are and however far; three in a row are."""
+    x = units()[0]
+    rng = np.random.default_rng(1)
+    at = np.sort(rng.choice(np.arange(500, len(x) - 30, 40), 150, replace=False))
+    for size in (1, 2):
+        spiked = x.copy()
+        for k in range(size):
+            spiked[at + k] += 5e-3 * rng.choice([-1, 1], len(at))
+        assert judged(spiked).events == ()
+    spiked = x.copy()
+    spiked[5000:5000 + BAND_EVENT_SAMPLES] += 5e-3
+    assert {e.signal for e in judged(spiked).events} == {"position", "speed"}
+
+
+def test_entry_and_exit_times() -> None:
+    """A push of 0.16 mm for 100 ms on the ramp is one stay outside of that length."""
+    x = units()[1].copy()
+    x[5000:5100] += 1.6e-4
+    events = [e for e in judged(x).events if e.signal == "position"]
+    assert [(e.band, round(e.t_in, 3), round(e.t_out, 3)) for e in events] == [("middle", 5.0, 5.1)]
+    assert events[0].section == "ramp at 0.5 mm/s" and 4e-5 < events[0].excess < 1.2e-4
+
+
+def test_missing_samples() -> None:
+    """A section that lost too much is left out and said; a fault without any section has no level."""
+    x = units(friction=50.0)[0].copy()
+    x[500:4001] = np.nan
+    lost = judged(x)
+    assert lost.levels == {RUBBED: Level.MAINTENANCE}
+    assert sum("is missing" in note for note in lost.notes) == 4 and "filter_clogging is not judged" in lost.notes[-1]
+    assert "a measured position" in catch_refusal(judged, np.full(len(x), np.nan))
+
+
+def test_bands_of_another_command_are_refused() -> None:
+    """In one line that says which they are of; so is a load they do not know."""
+    bands, com, nothing = load_default_bands(), PREFLIGHT, np.zeros(1000)
+    other = np.where((np.arange(len(com)) >= 500) & (np.arange(len(com)) < 1500), 4e-3, com)
+    for words, call in (
+            ("the command of the bands, preflight (4 steps, 2 ramps)", partial(judge_position, other, other)),
+            ("has 2 sections", partial(judge_position, com[:2000], com[:2000])),
+            ("unloaded plant", partial(judge_position, com, units()[0], load=np.full(len(com), 5e3)))):
+        assert words in catch_refusal(call, period=1e-3, bands=bands)
+    assert "steps or slow ramps" in catch_refusal(make_bands_by_simulation, load_model(), nothing, nothing, 1e-3)
+    assert [matches_command(bands, each, 1e-3) for each in (com, other)] == [True, False]
+
+
+SHORT = (Hold(time=0.3), Step(to=2e-3, time=0.4), Ramp(to=3e-3, time=1.5), Hold(time=0.2))
+
+
+@cache
+def short_bands(force: float = 0.0) -> Bands:
+    com = profile(SHORT).command
+    return make_bands_by_simulation(load_model(), com, np.full(len(com), force), 1e-3, count=64, faulty=48, seed=1)
+
+
+def test_any_command() -> None:
+    """Bands by simulation of a command that nobody has seen before judge as those of the preflight do."""
+    com = profile(SHORT).command
+    made = short_bands()
+    assert all(map(made.shows, made.faults))
+    for kind, ruling in ((make_kind(0.4), CLOGGED), (make_kind(friction=60.0), RUBBED), (make_kind(), None)):
+        x = simulate_units(load_model(), com, np.zeros_like(com), kind, 16, seed=99)
+        assert {judge_position(com, row, 1e-3, made).ruling for row in x} == {ruling}
+
+
+def test_faults_of_a_list_of_ones_own() -> None:
+    """Where none is a friction, ramps judge the others as well."""
+    com = profile(SHORT).command
+    made = make_bands_by_simulation(load_model(), com, np.zeros_like(com), 1e-3, 48, 32, seed=1, faults=[CLOGGING])
+    again = parse_bands(format_bands(made), "")
+    assert {ramp.fault for ramp in again.ramps} == {CLOGGED} and again.shows(again.faults[0])
+    for size, level in ((0.0, Level.ACCEPTABLE), (1.2 * CLOGGING.maintenance, Level.NON_NOMINAL)):
+        x = simulate_units(load_model(), com, np.zeros_like(com), CLOGGING.list_changes(size), 16, seed=99)
+        assert {judge_position(com, row, 1e-3, again).levels[CLOGGED] for row in x} == {level}
+    noise = make_bands.sample_sensor_noise(np.random.default_rng(1), load_model(), len(com))
+    assert set(measure_precursors(trace(com + noise, com), again.precursors)["break_away"].adds) == {CLOGGED}
+
+
+def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A healthy unit under 5 kN is not blamed: where no bands fit, they are made with the load."""
+    com = profile(SHORT).command
+    force = np.full(len(com), 5e3)
+    monkeypatch.setattr(make_bands, "make_bands_by_simulation", lambda *a, **k: short_bands(5e3))
+    bands = choose_bands(com, force, 1e-3)
+    run = simulate(load_model(), com, force, seed=3)
+    j = judge_trace(Trace.from_columns(run._asdict(), 1e-3, {}), bands)
+    assert (j.ruling, j.events) == (None, ()) and "5000 N" in bands.provenance["load"]
+
+
+def test_the_file(tmp_path: Path) -> None:
+    """What is written is read again, to the digit; it is small, says where it is from, and can be reviewed.
+
+    A step of no whole number of mm is read again, too.
+    """
+    (tmp_path / "b.toml").write_text(format_bands(load_default_bands()), encoding="utf-8")
+    again = load_bands(tmp_path / "b.toml")
+    assert judged(units(0.3)[0], again) == judged(units(0.3)[0])
+    assert {"made", "command", "command_hash", "model", "runs", "seed", "software"} <= again.provenance.keys()
+    assert (tmp_path / "b.toml").stat().st_size < 40_000
+    some = short_bands()
+    odd = replace(some, precursors={"overshoot_0.341mm": next(iter(some.precursors.values()))})
+    for bands in (load_default_bands(), some, odd):
+        text = format_bands(bands)
+        assert format_bands(parse_bands(text, "")) == text
+
+
+@pytest.mark.parametrize(("old", "new", "word"), [
+    ("period_ms = 1\n", "period_ms = 0\n", "a file of bands"),
+    ("amounts = [5.0, ", "amounts = [500.0, ", "rising"),
+    ("amounts = [5.0, ", "amounts = [", "of other lengths"),
+    ('plant = "eha"', 'plant = "ema"', "bands of the plant eha"),
+    ("[[ramp]]\nsection = ", "[[ramp]]\nsection = 9", "not a ramp of the command"),
+    ("", "[bands", "TOML"), ("", "x = 1\n", "bands"), ("", "[bands]\nperiod_ms = 1\n", "key")])
+def test_a_wrong_file_is_refused(old: str, new: str, word: str, tmp_path: Path) -> None:
+    """In one line."""
+    content = format_bands(load_default_bands())
+    assert old in content
+    (tmp_path / "b.toml").write_text(content.replace(old, new) if old else new)
+    assert word in catch_refusal(load_bands, tmp_path / "b.toml")
+    assert "a file that can be read" in catch_refusal(load_bands, tmp_path / "none.toml")
+
+
+OTHER = {"jack.mass": 150.0}
+
+
+def test_bands_remember_their_model_through_a_file() -> None:
+    """Its faults and its noise do not count; bands of another model are refused."""
+    com = RAMP_AND_SINE[:1400]
+    model = Model().replace(OTHER)
+    made = parse_bands(format_bands(make_bands_by_simulation(model, com, np.zeros_like(com), 1e-3, 8, 8)), "file")
+    same = {"filter.clogging": 0.2, "spool.static_friction": 20.0, "spool.dynamic_friction": 10.0,
+            "sensors.position_noise": 5e-6}
+    assert [list_design(x.replace(same), FAULTS) for x in (Model(), model)] == [{}, OTHER]
+    assert describe_other_model(made, model) == describe_other_model(made, model.replace(same)) == ""
+    for other in (Model(), model.replace({"jack.mass": 151.0})):
+        assert describe_other_model(made, other) == "the model eha with jack.mass = 150.0"
+    line = catch_refusal(diagnose, record_plant(com=RAMP_AND_SINE, seed=1), model, load_default_bands())
+    assert re.search(r"--bands: made for the model eha with all parameters nominal.*mass = 150", line)
+
+
+def trace(x: np.ndarray, com: np.ndarray | None = None) -> Trace:
+    com = PREFLIGHT if com is None else com
+    return Trace.from_columns({"com": com, "xj": x, "cor": np.full(len(x), 1e-3)}, 1e-3, {})
+
+
+def test_a_fleet_of_its_own() -> None:
+    """Another design's response, learned from healthy traces, is healthy then; its faults are still found."""
+    model = load_model().replace({"pilot.flow_gain": 0.069 * 0.88})
+    com = PREFLIGHT
+
+    def fleet(kind: dict[str, float], count: int, seed: int) -> list[Trace]:
+        return [trace(x) for x in simulate_units(model, com, np.zeros_like(com), kind, count, seed)]
+
+    sound = fleet(make_kind(), 32, 7)
+    strange = [judge_trace(t, load_default_bands()) for t in sound]
+    assert np.mean([j.severity[CLOGGED] for j in strange]) > 0.3
+    own = learn_bands(sound)
+    assert own.provenance["made"].startswith("from 32 healthy traces")
+    fresh = [judge_trace(t, own) for t in fleet(make_kind(), 16, 8)]
+    assert [j.events for j in fresh] == [()] * 16
+    assert np.mean([j.severity[CLOGGED] for j in fresh]) < 0.2
+    assert {judge_trace(t, own).ruling for t in fleet(make_kind(0.4), 8, 9)} == {CLOGGED}
+    assert own.precursors["overshoot_5mm"]["healthy"] != load_default_bands().precursors["overshoot_5mm"]["healthy"]
+
+
+def test_a_fleet_that_cannot_be_learned_from() -> None:
+    """Too few, another command in one of them, holes."""
+    own = [trace(x) for x in units()[:6]]
+    other, holed = PREFLIGHT.copy(), units()[7].copy()
+    other[500:1500], holed[3000:4000] = 4e-3, np.nan
+    for traces, reason in ((own[:3], "at least 5"), ([*own, trace(units()[7], other)], "odd.csv: com"),
+                           ([*own, trace(holed)], "missing")):
+        assert reason in catch_refusal(learn_bands, traces, names=[*"abcdef", "odd.csv"][:len(traces)])
+    doubtful = learn_bands([*own, trace(units(0.5)[0])], names=[*"abcdef", "clogged.csv"])
+    assert doubtful.provenance["doubtful"].endswith(": clogged.csv")
+
+
+def test_the_command(tmp_path: Path) -> None:
+    """`rig fdi --learn-bands` writes a file, from a command or from traces; without a place for it, one line."""
+    com = profile((Hold(time=0.1), Step(to=2e-3, time=0.15), Ramp(to=2.5e-3, time=0.9))).command
+    rows = "\n".join(f"{k / 1000:.3f},{value:.9g}" for k, value in enumerate(com))
+    (tmp_path / "c.csv").write_text("t,com\n" + rows + "\n")
+    told = answer("fdi", "--learn-bands", "--command", tmp_path / "c.csv", "--out", tmp_path / "b.toml")
+    assert told["judges"] == [CLOGGED, RUBBED]
+    assert load_bands(tmp_path / "b.toml").provenance["command"].endswith("c.csv")
+    assert "--out" in refuse("fdi", "--learn-bands")
+
+
+@pytest.mark.slow
+def test_the_shipped_bands_are_what_the_command_makes(tmp_path: Path) -> None:
+    """Byte for byte, on this kind of machine."""
+    assert rig("fdi", "--learn-bands", "--out", tmp_path / "b.toml", "--quiet").status == 0
+    assert (tmp_path / "b.toml").read_text() == format_bands(load_default_bands())
+
+
+MS = 1e-3
+
+
+@cache
+def run(clogging: float = 0.0, friction: float = 5.0) -> Trace:
+    model = load_model().replace({"filter.clogging": clogging, "spool.static_friction": friction,
+                                  "spool.dynamic_friction": friction / 1.5})
+    return Trace.from_columns(simulate(model, PREFLIGHT, seed=11)._asdict(), MS, {})
+
+
+def second_order(zeta: float, omega: float, rows: int, size: float) -> np.ndarray:
+    t = np.arange(rows) * MS
+    damped = omega * math.sqrt(1 - zeta**2)
+    return size * (1 - np.exp(-zeta * omega * t) * (np.cos(damped * t) + zeta * omega / damped * np.sin(damped * t)))
+
+
+def measure_features(com: np.ndarray, xj: np.ndarray) -> dict[str, float]:
+    return {name: float(v[0]) for name, v in compute_features(com, xj[None], MS, find_sections(com)).items()}
+
+
+@pytest.mark.parametrize(("zeta", "omega"), [(0.3, 100.0), (0.5, 80.0), (0.7, 150.0)])
+def test_a_step_of_second_order(zeta: float, omega: float) -> None:
+    """Overshoot exp(-pi zeta / root), its square back; settling as on a fine grid."""
+    com = np.r_[np.zeros(300), np.full(700, 2e-3)]
+    x = np.r_[np.zeros(300), second_order(zeta, omega, 700, 2e-3)]
+    found = measure_features(com, x)
+    root = math.sqrt(1 - zeta**2)
+    over = math.exp(-math.pi * zeta / root)
+    fine = np.arange(700_000) * 1e-6
+    y = 1 - np.exp(-zeta * omega * fine) * (np.cos(omega * root * fine) + zeta / root * np.sin(omega * root * fine))
+    for name, expected in {
+            "overshoot_2mm": pytest.approx(100 * over, abs=0.6),
+            "undershoot_2mm": pytest.approx(100 * over**2, abs=0.3),
+            "settling_time_2mm": pytest.approx(fine[np.flatnonzero(np.abs(y - 1) > 0.05)[-1]], abs=1.5e-3),
+            "rest_error": pytest.approx(0.0, abs=1e-6)}.items():
+        assert found[name] == expected, name
+
+
+def test_an_oscillation_on_a_ramp() -> None:
+    """A sine of 8 Hz and 50 um about a lag of 7 um gives back just that."""
+    ramp = 5e-4 * np.arange(2000) * MS
+    com = np.r_[np.zeros(300), ramp, np.full(300, 1e-3), 1e-3 - ramp, np.zeros(300)]
+    wave = 5e-5 * np.sin(2 * np.pi * 8 * np.arange(len(com)) * MS)
+    way = np.repeat([0.0, 1.0, 0.0, -1.0, 0.0], [300, 2000, 300, 2000, 300])
+    found = measure_features(com, com - 7e-6 * way + wave)
+    for name, expected in {
+            "stick_slip_frequency": pytest.approx(8.0, abs=0.4), "stick_slip_amplitude": pytest.approx(5e-5, rel=0.02),
+            "break_away": pytest.approx(5e-5, rel=0.02), "mean_ramp_error": pytest.approx(7e-6, abs=1.5e-6),
+            "speed_ripple": pytest.approx(2 * np.pi * 8 * 5e-5 / math.sqrt(2), rel=0.06)}.items():
+        assert found[name] == expected, name
+
+
+def test_what_a_command_does_not_show() -> None:
+    """No ramps, no stick-slip; no steps, no overshoot; an oscillation that goes on has no settling time."""
+    com = np.r_[np.zeros(200), np.full(800, 1e-3)]
+    found = measure_features(com, com + 2e-4 * np.sin(2 * np.pi * 10 * np.arange(1000) * MS))
+    assert "break_away" not in found and math.isnan(found["settling_time_1mm"])
+    assert format_precursor(math.nan, "settling_time_1mm") == "-"
+    assert compute_features(np.zeros(500), np.zeros((1, 500)), MS, [Section("hold", 0, 500, 0.0, 0.0, 0.0)]) == {}

@@ -1,16 +1,18 @@
-"""Sizes of both faults from a replay of the measured current: right, as sure as they say, and not misled by others.
-
-Beside another effect: sizes averaged over what may be right, and the search that finds the effect.
-"""
+"""Sizes of both faults, by the RMS grid and from a replay: right, as sure as they say, not misled by other effects."""
 
 from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from effect_files import SEARCHED, restored_catalogue
 from noisy_traces import record_plant
 from physics_cases import PREFLIGHT
+from refusals import catch_refusal
 
+from fdi import Trace
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import (
     CLOGGING,
@@ -32,10 +34,13 @@ from fdi.diagnosis.refine import (
     mix_estimates,
     refine_sizes,
 )
-from fdi.estimation.replay import hold_inputs
-from fdi.report.diagnosis_report import build_diagnosis_report
+from fdi.diagnosis.rms_grid import Grid, Map, Merged, Point, measure_bisector_distance, merge_minima, search_grid
+from fdi.estimation.replay import hold_inputs, read_cycles
+from fdi.report.diagnosis_report import build_diagnosis_report, list_overruled
 from fdi.thresholds import RESIDUAL_WORST
-from plant import load_model
+from plant import Model, load_model, simulate
+from plant.monitor import Monitor
+from plant.segments import Chirp, Hold, Ramp, Step, build_profile
 
 MODEL = load_model()
 
@@ -166,3 +171,145 @@ def test_a_level_that_depends_on_the_effect_is_disputed(worn: Diagnosis) -> None
     assert average(worn, Estimate(0.07, 0.02, 0.12)).disputed == ()
     unlikely = average(worn, Estimate(0.3, 0.25, 0.34), 200.0)
     assert unlikely.disputed == () and not unlikely.is_ambiguous and unlikely.sizes[CLOGGING.name].value == 0.05
+
+
+PLANTS = [name for name in Model().list_names()
+          if name.startswith(("torque", "pilot", "valve.f", "jack.area", "feedback"))]
+
+
+@cache
+def trace(kintas: float, fss: float, ratio: float = 2.0 / 3.0, scatter: int = 0) -> Trace:
+    """A preflight with faults; `scatter` seeds the tolerances of the plant, 0 for none."""
+    rng, model = np.random.default_rng(scatter), Model()
+    model = model.replace({name: model[name] * (1 + 0.015 * bool(scatter) * rng.normal()) for name in PLANTS})
+    changed = model.replace(faulty(kintas, fss) | {"spool.dynamic_friction": fss * ratio})
+    return of(simulate(changed, PREFLIGHT, seed=scatter))
+
+
+def is_near(point: Any, kintas: float, fss: float, within: tuple[float, float] = (0.051, 4.5)) -> bool:
+    """Whether a point of the grid is that close to the faults."""
+    return abs(point.sizes[0] - kintas) <= within[0] and abs(point.sizes[1] - fss) <= within[1]
+
+
+def of(columns: object) -> Trace:
+    return Trace.from_columns(columns._asdict(), 1e-3, {})  # type: ignore[attr-defined]
+
+
+def map_of(kintas: float, fss: float) -> Map:
+    return Map(np.zeros((1, 1)), Point((kintas, fss), 1e-5))
+
+
+def test_maps_are_rms_of_the_monitor() -> None:
+    """One cell by hand."""
+    measured = trace(0.25, 30.0)
+    grid = search_grid(measured, sliding=(1.0,))
+    row, column = 7, 5
+    c = read_cycles(measured, Model())[0]
+    run = Monitor(Model()).replay(np.array([[grid.axes[0][row], grid.axes[1][column]]]), c.cor, c.xj, 20.0)[0, 0]
+    steps, ramps = np.r_[500:4001], np.r_[4001:6001, 6501:8501]  # the sections of the preflight
+    of_steps, of_ramps = (np.var((c.xj - run)[rows]) for rows in (steps, ramps))
+    both = (len(steps) * of_steps + len(ramps) * of_ramps) / (len(steps) + len(ramps))
+    for made, variance in ((grid.step, of_steps), (grid.ramp, of_ramps), (grid.joint, both)):
+        assert made.rms[row, column] == pytest.approx(np.sqrt(variance), rel=1e-9) and made.rms.shape == (21, 21)
+        where = np.argwhere(made.rms == made.rms.min())[0]
+        assert made.minimum == ((grid.axes[0][where[0]], grid.axes[1][where[1]]), made.rms.min())
+    assert grid.simulations == 441 + 21 * 13
+
+
+@pytest.mark.parametrize(("kintas", "fss", "scatter"), [
+    (0.0, 70.0, 0), (0.35, 5.0, 0), (0.17, 45.0, 2)])
+def test_minimum_is_at_the_faults(kintas: float, fss: float, scatter: int) -> None:
+    """Within the width of the valley: Kintas is weak, FSS is not."""
+    grid = search_grid(trace(kintas, fss, scatter=scatter), sliding=(2.0 / 3.0,))
+    for found in (grid.joint.minimum, grid.best):
+        assert is_near(found, kintas, fss, (0.176 if scatter else 0.051, 9.0)), found
+    assert grid.best.rms <= grid.joint.minimum.rms
+
+
+def test_friction_that_is_static_alone() -> None:
+    """`--set spool.static_friction=70` leaves FDS as it was; the grid finds FSS, as it tries how the spool slides."""
+    measured = trace(0.0, 70.0, ratio=10.0 / 3.0 / 70.0)
+    found, paper = search_grid(measured), search_grid(measured, sliding=(1.0,))
+    assert found.joint.minimum.sizes[1] == pytest.approx(70.0, abs=9.0)
+    assert found.joint.minimum.rms < 0.9 * paper.joint.minimum.rms
+
+
+@pytest.mark.parametrize("which", ["step", "ramp"])
+def test_a_command_with_one_kind_of_section(which: str) -> None:
+    piece = Step(to=2e-3, time=0.8) if which == "step" else Ramp(to=1e-3, time=1.5)
+    com = build_profile([Hold(time=0.3), piece, Hold(time=0.2), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
+    grid = search_grid(of(simulate(Model().replace(faulty(0.0, 40.0)), com)))
+    there, absent = (grid.step, grid.ramp) if which == "step" else (grid.ramp, grid.step)
+    assert there is not None and absent is None
+    np.testing.assert_allclose(there.rms, grid.joint.rms, rtol=1e-12)
+    assert grid.merged.sizes == there.minimum.sizes and grid.merged.weight == float(which == "step")
+    assert there.minimum.sizes[1] == pytest.approx(40.0, abs=18.0)
+
+
+@pytest.mark.parametrize(("kintas", "fss", "other"), [
+    (0.25, 30.0, "load"), (0.0, 5.0, "null bias"), (0.25, 30.0, "jack friction")])
+def test_what_is_no_fault_of_these_does_not_lead_astray(kintas: float, fss: float, other: str) -> None:
+    changed = {"load": {}, "null bias": {"null_bias.current": 1e-4},
+               "jack friction": {"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}}[other]
+    load = np.full(len(PREFLIGHT), 3e3 * (other == "load"))
+    measured = of(simulate(Model().replace(faulty(kintas, fss) | changed), PREFLIGHT, load))
+    found = search_grid(measured, sliding=(2.0 / 3.0,)).best
+    assert is_near(found, kintas, fss, (0.126, 4.5)), found
+
+
+def test_gaps_are_left_out() -> None:
+    whole = trace(0.25, 30.0)
+    holes = {name: whole.column(name).copy() for name in ("com", "xj", "cor", "p12", "xs", "load")}
+    holes["xj"][700:760], holes["cor"][2000:2002] = np.nan, np.nan
+    grid = search_grid(Trace.from_columns(holes, 1e-3, {}))
+    assert not np.isnan(grid.joint.rms).any() and grid.joint.minimum.sizes[1] == pytest.approx(30.0, abs=9.0)
+
+
+def test_refusals() -> None:
+    com = build_profile([Hold(time=0.3), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
+    assert "steps or ramps" in catch_refusal(search_grid, of(simulate(Model(), com)))
+    assert "drive" in catch_refusal(search_grid, trace(0.25, 30.0), drive="position")
+
+
+@pytest.mark.parametrize(("kintas", "fss", "distance"), [
+    (0.25, 35.0, 0.0), (0.15, 0.0, 0.0), (0.35, 70.0, 0.0),  # on the bisector
+    (0.35, 0.0, 1.0), (0.35, 35.0, 1.0), (0.9, 69.0, 1.0),  # right edge and beyond
+    (0.15, 70.0, -1.0), (0.15, 35.0, -1.0), (0.0, 5.0, -1.0),  # left edge and beyond
+    (0.30, 35.0, 0.5), (0.20, 35.0, -0.5)])
+def test_first_bisector(kintas: float, fss: float, distance: float) -> None:
+    assert measure_bisector_distance((kintas, fss), FAULTS) == pytest.approx(distance, abs=1e-12)
+
+
+def test_centre_of_gravity() -> None:
+    def merge(step: Map | None, ramp: Map | None) -> tuple[float, ...]:
+        found = merge_minima(step, ramp, FAULTS)
+        return (*found.sizes, found.weight, found.distance)
+
+    merged = merge(map_of(0.34, 30.0), map_of(0.26, 40.0))  # their middle is (0.30, 35): 3/4 for the steps
+    assert merged == pytest.approx((0.75 * 0.34 + 0.25 * 0.26, 0.75 * 30.0 + 0.25 * 40.0, 0.75, 0.5))
+    assert merge(map_of(0.4, 20.0), map_of(0.36, 60.0))[:3] == pytest.approx((0.4, 20.0, 1.0))
+    assert merge(map_of(0.1, 20.0), map_of(0.0, 60.0))[:3] == pytest.approx((0.0, 60.0, 0.0))
+    assert merge(None, map_of(0.3, 20.0)) == (0.3, 20.0, 0.0, -1.0)
+
+
+def diagnosis(kintas: float, explained: bool = True, others: dict[str, Estimate] | None = None) -> Any:
+    def point(value: float) -> Map:
+        return Map(np.zeros((1, 1)), Point((value, 5.0), 54e-6))
+
+    axes = np.linspace(0.0, 0.5, 21), np.linspace(0.0, 90.0, 21)
+    grid = Grid(FAULTS, axes, point(2 * kintas), point(0.0), point(kintas), Merged((kintas, 5.0), 0.5, 0.0),
+                Point((kintas, 5.0), 54e-6), 441, "m")
+    sizes = {CLOGGING.name: Estimate(0.001, 0.0, 0.02), FRICTION.name: Estimate(5.0, 4.0, 6.0)}
+    refinement = SimpleNamespace(is_explained=explained)
+    return cast(Any, SimpleNamespace(faults=FAULTS, grids=(grid,), sizes=sizes, levels=dict.fromkeys(sizes),
+                                     others=others or {}, refinement=refinement, band_verdict=None))
+
+
+def test_a_grid_that_contradicts_the_fit_is_named() -> None:
+    (text,) = list_overruled(diagnosis(0.175, others={"null_bias.current": Estimate(2.4e-4, 2.3e-4, 2.5e-4)}))
+    assert text.startswith("filter clogging: the grid gives 0.175; the fit, which alone models the whole plant, finds "
+                           "Kintas 0.001 (0 .. 0.020)")
+    assert text.endswith("null bias 0.24 mA (0.23 .. 0.25). Trust the fit.")
+    (text,) = list_overruled(diagnosis(0.175, explained=False))
+    assert text.endswith("The fit does not explain the trace either.")
+    assert [*list_overruled(diagnosis(0.05))] == []  # it agrees

@@ -25,7 +25,7 @@ from fdi.trace.trace import Trace
 from plant import simulate
 from plant.declare import Chirp, Hold, Ramp, Step
 from plant.model import Model, load_model
-from plant.segments import build_profile
+from plant.segments import Segment, build_profile
 from studies.hidden_effects.truth import SYMBOLS, has_compiler, simulate_truth
 from studies.identification import sample_actuator
 
@@ -62,9 +62,10 @@ def runs() -> tuple[Trace, Trace, Trace]:
             measure(last, np.where(np.arange(2000) > 900, -4e3, 0.0), 3, "held"))
 
 
-def identify(fitted: list[Trace], held_out: list[Trace], free: object = FREE) -> Identification:
-    model = load_model()
-    ranges = parse_free_parameters(free, model, "test")
+def identify(fitted: list[Trace], held_out: list[Trace], free: object = FREE, plant: str = "eha") -> Identification:
+    """Of a plant; `free`: what a data sheet says, None for what the plant declares."""
+    model = load_model(plant)
+    ranges = parse_free_parameters(free, model, "test") if free else read_free_parameters(model, None)
     own = read_identification_runs(model, ranges, fitted, held_out)
     return identify_model(own.model, ranges, own.fitted, own.held_out, own.sources)
 
@@ -113,7 +114,7 @@ def test_range_that_is_too_narrow_gives_no_model_file(runs: tuple[Trace, Trace, 
     assert "mine.toml was written because of --out; its parameters do not explain the runs" in shown
     assert "rig compare" not in shown and "rig explain" not in shown
     written = read_provenance(Path("mine.toml")).identification
-    assert written is not None and written["verdict"] == "UNEXPLAINED"
+    assert written["verdict"] == "UNEXPLAINED"
 
 
 def test_model_file_is_read_by_every_command(found: Identification, runs: tuple[Trace, Trace, Trace],
@@ -123,7 +124,7 @@ def test_model_file_is_read_by_every_command(found: Identification, runs: tuple[
     write_identified_model(replace(found, model=named), path, "rig identify", "2026-01-01")
     assert load_model(path) == named and load_model(path).nominal["jack.area"] == named["jack.area"]
     origin = read_provenance(path).identification
-    assert origin is not None and (origin["runs"], origin["holdouts"]) == (["wave", "stops"], ["held"])
+    assert (origin["runs"], origin["holdouts"]) == (["wave", "stops"], ["held"])
     assert "95 %" in path.read_text()
     runs[2].write_csv(held)
     assert answer("compare", held, "--model", path)["verdict"] == "WITHIN_FLOOR"
@@ -157,18 +158,23 @@ def test_long_run_is_fitted_by_parts_and_an_end_stop_that_it_never_met_is_not_at
     assert travel.low < 0.013 and travel.high == 0.05
 
 
+LONG = Chirp(amplitude=2e-3, f0=1.0, f1=15.0, fade=15.0, time=3.0)
+
+
+def record_motor(unit: dict[str, float], *more: Segment, seed: int = 1) -> Trace:
+    """An `ema` that rests, and moves by steps, a ramp and `more`."""
+    model = load_model("ema")
+    command = build_profile([Hold(time=0.5), Step(to=0.01, time=1.0), Ramp(to=-0.005, time=1.0), *more,
+                             Step(to=0.0, time=1.0)], rate=1000.0).command
+    columns = simulate(model.replace(unit), command, seed=seed)._asdict()
+    return Trace.from_columns(columns, 1e-3, {"source": "motor"}, model.kind.signals)
+
+
 @pytest.mark.parametrize("moves_long", [True, False])
 def test_motor_that_rests_is_identified(moves_long: bool) -> None:
     """Dry friction at rest has any value, so rests are not compared; of short steps the beginnings show the mass."""
-    model, unit = load_model("ema"), {"surface.mass": 300.0, "surface.damping": 3500.0, "surface.friction": 180.0}
-    moved = [Chirp(amplitude=2e-3, f0=1.0, f1=15.0, fade=15.0, time=3.0)] if moves_long else [Hold(time=1.0)]
-    command = build_profile([Hold(time=0.5), Step(to=0.01, time=1.0), Ramp(to=-0.005, time=1.0), *moved,
-                             Step(to=0.0, time=1.0)], rate=1000.0).command
-    columns = simulate(model.replace(unit), command, seed=1)._asdict()
-    trace = Trace.from_columns(columns, 1e-3, {"source": "motor"}, model.kind.signals)
-    ranges = read_free_parameters(model, None)
-    own = read_identification_runs(model, ranges, [trace], [])
-    found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources)
+    unit = {"surface.mass": 300.0, "surface.damping": 3500.0, "surface.friction": 180.0}
+    found = identify([record_motor(unit, LONG if moves_long else Hold(time=1.0))], [], None, "ema")
     assert found.verdict in ("IDENTIFIED", "PARTLY") and any("at rest" in note for note in found.notes)
     held = {e.name: e.low <= unit[e.name] <= e.high for e in found.estimates if e.name in unit}
     assert held == dict.fromkeys(unit, True)
@@ -176,19 +182,10 @@ def test_motor_that_rests_is_identified(moves_long: bool) -> None:
 
 def test_what_no_known_force_shows_has_a_wide_interval() -> None:
     """All forces of a motor scale together, and no law of similarity is declared: only tolerances tie them."""
-    model, names = load_model("ema"), ("motor.torque_constant", "motor.inertia", "surface.mass", "surface.damping",
-                                       "surface.friction", "screw.compliance")
-    command = build_profile([Hold(time=0.5), Step(to=0.01, time=1.0), Ramp(to=-0.005, time=1.0), Chirp(
-        amplitude=2e-3, f0=1.0, f1=15.0, fade=15.0, time=3.0), Step(to=0.0, time=1.0)], rate=1000.0).command
-    unit = model.replace({"surface.friction": 130.0})
-    columns = simulate(unit, command, seed=3)._asdict()
-    trace = Trace.from_columns(columns, 1e-3, {"source": "motor"}, model.kind.signals)
-    table: dict[str, dict[str, float]] = {}
-    for group, _, field in (name.partition(".") for name in names):
-        table.setdefault(group, {})[field] = 2.0
-    ranges = parse_free_parameters(table, model, "test")
-    own = read_identification_runs(model, ranges, [trace], [])
-    found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources)
+    unit = load_model("ema").replace({"surface.friction": 130.0})
+    table = {"motor": {"torque_constant": 2.0, "inertia": 2.0}, "screw": {"compliance": 2.0},
+             "surface": {"mass": 2.0, "damping": 2.0, "friction": 2.0}}
+    found = identify([record_motor({"surface.friction": 130.0}, LONG, seed=3)], [], table, "ema")
     assert found.verdict in ("PARTLY", "IDENTIFIED")
     assert all(e.low < unit[e.name] < e.high and e.share > 0.05 for e in found.estimates)
 

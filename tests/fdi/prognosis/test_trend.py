@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from refusals import catch_refusal
-from rig_command import refuse, rig
+from rig_command import rig
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
 from fdi.prognosis import unit_trend
@@ -161,14 +161,6 @@ def test_the_command_on_an_earlier_answer(tmp_path: Path) -> None:
     page = (tmp_path / "x.html").read_text()
     assert "<svg" in page and "MaxBand" in page and "http://" not in page.replace("http://www.w3.org", "")
     assert (tmp_path / "x.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
-    (bad := tmp_path / "bad.json").write_text("{}")
-    (empty := tmp_path / "empty").mkdir()
-    (nan := tmp_path / "nan.json").write_text(points(nan, LINE).read_text().replace('"t": ', '"t": NaN, "x": ', 1))
-    for words in ([], [bad], [nan], [tmp_path / "none"], [empty], [bad, "--out", "x.txt"]):
-        refuse("trend", *words)
 
 
 def answered(file: Path, model: Any, again: bool = False, faults: Any = ()) -> dict[str, Any]:

@@ -1,24 +1,66 @@
-"""The report: one file that needs nothing else and says what the trace says; close-ups of failed checks."""
+"""The report: one file that needs nothing else and says what the trace says, in any form and in a browser."""
 
 import html
+import json
 import math
 import re
 import warnings
 from dataclasses import replace
+from enum import IntEnum
+from functools import cache
+from io import StringIO
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from browser import measure_page, needs_browser
 from html_page import HtmlPage
+from noisy_traces import SHORT, record_plant
 from refusals import catch_refusal
+from rich.console import Console
 from synthetic_run import record_run
 
-from fdi.report import drawing, run_report
-from fdi.report.report import render_html
+from fdi.comparison.compare import Comparison, compare
+from fdi.discovery.detectable import Blind
+from fdi.discovery.explain import Marks
+from fdi.discovery.explain_runs import Answer, Candidate
+from fdi.discovery.runs import Source
+from fdi.discovery.update_model import ModelUpdate, Provenance, Row
+from fdi.estimation.fit import Value
+from fdi.report import compare_report, drawing, run_report
+from fdi.report.compare_report import build_comparison_report
+from fdi.report.explain_report import (
+    MOODS,
+    build_explanation_report,
+    build_model_report,
+    describe_findings,
+    describe_verdict,
+)
+from fdi.report.report import (
+    Cell,
+    Column,
+    Figure,
+    Item,
+    Line,
+    Listing,
+    Medium,
+    Paragraph,
+    Report,
+    Section,
+    Table,
+    render_html,
+    to_json,
+    to_plain,
+    write_html,
+)
 from fdi.report.run_report import build_run_report, read_verdict, write_run_page
+from fdi.report.terminal import format_report, print_report
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Event, Trace
+from plant import Model
+from plant.signals import EHA
 from rig.recorder import Recorder, Signals, Timing
 from rig.recorder.recover import recover_log
 
@@ -249,3 +291,378 @@ def test_a_page_shows_each_failed_check_once() -> None:
     page = render_html(build_run_report(trace))
     assert "Failed checks" in page and page.count("Dashed: limits; red") == 2 and page.count("<script") == 1
     assert "Failed checks" not in render_html(build_run_report(replace(trace, checks=())))
+
+
+HOSTILE = "<script>alert('x')</script> [bold]a & b[/] [/nothing]"
+
+
+def report_with(*items: Item, **fields: Any) -> Report:
+    return Report("compare", "run 7", "MODEL_INCOMPLETE", "bad", "The error is above the noise floor.",
+                  sections=[Section("Signals", items)], **fields)
+
+
+TABLE = Table([Column("signal"), Column("error", "um", "right"), Column("floor from", medium=Medium.PAGE),
+               Column("short form", medium=Medium.TERMINAL)],
+              [["XJ", Cell("265", "bad", True), "repeats", "rep"], ["XS", Cell("1.02", "good"), "model", "mod"]],
+              caption="A perfect model has ratio 1.")
+
+
+@pytest.fixture
+def whole() -> Report:
+    drawn = Figure("The residual stays within the green band.", lambda: '<svg id="drawing"><path d="M0 0"/></svg>')
+    items = [TABLE, Line("floor", "from 1 repeat"), Line("solver", "0.1 um", "doubtful"), drawn,
+             Paragraph("Errors are RMS values."), Paragraph("only for a page", medium=Medium.PAGE),
+             Paragraph("only for a terminal", medium=Medium.TERMINAL), Table([Column("no rows")], []),
+             Listing("t,com,xj\n0,0,0", "run.csv", Medium.PAGE), Listing("*  *\n ** ", medium=Medium.TERMINAL)]
+    return report_with(*items, facts=[("model", "eha")], notes=["3 rows were left out"],
+                       next_command="rig explain run.csv", files=[("page", "compare.html")],
+                       data={"verdict": "MODEL_INCOMPLETE", "error": np.float64(2.65e-4), "floor": math.nan})
+
+
+def test_terminal_shows_every_kind_of_item(whole: Report) -> None:
+    text = format_report(whole, 80)
+    lines = text.splitlines()
+    assert lines[0] == "MODEL_INCOMPLETE  The error is above the noise floor."
+    assert not [words for words in (
+        "signal", "error [um]", "265", "A perfect model has ratio 1.", "Errors are RMS values.", "only for a terminal",
+        "rep", "*  *\n ** ") if words not in text]
+    assert {f"{label:<10}{words}" for label, words in (
+        ("floor", "from 1 repeat"), ("solver", "0.1 um"), ("note", "3 rows were left out"), ("page", "compare.html"),
+        ("next", "rig explain run.csv"))} <= set(lines)
+    assert not [words for words in ("only for a page", "floor from", "repeats", "svg", "t,com,xj", "green band",
+                                    "Signals", "no rows") if words in text]
+
+
+@pytest.mark.parametrize("width", [60, 80, 100])
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_a_terminal_cuts_no_word_and_no_command(width: int, is_terminal: bool) -> None:
+    text = ("the noise floor of the position is far above that of the sensor, and every repeat of the command differs "
+            "by more")
+    command = "rig explain a_long_name_of_a_recording.csv --repeat another_long_name_of_a_recording.csv --signals xj,xs"
+    out = StringIO()
+    print_report(Report("compare", "x", "FAIL", "bad", text, notes=[text], next_command=command, conclusion=text),
+                 Console(file=out, width=width, force_terminal=is_terminal, highlight=False, color_system=None))
+    lines = out.getvalue().splitlines()
+    others = [line for line in lines if command not in line]
+    assert any(line.endswith(command) for line in lines)  # it can be copied
+    assert " ".join(out.getvalue().split()).count(text) == 3 and (max(map(len, others)) <= width) == is_terminal, others
+    assert {word for line in others for word in line.split()} <= {*text.split(), "FAIL", "note", "verdict"}
+
+
+def test_page_shows_every_kind_of_item(whole: Report) -> None:
+    text = render_html(whole)
+    page = HtmlPage(text)
+    assert page.open == [] and 'class="verdict bad"' in text
+    assert not [words for words in (
+        "MODEL_INCOMPLETE", "run 7", "The error is above the noise floor.", "Signals", "error [um]", "265",
+        "A perfect model has ratio 1.", "from 1 repeat", "0.1 um", "Errors are RMS values.", "floor from",
+        "only for a page", "The residual stays within the green band.", "t,com,xj\n0,0,0", "run.csv", "model", "eha",
+        "3 rows were left out", "rig explain run.csv") if words not in page.text]
+    assert {"figure", "figcaption", "svg", "details", "pre", "h2"} <= set(page.tags)
+    assert all(cell in page.cells for cell in (["n is-bad strong", "265"], ["n is-good", "1.02"], ["", "XJ"]))
+    assert not [words for words in ("only for a terminal", "short form", "*  *", "no rows") if words in page.text]
+
+
+def test_page_leaves_out_a_figure_without_a_drawing_and_an_empty_section() -> None:
+    empty = Section("Nothing to see", [Paragraph("only there", medium=Medium.TERMINAL)])
+    report = Report("compare", "run 7", sections=[empty, Section("Drawn", [Figure("caption", lambda: "")])])
+    page = HtmlPage(render_html(report))
+    assert "Nothing to see" not in page.text and "caption" not in page.text and "figure" not in page.tags
+    assert 'class="verdict' not in render_html(report)  # it has none
+
+
+def test_neighbouring_lines_share_a_table_and_a_section_has_a_badge() -> None:
+    assert render_html(report_with(Line("a", "1"), Line("b", "2"), Paragraph("-"), Line("c", "3"))).count("<table") == 2
+    section = Section("filter clogging", [Line("size", "0.3")], Cell("MAINTENANCE", "doubtful"))
+    report = Report("fdi", "run 7", sentence="one sentence", sections=[section])
+    assert format_report(report).startswith("one sentence\n")
+    assert "filter clogging  MAINTENANCE\n" in format_report(report)
+    assert '<h2>filter clogging <span class="is-doubtful">MAINTENANCE</span></h2>' in render_html(report)
+
+
+@pytest.mark.parametrize("item", [
+    Table([Column(HOSTILE)], [[HOSTILE]], HOSTILE), Line(HOSTILE, HOSTILE), Paragraph(HOSTILE),
+    Listing(HOSTILE, HOSTILE), Figure(HOSTILE, lambda: "<svg></svg>")], ids=lambda item: type(item).__name__)
+def test_text_is_escaped(item: Item) -> None:
+    """Nothing that a file or a user says is markup, on the page or in the terminal."""
+    report = Report("compare", HOSTILE, HOSTILE, "bad", HOSTILE, [(HOSTILE, HOSTILE)], [HOSTILE],
+                    [Section(HOSTILE, [item], Cell(HOSTILE))], HOSTILE, [(HOSTILE, HOSTILE)])
+    page = HtmlPage(render_html(report))
+    assert page.open == [] and "script" not in page.tags and page.text.count(HOSTILE) >= 7
+    assert HOSTILE in format_report(report, 400)
+
+
+class _Level(IntEnum):
+    HIGH = 2
+
+
+@pytest.mark.parametrize(("value", "plain"), [
+    (math.nan, None), (-math.inf, None), (np.float64("inf"), None), (np.float32(0.5), 0.5), (np.int64(3), 3),
+    (np.bool_(True), True), (True, True), (1, 1), (None, None), ("word", "word"), (_Level.HIGH, 2),
+    ((1, math.nan), [1, None]), (np.array([1.0, np.nan]), [1.0, None]), (np.arange(2), [0, 1]),
+    ({"a": {"b": np.nan}}, {"a": {"b": None}}), (Path("a/b"), "a/b")])
+def test_plain_values(value: Any, plain: Any) -> None:
+    found = to_plain(value)
+    assert found == plain and type(found) is type(plain)
+    assert json.loads(to_json({"x": value}), parse_constant=pytest.fail) == {"x": plain}
+
+
+@pytest.mark.parametrize("columns", [3, 7, 12])
+@pytest.mark.parametrize("width", [40, 80])
+def test_narrow_terminal_cuts_no_number(columns: int, width: int) -> None:
+    """What does not fit goes into another block of columns, which begins with the names of the rows again."""
+    numbers = [f"{1.23456789 * 10 ** (i % 7):.6g} um" for i in range(columns)]
+    head = [Column("effect"), *(Column(f"error of signal {i}", align="right") for i in range(columns))]
+    table = Table(head, [["spool_friction", *numbers], ["null_bias", *numbers]])
+    folding = Table([Column("block"), Column("ratio", align="right"), Column("held against")],
+                    [["servovalve", "16.5", "Cor to XS, " * 20]])
+    lines, folded = (format_report(report_with(each), width).splitlines() for each in (table, folding))
+    own = [line for line in lines if "spool_friction" in line]
+    assert max(map(len, lines[2:])) <= width and "…" not in "".join(lines)
+    assert " ".join(" ".join(line.split()[1:]) for line in own) == " ".join(numbers)
+    assert (len(own) > 1 or columns < 12) and len(own) == sum("null_bias" in line for line in lines)
+    assert any(line.startswith("servovalve") and "16.5" in line for line in folded)  # long words fold beside numbers
+    assert max(map(len, folded[2:])) <= width and "\n".join(folded).count("Cor") == 20
+
+
+def test_terminal_limits_rows_and_says_how_many_are_left_and_each_must_fit_its_columns() -> None:
+    report = report_with(Table([Column("effect")], [[f"effect_{i}"] for i in range(12)], terminal_rows=8))
+    text = format_report(report)
+    assert "effect_7" in text and "effect_8" not in text and "and 4 more" in text
+    assert "effect_11" in render_html(report)
+    with pytest.raises(ValueError, match="longer"):
+        format_report(report_with(Table([Column("a")], [["1", "2"]])))
+
+
+def test_page_that_cannot_be_written(tmp_path: Path, whole: Report) -> None:
+    assert "--report" in catch_refusal(write_html, whole, tmp_path / "none" / "page.html", "--report")
+    write_html(whole, tmp_path / "page.html")
+    assert "run 7" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+FLOOR = {"xj": 2e-6, "p12": 2e4}
+ERROR = {"xj": 45e-6, "p12": 3e5}
+
+
+def candidate(effect: str, *beside: str, word: str = "explains") -> Candidate:
+    value = Value(1.5e-4, 1.4e-4, 1.6e-4, "A")
+    return Candidate(effect, beside, {f"{effect}.current": value}, dict(FLOOR), {"xj": 2.1e-6, "p12": 2e4},
+                     {"xj": 1.0, "p12": 1.0}, 1200.0, 1e-30, word)
+
+
+def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, is_at_floor: bool = False,
+           **fields: Any) -> Answer:
+    base = SimpleNamespace(is_at_floor=is_at_floor, is_far=False, effects=(), ratio={"xj": 22.5, "p12": 15.0})
+    trace = SimpleNamespace(declared=EHA, notes=())
+    explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, marks=Marks(1.0, 1e-6, ()),
+                                  ledger=[base], unseen={}, excerpt="",
+                                  search=SimpleNamespace(problem=SimpleNamespace(trace=trace)))
+    baseline = {"error": ERROR, "floor": FLOOR, "holdout": {"xj": 44e-6, "p12": 3e5}}
+    blind = (Blind("sensor_gain", "sensor_gain.error", 0.02, "1", "a stop"),
+             Blind("sensor_offset", "sensor_offset.offset", 1e-4, "m", "a stop"))
+    return Answer(cast(Any, explanation), candidates, baseline, blind, ("quantisation",), (), (), **fields)
+
+
+CASES = {
+    "NOTHING_MISSING": (answer("NOTHING_MISSING", ()), "the residual is noise"),
+    "EXPLAINED": (answer("EXPLAINED", ("a",), candidate("a")), "a explains the residual"),
+    "EXPLAINED by two": (answer("EXPLAINED", ("a", "b"), candidate("a", "b"), candidate("b", "a")),
+                         "a and b together explain the residual"),
+    "AMBIGUOUS": (answer("AMBIGUOUS", ("a", "b"), candidate("a"), candidate("b")), "a or b: each explains the"),
+    "PARTLY": (answer("PARTLY", ("a",), candidate("a", word="part")), "a explains part of the residual"),
+    "PARTLY by none": (answer("PARTLY", (), candidate("a", word="part")), "No effect of the catalogue"),
+    "UNEXPLAINED": (answer("UNEXPLAINED", (), candidate("a", word="no")), "the best, a, leaves"),
+    "UNEXPLAINED without candidates": (answer("UNEXPLAINED", ()), "No effect of the catalogue"),
+    "NOT_RESOLVABLE": (answer("NOT_RESOLVABLE", ("a",), candidate("a")), "a may be present"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_sentence_has_error_and_noise_floor(case: str) -> None:
+    sentence, words = describe_verdict(CASES[case][0]), CASES[case][1]
+    assert sentence.endswith(".") and {case.split(" ")[0] for case in CASES} == set(MOODS)
+    assert [each for each in (words, "XJ error 45.0 um", "noise floor 2.00 um") if each not in sentence] == []
+
+
+@pytest.mark.parametrize(("case", "words"), [
+    ("EXPLAINED", "current 150 uA (140 .. 160)"), ("PARTLY", "current 150 uA (140 .. 160)"),
+    ("NOT_RESOLVABLE", "current 150 uA (140 .. 160)"),
+    ("EXPLAINED by two", "a: current 150 uA (140 .. 160); b: current 150 uA (140 .. 160)")])
+def test_a_size_has_its_interval(case: str, words: str) -> None:
+    assert words in describe_verdict(CASES[case][0])
+
+
+def test_findings() -> None:
+    by = {"by": "measure XS too", "between": ("a", "b")}
+    told = answer("AMBIGUOUS", ("a", "b"), candidate("a"), candidate("b"), separate=by, pattern="a force")
+    plain, lines = ({line.label: line.text for line in describe_findings(given)}
+                    for given in (CASES["AMBIGUOUS"][0], told))
+    assert plain["to discriminate"].startswith("no sensor and no command")
+    assert plain["not detectable"] == "sensor_gain (up to 0.0200) and sensor_offset (up to 100 um); " \
+        "a stop would reveal sensor_gain and sensor_offset"
+    assert (lines["to discriminate"], lines["residual"]) == (
+        "measure XS too: in simulation this discriminates between a and b", "a force")
+
+
+@pytest.mark.parametrize("verdict", ["UNEXPLAINED", "EXPLAINED"])
+def test_an_actuator_far_from_the_model_is_to_be_identified(verdict: str) -> None:
+    """Only where no explanation is found: an explained one has its parameters listed as suspicious."""
+    far = answer(verdict, (), candidate("a", word="no"))
+    cast(Any, far.explanation.base).is_far = True
+    assert any("rig identify" in line.text for line in describe_findings(far)) == (verdict == "UNEXPLAINED")
+    cast(Any, far.explanation.base).ratio["xj"] = 400.0
+    assert any("400 noise floors" in line.text for line in describe_findings(far)) == (verdict == "UNEXPLAINED")
+
+
+def render_without_figures(report: Report) -> str:
+    """Drawing a figure needs whole traces; the commands' own tests draw them."""
+    sections = [replace(s, items=[i for i in s.items if not isinstance(i, Figure)]) for s in report.sections]
+    return render_html(replace(report, sections=sections))
+
+
+def test_the_report_of_an_explanation_in_all_forms() -> None:
+    sources = [Source("est.csv", "1"), Source("repeat.csv", "2"), Source("holdout.csv", "3")]
+    report = build_explanation_report(CASES["EXPLAINED"][0], "est.csv", "eha", sources, "rig explain est.csv",
+                                      "rig add a est.csv", notes=["3 rows left out"])
+    text, page, data = format_report(report, 80), render_without_figures(report), to_plain(report.data)
+    assert "no effect" in text and "explains" in text and "<1e-99" not in text and "1e-30" in text
+    assert "note            3 rows left out" in text and "next            rig add a est.csv" in text
+    assert not [words for words in ("held-out run", "holdout.csv", "150 uA (140 .. 160)", "not detectable up to",
+                                    "rig explain est.csv") if words not in page]
+    assert data["verdict"] == "EXPLAINED" and data["candidates"][0]["with"] == [] and "ledger" not in data
+    assert data["blind_to"][1]["smallest_visible"] is None
+    assert "ledger" in build_explanation_report(CASES["EXPLAINED by two"][0], "est.csv", "eha", sources).data
+
+
+def update(helps: bool) -> ModelUpdate:
+    steps = [SimpleNamespace(holdout=by, hypothesis=SimpleNamespace(errors=by)) for by in (ERROR, FLOOR)]
+    refit = SimpleNamespace(helps=helps, steps=steps, last=steps[-1], floor=FLOOR,
+                            search=SimpleNamespace(problem=SimpleNamespace(trace=SimpleNamespace(declared=EHA))))
+    known = Provenance(trace=Source("est.csv", "1"), holdout=Source("holdout.csv", "2"), floor=FLOOR,
+                       ledger=(Row(None, ERROR, ERROR), Row("a", FLOOR, FLOOR)), history=("rig add a",), effects=("a",))
+    return ModelUpdate(Model(), known, ("a",), "", cast(Any, refit),
+                       {"a.current": Value(1.5e-4, 1.4e-4, 1.6e-4, "A")}, (), ())
+
+
+def test_the_report_of_a_model_update_in_all_forms(tmp_path: Any) -> None:
+    report, useless = (build_model_report(update(helps), tmp_path / "m.toml", tmp_path / "m.toml.bak",
+                                          tmp_path / "m.html") for helps in (True, False))
+    assert useless.mood == "doubtful" and useless.sentence.endswith("a explains nothing but noise.")
+    text, page = format_report(report, 80), render_without_figures(report)
+    assert report.sentence == ("a added: XJ error 45.0 um -> 2.00 um, noise floor 2.00 um; held-out run 45.0 um -> "
+                               "2.00 um.")
+    assert not [words for words in ("model as it was", "+ a", "noise floor", "150 uA (140 .. 160)", "m.toml.bak",
+                                    "m.html") if words not in text.replace("\n", "")]
+    assert "held-out" in page and "22.5" in page and to_plain(report.data)["helps"] is True
+
+
+OFFSETS = {"xj": 0.0, "p12": 3e5, "xs": 8e-6}  # of the sensors; XJ is drawn to the measurement, so it has none
+
+
+@cache
+def record_offset() -> Trace:
+    """A trace whose sensors of P12 and XS show too much, so that measured minus model is positive."""
+    trace = record_plant(com=SHORT, seed=2)
+    return trace.with_columns({name: trace.column(name) + size for name, size in OFFSETS.items()})
+
+
+@cache
+def compare_offset() -> Comparison:
+    return compare(record_offset(), Model())
+
+
+def read_lines(drawing: str) -> list[list[np.ndarray]]:
+    """The values of the lines over time of each panel of a figure."""
+    return [[np.asarray(line.get_ydata()) for line in ax.lines if len(line.get_ydata()) > 2]
+            for ax in vars(drawing)["figure"].axes]
+
+
+def test_a_comparison_shows_measured_minus_model() -> None:
+    found = compare_offset()
+    panels = read_lines(compare_report.draw_overview(found))
+    scales = {"xj": 1e6, "p12": 1e-5, "xs": 1e6}
+    for number, (name, scale) in enumerate(scales.items()):
+        (measured, model), (residual,) = panels[1 + 2 * number:3 + 2 * number]  # after Com and XJ
+        if name != "xj":  # drawn in mm, its residual in um
+            np.testing.assert_allclose(residual, measured - model, atol=1e-9)
+            assert np.nanmean(residual) == pytest.approx(OFFSETS[name] * scale, rel=0.1)
+    captions = [item.caption for section in build_comparison_report(found).sections for item in section.items
+                if isinstance(item, Figure | Table) and "esidual" in item.caption]
+    assert captions and all("measured minus model" in text for text in captions[:2])
+
+
+FIND_SCROLLING = """window.probeNotes = {scrolling: [...document.querySelectorAll(".scroll")]
+  .filter(e => e.scrollWidth > e.clientWidth + 1).map(e => e.innerText.slice(0, 40)).join("; ")};"""
+ZOOM = """
+const svg = document.querySelector("svg[data-axes]"), r = svg.getBoundingClientRect();
+const k = r.width / svg.viewBox.baseVal.width;
+const panel = JSON.parse(svg.dataset.axes)[0], [x0, top, x1] = panel.box;
+const at = (x, y) => ({clientX: r.left + k * x, clientY: r.top + k * y, pointerId: 1, bubbles: true, button: 0});
+const place = t => x0 + (t - panel.x[0]) / (panel.x[1] - panel.x[0]) * (x1 - x0);
+const texts = () => [...svg.querySelectorAll("text")].filter(e => getComputedStyle(e).display !== "none"
+  && ![...svg.querySelectorAll("[style*='display: none'] text")].includes(e)).map(e => e.textContent).join("|");
+const read = () => [...document.querySelectorAll(".readout div")]
+  .map(e => e.children[0].textContent + "=" + e.children[1].textContent).join("|");
+svg.setPointerCapture = () => {};
+window.probeNotes = {before: texts()};
+svg.dispatchEvent(new PointerEvent("pointermove", at(place(0.75), top + 20)));
+window.probeNotes.whole = read();
+svg.dispatchEvent(new PointerEvent("pointerdown", at(place(0.52), top + 10)));
+svg.dispatchEvent(new PointerEvent("pointerup", at(place(0.58), top + 11)));
+svg.dispatchEvent(new PointerEvent("pointermove", at((x0 + x1) / 2, top + 20)));
+Object.assign(window.probeNotes, {zoomed: texts(), read: read()});
+svg.dispatchEvent(new MouseEvent("dblclick", {bubbles: true}));
+window.probeNotes.after = texts();
+"""
+
+
+@pytest.fixture(scope="module")
+def run_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of 3 s with a failed check and long words."""
+    t = np.arange(3000) / 1000
+    com = np.where(t < 0.5, 0.0, 5e-3)
+    xj = np.where(t < 0.5, 0.0, 5e-3 * (1.0 - np.exp(-40 * (t - 0.5))))
+    failed = CheckResult(
+        name="settling time of the step", kind="settling_time", signal="xj", value=100.0, unit="ms", high=80.0,
+        passed=False, t0=0.5, t1=1.5,
+        detail="0 of 1000 samples missing, and a remark that is long enough to need several lines on a phone")
+    trace = Trace.from_columns({"com": com, "xj": xj, "cor": 4.0 * (com - xj)}, 1e-3, {"node2.name": "x" * 200})
+    path = tmp_path_factory.mktemp("run_page") / "report.html"
+    path.write_text(render_html(build_run_report(replace(trace, checks=(failed,) * 3))), encoding="utf-8")
+    return path
+
+
+@needs_browser
+@pytest.mark.parametrize("width", [1400, 400])
+def test_nothing_is_cut_off(run_page: Path, width: int) -> None:
+    size = measure_page(run_page, width)
+    assert size.inner == width and size.scroll <= size.client and size.beyond == [] and size.errors == []
+
+
+@needs_browser
+def test_a_wide_table_fits_into_a_window_of_800_pixels(tmp_path: Path) -> None:
+    """Ten columns with long headings, as rig explain has: none is hidden and none is squeezed to a word a line."""
+    headings = ["XJ", "P12", "XS", "XJ, held-out run", "P12, held-out run", "XS, held-out run", "evidence", "p"]
+    columns = [Column("effect"), *(Column(heading, align="right") for heading in headings), Column("size")]
+    size = "amplitude 0.00022 (-0.00016 .. 0.00060), frequency 344 Hz (338 .. 349), phase 4.3 rad (0.3 .. 8.3)"
+    rows = [["null_bias + supply_ripple", "0.997", "0.999", "1.00", "1.00", "1.00", "0.991", "362661", "<1e-99", size]]
+    run_page = tmp_path / "wide.html"
+    report = Report("explain", "run.csv", sections=[Section("Candidates", [Table(columns, rows)])])
+    run_page.write_text(render_html(report))
+    high = "row: String(document.querySelectorAll('tr')[1].offsetHeight)"
+    notes = measure_page(run_page, 800, FIND_SCROLLING + f"Object.assign(window.probeNotes, {{{high}}})").notes
+    assert notes["scrolling"] == "" and int(notes["row"]) < 200, notes
+
+
+@needs_browser
+def test_a_figure_is_zoomed_and_read(run_page: Path) -> None:
+    notes = measure_page(run_page, 1200, ZOOM)
+    assert notes.errors == []
+    said = notes.notes
+    assert "XJ less the target=" in said["whole"] and "time=0.7500 s" in said["whole"].replace("0.750 s", "0.7500 s")
+    assert said["zoomed"] != said["before"] == said["after"]
+    assert {"0.540", "0.560"} <= set(said["zoomed"].split("|")) and "0.540" not in said["before"].split("|")
+    shown = dict(part.split("=") for part in said["read"].split("|"))
+    assert float(shown["time"].removesuffix(" s")) == pytest.approx(0.55, abs=0.001)
+    percent = float(shown["XJ less the target"].split()[0].replace("\u2212", "-"))
+    assert percent == pytest.approx(-100 * np.exp(-40 * 0.05), abs=1.0)  # beyond the target, % of the step

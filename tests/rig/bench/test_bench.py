@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from bus_stations import gather, spec
 from physics_cases import PREFLIGHT
-from rig_command import answer, refuse, rig
+from rig_command import answer, rig
 from vcan_host import kernel_has_vcan0
 
 from rig.bench import benchmarks
@@ -49,14 +49,6 @@ def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
 def test_whole_processes_are_timed() -> None:
     assert benchmarks.measure_help_time(rounds=1) > 0
     assert benchmarks.measure_run_process_speed(rounds=1) > 0
-
-
-def test_a_path_that_cannot_be_written_is_told_in_one_line(
-        monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(benchmarks, "run_benchmarks", lambda command, progress: {
-        "step": None, "times_real_time": 1.0, "cycle": 1.0, "lockstep": 1.0, "run_process": 1.0, "help_process": 1.0})
-    line = refuse("bench", "--out", tmp_path / "none" / "b.json", "--quiet")
-    assert "--out" in line and "none/b.json: expected a file that can be written (No such file" in line
 
 
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
@@ -125,12 +117,3 @@ def test_the_command_measures_everybody(bus_kind: str) -> None:
         assert figures["cycles"][name] >= 400 and figures["lost"][name] < figures["cycles"][name]
     if benchmarks.find_cyclictest():
         assert figures["times_us"]["lateness"][CYCLICTEST]["p50"] > 0
-
-
-@pytest.mark.parametrize(("words", "says"), [
-    (("realtime", "--bus", "virtual:x"), "--bus: virtual:x: expected socketcan:INTERFACE"),
-    (("realtime", "--blocks", 0), "--blocks"), (("realtime", "--seconds", 0.1), "--seconds"),
-    (("realtime", "--seconds", "nan"), "--seconds"),
-])
-def test_bad_input_is_one_line(words: tuple[object, ...], says: str) -> None:
-    assert says in refuse("bench", *words)

@@ -1,5 +1,7 @@
-"""The command as scripts and people see it: help, one-line errors, exit statuses, JSON, signals, closed pipes."""
+"""The command as scripts and people see it: help, errors, statuses, signals, pipes; `rig list` and `rig doctor`."""
 
+import importlib.util
+import json
 import os
 import pkgutil
 import re
@@ -13,9 +15,15 @@ import pytest
 from rig_command import SHORT, answer, finished, grown, refuse, rig, started
 
 from fdi.trace.trace import CLEANUP, Trace
-from rig.cli import commands
+from plant import Model, load_model
+from plant.effects import CATALOGUE
+from rig import doctor
+from rig.cli import commands, completion
 from rig.cli.command_list import COMMANDS, find_work
+from rig.cli.commands.list import KINDS
+from rig.cli.main import FIRST_STEPS
 from rig.network.master import Master
+from rig.sequences import checks, load_sequence
 
 LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 60')
 
@@ -65,13 +73,6 @@ def test_results_stay_where_no_run_comes_about(short: Path, tmp_path: Path) -> N
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_a_run_that_passes(short: Path, tmp_path: Path) -> None:
-    told = answer("run", short, "--out", tmp_path / "out")
-    assert (told["verdict"], told["timing"]["cycles"]) == ("PASS", 450)
-    assert told["timing"]["response_us"].keys() == {"p50", "p99", "p99_9", "max"}
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["report.html", "trace.mcap", "verdict.json"]
-
-
 def test_brackets_in_names_are_brackets(tmp_path: Path) -> None:
     """rich would take them for mark-up, and end a run that passed with a traceback."""
     text = SHORT.replace("A short one", "[red]A[/] short one").replace('"overshoot",', '"[/b] overshoot",', 1)
@@ -83,6 +84,7 @@ def test_a_run_for_people(short: Path, tmp_path: Path) -> None:
     said = rig("run", short, "--out", tmp_path / "out")
     assert said.status == 0 and "PASS" in said.out and "overshoot" in said.out and "times real time" in said.out
     assert rig("run", short, "--out", tmp_path / "out", "--quiet") == (0, "", "")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["report.html", "trace.mcap", "verdict.json"]
 
 
 def test_timing_that_is_invalid(short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,7 +158,6 @@ def test_output_that_nobody_reads_changes_no_verdict(how: str, short: Path, tmp_
         process = started(*words, stdout=None, preexec_fn=lambda: os.close(1))
     else:
         process = started(*words)
-        assert process.stdout is not None
         process.stdout.close()
         process.stdout = None
     said = finished(process)
@@ -176,3 +177,105 @@ def test_only_import_loads_the_reader_of_mf4_files(words: list[str], is_loaded: 
                "import can; print('pandas' in sys.modules)")
     done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == str(is_loaded)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_a_table_without_cut_words(kind: str) -> None:
+    rows = rig("list", kind, "--json").json[kind]
+    said = rig("list", kind)
+    assert said.status == 0 and "…" not in said.out
+    words = set(said.out.split())
+    assert rows and all(row["name"] in words for row in rows)
+
+
+def test_the_parameters_are_those_that_set_takes() -> None:
+    rows = {row["name"]: row for row in rig("list", "parameters", "--json").json["parameters"]}
+    assert rows.keys() >= Model().values.keys()
+    assert rows.keys() >= {name for e in CATALOGUE.values() if e.port and e.file is None for name in e.parameters
+                           if name.partition(".")[0] == "null_bias"}
+    assert rows["filter.clogging"] == {"name": "filter.clogging", "unit": "1", "default": 0.0, "range": ">= 0, < 1"}
+    assert rows["filter.law"]["default"] == "sqrt" and "linear" in rows["filter.law"]["range"]
+    for name, row in rows.items():
+        if isinstance(row["default"], float):
+            load_model().replace({name: row["default"]})  # a default is a value that --set takes
+    own = {row["name"]: row["default"] for row in
+           rig("list", "parameters", "jack", "--set", "jack.mass=150", "--json").json["parameters"]}
+    assert all("jack" in name for name in own) and own["jack.mass"] == 150.0
+
+
+def test_sequences_checks_and_models_can_be_used() -> None:
+    assert [row["name"] for row in rig("list", "checks", "--json").json["checks"]] == list(checks.KINDS)
+    sequences, models = (rig("list", kind, "--json").json[kind] for kind in ("sequences", "models"))
+    assert all(load_sequence(row["name"]).title == row["title"] for row in sequences)
+    assert all(load_model(row["name"]).plant == row["plant"] for row in models)
+
+
+def test_a_name_that_a_list_lacks() -> None:
+    nothing = rig("list", "signals", "nonsense")
+    assert (nothing.status, nothing.out.split(".")[0]) == (0, "no signals of that name")
+
+
+def test_the_first_steps_are_commands_that_exist() -> None:
+    named = re.findall(r"^    rig (\w+)", FIRST_STEPS, re.MULTILINE)
+    alone = rig()
+    assert (alone.status, alone.out, alone.err.count("\n")) == (2, FIRST_STEPS + "\n", 1)
+    assert len(named) >= 5 and set(named) <= set(COMMANDS)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("argcomplete") is None, reason="no argcomplete (extra shell)")
+@pytest.mark.parametrize(("line", "expected"), [
+    ("rig con", {"conformance"}), ("rig run --set filter.c", {"filter.clogging="}),
+    ("rig compare --rep", {"--repeat", "--report"}), ("rig effects null_b", {"null_bias"}),
+    ("rig run --model ", {"eha", "ehs", "ema", "servo", "emps", "own.py", "own.toml", "ownfolder/"}),
+    ("rig check pre", {"preflight", "preflight_ema"}), ("rig check own", {"own.toml", "ownfolder/"})])
+def test_the_answer_to_the_shell(line: str, expected: set[str], tmp_path: Path) -> None:
+    (tmp_path / "ownfolder").mkdir()
+    for name in ("own.toml", "own.py", "own.txt"):
+        (tmp_path / name).touch()
+    answer = tmp_path / "answer"
+    environment = {**os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)),
+                   "_ARGCOMPLETE_STDOUT_FILENAME": str(answer), "_ARGCOMPLETE_SUPPRESS_SPACE": "1",
+                   "_ARGCOMPLETE_IFS": "\n", "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-m", "rig.cli.main"], env=environment, cwd=tmp_path, check=False,
+                   capture_output=True, timeout=60)
+    assert {word.strip() for word in answer.read_text().split("\n")} == expected
+
+
+def test_completion_knows_all_parameters() -> None:
+    assert {name.rstrip("=") for name in completion.list_parameters()} >= set(Model().values)
+
+
+@pytest.fixture(scope="module")
+def findings() -> list[doctor.Finding]:
+    return doctor.examine_machine(seconds=0.05)
+
+
+def test_each_finding_is_there_once_and_says_what_it_is_for_and_how_to_get_it(findings: list[doctor.Finding]) -> None:
+    for finding in findings:
+        assert finding.area and finding.name and finding.found and finding.purpose, finding
+        assert bool(finding.remedy) == (finding.status != "ok"), finding
+    names = {finding.name for finding in findings}
+    assert len(names) == len(findings) and names >= {
+        "Python", "packages", "CAN in the kernel", "CAN interface", "CAN guest", "rerun", "Vulkan", "C compiler",
+        "compiled code", "disk", "kernel", "priority", "memory lock", "clock", "timer at 1 kHz"}
+
+
+def test_a_missing_package_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(doctor, "read_requirements", lambda: {"": ["numpy", "no-such-distribution"]})
+    said = rig("doctor", "--seconds", "0")
+    assert said.status == 1 and "missing: no-such-distribution" in said.out
+    assert said.out.splitlines()[0] == "FAIL  The bench cannot run without: packages."
+
+
+def test_tools_that_are_not_there_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_SEARCH_PATH", "/nowhere")
+    found = {finding.name: finding for finding in [*doctor.examine_tools(), *doctor.examine_buses()]}
+    assert found["C compiler"].status == "missing" and "gcc" in found["C compiler"].remedy
+    assert found["CAN guest"].remedy == "apt-get install user-mode-linux kmod iproute2"
+
+
+def test_json_is_one_object_and_nothing_else(tmp_path: Path) -> None:
+    told = answer("doctor", "--seconds", "0", "--out", tmp_path / "doctor.json")
+    assert told == json.loads((tmp_path / "doctor.json").read_text()) and told["verdict"] == "PASS"
+    assert rig("doctor", "--seconds", "0", "--quiet") == (0, "", "")

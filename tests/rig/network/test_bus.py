@@ -1,20 +1,53 @@
-"""One set of tests for every back end, then what is particular to each."""
+"""One set of tests for every back end, then what is particular to each; `--bus`; UDP; the compiled bus."""
 
+import os
 import select
 import socket
 import struct
+import subprocess
+import sys
+import threading
 import time
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import cache
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import can
 import codec
+import msgpack
+import numpy as np
 import pytest
-from bus_stations import gather, spec, stations
+from bus_stations import find_group, gather, spec, stations
+from can.interfaces.udp_multicast.utils import pack_message, unpack_message
+from hypothesis import given, settings, strategies as st
+from places import ROOT
+from refusals import catch_refusal
+from rig_command import SHORT, SLOW_START, rig
 
+from plant.compile import compile_function
 from plant.errors import RigError
 from rig.benches.bench import EXTENDED, FD, SWITCHED
-from rig.network.bus import Link, open_can
+from rig.network import bus as bus_module, raw_bus
+from rig.network.bus import Link, can_open, choose_bus, explain_socketcan_problem, open_can
 from rig.network.can_interface import UdpBus
-from rig.network.frame import FD_LENGTHS, Frame, find_cob_id
+from rig.network.frame import FD_LENGTHS, IDENTIFIER, Frame, find_cob_id, has_valid_length, make_message
+from rig.network.raw_bus import (
+    FRAME,
+    NO_TURN,
+    PAYLOAD_IN,
+    PAYLOAD_OUT,
+    QUEUE_FULL,
+    SENT,
+    TIMEOUT,
+    Port,
+    RawBus,
+    send_frame,
+)
 from rig.network.udp import PORT
 
 only_socketcan = pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
@@ -68,7 +101,6 @@ class TestLink:
         identifiers = (0x000, 0x07F, 0x080, 0x0FF, 0x182, 0x183, 0x202, 0x7FF, EXTENDED | 0x080, EXTENDED | 0x7F,
                        EXTENDED | 0x18FEF1AB, EXTENDED | 0x18FEF2AB, FD | 0x200, FD | EXTENDED | 0x12345)
         with stations(bus_kind, 2, fd=True) as (sender, receiver):
-            assert isinstance(receiver, Link)
             for left_out in ((0x080, 0x182, 0x000), (), (0x7FF, 0x07F), (), (EXTENDED | 0x080, FD | 0x200),
                              (EXTENDED | 0x18FEF1AB, FD | EXTENDED | 0x12345, 0x7F)):
                 receiver.leave_out(left_out)
@@ -121,13 +153,11 @@ class TestLink:
                     assert frame.cob_id == find_cob_id(sent) & ~SWITCHED and frame.data == data
                     link.send(find_cob_id(sent), data)
                     heard = other.recv(60)
-                    assert heard is not None
                     assert heard.equals(sent, timestamp_delta=None, check_channel=False, check_direction=False)
 
     @links
     def test_nodes_are_selected_by_classical_frames(self, bus_kind: str) -> None:
         with stations(bus_kind, 2) as (sender, receiver):
-            assert isinstance(receiver, Link)
             receiver.select_nodes(3)
             for cob_id in (0x183, 0x184, EXTENDED | 0x183, 0x080):
                 sender.send(cob_id, b"")
@@ -147,7 +177,6 @@ class TestLink:
     def test_error_frames_are_counted(self, bus_kind: str) -> None:
         """A controller's overflow report, put on vcan0 as the raw frame it is."""
         with stations(bus_kind, 1) as (link,), socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
-            assert isinstance(link, Link)
             raw.bind(("vcan0",))
             raw.send(struct.pack("=IB3x8s", 0x20000004, 8, b"\0\1" + bytes(6)))
             raw.send(struct.pack("=IB3x8s", 0x20000040, 8, bytes(8)))
@@ -157,7 +186,6 @@ class TestLink:
     @between_programs
     def test_loss_is_counted_to_the_frame(self, bus_kind: str) -> None:
         with stations(bus_kind, 2) as (sender, receiver):
-            assert isinstance(receiver, Link)
             many = 60_000  # more than the large receive buffer of a CAN socket holds
             for n in range(many):
                 sender.send(0x100, struct.pack("<I", n))
@@ -190,7 +218,6 @@ class TestLink:
 class TestUdpMulticast:
     def test_stays_on_the_loopback_interface(self, bus_kind: str) -> None:
         with open_can(spec(bus_kind)) as bus:
-            assert isinstance(bus, UdpBus)
             assert bus._tx.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == 0
             assert bus._tx.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, 4) == socket.inet_aton("127.0.0.1")
             assert bus._tx.getsockname()[0] == "127.0.0.1"
@@ -203,3 +230,420 @@ class TestUdpMulticast:
             stranger.sendto(b"\xff", (where.partition(":")[2], PORT))
             assert gather(link, 1, timeout=0.1) == []
             assert link.error_frames == 1
+
+
+HOUR = 3600 * 10**9  # ns
+SECOND = 10**9
+
+
+class Kernel:
+    """A CAN socket whose frames carry wall-clock stamps, and both clocks."""
+
+    def __init__(self) -> None:
+        self.monotonic, self.wall = 50 * SECOND, 1_700_000_000 * SECOND
+        self.waiting: list[int] = []
+
+    def receive(self) -> None:
+        """A frame comes in now."""
+        self.waiting.append(self.wall)
+
+    def advance(self, ns: int, step: int = 0) -> None:
+        """Time goes on; the wall clock is set by `step` as well."""
+        self.monotonic, self.wall = self.monotonic + ns, self.wall + ns + step
+
+    def recvmsg(self, *_: int) -> tuple[bytes, list[tuple[int, int, bytes]], int, Any]:
+        if not self.waiting:
+            raise BlockingIOError
+        stamp = struct.pack("@qq", *divmod(self.waiting.pop(0), SECOND))
+        return struct.pack("=IB3x8s", 0x182, 8, bytes(8)), [(1, 35, stamp)], 0, None
+
+
+@pytest.mark.parametrize("step", [0, HOUR, -HOUR, 3 * SECOND, -3 * SECOND])
+def test_a_frame_is_never_from_the_future_nor_older_than_the_one_before(step: int,
+                                                                       monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel = Kernel()
+    monkeypatch.setattr(bus_module.time, "time_ns", lambda: kernel.wall)
+    link = Link(can.Bus(interface="virtual", channel="clock steps"), lambda: kernel.monotonic)
+    link._socket = kernel  # type: ignore[assignment]
+    times, true = [], []
+    for k in range(10):
+        kernel.receive()
+        true.append(kernel.monotonic)
+        kernel.advance(200_000, step if k == 5 else 0)  # set between the arrival of a frame and its reading
+        times += [frame.t_ns for frame in link.poll()]
+        kernel.advance(800_000)
+    link.close()
+    assert times == sorted(times) and len(times) == 10
+    late = [t - expected for t, expected in zip(times, true, strict=True)]
+    assert all(-1_000_000 <= error <= 200_000 for error in late)  # of the one frame; all others are exact
+    assert [error for k, error in enumerate(late) if k != 5] == [0] * 9
+
+
+@pytest.fixture(autouse=True)
+def _no_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(bus_module.BUS_VARIABLE, raising=False)
+
+
+@pytest.mark.parametrize(("live", "more"), [([], ""), (["vcan0"], "; vcan0 up, but not taken unasked")])
+def test_auto_is_embedded_and_says_why(live: list[str], more: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus_module, "list_can_interfaces", lambda: live)
+    assert choose_bus() == ("embedded", f"embedded bus (neither --bus nor EHA_RIG_BUS is set){more}")
+
+
+def test_asked_or_configured(monkeypatch: pytest.MonkeyPatch) -> None:
+    for taken in ("embedded", "virtual", "virtual:x", "udp_multicast", "udp_multicast:239.1.2.3"):
+        assert choose_bus(taken) == (taken, f"{taken}, as asked")
+        monkeypatch.setenv(bus_module.BUS_VARIABLE, taken)
+        assert choose_bus("auto") == (taken, f"{taken}, as EHA_RIG_BUS says")
+        assert choose_bus("virtual:y")[0] == "virtual:y"  # asking beats the variable
+
+
+def test_bad_spec(monkeypatch: pytest.MonkeyPatch) -> None:
+    for bad in ("vcan0", "socketcan", "embedded:x", "udp_multicast:10.0.0.1", "udp_multicast:x", "nosuch:0"):
+        assert f"--bus: {bad}: expected " in catch_refusal(choose_bus, bad)
+        monkeypatch.setenv(bus_module.BUS_VARIABLE, bad)
+        assert f"EHA_RIG_BUS: {bad}: expected " in catch_refusal(choose_bus, "auto")
+    assert "--bus: expected auto, embedded, " in catch_refusal(choose_bus, "")
+
+
+def test_embedded_is_no_bus_between_programs() -> None:
+    assert "between programs" in catch_refusal(open_can, "embedded")
+
+
+def test_missing_interface_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Asked for or configured: an error, never a silent fall back to the simulation."""
+    monkeypatch.setenv(bus_module.BUS_VARIABLE, "socketcan:vcan77")
+    for use in (lambda: choose_bus("auto"), lambda: choose_bus("socketcan:vcan77"),
+                lambda: open_can("socketcan:vcan77")):
+        with pytest.raises(RigError, match=r"\Asocketcan:vcan77: .+\Z"):
+            use()
+
+
+DOWN, UP = {"type": "280", "flags": "0x80"}, {"type": "280", "flags": "0xc1"}  # as /sys/class/net has it
+CLASSICAL = "is set to classical CAN, not to CAN FD; sudo ip link set"
+
+
+@pytest.mark.parametrize(("name", "files", "fd", "said"), [
+    ("vcan1", {}, False, "ip link add vcan1 type vcan && sudo ip link set vcan1 up"),
+    ("can1", {}, False, "ip link set can1 up type can bitrate 1000000"),
+    ("eth0", {"type": "1", "flags": "0x1003"}, False, "eth0 is not a CAN interface"),
+    ("vcan0", DOWN, False, "vcan0 is down; sudo ip link set vcan0 up"), ("can0", UP, False, ""),
+    ("can0", UP | {"mtu": "16"}, False, ""), ("can0", UP | {"mtu": "72"}, True, ""),
+    ("can0", UP | {"mtu": "16"}, True, f"can0 {CLASSICAL} can0 down && sudo ip link set can0 up type can bitrate "
+                                       "1000000 dbitrate 4000000 fd on"),
+    ("vcan0", UP | {"mtu": "16"}, True, f"vcan0 {CLASSICAL} vcan0 down && sudo ip link set vcan0 mtu 72 up")])
+def test_what_is_wrong_with_an_interface(name: str, files: dict[str, str], fd: bool, said: str,
+                                         monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Absent, not CAN, down, classical, fine."""
+    for word in ("AF_CAN", "CAN_RAW"):
+        monkeypatch.setattr(socket, word, 29, raising=False)
+    monkeypatch.setattr(socket, "socket", lambda *_: SimpleNamespace(close=lambda: None))
+    monkeypatch.setattr(bus_module, "_NETWORK", tmp_path)
+    for file, text in files.items():
+        (tmp_path / name).mkdir(exist_ok=True)
+        (tmp_path / name / file).write_text(f"{text}\n")
+    problem = explain_socketcan_problem(name, fd)
+    assert said in problem and bool(said) == bool(problem)
+    assert bus_module.list_can_interfaces() == [name] * (files.get("flags") == "0xc1")
+
+
+def test_kernel_without_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: int) -> None:
+        raise OSError(97, os.strerror(97))
+
+    monkeypatch.setattr(socket, "socket", refuse)
+    assert "no SocketCAN" in explain_socketcan_problem("vcan0")
+
+
+def frame(cob_id: int, data: bytes = b"\1\2\3") -> can.Message:
+    return can.Message(arbitration_id=cob_id, data=data, is_extended_id=False)
+
+
+def test_it_is_registered_where_python_can_looks() -> None:
+    groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
+    declared = EntryPoint("eha_rig_udp", groups["can.interface"]["eha_rig_udp"], "can.interface")
+    assert declared.load() is UdpBus
+    with can.Bus(interface="eha_rig_udp", channel=find_group(), bitrate=1_000_000) as bus:
+        assert type(bus) is UdpBus
+
+
+def test_a_message_has_the_time_of_its_reception_and_passes_the_filters() -> None:
+    group = find_group()
+    filters = [{"can_id": 0x182, "can_mask": 0x7FF, "extended": False}]
+    with UdpBus(group, can_filters=filters) as bus, UdpBus(group) as other:
+        before = time.time()
+        for cob_id in (0x80, 0x182, 0x183):
+            other.send(frame(cob_id))
+        heard = bus.recv(60.0)
+        assert heard is not None and heard.arbitration_id == 0x182 and before <= heard.timestamp <= time.time()
+        assert group in str(heard.channel) and bus.recv(0.1) is None
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"channel": "10.0.0.1"}, "an IPv4 multicast group"),
+    ({"channel": "239.0.0.1", "receive_own_messages": True}, "receive_own_messages is not possible")])
+def test_what_it_cannot_do_is_refused(options: dict[str, object], words: str) -> None:
+    with pytest.raises(can.CanInitializationError, match=words):
+        UdpBus(**options)  # type: ignore[arg-type]
+
+
+def test_a_controller_of_python_can_and_canopen_alone_passes_a_run(tmp_path: Path) -> None:
+    group = find_group()
+    (tmp_path / "short.toml").write_text(SHORT + SLOW_START)
+    program = ROOT / "examples" / "foreign_controller.py"
+    imports = [line for line in program.read_text().splitlines() if line.startswith(("import", "from"))]
+    assert not any(package in line for line in imports for package in ("rig", "plant", "fdi", "dbc"))
+    other = subprocess.Popen([sys.executable, program, group])
+    try:
+        with can.Bus(interface="eha_rig_udp", channel=group) as bus:
+            boot = bus.recv(60.0)
+            assert boot is not None and (boot.arbitration_id, bytes(boot.data)) == (0x702, b"\0")
+        said = rig("run", tmp_path / "short.toml", "--bus", f"udp_multicast:{group}", "--controller", "external",
+                   "--out", tmp_path / "out", "--json")
+    finally:
+        other.terminate()
+        other.wait(20)
+    assert said.status == 0 and said.json["verdict"] == "PASS", said
+
+
+TAKE = "import sys; from rig.network.udp import Turn; turn = Turn(sys.argv[1], int(sys.argv[2])); turn.take(); "
+
+
+def test_a_turn_that_is_held_is_one_line_and_ends_with_its_holder() -> None:
+    group, send = find_group(), compile_function(send_frame)
+    message = can.Message(arbitration_id=1, is_extended_id=False)
+    with RawBus(f"udp_multicast:{group}") as bus, open_can(f"udp_multicast:{group}") as other:
+        with subprocess.Popen([sys.executable, "-c", TAKE + "print('taken', flush=True); input()", group, str(PORT)],
+                              stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+            assert holder.stdout is not None and holder.stdout.readline() == b"taken\n"
+            with pytest.raises(can.CanError, match=f"turn to send.*process {holder.pid}"):
+                other.send(message)
+            status = send(bus.port, 1, 0, 0)
+            assert status == NO_TURN
+            error = str(bus.explain_failure(status))
+            assert f"process {holder.pid}" in error and "\n" not in error
+            holder.kill()
+        assert send(bus.port, 1, 0, 0) == SENT
+        other.send(message)
+
+
+raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
+
+
+@cache
+def function(name: str) -> Callable[..., Any]:
+    return compile_function(getattr(raw_bus, name))  # type: ignore[no-any-return]
+
+
+def soon(seconds: float = 60.0) -> int:
+    return time.monotonic_ns() + round(seconds * 1e9)
+
+
+def payload(data: bytes) -> int:
+    return int.from_bytes(data.ljust(8, b"\0"), "little", signed=True)
+
+
+def receive_all(port: Port, silence: float = 0.5) -> list[int]:
+    """The COB-IDs of the frames that come until none did for `silence` seconds: a busy kernel hands them over later."""
+    receive = function("receive_frame")
+    return [frame[2] for frame in iter(lambda: receive(port, soon(silence)), (TIMEOUT, 0, 0, 0, 0))]
+
+
+@pytest.fixture
+def other(where: str) -> Iterator[can.BusABC]:
+    """A station of python-can on the same bus."""
+    with open_can(where) as bus:
+        yield bus
+
+
+@raw_kinds
+class TestFrames:
+    def test_frames_go_to_and_fro_between_python_can_and_compiled_code(self, where: str) -> None:
+        """Of all kinds and lengths; the payload of a frame up to 8 bytes is a number, that of every frame its bytes."""
+        kinds = [flags | wide for flags in (0, FD, FD | SWITCHED) for wide in (0, EXTENDED)]
+        cob_ids = [kind | number for kind in kinds for number in (0, 0x7F, 0x80, 0x182, 0x7FF)]
+        cob_ids += [kind | number for kind in kinds if kind & EXTENDED for number in (0x800, 0x18FEF1AB, IDENTIFIER)]
+        receive = function("receive_frame")
+        with open_can(where, fd=True) as other, RawBus(where, cob_ids) as bus:
+            receive(bus.port, 0)  # compiles it
+            for length in (*range(9), *FD_LENGTHS):
+                data = bytes(range(0xF8 - length, 0xF8))
+                for cob_id in [each for each in cob_ids if has_valid_length(each, length)]:
+                    sent = make_message(cob_id, data)
+                    other.send(sent)
+                    status, t_ns, *rest = receive(bus.port, soon())
+                    assert (status, *rest) == (FRAME, cob_id & ~SWITCHED, length, payload(data[:8]))
+                    assert bytes(bus.port.octets[PAYLOAD_IN: PAYLOAD_IN + length]) == data
+                    assert 0 <= time.monotonic_ns() - t_ns < 60e9
+                    bus.port.octets[PAYLOAD_OUT: PAYLOAD_OUT + length] = np.frombuffer(data, np.uint8)
+                    assert function("send_payload")(bus.port, cob_id, length) == SENT
+                    if length <= 8:
+                        assert function("send_frame")(bus.port, cob_id, length, payload(data)) == SENT
+                    for _ in range(1 + (length <= 8)):
+                        heard = other.recv(60)
+                        assert heard.equals(sent, timestamp_delta=None, check_channel=False, check_direction=False)
+
+    def test_only_the_kinds_asked_for_arrive(self, where: str) -> None:
+        """One number is four identifiers: of 11 or 29 bits, classical or CAN FD."""
+        kinds = (0, EXTENDED, FD, EXTENDED | FD)
+        with open_can(where, fd=True) as other:
+            for wanted in kinds:
+                with RawBus(where, [number | wanted for number in (0x12, 0xFF, 0x183)], fd=True) as bus:
+                    for kind in kinds:
+                        for number in (0x12, 0x13, 0xFF, 0x182, 0x183):
+                            other.send(make_message(number | kind, b"\1"))
+                    assert receive_all(bus.port) == [number | wanted for number in (0x12, 0xFF, 0x183)]
+                    bus.set_filter([EXTENDED | 0x12345678, 0x80])
+                    for number in (0x12, EXTENDED | 0x12345678, EXTENDED | 0x12345679, FD | 0x80, 0x80):
+                        other.send(make_message(number, b""))
+                    assert receive_all(bus.port) == [EXTENDED | 0x12345678, 0x80]
+
+    def test_only_the_frames_asked_for_arrive_and_none_of_its_own(self, where: str, other: can.BusABC) -> None:
+        wanted = [0x000, 0x050, 0x0FF, 0x183, 0x7FF]  # each length of an identifier in msgpack
+        with RawBus(where, wanted) as bus, RawBus(where) as python:
+            function("send_frame")(bus.port, 0x183, 0, 0)
+            for cob_id in range(0x800):
+                other.send(can.Message(arbitration_id=cob_id, is_extended_id=False))
+                if cob_id % 256 == 0:
+                    other.send(can.Message(arbitration_id=cob_id, is_extended_id=True))
+                    other.send(can.Message(arbitration_id=cob_id, is_extended_id=False, is_remote_frame=True))
+            assert receive_all(bus.port) == wanted
+            assert len(receive_all(python.port)) == 0x800 + 1
+            with pytest.raises(RigError, match="513 frames to receive; at most 512 are possible"):
+                bus.set_filter(range(EXTENDED, EXTENDED + 513))
+
+    def test_waits_until_its_deadline(self, where: str) -> None:
+        receive = function("receive_frame")
+        with RawBus(where) as bus:
+            assert receive(bus.port, 0) == (TIMEOUT, 0, 0, 0, 0)
+            end = soon(0.02)
+            assert receive(bus.port, end)[0] == TIMEOUT
+            assert time.monotonic_ns() >= end
+
+    def test_waits_in_the_call_that_receives(self, where: str, other: can.BusABC) -> None:
+        await_frame = function("await_frame")
+        with RawBus(where) as bus:
+            assert await_frame(bus.port) == (TIMEOUT, 0, 0, 0, 0)
+            other.send(can.Message(arbitration_id=0x123, data=b"\x07", is_extended_id=False))
+            status, t_ns, *rest = await_frame(bus.port)
+            assert (status, *rest) == (FRAME, 0x123, 1, 7)
+            bus.use_kernel_times(False)
+            before = time.monotonic_ns()
+            other.send(can.Message(arbitration_id=0x123, is_extended_id=False))
+            time.sleep(0.01)
+            assert t_ns <= before < before + 10_000_000 <= await_frame(bus.port)[1]
+
+    def test_a_lost_frame_is_counted(self, where: str) -> None:
+        receive, send = function("receive_frame"), function("send_frame")
+        with RawBus(where) as bus, RawBus(where, ()) as sender:
+            with socket.socket(fileno=os.dup(bus.descriptors[0])) as same:
+                same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 100_000)  # bytes; it holds some hundred frames
+            said = [send(sender.port, 0x100, 0, 0) for _ in range(3_000)]
+            sent = said.count(SENT)
+            kept = len(receive_all(bus.port))
+            send(sender.port, 0x100, 0, 0)  # the count rides on the next frame
+            assert receive(bus.port, soon())[0] == FRAME
+            assert kept + bus.overflows == sent
+            assert bus.overflows > 0
+            assert sent + said.count(QUEUE_FULL) == 3_000
+
+def read_by_python_can(data: bytes) -> tuple[Any, ...]:
+    """What `Link` on a `UdpBus` makes of a datagram: COB-ID, length, payload; (-1,) for what is no data frame."""
+    message = unpack_message(data, check=True)
+    cob_id, data = find_cob_id(message) & ~SWITCHED, bytes(message.data)
+    if message.is_error_frame or message.is_remote_frame or not has_valid_length(cob_id, len(data)):
+        return (-1,)
+    return cob_id, len(data), payload(data[:8]), data
+
+
+CLOSED_PORT = raw_bus.make_closed_port()
+
+
+def read_compiled(data: bytes) -> tuple[Any, ...]:
+    CLOSED_PORT.octets[raw_bus._IN: raw_bus._IN + len(data)] = np.frombuffer(data, np.uint8)
+    cob_id, *rest = function("decode_datagram")(CLOSED_PORT, len(data))
+    return (cob_id, *rest, bytes(CLOSED_PORT.octets[PAYLOAD_IN: PAYLOAD_IN + rest[0]])) if cob_id >= 0 else (cob_id,)
+
+
+FLAGS = ("is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "bitrate_switch", "error_state_indicator")
+messages = st.builds(  # some contradict themselves
+    lambda number, data, flags, t, channel: can.Message(
+        arbitration_id=number, data=b"" if "is_remote_frame" in flags else data, timestamp=t, channel=channel,
+        **{flag: flag in flags for flag in FLAGS}),
+    st.one_of(st.integers(0, 0x7FF), st.integers(0, 2**29), st.sampled_from([0, 0x7F, 0x80, 0xFF, 0x100, 0x7FF])),
+    st.one_of(st.binary(max_size=8), st.sampled_from(FD_LENGTHS).flatmap(lambda n: st.binary(min_size=n, max_size=n)),
+              st.binary(max_size=66)),
+    st.one_of(st.just(set()), st.sampled_from(FLAGS).map(lambda flag: {flag}), st.sets(st.sampled_from(FLAGS))),
+    st.one_of(st.floats(0, 2e9), st.integers(0, 2**40)), st.sampled_from([None, "239.0.0.1", 3, "x" * 40]))
+
+
+class TestDatagrams:
+    @settings(max_examples=100, deadline=None)
+    @given(messages)
+    def test_reads_what_python_can_packs(self, message: can.Message) -> None:
+        data = pack_message(message)
+        try:
+            expected = read_by_python_can(data)
+        except ValueError:  # its flags or its length contradict each other
+            expected = (-1,)
+        assert read_compiled(data) == expected
+        swapped = dict(sorted(msgpack.unpackb(data).items()))
+        assert read_compiled(msgpack.packb(swapped)) == (-1,)
+
+    @given(st.integers(0, IDENTIFIER), st.binary(max_size=64), st.sets(st.sampled_from(range(3))))
+    def test_packs_as_python_can_does(self, number: int, data: bytes, kinds: set[int]) -> None:
+        flags = sum((EXTENDED, FD, SWITCHED)[kind] for kind in kinds)
+        if not flags & FD:
+            flags, data = flags & EXTENDED, data[:8]
+        cob_id = flags | number & (IDENTIFIER if flags & EXTENDED else 0x7FF)
+        CLOSED_PORT.octets[PAYLOAD_OUT: PAYLOAD_OUT + len(data)] = np.frombuffer(data, np.uint8)
+        place, size = function("encode_datagram")(CLOSED_PORT, cob_id, len(data))
+        message = unpack_message(bytes(CLOSED_PORT.octets[place: place + size]), check=True)
+        assert message.equals(make_message(cob_id, data))
+
+    @settings(max_examples=150, deadline=None)
+    @given(messages, st.integers(0, 400), st.binary(min_size=1, max_size=9), st.sampled_from(["cut", "bad", "more"]))
+    def test_damaged_bytes_never_give_a_frame_that_python_can_does_not_see(
+            self, message: can.Message, place: int, bad: bytes, way: str) -> None:
+        data = pack_message(message)
+        place %= len(data)
+        data = {"cut": data[:place], "bad": data[:place] + bad + data[place + len(bad):], "more": data + bad}[way]
+        seen = read_compiled(data)
+        assert way == "bad" or seen == (-1,)
+        if seen[0] >= 0:  # a text that is not UTF-8 does not matter to it
+            fields = {key.decode(errors="replace"): value for key, value in msgpack.unpackb(data, raw=True).items()}
+            bits = fields.get("data") or b""
+            cob_id = fields["arbitration_id"]
+            cob_id |= EXTENDED if fields.get("is_extended_id", True) else 0
+            cob_id |= FD if fields.get("is_fd") else 0
+            assert seen == (cob_id, len(bits), payload(bits[:8]), bits)
+            assert fields["dlc"] == len(bits)
+            assert not (fields.get("is_remote_frame") or fields.get("is_error_frame"))
+
+
+@pytest.mark.parametrize("bus_kind", ["udp_multicast"], indirect=True)
+def test_everybody_hears_all_frames_in_one_order(where: str) -> None:
+    receive, send = function("receive_frame"), function("send_frame")
+    with ExitStack() as stack:
+        receivers = [stack.enter_context(RawBus(where)) for _ in range(3)]
+        senders = [stack.enter_context(RawBus(where, ())) for _ in range(4)]
+
+        def work(number: int) -> None:
+            for k in range(300):
+                assert send(senders[number].port, 0x100 + number, 8, k) == SENT
+
+        threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        heard = [[receive(bus.port, soon())[2:] for _ in range(1200)] for bus in receivers]
+        assert heard[0] == heard[1] == heard[2]
+        assert {frame[0] for frame in heard[0]} == {0x100, 0x101, 0x102, 0x103}
+
+
+def test_other_buses_are_refused() -> None:
+    for where in ("embedded", "virtual:x", "slcan:x"):
+        assert not can_open(where)
+        catch_refusal(RawBus, where)
+    assert can_open("udp_multicast") and can_open("socketcan:vcan0")

@@ -19,6 +19,8 @@ FRAMES = (codec.COMMAND, codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE)
 NODES = {1: "Rig", 2: "Controller", 3: "Plant"}
 SENDERS = {codec.COMMAND: 1, codec.FEEDBACK: 3, codec.VALVE_STATE: 3, codec.DRIVE: 2}
 RECEIVERS = {codec.COMMAND: {2}, codec.FEEDBACK: {1, 2}, codec.VALVE_STATE: {1}, codec.DRIVE: {1, 3}}
+
+
 class Pdo(NamedTuple):
     """One PDO of one dictionary."""
 
@@ -39,13 +41,8 @@ def pdos(node: int) -> Iterator[Pdo]:
     for base in (0x1400, 0x1800):
         for index in (index for index in od if base <= index < base + 0x200):
             words = [od[index + 0x200][sub].default for sub in range(1, od[index + 0x200][0].default + 1)]
-            objects = [(variable(od, word >> 16, word >> 8 & 0xFF), word & 0xFF) for word in words]
+            objects = [(od.get_variable(word >> 16, word >> 8 & 0xFF), word & 0xFF) for word in words]
             yield Pdo(node, od[index][1].default, base == 0x1800, od[index][2].default, objects)
-
-
-def variable(od: canopen.ObjectDictionary, index: int, sub: int) -> ODVariable:
-    item = od[index]
-    return item if isinstance(item, ODVariable) else item[sub]
 
 
 ALL_PDOS = [pdo for node in EDS for pdo in pdos(node)]

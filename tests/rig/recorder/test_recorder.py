@@ -1,23 +1,43 @@
-"""The log as others read it: the mcap library and Google's protobuf, not this project's own reader."""
+"""The log as others read it and after a kill; its layouts in the viewers; conversion from and to other files."""
 
+import json
+import re
 import shutil
 import struct
+import subprocess
 import time
 from dataclasses import fields
 from itertools import islice
 from pathlib import Path
 from typing import Any, get_type_hints
+from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
+from places import ROOT
+from refusals import catch_refusal
+from rig_command import refuse, rig
 from synthetic_run import ATTACHMENTS, METADATA, build_cycles, record_run
 
 from fdi.trace.mcap_log import open_log
+from fdi.trace.trace import Trace
 from plant.errors import InputError
-from rig.network.frame import Frame
+from rig.benches.bench import EXTENDED, FD, SWITCHED
+from rig.benches.bench_file import load_bench
+from rig.network.frame import FD_LENGTHS, Frame, make_message
 from rig.recorder import U32, CanFrame, Event, NmtState, Recorder, RecorderError
+from rig.recorder.convert import (
+    RAW_SUFFIXES,
+    export_trace,
+    import_csv,
+    import_frames,
+    list_can_messages,
+    read_raw_frames,
+)
+from rig.recorder.recover import recover_log
 from rig.recorder.schema import TOPICS, encode_schema, make_packer
 
 VALUES: dict[Any, st.SearchStrategy[Any]] = {
@@ -27,7 +47,7 @@ VALUES: dict[Any, st.SearchStrategy[Any]] = {
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record_run(tmp_path_factory.mktemp("log") / "trace.mcap", stop=1000)
+    return record_run(tmp_path_factory.mktemp("log") / "trace.mcap", stop=1300)
 
 
 @pytest.mark.parametrize("kind", TOPICS.values(), ids=lambda kind: kind.__name__)
@@ -44,7 +64,6 @@ def test_packed_record_is_what_protobuf_reads(kind: type, data: st.DataObject) -
     assert (opcode, length, log_time, publish_time) == (5, len(raw) - 9, t_ns, t_ns)
     schema = Schema(1, encode_schema(kind), "protobuf", f"eha.{kind.__name__}")
     decode = DecoderFactory().decoder_for("protobuf", schema)
-    assert decode is not None
     message = decode(raw[31:])
     for name, value in values.items():
         assert getattr(message, name) == value or value != value
@@ -54,7 +73,6 @@ def test_library_reads_a_complete_log(log: Path) -> None:
     with log.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
-        assert summary is not None and summary.statistics is not None
         rows = [(c.topic, m.log_time, d) for _, c, m, d in reader.iter_decoded_messages()]
         names = {a.name: a.data for a in reader.iter_attachments()}
         metadata = {m.name: m.metadata for m in reader.iter_metadata()}
@@ -62,18 +80,18 @@ def test_library_reads_a_complete_log(log: Path) -> None:
     assert {c.topic: c.metadata for c in summary.channels.values()}["/signals"]["unit.p12"] == "Pa"
     assert names == {name: data for name, (_, data) in ATTACHMENTS.items()}
     assert metadata == {"run": METADATA, "verdict": {"status": "ABORTED"}}
-    written = [(t, f, s) for t, f, s, _ in build_cycles() if s.cycle < 1000]
+    written = [(t, f, s) for t, f, s, _ in build_cycles() if s.cycle < 1300]
     assert [(t, d.cycle, d.xj, d.p12) for topic, t, d in rows if topic == "/signals"] == \
         [(t, s.cycle, s.xj, s.p12) for t, _, s in written]
     assert [(t, d.cob_id, d.data) for topic, t, d in rows if topic == "/can"] == \
         [tuple(f) for _, fs, _ in written for f in fs]
-    assert sum(topic == "/timing" for topic, _, _ in rows) == 1000
+    assert sum(topic == "/timing" for topic, _, _ in rows) == 1300
 
 
 def test_chunks_are_closed_in_time_behind_attachments_and_metadata(log: Path) -> None:
     with log.open("rb") as stream:
         summary = make_reader(stream).get_summary()
-    assert summary is not None and len(summary.chunk_indexes) >= 4
+    assert len(summary.chunk_indexes) >= 4
     for chunk in summary.chunk_indexes:
         assert chunk.message_end_time - chunk.message_start_time <= 250_000_000 and chunk.uncompressed_size < 100_000
     first = min(c.chunk_start_offset for c in summary.chunk_indexes)
@@ -151,5 +169,242 @@ def test_a_start_that_is_no_date_is_refused(tmp_path: Path, text: str) -> None:
     recorder = Recorder(tmp_path / "x.mcap", {}, {})
     recorder.metadata("clock", {"epoch_ns": text})
     recorder.close()
-    with pytest.raises(InputError, match=r"clock\.epoch_ns"):
-        open_log(tmp_path / "x.mcap")
+    assert "clock.epoch_ns" in catch_refusal(open_log, tmp_path / "x.mcap")
+
+
+def test_every_cut_gives_a_readable_log_or_a_clear_refusal(log: Path, tmp_path: Path) -> None:
+    data = log.read_bytes()
+    kept = []
+    for cut in range(0, len(data), 9001):
+        path, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
+        path.write_bytes(data[:cut])
+        try:
+            kept.append(recover_log(path, out).messages)
+        except InputError as error:
+            assert cut < 200 and "MCAP log" in str(error)
+            continue
+        with out.open("rb") as stream:
+            assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == kept[-1]
+    assert kept == sorted(kept) and kept[-1] > 0
+
+
+def test_damage_in_the_middle_costs_one_chunk(log: Path, tmp_path: Path) -> None:
+    with log.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    chunk = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)[2]
+    data = bytearray(log.read_bytes())
+    data[chunk.chunk_start_offset + chunk.chunk_length - 100] ^= 0xFF
+    (tmp_path / "bad.mcap").write_bytes(data)
+    salvage = recover_log(tmp_path / "bad.mcap", tmp_path / "out.mcap")
+    assert not salvage.complete and "damaged chunk" in salvage.reason
+    assert salvage.lost_bytes >= chunk.chunk_length
+    trace = Trace.read(tmp_path / "out.mcap", all=True)
+    assert len(trace.gaps) == 1 and len(trace) == 1300
+    assert "chunk at byte" in catch_refusal(Trace.read, tmp_path / "bad.mcap")
+
+
+def test_a_whole_log_stays_the_same(log: Path, tmp_path: Path) -> None:
+    salvage = recover_log(log, tmp_path / "out.mcap")
+    assert salvage.complete and salvage.lost_bytes == 0
+    before, after = Trace.read(log, all=True), Trace.read(tmp_path / "out.mcap", all=True)
+    assert (before.xj == after.xj).all() and before.events == after.events and before.attachments == after.attachments
+
+
+def test_refusals(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "text.mcap").write_text("t,com,xj,cor\n")
+    for source, out, said in ((tmp_path / "text.mcap", tmp_path / "out.mcap", "MCAP log"), (log, log, "another file"),
+                              (tmp_path / "none.mcap", tmp_path / "out.mcap", "a file that can be read")):
+        assert said in catch_refusal(recover_log, source, out)
+
+
+FOLDER = ROOT / "docs" / "viewers"
+Fields = dict[str, set[str]]  # topic -> names of its fields
+SCALES = {"mm": 1e3, "mA": 1e3, "bar": 1e-5, "um": 1e6, "N": 1.0, "us": 1e6}  # of the units in titles, from SI
+
+
+@pytest.fixture(scope="module")
+def topics(preflight: Path) -> tuple[Fields, Fields]:
+    """Topic -> all fields, and those that are numbers, of the messages in the log."""
+    with (preflight / "trace.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        last = {channel.topic: message for _, channel, _, message in reader.iter_decoded_messages()}
+    kinds = {topic: {field.name: type(getattr(message, field.name)) for field in message.DESCRIPTOR.fields}
+             for topic, message in last.items()}
+    return ({topic: set(fields) for topic, fields in kinds.items()},
+            {topic: {name for name, kind in fields.items() if kind in (float, int, bool)}
+             for topic, fields in kinds.items()})
+
+
+def list_panels(layout: Any) -> list[str]:
+    """The panels of a Foxglove layout, from its tree of splits."""
+    if isinstance(layout, str):
+        return [layout]
+    assert layout["direction"] in ("row", "column") and 0 < layout["splitPercentage"] < 100
+    return list_panels(layout["first"]) + list_panels(layout["second"])
+
+
+def test_foxglove_paths_are_in_the_log(topics: tuple[Fields, Fields]) -> None:
+    layout = json.loads((FOLDER / "eha.foxglove.json").read_text())
+    panels = list_panels(layout["layout"])
+    assert len(panels) == len(set(panels)) and set(panels) == set(layout["configById"])
+    every, numbers = topics
+    shown = set()
+    for name, panel in layout["configById"].items():
+        if "topicPath" in panel:
+            assert panel["topicPath"] in every
+            shown.add(panel["topicPath"])
+        for path in panel.get("paths", []):
+            found = re.fullmatch(r"(/\w+)(?:\{(\w+)==\d+\})?\.(\w+)(?:\.@mul\(([\d.]+)\))?", path["value"])
+            assert found, path["value"]
+            topic, chosen, field, factor = found.groups()
+            assert field in every[topic] and (chosen is None or chosen in numbers[topic])
+            shown.add(topic)
+            if name.startswith("Plot!"):
+                unit = re.search(r"\[(.*)\]", panel["foxglovePanelTitle"])
+                assert field in numbers[topic] and unit and float(factor or 1.0) == SCALES[unit[1]]
+    assert shown == set(every) - {"/can"}
+
+
+def test_plotjuggler_curves_are_in_the_log(topics: tuple[Fields, Fields]) -> None:
+    root = ElementTree.parse(FOLDER / "eha.plotjuggler.xml").getroot()
+    curves = [(area.attrib["name"], curve) for area in root.iter("DockArea") for curve in area.iter("curve")]
+    assert len(curves) > 10
+    for title, curve in curves:
+        topic, field = curve.attrib["name"][1:].split("/")
+        options, unit = curve.find("transform[@name='Scale/Offset']/options"), re.search(r"\[(.*)\]", title)
+        scale = 1.0 if options is None else float(options.attrib["value_scale"])
+        assert field in topics[1][f"/{topic}"] and scale == (SCALES[unit[1]] if unit else 1.0), title
+    for splitter in root.iter("DockSplitter"):
+        assert len(splitter) == int(splitter.attrib["count"]) == len(splitter.attrib["sizes"].split(";"))
+
+
+def test_every_signal_is_in_both_layouts() -> None:
+    for file in ("eha.foxglove.json", "eha.plotjuggler.xml"):
+        shown = set(re.findall(r"/signals[./](\w+)\b", (FOLDER / file).read_text()))
+        assert {"com", "xj", "cor", "p12", "xs", "load"} <= shown
+
+
+def test_the_page_names_the_topics_and_fields(topics: tuple[Fields, Fields]) -> None:
+    page = (ROOT / "docs" / "viewers.md").read_text()
+    rows = {topic: set(re.findall(r"`(\w+)`", text)) for topic, text in
+            re.findall(r"^\| `(/\w+)` \|[^|]*\|(.*)\|$", page, re.MULTILINE)}
+    assert rows.pop("/checks") < topics[0]["/checks"]
+    assert rows == {topic: fields for topic, fields in topics[0].items() if topic != "/checks"}
+
+
+@pytest.mark.parametrize("suffix", RAW_SUFFIXES)
+def test_raw_frames_there_and_back(log: Path, tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"x{suffix}"
+    assert export_trace(log, out) == 6500
+    bench = load_bench()
+    assert import_frames(out, tmp_path / "back.mcap", bench) == 1300
+    before, after = list(read_raw_frames(log)), list(read_raw_frames(tmp_path / "back.mcap"))
+    assert [f[1:] for f in before] == [f[1:] for f in after]
+    worst = max(abs(a.t_ns - b.t_ns) for a, b in zip(before, after, strict=True))
+    assert worst <= 100_000  # .trc counts 0.1 ms
+    want, got = Trace.read(log, all=True), Trace.read(tmp_path / "back.mcap")
+    for name, resolution in {"com": 1e-7, "xj": 1e-7, "cor": 1e-8, "p12": 10.0, "xs": 1e-9}.items():
+        np.testing.assert_allclose(got.column(name), want.column(name), atol=0.51 * resolution)
+    assert np.isnan(got.load).all() and not got.gaps
+    assert {*bench.files} <= got.attachments.keys()
+    assert got.provenance["imported"] == out.name
+
+
+@pytest.mark.parametrize("suffix", RAW_SUFFIXES)
+def test_every_kind_of_frame_there_and_back(tmp_path: Path, suffix: str) -> None:
+    """Classical and CAN FD, of 11 and of 29 bits, also with the same number: as python-can reads and writes them."""
+    kinds = [0, EXTENDED] if suffix == ".trc" else [0, EXTENDED, FD, EXTENDED | FD]
+    kinds += [kind | SWITCHED for kind in kinds if kind & FD]
+    frames = [Frame(0, 0x080, b"")]
+    for kind in kinds:
+        for number in (0, 0x080, 0x7FF, 0x1FFFFFFF if kind & EXTENDED else 0x123):
+            for length in (0, 3, 8, *(FD_LENGTHS if kind & FD else ())):
+                frames.append(Frame(len(frames) * 1_000_000, kind | number, bytes(range(0xF0 - length, 0xF0))))
+    recorder = Recorder(tmp_path / "x.mcap", {}, {})
+    for frame in frames:
+        recorder.frame(frame)
+    recorder.close()
+    assert list(read_raw_frames(tmp_path / "x.mcap")) == frames
+    out = tmp_path / f"x{suffix}"
+    assert export_trace(tmp_path / "x.mcap", out) == len(frames)
+    heard = list(list_can_messages(out))
+    for frame, (_, message) in zip(frames, heard, strict=True):
+        if not message.is_fd or frame.data:
+            assert message.equals(make_message(*frame[1:]), timestamp_delta=None, check_channel=False)
+    import_frames(out, tmp_path / "back.mcap", load_bench())
+    assert [frame[1:] for frame in read_raw_frames(tmp_path / "back.mcap")] == [frame[1:] for frame in frames]
+
+
+def test_fd_frames_do_not_go_into_a_trc(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "x.mcap", {}, {})
+    recorder.frame(Frame(0, FD | 0x80, bytes(64)))
+    recorder.close()
+    assert "x.trc: --out: expected a name that ends in .log, .blf or .asc" in catch_refusal(
+        export_trace, tmp_path / "x.mcap", tmp_path / "x.trc")
+    assert not (tmp_path / "x.trc").exists()
+
+
+def test_wireshark_decodes_the_export(log: Path, tmp_path: Path) -> None:
+    if not shutil.which("tshark"):
+        pytest.skip("no tshark on this machine (Debian: apt-get install tshark)")
+    export_trace(log, tmp_path / "x.blf")
+    words = ["tshark", "-r", str(tmp_path / "x.blf"), "-d", "can.subdissector,canopen", "-T", "fields", "-e", "can.id",
+             "-e", "_ws.malformed"]
+    lines = subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert len(lines) == 6500 and {line.strip() for line in lines} == {"128", "386", "387", "514", "643"}
+
+
+# In cycle 2 no drive frame comes, in cycle 3 the late one of cycle 2; cycles 4 and 5 are missing.
+CANDUMP = """\
+(1700000000.000000) can0 202#102700000700feff
+(1700000000.000100) can0 080#
+(1700000000.000200) can0 183#2027000000010000
+(1700000000.000300) can0 182#E80300000F00feff
+(1700000000.001000) can0 202#102700000700ffff
+(1700000000.001100) can0 080#
+(1700000000.001200) can0 183#2027000000010000
+(1700000000.001300) can0 182#E80300000F00ffff
+(1700000000.002000) can0 202#1027000007000000
+(1700000000.002100) can0 080#
+(1700000000.002200) can0 183#2027000000010000
+(1700000000.003000) can0 202#1027000007000100
+(1700000000.003100) can0 080#
+(1700000000.003200) can0 183#2027000000010000
+(1700000000.003300) can0 182#E80300000F000000
+(1700000000.006000) can0 202#1027000007000400
+(1700000000.006100) can0 080#
+(1700000000.006200) can0 183#2027000000010000
+(1700000000.006300) can0 182#E80300000F000400
+(1700000000.010000) can0 702#7F
+(1700000000.011000) can0 083#5082010000000000
+(1700000000.012000) can0 202#1027
+"""
+
+
+def test_lost_and_late_frames_of_a_candump(tmp_path: Path) -> None:
+    (tmp_path / "x.log").write_text(CANDUMP)
+    assert import_frames(tmp_path / "x.log", tmp_path / "x.mcap", load_bench()) == 5
+    trace = Trace.read(tmp_path / "x.mcap")
+    assert len(trace) == 7 and [g.cycles for g in trace.gaps] == [2]
+    np.testing.assert_allclose(trace.cor, [1e-5, 1e-5, 1e-5, np.nan, np.nan, np.nan, 1e-5])
+    np.testing.assert_allclose(trace.com, [1e-3, 1e-3, 1e-3, 1e-3, np.nan, np.nan, 1e-3])
+    assert [(n.node, n.name) for n in trace.nmt] == [(2, "pre-operational")]
+    assert [(e.kind, e.text[:14]) for e in trace.events] == [("emcy", "node 3: 0x8250"), ("frame", "0x202: 2 bytes")]
+
+
+def test_csv_becomes_a_log(log: Path, tmp_path: Path) -> None:
+    export_trace(log, tmp_path / "x.csv.gz")
+    assert import_csv(tmp_path / "x.csv.gz", tmp_path / "y.mcap") == 1000
+    before, after = Trace.read(log), Trace.read(tmp_path / "y.mcap")
+    np.testing.assert_array_equal(before.xj, after.xj)
+    np.testing.assert_array_equal(before.t, after.t)
+
+
+def test_commands(log: Path, tmp_path: Path) -> None:
+    assert rig("export", log, "--out", tmp_path / "x.csv", "--json").json["count"] == 1000
+    assert rig("export", log, "--all", "--force", "--out", tmp_path / "x.csv", "--json").json["count"] == 1300
+    assert rig("import", tmp_path / "x.csv", "--json").json == {"trace": str(tmp_path / "x.mcap"), "cycles": 1300}
+    assert "at least one raw frame" in refuse("export", tmp_path / "x.mcap", "--out", tmp_path / "x.blf")
+    (tmp_path / "cut.mcap").write_bytes(log.read_bytes()[:-2000])
+    answer = rig("recover", tmp_path / "cut.mcap", "--json").json
+    assert answer["path"] == str(tmp_path / "cut.recovered.mcap") and not answer["complete"]

@@ -18,9 +18,8 @@ from pathlib import Path
 import codec
 import numpy as np
 import pytest
-from bus_stations import spec
+from bus_stations import spec, stand_nodes, wait_for_node
 from rig_command import SHORT, SLOW_START, finished, gone, job, nodes_on, play, rig, started
-from standing_nodes import stand_nodes, wait_for_node
 from vcan_host import kernel_has_vcan0
 
 from fdi.report.run_report import build_run_report

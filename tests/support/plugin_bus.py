@@ -1,21 +1,18 @@
-"""Pytest plugin: says how many tests ran on which bus; leaves the socketcan ones to the guest where there is one.
+"""Pytest plugin: leaves the tests on socketcan to the guest where there is one.
 
 A test belongs to a bus when its parameters name one (the `bus_kind` fixture). On a kernel without vcan0, but with the
 User-Mode-Linux guest at hand, the socketcan tests are taken out here and run once, all together, inside the guest by
-vcan/test_vcan_guest.py; it records their number as the property `GUEST_TESTS`. A property travels from the worker that
-ran the test to the session that prints the summary.
+vcan/test_vcan_guest.py.
 """
 
 import os
-from collections import Counter
 
 import pytest
-from vcan_host import APT_LINE, guest_missing, kernel_has_vcan0
+from vcan_host import guest_missing, kernel_has_vcan0
 
 from rig.network.bus import explain_socketcan_problem
 
 BUSES = ("embedded", "virtual", "udp_multicast", "socketcan")
-GUEST_TESTS = "socketcan tests passed in the guest"  # property of a test: their number
 LEFT_TO_GUEST = pytest.StashKey[int]()  # socketcan tests taken out of this session
 RUNNER = "tests/vcan/test_vcan_guest.py"
 
@@ -50,18 +47,3 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left:
         config.hook.pytest_deselected(items=left)
         items[:] = [item for item in items if bus_of(item.nodeid) != "socketcan"]
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """The tests passed per bus, and what it takes where none ran on a real CAN interface."""
-    passed = terminalreporter.stats.get("passed", [])
-    properties = [(name, value) for report in passed for name, value in report.user_properties]
-    counts = Counter(bus for report in passed if (bus := bus_of(report.nodeid)))
-    in_guest = sum(value for name, value in properties if name == GUEST_TESTS)
-    if not counts and not in_guest:
-        return
-    words = [f"{bus} {counts[bus]}" for bus in BUSES[:-1]]
-    words.append(f"socketcan {in_guest} (in the guest)" if in_guest else f"socketcan {counts['socketcan']}")
-    terminalreporter.write_line("tests per bus: " + ", ".join(words))
-    if not in_guest and not counts["socketcan"] and guest_missing():
-        terminalreporter.write_line(f"no test ran on a real CAN interface; to get one on this machine: {APT_LINE}")

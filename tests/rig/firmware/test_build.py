@@ -1,6 +1,8 @@
-"""The datagrams of the C firmware's UDP port are python-can's: read what it packs, pack what it reads."""
+"""Parts of the stack in C: the object table of an EDS, devices of a user's own, datagrams as python-can has them."""
 
 import ctypes
+import shutil
+from pathlib import Path
 from typing import Any
 
 import can
@@ -8,6 +10,48 @@ import pytest
 from c_device import CFrame, load_datagrams, skip_without_compiler
 from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 from hypothesis import given, strategies as st
+from places import ROOT
+from refusals import catch_refusal
+
+from rig.firmware.build import build_device
+from rig.firmware.object_table import FOLDER, write_object_table
+
+DRIVE = ROOT / "examples" / "cia402_drive"
+
+
+def test_a_device_is_built_once_and_again_when_its_data_sheet_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    skip_without_compiler()
+    monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / "cache"))
+    folder = tmp_path / "drive"
+    shutil.copytree(DRIVE, folder)
+    first = build_device(folder)
+    assert build_device(folder) == first and first.name.startswith("drive-")
+    eds = folder / "drive.eds"
+    eds.write_text(eds.read_text().replace("DefaultValue=3.8", "DefaultValue=3.9"))
+    assert build_device(folder) != first
+
+
+def test_a_folder_without_sources_is_refused(tmp_path: Path) -> None:
+    assert "a folder with the C files of a device" in catch_refusal(build_device, tmp_path)
+
+
+def test_values_that_depend_on_the_node_number_are_marked() -> None:
+    source = write_object_table(DRIVE / "drive.eds")["object_table.c"]
+    assert "{0x1801, 0x01, KIND_UNSIGNED, 4, READABLE | WRITABLE | NODE_RELATIVE, 0x280u, 0, 0, NULL, 0}" in source
+    assert "{0x6078, 0x00, KIND_SIGNED, 2, READABLE | MAPPABLE, 0x0u, 0, 0, NULL, 0}" in source
+    assert "{0x2002, 0x01, KIND_REAL, 4, READABLE | WRITABLE, 0x40733333u, 0, 0, NULL, 0}" in source
+
+
+def test_object_table_is_that_of_the_eds() -> None:
+    """After a change of dbc/node2.eds: python -m rig.firmware.object_table."""
+    table = write_object_table()
+    assert {name: (FOLDER / name).read_text() for name in table} == table
+    assert "OBJECT_2110_05," in table["object_table.h"]
+    assert "{0x2110, 0x01, KIND_REAL, 8, READABLE | WRITABLE, 0x400E666666666666ull, 0, 0, NULL, 0}" in (
+        table["object_table.c"])  # 3.8
+
 
 EXTENDED = 1 << 31  # in an identifier: it has 29 bits
 
