@@ -426,10 +426,12 @@ class Bench:
 
         A demand in floating point has no such count.
         """
-        word = self.signals.command.word
-        counts = [float(abs(each.count)) for spec in self.frames.frames for each in spec.fields
-                  if each.name == word and each.kind is not Kind.FLOAT]
-        return max(self.noise or 2e-6, 0.2 * max(counts, default=0.0))
+        return max(self.noise or 2e-6, 0.2 * self.find_count(self.signals.command.word))
+
+    def find_count(self, word: str) -> float:
+        """What one count of a signal is worth in its frames, SI; 0 in floating point, and where no frame has it."""
+        return max((float(abs(each.count)) for spec in self.frames.frames for each in spec.fields
+                    if each.name == word and each.kind is not Kind.FLOAT), default=0.0)
 
     def replace_signals(self, signals: Signals, noise: float, model: str) -> Self:
         """The bench with the plant of another model: its signals, and the noise of the controlled one's sensor.

@@ -12,7 +12,7 @@ from plant.errors import require
 from plant.model import Model, find_effect, load_model
 from plant.plants import find_plant
 from rig.cli.answer import choose_file
-from rig.cli.inputs import load_chosen_effects, parse_changes
+from rig.cli.inputs import change_model, load_chosen_effects
 
 
 def load_known_model(args: argparse.Namespace) -> tuple[Model, Provenance]:
@@ -25,7 +25,7 @@ def load_known_model(args: argparse.Namespace) -> tuple[Model, Provenance]:
     is_file = args.model and Path(args.model).suffix != ".py" and Path(args.model).is_file()
     model, known = load_model_file(Path(args.model)) if is_file else (load_model(args.model or "eha"), Provenance())
     files = tuple(dict.fromkeys([*known.effect_files, *map(str, args.effects)]))
-    return model.replace(parse_changes(args.set)), replace(known, effect_files=files)
+    return change_model(model, args), replace(known, effect_files=files)
 
 
 def split_words(words: Sequence[str], plant: str, trace: str | None = None) -> tuple[list[str], str | None]:

@@ -50,20 +50,43 @@ def load_chosen_effects(args: argparse.Namespace) -> None:
     foreign_code.require_different_names((*args.effects, *brought))
 
 
+def find_log(args: argparse.Namespace) -> Path | None:
+    """The first log among the arguments."""
+    given = [getattr(args, "trace", None), *(getattr(args, name, None) or [] for name in ("traces", "words"))]
+    names = [name for each in given if each for name in ([each] if isinstance(each, str | Path) else each)]
+    return next((path for path in map(Path, names) if path.suffix == ".mcap" or (path / "trace.mcap").is_file()), None)
+
+
 def find_recorded_plant(args: argparse.Namespace) -> str | None:
     """The plant that the first log among the arguments was recorded on; None for `eha`, and where there is no log.
 
     Raises:
         InputError: the log brings a plant along that --trust does not allow.
     """
-    given = [getattr(args, "trace", None), *(getattr(args, name, None) or [] for name in ("traces", "words"))]
-    names = [name for each in given if each for name in ([each] if isinstance(each, str | Path) else each)]
-    log = next((path for path in map(Path, names) if path.suffix == ".mcap" or (path / "trace.mcap").is_file()), None)
+    log = find_log(args)
     if log is None:
         return None
     from rig.run.job import load_plant_of_log  # here: commands without a log need none of it
 
     return load_plant_of_log(log, is_trusted=args.trust) or None
+
+
+def change_model(model: Model, args: argparse.Namespace) -> Model:
+    """The model with the changes of --set, and with the steps in which the frames of a logged run carry the position.
+
+    The steps come from the bench and are no effect that the model lacks; --set gets them for the commands to type next.
+
+    Raises:
+        InputError: a change that is not possible.
+    """
+    log, offered = find_log(args), {effect.name for effect in model.kind.list_effects()}
+    if log is not None and "quantisation" in offered - {*model.effects}:
+        from rig.run.job import read_resolution
+
+        resolution = read_resolution(log)
+        if resolution > 0.5 * model.nominal.get(model.kind.signals.controlled.noise, 0.0):
+            args.set = [f"quantisation.lsb={resolution:g}", *args.set]
+    return model.replace(parse_changes(args.set))
 
 
 def load_chosen_model(args: argparse.Namespace) -> Model:
@@ -73,7 +96,7 @@ def load_chosen_model(args: argparse.Namespace) -> Model:
         InputError: a file, name or value that is invalid, or a model file with code that --trust does not allow.
     """
     load_chosen_effects(args)
-    return load_model(args.model or "eha").replace(parse_changes(args.set))
+    return change_model(load_model(args.model or "eha"), args)
 
 
 def load_declared_model(args: argparse.Namespace) -> Model:

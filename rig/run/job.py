@@ -205,6 +205,15 @@ def load_plant_of_log(path: Path, *, is_trusted: bool = False, announce: Announc
     return _load_stored_plant(codes, named)
 
 
+def read_resolution(path: Path) -> float:
+    """What one count of the controlled signal was worth in the frames of a logged run, SI; 0 if it is not known."""
+    try:
+        log = open_log(path / "trace.mcap" if path.is_dir() else path)
+        return float(log.metadata.get("run", {}).get("resolution", 0.0))
+    except (InputError, ValueError):  # whoever reads it as a trace says what is wrong
+        return 0.0
+
+
 def _load_stored_plant(codes: list[ForeignCode], named: str, *, keeps_name: bool = False) -> str:
     """Load the plant that a log calls so, from the files in it; what models call it from now on.
 

@@ -340,8 +340,10 @@ class Session:
         self.journal.drop_unplayed()
 
     def _choose_cleanup(self) -> Profile:
-        """The clean-up of the sequence; a tenth of a second without current if a node does not answer or came late."""
-        if self.nodes.look_again() or self.safety.is_cut_short:
+        """The clean-up of the sequence; a tenth of a second without current if a node does not answer or came late, or
+        where nothing was played that the log could show.
+        """
+        if self.nodes.look_again() or self.safety.is_cut_short or not self.stage.playing.queued:
             self._powered = self._may_power = False
             rate = self.job.bench.rate
             return build_profile((Hold(time=max(1, round(0.1 * rate)) / rate),), self._demand, rate)

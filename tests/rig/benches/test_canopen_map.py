@@ -137,6 +137,13 @@ def test_values_of_a_dcf_win_and_are_written_in_the_order_in_which_a_device_take
     assert bench.frames.frames[0].identifier == 0x405 and bench.nodes[Role.CONTROLLER].values == values
 
 
+def test_a_pdo_whose_mapping_alone_a_dcf_gives_is_switched_off_as_well() -> None:
+    sheet = format_eds({}, RPDOS).replace("[1600sub0]\n", "[1600sub0]\nParameterValue=1\n")
+    values = list_values(read_dictionary("x.dcf", sheet, NODE))
+    assert [(index, sub, int.from_bytes(data, "little")) for index, sub, data in values] == [
+        (0x1400, 1, 0x8000_0205), (0x1600, 0, 1), (0x1400, 1, 0x205)]
+
+
 def test_a_value_in_an_eds_is_not_written() -> None:
     sheet = format_eds({"2000": Entry(5, value="7")})
     assert list_values(read_dictionary("x.eds", sheet, NODE)) == ()
