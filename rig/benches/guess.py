@@ -37,13 +37,12 @@ for _signal in EHA[1:]:  # its name in a recording says both
     if _signal.role in ("output", "drive"):
         for _words in _WORDS[_signal.alias]:
             _words.add(_signal.name)
-_DEMAND = _WORDS["position_demand"][1]
 _WORDS_OF_PROFILES = ("control_word", "status_word", "mode", "mode_display")
 _USUAL = {"m": "1 um", "Pa": "1 kPa", "N": "1 N", "A": "1 uA"}  # counts, where the file says nothing
 _KNOWN_OBJECTS = {"0x607A": "command", "0x6078": "A", "0x6077": "N m"}  # CiA 402: role, or unit of the drive
 _RATED_CURRENT = 0x6075  # mA; 0x6078 counts thousandths of it
-_ENABLING = {"enable", "enabled", "active", "activate", "engage", "engaged", "request", "run", "on", "operational",
-             "ready"}
+_ENABLING = {"en", "enable", "enabled", "active", "activate", "engage", "engaged", "request", "run", "on",
+             "operational", "ready"}
 
 
 @dataclass(frozen=True)
@@ -79,8 +78,14 @@ class Wanted(NamedTuple):
         said = next(s for s in self.signals if s.word == word)
         own = {word.replace("_", "").lower(), said.symbol.lower()}
         parts = {part for part in word.lower().split("_") if len(part) > 1}
-        return parts | own, own | ({word.lower().split("_")[-1]} if len(parts) > 1 else set()) | (
-            _DEMAND if said == self.signals.command else set())
+        like = {self.signals.command.word: "position_demand", self.signals.controlled.word: "ram_position",
+                self.signals.drive.word: "current" if said.unit == "A" else ""}.get(word, "")
+        quantity, which = _WORDS.get(like, (set[str](), set[str]()))  # of the signal of the EHA with this role
+        if said == self.signals.command:
+            quantity = {part for part in self.signals.controlled.word.lower().split("_") if len(part) > 1}
+        elif said == self.signals.controlled:
+            quantity = set()
+        return parts | own | quantity, own | which | ({word.lower().split("_")[-1]} if len(parts) > 1 else set())
 
     def is_known_object(self, key: str, word: str) -> bool:
         """Whether an object of CiA 402 holds that signal."""
@@ -176,7 +181,7 @@ def _write_states(messages: Sequence[Any], sent: Sequence[Any]) -> list[str]:
                 tables["protection"].append(f'{key} = "crc8_sae_j1850"  {UNSURE}which checksum it is')
             elif words & {"counter", "cnt", "alive", "rolling", "sequence"}:
                 tables["protection"].append(f'{key} = "counter"')
-            elif message in sent and words & {"state", "status", "mode"}:
+            elif message in sent and words & {"state", "status", "st", "sts", "mode"}:
                 if values:
                     tables["ready"].append(f'{key} = "{values[0]}"  {UNSURE}the state in which main begins')
             elif message not in sent and words & (_ENABLING | {"mode"} if values else _ENABLING) and signal.length <= 8:

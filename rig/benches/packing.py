@@ -21,11 +21,11 @@ from rig.benches.checksums import CHECKSUMS, USERS_CHECKSUMS, add_byte
 _SCRATCH, PAYLOAD = 0, 8
 FRAMES, VALUES_AT = 16, 17  # how many frames, and where the values begin
 FRAMES_AT = 24
-# Columns of a frame. Of the loop: how many were sent, or the last alive counter; how many came wrong; the last cycle
-# in which one was taken, -1 before
+# Columns of a frame. Of the loop: how many were sent, or the last alive counter; the last cycle in which one was taken,
+# -1 before. The first frame with an identifier counts for all of them: it is their _COUNT_OF
 (IDENTIFIER, LENGTH, EVERY, IS_MINE, IS_BEFORE_SYNC, IS_ANSWER, IS_NUMBERED, ROLES, _FIRST, _END, _SELECTOR, COUNT,
- WRONG_COUNTERS, WRONG_CHECKSUMS, LAST_CYCLE, SENT_AS) = range(16)
-FRAME_WORDS = 16
+ _COUNT_OF, LAST_CYCLE, SENT_AS) = range(15)
+FRAME_WORDS = 15
 # Roles of a frame, bits of ROLES; above them each frame has a bit of its own
 COMMAND, FEEDBACK, VALVE, DRIVE = 1, 2, 4, 8
 BITS = {"command": COMMAND, "feedback": FEEDBACK, "valve_state": VALVE, "drive": DRIVE}
@@ -72,7 +72,8 @@ def pack_frame(m: Layout, at: int, cycle: int) -> None:
     """Write the payload of the frame at `at` from the values, which become what the receiver will read."""
     words = m.words
     words[PAYLOAD:PAYLOAD + 8] = 0
-    checksum, number = -1, words[at + COUNT]
+    checksum, sent = -1, words[at + _COUNT_OF] + COUNT
+    number = words[sent]
     for field in range(words[at + _FIRST], words[at + _END], _FIELD_WORDS):
         rule = words[field + _RULE]
         if rule == _VALUE:
@@ -83,7 +84,7 @@ def pack_frame(m: Layout, at: int, cycle: int) -> None:
         elif rule == _CONSTANT:
             _write_bits(m, field, words[field + _FIXED])
         elif rule == _COUNTER:
-            number = words[at + COUNT] % words[field + _FIXED]
+            number = words[sent] % words[field + _FIXED]
             _write_bits(m, field, number)
         elif rule == _CYCLE:
             _write_bits(m, field, cycle)
@@ -91,7 +92,7 @@ def pack_frame(m: Layout, at: int, cycle: int) -> None:
             checksum = field
     if checksum >= 0:
         _write_bits(m, checksum, _compute_checksum(m, at, checksum, number))
-    words[at + COUNT] += 1
+    words[sent] += 1
 
 
 @keep_apart
@@ -107,8 +108,8 @@ def read_cycle_number(m: Layout, at: int) -> int:
 def unpack_frame(m: Layout, at: int, length: int, cycle: int) -> int:
     """Take the values of the frame at `at` from the payload: ACCEPTED, or why they are not taken.
 
-    A frame with the number of another cycle, a wrong checksum or the alive counter of the one before is not taken.
-    A counter that jumps is counted: the frames between may be lost on the bus.
+    A frame with the number of another cycle, a wrong checksum or the alive counter of the one before is not taken. One
+    whose counter jumps is: the frames between may be lost on the bus.
     """
     words = m.words
     if length != words[at + LENGTH]:
@@ -129,15 +130,12 @@ def unpack_frame(m: Layout, at: int, length: int, cycle: int) -> int:
         said = _read_bits(m, checksum)
         _write_bits(m, checksum, 0)
         if said != _compute_checksum(m, at, checksum, number):
-            words[at + WRONG_CHECKSUMS] += 1
             return WRONG_CHECKSUM
     if counter >= 0:
-        last = words[at + COUNT]
-        words[at + COUNT] = number
-        if last >= 0 and number != (last + 1) % words[counter + _FIXED]:
-            words[at + WRONG_COUNTERS] += 1
-            if number == last:
-                return REPEATED
+        last = words[at + _COUNT_OF] + COUNT
+        if number == words[last] and words[counter + _FIXED] > 1:
+            return REPEATED
+        words[last] = number
     for field in range(words[at + _FIRST], words[at + _END], _FIELD_WORDS):
         if words[field + _RULE] == _VALUE and words[field + _CHANNEL] >= 0:
             m.doubles[words[VALUES_AT] + words[field + _CHANNEL]] = _decode(m, field, _read_bits(m, field))
@@ -276,14 +274,15 @@ def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], mine: Role
     m = Layout(words, words.view(np.float64), words.view(np.float32), words.view(np.uint8))
     words[FRAMES], words[VALUES_AT], ids = len(frames), values, values + len(channels)
     places = {name: i for i, name in enumerate(channels)}
-    at, field = FRAMES_AT, width
+    at, field, firsts = FRAMES_AT, width, dict[int, int]()
     for number, each in enumerate(frames):
         is_mine = each.sender is mine
         rules = [_find_rule(one) for one in each.fields]
         words[at: at + FRAME_WORDS] = (
             each.identifier, each.length, each.every, is_mine, each.is_before_sync, each.is_answer, _CYCLE in rules,
             sum(BITS[role] for role in each.roles) | 1 << _FIRST_OWN_BIT + number, field,
-            field + _FIELD_WORDS * len(each.fields), -1, 0 if is_mine else -1, 0, 0, -1, each.sent_as)
+            field + _FIELD_WORDS * len(each.fields), -1, 0 if is_mine else -1, firsts.setdefault(each.identifier, at),
+            -1, each.sent_as)
         for one, rule in zip(each.fields, rules, strict=True):
             _fill_field(m, field, one, rule, places.get(one.name, -1))
             if one is each.selector:

@@ -203,7 +203,7 @@ class Master:
             role = self._roles[frame.cob_id - HEARTBEAT_ID]
             self.heard_ns[role] = now = self.wire.clock.now()
             self._watch.receive(Frame(now, frame.cob_id, frame.data))
-            if frame.data[0] != NmtState.INITIALISING:  # not a boot-up
+            if frame.data[0] == NmtState.OPERATIONAL:  # only then it has the period that the rig has set
                 self.hooks.on_heartbeat(role, frame.t_ns if self._stamped else now)
         self.network.notify(frame.cob_id, bytearray(frame.data), frame.t_ns * 1e-9)
 

@@ -312,7 +312,7 @@ class EmbeddedLoop(CycleLoop):
         self.outputs.update({name: float(column[-1]) for name, column in values.items()})
         self._step = CycleInput(phase, float(b.inputs[played - 1, 0]), float(b.inputs[played - 1, 1]), control)
         self._open = int(block.t_ns[-1]), *block.make_row(-1)
-        self._sent[self._frames[0]] += played
+        self._sent[self._frames[0].identifier] += played
         self._begun += played
         self._played += played
         for answer in self._answers.values():

@@ -8,6 +8,7 @@ firing a burst. Either way the plant moves one period a SYNC, so a run that was 
 
 from abc import ABC, abstractmethod
 from array import array
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -205,18 +206,19 @@ class Loop(ABC):
 class _Answer:
     """A frame that comes in: what it says, and the last one of it."""
 
-    def __init__(self, spec: FrameSpec) -> None:
-        self.spec, self.roles = spec, set(spec.roles)
+    def __init__(self, spec: FrameSpec, counters: dict[int, int]) -> None:
+        """`counters`: the last alive counter of each identifier."""
+        self.spec, self.roles, self._counters = spec, set(spec.roles), counters
         self.cycle_mask = max(((1 << each.length) - 1 for each in spec.fields if each.name == "cycle"), default=0)
         self.is_guarded = any(each.guard for each in spec.fields)
         self.last = -1  # the cycle in which it came
-        self.counter = -1  # its last alive counter
 
     def is_sound(self, data: bytes) -> bool:
         """Whether its alive counter and checksum let it be taken."""
         if not self.is_guarded:
             return True
-        problem, self.counter = check_guards(self.spec, data, self.counter)
+        identifier = self.spec.identifier
+        problem, self._counters[identifier] = check_guards(self.spec, data, self._counters.get(identifier, -1))
         return problem in ("", "jump")
 
 
@@ -243,8 +245,10 @@ class CycleLoop(Loop):
         self._link = None if realtime or not isinstance(master.wire, LinkWire) else master.wire  # lockstep of programs
         self._faults, self._log, self._period, self._realtime = faults, log, bench.cycle_ns, realtime
         self._values, self._bench = CyclicValues(bench), bench
-        self._sent = dict.fromkeys(bench.frames.list_from(Role.RIG), 0)
-        self._answers = {each: _Answer(each) for each in bench.frames.frames if each.sender is not Role.RIG}
+        self._own = bench.frames.list_from(Role.RIG)
+        self._sent = Counter[int]()  # by identifier: the pages of a multiplexed message have one alive counter
+        counters: dict[int, int] = {}
+        self._answers = {each: _Answer(each, counters) for each in bench.frames.frames if each.sender is not Role.RIG}
         self._plant = None if bench.has_plant_node else FaultyPlant(scenario)
         self._emulators = [node for node in getattr(self._wire, "nodes", ()) if isinstance(node, Emulator)]
         self.outputs = dict.fromkeys(self._values.names, 0.0)
@@ -377,10 +381,10 @@ class CycleLoop(Loop):
 
     def _send_frames(self, *, is_before_sync: bool) -> None:
         """Send the frames of this cycle that go before SYNC, or those that follow it."""
-        for spec, sent in self._sent.items():
+        for spec in self._own:
             if spec.is_before_sync is is_before_sync and self._played % spec.every == 0:
-                data = pack(spec, {**self.outputs, "cycle": self.k}, sent)
-                self._sent[spec] += 1
+                data = pack(spec, {**self.outputs, "cycle": self.k}, self._sent[spec.identifier])
+                self._sent[spec.identifier] += 1
                 self.outputs.update(unpack(spec, data))  # what the receiver will read
                 self._late.pass_on(self._find_fault(spec), data, self._t_ns, partial(self._master.send, spec.sent_as))
 

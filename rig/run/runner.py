@@ -555,7 +555,7 @@ def open_recorder(job: Job, folder: Path, epoch_ns: int = 0, observer: Observer 
     """
     for name in ("verdict.json", "report.html"):  # of the run before
         (folder / name).unlink(missing_ok=True)
-    recorder = Recorder(folder / "trace.mcap", job.build_attachments(), 
+    recorder = Recorder(folder / "trace.mcap", job.build_attachments(),
                         collect_provenance(**job.list_settings(), resolution=job.bench.find_count(
                             job.model.kind.signals.controlled.word)), epoch_ns, observer, job.model.kind.signals)
     with contextlib.closing(recorder):

@@ -16,6 +16,7 @@ from rig.benches.packing import (
     WRONG_CHECKSUM,
     Layout,
     find_frame,
+    list_frame_places,
     make_layout,
     pack_frame,
     unpack_frame,
@@ -79,6 +80,21 @@ def test_a_multiplexed_frame_is_known_by_its_selector(compiled: tuple) -> None:
     assert layout.doubles[layout.words[VALUES_AT]:].tolist() == [10.0, 30.0]
     write_payload(layout, bytes((2, 0)))
     assert compiled[2](layout, 5) == -1
+
+
+def test_pages_of_a_message_have_one_alive_counter(compiled: tuple) -> None:
+    """Of a multiplexed message the sender counts all frames, and the receiver takes the next one of any page."""
+    pages = [FrameSpec(name=f"page {page}", identifier=5, length=2, sender=Role.RIG, fields=(
+        Field(name="selector", lowest=0, length=4, fixed=page),
+        Field(name="count", lowest=8, length=4, guard=Guard.COUNTER))) for page in (0, 1)]
+    sent, received = make_layout(pages, [], Role.RIG), make_layout(pages, [], Role.CONTROLLER)
+    for number in range(40):
+        compiled[0](sent, list_frame_places(sent)[number % 2], 0)
+        data = read_payload(sent, pages[0])
+        assert data == bytes((number % 2, number % 16))
+        write_payload(received, data)
+        at = compiled[2](received, 5)
+        assert compiled[1](received, at, 2, 0) == ACCEPTED and compiled[1](received, at, 2, 0) == REPEATED
 
 
 def test_an_answer_names_its_cycle(compiled: tuple) -> None:
