@@ -101,8 +101,9 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, 
         group: NamedTuple(group.title().replace("_", ""), list(fields.items()))
         for group, fields in groups.items()}
     is_usual = drive.name == usual.signals.drive.name
-    types["controller"] = Controller if is_usual else convert_group_unit(
-        Controller, usual.signals.drive.unit, drive.unit, inf)
+    same = usual.signals.controlled
+    law = Controller if first.unit == same.unit else convert_group_unit(Controller, same.unit, first.unit, inf)
+    types["controller"] = law if is_usual else convert_group_unit(law, usual.signals.drive.unit, drive.unit, inf)
     values |= {name: value for name, value in usual.nominal.items()
                if name == "controller.period" or (is_usual and name.startswith("controller."))}
     values["controller.period"] = period or values["controller.period"]
