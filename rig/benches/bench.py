@@ -190,7 +190,7 @@ def check_guards(spec: FrameSpec, data: bytes, last: int) -> tuple[str, int]:
     """What is wrong with checksum and alive counter of a frame, and its counter.
 
     "" for nothing, "checksum", "repeated" for the counter of the frame before, "jump" for one that is not the next.
-    `last`: the counter of the frame before, -1 for the first.
+    `last`: the counter of the frame before, -1 for the first, and behind a wrong checksum.
     """
     from rig.benches.checksums import compute_checksum
 
@@ -199,7 +199,7 @@ def check_guards(spec: FrameSpec, data: bytes, last: int) -> tuple[str, int]:
     for each in spec.fields:
         if each.guard is Guard.CHECKSUM and (
                 extract_bits(each, data) != compute_checksum(each, insert_bits(each, data, 0), max(number, 0))):
-            return "checksum", last
+            return "checksum", -1
     if counter is None or last < 0 or number == (last + 1) % counter.modulus:
         return "", number
     return "repeated" if number == last else "jump", number

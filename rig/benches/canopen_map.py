@@ -265,7 +265,10 @@ def list_values(dictionary: Any) -> tuple[tuple[int, int, bytes], ...]:
     for parameter in sorted({index & ~MAPPING for index, _ in given if RPDO <= index < TPDO + 2 * MAPPING}):
         mapping = {sub: data for (index, sub), data in given.items() if index == parameter + MAPPING}
         own = {sub: data for (index, sub), data in given.items() if index == parameter and sub}
-        cob_id = own.pop(1, _encode_cob_id(dictionary, parameter) if mapping else None)
+        default = read_number(dictionary, parameter, 1)
+        if mapping and default is not None and dictionary[parameter][1].writable:
+            own.setdefault(1, default.to_bytes(4, "little"))
+        cob_id = own.pop(1, None)
         if mapping and cob_id is not None:
             ordered.append((parameter, 1, (int.from_bytes(cob_id, "little") | INVALID).to_bytes(4, "little")))
         count = mapping.pop(0, None)
@@ -276,13 +279,6 @@ def list_values(dictionary: Any) -> tuple[tuple[int, int, bytes], ...]:
                     *((parameter, sub, data) for sub, data in own.items()),
                     *([(parameter, 1, cob_id)] if cob_id is not None else [])]
     return tuple(ordered)
-
-
-def _encode_cob_id(dictionary: Any, parameter: int) -> bytes | None:
-    """The bytes of a COB-ID that the device has after a reset, None if it cannot be written or is not known."""
-    found = find_variable(dictionary, parameter, 1)
-    default = read_number(dictionary, parameter, 1)
-    return None if found is None or not found.writable or default is None else default.to_bytes(4, "little")
 
 
 def list_variables(dictionary: Any) -> Iterator[ODVariable]:

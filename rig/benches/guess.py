@@ -76,15 +76,12 @@ class Wanted(NamedTuple):
         if word in _WORDS or word not in {s.word for s in self.signals}:
             return _WORDS.get(word, ({word}, {word}))
         said = next(s for s in self.signals if s.word == word)
-        own = {word.replace("_", "").lower(), said.symbol.lower()}
-        parts = {part for part in word.lower().split("_") if len(part) > 1}
-        like = {self.signals.command.word: "position_demand", self.signals.controlled.word: "ram_position",
+        own, controlled = {word.replace("_", "").lower(), said.symbol.lower()}, self.signals.controlled
+        whole = f"{controlled.word}_{word}" if said == self.signals.command else word
+        parts = {part for part in whole.lower().split("_") if len(part) > 1}
+        like = {self.signals.command.word: "position_demand", controlled.word: "ram_position",
                 self.signals.drive.word: "current" if said.unit == "A" else ""}.get(word, "")
-        quantity, which = _WORDS.get(like, (set[str](), set[str]()))  # of the signal of the EHA with this role
-        if said == self.signals.command:
-            quantity = {part for part in self.signals.controlled.word.lower().split("_") if len(part) > 1}
-        elif said == self.signals.controlled:
-            quantity = set()
+        quantity, which = _WORDS.get(like, (set(), set()))  # of the signal of the EHA with this role
         return parts | own | quantity, own | which | ({word.lower().split("_")[-1]} if len(parts) > 1 else set())
 
     def is_known_object(self, key: str, word: str) -> bool:

@@ -22,10 +22,11 @@ _SCRATCH, PAYLOAD = 0, 8
 FRAMES, VALUES_AT = 16, 17  # how many frames, and where the values begin
 FRAMES_AT = 24
 # Columns of a frame. Of the loop: how many were sent, or the last alive counter; the last cycle in which one was taken,
-# -1 before. The first frame with an identifier counts for all of them: it is their _COUNT_OF
+# -1 before. The first frame with an identifier counts for all of them: it is their _COUNT_OF. UNSOUND: frames with a
+# wrong checksum or alive counter
 (IDENTIFIER, LENGTH, EVERY, IS_MINE, IS_BEFORE_SYNC, IS_ANSWER, IS_NUMBERED, ROLES, _FIRST, _END, _SELECTOR, COUNT,
- _COUNT_OF, LAST_CYCLE, SENT_AS) = range(15)
-FRAME_WORDS = 15
+ _COUNT_OF, UNSOUND, LAST_CYCLE, SENT_AS) = range(16)
+FRAME_WORDS = 16
 # Roles of a frame, bits of ROLES; above them each frame has a bit of its own
 COMMAND, FEEDBACK, VALVE, DRIVE = 1, 2, 4, 8
 BITS = {"command": COMMAND, "feedback": FEEDBACK, "valve_state": VALVE, "drive": DRIVE}
@@ -126,16 +127,20 @@ def unpack_frame(m: Layout, at: int, length: int, cycle: int) -> int:
     number = 0
     if counter >= 0:
         number = _read_bits(m, counter)
+    last = words[at + _COUNT_OF] + COUNT
     if checksum >= 0:
         said = _read_bits(m, checksum)
         _write_bits(m, checksum, 0)
         if said != _compute_checksum(m, at, checksum, number):
+            words[at + UNSOUND] += 1
+            words[last] = -1
             return WRONG_CHECKSUM
     if counter >= 0:
-        last = words[at + _COUNT_OF] + COUNT
-        if number == words[last] and words[counter + _FIXED] > 1:
-            return REPEATED
-        words[last] = number
+        before, words[last] = words[last], number
+        if before >= 0 and number != (before + 1) % words[counter + _FIXED]:
+            words[at + UNSOUND] += 1
+            if number == before:
+                return REPEATED
     for field in range(words[at + _FIRST], words[at + _END], _FIELD_WORDS):
         if words[field + _RULE] == _VALUE and words[field + _CHANNEL] >= 0:
             m.doubles[words[VALUES_AT] + words[field + _CHANNEL]] = _decode(m, field, _read_bits(m, field))
@@ -282,7 +287,7 @@ def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], mine: Role
             each.identifier, each.length, each.every, is_mine, each.is_before_sync, each.is_answer, _CYCLE in rules,
             sum(BITS[role] for role in each.roles) | 1 << _FIRST_OWN_BIT + number, field,
             field + _FIELD_WORDS * len(each.fields), -1, 0 if is_mine else -1, firsts.setdefault(each.identifier, at),
-            -1, each.sent_as)
+            0, -1, each.sent_as)
         for one, rule in zip(each.fields, rules, strict=True):
             _fill_field(m, field, one, rule, places.get(one.name, -1))
             if one is each.selector:

@@ -115,6 +115,11 @@ class HardLoop(Loop):
         return int(self._words[hc.OVERRUNS])
 
     @property
+    def unsound(self) -> int:
+        """See `Loop`."""
+        return sum(int(self._layout.words[at + packing.UNSOUND]) for at in packing.list_frame_places(self._layout))
+
+    @property
     def underruns(self) -> int:
         """See `Loop`."""
         return int(self._words[hc.UNDERRUNS])

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -207,11 +208,9 @@ def load_plant_of_log(path: Path, *, is_trusted: bool = False, announce: Announc
 
 def read_resolution(path: Path) -> float:
     """What one count of the controlled signal was worth in the frames of a logged run, SI; 0 if it is not known."""
-    try:
-        log = open_log(path / "trace.mcap" if path.is_dir() else path)
-        return float(log.metadata.get("run", {}).get("resolution", 0.0))
-    except (InputError, ValueError):  # whoever reads it as a trace says what is wrong
-        return 0.0
+    with suppress(InputError, ValueError, KeyError):  # whoever reads it as a trace says what is wrong
+        return float(open_log(path / "trace.mcap" if path.is_dir() else path).metadata["run"]["resolution"])
+    return 0.0
 
 
 def _load_stored_plant(codes: list[ForeignCode], named: str, *, keeps_name: bool = False) -> str:

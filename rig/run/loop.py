@@ -165,6 +165,11 @@ class Loop(ABC):
         """Cycles for which no input was given in time; they repeat the last one."""
 
     @property
+    @abstractmethod
+    def unsound(self) -> int:
+        """Frames with a wrong checksum, or an alive counter that is not the next."""
+
+    @property
     def queued(self) -> int:
         """The cycle of the input that `cycle` takes next."""
         return self.k
@@ -206,20 +211,11 @@ class Loop(ABC):
 class _Answer:
     """A frame that comes in: what it says, and the last one of it."""
 
-    def __init__(self, spec: FrameSpec, counters: dict[int, int]) -> None:
-        """`counters`: the last alive counter of each identifier."""
-        self.spec, self.roles, self._counters = spec, set(spec.roles), counters
+    def __init__(self, spec: FrameSpec) -> None:
+        self.spec, self.roles = spec, set(spec.roles)
         self.cycle_mask = max(((1 << each.length) - 1 for each in spec.fields if each.name == "cycle"), default=0)
         self.is_guarded = any(each.guard for each in spec.fields)
         self.last = -1  # the cycle in which it came
-
-    def is_sound(self, data: bytes) -> bool:
-        """Whether its alive counter and checksum let it be taken."""
-        if not self.is_guarded:
-            return True
-        identifier = self.spec.identifier
-        problem, self._counters[identifier] = check_guards(self.spec, data, self._counters.get(identifier, -1))
-        return problem in ("", "jump")
 
 
 @dataclass(slots=True)
@@ -237,7 +233,7 @@ class CycleLoop(Loop):
     """Runs cycles one by one and passes each to `log` when it is complete. In real time it is soft: Python is in it."""
 
     kind = "soft"
-    k = overruns = underruns = 0
+    k = overruns = underruns = unsound = 0
 
     def __init__(self, master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver,
                  realtime: bool) -> None:
@@ -247,8 +243,8 @@ class CycleLoop(Loop):
         self._values, self._bench = CyclicValues(bench), bench
         self._own = bench.frames.list_from(Role.RIG)
         self._sent = Counter[int]()  # by identifier: the pages of a multiplexed message have one alive counter
-        counters: dict[int, int] = {}
-        self._answers = {each: _Answer(each, counters) for each in bench.frames.frames if each.sender is not Role.RIG}
+        self._counters: dict[int, int] = {}  # the last alive counter of each identifier
+        self._answers = {each: _Answer(each) for each in bench.frames.frames if each.sender is not Role.RIG}
         self._plant = None if bench.has_plant_node else FaultyPlant(scenario)
         self._emulators = [node for node in getattr(self._wire, "nodes", ()) if isinstance(node, Emulator)]
         self.outputs = dict.fromkeys(self._values.names, 0.0)
@@ -474,13 +470,22 @@ class CycleLoop(Loop):
         self._late.pass_on(action, frame.data, frame.t_ns if self._realtime else self._t_ns, lambda data:
                            self._take_answer(answer, data, self._wire.clock.now() if is_late else frame.t_ns))
 
+    def _is_sound(self, answer: _Answer, data: bytes) -> bool:
+        """Whether alive counter and checksum of an answer let it be taken."""
+        if not answer.is_guarded:
+            return True
+        identifier = answer.spec.identifier
+        problem, self._counters[identifier] = check_guards(answer.spec, data, self._counters.get(identifier, -1))
+        self.unsound += bool(problem)
+        return problem in ("", "jump")
+
     def _take_answer(self, answer: _Answer, data: bytes, t_ns: int) -> None:
         """Take the values of an answer: the first feedback, and of the others the last of this cycle."""
         if self._open is None or len(data) != answer.spec.length:
             return
         _, row, timing = self._open
         is_first = answer.last != self._begun - 1
-        if not (answer.cycle_mask or is_first or "drive" in answer.roles) or not answer.is_sound(data):
+        if not (answer.cycle_mask or is_first or "drive" in answer.roles) or not self._is_sound(answer, data):
             return
         values = unpack(answer.spec, data)
         if answer.cycle_mask and values["cycle"] != row.cycle & answer.cycle_mask:

@@ -40,7 +40,7 @@ from rig.run.job import Job
 from rig.run.loop import AFTER, CycleInput, History
 from rig.run.participants import NodeProcesses, find_firmware_parameters
 from rig.run.state import Journal, SafeState, Stage
-from rig.run.watch import PATIENCE, NodeWatch, OverrunWatch, ProtectionWatch
+from rig.run.watch import PATIENCE, NodeWatch, OverrunWatch
 from rig.sequences.checks import DriveFrames, Guard, GuardWatch
 from rig.sequences.protocol import Mask, ProtocolRecord, Rows
 
@@ -64,7 +64,7 @@ class CycleLog:
         self.after = History(self._signals)  # the probe after clean-up
         self._read_row = attrgetter(*self._signals.names)
         self.due_ns = array("q")  # log time of each cycle
-        self._drive, self.protection = job.bench.frames.drive, ProtectionWatch(job.bench)
+        self._drive = job.bench.frames.drive
         self._drives: list[Frame] = []
         self._keeps_drives = job.sequence.disturbs_bus
         self._words = PROFILES[job.bench.profile]
@@ -98,12 +98,9 @@ class CycleLog:
                 self._unjudged.append(signals)
         self._journal.recorder.cycles(block)
 
-    def keep_frame(self, frame: Frame) -> None:
-        """Record a frame; keep the drive frames for the checks of reactions, else look at its protection."""
+    def keep_drive(self, frame: Frame) -> None:
+        """Record a frame; keep the drive frames for the checks of reactions."""
         self._journal.recorder.frame(frame)
-        if not self._keeps_drives:
-            self.protection.add(frame)
-            return
         is_drive = frame.cob_id == self._drive.identifier and len(frame.data) == self._drive.length
         if is_drive and len(self._drives) < _MOST_DRIVES:
             self._drives.append(frame)
@@ -152,8 +149,7 @@ class Session:
         self._overruns = OverrunWatch(job.sequence.timing, job.period_ns * 1e-9,
                                       set(np.flatnonzero(injected.sync | injected.plant).tolist()))
         self.log = CycleLog(job, self.journal, self.nodes, self._overruns)
-        self._master.hooks.on_frame = (
-            self.log.keep_frame if job.sequence.disturbs_bus or self.log.protection.is_needed else recorder.frame)
+        self._master.hooks.on_frame = self.log.keep_drive if job.sequence.disturbs_bus else recorder.frame
         self._edges, self._resets = sorted(self.faults.edges), list(self.faults.resets)  # those to come
         self._injected = 0  # cycles whose frames of other nodes are sent
         self.starter = BringUp(job, self.stage, self.journal, self.safety, self._master, stop)
@@ -193,7 +189,6 @@ class Session:
                                     self.job.realtime, self.log.guarded)
         self._enablings.append((0, Enabling(self.job.bench, self.stage.loop, self.job.realtime, self._must_end)))
         self.nodes.begin()
-        self.log.protection.begin()
         self.stage.begun_ns, self.stage.is_playing = self.stage.clock.now(), True
         self._stalled_ns = self._master.wire.stalled_ns
 
@@ -400,7 +395,7 @@ class Session:
             heartbeats={NAMES[node]: times for node, times in self.nodes.heartbeats.items()},
             heard=(self.stage.begun_ns * 1e-9, self.stage.clock.now() * 1e-9),
             deaf=(self._master.wire.stalled_ns - self._stalled_ns) * 1e-9,
-            protected=self.log.protection.found,
+            unsound=self.stage.playing.unsound if not job.sequence.disturbs_bus else 0,
             deaf_cycles=self.faults.list_bus_off_cycles("rig").tolist(), heartbeat_period=HEARTBEAT * 1e-3,
             bench=job.bench,
             drive_limit=model.values.get(model.kind.signals.drive.limit, np.nan) if start.gains is None

@@ -1,16 +1,14 @@
 """The watch of the nodes of a run: emergencies, heartbeats, states, processes that end, and silence."""
 
-from collections import Counter
 from collections.abc import Collection, Container, Mapping
 from itertools import filterfalse
 from math import isnan
 
 from canopen.emcy import EmcyError
 
-from rig.benches.bench import Bench, Flags, Role, check_guards, describe_identifier
+from rig.benches.bench import Bench, Flags, Role, describe_identifier
 from rig.device.emcy import EmcyCode
 from rig.interrupts import describe_exit
-from rig.network.frame import Frame
 from rig.network.master import HEARTBEAT_LIMIT, Master
 from rig.network.node_objects import CONTROLLER, PLANT, RIG, NmtState, name_state
 from rig.recorder import NmtState as NmtRecord, Signals, Timing
@@ -203,29 +201,6 @@ def describe_missing(bench: Bench, cycles: int) -> str:
     """That no drive frame has come for so many cycles; its name and identifier are those of the bench."""
     frame = bench.frames.drive
     return f"no frame {frame.name} ({describe_identifier(frame.identifier)}) for {cycles} cycles"
-
-
-class ProtectionWatch:
-    """Counts the frames of the controller by what is wrong with their checksum and alive counter, "" for nothing."""
-
-    def __init__(self, bench: Bench) -> None:
-        self._frames, self._last = bench.frames, dict[int, int]()  # the last counter of an identifier
-        self.is_needed = any(each.guard for spec in bench.frames.list_from(CONTROLLER) for each in spec.fields)
-        self.found = Counter[str]()
-
-    def begin(self) -> None:
-        """Count from here on: a reset before it made counters begin again."""
-        self._last.clear()
-        self.found.clear()
-
-    def add(self, frame: Frame) -> None:
-        """Take in a frame that was sent or received."""
-        spec = self._frames.find(frame.cob_id, frame.data)
-        if spec is not None and spec.sender is CONTROLLER and len(frame.data) == spec.length:
-            last = self._last.get(spec.identifier, -1)
-            problem, number = check_guards(spec, frame.data, last)
-            self._last[spec.identifier] = -1 if problem == "checksum" else number  # the next is no jump
-            self.found[problem] += 1
 
 
 class OverrunWatch:

@@ -73,10 +73,6 @@ class ProtocolLimits:
         """The limit `status` for a profile, s, at `rate` cycles a second."""
         return max(words.delay, 2 / rate) if self.status is None else self.status
 
-    def find_missing(self, record: "ProtocolRecord") -> float:
-        """The limit `missing` of a run, 1."""
-        return (0.001 if record.realtime else 0.0) if self.missing is None else self.missing
-
     def find_step_delay(self, bench: Bench) -> float:
         """The limit `step_delay` on a bench, s.
 
@@ -128,8 +124,8 @@ class ProtocolRecord:
     those that objects of the controller hold, if it has them and follows them. `is_response_judged`: real time, and the
     controller is not in the rig's own process. `heartbeats`: of the nodes that send one, by name; `heard`: first and
     last time at which heartbeats could have been received, s; `deaf`: how long of it the rig received nothing, s;
-    `deaf_cycles`: in which, so that an EMCY of the controller may be missing here. `protected`: frames of the
-    controller by what is wrong with their checksum and alive counter; none: they have neither.
+    `deaf_cycles`: in which, so that an EMCY of the controller may be missing here. `unsound`: frames of
+    the controller with a wrong checksum or alive counter, as far as no fault of the sequence acts on frames.
     """
 
     run: Rows
@@ -141,7 +137,7 @@ class ProtocolRecord:
     heard: tuple[float, float] = (0.0, 0.0)
     deaf: float = 0.0
     deaf_cycles: Sequence[int] = ()
-    protected: Mapping[str, int] = field(default_factory=dict)
+    unsound: int = 0
     heartbeat_period: Second = 0.1
     bench: Bench = field(default_factory=load_bench)
     drive_limit: float = nan  # NaN: the plant declares none
@@ -173,8 +169,8 @@ class ProtocolRecord:
 def judge_protocol(record: ProtocolRecord, limits: ProtocolLimits) -> tuple[list[CheckResult], list[SkippedCheck]]:
     """The protocol checks of a run, in the order of the table, and those that do not apply to its bench."""
     judges: tuple[Callable[[ProtocolRecord, ProtocolLimits], Iterator[CheckResult | SkippedCheck]], ...] = (
-        _judge_current, _judge_status, _judge_drive_frames, _judge_protection, _judge_frozen, _judge_probes,
-        _judge_response, _judge_heartbeats, _judge_emergencies)
+        _judge_current, _judge_status, _judge_drive_frames, _judge_frozen, _judge_probes, _judge_response,
+        _judge_heartbeats, _judge_emergencies)
     found = [check for judge in judges for check in judge(record, limits)]
     return ([check for check in found if isinstance(check, CheckResult)],
             [check for check in found if isinstance(check, SkippedCheck)])
@@ -338,8 +334,8 @@ def _find_faulty(record: ProtocolRecord) -> Mask:
 
 
 def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
-    """Share of the cycles without a drive frame before the next SYNC, and with one of another cycle."""
-    allowed = limits.find_missing(record)
+    """Share of the cycles without a drive frame before the next SYNC, and with one of another cycle; unsound frames."""
+    allowed = (0.001 if record.realtime else 0.0) if limits.missing is None else limits.missing
     wrong = missing = cycles = 0
     for rows in record.stretches:
         judged = rows.on_time & ~_find_faulty(record) if rows is record.run else rows.on_time
@@ -349,7 +345,8 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
         wrong += int(is_wrong.sum())
         missing += int(is_missing.sum())
         cycles += int(judged.sum())
-    is_numbered = any(spec.has("cycle") for spec in record.bench.frames.list_from(Role.CONTROLLER))
+    own = record.bench.frames.list_from(Role.CONTROLLER)
+    is_numbered = any(spec.has("cycle") for spec in own)
     numbered = "drive frames of another cycle"
     for name, count in ((numbered, wrong), ("drive frames missing or late", missing)):
         value = 100 * count / cycles if cycles else 0.0
@@ -357,17 +354,8 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
             yield SkippedCheck(name, "the controller's frames do not carry the number of the cycle")
             continue
         yield _make_result(name, "drive", value, "%", high=100 * allowed, detail=f"{count} of {cycles}")
-
-
-def _judge_protection(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
-    """Share of the controller's frames with a wrong checksum, or an alive counter that is not the next one."""
-    if not record.protected:  # the frames have none, none came, or faults of the sequence act on frames
-        return
-    total, wrong = sum(record.protected.values()), {name: n for name, n in record.protected.items() if name}
-    allowed = limits.find_missing(record)
-    share = 100 * sum(wrong.values()) / total
-    yield _make_result("checksum and alive counter", "drive", share, "%", high=100 * allowed,
-                       detail=", ".join(f"{name}: {count} of {total}" for name, count in wrong.items()))
+    if any(each.guard for spec in own for each in spec.fields):
+        yield _make_result("wrong checksums and alive counters", "drive", record.unsound, "1", high=allowed * cycles)
 
 
 def _judge_frozen(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:

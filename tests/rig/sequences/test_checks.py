@@ -482,13 +482,11 @@ def judge(rows: Rows, bench: Bench, limits: ProtocolLimits | None = None,
     return {check.name: check for check in checks}, {check.name: check.reason for check in skipped}
 
 
-@pytest.mark.parametrize(("protected", "share", "detail"), [
-    ({"": 50}, 0.0, ""), ({"": 48, "jump": 1, "checksum": 1}, 4.0, "jump: 1 of 50, checksum: 1 of 50"), ({}, None, "")])
-def test_checksum_and_alive_counter_are_judged(protected: dict[str, int], share: float | None, detail: str) -> None:
-    record = ProtocolRecord(run=make_rows(SOUND), bench=DRIVE, drive_limit=8e-3, protected=protected)
-    check = {each.name: each for each in judge_protocol(record, ProtocolLimits())[0]}.get("checksum and alive counter")
-    assert (check and check.value, check.detail if check else "") == (share, detail)
-    assert check is None or check.passed is (share == 0.0)
+@pytest.mark.parametrize(("unsound", "missing", "passed"), [(0, None, True), (1, None, False), (1, 0.1, True)])
+def test_checksums_and_alive_counters_are_judged(unsound: int, missing: float | None, passed: bool) -> None:
+    record = ProtocolRecord(run=make_rows(SOUND), bench=ECU, unsound=unsound)
+    checks = {each.name: each for each in judge_protocol(record, ProtocolLimits(missing=missing))[0]}
+    assert checks["wrong checksums and alive counters"].passed is passed
 
 
 STATES, FOLLOWS, IDLE = ("status word follows the states of CiA 402", "status word follows the control word",
