@@ -77,8 +77,8 @@ class Wanted(NamedTuple):
             return _WORDS.get(word, ({word}, {word}))
         said = next(s for s in self.signals if s.word == word)
         own, controlled = {word.replace("_", "").lower(), said.symbol.lower()}, self.signals.controlled
-        whole = f"{controlled.word}_{word}" if said == self.signals.command else word
-        parts = {part for part in whole.lower().split("_") if len(part) > 1}
+        whole = f"{controlled.word}_{word}".lower() if said == self.signals.command else word.lower()
+        parts = {part for part in whole.split("_") if len(part) > 1}
         like = {self.signals.command.word: "position_demand", controlled.word: "ram_position",
                 self.signals.drive.word: "current" if said.unit == "A" else ""}.get(word, "")
         quantity, which = _WORDS.get(like, (set(), set()))  # of the signal of the EHA with this role

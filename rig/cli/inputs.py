@@ -3,9 +3,11 @@
 import argparse
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from fdi import foreign_code
+from fdi.trace.mcap_log import open_log
 from plant.effects import load_effects
 from plant.errors import InputError, require
 from plant.model import Model, load_model
@@ -81,11 +83,10 @@ def change_model(model: Model, args: argparse.Namespace) -> Model:
     """
     log, offered = find_log(args), {effect.name for effect in model.kind.list_effects()}
     if log is not None and "quantisation" in offered - {*model.effects}:
-        from rig.run.job import read_resolution
-
-        resolution = read_resolution(log)
-        if resolution > 0.5 * model.nominal.get(model.kind.signals.controlled.noise, 0.0):
-            args.set = [f"quantisation.lsb={resolution:g}", *args.set]
+        with suppress(InputError, KeyError, ValueError):  # of an older log it is not known
+            step = float(open_log(log / "trace.mcap" if log.is_dir() else log).metadata["run"]["resolution"])
+            if step > 0.5 * model.nominal.get(model.kind.signals.controlled.noise, 0.0):
+                args.set = [f"quantisation.lsb={step:g}", *args.set]
     return model.replace(parse_changes(args.set))
 
 

@@ -3,7 +3,6 @@
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -204,13 +203,6 @@ def load_plant_of_log(path: Path, *, is_trusted: bool = False, announce: Announc
         _require_file_name(path, code.name)
     require_trust(path, codes, is_trusted=is_trusted, announce=announce)
     return _load_stored_plant(codes, named)
-
-
-def read_resolution(path: Path) -> float:
-    """What one count of the controlled signal was worth in the frames of a logged run, SI; 0 if it is not known."""
-    with suppress(InputError, ValueError, KeyError):  # whoever reads it as a trace says what is wrong
-        return float(open_log(path / "trace.mcap" if path.is_dir() else path).metadata["run"]["resolution"])
-    return 0.0
 
 
 def _load_stored_plant(codes: list[ForeignCode], named: str, *, keeps_name: bool = False) -> str:

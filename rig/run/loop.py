@@ -241,7 +241,6 @@ class CycleLoop(Loop):
         self._link = None if realtime or not isinstance(master.wire, LinkWire) else master.wire  # lockstep of programs
         self._faults, self._log, self._period, self._realtime = faults, log, bench.cycle_ns, realtime
         self._values, self._bench = CyclicValues(bench), bench
-        self._own = bench.frames.list_from(Role.RIG)
         self._sent = Counter[int]()  # by identifier: the pages of a multiplexed message have one alive counter
         self._counters: dict[int, int] = {}  # the last alive counter of each identifier
         self._answers = {each: _Answer(each) for each in bench.frames.frames if each.sender is not Role.RIG}
@@ -377,7 +376,7 @@ class CycleLoop(Loop):
 
     def _send_frames(self, *, is_before_sync: bool) -> None:
         """Send the frames of this cycle that go before SYNC, or those that follow it."""
-        for spec in self._own:
+        for spec in self._bench.frames.list_from(Role.RIG):
             if spec.is_before_sync is is_before_sync and self._played % spec.every == 0:
                 data = pack(spec, {**self.outputs, "cycle": self.k}, self._sent[spec.identifier])
                 self._sent[spec.identifier] += 1
@@ -470,12 +469,10 @@ class CycleLoop(Loop):
         self._late.pass_on(action, frame.data, frame.t_ns if self._realtime else self._t_ns, lambda data:
                            self._take_answer(answer, data, self._wire.clock.now() if is_late else frame.t_ns))
 
-    def _is_sound(self, answer: _Answer, data: bytes) -> bool:
+    def _is_sound(self, spec: FrameSpec, data: bytes) -> bool:
         """Whether alive counter and checksum of an answer let it be taken."""
-        if not answer.is_guarded:
-            return True
-        identifier = answer.spec.identifier
-        problem, self._counters[identifier] = check_guards(answer.spec, data, self._counters.get(identifier, -1))
+        last = self._counters.get(spec.identifier, -1)
+        problem, self._counters[spec.identifier] = check_guards(spec, data, last)
         self.unsound += bool(problem)
         return problem in ("", "jump")
 
@@ -485,7 +482,8 @@ class CycleLoop(Loop):
             return
         _, row, timing = self._open
         is_first = answer.last != self._begun - 1
-        if not (answer.cycle_mask or is_first or "drive" in answer.roles) or not self._is_sound(answer, data):
+        if not (answer.cycle_mask or is_first or "drive" in answer.roles) or (
+                answer.is_guarded and not self._is_sound(answer.spec, data)):
             return
         values = unpack(answer.spec, data)
         if answer.cycle_mask and values["cycle"] != row.cycle & answer.cycle_mask:
