@@ -65,9 +65,8 @@ def list_quantities(group: type[Any]) -> Mapping[str, Quantity]:
         ValueError: a name that NumPy's records, from which laws in plain Python read parameters, have for themselves.
     """
     if group not in _KNOWN_GROUPS:  # reading annotations takes longer than everything else about a model
-        taken = [name for name in group._fields if hasattr(np.record, name)]
-        if taken:
-            raise ValueError(f"{group.__name__}: another name than {taken[0]}, which NumPy's records have as well")
+        for taken in {*group._fields} & {*dir(np.record)}:
+            raise ValueError(f"{group.__name__}: another name than {taken}, which NumPy's records have as well")
         hints = get_type_hints(group, include_extras=True)
         _KNOWN_GROUPS[group] = {name: get_args(hints[name])[1] for name in group._fields}
     return _KNOWN_GROUPS[group]
