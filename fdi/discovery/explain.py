@@ -23,6 +23,7 @@ the thresholds.
 | rivals | the best one leaves only noise | begins the others that do so too, and effects whose signature has a cosine of {LOOKS_ALIKE:g} with its own, from its tolerances |
 | small gain, again | the same | drops such an effect |
 | solver | half the step changes more than {SOLVER_ERROR_SHARE:g} floors | finishes again with 50 steps a cycle |
+| intervals, again | one of several effects has such an interval | leaves it out, if the others leave only noise |
 | whole recording | only an excerpt was fitted | judges on all rows |
 | left-out rows | the replay has an observer | judges on all rows that hang on no stop, as on a held-out run |
 | held-out run | there is one | rejects an effect that leaves more than {RESIDUAL_HELD_OUT:g} floors in the typical block; up to {HELD_OUT_UNDECIDED_SHARE:g} of the run may be undecided |
@@ -245,7 +246,8 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
         base = search.finish_hypothesis(base, 2)
         close = [search.finish_hypothesis(h, n) for h, n in zip(close, (6, 2), strict=False)]
         base, close = _doubt_small_gain(search, base, close, depth)
-    depth = depth if close else 0
+    close = leave_out_unshown(search, close)
+    depth = len(close[0].effects) if close else 0
     tried = [] if len(levels) == 1 else levels[depth or -1]
     others = [h for h in tried if h.effects not in [c.effects for c in close]]
     parents = [next((p for p in levels[i] if p.effects == close[0].effects[:i]), levels[i][0]) for i in range(1, depth)]
@@ -347,7 +349,7 @@ def _doubt_small_gain(search: Search, base: Hypothesis, close: list[Hypothesis],
         return base, close
     if base.is_at_floor:
         base = search.leave_out_effects(base, close[0])
-        close = [h for h in close if shows_effect(search.model, h)]
+        close = [h for h in close if shows_effect(search.model, h, h.effects[-1])]
     if not close or measure_gain(base, close[0]) >= GAIN_DOUBTFUL:
         return base, close
     if measure_gain(base, close[0]) > GAIN_SEEN:
@@ -356,12 +358,23 @@ def _doubt_small_gain(search: Search, base: Hypothesis, close: list[Hypothesis],
     return base, [] if depth == 1 and measure_gain(base, close[0]) <= GAIN_SEEN else close
 
 
-def shows_effect(model: Model, h: Hypothesis) -> bool:
-    """Whether the 95 % interval of a parameter of the last effect leaves out its off value.
+def leave_out_unshown(search: Search, close: list[Hypothesis]) -> list[Hypothesis]:
+    """The hypotheses, best first; the best of several effects without one that may be off, if noise alone is left then.
+
+    A further effect can help a fit out of a local minimum and then have no size itself.
+    """
+    if not close or len(close[0].effects) < 2 or all(shows_effect(search.model, close[0], e) for e in close[0].effects):
+        return close
+    fewer = search.finish_hypothesis(search.drop_each_effect(close[0])[0])
+    return [fewer, *(h for h in close if not set(fewer.effects) <= set(h.effects))] if fewer.is_at_floor else close
+
+
+def shows_effect(model: Model, h: Hypothesis, effect: str) -> bool:
+    """Whether the 95 % interval of a parameter of an effect leaves out its off value.
 
     If none does, the fit is better only by a stop that it met by chance.
     """
-    entry = model.find_effect(h.effects[-1])
+    entry = model.find_effect(effect)
     values = h.fit.values
     return any(abs(values[name] - entry.off.get(name, model.nominal.get(name, 0.0)))
                > INTERVAL_95_SD * h.fit.spread(name) for name in entry.fitted)

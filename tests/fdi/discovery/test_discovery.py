@@ -26,6 +26,7 @@ from fdi.discovery.explain import (
     explain,
     find_marks,
     helps_explain,
+    leave_out_unshown,
     shows_effect,
 )
 from fdi.discovery.explain_runs import Answer, Candidate, explain_runs
@@ -66,7 +67,7 @@ from fdi.discovery.sensitivity import (
     measure_size,
     summarise_injections,
 )
-from fdi.estimation.fit import Value, linearise, list_all_unknowns, silence_sensors
+from fdi.estimation.fit import Value, fit_unknowns, linearise, list_all_unknowns, silence_sensors
 from fdi.estimation.noise import fit_noise, measure_level
 from fdi.estimation.replay import hold_inputs
 from fdi.trace.trace import Trace
@@ -220,7 +221,19 @@ def test_an_effect_counts_only_if_its_interval_leaves_out_the_off_value(search: 
         return search.judge_fit(("null_bias",), replace(found, x=x))
 
     small = 0.01 * found.spread("null_bias.current")
-    assert [shows_effect(load_model(), move_bias(current)) for current in (1e-4, small)] == [True, False]
+    assert [shows_effect(load_model(), move_bias(current), "null_bias") for current in (1e-4, small)] == [True, False]
+
+
+def test_of_two_effects_the_one_that_may_be_off_is_left_out() -> None:
+    """A null bias alone is hidden: a constant load that was added to it has an interval around 0."""
+    search = Search(load_model(), hold_inputs(record_plant(BIAS, COMMAND)), [], ["null_bias", "constant_load"], 1)
+
+    def add(h: Hypothesis, effect: str) -> Hypothesis:
+        (p,) = scan_effects(search.problem, [h.fit], [effect])
+        return search.judge_fit((*h.effects, effect), fit_unknowns(search.problem, p.free, p.x))
+
+    both = add(add(search.fit_base(), "null_bias"), "constant_load")
+    assert [h.effects for h in leave_out_unshown(search, [both])] == [("null_bias",)]
 
 
 @pytest.mark.parametrize(("is_far", "verdict"), [(False, "EXPLAINED"), (True, "PARTLY")])
