@@ -1,7 +1,7 @@
 """A fit that begins far from the answer: several starts, noise taken for larger at first, scans along each unknown.
 
 A replay of a model that is far off meets every stop of the ram at another time, so the misfit has many valleys. Three
-things find the right one. Starts are scattered about the regressions' values. The noise counts for a hundred times its
+things find the right one. Starts are scattered about the data sheet's values. The noise counts for a hundred times its
 size at first, so that small stops count late. And before each stage every unknown is tried on a grid with the others
 held: runs side by side cost little, and a grid steps over ridges at which slopes point the wrong way.
 """
@@ -44,7 +44,7 @@ SEARCHES = 4  # pairs of such searches at most
 SEARCH_GAIN = 0.1  # share of the excess misfit that a pair must remove for another one to follow
 FITTED_SQUARE = 1.02  # mean square of whitened residuals up to which no other valley is looked for
 PROFILE_STEP = 0.05  # of the logarithm, or of the range
-SCATTERED = 48  # starts beside the regressions' values and the data sheet's
+SCATTERED = 48  # starts beside the data sheet's values
 GRID = (-0.3, -0.15, -0.07, -0.03, -0.01, 0.01, 0.03, 0.07, 0.15, 0.3)  # of the logarithm, or of half a range
 
 
@@ -61,17 +61,15 @@ def scale_values(free: Sequence[Free], values: Mapping[str, float]) -> Floats:
     return x
 
 
-def sample_starts(free: Sequence[Free], begin: Floats, known: frozenset[str], seed: int, count: int = SCATTERED
-                  ) -> Floats:
-    """Starts (m, p): `begin` (p,), the data sheet, and some scattered about `begin`.
+def sample_starts(free: Sequence[Free], seed: int) -> Floats:
+    """Starts (m, p): the data sheet, and some scattered about it by 0.4 of what is known of each unknown.
 
-    Those that are `known` from regressions are scattered by a tenth, tolerances not at all, the rest by 0.4 of what
-    is known of them.
+    Tolerances are not scattered.
     """
-    spread = np.array([(0.1 / f.scale if f.name in known else 0.4) * is_wide(f) for f in free])
-    scattered = begin + spread * np.random.default_rng(seed).standard_normal((count, len(free)))
+    spread = 0.4 * np.array([is_wide(f) for f in free])
+    scattered = spread * np.random.default_rng(seed).standard_normal((SCATTERED, len(free)))
     low, high = scaled_bounds(free)
-    return np.clip(np.vstack([begin, np.zeros(len(free)), scattered]), low, high)
+    return np.clip(np.vstack([np.zeros(len(free)), scattered]), low, high)
 
 
 def is_wide(f: Free, tolerance: float = 0.04) -> bool:
@@ -79,10 +77,9 @@ def is_wide(f: Free, tolerance: float = 0.04) -> bool:
     return f.scale * f.prior > tolerance if isinstance(f, LogFree) else f.prior * f.scale > tolerance * abs(f.centre)
 
 
-def fit_from_afar(problem: LogProblem, free: Sequence[Free], starts: Floats, progress: Progress = ignore_progress
-                  ) -> Fit:
-    """The best fit from some starts (m, p), scaled."""
-    factor = FIT_STAGES[0][0]
+def fit_from_afar(problem: LogProblem, free: Sequence[Free], seed: int, progress: Progress = ignore_progress) -> Fit:
+    """The best fit from the data sheet's values and from scattered starts."""
+    starts, factor = sample_starts(free, seed), FIT_STAGES[0][0]
     costs = compute_misfit(scale_noise(problem, factor).compute_white_residuals(free, starts))
     chosen = [starts[0], *starts[[k for k in np.argsort(costs) if k != 0][:FIT_STAGES[0][1] - 1]]]
     fits = [start_fit(free, x) for x in chosen]
@@ -98,13 +95,12 @@ def fit_from_afar(problem: LogProblem, free: Sequence[Free], starts: Floats, pro
     return fits[0]
 
 
-def search_other_valleys(problem: LogProblem, found: Fit, begin: Floats, seed: int, progress: Progress = ignore_progress
-                         ) -> Fit:
+def search_other_valleys(problem: LogProblem, found: Fit, seed: int, progress: Progress = ignore_progress) -> Fit:
     """The best of a fit and of searches by populations, two at a time, until one leaves only noise.
 
-    A narrow search begins at the best fit so far. A wide one begins at the values `begin` (p,) of the regressions,
-    which know nothing of the valley that the fit ended in. Each finds what the other misses (docs/identify.md). The
-    searches take coarse steps; what they find is fitted to the `problem` with its own steps.
+    A narrow search begins at the best fit so far. A wide one begins at the data sheet's values, which know nothing of
+    the valley that the fit ended in. Each finds what the other misses (docs/identify.md). The searches take coarse
+    steps; what they find is fitted to the `problem` with its own steps.
     """
     best = found
     for attempt in range(SEARCHES):
@@ -114,9 +110,8 @@ def search_other_valleys(problem: LogProblem, found: Fit, begin: Floats, seed: i
 
         def search(is_wide_search: bool, best: Fit = best, number: int = attempt) -> Fit:
             coarse = replace(problem.alone, steps=SEARCH_STEPS)
-            widths = _widen_frictions(best.free, 0.3, 0.2)
-            end = (search_widely(coarse, coarse, start_fit(best.free, begin), widths, WIDE_STAGES, seed + number)
-                   if is_wide_search else _search_narrowly(coarse, best, seed + number))
+            home, widths = start_fit(best.free, np.zeros(len(best.free))), _widen_frictions(best.free, 0.3, 0.2)
+            end = (search_widely(coarse, coarse, home, widths, WIDE_STAGES, seed + number) if is_wide_search else _search_narrowly(coarse, best, seed + number))
             return descend(problem.alone, end, ((1.0, 8),))
 
         before = best.misfit - np.count_nonzero(best.white)

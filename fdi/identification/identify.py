@@ -1,9 +1,9 @@
 """The nominal model of a user's actuator: its parameters from measured runs, and what these runs cannot tell.
 
-The data sheet says where each parameter is about. Regressions on the signals give first values
-(`estimate_by_regressions`), a fit that begins far away goes on from there (`global_fit`), and the last rounds have fine
-steps and the noise that is left. A parameter whose interval stays wide is not identifiable from these runs: it keeps
-the data sheet's value, and simulated candidate runs say which one would show it. Held-out runs judge the result.
+The data sheet says where each parameter is about. A fit that may begin far away goes on from there (`global_fit`), and
+the last rounds have fine steps and the noise that is left. A parameter whose interval stays wide is not identifiable
+from these runs: it keeps the data sheet's value, and simulated candidate runs say which one would show it. Held-out
+runs judge the result.
 """
 from __future__ import annotations
 
@@ -37,7 +37,6 @@ from fdi.estimation.long_recordings import can_be_cut, choose_excerpt, cut_excer
 from fdi.estimation.noise import fit_noise, sensor_floors, white_noise
 from fdi.estimation.replay import (
     SAME_PERIOD,
-    differentiate,
     find_undecided_rows,
     hold_inputs,
     leave_out_rest,
@@ -65,7 +64,6 @@ from fdi.identification.global_fit import (
     polish_fit,
     profile_unknowns,
     put_unknown,
-    sample_starts,
     scale_values,
     search_other_valleys,
 )
@@ -85,7 +83,7 @@ from fdi.thresholds import (
     RESIDUAL_WORST,
     STATIC_FRICTION_SYSTEMATIC_SD,
 )
-from fdi.trace.trace import Floats, Trace, fill_gaps, rms, shift_rows
+from fdi.trace.trace import Floats, Trace, rms
 from plant.errors import InputError, require
 from plant.lanes import Lanes
 from plant.model import Model, find_quantity, find_shipped_model
@@ -365,8 +363,8 @@ EXPERIMENTS = (
 )
 
 
-def advise_experiments(model: Model, free: Sequence[Free], problem: LogProblem, fit: Fit | None, unseen: Sequence[str]
-                       ) -> Iterator[Advice]:
+def advise_experiments(model: Model, free: Sequence[Free], problem: ScaledProblem, fit: Fit | None,
+                       unseen: Sequence[str]) -> Iterator[Advice]:
     """For each parameter that is not identifiable the candidate run that would show it best.
 
     Args:
@@ -409,7 +407,7 @@ def _simulate(model: Model, com: Floats, load: Floats, outputs: Sequence[str]) -
     return simulate_trace(Lanes(silence_readings(model), (), STEPS), np.empty(0), com, load, tuple(outputs))
 
 
-def _measure_information(problem: LogProblem, free: Sequence[Free], x: Floats) -> Floats:
+def _measure_information(problem: ScaledProblem, free: Sequence[Free], x: Floats) -> Floats:
     """What runs tell of scaled unknowns at `x` (p,): the matrix (p, p) of their slopes' products."""
     low, high = scaled_bounds(free)
     steps = np.array([DIFFERENCE / f.scale if isinstance(f, LogFree) else DIFFERENCE for f in free])
@@ -528,7 +526,7 @@ class Identification:
 class Settled(NamedTuple):
     """A fit taken to its end, and what it leaves of the runs."""
 
-    problem: LogProblem
+    problem: ScaledProblem
     fit: Fit
     hidden: Mapping[str, tuple[float, float, float]]  # of `find_hidden`
     model: Model  # with what was found as its design
@@ -570,31 +568,25 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
         return _tell_nothing(model, ranges, runs, sources, len(fitted), floor, reason, notes)
     gains = read_controller(fitted) if model.kind.controller else None
     free = list_unknowns(model, tuple(ranges))
-    progress("regressions", 0.02)
-    names = frozenset(f.name for f in free)
-    regressed = estimate_by_regressions(fitted, model, frozenset(model.values) - names)
-    begun = {name: value for name, value in regressed.items() if name in names}
-    first = replace(model, values=limit_friction_values({**model.values, **begun}))
-    parts, remarks = cut_long_runs(fitted, sources, first, floor)
+    parts, remarks = cut_long_runs(fitted, sources, model, floor)
     problem = make_problem(model, parts, floor, workers or count_threads())
     notes += remarks
-    starts = sample_starts(free, scale_values(free, {**model.values, **begun}), frozenset(begun), seed)
 
-    def settle(problem: LogProblem, fit: Fit) -> Settled:
+    def settle(problem: ScaledProblem, fit: Fit) -> Settled:
         progress("which parameters the runs show", 0.65)
         hidden = find_hidden(problem, fit, {r.name: r for r in ranges})
         problem, fit = hold_parameters(problem, fit, {name: value for name, (value, _, _) in hidden.items()})
         progress("last fits, with finer steps", 0.7)
-        problem, fit = finish(problem, fit, scale_values(fit.free, {**model.values, **begun}), seed, progress)
+        problem, fit = finish(problem, fit, seed, progress)
         progress("judging", 0.92)
         found = build_model(model, problem, fit, gains)
         return Settled(problem, fit, hidden, found, *measure_errors(model, found, runs, sources, len(fitted), floor))
 
-    settled = settle(problem, fit_from_afar(problem, free, starts, progress))
+    settled = settle(problem, fit_from_afar(problem, free, seed, progress))
     if model.kind.correct is not None and settled.worst_fitted > FITTED_RUN_WORST:
         progress("fitting the beginnings of motions", 0.6)
         moving = [leave_out_rest(t, model, memory=0.0) for t in runs[:len(fitted)]]
-        parts, _ = cut_long_runs(moving, sources, first, floor)
+        parts, _ = cut_long_runs(moving, sources, model, floor)
         begin = fit_beginnings(make_problem(settled.model, parts, floor, problem.workers), free, floor)
         settled = min(settled, settle(*begin), key=lambda each: each.worst_fitted)
     problem, fit, hidden, found, errors, residuals = settled
@@ -614,7 +606,7 @@ def cut_long_runs(runs: Sequence[Trace], sources: Sequence[Source], model: Model
     Args:
         runs: prepared for replay.
         sources: of them, in this order.
-        model: with first values: at those of a data sheet that is several times off, other parts would say most.
+        model: with the values of the data sheet.
         floor: of each signal, SI.
     """
     parts, remarks = [], []
@@ -628,8 +620,11 @@ def cut_long_runs(runs: Sequence[Trace], sources: Sequence[Source], model: Model
 
 
 @dataclass
+@dataclass
 class ScaledProblem(LogProblem):
     """The runs of an actuator of any size, which show less of it than those of a healthy unit of a known one."""
+
+    is_settled: bool = False  # whether fits leave only noise; one that is far off would take a pressure for unknown
 
     def find_flat(self, free: Sequence[Free], x: Floats) -> Floats:
         v = {**self.model.values, **self.list_values(free, x)}
@@ -642,17 +637,20 @@ class ScaledProblem(LogProblem):
                    "flapper.inertia": 1.0, "pilot.flow_gain": 1.0, "pilot.pressure_gain": 1.0}
         sticking = {"pilot.pressure_gain": 1.0, "spool.static_friction": 1.0, "spool.dynamic_friction": 1.0}
         turning = {"flapper.inertia": 1.0}  # its time constant, JF/BF, is 25 us: slopes by it are the solver's
-        return find_flat_directions(self, free, x, (leaking, flapper, sticking, turning))
+        # a larger piston at a lower pressure: of forces and flows the position alone knows products
+        pressing = {"jack.area": 1.0, "valve.flow_gain": 1.0, "valve.pressure_gain": -1.0, "jack.leakage": 2.0}
+        known = (leaking, flapper, sticking, turning)
+        return find_flat_directions(self, free, x, (*known, pressing) if self.is_settled else known)
 
 
-def make_problem(model: Model, fitted: Sequence[Trace], floor: Mapping[str, float], workers: int) -> LogProblem:
+def make_problem(model: Model, fitted: Sequence[Trace], floor: Mapping[str, float], workers: int) -> ScaledProblem:
     """The runs to fit with white noise of the floor's size; a signal that a run lacks counts nothing in it."""
     noise = tuple(white_noise(level) for level in floor.values())
     first, *others = (replace(t, outputs=tuple(floor)) for t in fitted)
     return ScaledProblem(silence_readings(model), first, noise, workers=workers, also=tuple(others))
 
 
-def find_hidden(problem: LogProblem, fit: Fit, ranges: Mapping[str, Range]
+def find_hidden(problem: ScaledProblem, fit: Fit, ranges: Mapping[str, Range]
                 ) -> dict[str, tuple[float, float, float]]:
     """Free parameters that no run shows, with the value nearest to the data sheet's, and the values that fit as well.
 
@@ -686,7 +684,7 @@ def find_hidden(problem: LogProblem, fit: Fit, ranges: Mapping[str, Range]
     return found
 
 
-def _find_edge(problem: LogProblem, fit: Fit, k: int, end: float, rounds: int = 3, parts: int = 15) -> float:
+def _find_edge(problem: ScaledProblem, fit: Fit, k: int, end: float, rounds: int = 3, parts: int = 15) -> float:
     """The value of unknown k, SI, between a fit that is well and the `end` of its range where it is not, that divides
     both."""
     f = fit.free[k]
@@ -703,7 +701,7 @@ def _find_edge(problem: LogProblem, fit: Fit, k: int, end: float, rounds: int = 
     return f.value(good)
 
 
-def hold_parameters(problem: LogProblem, fit: Fit, held: Mapping[str, float]) -> tuple[LogProblem, Fit]:
+def hold_parameters(problem: ScaledProblem, fit: Fit, held: Mapping[str, float]) -> tuple[ScaledProblem, Fit]:
     """The problem and the fit without some unknowns, which keep the values in `held`."""
     if not held:
         return problem, fit
@@ -718,23 +716,20 @@ def count_last_steps(model: Model) -> int:
     return LAST_STEPS if model.values.keys() >= BALANCED else max(LAST_STEPS, model.steps)
 
 
-def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress: Progress = ignore_progress
-           ) -> tuple[LogProblem, Fit]:
-    """The last rounds, with finer steps; then with the noise that is left, where only noise is left.
-
-    `begin`: the unknowns (p,) where regressions put them, at which a search begins if the fit ended in a local minimum.
-    """
+def finish(problem: ScaledProblem, fit: Fit, seed: int = 0, progress: Progress = ignore_progress
+           ) -> tuple[ScaledProblem, Fit]:
+    """The last rounds, with finer steps; then with the noise that is left, where only noise is left."""
     fine = replace(problem, steps=count_last_steps(problem.model), _lanes={})
     fit = descend(fine, fit, ((1.0, 8),))
     if not is_fitted(fit):
-        fit = search_other_valleys(fine, fit, begin, seed, progress)
+        fit = search_other_valleys(fine, fit, seed, progress)
     progress("last rounds", 0.9)
     fit = polish_fit(fine, fit, seed)
     size = np.sqrt(np.nanmean(fit.residuals**2, axis=1))
     if (size <= RESIDUAL_HELD_OUT * np.array([n.level for n in fine.noise])).all():
         learnt = tuple(fit_noise(r) if s > 0.0 else old  # a signal that the model gives exactly tells none
                        for r, s, old in zip(fit.residuals, size, fine.noise, strict=True))
-        fine = replace(fine, noise=learnt, _lanes={})
+        fine = replace(fine, noise=learnt, is_settled=True, _lanes={})
         fit = descend(fine, fit, ((1.0, 5),))
     if not fit.free or problem.model.values.keys() >= BALANCED:  # its `find_flat` knows what no run shows
         return fine, fit
@@ -743,7 +738,8 @@ def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress
     return fine, replace(fit, covariance=estimate_smooth_covariance(coarse, fit, flat))
 
 
-def fit_beginnings(problem: LogProblem, free: Sequence[Free], floor: Mapping[str, float]) -> tuple[LogProblem, Fit]:
+def fit_beginnings(problem: ScaledProblem, free: Sequence[Free], floor: Mapping[str, float]
+                   ) -> tuple[ScaledProblem, Fit]:
     """A fit from the model's own values that takes in the beginnings of motions, as far as they are decided.
 
     With an observer a fit first leaves them out: how a motion begins hangs on dry friction, and is soon forgotten. But
@@ -767,7 +763,7 @@ def fit_beginnings(problem: LogProblem, free: Sequence[Free], floor: Mapping[str
     return decided, descend(decided, fit, ((1.0, FIT_ROUNDS),))
 
 
-def build_model(model: Model, problem: LogProblem, fit: Fit, gains: ControllerGains | None) -> Model:
+def build_model(model: Model, problem: ScaledProblem, fit: Fit, gains: ControllerGains | None) -> Model:
     """The model whose nominal values are those that were found."""
     values = problem.list_values(fit.free, fit.x)
     held = {n: v for n, v in problem.model.values.items() if v != model.values.get(n) and not n.startswith("sensors.")
@@ -959,159 +955,3 @@ def read_controller(runs: Sequence[Trace], tolerance: float = 1e-3, fewest_rows:
     at_limit = int((np.abs(answer) > (1.0 - 1e-9) * largest).sum())
     return ControllerGains(gain, largest if at_limit >= fewest_rows else None,
                            float((left <= tolerance * largest).mean()))
-
-
-SMOOTHED = 25  # rows of the parabola that gives speed and acceleration
-MOVING = 1e-3  # m/s, above which the ram's friction is the dynamic one
-STALLED_ROWS = 20  # at a limit, in a row or not, that show it
-P12, XS = "p12", "xs"  # signals of the electrohydraulic actuator, whose equations the regressions are
-REGRESSED = {"jack.travel", "jack.area", "supply.pressure", "valve.flow_gain", "torque_motor.gain", "spool.travel"}
-
-
-def estimate_by_regressions(runs: Sequence[Trace], model: Model, known: frozenset[str] = frozenset()
-                            ) -> dict[str, float]:
-    """Parameters that the runs show without a replay, SI; those that need a signal nobody measured are left out.
-
-    Args:
-        runs: prepared for replay; of one actuator.
-        model: with the values of the data sheet, for what the regressions cannot tell.
-        known: parameters that are not free, so that others make up for them.
-    """
-    found: dict[str, float] = {}
-    if not model.values.keys() >= REGRESSED:
-        return found
-    position = np.concatenate([t.controlled for t in runs])
-    stroke = _find_limit(position)  # half of it, m, as far as the ram went
-    if stroke > 0.98 * model["jack.travel"] or _dwells(position, stroke):
-        found["jack.travel"] = stroke
-    if all(P12 in t.outputs for t in runs):
-        pressure = np.concatenate([t.mask_unusable(P12) for t in runs])
-        highest = _find_limit(pressure)
-        if highest > model["supply.pressure"] or _dwells(pressure, highest):
-            found["supply.pressure"] = highest
-    if all(XS in t.outputs for t in runs):
-        found |= _estimate_spool(runs, model)
-    p = {**model.values, **found}
-    if all({XS, P12} <= set(t.outputs) for t in runs):
-        found |= _estimate_jack(runs, p, "jack.area" not in known)
-    else:
-        has_spool = all(XS in t.outputs for t in runs)
-        drive = [t.mask_unusable(XS) if has_spool else shift_rows(t.drive, 4) for t in runs]
-        opening = 1.0 if has_spool else p["torque_motor.gain"] / p["feedback_spring.stiffness"]
-        gain = _regress([_smooth_speed(t) for t in runs], [[d] for d in drive], 1.0 if has_spool else 0.5)
-        if gain is not None and gain[0] > 0.0:
-            found["valve.flow_gain"] = gain[0] * p["jack.area"] / opening
-    return {name: value for name, value in found.items() if np.isfinite(value) and value > 0.0}
-
-
-def _estimate_spool(runs: Sequence[Trace], model: Model) -> dict[str, float]:
-    """Stiffness of the feedback spring, pilot flow gain, and both travels, from current and spool.
-
-    XS settles at GM I/KSF; with the flapper at its stop its speed is GQF XFM/ASV.
-    """
-    found: dict[str, float] = {}
-    size = 61
-    spool = [t.mask_unusable(XS) for t in runs]
-    every = np.concatenate(spool)
-    limit = _find_limit(every)
-    level = [np.where(_average((np.abs(t.column(XS)) > 0.6 * limit).astype(float), size) > 0.0, np.nan,
-                      _average(x, size)) for t, x in zip(runs, spool, strict=True)]
-    gain = _regress(level, [[_average(t.drive, size)] for t in runs])
-    if gain is None or gain[0] <= 0.0:
-        return found
-    ratio = model["feedback_spring.stiffness"] / model["torque_motor.gain"] * gain[0]  # KSF/GM of the model over own
-    found |= {"feedback_spring.stiffness": model["feedback_spring.stiffness"] / np.sqrt(ratio),
-              "torque_motor.gain": model["torque_motor.gain"] * np.sqrt(ratio)}
-    if float(np.nanmax(np.abs(every))) > 0.98 * model["spool.travel"] or _dwells(every, limit):
-        found["spool.travel"] = limit
-    speeds = [np.abs(differentiate(fill_gaps(x), 5, 1)) / t.period for t, x in zip(runs, spool, strict=True)]
-    found["pilot.flow_gain"] = _find_limit(np.concatenate(speeds)) * model["spool.end_area"] / model["flapper.travel"]
-    return found
-
-
-def _estimate_jack(runs: Sequence[Trace], p: Mapping[str, float], is_area_free: bool) -> dict[str, float]:
-    """Flow gain, leakage, area, mass, damping and friction from spool, pressure, position and load."""
-    found: dict[str, float] = {}
-    speed = [_smooth_speed(t) for t in runs]
-    acceleration = [differentiate(_fill_position(t), SMOOTHED, 2) / t.period**2 for t in runs]
-    spool = [_average(t.mask_unusable(XS), 9) for t in runs]
-    pressure = [_average(t.mask_unusable(P12), 9) for t in runs]
-    away = [np.where((np.abs(t.controlled) < 0.97 * p["jack.travel"]) & (np.abs(q) < 0.8 * p["supply.pressure"]),
-                     1.0, np.nan)
-            for t, q in zip(runs, pressure, strict=True)]
-    flow = _regress([v * w for v, w in zip(speed, away, strict=True)],
-                    [[x, -q] for x, q in zip(spool, pressure, strict=True)])
-    moving = [np.where((np.abs(v) > MOVING) & (np.abs(a) < 20.0), w, np.nan)
-              for v, a, w in zip(speed, acceleration, away, strict=True)]
-    load = [t.load for t in runs]
-    is_loaded = float(np.ptp(np.concatenate(load))) > 0.0
-    columns = [[a, v, np.sign(v), *([f] if is_loaded else [])]
-               for a, v, f in zip(acceleration, speed, load, strict=True)]
-    force = _regress([q * w for q, w in zip(pressure, moving, strict=True)], columns)
-    area = p["jack.area"]
-    if force is not None:
-        if is_loaded and is_area_free and force[3] > 0.0:
-            found["jack.area"] = area = 1.0 / force[3]
-        names = ("jack.mass", "jack.damping", "jack.dynamic_friction")
-        found |= {name: area * x for name, x in zip(names, force[:3], strict=True) if x > 0.0}
-        if "jack.dynamic_friction" in found:
-            ratio = p["jack.static_friction"] / p["jack.dynamic_friction"]
-            found["jack.static_friction"] = ratio * found["jack.dynamic_friction"]
-    if flow is not None and flow[0] > 0.0:
-        found["valve.flow_gain"] = flow[0] * area
-        leakage = flow[1] * area - found["valve.flow_gain"] / p["valve.pressure_gain"]
-        if leakage > 0.0:
-            found["jack.leakage"] = leakage
-    return found
-
-
-def _find_limit(x: Floats) -> float:
-    """The largest magnitude that some samples reach, so that noise does not set it."""
-    size = np.sort(np.abs(x[~np.isnan(x)]))
-    return float(np.median(size[-STALLED_ROWS:])) if len(size) else 0.0
-
-
-def _dwells(x: Floats, limit: float, share: float = 2e-3, rows: int = 5 * STALLED_ROWS) -> bool:
-    """Whether a signal stays at its limit."""
-    return int((np.abs(x) > (1.0 - share) * limit).sum()) >= rows
-
-
-def _smooth_speed(trace: Trace) -> Floats:
-    return differentiate(_fill_position(trace), SMOOTHED, 1) / trace.period
-
-
-def _fill_position(trace: Trace) -> Floats:
-    return fill_gaps(trace.mask_unusable(trace.declared.controlled.name))
-
-
-def _average(x: Floats, size: int) -> Floats:
-    return np.convolve(np.pad(fill_gaps(x), size // 2, "edge"), np.full(size, 1.0 / size), "valid")
-
-
-def _regress(y: Sequence[Floats], columns: Sequence[Sequence[Floats]], largest: float = 1.0, rounds: int = 6
-             ) -> Floats | None:
-    """Coefficients of y (n,) on columns, all runs together, by least squares in which outliers count little.
-
-    Rows whose first column is beyond `largest` times its maximum are left out, as all that saturates there. None if the
-    rows do not tell the columns apart.
-    """
-    target = np.concatenate(y)
-    table = np.column_stack([np.concatenate(c) for c in zip(*columns, strict=True)])
-    there = np.isfinite(target) & np.isfinite(table).all(axis=1)
-    if largest < 1.0 and there.any():
-        there &= np.abs(table[:, 0]) < largest * np.abs(table[there, 0]).max()
-    target, table = target[there], table[there]
-    scale = np.sqrt((table**2).mean(axis=0)) if len(table) > 100 else np.zeros(table.shape[1])
-    if not (scale > 0.0).all():
-        return None
-    weight = np.ones(len(target))
-    found = np.zeros(table.shape[1])
-    for _ in range(rounds):
-        rows = (table / scale) * weight[:, None]
-        found, _, rank, _ = np.linalg.lstsq(rows, target * weight, rcond=1e-6)
-        if rank < len(scale):
-            return None
-        left = np.abs(target - (table / scale) @ found)
-        usual = 1.5 * float(np.median(left)) + 1e-300
-        weight = np.sqrt(np.minimum(1.0, usual / np.maximum(left, 1e-300)))
-    return found / scale
