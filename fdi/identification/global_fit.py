@@ -111,7 +111,8 @@ def search_other_valleys(problem: LogProblem, found: Fit, seed: int, progress: P
         def search(is_wide_search: bool, best: Fit = best, number: int = attempt) -> Fit:
             coarse = replace(problem.alone, steps=SEARCH_STEPS)
             home, widths = start_fit(best.free, np.zeros(len(best.free))), _widen_frictions(best.free, 0.3, 0.2)
-            end = (search_widely(coarse, coarse, home, widths, WIDE_STAGES, seed + number) if is_wide_search else _search_narrowly(coarse, best, seed + number))
+            end = (search_widely(coarse, coarse, home, widths, WIDE_STAGES, seed + number) if is_wide_search
+                   else _search_narrowly(coarse, best, seed + number))
             return descend(problem.alone, end, ((1.0, 8),))
 
         before = best.misfit - np.count_nonzero(best.white)

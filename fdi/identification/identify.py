@@ -79,6 +79,7 @@ from fdi.thresholds import (
     INTERVAL_95_SD,
     MOVING_RAM,
     PILOT_FLOW_SYSTEMATIC_SD,
+    PRIORS_KNOW_MORE_MISFIT,
     RESIDUAL_HELD_OUT,
     RESIDUAL_WORST,
     STATIC_FRICTION_SYSTEMATIC_SD,
@@ -620,16 +621,31 @@ def cut_long_runs(runs: Sequence[Trace], sources: Sequence[Source], model: Model
 
 
 @dataclass
-@dataclass
 class ScaledProblem(LogProblem):
     """The runs of an actuator of any size, which show less of it than those of a healthy unit of a known one."""
 
-    is_settled: bool = False  # whether fits leave only noise; one that is far off would take a pressure for unknown
-
     def find_flat(self, free: Sequence[Free], x: Floats) -> Floats:
-        v = {**self.model.values, **self.list_values(free, x)}
-        if not v.keys() >= BALANCED:
+        if not self.model.values.keys() >= BALANCED:
             return np.empty((len(free), 0))
+        return find_flat_directions(self, free, x, self._list_ways(free, x))
+
+    def widen_covariance(self, fit: Fit) -> Floats:
+        """The covariance of a fit, (p, p), also along what no signal shows near it.
+
+        A larger piston moves alike at a lower pressure, as long as that is not at the supply's: without P12 the slopes
+        know area, flow gain and leakage only by the roughness of the misfit. A fit must not move along this direction.
+        """
+        leaking, *_ = self._list_ways(fit.free, fit.x)
+        pressing = {"jack.area": 1.0, "valve.flow_gain": 1.0, "jack.leakage": 2.0 + leaking.get("jack.leakage", 0.0)}
+        every = find_flat_directions(self, fit.free, fit.x, (pressing,), PRIORS_KNOW_MORE_MISFIT)
+        more = every[:, find_flat_directions(self, fit.free, fit.x).shape[1]:]
+        known = np.sum((more.T / [f.prior for f in fit.free]) ** 2, axis=1)  # by what is known beforehand
+        widened: Floats = fit.covariance + (more / known) @ more.T
+        return widened
+
+    def _list_ways(self, free: Sequence[Free], x: Floats) -> tuple[Mapping[str, float], ...]:
+        """Directions in which an actuator of another size may change beside those of a healthy unit: powers by name."""
+        v = {**self.model.values, **self.list_values(free, x)}
         leaking = {"valve.pressure_gain": 1.0}
         if v["jack.leakage"] > 0.0:  # only 1/GP + CLK/GQ counts
             leaking["jack.leakage"] = v["valve.flow_gain"] / (v["valve.pressure_gain"] * v["jack.leakage"])
@@ -637,10 +653,7 @@ class ScaledProblem(LogProblem):
                    "flapper.inertia": 1.0, "pilot.flow_gain": 1.0, "pilot.pressure_gain": 1.0}
         sticking = {"pilot.pressure_gain": 1.0, "spool.static_friction": 1.0, "spool.dynamic_friction": 1.0}
         turning = {"flapper.inertia": 1.0}  # its time constant, JF/BF, is 25 us: slopes by it are the solver's
-        # a larger piston at a lower pressure: of forces and flows the position alone knows products
-        pressing = {"jack.area": 1.0, "valve.flow_gain": 1.0, "valve.pressure_gain": -1.0, "jack.leakage": 2.0}
-        known = (leaking, flapper, sticking, turning)
-        return find_flat_directions(self, free, x, (*known, pressing) if self.is_settled else known)
+        return leaking, flapper, sticking, turning
 
 
 def make_problem(model: Model, fitted: Sequence[Trace], floor: Mapping[str, float], workers: int) -> ScaledProblem:
@@ -729,10 +742,12 @@ def finish(problem: ScaledProblem, fit: Fit, seed: int = 0, progress: Progress =
     if (size <= RESIDUAL_HELD_OUT * np.array([n.level for n in fine.noise])).all():
         learnt = tuple(fit_noise(r) if s > 0.0 else old  # a signal that the model gives exactly tells none
                        for r, s, old in zip(fit.residuals, size, fine.noise, strict=True))
-        fine = replace(fine, noise=learnt, is_settled=True, _lanes={})
+        fine = replace(fine, noise=learnt, _lanes={})
         fit = descend(fine, fit, ((1.0, 5),))
-    if not fit.free or problem.model.values.keys() >= BALANCED:  # its `find_flat` knows what no run shows
+    if not fit.free:
         return fine, fit
+    if problem.model.values.keys() >= BALANCED:  # its directions that no run shows are known
+        return fine, replace(fit, covariance=fine.widen_covariance(fit))
     # of an actuator whose laws of similarity nobody has declared it seems known by a jump at a stop
     coarse, flat = replace(fine, steps=problem.steps, _lanes={}), np.empty((len(fit.free), 0))
     return fine, replace(fit, covariance=estimate_smooth_covariance(coarse, fit, flat))

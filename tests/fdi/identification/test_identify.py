@@ -10,11 +10,16 @@ from rig_command import answer, refuse, rig
 
 from fdi.discovery.update_model import read_provenance
 from fdi.estimation import long_recordings
+from fdi.estimation.noise import sensor_floors
+from fdi.estimation.unidentifiable import start_fit
 from fdi.identification import global_fit
+from fdi.identification.global_fit import scale_values
 from fdi.identification.identify import (
     Identification,
     decide_verdict,
     identify_model,
+    list_unknowns,
+    make_problem,
     parse_free_parameters,
     read_free_parameters,
     read_identification_runs,
@@ -140,6 +145,21 @@ def test_area_needs_a_known_load(runs: tuple[Trace, Trace, Trace]) -> None:
     assert found.verdict in ("PARTLY", "CANNOT_TELL")
     assert not area.is_identifiable and area.high / area.low > 3.0
     assert {a.parameter: a.experiment for a in found.advice}["jack.area"] == "load"
+
+
+@pytest.mark.parametrize(("signals", "is_known"), [(["xj"], False), (["xj", "p12"], True)])
+def test_a_larger_piston_at_a_lower_pressure_moves_alike(runs: tuple[Trace, Trace, Trace], signals: list[str],
+                                                         is_known: bool) -> None:
+    """Without P12 not even a known load shows the area; slopes would know it by the roughness of the misfit alone."""
+    model = load_model()
+    ranges = parse_free_parameters({"valve": {"flow_gain": 6.0}, "jack": {"area": 5.0, "leakage": 10.0}}, model, "test")
+    own = read_identification_runs(model, ranges, [runs[1]], [], signals)
+    floor = {name: level.value for name, level in sensor_floors(own.fitted[0], model).items()}
+    unit = model.replace({SYMBOLS[symbol]: value for symbol, value in sample_plant().items()})
+    problem, free = make_problem(unit, own.fitted, floor, 1), list_unknowns(model, ranges)
+    fit = start_fit(free, scale_values(free, unit.values))
+    area = [f.name for f in free].index("jack.area")
+    assert bool(problem.widen_covariance(fit)[area, area] == fit.covariance[area, area]) == is_known
 
 
 def test_long_run_is_fitted_by_parts_and_an_end_stop_that_it_never_met_is_not_at_a_bound(
