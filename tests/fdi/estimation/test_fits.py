@@ -356,7 +356,7 @@ def test_scan_of_a_step_test_finds_the_size_at_which_a_backlash_bounces_like_the
 
 def test_error_that_is_watched_while_a_backlash_is_added_falls_to_the_noise() -> None:
     found = refit_effects(load_model("ema"), ["backlash"], _record_motor({"screw.backlash": 1e-4}))
-    assert max(found.last.error[s] / found.floor[s] for s in found.floor) < 1.3
+    assert max(found.last.hypothesis.errors[s] / found.floor[s] for s in found.floor) < 1.3
     assert found.last.hypothesis.fit.values["screw.backlash"] == pytest.approx(1e-4, rel=0.05)
 
 
