@@ -48,6 +48,16 @@ def find_quantity(name: str, where: object = "--set", plant: str = "eha") -> Qua
     return find_field(where, name, find_plant(plant).list_groups())
 
 
+class ParameterRecord(np.record):  # type: ignore[misc]  # its stubs call the base final
+    """Parameters by name; a field comes before an attribute that NumPy's records have for themselves, such as size."""
+
+    def __getattribute__(self, name: str) -> Any:
+        try:
+            return self[name]
+        except (ValueError, KeyError):  # there is no such field
+            return super().__getattribute__(name)
+
+
 @dataclass(frozen=True)
 class Model:
     """A plant with parameter `values` ("group.field" to SI number) and `effects`, in catalogue order."""
@@ -143,9 +153,9 @@ class Model:
     def build_record(self) -> NDArray[Any]:
         """The values as a record array of one row, fields group.field; compiled code reads it in each step."""
         groups = self.kind.list_groups(self.effects)
-        inner = {group: np.dtype((np.record, [(f, float) for f in cls._fields])) for group, cls in groups.items()}
+        inner = {group: np.dtype((ParameterRecord, [(f, float) for f in cls._fields])) for group, cls in groups.items()}
         row = tuple(tuple(self.values[f"{group}.{f}"] for f in cls._fields) for group, cls in groups.items())
-        return np.array([row], np.dtype((np.record, list(inner.items()))))
+        return np.array([row], np.dtype((ParameterRecord, list(inner.items()))))
 
     def build_start(self) -> tuple[Any, Any]:
         """The plant at rest as its sensors show it, and the memories of its effects."""

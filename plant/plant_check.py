@@ -77,7 +77,7 @@ def _check_parameters(plant: Plant, require: Callable[[bool, str, str], None]) -
     for group, cls in plant.parameters.items():
         try:
             quantities: Mapping[str, Any] = list_quantities(cls)
-        except (IndexError, TypeError, AttributeError, NameError, ValueError) as error:
+        except (IndexError, TypeError, AttributeError, NameError) as error:
             require(False, f"parameters, {group}",
                     f'a NamedTuple whose fields are Annotated[float, Quantity("unit")] ({error})')
         for name, q in quantities.items():

@@ -9,8 +9,6 @@ from collections import namedtuple
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
-import numpy as np
-
 
 class Quantity(NamedTuple):
     """Unit, symbol and range of a number. `low` and `high` are allowed; `above` and `below` are not."""
@@ -59,14 +57,8 @@ class Quantity(NamedTuple):
 
 
 def list_quantities(group: type[Any]) -> Mapping[str, Quantity]:
-    """The fields of a parameter group, in order, with their quantities.
-
-    Raises:
-        ValueError: a name that NumPy's records, from which laws in plain Python read parameters, have for themselves.
-    """
+    """The fields of a parameter group, in order, with their quantities."""
     if group not in _KNOWN_GROUPS:  # reading annotations takes longer than everything else about a model
-        for taken in {*group._fields} & {*dir(np.record)}:
-            raise ValueError(f"{group.__name__}: another name than {taken}, which NumPy's records have as well")
         hints = get_type_hints(group, include_extras=True)
         _KNOWN_GROUPS[group] = {name: get_args(hints[name])[1] for name in group._fields}
     return _KNOWN_GROUPS[group]

@@ -73,14 +73,22 @@ def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = Non
         shape = find_pattern(e.search, e.ledger[-1])
         if effect_file and found is None:
             write_effect(shape, effect_file)
-    separation = None
-    if e.verdict == "AMBIGUOUS":
-        equal = [h for h in e.ranked if h.is_at_floor and set(h.effects) <= set(e.effects)]
-        separation = find_separation(e.search, equal)
+    separation = find_separation(e.search, list_equal(e)) if e.verdict == "AMBIGUOUS" else None
     answer = assess_explanation(e, seed)
     told = replace(answer, pattern=str(shape or UNBALANCED) if is_left else "",
                    separate=separation._asdict() if separation else {}, law=law, law_effects=tuple(names.values()))
     return told, shape
+
+
+def list_equal(e: Explanation) -> list[Hypothesis]:
+    """The hypotheses between which an AMBIGUOUS explanation leaves the choice, best first."""
+    return [h for h in e.ranked if h.is_at_floor and set(h.effects) <= set(e.effects)]
+
+
+def list_shared_effects(e: Explanation) -> list[str]:
+    """The named effects about which equal hypotheses agree, and those that were told without one."""
+    equal = list_equal(e)
+    return [name for name in e.effects if len({name in h.effects for h in equal}) == 1]
 
 
 def explain_recording(runs: Runs, progress: Progress = ignore_progress, rounds: int = 2) -> Explanation:

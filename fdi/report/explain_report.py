@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi.discovery.explain_runs import Answer, Candidate, Suspicious
+from fdi.discovery.explain_runs import Answer, Candidate, Suspicious, list_shared_effects
 from fdi.discovery.laws.find_law import Law, LawCurve, LawSearch, Missing
 from fdi.discovery.laws.terms import describe_formula
 from fdi.discovery.residual_pattern import Pattern, find_smooth_rows
@@ -150,8 +150,11 @@ def describe_verdict(a: Answer) -> str:
             return (f"The error is at the noise floor ({floors}). {first.effect} may be present "
                     f"({_describe_sizes([first])}), but it is too small in this test to be certain.")
         case "AMBIGUOUS":
-            return (f"{join_words(a.explanation.effects, 'or')}: each explains the residual, and these data cannot "
-                    f"discriminate between them; {_describe_change(a, a.candidates[0])}.")
+            shared = list_shared_effects(a.explanation)
+            others = join_words([name for name in a.explanation.effects if name not in shared], "or")
+            said = f"{join_words(shared)} together with {others}" if shared else others
+            return (f"{said}: each explains the residual, and these data cannot discriminate between them; "
+                    f"{_describe_change(a, a.candidates[0])}.")
         case word if word == "UNEXPLAINED" or not named:
             return _describe_unexplained(a)
     rest = f"{_describe_sizes(named)}; {_describe_change(a, named[-1])}."

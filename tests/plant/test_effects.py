@@ -210,7 +210,6 @@ def test_the_users_effect_with_memory(file: Path) -> None:
     (COGGING.replace('"load"', '"laod"'), "no port 'laod'"),
     (COGGING.replace('Quantity("N")] = 0.0', 'Quantity("N")]'), "needs a default"),
     (COGGING.replace("def cogging", "def null_bias"), "the name is taken"),
-    (COGGING.replace("force: ", "size: ").replace(".force", ".size"), "another name than size"),
     (HEAD + "raise ValueError('two\\nlines')", "ValueError: two"),
 ])
 def test_a_bad_file_is_refused_in_one_line(file: Path, text: str, said: str) -> None:

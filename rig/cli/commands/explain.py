@@ -5,7 +5,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from fdi.discovery.explain_runs import Answer, explain_runs
+from fdi.discovery.explain_runs import Answer, explain_runs, list_shared_effects
 from fdi.discovery.residual_pattern import can_balance
 from fdi.discovery.runs import Runs, read_runs
 from fdi.discovery.sensitivity import Claim, describe_unit
@@ -74,7 +74,8 @@ def choose_next_command(args: argparse.Namespace, answer: Answer, effect_file: s
         both = (*answer.law.base.effects, *answer.law_effects)
         return f"rig add {' '.join(both)} {arguments} --effects {effect_file}"
     if answer.verdict in ("EXPLAINED", "PARTLY", "AMBIGUOUS") and effects:
-        chosen = effects[:1] if answer.verdict == "AMBIGUOUS" else effects
+        shared = list_shared_effects(answer.explanation)
+        chosen = effects if answer.verdict != "AMBIGUOUS" else dict.fromkeys([*shared, *answer.best.effects])
         return f"rig add {' '.join(chosen)} {arguments}"
     if answer.verdict == "UNEXPLAINED" and args.write_effect:
         return f"rig explain {arguments} --effects {args.write_effect}"

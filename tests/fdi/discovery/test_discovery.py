@@ -199,7 +199,7 @@ def test_a_recording_without_noise_is_taken_to_have_some() -> None:
     columns = {"com": SHORT, "xj": run.xj, "cor": run.cor, "p12": run.p12, "xs": run.xs}
     search = Search(Model(), hold_inputs(Trace.from_columns(columns, 1e-3, {})), [], ["supply_ripple"], 1)
     search.learn_noise(search.fit_base())
-    assert [n.level for n in search.noise] == pytest.approx([2e-7, 2e3, 1e-7], rel=1e-9)
+    assert [n.level for n in search.noise] == pytest.approx([5e-7, 5e3, 2.5e-7], rel=1e-9)
 
 
 @pytest.fixture(scope="module")

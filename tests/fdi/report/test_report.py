@@ -5,6 +5,7 @@ import json
 import math
 import re
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from enum import IntEnum
 from functools import cache
@@ -451,11 +452,11 @@ def candidate(effect: str, *beside: str, word: str = "explains") -> Candidate:
 
 
 def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, is_at_floor: bool = False,
-           **fields: Any) -> Answer:
+           ranked: Sequence[Any] = (), **fields: Any) -> Answer:
     base = SimpleNamespace(is_at_floor=is_at_floor, is_far=False, effects=(), ratio={"xj": 22.5, "p12": 15.0})
     trace = SimpleNamespace(declared=EHA, notes=())
     explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, marks=Marks(1.0, 1e-6, ()),
-                                  ledger=[base], unseen={}, excerpt="",
+                                  ledger=[base], unseen={}, excerpt="", ranked=ranked,
                                   search=SimpleNamespace(problem=SimpleNamespace(trace=trace)))
     baseline = {"error": ERROR, "floor": FLOOR, "holdout": {"xj": 44e-6, "p12": 3e5}}
     blind = (Blind("sensor_gain", "sensor_gain.error", 0.02, "1", "a stop"),
@@ -469,6 +470,9 @@ CASES = {
     "EXPLAINED by two": (answer("EXPLAINED", ("a", "b"), candidate("a", "b"), candidate("b", "a")),
                          "a and b together explain the residual"),
     "AMBIGUOUS": (answer("AMBIGUOUS", ("a", "b"), candidate("a"), candidate("b")), "a or b: each explains the"),
+    "AMBIGUOUS beside one": (answer("AMBIGUOUS", ("a", "b", "c"), candidate("b", "a"), candidate("c", "a"), ranked=[
+        SimpleNamespace(effects=pair, is_at_floor=True) for pair in (("a", "b"), ("c", "a"))]),
+        "a together with b or c: each explains the"),
     "PARTLY": (answer("PARTLY", ("a",), candidate("a", word="part")), "a explains part of the residual"),
     "PARTLY by none": (answer("PARTLY", (), candidate("a", word="part")), "No effect of the catalogue"),
     "UNEXPLAINED": (answer("UNEXPLAINED", (), candidate("a", word="no")), "the best, a, leaves"),
