@@ -172,7 +172,7 @@ def run_c_responder(bus: str) -> Iterator[None]:
         cpu = list_cpus()[-min(2, len(list_cpus()))]
         words = [str(build_responder(Path(folder))), *map(str, (receive, send, turn, cpu, LOOP_PRIORITY, cycle_at)),
                  feedback.hex(), valve.hex()]
-        with _run_process(words, *raw.descriptors) as process:
+        with _run_process(words, *(file for file in (receive, send, turn) if file >= 0)) as process:
             assert process.stdout is not None
             process.stdout.readline()
             yield

@@ -281,13 +281,14 @@ def test_a_checksum_of_the_users_own_protects_a_whole_run(tmp_path: Path) -> Non
     (tmp_path / "bench.toml").write_text(bench)
     (tmp_path / "ecu.dbc").write_bytes((ECU / "ecu.dbc").read_bytes())
     (tmp_path / "short.toml").write_text(SHORT + SLOW_START)
-    for inversion, trust, status in ((0xFF, (), 2), (0xFF, ("--trust",), 0), (0xFE, ("--trust",), 1)):
+    (tmp_path / "own.py").write_text(OWN_CHECKSUM.replace("INVERSION", "255"))
+    said = rig("run", tmp_path / "short.toml", *words, "--bus", where)
+    assert said.status == 2 and said.err.count("own.py") == 1 and said.err.count("\n") == 1
+    for inversion, verdict in ((255, "PASS"), (254, "ABORTED")):
         (tmp_path / "own.py").write_text(OWN_CHECKSUM.replace("INVERSION", str(inversion)))
         with run_device(ECU, where, *PATIENT[ECU]):
-            said = rig("run", tmp_path / "short.toml", *words, "--bus", where, *trust)
-        assert said.status == status, said.err
-        assert said.err.count("own.py") == 1 and said.err.count("\n") == 1 + (status == 1)  # refused, or announced
-    assert said.json["verdict"] == "ABORTED"
+            said = rig("run", tmp_path / "short.toml", *words, "--bus", where, "--trust")
+        assert said.json["verdict"] == verdict and said.err.count("own.py") == 1, said.err
 
 
 @examples

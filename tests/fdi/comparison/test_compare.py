@@ -536,7 +536,7 @@ def test_compare_finds_the_shipped_model_by_its_name() -> None:
     assert found["xj"]["closed_loop_error"] < 0.8 * rms(bare["xj"])
 
 
-EMPS = SHARED / "data" / "emps" / "EMPS_EMPS.mat"
+EMPS = SHARED / "data" / "emps" / "DATA_EMPS.mat"
 
 
 @pytest.fixture(scope="module")
