@@ -620,7 +620,6 @@ def cut_long_runs(runs: Sequence[Trace], sources: Sequence[Source], model: Model
     return tuple(parts), remarks
 
 
-@dataclass
 class ScaledProblem(LogProblem):
     """The runs of an actuator of any size, which show less of it than those of a healthy unit of a known one."""
 

@@ -330,16 +330,7 @@ def test_a_missing_package_is_named(name: str, package: str, tmp_path: Path, mon
     assert f"the package {package}" in line and "pip install 'eha-rig[measure]'" in line
 
 
-TIMED = """
-[time]
-source = "t"
-[signals.com]
-source = "com"
-[signals.xj]
-source = "xj"
-[signals.cor]
-source = "cor"
-"""
+TIMED = '\n[time]\nsource = "t"' + MAP
 
 BAD = {
     "missing column": (TIMED.replace('"xj"', '"xi"'), "signals.xj.source: expected a column of own.csv", "not 'xi'"),
