@@ -7,7 +7,6 @@ priors; its trials are replayed side by side in lanes.
 """
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -15,6 +14,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from fdi.estimation.mains import remove_mains
 from fdi.estimation.noise import Noise
 from fdi.thresholds import ANCHOR_RATE, BLOCK_FITTED_SQUARE, CONVERGED_GAIN, CONVERGED_SHARE, HEALTHY_TOLERANCES
 from fdi.trace.trace import Floats, Trace
@@ -26,7 +26,6 @@ from plant.run import simulate
 from plant.segments import build_profile
 from plant.threads import map_in_threads
 
-HUM = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0, 400.0)  # Hz
 HUM_MOST_SD = 8.0  # noise levels, of hum and noise together
 BLOCK = 100  # cycles
 FURTHEST = 1e15  # SI, of any signal
@@ -135,7 +134,8 @@ class Problem:
         trace = self.trace if trace is None else trace
         out = self._lanes[key].replay(values, trace.drive, trace.load, trace.anchor, self.anchor, trace.parts,
                                       trace.chambers, trace.slack)
-        if not (out.max() < FURTHEST and out.min() > -FURTHEST):  # a trial at which the simulation diverges
+        flat = out.transpose(0, 2, 1).reshape(-1)
+        if not float(flat @ flat) < FURTHEST**2:  # a trial at which the simulation diverges
             out = np.clip(np.nan_to_num(out, nan=FURTHEST), -FURTHEST, FURTHEST)
         return trace.pass_sensors(out).transpose(0, 2, 1)
 
@@ -155,7 +155,7 @@ class Problem:
         """Whitened residuals of predictions, (m, s, n), 0 where not measured."""
         white = np.empty(predicted.shape)
         for few in cut_runs(predicted.shape):
-            white[few] = self.whiten_residuals(self.subtract_measurements(predicted[few]))
+            self._whiten(self.subtract_measurements(predicted[few]), white[few])
         return white
 
     def compute_costs(self, free: Sequence[Free], x: Floats) -> Floats:
@@ -177,23 +177,27 @@ class Problem:
         Its slope is that of the prediction. What a report shows is the residual, measured minus model.
         """
         # an observer's replay that bounces otherwise than the measured motor is off by far more than any hum
-        is_observed = self.model.kind.correct is not None
-        most = HUM_MOST_SD * np.array([[n.level] for n in self.noise]) if is_observed else None
+        most = HUM_MOST_SD if self.model.kind.correct is not None else np.inf
+        limits = most * np.array([n.level for n in self.noise])
         residuals, start, period = np.empty(predicted.shape), 0, self.model.values["controller.period"]
         for trace in (self.trace, *self.also):
+            np.subtract(predicted[..., start:start + len(trace)], trace.measurements,
+                        out=residuals[..., start:start + len(trace)])
             for part in trace.parts or _cut_rows(len(trace)):
-                there = slice(start + part.first, start + part.stop)
-                measured = trace.measurements[:, part.first:part.stop]
-                residuals[..., there] = remove_mains(predicted[..., there] - measured, period, most)
+                remove_mains(residuals, start + part.first, start + part.stop, period, limits)
             start += len(trace)
         return residuals
 
     def whiten_residuals(self, residuals: Floats) -> Floats:
         """Residuals (m, s, n) as white noise of variance 1, if only noise is left; where nothing was measured, 0."""
-        white = np.empty(residuals.shape)
-        for i, noise in enumerate(self.noise):
-            white[:, i] = noise.whiten(residuals[:, i])
+        residuals = np.ascontiguousarray(residuals, float)
+        white = np.empty_like(residuals)
+        self._whiten(residuals, white)
         return white
+
+    def _whiten(self, residuals: Floats, white: Floats) -> None:
+        for i, noise in enumerate(self.noise):
+            noise.whiten_signal(residuals, i, white)
 
 
 P = TypeVar("P", bound=Problem)
@@ -218,43 +222,6 @@ def cut_runs(shape: Sequence[int], most: int = 120_000) -> list[slice]:
 def _cut_rows(rows: int, most: int = 60_000) -> list[Part]:
     """All rows in pieces of at most so many: the lines of the mains keep their phase no longer."""
     return [Part(first, min(first + most, rows), 0) for first in range(0, rows, most)]
-
-
-def remove_mains(residuals: Floats, period: float, most: Floats | None = None) -> Floats:
-    """Residuals (.., n) without the steady lines of the mains.
-
-    What is larger than `most` counts as that: a piece with large residuals would put lines into all others.
-    """
-    waves = find_mains_waves(residuals.shape[-1], period)
-    complete = residuals if np.isfinite(residuals).all() else np.nan_to_num(residuals)
-    if most is not None:
-        complete = np.clip(complete, -most, most)
-    turn = len(waves)
-    whole = residuals.shape[-1] // turn * turn  # of all turns that are complete
-    cut = (*residuals.shape[:-1], -1, turn)
-    sums = complete[..., :whole].reshape(cut).sum(axis=-2)
-    sums[..., :residuals.shape[-1] - whole] += complete[..., whole:]
-    steady = ((sums.reshape(-1, turn) @ waves) @ waves.T).reshape(sums.shape)
-    left = np.empty_like(residuals)
-    left[..., :whole] = (residuals[..., :whole].reshape(cut) - steady[..., None, :]).reshape(*cut[:-2], -1)
-    left[..., whole:] = residuals[..., whole:] - steady[..., :residuals.shape[-1] - whole]
-    return left
-
-
-@cache
-def find_mains_waves(n: int, period: float) -> Floats:
-    """Sines and cosines of the mains' lines that are orthonormal over n samples: what a steady hum looks like.
-
-    Only one turn of them, (turn, k), after which they all repeat, or all n samples where no such turn is whole. A hum
-    that starts with the test has the same phase in every run, so no repeat tells it from physics.
-    """
-    t = 2.0 * np.pi * period * np.arange(n)
-    raw = np.array([w(f * t) for f in HUM if f < 0.45 / period for w in (np.sin, np.cos)]).reshape(-1, n).T
-    turn = 1.0 / (math.gcd(*map(int, HUM)) * period)
-    waves, triangle = np.linalg.qr(raw)
-    if turn < n and math.isclose(turn, round(turn), rel_tol=1e-9):
-        waves = np.linalg.solve(triangle.T, raw[:round(turn)].T).T
-    return np.asarray(waves, np.float64)
 
 
 def cut_blocks(white: Floats, block: int = BLOCK) -> Floats:

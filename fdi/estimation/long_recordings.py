@@ -24,9 +24,9 @@ from fdi.estimation.fit import (
     Problem,
     limit_dynamic_friction,
     list_tolerance_sizes,
-    remove_mains,
     sum_blocks,
 )
+from fdi.estimation.mains import remove_mains
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import ANCHOR_RATE, RESIDUAL_HELD_OUT
 from fdi.trace.trace import Flags, Floats, Trace
@@ -277,9 +277,9 @@ def judge_on_all(problem: Problem, fits: Sequence[Fit], trace: Trace, steps: int
     turns = replay_in_turns(lanes, limit_dynamic_friction(names, values), trace, trace.anchor, problem.anchor)
     for first, out in turns:
         seen = trace.measurements[:, first:first + out.shape[1]]
-        left = out.transpose(0, 2, 1)[:, outputs] - seen
+        left = np.ascontiguousarray(out.transpose(0, 2, 1)[:, outputs] - seen)
         if seen.shape[1] > BLOCK:
-            left = remove_mains(left, period)
+            remove_mains(left, 0, seen.shape[1], period, np.full(len(seen), np.inf))
         squares.append(sum_blocks(np.nan_to_num(left)))
         counts.append(sum_blocks((~np.isnan(seen)).astype(float)))
     blocks, count = np.concatenate(squares, axis=-1), np.concatenate(counts, axis=-1)

@@ -262,30 +262,35 @@ class Noise(NamedTuple):
 
     def whiten(self, residual: Floats) -> Floats:
         """Residuals, (.., n), time last, as white noise of variance 1; NaN (nothing measured) gives 0."""
-        rows = np.ascontiguousarray(residual, float).reshape(-1, residual.shape[-1])
+        rows = np.ascontiguousarray(residual, float).reshape(-1, 1, residual.shape[-1])
         white = np.empty_like(rows)
-        _compile_filter()(rows, self.filter / self.innovation, white)
+        self.whiten_signal(rows, 0, white)
         return white.reshape(residual.shape)
+
+    def whiten_signal(self, residuals: Floats, signal: int, white: Floats) -> None:
+        """Fill one signal of `white` (m, s, n) with that of the residuals (m, s, n), as `whiten` does."""
+        _compile_filter()(residuals, signal, self.filter / self.innovation, white)
 
 
 @cache
 def _compile_filter() -> Function:
-    return compile_function(filter_rows)
+    return compile_function(filter_signal)
 
 
-def filter_rows(x: Floats, weights: Floats, out: Floats) -> None:
-    """Fill `out` (m, n) with weighted sums of each value of `x` (m, n) and those before it, 0 where one is missing.
+def filter_signal(x: Floats, signal: int, weights: Floats, out: Floats) -> None:
+    """Fill `out` (m, s, n) of a signal with weighted sums of each value of `x` (m, s, n) and those before it.
 
-    Compiled, as the residuals of every trial of a fit pass it: SciPy's lfilter takes five times as long.
+    Where one of them is missing, they are 0. Compiled, as the residuals of every trial of a fit pass it: SciPy's
+    lfilter takes five times as long.
     """
-    n, tile = x.shape[1], 1024  # a tile stays in the fastest cache for all weights
-    for row in range(len(x)):
+    n, tile = x.shape[2], 1024  # a tile stays in the fastest cache for all weights
+    for run in range(len(x)):
         for first in range(0, n, tile):
-            sums = out[row, first:first + tile]
+            sums = out[run, signal, first:first + tile]
             sums[:] = 0.0
             for i in range(len(weights)):
                 begin = max(i - first, 0)
-                there = x[row, first + begin - i:n]
+                there = x[run, signal, first + begin - i:n]
                 for t in range(len(sums) - begin):
                     sums[begin + t] += weights[i] * there[t]
             for t in range(len(sums)):
