@@ -815,7 +815,8 @@ def estimate_parameters(model: Model, ranges: Sequence[Range], fit: Fit,
             systematic *= abs(value)
         half = INTERVAL_95_SD * float(np.hypot(factor, systematic))
         low, high = (value * np.exp(-half), value * np.exp(half)) if r.is_relative else (value - half, value + half)
-        low, high = (min(max(float(end), r.low), r.high) for end in (low, high))
+        least, most = min(r.low, value), max(r.high, value)  # a static friction goes with the dynamic one, also beyond
+        low, high = (min(max(float(end), least), most) for end in (low, high))
         share = half / r.half_width
         seen = share <= IDENTIFIABLE_SHARE
         found.append(Estimate(r.name, r.unit, model[r.name], r.low, r.high, value, low, high, seen, min(share, 1.0)))
