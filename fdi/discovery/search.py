@@ -43,7 +43,7 @@ from fdi.estimation.fit import (
 from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, is_long, judge_on_all
 from fdi.estimation.noise import Noise
 from fdi.estimation.replay import find_undecided_rows, leave_out_rest, leave_out_rows, measure_decided_errors
-from fdi.estimation.unidentifiable import finish_fit, list_powers, scale_together
+from fdi.estimation.unidentifiable import finish_fit, list_directions, list_powers, scale_to, scale_together
 from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import (
     BLOCK_FITTED_SQUARE,
@@ -271,12 +271,22 @@ class Search:
             own = set(self.model.find_effect(gone).fitted)
             free = [usual.get(f.name) if f.name in own else f for f in h.fit.free]
             kept = [f for f in free if f is not None]
-            x = [(h.fit.values[f.name] - f.centre) / f.scale for f in kept]
-            inside = np.array([v if f.name not in own or f.low < h.fit.values[f.name] < f.high else 0.0
-                               for f, v in zip(kept, x, strict=True)])
-            return self.judge_fit(tuple(e for e in h.effects if e != gone), fit_unknowns(self.problem, kept, inside))
+            x = np.array([[(values[f.name] - f.centre) / f.scale
+                           if f.name not in own or f.low < values[f.name] < f.high else 0.0 for f in kept]
+                          for values in (h.fit.values, *self._list_ways_off(h.fit, gone))])
+            x = np.clip(x, *scaled_bounds(kept))
+            best = x[int(np.argmin(self.problem.compute_costs(kept, x)))] if len(x) > 1 else x[0]
+            return self.judge_fit(tuple(e for e in h.effects if e != gone), fit_unknowns(self.problem, kept, best))
 
         return sorted(self.map_parallel(fit_without, h.effects), key=lambda each: each.cost)
+
+    def _list_ways_off(self, fit: Fit, effect: str) -> list[dict[str, float]]:
+        """Values at which an effect is off and other parameters have taken its place, along directions no signal shows.
+        """
+        entry = self.model.find_effect(effect)
+        x = [scale_to(fit.free, fit.x, direction.powers, name, entry.off[name])
+             for direction in list_directions(self.problem, fit.values) for name in entry.fitted if name in entry.off]
+        return [replace(fit, x=there).values for there in x if there is not None]
 
     def map_parallel(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
         """In threads whose replays are made together: side by side in the lanes of a kernel."""

@@ -125,20 +125,28 @@ def list_directions_of_faults(at: Mapping[str, float]) -> list[Mapping[str, floa
 
 
 def list_directions(problem: Problem, at: Mapping[str, float]) -> list[Direction]:
-    """What no measured signal may show, for linear unknowns; `at` are parameters by name, SI.
+    """What no measured signal may show, for linear unknowns, where the model has these values, SI by name.
 
     Of pressure gain and leakage only 1/GP + CLK/GQ shows: a smaller gain is a larger leakage.
     """
+    at = {**problem.model.values, **at}
+    if not at.keys() >= BALANCED:
+        return []
     pairs = zip(list_powers(problem), FLAT_WITH_EFFECTS, strict=True)
     share = at["valve.pressure_gain"] * at["jack.leakage"] / at.get("viscosity_drift.factor", 1.0)
     loss = {"valve.pressure_gain": share / max(share, at["valve.flow_gain"]),
             "jack.leakage": at["valve.flow_gain"] / max(share, at["valve.flow_gain"])}
-    every = [*(Direction({**flat, **effects}) for flat, effects in pairs), Direction(loss), Direction(VISCOSITY),
-             Direction(POSITION_SCALE),
+    scaled = [{**flat, **effects} for flat, effects in pairs]
+    every = [*map(Direction, scaled), Direction(loss), Direction(VISCOSITY), Direction(POSITION_SCALE),
+             Direction(_subtract_powers(POSITION_SCALE, scaled[-1])),  # the same forces: under a known load only this
              Direction(FLAPPER, allowed=PRIORS_KNOW_MORE_MISFIT),
              Direction(SPOOL_WAY, frozenset({"xs"}), PRIORS_KNOW_MORE_MISFIT),
              Direction(JACK_PRESSURE, frozenset({"p12"}))]
     return [each for each in every if not each.shown_by & set(problem.trace.outputs)]
+
+
+def _subtract_powers(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float]:
+    return {name: a.get(name, 0.0) - b.get(name, 0.0) for name in {**a, **b}}
 
 
 def list_powers(problem: Problem) -> list[Mapping[str, float]]:
@@ -158,17 +166,25 @@ def scale_together(free: Sequence[Free], x: Floats, said: Mapping[str, float], l
     return moved
 
 
+def scale_to(free: Sequence[Free], x: Floats, said: Mapping[str, float], name: str, value: float) -> Floats | None:
+    """The same where that brings parameter `name` to a value; None if the powers do not move it there."""
+    k = next((k for k, f in enumerate(free) if f.name == name), None)
+    origin = ORIGINS.get(name, 0.0)
+    if k is None or name not in said:
+        return None
+    ratio = (value - origin) / (free[k].centre + free[k].scale * float(x[k]) - origin)
+    return scale_together(free, x, said, math.log(ratio) / said[name]) if ratio > 0.0 else None
+
+
 def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[list[Direction], Floats]:
     """The directions that hold at `x` (p,), and their tangents of scaled unknowns as columns (p, k).
 
     Left out is a direction that a bound stops, or that a trial replay does not find flat.
     """
-    if not problem.model.values.keys() >= BALANCED:
-        return [], np.empty((len(x), 0))
     low, high = scaled_bounds(free)
     names = {f.name for f in free}
-    at = {**problem.model.values, **problem.list_values(free, x)}
-    every = [each for each in list_directions(problem, at) if next(iter(each.powers)) in names]
+    every = [each for each in list_directions(problem, problem.list_values(free, x))
+             if next(iter(each.powers)) in names]
     if not every:
         return [], np.empty((len(x), 0))
     trials = np.array([[scale_together(free, x, each.powers, TRIED * share) for each in every]
