@@ -303,6 +303,12 @@ def test_tolerances_make_up_for_viscosity_and_for_the_scale_of_the_position(
     assert direction in find_flat(changes, "xj,p12,xs")
 
 
+def test_under_a_known_load_the_scale_of_the_position_leaves_forces_and_the_area_as_they_are() -> None:
+    changes = {"sensor_gain.error": 0.02, "aero_stiffness.stiffness": 3e5, "compressibility.coefficient": 1e-9}
+    flat = [powers for powers in find_flat(changes, "xj,p12,xs", load=5e3) if "sensor_gain.error" in powers]
+    assert [(powers["jack.area"], powers["jack.mass"], powers["valve.flow_gain"]) for powers in flat] == [(0, 1, -1)]
+
+
 FLOOR = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
 
 
