@@ -107,8 +107,7 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
             "Left: the missing quantity over the state that it follows best, with two standard errors. Right: over "
             "time.", partial(draw_pattern, pattern, trace.t[find_smooth_rows(trace)]))]),
         Section("Error after each effect", [Figure(
-            "Error over noise floor after each effect, on the fitted and on the held-out run. An effect that lowers "
-            "only the blue bar is overfitting.",
+            "Error over noise floor after each effect. One that lowers the bar of the fitted run alone overfits.",
             partial(draw_ledger, [Row(*row) for row in a.ledger], a.baseline["floor"], trace.declared))]
             if len(a.ledger) > 2 else []),
         _list_suspicious(a.suspicious),
@@ -389,16 +388,19 @@ def draw_change(trace: Trace, before: Hypothesis, after: Hypothesis | None, floo
 
 
 def draw_ledger(rows: Sequence[Row], floor: BySignal, declared: Signals) -> str:
-    """Error over noise floor of each signal after each effect, on the fitted run and on the held-out one."""
+    """Error over noise floor of each signal after each effect, on the fitted run and on the held-out one if there is."""
     x, signals = np.arange(len(rows)), [s for s in floor if s in rows[0].error]
+    names = [name_step(row) for row in rows]
+    runs = [("fitted run", AFTER, [row.error for row in rows])]
+    if any(row.holdout for row in rows):
+        runs += [("held-out run", ORANGE, [row.holdout for row in rows])]
 
     def draw_signal(s: str) -> Panel:
-        own, held = ([by.get(s, math.nan) / floor[s] for by in side] for side in
-                     ([row.error for row in rows], [row.holdout for row in rows]))
-        return [call("bar", x - 0.19, own, width=0.36, color=AFTER, label="fitted run"),
-                call("bar", x + 0.19, held, width=0.36, color=ORANGE, label="held-out run"),
+        bars = [call("bar", x + 0.38 * place, [by.get(s, math.nan) / floor[s] for by in errors], width=0.36,
+                     color=color, label=label) for place, (label, color, errors) in enumerate(runs)]
+        return [*bars,
                 level(1.0, GREEN, width=1.2),
-                call("set_xticks", x, [name_step(row) for row in rows], rotation=20, ha="right"),
+                call("set_xticks", x + 0.19 * (len(runs) - 1), names, rotation=20, ha="right"),
                 axes(yscale="log", title=declared.find(s).symbol,
                      ylabel="error over noise floor" if s == signals[0] else "")]
 
@@ -558,8 +560,8 @@ def build_model_report(update: ModelUpdate, path: Path | None = None, backup: Pa
         sections = [
             Section("Error after each step", [
                 _tabulate_errors(p.ledger, floor, signals), Figure(
-                    "Error over noise floor after each step, on the fitted and on the held-out run. An effect that "
-                    "lowers only the blue bar is overfitting.", partial(draw_ledger, p.ledger, floor, signals))]),
+                    "Error over noise floor after each step. One that lowers the bar of the fitted run alone overfits.",
+                    partial(draw_ledger, p.ledger, floor, signals))]),
             *sections,
             Section("Residual", [Figure(
                 "Residual (measured minus model) of each signal, before and after. Where the model is complete, the "
