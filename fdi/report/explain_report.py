@@ -388,7 +388,8 @@ def draw_change(trace: Trace, before: Hypothesis, after: Hypothesis | None, floo
 
 
 def draw_ledger(rows: Sequence[Row], floor: BySignal, declared: Signals) -> str:
-    """Error over noise floor of each signal after each effect, on the fitted run and on the held-out one if there is."""
+    """Error over noise floor of each signal after each effect, on the fitted run and the held-out one, if there is one.
+    """
     x, signals = np.arange(len(rows)), [s for s in floor if s in rows[0].error]
     names = [name_step(row) for row in rows]
     runs = [("fitted run", AFTER, [row.error for row in rows])]
