@@ -98,7 +98,10 @@ def check_sdo_by_state(t: Target, state: NmtState) -> str:
 
 
 def check_pdo_by_state(t: Target, state: NmtState) -> str:
-    """Sending: at SYNC. Receiving: a frame that is too short is noticed in OPERATIONAL only."""
+    """Sending: at SYNC. Receiving: a frame that is too short is noticed in OPERATIONAL only.
+
+    Whether it is noticed there is the subject of another test: a node that is silent shows nothing here.
+    """
     pdos = {identify(t, pdo): pdo for pdo in list_valid(t)}
     cyclic = {cob_id for cob_id, pdo in pdos.items() if not pdo.is_received and set_type(t, pdo, 1)}
     values = {cob_id: read_mapped(t, pdo) for cob_id, pdo in pdos.items() if pdo.is_received}
@@ -119,10 +122,11 @@ def check_pdo_by_state(t: Target, state: NmtState) -> str:
     require(is_running or not early, f"{name_state(state)}: {join_labels(early)} sent")
     if t.sheet.find(0x1014) and values and state != STOPPED:  # in STOPPED no EMCY could say so
         cob_id, each = next(iter(values.items()))
-        is_received = bool(send_short(t, pdos[cob_id], each, cob_id, is_running))
-        require(is_received == is_running, f"{name_state(state)}: {pdos[cob_id].name} is "
-                                           f"{'received' if is_received else 'not received'}")
+        is_noticed = bool(send_short(t, pdos[cob_id], each, cob_id, is_running))
+        require(is_running or not is_noticed, f"{name_state(state)}: {pdos[cob_id].name} is received")
         t.send(cob_id, b"".join(each))
+        if is_running and not is_noticed:
+            return f"{name_state(state)} {len(sent)} sent, reception not shown"
     return f"{name_state(state)} {len(sent)} sent"
 
 
