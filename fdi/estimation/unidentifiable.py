@@ -102,6 +102,10 @@ POSITION_SCALE: Mapping[str, float] = {
     "rod_backlash.width": -1.0, "stribeck.speed": -1.0, "presliding.deflection": -1.0,
     "presliding.speed": -1.0}
 
+# The same at the same forces: under a known load only this.
+POSITION_SCALE_AT_FORCES: Mapping[str, float] = {
+    name: POSITION_SCALE.get(name, 0.0) - power
+    for name, power in {**dict.fromkeys(POSITION_SCALE, 0.0), **FLAT[-1], **FLAT_WITH_EFFECTS[-1]}.items()}
 
 BALANCED = {"valve.pressure_gain", "valve.flow_gain", "jack.leakage"}  # a plant without them has other directions
 
@@ -121,7 +125,8 @@ def list_directions_of_faults(at: Mapping[str, float]) -> list[Mapping[str, floa
             {"coil_short.share": 1.0, "torque_motor.gain": -1.0},
             {"land_clearance.clearance": 3.0 * clearance**3 * leak["jack.leakage"] / most,
              "jack.leakage": -3.0 * flow / most},
-            {name: power * linear.get(name, 1.0) for name, power in POSITION_SCALE.items()}]
+            *({name: power * linear.get(name, 1.0) for name, power in powers.items()}
+              for powers in (POSITION_SCALE, POSITION_SCALE_AT_FORCES))]
 
 
 def list_directions(problem: Problem, at: Mapping[str, float]) -> list[Direction]:
@@ -136,17 +141,12 @@ def list_directions(problem: Problem, at: Mapping[str, float]) -> list[Direction
     share = at["valve.pressure_gain"] * at["jack.leakage"] / at.get("viscosity_drift.factor", 1.0)
     loss = {"valve.pressure_gain": share / max(share, at["valve.flow_gain"]),
             "jack.leakage": at["valve.flow_gain"] / max(share, at["valve.flow_gain"])}
-    scaled = [{**flat, **effects} for flat, effects in pairs]
-    every = [*map(Direction, scaled), Direction(loss), Direction(VISCOSITY), Direction(POSITION_SCALE),
-             Direction(_subtract_powers(POSITION_SCALE, scaled[-1])),  # the same forces: under a known load only this
+    every = [*(Direction({**flat, **effects}) for flat, effects in pairs), Direction(loss), Direction(VISCOSITY),
+             Direction(POSITION_SCALE), Direction(POSITION_SCALE_AT_FORCES),
              Direction(FLAPPER, allowed=PRIORS_KNOW_MORE_MISFIT),
              Direction(SPOOL_WAY, frozenset({"xs"}), PRIORS_KNOW_MORE_MISFIT),
              Direction(JACK_PRESSURE, frozenset({"p12"}))]
     return [each for each in every if not each.shown_by & set(problem.trace.outputs)]
-
-
-def _subtract_powers(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float]:
-    return {name: a.get(name, 0.0) - b.get(name, 0.0) for name in {**a, **b}}
 
 
 def list_powers(problem: Problem) -> list[Mapping[str, float]]:

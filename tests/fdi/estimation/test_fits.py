@@ -32,7 +32,15 @@ from fdi.estimation.replay import (
     read_cycles,
     replay_current,
 )
-from fdi.estimation.unidentifiable import FLAPPER, JACK_PRESSURE, POSITION_SCALE, SPOOL_WAY, VISCOSITY, find_tangents
+from fdi.estimation.unidentifiable import (
+    FLAPPER,
+    JACK_PRESSURE,
+    POSITION_SCALE,
+    POSITION_SCALE_AT_FORCES,
+    SPOOL_WAY,
+    VISCOSITY,
+    find_tangents,
+)
 from fdi.trace.trace import Floats, Trace, rms
 from plant import Model, load_model, simulate
 from plant.declare import Chirp, Hold, Ramp, Step
@@ -305,8 +313,9 @@ def test_tolerances_make_up_for_viscosity_and_for_the_scale_of_the_position(
 
 def test_under_a_known_load_the_scale_of_the_position_leaves_forces_and_the_area_as_they_are() -> None:
     changes = {"sensor_gain.error": 0.02, "aero_stiffness.stiffness": 3e5, "compressibility.coefficient": 1e-9}
-    flat = [powers for powers in find_flat(changes, "xj,p12,xs", load=5e3) if "sensor_gain.error" in powers]
-    assert [(powers["jack.area"], powers["jack.mass"], powers["valve.flow_gain"]) for powers in flat] == [(0, 1, -1)]
+    flat = find_flat(changes, "xj,p12,xs", load=5e3)
+    assert POSITION_SCALE_AT_FORCES in flat and POSITION_SCALE not in flat
+    assert [POSITION_SCALE_AT_FORCES[f"jack.{field}"] for field in ("area", "mass", "leakage")] == [0.0, 1.0, -1.0]
 
 
 FLOOR = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
