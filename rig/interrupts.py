@@ -1,6 +1,7 @@
 """Ctrl-C and SIGTERM: a run is asked to stop, so that its clean-up can bring the machine to rest. Ends of processes."""
 
 import contextlib
+import ctypes
 import os
 import signal
 import sys
@@ -67,6 +68,21 @@ def catch_signals() -> Iterator[Callable[[], bool]]:
 
     with handle_signals({signal.SIGINT: handle, signal.SIGTERM: handle}):
         yield is_to_stop
+
+
+def end_with_this_process() -> Callable[[], None]:
+    """What a new process does first (`preexec_fn`), so that the kernel kills it when the thread that starts it ends.
+
+    So a program of any kind ends with the rig, also with one that was killed: nothing of its own has to look.
+    """
+    prctl, kill_at_end, parent = ctypes.CDLL(None).prctl, 1, os.getpid()  # PR_SET_PDEATHSIG, linux/prctl.h
+
+    def prepare() -> None:
+        prctl(kill_at_end, signal.SIGKILL, 0, 0, 0)
+        if os.getppid() != parent:  # it ended before the kernel knew
+            os._exit(1)
+
+    return prepare
 
 
 def describe_exit(status: int) -> str:

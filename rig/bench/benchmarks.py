@@ -34,6 +34,7 @@ from plant.solve import run_closed_loop
 from rig.benches.bench import Role
 from rig.benches.bench_file import load_bench
 from rig.firmware.build import build_device
+from rig.interrupts import end_with_this_process
 from rig.network.bus import Link, LinkWire, can_open, open_can
 from rig.network.frame import WallClock
 from rig.network.master import Master
@@ -165,13 +166,13 @@ def run_c_responder(bus: str) -> Iterator[None]:
     """Run the responder in C on a bus while the context lasts, on the CPU and with the priority of the emulator."""
     frames = load_bench().frames
     with tempfile.TemporaryDirectory() as folder, RawBus(bus, [frames.sync or 0]) as raw:
-        receive, send, turn = raw.descriptors
+        receive, send, turn, place = raw.descriptors
         feedback, valve = (_pack(bus, frames.find_role(role).identifier) for role in ("feedback", "valve_state"))
         number = next(each for each in frames.find_role("valve_state").fields if each.name == "cycle")
         cycle_at = valve.index(_PAYLOAD) + number.lowest // 8
         cpu = list_cpus()[-min(2, len(list_cpus()))]
-        words = [str(build_responder(Path(folder))), *map(str, (receive, send, turn, cpu, LOOP_PRIORITY, cycle_at)),
-                 feedback.hex(), valve.hex()]
+        numbers = (receive, send, turn, place, cpu, LOOP_PRIORITY, cycle_at)
+        words = [str(build_responder(Path(folder))), *map(str, numbers), feedback.hex(), valve.hex()]
         with _run_process(words, *(file for file in (receive, send, turn) if file >= 0)) as process:
             assert process.stdout is not None
             process.stdout.readline()
@@ -190,7 +191,8 @@ def _pack(bus: str, cob_id: int) -> bytes:
 
 @contextlib.contextmanager
 def _run_process(words: list[str], *descriptors: int) -> Iterator[Peer]:
-    process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, pass_fds=descriptors)
+    process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, pass_fds=descriptors,
+                               preexec_fn=end_with_this_process())
     try:
         yield process
     finally:

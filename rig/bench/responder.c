@@ -1,18 +1,18 @@
 /* Answers each SYNC with feedback and valve state, as fast as a C program can: the measure for the plant emulator.
  *
- *   responder RECEIVE SEND TURN CPU PRIORITY CYCLE_AT FEEDBACK VALVE_STATE
+ *   responder RECEIVE SEND TURN PLACE CPU PRIORITY CYCLE_AT FEEDBACK VALVE_STATE
  *
- * RECEIVE and SEND are open sockets on which only SYNC arrives, TURN the file whose lock is the turn on the UDP bus
- * (udp.py) or -1. The two frames are given in hexadecimal as they go out; CYCLE_AT is the place of the cycle counter in
- * VALVE_STATE.
+ * RECEIVE and SEND are open sockets on which only SYNC arrives, TURN and PLACE the file and its byte whose lock is the
+ * turn on the UDP bus (udp.py); TURN is -1 on others. The two frames are given in hexadecimal as they go out; CYCLE_AT
+ * is the place of the cycle counter in VALVE_STATE.
  */
 #define _GNU_SOURCE
 #include <errno.h>
+#include <fcntl.h>
 #include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/file.h>
 #include <sys/mman.h>
 #include <sys/socket.h>
 
@@ -31,22 +31,32 @@ static struct frame read_frame(const char *text) {
     return frame;
 }
 
-static int send_frame(int socket, int turn, const struct frame *frame) {
-    if (turn >= 0 && flock(turn, LOCK_EX) != 0) return -1;
+static int turn;
+static off_t place;
+
+static int set_lock(short kind) {
+    struct flock lock = {.l_type = kind, .l_whence = SEEK_SET, .l_start = place, .l_len = 1};
+    return fcntl(turn, F_OFD_SETLKW, &lock);
+}
+
+static int send_frame(int socket, const struct frame *frame) {
+    if (turn >= 0 && set_lock(F_WRLCK) != 0) return -1;
     ssize_t sent = send(socket, frame->bytes, frame->size, 0);
-    if (turn >= 0) flock(turn, LOCK_UN);
+    if (turn >= 0) set_lock(F_UNLCK);
     return sent < 0 ? -1 : 0;
 }
 
 int main(int count, char **words) {
-    if (count != 9) return 2;
-    int receive = atoi(words[1]), transmit = atoi(words[2]), turn = atoi(words[3]);
-    struct sched_param priority = {.sched_priority = atoi(words[5])};
-    size_t cycle_at = (size_t)atoi(words[6]);
-    struct frame feedback = read_frame(words[7]), valve = read_frame(words[8]);
+    if (count != 10) return 2;
+    int receive = atoi(words[1]), transmit = atoi(words[2]);
+    turn = atoi(words[3]);
+    place = atoll(words[4]);
+    struct sched_param priority = {.sched_priority = atoi(words[6])};
+    size_t cycle_at = (size_t)atoi(words[7]);
+    struct frame feedback = read_frame(words[8]), valve = read_frame(words[9]);
     cpu_set_t cpus;
     CPU_ZERO(&cpus);
-    CPU_SET(atoi(words[4]), &cpus);
+    CPU_SET(atoi(words[5]), &cpus);
     sched_setaffinity(0, sizeof cpus, &cpus);
     sched_setscheduler(0, SCHED_FIFO, &priority); /* without the right to it, as it is: so does the emulator */
     mlockall(MCL_CURRENT | MCL_FUTURE);
@@ -58,6 +68,6 @@ int main(int count, char **words) {
             if (errno != EAGAIN && errno != EINTR) return 1; /* the sockets have a limit for waiting */
         valve.bytes[cycle_at] = (unsigned char)(cycle & 0xFF);
         valve.bytes[cycle_at + 1] = (unsigned char)(cycle >> 8 & 0xFF);
-        if (send_frame(transmit, turn, &feedback) != 0 || send_frame(transmit, turn, &valve) != 0) return 1;
+        if (send_frame(transmit, &feedback) != 0 || send_frame(transmit, &valve) != 0) return 1;
     }
 }

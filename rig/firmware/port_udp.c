@@ -60,7 +60,7 @@ static bool open_group(const char *channel)
     }
     if (!open_sender() || !join_group())
         return report(channel, "cannot be opened");
-    return turn_join(channel, UDP_PORT) || report(channel, "no file for the turn to send");
+    return turn_join(channel, UDP_PORT) || report(channel, "no lock for the turn to send");
 }
 
 static enum port_result receive(struct frame *frame, int64_t until_ns)

@@ -6,7 +6,6 @@
 #include <stdio.h>
 #include <string.h>
 #include <sys/mman.h>
-#include <unistd.h>
 
 #include "port.h"
 
@@ -62,10 +61,10 @@ static void raise_priority(void)
 }
 
 /* Frames that wait are handled before the timers run: after a stall of this process they are not late, we are. */
-static void run(struct node node, long parent)
+static void run(struct node node)
 {
     int64_t tick_ns = port->now();
-    while (!is_ended && !is_bus_gone && (parent == 0 || parent == (long)getppid())) {
+    while (!is_ended && !is_bus_gone) {
         struct frame frame;
         enum port_result result = PORT_FRAME;
         for (unsigned count = 0; result == PORT_FRAME && count < BURST; count++) {
@@ -82,7 +81,7 @@ static void run(struct node node, long parent)
     }
 }
 
-int serve_node(struct node node, const char *bus, long parent)
+int serve_node(struct node node, const char *bus)
 {
     struct sigaction action;
     memset(&action, 0, sizeof action);
@@ -93,7 +92,7 @@ int serve_node(struct node node, const char *bus, long parent)
     if (channel == NULL || !port->open(channel))
         return 2;
     raise_priority();
-    run(node, parent);
+    run(node);
     port->close();
     if (is_bus_gone)
         fprintf(stderr, "%s: the bus is gone\n", bus);

@@ -15,8 +15,7 @@ struct node {
 
 extern const struct output BUS_OUTPUT; /* where a node sends: the bus that is served */
 
-/* Serve a node on `bus` (socketcan:INTERFACE or udp_multicast[:GROUP]) until SIGINT, SIGTERM or the death of the process
- * `parent` (0: none). Returns the exit status: 0, 1 if the bus is gone, 2 if it cannot be opened. */
-int serve_node(struct node node, const char *bus, long parent);
+/* Serve a node on `bus` (socketcan:INTERFACE or udp_multicast[:GROUP]) until SIGINT or SIGTERM. Returns the exit status: 0, 1 if the bus is gone, 2 if it cannot be opened. */
+int serve_node(struct node node, const char *bus);
 
 #endif

@@ -5,7 +5,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-/* Join the programs that use a group and port. False if the file whose lock it is cannot be made. */
+/* Join the programs that use a group and port. False for no IPv4 address, and where there is no /dev/null. */
 bool turn_join(const char *group, uint16_t port);
 
 /* Wait up to a second for the turn. False if another program held it for longer. */

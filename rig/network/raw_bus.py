@@ -51,7 +51,7 @@ from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.network import udp
 from rig.network.bus import can_open, parse_spec, require_interface
 from rig.network.frame import IDENTIFIER, has_valid_length
-from rig.network.udp import SO_RXQ_OVFL, SO_TIMESTAMPNS, TURN_LIMIT_NS, TURN_PAUSE_NS, Turn, set_receive_options
+from rig.network.udp import FLOCK, SO_RXQ_OVFL, SO_TIMESTAMPNS, TURN_LIMIT_NS, TURN_PAUSE_NS, Turn, set_receive_options
 
 # status of receive_frame
 TIMEOUT, FRAME = 0, 1
@@ -70,7 +70,7 @@ _LATEST = 7  # time of the last frame: of two frames in a queue the second is no
 _OWN, _COUNTS_LOSSES = 8, 9  # UDP: own port, network order; whether the kernel's count is of losses alone
 _STAMPED, _LISTED = 10, 11  # whether kernel times are used; how many COB-IDs beyond the classical ones are received
 # .. then what the kernel reads and writes (asm-generic, 64 bit), as byte offsets
-_MESSAGE, _VECTOR, _POLL, _TIME, _ERRNO, _SENDER = 256, 320, 336, 352, 368, 432
+_MESSAGE, _VECTOR, _POLL, _TIME, _ERRNO, _SENDER, _LOCK = 256, 320, 336, 352, 368, 432, 448
 _CONTROL, _ALLOWED, _FRAME_IN, _FRAME_OUT = 512, 1024, 1280, 1360  # _FRAME: struct can_frame, canfd_frame
 _IN, _OUT, _WIDE_OUT, _LIST = 2048, 4096, 4608, 5120  # datagrams: in; out, with 11 and with 29 bits
 _CONTROL_SIZE, _IN_SIZE, _OUT_SIZE, _SENDER_SIZE, _LIST_SIZE = 256, 2048, 512, 16, 4096
@@ -87,7 +87,7 @@ _REALTIME, _MONOTONIC, _ABSOLUTE = 0, 1, 1
 _recvmsg = ForeignCall("qiqi", "recvmsg")
 _send = ForeignCall("qiqqi", "send")
 _ppoll = ForeignCall("iqqqq", "ppoll")
-_flock = ForeignCall("iii", "flock")
+_fcntl = ForeignCall("iiiq", "fcntl")
 _clock_gettime = ForeignCall("iiq", "clock_gettime")
 _clock_nanosleep = ForeignCall("iiiqq", "clock_nanosleep")
 _errno_location = ForeignCall("q", "__errno_location")
@@ -306,7 +306,7 @@ def send_payload(port: Port, cob_id: int, length: int) -> int:
 def _send_datagram(port: Port, cob_id: int, length: int) -> int:
     start, size = encode_datagram(port, cob_id, length)
     give_up = 0
-    while _flock(port.words[_TURN], fcntl.LOCK_EX | fcntl.LOCK_NB) != 0:
+    while _set_lock(port, fcntl.F_WRLCK) != 0:
         now = read_clock(port)
         if give_up == 0:
             give_up = now + TURN_LIMIT_NS
@@ -314,8 +314,14 @@ def _send_datagram(port: Port, cob_id: int, length: int) -> int:
             return NO_TURN
         sleep_until(port, now + TURN_PAUSE_NS)
     status = _transmit(port, start, size)
-    _flock(port.words[_TURN], fcntl.LOCK_UN)
+    _set_lock(port, fcntl.F_UNLCK)
     return status
+
+
+def _set_lock(port: Port, kind: int) -> int:
+    """Take the turn, or give it: 0 if that was possible."""
+    port.words[_LOCK // 8] = kind
+    return _fcntl(port.words[_TURN], fcntl.F_OFD_SETLK, port.octets.ctypes.data + _LOCK)
 
 
 def _transmit(port: Port, start: int, size: int) -> int:
@@ -498,10 +504,10 @@ class RawBus(contextlib.AbstractContextManager["RawBus"]):
         self.close()
 
     @property
-    def descriptors(self) -> tuple[int, int, int]:
-        """File descriptors of the sockets that receive and send, and that of the turn or -1."""
-        turn = -1 if self._turn is None else self._turn.descriptor
-        return int(self.port.words[_RX]), int(self.port.words[_TX]), turn
+    def descriptors(self) -> tuple[int, int, int, int]:
+        """File descriptors of the sockets that receive and send, that of the turn or -1, and the turn's place."""
+        turn, place = (-1, 0) if self._turn is None else (self._turn.descriptor, self._turn.place)
+        return int(self.port.words[_RX]), int(self.port.words[_TX]), turn, place
 
     @property
     def overflows(self) -> int:
@@ -524,6 +530,8 @@ class RawBus(contextlib.AbstractContextManager["RawBus"]):
         self.port.words[_OWN] = socket.htons(tx.getsockname()[1])
         tx.connect((group, udp.PORT))
         self.port.words[_TURN] = self._turn.descriptor
+        self.port.octets[_LOCK: _LOCK + FLOCK.size] = np.frombuffer(
+            FLOCK.pack(fcntl.F_UNLCK, os.SEEK_SET, self._turn.place, 1, 0), np.uint8)
         return rx, tx
 
     def set_filter(self, cob_ids: Sequence[int]) -> None:

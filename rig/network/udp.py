@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import fcntl
+import glob
 import ipaddress
 import os
 import socket
@@ -111,28 +112,28 @@ def set_receive_options(raw: socket.socket) -> None:
 
 TURN_LIMIT_NS = 1_000_000_000  # a turn takes 20 us; one that takes a second is held by a stopped or foreign program
 TURN_PAUSE_NS = 20_000  # between two attempts to take it
+FLOCK = struct.Struct("@hhqqi4x")  # struct flock, fcntl.h: type, from where, first byte, number of bytes, process
 
 
 class Turn:
-    """The turn of one group and port: a lock on a file, of which the kernel relieves a program that ends.
+    """The turn of one group and port: a lock on a byte of /dev/null, of which the kernel relieves a program that ends.
 
-    `descriptor` is that of the file, for compiled code (`flock`). The programs in C take the same one
-    (rig/firmware/turn.c). Raises OSError where the file cannot be made.
+    Every user may lock there, and no file is left behind. The byte at `place` belongs to one group and port;
+    `descriptor` holds the lock (an open file description lock, fcntl(2)), also for compiled code. The programs in C
+    take the same one (rig/firmware/turn.c). Raises OSError where there is no /dev/null.
     """
 
     def __init__(self, group: str, port: int) -> None:
-        self._where, path = f"udp_multicast {group}:{port}", f"/dev/shm/eha-rig-{group}-{port}"
-        try:
-            self.descriptor = os.open(path, os.O_RDONLY)  # to make it again may be refused where another user has it
-        except FileNotFoundError:
-            self.descriptor = os.open(path, os.O_RDONLY | os.O_CREAT, 0o666)
+        self._where = f"udp_multicast {group}:{port}"
+        self.place = int(ipaddress.IPv4Address(group)) << 16 | port
+        self.descriptor = os.open(os.devnull, os.O_RDWR)
 
     def take(self) -> None:
         """Wait for the turn. Raises RigError: another program has held it for longer than a second."""
         give_up = time.monotonic_ns() + TURN_LIMIT_NS
         while True:
             try:
-                fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                self._set_lock(fcntl.F_WRLCK)
                 return
             except BlockingIOError:
                 if time.monotonic_ns() > give_up:
@@ -141,15 +142,22 @@ class Turn:
 
     def give(self) -> None:
         """Let the next one send."""
-        fcntl.flock(self.descriptor, fcntl.LOCK_UN)
+        self._set_lock(fcntl.F_UNLCK)
+
+    def _set_lock(self, kind: int) -> None:
+        fcntl.fcntl(self.descriptor, fcntl.F_OFD_SETLK, FLOCK.pack(kind, os.SEEK_SET, self.place, 1, 0))
 
     def explain_failure(self) -> RigError:
         """The error for a turn that did not come."""
-        file = f":{os.fstat(self.descriptor).st_ino} "
-        locks = Path("/proc/locks").read_text().splitlines()
-        holders = [f"process {line.split()[4]}" for line in locks if file in line]
+        holders = set()
+        for path in glob.glob("/proc/[0-9]*/fdinfo/*"):  # noqa: PTH207 - Path.glob raises where a process ends
+            with contextlib.suppress(OSError):
+                info = Path(path)
+                if f" {self.place} {self.place}\n" in info.read_text():
+                    holders.add(f"process {info.parts[2]}")
         return RigError(f"{self._where}: the turn to send was held for more than {TURN_LIMIT_NS * 1e-9:g} s by "
-                        f"{' and '.join(holders) or 'another program'}; stop that program, or take another group")
+                        f"{' and '.join(sorted(holders)) or 'another program'}; "
+                        "stop that program, or take another group")
 
     def close(self) -> None:
         """Give the file back, and the turn with it."""

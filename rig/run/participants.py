@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import select
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from plant import Model
 from plant.errors import InputError, require
 from rig.benches.bench import Role
 from rig.benches.bench_file import is_plant_bench
+from rig.interrupts import end_with_this_process
 from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, open_can
 from rig.network.frame import Node, Send, VirtualClock, WallClock
 from rig.network.master import BusError, Master
@@ -129,13 +129,12 @@ def find_firmware_parameters(model: Model) -> dict[str, float]:
 
 
 def make_node_command(node: Role, bus: str, *words: str, is_in_c: bool = False) -> list[str]:
-    """The command that runs a node of ours as a process of its own, which ends when this one does."""
-    parent = ("--parent", str(os.getpid()))
+    """The command that runs a node of ours as a process of its own."""
     if is_in_c:
         from rig.firmware.build import build_controller
 
-        return [str(build_controller()), bus, *parent]
-    return [sys.executable, "-m", "rig.cli.main", "node", NAMES[node], "--bus", bus, "--quiet", *parent, *words]
+        return [str(build_controller()), bus]
+    return [sys.executable, "-m", "rig.cli.main", "node", NAMES[node], "--bus", bus, *words]
 
 
 def _make_command(job: Job, node: Role) -> list[str]:
@@ -174,8 +173,8 @@ Child = subprocess.Popen[bytes]
 
 
 class NodeProcesses:
-    """Processes of this run, by role. Each has its own session, so that Ctrl-C reaches the rig alone: clean-up
-    needs its plant.
+    """Processes of this run, by role; they end with it, also when it is killed. Each has its own session, so that
+    Ctrl-C reaches the rig alone: clean-up needs its plant.
     """
 
     def __init__(self) -> None:
@@ -186,7 +185,7 @@ class NodeProcesses:
         """Start a node as a new process. `announces`: it writes a line as soon as it is on the bus, see `is_ready`."""
         output = subprocess.PIPE if announces else subprocess.DEVNULL
         self._children[node] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output,
-                                                start_new_session=True)
+                                                start_new_session=True, preexec_fn=end_with_this_process())
         if announces:
             self._silent.add(node)
 

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import os
 import signal
 import time
 
@@ -61,11 +60,11 @@ def run_command(args: argparse.Namespace) -> int:
         role = PLANT if args.node == "plant" else CONTROLLER
         require_free_number(bench.find_number(role), args.node, link, bus,
                             LISTENING_TIME - (clock.now() - opened_ns) * 1e-9)
-        if args.parent or not (args.quiet or args.json):  # the rig that has started it waits for this line
+        if not (args.quiet or args.json):  # a rig that has started it waits for this line
             kind = "compiled loop" if is_compiled else "Python loop, soft real time"
             print(f"{args.node} on {bus}, {kind}; Ctrl-C ends it", flush=True)
         stack.enter_context(raise_priority(1 if is_compiled else LOOP_PRIORITY))
-        serve_node(node, link, clock, lambda: bool(ended) or args.parent not in (0, os.getppid()))
+        serve_node(node, link, clock, lambda: bool(ended))
     counts = {"node": args.node, "bus": bus, "lost": link.overflows, "unsent": link.unsent,
               "error_frames": link.error_frames}
     sentence = f"incoming frames lost {link.overflows}, not sent {link.unsent}, error frames {link.error_frames}"

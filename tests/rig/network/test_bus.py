@@ -425,6 +425,7 @@ def test_a_turn_that_is_held_is_one_line_and_ends_with_its_holder() -> None:
             holder.kill()
         assert send(bus.port, 1, 0, 0) == SENT
         other.send(message)
+    assert not [path for path in Path("/dev/shm").glob("*") if group in path.name]
 
 
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)

@@ -289,6 +289,30 @@ def test_a_killed_run_loses_half_a_second_at_most(tmp_path: Path) -> None:
     assert min(lost) <= 500
 
 
+STARTS_A_NODE = """
+import sys, time
+from rig.network.node_objects import CONTROLLER
+from rig.run.participants import NodeProcesses
+processes = NodeProcesses()
+processes.start(CONTROLLER, ["sleep", "60"])
+print(processes._children[CONTROLLER].pid, flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_node_of_any_kind_ends_with_a_rig_that_is_killed() -> None:
+    """Also one that knows nothing of the rig, or that is still loading and does not look for it."""
+    with subprocess.Popen([sys.executable, "-c", STARTS_A_NODE], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        node = Path("/proc", process.stdout.readline().strip())
+        assert node.exists()
+        process.kill()
+    end = time.monotonic() + 10.0
+    while node.exists() and (node / "stat").read_text().split()[2] != "Z":  # nobody collects its status in a container
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 def test_an_external_node_that_dies_is_named_and_the_run_ends(tmp_path: Path) -> None:
     """In lockstep every cycle without answers would wait; the sequence has a minute to go, and wants the safe state.
 
@@ -390,7 +414,7 @@ def test_a_second_node_of_a_number_does_not_start(bus_with_nodes: str) -> None:
 def test_a_plant_that_came_first_is_used_in_place_of_ours(bus_with_nodes: str) -> None:
     """On a slow machine a plant that the operator starts together with the run answers after the run has looked."""
     processes = NodeProcesses()
-    words = ["node", "plant", "--bus", bus_with_nodes, "--quiet", "--parent", str(os.getpid())]
+    words = ["node", "plant", "--bus", bus_with_nodes]
     processes.start(PLANT, [sys.executable, "-m", "rig.cli.main", *words], announces=True)
     try:
         with open_master(bus_with_nodes) as master:

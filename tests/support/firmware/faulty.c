@@ -1,11 +1,10 @@
 /* The reference firmware with a fault, to see that the bench notices:
  *
- *     faulty FAULT BUS [--parent PID]
+ *     faulty FAULT BUS
  *
  * The faults change frames and memory around a sound controller, as a careless programmer would have from within.
  */
 #include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
 
 #include "bytes.h"
@@ -93,8 +92,7 @@ static void tick(void *context, int64_t t_ns)
 
 int main(int count, char **words)
 {
-    const bool has_parent = count == 5 && strcmp(words[3], "--parent") == 0;
-    if (count != 3 && !has_parent)
+    if (count != 3)
         return 2;
     fault = words[1];
     const struct output output = {send_spoiled, NULL};
@@ -104,5 +102,5 @@ int main(int count, char **words)
         const double gain = 20.0;
         memcpy(&controller.values[OBJECT_2110_02], &gain, sizeof gain);
     }
-    return serve_node((struct node){NULL, receive, tick}, words[2], has_parent ? atol(words[4]) : 0);
+    return serve_node((struct node){NULL, receive, tick}, words[2]);
 }
