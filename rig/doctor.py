@@ -217,7 +217,9 @@ def count_frames(bench: Bench, frames: Iterable[Frame]) -> tuple[dict[str, Count
 def judge_frames(bench: Bench, heard: dict[str, Counter[int]], others: Counter[str], seconds: float
                  ) -> Iterator[Finding]:
     """Which frames of a bench were heard within `seconds`."""
-    for load in list_loads(bench):
+    loads = list_loads(bench)
+    reached = {load.direction.split()[0] for load in loads if heard[load.name]}  # whose power and wiring are right
+    for load in loads:
         received, is_ours = heard[load.name].total(), load.direction.startswith("rig")
         wrong = sorted(length for length in heard[load.name] if length != load.length)
         status: Status = "limited" if wrong or (is_ours and received) else "ok"
@@ -225,9 +227,13 @@ def judge_frames(bench: Bench, heard: dict[str, Counter[int]], others: Counter[s
         text += f", some of {' and '.join(map(str, wrong))} bytes, not {load.length}" if wrong else ""
         remedy = "another rig is on the bus; end it" if is_ours and received else ""
         if not received and not is_ours:
-            status, remedy = "missing", "power, wiring, bit rate" + (
-                "; PDOs come after NMT start" if bench.nodes and load.content else "") + (
-                "; some devices send it when the rig has set 0x1017" if load.name.startswith("heartbeat") else "")
+            causes = [] if load.direction.split()[0] in reached else ["power, wiring, bit rate"]
+            if load.name.startswith("heartbeat"):
+                causes.append("some devices send it when the rig has set 0x1017")
+            else:
+                causes.append("PDOs come after NMT start" if bench.nodes else
+                              "or it only answers the rig, which sends nothing here: see rig run")
+            status, remedy = "missing", "; ".join(causes)
         yield Finding(bench.name, f"{load.name} {describe_identifier(load.identifier)}", status, text,
                       f"{load.direction}, every {1000 * load.period:g} ms", remedy)
     if others:

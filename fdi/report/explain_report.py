@@ -50,6 +50,7 @@ from fdi.report.numbers import (
     name_parameter,
 )
 from fdi.report.report import Cell, Column, Figure, Line, Listing, Medium, Mood, Report, Section, Table, tabulate
+from fdi.report.run_report import list_faults
 from fdi.thresholds import RESIDUAL_FOREIGN
 from fdi.trace.trace import Floats, Trace
 from plant.signals import Signals
@@ -121,8 +122,16 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
         *([_list_claims(claims)] if claims else []),
         Section("Provenance", [Listing(command, medium=page)] if command else [])]
     facts = [("model", model), *list_sources(sources, bool(a.baseline["holdout"]))]
-    return Report("explain", title, a.verdict, MOODS[a.verdict], describe_verdict(a), facts, notes, sections,
-                  next_command, files, collect_data(a, notes, claims))
+    injected = describe_injected_faults(trace)
+    sentence = " ".join(filter(None, (describe_verdict(a), injected)))
+    return Report("explain", title, a.verdict, MOODS[a.verdict], sentence, facts, notes, sections, next_command, files,
+                  collect_data(a, list(filter(None, (*notes, injected))), claims))
+
+
+def describe_injected_faults(trace: Trace) -> str:
+    """What the sequence of the run injected, and when; "" for nothing. Effects are fitted to the whole run."""
+    faults = [f"{name} from {begin:g} to {end:g} s" for name, begin, end in list_faults(trace)]
+    return f"The log names what its sequence injected: {join_words(faults)}." if faults else ""
 
 
 def find_signals(a: Answer) -> Signals:

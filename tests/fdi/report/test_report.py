@@ -30,7 +30,7 @@ from fdi.discovery.explain_runs import Answer, Candidate
 from fdi.discovery.runs import Source
 from fdi.discovery.update_model import ModelUpdate, Provenance, Row
 from fdi.estimation.fit import Value
-from fdi.report import compare_report, drawing, run_report
+from fdi.report import compare_report, drawing, explain_report, run_report
 from fdi.report.compare_report import build_comparison_report
 from fdi.report.explain_report import (
     MOODS,
@@ -199,6 +199,8 @@ def test_injected_faults_are_shaded_from_begin_to_end(preflight: Path) -> None:
     faulty = replace(trace, events=events)
     assert run_report.list_faults(faulty) == [
         ("lost drive", 1.0, 2.5), ("parameter filter.clogging", 3.0, trace.t[-1])]
+    assert "injected: lost drive from 1 to 2.5 s" in explain_report.describe_injected_faults(faulty)
+    assert explain_report.describe_injected_faults(trace) == ""
     assert "lost drive" in render_run(faulty) and run_report.draw_signals(faulty) != run_report.draw_signals(trace)
 
 

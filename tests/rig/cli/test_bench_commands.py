@@ -17,8 +17,9 @@ from rig.benches.bench import Role, list_inputs, list_outputs, pack
 from rig.benches.bench_file import ControllerKeys, NodeKeys, load_bench
 from rig.benches.checksums import CHECKSUMS
 from rig.benches.guess import UNSURE
+from rig.doctor import count_frames, judge_frames
 from rig.network.bus import Link, open_can
-from rig.network.frame import WallClock
+from rig.network.frame import Frame, WallClock
 
 PLANT = ROOT / "tests" / "support" / "trim_jack.py"
 PAGE = (ROOT / "docs" / "bench.md").read_text()
@@ -126,6 +127,12 @@ def test_the_doctor_listens_for_a_bench() -> None:
 
     silent = rig("doctor", "--bench", ECU / "bench.toml", "--bus", spec, "--seconds", "0.2")
     assert silent.status == 1 and "Nothing of the controller is heard" in silent.out
+    (drive_frame,) = (each for each in judge_frames(bench, *count_frames(bench, []), 1.0) if "Drive" in each.name)
+    assert "power, wiring, bit rate" in drive_frame.remedy and "only answers the rig" in drive_frame.remedy
+    eha = load_bench("eha")
+    beating = judge_frames(eha, *count_frames(eha, [Frame(0, 0x702, b"\x05")]), 1.0)
+    remedies = {each.name.split()[0]: each.remedy for each in beating}
+    assert remedies["TPDO1"] == "PDOs come after NMT start" and "power" in remedies["plant"]
     thread = threading.Thread(target=send)
     thread.start()
     try:
