@@ -14,9 +14,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from rig.benches.bench import Bench, describe_identifier
 from rig.benches.bench_report import list_loads
 from rig.network import bus, udp
@@ -25,7 +22,6 @@ from rig.network.frame import Frame, WallClock
 from rig.run import priority
 
 Status = Literal["ok", "limited", "missing"]
-TIMER_PERIOD = 1_000_000  # ns
 
 
 class Finding(NamedTuple):
@@ -40,10 +36,10 @@ class Finding(NamedTuple):
     needed: bool = False  # without it not even the embedded bench runs
 
 
-def examine_machine(seconds: float = 1.0) -> list[Finding]:
-    """Examine everything; each timer measurement takes `seconds`, 0 skips them."""
+def examine_machine() -> list[Finding]:
+    """Examine everything."""
     return [*examine_python(), *examine_buses(), *examine_viewer(), *examine_tools(), *examine_storage(),
-            *examine_rights(), *(measure_timers(seconds) if seconds > 0 else ())]
+            *examine_rights()]
 
 
 def _find(area: str, name: str, value: str, purpose: str, remedy: str, needed: bool = False) -> Finding:
@@ -252,11 +248,11 @@ def examine_rights() -> list[Finding]:
     """Kernel and rights that decide how well `--pace realtime` can keep its cycle."""
     is_preempt_rt = _read_text("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in platform.version()
     kernel = f"{platform.release()}, {'PREEMPT_RT' if is_preempt_rt else 'not PREEMPT_RT'}, {os.cpu_count()} CPUs"
-    is_fifo, locked = bool(priority.run_under_fifo(lambda: True)), priority.read_memory_lock_limit()
+    is_fifo, locked = priority.is_fifo_granted(), priority.read_memory_lock_limit()
     resolution = priority.read_clock_resolution_ns()
     source = _read_text("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "unknown source"
     return [
-        _grade("real time", "kernel", is_preempt_rt, kernel, "bounds the worst lateness",
+        _grade("real time", "kernel", is_preempt_rt, kernel, "bounds the lateness that rig bench realtime measures",
                "a PREEMPT_RT kernel (Debian: linux-image-rt-amd64)"),
         _find("real time", "priority", f"SCHED_FIFO up to priority {priority.read_priority_limit()}" if is_fifo else "",
               "other programs do not delay the loop", "as root: echo \"$USER - rtprio 90\" >> "
@@ -266,19 +262,3 @@ def examine_rights() -> list[Finding]:
                "as root: echo \"$USER - memlock unlimited\" >> /etc/security/limits.d/rt.conf"),
         _grade("real time", "clock", resolution <= 1e3, f"{resolution:.0f} ns, {source}", "the cycle's due times",
                "a kernel with CONFIG_HIGH_RES_TIMERS")]
-
-
-def measure_timers(seconds: float) -> Iterator[Finding]:
-    """Lateness of a 1 kHz timer, measured now: as an ordinary process, and under SCHED_FIFO where that is allowed."""
-    ordinary = priority.measure_timer_lateness(seconds, TIMER_PERIOD)
-    yield grade_timer("timer at 1 kHz", ordinary, "what --pace realtime can expect here")
-    if (fifo := priority.run_under_fifo(lambda: priority.measure_timer_lateness(seconds, TIMER_PERIOD))) is not None:
-        yield grade_timer("timer under FIFO", fifo, "the same with real-time priority")
-
-
-def grade_timer(name: str, late_ns: NDArray[np.int64], purpose: str) -> Finding:
-    """Percentiles of the lateness, and how many periods were over at the wake-up."""
-    late, missed = priority.compute_percentiles(late_ns * 1e-9), int(np.count_nonzero(late_ns >= TIMER_PERIOD))
-    text = (f"late by {late['p50']:.0f} us (p50), {late['p99']:.0f} (p99), {late['p99_9']:.0f} (p99.9), "
-            f"{late['max']:.0f} (max){f'; {missed} of {len(late_ns)} periods missed' if missed else ''}")
-    return _grade("real time", name, not missed, text, purpose, "an idle machine, real-time priority, PREEMPT_RT")

@@ -215,12 +215,11 @@ COMMANDS = {
     "doctor": Command(
         "report what this machine can do: CAN, vcan, real-time rights, viewer",
         "Exit status 1 if the embedded bench cannot run here.",
-        (option("--seconds", type=float, default=1.0, metavar="S",
-                help="duration of each timer measurement, and of listening; 0: no measurement (default 1)"),
-         Group("listen for a bench", (
+        (Group("listen for a bench", (
              BENCH, TRUST,
+             option("--seconds", type=float, default=1.0, metavar="S", help="how long to listen (default 1)"),
              option("--bus", default="auto", metavar="INTERFACE:CHANNEL",
-                    help="with --bench: where to listen, such as socketcan:can0 or udp_multicast"))))),
+                    help="with --bench: where to listen, such as socketcan:can0 or udp_multicast"))),)),
     "effects": Command(
         "list the catalogue of physical effects, or show one in detail",
         "An effect of --effects, or any with --test, is also tested: exit status 1 if it fails.",

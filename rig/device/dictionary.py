@@ -2,11 +2,11 @@
 
 import struct
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import cast
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from plant.errors import InputError
+from plant.errors import require
 from plant.tables import read_file
 from rig.benches.bench import decode_device_text
 from rig.benches.canopen_map import list_variables, read_dictionary
@@ -14,25 +14,21 @@ from rig.device.sdo import Abort, SdoAbort, abort_unless
 
 Value = int | float | bytes
 
-_FORMATS = {
-    datatypes.BOOLEAN: "?", datatypes.INTEGER8: "b", datatypes.INTEGER16: "h", datatypes.INTEGER32: "i",
-    datatypes.INTEGER64: "q", datatypes.UNSIGNED8: "B", datatypes.UNSIGNED16: "H", datatypes.UNSIGNED32: "I",
-    datatypes.UNSIGNED64: "Q", datatypes.REAL32: "f", datatypes.REAL64: "d",
-}  # fmt: skip
 _STRINGS = (datatypes.VISIBLE_STRING, datatypes.OCTET_STRING, datatypes.DOMAIN)
 
 
-class Entry(NamedTuple):
-    """One sub-index: what it is, who may do what with it, what it holds after power-on."""
+def find_struct(entry: ODVariable) -> struct.Struct | None:
+    """What packs the number of an entry; None for strings and domains, and for numbers of 24 bits and the like."""
+    known = ODVariable.STRUCT_TYPES.get(entry.data_type or 0)
+    return known if type(known) is struct.Struct else None
 
-    name: str
-    code: str  # struct format of a number, "" for strings and domains
-    readable: bool
-    writable: bool
-    mappable: bool
-    default: Value
-    low: int | None
-    high: int | None
+
+def read_default(entry: ODVariable) -> Value:
+    """What an entry holds after power-on."""
+    default: int | float | bytes | str | None = entry.default
+    if find_struct(entry) is not None:
+        return cast(Value, default or 0)
+    return default.encode("ascii") if isinstance(default, str) else cast(bytes, default or b"")
 
 
 class Dictionary:
@@ -50,7 +46,7 @@ class Dictionary:
 
     def restore(self, first: int, last: int) -> None:
         """Set the objects from index `first` to `last` to their defaults."""
-        self.values |= {key: entry.default for key, entry in self.entries.items() if first <= key[0] <= last}
+        self.values |= {key: read_default(entry) for key, entry in self.entries.items() if first <= key[0] <= last}
 
     def __contains__(self, key: tuple[int, int]) -> bool:
         return key in self.entries
@@ -63,7 +59,7 @@ class Dictionary:
         """An integer object's value, or `absent` where the device has no such object."""
         return cast(int, self.values.get((index, sub), absent))
 
-    def find(self, index: int, sub: int) -> Entry:
+    def find(self, index: int, sub: int) -> ODVariable:
         """The entry. Raises SdoAbort: no such object, no such sub-index."""
         entry = self.entries.get((index, sub))
         if entry is None:
@@ -75,46 +71,39 @@ class Dictionary:
         entry = self.find(index, sub)
         abort_unless(entry.readable, Abort.WRITE_ONLY)
         value = self.values[index, sub]
-        return value if isinstance(value, bytes) else struct.pack("<" + entry.code, value)
+        number = find_struct(entry)
+        return cast(bytes, value) if number is None else number.pack(value)
 
     def find_size(self, index: int, sub: int) -> int:
         """Bytes an SDO download must bring, 0 for any number. Raises SdoAbort: absent, read-only."""
         entry = self.find(index, sub)
         abort_unless(entry.writable, Abort.READ_ONLY)
-        return struct.calcsize("<" + entry.code)
+        number = find_struct(entry)
+        return 0 if number is None else number.size
 
     def decode(self, index: int, sub: int, data: bytes) -> Value:
         """The value an SDO download would store. Raises SdoAbort: absent, read-only, length, range."""
         size, entry = self.find_size(index, sub), self.find(index, sub)
-        if not entry.code:
+        number = find_struct(entry)
+        if number is None:
             return data
         abort_unless(len(data) >= size, Abort.TOO_SHORT)
         abort_unless(len(data) <= size, Abort.TOO_LONG)
-        value: int | float = struct.unpack("<" + entry.code, data)[0]
-        abort_unless(entry.high is None or value <= entry.high, Abort.TOO_HIGH)
-        abort_unless(entry.low is None or value >= entry.low, Abort.TOO_LOW)
+        value: int | float = number.unpack(data)[0]
+        abort_unless(entry.max is None or value <= entry.max, Abort.TOO_HIGH)
+        abort_unless(entry.min is None or value >= entry.min, Abort.TOO_LOW)
         return value
 
 
-def _load(path: Path, node_id: int) -> dict[tuple[int, int], Entry]:
+def _load(path: Path, node_id: int) -> dict[tuple[int, int], ODVariable]:
     """Read the EDS. Raises InputError if it cannot be read or holds a type this core does not know."""
     od = read_dictionary(str(path), decode_device_text(read_file(path)), node_id)
-    return {(each.index, each.subindex): _entry(path, each) for each in list_variables(od) if each.index >= 0x1000}
-
-
-def _entry(path: Path, variable: ODVariable) -> Entry:
-    code = _FORMATS.get(variable.data_type or 0, "")
-    if not code and variable.data_type not in _STRINGS:
-        where = f"{variable.index:04X}sub{variable.subindex:X}.DataType"
-        raise InputError(path, where, f"an integer of 8, 16, 32 or 64 bits, REAL, string or DOMAIN, "
-                                      f"not 0x{variable.data_type or 0:04X}")  # fmt: skip
-    default: Value
-    if code:
-        default = 0 if variable.default is None else variable.default
-    else:
-        default = variable.default.encode("ascii") if isinstance(variable.default, str) else variable.default or b""
-    return Entry(variable.name, code, variable.readable, variable.writable, variable.pdo_mappable, default,
-                 variable.min, variable.max)  # fmt: skip
+    entries = {(each.index, each.subindex): each for each in list_variables(od) if each.index >= 0x1000}
+    for (index, sub), entry in entries.items():
+        require(find_struct(entry) is not None or entry.data_type in _STRINGS, path, f"{index:04X}sub{sub:X}.DataType",
+                "an integer of 8, 16, 32 or 64 bits, REAL, string or DOMAIN, "
+                f"not 0x{entry.data_type or 0:04X}")
+    return entries
 
 
 INVALID = 1 << 31  # PDO and EMCY: switched off

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from plant.errors import InputError, require
 from rig.benches.canopen_map import MAPPING, RPDO, TPDO
-from rig.device.dictionary import INVALID, Dictionary, check_switchable
+from rig.device.dictionary import INVALID, Dictionary, check_switchable, find_struct
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
 from rig.device.sdo import Abort, abort_unless
 from rig.network.frame import Frame, Send
@@ -31,11 +31,12 @@ def read_mapping(od: Dictionary, index: int) -> tuple[list[tuple[int, int]], str
         word = od.read_number(index, sub)
         key, bits = (word >> 16, word >> 8 & 0xFF), word & 0xFF
         entry = od.entries.get(key)
-        if entry is None or not entry.mappable or not entry.code or struct.calcsize(entry.code) * 8 != bits:
+        number = None if entry is None or not entry.pdo_mappable else find_struct(entry)
+        if number is None or 8 * number.size != bits:
             raise InputError(od.path, f"{index:04X}sub{sub:X}",
                              f"a mappable object and its length, not 0x{word:08X}")
         keys.append(key)
-        codes += entry.code
+        codes += number.format.lstrip("<")
     packer = struct.Struct(codes)
     require(packer.size <= 8, od.path, f"{index:04X}", f"at most 8 bytes in a PDO, not {packer.size}")
     return keys, packer

@@ -5,14 +5,15 @@
 does so for the reference firmware. A test compares its two files with the EDS, so they cannot differ from it unnoticed.
 """
 
-import struct
 from pathlib import Path
 
+from canopen.objectdictionary import ODVariable
+
 from dbc import EDS
-from rig.device.dictionary import Dictionary, Entry, Value
+from rig.device.dictionary import Dictionary, Value, find_struct, read_default
 
 FOLDER = Path(__file__).parent
-_KINDS = {"f": "KIND_REAL", "d": "KIND_REAL", **dict.fromkeys("bhiq", "KIND_SIGNED")}
+_KINDS = {"f": "KIND_REAL", "d": "KIND_REAL", **dict.fromkeys("bhlq", "KIND_SIGNED")}  # by struct format
 
 
 def write_object_table(eds: Path = EDS[2]) -> dict[str, str]:
@@ -28,28 +29,25 @@ def write_object_table(eds: Path = EDS[2]) -> dict[str, str]:
     source = ["/* Generated, see object_table.h. */", '#include "object_table.h"', "",
               "const struct object OBJECT_TABLE[OBJECT_COUNT] = {"]  # fmt: skip
     for key, entry in entries:
-        source += [f"    /* {entry.name} */", f"    {_write_entry(*key, entry, others[key].default)},"]
+        source += [f"    /* {entry.name} */", f"    {_write_entry(*key, entry, read_default(others[key]))},"]
     return {"object_table.h": "\n".join(header), "object_table.c": "\n".join([*source, "};", ""])}
 
 
-def _write_entry(index: int, sub: int, entry: Entry, default_of_node_2: Value) -> str:
-    kind = "KIND_TEXT" if isinstance(entry.default, bytes) else _KINDS.get(entry.code, "KIND_UNSIGNED")
-    flags = {"READABLE": entry.readable, "WRITABLE": entry.writable, "MAPPABLE": entry.mappable,
-             "HAS_LOW_LIMIT": entry.low is not None, "HAS_HIGH_LIMIT": entry.high is not None,
-             "NODE_RELATIVE": default_of_node_2 != entry.default}
+def _write_entry(index: int, sub: int, entry: ODVariable, default_of_node_2: Value) -> str:
+    default, number = read_default(entry), find_struct(entry)
+    flags = {"READABLE": entry.readable, "WRITABLE": entry.writable, "MAPPABLE": entry.pdo_mappable,
+             "HAS_LOW_LIMIT": entry.min is not None, "HAS_HIGH_LIMIT": entry.max is not None,
+             "NODE_RELATIVE": default_of_node_2 != default}
     words = " | ".join(name for name, is_set in flags.items() if is_set) or "0"
-    initial = entry.default if isinstance(entry.default, bytes) else entry.default - flags["NODE_RELATIVE"]
-    text = f'"{entry.default.decode("ascii")}"' if isinstance(entry.default, bytes) else "NULL"
-    length = len(entry.default) if isinstance(entry.default, bytes) else 0
-    return (f"{{0x{index:04X}, 0x{sub:02X}, {kind}, {struct.calcsize('<' + entry.code)}, {words}, "
-            f"{_write_bits(entry.code, initial)}, {entry.low or 0}, {entry.high or 0}, {text}, {length}}}")
-
-
-def _write_bits(code: str, value: Value) -> str:
-    """The bits of a number as an unsigned integer constant."""
-    if isinstance(value, bytes):
-        return "0"
-    return f"0x{int.from_bytes(struct.pack('<' + code, value), 'little'):X}u" + ("ll" if code in "dqQ" else "")
+    kind, size, bits, text, length = "KIND_TEXT", 0, "0", "NULL", 0
+    if isinstance(default, bytes):
+        text, length = f'"{default.decode("ascii")}"', len(default)
+    elif number is not None:
+        kind, size = _KINDS.get(number.format.lstrip("<"), "KIND_UNSIGNED"), number.size
+        packed = number.pack(default - flags["NODE_RELATIVE"])
+        bits = f"0x{int.from_bytes(packed, 'little'):X}u" + "ll" * (size == 8)  # as an unsigned integer constant
+    return (f"{{0x{index:04X}, 0x{sub:02X}, {kind}, {size}, {words}, {bits}, {entry.min or 0}, {entry.max or 0}, "
+            f"{text}, {length}}}")
 
 
 if __name__ == "__main__":

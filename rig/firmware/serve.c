@@ -91,6 +91,8 @@ int serve_node(struct node node, const char *bus)
     const char *channel = choose_port(bus);
     if (channel == NULL || !port->open(channel))
         return 2;
+    printf("on %s\n", bus); /* who has started this program waits for the line */
+    fflush(stdout);
     raise_priority();
     run(node);
     port->close();

@@ -153,14 +153,13 @@ class HardLoop(Loop):
         self._buffers.settings[-1] = self._values.list_safe(word)
         self._words[hc.OVERRIDE_LIMIT] = self._words[hc.TAIL]
 
-    def wait_until_played(self, stop: Callable[[], bool]) -> bool:
+    def wait_until_played(self, stop: Callable[[], bool]) -> None:
         """See `Loop`. The queue may then run empty: until the next input the last one is repeated."""
         self._words[hc.MAY_IDLE_AT] = self._words[hc.TAIL]
-        while self.waiting:
+        is_over = False
+        while self.waiting and not is_over:
             self.serve()
-            if stop():
-                return False
-        return True
+            is_over = stop()
 
     def hold(self, phase: int) -> float:
         """See `Loop`; the last input is repeated until the next one."""

@@ -200,9 +200,8 @@ class Loop(ABC):
     def override_control(self, word: int) -> None:  # noqa: B027 - nothing is queued
         """Use this control word in all cycles already queued, from the next one on."""
 
-    def wait_until_played(self, stop: Callable[[], bool]) -> bool:
-        """Wait until all inputs are taken; False when `stop()` came true before."""
-        return True
+    def wait_until_played(self, stop: Callable[[], bool]) -> None:  # noqa: B027 - nothing is queued
+        """Wait until all inputs are taken, or `stop()`."""
 
     def close(self) -> None:  # noqa: B027 - nothing to give back
         """Give back what the loop holds, whatever happened."""

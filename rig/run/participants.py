@@ -109,8 +109,7 @@ def _start_missing_nodes(job: Job, master: Master, processes: NodeProcesses, riv
         if node == CONTROLLER and wanted != "external" and there:
             raise BusError(f"a node {number} is on {job.bus} already: say --controller external, or stop it")
         if not there:
-            is_c_firmware = node == CONTROLLER and job.controller == "c"
-            processes.start(node, _make_command(job, node), announces=not is_c_firmware)
+            processes.start(node, _make_command(job, node))
             if is_replaced(master, node, processes) and wanted != "auto":
                 raise BusError(f"a {name} is on {job.bus} already: stop it, or say "
                                f"--{NAMES[node]} external")
@@ -179,30 +178,21 @@ class NodeProcesses:
 
     def __init__(self) -> None:
         self._children: dict[Role, Child] = {}
-        self._silent: set[Role] = set()  # nodes that are to say when they are on the bus, and have not yet
 
-    def start(self, node: Role, command: Sequence[str], *, announces: bool = False) -> None:
-        """Start a node as a new process. `announces`: it writes a line as soon as it is on the bus, see `is_ready`."""
-        output = subprocess.PIPE if announces else subprocess.DEVNULL
-        self._children[node] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output,
+    def start(self, node: Role, command: Sequence[str]) -> None:
+        """Start a node as a new process, which writes a line as soon as it is on the bus."""
+        self._children[node] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                                                 start_new_session=True, preexec_fn=end_with_this_process())
-        if announces:
-            self._silent.add(node)
 
     def is_ready(self, node: Role) -> bool:
-        """Whether the node has said that it is on the bus, if it is one that says so."""
-        if node in self._silent:
-            output = self._children[node].stdout
-            assert output is not None
-            if select.select([output], [], [], 0)[0] and output.readline():
-                self._silent.discard(node)
-        return node not in self._silent
+        """Whether the node has said that it is on the bus."""
+        output = self._children[node].stdout
+        assert output is not None
+        return bool(select.select([output], [], [], 0)[0] and output.readline())  # nothing: it has ended
 
     def forget(self, node: Role) -> None:
         """Leave out a node whose process has ended: another one has taken its place on the bus."""
-        child = self._children.pop(node)
-        if child.stdout is not None:
-            child.stdout.close()
+        self._children.pop(node).communicate()
 
     def find_ended(self) -> dict[Role, int]:
         """Nodes whose process has ended, with its exit status; negative: the signal that ended it."""
@@ -224,10 +214,7 @@ class NodeProcesses:
         for child in children:
             child.terminate()
         for child in children:
-            try:
+            with contextlib.suppress(subprocess.TimeoutExpired):
                 child.wait(5)
-            except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait()
-            if child.stdout is not None:
-                child.stdout.close()
+            child.kill()
+            child.communicate()

@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,9 +154,6 @@ def name_scheduler() -> str:
     return names.get(os.sched_getscheduler(0), "unknown")
 
 
-R = TypeVar("R")
-
-
 def compute_percentiles(seconds: NDArray[np.floating]) -> dict[str, float]:
     """p50, p99, p99.9 and the largest of the times that are not missing, us; nothing if all are."""
     known = seconds[~np.isnan(seconds)] * 1e6
@@ -166,25 +162,10 @@ def compute_percentiles(seconds: NDArray[np.floating]) -> dict[str, float]:
     return dict(zip(PERCENTILES, np.percentile(known, (50, 99, 99.9, 100)).tolist(), strict=True))
 
 
-def measure_timer_lateness(seconds: float, period_ns: int = 1_000_000) -> NDArray[np.int64]:
-    """Sleep until t0 + k * period, as the real-time loop does, and note how late each wake-up is, ns.
-
-    Due times never move: a late wake-up does not push the next one, so lateness is not hidden by the sum of sleeps.
-    """
-    late = np.empty(max(1, round(seconds * 1e9 / period_ns)), dtype=np.int64)
-    due = time.monotonic_ns()
-    for k in range(late.size):
-        due += period_ns
-        if (rest := due - time.monotonic_ns()) > 0:
-            time.sleep(rest / 1e9)
-        late[k] = time.monotonic_ns() - due
-    return late
-
-
-def run_under_fifo(function: Callable[[], R], priority: int = 1) -> R | None:
-    """`function()` in a thread of its own under SCHED_FIFO; None where the right to it is not granted."""
+def is_fifo_granted() -> bool:
+    """Whether a thread may run under SCHED_FIFO."""
     with ThreadPoolExecutor(1) as pool:
-        return pool.submit(lambda: function() if _set_fifo(0, priority) else None).result()  # 0: this thread only
+        return pool.submit(_set_fifo, 0, 1).result()  # 0: this thread only
 
 
 def read_clock_resolution_ns() -> float:

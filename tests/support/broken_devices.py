@@ -2,6 +2,7 @@
 
 import heapq
 from collections.abc import Callable
+from copy import copy
 from functools import partial, reduce
 from pathlib import Path
 from typing import Any
@@ -96,7 +97,9 @@ def wrap_all(path: str, name: str, around: Callable[..., Any]) -> Break:
 def change_entries(**values: Any) -> Break:
     """Every object of the dictionary is described otherwise."""
     def patch(device: Any) -> None:
-        device.od.entries = {key: entry._replace(**values) for key, entry in device.od.entries.items()}
+        device.od.entries = {key: copy(entry) for key, entry in device.od.entries.items()}
+        for entry in device.od.entries.values():
+            vars(entry).update(values)
     return patch
 
 

@@ -133,5 +133,5 @@ def start_node(name: str, bus: str, wire: Wire, processes: NodeProcesses) -> Non
         return
     if name == "c":
         require_firmware_bus(bus)
-    processes.start(role, make_node_command(role, bus, is_in_c=name == "c"), announces=name != "c")
+    processes.start(role, make_node_command(role, bus, is_in_c=name == "c"))
     is_replaced(master, role, processes)

@@ -25,7 +25,7 @@ def run_command(args: argparse.Namespace) -> int:
         bench = load_bench(args.bench, is_trusted=args.trust)
         report = build_listening_report(bench, choose_bus(args.bus)[0], args.seconds)
     else:
-        report = build_doctor_report(doctor.examine_machine(args.seconds))
+        report = build_doctor_report(doctor.examine_machine())
     return give_answer(report, args, int(report.verdict != "PASS"), places)
 
 

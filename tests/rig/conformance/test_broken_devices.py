@@ -416,11 +416,11 @@ DEFECTS: list[tuple[str, Break, str]] = [
     ("unknown object: another code", change_abort(Abort.NO_OBJECT, Abort.NO_SUBINDEX), "2.7"),
     ("unknown sub-index: another code", change_abort(Abort.NO_SUBINDEX, Abort.NO_OBJECT), "2.8"),
     ("write-only: another code", change_abort(Abort.WRITE_ONLY, 0x06010000), "2.10"),
-    ("read-only objects written", change_entries(writable=True), "2.9"),
+    ("read-only objects written", change_entries(access_type="rw"), "2.9"),
     ("any length accepted", all_of(wrap("od.decode", ignore_length),
                                    wrap("sdo._size", lambda device, old, index, sub: old(index, sub) * 0)),
      "2.12 3.13"),
-    ("limits ignored", change_entries(low=None, high=None), "2.13"),
+    ("limits ignored", change_entries(min=None, max=None), "2.13"),
     ("constant differs from the EDS", wrap("sdo._upload", lambda device, old, index, sub: old(index, sub)
                                            if (index, sub) != (0x1018, 2) else bytes(4)), "2.3"),
     ("object of the EDS cannot be read", wrap("od.find", refuse_version), "2.1 2.3 2.8 2.14"),

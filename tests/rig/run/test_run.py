@@ -415,7 +415,7 @@ def test_a_plant_that_came_first_is_used_in_place_of_ours(bus_with_nodes: str) -
     """On a slow machine a plant that the operator starts together with the run answers after the run has looked."""
     processes = NodeProcesses()
     words = ["node", "plant", "--bus", bus_with_nodes]
-    processes.start(PLANT, [sys.executable, "-m", "rig.cli.main", *words], announces=True)
+    processes.start(PLANT, [sys.executable, "-m", "rig.cli.main", *words])
     try:
         with open_master(bus_with_nodes) as master:
             assert participants.is_replaced(master, PLANT, processes)
@@ -433,7 +433,7 @@ def test_a_run_that_asks_for_its_own_plant_refuses_another_one(bus_with_nodes: s
 
 def test_a_node_of_ours_that_ends_is_no_node() -> None:
     processes = NodeProcesses()
-    processes.start(CONTROLLER, [sys.executable, "-c", "raise SystemExit(2)"], announces=True)
+    processes.start(CONTROLLER, [sys.executable, "-c", "raise SystemExit(2)"])
     with (open_master(spec("udp_multicast")) as master,
           pytest.raises(BusError, match=r"our own controller did not start")):
         participants.is_replaced(master, CONTROLLER, processes)
