@@ -70,19 +70,18 @@ def catch_signals() -> Iterator[Callable[[], bool]]:
         yield is_to_stop
 
 
-def end_with_this_process() -> Callable[[], None]:
-    """What a new process does first (`preexec_fn`), so that the kernel kills it when the thread that starts it ends.
+_prctl = ctypes.CDLL(None).prctl  # here: a new process may not load a library any more
+_KILL_AT_END = 1  # PR_SET_PDEATHSIG, linux/prctl.h
 
-    So a program of any kind ends with the rig, also with one that was killed: nothing of its own has to look.
+
+def end_with(parent: int) -> None:
+    """Let the kernel kill this process when the thread of `parent` that has started it ends.
+
+    So a program of any kind ends with a rig that is killed: it runs this first (`preexec_fn`) and need not look.
     """
-    prctl, kill_at_end, parent = ctypes.CDLL(None).prctl, 1, os.getpid()  # PR_SET_PDEATHSIG, linux/prctl.h
-
-    def prepare() -> None:
-        prctl(kill_at_end, signal.SIGKILL, 0, 0, 0)
-        if os.getppid() != parent:  # it ended before the kernel knew
-            os._exit(1)
-
-    return prepare
+    _prctl(_KILL_AT_END, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:  # it ended before the kernel knew
+        os._exit(1)
 
 
 def describe_exit(status: int) -> str:

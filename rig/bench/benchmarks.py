@@ -34,7 +34,7 @@ from plant.solve import run_closed_loop
 from rig.benches.bench import Role
 from rig.benches.bench_file import load_bench
 from rig.firmware.build import build_device
-from rig.interrupts import end_with_this_process
+from rig.interrupts import end_with
 from rig.network.bus import Link, LinkWire, can_open, open_can
 from rig.network.frame import WallClock
 from rig.network.master import Master
@@ -192,7 +192,7 @@ def _pack(bus: str, cob_id: int) -> bytes:
 @contextlib.contextmanager
 def _run_process(words: list[str], *descriptors: int) -> Iterator[Peer]:
     process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, pass_fds=descriptors,
-                               preexec_fn=end_with_this_process())
+                               preexec_fn=partial(end_with, os.getpid()))
     try:
         yield process
     finally:

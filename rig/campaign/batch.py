@@ -23,7 +23,7 @@ from types import FrameType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from plant.errors import InputError, RigError, report_system_error
-from rig.interrupts import describe_exit, ignore_interrupts
+from rig.interrupts import describe_exit, end_with, ignore_interrupts
 from rig.network.frame import WallClock
 
 Job = TypeVar("Job")
@@ -325,7 +325,7 @@ class _Worker(Generic[Job]):
     def __init__(self, work: Callable[[Job], Any]) -> None:
         context = get_context("spawn")
         self.connection, far_end = context.Pipe()
-        self.process = context.Process(target=_serve_jobs, args=(far_end, work), daemon=True)
+        self.process = context.Process(target=_serve_jobs, args=(far_end, work, os.getpid()), daemon=True)
         with ignore_interrupts():
             self.process.start()
         far_end.close()
@@ -388,8 +388,9 @@ def _wait_for_messages(workers: Sequence[_Worker[Job]], clock: WallClock) -> lis
     return [worker for worker in workers if worker.connection in ready or worker.due_ns <= now]
 
 
-def _serve_jobs(parent: Any, work: Callable[[Any], Any]) -> None:
-    """The main function of a worker process: do the jobs that come until the parent closes the connection."""
+def _serve_jobs(parent: Any, work: Callable[[Any], Any], parent_id: int) -> None:
+    """The main function of a worker process: do the jobs that come until the parent closes the connection, or ends."""
+    end_with(parent_id)
     signal.signal(signal.SIGTERM, _exit_on_signal)
     with contextlib.suppress(EOFError, OSError):  # the parent has closed the connection, or is gone
         parent.send((_STARTED, None))

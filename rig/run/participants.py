@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from plant import Model
 from plant.errors import InputError, require
 from rig.benches.bench import Role
 from rig.benches.bench_file import is_plant_bench
-from rig.interrupts import end_with_this_process
+from rig.interrupts import end_with
 from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, open_can
 from rig.network.frame import Node, Send, VirtualClock, WallClock
 from rig.network.master import BusError, Master
@@ -182,7 +183,7 @@ class NodeProcesses:
     def start(self, node: Role, command: Sequence[str]) -> None:
         """Start a node as a new process, which writes a line as soon as it is on the bus."""
         self._children[node] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                                                start_new_session=True, preexec_fn=end_with_this_process())
+                                                start_new_session=True, preexec_fn=partial(end_with, os.getpid()))
 
     def is_ready(self, node: Role) -> bool:
         """Whether the node has said that it is on the bus."""

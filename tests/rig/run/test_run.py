@@ -290,7 +290,7 @@ def test_a_killed_run_loses_half_a_second_at_most(tmp_path: Path) -> None:
 
 
 STARTS_A_NODE = """
-import sys, time
+import time
 from rig.network.node_objects import CONTROLLER
 from rig.run.participants import NodeProcesses
 processes = NodeProcesses()
@@ -298,17 +298,23 @@ processes.start(CONTROLLER, ["sleep", "60"])
 print(processes._children[CONTROLLER].pid, flush=True)
 time.sleep(60)
 """
+STARTS_A_WORKER = """
+import os
+from rig.campaign.batch import run_in_processes
+next(run_in_processes(os.system, ["echo $PPID; sleep 60"] * 2, 2, None))
+"""
 
 
-def test_a_node_of_any_kind_ends_with_a_rig_that_is_killed() -> None:
-    """Also one that knows nothing of the rig, or that is still loading and does not look for it."""
-    with subprocess.Popen([sys.executable, "-c", STARTS_A_NODE], stdout=subprocess.PIPE, text=True) as process:
+@pytest.mark.parametrize("code", [STARTS_A_NODE, STARTS_A_WORKER], ids=["node", "worker"])
+def test_what_a_rig_has_started_ends_with_it_when_it_is_killed(code: str) -> None:
+    """Also a program that knows nothing of the rig, or that is still loading or busy and does not look for it."""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        node = Path("/proc", process.stdout.readline().strip())
-        assert node.exists()
+        started = Path("/proc", process.stdout.readline().strip())
+        assert started.exists()
         process.kill()
     end = time.monotonic() + 10.0
-    while node.exists() and (node / "stat").read_text().split()[2] != "Z":  # nobody collects its status in a container
+    while started.exists() and (started / "stat").read_text().split()[2] != "Z":  # where nobody collects its status
         assert time.monotonic() < end
         time.sleep(0.01)
 
