@@ -70,6 +70,17 @@ def catch_signals() -> Iterator[Callable[[], bool]]:
         yield is_to_stop
 
 
+def exit_on_signal(number: int, frame: FrameType | None) -> None:
+    """End by an exception, so that `subprocess.run` ends its own process, too.
+
+    It is raised again and again until the process has ended: Python drops an exception that comes in a destructor or in
+    a function that compiled code calls, as the compiler does.
+    """
+    signal.signal(signal.SIGALRM, exit_on_signal)
+    signal.setitimer(signal.ITIMER_REAL, 0.3)
+    raise SystemExit(128 + signal.SIGTERM)
+
+
 _prctl = ctypes.CDLL(None).prctl  # here: a new process may not load a library any more
 _KILL_AT_END = 1  # PR_SET_PDEATHSIG, linux/prctl.h
 

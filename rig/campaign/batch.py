@@ -19,11 +19,10 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from functools import partial
 from multiprocessing import connection, get_context
 from pathlib import Path
-from types import FrameType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from plant.errors import InputError, RigError, report_system_error
-from rig.interrupts import describe_exit, end_with, ignore_interrupts
+from rig.interrupts import describe_exit, end_with, exit_on_signal, ignore_interrupts
 from rig.network.frame import WallClock
 
 Job = TypeVar("Job")
@@ -391,7 +390,7 @@ def _wait_for_messages(workers: Sequence[_Worker[Job]], clock: WallClock) -> lis
 def _serve_jobs(parent: Any, work: Callable[[Any], Any], parent_id: int) -> None:
     """The main function of a worker process: do the jobs that come until the parent closes the connection, or ends."""
     end_with(parent_id)
-    signal.signal(signal.SIGTERM, _exit_on_signal)
+    signal.signal(signal.SIGTERM, exit_on_signal)
     with contextlib.suppress(EOFError, OSError):  # the parent has closed the connection, or is gone
         parent.send((_STARTED, None))
         while True:
@@ -401,17 +400,6 @@ def _serve_jobs(parent: Any, work: Callable[[Any], Any], parent_id: int) -> None
             except Exception as error:
                 message = _RAISED, _make_picklable(error)
             parent.send(message)
-
-
-def _exit_on_signal(number: int, frame: FrameType | None) -> None:
-    """End by an exception, so that `subprocess.run` in a job ends its own process, too.
-
-    It is raised again and again until the process has ended: Python drops an exception that comes in a destructor or in
-    a function that compiled code calls, as the compiler does.
-    """
-    signal.signal(signal.SIGALRM, _exit_on_signal)
-    signal.setitimer(signal.ITIMER_REAL, 0.3)
-    raise SystemExit(128 + signal.SIGTERM)
 
 
 def _make_picklable(error: Exception) -> Exception:

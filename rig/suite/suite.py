@@ -33,7 +33,7 @@ from rig.evidence.requirements import (
     tabulate_requirements,
     trace_requirements,
 )
-from rig.interrupts import handle_signals
+from rig.interrupts import exit_on_signal, handle_signals
 from rig.network.frame import WallClock
 from rig.run.job import JobChoice, build_job, find_differences, load_tested_sequence
 from rig.run.participants import EMBEDDED_NAMES
@@ -335,12 +335,9 @@ def catch_termination(bus: str, patience: float = 1.0) -> Iterator[Callable[[], 
         nonlocal is_asked
         is_asked = True
         if is_embedded:
-            signal.setitimer(signal.ITIMER_REAL, patience, 0.5)  # repeated: an exception may be lost in a callback
+            signal.setitimer(signal.ITIMER_REAL, patience)
 
-    def end(number: int, frame: FrameType | None) -> None:
-        raise SystemExit(128 + signal.SIGTERM)
-
-    with handle_signals({signal.SIGTERM: ask, signal.SIGALRM: end}):
+    with handle_signals({signal.SIGTERM: ask, signal.SIGALRM: exit_on_signal}):
         try:
             yield lambda: is_asked
         finally:
