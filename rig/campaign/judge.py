@@ -321,13 +321,12 @@ def sample_coloured_noise(n: int, level: float, colour: float, hum: float, perio
         period: of a cycle, s.
         rng: source of the random numbers.
     """
+    from scipy.signal import lfilter  # here: it takes long to import
+
     white = level * rng.standard_normal(n)
-    noise, last = np.empty(n), float(white[0])
-    noise[0] = last
-    for k, innovation in enumerate((np.sqrt(1 - colour**2) * white).tolist()[1:], start=1):
-        noise[k] = last = colour * last + innovation
-    noise += hum * np.sin(2 * np.pi * 50.0 * period * np.arange(n) + 1.0)
-    return noise
+    white[1:] *= np.sqrt(1 - colour**2)
+    noise: Floats = lfilter([1.0], [1.0, -colour], white)
+    return noise + hum * np.sin(2 * np.pi * 50.0 * period * np.arange(n) + 1.0)
 
 
 def add_faults(model: Model, sizes: Mapping[str, float], faults: Sequence[Fault] = ()) -> Model:

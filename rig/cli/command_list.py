@@ -338,6 +338,7 @@ COMMANDS = {
                 help="the bus to join: socketcan:can0 is a CAN interface, udp_multicast works between programs on "
                      "this machine (needed, unless EHA_RIG_BUS names a bus)"),
          BENCH,
+         option("--announce", action="store_true", help=argparse.SUPPRESS),  # also with --quiet: a rig waits for it
          Group("model", MODEL, "The emulator simulates it and the firmware takes its gains from it, until a rig on "
                                "the bus loads another. The bench drives servovalves: ehs and servo are refused."))),
     "recover": Command(

@@ -27,7 +27,7 @@ def read_default(entry: ODVariable) -> Value:
     """What an entry holds after power-on."""
     default: int | float | bytes | str | None = entry.default
     if find_struct(entry) is not None:
-        return cast(Value, default or 0)
+        return 0 if default is None else cast(Value, default)
     return default.encode("ascii") if isinstance(default, str) else cast(bytes, default or b"")
 
 

@@ -134,7 +134,7 @@ def make_node_command(node: Role, bus: str, *words: str, is_in_c: bool = False) 
         from rig.firmware.build import build_controller
 
         return [str(build_controller()), bus]
-    return [sys.executable, "-m", "rig.cli.main", "node", NAMES[node], "--bus", bus, *words]
+    return [sys.executable, "-m", "rig.cli.main", "node", NAMES[node], "--bus", bus, "--quiet", "--announce", *words]
 
 
 def _make_command(job: Job, node: Role) -> list[str]:
@@ -211,10 +211,9 @@ class NodeProcesses:
 
     def stop(self) -> None:
         """Terminate all processes; kill those that do not end within 5 s."""
-        children = self._children.values()
-        for child in children:
+        for child in self._children.values():
             child.terminate()
-        for child in children:
+        for child in self._children.values():
             with contextlib.suppress(subprocess.TimeoutExpired):
                 child.wait(5)
             child.kill()

@@ -60,7 +60,7 @@ def run_command(args: argparse.Namespace) -> int:
         role = PLANT if args.node == "plant" else CONTROLLER
         require_free_number(bench.find_number(role), args.node, link, bus,
                             LISTENING_TIME - (clock.now() - opened_ns) * 1e-9)
-        if not (args.quiet or args.json):  # a rig that has started it waits for this line
+        if args.announce or not (args.quiet or args.json):
             kind = "compiled loop" if is_compiled else "Python loop, soft real time"
             print(f"{args.node} on {bus}, {kind}; Ctrl-C ends it", flush=True)
         stack.enter_context(raise_priority(1 if is_compiled else LOOP_PRIORITY))

@@ -420,7 +420,7 @@ def test_a_second_node_of_a_number_does_not_start(bus_with_nodes: str) -> None:
 def test_a_plant_that_came_first_is_used_in_place_of_ours(bus_with_nodes: str) -> None:
     """On a slow machine a plant that the operator starts together with the run answers after the run has looked."""
     processes = NodeProcesses()
-    words = ["node", "plant", "--bus", bus_with_nodes]
+    words = ["node", "plant", "--bus", bus_with_nodes, "--quiet", "--announce"]
     processes.start(PLANT, [sys.executable, "-m", "rig.cli.main", *words])
     try:
         with open_master(bus_with_nodes) as master:
