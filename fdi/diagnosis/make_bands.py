@@ -476,15 +476,22 @@ def sample_sensor_noise(rng: np.random.Generator, model: Model, cycles: int, mos
         most_hum: largest amplitude of the hum, in standard deviations of the noise.
         hum_frequency: Hz.
     """
+    level, colour = model.values.get(model.kind.signals.controlled.noise, 0.0), rng.uniform(0.0, most_colour)
+    noise = colour_noise(rng.standard_normal(cycles), colour)
+    hum: Floats = rng.uniform(0.0, most_hum) * np.sin(2 * np.pi * (hum_frequency * model["controller.period"] *
+                                                           np.arange(cycles) + rng.uniform()))
+    return level * (noise + hum)
+
+
+def colour_noise(white: Floats, colour: float) -> Floats:
+    """First-order noise of the standard deviation of the white noise, (n,), that it is made from.
+
+    `colour`: correlation from one sample to the next.
+    """
     from scipy.signal import lfilter
 
-    level, colour = model.values.get(model.kind.signals.controlled.noise, 0.0), rng.uniform(0.0, most_colour)
-    white = rng.standard_normal(cycles)
-    white[1:] *= np.sqrt(1.0 - colour**2)
-    hum = rng.uniform(0.0, most_hum) * np.sin(2 * np.pi * (hum_frequency * model["controller.period"] *
-                                                           np.arange(cycles) + rng.uniform()))
-    coloured: Floats = level * (lfilter([1.0], [1.0, -colour], white) + hum)
-    return coloured
+    white[1:] *= np.sqrt(1.0 - colour**2)  # of the innovations
+    return np.asarray(lfilter([1.0], [1.0, -colour], white))
 
 
 def _sample_parameters(rng: np.random.Generator, model: Model, tolerance: Mapping[str, float], names: list[str],

@@ -321,12 +321,10 @@ def sample_coloured_noise(n: int, level: float, colour: float, hum: float, perio
         period: of a cycle, s.
         rng: source of the random numbers.
     """
-    from scipy.signal import lfilter  # here: it takes long to import
+    from fdi.diagnosis.make_bands import colour_noise  # here: it takes long to import
 
-    white = level * rng.standard_normal(n)
-    white[1:] *= np.sqrt(1 - colour**2)
-    noise: Floats = lfilter([1.0], [1.0, -colour], white)
-    return noise + hum * np.sin(2 * np.pi * 50.0 * period * np.arange(n) + 1.0)
+    mains: Floats = hum * np.sin(2 * np.pi * 50.0 * period * np.arange(n) + 1.0)
+    return colour_noise(level * rng.standard_normal(n), colour) + mains
 
 
 def add_faults(model: Model, sizes: Mapping[str, float], faults: Sequence[Fault] = ()) -> Model:
