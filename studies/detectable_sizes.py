@@ -155,7 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{progress.done} of {progress.total}: {row['effect']} {row['factor']:g} {row['verdict']}", flush=True)
 
     effects = given.effects.split(",")
-    claimed = claim_sizes(given.out, effects, Workers(given.jobs, single_threaded=True), report_claims)
+    claimed = claim_sizes(given.out, effects, Workers(given.jobs), report_claims)
     print(format_table(run_study(given.cases or 2 * len(effects), given.out, show, effects, claimed)))
     return 0
 

@@ -123,9 +123,8 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
         Section("Provenance", [Listing(command, medium=page)] if command else [])]
     facts = [("model", model), *list_sources(sources, bool(a.baseline["holdout"]))]
     injected = describe_injected_faults(trace)
-    sentence = " ".join(filter(None, (describe_verdict(a), injected)))
-    return Report("explain", title, a.verdict, MOODS[a.verdict], sentence, facts, notes, sections, next_command, files,
-                  collect_data(a, list(filter(None, (*notes, injected))), claims))
+    return Report("explain", title, a.verdict, MOODS[a.verdict], f"{describe_verdict(a)} {injected}".rstrip(), facts,
+                  notes, sections, next_command, files, collect_data(a, [*notes, *filter(None, [injected])], claims))
 
 
 def describe_injected_faults(trace: Trace) -> str:

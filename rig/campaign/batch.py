@@ -34,7 +34,6 @@ class Workers(NamedTuple):
 
     processes: int = 1  # on this machine; one is this process itself
     scheduler: str = ""  # address of a Dask scheduler; if given, its workers do the jobs
-    single_threaded: bool = False  # limit each worker process to one thread (see `plant.threads`)
 
 
 class Batch(NamedTuple):
@@ -85,7 +84,7 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: Worker
     """Each job with its result as soon as it is finished; see `run_batch` for what it raises."""
     if not jobs:
         return
-    remote = partial(_work_single_threaded, work) if workers.single_threaded else work
+    remote = partial(_work_single_threaded, work)
     if workers.scheduler:
         with connect_to_cluster(workers.scheduler) as client:
             yield from run_on_cluster(client, remote, jobs, describe_failure)

@@ -43,7 +43,7 @@ def run_command(args: argparse.Namespace) -> int:
         folder = Path(args.out or args.what or "")
         return give_summary(read_campaign_rows(folder), folder, args)
     chosen, folder = choose_matrix(args)
-    workers = Workers(args.jobs or len(os.sched_getaffinity(0)), args.scheduler or "", single_threaded=True)
+    workers = Workers(args.jobs or len(os.sched_getaffinity(0)), args.scheduler or "")
     with show_batch_progress(args) as report_progress:
         rows = run_campaign(chosen, folder, workers, report_progress, args.most, args.again)
     return give_summary(rows, folder, args)

@@ -46,12 +46,12 @@ def run_command(args: argparse.Namespace) -> int:
 def parse_workers(text: str | None) -> Workers:
     """What --workers names: a number of processes, or a Dask scheduler; all cores without it. Raises InputError."""
     if text is None:
-        return Workers(len(os.sched_getaffinity(0)), single_threaded=True)
+        return Workers(len(os.sched_getaffinity(0)))
     if "://" in text:
-        return Workers(scheduler=text, single_threaded=True)
+        return Workers(scheduler=text)
     require(text.isdecimal() and int(text) >= 1, "--workers", text,
             "1 or more processes, or the address of a Dask scheduler such as tcp://127.0.0.1:8786")
-    return Workers(int(text), single_threaded=True)
+    return Workers(int(text))
 
 
 def _measure_claims(args: argparse.Namespace, runs: Runs, answer: Answer, hidden: Sequence[str],

@@ -329,13 +329,10 @@ def test_a_worker_that_cannot_start_is_an_error_and_not_an_endless_loop() -> Non
         list(run_in_processes(campaign_work.Unpicklable(), [1, 2], 2, fail_test))
 
 
-@pytest.mark.parametrize(("single_threaded", "threads"), [(False, 5), (True, 1)])
-def test_workers_are_limited_to_one_thread_on_demand(single_threaded: bool, threads: int,
-                                                     monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_are_limited_to_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "5")
-    workers = Workers(2, single_threaded=single_threaded)
-    results = dict(run_jobs(campaign_work.count_usable_threads, [1, 2], workers, fail_test))
-    assert results == {1: threads, 2: threads} and os.environ["OMP_NUM_THREADS"] == "5"
+    results = dict(run_jobs(campaign_work.count_usable_threads, [1, 2], Workers(2), fail_test))
+    assert results == {1: 1, 2: 1} and os.environ["OMP_NUM_THREADS"] == "5"
 
 
 @pytest.mark.parametrize("work", ["run_sleeping_process", "run_process_without_signals"])
