@@ -1,22 +1,24 @@
 """Reading an MCAP log of protobuf messages, by the schemas that stand in the file itself.
 
-Rows of numbers are read as whole columns through the index of each chunk. Other messages are found by a plain scan and
-read by protobuf's parser; the library's message iterator makes an object of every record first, which is slower.
+Messages are found through the index of each chunk and read by protobuf's parser; the library's message iterator makes
+an object of every record first, which is slower.
 """
 
 import contextlib
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass
 from io import BytesIO
+from itertools import chain
+from operator import attrgetter
 from pathlib import Path
 from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 import zstandard
-from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor import FieldDescriptor
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -29,10 +31,10 @@ from numpy.typing import NDArray
 from plant.errors import InputError, require
 from plant.unpacking import UnpackingError, limit_unpacked_size
 
-_NUMBERS = {  # protobuf types of fixed width: wire type and numpy type
-    FieldDescriptorProto.TYPE_DOUBLE: (1, "<f8"),
-    FieldDescriptorProto.TYPE_FIXED32: (5, "<u4"),
-    FieldDescriptorProto.TYPE_BOOL: (0, "?"),
+_KINDS = {  # protobuf's kinds of numbers as numpy's; all others are objects
+    FieldDescriptor.CPPTYPE_DOUBLE: "f8", FieldDescriptor.CPPTYPE_FLOAT: "f8", FieldDescriptor.CPPTYPE_BOOL: "?",
+    FieldDescriptor.CPPTYPE_INT32: "i8", FieldDescriptor.CPPTYPE_INT64: "i8", FieldDescriptor.CPPTYPE_UINT32: "i8",
+    FieldDescriptor.CPPTYPE_UINT64: "u8",
 }
 MOST_RECORDS = 1000  # attachments, and metadata records, of a log
 _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
@@ -64,14 +66,10 @@ class Log:
             InputError: messages that are not protobuf or do not fit their schema, and chunks that are damaged.
         """
         with _report_damage(self.path, " and ".join(topics)):
-            factory = DecoderFactory()
-            decode = {number: (c.topic, factory.decoder_for(c.message_encoding, self.schemas.get(c.schema_id)))
-                      for number, c in self.channels.items() if c.topic in topics}
-            found = sorted(self.list_raw_messages(set(decode)), key=lambda message: message[1])
+            decode = self._find_decoders(topics)
+            found = sorted(self.list_raw_messages(decode.keys()), key=lambda message: message[1])
             for channel, time_ns, data in found[:most]:
                 topic, parse = decode[channel]
-                if parse is None:
-                    raise InputError(self.path, topic, "protobuf messages")
                 yield topic, time_ns, parse(data)
 
     def read_columns(self, topic: str) -> dict[str, NDArray[Any]]:
@@ -81,36 +79,30 @@ class Log:
             InputError: messages that are not protobuf or do not fit their schema, and chunks that are damaged.
         """
         with _report_damage(self.path, topic):
-            if (columns := self._read_rows(topic)) is not None:
-                return columns
-            messages = [(time_ns, message) for _, time_ns, message in self.read_messages(topic)]
-            if not messages:
+            decode = self._find_decoders([topic])
+            messages = ((time_ns, decode[channel][1](data))
+                        for channel, time_ns, data in self.list_raw_messages(decode.keys()))
+            first = next(messages, None)
+            if first is None:
                 return {"time_ns": np.empty(0, np.int64)}
-            names = [field.name for field in messages[0][1].DESCRIPTOR.fields]
-            return {"time_ns": np.array([time_ns for time_ns, _ in messages])} | {
-                name: np.array([getattr(message, name) for _, message in messages]) for name in names}
+            fields = first[1].DESCRIPTOR.fields
+            kinds = [(f.name, _KINDS.get(f.cpp_type, "O")) for f in fields]
+            read = attrgetter(*(f.name for f in fields))
+            rows = ((time_ns, *read(message)) for time_ns, message in chain([first], messages))
+            table = np.fromiter(rows, np.dtype([("time_ns", "i8"), *kinds]))
+            table = table[np.argsort(table["time_ns"], kind="stable")]
+            return {name: table[name].copy() for name in table.dtype.names or ()}
 
-    def _read_rows(self, topic: str) -> dict[str, NDArray[Any]] | None:
-        """The same for messages that all hold the same numbers in the same places; None if they do not."""
-        numbers = [number for number, channel in self.channels.items() if channel.topic == topic]
-        layout = _row_layout(self.schemas.get(self.channels[numbers[0]].schema_id)) if len(numbers) == 1 else None
-        if layout is None:
-            return None
-        dtype, tags = layout
-        parts = []
-        for raw, offsets in self._unpack_chunks({numbers[0]}):
-            rows = None if offsets is None else _decode_rows(raw, offsets, dtype)
-            if rows is None:
-                return None
-            parts.append(rows)
-        if not parts:
-            return None
-        table = np.concatenate(parts)
-        if not all((table[name] == value).all() for name, value in tags.items()):
-            return None
-        table["time_ns"] -= self.epoch_ns
-        table = table[np.argsort(table["time_ns"], kind="stable")]
-        return {name: table[name].copy() for name in dtype.names or () if not name.startswith(".")}
+    def _find_decoders(self, topics: Collection[str]) -> dict[int, tuple[str, Callable[[bytes], Any]]]:
+        """Topic and parser of each channel of these topics, by its number."""
+        factory, found = DecoderFactory(), {}
+        for number, channel in self.channels.items():
+            if channel.topic in topics:
+                parse = factory.decoder_for(channel.message_encoding, self.schemas.get(channel.schema_id))
+                if parse is None:
+                    raise InputError(self.path, channel.topic, "protobuf messages")
+                found[number] = channel.topic, parse
+        return found
 
     def list_raw_messages(self, channels: Set[int] | None = None) -> Iterator[tuple[int, int, bytes]]:
         """(channel, log time in ns, data) of every message, or of those of some channels, in the order of the file.
@@ -213,50 +205,12 @@ def _read_chunk(path: Path, stream: BinaryIO, index: ChunkIndex) -> bytes:
         raise InputError(path, f"chunk at byte {index.chunk_start_offset}", f"sound data ({error})") from error
 
 
-def _row_layout(schema: Schema | None) -> tuple[np.dtype[Any], dict[str, int]] | None:
-    """A whole message record whose fields are all numbers of fixed width, as a numpy type, and what its tags must be.
-
-    Names that begin with a dot are not fields of the message. None for a schema with other fields.
-    """
-    if schema is None or schema.encoding != "protobuf":
-        return None
-    files = FileDescriptorSet.FromString(schema.data).file
-    messages = [message for file in files for message in file.message_type]
-    if len(messages) != 1:
-        return None
-    fields = messages[0].field
-    if any(field.type not in _NUMBERS or field.label == field.LABEL_REPEATED for field in fields):
-        return None
-    head = [(".opcode", "u1"), (".length", "<u8"), (".channel", "<u2"), (".sequence", "<u4"), ("time_ns", "<i8"),
-            (".published", "<u8")]
-    columns, tags = [], {".opcode": int(Opcode.MESSAGE)}
-    for field in sorted(fields, key=lambda field: field.number):
-        wire, kind = _NUMBERS[field.type]
-        tag = f".tag {field.name}"
-        tags[tag] = field.number << 3 | wire
-        columns += [(tag, "u1"), (field.name, kind)]
-    if max(tags.values()) > 0x7F:  # a tag of two bytes
-        return None
-    dtype = np.dtype([*head, *columns])
-    tags[".length"] = dtype.itemsize - _RECORD.size
-    return dtype, tags
-
-
 def _message_offsets(stream: BinaryIO, index: ChunkIndex, channel: int) -> NDArray[np.int64]:
     """Where the messages of a channel begin in an unpacked chunk, from the message index behind it."""
     file = BoundedFile(stream)
     file.seek(index.message_index_offsets[channel])
     _, length = _RECORD.unpack(file.read(_RECORD.size))
     return np.frombuffer(file.read(length)[6:], "<u8").reshape(-1, 2)[:, 1].astype(np.int64)
-
-
-def _decode_rows(raw: bytes, offsets: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArray[Any] | None:
-    """The records at `offsets` of a chunk; None if one would end beyond it."""
-    if len(offsets) and (offsets.min() < 0 or offsets.max() > len(raw) - dtype.itemsize):
-        return None
-    places = offsets[:, None] + np.arange(dtype.itemsize)
-    rows: NDArray[Any] = np.frombuffer(raw, np.uint8)[places].view(dtype)[:, 0]
-    return rows
 
 
 def scan_messages(raw: bytes, starts: Iterable[int] | None = None) -> Iterator[tuple[int, int, int, bytes]]:
