@@ -2,9 +2,7 @@
 
 import gzip
 import io
-import zlib
-from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 
 class UnpackingError(ValueError):
@@ -22,7 +20,7 @@ def limit_unpacked_size(packed: int) -> int:
 class LimitedGzip(io.RawIOBase):
     """The content of `size` bytes of gzip data, up to what `limit_unpacked_size` allows; beyond it, UnpackingError."""
 
-    def __init__(self, packed: Path | io.BytesIO, size: int) -> None:
+    def __init__(self, packed: BinaryIO, size: int) -> None:
         self._file = gzip.open(packed)  # noqa: SIM115 (closed by `close`)
         self._left = self._most = limit_unpacked_size(size)
 
@@ -40,15 +38,3 @@ class LimitedGzip(io.RawIOBase):
     def close(self) -> None:
         self._file.close()
         super().close()
-
-
-def unpack_gzip(packed: bytes) -> bytes:
-    """Unpack gzip data of one or several members.
-
-    Raises:
-        UnpackingError: no gzip data, cut short, or more of them than `limit_unpacked_size` allows.
-    """
-    try:
-        return LimitedGzip(io.BytesIO(packed), len(packed)).readall()
-    except (OSError, EOFError, zlib.error) as error:
-        raise UnpackingError(str(error)) from error

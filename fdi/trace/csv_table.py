@@ -1,14 +1,17 @@
-"""CSV files of traces: SI units, one row per cycle, empty fields for missing samples; or a plant's own columns."""
+"""Text tables: CSV files of traces (SI units, a row per cycle), in a plant's own columns, or of any other logger."""
 
 import contextlib
 import csv
 import gzip
 import io
 import math
+import re
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping
-from itertools import chain
+from array import array
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +21,9 @@ from plant.errors import InputError, report_system_error, require
 from plant.plants import Plant, Table, Term, find_plant, list_plants
 from plant.signals import Signals
 from plant.unpacking import LimitedGzip, UnpackingError
+
+COMMENTS = ("#", "%", "//", "!")
+MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "#n/a", "nil"}
 
 
 def read_csv(path: Path, signals: Signals) -> tuple[dict[str, Floats], tuple[str, ...], str, Signals]:
@@ -32,21 +38,30 @@ def read_csv(path: Path, signals: Signals) -> tuple[dict[str, Floats], tuple[str
     """
     with report_unreadable(path, "UTF-8"), open_text(path) as stream:
         header = stream.readline()
-        def list_names(separator: str) -> set[str]:
-            return {name.strip() for name in next(csv.reader([header], delimiter=separator), [])}
+    if (found := find_own_table(partial(split_line, header))) is not None:
+        plant, table = found
+        sources, notes = _read_known(path, split_line(header, table.separator), table.separator, sorted(table.sources))
+        return combine_columns(sources, table), notes, plant.name, plant.signals
+    names = split_line(header, ",")
+    known = (signals, *(find_plant(name).signals for name in list_plants() if not {*signals.required} <= {*names}))
+    signals = next((s for s in known if {*s.required} <= {*names}), signals)
+    required = ("t", *signals.required)
+    possible = (*required, *(name for name in signals.names if name not in required))
+    for name in required:
+        require(name in names, f"{path}: line 1", name, f"a column of this name in the header {','.join(possible)}")
+    return *_read_known(path, names, ",", [name for name in possible if name in names]), "", signals
 
-        if (found := find_own_table(list_names)) is not None:
-            plant, table = found
-            rows = csv.reader(chain([header], stream), delimiter=table.separator)
-            sources, notes = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
-            return combine_columns(sources, table), notes, plant.name, plant.signals
-        rows = csv.reader(chain([header], stream))
-        names = {name.strip() for name in next(csv.reader([header]), [])}
-        known = (signals, *(find_plant(name).signals for name in list_plants() if not {*signals.required} <= names))
-        signals = next((s for s in known if {*s.required} <= names), signals)
-        required = ("t", *signals.required)
-        optional = tuple(name for name in signals.names if name not in required)
-        return *_parse_rows(path, rows, required, optional), "", signals
+
+def _read_known(path: Path, names: Sequence[str], separator: str, known: Collection[str]
+                ) -> tuple[dict[str, Floats], tuple[str, ...]]:
+    """The known columns of a text with these names in its first line, and which were left out."""
+    require(len(set(names)) == len(names), f"{path}: line 1", "header", "each column once")
+    columns = read_columns(path, Layout("utf-8-sig", separator, ".", tuple(names), 1, 2), known)
+    unknown = [name for name in names if name not in columns]
+    if len(unknown) < 2:
+        return columns, tuple(f"column {name} is not known and was left out" for name in unknown)
+    more = f" and {len(unknown) - 3} more" if len(unknown) > 3 else ""
+    return columns, (f"{len(unknown)} columns are not known and were left out: {', '.join(unknown[:3])}{more}",)
 
 
 def find_own_table(list_names: Callable[[str], Collection[str]]) -> tuple[Plant, Table] | None:
@@ -59,7 +74,7 @@ def find_own_table(list_names: Callable[[str], Collection[str]]) -> tuple[Plant,
 
 
 @contextlib.contextmanager
-def report_unreadable(path: Path, encodings: str) -> Iterator[None]:
+def report_unreadable(where: object, encodings: str) -> Iterator[None]:
     """Errors of reading a table as one line. `encodings`: those that the reader knows, in words.
 
     Raises InputError.
@@ -67,11 +82,11 @@ def report_unreadable(path: Path, encodings: str) -> Iterator[None]:
     try:
         yield
     except UnicodeError as error:
-        raise InputError(path, "", f"a text file ({encodings})") from error
+        raise InputError(where, "", f"a text file ({encodings})") from error
     except csv.Error as error:
-        raise InputError(path, "", f"a table of numbers ({error})") from error
+        raise InputError(where, "", f"a table of numbers ({error})") from error
     except (OSError, EOFError, zlib.error, UnpackingError) as error:
-        raise InputError(path, "", f"a readable file ({getattr(error, 'strerror', None) or error})") from error
+        raise InputError(where, "", f"a readable file ({getattr(error, 'strerror', None) or error})") from error
 
 
 def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
@@ -84,54 +99,103 @@ def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
         part.write_bytes(gzip.compress(raw, mtime=0) if path.suffix == ".gz" else raw)
 
 
-def open_text(path: Path, encoding: str = "utf-8-sig") -> io.TextIOBase:
-    """A text file, unpacked if it is a `.gz`. Reading a `.gz` beyond its limit raises UnpackingError."""
-    if path.suffix == ".gz":
-        unpacked = io.BufferedReader(LimitedGzip(path, path.stat().st_size))
-        return io.TextIOWrapper(unpacked, encoding=encoding, newline="")
-    return path.open(encoding=encoding, newline="")
+def open_text(source: Path | bytes, encoding: str = "utf-8-sig") -> io.TextIOWrapper:
+    """The text of a file, unpacked if it is gzip-compressed. Reading that beyond its limit raises UnpackingError."""
+    packed = io.BytesIO(source) if isinstance(source, bytes) else source.open("rb")
+    is_packed, size = packed.read(2) == b"\x1f\x8b", packed.seek(0, io.SEEK_END)
+    packed.seek(0)
+    unpacked = io.BufferedReader(LimitedGzip(packed, size)) if is_packed else packed
+    return io.TextIOWrapper(unpacked, encoding=encoding, newline="")
 
 
-def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...],
-                optional: tuple[str, ...]) -> tuple[dict[str, Floats], tuple[str, ...]]:
-    """The columns and the notes of a CSV text."""
-    header = [name.strip() for name in next(rows, [])]
-    for name in required:
-        require(name in header, f"{path}: line 1", name,
-                f"a column of this name in the header {','.join([*required, *optional])}")
-    require(len(set(header)) >= len(header), f"{path}: line 1", "header", "each column once")
-    known = [(i, name) for i, name in enumerate(header) if name in required or name in optional]
-    values: dict[str, list[float]] = {name: [] for _, name in known}
-    words = dict.fromkeys(values, 0)  # fields that say "nan"
-    last = -math.inf
-    for line, row in enumerate(rows, 2):
-        if not row:
-            continue
-        if len(row) != len(header):
-            raise InputError(f"{path}: line {line}", "", f"{len(header)} fields as in the header, not {len(row)}")
-        for i, name in known:
-            try:
-                value = float(row[i]) if row[i].strip() else math.nan
-            except ValueError:
-                value = math.inf
-            if math.isinf(value):
-                raise InputError(f"{path}: line {line}", name, f"a finite number or an empty field, not {row[i]!r}")
-            values[name].append(value)
-            words[name] += math.isnan(value) and bool(row[i].strip())
-        if "t" in values:
-            t = values["t"][-1]
-            if not t > last:
-                raise InputError(f"{path}: line {line}", "t", f"a time after {last:g} s, "
-                                                              f"not {row[header.index('t')]!r}")
-            last = t
-    require(values[known[0][1]], path, "", "at least one row after the header")
-    unknown = [name for name in header if name not in values]
-    notes = [f"column {name} is not known and was left out" for name in unknown]
-    if len(unknown) > 1:
-        more = f" and {len(unknown) - 3} more" if len(unknown) > 3 else ""
-        notes = [f"{len(unknown)} columns are not known and were left out: {', '.join(unknown[:3])}{more}"]
-    notes += [f"column {name}: {count} fields say nan and count as missing" for name, count in words.items() if count]
-    return {name: np.array(column) for name, column in values.items()}, tuple(notes)
+class Layout(NamedTuple):
+    """How a text table is written."""
+
+    encoding: str
+    separator: str  # " ": any white space
+    decimal: str
+    names: tuple[str, ...]
+    name_line: int  # 0: the file has no names
+    first_line: int  # of the numbers
+
+
+def read_columns(source: Path | bytes, layout: Layout, names: Collection[str], dates: Collection[str] = (),
+                 where: object = None) -> dict[str, Floats]:
+    """Columns of a text table, (rows,) each, NaN where a field is empty or says so; seconds of those that are `dates`.
+
+    The table is read line by line: memory holds the chosen columns alone. `where` names it in refusals, default by its
+    path.
+
+    Raises:
+        InputError: a field that is no number or date, or a row of another length; it names the line.
+    """
+    where = where or source
+    columns = {name: array("d") for name in names}
+    parse_number, width = make_number_parser(layout.decimal), len(layout.names)
+    parsers = [(layout.names.index(name), name, _parse_date if name in dates else parse_number) for name in columns]
+    encoding = layout.encoding.removesuffix("-sig").upper()
+    with report_unreadable(where, encoding), open_text(source, layout.encoding) as stream:
+        for line, text in enumerate(stream, 1):
+            if line < layout.first_line or is_comment(text):
+                continue
+            fields = split_line(text.rstrip("\r\n"), layout.separator)
+            if len(fields) != width and not is_padded(fields, width):
+                raise InputError(f"{where}: line {line}", "", f"{width} fields, not {len(fields)}")
+            for i, name, parse in parsers:
+                try:
+                    columns[name].append(parse(fields[i]))
+                except ValueError:
+                    kind = "a date and time (ISO 8601)" if name in dates else "a finite number or an empty field"
+                    raise InputError(f"{where}: line {line}", name, f"{kind}, not {fields[i]!r}") from None
+    require(len(next(iter(columns.values()), array("d"))), where, "", "at least one row of numbers")
+    return {name: np.frombuffer(column) for name, column in columns.items()}
+
+
+def is_comment(line: str) -> bool:
+    """Whether a line of a text table has neither names nor numbers."""
+    return not line.strip() or line.lstrip().startswith(COMMENTS)
+
+
+def split_line(line: str, separator: str) -> list[str]:
+    """The fields of a line, without blanks around them."""
+    if separator == " ":
+        return line.split()
+    if '"' not in line:
+        return [field.strip() for field in line.split(separator)]
+    return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
+
+
+def is_padded(fields: Sequence[str], width: int) -> bool:
+    """Whether a row has only empty fields more, as behind a last separator."""
+    return len(fields) > width and not any(fields[width:])
+
+
+def make_number_parser(decimal: str) -> Callable[[str], float]:
+    """Text to number, NaN for a missing one; raises ValueError for any other text and for infinity."""
+    def parse(text: str) -> float:
+        if decimal == "," and "." in text:
+            raise ValueError
+        try:
+            value = float(text.replace(decimal, "."))
+        except ValueError:
+            if text.lower() in MISSING:
+                return math.nan
+            raise
+        if math.isinf(value) or "_" in text:
+            raise ValueError
+        return value
+
+    return parse
+
+
+def _parse_date(text: str) -> float:
+    """Seconds of an ISO date and time; a zone is left out."""
+    text = re.sub(r"(Z|[+-]\d\d:?\d\d)$", "", text.strip()).replace(",", ".")
+    value = np.datetime64(text.replace(" ", "T"), "ns")
+    if np.isnat(value):
+        raise ValueError
+    # relative to 2020, so that a double resolves 0.1 us
+    return float((value - np.datetime64("2020-01-01", "ns")).astype(np.int64)) / 1e9
 
 
 def combine_columns(sources: Mapping[str, Floats], table: Table) -> dict[str, Floats]:

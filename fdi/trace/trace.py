@@ -328,6 +328,10 @@ def make_table_trace(path: Path, columns: dict[str, Floats], signals: Signals, n
     """
     t = columns.pop("t")
     require(len(t) >= 2, path, "t", "at least two rows")
+    falls = ~(np.diff(t) > 0.0)
+    if falls.any():
+        row = int(falls.argmax())
+        raise InputError(f"{path}: line {row + 3}", "t", f"a time after {t[row]:g} s, not {t[row + 1]:g}")
     typical = float(np.percentile(np.diff(t), 50, method="lower"))
     rows = np.concatenate([[0], np.cumsum(np.rint(np.diff(t) / typical).astype(int))])
     if (np.diff(rows) < 1).any():

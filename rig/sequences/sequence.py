@@ -21,6 +21,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from fdi.trace.command_file import parse_columns
 from plant import segments, tables
 from plant.errors import InputError, require
 from plant.model import build_bare_model, find_quantity, load_model
@@ -38,7 +39,6 @@ from plant.segments import (
     Segment,
     build_profile,
     list_section_names,
-    parse_columns,
     resample_on_cycles,
 )
 from plant.signals import EHA

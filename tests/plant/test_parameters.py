@@ -1,6 +1,5 @@
 """Parameters, model files and commands as data: what is refused and how it is said, and what comes back as it went."""
 
-import gzip
 import tomllib
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,8 +26,6 @@ from plant.segments import (
     Sine,
     Step,
     build_profile,
-    parse_columns,
-    read_command,
     resample_on_cycles,
 )
 
@@ -236,13 +233,6 @@ def test_schroeder_phases_keep_the_crest_low() -> None:
     assert schroeder < 2.0 < 7.0 < aligned
 
 
-def test_csv_files_are_read_resampled_and_shifted_to_their_first_row() -> None:
-    exact = parse_columns(b"t,com,xj\n4.000,0,9\n4.001,1e-3,9\n4.002,2e-3,9\n", "c.csv")
-    assert exact.keys() == {"com"} and exact["com"].tolist() == [0.0, 1e-3, 2e-3]
-    coarse = parse_columns(gzip.compress(b"t,value\n0,0\n0.004,4\n"), "c.csv.gz")
-    np.testing.assert_allclose(coarse["value"], [0, 1, 2, 3, 4])
-
-
 RAMP = 0.5 * np.arange(40) / 1000  # 0.5 m/s in rows of 1 ms
 STEP = np.r_[np.zeros(21), np.ones(19)]
 
@@ -262,39 +252,6 @@ def test_samples_hold_on_another_period_and_the_seconds_stay(period: float, cycl
 def test_breakpoints_are_joined_by_lines_and_one_row_is_one_cycle(t: list[float], values: list[float], period: float,
                                                                  expected: list[float]) -> None:
     assert resample_on_cycles(np.array(t), np.array(values), period).tolist() == expected
-
-
-def test_read_command_gives_the_load_only_if_there_is_one(tmp_path: Path) -> None:
-    (tmp_path / "load.csv").write_text("\ufeffT, Com ,load\n0,1e-3,100\n\n0.001,2e-3,200\n", encoding="utf-8")
-    (tmp_path / "none.csv").write_text("t,com\n0,1\n")
-    command = read_command(tmp_path / "load.csv")
-    assert command.load is not None and read_command(tmp_path / "none.csv").load is None
-    assert command.com.tolist() == [1e-3, 2e-3] and command.load.tolist() == [100.0, 200.0]
-
-
-@pytest.mark.parametrize(("text", "message"), [
-    ("", "c.csv: line 1: expected a header with a column t and commas between columns"),
-    ("t;com\n0;1\n", "c.csv: line 1: expected a header with a column t and commas between columns"),
-    ("t,xj\n0,1\n", "c.csv: line 1: expected a header with the columns t and com"),
-    ("t,com\n", "c.csv: line 2: expected at least one row below the header"),
-    ("t,com\n0,1\n0.001,one\n", "c.csv: line 3, com: expected a finite number, not 'one'"),
-    ("t,com\n0,1\n0.001\n", "c.csv: line 3, com: expected a finite number, not ''"),
-    ("t,com\n0,nan\n", "c.csv: line 2, com: expected a finite number, not 'nan'"),
-    ("t,com\n0,1\n0.001,-5\n", "c.csv: line 3, com: expected at most 1 either way, not -5"),
-    ("t,com,load\n0,0,1e7\n", "c.csv: line 2, load: expected at most 1e+06 either way, not 1e+07"),
-    ("t,com\n0,1\n0,2\n", "c.csv: line 3, t: expected a time after 0 s, not 0"),
-    ("t,com\n0,1\n10000,2\n", "c.csv: line 3, t: expected seconds, and at most 3600 of them, not 10000"),
-])
-def test_a_bad_file_is_refused_with_its_line(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "c.csv").write_text(text)
-    assert catch_refusal(read_command, tmp_path / "c.csv") == f"{tmp_path}/{message}"
-
-
-def test_what_is_no_csv_at_all_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "c.csv").write_bytes(b"\x1f\x8bnot gzip")
-    assert "CSV" in catch_refusal(read_command, tmp_path / "c.csv")
-    for path in (tmp_path / "absent.csv", tmp_path):
-        assert "a file that can be read" in catch_refusal(read_command, path)
 
 
 @pytest.mark.parametrize(("make", "key", "expected"), [

@@ -2,11 +2,9 @@
 from __future__ import annotations
 
 import codecs
-import csv
 import importlib
 import math
 import re
-from array import array
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -19,7 +17,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.csv_table import open_text, report_unreadable
+from fdi.trace.csv_table import (
+    MISSING,
+    Layout,
+    is_comment,
+    is_padded,
+    make_number_parser,
+    open_text,
+    read_columns,
+    report_unreadable,
+    split_line,
+)
 from fdi.trace.trace import Floats, Trace
 from plant.errors import InputError, require
 from plant.units import find_unit
@@ -152,22 +160,8 @@ READERS: Mapping[str, Callable[[Path], Measurement]] = {".mf4": _open_mdf, ".mdf
                                                         ".parquet": _open_parquet, ".mcap": _open_log}
 SUFFIXES = (*TEXT_SUFFIXES, *READERS)
 
-ENCODINGS = "UTF-8, UTF-16 or Latin-1"  # that text tables may have
 SEPARATORS = (";", "\t", "|", ",", " ")
-COMMENTS = ("#", "%", "//", "!")
-MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "#n/a", "nil"}
 SAMPLE_LINES = 200  # of a file, from which its layout is found
-
-
-class Layout(NamedTuple):
-    """How a text table is written."""
-
-    encoding: str
-    separator: str  # " ": any white space
-    decimal: str
-    names: tuple[str, ...]
-    name_line: int  # 0: the file has no names
-    first_line: int  # of the numbers
 
 
 def _describe_layout(layout: Layout) -> str:
@@ -178,32 +172,6 @@ def _describe_layout(layout: Layout) -> str:
                                                        "no names")
 
 
-def _read_columns(path: Path, layout: Layout, names: Collection[str], dates: Collection[str]) -> dict[str, Channel]:
-    """Columns of a text table, (rows,) each. It is read line by line: memory holds the chosen columns alone.
-
-    Raises:
-        InputError: a field that is no number or date, or a row of another length; it names the line.
-    """
-    columns = {name: array("d") for name in names}
-    parse_number, width = _make_number_parser(layout.decimal), len(layout.names)
-    parsers = [(layout.names.index(name), name, _parse_date if name in dates else parse_number) for name in columns]
-    with report_unreadable(path, ENCODINGS), open_text(path, layout.encoding) as stream:
-        for line, text in enumerate(stream, 1):
-            if line < layout.first_line or _is_comment(text):
-                continue
-            fields = _split_line(text.rstrip("\r\n"), layout.separator)
-            if len(fields) != width and not _is_padded(fields, width):
-                raise InputError(f"{path}: line {line}", "", f"{width} fields, not {len(fields)}")
-            for i, name, parse in parsers:
-                try:
-                    columns[name].append(parse(fields[i]))
-                except ValueError:
-                    kind = "a date and time (ISO 8601)" if name in dates else "a finite number or an empty field"
-                    raise InputError(f"{path}: line {line}", name, f"{kind}, not {fields[i]!r}") from None
-    require(len(next(iter(columns.values()), array("d"))), path, "", "at least one row of numbers")
-    return {name: Channel(np.frombuffer(column)) for name, column in columns.items()}
-
-
 def open_text_table(path: Path, separator: str | None = None, decimal: str | None = None,
                     name_line: int | None = None) -> Measurement:
     """A text table; what is not given is found in its first lines.
@@ -211,16 +179,16 @@ def open_text_table(path: Path, separator: str | None = None, decimal: str | Non
     Raises:
         InputError: a file that cannot be read or holds no table of numbers.
     """
-    with report_unreadable(path, ENCODINGS):
+    with report_unreadable(path, "UTF-8, UTF-16 or Latin-1"):
         encoding = _find_encoding(path)
         with open_text(path, encoding) as stream:
             lines = [line.rstrip("\r\n") for line in islice(stream, SAMPLE_LINES)]
         separator, decimal = _find_separators(path, lines, separator, decimal)
-        parse = _make_number_parser(decimal)
-        rows = [[] if _is_comment(line) and number != name_line else _split_line(line, separator)
+        parse = make_number_parser(decimal)
+        rows = [[] if is_comment(line) and number != name_line else split_line(line, separator)
                 for number, line in enumerate(lines, 1)]
         width = _find_width(rows, parse)
-        rows = [row[:width] if _is_padded(row, width) else row for row in rows]
+        rows = [row[:width] if is_padded(row, width) else row for row in rows]
         first = next((i for i, row in enumerate(rows) if i + 1 != name_line and _is_data(row, width, parse)), None)
         if first is None:
             raise InputError(path, "", "a table with rows of numbers in its first 200 lines")
@@ -229,7 +197,11 @@ def open_text_table(path: Path, separator: str | None = None, decimal: str | Non
                    for i, name in enumerate(names))
     layout = Layout(encoding, separator, decimal, unique, line, first + 1)
     return Measurement(path, _describe_layout(layout), dict(zip(unique, units, strict=True)),
-                       partial(_read_columns, path, layout), layout=layout)
+                       partial(_read_text, path, layout), layout=layout)
+
+
+def _read_text(path: Path, layout: Layout, names: Collection[str], dates: Collection[str]) -> dict[str, Channel]:
+    return {name: Channel(values) for name, values in read_columns(path, layout, names, dates).items()}
 
 
 def split_unit(name: str) -> tuple[str, str]:
@@ -265,51 +237,6 @@ def _find_encoding(path: Path) -> str:
     return "utf-8-sig"
 
 
-def _is_comment(line: str) -> bool:
-    return not line.strip() or line.lstrip().startswith(COMMENTS)
-
-
-def _split_line(line: str, separator: str) -> list[str]:
-    if separator == " ":
-        return line.split()
-    if '"' not in line:
-        return [field.strip() for field in line.split(separator)]
-    return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
-
-
-def _is_padded(fields: list[str], width: int) -> bool:
-    """Whether a row has only empty fields more, as behind a last separator."""
-    return len(fields) > width and not any(fields[width:])
-
-
-def _make_number_parser(decimal: str) -> Callable[[str], float]:
-    """Text to number, NaN for a missing one; raises ValueError for any other text and for infinity."""
-    def parse(text: str) -> float:
-        if decimal == "," and "." in text:
-            raise ValueError
-        try:
-            value = float(text.replace(decimal, "."))
-        except ValueError:
-            if text.lower() in MISSING:
-                return math.nan
-            raise
-        if math.isinf(value) or "_" in text:
-            raise ValueError
-        return value
-
-    return parse
-
-
-def _parse_date(text: str) -> float:
-    """Seconds of an ISO date and time; a zone is left out."""
-    text = re.sub(r"(Z|[+-]\d\d:?\d\d)$", "", text.strip()).replace(",", ".")
-    value = np.datetime64(text.replace(" ", "T"), "ns")
-    if np.isnat(value):
-        raise ValueError
-    # relative to 2020, so that a double resolves 0.1 us
-    return float((value - np.datetime64("2020-01-01", "ns")).astype(np.int64)) / 1e9
-
-
 def _is_number(text: str, parse: Callable[[str], float]) -> bool:
     try:
         return not math.isnan(parse(text))
@@ -320,9 +247,9 @@ def _is_number(text: str, parse: Callable[[str], float]) -> bool:
 def _find_separators(path: Path, lines: list[str], separator: str | None, decimal: str | None) -> tuple[str, str]:
     """The pair under which most fields are numbers."""
     best, found = 0.0, ("", "")
-    body = [line for line in lines if not _is_comment(line)]
+    body = [line for line in lines if not is_comment(line)]
     for sep, dec in product([separator] if separator else SEPARATORS, [decimal] if decimal else (".", ",")):
-        rows, parse = [_split_line(line, sep) for line in body], _make_number_parser(dec)
+        rows, parse = [split_line(line, sep) for line in body], make_number_parser(dec)
         width = max(Counter(map(len, rows)).items(), key=lambda pair: pair[1], default=(0, 0))[0]
         if dec == sep or width < 2:
             continue
@@ -371,7 +298,7 @@ def _find_names_in_comment(lines: list[str], first: int, width: int) -> list[str
     """Names in the last comment line above the numbers, as `# t, x, p`; empty ones if there are none."""
     for line in reversed(lines[:first]):
         for separator in SEPARATORS:
-            names = _split_line(line.strip().lstrip("#%!/ "), separator)
+            names = split_line(line.strip().lstrip("#%!/ "), separator)
             if len(names) == width and all(names):
                 return names
     return [""] * width

@@ -7,12 +7,13 @@ from typing import Any
 from fdi.output import require_new, require_writable
 from fdi.report.numbers import format_amount
 from fdi.report.report import Report
+from fdi.trace.command_file import read_command
 from fdi.trace.trace import Trace
 from plant import load_model, simulate
 from plant.errors import require
 from plant.plant_check import find_divergence
 from plant.plants import Plant
-from plant.segments import Points, build_profile, read_command
+from plant.segments import Points, build_profile
 from rig.cli.answer import give_answer
 from rig.cli.inputs import load_chosen_model
 from rig.sequences.sequence import load_nominal_test

@@ -1,0 +1,61 @@
+"""Command files: the demand of a test, and the load on the plant, as columns of a CSV text."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.trace.csv_table import Layout, open_text, read_columns, report_unreadable, split_line
+from plant.errors import InputError, require
+from plant.segments import LONGEST, RATE, Array, resample_on_cycles
+from plant.signals import EHA, Signals
+from plant.tables import read_file
+
+
+def read_command(path: str | Path, period: float = 1 / RATE, signals: Signals = EHA) -> tuple[Array, Array | None]:
+    """Command and load, None without such a column, of a file: CSV (or .csv.gz) in SI units.
+
+    Its columns are t and those of the plant's signals, of the EHA com and load. One value per cycle of `period` s, as
+    `resample_on_cycles` makes it.
+
+    Raises:
+        InputError: the file, the line and what was expected there.
+    """
+    columns = parse_columns(read_file(Path(path)), path, period, signals)
+    require("com" in columns, path, "line 1", f"a header with the columns t and {signals.command.name}")
+    return columns["com"], columns.get("load")
+
+
+def parse_columns(data: bytes, where: object, period: float = 1 / RATE, signals: Signals = EHA) -> dict[str, Array]:
+    """The columns com, value and load of a CSV text, those that it has, one value per cycle from its first row.
+
+    com and load stand for the command and the load of the plant's `signals`, by whose names the text has them.
+
+    Rows need not be one cycle apart: see `resample_on_cycles`. Other columns are ignored, so a trace is a command too.
+
+    Raises:
+        InputError: a value that is no finite number, or times that do not increase.
+    """
+    with report_unreadable(where, "CSV in UTF-8, plain or gzip-compressed"), open_text(data) as stream:
+        titles = [title.lower() for title in split_line(stream.readline(), ",")]
+    require("t" in titles, where, "line 1", "a header with a column t and commas between columns")
+    load = signals.load
+    known = [("t", "t", math.inf), ("com", signals.command.name, signals.command.largest), ("value", "value", math.inf),
+             *([("load", load.name, load.largest)] if load else [])]
+    picked = [(key, name.lower(), most) for key, name, most in known if name.lower() in titles]
+    columns = read_columns(data, Layout("utf-8-sig", ",", ".", tuple(titles), 1, 2), [name for _, name, _ in picked],
+                           where=where)
+    t = columns["t"]
+    _refuse_row(where, "t", t, np.append(False, np.diff(t) <= 0.0), "a time after that of the row before")
+    _refuse_row(where, "t", t, t - t[0] > LONGEST, f"seconds, and at most {LONGEST:g} of them")
+    for key, name, most in picked:
+        expected = f"at most {most:g} either way" if most < math.inf else "a finite number"
+        _refuse_row(where, key, columns[name], ~(np.abs(columns[name]) <= most), expected)
+    return {key: resample_on_cycles(t, columns[name], period) for key, name, _ in picked if key != "t"}
+
+
+def _refuse_row(where: object, name: str, column: Array, is_bad: NDArray[np.bool_], expected: str) -> None:
+    if is_bad.any():
+        row = int(is_bad.argmax())
+        raise InputError(where, f"line {row + 2}, {name}", f"{expected}, not {column[row]:g}")
