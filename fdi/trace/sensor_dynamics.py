@@ -8,25 +8,26 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from fdi.thresholds import ROUNDED_SHARE
 from fdi.trace.sections import Floats
-from plant.errors import InputError
+from plant.quantity import Quantity
+from plant.tables import Place, build_dataclass
 
 
 @dataclass(frozen=True)
 class SensorDynamics:
     """The measuring chain of one signal, in the order in which it acts."""
 
-    lag: float = 0.0  # s, time constant
-    moving_mean: float = 1.0  # samples of the logger
-    sample_period: float = 0.0  # s, of the logger; 0: the trace's own period
+    lag: Annotated[float, Quantity("s", low=0)] = 0.0  # time constant
+    moving_mean: Annotated[float, Quantity("1", low=1, high=1e6)] = 1.0  # samples of the logger
+    sample_period: Annotated[float, Quantity("s", low=0)] = 0.0  # of the logger; 0: the trace's own period
     centred: bool = False  # the mean is over samples before and after, as made afterwards; else over the last ones
-    delay: float = 0.0  # s, what is left of a delay after whole rows
-    quantum: float = 0.0  # step of the reading, SI
+    delay: Annotated[float, Quantity("s", low=-1e3, high=1e3)] = 0.0  # what is left of a delay after whole rows
+    quantum: Annotated[float, Quantity("1", low=0)] = 0.0  # step of the reading, SI
 
     @property
     def filters(self) -> bool:
@@ -150,20 +151,15 @@ def read_sensors(where: object, metadata: Mapping[str, str]) -> dict[str, Sensor
     Raises:
         InputError: text that is no dynamics.
     """
-    out = {}
+    found = {}
     for key, text in metadata.items():
-        if not key.startswith(PREFIX):
-            continue
-        try:
-            sensor = SensorDynamics(**json.loads(text))
-            numbers = (sensor.lag, sensor.moving_mean, sensor.sample_period, sensor.quantum)
-            is_valid = all(math.isfinite(x) and x >= 0.0 for x in numbers) and math.isfinite(sensor.delay)
-            if not (is_valid and 1.0 <= sensor.moving_mean <= 1e6 and abs(sensor.delay) <= 1e3):
-                raise ValueError
-        except (TypeError, ValueError) as error:
-            raise InputError(where, f"metadata run.{key}", f"a sensor's dynamics as JSON, not {text!r}") from error
-        out[key.removeprefix(PREFIX)] = sensor
-    return out
+        if key.startswith(PREFIX):
+            place = Place(str(where), keys=f"metadata run.{key}")
+            try:
+                found[key.removeprefix(PREFIX)] = build_dataclass(SensorDynamics, json.loads(text), place)
+            except (ValueError, RecursionError) as error:
+                raise place.refuse(f"a sensor's dynamics as JSON, not {text!r}") from error
+    return found
 
 
 FEWEST_VALUES = 20  # distinct ones that show how finely a column was recorded
