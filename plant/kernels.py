@@ -37,19 +37,20 @@ def write_signal_functions(signals: Signals) -> dict[str, Function]:
     count = range(len(outputs))
     noisy = [f"y[{i}] + p.{s.noise} * n[{i}]" if s.noise else f"y[{i}]" for i, s in zip(count, outputs, strict=True)]
     driven = columns.index(signals.drive.name)
-    return {
-        **_write("add_noise", "y, n, p", [f"return {_tuple(noisy)}"]),
-        **_write("replace_first", "y, x", [f"return {_tuple(['x', *(f'y[{i}]' for i in count[1:])])}"]),
-        **_write("get_readings", "a, k", [f"return {_tuple([f'a[k, {i}]' for i in count])}"]),
-        **_write("load_readings", "a", [f"return {_tuple([f'a[{i}]' for i in count])}"]),
-        **_write("store_readings", "y, a", [f"a[{i}] = y[{i}]" for i in count]),
-        **_write("keep_row", "y, drive, out, k", [*(f"out[k, {at}] = y[{i}]" for i, at in enumerate(places)),
-                                                        f"out[k, {driven}] = drive"]),
-        **_write("keep_answer", "drive, out, row, k", [f"out[row, {driven}, k] = drive"]),
-        **_write("keep_sample", "y, out, row, k, closed", [
+    sources = {
+        "add_noise": ("y, n, p", [f"return {_tuple(noisy)}"]),
+        "replace_first": ("y, x", [f"return {_tuple(['x', *(f'y[{i}]' for i in count[1:])])}"]),
+        "get_readings": ("a, k", [f"return {_tuple([f'a[k, {i}]' for i in count])}"]),
+        "load_readings": ("a", [f"return {_tuple([f'a[{i}]' for i in count])}"]),
+        "store_readings": ("y, a", [f"a[{i}] = y[{i}]" for i in count]),
+        "keep_row": ("y, drive, out, k", [*(f"out[k, {at}] = y[{i}]" for i, at in enumerate(places)),
+                                          f"out[k, {driven}] = drive"]),
+        "keep_answer": ("drive, out, row, k", [f"out[row, {driven}, k] = drive"]),
+        "keep_sample": ("y, out, row, k, closed", [
             "if closed:", *(f"    out[row, {at}, k] = y[{i}]" for i, at in enumerate(places)),
             "else:", *(f"    out[row, {i}, k] = y[{i}]" for i in count)]),
     }
+    return {name: write_function(name, arguments, lines) for name, (arguments, lines) in sources.items()}
 
 
 def write_reader(places: Sequence[tuple[int, int]]) -> Function:
@@ -58,13 +59,13 @@ def write_reader(places: Sequence[tuple[int, int]]) -> Function:
     `state` and `level` give a number of a flat state and of the parameters by its place, `n` are the noise's numbers.
     """
     shown = [f"state({field}) + level({noise}) * n[{i}]" for i, (field, noise) in enumerate(places)]
-    return _write("read_fields", "state, level, n", [f"return {_tuple(shown)}"])["read_fields"]
+    return write_function("read_fields", "state, level, n", [f"return {_tuple(shown)}"])
 
 
 def write_constant(name: str, value: Any) -> Function:
     """A function of that name that returns `value`, a number or a NamedTuple of numbers."""
     shown = f"Kind({', '.join(map(repr, value))})" if isinstance(value, tuple) else repr(value)
-    return _write(name, "", [f"return {shown}"], Kind=type(value))[name]
+    return write_function(name, "", [f"return {shown}"], Kind=type(value))
 
 
 def write_mover(state: type[Any], names: Sequence[str], factor: float = 1.0) -> Function:
@@ -74,16 +75,17 @@ def write_mover(state: type[Any], names: Sequence[str], factor: float = 1.0) -> 
     """
     moved = "distance" if factor == 1.0 else f"{factor!r} * distance"
     fields = ", ".join(f"s.{f} + {moved}" if f in names else f"s.{f}" for f in state._fields)
-    return _write("move_plant", "s, distance, p", [f"return State({fields})"], State=state)["move_plant"]
+    return write_function("move_plant", "s, distance, p", [f"return State({fields})"], State=state)
 
 
 def _tuple(items: Sequence[str]) -> str:
     return f"({''.join(f'{item}, ' for item in items)})"
 
 
-def _write(name: str, arguments: str, lines: Sequence[str], **known: Any) -> dict[str, Function]:
+def write_function(name: str, arguments: str, lines: Sequence[str], **known: Any) -> Function:
+    """The function of these lines, which may use the names that are `known`."""
     exec("\n    ".join([f"def {name}({arguments}):", *lines]), known)
-    return {name: known[name]}
+    return known[name]
 
 
 def make_packers(shape: Any, first: int = 0) -> tuple[Function, Function]:
@@ -108,11 +110,8 @@ def _make_converters(shape: Any, lane: str, place: Callable[[int], str]) -> tupl
     kinds: dict[str, type[Any]] = {}
     paths: list[str] = []
     built = _build_expression(shape, "s", kinds, paths, place)
-    stores = [f"    {place(i)} = {path}" for i, path in enumerate(paths)]
-    source = "\n".join([f"def keep(s, a{lane}):", *stores, f"def at(a{lane}):", f"    return {built}"])
-    made: dict[str, Any] = dict(kinds)
-    exec(source, made)
-    return made["keep"], made["at"], len(paths)
+    keep = write_function("keep", f"s, a{lane}", [f"{place(i)} = {path}" for i, path in enumerate(paths)])
+    return keep, write_function("at", f"a{lane}", [f"return {built}"], **kinds), len(paths)
 
 
 def list_state_values(start: Any) -> list[float]:

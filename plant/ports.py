@@ -11,6 +11,7 @@ from itertools import count
 from typing import Any, NamedTuple
 
 from plant.compile import Function, bind_later, raise_unbound, rebind_names
+from plant.kernels import write_function
 from plant.state import Input, Memory
 
 _NUMBERS = count()
@@ -74,23 +75,19 @@ def make_memory_type(names: Sequence[str]) -> type[Any]:
 def bind_port(name: str, law: Function, remembers: bool, memory: type[Any]) -> Function:
     """at_NAME for a chain of laws (see `chain_laws`) in a plant whose memories have the type `memory`."""
     own = ", ".join("own" if field == name else f"m.{field}" for field in memory._fields)
-    lines = ([f"    x, own = law(x, m.{name}, s, u, p)", f"    return x, Memory({own})"] if remembers else
-             [f"    return law(x, m.{name}, s, u, p)[0], m"])
-    made: dict[str, Any] = {"law": law, "Memory": memory}
-    exec("\n".join([f"def at_{name}(x, m, s, u, p):", *lines]), made)
-    return made[f"at_{name}"]
+    lines = ([f"x, own = law(x, m.{name}, s, u, p)", f"return x, Memory({own})"] if remembers else
+             [f"return law(x, m.{name}, s, u, p)[0], m"])
+    return write_function(f"at_{name}", "x, m, s, u, p", lines, law=law, Memory=memory)
 
 
 def bind_shifts(shifts: Iterable[tuple[str, Function]], memory: type[Any]) -> Function:
     """`(m, moved)`: the memories after the controlled body was moved, by the shift of each port that has one."""
-    made: dict[str, Any] = {f"shift_{name}": shift for name, shift in shifts}
+    made = {f"shift_{name}": shift for name, shift in shifts}
     if not made:
         return keep_memory
     own = ", ".join(f"shift_{field}(m.{field}, moved)" if f"shift_{field}" in made else f"m.{field}"
                     for field in memory._fields)
-    made["Memory"] = memory
-    exec(f"def shift_memories(m, moved):\n    return Memory({own})", made)
-    return made["shift_memories"]
+    return write_function("shift_memories", "m, moved", [f"return Memory({own})"], Memory=memory, **made)
 
 
 def chain_laws(laws: Iterable[tuple[Function, type[Any] | None]]) -> tuple[Function, Memory]:
