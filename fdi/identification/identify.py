@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -89,6 +89,7 @@ from plant.errors import InputError, require
 from plant.lanes import Lanes
 from plant.model import Model, find_quantity, find_shipped_model
 from plant.parameters import read_toml
+from plant.tables import Place, build_dataclass
 from plant.threads import count_threads
 
 FRICTIONS = (("jack.static_friction", "jack.dynamic_friction"), ("spool.static_friction", "spool.dynamic_friction"))
@@ -115,7 +116,15 @@ class Range(NamedTuple):
         return 0.5 * (math.log(self.high / self.low) if self.is_relative else self.high - self.low)
 
 
-USUAL_FACTOR = 4  # within which a parameter may be wrong where nothing says so
+USUAL_FACTOR = 4.0  # within which a parameter may be wrong where nothing says so
+Width = float | tuple[float, float]  # how widely a parameter is free: a factor either way, or a range, SI
+
+
+@dataclass(frozen=True)
+class FreeParameters:
+    """What is free, as a model file has it."""
+
+    identify: Mapping[str, Width]
 
 
 def read_free_parameters(model: Model, source: str | Path | None) -> tuple[Range, ...]:
@@ -139,13 +148,13 @@ def read_free_parameters(model: Model, source: str | Path | None) -> tuple[Range
     tables = read_toml(usual)["identify"]
     if {f"{group}.{field}" for group, fields in tables.items() for field in fields} <= model.values.keys():
         return parse_free_parameters(tables, model, usual.name)
-    widths: dict[str, Any] = dict.fromkeys(list_relative_tolerances(model, model.list_names()), USUAL_FACTOR)
+    widths: dict[str, Width] = dict.fromkeys(list_relative_tolerances(model, model.list_names()), USUAL_FACTOR)
     if model.kind.foreign is not None:  # the map of an FMU gives ranges
         known = {name: find_quantity(name, plant=model.plant) for name in model.list_names()}
-        widths |= {name: [q.low, q.high] for name, q in known.items()
+        widths |= {name: (q.low, q.high) for name, q in known.items()
                    if math.isfinite(q.high - q.low) and name.partition(".")[0] not in ("controller", "sensors")}
     scattering = {name: _parse_range(name, width, model, model.name) for name, width in widths.items()
-                  if model[name] > 0.0 or isinstance(width, list)}
+                  if model[name] > 0.0 or isinstance(width, tuple)}
     require(scattering, source, "identify", "tables [identify.GROUP] that say what is free (docs/identify.md)")
     return tuple(scattering.values())
 
@@ -156,42 +165,30 @@ def parse_free_parameters(tables: object, model: Model, where: object) -> tuple[
     Raises:
         InputError: an unknown parameter, or a factor or range that cannot be.
     """
-    if not isinstance(tables, Mapping):
-        raise InputError(where, "identify", "a table [identify.GROUP] of factors and ranges")
     found = {}
-    for group, fields in tables.items():
-        if not isinstance(fields, Mapping):
-            raise InputError(where, f"identify.{group}", "a table of factors and ranges, such as area = 4")
-        for field, width in fields.items():
-            name = f"{group}.{field}"
-            find_quantity(name, where, model.plant)
-            require(name in model.values, where, f"identify.{name}",
-                    f"a parameter that the model has; add {group} to its effects")
-            found[name] = _parse_range(name, width, model, where)
+    for name, width in build_dataclass(FreeParameters, {"identify": tables}, Place(str(where))).identify.items():
+        find_quantity(name, where, model.plant)
+        require(name in model.values, where, f"identify.{name}",
+                f"a parameter that the model has; add {name.partition('.')[0]} to its effects")
+        found[name] = _parse_range(name, width, model, where)
     require(found, where, "identify", "at least one free parameter")
     return tuple(found[name] for name in model.list_names() if name in found)
 
 
-def _parse_range(name: str, width: Any, model: Model, where: object) -> Range:
+def _parse_range(name: str, width: Width, model: Model, where: object) -> Range:
     q, value = find_quantity(name, where, model.plant), model[name]
     possible_low, possible_high = max(q.low, q.above), min(q.high, q.below)
-    field = f"identify.{name}"
-    if _is_number(width):
-        require(1.0 < width < math.inf, where, field, f"a factor above 1, not {width:g}")
-        require(value > 0.0, where, field, f"a range [low, high]: a factor says nothing of {value:g}")
-        low, high = max(value / width, possible_low), min(value * width, possible_high)
-    elif isinstance(width, list) and len(width) == 2 and all(map(_is_number, width)) and width[0] < width[1]:
-        low, high = map(float, width)
-        if low < possible_low or high > possible_high:
-            raise InputError(where, field, f"a range within {possible_low:g} .. {possible_high:g} {q.unit}")
+    if isinstance(width, tuple):
+        low, high = width
+        require(possible_low <= low < high <= possible_high, where, f"identify.{name}",
+                f"a range [low, high] within {possible_low:g} .. {possible_high:g} {q.unit}, not {list(width)}")
     else:
-        raise InputError(where, field, f"a factor above 1, or a range [low, high] in {q.unit}, not {width!r}")
+        require(width > 1.0, where, f"identify.{name}", f"a factor above 1, not {width:g}")
+        require(value > 0.0, where, f"identify.{name}",
+                f"a range [low, high] in {q.unit}: a factor says nothing of {value:g}")
+        low, high = max(value / width, possible_low), min(value * width, possible_high)
     middle = math.sqrt(low * high) if low > 0.0 else 0.5 * (low + high)
     return Range(name, value if low <= value <= high else middle, low, high, q.unit)
-
-
-def _is_number(x: object) -> bool:
-    return isinstance(x, (int, float)) and not isinstance(x, bool)
 
 
 def get_systematic_sd(name: str) -> float:

@@ -221,7 +221,7 @@ def test_run_at_rest_identifies_nothing() -> None:
 @pytest.mark.parametrize(("table", "field"), [
     ({"jack": {"area": 0.5}}, "identify.jack.area"), ({"jack": {"area": [2.0, 1.0]}}, "identify.jack.area"),
     ({"jack": {"area": "wide"}}, "identify.jack.area"), ({"filter": {"clogging": 3}}, "identify.filter.clogging"),
-    ({"jack": 4}, "identify.jack"), ({"jack": {"aera": 4}}, "jack.aera"), ({}, "identify"), (4, "identify"),
+    ({"jack": 4}, "jack"), ({"jack": {"aera": 4}}, "jack.aera"), ({}, "identify"), (4, "identify"),
     ({"jack": {"area": [0.0, 1.0]}}, "identify.jack.area"), ({"null_bias": {"current": [-1e-4, 1e-4]}}, "null_bias")])
 def test_ranges_that_cannot_be_are_refused(table: object, field: str) -> None:
     assert field in catch_refusal(parse_free_parameters, table, load_model(), "m.toml")
