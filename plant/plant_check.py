@@ -2,14 +2,14 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plant.compile import find_fields_of
-from plant.errors import InputError, suggest_name
+from plant.errors import InputError, require, suggest_name
 from plant.faults import Fault
 from plant.quantity import Quantity, list_quantities
 from plant.segments import Segment, build_profile
@@ -31,66 +31,67 @@ def check_declaration(plant: Plant, where: object) -> None:
     Raises:
         InputError: the field of the declaration and what was expected there.
     """
-    def require(is_right: bool, field: str, expected: str) -> None:
-        if not is_right:
-            raise InputError(where, field, expected)
-
     for signal in plant.signals:
-        require(isinstance(signal.unit, str) and bool(signal.unit), f"signal {signal.name}", 'a unit, "1" for none')
-    _check_parameters(plant, require)
-    require(isinstance(plant.state, type) and hasattr(plant.state, "_fields"), "state",
+        require(isinstance(signal.unit, str) and bool(signal.unit), where, f"signal {signal.name}",
+                'a unit, "1" for none')
+    _check_parameters(plant, where)
+    require(isinstance(plant.state, type) and hasattr(plant.state, "_fields"), where, "state",
             "a NamedTuple of floats, class State(NamedTuple)")
     for name in plant.state._fields:
-        require(isinstance(plant.state._field_defaults.get(name), float | int), f"State.{name}",
+        require(isinstance(plant.state._field_defaults.get(name), float | int), where, f"State.{name}",
                 "a number as default, the plant at rest")
     for name, counts in ARGUMENTS.items():
         function = getattr(plant, name)
         if name == "moves" and not callable(function):
             unknown = [f for f in function if f not in plant.state._fields]
-            require(not unknown, "moves", f"fields of the state ({', '.join(plant.state._fields)}), not {unknown[:1]}")
+            require(not unknown, where, "moves",
+                    f"fields of the state ({', '.join(plant.state._fields)}), not {unknown[:1]}")
         elif function is not None or name in ("step", "measure"):
-            require(callable(function) and len(inspect.signature(function).parameters) in counts, name,
+            require(callable(function) and len(inspect.signature(function).parameters) in counts, where, name,
                     f"a function of {' or '.join(map(str, counts))} arguments")
     known = {f"{group}.{name}" for group, cls in plant.parameters.items() for name in cls._fields}
     for signal in plant.signals:
         for use, name in (("noise", signal.noise), ("limit", signal.limit)):
-            require(not name or name in known, f"signal {signal.name}, {use}", f"a parameter, not {name!r}")
+            require(not name or name in known, where, f"signal {signal.name}, {use}", f"a parameter, not {name!r}")
     for e in plant.effects.values():
-        require(e.base or e.port in plant.ports, f"effect {e.name}",
+        require(e.base or e.port in plant.ports, where, f"effect {e.name}",
                 f"one of the ports that the step has ({', '.join(plant.ports)}), not {e.port!r}")
-        require(e.base or e.name not in plant.parameters, f"effect {e.name}", "a name that no parameter group has")
-        require(set(e.fitted) <= (known if e.base else set(e.parameters)), f"effect {e.name}",
+        require(e.base or e.name not in plant.parameters, where, f"effect {e.name}",
+                "a name that no parameter group has")
+        require(set(e.fitted) <= (known if e.base else set(e.parameters)), where, f"effect {e.name}",
                 f"parameters that exist, not {', '.join(e.fitted)}")
         unknown = sorted(find_fields_of(e.function, "p") - {*plant.parameters, e.name}) if e.function else []
-        require(not unknown, f"effect {e.name}", f"p.{e.name}.FIELD for its own parameters, or a group of the plant "
-                f"({', '.join(plant.parameters)}), not p.{', p.'.join(unknown)}")
+        require(not unknown, where, f"effect {e.name}",
+                f"p.{e.name}.FIELD for its own parameters, or a group of the plant ({', '.join(plant.parameters)}), "
+                f"not p.{', p.'.join(unknown)}")
     known |= {name for e in plant.list_effects() for name in e.parameters}
     for fault in plant.faults:
-        require(isinstance(fault, Fault), "faults", "values Fault(...)")
-        require(fault.parameter in known, f"fault {fault.name}, parameter",
+        require(isinstance(fault, Fault), where, "faults", "values Fault(...)")
+        require(fault.parameter in known, where, f"fault {fault.name}, parameter",
                 f"a parameter of the plant or of an effect{suggest_name(fault.parameter, known)}")
-    require(all(isinstance(s, Segment) for s in plant.profile), "profile", "segments such as Step(to=1e-3, time=1.0)")
-    _check_readings(plant, require)
+    require(all(isinstance(s, Segment) for s in plant.profile), where, "profile",
+            "segments such as Step(to=1e-3, time=1.0)")
+    _check_readings(plant, where)
 
 
-def _check_parameters(plant: Plant, require: Callable[[bool, str, str], None]) -> None:
+def _check_parameters(plant: Plant, where: object) -> None:
     for group, cls in plant.parameters.items():
         try:
             quantities: Mapping[str, Any] = list_quantities(cls)
         except (IndexError, TypeError, AttributeError, NameError) as error:
-            require(False, f"parameters, {group}",
-                    f'a NamedTuple whose fields are Annotated[float, Quantity("unit")] ({error})')
+            raise InputError(where, f"parameters, {group}", "a NamedTuple whose fields are Annotated[float, "
+                             f'Quantity("unit")] ({error})') from error
         for name, q in quantities.items():
             field = f"{group}.{name}"
-            require(isinstance(q, Quantity) and bool(q.unit), field, 'Quantity("unit"), "1" for none')
+            require(isinstance(q, Quantity) and bool(q.unit), where, field, 'Quantity("unit"), "1" for none')
             value = plant.values.get(field, cls._field_defaults.get(name))
-            require(isinstance(value, float | int), field, f"a nominal value as default, not {value!r}")
-            require(not q.refuses(float(value or 0.0)), field, f"{q.expected}, not {value:g}")
-    require("controller.period" in plant.nominal, "parameters",
+            require(isinstance(value, float | int), where, field, f"a nominal value as default, not {value!r}")
+            require(not q.refuses(float(value or 0.0)), where, field, f"{q.expected}, not {value:g}")
+    require("controller.period" in plant.nominal, where, "parameters",
             "a group Controller with the field period, s, the cycle of the controller")
 
 
-def _check_readings(plant: Plant, require: Callable[[bool, str, str], None]) -> None:
+def _check_readings(plant: Plant, where: object) -> None:
     """One call of `measure` and of `step`, in plain Python, on the plant at rest."""
     from plant.model import build_bare_model, build_kernel
     from plant.solve import step_cycle
@@ -101,13 +102,13 @@ def _check_readings(plant: Plant, require: Callable[[bool, str, str], None]) -> 
         y = plant.measure(plant.state(), record[0])
     with explain_errors(str(plant.file), "step"):
         after = build_kernel(step_cycle, (), False, plant.key)(*plant.build_start(()), 0.0, 0.0, 0.0, 0.0, record, 1)
-    require(isinstance(y, tuple) and len(y) == len(names) and all(isinstance(x, float | int) for x in y), "measure",
-            f"a tuple of {len(names)} numbers, {', '.join(names)}, not {y!r}")
-    require(isinstance(after, tuple) and len(after) == 2 and isinstance(after[0], plant.state), "step",
+    require(isinstance(y, tuple) and len(y) == len(names) and all(isinstance(x, float | int) for x in y), where,
+            "measure", f"a tuple of {len(names)} numbers, {', '.join(names)}, not {y!r}")
+    require(isinstance(after, tuple) and len(after) == 2 and isinstance(after[0], plant.state), where, "step",
             "the new State and the memories, return State(...), m")
     with explain_errors(str(plant.file), "moves"):
         share = plant.find_share_moved(plant.move)
-    require(share == 1.0, "moves", f"a move of {names[0]} by the distance in "
+    require(share == 1.0, where, "moves", f"a move of {names[0]} by the distance in "
             f"{plant.signals.controlled.unit}, not by {share:.3g} times that")
 
 
