@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.csv_table import Layout, open_text, read_columns, report_unreadable, split_line
+from fdi.trace.csv_table import Layout, open_text, read_columns, report_unreadable, require_growth, split_line
 from plant.errors import InputError, require
 from plant.segments import LONGEST, RATE, Array, resample_on_cycles
 from plant.signals import EHA, Signals
@@ -47,7 +47,7 @@ def parse_columns(data: bytes, where: object, period: float = 1 / RATE, signals:
     columns = read_columns(data, Layout("utf-8-sig", ",", ".", tuple(titles), 1, 2), [name for _, name, _ in picked],
                            where=where)
     t = columns["t"]
-    _refuse_row(where, "t", t, np.append(False, np.diff(t) <= 0.0), "a time after that of the row before")
+    require_growth(t, where, "t")
     _refuse_row(where, "t", t, t - t[0] > LONGEST, f"seconds, and at most {LONGEST:g} of them")
     for key, name, most in picked:
         expected = f"at most {most:g} either way" if most < math.inf else "a finite number"

@@ -198,6 +198,19 @@ def _parse_date(text: str) -> float:
     return float((value - np.datetime64("2020-01-01", "ns")).astype(np.int64)) / 1e9
 
 
+def require_growth(t: Floats, where: object, field: str, hint: str = "") -> None:
+    """Refuse times that do not grow, with a `hint` at what they may be.
+
+    Raises:
+        InputError: it names the row and both times.
+    """
+    grows = np.diff(t) > 0.0
+    if not grows.all():
+        row = int(np.argmin(grows)) + 1
+        raise InputError(where, field,
+                         f"times that grow; row {row + 1} has {t[row]:.9g} s after {t[row - 1]:.9g} s{hint}")
+
+
 def combine_columns(sources: Mapping[str, Floats], table: Table) -> dict[str, Floats]:
     """The columns of a trace from those of a plant's own rig; NaN where a part of one is missing."""
     def shift_term(term: Term) -> Floats:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.check_result import CheckResult
-from fdi.trace.csv_table import read_csv, write_csv
+from fdi.trace.csv_table import read_csv, require_growth, write_csv
 from fdi.trace.declaration import DECLARATION, read_declaration
 from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import Section, find_sections
@@ -328,10 +328,7 @@ def make_table_trace(path: Path, columns: dict[str, Floats], signals: Signals, n
     """
     t = columns.pop("t")
     require(len(t) >= 2, path, "t", "at least two rows")
-    falls = ~(np.diff(t) > 0.0)
-    if falls.any():
-        row = int(falls.argmax())
-        raise InputError(f"{path}: line {row + 3}", "t", f"a time after {t[row]:g} s, not {t[row + 1]:g}")
+    require_growth(t, path, "t")
     typical = float(np.percentile(np.diff(t), 50, method="lower"))
     rows = np.concatenate([[0], np.cumsum(np.rint(np.diff(t) / typical).astype(int))])
     if (np.diff(rows) < 1).any():

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
+from fdi.trace.csv_table import require_growth
 from fdi.trace.importing.formats import OTHER_UNITS, Channel, Measurement
 from fdi.trace.sensor_dynamics import SensorDynamics
 from fdi.trace.trace import Floats, Trace
@@ -213,6 +214,9 @@ def convert_to_si(values: Floats, unit: Unit) -> Floats:
 # Times
 # ---------------------------------------------------------------------------------------------------------------------
 
+COUNTER = " (a counter that wraps needs bits and rate)"
+
+
 def compute_times(base: TimeBase, samples: int, column: Floats | None, where: object, field: str) -> Floats:
     """Times (s) of so many samples; `column` holds the values of the base's source.
 
@@ -228,7 +232,7 @@ def compute_times(base: TimeBase, samples: int, column: Floats | None, where: ob
     if base.bits is not None and base.rate is not None:
         return unwrap_counter(column, base.bits, where, field) / base.rate
     t = column - column[0] if base.is_calendar else convert_to_si(column, require_unit(base.unit, "s", where, field))
-    require_growth(t, where, field)
+    require_growth(t, where, field, COUNTER)
     return t
 
 
@@ -252,19 +256,6 @@ def unwrap_counter(counts: Floats, bits: int, where: object, field: str) -> Floa
         row = int((steps == 0).argmax()) + 2
         raise InputError(where, field, f"a counter that goes on in every row; row {row} repeats {counts[row - 1]:g}")
     return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def require_growth(t: Floats, where: object, field: str) -> None:
-    """Refuse times that do not grow.
-
-    Raises:
-        InputError: it names the row and both times.
-    """
-    grows = np.diff(t) > 0.0
-    if not grows.all():
-        row = int(np.argmin(grows)) + 1
-        raise InputError(where, field, f"times that grow; row {row + 1} has {t[row]:.9g} s after {t[row - 1]:.9g} s "
-                                       "(a counter that wraps needs bits and rate)")
 
 
 CYCLE_PARTS = {"drive": "answer", "command": "demand"}  # by role, where in a cycle a held value comes
@@ -394,7 +385,7 @@ def _find_times(measurement: Measurement, chosen: ImportMap, signal: SignalMap, 
     if base is None:
         if channel.t is None:
             raise InputError(chosen.path, "time", "a table with source (a column) or rate (rows a second)")
-        require_growth(channel.t, measurement.path, signal.source)
+        require_growth(channel.t, measurement.path, signal.source, COUNTER)
         return channel.t
     column = channels[base.source].values if base.source else None
     if column is not None and len(column) != len(channel.values):
