@@ -29,6 +29,7 @@ from fdi.diagnosis.precursors import (
     compute_half_range,
     find_lasting_peak,
     find_stays,
+    measure_ramp,
     read_columns,
     select_ramp_rows,
 )
@@ -42,7 +43,6 @@ from fdi.thresholds import (
     SAME_COMMAND_TIME,
     SECTION_MEASURED_SHARE,
 )
-from fdi.trace.check_result import compute_speed
 from fdi.trace.sections import Section, describe_section, find_sections
 from fdi.trace.trace import Flags, Floats, Trace
 from plant.errors import InputError, require
@@ -368,17 +368,15 @@ def find_excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts:
     place = place_sections(bands, parts)
     notes: list[str] = []
     out: list[Excursion] = []
-    velocity = compute_speed(xj, 1.0 / period)
     shown: dict[str, list[tuple[float, float]]] = {fault.name: [] for fault in bands.faults if len(fault.amounts)}
     lost: dict[int, bool] = {}
     for ramp in bands.ramps:
-        s, rows = place[ramp.section], select_ramp_rows(place[ramp.section], period)
-        error = np.sign(s.rate) * (com[rows] - xj[rows])
+        s = place[ramp.section]
+        error, beyond = measure_ramp(xj, com, s, period)
         if ramp.section not in lost:
             lost[ramp.section] = _is_lost(error, s, bands, notes)
         if lost[ramp.section]:
             continue
-        beyond = np.sign(s.rate) * velocity[rows] - abs(s.rate)
         half = float(compute_half_range(error))
         fastest = float(find_lasting_peak(beyond))
         scale, fault = ramp.compute_scale(half, fastest), bands.find(ramp.fault)
@@ -388,7 +386,7 @@ def find_excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts:
         for signal, x, width in (("position", scale * (error - ramp.position.centre), ramp.position),
                                  ("speed", beyond - ramp.speed.centre, ramp.speed)):
             middle, most = (np.full(len(x), limit) for limit in (width.middle, width.most))
-            out.append(Excursion(signal, s, rows.start, np.abs(x), middle, most, fault.name))
+            out.append(Excursion(signal, s, select_ramp_rows(s, period).start, np.abs(x), middle, most, fault.name))
     amounts: dict[str, Sequence[float]] = {
         name: np.mean(pairs, axis=0).tolist() if pairs else [float(bands.find(name).amounts[0])] * 2
         for name, pairs in shown.items()}

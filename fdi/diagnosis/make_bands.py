@@ -36,9 +36,9 @@ from fdi.diagnosis.precursors import (
     compute_half_range,
     find_lasting_peak,
     is_slow_ramp,
+    measure_ramp,
     measure_step,
     read_columns,
-    select_ramp_rows,
 )
 from fdi.estimation.fit import limit_dynamic_friction, list_tolerance_sizes
 from fdi.output import require_writable, write_text
@@ -56,7 +56,6 @@ from fdi.thresholds import (
     RAMP_HEALTHY_SHARE,
     STEP_FAULT_LEAVES_SD,
 )
-from fdi.trace.check_result import compute_speed
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Floats, Trace, fill_gaps, measure_scale
 from plant.errors import InputError, require
@@ -236,16 +235,10 @@ def _make_step_band(number: int, s: Section, period: float, sound: Floats, rubbi
                     most)
 
 
-def _measure_ramp(x: Floats, com: Floats, s: Section, period: float) -> tuple[Floats, Floats]:
-    """Following error, and speed beyond the demand's, of runs `x` (m, n) on a ramp, in its direction."""
-    rows, way = select_ramp_rows(s, period), np.sign(s.rate)
-    return way * (com[rows] - x[:, rows]), way * compute_speed(x, 1.0 / period)[:, rows] - abs(s.rate)
-
-
 def _make_ramp_band(number: int, s: Section, com: Floats, period: float, fault: str, runs: Sequence[Floats]
                     ) -> RampBand:
     """The band of a ramp from healthy units, and those with the fault at MidBand and at MaxBand."""
-    errors, speeds = zip(*(_measure_ramp(x, com, s, period) for x in runs), strict=True)
+    errors, speeds = zip(*(measure_ramp(x, com, s, period) for x in runs), strict=True)
     return RampBand(number, fault, _make_width(*errors), _make_width(*speeds), np.empty(0))
 
 
@@ -255,7 +248,7 @@ def _make_friction_ramp(number: int, s: Section, com: Floats, period: float, fau
     the former and a low dynamic friction.
     """
     band = _make_ramp_band(number, s, com, period, fault, [rubbing[0], *(rubbing[i] for i in at)])
-    errors, speeds = zip(*(_measure_ramp(x, com, s, period) for x in (*rubbing, *easy)), strict=True)
+    errors, speeds = zip(*(measure_ramp(x, com, s, period) for x in (*rubbing, *easy)), strict=True)
     half = np.array([np.median(compute_half_range(e)) for e in errors])
     band = band._replace(half_range=np.maximum.accumulate(half[:len(rubbing)]))
     if not easy:
@@ -396,7 +389,7 @@ class _Fleet:
 
     def correct_ramp(self, r: RampBand) -> RampBand:
         """The fleet's centres and healthy widths; a limit too near to them is dropped."""
-        error, fast = _measure_ramp(self.x, self.com, self.base.sections[r.section], self.base.period)
+        error, fast = measure_ramp(self.x, self.com, self.base.sections[r.section], self.base.period)
         half = r.half_range
         if len(half):
             half = np.maximum.accumulate(np.r_[np.median(compute_half_range(error)), half[1:]])

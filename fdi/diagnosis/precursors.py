@@ -55,6 +55,12 @@ def select_ramp_rows(s: Section, period: float, settling: float = 0.2) -> slice:
     return slice(s.start + round(settling / period), s.stop)
 
 
+def measure_ramp(x: Floats, com: Floats, s: Section, period: float) -> tuple[Floats, Floats]:
+    """Following error, and speed beyond the demand's, of runs `x` (.., n) on a ramp of `com` (n,), in its direction."""
+    rows, way = select_ramp_rows(s, period), np.sign(s.rate)
+    return way * (com[rows] - x[..., rows]), way * compute_speed(x, 1.0 / period)[..., rows] - abs(s.rate)
+
+
 def read_columns(source: Trace) -> tuple[Floats, Floats, Floats, float, float]:
     """Command without holes, position with NaN where it cannot be used, load, period and first time of a trace."""
     position = source.mask_unusable(source.declared.controlled.name)

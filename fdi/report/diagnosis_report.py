@@ -17,6 +17,7 @@ from fdi.diagnosis.precursors import (
     compute_half_range,
     find_lasting_peak,
     format_precursor,
+    measure_ramp,
     read_columns,
     select_ramp_rows,
 )
@@ -71,7 +72,6 @@ from fdi.report.report import (
 )
 from fdi.sources import name_software
 from fdi.thresholds import BAND_NEAREST_LIMIT_SD
-from fdi.trace.check_result import compute_speed
 from fdi.trace.sections import Section as CommandSection, find_sections
 from fdi.trace.trace import Trace
 
@@ -600,13 +600,10 @@ def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict, fault: BandFault
 
 
 def _draw_ramp(trace: Trace, ramp: RampBand, s: CommandSection, judged: BandVerdict, is_first: bool) -> Iterator[Panel]:
-    rows, way = select_ramp_rows(s, trace.period), np.sign(s.rate)
-    controlled = trace.declared.controlled
-    x, speed = trace.mask_unusable(controlled.name), f"{controlled.shown_unit}/s"
-    fine, small = choose_unit(controlled.unit, 0.0)
+    rows, controlled = select_ramp_rows(s, trace.period), trace.declared.controlled
+    speed, (fine, small) = f"{controlled.shown_unit}/s", choose_unit(controlled.unit, 0.0)
     events = [e for e in judged.events if e.fault == ramp.fault]
-    error = way * (trace.command[rows] - x[rows])
-    fast = way * compute_speed(x, 1.0 / trace.period)[rows] - abs(s.rate)
+    error, fast = measure_ramp(trace.mask_unusable(controlled.name), trace.command, s, trace.period)
     scale = ramp.compute_scale(float(compute_half_range(error)), float(find_lasting_peak(fast)))
     limits = (float(trace.t[rows.start]), float(trace.t[rows.stop - 1]))
     above = axes(title=f"ramp at {s.rate * controlled.shown_scale:+.3g} {speed}, judged from {limits[0]:.4g} s",
