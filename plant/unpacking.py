@@ -21,7 +21,7 @@ class LimitedGzip(io.RawIOBase):
     """The content of `size` bytes of gzip data, up to what `limit_unpacked_size` allows; beyond it, UnpackingError."""
 
     def __init__(self, packed: BinaryIO, size: int) -> None:
-        self._file = gzip.open(packed)  # noqa: SIM115 (closed by `close`)
+        self._packed, self._file = packed, gzip.open(packed)  # noqa: SIM115 (closed by `close`)
         self._left = self._most = limit_unpacked_size(size)
 
     def readable(self) -> bool:
@@ -37,4 +37,5 @@ class LimitedGzip(io.RawIOBase):
 
     def close(self) -> None:
         self._file.close()
+        self._packed.close()
         super().close()

@@ -34,7 +34,7 @@ def read_csv(path: Path, signals: Signals) -> tuple[dict[str, Floats], tuple[str
         plant whose rig wrote the file in its own columns, "" for a trace of this software; the signals of the columns.
 
     Raises:
-        InputError: anything but numbers, and t that does not grow; it names the line.
+        InputError: a column that is missing, or anything but numbers; it names the line.
     """
     with report_unreadable(path, "UTF-8"), open_text(path) as stream:
         header = stream.readline()
