@@ -94,11 +94,11 @@ def wrap_all(path: str, name: str, around: Callable[..., Any]) -> Break:
     return patch
 
 
-def change_entries(**values: Any) -> Break:
-    """Every object of the dictionary is described otherwise."""
+def change_entries(is_meant: Callable[[Any], bool], **values: Any) -> Break:
+    """Objects of the dictionary are described otherwise."""
     def patch(device: Any) -> None:
         device.od.entries = {key: copy(entry) for key, entry in device.od.entries.items()}
-        for entry in device.od.entries.values():
+        for entry in filter(is_meant, device.od.entries.values()):
             vars(entry).update(values)
     return patch
 

@@ -243,14 +243,13 @@ def map_freely(*rules: str) -> Break:
         is_fixed = not od.read_number(parameters[index], 1) & INVALID or (sub and od.read_number(index, 0))
         for rule, is_broken, code in (
                 ("off", is_fixed, 0x08000022), ("object", sub and entry is None, 0x06020000),
-                ("mappable", sub and entry is not None and not entry.mappable, 0x06040041),
+                ("mappable", sub and entry is not None and not entry.pdo_mappable, 0x06040041),
                 ("length", bits > 64, 0x06040042)):
             if rule in rules and is_broken:
                 raise SdoAbort(code)
 
     def patch(device: Any) -> None:
-        device.od.entries = {key: entry._replace(writable=True) if key[0] in parameters else entry
-                             for key, entry in device.od.entries.items()}
+        change_entries(lambda entry: entry.index in parameters, access_type="rw")(device)
         wrap("_check", check)(device)
     return patch
 
@@ -416,11 +415,11 @@ DEFECTS: list[tuple[str, Break, str]] = [
     ("unknown object: another code", change_abort(Abort.NO_OBJECT, Abort.NO_SUBINDEX), "2.7"),
     ("unknown sub-index: another code", change_abort(Abort.NO_SUBINDEX, Abort.NO_OBJECT), "2.8"),
     ("write-only: another code", change_abort(Abort.WRITE_ONLY, 0x06010000), "2.10"),
-    ("read-only objects written", change_entries(access_type="rw"), "2.9"),
+    ("read-only objects written", change_entries(lambda entry: entry.readable, access_type="rw"), "2.9"),
     ("any length accepted", all_of(wrap("od.decode", ignore_length),
                                    wrap("sdo._size", lambda device, old, index, sub: old(index, sub) * 0)),
      "2.12 3.13"),
-    ("limits ignored", change_entries(min=None, max=None), "2.13"),
+    ("limits ignored", change_entries(lambda entry: True, min=None, max=None), "2.13"),
     ("constant differs from the EDS", wrap("sdo._upload", lambda device, old, index, sub: old(index, sub)
                                            if (index, sub) != (0x1018, 2) else bytes(4)), "2.3"),
     ("object of the EDS cannot be read", wrap("od.find", refuse_version), "2.1 2.3 2.8 2.14"),

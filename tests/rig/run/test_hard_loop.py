@@ -193,7 +193,7 @@ def test_rows_and_log(bus_kind: str, realtime: bool) -> None:
                     and round(row.xj * 1e6) == row.cycle]
 
         if realtime:
-            assert one.loop.wait_until_played(lambda: False)
+            one.loop.wait_until_played(lambda: False)
             one.play_until(lambda: bool(whole()) and one.logged(codec.DRIVE)[29:] != [])
         one.loop.finish()
         other.close()
@@ -299,7 +299,8 @@ def test_waiting_for_the_end_of_the_queue_is_no_underrun(bus_kind: str) -> None:
     """Neither is the hold behind it."""
     with bench(bus_kind, True) as one:
         one.play(*range(10))
-        assert one.loop.wait_until_played(lambda: False) and one.loop.waiting == 0
+        one.loop.wait_until_played(lambda: False)
+        assert one.loop.waiting == 0
         underruns, k = one.loop.underruns, one.loop.k
         one.play_until(lambda: one.loop.k >= k + 3)
         assert one.loop.hold(2) == pytest.approx(9e-7)
