@@ -196,14 +196,14 @@ def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -
     assert not first.passed and "t = 0.1" in first.text
 
 
-@pytest.mark.parametrize("plant", ["eha", pytest.param("ema", marks=pytest.mark.slow), "mine.py"])
+@pytest.mark.parametrize("plant", ["eha", pytest.param("ema", marks=pytest.mark.slow), "new_plant.py"])
 @pytest.mark.parametrize(("kind", "check"), [("sequence", ["check", "my_new.toml"]),
                                              ("fault", ["check", "my_new.toml"]),
                                              ("effect", ["effects", "--effects", "my_new.py", "my_new"])])
 def test_a_new_file_passes_its_own_check(kind: str, check: list[str], plant: str, tmp_path: Path,
                                          monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text(TEXT)
+    (tmp_path / "new_plant.py").write_text(TEXT)
     assert rig("new", kind, "my_new", "--model", plant, "--json").json["verdict"] == "COMPLETE"
     said = rig(*check, "--model", plant, "--json")
     assert said.status == 0 and "are of a bench" in rig("new", kind, "other", "--node", "3").err

@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from itertools import count
 from typing import Protocol
 
+import pytest
 from c_device import run_program
 
 from rig.network.bus import EmbeddedBus, Link, open_can
@@ -16,6 +17,8 @@ from rig.network.frame import Frame
 from rig.network.node_objects import NAMES
 
 _SERIAL = count()
+raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)  # between programs
+only_udp = pytest.mark.parametrize("bus_kind", ["udp_multicast"], indirect=True)  # what the bus is does not matter
 
 
 class Station(Protocol):

@@ -8,7 +8,7 @@ from pathlib import Path
 import codec
 import numpy as np
 import pytest
-from bus_stations import gather, spec
+from bus_stations import gather, raw_kinds, spec
 from physics_cases import PREFLIGHT
 from rig_command import answer, rig
 from vcan_host import kernel_has_vcan0
@@ -51,7 +51,6 @@ def test_whole_processes_are_timed() -> None:
     assert benchmarks.measure_run_process_speed(rounds=1) > 0
 
 
-raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
 
 HISTOGRAM = """# /dev/cpu_dma_latency set to 0us
 # Histogram

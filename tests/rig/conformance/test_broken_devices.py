@@ -598,13 +598,13 @@ def test_a_node_by_its_number_and_data_sheet() -> None:
 
 @pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
 def test_the_firmware_passes_on_a_can_interface(bus_kind: str) -> None:
-    """SDO, PDO and NMT over the kernel's CAN.
+    """SDO over the kernel's CAN, whose transfers take many frames.
 
     The rest takes minutes on a slow guest and is the same code; 3.15 looks for 6 s how the SDO server waits, which is
-    the same on every bus. The nodes in Python are taken through SDO, NMT and PDO there by the runs.
+    the same on every bus. All nodes are taken through NMT and PDO there by the runs.
     """
     skip_without_compiler()
-    numbers = [each.number for each in CASES if each.number[0] in "346" and each.number != "3.15"]
+    numbers = [each.number for each in CASES if each.number[0] == "3" and each.number != "3.15"]
     words = [word for number in numbers for word in ("--chapter", number)]
     said = rig("conformance", "c", "--bus", spec(bus_kind), "--json", "--timeout", 20, "--tolerance", 2000, *words)
     assert [test["number"] for test in said.json["tests"]] == numbers

@@ -15,7 +15,7 @@ from typing import Any
 import codec
 import numpy as np
 import pytest
-from bus_stations import spec
+from bus_stations import only_udp, raw_kinds, spec
 from node_bench import MS, FirmwareDesk, PlantDesk
 
 from plant import Actuator, Model
@@ -49,8 +49,6 @@ from rig.sequences.faults import (
     Short,
     Stuck,
 )
-
-raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
 
 
 class BusDesk:
@@ -174,10 +172,10 @@ def write_script(text: str, schedule: Schedule) -> list[tuple[int, bytes]]:
     return frames
 
 
-@raw_kinds
 class TestServices:
     """The CANopen services beside the loop, and what passes between the two."""
 
+    @raw_kinds
     def test_the_record_of_the_cycles_can_be_read(self, desk: BusDesk) -> None:
         before = time.monotonic_ns()
         for _ in range(20):
@@ -197,6 +195,7 @@ class TestServices:
         assert abs(counts[7] - int((record.done - record.sync).max()) // 1000) <= 1
         assert counts[8] & 1  # compiled
 
+    @only_udp
     def test_a_short_drive_is_an_emergency_and_counts_as_missing(self, desk: BusDesk) -> None:
         run_cycle(desk, None)
         desk.link.send(codec.DRIVE, b"123")
@@ -204,6 +203,7 @@ class TestServices:
         desk.settle()
         assert next(data[:2] for cob_id, data in desk.heard if cob_id == 0x083) == b"\x10\x82"
 
+    @only_udp
     def test_a_plant_without_a_number_says_so_and_stops(self, desk: BusDesk) -> None:
         run_cycle(desk)
         words = desk.node._memory.words
@@ -218,6 +218,7 @@ class TestServices:
         desk.restart()
         assert run_cycle(desk) == (0.0, 0, 0)
 
+    @only_udp
     @pytest.mark.parametrize(("text", "fault"), [
         ("SD" * 14, Lost(frame="sync", start=0.005, end=0.007)), ("SD" * 14, Lost(frame="sync", start=0.005, end=0.01)),
         ("SD" * 14, Duplicated(frame="sync", start=0.003, end=0.009)),
@@ -247,6 +248,7 @@ class TestServices:
             desk.settle()
         assert [each for each in desk.heard if each[0] in sent_in_cycle] == expected
 
+    @only_udp
     def test_the_loop_ends_with_the_services(self, bus_kind: str) -> None:
         with BusDesk(spec(bus_kind), Scenario(QUIET, Plan(stop=0))).run() as desk:
             run_cycle(desk)
@@ -254,6 +256,7 @@ class TestServices:
             assert thread is not None and thread.is_alive()
         assert not thread.is_alive()
 
+    @raw_kinds
     def test_a_transmission_type_and_a_cob_id_set_by_sdo_are_those_of_the_loop(self, desk: BusDesk) -> None:
         desk.nmt(128)
         for request in (b"\x2f\x00\x18\x02\x02\0\0\0",  # feedback with every second SYNC

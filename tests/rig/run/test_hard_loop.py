@@ -16,7 +16,7 @@ from typing import Any
 
 import codec
 import pytest
-from bus_stations import spec
+from bus_stations import only_udp, raw_kinds, spec
 from log_rows import CycleBook
 from numba.core.event import install_recorder
 
@@ -46,9 +46,6 @@ from rig.sequences.faults import (
 )
 
 PERIOD = 10_000_000  # ns: ten times the bench's, because the nodes of this test are Python on a busy machine
-raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
-# what the bus is does not matter to these
-only_udp = pytest.mark.parametrize("bus_kind", ["udp_multicast"], indirect=True)
 
 
 class Nodes(threading.Thread):
@@ -362,7 +359,7 @@ def test_a_late_cycle_drops_due_times_and_counts_them(bus_kind: str) -> None:
         assert len(sent) == len(one.rows)
 
 
-@raw_kinds
+@only_udp
 @paces
 def test_frames_of_another_cycle_or_length_are_no_answers(bus_kind: str, realtime: bool) -> None:
     with bench(bus_kind, realtime) as one:
@@ -381,7 +378,7 @@ def test_frames_of_another_cycle_or_length_are_no_answers(bus_kind: str, realtim
             assert all(map(isnan, (timing.feedback_response, timing.valve_response)))
 
 
-@raw_kinds
+@only_udp
 @paces
 def test_a_second_rig_is_told(bus_kind: str, realtime: bool) -> None:
     with bench(bus_kind, realtime) as one:
