@@ -1,7 +1,7 @@
 # Two commands: `make preflight` runs the bench, `make test` proves it. Both make their own environment first.
 #   make quick    ruff and the short tests, for every edit                make test ARGS="-k bus"   a part of the tests
 #   make lint     ruff and mypy alone                                     make pytest ARGS=..       the same without lint
-#   make newcomer every line of README, tutorial and how-to pages, bad inputs; ARGS=inputs a part (shown, pages)
+#   make newcomer every line of README, tutorial and how-to pages; ARGS=shown a part (shown, pages)
 #   make docs     the pages as a searchable site in site/, which needs no network
 #   make bench    the project's benchmarks     make clean                what was made here, but for runs/
 PYTHON ?= python3

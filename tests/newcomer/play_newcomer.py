@@ -1,7 +1,7 @@
-"""Play a newcomer: the lines of README and tutorial in a fresh clone, of other pages, and bad inputs.
+"""Play a newcomer: the lines of README and tutorial in a fresh clone, and those of other pages.
 
-`make newcomer` runs all of it and prints a table; `make newcomer ARGS=inputs` a part: shown, pages or inputs.
-Exit status 1 if something is wrong. The quick parts are tests as well (test_newcomer.py).
+`make newcomer` runs all of it and prints a table; `make newcomer ARGS=shown` a part: shown or pages.
+Exit status 1 if something is wrong. Bad inputs are tests (test_newcomer.py).
 """
 
 import argparse
@@ -10,12 +10,10 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import shown_commands
-from bad_inputs import BAD_INPUTS, find_faults, write_bad_files
 from places import ROOT
 
 Row = tuple[str, str, str, str]  # what, status, time, result
@@ -74,20 +72,7 @@ def play_pages(folder: Path) -> Iterator[Row]:
             yield f"{part.page}: `{played.line}`", status, f"{played.seconds:.1f} s", result
 
 
-def play_inputs(folder: Path) -> Iterator[Row]:
-    """The bad inputs, each as a process of its own."""
-    write_bad_files(folder)
-    for case in BAD_INPUTS:
-        start = time.monotonic()
-        done = subprocess.run([sys.executable, "-m", "rig.cli.main", *case.words.split()], cwd=folder, text=True,
-                              env=make_environment(), capture_output=True)
-        faults = find_faults(case, done.returncode, done.stdout, done.stderr)
-        yield (f"`rig {case.words}`", str(done.returncode), f"{time.monotonic() - start:.1f} s",
-               "; ".join(faults) or "ok")
-
-
-PARTS: dict[str, Callable[[Path], Iterator[Row]]] = {
-    "shown": play_shown, "pages": play_pages, "inputs": play_inputs}
+PARTS: dict[str, Callable[[Path], Iterator[Row]]] = {"shown": play_shown, "pages": play_pages}
 
 if __name__ == "__main__":
     sys.exit(main())

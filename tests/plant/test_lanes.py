@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from effect_files import COGGING, MEMORY
+from effect_files import MEMORY
 from other_cpus import compiles_for
 from refusals import catch_refusal
 
@@ -144,13 +144,11 @@ def test_runs_with_few_costly_effects_get_a_kernel_of_their_own_once_it_is_worth
     assert len(catalogue._assign_runs(few, 1)) == 1  # a block takes as long for one run as for sixteen
 
 
-@pytest.mark.parametrize(("text", "changes"), [(COGGING, {"cogging.force": 500.0}), (MEMORY, {"wear.rate": 1e4})])
-def test_effects_of_a_user(text: str, changes: dict[str, float], tmp_path: Path) -> None:
-    """With a sine and with a memory. (A changed file is not served by old code: test_compile.py.)"""
-    (tmp_path / "mine.py").write_text(text)
+def test_an_effect_of_a_user_with_a_memory(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(MEMORY)
     load_effects(tmp_path / "mine.py")
-    model = QUIET.replace(changes)
-    runs = Lanes(model, list(changes), steps=10).replay(np.array([[*changes.values()], [0.0]]), CURRENT, FORCE)
+    model = QUIET.replace({"wear.rate": 1e4})
+    runs = Lanes(model, ["wear.rate"], steps=10).replay(np.array([[1e4], [0.0]]), CURRENT, FORCE)
     for rows, one in zip(runs, (model, QUIET), strict=True):
         assert (rows == one_run(one, CURRENT, FORCE)).all()
 

@@ -233,19 +233,6 @@ def test_schroeder_phases_keep_the_crest_low() -> None:
     assert schroeder < 2.0 < 7.0 < aligned
 
 
-RAMP = 0.5 * np.arange(40) / 1000  # 0.5 m/s in rows of 1 ms
-STEP = np.r_[np.zeros(21), np.ones(19)]
-
-
-@pytest.mark.parametrize(("period", "cycles"), [(0.0005, 80), (0.001, 40), (0.0015, 27), (0.002, 20), (0.004, 10)])
-def test_samples_hold_on_another_period_and_the_seconds_stay(period: float, cycles: int) -> None:
-    t = 3.0 + np.arange(40) / 1000
-    ramp, step = resample_on_cycles(t, RAMP, period), resample_on_cycles(t, STEP, period)
-    at = np.arange(cycles) * period
-    np.testing.assert_allclose(ramp, 0.5 * np.floor(at * 1000 + 1e-6) / 1000, atol=1e-15)
-    assert step.tolist() == [float(x > 0.0209) for x in at]  # nothing between 0 and 1
-
-
 @pytest.mark.parametrize(("t", "values", "period", "expected"), [
     ([0.0, 0.004, 0.005], [0.0, 4.0, 9.0], 0.002, [0, 2, 4]), ([5.0], [3.0], 0.002, [3.0]),
     ([0.0, 0.004, 0.005], [0.0, 4.0, 9.0], 0.001, [0, 1, 2, 3, 4, 9])])

@@ -31,8 +31,6 @@ class Variant:
             self.command = codec.unpack_command(frame.data)
         elif frame.cob_id == codec.FEEDBACK:
             self.feedback = codec.unpack_feedback(frame.data)
-        elif frame.cob_id == 0x000 and frame.data[0] in (129, 130):
-            self.reset()
         self.firmware.receive(self.hear(frame))
 
     def tick(self, t_ns: int) -> None:
@@ -41,9 +39,6 @@ class Variant:
     def hear(self, frame: Frame) -> Frame:
         """What the controller hears of a frame."""
         return frame
-
-    def reset(self) -> None:
-        """An NMT reset came."""
 
     def answer(self, drive: Drive) -> Drive | None:
         """What it says in place of a sound answer; None: nothing."""
@@ -63,10 +58,6 @@ class Variant:
     def swallows(self, cob_id: int, data: bytes) -> bool:
         """Whether another frame than the drive frame is not sent."""
         return False
-
-
-class Sound(Variant):
-    pass
 
 
 def vary(answer: Callable[[Variant, Drive], Drive | None]) -> type[Variant]:
@@ -90,8 +81,6 @@ CycleLate = vary(lambda self, drive: self.last)
 OldCurrent = vary(lambda self, drive: drive._replace(current=self.last.current if self.last and drive.current else 0.0))
 # The cycle number is that of the cycle before, all else is right.
 StaleNumber = vary(lambda self, drive: drive._replace(cycle=(drive.cycle - 1) & 0xFFFF))
-# From some time on the cycle number stands still for two cycles in a hundred.
-StuckNumber = vary(lambda self, drive: drive._replace(cycle=drive.cycle - (drive.cycle % 50 == 1)))
 NoOutput = vary(lambda self, drive: drive._replace(current=0.0))
 WrongSign = vary(lambda self, drive: drive._replace(current=-drive.current))
 GainLow = vary(lambda self, drive: drive._replace(current=limit(0.7 * drive.current)))
@@ -103,8 +92,6 @@ AlwaysActive = vary(lambda self, drive: drive._replace(status=0xF))
 NeverReady = vary(lambda self, drive: drive._replace(status=drive.status & 7))
 # NaN becomes the smallest INT32 when a C program casts it; here from cycle 120 on.
 NotANumber = vary(lambda self, drive: drive._replace(current=-2.0**31 * codec.CURRENT) if drive.cycle >= 120 else drive)
-# While the control word is ACTIVE, the current is at its limit, or is not limited.
-Saturated = vary(lambda self, drive: drive._replace(current=CURRENT_LIMIT) if is_active(drive) else drive)
 BeyondLimit = vary(lambda self, drive: drive._replace(current=3.8 * (self.command.position - self.feedback.position))
                    if is_active(drive) else drive)
 
@@ -120,13 +107,6 @@ class Frozen(Variant):
         return self._kept._replace(cycle=drive.cycle)
 
 
-class FrozenCurrent(Frozen):
-    """The current stands still from cycle 120 on, while the control word is ACTIVE."""
-
-    def answer(self, drive: Drive) -> Drive:
-        return drive._replace(current=super().answer(drive).current) if is_active(drive) else drive
-
-
 class IgnoresControl(Variant):
     """The loop is always closed; the status word follows the control word all the same."""
 
@@ -137,19 +117,6 @@ class IgnoresControl(Variant):
 
     def answer(self, drive: Drive) -> Drive:
         return drive._replace(status=self.command.control & 7 | 8)
-
-
-class IgnoresSwitchOff(IgnoresControl):
-    """Once ACTIVE, the loop stays closed."""
-
-    _was_active = False
-
-    def hear(self, frame: Frame) -> Frame:
-        self._was_active |= self.command.control == 7
-        return super().hear(frame) if self._was_active else frame
-
-    def reset(self) -> None:
-        self._was_active = False
 
 
 class SlowStatus(Variant):

@@ -6,6 +6,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #ifndef STEP_THAT
 #define STEP_THAT -1
@@ -39,7 +40,7 @@ static int step(Slide *s, double h) {
     double mass = s->is_big ? 10.0 : 1.0;
     if (s->steps++ == STEP_THAT) {
         if (DOES == CRASH) say(s, 1, "about to fail"), *(volatile int *)0 = 1;
-        if (DOES == HANG) for (;;) {}
+        if (DOES == HANG) for (;;) pause();
         if (DOES == REFUSE) return say(s, 3, "the solver did not converge"), 3;
         if (DOES == GIVE_NAN) s->x = NAN;
     }

@@ -482,7 +482,6 @@ def test_a_hidden_law_is_found_named_and_written(name: str, tmp_path: Path) -> N
         traces = record_runs(Model().replace({"hidden_law.size": outside.size}))
     found = search_law(traces)
     law = found.law
-    print(name, describe_search(found))
     assert law is not None and law.holds and [term.name for term in law.terms] == [outside.term], law
     assert all(error < 1.2 * found.floor[signal] for signal, error in law.holdout.items())
     worst = max(found.floor, key=lambda s: found.base.errors[s] / found.floor[s])
@@ -491,18 +490,6 @@ def test_a_hidden_law_is_found_named_and_written(name: str, tmp_path: Path) -> N
     names = write_law_file(tmp_path / "law.py", law.terms, law.values, law.reason)
     assert load_effects(tmp_path / "law.py") == list(names.values()) == [f"missing_{law.terms[0].place}"]
     assert CATALOGUE[names[law.terms[0].place]].starts
-
-
-def describe_search(found: LawSearch) -> str:
-    """A row of the table of laws in docs/statistics.md."""
-    worst = max(found.floor, key=lambda s: found.base.errors[s] / found.floor[s])
-    floor = found.floor[worst]
-    if found.law is None:
-        return f"{worst}: {found.base.errors[worst] / floor:.2f} floors, no law"
-    values = ", ".join(f"{f} {v.value:.4g} ({v.low:.4g} to {v.high:.4g})" for f, v in found.law.values.items())
-    return (f"{worst}: {found.base.errors[worst] / floor:.2f} -> {found.law.hypothesis.errors[worst] / floor:.2f}, "
-            f"held-out {found.holdout['base'][worst] / floor:.2f} -> {found.law.holdout[worst] / floor:.2f} floors; "
-            f"{values}; holds {found.law.holds}: {found.law.reason}")
 
 
 def test_a_healthy_run_has_no_law() -> None:

@@ -146,26 +146,16 @@ def test_links_and_devices_are_written_through(tmp_path: Path) -> None:
     assert "can be written" in catch_refusal(write_text, tmp_path / "no" / "a.txt", "text")
 
 
-def simulated(folder: Path, *words: object) -> np.ndarray:
-    """The trace of a simulation, by column."""
-    told = answer("simulate", "--out", folder / "s.csv", *words)
-    table = np.genfromtxt(folder / "s.csv", delimiter=",", names=True)
-    assert (table.dtype.names, len(table)) == (("t", "com", "xj", "cor", "p12", "xs", "load"), told["cycles"])
-    return table
-
-
-def written(folder: Path, t: np.ndarray, com: np.ndarray, load: np.ndarray) -> Path:
-    rows = "\n".join(f"{a:.4f},{b!r},{c!r}" for a, b, c in zip(t, com.tolist(), load.tolist(), strict=True))
-    (folder / "c.csv").write_text(f"t,com,load\n{rows}\n")
-    return folder / "c.csv"
-
-
 @pytest.mark.parametrize("period", [0.0005, 0.001, 0.002])
 def test_a_ramp_and_a_step_keep_their_seconds(period: float, tmp_path: Path) -> None:
     """A ramp of 5 mm/s for 0.3 s, then a step of 1 mm, and a load that comes with it."""
     t = np.arange(501) / 1000
     com, load = np.where(t < 0.3, 5e-3 * t, 2.5e-3), np.where(t < 0.3, 0.0, 2e3)
-    run = simulated(tmp_path, "--command", written(tmp_path, t, com, load), f"--set=controller.period={period}")
+    rows = "\n".join(f"{a:.4f},{b!r},{c!r}" for a, b, c in zip(t, com.tolist(), load.tolist(), strict=True))
+    (tmp_path / "c.csv").write_text(f"t,com,load\n{rows}\n")
+    answer("simulate", "--command", tmp_path / "c.csv", f"--set=controller.period={period}", "--out",
+           tmp_path / "s.csv")
+    run = np.genfromtxt(tmp_path / "s.csv", delimiter=",", names=True)
     assert run["t"][-1] == pytest.approx(0.5, abs=0.001) and np.diff(run["t"]) == pytest.approx(period)
     row = np.floor(run["t"] * 1000 + 1e-6).astype(int)
     assert (run["com"] == com[row]).all() and (run["load"] == load[row]).all()

@@ -567,13 +567,6 @@ def test_junit_has_skips_and_no_control_characters() -> None:
     assert suite[0][0].get("message") == "bytes ??"
 
 
-def test_times_that_could_not_be_measured_make_the_timing_invalid() -> None:
-    late = Result(CASES[-1], "late", Verdict.SKIPPED, 0.0)
-    for results, is_late, verdict in (([late], True, "INVALID_TIMING"), ([late], False, "PASS"),
-                                      ([late, late._replace(verdict=Verdict.FAIL)], True, "FAIL")):
-        assert Outcome(results, [], is_late).verdict == verdict
-
-
 def test_a_node_that_is_not_there() -> None:
     words = ("conformance", "9", "--eds", EDS[2], "--bus", spec("udp_multicast"), "--chapter", "3.1")
     assert "node 9 does not answer" in refuse(*words)

@@ -74,14 +74,10 @@ def test_the_program_says_what_it_needs(words: list[str]) -> None:
 
 CAUGHT_BY = {
     "late_frame": "drive frames of another cycle",
-    "stale_cycle": "drive frames of another cycle",
-    "missed_cycles": "drive frames missing or late",
     "no_heartbeat": "heartbeat period, controller",
-    "nan_current": "current within its limit",
     "leaks_state": "same answers after a reset",
 }
 
-LOSES_FRAMES = ("late_frame", "stale_cycle", "missed_cycles")
 # A heartbeat takes 100 ms of wall time, in which lockstep runs through hundreds of cycles.
 LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 3.0')
 
@@ -113,7 +109,7 @@ def list_failed(outcome: Outcome) -> list[str]:
 def test_each_fault_is_caught_by_its_check(
     tmp_path: Path, fault: str, bus_with_plant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if fault in LOSES_FRAMES:
+    if fault == "late_frame":
         monkeypatch.setattr(participants, "FRAME_TIMEOUT", 0.1)  # s: it is spent in each cycle without an answer
     with run_program(build_faulty(), fault, bus_with_plant):
         outcome = play_short(tmp_path, bus_with_plant, fault)
@@ -127,15 +123,6 @@ def test_a_firmware_that_is_slow_to_start_is_caught(tmp_path: Path, bus_with_pla
         outcome = play_short(tmp_path, bus_with_plant, "slow_start")
     assert (outcome.verdict, outcome.status) == ("ABORTED", 1)
     assert "node 2 controller must be OPERATIONAL within 1 s of NMT start" in outcome.aborted
-
-
-def test_runs_against_one_sound_firmware_pass(tmp_path: Path, bus_with_plant: str) -> None:
-    """Without one false alarm, and without a restart of the firmware in between."""
-    with run_program(build_controller(), bus_with_plant):
-        for seed in range(4):
-            outcome = play_short(tmp_path, bus_with_plant, "none", seed)
-            assert (seed, outcome.verdict, list_failed(outcome)) == (seed, "PASS", [])
-            assert set(outcome.counters.values()) == {0}
 
 
 def test_a_run_under_the_sanitizers_passes(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def unit(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Path]
 
 
 @pytest.mark.parametrize(("name", "version"), [*((name, version) for name in MODELS for version in "23"),
-                                               ("servo", "3")])
+                                               ("ehs", "3")])
 def test_a_unit_is_valid_and_has_the_bits_of_rig_simulate(
     unit: Callable[[str, str], Path], name: str, version: str
 ) -> None:

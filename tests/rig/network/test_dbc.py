@@ -9,7 +9,6 @@ import canopen
 import cantools
 import codec
 import pytest
-from canopen.objectdictionary import ODVariable
 from cantools.database.can import Database
 from codec import SIGNALS, Signal
 
@@ -28,7 +27,6 @@ class Pdo(NamedTuple):
     cob_id: int
     sends: bool
     kind: int
-    objects: list[tuple[ODVariable, int]]  # mapped object, length in bits
 
 
 def load_database() -> Database:
@@ -40,9 +38,7 @@ def pdos(node: int) -> Iterator[Pdo]:
     od = canopen.import_od(str(EDS[node]), node)
     for base in (0x1400, 0x1800):
         for index in (index for index in od if base <= index < base + 0x200):
-            words = [od[index + 0x200][sub].default for sub in range(1, od[index + 0x200][0].default + 1)]
-            objects = [(od.get_variable(word >> 16, word >> 8 & 0xFF), word & 0xFF) for word in words]
-            yield Pdo(node, od[index][1].default, base == 0x1800, od[index][2].default, objects)
+            yield Pdo(node, od[index][1].default, base == 0x1800, od[index][2].default)
 
 
 ALL_PDOS = [pdo for node in EDS for pdo in pdos(node)]

@@ -356,18 +356,6 @@ def test_sensor_faults_show_in_the_frames_only() -> None:
     assert desk.node.plant.actuator.state == sound.node.plant.actuator.state
 
 
-def test_a_parameter_ramps_cycle_by_cycle_and_returns_when_main_ends() -> None:
-    fault = Parameter(parameter="filter.clogging", value=0.4, start=0.01, ramp=0.004)
-    desk = PlantDesk(Scenario(QUIET, Plan(faults=(fault,), start=5, stop=25)))
-    index = desk.node.plant.actuator._index["filter.clogging"]
-    seen = []
-    for _ in range(30):
-        desk.cycle()
-        seen.append(float(desk.node.plant.actuator._live[index]))
-    assert seen[15:20] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
-    assert seen[:15] == [0.0] * 15 and seen[20:25] == [0.4] * 5 and seen[25:] == [0.0] * 5
-
-
 def test_after_a_pause_the_cycle_is_that_of_the_bus_and_no_fault_was_slept_through() -> None:
     """A fault that ended meanwhile has ended; one that began has begun; the first cycle is nobody's miss."""
     desk = PlantDesk(Scenario(QUIET, Plan(faults=(
@@ -431,21 +419,6 @@ def test_garbage_is_refused_and_the_plant_stays_as_it_was(what: str) -> None:
 def test_no_new_plant_while_one_runs() -> None:
     desk = PlantDesk(scenario())
     assert desk.download(scenario().to_bytes()) == Abort.STATE
-
-
-def test_a_plant_without_a_number_says_so_and_stops() -> None:
-    """Division by zero far out: EMCY 0x6000, no made-up feedback, and the node lives on."""
-    desk = PlantDesk(scenario())
-    desk.cycle()
-    desk.node.plant.actuator._flat[:] = np.nan
-    before = len(desk.frames(codec.FEEDBACK))
-    desk.send(codec.SYNC)
-    assert desk.emergencies() == [0x6000] and desk.node.device.state is NmtState.PRE_OPERATIONAL
-    assert len(desk.frames(codec.FEEDBACK)) == before
-    desk.nmt(130)
-    desk.nmt(1)
-    desk.k = 0
-    assert desk.cycle()[1] == (0.0, 0, 0)
 
 
 ACTIVE, RESET = CIA408.ladder[-1], CIA408.reset

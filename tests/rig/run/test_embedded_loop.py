@@ -12,9 +12,8 @@ from fdi.trace.trace import Trace
 from plant.run import NoiseStream
 from plant.segments import Array
 from rig.run import bring_up
-from rig.run.embedded_loop import EmbeddedLoop, find_busy_cycles
+from rig.run.embedded_loop import EmbeddedLoop
 from rig.run.runner import Outcome
-from rig.sequences.faults import Late, Noise, Parameter, Plan, Schedule
 
 LOADED = SHORT.replace("main = [", 'load = [{ kind = "ramp", to = 1500, time = 0.3 }]\nmain = [')
 GUARDED = SHORT + 'guards = [{ name = "g", signal = "error", low = -0.5, high = 0.1, unit = "mm", cycles = %d }]'
@@ -99,13 +98,3 @@ def test_a_plant_that_diverges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     trace = Trace.read(tmp_path / "alone", all=True)
     assert np.isnan(trace.xj[200:]).all() and not np.nan_to_num(trace.cor[-50:]).any()
     assert sum(played) > 150
-
-
-def test_python_plays_the_cycles_in_which_a_fault_begins_acts_or_ends() -> None:
-    """A parameter needs Python where it changes, a frame where it is hit, any other fault all the time."""
-    plan = Plan(faults=(Parameter(parameter="filter.clogging", value=0.4, start=0.1, end=0.2, ramp=0.01),
-                        Late(frame="drive", delay=1e-3, start=0.3, end=0.32, every=10),
-                        Noise(signal="xj", value=1e-6, start=0.4, end=0.401)), start=50, stop=500)
-    busy = find_busy_cycles(plan, Schedule(plan, {"filter.clogging": 0.0}))
-    assert busy.tolist() == [*range(149, 162), *range(249, 252), *range(349, 353), *range(359, 363), *range(369, 372),
-                             *range(449, 453)]

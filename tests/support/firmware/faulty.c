@@ -12,12 +12,10 @@
 #include "serve.h"
 
 enum { DRIVE = 0x182, HEARTBEAT = 0x702 };
-enum { CURRENT = 0, CYCLE = 6 }; /* bytes in the drive frame */
 
 static struct controller controller;
 static const char *fault;
 static uint8_t previous[8]; /* drive frame */
-static unsigned drives;     /* sent, that is: computed */
 static int64_t now_ns, start_ns;
 static struct frame start;
 
@@ -26,39 +24,21 @@ static bool has(const char *name)
     return strcmp(fault, name) == 0;
 }
 
-static int32_t current_of(const uint8_t *drive)
-{
-    return (int32_t)(uint32_t)read_bytes(drive + CURRENT, 4);
-}
-
-static void set_current(uint8_t *drive, double counts)
-{
-    write_bytes(drive + CURRENT, (uint32_t)(int32_t)counts, 4);
-}
-
-/* Change a drive frame as the fault does; false: it is not sent. */
-static bool spoil_drive(uint8_t *drive)
+/* Put the last drive frame in place of this one. */
+static void swap_with_previous(uint8_t *drive)
 {
     uint8_t sound[8];
-    const bool is_active = current_of(drive) != 0;
     memcpy(sound, drive, 8);
-    drives++;
-    if (has("late_frame"))
-        memcpy(drive, previous, 8);
-    else if (has("stale_cycle"))
-        write_bytes(drive + CYCLE, read_bytes(drive + CYCLE, 2) - 1, 2);
-    else if (has("nan_current") && is_active && drives > 150)
-        set_current(drive, INT32_MIN); /* what a conversion of NaN gives on x86 */
+    memcpy(drive, previous, 8);
     memcpy(previous, sound, 8);
-    return !(has("missed_cycles") && drives % 50 == 0);
 }
 
 static void send_spoiled(void *context, uint32_t cob_id, const uint8_t *data, uint8_t length)
 {
     uint8_t spoiled[8] = {0};
     memcpy(spoiled, data, length);
-    if (cob_id == DRIVE && length == 8 && !spoil_drive(spoiled))
-        return;
+    if (cob_id == DRIVE && length == 8 && has("late_frame"))
+        swap_with_previous(spoiled);
     if (cob_id == HEARTBEAT && has("no_heartbeat") && data[0] != NMT_INITIALISING)
         return;
     BUS_OUTPUT.send(context, cob_id, spoiled, length);
@@ -98,7 +78,7 @@ int main(int count, char **words)
     const struct output output = {send_spoiled, NULL};
     if (!controller_init(&controller, output))
         return 2;
-    if (has("leaks_state") || has("integral")) { /* with an integral part there is something to leak */
+    if (has("leaks_state")) { /* with an integral part there is something to leak */
         const double gain = 20.0;
         memcpy(&controller.values[OBJECT_2110_02], &gain, sizeof gain);
     }
