@@ -1,7 +1,6 @@
 """Every plant, shipped or a user's: one suite over what it declares; pump-driven ones in closed form; bad files."""
 
 import re
-from collections.abc import Iterator
 from math import factorial
 from pathlib import Path
 
@@ -39,11 +38,7 @@ TEXT = EXAMPLE.read_text()
 ROWS = 300
 
 
-def list_models() -> Iterator[str]:
-    yield from (*list_plants(), str(EXAMPLE))
-
-
-@pytest.fixture(params=list_models(), ids=lambda name: Path(name).stem)
+@pytest.fixture(params=[*list_plants(), str(EXAMPLE)], ids=lambda name: Path(name).stem)
 def model(request: pytest.FixtureRequest) -> Model:
     return load_model(request.param)
 
@@ -56,10 +51,6 @@ def find_command(model: Model) -> np.ndarray:
     return np.ascontiguousarray(whole[max(middle - 5, 0):][:ROWS])
 
 
-def silence(model: Model) -> Model:
-    return model.replace({s.noise: 0.0 for s in model.kind.signals.outputs if s.noise})
-
-
 def test_runs_are_finite_and_repeatable_and_those_of_plain_python(model: Model) -> None:
     com = find_command(model)
     once, again, plain = (simulate(model, com, seed=2, steps=20, fast=fast) for fast in (True, True, False))
@@ -69,7 +60,8 @@ def test_runs_are_finite_and_repeatable_and_those_of_plain_python(model: Model) 
 
 
 def test_lanes_are_single_runs(model: Model) -> None:
-    quiet, com = silence(model), find_command(model)
+    com = find_command(model)
+    quiet = model.replace({s.noise: 0.0 for s in model.kind.signals.outputs if s.noise})
     run = simulate(quiet, com, steps=20)
     whole = np.column_stack([getattr(run, s.name) for s in quiet.kind.signals.columns])
     out = Lanes(quiet, ()).closed_loop(np.empty((3, 0)), com, np.zeros(len(com)))
@@ -196,11 +188,14 @@ def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -
     assert not first.passed and "t = 0.1" in first.text
 
 
-@pytest.mark.parametrize("plant", ["eha", pytest.param("ema", marks=pytest.mark.slow), "new_plant.py"])
-@pytest.mark.parametrize(("kind", "check"), [("sequence", ["check", "my_new.toml"]),
-                                             ("fault", ["check", "my_new.toml"]),
-                                             ("effect", ["effects", "--effects", "my_new.py", "my_new"])])
-def test_a_new_file_passes_its_own_check(kind: str, check: list[str], plant: str, tmp_path: Path,
+CHECK = ("check", "my_new.toml")
+TRIAL = ("effects", "--effects", "my_new.py", "my_new")  # on a shipped plant its own kernels take five seconds
+
+
+@pytest.mark.parametrize(("kind", "check", "plant"), [
+    ("sequence", CHECK, "eha"), ("fault", CHECK, "eha"), pytest.param("effect", TRIAL, "eha", marks=pytest.mark.slow),
+    *((kind, check, "new_plant.py") for kind, check in (("sequence", CHECK), ("fault", CHECK), ("effect", TRIAL)))])
+def test_a_new_file_passes_its_own_check(kind: str, check: tuple[str, ...], plant: str, tmp_path: Path,
                                          monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "new_plant.py").write_text(TEXT)
@@ -393,8 +388,7 @@ def test_the_bench_refuses_it() -> None:
     assert "a sequence of your own" in refuse("run", "--model", "ehs", "--bench", "eha")
 
 
-P = Model().values
-GQ, GP, AJ = P["valve.flow_gain"], P["valve.pressure_gain"], P["jack.area"]
+AJ = Model()["jack.area"]
 
 
 @pytest.mark.parametrize("changes", [{}, {"spool.static_friction": 45.0}, {"filter.clogging": 0.3},

@@ -33,19 +33,11 @@ from studies.bench_mutations import run_trials
 from studies.bus_faults import FAULTS, PHASES, build_bus_faults_report, collect_figures, study_bus_faults
 from studies.hidden_effects import command, hidden, score
 from studies.hidden_effects.truth import SYMBOLS, has_compiler, nominal_symbols, parameter_names, simulate_truth
-from studies.long_recordings import build_long_recordings_report, make_command, record_unit
+from studies.long_recordings import make_command, record_unit
 from studies.peers import grid_runs, many_runs, rivals
 from studies.robustness.disturb import disturb_run, find_processes, judge_verdict
-from studies.robustness.fuzz import invent_frames
 from studies.robustness.run_study import build_robustness_report, run_study
 from studies.servo_ledger import fit_directional_gains
-
-
-def test_cost_of_recordings() -> None:
-    """The table names length, CPU time and memory of each command."""
-    costs = [{"command": "compare", "length": 1800.0, "cpu": 46.7, "memory": 1_350_000_000, "verdict": "WITHIN_FLOOR"}]
-    report = build_long_recordings_report({"seed": 0, "cpus": 2, "costs": costs})
-    assert report.sentence == "1800 s of recording at 1 kHz take 1.35 GB at most."
 
 
 def test_recordings_repeat_by_their_seed() -> None:
@@ -80,19 +72,6 @@ def test_either_fault_alone() -> None:
 
 
 DATA = SHARED / "data" / "electrohydrostatic_rig_raw"
-
-
-@pytest.mark.parametrize("delay", [0, 3])
-def test_it_finds_gains_and_delay_exactly(delay: int) -> None:
-    rng = np.random.default_rng(1)
-    error = rng.integers(-100, 100, 5000).astype(float)
-    side = np.roll(np.sign(error), delay)
-    answer = np.where(side > 0.0, 10.0, 7.0) * np.roll(error, delay)
-    error, answer, side = error[:-delay or None], answer[:-delay or None], side[:-delay or None]
-    found = fit_directional_gains(error[delay:], answer[delay:], side[delay:])
-    assert (found.out, found.back, found.delay) == pytest.approx((10.0, 7.0, delay))
-    assert found.residual == pytest.approx(0.0, abs=1e-9) and found.exact == 1.0
-    assert found.asymmetry == pytest.approx(-0.3)
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no measurements at {DATA.name}: they belong to others")
@@ -192,14 +171,6 @@ def test_every_rival_makes_the_same_map() -> None:
 LIMIT = 600.0  # s: it only ends a test that hangs
 
 
-def test_a_seed_gives_the_same_frames_again() -> None:
-    frames = list(invent_frames(5000, 3))
-    assert frames[:500] == list(invent_frames(500, 3)) != list(invent_frames(500, 4))
-    assert 400 < sum(frame.cob_id == 0x080 and not frame.data for frame in frames) < 900
-    assert {len(frame.data) for frame in frames} == set(range(9))
-    assert len({frame.cob_id for frame in frames}) > 300
-
-
 @pytest.mark.parametrize(("victim", "seed"), [("plant", 13), ("rig", 15)])  # soon after the first cycles
 def test_a_killed_process(victim: str, seed: int) -> None:
     trial = disturb_run("kill", victim, seed, limit=LIMIT)
@@ -277,16 +248,6 @@ def test_the_simulator_leaves_sensor_noise_of_an_independent_trace(case: str, na
     assert rms(run.xj - trace["xj"]) == pytest.approx(2e-6, rel=0.05)
     assert rms(run.p12 - trace["p12"]) == pytest.approx(2e4, rel=0.03)
     assert rms(run.xs - trace["xs"]) == pytest.approx(1e-6, rel=0.03)
-
-
-@needs_simulator
-@shared
-def test_commands_and_loads_are_those_of_the_practice_traces() -> None:
-    trace = read(PRACTICE / "04/est.csv.gz")
-    assert np.abs(command.preflight_command() - trace["com"]).max() < 1e-10
-    for name in ("est", "holdout"):
-        load = read(PRACTICE / f"04/{name}.csv.gz")["load"]
-        assert (command.known_load_profile(len(load), 6000.0) == load).all()
 
 
 @needs_simulator

@@ -26,15 +26,13 @@ def cogging(x, s, u, p):
     return x + p.cogging.force * sin(2.0 * pi * s.jack_position / p.cogging.length)
 '''
 
-STIFF = HEAD + '''
-SCALE = {scale}
-
+SPRING = HEAD + '''
 class Spring(NamedTuple):
     stiffness: Annotated[float, Quantity("N/m")] = 0.0
 
 @effect("load", Spring, law="FR = FR + K XJ")
 def spring(x, s, u, p):
-    return x + SCALE * p.spring.stiffness * s.jack_position
+    return x + p.spring.stiffness * s.jack_position
 '''
 
 MEMORY = "from __future__ import annotations\n" + HEAD + '''

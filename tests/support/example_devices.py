@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import canopen
 import cantools
 from c_device import CNode, run_program, skip_without_compiler
 from canopen.profiles.p402 import BaseNode402, State402
-from embedded_network import EmbeddedNetwork
 from node_bench import MS, Desk
 from places import ROOT
 
@@ -45,10 +45,18 @@ class Answer(NamedTuple):
 class DriveDesk(Desk):
     """A drive opposite the canopen library, cycle by cycle."""
 
-    def __init__(self, number: int = 5) -> None:
-        super().__init__(lambda send: make_drive(send, number))
-        self.network = EmbeddedNetwork(self._bus, lambda: self.t_ns)
-        self.remote = BaseNode402(number, str(DRIVE / "drive.eds"))
+    def __init__(self) -> None:
+        super().__init__(make_drive)
+        self.network: Any = canopen.Network()
+        send = self._bus.attach(
+            lambda frame: self.network.notify(frame.cob_id, bytearray(frame.data), frame.t_ns / 1e9))
+
+        def send_message(can_id: int, data: bytes, remote: bool = False) -> None:
+            send(can_id, bytes(data))
+            self._bus.deliver(self.t_ns)
+
+        self.network.send_message = send_message
+        self.remote = BaseNode402(5, str(DRIVE / "drive.eds"))
         self.network.add_node(self.remote)
         self.sdo = self.remote.sdo
 

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from enum import IntEnum
-from functools import cache
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +22,7 @@ from refusals import catch_refusal
 from rich.console import Console
 from synthetic_run import record_run
 
-from fdi.comparison.compare import Comparison, compare
+from fdi.comparison.compare import compare
 from fdi.discovery.detectable import Blind
 from fdi.discovery.explain import Marks
 from fdi.discovery.explain_runs import Answer, Candidate
@@ -565,18 +564,6 @@ def test_the_report_of_a_model_update_in_all_forms(tmp_path: Any) -> None:
 OFFSETS = {"xj": 0.0, "p12": 3e5, "xs": 8e-6}  # of the sensors; XJ is drawn to the measurement, so it has none
 
 
-@cache
-def record_offset() -> Trace:
-    """A trace whose sensors of P12 and XS show too much, so that measured minus model is positive."""
-    trace = record_plant(com=SHORT, seed=2)
-    return trace.with_columns({name: trace.column(name) + size for name, size in OFFSETS.items()})
-
-
-@cache
-def compare_offset() -> Comparison:
-    return compare(record_offset(), Model())
-
-
 def read_lines(drawing: str) -> list[list[np.ndarray]]:
     """The values of the lines over time of each panel of a figure."""
     return [[np.asarray(line.get_ydata()) for line in ax.lines if len(line.get_ydata()) > 2]
@@ -584,7 +571,10 @@ def read_lines(drawing: str) -> list[list[np.ndarray]]:
 
 
 def test_a_comparison_shows_measured_minus_model() -> None:
-    found = compare_offset()
+    """Of a trace whose sensors of P12 and XS show too much, so that measured minus model is positive."""
+    trace = record_plant(com=SHORT, seed=2)
+    biased = trace.with_columns({name: trace.column(name) + size for name, size in OFFSETS.items()})
+    found = compare(biased, Model())
     panels = read_lines(compare_report.draw_overview(found))
     scales = {"xj": 1e6, "p12": 1e-5, "xs": 1e6}
     for number, (name, scale) in enumerate(scales.items()):

@@ -266,8 +266,8 @@ def assert_refused(*commands: tuple[object, ...]) -> None:
 def test_a_small_log_does_not_take_gigabytes(tmp_path: Path) -> None:
     kinds = ("attachment", "record", "one chunk", "lying chunk", "many chunks", "one chunk indexed often")
     logs = [write_bomb(tmp_path / f"{kind}.mcap", kind) for kind in kinds]
-    for log in logs:  # messages by topic, and one by one
-        assert_refused(("report", log), ("export", log, "--out", tmp_path / "x.log"))
+    assert_refused(*(("report", log) for log in logs))  # messages by topic, and one by one
+    assert_refused(*(("export", log, "--out", tmp_path / "x.log") for log in logs))
     for said in rig_with_little_memory(*(("recover", log) for log in logs)):  # keeps what is sound, if there is any
         assert said.status in (0, 2), said
 
@@ -279,12 +279,6 @@ def test_a_packed_table_does_not_take_gigabytes(tmp_path: Path) -> None:
     long_table.write_bytes(gzip.compress(b"t,com,xj,cor\n" + row))
     assert max(long_line.stat().st_size, long_table.stat().st_size) < 1_000_000
     assert_refused(("report", long_line), ("simulate", "--command", long_line), ("report", long_table))
-
-
-def test_numbers_of_cycles_do_not_take_gigabytes(tmp_path: Path) -> None:
-    (tmp_path / "t.csv").write_text("t,com,xj,cor\n" + "".join(f"{0.001 * k:.3f},0,0,0\n" for k in range(500)) +
-                                    "4000000,0,0,0\n")
-    assert "gaps that leave" in catch_refusal(Trace.read, tmp_path / "t.csv")
 
 
 def test_brackets_do_not_end_the_program(tmp_path: Path) -> None:

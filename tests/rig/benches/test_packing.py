@@ -67,21 +67,6 @@ def test_alive_counter_and_checksum(checksum: str, data_id: int, data_ids: tuple
         assert read(received, FRAMES_AT, 8, 0) == WRONG_CHECKSUM and check_guards(spec, broken, last)[0] == "checksum"
 
 
-def test_a_multiplexed_frame_is_known_by_its_selector(compiled: tuple) -> None:
-    """Frames with one identifier are told apart by the value of the selector; another value is of no frame."""
-    pages = [FrameSpec(name=f"page {page}", identifier=5, length=2, sender=Role.CONTROLLER, fields=(
-        Field(name="selector", lowest=0, length=4, fixed=page), Field(name=f"value{page}", lowest=8, length=8)))
-        for page in (1, 3)]
-    layout = make_layout(pages, ["value1", "value3"], Role.RIG)
-    for page, value in ((1, 10), (3, 30)):
-        write_payload(layout, bytes((page, value)))
-        at = compiled[2](layout, 5)
-        assert compiled[1](layout, at, 2, 0) == ACCEPTED
-    assert layout.doubles[layout.words[VALUES_AT]:].tolist() == [10.0, 30.0]
-    write_payload(layout, bytes((2, 0)))
-    assert compiled[2](layout, 5) == -1
-
-
 def test_pages_of_a_message_have_one_alive_counter(compiled: tuple) -> None:
     """Of a multiplexed message the sender counts all frames, and the receiver takes the next one of any page."""
     pages = [FrameSpec(name=f"page {page}", identifier=5, length=2, sender=Role.RIG, fields=(

@@ -18,7 +18,7 @@ from fdi.trace.trace import CLEANUP, Trace
 from plant import Model, load_model
 from plant.effects import CATALOGUE
 from rig import doctor
-from rig.cli import commands, completion
+from rig.cli import commands
 from rig.cli.command_list import COMMANDS, find_work
 from rig.cli.commands.list import KINDS
 from rig.cli.main import FIRST_STEPS
@@ -239,10 +239,6 @@ def test_the_answer_to_the_shell(line: str, expected: set[str], tmp_path: Path) 
     subprocess.run([sys.executable, "-m", "rig.cli.main"], env=environment, cwd=tmp_path, check=False,
                    capture_output=True, timeout=60)
     assert {word.strip() for word in answer.read_text().split("\n")} == expected
-
-
-def test_completion_knows_all_parameters() -> None:
-    assert {name.rstrip("=") for name in completion.list_parameters()} >= set(Model().values)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from changed_logs import change_log
-from effect_files import HEAD
+from effect_files import SPRING
 from refusals import catch_refusal
 from rig_command import SHORT, answer, job, play, refuse, rig
 from synthetic_run import record_run
@@ -165,14 +165,7 @@ def test_a_ramp_and_a_step_keep_their_seconds(period: float, tmp_path: Path) -> 
     assert run["xj"][-1] == pytest.approx(2.5e-3, abs=50e-6)
 
 
-CODE = (HEAD + '''
-class Spring(NamedTuple):
-    stiffness: Annotated[float, Quantity("N/m")] = 0.0
-
-@effect("load", Spring, law="FR = FR + K XJ")
-def spring(x, s, u, p):
-    return x + p.spring.stiffness * s.jack_position
-
+CODE = (SPRING + '''
 with open("ran", "a") as out:
     out.write("ran ")
 ''').encode()

@@ -106,11 +106,6 @@ def test_it_leaves_out_other_frames(flags: dict[str, bool]) -> None:
     assert unpack(pack_message(message)) is None
 
 
-@given(st.binary(max_size=300))
-def test_foreign_bytes_are_no_frame_unless_python_can_reads_one(data: bytes) -> None:
-    unpack(data)
-
-
 @given(frames, st.integers(0, 200), st.integers(0, 255))
 def test_a_damaged_datagram_gives_at_most_a_frame_of_eight_bytes(frame: tuple[int, bytes], at: int, byte: int) -> None:
     """Undefined behaviour ends the process, because the library is built with its sanitizer."""

@@ -22,7 +22,7 @@ from plant import Model, RigError, load_model, simulate
 from plant.lanes import Lanes
 from plant.tables import Place
 from rig.fmi import foreign
-from rig.fmi.export import export_fmu, find_exponents
+from rig.fmi.export import export_fmu
 from rig.fmi.foreign import Port, Unit, find_variable, read_description
 
 fmpy = pytest.importorskip("fmpy")
@@ -218,21 +218,6 @@ def test_wrong_calls_are_refused_and_the_unit_goes_on(make_instance: Callable[..
     assert is_refused(step, 1e-3, 1e-3)
 
 
-def test_messages_reach_the_logger(unit: Callable[[str, str], Path], tmp_path: Path) -> None:
-    from fmpy.fmi3 import FMU3Slave, fmi3LogMessageCallback
-
-    path = unit("nominal", "3")
-    said: list[str] = []
-    described = fmpy.read_model_description(str(path))
-    slave = FMU3Slave(guid=described.guid, unzipDirectory=fmpy.extract(str(path), str(tmp_path)),
-                      modelIdentifier=described.coSimulation.modelIdentifier, instanceName="unit")
-    slave.instantiate(logMessage=fmi3LogMessageCallback(lambda _e, _s, _c, text: said.append(text.decode())))
-    with pytest.raises(Exception, match="fmi3DoStep"):
-        slave.doStep(0.0, 1e-3)
-    assert said == ["fmi3DoStep: not allowed in this state of the unit"]
-    slave.freeInstance()
-
-
 # ---------------------------------------------------------------------------------- the command
 
 
@@ -278,12 +263,6 @@ def root(x, s, u, p):
 def test_without_a_compiler_one_line_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(shutil, "which", lambda name: None)
     assert "a C compiler to link the FMU with" in refuse("export", "--fmu", tmp_path / "a.fmu")
-
-
-def test_units_are_split_into_si_units() -> None:
-    assert find_exponents("N m s2/m") == {"kg": 1, "m": 1}
-    assert find_exponents("m3/s/Pa") == {"kg": -1, "m": 4, "s": 1}
-    assert find_exponents("m rms") == {"m": 1} and find_exponents("1") == {} and find_exponents("raw/m") is None
 
 
 SLIDE = """

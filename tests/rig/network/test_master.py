@@ -84,7 +84,6 @@ def test_bring_up_and_some_cycles(wire: Wire) -> None:
         states = [state for n, state in seen if n == node]
         assert 0 in states and states[-2:] == [5, 127]  # a heartbeat may come before the boot-up
     assert master.list_errors() == [] and not master.hears_rival(0.0)
-    assert master.is_present(PLANT, 60.0) and master.is_present(CONTROLLER, 60.0)
 
 
 def test_a_rig_that_stood_still_knows_how_long_answers_may_have_waited(wire: Wire) -> None:

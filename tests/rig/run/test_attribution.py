@@ -97,12 +97,6 @@ def test_who_is_to_blame_for_a_slow_start(controller: StartTime | None, plant: S
         assert cause is not None and cause.is_lateness and cause.text == found[1]
 
 
-def test_a_run_without_trouble() -> None:
-    found = Script().attribute()
-    assert found.cause is None and found.judged.all() and not found.affected.any()
-    assert set(found.invalid.values()) == {0} and found.overruns.sum() == 0
-
-
 KILLED = "its process was ended by SIGKILL"
 LATE_SYNC = ("late", 300, 1.9e-3)
 MISSED = ("report", 604.0, PLANT, 0x8250)

@@ -37,10 +37,6 @@ def play_sequence(name: str, folder: Path, **settings: object) -> Outcome:
     return play(replace(job(**settings), sequence=load_sequence(name)), folder)  # type: ignore[arg-type]
 
 
-def find_failures(outcome: Outcome) -> set[str]:
-    return {check.name for check in outcome.checks if not check.passed}
-
-
 @pytest.mark.parametrize("name", [*LOSSES, "reset_in_mid_run"])
 def test_the_reference_firmware_reacts_and_recovers(tmp_path: Path, name: str) -> None:
     outcome = play_sequence(name, tmp_path)
@@ -88,4 +84,4 @@ def test_a_controller_that_does_not_react_fails(tmp_path: Path, monkeypatch: pyt
                                                 patched: tuple[object, str], value: object, failed: set[str]) -> None:
     monkeypatch.setattr(*patched, value)
     outcome = play_sequence(name, tmp_path)
-    assert outcome.verdict == "FAIL" and failed <= find_failures(outcome)
+    assert outcome.verdict == "FAIL" and failed <= {check.name for check in outcome.checks if not check.passed}

