@@ -171,9 +171,9 @@ def test_every_rival_makes_the_same_map() -> None:
 LIMIT = 600.0  # s: it only ends a test that hangs
 
 
-@pytest.mark.parametrize(("victim", "seed"), [("plant", 13), ("rig", 15)])  # soon after the first cycles
-def test_a_killed_process(victim: str, seed: int) -> None:
-    trial = disturb_run("kill", victim, seed, limit=LIMIT)
+def test_a_killed_process() -> None:
+    """The plant, soon after the first cycles."""
+    trial = disturb_run("kill", "plant", 13, limit=LIMIT)
     assert trial.problems == () and trial.cycles > 0, trial
 
 
@@ -207,10 +207,10 @@ def test_the_study_as_a_whole() -> None:
 
     Some of the changed logs are still good enough to be read; the others are refused, and nothing else happens.
     """
-    figures = run_study(2000, 0, 0.01, 1, "builtin", lambda stage, share: None)
+    figures = run_study(1000, 0, 0.01, 1, "builtin", lambda stage, share: None)
     assert figures["problems"] == [] and figures["soak"]["verdicts"] == {"PASS": figures["soak"]["runs"]}
-    assert [count["works"] and count["frames"] >= 2000 for count in figures["frames"]] == [True] * 3
-    assert min(count["answers"] for count in figures["frames"][:2]) > 40
+    assert [count["works"] and count["frames"] >= 1000 for count in figures["frames"]] == [True] * 3
+    assert min(count["answers"] for count in figures["frames"][:2]) > 20
     assert max(figures["datagrams"]["growth"].values()) < 16 << 20
     accepted, refused = figures["logs"]["accepted"], figures["logs"]["refused"]
     assert accepted["recover"] > 0 and accepted["report"] + refused["report"] == 2

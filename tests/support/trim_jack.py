@@ -2,7 +2,6 @@
 from plant.declare import (
     Annotated,
     Any,
-    Fault,
     Hold,
     NamedTuple,
     Plant,
@@ -134,8 +133,6 @@ PLANT = Plant(
              Signal("hinge", "Mh", "N m", "hinge moment", "load", largest=1e4)),
     parameters=(Rotor, Gearing, Housing, Controller), state=State, step=step, measure=measure, moves=("turned",),
     control=control, control_memory=Memory,
-    faults=(Fault("seal", "swollen seal", "tight_seal.torque", (0.0, 0.1), 0.01, 0.04, "our choice"),
-            Fault("magnet", "loss of magnetisation", "weak_magnet.share", (0.0, 0.5), 0.05, 0.2, "our choice")),
     profile=(Hold(time=0.2), Step(to=0.02, time=0.6), Ramp(to=-0.03, time=1.0),
              Sine(amplitude=0.02, frequency=1.0, time=1.0), Ramp(to=0.0, time=0.7), Hold(time=0.4)),
 )

@@ -192,6 +192,7 @@ class TestServices:
         counts = [int.from_bytes(desk.upload(0x2211, sub), "little") for sub in range(1, 10)]
         assert counts[:5] == [1, 0, 22, 0, 0]
         assert abs(counts[7] - int((record.done - record.sync).max()) // 1000) <= 1
+        assert counts[8] & 1  # compiled
 
     @only_udp
     def test_a_short_drive_is_an_emergency_and_counts_as_missing(self, desk: BusDesk) -> None:

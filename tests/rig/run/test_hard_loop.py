@@ -29,7 +29,7 @@ from rig.network.raw_bus import RawBus
 from rig.network.udp import PORT, Turn
 from rig.nodes.scenario import Scenario
 from rig.recorder import Signals
-from rig.run.hard_loop import HardLoop
+from rig.run.hard_loop import HardLoop, compile_cycle
 from rig.run.loop import CycleInput, CycleLoop
 from rig.sequences.faults import (
     BusOff,
@@ -217,6 +217,9 @@ def test_rows_and_log(bus_kind: str, realtime: bool) -> None:
             assert one.logged(cob_id) == [frame.data for frame in one.nodes.heard if frame.cob_id == cob_id] != []
         drives = one.logged(codec.DRIVE)
         assert drives == [codec.pack_drive(k * 1e-8, 15, k) for k in range(len(drives))]
+        compile_cycle.cache_clear()
+        compile_cycle()
+        assert compiled.buffer  # the listener hears
 
 
 @only_udp

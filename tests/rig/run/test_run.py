@@ -322,7 +322,7 @@ def test_what_a_rig_has_started_ends_with_it_when_it_is_killed(code: str) -> Non
 def test_an_external_node_that_dies_is_named_and_the_run_ends(tmp_path: Path) -> None:
     """In lockstep every cycle without answers would wait; the sequence has a minute to go, and wants the safe state.
 
-    Nobody tells the rig that the node has ended (of its own nodes the system does: test_live.py). The first cycle
+    Nobody tells the rig that the node has ended (of its own nodes the system does: test_view.py). The first cycle
     without an answer waits; then the node is known to be gone, and no other cycle waits. Without that knowledge three
     cycles would wait until the other node reports missing frames, and clean-up would wait after them.
     """
