@@ -207,10 +207,10 @@ def test_the_study_as_a_whole() -> None:
 
     Some of the changed logs are still good enough to be read; the others are refused, and nothing else happens.
     """
-    figures = run_study(1000, 0, 0.01, 1, "builtin", lambda stage, share: None)
+    figures = run_study(2000, 0, 0.01, 1, "builtin", lambda stage, share: None)
     assert figures["problems"] == [] and figures["soak"]["verdicts"] == {"PASS": figures["soak"]["runs"]}
-    assert [count["works"] and count["frames"] >= 1000 for count in figures["frames"]] == [True] * 3
-    assert min(count["answers"] for count in figures["frames"][:2]) > 20
+    assert [count["works"] and count["frames"] >= 2000 for count in figures["frames"]] == [True] * 3
+    assert min(count["answers"] for count in figures["frames"][:2]) > 40
     assert max(figures["datagrams"]["growth"].values()) < 16 << 20
     accepted, refused = figures["logs"]["accepted"], figures["logs"]["refused"]
     assert accepted["recover"] > 0 and accepted["report"] + refused["report"] == 2
