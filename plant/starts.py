@@ -16,6 +16,7 @@ from plant.segments import Array
 
 VISIBLE = (3.0, 30.0, 300.0)  # noise levels that starts are to show
 SHAPES = (1.0, 0.4, 2.5)  # times the usual value, for a parameter that does nothing alone
+QUARTERS = [0.5 * np.pi * turns for turns in range(-1, 4)]  # of a turn, rad: starts of a phase
 DECADES = (-15, 13)  # where the size of a parameter without a hint is looked for
 ANCHOR = 2.0  # 1/s
 WITHOUT_SIZE = ("1", "s", "Hz", "rad")  # units of parameters that are alike in plants of any size
@@ -51,9 +52,10 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None, plant
              if (sizes := _find_sizes(effect, name, off, command, load, plant))}
     found = [usual | {name: size} for name, sizes in sized.items() for size in sizes]
     for name, value in usual.items():
-        if name not in sized and (value or parse_hint(effect.parameters[name])):
-            shapes = parse_hint(effect.parameters[name]) or [
-                _clip_to_range(effect.parameters[name], factor * value) for factor in SHAPES]
+        if name not in sized:
+            quantity = effect.parameters[name]
+            usually = QUARTERS if quantity.unit == "rad" else [factor * value for factor in SHAPES]
+            shapes = parse_hint(quantity) or [_clip_to_range(quantity, x) for x in usually]
             found = [start | {name: shape} for start in found for shape in dict.fromkeys(shapes)]
     return tuple(found)
 

@@ -902,7 +902,8 @@ class JointSearch:
         """A unit with the best sizes of the faults and no other deviation: an effect may lead fits astray."""
         free = self.list_unknowns()
         x = choose_start(self.problem, free, list_coarse_starts(self.problem.faults))
-        return linearise_across(self.problem, free, x, guess_covariance(free), self.problem.alone.find_flat(free, x))
+        return linearise_across(self.problem, replay_fit(self.problem, start_fit(free, x), x),
+                                self.problem.alone.find_flat(free, x))
 
     def finish(self, found: Sequence[Hypothesis]) -> list[Hypothesis]:
         """The likely ones to the end with finer steps, under the noise that the best one leaves."""

@@ -10,20 +10,20 @@ the thresholds.
 | base | always | fits the tolerances; learns the noise if at most {RESIDUAL_IS_NOISE:g} floors are left, and fits with a population if the mean square is above {WHITE_SQUARE_POOR:g} |
 | first effect | always | fits the eight effects that promise to gain more than {GAIN_WORTH_A_FIT:g}, in stages, the best two to the end; the base again from there, if the best gains more than {GAIN_SEEN:g} |
 | noise | the base leaves more than noise | learns the noise under the best first effect; fits the base and the best four again |
-| second effect | the first leaves more than noise and gains more than {GAIN_SEEN:g} | fits the four most promising effects beside each of the best two |
+| second effect | the first leaves more than noise and gains more than {GAIN_SEEN:g}, or only noise with far tolerances | fits the four most promising effects beside each of the best two |
 | third effect | so does the second, which also removes {FURTHER_EFFECT_SHARE:g} of the excess cost, and leaves at most {ERROR_PARTLY_EXPLAINED:g} of the excess on the held-out run | the same |
 | finer steps | the best leaves at most {RESIDUAL_IS_NEAR_NOISE:g} floors | asks whether 20 steps a cycle leave only noise |
 | missed stops | that holds for the first effect, and the second gains at most {GAIN_SEEN:g} | fits the first with a population |
 | more noise | the best leaves more than noise, or its tolerances are those of {TOLERANCES_FAR_SHARE:.2%} of healthy units | searches again from a nominal unit with 30 and 6 times the noise |
 | other valleys | two effects remove {FURTHER_EFFECT_SHARE:g} of the excess cost and still leave more than noise | fits the best two pairs with a population |
-| number of effects | always | keeps the effects that gain more than {GAIN_SEEN:g}, of several only those whose removal costs more than {GAIN_CONVINCES:g}; or that gain {GAIN_DOUBTFUL:g} on the run and alone leave only noise |
+| number of effects | always | keeps the effects that gain more than {GAIN_SEEN:g}, of several only those whose removal costs more than {GAIN_CONVINCES:g} or leaves far tolerances; or that gain {GAIN_DOUBTFUL:g} on the run and alone leave only noise |
 | last fits | always | finishes the base and the best four with finer steps, on the repeats too; begins again those of the best two that leave a mean square above {WHITE_SQUARE_POOR:g} or have far tolerances; with a population these and the base, if they leave only noise and still such a mean square or far tolerances, unless the solver errs |
 | intervals | the base leaves only noise | drops effects whose 95 % interval holds the off value |
 | small gain | the gain is below {GAIN_DOUBTFUL:g} | fits the base again from there; a single effect that then gains at most {GAIN_SEEN:g} begins again from the base |
 | rivals | the best one leaves only noise | begins the others that do so too, and effects whose signature has a cosine of {LOOKS_ALIKE:g} with its own, from its tolerances |
 | small gain, again | the same | drops such an effect |
 | solver | half the step changes more than {SOLVER_ERROR_SHARE:g} floors | finishes again with 50 steps a cycle |
-| intervals, again | one of several effects has such an interval | leaves it out, if the others leave only noise |
+| intervals, again | the squares of the sizes of one of several effects are below {GAIN_CONVINCES:g} variances | leaves it out, if the others leave only noise; one without such an interval not where they then have far tolerances |
 | whole recording | only an excerpt was fitted | judges on all rows |
 | left-out rows | the replay has an observer | judges on all rows that hang on no stop, as on a held-out run |
 | held-out run | there is one | rejects an effect that leaves more than {RESIDUAL_HELD_OUT:g} floors in the typical block; up to {HELD_OUT_UNDECIDED_SHARE:g} of the run may be undecided |
@@ -43,7 +43,7 @@ import numpy as np
 
 from fdi.discovery.detectable import Blind, find_hidden_effects
 from fdi.discovery.residual_pattern import is_periodic_in_position
-from fdi.discovery.search import FINE, TRUEST, Hypothesis, Search, Sensitivity
+from fdi.discovery.search import FINE, Hypothesis, Search, Sensitivity
 from fdi.estimation.fit import Problem, compute_typical_rms, fit_unknowns, replay_fit
 from fdi.estimation.replay import (
     answer_readings,
@@ -169,7 +169,7 @@ def _search_levels(search: Search, base: Hypothesis, progress: Progress) -> list
             tried = _search_other_valleys(search, levels, tried)
         levels.append(tried)
         before = levels[-2][0]
-        if done or tried[0].is_at_floor or measure_gain(before, tried[0]) <= GAIN_SEEN:
+        if ((done or tried[0].is_at_floor) and not tried[0].is_far) or measure_gain(before, tried[0]) <= GAIN_SEEN:
             break
         # the first effect is no such way: two large effects each help little alone
         if count > 1 and not (takes_fair_share(search.problem, before, tried[0])
@@ -227,12 +227,13 @@ def measure_gain(parent: Hypothesis, h: Hypothesis) -> float:
 
 
 def helps_explain(before: Hypothesis, after: Hypothesis, least: float) -> bool:
-    """Whether a further effect gains more than `least`, or leaves only noise where more was left.
+    """Whether an effect gains more than `least`, or leaves only noise where more was left or tolerances were far.
 
     Of a repeat even the right effect may miss another stop, which costs hundreds.
     """
-    is_first_at_floor = after.is_at_floor and not before.is_at_floor
-    return measure_gain(before, after) > least or (is_first_at_floor and before.cost - after.cost > GAIN_DOUBTFUL)
+    is_nearer = before.is_at_floor and before.is_far and not after.is_far
+    is_first_at_floor = not before.is_at_floor and before.cost - after.cost > GAIN_DOUBTFUL
+    return measure_gain(before, after) > least or (after.is_at_floor and (is_nearer or is_first_at_floor))
 
 
 def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, progress: Progress) -> Explanation:
@@ -246,7 +247,7 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
         base = search.finish_hypothesis(base, 2)
         close = [search.finish_hypothesis(h, n) for h, n in zip(close, (6, 2), strict=False)]
         base, close = _doubt_small_gain(search, base, close, depth)
-    close = leave_out_unshown(search, close)
+    close = leave_out_unneeded(search, close)
     depth = len(close[0].effects) if close else 0
     tried = [] if len(levels) == 1 else levels[depth or -1]
     others = [h for h in tried if h.effects not in [c.effects for c in close]]
@@ -280,8 +281,9 @@ def _choose_depth(search: Search, levels: list[list[Hypothesis]]) -> int:
     """How many effects the last fits have; `_prune_level` may put a better hypothesis first in that level."""
     firsts = [level[0] for level in levels]
     depth = max((i for i in range(1, len(levels)) if helps_explain(firsts[i - 1], firsts[i], GAIN_SEEN)
-                 and (i == 1 or takes_fair_share(search.problem, firsts[i - 1], firsts[i]))), default=0)
-    if depth > 1 and firsts[1].is_at_floor and measure_gain(firsts[1], firsts[depth]) <= GAIN_CONVINCES:
+                 and (i == 1 or firsts[i - 1].is_at_floor
+                      or takes_fair_share(search.problem, firsts[i - 1], firsts[i]))), default=0)
+    if depth > 1 and firsts[1].is_at_floor and not helps_explain(firsts[1], firsts[depth], GAIN_CONVINCES):
         depth = 1
     if depth == 0 and len(levels) > 1 and (levels[0][0].is_far or not levels[0][0].is_at_floor):
         depth = 1  # a unit that is hardly healthy, or more than noise left: only fits taken to the end tell what helps
@@ -358,26 +360,34 @@ def _doubt_small_gain(search: Search, base: Hypothesis, close: list[Hypothesis],
     return base, [] if depth == 1 and measure_gain(base, close[0]) <= GAIN_SEEN else close
 
 
-def leave_out_unshown(search: Search, close: list[Hypothesis]) -> list[Hypothesis]:
-    """The hypotheses, best first; the best of several effects without one that may be off, if noise alone is left then.
+def leave_out_unneeded(search: Search, close: list[Hypothesis]) -> list[Hypothesis]:
+    """The hypotheses, best first; the best of several effects without one that is not needed, if noise is left then.
 
-    A further effect can help a fit out of a local minimum and then have no size itself.
+    A further effect can help a fit out of a local minimum, past an impact or over steps of the solver that the last
+    fits refine, and then have next to no size itself. One that spares the unit far tolerances is needed.
     """
-    if not close or len(close[0].effects) < 2 or all(shows_effect(search.model, close[0], e) for e in close[0].effects):
+    def are_shown(h: Hypothesis, least_sd: float = INTERVAL_95_SD) -> bool:
+        return all(shows_effect(search.model, h, e, least_sd) for e in h.effects)
+
+    if not close or len(close[0].effects) < 2 or are_shown(close[0], GAIN_CONVINCES**0.5):
         return close
     fewer = search.finish_hypothesis(search.drop_each_effect(close[0])[0])
-    return [fewer, *(h for h in close if not set(fewer.effects) <= set(h.effects))] if fewer.is_at_floor else close
+    more = [h for h in close if set(fewer.effects) <= set(h.effects)]
+    needed = [h for h in more if fewer.is_far and not h.is_far and are_shown(h)]
+    if not fewer.is_at_floor or close[0] in needed:
+        return close
+    return [*needed, fewer, *(h for h in close if h not in more)]
 
 
-def shows_effect(model: Model, h: Hypothesis, effect: str) -> bool:
-    """Whether the 95 % interval of a parameter of an effect leaves out its off value.
+def shows_effect(model: Model, h: Hypothesis, effect: str, least_sd: float = INTERVAL_95_SD) -> bool:
+    """Whether a parameter of an effect is so many standard deviations from its off value, by default those of 95 %.
 
-    If none does, the fit is better only by a stop that it met by chance.
+    If none is, the fit is better only by a stop that it met by chance.
     """
     entry = model.find_effect(effect)
     values = h.fit.values
-    return any(abs(values[name] - entry.off.get(name, model.nominal.get(name, 0.0)))
-               > INTERVAL_95_SD * h.fit.spread(name) for name in entry.fitted)
+    return any(abs(values[name] - entry.off.get(name, model.nominal.get(name, 0.0))) > least_sd * h.fit.spread(name)
+               for name in entry.fitted)
 
 
 def sort_by_cost(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
@@ -469,7 +479,7 @@ def judge_left_out_rows(search: Search, h: Hypothesis, floor: Mapping[str, float
     """
     if search.model.kind.correct is None:
         return h
-    problem = search.make_problem(search.run, TRUEST)
+    problem = search.make_problem(search.run, search.finest)
     judged = _judge_run(problem, problem.compute_residuals(h.fit.free, h.fit.x[None])[0], h, floor)
     return h if judged.holds else replace(h, ratio={s: max(x, judged.decided.get(s, 0.0) / floor[s])
                                                     for s, x in h.ratio.items()})

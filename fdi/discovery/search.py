@@ -67,7 +67,7 @@ from plant.threads import R, T, count_threads, map_together
 FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage
 FINE = 20  # steps a cycle of the last fits
-TRUEST = 100  # the same for what the last fits are led by, and of runs that they never saw; slopes do with less
+TRUEST = 100  # at least, for what the last fits are led by, and of runs that they never saw; slopes do with less
 EASED = (30.0, 6.0)  # times the noise, stage by stage
 VALLEY_STAGES = ((30.0, 20), (6.0, 20), (2.0, 20), (1.0, 30))  # times the noise, and generations
 
@@ -149,7 +149,8 @@ class Search:
         bare = silence_readings(model)
         self.problem = Problem(ready, trace, self.noise, workers=self.workers, bare=bare)
         self.repeats = [Problem(ready, r, self.noise, bare=bare) for r in repeats]
-        self.fine: Problem | None = None  # with the steps of last residuals
+        self.finest = max(TRUEST, model.steps)  # steps a cycle of last residuals; a slow cycle has many of the plant's
+        self.fine: Problem | None = None  # with these steps
         self._left_unseen: dict[Hypothesis, Floats] = {}
         self.effects = [e for e in effects if e not in model.effects or model.find_effect(e).base]
         self.stage = NO_STAGE  # of the work: each fit, and each round of a last fit, is a step
@@ -334,7 +335,7 @@ class Search:
     def replay_holdout(self, hypotheses: Sequence[Hypothesis]) -> tuple[Problem, list[Floats]]:
         """The held-out run, and what each hypothesis leaves of it, (s, n) SI; none is replayed twice."""
         assert self.holdout is not None
-        problem = self.make_problem(self.holdout, FINE if is_long(self.holdout) else TRUEST)
+        problem = self.make_problem(self.holdout, FINE if is_long(self.holdout) else self.finest)
         new = [h for h in dict.fromkeys(hypotheses) if h not in self._left_unseen]
         left = map_together(lambda h: problem.compute_residuals(h.fit.free, h.fit.x[None])[0], new, self.workers)
         self._left_unseen.update(zip(new, left, strict=True))
@@ -568,9 +569,9 @@ class Search:
         typical = np.sqrt([np.nanmean(np.minimum(c**2, np.nanpercentile(c**2, 98.0))) for c in change])
         return max(float(t) / floor[s] for s, t in zip(self.problem.trace.outputs, typical, strict=True))
 
-    def refine_steps(self, steps: int, finest: int = TRUEST) -> None:
-        """Finer steps from here on, `finest` where only slopes do not ask for them; fits to the repeats as well."""
-        steps = max(steps, self.problem.steps)
+    def refine_steps(self, steps: int, finest: int | None = None) -> None:
+        """Finer steps from here on, `finest` where not only slopes ask for them; fits to the repeats as well."""
+        steps, finest = max(steps, self.problem.steps), finest or self.finest
         self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.trace for p in self.repeats))
         self.fine = replace(self.problem, steps=finest, _lanes={})
         self.repeats = [replace(p, steps=finest, _lanes={}) for p in self.repeats]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -20,7 +21,6 @@ from fdi.estimation.fit import (
     Fit,
     Free,
     Problem,
-    compute_misfit,
     compute_weights,
     cut_at_bounds,
     find_best_trial,
@@ -426,6 +426,7 @@ L = TypeVar("L", bound=LogProblem)
 PATIENCE = 3  # rounds without a gain, in which the covariance still grows to what it is
 DIRECTION_WIDTH_SD = 3.0  # of a difference, standard deviations
 SMOOTH_WIDTHS = (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0)  # of differences that are compared, standard deviations
+FIRST_WIDTH = 10.0  # of the covariance that a last fit begins with: narrow differences see jumps alone, and stay narrow
 SMOOTH_PASSES = 4  # in which the covariance settles
 WIDEST_VARIANCE, NARROWEST_VARIANCE = 25.0, 1e-14  # variances of scaled unknowns, within which a direction is taken
 
@@ -444,7 +445,10 @@ def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | No
     if now is fit:  # its residuals may be those of other steps, another noise or another place
         now = replay_fit(problem, fit, fit.x)
     _, flat = find_tangents(slopes, now.free, now.x)
-    now = take_steps(problem, now, lambda fit: linearise_along(problem, fit, slopes, flat), rounds, stage)
+    linearise = linearise_along
+    if not problem.model.values.keys() >= BALANCED:  # nobody has declared what no signal shows
+        linearise, now = linearise_smoothly, replace(now, covariance=FIRST_WIDTH**2 * now.covariance)
+    now = take_steps(problem, now, partial(linearise, slopes, flat=flat), rounds, stage)
     return replace(relax_fit(problem, now, find_tangents(slopes, now.free, now.x)[0]), converged=True)
 
 
@@ -461,23 +465,22 @@ def take_steps(problem: Problem, now: Fit, linearise: Callable[[Fit], Fit], roun
     return now
 
 
-def linearise_along(problem: Problem, now: Fit, slopes: Problem, flat: Floats) -> Fit:
+def linearise_along(slopes: Problem, now: Fit, flat: Floats) -> Fit:
     """A fit with its Jacobian by differences along the principal directions of its covariance, and the next covariance.
 
-    The residuals of `now` are those of `problem` at its unknowns; they are not replayed again. The differences are
-    those of `slopes`. Along `flat` (p, k) there is no slope.
+    The residuals stay those of `now`; the differences are those of `slopes`. Along `flat` (p, k) there is no slope.
     """
     x = now.x
     moves = np.array([cut_at_bounds(now.free, x, d) for d in _find_principal(now.covariance).T])
-    if slopes is problem:
-        differences = slopes.compute_white_residuals(now.free, x + moves) - now.white
-    else:
-        near = slopes.compute_white_residuals(now.free, np.vstack([x, x + moves]))
-        differences = near[1:] - near[0]
-    steep = np.asarray(np.linalg.pinv(moves), np.float64) @ differences.reshape(len(x), -1)
-    jacobian = remove_slope(steep.reshape(len(x), *now.white.shape), flat)
+    white = slopes.compute_white_residuals(now.free, np.vstack([x, x + moves]))
+    steep = np.asarray(np.linalg.pinv(moves), np.float64) @ (white[1:] - white[0]).reshape(len(x), -1)
+    return _weigh_slopes(now, remove_slope(steep.reshape(len(x), *now.white.shape), flat))
+
+
+def _weigh_slopes(now: Fit, jacobian: Floats) -> Fit:
+    """A fit with this Jacobian (p, s, n), the covariance that follows from it, and its cost with the priors."""
+    x, prior = now.x, np.diag(weigh_priors(now.free))
     heavy = (jacobian * compute_weights(now.white)).reshape(len(x), -1)
-    prior = np.diag(weigh_priors(now.free))
     known = invert_hessian(heavy @ jacobian.reshape(len(x), -1).T + prior)
     return replace(now, cost=now.misfit + float(x @ prior @ x), covariance=known, jacobian=jacobian)
 
@@ -503,13 +506,9 @@ def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats, stag
     `flat` (p, k) are the directions that the data do not see. `stage` takes a step with each round. `slopes`: the same
     problem with coarser steps, for the differences; default `problem` itself.
     """
-    def linearise(fit: Fit) -> Fit:
-        here = linearise_across(slopes or problem, fit.free, fit.x, fit.covariance, flat)
-        return here if slopes is None else replace(here, cost=fit.cost, misfit=fit.misfit, residuals=fit.residuals,
-                                                   white=fit.white)
-
-    begun = begun if slopes is None else replay_fit(problem, begun, begun.x)
-    return replace(relax_along(take_steps(problem, begun, linearise, rounds, stage), flat), converged=True)
+    linearise = partial(linearise_across, slopes or problem, flat=flat)
+    found = take_steps(problem, replay_fit(problem, begun, begun.x), linearise, rounds, stage)
+    return replace(relax_along(found, flat), converged=True)
 
 
 def list_moves_across(free: Sequence[Free], covariance: Floats, flat: Floats, width: float
@@ -527,45 +526,42 @@ def list_moves_across(free: Sequence[Free], covariance: Floats, flat: Floats, wi
 
 
 def estimate_smooth_covariance(problem: Problem, found: Fit, flat: Floats) -> Floats:
-    """The covariance (p, p) of a fit by the slopes that the model has where it is smooth.
+    """The covariance (p, p) of a fit by the slopes that the model has where it is smooth."""
+    for _ in range(SMOOTH_PASSES):
+        found = linearise_smoothly(problem, found, flat)
+    return found.covariance
 
-    A stop of the ram that comes or goes within a difference makes it jump, and the jump is no slope: taken for one, it
-    makes directions known that are not, and intervals too narrow. So differences are taken at several widths, either
+
+def linearise_smoothly(slopes: Problem, now: Fit, flat: Floats) -> Fit:
+    """A fit with its Jacobian by the slopes that the model has where it is smooth, and the next covariance.
+
+    A stop that comes or goes within a difference makes it jump, and the jump is no slope: taken for one, it makes
+    directions known that are not, and intervals too narrow. So differences are taken at several widths, either
     way, and each principal direction counts with the least of its slopes. The directions follow the covariance.
     """
-    free, x, covariance = found.free, found.x, found.covariance
+    free, x = now.free, now.x
     low, high = scaled_bounds(free)
-    weights = compute_weights(found.white).reshape(-1)
-    prior = np.diag(weigh_priors(free))
-    for _ in range(SMOOTH_PASSES):
-        places, inverse, ways = list_moves_across(free, covariance, flat, 1.0)
-        moves = np.clip(x + np.multiply.outer(SMOOTH_WIDTHS, ways), low, high) - x
-        white = problem.compute_white_residuals(free, np.vstack([x, x + moves.reshape(-1, len(x))]))
-        shifts = (white[1:] - white[0]).reshape(*moves.shape[:2], -1)
-        length = np.linalg.norm(moves, axis=2) / np.linalg.norm(ways, axis=1)
-        is_long = length > 0.5 * min(map(abs, SMOOTH_WIDTHS))  # others a bound has cut off
-        slopes = np.where(is_long, (weights * shifts**2).sum(axis=2) / np.maximum(length, 1e-9) ** 2, np.inf)
-        least = slopes.argmin(axis=0), np.arange(len(ways))
-        steep = np.asarray(np.linalg.pinv(moves[least][:, places]), np.float64) @ shifts[least]
-        jacobian = inverse.T @ steep
-        covariance = invert_hessian((jacobian * weights) @ jacobian.T + prior)
-    return covariance
+    places, inverse, ways = list_moves_across(free, now.covariance, flat, 1.0)
+    moves = np.clip(x + np.multiply.outer(SMOOTH_WIDTHS, ways), low, high) - x
+    white = slopes.compute_white_residuals(free, np.vstack([x, x + moves.reshape(-1, len(x))]))
+    shifts = (white[1:] - white[0]).reshape(*moves.shape[:2], -1)
+    length = np.linalg.norm(moves, axis=2) / np.linalg.norm(ways, axis=1)
+    is_long = length > 0.5 * min(map(abs, SMOOTH_WIDTHS))  # others a bound has cut off
+    squares = (compute_weights(now.white).reshape(-1) * shifts**2).sum(axis=2)
+    steepness = np.where(is_long, squares / np.maximum(length, 1e-9) ** 2, np.inf)
+    least = steepness.argmin(axis=0), np.arange(len(ways))
+    steep = np.asarray(np.linalg.pinv(moves[least][:, places]), np.float64) @ shifts[least]
+    return _weigh_slopes(now, (inverse.T @ steep).reshape(len(x), *now.white.shape))
 
 
-def linearise_across(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, flat: Floats) -> Fit:
-    """The model at `x` (p,), its Jacobian by differences across the valley, along principal directions there."""
-    places, inverse, ways = list_moves_across(free, covariance, flat, DIRECTION_WIDTH_SD)
+def linearise_across(slopes: Problem, now: Fit, flat: Floats) -> Fit:
+    """A fit with its Jacobian by differences across the valley, along principal directions there."""
+    free, x = now.free, now.x
+    places, inverse, ways = list_moves_across(free, now.covariance, flat, DIRECTION_WIDTH_SD)
     moves = np.array([cut_at_bounds(free, x, way) for way in ways])
-    predicted = problem.predict_unknowns(free, np.vstack([x, x + moves]))
-    white, left = problem.whiten_predictions(predicted), problem.subtract_measurements(predicted[:1])[0]
+    white = slopes.compute_white_residuals(free, np.vstack([x, x + moves]))
     steep = np.asarray(np.linalg.pinv(moves[:, places]), np.float64) @ (white[1:] - white[0]).reshape(len(places), -1)
-    jacobian = (inverse.T @ steep).reshape(len(free), *white[0].shape)
-    prior = np.diag(weigh_priors(free))
-    flat_rows = jacobian.reshape(len(free), -1)
-    heavy = (jacobian * compute_weights(white[0])).reshape(len(free), -1)
-    held = float(compute_misfit(white[:1])[0])
-    covariance = invert_hessian(heavy @ flat_rows.T + prior)
-    return Fit(tuple(free), x, held + float(x @ prior @ x), held, covariance, left, white[0], jacobian)
+    return _weigh_slopes(now, (inverse.T @ steep).reshape(len(x), *now.white.shape))
 
 
 def invert_hessian(hessian: Floats) -> Floats:

@@ -26,7 +26,7 @@ from fdi.discovery.explain import (
     explain,
     find_marks,
     helps_explain,
-    leave_out_unshown,
+    leave_out_unneeded,
     shows_effect,
 )
 from fdi.discovery.explain_runs import Answer, Candidate, explain_runs
@@ -233,7 +233,7 @@ def test_of_two_effects_the_one_that_may_be_off_is_left_out() -> None:
         return search.judge_fit((*h.effects, effect), fit_unknowns(search.problem, p.free, p.x))
 
     both = add(add(search.fit_base(), "null_bias"), "constant_load")
-    assert [h.effects for h in leave_out_unshown(search, [both])] == [("null_bias",)]
+    assert [h.effects for h in leave_out_unneeded(search, [both])] == [("null_bias",)]
 
 
 @pytest.mark.parametrize(("is_far", "verdict"), [(False, "EXPLAINED"), (True, "PARTLY")])

@@ -1,7 +1,7 @@
 """Recordings as fits need them, and fits: flat directions, backlash, rows that hang on a level of friction."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from types import SimpleNamespace
@@ -16,7 +16,15 @@ from fdi.comparison.compare import compare
 from fdi.discovery.runs import read_runs
 from fdi.discovery.search import Search, scan_effects
 from fdi.discovery.update_model import refit_effects
-from fdi.estimation.fit import Fit, Problem, complete_model, linearise, list_all_unknowns, list_tolerance_unknowns
+from fdi.estimation.fit import (
+    Fit,
+    Free,
+    Problem,
+    complete_model,
+    linearise,
+    list_all_unknowns,
+    list_tolerance_unknowns,
+)
 from fdi.estimation.long_recordings import PIECE, choose_excerpt, cut_excerpt, is_long, judge_on_all, make_excerpt
 from fdi.estimation.noise import white_noise
 from fdi.estimation.replay import (
@@ -40,6 +48,7 @@ from fdi.estimation.unidentifiable import (
     SPOOL_WAY,
     VISCOSITY,
     find_tangents,
+    finish_fit,
 )
 from fdi.trace.trace import Floats, Trace, rms
 from plant import Model, load_model, simulate
@@ -316,6 +325,25 @@ def test_under_a_known_load_the_scale_of_the_position_leaves_forces_and_the_area
     flat = find_flat(changes, "xj,p12,xs", load=5e3)
     assert POSITION_SCALE_AT_FORCES in flat and POSITION_SCALE not in flat
     assert [POSITION_SCALE_AT_FORCES[f"jack.{field}"] for field in ("area", "mass", "leakage")] == [0.0, 1.0, -1.0]
+
+
+class RoughSum(Problem):
+    """100 samples of a sum of two unknowns, with jumps wherever the first one moves, as behind a backlash."""
+
+    def predict_unknowns(self, free: Sequence[Free], x: Floats) -> Floats:
+        return 10.0 * x.sum(axis=1)[:, None, None] + 0.15 * np.sign(np.sin(300.0 * x[:, :1, None] + np.arange(100.0)))
+
+    def subtract_measurements(self, predicted: Floats) -> Floats:
+        return predicted
+
+
+def test_only_the_tolerance_limits_a_size_that_no_signal_tells_from_it() -> None:
+    """Of a plant of which no such directions are declared; the differences of the first fit see jumps alone."""
+    free = [Free("tolerance", 0.0, 1.0, 1.0, -5.0, 5.0, 0.3), Free("size", 0.0, 1.0, np.inf, -50.0, 50.0, 0.05)]
+    problem = RoughSum(load_model("ema"), record_healthy(), (white_noise(1.0),))
+    begun = linearise(problem, free, np.array([2.0, -2.0]))
+    found = finish_fit(problem, begun, 5)
+    assert begun.spread("size") < 0.2 and found.spread("size") > 0.6 and abs(found.x).max() < 0.5
 
 
 FLOOR = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
