@@ -434,7 +434,9 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
     # where the base leaves only noise: single stops that a fit has met by chance are missed elsewhere
     sure = [h for h in there if not (unseen and base.is_at_floor) or costs[()] - costs[h.effects] > GAIN_SEEN]
     if base.is_at_floor and (measure_gain(base, best) < GAIN_CONVINCES or (there and not sure)):
-        return ("NOT_RESOLVABLE", tuple(best.effects)) if not prints else ("EXPLAINED", prints)
+        alike = [h for h in close if not h.is_far and measure_gain(base, h) > GAIN_SEEN
+                 and not _is_better(best, h, costs)]
+        return ("NOT_RESOLVABLE", _list_effects([best, *alike])) if not prints else ("EXPLAINED", prints)
     there = sure
     if there and all(h.is_far for h in there):
         return "PARTLY", (*prints, *there[0].effects)
@@ -444,13 +446,17 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
             not h.is_far and not _is_better(there[0], h, costs)
             and not (base.is_at_floor and measure_gain(base, h) < GAIN_CONVINCES))]
         if len(equal) > 1:
-            return "AMBIGUOUS", (*prints, *dict.fromkeys(e for h in equal for e in h.effects))
+            return "AMBIGUOUS", (*prints, *_list_effects(equal))
         return "EXPLAINED", (*prints, *there[0].effects)
     left, before = (measure_excess(h.errors, floor) for h in (best, base))
     better = min(left, 1e18) < ERROR_PARTLY_EXPLAINED**2 * before
     if better and part:
         return "PARTLY", (*prints, *best.effects)
     return ("PARTLY" if prints else "UNEXPLAINED"), prints
+
+
+def _list_effects(hypotheses: Iterable[Hypothesis]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(effect for h in hypotheses for effect in h.effects))
 
 
 def _is_better(h: Hypothesis, other: Hypothesis, unseen: Mapping[tuple[str, ...], float]) -> bool:

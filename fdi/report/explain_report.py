@@ -153,9 +153,9 @@ def describe_verdict(a: Answer) -> str:
                     f"{len(a.explanation.search.effects)} effects would change nothing in it that the tolerances do "
                     "not.")
         case "NOT_RESOLVABLE":
-            first = a.candidates[0]
-            return (f"The error is at the noise floor ({floors}). {first.effect} may be present "
-                    f"({_describe_sizes([first])}), but it is too small in this test to be certain.")
+            one = join_words((c.effect for c in named), "or")
+            return (f"The error is at the noise floor ({floors}). {one} may be present ({_describe_sizes(named)}), but "
+                    "it is too small in this test to be certain.")
         case "AMBIGUOUS":
             shared = list_shared_effects(a.explanation)
             others = join_words([name for name in a.explanation.effects if name not in shared], "or")
