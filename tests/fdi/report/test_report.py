@@ -455,7 +455,7 @@ def candidate(effect: str, *beside: str, word: str = "explains") -> Candidate:
 def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, is_at_floor: bool = False,
            ranked: Sequence[Any] = (), **fields: Any) -> Answer:
     base = SimpleNamespace(is_at_floor=is_at_floor, is_far=False, effects=(), ratio={"xj": 22.5, "p12": 15.0})
-    trace = SimpleNamespace(declared=EHA, notes=())
+    trace = SimpleNamespace(declared=EHA, notes=(), events=())
     explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, marks=Marks(1.0, 1e-6, ()),
                                   ledger=[base], unseen={}, excerpt="", ranked=ranked,
                                   search=SimpleNamespace(problem=SimpleNamespace(trace=trace)))
