@@ -158,10 +158,11 @@ def describe_verdict(a: Answer) -> str:
                     "it is too small in this test to be certain.")
         case "AMBIGUOUS":
             shared = list_shared_effects(a.explanation)
-            others = join_words([name for name in a.explanation.effects if name not in shared], "or")
-            said = f"{join_words(shared)} together with {others}" if shared else others
+            others = [name for name in a.explanation.effects if name not in shared]
+            said = f"{join_words(shared)} together with " * bool(shared) + join_words(others, "or")
+            last = next((c for c in named if c.effect in others), a.candidates[0])
             return (f"{said}: each explains the residual, and these data cannot discriminate between them; "
-                    f"{_describe_change(a, a.candidates[0])}.")
+                    f"{_describe_change(a, last)}.")
         case word if word == "UNEXPLAINED" or not named:
             return _describe_unexplained(a)
     rest = f"{_describe_sizes(named)}; {_describe_change(a, named[-1])}."

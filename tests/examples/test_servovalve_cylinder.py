@@ -55,6 +55,19 @@ def test_an_open_loop_has_no_following_error(tmp_path: Path) -> None:
     assert "rms_error" not in told and told["cycles"] > 0
 
 
+def test_steady_speed_and_pressures_are_those_of_four_orifices() -> None:
+    """v = K w/AA root((pS - r pT - F/AA)/(1 + r^3)) out, r the ratio of the areas; from v both pressures follow."""
+    model = load_cylinder(cylinder__friction=60.0, cylinder__damping=0.0, cylinder__stroke=2.0, valve__overlap=0.2)
+    run = simulate(model, np.full(3000, 3.0))
+    v = float(np.diff(run.position[-500:]).mean()) / 1e-3
+    area, width = 0.25 * pi * 0.016**2, 5.5e-9 * 2.8
+    r = 1.0 - (0.010 / 0.016) ** 2
+    expected = width / area * sqrt((4.4e6 - r * 1e5 - 60.0 / area) / (1.0 + r**3))
+    assert v == pytest.approx(expected, rel=2e-3)
+    assert run.pressure_a[-1] == pytest.approx(4.4e6 - (area * v / width) ** 2, rel=5e-3)
+    assert run.pressure_b[-1] == pytest.approx(1e5 + (r * area * v / width) ** 2, rel=1e-2)
+
+
 def test_motion_is_that_of_an_independent_solver() -> None:
     """The equations of the file's head, as they stand there, by scipy: start of a stroke with oil, hose and air."""
     changes = {"cylinder.air_a": 2e-7, "cylinder.air_b": 1e-7, "cylinder.leakage": 1e-13, "valve.supply_to_b": 0.8}

@@ -1,11 +1,14 @@
-"""What a newcomer types wrongly, and that `make newcomer` plays every line of the pages or says why not."""
+"""What a newcomer types wrongly, Ctrl-C in a search; that `make newcomer` plays all lines of the pages or says why not.
+"""
 
+import signal
+import time
 from pathlib import Path
 
 import pytest
 from bad_inputs import BAD_INPUTS, find_faults, write_bad_files
 from places import ROOT
-from rig_command import rig
+from rig_command import finished, rig, started
 from shown_commands import (
     NOT_PLAYED,
     NOT_PLAYED_PAGES,
@@ -34,6 +37,16 @@ def test_bad_input_gets_one_line_that_names_it(tmp_path: Path, monkeypatch: pyte
 
 def test_bad_inputs_are_of_every_command() -> None:
     assert {case.words.split()[0] for case in BAD_INPUTS} == {*COMMANDS, "fly"}
+
+
+def test_ctrl_c_ends_a_search_and_leaves_nothing(tmp_path: Path) -> None:
+    assert rig("simulate", "--out", tmp_path / "run.csv").status == 0
+    process = started("explain", tmp_path / "run.csv", "--out", tmp_path / "page.html")
+    time.sleep(3.0)  # it may still load its libraries, and then it ends as well
+    process.send_signal(signal.SIGINT)
+    said = finished(process)
+    assert (said.status, said.err.count("\n")) == (130, 1), said
+    assert [path.name for path in tmp_path.iterdir()] == ["run.csv"]
 
 
 def test_every_command_line_of_a_page_is_played_or_has_a_reason() -> None:

@@ -1,6 +1,7 @@
 """The physics of the electromechanical actuator against closed forms, an independent solver and its own energy."""
 
 from collections import namedtuple
+from functools import cache
 from math import pi
 from typing import Any
 
@@ -44,12 +45,14 @@ def fill_states(s: Any, drive: Any, load: Any, p: Any, h: float, out: Any) -> No
         s, m = step(s, m, Input(drive[i], load[i], 0.0, i * h, 0.0, h), p, k)
 
 
-FILL = compile_function(fill_states, {})
+@cache
+def compile_run() -> Any:
+    return compile_function(fill_states, {})
 
 
 def run(p: Any, drive: Array, h: float = 1e-5, s: ema.State | None = None, load: float = 0.0) -> Array:
     out = np.empty((len(drive), 5))
-    FILL(s or ema.State(), np.asarray(drive, float), np.full(len(drive), load), p, h, out)
+    compile_run()(s or ema.State(), np.asarray(drive, float), np.full(len(drive), load), p, h, out)
     return out
 
 
@@ -57,11 +60,24 @@ def hold(value: float, time: float, h: float = 1e-5) -> Array:
     return np.full(round(time / h), value)
 
 
-def test_the_voltage_limits_the_rise_of_the_current() -> None:
+def test_the_current_follows_as_a_first_order_lag_and_the_voltage_limits_it() -> None:
+    i = run(USUAL, hold(1.0, 3e-3))[:, 0]
+    assert np.abs(i - (1.0 - np.exp(-USUAL.drive.bandwidth * 1e-5 * np.arange(len(i))))).max() < 1e-4
     i = run(change_parameters(**{"drive.voltage": 5.0}), hold(20.0, 0.02))[:, 0]
     rise = 5.0 / USUAL.motor.resistance * (1.0 - np.exp(-5e-4 * USUAL.motor.resistance / USUAL.motor.inductance))
     assert i[50] == pytest.approx(rise, rel=1e-2)  # the motor has hardly moved
     assert i.max() < 5.0 / USUAL.motor.resistance
+
+
+def test_two_masses_on_the_screw_swing_at_their_frequency_and_keep_their_energy() -> None:
+    s = run(change_parameters(**NO_FRICTION), hold(0.0, 1.0), s=ema.State(motor_position=1e-4))
+    stretch = s[:, 1] - s[:, 3]
+    up = np.flatnonzero((stretch[:-1] < 0.0) & (stretch[1:] >= 0.0))
+    times = up + stretch[up] / (stretch[up] - stretch[up + 1])
+    found = 2.0 * pi / (np.diff(times).mean() * 1e-5)
+    assert found == pytest.approx(np.sqrt(STIFF * (1.0 / MOTOR + 1.0 / MASS)), rel=2e-5)
+    energy = 0.5 * (MOTOR * s[:, 2]**2 + MASS * s[:, 4]**2 + STIFF * stretch**2)
+    assert np.abs(energy / energy[0] - 1.0).max() < 1e-4
 
 
 def test_a_rigid_screw_moves_both_masses_as_one() -> None:

@@ -94,6 +94,19 @@ def test_pilot_loop_gain(clogging: float, law: str, power: float) -> None:
     assert lag == pytest.approx(speed / gain, rel=0.01)
 
 
+def test_largest_speed() -> None:
+    model = SMOOTH.replace({"jack.damping": 0.0, "jack.leakage": 0.0, "controller.current_limit": 9e-3})
+    run = simulate(model, np.full(200, 0.035))
+    assert np.diff(run.xj).max() * 1000 == pytest.approx(GQ * V["spool.travel"] / AJ, rel=1e-6)
+    assert GQ * V["spool.travel"] / AJ == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("force", [-3000.0, 1000.0, 5000.0])
+def test_droop_under_load(force: float) -> None:
+    run = simulate(SMOOTH, np.zeros(1500), load=np.full(1500, force))
+    assert run.xj[-1] == pytest.approx(-DROOP * force, rel=1e-3)
+
+
 def overshoot(record, gain, target, steps, h):
     """Largest position on a step to `target` with a controller that answers at once."""
     p = record[0]

@@ -252,6 +252,14 @@ def test_sections_with_their_shares(c: Trace, m: Motion) -> None:
     assert {"motion within 3 mm", "step to 5 mm"} <= {p.section for p in found}
 
 
+def test_white_noise_stays_within_its_bands(c: Trace, m: Motion) -> None:
+    found = [examine_residuals(c, {"xj": sample_noise(seed, len(c))[:, 0]}, {}, m)["xj"]
+             for seed in range(100, 120)]  # not that of the trace, whose noise is in its own XJ
+    assert sum(d.departs > d.allowed for d in found) <= 4  # 5 %
+    assert sum(any(abs(f.correlation) > f.bound for f in d.follows) for d in found) <= 3  # 1 % of two
+    assert not any(d.depends and d.depends[0].share > 0.02 for d in found)
+
+
 def test_coloured_noise_is_white_when_a_repeat_shows_its_colour(c: Trace, m: Motion) -> None:
     r, repeat = (sample_noise(seed, len(c), "hum")[:, 0] for seed in (1, 2))
     alone = examine_residuals(c, {"xj": r}, {}, m)["xj"]

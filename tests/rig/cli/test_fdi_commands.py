@@ -5,6 +5,7 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from effect_files import SPRING, restored_catalogue
 from noisy_traces import SHORT, record_healthy, record_plant
@@ -337,6 +338,17 @@ def test_nothing_is_blamed_where_something_else_is_wrong() -> None:
     assert all(each in (None, Level.ACCEPTABLE) for each in found.levels.values())
     assert all(0.0 <= size.low <= size.value <= size.high for size in found.sizes.values())
     assert "Something else is wrong" in describe_verdict(found)
+
+
+def test_a_gap_is_told(folder: Path, tmp_path: Path) -> None:
+    """A quarter of a second is missing while the ram moves on: what is left is judged."""
+    trace = Trace.read(folder / "est.csv")
+    there = np.abs(np.arange(len(trace)) - 9824.5) > 125.0
+    holed = {name: np.where(there, trace.column(name), np.nan) for name in ("com", "xj", "cor", "p12", "xs")}
+    Trace.from_columns(holed, trace.period, {}).write_csv(tmp_path / "gap.csv")
+    found = diagnose(Trace.read(tmp_path / "gap.csv"), load_model())
+    assert any("missing in 250 of 13500 rows" in note for note in found.notes)
+    assert all(each in (None, Level.ACCEPTABLE) for each in found.levels.values()) and found.ruling is None
 
 
 def test_a_unit_without_leakage_is_judged(folder: Path) -> None:

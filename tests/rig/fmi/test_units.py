@@ -218,6 +218,21 @@ def test_wrong_calls_are_refused_and_the_unit_goes_on(make_instance: Callable[..
     assert is_refused(step, 1e-3, 1e-3)
 
 
+def test_messages_reach_the_logger(unit: Callable[[str, str], Path], tmp_path: Path) -> None:
+    from fmpy.fmi3 import FMU3Slave, fmi3LogMessageCallback
+
+    path = unit("nominal", "3")
+    said: list[str] = []
+    described = fmpy.read_model_description(str(path))
+    slave = FMU3Slave(guid=described.guid, unzipDirectory=fmpy.extract(str(path), str(tmp_path)),
+                      modelIdentifier=described.coSimulation.modelIdentifier, instanceName="unit")
+    slave.instantiate(logMessage=fmi3LogMessageCallback(lambda _e, _s, _c, text: said.append(text.decode())))
+    with pytest.raises(Exception, match="fmi3DoStep"):
+        slave.doStep(0.0, 1e-3)
+    assert said == ["fmi3DoStep: not allowed in this state of the unit"]
+    slave.freeInstance()
+
+
 # ---------------------------------------------------------------------------------- the command
 
 

@@ -227,3 +227,27 @@ def test_a_controller_that_sends_no_frames_ends_the_run_with_a_line_that_names_t
     assert (outcome.verdict, outcome.status) == ("ABORTED", 1)
     assert said in outcome.why and "no frame Drive (0x18F00005)" in outcome.aborted
     assert outcome.attribution.cause is not None and outcome.attribution.cause.source is Role.CONTROLLER
+
+
+class Forgetful(CanopenDevice):
+    """It keeps a part of its current over a reset: what it has answered so far counts on."""
+
+    def take(self, message: can.Message) -> list[can.Message]:
+        found = super().take(message)
+        self._kept = getattr(self, "_kept", 0.0) + 1e-4 * bool(found)
+        self._output = (*self._output[:2], 1e-6 / (1.0 + self._kept))
+        return found
+
+
+def test_a_controller_that_remembers_over_a_reset_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The probes are played by the roles of the frames, on a bench without control word and without phases."""
+    where = spec("udp_multicast")
+    (tmp_path / "steps.toml").write_text(SEQUENCE)
+    for device, names in ((CanopenDevice, []), (Forgetful, ["same answers after a reset"])):
+        monkeypatch.setitem(globals(), "CanopenDevice", device)
+        station = start_synchronous(tmp_path, where)
+        job = build_job(JobChoice(sequence=str(tmp_path / "steps.toml"), bench=str(tmp_path / "bench.toml"), bus=where))
+        with run_device(station):
+            outcome = run_job(job, tmp_path / "run", ignore_progress, lambda: False)
+        assert [check.name for check in outcome.checks if not check.passed] == names
+        assert "delay of the answer to a step" in [check.name for check in outcome.checks]

@@ -23,6 +23,7 @@ from rig.network.bus import EmbeddedWire
 from rig.network.frame import Frame, Send, VirtualClock
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
+from rig.recorder import RecorderError
 from rig.run import participants, runner
 from rig.run.job import read_job
 from rig.run.participants import NodeProcesses
@@ -93,7 +94,7 @@ def test_trouble_is_the_safe_state_and_ends_main(tmp_path: Path) -> None:
 
 
 def test_the_page_has_a_section_for_the_first_cause(tmp_path: Path) -> None:
-    """With time and evidence, and what followed."""
+    """With time and evidence, and what followed; a run without trouble has no such section."""
     title = "First cause and consequences"
     outcome = play(job(with_faults(SHORT, 'kind = "lost", frame = "feedback", start = 0.2')), tmp_path)
     sections = {section.title: section for section in build_run_report(Trace.read(tmp_path, all=True)).sections}
@@ -104,6 +105,9 @@ def test_the_page_has_a_section_for_the_first_cause(tmp_path: Path) -> None:
     assert [row[2] for row in rows] == [each["text"] for each in outcome.to_json()["consequences"]] and len(rows) > 0
     write_run_page(tmp_path, tmp_path / "p.html")
     assert title in (tmp_path / "p.html").read_text()
+    play(job(), tmp_path / "sound")
+    write_run_page(tmp_path / "sound", tmp_path / "q.html")
+    assert title not in (tmp_path / "q.html").read_text()
 
 
 def test_a_sequence_may_be_about_trouble(tmp_path: Path) -> None:
@@ -192,6 +196,19 @@ def test_whatever_is_raised_clean_up_runs_and_the_log_is_whole(tmp_path: Path, e
     assert (setup, cleanup) == (50, 50) and 1 < main < 250
     assert Trace.read(tmp_path, all=True).events[-1].text == "end"
     assert threading.active_count() == threads and not (tmp_path / "verdict.json").exists()
+
+
+def test_a_log_that_cannot_be_written_is_told_after_clean_up(tmp_path: Path) -> None:
+    """The disk goes away in mid run."""
+    calls = iter(range(10**6))
+
+    def stop() -> bool:
+        if next(calls) == 5:
+            (tmp_path / "trace.mcap").unlink()
+        return False
+
+    with pytest.raises(RecorderError, match="deleted"):
+        play(job(SHORT.replace("time = 0.2 }", "time = 2.0 }")), tmp_path, stop)
 
 
 def test_a_load_that_no_node_takes_is_bad_input(tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ from fdi.diagnosis.diagnosis import diagnose
 from fdi.report.run_report import build_run_report
 from fdi.report.terminal import format_report
 from fdi.trace.trace import Trace
-from rig.run.runner import Outcome, run_job
+from plant import load_model
+from rig.run.runner import Outcome, find_limits, run_job
 
 UNCHECKED = SHORT.partition("checks = [")[0]
 TO_THE_STOP = """
@@ -47,6 +48,15 @@ def test_the_ram_at_its_stop_and_the_current_at_its_limit_are_reported(tmp_path:
     assert "limits reached: ram at its stop (40 mm)" in text and "current at its limit (8 mA)" in text
     assert [each["parameter"] for each in said(outcome)["limits"]] == [  # type: ignore[attr-defined]
         "jack.travel", "spool.travel", "controller.current_limit"]
+
+
+def test_a_signal_just_inside_its_limit_is_not_reported() -> None:
+    model = load_model()
+    columns = {"xj": np.array([0.0399, np.nan]), "xs": np.array([-1.24e-3, 0.0]), "cor": np.array([7.9999e-3, 0.0])}
+    assert find_limits(columns.__getitem__, model, 0) == ()
+    columns["cor"][1] = -8e-3
+    (limit,) = find_limits(columns.__getitem__, model, 1)
+    assert (limit.signal, limit.t, limit.seconds) == ("cor", 0.0, 1e-3)
 
 
 STEPS = """
