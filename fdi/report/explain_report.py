@@ -159,7 +159,8 @@ def describe_verdict(a: Answer) -> str:
         case "AMBIGUOUS":
             shared = list_shared_effects(a.explanation)
             others = [name for name in a.explanation.effects if name not in shared]
-            said = f"{join_words(shared)} together with " * bool(shared) + join_words(others, "or")
+            one = join_words(others, "or")
+            said = f"{join_words(shared)} together with {one}" if shared else one
             last = next((c for c in named if c.effect in others), a.candidates[0])
             return (f"{said}: each explains the residual, and these data cannot discriminate between them; "
                     f"{_describe_change(a, last)}.")
