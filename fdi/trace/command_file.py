@@ -50,8 +50,8 @@ def parse_columns(data: bytes, where: object, period: float = 1 / RATE, signals:
     require_growth(t, where, "t")
     _refuse_row(where, "t", t, t - t[0] > LONGEST, f"seconds, and at most {LONGEST:g} of them")
     for key, name, most in picked:
-        expected = f"at most {most:g} either way" if most < math.inf else "a finite number"
-        _refuse_row(where, key, columns[name], ~(np.abs(columns[name]) <= most), expected)
+        _refuse_row(where, key, columns[name], ~np.isfinite(columns[name]), "a finite number")
+        _refuse_row(where, key, columns[name], np.abs(columns[name]) > most, f"at most {most:g} either way")
     return {key: resample_on_cycles(t, columns[name], period) for key, name, _ in picked if key != "t"}
 
 

