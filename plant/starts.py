@@ -54,7 +54,7 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None, plant
     for name, value in usual.items():
         if name not in sized:
             quantity = effect.parameters[name]
-            usually = QUARTERS if quantity.unit == "rad" else [factor * value for factor in SHAPES]
+            usually = [factor * value for factor in SHAPES] if value or quantity.unit != "rad" else QUARTERS
             shapes = parse_hint(quantity) or [_clip_to_range(quantity, x) for x in usually]
             found = [start | {name: shape} for start in found for shape in dict.fromkeys(shapes)]
     return tuple(found)
