@@ -273,6 +273,18 @@ def test_a_hint_spares_the_search(file: Path) -> None:
     assert (force, length) == (pytest.approx([200.0, 1000.0, 5000.0]), pytest.approx([1e-3, 2e-3, 4e-3]))
 
 
+def test_a_phase_starts_at_quarter_turns_and_an_angle_where_it_usually_is(file: Path) -> None:
+    file.write_text(COGGING.replace('Quantity("N")', 'Quantity("N", low=0, typical="0.2-5 kN")').replace(
+        "\n@effect", '    phase: Annotated[float, Quantity("rad")] = 0.0\n'
+                      '    tilt: Annotated[float, Quantity("rad")] = 0.1\n\n@effect', 1).replace(
+        "/ p.cogging.length", "/ p.cogging.length + p.cogging.phase + p.cogging.tilt"))
+    load_effects(file)
+    starts = find_starts(CATALOGUE["cogging"], PREFLIGHT)
+    phases, tilts = (sorted({start[f"cogging.{name}"] for start in starts}) for name in ("phase", "tilt"))
+    assert phases == pytest.approx([quarter * 0.5 * np.pi for quarter in range(-1, 4)])  # for either range of a turn
+    assert tilts == pytest.approx([0.04, 0.1, 0.25])
+
+
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_the_trial_of_an_unsound_effect(file: Path) -> None:
     text = COGGING.replace("return x +", "return (x + 1.0) * (1.0 + p.cogging.force) ** 400 +")
