@@ -16,7 +16,7 @@ from plant.segments import Array
 
 VISIBLE = (3.0, 30.0, 300.0)  # noise levels that starts are to show
 SHAPES = (1.0, 0.4, 2.5)  # times the usual value, for a parameter that does nothing alone
-QUARTERS = [0.5 * np.pi * turns for turns in range(-1, 4)]  # of a turn, rad: starts of a phase, of -pi .. pi or of 0 .. 2 pi
+QUARTERS = [0.5 * np.pi * turns for turns in range(-1, 4)]  # starts of a phase, rad, of -pi .. pi or of 0 .. 2 pi
 DECADES = (-15, 13)  # where the size of a parameter without a hint is looked for
 ANCHOR = 2.0  # 1/s
 WITHOUT_SIZE = ("1", "s", "Hz", "rad")  # units of parameters that are alike in plants of any size
