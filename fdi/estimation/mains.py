@@ -1,7 +1,7 @@
 """Steady lines of the mains, which are taken out of residuals: a hum that starts with the test has the same phase in
 every run, so no repeat tells it from physics.
 
-All residuals of a fit pass this. What is done once a value is compiled: it takes a third of the time of array
+All residuals of a fit pass this. What is done once a value is compiled: it takes an eighth of the time of array
 expressions, and holds no other thread.
 """
 from __future__ import annotations
