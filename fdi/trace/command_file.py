@@ -6,7 +6,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.csv_table import Layout, open_text, read_columns, report_unreadable, require_growth, split_line
+from fdi.trace.csv_table import (
+    Layout,
+    is_comment,
+    open_text,
+    read_columns,
+    report_unreadable,
+    require_growth,
+    split_line,
+)
 from plant.errors import InputError, require
 from plant.segments import LONGEST, RATE, Array, resample_on_cycles
 from plant.signals import EHA, Signals
@@ -48,14 +56,16 @@ def parse_columns(data: bytes, where: object, period: float = 1 / RATE, signals:
                            where=where)
     t = columns["t"]
     require_growth(t, where, "t")
-    _refuse_row(where, "t", t, t - t[0] > LONGEST, f"seconds, and at most {LONGEST:g} of them")
+    _refuse_row(data, where, "t", t, t - t[0] > LONGEST, f"seconds, and at most {LONGEST:g} of them")
     for key, name, most in picked:
-        _refuse_row(where, key, columns[name], ~np.isfinite(columns[name]), "a finite number")
-        _refuse_row(where, key, columns[name], np.abs(columns[name]) > most, f"at most {most:g} either way")
+        _refuse_row(data, where, key, columns[name], ~np.isfinite(columns[name]), "a finite number")
+        _refuse_row(data, where, key, columns[name], np.abs(columns[name]) > most, f"at most {most:g} either way")
     return {key: resample_on_cycles(t, columns[name], period) for key, name, _ in picked if key != "t"}
 
 
-def _refuse_row(where: object, name: str, column: Array, is_bad: NDArray[np.bool_], expected: str) -> None:
+def _refuse_row(data: bytes, where: object, name: str, column: Array, is_bad: NDArray[np.bool_], expected: str) -> None:
     if is_bad.any():
         row = int(is_bad.argmax())
-        raise InputError(where, f"line {row + 2}, {name}", f"{expected}, not {column[row]:g}")
+        with open_text(data) as stream:  # rows are not lines: comments and empty lines stand between them
+            lines = [number for number, text in enumerate(stream, 1) if number > 1 and not is_comment(text)]
+        raise InputError(where, f"line {lines[row]}, {name}", f"{expected}, not {column[row]:g}")
