@@ -1,11 +1,10 @@
 """Stations on one bus of any back end, with the same few calls; nodes that stay on a bus for the tests of a file."""
 
-import contextlib
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from itertools import count
 from typing import Protocol
 
@@ -69,10 +68,7 @@ def stations(kind: str, number: int = 3, fd: bool = False) -> Iterator[list[Stat
         return
     where = spec(kind)
     with ExitStack() as stack:
-        links = [Link(open_can(where, fd=fd), clock) for _ in range(number)]
-        for link in links:
-            stack.callback(link.close)
-        yield list(links)
+        yield [stack.enter_context(closing(Link(open_can(where, fd=fd), clock))) for _ in range(number)]
 
 
 def gather(station: Station, number: int, timeout: float = 60.0) -> list[Frame]:
@@ -84,10 +80,10 @@ def gather(station: Station, number: int, timeout: float = 60.0) -> list[Frame]:
     return frames
 
 
-@contextlib.contextmanager
+@contextmanager
 def stand_nodes(where: str, *nodes: int) -> Iterator[None]:
     """`rig node` on a bus for each of the node numbers, all started at once."""
-    with contextlib.ExitStack() as stack:
+    with ExitStack() as stack:
         for node in nodes:
             words = ("-m", "rig.cli.main", "node", NAMES[node], "--bus", where, "--quiet")
             stack.enter_context(run_program(sys.executable, *words))
@@ -98,8 +94,8 @@ def stand_nodes(where: str, *nodes: int) -> Iterator[None]:
 
 def wait_for_node(where: str, node: int, seconds: float = 300.0) -> None:
     """Until a node has sent a heartbeat: the plant may compile its model and its cycle before."""
-    link, heard, end = Link(open_can(where), time.monotonic_ns), set[int](), time.monotonic() + seconds
-    while 0x700 + node not in heard and time.monotonic() < end:
-        heard |= {frame.cob_id for frame in link.poll(0.1)}
-    link.close()
+    heard, end = set[int](), time.monotonic() + seconds
+    with closing(Link(open_can(where), time.monotonic_ns)) as link:
+        while 0x700 + node not in heard and time.monotonic() < end:
+            heard |= {frame.cob_id for frame in link.poll(0.1)}
     assert 0x700 + node in heard

@@ -61,10 +61,14 @@ class CNode:
         self._call("tick", ctypes.c_int64(t_ns))
 
 
+needs_compiler = pytest.mark.skipif(not any(map(shutil.which, ("gcc", "cc", "clang"))),
+                                    reason="no C compiler: apt-get install gcc libc6-dev")
+
+
 def skip_without_compiler() -> None:
-    """Skip the test that calls this where there is no C compiler."""
-    if not any(map(shutil.which, ("gcc", "cc", "clang"))):
-        pytest.skip("no C compiler: apt-get install gcc libc6-dev")
+    """Skip the test whose fixture or device calls this where `needs_compiler` would skip it."""
+    if needs_compiler.args[0]:
+        pytest.skip(needs_compiler.kwargs["reason"])
 
 
 @cache

@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from short_runs import HIDDEN, STEPS, build_command
+from short_runs import HIDDEN, STEPS, build_command, simulate_trace
 
 from fdi.trace.trace import Trace
-from plant import Model, simulate
+from plant import Model
 
 DBC_TEXT = """VERSION ""
 
@@ -64,8 +64,7 @@ unit = "um"
 
 def simulate_run(rows: int = 1500) -> Trace:
     """A run with a null bias, which compare finds."""
-    columns = simulate(Model().replace(HIDDEN), build_command()[:rows], None, 1, STEPS)
-    return Trace.from_columns(columns._asdict(), 1e-3, {})
+    return simulate_trace(Model().replace(HIDDEN), build_command()[:rows], seed=1, steps=STEPS)
 
 
 def write_german_csv(trace: Trace, path: Path) -> None:

@@ -8,6 +8,7 @@ import contextlib
 import io
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -15,10 +16,12 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 from answer_schemas import check_answer
 
 from fdi.progress import ignore_progress
+from fdi.trace.trace import Trace
 from plant import load_model
 from rig.cli.main import main
 from rig.network import master
@@ -81,6 +84,12 @@ def answer(*words: object, status: int = 0) -> dict[str, Any]:
     return said.json
 
 
+def write_file(path: Path, text: str) -> Path:
+    """A file of a user with this text; its path, to be a word of a command."""
+    path.write_text(text)
+    return path
+
+
 def started(*words: object, **options: Any) -> subprocess.Popen[str]:
     """The command as a process of its own."""
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
@@ -92,6 +101,12 @@ def finished(process: subprocess.Popen[str], timeout: float = 300.0) -> Said:
     out, err = process.communicate(timeout=timeout)
     typed = process.args[3:] if isinstance(process.args, list) else ()  # after python -m rig.cli.main
     return Said(process.returncode, out or "", err or "", typed)
+
+
+def interrupted(process: subprocess.Popen[str]) -> Said:
+    """Press Ctrl-C, and wait for the end."""
+    process.send_signal(signal.SIGINT)
+    return finished(process)
 
 
 def grown(path: Path, size: int, timeout: float = 300.0) -> None:
@@ -178,6 +193,18 @@ def stop_after(questions: int) -> Callable[[], bool]:
     """An operator who presses Ctrl-C after the run has asked for it so often, each time cycles are over."""
     asked = iter(range(10**9))
     return lambda: next(asked) >= questions
+
+
+def act_at(question: int, act: Callable[[], object]) -> Callable[[], bool]:
+    """Nobody stops the run, but when it asks for that time something happens."""
+    asked = iter(range(10**9))
+    return lambda: bool(next(asked) == question and act())
+
+
+def read_signals(folder: Path) -> np.ndarray:
+    """Com, XJ, Cor, P12, XS and load of all cycles in the log of a run, (6, n)."""
+    trace = Trace.read(folder, all=True)
+    return np.array([trace.column(name) for name in ("com", "xj", "cor", "p12", "xs", "load")])
 
 
 def kinds(outcome: Outcome) -> list[tuple[str, str]]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,14 +28,19 @@ def build_other_command() -> np.ndarray:
     return np.round(np.where((t > 0.2) & (t < 1.0), -2e-3, wave), 15)
 
 
+def simulate_trace(model: Model, command: np.ndarray, load: np.ndarray | None = None, **options: Any) -> Trace:
+    """What a simulation would have recorded."""
+    run = simulate(model, command, load, **options)
+    return Trace.from_columns(run._asdict(), 1e-3, {}, model.kind.signals)
+
+
 def write_measured_runs(folder: Path, changes: Mapping[str, float]) -> dict[str, Path]:
     """Files `est`, `repeat` and `holdout` of the nominal plant with `changes`."""
     files = {}
     for seed, name in enumerate(("est", "repeat", "holdout"), 1):
         demand = build_other_command() if name == "holdout" else build_command()
-        columns = simulate(Model().replace(changes), demand, None, seed, STEPS)
         files[name] = folder / f"{name}.csv"
-        Trace.from_columns(columns._asdict(), 1e-3, {}).write_csv(files[name])
+        simulate_trace(Model().replace(changes), demand, seed=seed, steps=STEPS).write_csv(files[name])
     return files
 
 
