@@ -22,28 +22,28 @@ from plant.run import compute_answers
 from plant.state import Input, Lag, Line
 from rig.benches.profiles import CIA408
 
-MILLI = 1e-3
 ADVANCED = np.random.default_rng(1).uniform(-4e-3, 4e-3, 60)  # A, a new one each cycle
 
 
-def test_hysteresis_is_a_loop_of_its_width_at_any_rate() -> None:
+@pytest.mark.parametrize("period", [400, 1600])  # cycles
+def test_hysteresis_is_a_loop_of_its_width_at_any_rate(period: int) -> None:
     """Up against down at no current: the spool is apart by what the width of the loop in current moves it."""
-    for period in (400, 1600):  # cycles
-        current = 2e-3 * np.interp(np.arange(1.75 * period) / period, [0, 0.25, 0.75, 1.25, 1.75], [0, 1, -1, 1, -1])
-        xs, plain = (drive_plant(EASY.replace({"torque_motor_hysteresis.width": width}), current)[1][2]
-                     for width in (2e-4, 0.0))
-        down, up = (xs - plain)[[period // 2, period]]
-        assert (2.0 * down, down - up) == pytest.approx((measure_spool(EASY, 2e-4),) * 2, rel=0.01)
+    current = 2e-3 * np.interp(np.arange(1.75 * period) / period, [0, 0.25, 0.75, 1.25, 1.75], [0, 1, -1, 1, -1])
+    xs, plain = (drive_plant(EASY.replace({"torque_motor_hysteresis.width": width}), current)[1][2]
+                 for width in (2e-4, 0.0))
+    down, up = (xs - plain)[[period // 2, period]]
+    assert (2.0 * down, down - up) == pytest.approx((measure_spool(EASY, 2e-4),) * 2, rel=0.01)
 
 
 REST = State()
 
 
-def follow(law: Callable[..., Any], x: Iterable[float], memory: Any, p: Any, s: State = REST) -> np.ndarray:
+def follow(law: Callable[..., Any], x: Iterable[float], memory: Any, p: Any, s: State = REST, h: float = H
+           ) -> np.ndarray:
     """What a law with memory makes of a signal, a value a step."""
     out = []
     for k, value in enumerate(x):
-        y, memory = law(value, memory, s, Input(h=H, t=k * H), p)
+        y, memory = law(value, memory, s, Input(h=h, t=k * h), p)
         out.append(y)
     return np.array(out)
 
@@ -85,16 +85,16 @@ def test_current_limit_caps_the_speed_and_does_nothing_below() -> None:
     assert (below == plain).all()
 
 
-def test_the_nozzles_gain_differs_by_direction() -> None:
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_nozzles_gain_differs_by_direction(sign: float) -> None:
     """The spool settles with the slowest root of flapper and pilot loop, whose gain is Kv (1 + a) or Kv (1 - a)."""
     model = EASY.replace({"nozzle_asymmetry.asymmetry": 0.2, "flapper.damping": 0.2})
     v = model.values
     kv = v["pilot.flow_gain"] * v["feedback_spring.stiffness"] / v["spool.end_area"]
-    for sign in (1.0, -1.0):
-        xs = drive_plant(model, np.full(25, sign * 1e-3))[1][2]
-        rate = np.polyfit(np.arange(6, 14), np.log(1.0 - xs[6:14] / measure_spool(model, sign * 1e-3)), 1)[0] / MILLI
-        roots = np.roots([v["flapper.inertia"], v["flapper.damping"], v["flapper.stiffness"], kv * (1 + 0.2 * sign)])
-        assert rate == pytest.approx(max(roots.real), rel=0.03)
+    xs = drive_plant(model, np.full(25, sign * 1e-3))[1][2]
+    rate = np.polyfit(np.arange(6, 14), np.log(1.0 - xs[6:14] / measure_spool(model, sign * 1e-3)), 1)[0] / 1e-3
+    roots = np.roots([v["flapper.inertia"], v["flapper.damping"], v["flapper.stiffness"], kv * (1 + 0.2 * sign)])
+    assert rate == pytest.approx(max(roots.real), rel=0.03)
 
 
 def test_the_worn_ball_lets_the_spool_go_half_a_gap_further_and_hunt_at_null() -> None:
@@ -104,13 +104,13 @@ def test_the_worn_ball_lets_the_spool_go_half_a_gap_further_and_hunt_at_null() -
     assert xs[-1] == pytest.approx(measure_spool(model, 1e-3) + 10e-6, rel=1e-4) and hunting > 2e-6 > 1e-9 > quiet
 
 
-def test_flow_force_is_a_weaker_torque_motor_that_depends_on_the_pressure() -> None:
+@pytest.mark.parametrize("load", [0.0, 15e3])
+def test_flow_force_is_a_weaker_torque_motor_that_depends_on_the_pressure(load: float) -> None:
     model = EASY.replace({"flow_force.coefficient": 2e-3})
     lever = 2e-3 * model["flapper.stiffness"] / (model["spool.end_area"] * model["pilot.pressure_gain"])
-    for load in (0.0, 15e3):
-        _, p12, xs, _, _ = drive_plant(model, np.full(80, 2e-3), load)[1][:, -1]
-        spring = model["feedback_spring.stiffness"] + lever * (model["supply.pressure"] - abs(p12))
-        assert xs == pytest.approx(model["torque_motor.gain"] * 2e-3 / spring, rel=1e-3)
+    _, p12, xs, _, _ = drive_plant(model, np.full(80, 2e-3), load)[1][:, -1]
+    spring = model["feedback_spring.stiffness"] + lever * (model["supply.pressure"] - abs(p12))
+    assert xs == pytest.approx(model["torque_motor.gain"] * 2e-3 / spring, rel=1e-3)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -192,13 +192,12 @@ def test_compressibility_resonates_where_it_should_and_the_step_damps_nothing(h:
 COMMAND = np.r_[np.zeros(10), np.full(150, 2e-3), 2e-3 + 1e-3 * np.sin(np.arange(250) * 0.02)]
 STEADY = np.full(80, 1e-3)  # A
 AREA = WHOLE["jack.area"]
-LEAKY = {"jack.leakage": 3e-11}
 
 
 def list_steady_cases() -> Iterator[Any]:
     """Model, current, load and force of dry friction at the speed v of the ram, N."""
     yield pytest.param(EASY.replace({"jack.damping": 20e3}), STEADY, 0.0, lambda v: 0.0, id="viscous drag")
-    yield pytest.param(EASY.replace(LEAKY), np.zeros(60), 6e3, lambda v: 0.0, id="leakage")
+    yield pytest.param(EASY.replace({"jack.leakage": 3e-11}), np.zeros(60), 6e3, lambda v: 0.0, id="leakage")
     dry = {"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}
     for sign in (1.0, -1.0):
         yield pytest.param(QUIET_SPOOL.replace(dry), sign * STEADY, 0.0, lambda v: np.sign(v) * 1000.0,
@@ -225,11 +224,11 @@ def test_pressure_at_constant_speed_is_friction_drag_and_load(model: Model, curr
     assert AREA * p12 == pytest.approx(dry(v) + model["jack.damping"] * v + load, rel=2e-3) and abs(v) > 1e-6
 
 
-def test_a_ram_with_asymmetric_friction_at_rest_holds_more_one_way() -> None:
+@pytest.mark.parametrize(("load", "moves"), [(559.0, False), (561.0, True), (-1039.0, False), (-1041.0, True)])
+def test_a_ram_with_asymmetric_friction_at_rest_holds_more_one_way(load: float, moves: bool) -> None:
     """Loads up to FS (1 - d) against extension and FS (1 + d) with it move nothing, more does."""
-    model = WHOLE.replace({"friction_asymmetry.asymmetry": 0.3})
-    for load, moves in ((559.0, False), (561.0, True), (-1039.0, False), (-1041.0, True)):
-        assert (drive_plant(model, np.zeros(30), load)[0].state.jack_position != 0.0) == moves, load
+    plant, _ = drive_plant(WHOLE.replace({"friction_asymmetry.asymmetry": 0.3}), np.zeros(30), load)
+    assert (plant.state.jack_position != 0.0) == moves
 
 
 @pytest.mark.parametrize("deflection", [5e-6, 2e-5, 1e-4])
@@ -273,17 +272,17 @@ def test_sensor_lag_is_a_first_order_lag(tau: float, signal: str) -> None:
     np.testing.assert_allclose(sensed, expected, atol=2e-4 * np.abs(x).max())
 
 
+@pytest.mark.parametrize("fast", [True, False])
 @pytest.mark.parametrize("more", [{}, {"sensor_lag.time": 2e-3}])
-def test_the_first_sample_has_the_sensors_offset(more: dict[str, float]) -> None:
+def test_the_first_sample_has_the_sensors_offset(more: dict[str, float], fast: bool) -> None:
     """The transducer shows it before the plant has made a step."""
     model = WHOLE.replace({"sensor_offset.offset": 50e-6} | more)
-    for fast in (True, False):
-        plant = Actuator(model, steps=20, fast=fast)
-        run = simulate(model, np.zeros(3), steps=20, fast=fast)
-        assert plant.sample()[0] == run.xj[0] == 50e-6
-        assert run.cor[0] == -50e-6 * model["controller.proportional_gain"]
-        plant.advance(0.0)
-        assert plant.sample()[0] == run.xj[1] == 50e-6  # nor is there a jump in the second
+    plant = Actuator(model, steps=20, fast=fast)
+    run = simulate(model, np.zeros(3), steps=20, fast=fast)
+    assert plant.sample()[0] == run.xj[0] == 50e-6
+    assert run.cor[0] == -50e-6 * model["controller.proportional_gain"]
+    plant.advance(0.0)
+    assert plant.sample()[0] == run.xj[1] == 50e-6  # nor is there a jump in the second
 
 
 def test_readings_are_whole_steps_and_their_error_is_evenly_spread() -> None:
@@ -376,21 +375,17 @@ def test_a_weaker_magnet_moves_the_spool_by_less() -> None:
 
 def test_shorted_turns_lose_gain_and_lag_by_their_share_of_the_time_constant() -> None:
     _, p, _ = build("coil_short.share", 0.2)
-    h, memory, out = 1e-6, Flux(), []
-    for _ in range(4000):
-        y, memory = coil_short(1e-3, memory, State(), Input(h=h), p)
-        out.append(y)
-    t = h * np.arange(1, 4001)
+    out, t = follow(coil_short, np.full(4000, 1e-3), Flux(), p, h=1e-6), 1e-6 * np.arange(1, 4001)
     assert np.allclose(out, 0.8e-3 * (1.0 - np.exp(-t / 0.6e-3)), atol=2e-6)
 
 
 @pytest.mark.parametrize("b", [0.3, -0.3, 1.0])
-def test_a_blocked_nozzle_is_half_the_difference_of_the_openings(b: float) -> None:
+@pytest.mark.parametrize("x", [-1e-5, 0.0, 2e-5])
+def test_a_blocked_nozzle_is_half_the_difference_of_the_openings(b: float, x: float) -> None:
     model, p, _ = build("nozzle_block.share", b)
     most = model["flapper.travel"]
-    for x in (-1e-5, 0.0, 2e-5):
-        left, right = (most + x) * (1.0 + min(b, 0.0)), (most - x) * (1.0 - max(b, 0.0))
-        assert nozzle_block(x, State(), Input(), p) == pytest.approx(0.5 * (left - right), abs=1e-18)
+    left, right = (most + x) * (1.0 + min(b, 0.0)), (most - x) * (1.0 - max(b, 0.0))
+    assert nozzle_block(x, State(), Input(), p) == pytest.approx(0.5 * (left - right), abs=1e-18)
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.05])

@@ -12,7 +12,7 @@ from effect_files import COGGING, HEAD, MEMORY
 from effects_cases import EASY, LAWS, QUIET_SPOOL, WHOLE
 from physics_cases import PREFLIGHT, SILENT
 from refusals import catch_refusal
-from rig_command import answer, refuse
+from rig_command import answer, refuse, write_file
 
 from plant import Actuator, Model, simulate
 from plant.effects import CATALOGUE, load_effects
@@ -56,31 +56,32 @@ def test_the_catalogue_is_the_canonical_one() -> None:
     assert set(CATALOGUE) == {*CANONICAL, "current_noise"}
 
 
-def test_each_says_what_it_is() -> None:
-    for name, e in CATALOGUE.items():
-        assert e.law and e.symptoms and e.source and e.parameters, name
-        assert e.base or e.function.__doc__, name
-        assert set(e.fitted) <= set(e.parameters) and bool(e.fitted) == (not e.disturbance), name
-        for other in e.confused_with:
-            assert other in CATALOGUE or find_quantity(other), name
-            assert other not in CATALOGUE or name in CATALOGUE[other].confused_with, other
-        assert all(name in CATALOGUE[other].excludes for other in e.excludes), name
-        assert e.firmware == (name == "command_rate_limit")
+@pytest.mark.parametrize("name", [*CANONICAL, "current_noise"])
+def test_each_says_what_it_is(name: str) -> None:
+    e = CATALOGUE[name]
+    assert e.law and e.symptoms and e.source and e.parameters
+    assert e.base or e.function.__doc__
+    assert set(e.fitted) <= set(e.parameters) and bool(e.fitted) == (not e.disturbance)
+    for other in e.confused_with:
+        assert other in CATALOGUE or find_quantity(other)
+        assert other not in CATALOGUE or name in CATALOGUE[other].confused_with, other
+    assert all(name in CATALOGUE[other].excludes for other in e.excludes)
+    assert e.firmware == (name == "command_rate_limit")
 
 
-def test_the_starts_of_each_are_values_that_it_allows() -> None:
-    for name in CANONICAL:
-        e, usual = CATALOGUE[name], load_nominal_values() | dict(CATALOGUE[name].off)
-        assert len(e.starts) >= 2, name
-        for start in e.starts:
-            assert tuple(start) == e.fitted, name
-            assert not any(e.parameters[parameter].refuses(value) for parameter, value in start.items()), name
-            assert start != {parameter: usual[parameter] for parameter in start}, name
-            assert e.is_active(start) or e.base, name
-        for parameter, quantity in e.parameters.items():  # what is said to be typical is what a fit tries
-            for value in parse_hint(quantity) if parameter == e.fitted[0] and len(e.fitted) == 1 else ():
-                sizes = [abs(start[parameter]) for start in e.starts]
-                assert min(sizes) / 4 <= abs(value) <= 4 * max(sizes), parameter
+@pytest.mark.parametrize("name", CANONICAL)
+def test_the_starts_of_each_are_values_that_it_allows(name: str) -> None:
+    e, usual = CATALOGUE[name], load_nominal_values() | dict(CATALOGUE[name].off)
+    assert len(e.starts) >= 2
+    for start in e.starts:
+        assert tuple(start) == e.fitted
+        assert not any(e.parameters[parameter].refuses(value) for parameter, value in start.items())
+        assert start != {parameter: usual[parameter] for parameter in start}
+        assert e.is_active(start) or e.base
+    for parameter, quantity in e.parameters.items():  # what is said to be typical is what a fit tries
+        for value in parse_hint(quantity) if parameter == e.fitted[0] and len(e.fitted) == 1 else ():
+            sizes = [abs(start[parameter]) for start in e.starts]
+            assert min(sizes) / 4 <= abs(value) <= 4 * max(sizes), parameter
 
 
 @pytest.mark.parametrize("steps", [FEW, 50, 100])
@@ -180,10 +181,14 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "mine.py"
 
 
+def load_text(file: Path, text: str) -> list[str]:
+    """Write an effect file and load it; the names of its effects."""
+    return load_effects(write_file(file, text))
+
+
 def test_the_users_effect_is_found_and_acts(file: Path) -> None:
     """A force periodic over a metre is a spring where the ram moves millimetres."""
-    file.write_text(COGGING)
-    assert load_effects(file) == ["cogging"]
+    assert load_text(file, COGGING) == ["cogging"]
     model = SILENT.replace({"cogging.force": 5e5 / (2.0 * np.pi), "cogging.length": 1.0})
     ours = columns(WHOLE.replace({"aero_stiffness.stiffness": 5e5}))
     assert np.abs(columns(model)[2] - ours[2]).max() < 5e-6  # the same physics, at the start of the step not its middle
@@ -192,8 +197,7 @@ def test_the_users_effect_is_found_and_acts(file: Path) -> None:
 
 
 def test_the_users_effect_with_memory(file: Path) -> None:
-    file.write_text(MEMORY)
-    assert load_effects(file) == ["wear"] and CATALOGUE["wear"].parameters["wear.rate"].unit == "N/m"
+    assert load_text(file, MEMORY) == ["wear"] and CATALOGUE["wear"].parameters["wear.rate"].unit == "N/m"
     plant, places = Actuator(SILENT.replace({"wear.rate": 3e5}), fast=False, steps=FEW), [0.0]
     for current in 4e-3 * np.sin(np.arange(300) * 0.05):
         plant.advance(current)
@@ -214,8 +218,7 @@ def test_the_users_effect_with_memory(file: Path) -> None:
 ])
 def test_a_bad_file_is_refused_in_one_line(file: Path, text: str, said: str) -> None:
     assert "a Python file with effects" in catch_refusal(load_effects, file)  # there is none yet
-    file.write_text(text)
-    line = catch_refusal(load_effects, file)
+    line = catch_refusal(load_text, file, text)
     assert said in line and str(file) in line
 
 
@@ -224,8 +227,7 @@ def test_a_bad_file_is_refused_in_one_line(file: Path, text: str, said: str) -> 
     ("return x + open('f')", "position", Actuator), ("return [x, 'text']", "load", partial(simulate, command=COMMAND))])
 def test_a_law_that_cannot_run_is_refused(file: Path, body: str, port: str, use: Callable[[Model], object]) -> None:
     start = COGGING.index("    return x +")
-    file.write_text(COGGING[:start].replace("load", port) + f"    {body}\n")
-    load_effects(file)
+    load_text(file, COGGING[:start].replace("load", port) + f"    {body}\n")
     assert "cogging" in catch_refusal(use, Model().with_effects(["cogging"]))
 
 
@@ -233,8 +235,7 @@ def test_a_law_that_cannot_run_is_refused(file: Path, body: str, port: str, use:
     (COGGING, "cogging", "cogging.force"), (DEMAND, "rounding", "rounding.step")])
 def test_an_effect_without_a_hint_starts_where_it_shows(file: Path, text: str, name: str, sized: str) -> None:
     """Nothing is said about how large it is: sizes are found that show 3, 30 and 300 times the noise."""
-    file.write_text(text)
-    load_effects(file)
+    load_text(file, text)
     starts = find_starts(CATALOGUE[name], PREFLIGHT)
     assert all(tuple(start) == CATALOGUE[name].fitted for start in starts)
     upwards = [start for start in starts if start[sized] > 0.0 and start.get("cogging.length", 1e-3) == 1e-3]
@@ -264,9 +265,8 @@ def test_an_effect_of_the_plants_own_parameters_starts_on_either_side_of_nominal
 
 
 def test_a_hint_spares_the_search(file: Path) -> None:
-    file.write_text(COGGING.replace('Quantity("N")', 'Quantity("N", low=0, typical="0.2-5 kN")')
-                    .replace("above=0)", 'above=0, typical="1-4 mm")'))
-    load_effects(file)
+    load_text(file, COGGING.replace('Quantity("N")', 'Quantity("N", low=0, typical="0.2-5 kN")')
+              .replace("above=0)", 'above=0, typical="1-4 mm")'))
     starts = ensure_starts("cogging", PREFLIGHT).starts
     force, length = (sorted({start[f"cogging.{name}"] for start in starts}) for name in ("force", "length"))
     assert starts == CATALOGUE["cogging"].starts
@@ -274,11 +274,10 @@ def test_a_hint_spares_the_search(file: Path) -> None:
 
 
 def test_a_phase_starts_at_quarter_turns_and_an_angle_where_it_usually_is(file: Path) -> None:
-    file.write_text(COGGING.replace('Quantity("N")', 'Quantity("N", low=0, typical="0.2-5 kN")').replace(
+    load_text(file, COGGING.replace('Quantity("N")', 'Quantity("N", low=0, typical="0.2-5 kN")').replace(
         "\n@effect", '    phase: Annotated[float, Quantity("rad")] = 0.0\n'
                       '    tilt: Annotated[float, Quantity("rad")] = 0.1\n\n@effect', 1).replace(
         "/ p.cogging.length", "/ p.cogging.length + p.cogging.phase + p.cogging.tilt"))
-    load_effects(file)
     starts = find_starts(CATALOGUE["cogging"], PREFLIGHT)
     phases, tilts = (sorted({start[f"cogging.{name}"] for start in starts}) for name in ("phase", "tilt"))
     assert phases == pytest.approx([quarter * 0.5 * np.pi for quarter in range(-1, 4)])  # for either range of a turn
@@ -288,16 +287,14 @@ def test_a_phase_starts_at_quarter_turns_and_an_angle_where_it_usually_is(file: 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_the_trial_of_an_unsound_effect(file: Path) -> None:
     text = COGGING.replace("return x +", "return (x + 1.0) * (1.0 + p.cogging.force) ** 400 +")
-    file.write_text(text.replace('Quantity("N")', 'Quantity("N", low=0, high=1e3)').replace('"load"', '"position"'))
-    load_effects(file)
+    load_text(file, text.replace('Quantity("N")', 'Quantity("N", low=0, high=1e3)').replace('"load"', '"position"'))
     off, *infinite = check_effect("cogging", COMMAND).faults
     assert off == "at its off value it changes the plant"
     assert infinite and all("has no number any more" in fault for fault in infinite)
 
 
 def test_the_trial_of_an_effect_that_does_not_show(file: Path) -> None:
-    file.write_text(COGGING)
-    load_effects(file)
+    load_text(file, COGGING)
     found = check_effect("cogging", np.zeros(100))
     assert found.faults == ("no size of it changes anything on this command",) and not found.visible
 
