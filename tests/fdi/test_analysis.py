@@ -16,14 +16,14 @@ import pytest
 from effect_files import restored_catalogue
 from refusals import catch_refusal
 from rig_command import rig
-from short_runs import HIDDEN, build_command, write_measured_runs
+from short_runs import HIDDEN, build_command, simulate_trace, write_measured_runs
 
 import fdi
 from fdi.analysis import Plot, Result
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.refine import SUSPECTS
 from fdi.trace.trace import Trace
-from plant import Model, simulate
+from plant import Model
 
 PAGE = (Path(__file__).parents[2] / "docs" / "python.md").read_text()
 EXAMPLES = [re.sub(r"^    ", "", block, flags=re.MULTILINE) for block in
@@ -110,14 +110,14 @@ def test_without_plotly_the_message_says_what_to_install(
     assert "pip install 'eha-rig[plots]'" in catch_refusal(lines["comparison"].plot("Where").to_plotly)
 
 
-def test_values_have_a_short_repr(lines: dict[str, Any]) -> None:
-    begins = {"comparison": "<ComparisonResult MODEL_INCOMPLETE: The model does not explain", "explanation": "<",
-              "trace": "<Trace of run.csv: 4000 cycles of 1 ms, 4 s, xj, p12, xs>", "result": "<", "diagnosis": "<",
-              "plot": "<", "model": "<Model eha of plant eha: nominal>",
-              "fitted": "<Model eha of plant eha with null_bias: "}
-    for name, begin in begins.items():
-        text = repr({**lines, "model": Model(), "fitted": lines["result"].model}[name])
-        assert text.startswith(begin) and len(text) < 180 and "\n" not in text, text
+@pytest.mark.parametrize(("name", "begin"), [
+    ("comparison", "<ComparisonResult MODEL_INCOMPLETE: The model does not explain"), ("explanation", "<"),
+    ("trace", "<Trace of run.csv: 4000 cycles of 1 ms, 4 s, xj, p12, xs>"), ("result", "<"), ("diagnosis", "<"),
+    ("plot", "<"), ("model", "<Model eha of plant eha: nominal>"),
+    ("fitted", "<Model eha of plant eha with null_bias: ")])
+def test_values_have_a_short_repr(name: str, begin: str, lines: dict[str, Any]) -> None:
+    text = repr({**lines, "model": Model(), "fitted": lines["result"].model}[name])
+    assert text.startswith(begin) and len(text) < 180 and "\n" not in text, text
 
 
 @pytest.mark.parametrize("name", ["comparison", "explanation", "result", "diagnosis"])
@@ -162,10 +162,9 @@ def test_importing_fdi_loads_neither_numba_nor_matplotlib() -> None:
 
 
 def test_the_bar_of_a_diagnosis_moves_within_its_long_stage() -> None:
-    columns = simulate(Model().replace({"filter.clogging": 0.2}), build_command(), None, 1, 50)
+    run = simulate_trace(Model().replace({"filter.clogging": 0.2}), build_command(), seed=1, steps=50)
     seen: list[tuple[str, float]] = []
-    diagnose(Trace.from_columns(columns._asdict(), 1e-3, {}), workers=1,
-             progress=lambda name, share: seen.append((name, share)))
+    diagnose(run, workers=1, progress=lambda name, share: seen.append((name, share)))
     shares = [share for _, share in seen]
     assert shares == sorted(shares) and shares[-1] == 1.0
     assert len({share for name, share in seen if name == "refinement"}) > 8

@@ -3,11 +3,12 @@
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from rig_command import SHORT
+from short_runs import simulate_trace
 
 from dbc import EDS
-from fdi.trace.trace import Trace
-from plant import Model, simulate
+from plant import Model
 
 SLIP = """from typing import Annotated, NamedTuple
 from plant.effects import effect
@@ -300,8 +301,8 @@ def write_bad_files(folder: Path) -> None:
         (folder / name).write_text(text, encoding="latin-1")
     for seed, (name, size) in enumerate((("run.csv", 1e-3), ("run2.csv", 1e-3), ("other.csv", -2e-3), ("rest.csv", 0.0),
                                          ("dates/run.csv", 1e-3))):
-        columns = simulate(Model(), [size * (k > 50) for k in range(400)], None, seed, 20)
-        Trace.from_columns(columns._asdict(), 1e-3, {}).write_csv(folder / name)
+        command = size * (np.arange(400) > 50)
+        simulate_trace(Model(), command, seed=seed, steps=20).write_csv(folder / name)
 
 
 def find_faults(case: BadInput, status: int, out: str, err: str) -> list[str]:

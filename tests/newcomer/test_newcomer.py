@@ -5,7 +5,6 @@ import signal
 import time
 from pathlib import Path
 
-import pytest
 from bad_inputs import BAD_INPUTS, find_faults, write_bad_files
 from places import ROOT
 from rig_command import finished, rig, started
@@ -22,17 +21,16 @@ from plant.effects import CATALOGUE
 from rig.cli.command_list import COMMANDS
 
 
-def test_bad_input_gets_one_line_that_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_bad_files(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+def test_bad_input_gets_one_line_that_names_it(here: Path) -> None:
+    write_bad_files(here)
+    before = {path: path.read_bytes() for path in here.rglob("*") if path.is_file()}
     found = {}
     for case in BAD_INPUTS:
         said = rig(*case.words.split())
         CATALOGUE.pop("slip", None)  # of one of them
         found[case.words] = find_faults(case, said.status, said.out, said.err)
     assert {words: faults for words, faults in found.items() if faults} == {}
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert {path: path.read_bytes() for path in here.rglob("*") if path.is_file()} == before
 
 
 def test_bad_inputs_are_of_every_command() -> None:

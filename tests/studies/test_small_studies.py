@@ -18,13 +18,14 @@ import pytest
 from noisy_traces import SHORT, record_plant
 from physics_cases import PREFLIGHT
 from places import SHARED
+from short_runs import simulate_trace
 
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import FRICTION, Level
 from fdi.estimation.fit import complete_model
 from fdi.report.report import render_html
 from fdi.trace.trace import Trace
-from plant import Model, simulate
+from plant import Model
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes
 from rig.bench import benchmarks
@@ -54,7 +55,7 @@ def test_recordings_repeat_by_their_seed() -> None:
 def trace(kintas: float, fss: float) -> Trace:
     model = Model().replace({"filter.clogging": kintas, "spool.static_friction": fss,
                              "spool.dynamic_friction": fss / 1.5})
-    return Trace.from_columns(simulate(model, PREFLIGHT)._asdict(), 1e-3, {})
+    return simulate_trace(model, PREFLIGHT)
 
 
 def texts(svg: str) -> set[str]:
@@ -89,20 +90,20 @@ def other_command() -> Diagnosis:
     return diagnose(record_plant({"spool.static_friction": 45.0, "spool.dynamic_friction": 30.0}, SHORT))
 
 
-def test_global_optimisers_leave_less_than_the_grid(other_command: Diagnosis) -> None:
+@pytest.mark.parametrize("name", [
+    "differential evolution", "simulated annealing",
+    pytest.param("genetic", marks=pytest.mark.skipif(not methods.is_installed("pygad"), reason="needs pygad"))])
+def test_global_optimisers_leave_less_than_the_grid(name: str, other_command: Diagnosis) -> None:
     d, grid = other_command, (0.1, 38.0)
     at_grid = methods.Objective(methods.make_problem(d.model, d.trace, d.floor), d.model, grid)
     left = at_grid.report("grid", at_grid.start).left
-    for name in ("differential evolution", "simulated annealing", "genetic"):
-        if name != "genetic" or methods.is_installed("pygad"):
-            found = methods.METHODS[name](d.model, d.trace, grid, d.floor, 0)
-            assert found.left < 0.9 * left and 200 < found.simulations < 500
-            assert 19.0 <= found.fss <= 76.0 and 0.0 <= found.kintas <= 0.3
+    found = methods.METHODS[name](d.model, d.trace, grid, d.floor, 0)
+    assert found.left < 0.9 * left and 200 < found.simulations < 500
+    assert 19.0 <= found.fss <= 76.0 and 0.0 <= found.kintas <= 0.3
 
 
+@pytest.mark.skipif(not methods.is_installed("sklearn"), reason="needs scikit-learn")
 def test_learners_know_units_that_they_never_saw(other_command: Diagnosis) -> None:
-    if not methods.is_installed("sklearn"):
-        pytest.skip("needs scikit-learn")
     data = methods.simulate_lesson(other_command.trace, other_command.model, cloggings=(0.0, 0.3),
                                        frictions=(5.0, 45.0, 90.0), held_out=4)
     assert data.unseen.sum() == 2 * 3 * 4
@@ -291,9 +292,6 @@ def test_the_plants_effects_are_what_the_table_says_as_written_twice() -> None:
         assert max(left) < (1.0 if effect.name == "compressibility" else 0.5), (effect.name, effect.size, left)
 
 
-SCRIPT = Path(score.__file__)
-
-
 def truth(kind: str, effects: Sequence[str] = (), floors: float = 9.0, where: Sequence[str] = ("xj/s02", "xs/s03"),
           **more: Any) -> dict[str, Any]:
     """A truth as the maker writes it."""
@@ -337,7 +335,7 @@ def folder(tmp_path: Path) -> Path:
 
 def run_script(*arguments: object) -> subprocess.CompletedProcess[str]:
     """The scorer as others run it: without site packages and without this project on the path."""
-    return subprocess.run([sys.executable, "-I", "-S", str(SCRIPT), *map(str, arguments)], capture_output=True,
+    return subprocess.run([sys.executable, "-I", "-S", str(score.__file__), *map(str, arguments)], capture_output=True,
                           text=True, check=False)
 
 

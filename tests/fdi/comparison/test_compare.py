@@ -12,7 +12,7 @@ from noisy_traces import LEVELS, SHORT, make_backlash, make_lag, record_healthy,
 from places import SHARED
 from refusals import catch_refusal
 from rig_command import answer, rig
-from short_runs import STEPS, build_command
+from short_runs import STEPS, build_command, simulate_trace
 
 from fdi.comparison.compare import Comparison, compare, compare_controller, find_lags
 from fdi.comparison.residuals import (
@@ -32,7 +32,7 @@ from fdi.report.compare_report import describe_findings, describe_verdict
 from fdi.thresholds import CONTROLLER_ERROR_RATIO
 from fdi.trace.sensor_dynamics import SensorDynamics, measure_resolution, read_sensors, write_sensors
 from fdi.trace.trace import Trace, rms, shift_rows
-from plant import Model, load_model, simulate
+from plant import Model, load_model
 from rig.recorder.convert import write_mcap
 
 MODEL = Model()
@@ -148,8 +148,7 @@ def test_noise_that_nobody_stated_gives_a_lower_bound() -> None:
 
 def test_a_simulation_without_noise_is_its_own_floor() -> None:
     quiet = MODEL.replace({f"sensors.{name}_noise": 0.0 for name in ("position", "pressure", "spool")})
-    run = simulate(quiet, SHORT)
-    assert compare(Trace.from_columns(run._asdict(), 1e-3, {}), quiet).verdict == "WITHIN_FLOOR"
+    assert compare(simulate_trace(quiet, SHORT), quiet).verdict == "WITHIN_FLOOR"
 
 
 def test_rows_lost_at_random_are_no_error() -> None:
@@ -319,7 +318,7 @@ MEAN = SensorDynamics(moving_mean=20.0)
 @cache
 def run_nominal() -> Trace:
     """The nominal plant with its sensors' noise, 2.5 s."""
-    return Trace.from_columns(simulate(Model(), build_command()[:2500], None, 1, STEPS)._asdict(), 1e-3, {})
+    return simulate_trace(Model(), build_command()[:2500], seed=1, steps=STEPS)
 
 
 def filter_by_loop(x: np.ndarray, sensor: SensorDynamics) -> np.ndarray:
@@ -425,13 +424,13 @@ def nominal(case: str) -> Comparison:
 
 @needs_traces
 @pytest.mark.parametrize("case", TRUE)
-def test_the_truth_is_at_the_floor(case: str) -> None:
-    for name, repeats in (("est", [trace(case, "repeat")]), ("holdout", [])):
-        found = compare(trace(case, name), Model().replace(TRUE[case]), repeats)
-        assert found.verdict == "WITHIN_FLOOR", describe_verdict(found)
-        for signal in found.signals.values():
-            noise = signal.floor.value / SENSOR_NOISE[signal.signal.name]
-            assert (signal.ratio, noise) == pytest.approx((1.0, 1.0), abs=0.03)
+@pytest.mark.parametrize(("name", "repeats"), [("est", ["repeat"]), ("holdout", [])])
+def test_the_truth_is_at_the_floor(case: str, name: str, repeats: list[str]) -> None:
+    found = compare(trace(case, name), Model().replace(TRUE[case]), [trace(case, each) for each in repeats])
+    assert found.verdict == "WITHIN_FLOOR", describe_verdict(found)
+    for signal in found.signals.values():
+        noise = signal.floor.value / SENSOR_NOISE[signal.signal.name]
+        assert (signal.ratio, noise) == pytest.approx((1.0, 1.0), abs=0.03)
 
 
 @needs_traces

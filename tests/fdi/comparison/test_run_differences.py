@@ -93,15 +93,17 @@ def test_missing_samples_signals_and_units_are_left_out() -> None:
     assert pair.not_compared == {"p12": "only A has it", "cor": "in A in A, in rad/s in B"}
 
 
-def test_checks_are_matched_by_name_and_changes_are_marked() -> None:
-    failed, limits, new = (replace(LIMITED, **keys) for keys in (
-        {"value": 13.0, "passed": False}, {"high": 12.0}, {"name": "rise time"}))
-    for runs, changed, other_limits in (
-            ([[LIMITED], [failed]], [True], [False]), ([[LIMITED], [LIMITED, new]], [False, True], [False, False]),
-            ([[LIMITED], [limits], []], [False], [True]),  # a run without any checks changes none
-            ([[LIMITED, failed], [LIMITED, failed]], [False, False], [False, False])):
-        found = match_checks(runs)
-        assert [[c.is_changed for c in found], [c.has_other_limits for c in found]] == [changed, other_limits]
+FAILED, NEW = replace(LIMITED, value=13.0, passed=False), replace(LIMITED, name="rise time")
+
+
+@pytest.mark.parametrize(("runs", "changed", "other_limits"), [
+    ([[LIMITED], [FAILED]], [True], [False]), ([[LIMITED], [LIMITED, NEW]], [False, True], [False, False]),
+    ([[LIMITED], [replace(LIMITED, high=12.0)], []], [False], [True]),  # a run without any checks changes none
+    ([[LIMITED, FAILED], [LIMITED, FAILED]], [False, False], [False, False])])
+def test_checks_are_matched_by_name_and_changes_are_marked(runs: list[list[CheckResult]], changed: list[bool],
+                                                           other_limits: list[bool]) -> None:
+    found = match_checks(runs)
+    assert [[c.is_changed for c in found], [c.has_other_limits for c in found]] == [changed, other_limits]
 
 
 def test_a_changed_check_makes_runs_different() -> None:

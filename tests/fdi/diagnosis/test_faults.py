@@ -15,7 +15,8 @@ from noisy_traces import SHORT as RAMP_AND_SINE, record_plant
 from physics_cases import PREFLIGHT
 from places import ROOT
 from refusals import catch_refusal
-from rig_command import answer, refuse, rig
+from rig_command import answer, refuse, rig, write_file
+from short_runs import simulate_trace
 
 from fdi.diagnosis import make_bands
 from fdi.diagnosis.ambiguity import cut_intervals, find_groups
@@ -53,7 +54,7 @@ from fdi.estimation.fit import Free
 from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
-from plant import Model, load_model, simulate
+from plant import Model, load_model
 from plant.faults import Fault, place_fault
 from plant.plants import find_plant
 from plant.segments import Hold, Ramp, Step, build_profile as profile
@@ -67,8 +68,7 @@ def write(path: Path, **keys: Any) -> Path:
     """A fault file with one fault: GAP with other keys; None leaves one out."""
     table = {key: value for key, value in {**GAP, **keys}.items() if value is not None}
     lines = [f"{key} = {json.dumps(value).replace(': ', ' = ')}" for key, value in table.items()]
-    path.write_text("\n".join(["[faults.play]", *lines]) + "\n")
-    return path
+    return write_file(path, "\n".join(["[faults.play]", *lines]) + "\n")
 
 
 def test_the_papers_faults_are_a_file_with_the_limits_of_table_2() -> None:
@@ -101,16 +101,14 @@ def test_the_papers_faults_are_a_file_with_the_limits_of_table_2() -> None:
     ({"parameter": "quantisation.lsb"}, ["parameter", "a replay of the measured drive shows"]),
     ({"both_ways": 1}, ["both_ways", "true or false"])])
 def test_a_bad_fault_is_one_line_with_status_2(tmp_path: Path, keys: dict[str, Any], words: list[str]) -> None:
-    file = write(tmp_path / "bad.toml", **keys)
-    text = catch_refusal(load_faults, file)
-    assert "\n" not in text and all(word in text for word in ("bad.toml", "faults.play", *words)), text
+    text = catch_refusal(load_faults, write(tmp_path / "bad.toml", **keys))
+    assert all(word in text for word in ("bad.toml", "faults.play", *words)), text
 
 
 def test_bad_files_and_lists(tmp_path: Path) -> None:
     for content, word in (("", "at least one table"), ("[faults]\n", "at least one table"), ("x = 1\n", "only tables"),
                           ("[faults.a]\n", "also the key 'title'"), ("[faults\n", "TOML")):
-        (tmp_path / "bad.toml").write_text(content)
-        assert word in catch_refusal(load_faults, tmp_path / "bad.toml")
+        assert word in catch_refusal(load_faults, write_file(tmp_path / "bad.toml", content))
     write(tmp_path / "two.toml").open("a").write((tmp_path / "two.toml").read_text().replace("play]", "other]"))
     assert "of its own" in catch_refusal(load_faults, tmp_path / "two.toml")
     assert "a fault file" in catch_refusal(choose_faults, None, find_plant("ehs"))
@@ -118,8 +116,7 @@ def test_bad_files_and_lists(tmp_path: Path) -> None:
         assert rig(*words).status == 2
 
 
-def test_a_new_fault_passes_its_own_checks_and_is_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_new_fault_passes_its_own_checks_and_is_listed(here: Path) -> None:
     assert rig("new", "fault", "my_gap", "--json").json["verdict"] == "COMPLETE"
     assert rig("list", "faults", "--faults", "my_gap.toml", "--json").json["faults"][0]["maintenance"] == 3.178
     assert rig("check", "my_gap.toml").status == 0
@@ -203,9 +200,8 @@ def test_backlash_is_measured_although_rows_hang_on_its_impacts() -> None:
     assert found.sizes["backlash"].low < 8e-5 < found.sizes["backlash"].high
 
 
-def test_a_plant_and_faults_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plant_and_faults_of_ones_own(here: Path) -> None:
     """`rig fdi`, `rig campaign` and `rig trend` with both; bands and maps speak of this plant and of no other."""
-    monkeypatch.chdir(tmp_path)
     assert rig("new", "plant", "new_plant").status == 0
     Path("faults.toml").write_text("""
 [faults.bearing]
@@ -253,16 +249,13 @@ CLOGGED, RUBBED = "filter_clogging", "spool_friction"
 NAN = math.nan
 
 
-@cache
-def parts() -> list[Section]:
-    return find_sections(PREFLIGHT)
+PARTS = find_sections(PREFLIGHT)
 
 
 @cache
 def units(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5, count: int = 16) -> np.ndarray:
-    com = PREFLIGHT
     kind = make_kind(clogging, friction, sliding)
-    return simulate_units(load_model(), com, np.zeros_like(com), kind, count, seed=4321)
+    return simulate_units(load_model(), PREFLIGHT, np.zeros_like(PREFLIGHT), kind, count, seed=4321)
 
 
 def make_kind(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5) -> dict[str, float]:
@@ -273,7 +266,7 @@ def make_kind(clogging: float = NAN, friction: float = NAN, sliding: float = 1 /
 
 
 def judged(x: np.ndarray, bands: Bands | None = None) -> BandVerdict:
-    return judge_position(PREFLIGHT, x, 1e-3, bands or load_default_bands(), parts=parts())
+    return judge_position(PREFLIGHT, x, 1e-3, bands or load_default_bands(), parts=PARTS)
 
 
 def levels(found: list[BandVerdict], fault: str) -> list[Level]:
@@ -359,46 +352,41 @@ def test_bands_of_another_command_are_refused() -> None:
     assert [matches_command(bands, each, 1e-3) for each in (com, other)] == [True, False]
 
 
-SHORT = (Hold(time=0.3), Step(to=2e-3, time=0.4), Ramp(to=3e-3, time=1.5), Hold(time=0.2))
+SHORT = profile((Hold(time=0.3), Step(to=2e-3, time=0.4), Ramp(to=3e-3, time=1.5), Hold(time=0.2))).command
 
 
 @cache
 def short_bands(force: float = 0.0) -> Bands:
-    com = profile(SHORT).command
-    return make_bands_by_simulation(load_model(), com, np.full(len(com), force), 1e-3, count=64, faulty=48, seed=1)
+    return make_bands_by_simulation(load_model(), SHORT, np.full(len(SHORT), force), 1e-3, count=64, faulty=48, seed=1)
 
 
 def test_any_command() -> None:
     """Bands by simulation of a command that nobody has seen before judge as those of the preflight do."""
-    com = profile(SHORT).command
     made = short_bands()
     assert all(map(made.shows, made.faults))
     for kind, ruling in ((make_kind(0.4), CLOGGED), (make_kind(friction=60.0), RUBBED), (make_kind(), None)):
-        x = simulate_units(load_model(), com, np.zeros_like(com), kind, 16, seed=99)
-        assert {judge_position(com, row, 1e-3, made).ruling for row in x} == {ruling}
+        x = simulate_units(load_model(), SHORT, np.zeros_like(SHORT), kind, 16, seed=99)
+        assert {judge_position(SHORT, row, 1e-3, made).ruling for row in x} == {ruling}
 
 
 def test_faults_of_a_list_of_ones_own() -> None:
     """Where none is a friction, ramps judge the others as well."""
-    com = profile(SHORT).command
-    made = make_bands_by_simulation(load_model(), com, np.zeros_like(com), 1e-3, 48, 32, seed=1, faults=[CLOGGING])
+    made = make_bands_by_simulation(load_model(), SHORT, 0.0 * SHORT, 1e-3, 48, 32, seed=1, faults=[CLOGGING])
     again = parse_bands(format_bands(made), "")
     assert {ramp.fault for ramp in again.ramps} == {CLOGGED} and again.shows(again.faults[0])
     for size, level in ((0.0, Level.ACCEPTABLE), (1.2 * CLOGGING.maintenance, Level.NON_NOMINAL)):
-        x = simulate_units(load_model(), com, np.zeros_like(com), CLOGGING.list_changes(size), 16, seed=99)
-        assert {judge_position(com, row, 1e-3, again).levels[CLOGGED] for row in x} == {level}
-    noise = make_bands.sample_sensor_noise(np.random.default_rng(1), load_model(), len(com))
-    assert set(measure_precursors(trace(com + noise, com), again.precursors)["break_away"].adds) == {CLOGGED}
+        x = simulate_units(load_model(), SHORT, np.zeros_like(SHORT), CLOGGING.list_changes(size), 16, seed=99)
+        assert {judge_position(SHORT, row, 1e-3, again).levels[CLOGGED] for row in x} == {level}
+    noise = make_bands.sample_sensor_noise(np.random.default_rng(1), load_model(), len(SHORT))
+    assert set(measure_precursors(trace(SHORT + noise, SHORT), again.precursors)["break_away"].adds) == {CLOGGED}
 
 
 def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
     """A healthy unit under 5 kN is not blamed: where no bands fit, they are made with the load."""
-    com = profile(SHORT).command
-    force = np.full(len(com), 5e3)
+    force = np.full(len(SHORT), 5e3)
     monkeypatch.setattr(make_bands, "make_bands_by_simulation", lambda *a, **k: short_bands(5e3))
-    bands = choose_bands(com, force, 1e-3)
-    run = simulate(load_model(), com, force, seed=3)
-    j = judge_trace(Trace.from_columns(run._asdict(), 1e-3, {}), bands)
+    bands = choose_bands(SHORT, force, 1e-3)
+    j = judge_trace(simulate_trace(load_model(), SHORT, force, seed=3), bands)
     assert (j.ruling, j.events) == (None, ()) and "5000 N" in bands.provenance["load"]
 
 
@@ -407,8 +395,7 @@ def test_the_file(tmp_path: Path) -> None:
 
     A step of no whole number of mm is read again, too.
     """
-    (tmp_path / "b.toml").write_text(format_bands(load_default_bands()), encoding="utf-8")
-    again = load_bands(tmp_path / "b.toml")
+    again = load_bands(write_file(tmp_path / "b.toml", format_bands(load_default_bands())))
     assert judged(units(0.3)[0], again) == judged(units(0.3)[0])
     assert {"made", "command", "command_hash", "model", "runs", "seed", "software"} <= again.provenance.keys()
     assert (tmp_path / "b.toml").stat().st_size < 40_000
@@ -430,8 +417,8 @@ def test_a_wrong_file_is_refused(old: str, new: str, word: str, tmp_path: Path) 
     """In one line."""
     content = format_bands(load_default_bands())
     assert old in content
-    (tmp_path / "b.toml").write_text(content.replace(old, new) if old else new)
-    assert word in catch_refusal(load_bands, tmp_path / "b.toml")
+    file = write_file(tmp_path / "b.toml", content.replace(old, new) if old else new)
+    assert word in catch_refusal(load_bands, file)
     assert "a file that can be read" in catch_refusal(load_bands, tmp_path / "none.toml")
 
 
@@ -461,10 +448,9 @@ def trace(x: np.ndarray, com: np.ndarray | None = None) -> Trace:
 def test_a_fleet_of_its_own() -> None:
     """Another design's response, learned from healthy traces, is healthy then; its faults are still found."""
     model = load_model().replace({"pilot.flow_gain": 0.069 * 0.88})
-    com = PREFLIGHT
 
     def fleet(kind: dict[str, float], count: int, seed: int) -> list[Trace]:
-        return [trace(x) for x in simulate_units(model, com, np.zeros_like(com), kind, count, seed)]
+        return [trace(x) for x in simulate_units(model, PREFLIGHT, np.zeros_like(PREFLIGHT), kind, count, seed)]
 
     sound = fleet(make_kind(), 32, 7)
     strange = [judge_trace(t, load_default_bands()) for t in sound]
@@ -494,8 +480,8 @@ def test_the_command(tmp_path: Path) -> None:
     """`rig fdi --learn-bands` writes a file, from a command or from traces; without a place for it, one line."""
     com = profile((Hold(time=0.1), Step(to=2e-3, time=0.15), Ramp(to=2.5e-3, time=0.9))).command
     rows = "\n".join(f"{k / 1000:.3f},{value:.9g}" for k, value in enumerate(com))
-    (tmp_path / "c.csv").write_text("t,com\n" + rows + "\n")
-    told = answer("fdi", "--learn-bands", "--command", tmp_path / "c.csv", "--out", tmp_path / "b.toml")
+    command = write_file(tmp_path / "c.csv", f"t,com\n{rows}\n")
+    told = answer("fdi", "--learn-bands", "--command", command, "--out", tmp_path / "b.toml")
     assert told["judges"] == [CLOGGED, RUBBED]
     assert load_bands(tmp_path / "b.toml").provenance["command"].endswith("c.csv")
     assert "--out" in refuse("fdi", "--learn-bands")
@@ -515,7 +501,7 @@ MS = 1e-3
 def run(clogging: float = 0.0, friction: float = 5.0) -> Trace:
     model = load_model().replace({"filter.clogging": clogging, "spool.static_friction": friction,
                                   "spool.dynamic_friction": friction / 1.5})
-    return Trace.from_columns(simulate(model, PREFLIGHT, seed=11)._asdict(), MS, {})
+    return simulate_trace(model, PREFLIGHT, seed=11)
 
 
 def second_order(zeta: float, omega: float, rows: int, size: float) -> np.ndarray:

@@ -11,6 +11,7 @@ from effect_files import SEARCHED, restored_catalogue
 from noisy_traces import record_plant
 from physics_cases import PREFLIGHT
 from refusals import catch_refusal
+from short_runs import simulate_trace
 
 from fdi import Trace
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
@@ -38,7 +39,7 @@ from fdi.diagnosis.rms_grid import Grid, Map, Merged, Point, measure_bisector_di
 from fdi.estimation.replay import hold_inputs, read_cycles
 from fdi.report.diagnosis_report import build_diagnosis_report, list_overruled
 from fdi.thresholds import RESIDUAL_WORST
-from plant import Model, load_model, simulate
+from plant import Model, load_model
 from plant.monitor import Monitor
 from plant.segments import Chirp, Hold, Ramp, Step, build_profile
 
@@ -89,13 +90,13 @@ def test_levels(size: tuple[float, float, float], expected: Level | None) -> Non
     assert judge_size(CLOGGING, Estimate(*size)) == expected
 
 
-def test_the_ruling_fault_is_further_along_its_own_limits() -> None:
+@pytest.mark.parametrize(("clogging", "friction", "ruling"), [
+    (Level.MAINTENANCE, Level.MAINTENANCE, FRICTION.name), (Level.MAINTENANCE, Level.ACCEPTABLE, CLOGGING.name),
+    (Level.ACCEPTABLE, Level.ACCEPTABLE, None)])
+def test_the_ruling_fault_is_further_along_its_own_limits(clogging: Level, friction: Level, ruling: str | None) -> None:
     sizes = {CLOGGING.name: Estimate(0.3, 0.26, 0.34), FRICTION.name: Estimate(69.0, 66.0, 72.0)}
-    both = dict.fromkeys(sizes, Level.MAINTENANCE)
     assert compute_severity(CLOGGING, 0.3) == pytest.approx(1.5) and compute_severity(FRICTION, 69.0) > 1.9
-    for levels, ruling in ((both, FRICTION.name), ({**both, FRICTION.name: Level.ACCEPTABLE}, CLOGGING.name),
-                           (dict.fromkeys(sizes, Level.ACCEPTABLE), None)):
-        assert find_ruling_fault(FAULTS, sizes, levels) == ruling
+    assert find_ruling_fault(FAULTS, sizes, {CLOGGING.name: clogging, FRICTION.name: friction}) == ruling
 
 
 def test_a_model_with_a_known_effect_keeps_it() -> None:
@@ -104,12 +105,11 @@ def test_a_model_with_a_known_effect_keeps_it() -> None:
 
 
 COMMAND = np.concatenate([PREFLIGHT[2000:4200], PREFLIGHT[9000:11600]])  # steps, a ramp and a sine
-WORN = {"filter.clogging": 0.35, "sensor_lag.time": 1e-3}
 
 
 @pytest.fixture(scope="module")
 def worn() -> Diagnosis:
-    trace = record_plant(WORN, COMMAND, seed=3)
+    trace = record_plant({"filter.clogging": 0.35, "sensor_lag.time": 1e-3}, COMMAND, seed=3)
     with restored_catalogue(*SEARCHED):
         return diagnose(trace, with_effects=True)
 
@@ -183,16 +183,12 @@ def trace(kintas: float, fss: float, ratio: float = 2.0 / 3.0, scatter: int = 0)
     rng, model = np.random.default_rng(scatter), Model()
     model = model.replace({name: model[name] * (1 + 0.015 * bool(scatter) * rng.normal()) for name in PLANTS})
     changed = model.replace(faulty(kintas, fss) | {"spool.dynamic_friction": fss * ratio})
-    return of(simulate(changed, PREFLIGHT, seed=scatter))
+    return simulate_trace(changed, PREFLIGHT, seed=scatter)
 
 
 def is_near(point: Any, kintas: float, fss: float, within: tuple[float, float] = (0.051, 4.5)) -> bool:
     """Whether a point of the grid is that close to the faults."""
     return abs(point.sizes[0] - kintas) <= within[0] and abs(point.sizes[1] - fss) <= within[1]
-
-
-def of(columns: object) -> Trace:
-    return Trace.from_columns(columns._asdict(), 1e-3, {})  # type: ignore[attr-defined]
 
 
 def map_of(kintas: float, fss: float) -> Map:
@@ -238,7 +234,7 @@ def test_friction_that_is_static_alone() -> None:
 def test_a_command_with_one_kind_of_section(which: str) -> None:
     piece = Step(to=2e-3, time=0.8) if which == "step" else Ramp(to=1e-3, time=1.5)
     com = build_profile([Hold(time=0.3), piece, Hold(time=0.2), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
-    grid = search_grid(of(simulate(Model().replace(faulty(0.0, 40.0)), com)))
+    grid = search_grid(simulate_trace(Model().replace(faulty(0.0, 40.0)), com))
     there, absent = (grid.step, grid.ramp) if which == "step" else (grid.ramp, grid.step)
     assert there is not None and absent is None
     np.testing.assert_allclose(there.rms, grid.joint.rms, rtol=1e-12)
@@ -252,7 +248,7 @@ def test_what_is_no_fault_of_these_does_not_lead_astray(kintas: float, fss: floa
     changed = {"load": {}, "null bias": {"null_bias.current": 1e-4},
                "jack friction": {"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}}[other]
     load = np.full(len(PREFLIGHT), 3e3 * (other == "load"))
-    measured = of(simulate(Model().replace(faulty(kintas, fss) | changed), PREFLIGHT, load))
+    measured = simulate_trace(Model().replace(faulty(kintas, fss) | changed), PREFLIGHT, load)
     found = search_grid(measured, sliding=(2.0 / 3.0,)).best
     assert is_near(found, kintas, fss, (0.126, 4.5)), found
 
@@ -267,7 +263,7 @@ def test_gaps_are_left_out() -> None:
 
 def test_refusals() -> None:
     com = build_profile([Hold(time=0.3), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
-    assert "steps or ramps" in catch_refusal(search_grid, of(simulate(Model(), com)))
+    assert "steps or ramps" in catch_refusal(search_grid, simulate_trace(Model(), com))
     assert "drive" in catch_refusal(search_grid, trace(0.25, 30.0), drive="position")
 
 

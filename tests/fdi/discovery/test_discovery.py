@@ -13,9 +13,17 @@ from effect_files import HEAD, SEARCHED, restored_catalogue
 from effects_cases import LAWS
 from noisy_traces import SHORT, record_plant
 from refusals import catch_refusal
-from rig_command import rig
+from rig_command import rig, write_file
 from scipy.signal import lfilter
-from short_runs import HIDDEN, STEPS, build_command, build_other_command, list_trace_arguments, write_measured_runs
+from short_runs import (
+    HIDDEN,
+    STEPS,
+    build_command,
+    build_other_command,
+    list_trace_arguments,
+    simulate_trace,
+    write_measured_runs,
+)
 
 import rig.campaign.sensitivity as rounds
 from fdi import thresholds
@@ -113,8 +121,7 @@ def test_independent_noise_of_any_colour_does_not_repeat_and_physics_does() -> N
 def _recorded(changes: dict[str, float], seed: int = 0) -> Trace:
     t = np.arange(3000) * 1e-3
     com = 5e-3 * np.sign(np.sin(2 * np.pi * t))
-    columns = simulate(Model().with_effects(LAWS).replace(changes), com, seed=seed)
-    return Trace.from_columns(columns._asdict(), 1e-3, {})
+    return simulate_trace(Model().with_effects(LAWS).replace(changes), com, seed=seed)
 
 
 def test_the_firmware_leaves_its_mark_without_noise() -> None:
@@ -292,8 +299,7 @@ def test_a_pair_is_shown_once_with_the_sizes_of_both() -> None:
 
 
 def record_unit(changes: dict[str, float], seed: int) -> Trace:
-    columns = simulate(Model().replace(changes), build_command(), None, seed, 200)
-    return Trace.from_columns(columns._asdict(), 1e-3, {})
+    return simulate_trace(Model().replace(changes), build_command(), seed=seed, steps=STEPS)
 
 
 @pytest.fixture(scope="module")
@@ -384,8 +390,8 @@ def test_a_written_law_is_what_the_library_replayed(place: str, tmp_path: Path) 
     values = {field: SIZES[field] for term in terms for field in term.fields}
     states = sample_states(7, 300)
     with registered_library():
-        (tmp_path / "law.py").write_text(write_effects({place: "own_law"}, terms, values, "A law."))
-        assert load_effects(tmp_path / "law.py") == ["own_law"]
+        text = write_effects({place: "own_law"}, terms, values, "A law.")
+        assert load_effects(write_file(tmp_path / "law.py", text)) == ["own_law"]
         library = Model().with_effects([LIBRARY[place]]).replace(
             {name_parameter(t, f): values[f] for t in terms for f in t.fields})
         own = Model().with_effects(["own_law"])
@@ -457,8 +463,7 @@ QUICK = ("cogging",)
 def record_runs(model: Model) -> list[Trace]:
     """Short runs of a plant, the last one with another command; white noise of the sensors."""
     commands = build_command(), build_command(), build_other_command()
-    return [Trace.from_columns(simulate(model, com, None, seed, STEPS)._asdict(), 1e-3, {})
-            for seed, com in enumerate(commands, 1)]
+    return [simulate_trace(model, com, seed=seed, steps=STEPS) for seed, com in enumerate(commands, 1)]
 
 
 def search_law(traces: list[Trace]) -> LawSearch:
@@ -476,9 +481,8 @@ def search_law(traces: list[Trace]) -> LawSearch:
                                   for name in OUTSIDE])
 def test_a_hidden_law_is_found_named_and_written(name: str, tmp_path: Path) -> None:
     outside = OUTSIDE[name]
-    (tmp_path / "hidden.py").write_text(HIDDEN_LAW.format(port=outside.port, law=outside.law))
     with restored_catalogue():
-        load_effects(tmp_path / "hidden.py")
+        load_effects(write_file(tmp_path / "hidden.py", HIDDEN_LAW.format(port=outside.port, law=outside.law)))
         traces = record_runs(Model().replace({"hidden_law.size": outside.size}))
     found = search_law(traces)
     law = found.law

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from noisy_traces import record_healthy, record_plant
 from refusals import catch_refusal
+from short_runs import simulate_trace
 
 from fdi.comparison.compare import compare
 from fdi.discovery.runs import read_runs
@@ -162,13 +163,12 @@ def test_a_repeat_is_found_by_its_command() -> None:
         assert line.startswith("--repeat") and words in line
 
 
-def test_a_period_that_no_controller_has_is_refused_in_one_line() -> None:
+@pytest.mark.parametrize(("period", "text"), [(5e-5, "0.05 ms"), (0.2, "200 ms")])
+def test_a_period_that_no_controller_has_is_refused_in_one_line(period: float, text: str) -> None:
     quantity = find_quantity("controller.period")
     assert (quantity.low, quantity.high) == PERIODS
     assert match_period(Model(), made(50e-3))["controller.period"] == 50e-3
-    for period, text in ((5e-5, "0.05 ms"), (0.2, "200 ms")):
-        line = catch_refusal(match_period, Model(), made(period))
-        assert f"0.1 to 100 ms apart; these rows are {text} apart" in line
+    assert f"0.1 to 100 ms apart; these rows are {text} apart" in catch_refusal(match_period, Model(), made(period))
 
 
 LEVELS = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
@@ -269,7 +269,6 @@ def test_what_a_law_remembers_is_found_where_a_recording_begins_in_the_middle() 
 
 T = 1e-3 * np.arange(1500)
 GENTLE = 5e-4 * np.sin(2.0 * np.pi * 1.5 * T) * (1.0 - np.exp(-5.0 * T))  # m, neither flapper nor spool stops
-FAST = np.where(T > 0.2, 5e-3, 0.0)  # m, both do
 
 
 def find_flat(changes: dict[str, float], signals: str, com: Floats = GENTLE, load: float = 0.0
@@ -300,7 +299,8 @@ def test_a_known_load_does_not_show_the_pressure_but_the_area() -> None:
 
 
 def test_a_stop_shows_how_far_flapper_and_spool_move() -> None:
-    gentle, fast = find_flat({}, "xj"), find_flat({"torque_motor.gain": 2.5}, "xj", FAST)
+    both = np.where(T > 0.2, 5e-3, 0.0)  # m, the command that brings both to their stops
+    gentle, fast = find_flat({}, "xj"), find_flat({"torque_motor.gain": 2.5}, "xj", both)
     assert [way in found for found in (gentle, fast) for way in (FLAPPER, SPOOL_WAY)] == [True, True, False, False]
 
 
@@ -369,9 +369,8 @@ def _record_motor(changes: Mapping[str, float], step: float = 0.0) -> Trace:
     command = build_profile([Hold(time=0.3), Ramp(to=0.01, time=1.0), Hold(time=0.3),
                              Chirp(amplitude=1e-3, f0=1.0, f1=20.0, fade=20.0, time=2.0)], rate=1000.0).command
     unit = unit.replace({"sensors.position_noise": 0.0} if step else {})
-    columns = simulate(unit, command, seed=3, steps=100)._asdict()
-    columns["position"] = step * np.round(columns["position"] / step) if step else columns["position"]
-    return hold_inputs(Trace.from_columns(columns, 1e-3, {}, unit.kind.signals))
+    run = simulate_trace(unit, command, seed=3, steps=100)
+    return hold_inputs(run.with_columns({"position": step * np.round(run.position / step)}) if step else run)
 
 
 def test_an_observer_does_not_take_the_steps_of_a_position_for_motion() -> None:
@@ -387,8 +386,7 @@ def test_scan_of_a_step_test_finds_the_size_at_which_a_backlash_bounces_like_the
     model = load_model("ema")
     steps = [Step(to=to, time=2.0) for to in (0.01, -0.01, 0.005, 0.0)]
     command = build_profile([Hold(time=0.3), *steps], rate=1000.0).command
-    columns = simulate(model.replace({"screw.backlash": 1e-4}), command, seed=3)._asdict()
-    trace = hold_inputs(Trace.from_columns(columns, 1e-3, {}, model.kind.signals))
+    trace = hold_inputs(simulate_trace(model.replace({"screw.backlash": 1e-4}), command, seed=3))
     search = Search(model, trace, [], ["backlash"], 1)
     assert 200 <= search.problem.trace.usable.sum() < 0.3 * len(trace)
     healthy = linearise(search.problem, list_all_unknowns(search.model), np.zeros(4))

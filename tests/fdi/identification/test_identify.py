@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from refusals import catch_refusal
-from rig_command import answer, refuse, rig
+from rig_command import answer, refuse, rig, write_file
 
 from fdi.discovery.update_model import read_provenance
 from fdi.estimation import long_recordings
@@ -99,12 +99,11 @@ def test_stops_at_the_wrong_moment_in_a_fitted_run_leave_doubt(found: Identifica
     assert held.is_held_out and decide_verdict(found.estimates, [first, *others[:-1], held])[0] == "IDENTIFIED"
 
 
-def test_range_that_is_too_narrow_gives_no_model_file(runs: tuple[Trace, Trace, Trace], tmp_path: Path,
+def test_range_that_is_too_narrow_gives_no_model_file(runs: tuple[Trace, Trace, Trace], here: Path,
                                                       monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(global_fit, "SEARCHES", 0)  # no other valley is deeper, and looking for one takes ten seconds
-    runs[1].write_csv(tmp_path / "stops.csv")
-    (tmp_path / "sheet.toml").write_text("[identify.jack]\narea = 1.3\ntravel = 6\n[identify.valve]\nflow_gain = 6\n"
+    runs[1].write_csv(here / "stops.csv")
+    (here / "sheet.toml").write_text("[identify.jack]\narea = 1.3\ntravel = 6\n[identify.valve]\nflow_gain = 6\n"
                                          "[identify.supply]\npressure = 3\n")
     told = answer("identify", "stops.csv", "--model", "sheet.toml", status=1)
     area = told["parameters"]["jack.area"]
@@ -224,8 +223,8 @@ def test_ranges_that_cannot_be_are_refused(table: object, field: str) -> None:
 
 
 def test_ranges_of_a_model_file(tmp_path: Path) -> None:
-    path = tmp_path / "sheet.toml"
-    path.write_text("[jack]\narea = 3e-3\n[identify.jack]\narea = 1.5\nleakage = [1e-13, 1e-11]\n")
+    path = write_file(tmp_path / "sheet.toml",
+                      "[jack]\narea = 3e-3\n[identify.jack]\narea = 1.5\nleakage = [1e-13, 1e-11]\n")
     model = load_model(path)
     area, leakage = read_free_parameters(model, path)
     assert (area.centre, area.low, area.high) == pytest.approx((3e-3, 2e-3, 4.5e-3))
@@ -233,10 +232,11 @@ def test_ranges_of_a_model_file(tmp_path: Path) -> None:
     assert len(read_free_parameters(load_model(), None)) > 10
 
 
-def test_runs_that_cannot_be_used(runs: tuple[Trace, Trace, Trace], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("fitted", "held_out", "signals", "option"), [
+    (1, 1, None, "--holdout"), (2, 0, None, "other runs"), (1, 0, ["speed"], "--signals")])  # so many times a run
+def test_runs_that_cannot_be_used(runs: tuple[Trace, Trace, Trace], fitted: int, held_out: int,
+                                  signals: list[str] | None, option: str, tmp_path: Path) -> None:
     ranges = parse_free_parameters(FREE, load_model(), "test")
-    for fitted, held_out, signals, option in (([runs[0]], [runs[0]], None, "--holdout"),
-                                              ([runs[0], runs[0]], [], None, "other runs"),
-                                              ([runs[0]], [], ["speed"], "--signals")):
-        assert option in catch_refusal(read_identification_runs, load_model(), ranges, fitted, held_out, signals)
+    assert option in catch_refusal(read_identification_runs, load_model(), ranges, [runs[0]] * fitted,
+                                   [runs[0]] * held_out, signals)
     assert "none.csv" in refuse("identify", tmp_path / "none.csv")

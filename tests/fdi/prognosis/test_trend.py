@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from refusals import catch_refusal
-from rig_command import rig
+from rig_command import rig, write_file
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
 from fdi.prognosis import unit_trend
@@ -49,8 +49,7 @@ def test_dates_are_found_in_texts_and_names() -> None:
 
 
 def test_a_table_of_dates(tmp_path: Path) -> None:
-    table = tmp_path / "dates.csv"
-    table.write_text("file,date,hours\na.csv,2026-01-01,10\nrun/,2026-02-01,\n")
+    table = write_file(tmp_path / "dates.csv", "file,date,hours\na.csv,2026-01-01,10\nrun/,2026-02-01,\n")
     rows = read_dates_table(table)
     row = {"date": parse_date("2026-01-01"), "hours": 10.0, "flights": pytest.approx(math.nan, nan_ok=True)}
     assert find_row(rows, "sub/a.csv") == row
@@ -142,8 +141,7 @@ def points(path: Path, sizes: Sequence[float]) -> Path:
     """An earlier answer with these sizes of spool friction."""
     rows = [{"trace": f"{i}.csv", "t": parse_date("2026-01-05") + 7.0 * i, "fss": e._asdict(),
              "kintas": {"value": 0.0, "low": 0.0, "high": 0.06}} for i, e in enumerate(estimates(sizes))]
-    path.write_text(json.dumps({"axis": "date", "points": rows}))
-    return path
+    return write_file(path, json.dumps({"axis": "date", "points": rows}))
 
 
 def test_the_command_on_an_earlier_answer(tmp_path: Path) -> None:

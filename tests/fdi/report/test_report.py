@@ -203,9 +203,6 @@ def test_injected_faults_are_shaded_from_begin_to_end(preflight: Path) -> None:
     assert "lost drive" in render_run(faulty) and run_report.draw_signals(faulty) != run_report.draw_signals(trace)
 
 
-NAN = float("nan")
-
-
 def make_trace() -> Trace:
     """A step of 5 mm at t = 0.5 s with 12 % overshoot, then a ramp with a lag of 20 um and a band of 8 um."""
     t = np.arange(3000) / 1000
@@ -218,7 +215,7 @@ def make_trace() -> Trace:
 
 
 def make_check(kind: str, value: float, unit: str, high: float, window: tuple[float, float], signal: str = "xj",
-               low: float = NAN) -> CheckResult:
+               low: float = math.nan) -> CheckResult:
     return CheckResult(name=kind, kind=kind, signal=signal, value=value, unit=unit, low=low, high=high, passed=False,
                        t0=window[0], t1=window[1])
 
@@ -226,10 +223,6 @@ def make_check(kind: str, value: float, unit: str, high: float, window: tuple[fl
 def draw(check: CheckResult) -> Any:
     """Axes of the close-up of a check."""
     return vars(run_report.draw_failed_check(make_trace(), check))["figure"].axes[0]
-
-
-def find_curve(ax: Any) -> Any:
-    return max(ax.lines, key=lambda line: len(line.get_xdata()))
 
 
 def find_mark(ax: Any) -> tuple[float, float]:
@@ -260,13 +253,14 @@ def test_overshoot_is_marked_at_its_peak_beside_its_limit_and_times_are_lines_af
 def test_levels_stand_in_the_unit_of_the_check(kind: str, value: float, levels: list[float]) -> None:
     ax = draw(make_check(kind, value, "um", 6.0 if kind == "break_away" else 14.0, (1.6, 2.9)))
     assert list_places(ax, "y") == pytest.approx(levels, abs=0.5) and "[um]" in ax.get_ylabel()
-    assert 10.0 < np.nanmedian(find_curve(ax).get_ydata()) < 30.0  # um, not m
+    curve = max((line.get_ydata() for line in ax.lines), key=len)
+    assert 10.0 < np.nanmedian(curve) < 30.0  # um, not m
 
 
 @pytest.mark.parametrize(("kind", "signal"), [("shut_off", ""), ("recovers", ""), ("response_within", "xj"),
                                               ("response_within", "node 2 0x8250")])
 @pytest.mark.parametrize(("value", "places", "label"), [
-    (12.0, [0.5, 0.505, 0.512], "measured 12 ms"), (NAN, [0.5, 0.505], "not measurable")])
+    (12.0, [0.5, 0.505, 0.512], "measured 12 ms"), (math.nan, [0.5, 0.505], "not measurable")])
 def test_a_reaction_stands_between_its_begin_and_its_limit(kind: str, signal: str, value: float, places: list[float],
                                                            label: str) -> None:
     ax = draw(replace(make_check(kind, value, "ms", 5.0, (0.2, 1.5), signal), after=0.5, above=4e-3))
@@ -279,9 +273,9 @@ def test_a_reaction_stands_between_its_begin_and_its_limit(kind: str, signal: st
 @pytest.mark.parametrize("kind", sorted(run_report.DRAWERS))
 def test_every_kind_survives_a_value_that_could_not_be_measured(kind: str) -> None:
     unit = {"overshoot": "%", "amplitude_ratio": "1", "phase_lag": "deg"}.get(kind, "ms" if "time" in kind else "um")
-    check = make_check(kind, NAN, unit, 5.0, (0.5, 1.5))
+    check = make_check(kind, math.nan, unit, 5.0, (0.5, 1.5))
     assert run_report.draw_failed_check(make_trace(), check).startswith("<svg")
-    for other in (replace(check, t0=NAN, t1=NAN), replace(check, kind="event_never"),
+    for other in (replace(check, t0=math.nan, t1=math.nan), replace(check, kind="event_never"),
                       replace(check, t0=50.0, t1=51.0)):
         assert not run_report.draw_failed_check(make_trace(), other)
 

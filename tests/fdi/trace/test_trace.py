@@ -5,6 +5,7 @@ import json
 import resource
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from physics_cases import PREFLIGHT
 from places import SUPPORT
 from refusals import catch_refusal
-from rig_command import Said
+from rig_command import Said, write_file
 from synthetic_run import ATTACHMENTS, record_run
 
 from fdi.trace.mcap_log import Log, open_log
@@ -58,17 +59,16 @@ def test_whole_log_keeps_the_time_axis(run: Path) -> None:
 @pytest.mark.parametrize("everything", [False, True])
 def test_events_keep_to_the_rows_after_a_stall(tmp_path: Path, everything: bool) -> None:
     """A real-time run that stood still for 2 s in its set-up and again in main: rows go on, log times jump."""
-    recorder = Recorder(tmp_path / "trace.mcap", {}, {"period": "0.001"})
     records = {0: [(-500_000_000, Event("INFO", "phase", "bring-up"))], 150: [(0, NmtState(3, 5, "operational"))],
                100: [(-100_000, Event("INFO", "phase", "main"))],  # before cycle: by how many ns
                200: [(-1_000_000_000, Event("WARN", "stall", "half way")), (500_000, Event("WARN", "fault", "after"))],
                299: [(3_000_000_000, Event("INFO", "phase", "end"))]}
-    for k in range(300):
-        t_ns = 500_000_000 + k * 1_000_000 + 2_000_000_000 * ((k >= 50) + (k >= 200))
-        for after, record in records.get(k, []):
-            recorder.put(t_ns + after, record)
-        recorder.cycle(t_ns, Signals(k, int(k >= 100), 0, 0, 0, 0, 0, 0, 0, 0, 0), Timing(k, False, 0, 0, 0))
-    recorder.close()
+    with closing(Recorder(tmp_path / "trace.mcap", {}, {"period": "0.001"})) as recorder:
+        for k in range(300):
+            t_ns = 500_000_000 + k * 1_000_000 + 2_000_000_000 * ((k >= 50) + (k >= 200))
+            for after, record in records.get(k, []):
+                recorder.put(t_ns + after, record)
+            recorder.cycle(t_ns, Signals(k, int(k >= 100), 0, 0, 0, 0, 0, 0, 0, 0, 0), Timing(k, False, 0, 0, 0))
     trace = Trace.read(tmp_path / "trace.mcap", all=everything)
     assert [event.t for event in trace.events] == pytest.approx([-0.6, -1e-4, 0.0995, 0.1005, 3.199], abs=1e-6)
     assert trace.nmt[0].t == 0.05
@@ -85,21 +85,16 @@ def test_csv_there_and_back(run: Path, tmp_path: Path, name: str) -> None:
     assert again.period == trace.period
 
 
-def _csv(tmp_path: Path, text: str) -> Path:
-    path = tmp_path / "x.csv"
-    path.write_text(text)
-    return path
-
-
 def test_missing_samples_and_gaps(tmp_path: Path) -> None:
-    path = _csv(tmp_path, "t,com,xj,cor,note\n0.000,0,1e-6,2e-6,7\n0.001,0,,3e-6,7\n"
-                          "0.004,0,3e-6,4e-6,7\n0.005,0,1e-6,1e-6,7\n")
+    path = write_file(tmp_path / "x.csv", "t,com,xj,cor,note\n0.000,0,1e-6,2e-6,7\n0.001,0,,3e-6,7\n"
+                                           "0.004,0,3e-6,4e-6,7\n0.005,0,1e-6,1e-6,7\n")
     trace = Trace.read(path)
     np.testing.assert_array_equal(np.isnan(trace.xj), [False, True, True, True, False, False])
     np.testing.assert_allclose(trace.t, np.arange(6) * 1e-3)
     assert (trace.period, trace.gaps, trace.signals) == (1e-3, (Gap(0.001, 0.004, 2),), ("com", "xj", "cor"))
     assert np.isnan(trace.p12).all() and trace.notes == ("column note is not known and was left out",)
-    several = Trace.read(_csv(tmp_path, "t,com,xj,cor,a,b,c,d,e\n0,0,0,0,1,2,3,4,5\n0.001,0,0,0,1,2,3,4,5\n"))
+    several = Trace.read(write_file(
+        tmp_path / "x.csv", "t,com,xj,cor,a,b,c,d,e\n0,0,0,0,1,2,3,4,5\n0.001,0,0,0,1,2,3,4,5\n"))
     assert several.notes == ("5 columns are not known and were left out: a, b, c and 2 more",)
     trace.write_csv(tmp_path / "y.csv")
     assert Trace.read(tmp_path / "y.csv").gaps == trace.gaps
@@ -107,14 +102,13 @@ def test_missing_samples_and_gaps(tmp_path: Path) -> None:
 
 def test_fields_that_say_nan_are_missing(tmp_path: Path) -> None:
     rows = "0.000,0,1e-6,2e-6,nan\n0.001,0,,3e-6,NaN\n0.002,0,1e-6,0,1e5\n"
-    trace = Trace.read(_csv(tmp_path, "t,com,xj,cor,p12\n" + rows))
+    trace = Trace.read(write_file(tmp_path / "x.csv", "t,com,xj,cor,p12\n" + rows))
     np.testing.assert_array_equal(np.isnan(trace.p12), [True, True, False])
 
 
 def test_jitter_of_the_recorded_time_is_not_a_gap(tmp_path: Path) -> None:
     t = np.arange(5000) * 1e-3 + np.random.default_rng(1).uniform(-2e-4, 2e-4, 5000)
-    path = _csv(tmp_path, "t,com,xj,cor\n" + "".join(f"{v:.6f},0,0,0\n" for v in t))
-    trace = Trace.read(path)
+    trace = Trace.read(write_file(tmp_path / "x.csv", "t,com,xj,cor\n" + "".join(f"{v:.6f},0,0,0\n" for v in t)))
     assert len(trace) == 5000 and not trace.gaps and trace.period == pytest.approx(1e-3, rel=1e-3)
 
 
@@ -137,16 +131,17 @@ HEAD = "t,com,xj,cor\n"
     ("t,com,xj,cor,xj\n0,0,0,0,0\n", "line 1: header: expected each column once"),
 ])
 def test_refusals(tmp_path: Path, text: str, says: str) -> None:
-    line = catch_refusal(Trace.read, _csv(tmp_path, text))
+    line = catch_refusal(Trace.read, write_file(tmp_path / "x.csv", text))
     assert says in line and "x.csv" in line
 
 
-def test_refusals_of_files(tmp_path: Path) -> None:
-    for name, data in {"a.csv": b"\xff\xfe\x00", "b.csv.gz": b"not gzip", "c.csv.gz": gzip.compress(HEAD.encode())[:-9],
-                       "d.mcap": b"nothing", "e.mcap": b"", "f.xlsx": b"", "none.csv": None}.items():
-        if data is not None:
-            (tmp_path / name).write_bytes(data)
-        assert name in catch_refusal(Trace.read, tmp_path / name)
+@pytest.mark.parametrize(("name", "data"), [
+    ("a.csv", b"\xff\xfe\x00"), ("b.csv.gz", b"not gzip"), ("c.csv.gz", gzip.compress(HEAD.encode(), mtime=0)[:-9]),
+    ("d.mcap", b"nothing"), ("e.mcap", b""), ("f.xlsx", b"")])
+def test_refusals_of_files(name: str, data: bytes, tmp_path: Path) -> None:
+    assert name in catch_refusal(Trace.read, tmp_path / name)  # there is none yet
+    (tmp_path / name).write_bytes(data)
+    assert name in catch_refusal(Trace.read, tmp_path / name)
 
 
 def test_run_that_ended_in_its_set_up(tmp_path: Path) -> None:
@@ -224,11 +219,10 @@ class OldTiming:
 def test_a_log_of_an_earlier_version_has_no_feedback_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(schema.TOPICS, "/timing", OldTiming)
     monkeypatch.setitem(schema.CHANNELS, OldTiming, schema.CHANNELS[Timing])
-    recorder = Recorder(tmp_path / "trace.mcap", {}, {"period": "0.001"})
-    for k in range(10):
-        old = OldTiming(k, False, 1e-5, 2e-4, 3e-4)
-        recorder.cycle(k * 1_000_000, Signals(k, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0), old)  # type: ignore[arg-type]
-    recorder.close()
+    with closing(Recorder(tmp_path / "trace.mcap", {}, {"period": "0.001"})) as recorder:
+        for k in range(10):
+            old = OldTiming(k, False, 1e-5, 2e-4, 3e-4)
+            recorder.cycle(k * 1_000_000, Signals(k, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0), old)  # type: ignore[arg-type]
     timing = Trace.read(tmp_path / "trace.mcap").timing
     assert set(timing.response) == {2e-4} and len(timing.execution) == 10
     assert np.isnan([timing.feedback_response, timing.valve_response, timing.execution]).all()
@@ -246,10 +240,8 @@ print(json.dumps([rig(*words) for words in json.load(sys.stdin)]))
 
 def rig_with_little_memory(*commands: tuple[object, ...]) -> list[Said]:
     """Commands, one after the other, in a process that may not have more than MEMORY."""
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-
-    done = subprocess.run([sys.executable, "-c", PLAYED], preexec_fn=limit, text=True, capture_output=True, timeout=120,
+    done = subprocess.run([sys.executable, "-c", PLAYED], text=True, capture_output=True, timeout=120,
+                          preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY)),
                           input=json.dumps(commands, default=str),
                           env={"OPENBLAS_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "PYTHONPATH": str(SUPPORT)})
     assert done.returncode == 0, (commands, done)

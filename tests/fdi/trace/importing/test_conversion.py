@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from foreign_recordings import CAN_MAP, DBC_TEXT, MDF_MAP, simulate_run, write_can_log, write_german_csv, write_mf4
 from refusals import catch_refusal
-from rig_command import refuse, rig
+from rig_command import refuse, rig, write_file
 from scipy.io import savemat
 
 from fdi.trace.importing.conversion import Imported, Samples, import_measurement, parse_map, place_samples
@@ -110,8 +110,7 @@ def test_clock_that_is_not_the_models_keeps_its_samples(tmp_path: Path) -> None:
 
 
 def guess(tmp_path: Path, lines: list[str]) -> GuessedMap:
-    (tmp_path / "x.csv").write_text("\n".join(lines))
-    return guess_map(open_measurement(tmp_path / "x.csv"))
+    return guess_map(open_measurement(write_file(tmp_path / "x.csv", "\n".join(lines))))
 
 
 def test_guess_of_a_table_without_names(tmp_path: Path) -> None:
@@ -175,24 +174,20 @@ def test_the_map_in_the_manual_is_valid() -> None:
     assert found.signals["xj"].make_dynamics("m").quantum == pytest.approx(2.5e-5)
 
 
-LAYOUTS = {
-    "comma": ("t,x\n0,1.5\n1,2.5\n2,-3e-2\n", "utf-8"),
-    "semicolon and decimal comma": ("t;x\n0;1,5\n1;2,5\n2;-3e-2\n", "utf-8"),
-    "tabulator": ("t\tx\n0\t1.5\n1\t2.5\n2\t-3e-2\n", "utf-8"),
-    "white space": ("   t     x\n 0   1.5\n 1   2.5\n  2  -3e-2\n", "utf-8"),
-    "mark of UTF-8, CRLF": ("t,x\r\n0,1.5\r\n1,2.5\r\n2,-3e-2\r\n", "utf-8-sig"),
-    "UTF-16": ("t,x\n0,1.5\n1,2.5\n2,-3e-2\n", "utf-16"),
-    "comments and an empty line": ("# a logger\n% 3 rows\n\nt,x\n0,1.5\n# pause\n1,2.5\n2,-3e-2\n", "utf-8"),
-    "quoted": ('"t","x"\n"0","1.5"\n"1","2.5"\n"2","-3e-2"\n', "utf-8"),
-    "names in a comment": ("# t, x\n0,1.5\n1,2.5\n2,-3e-2\n", "utf-8"),
-    "words above": ("Logger,7\nserial number 12\nt,x\n0,1.5\n1,2.5\n2,-3e-2\n", "utf-8"),
-    "last separator": ("t;x\n0;1.5;\n1;2.5;\n2;-3e-2;\n", "utf-8"),
-}
-
-
-@pytest.mark.parametrize("case", LAYOUTS)
-def test_layouts(case: str, tmp_path: Path) -> None:
-    text, encoding = LAYOUTS[case]
+@pytest.mark.parametrize(("text", "encoding"), [
+    pytest.param("t,x\n0,1.5\n1,2.5\n2,-3e-2\n", "utf-8", id="comma"),
+    pytest.param("t;x\n0;1,5\n1;2,5\n2;-3e-2\n", "utf-8", id="semicolon and decimal comma"),
+    pytest.param("t\tx\n0\t1.5\n1\t2.5\n2\t-3e-2\n", "utf-8", id="tabulator"),
+    pytest.param("   t     x\n 0   1.5\n 1   2.5\n  2  -3e-2\n", "utf-8", id="white space"),
+    pytest.param("t,x\r\n0,1.5\r\n1,2.5\r\n2,-3e-2\r\n", "utf-8-sig", id="mark of UTF-8, CRLF"),
+    pytest.param("t,x\n0,1.5\n1,2.5\n2,-3e-2\n", "utf-16", id="UTF-16"),
+    pytest.param("# a logger\n% 3 rows\n\nt,x\n0,1.5\n# pause\n1,2.5\n2,-3e-2\n", "utf-8", id="with comments"),
+    pytest.param('"t","x"\n"0","1.5"\n"1","2.5"\n"2","-3e-2"\n', "utf-8", id="quoted"),
+    pytest.param("# t, x\n0,1.5\n1,2.5\n2,-3e-2\n", "utf-8", id="names in a comment"),
+    pytest.param("Logger,7\nserial number 12\nt,x\n0,1.5\n1,2.5\n2,-3e-2\n", "utf-8", id="words above"),
+    pytest.param("t;x\n0;1.5;\n1;2.5;\n2;-3e-2;\n", "utf-8", id="last separator"),
+])
+def test_layouts(text: str, encoding: str, tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_bytes(text.encode(encoding))
     table = open_text_table(tmp_path / "x.csv")
     assert list(table.units)[:2] == ["t", "x"]
@@ -209,9 +204,9 @@ def test_units_from_a_line_and_from_brackets(content: str, units: dict[str, str]
 
 
 def test_missing_fields_and_dates(tmp_path: Path) -> None:
-    (tmp_path / "x.csv").write_text("when,x,y\n2024-05-01T12:00:00.000,1,2\n2024-05-01T12:00:00.001,NaN,2\n"
-                                    "2024-05-01T12:00:00.003,,n/a\n")
-    columns = open_text_table(tmp_path / "x.csv").read(["when", "x"], ["when"])
+    file = write_file(tmp_path / "x.csv", "when,x,y\n2024-05-01T12:00:00.000,1,2\n2024-05-01T12:00:00.001,NaN,2\n"
+                                          "2024-05-01T12:00:00.003,,n/a\n")
+    columns = open_text_table(file).read(["when", "x"], ["when"])
     assert np.diff(columns["when"].values).round(7).tolist() == [0.001, 0.002]
     assert np.isnan(columns["x"].values).tolist() == [False, True, True]
 
@@ -221,8 +216,8 @@ def test_missing_fields_and_dates(tmp_path: Path) -> None:
     ("2", "line 4", "2 fields, not 1"), ("2,3,4", "line 4", "2 fields, not 3"),
 ])
 def test_bad_rows(row: str, place: str, reason: str, tmp_path: Path) -> None:
-    (tmp_path / "x.csv").write_text(f"t,x\n0,1\n1,2\n{row}\n3,4\n")
-    line = catch_refusal(open_text_table(tmp_path / "x.csv").read, ["t", "x"], [])
+    table = open_text_table(write_file(tmp_path / "x.csv", f"t,x\n0,1\n1,2\n{row}\n3,4\n"))
+    line = catch_refusal(table.read, ["t", "x"], [])
     assert place in line and reason in line
 
 
