@@ -10,10 +10,10 @@ import canopen
 import pytest
 from broken_devices import list_cases
 from bus_stations import spec
-from c_device import skip_without_compiler
+from c_device import needs_compiler
 from example_devices import DRIVE, ECU, PATIENT, DriveDesk, EcuDesk, make_drive, run_device
 from node_bench import MS
-from rig_command import SHORT, SLOW_START, Said, rig
+from rig_command import SHORT, SLOW_START, Said, rig, write_file
 
 from rig.conformance.run_cases import run_cases
 from rig.conformance.target import DataSheet, Options, Target
@@ -25,7 +25,6 @@ from rig.run import participants
 OFF, SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, RESET = 0x00, 0x06, 0x07, 0x0F, 0x02, 0x80
 DISABLED, READY, SWITCHED_ON, ENABLED = "SWITCH ON DISABLED", "READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"
 STOPPED, REACTION, FAULT = "QUICK STOP ACTIVE", "FAULT REACTION ACTIVE", "FAULT"
-VALUE_RANGE = 0x06090030  # SDO abort code
 
 
 @pytest.fixture
@@ -36,7 +35,7 @@ def drive() -> DriveDesk:
     return desk
 
 
-TRANSITIONS = [
+@pytest.mark.parametrize(("controls", "states"), [
     ([OFF], [DISABLED]),  # 0, 1
     ([SWITCH_ON, ENABLE], [DISABLED, DISABLED]),
     ([SHUTDOWN, SWITCH_ON, ENABLE], [READY, SWITCHED_ON, ENABLED]),  # 2, 3, 4
@@ -50,28 +49,24 @@ TRANSITIONS = [
     ([SHUTDOWN, SWITCH_ON, QUICK_STOP], [READY, SWITCHED_ON, DISABLED]),  # 10
     ([SHUTDOWN, ENABLE, QUICK_STOP, QUICK_STOP], [READY, ENABLED, STOPPED, DISABLED]),  # 11, 12
     ([SHUTDOWN, ENABLE, RESET], [READY, ENABLED, ENABLED]),  # no fault to reset
-]
-
-
-def test_each_transition(drive: DriveDesk) -> None:
+])
+def test_each_transition(drive: DriveDesk, controls: list[int], states: list[str]) -> None:
     """Control words from SWITCH ON DISABLED on, and the states that they lead to."""
-    for controls, states in TRANSITIONS:
-        assert drive.cycle(OFF).state == DISABLED
-        assert ([drive.cycle(control).state for control in controls], controls) == (states, controls)
+    assert drive.cycle(OFF).state == DISABLED
+    assert [drive.cycle(control).state for control in controls] == states
 
 
-def test_current_follows_the_error_up_to_its_limit(drive: DriveDesk) -> None:
-    for target, position, current in (
-        (1000, 0.5, 95),  # 3.8 A/m over 0.5 mm is 1.9 mA, 95 per mille of 20 mA
-        (-1000, 0.5, -285),
-        (0, -0.0101, 2),  # 38 uA: 1.9 counts
-        (100_000, 0.0, 400),
-        (-2_147_483_648, 1e30, -400),
-    ):
-        drive.cycle(OFF)
-        answer = drive.enable(target, position)
-        is_limited = bool(answer.status & 0x800)
-        assert (answer.current, is_limited) == (current, abs(current) == 400)
+@pytest.mark.parametrize(("target", "position", "current"), [
+    (1000, 0.5, 95),  # 3.8 A/m over 0.5 mm is 1.9 mA, 95 per mille of 20 mA
+    (-1000, 0.5, -285),
+    (0, -0.0101, 2),  # 38 uA: 1.9 counts
+    (100_000, 0.0, 400),
+    (-2_147_483_648, 1e30, -400),
+])
+def test_current_follows_the_error_up_to_its_limit(drive: DriveDesk, target: int, position: float, current: int
+                                                   ) -> None:
+    answer = drive.enable(target, position)
+    assert (answer.current, bool(answer.status & 0x800)) == (current, abs(current) == 400)
 
 
 def test_what_it_does_not_know_is_refused(drive: DriveDesk) -> None:
@@ -82,33 +77,32 @@ def test_what_it_does_not_know_is_refused(drive: DriveDesk) -> None:
         before = leaf.raw
         with pytest.raises(canopen.SdoAbortedError) as caught:
             leaf.raw = value
-        assert caught.value.code == VALUE_RANGE and leaf.raw == before
+        assert caught.value.code == 0x06090030 and leaf.raw == before  # value range
 
 
-def test_a_missing_rpdo_is_a_fault(drive: DriveDesk) -> None:
-    for number in (1, 2):
-        drive.cycle(OFF)
-        drive.enable(target=1000)
-        answers = [drive.cycle(silent=(number,)) for _ in range(5)]
-        assert [answer.state for answer in answers] == [ENABLED, ENABLED, ENABLED, REACTION, FAULT]
-        assert [answer.current for answer in answers] == [190, 190, 190, 0, 0]
-        assert drive.last_emergency() == (0x8250, number) and drive.sdo[0x603F].raw == 0x8250
-        drive.sdo[0x6040].raw = RESET
-        assert drive.cycle(RESET, silent=(number,)).state == FAULT  # the cause is still there
-        assert drive.cycle(RESET).state == FAULT  # no rising edge
-        assert drive.last_emergency()[0] == 0
-        assert [drive.cycle(control).state for control in (ENABLE, RESET, SHUTDOWN, ENABLE)] == (
-            [FAULT, DISABLED, READY, ENABLED])
-        assert drive.sdo[0x603F].raw == 0
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_missing_rpdo_is_a_fault(drive: DriveDesk, number: int) -> None:
+    drive.enable(target=1000)
+    answers = [drive.cycle(silent=(number,)) for _ in range(5)]
+    assert [answer.state for answer in answers] == [ENABLED, ENABLED, ENABLED, REACTION, FAULT]
+    assert [answer.current for answer in answers] == [190, 190, 190, 0, 0]
+    assert drive.last_emergency() == (0x8250, number) and drive.sdo[0x603F].raw == 0x8250
+    drive.sdo[0x6040].raw = RESET
+    assert drive.cycle(RESET, silent=(number,)).state == FAULT  # the cause is still there
+    assert drive.cycle(RESET).state == FAULT  # no rising edge
+    assert drive.last_emergency()[0] == 0
+    assert [drive.cycle(control).state for control in (ENABLE, RESET, SHUTDOWN, ENABLE)] == (
+        [FAULT, DISABLED, READY, ENABLED])
+    assert drive.sdo[0x603F].raw == 0
 
 
-def test_a_position_that_is_no_number_is_a_fault(drive: DriveDesk) -> None:
-    for value in (float("nan"), float("inf")):
-        drive.enable(target=1000)
-        assert drive.cycle(position=value)[:2] == (REACTION, 0)
-        assert drive.last_emergency()[0] == 0x7300
-        assert drive.cycle(position=0.0)[:2] == (FAULT, 0)
-        assert [drive.cycle(control).state for control in (OFF, RESET)] == [FAULT, DISABLED]
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_position_that_is_no_number_is_a_fault(drive: DriveDesk, value: float) -> None:
+    drive.enable(target=1000)
+    assert drive.cycle(position=value)[:2] == (REACTION, 0)
+    assert drive.last_emergency()[0] == 0x7300
+    assert drive.cycle(position=0.0)[:2] == (FAULT, 0)
+    assert [drive.cycle(control).state for control in (OFF, RESET)] == [FAULT, DISABLED]
 
 
 def test_lost_sync_is_a_fault(drive: DriveDesk) -> None:
@@ -165,15 +159,16 @@ def test_five_sound_frames_make_it_operational() -> None:
     assert [ecu.cycle(enable=0)["State"] for _ in range(6)] == [SYNCHRONISING] * 4 + [OPERATIONAL] * 2
 
 
-def test_current_of_the_ecu_follows_the_error_up_to_its_limit(ecu: EcuDesk) -> None:
+@pytest.mark.parametrize(("target", "position", "current"), [
+    (1.0, 0.5, 1.8), (-1.0, 0.5, -5.4), (5.0, 0.0, 8.0), (-5.0, 0.0, -8.0), (0.0, 0.00123, -0.004),
+    (-8388.608, 1342.17727, -8.0),  # the ends of the ranges
+])
+def test_current_of_the_ecu_follows_the_error_up_to_its_limit(ecu: EcuDesk, target: float, position: float,
+                                                              current: float) -> None:
     """3.6 A/m; the derivative part is 0 in the first cycle with a current and while nothing changes."""
-    for target, position, current in (
-        (1.0, 0.5, 1.8), (-1.0, 0.5, -5.4), (5.0, 0.0, 8.0), (-5.0, 0.0, -8.0), (0.0, 0.00123, -0.004),
-        (-8388.608, 1342.17727, -8.0),  # the ends of the ranges
-    ):
-        ecu.cycle(target, position, enable=0)
-        said = [read(ecu.cycle(target, position)) for _ in range(2)]
-        assert said == [pytest.approx((OPERATIONAL, current))] * 2
+    ecu.cycle(target, position, enable=0)
+    said = [read(ecu.cycle(target, position)) for _ in range(2)]
+    assert said == [pytest.approx((OPERATIONAL, current))] * 2
 
 
 @pytest.mark.parametrize(("name", "kind"), list(product(("Demand", "Feedback"), ("checksum", "counter"))))
@@ -262,9 +257,8 @@ def test_a_checksum_of_the_users_own_protects_a_whole_run(tmp_path: Path) -> Non
 
 @examples
 def test_a_short_run_passes_in_real_time(tmp_path: Path, folder: Path) -> None:
-    (tmp_path / "short.toml").write_text(SHORT + SLOW_START + IN_TIME)
+    words = (write_file(tmp_path / "short.toml", SHORT + SLOW_START + IN_TIME), "--pace", "realtime")
     for k in range(TRIES):
-        words = (tmp_path / "short.toml", "--pace", "realtime")
         said = run_bench(folder, spec("udp_multicast"), tmp_path / str(k), *words)
         if said.json["verdict"] not in ("ABORTED", "INVALID_TIMING"):
             assert (said.status, said.json["verdict"], list_failed(said)) == (0, "PASS", [])
@@ -287,27 +281,26 @@ def test_a_faulty_controller_does_not_pass(tmp_path: Path, folder: Path, fault: 
                                            monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(participants, "FRAME_TIMEOUT", 0.2)  # s: it is spent in each cycle without an answer
     found_by, text = FOUND_BY[fault]
-    (tmp_path / "step.toml").write_text(text)
-    words = (tmp_path / "step.toml",) if text else ()
+    words = (write_file(tmp_path / "step.toml", text),) if text else ()
     said = run_bench(folder, spec("udp_multicast"), tmp_path, *words, options=("--fault", fault, *PATIENT[folder]))
     cause = (said.json.get("cause") or {}).get("text", "")
     assert said.status == 1 and said.json["verdict"] in ("FAIL", "ABORTED")
     assert any(re.search(found_by, text) for text in [*list_failed(said), cause]), (list_failed(said), cause)
 
 
+@needs_compiler
 @pytest.mark.parametrize(("folder", "line"), [
     *((DRIVE, line) for line in ("", "--node", "B --node 0", "B --node 128", "B --fault x", "B --other 1")),
     *((ECU, line) for line in ("", "--timeout", "B --timeout 0", "B --fault x"))])
 def test_a_wrong_command_line_is_one_line(folder: Path, line: str) -> None:
-    skip_without_compiler()
     done = subprocess.run([build_device(folder), *line.split()], capture_output=True, text=True, timeout=20)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
 
 
-def test_the_page_names_each_fault() -> None:
+@examples
+def test_the_page_names_each_fault(folder: Path) -> None:
     """What the page of an example lists is what its program takes."""
-    for folder in (DRIVE, ECU):
-        names = re.search(r"NAMES\[\] = \{(.*?)\}", (folder / "faults.c").read_text(), re.DOTALL)
-        assert names is not None
-        page = (folder / "README.md").read_text()
-        assert [name for name in re.findall(r'"(\w+)"', names[1])[1:] if f"`{name}`" not in page] == []
+    names = re.search(r"NAMES\[\] = \{(.*?)\}", (folder / "faults.c").read_text(), re.DOTALL)
+    assert names is not None
+    page = (folder / "README.md").read_text()
+    assert [name for name in re.findall(r'"(\w+)"', names[1])[1:] if f"`{name}`" not in page] == []

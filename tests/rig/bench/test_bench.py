@@ -3,12 +3,13 @@
 import json
 import os
 import shutil
+from contextlib import closing
 from pathlib import Path
 
 import codec
 import numpy as np
 import pytest
-from bus_stations import gather, raw_kinds, spec
+from bus_stations import gather, raw_kinds
 from physics_cases import PREFLIGHT
 from rig_command import answer, rig
 from vcan_host import kernel_has_vcan0
@@ -73,16 +74,13 @@ def test_the_histogram_of_cyclictest() -> None:
 
 @needs_gcc
 @raw_kinds
-def test_the_responder_in_c_sends_the_frames_of_the_emulator(bus_kind: str) -> None:
-    where = spec(bus_kind)
-    link = Link(open_can(where), lambda: 0)
-    with run_c_responder(where):
+def test_the_responder_in_c_sends_the_frames_of_the_emulator(where: str) -> None:
+    with closing(Link(open_can(where), lambda: 0)) as link, run_c_responder(where):
         for cycle in range(300):
             link.send(codec.SYNC, b"")
             feedback, valve = gather(link, 2)
             assert (feedback.cob_id, len(feedback.data), valve.cob_id) == (codec.FEEDBACK, 8, codec.VALVE_STATE)
             assert codec.unpack_valve_state(valve.data).cycle == cycle
-    link.close()
 
 
 def test_percentiles_ratios_and_targets() -> None:
@@ -106,8 +104,8 @@ def test_percentiles_ratios_and_targets() -> None:
 # The guest has a clock of 100 Hz: no real time there.
 @pytest.mark.parametrize("bus_kind", ["udp_multicast"] + ["socketcan"] * ("EHA_RIG_GUEST" not in os.environ
                                                                           and kernel_has_vcan0()), indirect=True)
-def test_the_command_measures_everybody(bus_kind: str) -> None:
-    said = rig("bench", "realtime", "--bus", spec(bus_kind), "--seconds", 0.5, "--blocks", 1, "--json")
+def test_the_command_measures_everybody(where: str) -> None:
+    said = rig("bench", "realtime", "--bus", where, "--seconds", 0.5, "--blocks", 1, "--json")
     assert said.status in (0, 1) and said.err == ""
     figures = said.json
     there = {COMPILED} | ({IN_C} if shutil.which("gcc") else set())

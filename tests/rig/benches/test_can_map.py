@@ -11,9 +11,9 @@ from cantools.database import Database, load_string
 from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from hypothesis import given, settings, strategies as st
+from refusals import catch_refusal
 
 from plant.compile import compile_function
-from plant.errors import InputError
 from rig.benches.bench import EXTENDED, FD, SWITCHED, Field, FrameSpec, Guard, Kind, Role, extract_bits, pack, unpack
 from rig.benches.bench_file import load_bench_from_files
 from rig.benches.checksums import compute_checksum, compute_crc8, load_checksum
@@ -247,13 +247,13 @@ def test_nested_multiplexers_are_refused() -> None:
     part = "SG_ Part m3M : 40|8@1+ (1,0) [0|0] \"\" Rig"
     nested = MULTIPLEXED.replace("SG_ State m3 :", f"{part}\n SG_ State m3 :").replace(
         "SG_MUL_VAL_ 11 State Kind 3-3;", "SG_MUL_VAL_ 11 Part Kind 3-3;\nSG_MUL_VAL_ 11 State Part 3-3;")
-    with pytest.raises(InputError, match="signals of one multiplexer; Drive has Kind and Part, a nested one"):
-        load_multiplexed(nested, "State")
+    said = catch_refusal(load_multiplexed, nested, "State")
+    assert "signals of one multiplexer; Drive has Kind and Part, a nested one" in said
 
 
 def test_a_selector_has_no_other_use() -> None:
-    with pytest.raises(InputError, match=r"Drive\.Page is the multiplexer of used ones"):
-        load_pages("[controller.ready]", '"Drive.Page" = 2')
+    said = catch_refusal(load_pages, "[controller.ready]", '"Drive.Page" = 2')
+    assert "Drive.Page is the multiplexer of used ones" in said
 
 
 # AUTOSAR SWS CRC Library, 7.2.1.2 and 7.2.1.3: data, CRC-8 (SAE J1850), CRC-8 with polynomial 0x2F
@@ -265,13 +265,12 @@ def make_field(checksum: str, **options: object) -> Field:
     return Field(name="", lowest=0, length=8, guard=Guard.CHECKSUM, checksum=checksum, **options)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("name", "polynomial", "column"), [("crc8_sae_j1850", 0x1D, 1), ("crc8_h2f", 0x2F, 2)])
 @pytest.mark.parametrize("row", PUBLISHED.split(";"))
-def test_crcs_equal_the_tables_of_autosar(row: str) -> None:
-    data, j1850, h2f = (bytes.fromhex(word) for word in row.split())
-    assert compute_crc8(data, 0x1D) == j1850[0]
-    assert compute_crc8(data, 0x2F) == h2f[0]
-    for name, expected in (("crc8_sae_j1850", j1850), ("crc8_h2f", h2f)):
-        assert compute_checksum(make_field(name), b"\xA5" + data, 0) == expected[0]
+def test_crcs_equal_the_tables_of_autosar(row: str, name: str, polynomial: int, column: int) -> None:
+    words = [bytes.fromhex(word) for word in row.split()]
+    own = compute_crc8(words[0], polynomial), compute_checksum(make_field(name), b"\xA5" + words[0], 0)
+    assert own == (words[column][0],) * 2
 
 
 @pytest.mark.parametrize("data_id, data, expected", [
@@ -305,6 +304,4 @@ def test_what_stands_in_the_field_does_not_count(data: bytes, crc: int) -> None:
     ("def f(data): return 1", "sums.py: f: expected a whole number from (data, counter), not TypeError"),
 ])
 def test_an_error_of_a_user_is_one_line(source: str, error: str) -> None:
-    with pytest.raises(InputError) as raised:
-        load_checksum("sums.py", source.encode(), "f")
-    assert str(raised.value).startswith(error) and "\n" not in str(raised.value)
+    assert catch_refusal(load_checksum, "sums.py", source.encode(), "f").startswith(error)

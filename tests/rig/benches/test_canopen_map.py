@@ -90,12 +90,12 @@ def load(objects: dict[str, Entry], rpdos: tuple[Mapped, ...] = RPDOS, tpdos: tu
     return load_bench_from_files({"b.toml": DRIVE.encode(), "x.eds": format_eds(objects, rpdos, tpdos).encode()})
 
 
-def test_transmission_types_say_when_a_frame_comes() -> None:
-    frames = {spec.name: spec for spec in load(OBJECTS).frames.frames}
-    assert [spec.is_before_sync for spec in frames.values()] == [True, False, False]
-    for kind, every, is_answer in ((0, 1, False), (1, 1, True), (240, 240, True), (254, 1, True), (255, 1, True)):
-        spec = load(OBJECTS, tpdos=(TPDOS[0]._replace(kind=kind),)).frames.frames[-1]
-        assert (spec.every, spec.is_answer) == (every, is_answer)
+@pytest.mark.parametrize(("kind", "every", "is_answer"), [(0, 1, False), (1, 1, True), (240, 240, True), (254, 1, True),
+                                                         (255, 1, True)])
+def test_transmission_types_say_when_a_frame_comes(kind: int, every: int, is_answer: bool) -> None:
+    assert [spec.is_before_sync for spec in load(OBJECTS).frames.frames] == [True, False, False]
+    spec = load(OBJECTS, tpdos=(TPDOS[0]._replace(kind=kind),)).frames.frames[-1]
+    assert (spec.every, spec.is_answer) == (every, is_answer)
 
 
 def test_an_event_driven_frame_is_awaited_only_where_no_other_brings_the_current() -> None:

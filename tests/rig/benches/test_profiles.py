@@ -8,6 +8,7 @@ from rig.benches.profiles import (
     CIA408,
     PROFILES,
     TRANSITIONS,
+    ProfileWords,
     State,
     choose_control,
     find_state,
@@ -64,12 +65,12 @@ def test_quick_stop_is_asked_for_directly() -> None:
     assert choose_control(CIA402, State.QUICK_STOP, State.ACTIVE) == TABLE[State.ACTIVE, State.QUICK_STOP]
 
 
-def test_a_fault_is_acknowledged_by_a_rising_edge_and_only_where_asked_for() -> None:
-    for words in (CIA402, CIA408):
-        first = choose_control(words, State.ACTIVE, State.FAULT, 0, resets=True)
-        second = choose_control(words, State.ACTIVE, State.FAULT, first, resets=True)
-        assert first == words.reset and second & words.reset == 0
-        assert choose_control(words, State.ACTIVE, State.FAULT) == words.ladder[0]
+@pytest.mark.parametrize("words", [CIA402, CIA408], ids=["402", "408"])
+def test_a_fault_is_acknowledged_by_a_rising_edge_and_only_where_asked_for(words: ProfileWords) -> None:
+    first = choose_control(words, State.ACTIVE, State.FAULT, 0, resets=True)
+    second = choose_control(words, State.ACTIVE, State.FAULT, first, resets=True)
+    assert first == words.reset and second & words.reset == 0
+    assert choose_control(words, State.ACTIVE, State.FAULT) == words.ladder[0]
 
 
 def test_the_words_of_cia_408_are_those_of_the_bus_page() -> None:

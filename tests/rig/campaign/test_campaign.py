@@ -74,8 +74,7 @@ def wait_for(holds: Callable[[], bool], process: subprocess.Popen[str], seconds:
 def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished campaign of eight cases, by this process."""
     where = tmp_path_factory.mktemp("campaign") / "local"
-    model = Model()
-    whole = judge.build_matrix({"seeds": 2, "case": judge.parse_faults(MATRIX[1:6:2])}, model, MATRIX[-1], "test")
+    whole = judge.build_matrix({"seeds": 2, "case": judge.parse_faults(MATRIX[1:6:2])}, Model(), MATRIX[-1], "test")
     run_campaign(whole, where, Workers())
     return where
 
@@ -232,14 +231,12 @@ def test_rig_fdi_in_a_campaign_finds_both_faults_and_the_statistics_are_written(
     assert json.loads((tmp_path / "summary.json").read_text()) == said.json
 
 
-def test_a_plant_file_is_judged_by_worker_processes_and_resumed_only_with_trust(
-        environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_plant_file_is_judged_by_worker_processes_and_resumed_only_with_trust(environment: Path, here: Path) -> None:
     rig("new", "plant", "my_motor")
     work = ("--work", "campaign_work:count_rows")
     rig("campaign", "--model", "my_motor.py", "--fault", "healthy", "--seeds", 3, "--out", "two", "--jobs", 2,
         "--most", 2, *work)
-    found = rows(tmp_path / "two")
+    found = rows(here / "two")
     fault, = judge.restore_faults(judge.read_matrix_of_folder("two").spec)
     assert [row["status"] for row in found] == ["ok", "ok"]
     truth = {row[f"true_{fault.key}"] for row in found}
@@ -339,10 +336,7 @@ def test_workers_are_limited_to_one_thread(monkeypatch: pytest.MonkeyPatch) -> N
 def test_an_interruption_ends_the_workers_and_the_processes_they_started(work: str, tmp_path: Path) -> None:
     command = [sys.executable, str(Path(campaign_work.__file__)), work, str(tmp_path)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    end = time.monotonic() + 600  # only ends a test that hangs
-    while (not (tmp_path / "pids").exists() or len((tmp_path / "pids").read_text().split()) < 4):
-        assert time.monotonic() < end and process.poll() is None
-        time.sleep(0.05)
+    wait_for(lambda: (tmp_path / "pids").exists() and len((tmp_path / "pids").read_text().split()) >= 4, process)
     pids = [int(word) for word in (tmp_path / "pids").read_text().split()]
     assert all(is_running(pid) for pid in pids)
     process.send_signal(signal.SIGINT)

@@ -4,13 +4,15 @@ import math
 import re
 import shutil
 import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
 from device_files import BENCH, write_bench
 from places import ROOT
-from rig_command import refuse, rig
+from rig_command import refuse, rig, write_file
 
 from plant.signals import EHA
 from rig.benches.bench import Role, list_inputs, list_outputs, pack
@@ -52,10 +54,8 @@ def test_a_sequence_is_checked_together_with_a_bench(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", SHEETS)
-def test_a_new_bench_can_be_used_or_says_what_is_missing(name: str, tmp_path: Path,
-                                                         monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    sheet = Path(shutil.copy(SHEETS[name], tmp_path)).name
+def test_a_new_bench_can_be_used_or_says_what_is_missing(name: str, here: Path) -> None:
+    sheet = Path(shutil.copy(SHEETS[name], here)).name
     answer = rig("new", "bench", name, "--eds" if sheet.endswith("eds") else "--dbc", sheet, "--json").json
     assert answer["verdict"] == "COMPLETE" and Path(f"{name}.toml").exists()
     assert rig("check", "--bench", f"{name}.toml").status == 0
@@ -67,14 +67,14 @@ def test_a_new_bench_can_be_used_or_says_what_is_missing(name: str, tmp_path: Pa
     assert "a file that does not exist yet" in refuse("new", "bench", name, "--eds", sheet)
 
 
-def test_the_guess_of_an_example_is_the_example(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "option", "words"), [("drive", "--eds", ("--node", 5)), ("ecu", "--dbc", ())])
+def test_the_guess_of_an_example_is_the_example(name: str, option: str, words: tuple[object, ...], tmp_path: Path
+                                                ) -> None:
     """For the frames; what the data sheet cannot say is marked."""
-    for name, sheet, words in (("drive", SHEETS["drive"], ("--node", 5)), ("ecu", SHEETS["ecu"], ())):
-        path = tmp_path / f"{name}.toml"
-        option = "--eds" if sheet.suffix == ".eds" else "--dbc"
-        assert rig("new", "bench", name, option, sheet, *words, "--out", path).status == 0
-        guessed, own = load_bench(str(path)), load_bench(str(sheet.parent / "bench.toml"))
-        assert (repr(guessed.frames), guessed.phases, guessed.ready) == (repr(own.frames), own.phases, own.ready)
+    path, sheet = tmp_path / f"{name}.toml", SHEETS[name]
+    assert rig("new", "bench", name, option, sheet, *words, "--out", path).status == 0
+    guessed, own = load_bench(str(path)), load_bench(str(sheet.parent / "bench.toml"))
+    assert (repr(guessed.frames), guessed.phases, guessed.ready) == (repr(own.frames), own.phases, own.ready)
 
 
 TRIM_DBC = """VERSION ""
@@ -117,9 +117,8 @@ def test_the_doctor_listens_for_a_bench() -> None:
     spec, bench = "udp_multicast:239.74.163.93", load_bench(str(ECU / "bench.toml"))
     drive, demand = (bench.frames.list_from(role)[0] for role in (Role.CONTROLLER, Role.RIG))
     stop = threading.Event()
-    link = Link(open_can(spec), WallClock().now)
 
-    def send() -> None:
+    def send(link: Link) -> None:
         while not stop.wait(0.002):
             for identifier, data in ((drive.identifier, pack(drive, {})), (drive.identifier, b"12"), (0x123, b""),
                                      (demand.identifier, pack(demand, {}))):
@@ -133,14 +132,13 @@ def test_the_doctor_listens_for_a_bench() -> None:
     beating = judge_frames(eha, *count_frames(eha, [Frame(0, 0x702, b"\x05")]), 1.0)
     remedies = {each.name.split()[0]: each.remedy for each in beating}
     assert remedies["TPDO1"] == "PDOs come after NMT start" and "power" in remedies["plant"]
-    thread = threading.Thread(target=send)
-    thread.start()
-    try:
-        said = rig("doctor", "--bench", ECU / "bench.toml", "--bus", spec, "--seconds", "1", "--json")
-    finally:
-        stop.set()
-        thread.join()
-        link.close()
+    with closing(Link(open_can(spec), WallClock().now)) as link, ThreadPoolExecutor() as pool:
+        sender = pool.submit(send, link)
+        try:
+            said = rig("doctor", "--bench", ECU / "bench.toml", "--bus", spec, "--seconds", "1", "--json")
+        finally:
+            stop.set()
+            sender.result()  # raises what went wrong in it
     found = {each["name"].split()[0]: each for each in said.json["findings"]}
     assert found["Drive"]["status"] == "limited"
     assert f"some of 2 bytes, not {drive.length}" in found["Drive"]["found"]
@@ -163,5 +161,5 @@ def test_the_examples_on_the_page_are_valid(tmp_path: Path) -> None:
     shutil.copy(DRIVE / "drive.eds", tmp_path / "drive_x.eds")
     shutil.copy(ECU / "ecu.dbc", tmp_path / "ecu.dbc")
     for text in (canopen, can):
-        (tmp_path / "b.toml").write_text(text)
-        assert len(load_bench(str(tmp_path / "b.toml")).frames.frames) >= 3
+        bench = load_bench(str(write_file(tmp_path / "b.toml", text)))
+        assert len(bench.frames.frames) >= 3

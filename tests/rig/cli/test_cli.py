@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from rig_command import SHORT, answer, finished, grown, refuse, rig, started
+from rig_command import SHORT, answer, finished, grown, interrupted, refuse, rig, started, write_file
 
 from fdi.trace.trace import CLEANUP, Trace
 from plant import Model, load_model
@@ -30,12 +30,7 @@ LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold
 
 @pytest.fixture
 def short(tmp_path: Path) -> Path:
-    return written(tmp_path / "short.toml", SHORT)
-
-
-def written(path: Path, text: str) -> Path:
-    path.write_text(text)
-    return path
+    return write_file(tmp_path / "short.toml", SHORT)
 
 
 def test_the_command_list_agrees_with_the_modules() -> None:
@@ -76,7 +71,7 @@ def test_results_stay_where_no_run_comes_about(short: Path, tmp_path: Path) -> N
 def test_brackets_in_names_are_brackets(tmp_path: Path) -> None:
     """rich would take them for mark-up, and end a run that passed with a traceback."""
     text = SHORT.replace("A short one", "[red]A[/] short one").replace('"overshoot",', '"[/b] overshoot",', 1)
-    said = rig("run", written(tmp_path / "odd.toml", text.replace('"rest"', '"[rest"')), "--out", tmp_path / "[out]")
+    said = rig("run", write_file(tmp_path / "odd.toml", text.replace('"rest"', '"[rest"')), "--out", tmp_path / "[out]")
     assert said.status == 0 and "[red]A[/] short one" in said.out and "[/b] overshoot" in said.out, said
 
 
@@ -103,12 +98,11 @@ def test_a_bug_is_neither_a_verdict_nor_bad_input(short: Path, monkeypatch: pyte
 
 
 def test_ctrl_c_runs_clean_up_and_closes_the_log_in_a_folder_that_no_other_run_got(short: Path, tmp_path: Path) -> None:
-    long = written(tmp_path / "long.toml", LONG)
-    process = started("run", long, "--pace", "realtime", "--out", tmp_path / "out", "--json")
+    process = started("run", write_file(tmp_path / "long.toml", LONG), "--pace", "realtime", "--out", tmp_path / "out",
+                      "--json")
     grown(tmp_path / "out" / "trace.mcap", 60_000)
     assert "no other run" in refuse("run", short, "--out", tmp_path / "out")
-    process.send_signal(signal.SIGINT)
-    said = finished(process)
+    said = interrupted(process)
     assert said.status == 130 and said.json["verdict"] == "ABORTED" and said.err == ""
     trace = Trace.read(tmp_path / "out", all=True)
     assert (trace.phase == CLEANUP).sum() == 50 and trace.events[-1].text == "end"
@@ -117,12 +111,11 @@ def test_ctrl_c_runs_clean_up_and_closes_the_log_in_a_folder_that_no_other_run_g
 def test_a_second_ctrl_c_ends_it_and_the_log_is_closed_all_the_same(tmp_path: Path) -> None:
     text = LONG.replace('kind = "ramp", to = 0.0, time = 0.05', 'kind = "hold", time = 60')
     log = tmp_path / "out" / "trace.mcap"
-    process = started("run", written(tmp_path / "long.toml", text), "--pace", "realtime", "--out", tmp_path / "out")
+    process = started("run", write_file(tmp_path / "long.toml", text), "--pace", "realtime", "--out", tmp_path / "out")
     grown(log, 60_000)
     process.send_signal(signal.SIGTERM)
     grown(log, log.stat().st_size + 30_000)  # the run goes on, in its clean-up
-    process.send_signal(signal.SIGINT)
-    said = finished(process)
+    said = interrupted(process)
     assert said.status == 130 and said.err.splitlines()[-1] == "rig run: interrupted" and "Traceback" not in said.err
     assert Trace.read(tmp_path / "out", all=True).events[-1].text == "end"
 
@@ -145,8 +138,7 @@ def test_ctrl_c_is_not_lost_where_python_ignores_exceptions() -> None:
     assert (done.stdout, done.stderr) == ("heard\n", "")
 
 
-def test_runs_without_a_folder_get_new_ones(short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_runs_without_a_folder_get_new_ones(short: Path, here: Path) -> None:
     traces = [rig("run", short, "--json").json["trace"] for _ in range(2)]
     assert traces == ["runs/short/trace.mcap", "runs/short-2/trace.mcap"]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from effect_files import SPRING, restored_catalogue
 from noisy_traces import SHORT, record_healthy, record_plant
-from rig_command import Said, answer, refuse, rig
+from rig_command import Said, answer, refuse, rig, write_file
 from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 from synthetic_run import record_run
 
@@ -79,8 +79,8 @@ def test_a_page_that_needs_no_network(fault: Said, folder: Path) -> None:
 def test_the_right_parameters_bring_it_to_the_floor(folder: Path) -> None:
     friction = ["--set", "spool.static_friction=30", "--set", "spool.dynamic_friction=20"]
     assert answer("compare", folder / "fault.csv", *friction)["verdict"] == "WITHIN_FLOOR"
-    (folder / "model.toml").write_text('name = "stiff"\n[spool]\nstatic_friction = 30.0\ndynamic_friction = 20.0\n')
-    said = rig("compare", folder / "fault.csv", "--model", folder / "model.toml")
+    text = 'name = "stiff"\n[spool]\nstatic_friction = 30.0\ndynamic_friction = 20.0\n'
+    said = rig("compare", folder / "fault.csv", "--model", write_file(folder / "model.toml", text))
     assert said.status == 0 and said.out.startswith("WITHIN_FLOOR  The model explains this trace")
     assert "next" not in said.out
 
@@ -163,9 +163,8 @@ def test_effects_that_hide_in_the_tolerances_are_listed_with_what_would_reveal_t
 
 
 @pytest.mark.slow
-def test_both_effects_of_the_readme_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_effects_of_the_readme_are_named(here: Path) -> None:
     """A repeat on which the right second effect misses another stop is no evidence against it."""
-    monkeypatch.chdir(tmp_path)
     assert rig("simulate", "--samples", "--quiet").status == 0
     said = rig("explain", "run.csv", "--repeat", "run2.csv", "--holdout", "held.csv", "--json").json
     assert (said["verdict"], {*said["effects"]}) == ("EXPLAINED", {"null_bias", "jack_friction"})
@@ -211,8 +210,7 @@ def test_the_file_is_a_model_with_intervals_and_provenance(added: tuple[Said, Pa
 
 def test_a_run_at_rest_shows_next_to_nothing(tmp_path: Path) -> None:
     """Noise alone is left of it, also with a bias hidden: it does not say that nothing is missing."""
-    command = tmp_path / "rest.csv"
-    command.write_text("t,com\n0,0\n2,0\n")
+    command = write_file(tmp_path / "rest.csv", "t,com\n0,0\n2,0\n")
     run = tmp_path / "run.csv"
     assert rig("simulate", "--command", command, "--set=null_bias.current=5e-5", "--out", run).status == 0
     said = rig("explain", run, "--json", "--out", tmp_path / "page.html").json
@@ -253,15 +251,13 @@ def test_taken_out_without_a_run_all_else_stays(model: Path) -> None:
 
 
 def test_a_base_effect_comes_out_at_its_value_before(tmp_path: Path) -> None:
-    path = tmp_path / "m.toml"
-    path.write_text("[spool]\nstatic_friction = 40.0\ndynamic_friction = 30.0\n")
+    path = write_file(tmp_path / "m.toml", "[spool]\nstatic_friction = 40.0\ndynamic_friction = 30.0\n")
     assert rig("remove", "spool_friction", "--model", path, "--quiet").status == 0
     assert load_model(path).values == Model().values
 
 
 def test_a_model_with_a_users_effect_finds_its_file_or_asks_for_it(tmp_path: Path) -> None:
-    own, run, file = tmp_path / "spring.py", tmp_path / "s.csv", tmp_path / "m.toml"
-    own.write_text(SPRING)
+    own, run, file = write_file(tmp_path / "spring.py", SPRING), tmp_path / "s.csv", tmp_path / "m.toml"
     with restored_catalogue():
         assert rig("simulate", "--effects", own, "--set=spring.stiffness=1e5", "--out", run, "--quiet").status == 0
         model = Model().replace({"spring.stiffness": 1e5})

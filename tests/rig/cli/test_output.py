@@ -21,6 +21,7 @@ from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from rig.recorder.convert import RAW_SUFFIXES
 
+pytestmark = pytest.mark.usefixtures("here")
 HEADER = "t,com,xj,cor\n"
 COMMANDS = {  # name -> words, of what suffix the result is
     "view": (["view", "{log}", "--out", "{out}"], ".rrd"),
@@ -91,11 +92,8 @@ SMALLEST = 4096  # bytes that a file may have
 
 def run_limited(*words: str) -> subprocess.CompletedProcess[str]:
     """`rig` in a process in which no file grows beyond SMALLEST bytes, as on a disk that is full then."""
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (SMALLEST, SMALLEST))
-
     return subprocess.run([sys.executable, "-B", "-m", "rig.cli.main", *words], capture_output=True, text=True,
-                          preexec_fn=limit, check=False)
+                          preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (SMALLEST, SMALLEST)))
 
 
 @pytest.mark.parametrize("name", ["run.csv", "run.mcap", "frames.asc"])
@@ -179,12 +177,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("log")
     play(job(seed=3), folder)
     return folder / "trace.mcap"
-
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The test works in its own folder."""
-    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture
@@ -279,13 +271,13 @@ def test_names_texts_and_settings_of_a_log_are_checked(log: Path, attachments: d
     assert [path.name for path in Path().iterdir()] == ["sent.mcap"]
 
 
-def test_a_log_does_not_choose_the_bus(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("words", [["sent.mcap", "--bus", "embedded"], ["{log}"]])  # asked for, and as it was
+def test_a_log_does_not_choose_the_bus(words: list[str], log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     change_log(log, Path("sent.mcap"), settings={"bus": "udp_multicast:239.77.7.7"})
     monkeypatch.setenv("EHA_RIG_BUS", "udp_multicast:239.77.7.8")
     assert "--bus udp_multicast:239.77.7.7" in refuse("run", "--from", "sent.mcap", "--out", "out")
-    for words in (["sent.mcap", "--bus", "embedded"], [log]):  # embedded before, embedded now
-        said = rig("run", "--from", *words, "--json", "--out", "out")
-        assert said.status == 0 and said.json["run"]["bus"] == "embedded", said
+    said = rig("run", "--from", *(word.format(log=log) for word in words), "--json", "--out", "out")
+    assert said.status == 0 and said.json["run"]["bus"] == "embedded", said
 
 
 def test_texts_of_a_log_do_not_command_the_terminal(log: Path) -> None:

@@ -20,11 +20,11 @@ from broken_devices import (
     wrap,
     wrap_all,
 )
-from bus_stations import spec
-from c_device import skip_without_compiler
+from bus_stations import only_udp, spec, stand_nodes
+from c_device import needs_compiler
 from device_bench import change_sheet, describe_variable
 from refusals import catch_refusal
-from rig_command import gone, refuse, rig, started
+from rig_command import gone, nodes_on, refuse, rig, write_file
 
 from dbc import EDS
 from plant.errors import RigError
@@ -34,6 +34,7 @@ from rig.device import Abort, NmtState, SdoAbort
 from rig.device.dictionary import INVALID
 from rig.network.bus import Done, EmbeddedWire
 from rig.network.frame import Send, VirtualClock
+from rig.network.node_objects import CONTROLLER
 from rig.nodes.firmware import Firmware
 
 
@@ -155,8 +156,8 @@ def test_defect_of_the_data_sheet_is_found(
 
 def test_missing_mandatory_object(tmp_path: Path) -> None:
     (before, _), (_, after) = (EDS[3].read_text().split(f"[{section}]\n") for section in ("1001", "1018"))
-    (tmp_path / "without.eds").write_text(f"{before}[1018]\n{after}")
-    assert list_cases(examine(nothing, chapters=("1",), sheet=tmp_path / "without.eds")) == ["1.2", "1.3"]
+    sheet = write_file(tmp_path / "without.eds", f"{before}[1018]\n{after}")
+    assert list_cases(examine(nothing, chapters=("1",), sheet=sheet)) == ["1.2", "1.3"]
 
 
 def test_data_sheet_that_promises_more_than_the_node_has(tmp_path: Path) -> None:
@@ -168,8 +169,7 @@ def test_data_sheet_that_promises_more_than_the_node_has(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("text", ["", "not an EDS", "[1000]\n", "[DeviceInfo]\n[1000]\nParameterName=x\nDataType=zz\n"])
 def test_no_data_sheet(tmp_path: Path, text: str) -> None:
-    (tmp_path / "bad.eds").write_text(text)
-    assert "electronic data sheet" in catch_refusal(DataSheet, tmp_path / "bad.eds", 3)
+    assert "electronic data sheet" in catch_refusal(DataSheet, write_file(tmp_path / "bad.eds", text), 3)
 
 
 MS = 1_000_000  # ns
@@ -248,10 +248,7 @@ def map_freely(*rules: str) -> Break:
             if rule in rules and is_broken:
                 raise SdoAbort(code)
 
-    def patch(device: Any) -> None:
-        change_entries(lambda entry: entry.index in parameters, access_type="rw")(device)
-        wrap("_check", check)(device)
-    return patch
+    return all_of(change_entries(lambda entry: entry.index in parameters, access_type="rw"), wrap("_check", check))
 
 
 @pytest.mark.parametrize(("rules", "said"), [
@@ -280,7 +277,7 @@ def test_a_mapping_that_the_sheet_lacks_or_of_no_length_is_restored(tmp_path: Pa
     free = map_freely("off", "object", "mappable", "length")
     no_length = wrap("sdo._upload", lambda device, old, index, sub: bytes(4) if (index, sub) == (0x1600, 1) else
                      old(index, sub))
-    for patch in (free, lambda device: (free(device), no_length(device))):
+    for patch in (free, all_of(free, no_length)):
         outcome = examine(patch, chapters=("4.17",), sheet=sheet)
         assert measured(outcome, "4.17") == (Verdict.PASS, "RPDO1, TPDO1, TPDO2")
 
@@ -518,10 +515,10 @@ def test_our_nodes_pass_on_the_embedded_bus(node: str) -> None:
     assert len(by_verdict["pass"]) == len(CASES) - len(NOT_FOR_OUR_NODES[node]) == said.json["counts"]["pass"]
 
 
-def test_the_firmware_passes_on_udp() -> None:
+@only_udp
+@needs_compiler
+def test_the_firmware_passes_on_udp(where: str) -> None:
     """Wide limits, for the machine may be busy. Nothing is left behind."""
-    skip_without_compiler()
-    where = spec("udp_multicast")
     said = rig("conformance", "c", "--bus", where, "--json", "--timeout", 20, "--tolerance", 2000)
     failed = [(test["number"], test["measured"]) for test in said.json["tests"] if test["verdict"] == "fail"]
     assert (failed, said.err) == ([], "")
@@ -546,8 +543,8 @@ def test_files(tmp_path: Path) -> None:
 
 
 def test_a_failure_is_shown_everywhere(tmp_path: Path) -> None:
-    sheet, junit = tmp_path / "other.eds", tmp_path / "junit.xml"
-    sheet.write_text(EDS[3].read_text().replace("EHA plant emulator", "EHA <other>"))
+    junit = tmp_path / "junit.xml"
+    sheet = write_file(tmp_path / "other.eds", EDS[3].read_text().replace("EHA plant emulator", "EHA <other>"))
     said = rig("conformance", "plant", "--eds", sheet, "--chapter", 2, "--junit", junit, "--out", tmp_path)
     assert said.status == 1 and said.out.startswith("FAIL  1 test failed: 2.3.") and "2.3 fail" in said.out
     (failed,) = ElementTree.parse(junit).getroot().findall(".//testcase[failure]")
@@ -572,23 +569,19 @@ def test_a_node_that_is_not_there() -> None:
     assert "node 9 does not answer" in refuse(*words)
 
 
-def test_a_node_by_its_number_and_data_sheet() -> None:
+@only_udp
+def test_a_node_by_its_number_and_data_sheet(where: str) -> None:
     """Any node on the bus; it is not ours to start or to end, and its values are not changed without --write."""
-    bus = spec("udp_multicast")
-    node = started("node", "controller", "--bus", bus)
-    try:
-        assert node.stdout is not None and "controller on" in node.stdout.readline()
-        words = ("conformance", 2, "--eds", EDS[2], "--bus", bus, "--json", "--timeout", 20, "--tolerance", 2000,
-                 "--chapter", "2", "--chapter", "4.15", "--chapter", "6.12")
+    words = ("conformance", 2, "--eds", EDS[2], "--bus", where, "--json", "--timeout", 20, "--tolerance", 2000,
+             "--chapter", "2", "--chapter", "4.15", "--chapter", "6.12")
+    with stand_nodes(where, CONTROLLER):
         said, more = rig(*words), rig(*words, "--write")
-        assert (said.status, more.status, node.poll()) == (0, 0, None)
-    finally:
-        node.terminate()
-        node.communicate(timeout=30)
+        assert (said.status, more.status, len(nodes_on(where))) == (0, 0, 1)
     assert [test["number"] for test in said.json["tests"] if test["verdict"] == "skipped"] == ["4.15", "6.12"]
     assert (said.json["write"], more.json["write"], more.json["counts"]["skipped"]) == (False, True, 0)
 
 
+@needs_compiler
 @pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
 def test_the_firmware_passes_on_a_can_interface(bus_kind: str) -> None:
     """SDO over the kernel's CAN, whose transfers take many frames.
@@ -596,7 +589,6 @@ def test_the_firmware_passes_on_a_can_interface(bus_kind: str) -> None:
     The rest takes minutes on a slow guest and is the same code; 3.15 looks for 6 s how the SDO server waits, which is
     the same on every bus. All nodes are taken through NMT and PDO there by the runs.
     """
-    skip_without_compiler()
     numbers = [each.number for each in CASES if each.number[0] == "3" and each.number != "3.15"]
     words = [word for number in numbers for word in ("--chapter", number)]
     said = rig("conformance", "c", "--bus", spec(bus_kind), "--json", "--timeout", 20, "--tolerance", 2000, *words)

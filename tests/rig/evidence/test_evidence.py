@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from refusals import catch_refusal
-from rig_command import SHORT, answer, refuse, rig
+from rig_command import SHORT, answer, refuse, rig, write_file
 
 from fdi.progress import ignore_progress
 from rig.evidence.package import verify_package, write_package
@@ -140,9 +140,8 @@ def write_evil(path: Path, name: str) -> Path:
 
 
 def test_bad_packages_are_refused_in_one_line(runs: Path, package: Path, tmp_path: Path) -> None:
-    (tmp_path / "no.zip").write_text("no zip")
     (package / "MANIFEST.sha256").write_text("0" * 64 + "  ../../etc/passwd\n")
-    for path, words in ((tmp_path / "no.zip", "a folder or zip that rig evidence made"),
+    for path, words in ((write_file(tmp_path / "no.zip", "no zip"), "a folder or zip that rig evidence made"),
                         (tmp_path / "nothing", "a folder or zip that rig evidence made"),
                         (runs / "run", "a package of rig evidence, which has this file"),
                         (package, "MANIFEST.sha256:1: expected a file of the package, not '../../etc/passwd'"),
@@ -230,8 +229,7 @@ def test_a_package_signed_by_gpg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_minisign_is_called_with_the_key_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A program in its place that signs with the text of the secret key, and knows it by the public one."""
-    fake = tmp_path / "minisign"
-    fake.write_text(f"#!{sys.executable}\n" + """
+    fake = write_file(tmp_path / "minisign", f"#!{sys.executable}\n" + """
 import sys
 given = dict(zip(sys.argv[2::2], sys.argv[3::2]))
 content = open(given["-m"]).read() + open(given.get("-s") or given["-p"]).read()

@@ -7,7 +7,7 @@ from typing import Any
 
 import can
 import pytest
-from c_device import CFrame, load_datagrams, skip_without_compiler
+from c_device import CFrame, load_datagrams, needs_compiler, skip_without_compiler
 from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 from hypothesis import given, strategies as st
 from places import ROOT
@@ -19,10 +19,10 @@ from rig.firmware.object_table import FOLDER, write_object_table
 DRIVE = ROOT / "examples" / "cia402_drive"
 
 
+@needs_compiler
 def test_a_device_is_built_once_and_again_when_its_data_sheet_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    skip_without_compiler()
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / "cache"))
     folder = tmp_path / "drive"
     shutil.copytree(DRIVE, folder)

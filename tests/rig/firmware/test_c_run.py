@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from bus_stations import spec, stand_nodes
-from c_device import SANITIZERS, STRICT, SUPPORT, build_faulty, run_program, skip_without_compiler
+from bus_stations import only_udp, spec, stand_nodes
+from c_device import SANITIZERS, STRICT, SUPPORT, build_faulty, needs_compiler, run_program, skip_without_compiler
 from log_rows import describe_first_difference
 from rig_command import SHORT, job, nodes_on, play, rig
 
@@ -22,10 +22,11 @@ from rig.run import participants
 from rig.run.runner import Outcome
 
 
-def test_preflight_rows_are_byte_for_byte_those_of_the_builtin_controller(tmp_path: Path, preflight: Path) -> None:
+@only_udp
+@needs_compiler
+def test_preflight_rows_are_byte_for_byte_those_of_the_builtin_controller(where: str, tmp_path: Path,
+                                                                          preflight: Path) -> None:
     """On a CAN interface the same is asked in tests/vcan."""
-    skip_without_compiler()
-    where = spec("udp_multicast")
     said = rig("run", "--controller", "c", "--bus", where, "--json", "--out", tmp_path)
     assert said.status == 0, said.err
     assert said.json["verdict"] == "PASS"
@@ -33,9 +34,9 @@ def test_preflight_rows_are_byte_for_byte_those_of_the_builtin_controller(tmp_pa
     assert nodes_on(where) == []
 
 
+@needs_compiler
 def test_gains_of_the_model_reach_the_firmware(tmp_path: Path) -> None:
     """With integral and derivative part and the output at its limit: the law has the same bits."""
-    skip_without_compiler()
     gains = {"controller.proportional_gain": 9.0, "controller.integral_gain": 40.0, "controller.derivative_gain": 0.01,
              "controller.current_limit": 2e-3}  # fmt: skip
     play(job(set_=gains, seed=1), tmp_path / "builtin")
@@ -56,8 +57,8 @@ def test_what_the_firmware_cannot_do_is_one_line(tmp_path: Path, monkeypatch: py
     assert answer.status == 2 and said in answer.err and answer.err.count("\n") == 1
 
 
+@needs_compiler
 def test_an_error_of_the_compiler_is_one_line(tmp_path: Path) -> None:
-    skip_without_compiler()
     (tmp_path / "bad.c").write_text("int main(void) { return x; }\n")
     with pytest.raises(RigError) as caught:
         build_program("bad", [tmp_path / "bad.c"], STRICT)
@@ -65,9 +66,9 @@ def test_an_error_of_the_compiler_is_one_line(tmp_path: Path) -> None:
     assert not isinstance(caught.value, InputError)
 
 
+@needs_compiler
 @pytest.mark.parametrize("words", [[], ["embedded"], ["socketcan"], ["socketcan:"], ["udp_multicast:x"], ["a", "b"]])
 def test_the_program_says_what_it_needs(words: list[str]) -> None:
-    skip_without_compiler()
     done = subprocess.run([build_controller(), *words], capture_output=True, text=True, timeout=20)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
 
@@ -125,13 +126,13 @@ def test_a_firmware_that_is_slow_to_start_is_caught(tmp_path: Path, bus_with_pla
     assert "node 2 controller must be OPERATIONAL within 1 s of NMT start" in outcome.aborted
 
 
-def test_a_run_under_the_sanitizers_passes(tmp_path: Path) -> None:
+@only_udp
+@needs_compiler
+def test_a_run_under_the_sanitizers_passes(where: str, tmp_path: Path) -> None:
     """The whole program with its port; the first wrong access to memory would end it.
 
     Not in the guest, whose kernel has no room for the sanitizer's shadow memory.
     """
-    skip_without_compiler()
-    where = spec("udp_multicast")
     program = build_program("controller", sorted(FOLDER.glob("*.c")), (*STRICT, *SANITIZERS))
     with run_program(program, where):
         outcome = play(job(f"{SHORT}[timing]\noperational = 20\n", seed=1, controller="external", bus=where), tmp_path)
@@ -229,9 +230,9 @@ def run_in_c(script: list[Frame]) -> list[tuple[int, int, bytes]]:
     return [(t_ns, cob_id, data[:length]) for t_ns, cob_id, length, data in RECORD.iter_unpack(done.stdout)]
 
 
+@needs_compiler
 @pytest.mark.parametrize("seed", range(2))
 def test_same_answers_to_a_random_script(seed: int) -> None:
-    skip_without_compiler()
     script = make_script(seed, 40_000)
     expected, sent = run_in_python(script), run_in_c(script)
     different = next((k for k, pair in enumerate(zip(expected, sent, strict=False)) if pair[0] != pair[1]), None)

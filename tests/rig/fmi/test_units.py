@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from c_device import skip_without_compiler
+from c_device import needs_compiler, skip_without_compiler
 from effect_files import HEAD, restored_catalogue
 from places import ROOT
 from rig_command import answer, refuse, rig
@@ -236,8 +236,8 @@ def test_messages_reach_the_logger(unit: Callable[[str, str], Path], tmp_path: P
 # ---------------------------------------------------------------------------------- the command
 
 
+@needs_compiler
 def test_rig_export_writes_units_and_refuses_bad_words(tmp_path: Path) -> None:
-    skip_without_compiler()
     out = tmp_path / "unit.fmu"
     found = answer("export", "--fmu", out, "--fmi", "3", "--set", "spool.static_friction=35")
     assert (found["path"], found["fmi"]) == (str(out), "3") and found["platforms"]
@@ -250,8 +250,8 @@ def test_rig_export_writes_units_and_refuses_bad_words(tmp_path: Path) -> None:
     assert "a trace to export" in refuse("export")
 
 
+@needs_compiler
 def test_effects_of_a_user_are_exported_unless_they_need_more_than_arithmetic(tmp_path: Path) -> None:
-    skip_without_compiler()
     law, out = tmp_path / "law.py", tmp_path / "law.fmu"
     with restored_catalogue():
         law.write_text(HEAD + LAW)
@@ -308,15 +308,14 @@ cleanup = [{ kind = "hold", time = 0.02 }]
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(here: Path) -> Path:
     """The present folder, with a model file of a slide and a short sequence."""
     skip_without_compiler()
-    monkeypatch.chdir(tmp_path)
     Path("slide.toml").write_text(SLIDE)
     Path("short.toml").write_text(SHORT)
     rows = ((t, 1e-3 * (t > 0.2) + 5e-4 * np.sin(9 * t)) for t in np.arange(0, 1.5, 0.01))
     Path("command.csv").write_text("t,com\n" + "".join(f"{t:.2f},{com:.6f}\n" for t, com in rows))
-    return tmp_path
+    return here
 
 
 @pytest.mark.parametrize("version", [pytest.param("2", marks=pytest.mark.slow), "3"])
@@ -373,20 +372,16 @@ def test_identify_finds_the_parameters_that_the_map_gives_a_range(folder: Path) 
     assert found["parameters"]["drive.gain"]["value"] == pytest.approx(2.4, rel=0.01)
 
 
-BROKEN = {
-    "crash": ({"does": "CRASH", "at": 100}, "the unit crashed in step (SIGSEGV); its last message: about to fail"),
-    "hang": ({"does": "HANG", "at": 100}, "the unit has not answered for 4 s in step; it was stopped"),
-    "refusal": ({"does": "REFUSE", "at": 100}, "at 0.1 s; its message: the solver did not converge"),
-    "NaN": ({"does": "GIVE_NAN", "at": 100}, "the unit gives nan for xj at 0.101 s"),
-}
-
-
-@pytest.mark.parametrize("name", BROKEN)
+@pytest.mark.parametrize(("fault", "expected"), [
+    ({"does": "CRASH", "at": 100}, "the unit crashed in step (SIGSEGV); its last message: about to fail"),
+    ({"does": "HANG", "at": 100}, "the unit has not answered for 4 s in step; it was stopped"),
+    ({"does": "REFUSE", "at": 100}, "at 0.1 s; its message: the solver did not converge"),
+    ({"does": "GIVE_NAN", "at": 100}, "the unit gives nan for xj at 0.101 s"),
+])
 def test_a_unit_that_breaks_ends_the_run_with_a_verdict_and_a_readable_log(
-    folder: Path, name: str, monkeypatch: pytest.MonkeyPatch
+    folder: Path, fault: dict[str, Any], expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fault, expected = BROKEN[name]
-    build_fmu(Path("slide.fmu"), **fault)  # type: ignore[arg-type]
+    build_fmu(Path("slide.fmu"), **fault)
     monkeypatch.setattr(foreign, "LONGEST_CALL", 4.0)  # loading takes a second on a busy machine
     assert expected in refuse("simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
     said = rig("run", "short.toml", "--model", "slide.toml", "--out", "run", "--quiet")
@@ -396,42 +391,34 @@ def test_a_unit_that_breaks_ends_the_run_with_a_verdict_and_a_readable_log(
     assert len(Trace.read("run", all=True)) > 50
 
 
-REFUSED = {
-    "another platform": ({"platform": "win64"}, "slide.so; it has only binaries/win64/slide.so"),
-    "source code": ({"sources": True}, "it has none and source code: python -m fmpy compile slide.fmu"),
-    "version": ({"fmi": "1.0"}, "fmiVersion: expected 2.0 or 3.0, not 1.0"),
-    "model exchange": ({"kind": "ModelExchange"}, "an FMU for co-simulation; this one is for model exchange only"),
-    "its tool": ({"unit": 'needsExecutionTool="true"', "does": "REFUSE", "at": 1}, "needs the tool that made it"),
-    "step": ({"unit": 'fixedInternalStepSize="0.0003"'}, "a step of which the cycle of 1 ms is a multiple, not 0.3 ms"),
-    "event mode": ({"does": "EVENT_MODE"}, "its message: this unit needs event mode"),
-    "end": ({"does": "END", "at": 3}, "the unit asks to end the simulation"),
-}
+@pytest.mark.parametrize(("kind", "expected"), [
+    ({"platform": "win64"}, "slide.so; it has only binaries/win64/slide.so"),
+    ({"sources": True}, "it has none and source code: python -m fmpy compile slide.fmu"),
+    ({"fmi": "1.0"}, "fmiVersion: expected 2.0 or 3.0, not 1.0"),
+    ({"kind": "ModelExchange"}, "an FMU for co-simulation; this one is for model exchange only"),
+    ({"unit": 'needsExecutionTool="true"', "does": "REFUSE", "at": 1}, "needs the tool that made it"),
+    ({"unit": 'fixedInternalStepSize="0.0003"'}, "a step of which the cycle of 1 ms is a multiple, not 0.3 ms"),
+    ({"does": "EVENT_MODE"}, "its message: this unit needs event mode"),
+    ({"does": "END", "at": 3}, "the unit asks to end the simulation"),
+])
+def test_a_unit_that_cannot_run_here_is_refused(folder: Path, kind: dict[str, Any], expected: str) -> None:
+    build_fmu(Path("slide.fmu"), **kind)
+    assert expected in refuse("simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_unit_that_cannot_run_here_is_refused(folder: Path, name: str) -> None:
-    build_fmu(Path("slide.fmu"), **REFUSED[name][0])  # type: ignore[arg-type]
-    assert REFUSED[name][1] in refuse(
-        "simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
-
-
-MAPS = {  # replaced in SLIDE
-    "no file": ('file = "slide.fmu"', 'file = "none.fmu"', "none.fmu: expected an FMU; it does not exist"),
-    "no zip": ('file = "slide.fmu"', 'file = "slide.toml"', "an FMU, a zip archive with a modelDescription.xml"),
-    "no variable": ('"slide.x"', '"slide.y"', "a variable of slide.fmu, not 'slide.y'; did you mean slide.x?"),
-    "wrong way": ('variable = "u"', 'variable = "slide.x"', "a variable that is input; slide.x is output"),
-    "unit": ('count = "1 mm"', 'count = "1 bar"', "not 'bar'"),
-    "noise": ('noise = "1 um"', 'noise = "1 bar"', "plant.outputs.ram_position.noise: expected one of m,"),
-    "key": ("[plant.inputs]", "[plant.input]", "plant.input: expected one of file, seed, inputs, outputs, parameters"),
-    "two drives": ('load_force = {', 'torque = {', "one signal that drives the plant"),
-    "no dot": ('drive.damping = "d"', 'damping = "d"', "GROUP.NAME = VARIABLE"),
-}
-
-
-@pytest.mark.parametrize("name", MAPS)
-def test_a_wrong_map_is_refused_with_its_line(folder: Path, name: str) -> None:
+@pytest.mark.parametrize(("old", "new", "expected"), [  # replaced in SLIDE
+    ('file = "slide.fmu"', 'file = "none.fmu"', "none.fmu: expected an FMU; it does not exist"),
+    ('file = "slide.fmu"', 'file = "slide.toml"', "an FMU, a zip archive with a modelDescription.xml"),
+    ('"slide.x"', '"slide.y"', "a variable of slide.fmu, not 'slide.y'; did you mean slide.x?"),
+    ('variable = "u"', 'variable = "slide.x"', "a variable that is input; slide.x is output"),
+    ('count = "1 mm"', 'count = "1 bar"', "not 'bar'"),
+    ('noise = "1 um"', 'noise = "1 bar"', "plant.outputs.ram_position.noise: expected one of m,"),
+    ("[plant.inputs]", "[plant.input]", "plant.input: expected one of file, seed, inputs, outputs, parameters"),
+    ('load_force = {', 'torque = {', "one signal that drives the plant"),
+    ('drive.damping = "d"', 'damping = "d"', "GROUP.NAME = VARIABLE"),
+])
+def test_a_wrong_map_is_refused_with_its_line(folder: Path, old: str, new: str, expected: str) -> None:
     build_fmu(Path("slide.fmu"))
-    old, new, expected = MAPS[name]
     Path("slide.toml").write_text(SLIDE.replace(old, new))
     assert expected in refuse("simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
 

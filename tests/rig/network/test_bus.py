@@ -6,10 +6,10 @@ import socket
 import struct
 import subprocess
 import sys
-import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import cache
 from importlib.metadata import EntryPoint
@@ -27,7 +27,7 @@ from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 from hypothesis import given, settings, strategies as st
 from places import ROOT
 from refusals import catch_refusal
-from rig_command import SHORT, SLOW_START, rig
+from rig_command import SHORT, SLOW_START, rig, write_file
 
 from plant.compile import compile_function
 from plant.errors import RigError
@@ -106,9 +106,8 @@ class TestLink:
             assert gather(receiver, 1, timeout=0.05) == []
 
     @only_udp
-    def test_the_kernel_drops_them(self, bus_kind: str) -> None:
+    def test_the_kernel_drops_them(self, where: str) -> None:
         """They wake nobody: nothing is there to be read."""
-        where = spec(bus_kind)
         with open_can(where) as other, open_can(where) as bus:
             sender, link = (Link(each, time.monotonic_ns) for each in (other, bus))
             link.leave_out([codec.SYNC, EXTENDED | 0x7F, EXTENDED | 0x18FEF1AB])
@@ -121,8 +120,7 @@ class TestLink:
             assert [frame.cob_id for frame in gather(link, 3)] == others
 
     @links
-    def test_foreign_frames_are_counted_and_dropped(self, bus_kind: str) -> None:
-        where = spec(bus_kind)
+    def test_foreign_frames_are_counted_and_dropped(self, bus_kind: str, where: str) -> None:
         with open_can(where) as bus, open_can(where) as other:
             link = Link(bus, time.monotonic_ns)
             other.send(can.Message(arbitration_id=0x123, is_extended_id=False, is_remote_frame=True, dlc=2))
@@ -134,8 +132,7 @@ class TestLink:
             assert (link.dropped, link.error_frames, link.overflows, link.unsent) == (2, bus_kind != "socketcan", 0, 0)
 
     @links
-    def test_a_bus_of_python_can_hears_and_sends_the_same(self, bus_kind: str) -> None:
-        where = spec(bus_kind)
+    def test_a_bus_of_python_can_hears_and_sends_the_same(self, where: str) -> None:
         with open_can(where, fd=True) as bus, open_can(where, fd=True) as other:
             link = Link(bus, time.monotonic_ns)
             for flags in ({}, {"is_fd": True}, {"is_fd": True, "bitrate_switch": True}):
@@ -178,8 +175,7 @@ class TestLink:
             assert (link.error_frames, link.overflows, link.dropped) == (2, 1, 0)
 
     @raw_kinds
-    def test_loss_is_counted_to_the_frame(self, bus_kind: str) -> None:
-        where = spec(bus_kind)
+    def test_loss_is_counted_to_the_frame(self, where: str) -> None:
         with open_can(where) as other, open_can(where) as bus:
             sender, receiver = (Link(each, time.monotonic_ns) for each in (other, bus))
             make_buffer_small(bus.fileno())
@@ -201,24 +197,23 @@ class TestLink:
             first, second = gather(receiver, 2)
             assert 0 <= second.t_ns - first.t_ns <= sent + 100_000
 
-    def test_a_bus_that_is_gone_is_one_line(self) -> None:
+    @pytest.mark.parametrize("use", [lambda link: link.send(0x80, b""), Link.poll], ids=["send", "poll"])
+    def test_a_bus_that_is_gone_is_one_line(self, use: Callable[[Link], object]) -> None:
         link = Link(open_can(spec("virtual")), time.monotonic_ns)
         link.close()
-        for use in (lambda: link.send(0x80, b""), lambda: link.poll()):
-            with pytest.raises(RigError, match=r"\A.+\Z"):
-                use()
+        with pytest.raises(RigError, match=r"\A.+\Z"):
+            use(link)
 
 
 @only_udp
 class TestUdpMulticast:
-    def test_stays_on_the_loopback_interface(self, bus_kind: str) -> None:
-        with open_can(spec(bus_kind)) as bus:
+    def test_stays_on_the_loopback_interface(self, where: str) -> None:
+        with open_can(where) as bus:
             assert bus._tx.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == 0
             assert bus._tx.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, 4) == socket.inet_aton("127.0.0.1")
             assert bus._tx.getsockname()[0] == "127.0.0.1"
 
-    def test_strangers_datagram_is_an_error_frame(self, bus_kind: str) -> None:
-        where = spec(bus_kind)
+    def test_strangers_datagram_is_an_error_frame(self, where: str) -> None:
         with open_can(where) as bus, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             link = Link(bus, time.monotonic_ns)
             stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
@@ -238,19 +233,20 @@ def test_auto_is_embedded_and_says_why(live: list[str], more: str, monkeypatch: 
     assert choose_bus() == ("embedded", f"embedded bus (neither --bus nor EHA_RIG_BUS is set){more}")
 
 
-def test_asked_or_configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    for taken in ("embedded", "virtual", "virtual:x", "udp_multicast", "udp_multicast:239.1.2.3"):
-        assert choose_bus(taken) == (taken, f"{taken}, as asked")
-        monkeypatch.setenv(bus_module.BUS_VARIABLE, taken)
-        assert choose_bus("auto") == (taken, f"{taken}, as EHA_RIG_BUS says")
-        assert choose_bus("virtual:y")[0] == "virtual:y"  # asking beats the variable
+@pytest.mark.parametrize("taken", ["embedded", "virtual", "virtual:x", "udp_multicast", "udp_multicast:239.1.2.3"])
+def test_asked_or_configured(taken: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert choose_bus(taken) == (taken, f"{taken}, as asked")
+    monkeypatch.setenv(bus_module.BUS_VARIABLE, taken)
+    assert choose_bus("auto") == (taken, f"{taken}, as EHA_RIG_BUS says")
+    assert choose_bus("virtual:y")[0] == "virtual:y"  # asking beats the variable
 
 
-def test_bad_spec(monkeypatch: pytest.MonkeyPatch) -> None:
-    for bad in ("vcan0", "socketcan", "embedded:x", "udp_multicast:10.0.0.1", "udp_multicast:x", "nosuch:0"):
-        assert f"--bus: {bad}: expected " in catch_refusal(choose_bus, bad)
-        monkeypatch.setenv(bus_module.BUS_VARIABLE, bad)
-        assert f"EHA_RIG_BUS: {bad}: expected " in catch_refusal(choose_bus, "auto")
+@pytest.mark.parametrize("bad", ["vcan0", "socketcan", "embedded:x", "udp_multicast:10.0.0.1", "udp_multicast:x",
+                                 "nosuch:0"])
+def test_bad_spec(bad: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert f"--bus: {bad}: expected " in catch_refusal(choose_bus, bad)
+    monkeypatch.setenv(bus_module.BUS_VARIABLE, bad)
+    assert f"EHA_RIG_BUS: {bad}: expected " in catch_refusal(choose_bus, "auto")
     assert "--bus: expected auto, embedded, " in catch_refusal(choose_bus, "")
 
 
@@ -258,13 +254,14 @@ def test_embedded_is_no_bus_between_programs() -> None:
     assert "between programs" in catch_refusal(open_can, "embedded")
 
 
-def test_missing_interface_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("use", "where"), [(choose_bus, "auto"), (choose_bus, "socketcan:vcan77"),
+                                            (open_can, "socketcan:vcan77")])
+def test_missing_interface_is_told_how_to_get_it(use: Callable[[str], object], where: str,
+                                                 monkeypatch: pytest.MonkeyPatch) -> None:
     """Asked for or configured: an error, never a silent fall back to the simulation."""
     monkeypatch.setenv(bus_module.BUS_VARIABLE, "socketcan:vcan77")
-    for use in (lambda: choose_bus("auto"), lambda: choose_bus("socketcan:vcan77"),
-                lambda: open_can("socketcan:vcan77")):
-        with pytest.raises(RigError, match=r"\Asocketcan:vcan77: .+\Z"):
-            use()
+    with pytest.raises(RigError, match=r"\Asocketcan:vcan77: .+\Z"):
+        use(where)
 
 
 DOWN, UP = {"type": "280", "flags": "0x80"}, {"type": "280", "flags": "0xc1"}  # as /sys/class/net has it
@@ -336,8 +333,7 @@ def test_what_it_cannot_do_is_refused(options: dict[str, object], words: str) ->
 
 
 def test_a_controller_of_python_can_and_canopen_alone_passes_a_run(tmp_path: Path) -> None:
-    group = find_group()
-    (tmp_path / "short.toml").write_text(SHORT + SLOW_START)
+    group, short = find_group(), write_file(tmp_path / "short.toml", SHORT + SLOW_START)
     program = ROOT / "examples" / "foreign_controller.py"
     imports = [line for line in program.read_text().splitlines() if line.startswith(("import", "from"))]
     assert not any(package in line for line in imports for package in ("rig", "plant", "fdi", "dbc"))
@@ -346,7 +342,7 @@ def test_a_controller_of_python_can_and_canopen_alone_passes_a_run(tmp_path: Pat
         with can.Bus(interface="eha_rig_udp", channel=group) as bus:
             boot = bus.recv(60.0)
             assert boot is not None and (boot.arbitration_id, bytes(boot.data)) == (0x702, b"\0")
-        said = rig("run", tmp_path / "short.toml", "--bus", f"udp_multicast:{group}", "--controller", "external",
+        said = rig("run", short, "--bus", f"udp_multicast:{group}", "--controller", "external",
                    "--out", tmp_path / "out", "--json")
     finally:
         other.terminate()
@@ -577,18 +573,14 @@ def test_everybody_hears_all_frames_in_one_order(where: str) -> None:
             for k in range(300):
                 assert send(senders[number].port, 0x100 + number, 8, k) == SENT
 
-        threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(work, range(4)))  # raises what failed in a thread
         heard = [[receive(bus.port, soon())[2:] for _ in range(1200)] for bus in receivers]
         assert heard[0] == heard[1] == heard[2]
         assert {frame[0] for frame in heard[0]} == {0x100, 0x101, 0x102, 0x103}
 
 
-def test_other_buses_are_refused() -> None:
-    for where in ("embedded", "virtual:x", "slcan:x"):
-        assert not can_open(where)
-        catch_refusal(RawBus, where)
-    assert can_open("udp_multicast") and can_open("socketcan:vcan0")
+@pytest.mark.parametrize("where", ["embedded", "virtual:x", "slcan:x"])
+def test_other_buses_are_refused(where: str) -> None:
+    assert not can_open(where) and can_open("udp_multicast") and can_open("socketcan:vcan0")
+    catch_refusal(RawBus, where)

@@ -1,8 +1,8 @@
 """The canopen library as master through both kinds of wire; every wrong SDO answer ends in one line."""
 
-import contextlib
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from functools import partial
 
 import codec
@@ -25,7 +25,7 @@ from rig.sequences.faults import Plan
 SCENARIO = Scenario(Model(), Plan(stop=10)).to_bytes()
 
 
-@contextlib.contextmanager
+@contextmanager
 def served(where: str, *makers: type[Emulator] | type[Firmware]) -> Iterator[None]:
     """Nodes on a bus between programs, each in a thread of its own."""
     over, clock = threading.Event(), WallClock()
@@ -50,10 +50,8 @@ def wire(bus_kind: str) -> Iterator[Wire]:
         yield EmbeddedWire(VirtualClock(), [Emulator, Firmware])
         return
     where, clock = spec(bus_kind), WallClock()
-    with served(where, Emulator, Firmware):
-        link = LinkWire(Link(open_can(where), clock.now), clock)
+    with served(where, Emulator, Firmware), closing(LinkWire(Link(open_can(where), clock.now), clock)) as link:
         yield link
-        link.close()
 
 
 def alone() -> Master:

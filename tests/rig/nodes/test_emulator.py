@@ -8,7 +8,7 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import pairwise
 from typing import Any
 
@@ -66,27 +66,24 @@ class BusDesk:
 
         def serve() -> None:
             clock = WallClock()
-            with RawBus(self.where) as raw:
-                link = Link(open_can(self.where), clock.now)
+            with RawBus(self.where) as raw, closing(Link(open_can(self.where), clock.now)) as link:
                 link.leave_out(list_unheard(load_bench()))
                 self.node = EmulatorService(link.send, raw, enter_loop_thread, self.scenario)
                 ready.set()
                 serve_node(self.node, link, clock, ended.is_set)
                 self.node.close()
-                link.close()
 
         thread = threading.Thread(target=serve)
-        self.link = Link(open_can(self.where), time.monotonic_ns)
-        thread.start()
-        try:
-            assert ready.wait(120)
-            self.await_frame(0x703)
-            self.restart()
-            yield self
-        finally:
-            ended.set()
-            thread.join()
-            self.link.close()
+        with closing(Link(open_can(self.where), time.monotonic_ns)) as self.link:
+            thread.start()
+            try:
+                assert ready.wait(120)
+                self.await_frame(0x703)
+                self.restart()
+                yield self
+            finally:
+                ended.set()
+                thread.join()
 
     def restart(self) -> None:
         """Reset, lockstep (0x1006 = 0: nobody watches SYNC), start."""
@@ -315,14 +312,14 @@ def test_missing_and_late_drives(drives: str, flags: list[int], counted: tuple[i
     assert (counters(desk), desk.emergencies(), desk.node.plant.drive) == (counted, emergencies, current)
 
 
-def test_lost_and_late_drive_as_the_plan_says() -> None:
-    for fault, two, counted in (
-            (Lost(frame="drive", start=0.003, count=1), [1, 0], (1, 0)),
-            (Late(frame="drive", start=0.003, end=0.004, delay=1.5e-3), [1, 2], (1, 1)),
-            (Late(frame="drive", start=0.003, end=0.004, delay=0.5e-3), [0, 0], (0, 0))):  # what comes last counts
-        desk = PlantDesk(scenario(fault))
-        assert [desk.cycle(1e-3)[1].flags for _ in range(8)] == [0, 0, 0, 0, *two, 0, 0]
-        assert counters(desk) == counted
+@pytest.mark.parametrize(("fault", "two", "counted"), [
+    (Lost(frame="drive", start=0.003, count=1), [1, 0], (1, 0)),
+    (Late(frame="drive", start=0.003, end=0.004, delay=1.5e-3), [1, 2], (1, 1)),
+    (Late(frame="drive", start=0.003, end=0.004, delay=0.5e-3), [0, 0], (0, 0))])  # what comes last counts
+def test_lost_and_late_drive_as_the_plan_says(fault: Fault, two: list[int], counted: tuple[int, int]) -> None:
+    desk = PlantDesk(scenario(fault))
+    assert [desk.cycle(1e-3)[1].flags for _ in range(8)] == [0, 0, 0, 0, *two, 0, 0]
+    assert counters(desk) == counted
 
 
 def test_feedback_lost_and_late() -> None:

@@ -6,6 +6,7 @@ import shutil
 import struct
 import subprocess
 import time
+from contextlib import closing
 from dataclasses import fields
 from itertools import islice
 from pathlib import Path
@@ -19,7 +20,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from places import ROOT
 from refusals import catch_refusal
-from rig_command import refuse, rig
+from rig_command import refuse, rig, write_file
 from synthetic_run import ATTACHMENTS, METADATA, build_cycles, record_run
 
 from fdi.trace.mcap_log import open_log
@@ -145,13 +146,12 @@ def test_times_are_dates_for_others_and_seconds_of_the_run_for_us(tmp_path: Path
     """MCAP's log and publish times count from 1970; our own readers count from the start, as in a log without dates."""
     epoch_ns = 1_790_000_000_123_456_789
     for name, epoch in (("dated", epoch_ns), ("old", 0)):
-        recorder = Recorder(tmp_path / f"{name}.mcap", {}, {"period": "0.001"}, epoch)
-        for t_ns, frames, signals, timing in islice(build_cycles(), 400):
-            for frame in frames:
-                recorder.frame(frame)
-            recorder.cycle(t_ns, signals, timing)
-        recorder.put(250_000_000, Event("INFO", "phase", "main"))
-        recorder.close()
+        with closing(Recorder(tmp_path / f"{name}.mcap", {}, {"period": "0.001"}, epoch)) as recorder:
+            for t_ns, frames, signals, timing in islice(build_cycles(), 400):
+                for frame in frames:
+                    recorder.frame(frame)
+                recorder.cycle(t_ns, signals, timing)
+            recorder.put(250_000_000, Event("INFO", "phase", "main"))
     with (tmp_path / "dated.mcap").open("rb") as stream:
         times = [(m.log_time, m.publish_time) for _, _, m in make_reader(stream).iter_messages(topics=["/signals"])]
     assert times == [(epoch_ns + k * 1_000_000,) * 2 for k in range(400)]
@@ -166,9 +166,8 @@ def test_times_are_dates_for_others_and_seconds_of_the_run_for_us(tmp_path: Path
 
 @pytest.mark.parametrize("text", ["-1", "1e9", "99999999999999999999", "²"])
 def test_a_start_that_is_no_date_is_refused(tmp_path: Path, text: str) -> None:
-    recorder = Recorder(tmp_path / "x.mcap", {}, {})
-    recorder.metadata("clock", {"epoch_ns": text})
-    recorder.close()
+    with closing(Recorder(tmp_path / "x.mcap", {}, {})) as recorder:
+        recorder.metadata("clock", {"epoch_ns": text})
     assert "clock.epoch_ns" in catch_refusal(open_log, tmp_path / "x.mcap")
 
 
@@ -210,11 +209,11 @@ def test_a_whole_log_stays_the_same(log: Path, tmp_path: Path) -> None:
     assert (before.xj == after.xj).all() and before.events == after.events and before.attachments == after.attachments
 
 
-def test_refusals(log: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "said"), [("text.mcap", "MCAP log"), ("none.mcap", "a file that can be read")])
+def test_refusals(name: str, said: str, log: Path, tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("t,com,xj,cor\n")
-    for source, out, said in ((tmp_path / "text.mcap", tmp_path / "out.mcap", "MCAP log"), (log, log, "another file"),
-                              (tmp_path / "none.mcap", tmp_path / "out.mcap", "a file that can be read")):
-        assert said in catch_refusal(recover_log, source, out)
+    assert said in catch_refusal(recover_log, tmp_path / name, tmp_path / "out.mcap")
+    assert "another file" in catch_refusal(recover_log, log, log)
 
 
 FOLDER = ROOT / "docs" / "viewers"
@@ -314,10 +313,9 @@ def test_every_kind_of_frame_there_and_back(tmp_path: Path, suffix: str) -> None
         for number in (0, 0x080, 0x7FF, 0x1FFFFFFF if kind & EXTENDED else 0x123):
             for length in (0, 3, 8, *(FD_LENGTHS if kind & FD else ())):
                 frames.append(Frame(len(frames) * 1_000_000, kind | number, bytes(range(0xF0 - length, 0xF0))))
-    recorder = Recorder(tmp_path / "x.mcap", {}, {})
-    for frame in frames:
-        recorder.frame(frame)
-    recorder.close()
+    with closing(Recorder(tmp_path / "x.mcap", {}, {})) as recorder:
+        for frame in frames:
+            recorder.frame(frame)
     assert list(read_raw_frames(tmp_path / "x.mcap")) == frames
     out = tmp_path / f"x{suffix}"
     assert export_trace(tmp_path / "x.mcap", out) == len(frames)
@@ -330,9 +328,8 @@ def test_every_kind_of_frame_there_and_back(tmp_path: Path, suffix: str) -> None
 
 
 def test_fd_frames_do_not_go_into_a_trc(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "x.mcap", {}, {})
-    recorder.frame(Frame(0, FD | 0x80, bytes(64)))
-    recorder.close()
+    with closing(Recorder(tmp_path / "x.mcap", {}, {})) as recorder:
+        recorder.frame(Frame(0, FD | 0x80, bytes(64)))
     assert "x.trc: --out: expected a name that ends in .log, .blf or .asc" in catch_refusal(
         export_trace, tmp_path / "x.mcap", tmp_path / "x.trc")
     assert not (tmp_path / "x.trc").exists()
@@ -376,8 +373,7 @@ CANDUMP = """\
 
 
 def test_lost_and_late_frames_of_a_candump(tmp_path: Path) -> None:
-    (tmp_path / "x.log").write_text(CANDUMP)
-    assert import_frames(tmp_path / "x.log", tmp_path / "x.mcap", load_bench()) == 5
+    assert import_frames(write_file(tmp_path / "x.log", CANDUMP), tmp_path / "x.mcap", load_bench()) == 5
     trace = Trace.read(tmp_path / "x.mcap")
     assert len(trace) == 7 and [g.cycles for g in trace.gaps] == [2]
     np.testing.assert_allclose(trace.cor, [1e-5, 1e-5, 1e-5, np.nan, np.nan, np.nan, 1e-5])

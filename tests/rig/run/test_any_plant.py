@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bus_stations import spec
+from bus_stations import only_udp, spec
 from example_devices import DRIVE, PATIENT, run_device
 from places import ROOT
-from rig_command import Said, refuse, rig
+from rig_command import Said, refuse, rig, write_file
 
 from fdi.discovery.explain import compute_firmware_residual
 from fdi.estimation.fit import silence_sensors
@@ -61,8 +61,7 @@ def write_bench(folder: Path, **changes: str) -> Path:
         text = text.replace(old, new)
     (folder / "trim_jack.py").write_text(text)
     (folder / "drive.eds").write_bytes((DRIVE / "drive.eds").read_bytes())
-    (folder / "trim.toml").write_text(BENCH)
-    return folder / "trim.toml"
+    return write_file(folder / "trim.toml", BENCH)
 
 
 def test_an_ema_with_a_cia402_drive(tmp_path: Path) -> None:
@@ -74,34 +73,32 @@ def test_an_ema_with_a_cia402_drive(tmp_path: Path) -> None:
     assert abs(trace.position[-1]) < 2e-5 and abs(trace.column("motor_speed")).max() > 100.0
 
 
-def test_from_a_plant_file_to_its_hidden_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@only_udp
+def test_from_a_plant_file_to_its_hidden_fault(where: str, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One Python file and one bench file, five measured signals: check, run, explain, run --from."""
-    write_bench(tmp_path)
-    monkeypatch.chdir(tmp_path)
+    write_bench(here)
     Path("stiff.toml").write_text('plant = "trim_jack.py"\neffects = ["tight_seal"]\n[tight_seal]\ntorque = 0.02\n')
     checked = rig("check", "preflight", "--bench", "trim.toml", "--trust", "--json").json
     carried = {signal for each in checked["bench"]["frames"] for signal in each["signals"]}
     assert checked["verdict"] == "WITHIN_LIMITS" and {"trim_cmd", "trim_angle", "torque_ref"} <= carried
-    run = play(tmp_path / "hidden", "--bench", "trim.toml", "--model", "stiff.toml", "--trust")
+    run = play(here / "hidden", "--bench", "trim.toml", "--model", "stiff.toml", "--trust")
     assert run.status == 0, run
-    assert {"shaft_rate", "phase_amps", "gear_torque", "case_rise"} <= {*Trace.read(tmp_path / "hidden").signals}
-    where = spec("udp_multicast")
-    elsewhere = tmp_path / "elsewhere"  # the log has the plant with it
+    assert {"shaft_rate", "phase_amps", "gear_torque", "case_rise"} <= {*Trace.read(here / "hidden").signals}
+    elsewhere = here / "elsewhere"  # the log has the plant with it
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
-    assert "--trust, because it brings code along" in refuse("compare", tmp_path / "hidden")
-    explained = rig("explain", tmp_path / "hidden", "--trust", "--json").json
+    assert "--trust, because it brings code along" in refuse("compare", here / "hidden")
+    explained = rig("explain", here / "hidden", "--trust", "--json").json
     assert (explained["verdict"], explained["effects"]) == ("EXPLAINED", ["tight_seal"])
     with run_device(DRIVE, where, *PATIENT[DRIVE]):
-        again = rig("run", "--from", tmp_path / "hidden", "--trust", "--bus", where, "--out", elsewhere / "again")
+        again = rig("run", "--from", here / "hidden", "--trust", "--bus", where, "--out", elsewhere / "again")
     assert again.status == 0, again
-    first, second = (Trace.read(folder) for folder in (tmp_path / "hidden", elsewhere / "again"))
+    first, second = (Trace.read(folder) for folder in (here / "hidden", elsewhere / "again"))
     assert (first.column("trim_angle") == second.column("trim_angle")).all()
 
 
-def test_a_plant_without_a_device_runs_with_its_own_controller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plant_without_a_device_runs_with_its_own_controller(here: Path) -> None:
     """Nothing but the plant file: run, and repeat."""
-    monkeypatch.chdir(tmp_path)
     assert rig("new", "plant", "motor").status == 0
     slower = Path("motor.py").read_text().replace('high=0.1)] = 1e-3', 'high=0.1)] = 2e-3')
     Path("motor.py").write_text(slower)
@@ -119,9 +116,9 @@ def test_a_plant_without_a_device_runs_with_its_own_controller(tmp_path: Path, m
 
 def test_a_replay_of_a_run_begins_with_its_set_up(tmp_path: Path) -> None:
     """There the plant rests, so it is known; bring-up leaves nothing in the integral of a law that nothing disables."""
-    (tmp_path / "short.toml").write_text(SHORT)
+    short = write_file(tmp_path / "short.toml", SHORT)
     silent = [f"--set=sensors.{name}_noise=0" for name in ("position", "motor_speed", "current")]
-    assert rig("run", tmp_path / "short.toml", "--model", "ema", *silent, "--out", tmp_path / "run").status == 0
+    assert rig("run", short, "--model", "ema", *silent, "--out", tmp_path / "run").status == 0
     trace, ema = Trace.read(tmp_path / "run"), silence_sensors(load_model("ema"))
     assert trace.t[0] == 0.0 and len(trace.lead["demand"]) == 50
     assert np.abs(trace.lead["current_demand"]).max() < 0.05  # A; the noise of its sensor is 0.02
@@ -156,13 +153,12 @@ def test_a_mistake_in_a_bench_of_an_own_plant(old: str, new: str, line: str, tmp
     ('"command", largest=2.0', "expected one signal of role command, not []")])
 def test_a_plant_without_a_role_is_refused(role: str, line: str, tmp_path: Path) -> None:
     """A bench needs what drives the plant and what commands it."""
-    bench = write_bench(tmp_path, **{f", {role})": ")"})
-    said = rig("check", "--bench", bench, "--trust")
+    said = rig("check", "--bench", write_bench(tmp_path, **{f", {role})": ")"}), "--trust")
     assert said.status == 2 and line in said.err
 
 
-def test_a_plant_file_is_code(tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", ["check", "run", "doctor"])
+def test_a_plant_file_is_code(command: str, tmp_path: Path) -> None:
     """A bench file is data that people send to each other: the plant in it runs with --trust only."""
-    bench = write_bench(tmp_path, **{"stabiliser trim jack": "another jack"})
-    for words in (("check", "--bench", bench), ("run", "--bench", bench), ("doctor", "--bench", bench)):
-        assert "expected --trust, because it brings code along that would run here: trim_jack.py" in refuse(*words)
+    said = refuse(command, "--bench", write_bench(tmp_path, **{"stabiliser trim jack": "another jack"}))
+    assert "expected --trust, because it brings code along that would run here: trim_jack.py" in said

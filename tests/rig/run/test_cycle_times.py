@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig_command import SHORT, job, play, refuse, rig
+from rig_command import SHORT, job, play, refuse, rig, write_file
 
 import dbc
 from fdi.trace.trace import Trace
@@ -55,9 +55,9 @@ def test_the_preflight_is_predicted_at_any_cycle(cycle: str, tmp_path: Path) -> 
 def test_a_run_is_that_of_the_simulation_at_any_cycle(cycle: str, tmp_path: Path) -> None:
     """But for the rounding of the frames. The log knows the cycle, and the run can be repeated from it."""
     bench = write_bench(tmp_path, cycle)
-    (tmp_path / "short.toml").write_text(SHORT)
+    short = write_file(tmp_path / "short.toml", SHORT)
     gain = f"controller.proportional_gain={GAIN!r}"
-    said = rig("run", tmp_path / "short.toml", "--bench", bench, "--set", gain, "--json", "--out", tmp_path / "a")
+    said = rig("run", short, "--bench", bench, "--set", gain, "--json", "--out", tmp_path / "a")
     assert said.json["verdict"] == "PASS" and said.json["run"]["period"] == float(cycle) / 1e3
     trace, period = Trace.read(tmp_path / "a"), float(cycle) / 1e3
     assert trace.period == period and len(trace) == round(0.35 / period)
@@ -90,23 +90,22 @@ def test_a_bench_in_a_test_has_its_own_cycle(tmp_path: Path) -> None:
     assert run.trace.period == 5e-3 and (run.trace.com == np.rint(command * 1e7) / 1e7).all()
 
 
-def test_what_such_cycles_cannot_show_is_refused(tmp_path: Path) -> None:
-    bench, sequence = write_bench(tmp_path, "2"), tmp_path / "odd.toml"
-    for old, new, said in (
-            ('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 0.051',
-             "odd.toml:5: main[0].time: expected whole cycles of 0.002 s, not 0.051"),
-            ('kind = "hold", time = 0.05 },\n  { name = "step"',
-             'kind = "sine", amplitude = 1e-3, frequency = 250, time = 0.05 },\n  { name = "step"',
-             "odd.toml:5: main[0].frequency: expected a frequency below 250 Hz, not 250"),
-            ("checks = [", 'checks = [ { name = "x", kind = "phase_lag", frequency = 300, high = 1 },',
-             "checks[0].frequency: expected below half the rate of 500 Hz, not 300"),
-            ("checks = [", 'faults = [{ kind = "jitter", start = 0.1, size = 2e-3 }]\nchecks = [',
-             "faults[0].size: expected a time below a cycle, 0.002 s, not 0.002"),
-            ("checks = [", 'timing = { sync = 3e-3 }\nchecks = [',
-             "timing.sync: expected at most a cycle, 0.002 s, not 0.003")):
-        sequence.write_text(SHORT.replace(old, new, 1))
-        for command in ("run", "check"):
-            assert said in refuse(command, sequence, "--bench", bench), new
+@pytest.mark.parametrize("command", ["run", "check"])
+@pytest.mark.parametrize(("old", "new", "said"), [
+    ('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 0.051',
+     "odd.toml:5: main[0].time: expected whole cycles of 0.002 s, not 0.051"),
+    ('kind = "hold", time = 0.05 },\n  { name = "step"',
+     'kind = "sine", amplitude = 1e-3, frequency = 250, time = 0.05 },\n  { name = "step"',
+     "odd.toml:5: main[0].frequency: expected a frequency below 250 Hz, not 250"),
+    ("checks = [", 'checks = [ { name = "x", kind = "phase_lag", frequency = 300, high = 1 },',
+     "checks[0].frequency: expected below half the rate of 500 Hz, not 300"),
+    ("checks = [", 'faults = [{ kind = "jitter", start = 0.1, size = 2e-3 }]\nchecks = [',
+     "faults[0].size: expected a time below a cycle, 0.002 s, not 0.002"),
+    ("checks = [", 'timing = { sync = 3e-3 }\nchecks = [',
+     "timing.sync: expected at most a cycle, 0.002 s, not 0.003")])
+def test_what_such_cycles_cannot_show_is_refused(command: str, old: str, new: str, said: str, tmp_path: Path) -> None:
+    sequence = write_file(tmp_path / "odd.toml", SHORT.replace(old, new, 1))
+    assert said in refuse(command, sequence, "--bench", write_bench(tmp_path, "2"))
 
 
 def test_the_period_of_the_model_is_the_cycle_of_the_bench(tmp_path: Path) -> None:

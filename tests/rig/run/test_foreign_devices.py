@@ -3,14 +3,13 @@
 Each is written with canopen or cantools, and each closes the same position loop, so each must move the ram alike.
 """
 
-import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import can
 import numpy as np
 import pytest
-from bus_stations import spec
+from bus_stations import only_udp
 from device_files import Entry, Mapped, format_eds
 from python_devices import CanDevice, CanopenDevice, PythonDevice
 
@@ -20,8 +19,8 @@ from plant import simulate
 from rig.benches.bench import Bench, Role
 from rig.recorder.convert import export_trace, import_frames
 from rig.run import bring_up, participants
-from rig.run.job import JobChoice, build_job
-from rig.run.runner import run_job
+from rig.run.job import Job, JobChoice, build_job
+from rig.run.runner import Outcome, run_job
 
 SEQUENCE = """
 title = "Two steps"
@@ -150,29 +149,25 @@ CASES = [*((start, "udp_multicast", True) for start in DEVICES), (start_can_fd, 
          *((start, "udp_multicast", False) for start in (start_every_second, start_multiplexed))]
 
 
-@contextlib.contextmanager
-def run_device(device: PythonDevice) -> Iterator[None]:
+def play(folder: Path, where: str, device: PythonDevice, seed: int = 0) -> tuple[Job, Outcome]:
+    """Two steps in lockstep with that device as controller, on the bench file of the folder."""
+    (folder / "steps.toml").write_text(SEQUENCE)
+    job = build_job(JobChoice(str(folder / "steps.toml"), bench=str(folder / "bench.toml"), bus=where, seed=seed))
     device.start()
     try:
-        yield
+        return job, run_job(job, folder / "run", ignore_progress, lambda: False)
     finally:
         device.close()
 
 
 @pytest.mark.parametrize(("start", "bus_kind", "is_compiled"), CASES, indirect=["bus_kind"],
                          ids=lambda value: getattr(value, "__name__", str(value)).removeprefix("start_"))
-def test_a_foreign_controller_closes_the_loop(start: object, bus_kind: str, is_compiled: bool, tmp_path: Path,
-                                              monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_foreign_controller_closes_the_loop(start: Callable[[Path, str], PythonDevice], is_compiled: bool, where: str,
+                                              tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The ram moves as a simulation of the same law does, whatever frames carry demand, position and current."""
     if not is_compiled:  # as on a bus that only python-can knows
         monkeypatch.setattr(bring_up, "can_open", lambda spec: False)
-    where = spec(bus_kind)
-    device = start(tmp_path, where)  # type: ignore[operator]
-    (tmp_path / "steps.toml").write_text(SEQUENCE)
-    bench = str(tmp_path / "bench.toml")
-    job = build_job(JobChoice(sequence=str(tmp_path / "steps.toml"), bench=bench, bus=where, seed=3))
-    with run_device(device):
-        outcome = run_job(job, tmp_path / "run", ignore_progress, lambda: False)
+    job, outcome = play(tmp_path, where, start(tmp_path, where), seed=3)
     assert not outcome.aborted, outcome.aborted
     trace = Trace.read(tmp_path / "run")
     law = simulate(job.model, trace.com, seed=3)
@@ -210,20 +205,17 @@ class Mute(CanDevice):
         return found if self._left >= 0 else []
 
 
+@only_udp
 @pytest.mark.parametrize(("answers", "said"), [
     (0, "controller: no frame Drive (0x18F00005) for 5 cycles"), (1080, "controller stopped answering"),
 ])
 def test_a_controller_that_sends_no_frames_ends_the_run_with_a_line_that_names_them(
-    answers: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    answers: int, said: str, where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(participants, "FRAME_TIMEOUT", 0.2)  # s: it is spent in each cycle without an answer
-    where = spec("udp_multicast")
     (tmp_path / "device.dbc").write_text(PAGES_DBC)
     (tmp_path / "bench.toml").write_text(CAN.format(demand="Feedback.Position"))
-    (tmp_path / "steps.toml").write_text(SEQUENCE)
-    job = build_job(JobChoice(sequence=str(tmp_path / "steps.toml"), bench=str(tmp_path / "bench.toml"), bus=where))
-    with run_device(Mute(where, answers)):
-        outcome = run_job(job, tmp_path / "run", ignore_progress, lambda: False)
+    _, outcome = play(tmp_path, where, Mute(where, answers))
     assert (outcome.verdict, outcome.status) == ("ABORTED", 1)
     assert said in outcome.why and "no frame Drive (0x18F00005)" in outcome.aborted
     assert outcome.attribution.cause is not None and outcome.attribution.cause.source is Role.CONTROLLER
@@ -239,15 +231,12 @@ class Forgetful(CanopenDevice):
         return found
 
 
-def test_a_controller_that_remembers_over_a_reset_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@only_udp
+@pytest.mark.parametrize(("device", "failed"), [(CanopenDevice, []), (Forgetful, ["same answers after a reset"])])
+def test_a_controller_that_remembers_over_a_reset_fails(device: type[CanopenDevice], failed: list[str], where: str,
+                                                        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The probes are played by the roles of the frames, on a bench without control word and without phases."""
-    where = spec("udp_multicast")
-    (tmp_path / "steps.toml").write_text(SEQUENCE)
-    for device, names in ((CanopenDevice, []), (Forgetful, ["same answers after a reset"])):
-        monkeypatch.setitem(globals(), "CanopenDevice", device)
-        station = start_synchronous(tmp_path, where)
-        job = build_job(JobChoice(sequence=str(tmp_path / "steps.toml"), bench=str(tmp_path / "bench.toml"), bus=where))
-        with run_device(station):
-            outcome = run_job(job, tmp_path / "run", ignore_progress, lambda: False)
-        assert [check.name for check in outcome.checks if not check.passed] == names
-        assert "delay of the answer to a step" in [check.name for check in outcome.checks]
+    monkeypatch.setitem(globals(), "CanopenDevice", device)
+    _, outcome = play(tmp_path, where, start_synchronous(tmp_path, where))
+    assert [check.name for check in outcome.checks if not check.passed] == failed
+    assert "delay of the answer to a step" in [check.name for check in outcome.checks]

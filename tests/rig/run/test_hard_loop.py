@@ -8,7 +8,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import groupby, pairwise
 from math import isnan
@@ -157,12 +157,8 @@ class Bench(CycleBook):
 @contextmanager
 def bench(kind: str, realtime: bool, *faults: Fault, ahead: int = 50) -> Iterator[Bench]:
     one = Bench(spec(kind), realtime, faults, ahead)
-    try:
+    with closing(one.wire), closing(one.nodes), closing(one.loop):
         yield one
-    finally:
-        one.loop.close()
-        one.nodes.close()
-        one.wire.close()
 
 
 paces = pytest.mark.parametrize("realtime", [False, True], ids=["lockstep", "realtime"])
@@ -176,8 +172,8 @@ def test_rows_and_log(bus_kind: str, realtime: bool) -> None:
     Every frame reaches the log once and in order: those of the cycle, and those that the services send and receive on
     their own socket. Nothing is compiled once the loop is made.
     """
-    with bench(bus_kind, realtime) as one, install_recorder("numba:compiler_lock") as compiled:
-        other = Link(open_can(one.where), time.monotonic_ns)
+    with (bench(bus_kind, realtime) as one, install_recorder("numba:compiler_lock") as compiled,
+          closing(Link(open_can(one.where), time.monotonic_ns)) as other):
         one.master._beat.configure(1, one.wire.clock.now())
         for k in range(30):
             one.play(k)
@@ -192,7 +188,6 @@ def test_rows_and_log(bus_kind: str, realtime: bool) -> None:
             one.loop.wait_until_played(lambda: False)
             one.play_until(lambda: bool(whole()) and one.logged(codec.DRIVE)[29:] != [])
         one.loop.finish()
-        other.close()
         one.wire.poll(0.0)
         one.loop.close()
         one.settle()
@@ -336,14 +331,12 @@ def test_the_control_word_is_overridden_and_hold_discards_what_is_queued(bus_kin
 @only_udp
 def test_a_late_cycle_drops_due_times_and_counts_them(bus_kind: str) -> None:
     """The turn to send on the bus is held for 5 periods: no burst follows, and the grid stays."""
-    with bench(bus_kind, True) as one:
-        turn = Turn(one.where.partition(":")[2], PORT)
+    with bench(bus_kind, True) as one, closing(Turn(one.where.partition(":")[2], PORT)) as turn:
         one.play(*range(20))
         one.play_until(lambda: one.loop.k >= 5)
         turn.take()
         time.sleep(5.2 * PERIOD * 1e-9)
         turn.give()
-        turn.close()
         one.loop.finish()
         steps = [(later - earlier) / PERIOD for earlier, later in pairwise(one.times)]
         assert all(step == round(step) >= 1 for step in steps) and max(steps) >= 4
@@ -356,9 +349,8 @@ def test_a_late_cycle_drops_due_times_and_counts_them(bus_kind: str) -> None:
 @only_udp
 @paces
 def test_frames_of_another_cycle_or_length_are_no_answers(bus_kind: str, realtime: bool) -> None:
-    with bench(bus_kind, realtime) as one:
+    with bench(bus_kind, realtime) as one, closing(Link(open_can(one.where), time.monotonic_ns)) as stranger:
         one.nodes.mute = True
-        stranger = Link(open_can(one.where), time.monotonic_ns)
         for k in range(3):
             for cob_id in (codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE):
                 stranger.send(cob_id, bytes(7))
@@ -366,7 +358,6 @@ def test_frames_of_another_cycle_or_length_are_no_answers(bus_kind: str, realtim
             stranger.send(codec.VALVE_STATE, codec.pack_valve_state(1e-3, 0, k + 77))
             one.play(k)
         one.loop.finish()
-        stranger.close()
         for row, timing in zip(one.rows, one.timings, strict=True):
             assert all(map(isnan, (row.xj, row.p12, row.xs, row.cor, timing.response, timing.work)))
             assert all(map(isnan, (timing.feedback_response, timing.valve_response)))
@@ -375,16 +366,14 @@ def test_frames_of_another_cycle_or_length_are_no_answers(bus_kind: str, realtim
 @only_udp
 @paces
 def test_a_second_rig_is_told(bus_kind: str, realtime: bool) -> None:
-    with bench(bus_kind, realtime) as one:
+    with bench(bus_kind, realtime) as one, closing(Link(open_can(one.where), time.monotonic_ns)) as rig:
         rivals: list[int] = []
         one.master.hooks.on_rival = rivals.append
         one.play(0, 1)
-        rig = Link(open_can(one.where), time.monotonic_ns)
         rig.send(codec.COMMAND, struct.pack("<iHH", 0, 7, 500))
         rig.send(0x000, b"\x80\x00")
         one.play(*range(2, 10))
         one.loop.finish()
-        rig.close()
         assert sorted(rivals) == [0x000, codec.COMMAND]
 
 

@@ -11,15 +11,27 @@ import sys
 import time
 import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import pairwise
 from pathlib import Path
 
 import codec
 import numpy as np
 import pytest
-from bus_stations import spec, stand_nodes, wait_for_node
-from rig_command import SHORT, SLOW_START, finished, gone, job, nodes_on, play, rig, started
+from bus_stations import only_udp, spec, stand_nodes, wait_for_node
+from rig_command import (
+    SHORT,
+    SLOW_START,
+    finished,
+    gone,
+    job,
+    nodes_on,
+    play,
+    read_signals,
+    rig,
+    started,
+    write_file,
+)
 from vcan_host import kernel_has_vcan0
 
 from fdi.report.run_report import build_run_report
@@ -35,24 +47,17 @@ from rig.run import participants, runner
 from rig.run.participants import NodeProcesses
 from rig.run.session import Session
 
-SIGNALS = ("com", "xj", "cor", "p12", "xs")
 LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 60')
 LONG += 'ends = "safe_state"\n' + SLOW_START
 SMOOTH = {f"{part}.{kind}_friction": 0.0 for part in ("spool", "jack") for kind in ("static", "dynamic")}
 QUIET = {f"sensors.{what}_noise": 0.0 for what in ("position", "pressure", "spool")}
 
 
-def columns(folder: Path) -> np.ndarray:
-    """All cycles, shape (5, n)."""
-    trace = Trace.read(folder, all=True)
-    return np.array([trace.column(name) for name in SIGNALS])
-
-
 @pytest.fixture
 def reference(tmp_path: Path) -> np.ndarray:
     """The short sequence in lockstep on the embedded bus, seed 1."""
     play(job(seed=1), tmp_path / "reference")
-    return columns(tmp_path / "reference")
+    return read_signals(tmp_path / "reference")
 
 
 def test_the_bench_is_the_simulation(tmp_path: Path) -> None:
@@ -67,19 +72,19 @@ def test_the_bench_is_the_simulation(tmp_path: Path) -> None:
 def test_real_time_gives_the_same_signals(tmp_path: Path, reference: np.ndarray) -> None:
     """However late the machine is: the plant moves one period a SYNC."""
     outcome = play(job(seed=1, pace="realtime", max_overruns=1.0), tmp_path / "b")
-    assert outcome.verdict == "PASS" and np.array_equal(columns(tmp_path / "b"), reference)
+    assert outcome.verdict == "PASS" and np.array_equal(read_signals(tmp_path / "b"), reference)
     assert 0 < outcome.speed < 1.05 and outcome.timing["lateness_us"]["max"] > 0
     assert outcome.timing["kind"] == Trace.read(tmp_path / "b").provenance["timing.kind"] == "soft real time"
     page = build_run_report(Trace.read(tmp_path / "b"))
     assert "soft real time: the cycles run in Python, because compiled code" in dict(page.facts)["timing"]
 
 
-def test_processes_on_a_bus_give_the_same_signals(tmp_path: Path, reference: np.ndarray) -> None:
+@only_udp
+def test_processes_on_a_bus_give_the_same_signals(where: str, tmp_path: Path, reference: np.ndarray) -> None:
     """Plant and controller as processes of their own: same signals, and nobody is left behind."""
-    where = spec("udp_multicast")
     outcome = play(job(seed=1, bus=where), tmp_path / "b")
     assert (outcome.verdict, outcome.aborted, set(outcome.counters.values())) == ("PASS", "", {0})
-    assert np.array_equal(columns(tmp_path / "b"), reference), outcome.counters
+    assert np.array_equal(read_signals(tmp_path / "b"), reference), outcome.counters
     assert nodes_on(where) == []
 
 
@@ -196,7 +201,7 @@ def test_the_compiled_cycle_in_real_time_gives_the_same_signals(bus_kind: str, t
         folder = tmp_path / str(attempt)
         outcome = play(job(seed=1, bus=spec(bus_kind), pace="realtime", max_overruns=1.0), folder)
         assert outcome.timing["kind"] == "hard real time"
-        rows, flags = columns(folder), open_log(folder / "trace.mcap").read_columns("/signals")["flags"]
+        rows, flags = read_signals(folder), open_log(folder / "trace.mcap").read_columns("/signals")["flags"]
         shared = min(rows.shape[1], 400)  # set-up and main; a hold may come before clean-up
         bad = np.flatnonzero(np.isnan(rows[:, :shared]).any(axis=0) | (flags[:shared] != 0))
         sound = int(bad[0]) if len(bad) else shared
@@ -210,17 +215,16 @@ def test_a_rig_does_not_disturb_another(tmp_path: Path) -> None:
     """On a bus where a SYNC is heard not a word is said. A SYNC every 10 ms, unless this program stands still."""
     for attempt in range(5):
         where = spec("udp_multicast")
-        other, listener = (Link(open_can(where), time.monotonic_ns) for _ in range(2))
-        process = started("run", "--bus", where, "--out", tmp_path / str(attempt))
-        sent = [time.monotonic()]
-        while process.poll() is None:
-            other.send(codec.SYNC, b"")
-            sent.append(time.monotonic())
-            time.sleep(0.01)
-        said = finished(process)
-        heard = {frame.cob_id for frame in listener.poll(0.0)}
-        other.close()
-        listener.close()
+        with (closing(Link(open_can(where), time.monotonic_ns)) as other,
+              closing(Link(open_can(where), time.monotonic_ns)) as listener):
+            process = started("run", "--bus", where, "--out", tmp_path / str(attempt))
+            sent = [time.monotonic()]
+            while process.poll() is None:
+                other.send(codec.SYNC, b"")
+                sent.append(time.monotonic())
+                time.sleep(0.01)
+            said = finished(process)
+            heard = {frame.cob_id for frame in listener.poll(0.0)}
         if said.status == 2 or max(later - earlier for earlier, later in pairwise(sent)) < 0.1:
             break
     assert said.status == 2 and "another rig is active" in said.err and heard == {codec.SYNC}
@@ -245,9 +249,8 @@ def find_last_cycle(frames: list[Frame], last: int) -> int:
 
 def await_main(where: str, process: subprocess.Popen[str]) -> None:
     """Until a run of `LONG` on that bus is well within its main part."""
-    link = Link(open_can(where), time.monotonic_ns)
-    assert wait_for_cycle(link, process, 500) >= 500
-    link.close()
+    with closing(Link(open_can(where), time.monotonic_ns)) as link:
+        assert wait_for_cycle(link, process, 500) >= 500
 
 
 def killed(where: str, folder: Path, cycles: int) -> int:
@@ -256,15 +259,13 @@ def killed(where: str, folder: Path, cycles: int) -> int:
     -1: the run ended by itself before, because the machine stood still for so long that a node missed the other.
     """
     folder.mkdir()
-    (folder / "long.toml").write_text(LONG)
-    link = Link(open_can(where), time.monotonic_ns)
-    process = started("run", folder / "long.toml", "--bus", where, "--pace", "realtime", "--out", folder, "--quiet")
-    last = wait_for_cycle(link, process, cycles)
-    process.send_signal(signal.SIGKILL)
-    was_killed = finished(process).status == -signal.SIGKILL
-    last = find_last_cycle(link.poll(0.0), last)
-    link.close()
-    return last if was_killed else -1
+    sequence = write_file(folder / "long.toml", LONG)
+    with closing(Link(open_can(where), time.monotonic_ns)) as link:
+        process = started("run", sequence, "--bus", where, "--pace", "realtime", "--out", folder, "--quiet")
+        last = wait_for_cycle(link, process, cycles)
+        process.kill()
+        was_killed = finished(process).status == -signal.SIGKILL
+        return find_last_cycle(link.poll(0.0), last) if was_killed else -1
 
 
 def test_a_killed_run_loses_half_a_second_at_most(tmp_path: Path) -> None:
@@ -319,20 +320,19 @@ def test_what_a_rig_has_started_ends_with_it_when_it_is_killed(code: str) -> Non
         time.sleep(0.01)
 
 
-def test_an_external_node_that_dies_is_named_and_the_run_ends(tmp_path: Path) -> None:
+@only_udp
+def test_an_external_node_that_dies_is_named_and_the_run_ends(where: str, tmp_path: Path) -> None:
     """In lockstep every cycle without answers would wait; the sequence has a minute to go, and wants the safe state.
 
     Nobody tells the rig that the node has ended (of its own nodes the system does: test_view.py). The first cycle
     without an answer waits; then the node is known to be gone, and no other cycle waits. Without that knowledge three
     cycles would wait until the other node reports missing frames, and clean-up would wait after them.
     """
-    where = spec("udp_multicast")
-    (tmp_path / "long.toml").write_text(LONG)
     nodes = [started("node", each, "--bus", where) for each in ("plant", "controller")]
     for node in (PLANT, CONTROLLER):
         wait_for_node(where, node)
-    process = started("run", tmp_path / "long.toml", "--bus", where, "--controller", "external", "--plant", "external",
-                      "--out", tmp_path, "--json")
+    process = started("run", write_file(tmp_path / "long.toml", LONG), "--bus", where, "--controller", "external",
+                      "--plant", "external", "--out", tmp_path, "--json")
     await_main(where, process)
     nodes[1].kill()
     said = finished(process)
@@ -349,11 +349,10 @@ def test_an_external_node_that_dies_is_named_and_the_run_ends(tmp_path: Path) ->
     assert int((trace.phase == CLEANUP).sum()) == 100
 
 
-def test_ctrl_c_at_a_terminal_reaches_the_rig_alone(tmp_path: Path) -> None:
+@only_udp
+def test_ctrl_c_at_a_terminal_reaches_the_rig_alone(where: str, tmp_path: Path) -> None:
     """A terminal interrupts all its processes; clean-up needs the plant."""
-    where = spec("udp_multicast")
-    (tmp_path / "long.toml").write_text(LONG)
-    process = started("run", tmp_path / "long.toml", "--bus", where, "--out", tmp_path, "--quiet",
+    process = started("run", write_file(tmp_path / "long.toml", LONG), "--bus", where, "--out", tmp_path, "--quiet",
                       start_new_session=True)
     await_main(where, process)  # on a new machine the cycle is compiled first
     os.killpg(process.pid, signal.SIGINT)
@@ -362,9 +361,10 @@ def test_ctrl_c_at_a_terminal_reaches_the_rig_alone(tmp_path: Path) -> None:
     assert (trace.phase == CLEANUP).sum() == 50 and not np.isnan(trace.xj).any()
 
 
-def test_nodes_that_were_there_before_are_taken_and_left_alone(tmp_path: Path, reference: np.ndarray) -> None:
+@only_udp
+def test_nodes_that_were_there_before_are_taken_and_left_alone(where: str, tmp_path: Path,
+                                                               reference: np.ndarray) -> None:
     """`rig node` twice, and a run that finds them."""
-    where = spec("udp_multicast")
     nodes = [started("node", "plant", "--bus", where), started("node", "controller", "--bus", where, "--json")]
     try:
         wait_for_node(where, CONTROLLER)
@@ -378,7 +378,7 @@ def test_nodes_that_were_there_before_are_taken_and_left_alone(tmp_path: Path, r
     assert outcome.verdict == "PASS" and [one.status for one in said] == [0, 0]
     assert "incoming frames lost 0" in said[0].out
     assert said[1].json == {"node": "controller", "bus": where, "lost": 0, "unsent": 0, "error_frames": 0}
-    assert np.array_equal(columns(tmp_path / "b"), reference), outcome.counters
+    assert np.array_equal(read_signals(tmp_path / "b"), reference), outcome.counters
 
 
 def test_the_memory_of_a_run_is_free_when_it_ends(
@@ -406,9 +406,8 @@ def test_the_memory_of_a_run_is_free_when_it_ends(
 def open_master(where: str) -> Iterator[Master]:
     """The rig's end of a bus."""
     clock = WallClock()
-    wire = LinkWire(Link(open_can(where), clock.now), clock, 2.0)
-    yield Master(wire, clock.now, False, load_bench())
-    wire.close()
+    with closing(LinkWire(Link(open_can(where), clock.now), clock, 2.0)) as wire:
+        yield Master(wire, clock.now, False, load_bench())
 
 
 def test_a_second_node_of_a_number_does_not_start(bus_with_nodes: str) -> None:

@@ -3,27 +3,30 @@
 import json
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from rig_command import SHORT, job, kinds, play, rig, stop_after
+from refusals import catch_refusal
+from rig_command import SHORT, act_at, job, kinds, play, read_signals, rig, stop_after
 
 from fdi.progress import ignore_progress
 from fdi.report.report import Line, Table
 from fdi.report.run_report import build_run_report, write_run_page
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import CLEANUP, MAIN, SETUP, Trace
-from plant import InputError, RigError
+from plant import RigError
 from plant.effects import CATALOGUE
 from rig.network.bus import EmbeddedWire
 from rig.network.frame import Frame, Send, VirtualClock
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
-from rig.recorder import RecorderError
+from rig.recorder import Recorder, RecorderError, Signals, Timing
 from rig.run import participants, runner
 from rig.run.job import read_job
 from rig.run.participants import NodeProcesses
@@ -182,16 +185,9 @@ def test_noise_of_strangers_is_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("error", [RigError("the bus is gone"), RuntimeError("a bug"), KeyboardInterrupt()])
 def test_whatever_is_raised_clean_up_runs_and_the_log_is_whole(tmp_path: Path, error: BaseException) -> None:
-    calls = iter(range(10**6))
-
-    def stop() -> bool:
-        if next(calls) == 5:
-            raise error
-        return False
-
     threads = threading.active_count()
     with pytest.raises(type(error)):
-        play(job(), tmp_path, stop)
+        play(job(), tmp_path, act_at(5, Mock(side_effect=error)))
     setup, main, cleanup = phases(tmp_path)
     assert (setup, cleanup) == (50, 50) and 1 < main < 250
     assert Trace.read(tmp_path, all=True).events[-1].text == "end"
@@ -200,15 +196,9 @@ def test_whatever_is_raised_clean_up_runs_and_the_log_is_whole(tmp_path: Path, e
 
 def test_a_log_that_cannot_be_written_is_told_after_clean_up(tmp_path: Path) -> None:
     """The disk goes away in mid run."""
-    calls = iter(range(10**6))
-
-    def stop() -> bool:
-        if next(calls) == 5:
-            (tmp_path / "trace.mcap").unlink()
-        return False
-
+    text = SHORT.replace("time = 0.2 }", "time = 2.0 }")
     with pytest.raises(RecorderError, match="deleted"):
-        play(job(SHORT.replace("time = 0.2 }", "time = 2.0 }")), tmp_path, stop)
+        play(job(text), tmp_path, act_at(5, (tmp_path / "trace.mcap").unlink))
 
 
 def test_a_load_that_no_node_takes_is_bad_input(tmp_path: Path) -> None:
@@ -217,8 +207,7 @@ def test_a_load_that_no_node_takes_is_bad_input(tmp_path: Path) -> None:
         -1e6, 1e6, 250_000)))
     text = 'title = "x"\nmain = [{ kind = "hold", time = 250 }]\nload = [{ kind = "csv", file = "x.csv" }]'
     sequence = parse_sequence(text, "x.toml", lambda name: f"t,value\n{rows}\n".encode())
-    with pytest.raises(InputError, match="KiB compressed"):
-        play(replace(job(), sequence=sequence), tmp_path)
+    assert "KiB compressed" in catch_refusal(play, replace(job(), sequence=sequence), tmp_path)
 
 
 def test_a_node_that_sends_nothing_but_emergencies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -305,8 +294,8 @@ def test_who_the_nodes_are(tmp_path: Path) -> None:
 
 
 def test_another_firmware_than_the_sequence_asks_for_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"firmware\.product: expected 0x00000007, but the controller has 0x00000002"):
-        play(job(SHORT + "[firmware]\nproduct = 7\n"), tmp_path)
+    said = catch_refusal(play, job(SHORT + "[firmware]\nproduct = 7\n"), tmp_path)
+    assert "firmware.product: expected 0x00000007, but the controller has 0x00000002" in said
 
 
 def test_too_many_overruns_in_a_row_end_main(tmp_path: Path) -> None:
@@ -342,12 +331,10 @@ faults = [
   { kind = "lost", frame = "drive", start = 0.0, probability = 0.1 },
 ]
 """
-SIGNALS = ("com", "xj", "cor", "p12", "xs", "load")
 
 
 def same(a: Path, b: Path) -> bool:
-    one, two = (Trace.read(path, all=True) for path in (a, b))
-    return all(np.array_equal(one.column(name), two.column(name), equal_nan=True) for name in SIGNALS)
+    return np.array_equal(read_signals(a), read_signals(b), equal_nan=True)
 
 
 def test_all_that_decides_is_in_the_log(tmp_path: Path) -> None:
@@ -397,14 +384,10 @@ def test_two_effect_files_of_one_name_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("missing", ["seed", "model.toml"])
 def test_a_log_without_what_decides_is_refused(tmp_path: Path, missing: str) -> None:
-    from rig.recorder import Recorder, Signals, Timing
-
     attachments = {} if missing == "model.toml" else {"model.toml": ("", b""), "sequence/x.toml": ("", b"")}
-    recorder = Recorder(tmp_path / "trace.mcap", attachments, {"period": "0.001"})
-    recorder.cycle(0, Signals(0, 1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0), Timing(0, False, 0.0, 0.0, 0.0))
-    recorder.close()
-    with pytest.raises(InputError, match="only logs of `rig run`"):
-        read_job(tmp_path / "trace.mcap")
+    with closing(Recorder(tmp_path / "trace.mcap", attachments, {"period": "0.001"})) as recorder:
+        recorder.cycle(0, Signals(0, 1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0), Timing(0, False, 0.0, 0.0, 0.0))
+    assert "only logs of `rig run`" in catch_refusal(read_job, tmp_path / "trace.mcap")
 
 
 def test_bus_and_pace_may_be_asked_for_anew(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig_command import SHORT, job, play, rig
+from rig_command import SHORT, job, play, rig, write_file
 
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.report.run_report import build_run_report
@@ -22,8 +22,7 @@ main = [{ kind = "ramp", to = 0.05, time = 1.5 }, { kind = "hold", time = 0.1 }]
 
 
 def said(outcome: Outcome) -> dict[str, object]:
-    found: dict[str, object] = json.loads((outcome.folder / "verdict.json").read_text())
-    return found
+    return json.loads((outcome.folder / "verdict.json").read_text())
 
 
 def test_without_checks_nothing_passed(tmp_path: Path) -> None:
@@ -96,8 +95,8 @@ def test_without_checks_only_an_acceptable_diagnosis_is_a_pass(tmp_path: Path) -
 
 
 def test_a_clogged_filter_fails_a_run_with_fdi(tmp_path: Path) -> None:
-    (tmp_path / "steps.toml").write_text(STEPS)
-    answer = rig("run", tmp_path / "steps.toml", "--fdi", "--set", "filter.clogging=0.28", "--out", tmp_path / "run")
+    steps = write_file(tmp_path / "steps.toml", STEPS)
+    answer = rig("run", steps, "--fdi", "--set", "filter.clogging=0.28", "--out", tmp_path / "run")
     assert answer.status == 1
     lines = answer.out.rstrip().splitlines()
     assert lines[1].startswith("FAIL  rig fdi: Filter clogging requires maintenance")
@@ -109,9 +108,9 @@ def test_a_clogged_filter_fails_a_run_with_fdi(tmp_path: Path) -> None:
 
 
 def test_what_is_not_nominal_stands_everywhere(tmp_path: Path) -> None:
-    text = SHORT + 'faults = [{ kind = "parameter", parameter = "filter.clogging", value = 0.1, start = 0.1 }]\n'
-    sequence = tmp_path / "short.toml"
-    sequence.write_text(text)
+    sequence = write_file(tmp_path / "short.toml", SHORT + """
+faults = [{ kind = "parameter", parameter = "filter.clogging", value = 0.1, start = 0.1 }]
+""")
     out = tmp_path / "run"
     answer = rig("run", str(sequence), "--set", "null_bias.current=1e-5", "--set", "filter.law=linear", "--out",
                  str(out))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from places import ROOT
 from refusals import catch_refusal
-from rig_command import SHORT, job, play, rig
+from rig_command import SHORT, job, play, rig, write_file
 
 from fdi.report.run_report import build_run_report
 from fdi.report.terminal import format_report
@@ -92,24 +92,24 @@ def test_errors_of_a_known_offset() -> None:
     assert judged(run, {}, "never_exceeds", signal="error", unit="um").value == np.abs(run.xj).max() / MICRON
 
 
-def test_response_to_a_fault_by_event_and_by_signal() -> None:
+@pytest.mark.parametrize(("keys", "value"), [
+    ({"after": "fault", "event": "EMCY 0x8250"}, pytest.approx(3.0)),
+    ({"after": 0.6, "signal": "xj", "above": 5e-4}, pytest.approx(1000 * LAG * log(2), abs=1.1)),
+    ({"after": 0.55, "signal": "xj", "below": 1e-3}, 0.0)])
+def test_response_to_a_fault_by_event_and_by_signal(keys: dict[str, Any], value: float) -> None:
     run, sections = follower(Hold(time=0.6), Step(to=1e-3, time=0.4))
     events = (Event(0.1, "EMCY", "node 3: 0x8250"), Event(0.503, "emcy", "0x8250 node 3"))
-    for keys, value in (({"after": "fault", "event": "EMCY 0x8250"}, pytest.approx(3.0)),
-                        ({"after": 0.6, "signal": "xj", "above": 5e-4}, pytest.approx(1000 * LAG * log(2), abs=1.1)),
-                        ({"after": 0.55, "signal": "xj", "below": 1e-3}, 0.0)):
-        assert judged(run, sections, "response_within", events, unit="ms", **keys).value == value
+    assert judged(run, sections, "response_within", events, unit="ms", **keys).value == value
 
 
-def test_events_are_counted_in_their_window() -> None:
+@pytest.mark.parametrize(("kind", "keys", "count", "passed"), [
+    ("event_occurs", {"event": "0x8250"}, 2, True), ("event_occurs", {"event": "0x9999"}, 0, False),
+    ("event_never", {"event": "emcy", "window": (0.3, 0.6)}, 0, True), ("event_never", {"event": "emcy"}, 2, False)])
+def test_events_are_counted_in_their_window(kind: str, keys: dict[str, Any], count: int, passed: bool) -> None:
     run, sections = follower(Hold(time=1.0))
     events = (Event(0.2, "EMCY", "0x8250"), Event(0.7, "EMCY", "0x8250"))
-    for kind, keys, count, passed in (("event_occurs", {"event": "0x8250"}, 2, True),
-                                      ("event_occurs", {"event": "0x9999"}, 0, False),
-                                      ("event_never", {"event": "emcy", "window": (0.3, 0.6)}, 0, True),
-                                      ("event_never", {"event": "emcy"}, 2, False)):
-        (result,) = evaluate_checks([checks.KEYS[kind](kind=kind, name="n", **keys)], run, sections, events)
-        assert (result.value, result.passed) == (count, passed), keys
+    (result,) = evaluate_checks([checks.KEYS[kind](kind=kind, name="n", **keys)], run, sections, events)
+    assert (result.value, result.passed) == (count, passed)
 
 
 def test_few_missing_samples_are_bridged_and_mentioned() -> None:
@@ -356,12 +356,12 @@ def test_without_a_calibration_the_uncertainty_is_unknown_and_exact_numbers_have
         assert (exact.verdict, exact.uncertainty) == ("PASS", 0.0)
 
 
-def test_a_level_that_only_the_errors_of_the_sensor_pass_is_open() -> None:
+@pytest.mark.parametrize(("position", "verdict"), [
+    (0.996e-3, "CANNOT_TELL"), (1.004e-3, "CANNOT_TELL"), (1.1e-3, "PASS"), (0.9e-3, "FAIL")])
+def test_a_level_that_only_the_errors_of_the_sensor_pass_is_open(position: float, verdict: str) -> None:
     check = checks.KEYS["response_within"](kind="response_within", name="level", signal="xj", above=1e-3, after=0.0,
                                            high=1.0)
-    for position, verdict in ((0.996e-3, "CANNOT_TELL"), (1.004e-3, "CANNOT_TELL"), (1.1e-3, "PASS"), (0.9e-3, "FAIL")):
-        result = check.judge(RunData(make_run(SIZE, np.full(100, position)), metrology=calibrate()))
-        assert result.verdict == verdict, position
+    assert check.judge(RunData(make_run(SIZE, np.full(100, position)), metrology=calibrate())).verdict == verdict
 
 
 @pytest.mark.parametrize(("decision", "value", "low", "high", "u", "expected"), [
@@ -400,8 +400,7 @@ u = "rectangular ±0.2 bar"
 def write_bench(folder: Path, calibration: str = CALIBRATION) -> Path:
     for name in ("node2.eds", "node3.eds"):
         (folder / name).write_bytes((ROOT / "dbc" / name).read_bytes())
-    (folder / "rig.toml").write_text((ROOT / "rig/benches/eha.toml").read_text() + calibration)
-    return folder / "rig.toml"
+    return write_file(folder / "rig.toml", (ROOT / "rig/benches/eha.toml").read_text() + calibration)
 
 
 def test_a_bench_file_has_the_calibrations(tmp_path: Path) -> None:
@@ -427,10 +426,10 @@ def test_mistakes_are_one_line_each(old: str, new: str, message: str, tmp_path: 
 
 def test_a_run_says_it_everywhere(tmp_path: Path) -> None:
     """U and the open verdict stand in JSON, terminal, page, log and JUnit; a calibration that has expired is said."""
-    sequence = tmp_path / "short.toml"
-    sequence.write_text(SHORT.replace("high = 30.0 }", "high = 20.0, requirement = 'REQ-1' }").replace(
+    text = SHORT.replace("high = 30.0 }", "high = 20.0, requirement = 'REQ-1' }").replace(
         "event = \"EMCY\" },", "event = \"EMCY\" },\n{name = 'pressure', kind = 'never_exceeds', signal = 'p12', "
-        "high = 400, unit = 'bar'}"))
+        "high = 400, unit = 'bar'}")
+    sequence = write_file(tmp_path / "short.toml", text)
     bench = write_bench(tmp_path, CALIBRATION.replace("gain = 1e-3", "gain = 0.5"))
     found = rig("run", sequence, "--bench", bench, "--out", tmp_path / "run", "--junit", tmp_path / "j.xml", "--json")
     answer = found.json
@@ -511,13 +510,14 @@ def test_a_drive_is_held_against_the_state_machine(parts: list[tuple[int, int, f
     assert {name for name in (STATES, FOLLOWS, IDLE) if not found[name].passed} == failed
 
 
-def test_the_cycles_in_which_a_drive_is_enabled_are_judged_with_the_run() -> None:
+@pytest.mark.parametrize(("before", "passed"), [(ENABLED, True), ([(0x0F, 0x1237, 0.0, 5)], False)])
+def test_the_cycles_in_which_a_drive_is_enabled_are_judged_with_the_run(before: list[tuple[int, int, float, int]],
+                                                                        passed: bool) -> None:
     """They come before the run, whose first row finds the drive enabled."""
-    enabled = make_rows([(0x0F, 0x1237, 1e-3, 50)])
-    for before, passed in ((make_rows(ENABLED), True), (make_rows([(0x0F, 0x1237, 0.0, 5)]), False)):
-        record = ProtocolRecord(run=enabled, enabling=[(0, before)], bench=DRIVE, drive_limit=8e-3)
-        found = {check.name: check.passed for check in judge_protocol(record, ProtocolLimits())[0]}
-        assert found[STATES] is passed
+    record = ProtocolRecord(run=make_rows([(0x0F, 0x1237, 1e-3, 50)]), enabling=[(0, make_rows(before))], bench=DRIVE,
+                            drive_limit=8e-3)
+    found = {check.name: check.passed for check in judge_protocol(record, ProtocolLimits())[0]}
+    assert found[STATES] is passed
 
 
 def test_a_small_current_may_be_allowed_when_idle() -> None:
@@ -536,10 +536,10 @@ def test_a_controller_that_is_switched_off_by_phase_sends_no_current() -> None:
     assert "no current unless enabled" in always[1]
 
 
-def test_what_does_not_apply_is_named_with_its_reason_and_is_no_check() -> None:
-    for bench, expected in (
-            (DRIVE, {"drive frames of another cycle", "heartbeat period, controller", "undocumented EMCY codes"}),
-            (ECU, {"drive frames of another cycle", "same answers after a reset", "heartbeat period, controller",
-                   "undocumented EMCY codes", "status word follows the control word"})):
-        found, skipped = judge(make_rows(SOUND), bench)
-        assert set(skipped) == expected and all(skipped.values()) and not set(found) & set(skipped)
+@pytest.mark.parametrize(("bench", "expected"), [
+    (DRIVE, {"drive frames of another cycle", "heartbeat period, controller", "undocumented EMCY codes"}),
+    (ECU, {"drive frames of another cycle", "same answers after a reset", "heartbeat period, controller",
+           "undocumented EMCY codes", "status word follows the control word"})], ids=["drive", "ECU"])
+def test_what_does_not_apply_is_named_with_its_reason_and_is_no_check(bench: Bench, expected: set[str]) -> None:
+    found, skipped = judge(make_rows(SOUND), bench)
+    assert set(skipped) == expected and all(skipped.values()) and not set(found) & set(skipped)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from refusals import catch_refusal
-from rig_command import Said, refuse, rig
+from rig_command import Said, refuse, rig, write_file
 
 from rig.sequences import load_sequence
 
@@ -50,9 +50,8 @@ def note(run, word):
 
 
 def write(folder: Path, sequence: str = SEQUENCE, code: str = CODE) -> Path:
-    (folder / "own.toml").write_text(sequence)
-    (folder / "own.py").write_text(code)
-    return folder / "own.toml"
+    write_file(folder / "own.py", code)
+    return write_file(folder / "own.toml", sequence)
 
 
 def test_profile_check_and_steps_run_from_a_log_too(tmp_path: Path) -> None:
@@ -76,9 +75,8 @@ def test_profile_check_and_steps_run_from_a_log_too(tmp_path: Path) -> None:
 def test_the_example_of_the_page_works(tmp_path: Path) -> None:
     block = DOCS.read_text().split("The files `settle.toml` and `settle.py`:\n")[1].split("\nAn exception")[0]
     toml, code = re.sub(r"^    ", "", block, flags=re.MULTILINE).split("import numpy as np", 1)
-    (tmp_path / "settle.toml").write_text(toml)
-    (tmp_path / "settle.py").write_text("import numpy as np" + code)
-    said = rig("run", tmp_path / "settle.toml", "--out", tmp_path / "out", "--json")
+    write_file(tmp_path / "settle.py", "import numpy as np" + code)
+    said = rig("run", write_file(tmp_path / "settle.toml", toml), "--out", tmp_path / "out", "--json")
     assert (said.status, said.json["checks"][0]["name"]) == (0, "energy of the error")
     assert (tmp_path / "out" / "note.txt").read_text() == "Own profile, own measure, seed 0"
 
@@ -123,11 +121,12 @@ def test_a_wrong_entry_is_one_line(tmp_path: Path, old: str, new: str, line: str
     assert said.status == 2 and len(said.err.splitlines()) == 1 and re.search(line, said.err), said.err
 
 
-def test_a_value_that_cannot_be_measured_fails_the_check(tmp_path: Path) -> None:
-    for returned, why in (("None", "no value"), ("float('nan')", "returned nan"), ("'x'", "not a number")):
-        said = run_with(tmp_path, "return 1e6 * np.abs(window.error).max()", f"return {returned}")
-        detail = json.loads((tmp_path / "out" / "verdict.json").read_text())["checks"][0]["detail"]
-        assert said.status == 1 and why in detail
+@pytest.mark.parametrize(("returned", "why"), [("None", "no value"), ("float('nan')", "returned nan"),
+                                               ("'x'", "not a number")])
+def test_a_value_that_cannot_be_measured_fails_the_check(returned: str, why: str, tmp_path: Path) -> None:
+    said = run_with(tmp_path, "return 1e6 * np.abs(window.error).max()", f"return {returned}")
+    detail = json.loads((tmp_path / "out" / "verdict.json").read_text())["checks"][0]["detail"]
+    assert said.status == 1 and why in detail
 
 
 def test_the_step_after_runs_even_if_the_run_cannot(tmp_path: Path) -> None:

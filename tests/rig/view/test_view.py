@@ -14,7 +14,6 @@ import struct
 import subprocess
 import sys
 import termios
-import time
 import urllib.request
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,8 +25,8 @@ import pytest
 from matplotlib.image import imread
 from recording_rows import Rows, read_names, read_recording
 from refusals import catch_refusal
-from rig_command import answer, finished, gone, grown, nodes_on, refuse, rig, started
-from short_runs import build_command
+from rig_command import answer, finished, gone, grown, interrupted, nodes_on, refuse, rig, started, write_file
+from short_runs import build_command, simulate_trace
 from synthetic_run import build_cycles, record_run
 
 from fdi.comparison.compare import compare
@@ -36,7 +35,7 @@ from fdi.report.numbers import format_ratio
 from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
-from plant import Model, simulate
+from plant import Model
 from plant.plants import find_plant
 from rig.benches.bench_file import load_bench
 from rig.recorder import Event, NmtState, Record, Signals, Timing
@@ -138,15 +137,14 @@ checks = [{ name = "begins", kind = "event_occurs", event = "phase main", window
 @pytest.mark.parametrize("begin_ns", [0, *range(1_800_000_000_000_000_000, 1_800_000_000_000_000_256, 51)])
 def test_events_stand_at_their_cycle(begin_ns: int, tmp_path: Path) -> None:
     """Those written before the first row of main too, and whatever the log times: a float64 rounds ns since 1970."""
-    (tmp_path / "events.toml").write_text(EVENTS)
-    run = LiveRun(make_live_plan(load_sequence(tmp_path / "events.toml"), "lockstep", load_bench()))
-    words = {0: ("phase", "set-up"), 20: ("phase", "main"), 120: ("guard", "first")}
+    sequence = load_sequence(write_file(tmp_path / "events.toml", EVENTS))
+    run = LiveRun(make_live_plan(sequence, "lockstep", load_bench()))
+    events = {0: [Event("INFO", "phase", "set-up")], 120: [Event("INFO", "guard", "first")],
+              20: [Event("INFO", "phase", "main"), Event("WARN", "fault", "early")]}
     for cycle in range(220):
         t_ns = begin_ns + cycle * 1_000_000
-        if cycle in words:
-            run.add(t_ns, Event("INFO", *words[cycle]))
-        if cycle == 20:
-            run.add(t_ns, Event("WARN", "fault", "early"))
+        for event in events.get(cycle, []):
+            run.add(t_ns, event)
         run.add(t_ns, Signals(cycle, int(cycle >= 20), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 7, 15, 0))
         run.add(t_ns, Timing(cycle, False, 0.0, 0.0, 0.0))
     run.judge_checks()
@@ -220,8 +218,7 @@ SHOWN = {"nodes": r"node 2 controller operational|node 3 plant      operational"
 
 def test_screen_follows_the_run_and_ctrl_c_restores_the_terminal(tmp_path: Path) -> None:
     """A run that lasts until all of it was seen, however slowly the screen is drawn."""
-    sequence = tmp_path / "watched.toml"
-    sequence.write_text(WATCHED)
+    sequence = write_file(tmp_path / "watched.toml", WATCHED)
     seen: dict[str, set[str]] = {name: set() for name in ("plot", *SHOWN)}
     stopped: list[int] = []
 
@@ -246,8 +243,8 @@ def test_screen_follows_the_run_and_ctrl_c_restores_the_terminal(tmp_path: Path)
 
 
 def test_lines_without_a_terminal(tmp_path: Path) -> None:
-    (tmp_path / "events.toml").write_text(EVENTS)
-    said = finished(started("run", tmp_path / "events.toml", "--live", "--json", "--out", tmp_path / "run"))
+    sequence = write_file(tmp_path / "events.toml", EVENTS)
+    said = finished(started("run", sequence, "--live", "--json", "--out", tmp_path / "run"))
     lines = said.err.splitlines()
     assert said.status == 1 and said.out.startswith("{") and "live" not in said.out
     assert lines[0] == "live: standard error is no terminal: a line every 2 s instead of the screen"
@@ -256,8 +253,7 @@ def test_lines_without_a_terminal(tmp_path: Path) -> None:
 
 def test_dead_node_is_announced_before_the_run_ends(tmp_path: Path) -> None:
     """The plant's process is killed; the line comes while the rig is still at work on its clean-up of 4000 cycles."""
-    sequence = tmp_path / "long.toml"
-    sequence.write_text(LONG + 'cleanup = [{ kind = "hold", time = 4 }]\n')
+    sequence = write_file(tmp_path / "long.toml", LONG + 'cleanup = [{ kind = "hold", time = 4 }]\n')
     group = f"udp_multicast:239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
     run = started("run", sequence, "--bus", group, "--out", tmp_path / "run")
     run.stdout.readline()  # the nodes are there
@@ -279,7 +275,9 @@ def test_what_is_not_shown(words: tuple[str, ...], line: str, tmp_path: Path) ->
     assert line in refuse("run", *words, "--out", tmp_path / "runs")
 
 
-needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="pip install 'eha-rig[view]'")
+REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"  # forbids skips
+needs_viewer = pytest.mark.skipif(not REQUIRED and importlib.util.find_spec("rerun") is None,
+                                  reason="pip install 'eha-rig[view]'")
 SHORT = """title = "Short"
 setup = [{ kind = "hold", time = 0.2 }]
 main = [{ name = "rest", kind = "hold", time = 0.3 }, { name = "out", kind = "step", to = 1e-3, time = 0.5 }]
@@ -290,10 +288,10 @@ checks = [{ name = "position", kind = "never_exceeds", signal = "xj", high = 6, 
 """
 
 
-@needs_rerun
+@needs_viewer
 def test_what_arrives_is_what_the_log_holds(tmp_path: Path) -> None:
-    (tmp_path / "short.toml").write_text(SHORT)
-    said = rig("run", tmp_path / "short.toml", "--live", f"rerun:{tmp_path}/live.rrd", "--out", tmp_path / "run")
+    short = write_file(tmp_path / "short.toml", SHORT)
+    said = rig("run", short, "--live", f"rerun:{tmp_path}/live.rrd", "--out", tmp_path / "run")
     assert said.status == 1 and said.err == "" and "too small" in said.out
     rows, trace = read_recording(tmp_path / "live.rrd"), Trace.read(tmp_path / "run", all=True)
     for entity, values in (("/position/ram", trace.xj * 1e3), ("/spool/spool", trace.xs * 1e6),
@@ -309,50 +307,49 @@ def test_what_arrives_is_what_the_log_holds(tmp_path: Path) -> None:
     assert not any(math.isnan(t) for t, _ in rows["/log/events"])
 
 
-@needs_rerun
+@needs_viewer
 def test_the_run_goes_on_when_the_viewer_is_closed(tmp_path: Path) -> None:
-    (tmp_path / "long.toml").write_text(LONG)
-    port = find_free_port()
+    long, port = write_file(tmp_path / "long.toml", LONG), find_free_port()
     server = subprocess.Popen([sys.executable, "-m", "rerun", "--serve-grpc", "--bind", "127.0.0.1", "--port",
                                str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     log = tmp_path / "run" / "trace.mcap"
     try:
         while not is_listening(port):
             assert server.poll() is None
-        run = started("run", tmp_path / "long.toml", "--live", f"rerun:{port}", "--quiet", "--out", tmp_path / "run")
+        run = started("run", long, "--live", f"rerun:{port}", "--quiet", "--out", tmp_path / "run")
         grown(log, 100_000)  # well into main
     finally:
         os.killpg(server.pid, signal.SIGKILL)
         server.wait()
     assert run.stderr.readline() == "rig run: the viewer was closed; the run goes on\n"
     grown(log, log.stat().st_size + 100_000)
-    run.send_signal(signal.SIGINT)
-    assert finished(run).status == 130 and (tmp_path / "run" / "verdict.json").exists()
+    assert interrupted(run).status == 130 and (tmp_path / "run" / "verdict.json").exists()
 
 
 @pytest.mark.parametrize(("status", "words"), [(2, ["run", "--live", "rerun", "--out", "run"]),
                                                (1, ["view", "trace.mcap", "--out", "x.rrd"])])
-def test_without_the_viewer_one_line_says_how_to_get_it(status: int, words: list[str], tmp_path: Path,
+def test_without_the_viewer_one_line_says_how_to_get_it(status: int, words: list[str], here: Path,
                                                         monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    record_run(tmp_path / "trace.mcap", stop=400)
+    record_run(here / "trace.mcap", stop=400)
     monkeypatch.setitem(sys.modules, "rerun", None)
     said = rig(*words)
     assert (said.status, said.err.count("\n")) == (status, 1) and "pip install 'eha-rig[view]'" in said.err
-    assert [path.name for path in tmp_path.iterdir()] == ["trace.mcap"]
+    assert [path.name for path in here.iterdir()] == ["trace.mcap"]
 
 
-@needs_rerun
-@pytest.mark.parametrize("word", ["rerun", "rerun:x", "rerun:0", "rerun:/absent/live.rrd", "rerun:{port}"])
-def test_places_that_cannot_be_used(word: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
+
+
+@needs_viewer
+@pytest.mark.usefixtures("no_display")
+@pytest.mark.parametrize("word", ["rerun", "rerun:x", "rerun:0", "rerun:/absent/live.rrd", "rerun:{port}"])
+def test_places_that_cannot_be_used(word: str) -> None:
     assert "--live" in catch_refusal(find_viewer_place, word.format(port=find_free_port()))
 
 
-REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"  # forbids skips
-needs_viewer = pytest.mark.skipif(not REQUIRED and importlib.util.find_spec("rerun") is None,
-                                reason="pip install 'eha-rig[view]'")
 needs_driver = pytest.mark.skipif(
     not REQUIRED and not any(Path(place).glob("vulkan/icd.d/*.json") for place in ("/usr/share", "/etc")),
     reason="no Vulkan driver (Debian: apt-get install mesa-vulkan-drivers libvulkan1)")
@@ -442,10 +439,8 @@ def test_viewer_that_cannot_draw_says_so(tmp_path: Path) -> None:
 
 
 @needs_viewer
-def test_without_a_display_one_line_says_so_and_the_viewer_listens_on_this_machine_only(
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
+@pytest.mark.usefixtures("no_display")
+def test_without_a_display_one_line_says_so_and_the_viewer_listens_on_this_machine_only() -> None:
     with pytest.raises(ViewerError, match="no display"):
         viewer.open_viewer(Path("x.rrd"))
     words = viewer.make_viewer_command(9999)
@@ -460,8 +455,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """run.csv of a plant with a null bias, healthy.csv, and late.csv: the healthy one 0.25 s later."""
     folder = tmp_path_factory.mktemp("runs")
     for name, changes in (("run", {"null_bias.current": 1.5e-4}), ("healthy", {})):
-        columns = simulate(Model().replace(changes), build_command()[:1200], None, 1, 100)
-        Trace.from_columns(columns._asdict(), 1e-3, {}).write_csv(folder / f"{name}.csv")
+        run = simulate_trace(Model().replace(changes), build_command()[:1200], seed=1, steps=100)
+        run.write_csv(folder / f"{name}.csv")
     rows = np.loadtxt(folder / "healthy.csv", delimiter=",", comments="#", skiprows=1)
     head = (folder / "healthy.csv").read_text().splitlines()[0]
     late = np.vstack([np.tile(rows[:1], (250, 1)), rows])
@@ -531,8 +526,8 @@ def test_runs_are_overlaid_and_subtracted_on_the_time_of_the_first(folder: Path,
 @needs_viewer
 def test_a_theme_is_served_for_a_browser_until_ctrl_c(folder: Path) -> None:
     """A script that notes the address stands in for a browser, which would open a window."""
-    script, note = folder / "browser", folder / "address.txt"
-    script.write_text(f'#!/bin/sh\nprintf %s "$1" > {note}.part\nmv {note}.part {note}\n')
+    note = folder / "address.txt"
+    script = write_file(folder / "browser", f'#!/bin/sh\nprintf %s "$1" > {note}.part\nmv {note}.part {note}\n')
     script.chmod(0o755)
     process = started("view", folder / "run.csv", "--theme", "light", "--json",
                       env={**os.environ, "BROWSER": f"{script} %s"})
@@ -542,13 +537,11 @@ def test_a_theme_is_served_for_a_browser_until_ctrl_c(folder: Path) -> None:
         assert address.hostname == "127.0.0.1" and parse_qs(address.query)["theme"] == ["light"]
         with urllib.request.urlopen(place) as page:
             assert b"rerun" in page.read().lower()
-        while not note.exists():
-            time.sleep(0.05)
+        grown(note, 1)
         assert note.read_text() == place
         data = urlsplit(parse_qs(address.query)["url"][0])
         with socket.create_connection(("127.0.0.1", data.port or 0)):
             pass
     finally:
-        process.send_signal(signal.SIGINT)
-        said = finished(process)
+        said = interrupted(process)
     assert said.status == 0 and said.err == ""
