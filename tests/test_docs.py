@@ -1,6 +1,5 @@
 """The documentation is complete and true, its examples work, it becomes a site; the schemas of the JSON answers."""
 
-import argparse
 import ast
 import importlib.util
 import inspect
@@ -25,7 +24,7 @@ from jsonschema import Draft202012Validator
 from notebook_page import RunCell, check_format, run_notebook
 from places import ROOT
 from reference_pages import write_reference
-from rig_command import rig
+from rig_command import rig, write_file
 from short_runs import HIDDEN, write_measured_runs
 
 from plant import Model, load_model, simulate
@@ -74,13 +73,11 @@ def test_the_example_of_a_model_file_is_valid(tmp_path: Path) -> None:
     """And what `to_toml` writes of it is the same model."""
     text = next(block for block in indented_blocks((ROOT / "docs" / "models.md").read_text())
                 if block.startswith("name ="))
-    (tmp_path / "unit.toml").write_text(text)
-    model = load_model(tmp_path / "unit.toml")
+    model = load_model(write_file(tmp_path / "unit.toml", text))
     assert (model.name, set(model.effects)) == ("unit 7", {"null_bias", "quantisation"})
     assert {name for name in model.list_changes() if name.startswith("jack.")} == {
         "jack.static_friction", "jack.dynamic_friction"}
-    (tmp_path / "again.toml").write_text(model.to_toml())
-    assert load_model(tmp_path / "again.toml").values == model.values
+    assert load_model(write_file(tmp_path / "again.toml", model.to_toml())).values == model.values
 
 
 def test_the_example_of_a_sequence_is_valid() -> None:
@@ -94,9 +91,9 @@ def test_the_effects_in_the_manual_work(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "effects.md").read_text()
     code = [block for block in indented_blocks(text) if re.match(r"# my_effects\.py|class ", block)]
     assert all(len(block.splitlines()) <= 25 for block in code)
-    (tmp_path / "my_effects.py").write_text("\n".join(code))
-    assert load_effects(tmp_path / "my_effects.py") == ["seal_drag", "rod_play"]
-    said = rig("effects", "--effects", tmp_path / "my_effects.py", "seal_drag")
+    file = write_file(tmp_path / "my_effects.py", "\n".join(code))
+    assert load_effects(file) == ["seal_drag", "rod_play"]
+    said = rig("effects", "--effects", file, "seal_drag")
     assert said.status == 0 and "seal_drag: exact at its off value" in said.out
     for row in re.findall(r"^    (level = .*)", text, re.MULTILINE):
         assert " ".join(row.split()) in " ".join(said.out.split())
@@ -116,29 +113,32 @@ def test_the_readme_names_only_commands_that_exist_and_all_of_them() -> None:
     assert {*typed, *re.findall(r"`rig ([a-z]+)", README)} == set(COMMANDS)
 
 
-def test_every_link_has_a_target() -> None:
-    for page in PAGES:
-        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
-            assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
+every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 
-def test_files_and_names_in_the_text_exist() -> None:
-    for page in PAGES:
-        text = page.read_text()
-        for path in re.findall(r"`((?:plant|fdi|rig|dbc|tests|docs)/[\w./]*)`", text):
-            assert (ROOT / path).exists(), f"{page.name}: {path}"
-        for dotted in re.findall(r"`((?:plant|fdi|rig)(?:\.\w+)+)", text):
-            module, _, attribute = dotted.rpartition(".")
-            assert hasattr(importlib.import_module(module), attribute), f"{page.name}: {dotted}"
+@every_page
+def test_every_link_has_a_target(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+        assert target.startswith("http") or (page.parent / target).exists(), target
 
 
-def test_every_figure_has_a_caption() -> None:
+@every_page
+def test_files_and_names_in_the_text_exist(page: Path) -> None:
+    text = page.read_text()
+    for path in re.findall(r"`((?:plant|fdi|rig|dbc|tests|docs)/[\w./]*)`", text):
+        assert (ROOT / path).exists(), path
+    for dotted in re.findall(r"`((?:plant|fdi|rig)(?:\.\w+)+)", text):
+        module, _, attribute = dotted.rpartition(".")
+        assert hasattr(importlib.import_module(module), attribute), dotted
+
+
+@every_page
+def test_every_figure_has_a_caption(page: Path) -> None:
     """A line in italics below the figure that says what to see in it."""
-    for page in PAGES:
-        lines = page.read_text().splitlines()
-        for number, line in enumerate(lines):
-            if line.startswith("!["):
-                assert not lines[number + 1] and lines[number + 2].startswith("*"), f"{page.name}: {line}"
+    lines = page.read_text().splitlines()
+    for number, line in enumerate(lines):
+        if line.startswith("!["):
+            assert not lines[number + 1] and lines[number + 2].startswith("*"), line
 
 
 def commands_shown(page: Path) -> list[str]:
@@ -151,13 +151,8 @@ def commands_shown(page: Path) -> list[str]:
 def test_the_commands_shown_are_accepted(page: Path) -> None:
     for line in commands_shown(page):
         print(line)  # a refusal ends the test, and this is then the last line that is shown
-        parse_command(line)
-
-
-def parse_command(line: str) -> argparse.Namespace:
-    """The options of a command line, as `rig` reads them."""
-    _, name, *words = shlex.split(line)
-    return main.build_command_parser(name).parse_intermixed_args(words)
+        _, name, *words = shlex.split(line)
+        main.build_command_parser(name).parse_intermixed_args(words)
 
 
 @pytest.mark.parametrize("script", sorted((ROOT / "docs").glob("*.py")), ids=lambda path: path.name)
@@ -274,10 +269,8 @@ def test_every_page_is_in_the_navigation(reference: Path) -> None:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_page_of_a_command_has_what_its_help_has(
         command: str, reference: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from rig.cli.main import main
-
     with pytest.raises(SystemExit):
-        main([command, "--help"])
+        main.main([command, "--help"])
     page = (reference / "commands" / f"{command}.md").read_text()
     options = set(re.findall(r"^ +(?:-\w, )?(--[a-z][\w-]+)", capsys.readouterr().out, re.MULTILINE))
     assert {"--help", "--json", "--out"} <= options
@@ -346,14 +339,12 @@ def test_the_notebook_is_stored_without_results() -> None:
 PAGE = (ROOT / "docs" / "json.md").read_text()
 SCHEMAS = load_schemas()
 
-PROMISED = {  # keys that other programs rely on
-    "run": "verdict trace checks timing fdi",
-    "compare": "verdict signals solver_error where blocks",
-    "explain": "verdict effects candidates baseline blind_to separate pattern",
-    "add": "model ledger floor",
-    "fdi": "level ruling events precursors grid refined",
-}
-PROMISED_BELOW = {
+PROMISED = {  # keys that other programs rely on: of an answer, and below one of its keys
+    ("run", ""): "verdict trace checks timing fdi",
+    ("compare", ""): "verdict signals solver_error where blocks",
+    ("explain", ""): "verdict effects candidates baseline blind_to separate pattern",
+    ("add", ""): "model ledger floor",
+    ("fdi", ""): "level ruling events precursors grid refined",
     ("run", "timing"): "cycles overruns lateness_us response_us scheduler",
     ("compare", "signals"): "unit error floor ratio closed_loop_error",
     ("compare", "where"): "section t0 t1 share condition",
@@ -387,16 +378,14 @@ def test_every_command_that_answers_in_json_has_a_schema() -> None:
     assert {name_schema(each) for each in words} | more == set(SCHEMAS)
 
 
-@pytest.mark.parametrize("command", PROMISED)
-def test_the_promised_keys_are_required(command: str) -> None:
+@pytest.mark.parametrize(("command", "key"), PROMISED)
+def test_the_promised_keys_are_required(command: str, key: str) -> None:
     schema = SCHEMAS[f"{command}.json"]
-    assert set(PROMISED[command].split()) <= set(schema["required"])
-    for (owner, key), keys in PROMISED_BELOW.items():
-        if owner == command:
-            inner = schema["properties"][key]
-            inner = next((each for each in inner.get("anyOf", []) if "properties" in each), inner)
-            inner = inner.get("items") or inner.get("additionalProperties") or inner
-            assert set(keys.split()) <= set(inner["required"]), key
+    if key:
+        schema = schema["properties"][key]
+        schema = next((each for each in schema.get("anyOf", []) if "properties" in each), schema)
+        schema = schema.get("items") or schema.get("additionalProperties") or schema
+    assert set(PROMISED[command, key].split()) <= set(schema["required"])
 
 
 def list_keys(schema: Any) -> Iterator[str]:
@@ -439,8 +428,7 @@ def test_the_answers_of_runs(preflight: Path, aborted: Path) -> None:
     assert_all_seen("run", *answers)
 
 
-def test_the_answers_of_small_commands(preflight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_answers_of_small_commands(preflight: Path, here: Path) -> None:
     Path("command.csv").write_text("t,com\n0,0\n0.001,1e-3\n0.002,1e-3\n")
     simulated = rig("simulate", "--command", "command.csv", "--out", "short.csv", "--json").json
     samples = rig("simulate", "--samples", "--json").json

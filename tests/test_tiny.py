@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 from rig_command import rig
 
 from fdi.trace.trace import Trace
@@ -27,8 +26,7 @@ def failed(verdict: dict) -> set[str]:  # type: ignore[type-arg]
     return {check["name"] for check in verdict["checks"] if not check["passed"]}
 
 
-def test_the_promise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_promise(here: Path) -> None:
 
     # The preflight: an actuator, a controller and a sequencer talk CANopen. No hardware, no rights, no set-up.
     sound = rig("run", "preflight", "--seed", 1, "--json")
