@@ -231,9 +231,13 @@ def helps_explain(before: Hypothesis, after: Hypothesis, least: float) -> bool:
 
     Of a repeat even the right effect may miss another stop, which costs hundreds.
     """
-    is_nearer = before.is_at_floor and before.is_far and not after.is_far
-    is_first_at_floor = not before.is_at_floor and before.cost - after.cost > GAIN_DOUBTFUL
-    return measure_gain(before, after) > least or (after.is_at_floor and (is_nearer or is_first_at_floor))
+    is_first_at_floor = not before.is_at_floor and after.is_at_floor and before.cost - after.cost > GAIN_DOUBTFUL
+    return measure_gain(before, after) > least or is_first_at_floor or spares_far_tolerances(before, after)
+
+
+def spares_far_tolerances(before: Hypothesis, after: Hypothesis) -> bool:
+    """Whether both leave only noise, and only the first needs tolerances that few healthy units have."""
+    return before.is_at_floor and before.is_far and after.is_at_floor and not after.is_far
 
 
 def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, progress: Progress) -> Explanation:
@@ -247,9 +251,9 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
         base = search.finish_hypothesis(base, 2)
         close = [search.finish_hypothesis(h, n) for h, n in zip(close, (6, 2), strict=False)]
         base, close = _doubt_small_gain(search, base, close, depth)
-    close = leave_out_unneeded(search, close)
+    close = leave_out_unneeded(search, _spare_far_tolerances(search, base, close))
     depth = len(close[0].effects) if close else 0
-    tried = [] if len(levels) == 1 else levels[depth or -1]
+    tried = [] if len(levels) == 1 else levels[depth or -1] if depth < len(levels) else []
     others = [h for h in tried if h.effects not in [c.effects for c in close]]
     parents = [next((p for p in levels[i] if p.effects == close[0].effects[:i]), levels[i][0]) for i in range(1, depth)]
     base, *close = (judge_left_out_rows(search, h, floor) for h in search.judge_on_all([base, *close], FINE))
@@ -357,7 +361,16 @@ def _doubt_small_gain(search: Search, base: Hypothesis, close: list[Hypothesis],
     if measure_gain(base, close[0]) > GAIN_SEEN:
         base = search.finish_hypothesis(search.refit_base(base, close[0]), LONG)
         base = search.leave_out_effects(base, close[0])
-    return base, [] if depth == 1 and measure_gain(base, close[0]) <= GAIN_SEEN else close
+    return base, close if depth > 1 or helps_explain(base, close[0], GAIN_SEEN) else []
+
+
+def _spare_far_tolerances(search: Search, base: Hypothesis, close: list[Hypothesis]) -> list[Hypothesis]:
+    """The hypotheses, best first, after those in which one more effect stands in for a tolerance that was far off."""
+    best = base if base.is_at_floor or not close else close[0]
+    if not (best.is_at_floor and best.is_far) or any(spares_far_tolerances(best, h) for h in close):
+        return close
+    found = search.add_each_in_place(best, LONG)
+    return [*(h for h in found if spares_far_tolerances(best, h)), *close]
 
 
 def leave_out_unneeded(search: Search, close: list[Hypothesis]) -> list[Hypothesis]:
@@ -424,16 +437,18 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
     prints = tuple(f.effect for f in marks.prints)
     firmware_left = marks.is_firmware_different and not any(p.is_firmware for p in marks.prints)
     if not close:
-        if not base.is_at_floor:
+        if not base.is_at_floor or base.is_far:
             return ("PARTLY" if prints else "UNEXPLAINED"), prints
         if firmware_left:
             return "UNEXPLAINED", prints
         return ("EXPLAINED" if prints else "NOTHING_MISSING"), prints
     best = close[0]
     there = [h for h in holding if h.is_at_floor]
+    spared = [h for h in there if spares_far_tolerances(base, h)]
     # where the base leaves only noise: single stops that a fit has met by chance are missed elsewhere
-    sure = [h for h in there if not (unseen and base.is_at_floor) or costs[()] - costs[h.effects] > GAIN_SEEN]
-    if base.is_at_floor and (measure_gain(base, best) < GAIN_CONVINCES or (there and not sure)):
+    sure = spared or [h for h in there
+                      if not (unseen and base.is_at_floor) or costs[()] - costs[h.effects] > GAIN_SEEN]
+    if base.is_at_floor and not spared and (measure_gain(base, best) < GAIN_CONVINCES or (there and not sure)):
         alike = [h for h in close if not h.is_far and measure_gain(base, h) > GAIN_SEEN
                  and not _is_better(best, h, costs)]
         return ("NOT_RESOLVABLE", _list_effects([best, *alike])) if not prints else ("EXPLAINED", prints)
@@ -441,10 +456,12 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
     if there and all(h.is_far for h in there):
         return "PARTLY", (*prints, *there[0].effects)
     if best.is_at_floor and there and not firmware_left:
-        # named alone only with the gain with which an effect is named where the model is at the floor without it
-        equal = [h for h in there if h is there[0] or (
-            not h.is_far and not _is_better(there[0], h, costs)
-            and not (base.is_at_floor and measure_gain(base, h) < GAIN_CONVINCES))]
+        if spared:
+            equal = [h for h in there if measure_gain(h, there[0]) < GAIN_TIE]
+        else:  # named alone only with the gain with which an effect is named where only noise is left without it
+            equal = [h for h in there if h is there[0] or (
+                not h.is_far and not _is_better(there[0], h, costs)
+                and not (base.is_at_floor and measure_gain(base, h) < GAIN_CONVINCES))]
         if len(equal) > 1:
             return "AMBIGUOUS", (*prints, *_list_effects(equal))
         return "EXPLAINED", (*prints, *there[0].effects)

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtrc
 
 from fdi.estimation import noise as noises
 from fdi.estimation.fit import (
@@ -43,7 +43,14 @@ from fdi.estimation.fit import (
 from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, is_long, judge_on_all
 from fdi.estimation.noise import Noise
 from fdi.estimation.replay import find_undecided_rows, leave_out_rest, leave_out_rows, measure_decided_errors
-from fdi.estimation.unidentifiable import finish_fit, list_directions, list_powers, scale_to, scale_together
+from fdi.estimation.unidentifiable import (
+    finish_fit,
+    list_directions,
+    list_powers,
+    scale_to,
+    scale_together,
+    take_curved_step,
+)
 from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import (
     BLOCK_FITTED_SQUARE,
@@ -56,7 +63,6 @@ from fdi.thresholds import (
     RESIDUAL_IS_NEAR_NOISE,
     RESIDUAL_IS_NOISE,
     SOLVER_ERROR_SHARE,
-    TOLERANCES_FAR_SHARE,
     WHITE_SQUARE_POOR,
 )
 from fdi.trace.trace import Flags, Floats, Trace
@@ -68,6 +74,8 @@ FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage
 FINE = 20  # steps a cycle of the last fits
 TRUEST = 100  # at least, for what the last fits are led by, and of runs that they never saw; slopes do with less
+UNUSUAL_SD = 2.0  # standard deviations of a tolerance, from which on an effect may have moved it
+TAKEN_BACK = (0.875, 0.75, 0.625, 0.5, 0.375, 0.25, 0.125, 0.0)  # shares of far tolerances that are left
 EASED = (30.0, 6.0)  # times the noise, stage by stage
 VALLEY_STAGES = ((30.0, 20), (6.0, 20), (2.0, 20), (1.0, 30))  # times the noise, and generations
 
@@ -101,9 +109,8 @@ class Hypothesis:
 
     @property
     def is_far(self) -> bool:
-        """True when few healthy units have such tolerances: it may have ended far off in a valley."""
-        known = np.isfinite([f.prior for f in self.fit.free]).sum()
-        return bool(self.tolerance_cost > chdtri(known, TOLERANCES_FAR_SHARE))
+        """True when few healthy units have such tolerances: it ended far off in a valley, or lacks an effect."""
+        return self.fit.is_far
 
     @property
     def cost(self) -> float:
@@ -222,6 +229,43 @@ class Search:
             has_prior = np.array([np.isfinite(f.prior) for f in ranked[0].fit.free])
             ranked[0] = self.retry_from(ranked[0], [np.where(has_prior & (np.abs(x) > 1.0), 0.0, x)])
         return ranked
+
+    def add_each_in_place(self, start: Hypothesis, rounds: int, fitted: int = 4) -> list[Hypothesis]:
+        """`start` with one more effect each, in place of the tolerances that are far off; best first.
+
+        An effect that does what a tolerance does gains only the square of that, which no forecast from afar sees: the
+        valley is narrow and bends. So the tolerances are taken back to a healthy unit in eighths, and the effect and
+        the rest are fitted at each.
+        """
+        problem, own = self.fine or self.problem, {f.name: f for f in start.fit.free}
+        far = {f.name: start.fit.values[f.name] for f, x in zip(start.fit.free, start.fit.x, strict=True)
+               if abs(x) > UNUSUAL_SD * f.prior}
+
+        def hold(free: Sequence[Free], share: float) -> list[Free]:
+            return [f._replace(centre=own[f.name].centre + share * (far[f.name] - own[f.name].centre), prior=1e-6)
+                    if f.name in far and np.isfinite(f.prior) else f for f in free]
+
+        free, x = hold(start.fit.free, TAKEN_BACK[0]), np.where([name in far for name in own], 0.0, start.fit.x)
+        begun = linearise(problem, free, x)
+        prospects = scan_effects(problem, [begun], self.list_further_effects(start.effects), self.workers)
+
+        def fit_in_place(p: Prospect) -> Hypothesis:
+            values = begun.values
+            before = np.array([(values.get(f.name, f.centre) - f.centre) / f.scale for f in p.free])
+            at = p.x
+            for share in TAKEN_BACK:
+                ahead = np.clip(2.0 * at - before, *scaled_bounds(p.free))
+                fit = take_curved_step(problem, linearise(problem, hold(p.free, share), ahead))
+                fit = take_curved_step(problem, linearise(problem, fit.free, fit.x))
+                before, at = at, fit.x
+            free = [own.get(f.name, f) if np.isfinite(f.prior) else f for f in p.free]
+            there = linearise(problem, free, at)
+            if there.cost < start.cost + GAIN_DOUBTFUL:
+                there = finish_fit(problem, there, rounds, self.problem, take_step=take_curved_step)
+            return self.judge_fit((*start.effects, p.effect), there)
+
+        worth = [p for p in prospects if p.cost < begun.cost - GAIN_WORTH_A_FIT][:fitted]
+        return sorted(self.map_parallel(fit_in_place, worth), key=lambda h: h.cost)
 
     def add_each_with_more_noise(self, start: Hypothesis, tried: Sequence[Hypothesis], fitted: int = 6
                                  ) -> list[Hypothesis]:

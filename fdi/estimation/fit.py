@@ -13,10 +13,18 @@ from functools import cache
 from typing import NamedTuple, TypeVar
 
 import numpy as np
+from scipy.special import chdtrc
 
 from fdi.estimation.mains import remove_mains
 from fdi.estimation.noise import Noise
-from fdi.thresholds import ANCHOR_RATE, BLOCK_FITTED_SQUARE, CONVERGED_GAIN, CONVERGED_SHARE, HEALTHY_TOLERANCES
+from fdi.thresholds import (
+    ANCHOR_RATE,
+    BLOCK_FITTED_SQUARE,
+    CONVERGED_GAIN,
+    CONVERGED_SHARE,
+    HEALTHY_TOLERANCES,
+    TOLERANCES_FAR_SHARE,
+)
 from fdi.trace.trace import Floats, Trace
 from plant.effects import Effect
 from plant.lanes import Lanes, Part
@@ -412,6 +420,14 @@ class Fit:
         """Standard deviation of a parameter, SI units."""
         i = [f.name for f in self.free].index(name)
         return float(np.sqrt(self.covariance[i, i])) * self.free[i].scale
+
+    @property
+    def is_far(self) -> bool:
+        """True when few healthy units have such tolerances, all together or the furthest of them."""
+        squares = weigh_priors(self.free) * self.x**2
+        count = np.count_nonzero(np.isfinite([f.prior for f in self.free]))
+        share = min(chdtrc(count, squares.sum()), count * chdtrc(1, squares.max(initial=0.0)))
+        return bool(share < TOLERANCES_FAR_SHARE)
 
 
 class Value(NamedTuple):

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.fit import (
+    DAMPINGS,
     Fit,
     Free,
     Problem,
@@ -431,12 +432,41 @@ SMOOTH_PASSES = 4  # in which the covariance settles
 WIDEST_VARIANCE, NARROWEST_VARIANCE = 25.0, 1e-14  # variances of scaled unknowns, within which a direction is taken
 
 
+def take_best_step(problem: Problem, fit: Fit) -> Fit:
+    """The best of some damped Gauss-Newton steps; the fit itself if none gains."""
+    gradient, hessian = form_normal_equations(fit)
+    best = find_best_trial(problem, fit, step_within_bounds(fit, hessian, gradient))
+    return best if best.cost < fit.cost else fit
+
+
+def take_curved_step(problem: Problem, fit: Fit) -> Fit:
+    """The best of some damped steps, each then led back twice to the floor of the valley; the fit if none gains.
+
+    Where an effect does what a tolerance does the valley is narrow and bends: a straight step along it soon climbs a
+    wall. What that adds to the residuals further steps with the same Jacobian take away (chord steps).
+    """
+    free, prior = fit.free, weigh_priors(fit.free)
+    gradient, hessian = form_normal_equations(fit)
+    heavy = (fit.jacobian * compute_weights(fit.white)).reshape(len(fit.x), -1)
+    ends, gradients = [fit] * len(DAMPINGS), [gradient] * len(DAMPINGS)
+    best = fit
+    for _ in range(3):
+        x = np.array([step_within_bounds(end, hessian, g, (damping,))[0]
+                      for end, g, damping in zip(ends, gradients, DAMPINGS, strict=True)])
+        white = problem.compute_white_residuals(free, x)
+        gradients = [heavy @ left.reshape(-1) + prior * at for left, at in zip(white, x, strict=True)]
+        ends = [replace(fit, x=at) for at in x]
+        found = find_best_trial(problem, fit, x)
+        best = found if found.cost < best.cost else best
+    return best
+
+
 def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | None = None,
-               stage: Stage = NO_STAGE) -> Fit:
+               stage: Stage = NO_STAGE, take_step: Callable[[Problem, Fit], Fit] = take_best_step) -> Fit:
     """A fit taken to the end, with a covariance that holds at the width of its own intervals.
 
     `slopes`: the same problem with coarser steps, for the differences; default `problem` itself. `stage` takes a step
-    with each round.
+    with each round, which is made by `take_step`.
     """
     if not fit.free:  # a plant without tolerances
         return replace(replay_fit(problem, fit, fit.x), converged=True)
@@ -448,16 +478,17 @@ def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | No
     linearise = linearise_along
     if not problem.model.values.keys() >= BALANCED:  # nobody has declared what no signal shows
         linearise, now = linearise_smoothly, replace(now, covariance=FIRST_WIDTH**2 * now.covariance)
-    now = take_steps(problem, now, partial(linearise, slopes, flat=flat), rounds, stage)
+    now = take_steps(problem, now, partial(linearise, slopes, flat=flat), rounds, stage, take_step)
     return replace(relax_fit(problem, now, find_tangents(slopes, now.free, now.x)[0]), converged=True)
 
 
-def take_steps(problem: Problem, now: Fit, linearise: Callable[[Fit], Fit], rounds: int, stage: Stage) -> Fit:
+def take_steps(problem: Problem, now: Fit, linearise: Callable[[Fit], Fit], rounds: int, stage: Stage,
+               take_step: Callable[[Problem, Fit], Fit] = take_best_step) -> Fit:
     """A fit after so many rounds of damped Gauss-Newton steps, fewer if `PATIENCE` of them gain nothing."""
     idle = 0
     for _ in range(rounds):
         here = linearise(now)
-        now = take_best_step(problem, here)
+        now = take_step(problem, here)
         idle = idle + 1 if here.cost - now.cost < CONVERGED_GAIN else 0
         stage.finish_step()
         if idle >= PATIENCE:
@@ -490,13 +521,6 @@ def _find_principal(covariance: Floats) -> Floats:
     variances, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     wide: Floats = DIRECTION_WIDTH_SD * vectors * np.sqrt(np.clip(variances, NARROWEST_VARIANCE, WIDEST_VARIANCE))
     return wide
-
-
-def take_best_step(problem: Problem, fit: Fit) -> Fit:
-    """The best of some damped Gauss-Newton steps; the fit itself if none gains."""
-    gradient, hessian = form_normal_equations(fit)
-    best = find_best_trial(problem, fit, step_within_bounds(fit, hessian, gradient))
-    return best if best.cost < fit.cost else fit
 
 
 def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats, stage: Stage = NO_STAGE,

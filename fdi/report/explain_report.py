@@ -56,6 +56,7 @@ from fdi.trace.trace import Floats, Trace
 from plant.signals import Signals
 
 BySignal = Mapping[str, float]  # SI
+FAR_OFF = "only with tolerances that fewer than one healthy unit in 1,000 has"
 
 MOODS: dict[str, Mood] = {"NOTHING_MISSING": "good", "EXPLAINED": "good", "PARTLY": "doubtful", "AMBIGUOUS": "doubtful",
                           "NOT_RESOLVABLE": "doubtful", "UNEXPLAINED": "bad"}
@@ -170,13 +171,16 @@ def describe_verdict(a: Answer) -> str:
     if a.verdict == "EXPLAINED":
         return f"{words} {'together ' if len(named) > 1 else ''}{verb} the residual: {rest}"
     if a.best.is_at_floor and a.best.is_far:
-        return (f"{words} {verb} the residual only with tolerances that fewer than one healthy unit in 1,000 has: "
-                f"{rest} Something else may be missing instead.")
+        return (f"{words} {verb} the residual {FAR_OFF}: {rest} Something else may be missing instead.")
     return f"{words} {verb} part of the residual: {rest} Something else is missing too."
 
 
 def _describe_unexplained(a: Answer) -> str:
-    if a.explanation.base.is_at_floor and not a.explanation.effects:
+    base = a.explanation.base
+    if base.is_at_floor and base.is_far:
+        return (f"The model explains the run {FAR_OFF} ({_describe_furthest(base)}), and no effect of the catalogue "
+                "does it with usual ones.")
+    if base.is_at_floor and not a.explanation.effects:
         return ("The output of the controller differs from the model's, and no effect of the catalogue explains the "
                 "difference." if a.explanation.marks.is_firmware_different else
                 "The model fits this run, but not the held-out run; this run does not show what is missing.")
@@ -209,10 +213,19 @@ def _find_worst_signal(a: Answer) -> str:
 
 
 def _describe_change(a: Answer, c: Candidate) -> str:
-    """Error before and after, noise floor, held-out run."""
+    """Error before and after, noise floor, held-out run; or what the tolerances would be, where only these tell."""
+    base = a.explanation.base
+    if base.is_at_floor and base.is_far:
+        return f"the model explains the run without it {FAR_OFF} ({_describe_furthest(base)})"
     s, signals = _find_worst_signal(a), find_signals(a)
     sentence = _describe_step(s, a.baseline["error"], c.error, a.baseline["floor"], signals)
     return sentence + (f"; held-out run {_format(c.holdout, s, signals)}" if s in c.holdout else "")
+
+
+def _describe_furthest(h: Hypothesis) -> str:
+    """The parameter that a fit has moved furthest from a healthy unit."""
+    sd, name = max((abs(float(x)) / f.prior, f.name) for f, x in zip(h.fit.free, h.fit.x, strict=True))
+    return f"{name} at {sd:.1f} standard deviations"
 
 
 def _format(by_signal: BySignal, name: str, signals: Signals) -> str:
