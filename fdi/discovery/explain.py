@@ -23,6 +23,7 @@ the thresholds.
 | rivals | the best one leaves only noise | begins the others that do so too, and effects whose signature has a cosine of {LOOKS_ALIKE:g} with its own, from its tolerances |
 | small gain, again | the same | drops such an effect |
 | solver | half the step changes more than {SOLVER_ERROR_SHARE:g} floors | finishes again with 50 steps a cycle |
+| tolerances | the best leaves only noise, with far tolerances | takes these back in eighths, with each of four effects in their place; keeps those that end near |
 | intervals, again | the squares of the sizes of one of several effects are below {GAIN_CONVINCES:g} variances | leaves it out, if the others leave only noise; one without such an interval not where they then have far tolerances |
 | whole recording | only an excerpt was fitted | judges on all rows |
 | left-out rows | the replay has an observer | judges on all rows that hang on no stop, as on a held-out run |

@@ -173,8 +173,10 @@ def scale_to(free: Sequence[Free], x: Floats, said: Mapping[str, float], name: s
     origin = ORIGINS.get(name, 0.0)
     if k is None or name not in said:
         return None
-    ratio = (value - origin) / (free[k].centre + free[k].scale * float(x[k]) - origin)
-    return scale_together(free, x, said, math.log(ratio) / said[name]) if ratio > 0.0 else None
+    now = free[k].centre + free[k].scale * float(x[k]) - origin
+    if (value - origin) * now <= 0.0:  # no factor leads from zero, or past it
+        return None
+    return scale_together(free, x, said, math.log((value - origin) / now) / said[name])
 
 
 def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[list[Direction], Floats]:
