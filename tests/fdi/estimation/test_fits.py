@@ -50,6 +50,7 @@ from fdi.estimation.unidentifiable import (
     VISCOSITY,
     find_tangents,
     finish_fit,
+    scale_to,
 )
 from fdi.trace.trace import Floats, Trace, rms
 from plant import Model, load_model, simulate
@@ -409,3 +410,11 @@ def test_a_rest_hangs_on_stops_and_a_reversal_does_not() -> None:
     x[500:520] = np.nan
     rest = find_rest_rows(x, 1e-3, 1e-6)
     assert rest[:1150].all() and not rest[1300:2490].any() and rest[2550:].all()  # and until a replay has forgotten it
+
+
+@pytest.mark.parametrize(("x", "moved"), [(2.0, 4.0), (0.0, None), (-2.0, None)])
+def test_no_factor_leads_from_zero_or_past_it(x: float, moved: float | None) -> None:
+    """`rig explain` ended with a division by zero where a size that trades with others was fitted to 0."""
+    free = [Free("jack.leakage", 0.0, 1.0, np.inf, -10.0, 10.0, 0.1)]
+    found = scale_to(free, np.array([x]), {"jack.leakage": 1.0}, "jack.leakage", 4.0)
+    assert (found is None) is (moved is None) and (found is None or found[0] == pytest.approx(moved))
