@@ -284,7 +284,7 @@ def test_a_small_gain_must_show_on_the_held_out_run(costs: tuple[float, ...], un
 @pytest.mark.parametrize(("costs", "verdict"), [
     ((), "UNEXPLAINED"), ((980.0,), "EXPLAINED"), ((980.0, 990.0), "AMBIGUOUS"), ((980.0, 995.0), "EXPLAINED")])
 def test_an_effect_that_spares_the_unit_far_tolerances_is_named(costs: tuple[float, ...], verdict: str) -> None:
-    """A joint that had softened by half was NOTHING_MISSING, with its stiffness at -4.5 standard deviations."""
+    """A joint that had softened by 45 % was NOTHING_MISSING, with its stiffness at -4.5 standard deviations."""
     base = make_judged((), 1000.0, at_floor=True, is_far=True)
     close = [make_judged((name,), cost) for name, cost in zip(("soft_spline", "backlash"), costs, strict=False)]
     unseen = [900.0] * (1 + len(close))
