@@ -49,7 +49,9 @@ from fdi.estimation.unidentifiable import (
     list_powers,
     scale_to,
     scale_together,
+    start_fit,
     take_curved_step,
+    take_steps,
 )
 from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import (
@@ -249,15 +251,16 @@ class Search:
         begun = linearise(problem, free, x)
         prospects = scan_effects(problem, [begun], self.list_further_effects(start.effects), self.workers)
 
+        def linearise_here(now: Fit) -> Fit:
+            return linearise(problem, now.free, now.x)
+
         def fit_in_place(p: Prospect) -> Hypothesis:
-            values = begun.values
-            before = np.array([(values.get(f.name, f.centre) - f.centre) / f.scale for f in p.free])
+            before = np.array([(begun.values.get(f.name, f.centre) - f.centre) / f.scale for f in p.free])
             at = p.x
             for share in TAKEN_BACK:
                 ahead = np.clip(2.0 * at - before, *scaled_bounds(p.free))
-                fit = take_curved_step(problem, linearise(problem, hold(p.free, share), ahead))
-                fit = take_curved_step(problem, linearise(problem, fit.free, fit.x))
-                before, at = at, fit.x
+                fit = start_fit(hold(p.free, share), ahead)
+                before, at = at, take_steps(problem, fit, linearise_here, 2, NO_STAGE, take_curved_step).x
             free = [own.get(f.name, f) if np.isfinite(f.prior) else f for f in p.free]
             there = linearise(problem, free, at)
             if there.cost < start.cost + GAIN_DOUBTFUL:

@@ -22,6 +22,7 @@ from fdi.estimation.fit import (
     Fit,
     Free,
     Problem,
+    compute_misfit,
     compute_weights,
     cut_at_bounds,
     find_best_trial,
@@ -447,20 +448,20 @@ def take_curved_step(problem: Problem, fit: Fit) -> Fit:
     Where an effect does what a tolerance does the valley is narrow and bends: a straight step along it soon climbs a
     wall. What that adds to the residuals further steps with the same Jacobian take away (chord steps).
     """
-    free, prior = fit.free, weigh_priors(fit.free)
+    prior = weigh_priors(fit.free)
     gradient, hessian = form_normal_equations(fit)
     heavy = (fit.jacobian * compute_weights(fit.white)).reshape(len(fit.x), -1)
-    ends, gradients = [fit] * len(DAMPINGS), [gradient] * len(DAMPINGS)
-    best = fit
+    ends, gradients = [fit.x] * len(DAMPINGS), [gradient] * len(DAMPINGS)
+    best, least = fit.x, fit.cost
     for _ in range(3):
-        x = np.array([step_within_bounds(end, hessian, g, (damping,))[0]
+        x = np.array([step_within_bounds(replace(fit, x=end), hessian, g, (damping,))[0]
                       for end, g, damping in zip(ends, gradients, DAMPINGS, strict=True)])
-        white = problem.compute_white_residuals(free, x)
-        gradients = [heavy @ left.reshape(-1) + prior * at for left, at in zip(white, x, strict=True)]
-        ends = [replace(fit, x=at) for at in x]
-        found = find_best_trial(problem, fit, x)
-        best = found if found.cost < best.cost else best
-    return best
+        white = problem.compute_white_residuals(fit.free, x)
+        costs = compute_misfit(white) + x**2 @ prior
+        if costs.min() < least:
+            best, least = x[int(np.argmin(costs))], float(costs.min())
+        ends, gradients = list(x), [heavy @ left.reshape(-1) + prior * at for left, at in zip(white, x, strict=True)]
+    return replay_fit(problem, fit, best) if least < fit.cost else fit
 
 
 def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | None = None,

@@ -171,7 +171,7 @@ def describe_verdict(a: Answer) -> str:
     if a.verdict == "EXPLAINED":
         return f"{words} {'together ' if len(named) > 1 else ''}{verb} the residual: {rest}"
     if a.best.is_at_floor and a.best.is_far:
-        return (f"{words} {verb} the residual {FAR_OFF}: {rest} Something else may be missing instead.")
+        return f"{words} {verb} the residual {FAR_OFF}: {rest} Something else may be missing instead."
     return f"{words} {verb} part of the residual: {rest} Something else is missing too."
 
 
