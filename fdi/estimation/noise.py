@@ -74,7 +74,7 @@ def floor_from_repeats(residual: Floats, repeats: Sequence[Floats], period: floa
     n = min(len(residual), *(len(r) for r in repeats))
     runs = [residual[:n], *(r[:n] for r in repeats)]
     pairs = [(a - b) / np.sqrt(2.0) for a, b in combinations(runs, 2)]
-    difference = float(np.sqrt(np.nanmean(np.concatenate(pairs) ** 2)))
+    difference = rms(np.concatenate(pairs))
     lines = find_hum_lines(runs, period)
     steady = [_remove_lines(r, lines, period) for r in runs]
     level, share, freedom = measure_quiet_level([(a - b) / np.sqrt(2.0) for a, b in combinations(steady, 2)])

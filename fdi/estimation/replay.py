@@ -45,7 +45,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.sensor_dynamics import find_comb
 from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, fill_gaps, hold_last, hold_next, rms
-from plant.errors import InputError
+from plant.errors import InputError, require
 from plant.lanes import Lanes
 from plant.model import Model
 from plant.plants import MODULES
@@ -806,19 +806,20 @@ def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_shar
         same_share: share of the rows in which both commands must be the same.
 
     Raises:
-        InputError: another command, other cycles, or no signal in common.
+        InputError: another command, other cycles, no signal in common, or the same samples.
     """
     source = f"--repeat {trace.provenance.get('source', number)}"
     outputs = [name for name in first.outputs if name in trace.signals]
-    if not outputs:
-        raise InputError(source, ", ".join(first.outputs), "a signal that the trace has too")
+    require(outputs, source, ", ".join(first.outputs), "a signal that the trace has too")
     ways = [way for way in read_cycles(trace, model, outputs, source) if way.period == first.period]
-    if not ways:
-        raise InputError(source, "t", f"rows as in the trace it repeats; they are {1e3 * trace.period:g} ms apart")
+    require(ways, source, "t", f"rows as in the trace it repeats; they are {1e3 * trace.period:g} ms apart")
     repeat = ways[0]
     for late in (0, _find_first_move(first) - _find_first_move(repeat)):
         if _measure_agreement(first, repeat, late) >= same_share:
-            return _align_repeat(repeat, late, len(first))
+            repeat = _align_repeat(repeat, late, len(first))
+            require(any(np.nansum(np.abs(repeat.column(name) - first.column(name))) > 0.0 for name in outputs),
+                    source, "", "the same command run again; every sample of this one is that of the trace itself")
+            return repeat
     raise InputError(source, first.declared.command.name,
                      "the command of the trace it repeats; another command is no repeat")
 

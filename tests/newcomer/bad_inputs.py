@@ -215,6 +215,7 @@ BAD_INPUTS = [
     bad("diff run.csv", "B", "required"),
     bad("diff run.csv absent.csv", "absent.csv", "does not exist"),
     bad("compare run.csv --repeat other.csv", "other.csv", "com"),
+    bad("compare run.csv --repeat run.csv", "--repeat run.csv", "the same command run again"),
     bad("explain run.csv --repeat run.csv", "--repeat", "run.csv", "the same command run again"),
     bad("explain run.csv --repeat other.csv", "another command is no repeat"),
     bad("explain run.csv --holdout run.csv", "--holdout", "run.csv", "a run that no fit has seen"),
