@@ -60,6 +60,11 @@ class Fault:
         return re.sub(r"\W+", "_", self.symbol or self.name).strip("_").lower()
 
     @property
+    def bracketed_unit(self) -> str:
+        """What stands behind a name in the head of a column or at an axis: a space and the unit, or nothing."""
+        return "" if self.unit == "1" else f" [{self.unit}]"
+
+    @property
     def falls(self) -> bool:
         """Whether the size of the fault is smaller than that of a healthy unit."""
         return self.acceptable > self.maintenance

@@ -603,14 +603,11 @@ def _choose_outputs(trace: Trace, outputs: Sequence[str] | None, source: object)
         if name not in trace.signals:
             words = f"{declared.drive.symbol}, {declared.command.symbol} and {declared.controlled.symbol}"
             raise InputError(source, name, f"a measured column: a replay starts from {words}")
-    if len(trace) < FEWEST_ROWS:
-        raise InputError(source, "t", f"at least {FEWEST_ROWS} rows, not {len(trace)}")
+    require(len(trace) >= FEWEST_ROWS, source, "t", f"at least {FEWEST_ROWS} rows, not {len(trace)}")
     measured = [name for name in trace.output_names if name in trace.signals]
     for name in outputs or ():
-        if name not in trace.output_names:
-            raise InputError("--signals", name, f"some of {','.join(trace.output_names)}")
-        if name not in measured:
-            raise InputError(source, name, f"a measured signal; this trace has {', '.join(measured)}")
+        require(name in trace.output_names, "--signals", name, f"some of {','.join(trace.output_names)}")
+        require(name in measured, source, name, f"a measured signal; this trace has {', '.join(measured)}")
     return tuple(name for name in measured if not outputs or name in outputs)
 
 
@@ -814,14 +811,14 @@ def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_shar
     ways = [way for way in read_cycles(trace, model, outputs, source) if way.period == first.period]
     require(ways, source, "t", f"rows as in the trace it repeats; they are {1e3 * trace.period:g} ms apart")
     repeat = ways[0]
-    for late in (0, _find_first_move(first) - _find_first_move(repeat)):
-        if _measure_agreement(first, repeat, late) >= same_share:
-            repeat = _align_repeat(repeat, late, len(first))
-            require(any(np.nansum(np.abs(repeat.column(name) - first.column(name))) > 0.0 for name in outputs),
-                    source, "", "the same command run again; every sample of this one is that of the trace itself")
-            return repeat
-    raise InputError(source, first.declared.command.name,
-                     "the command of the trace it repeats; another command is no repeat")
+    fitting = [late for late in (0, _find_first_move(first) - _find_first_move(repeat))
+               if _measure_agreement(first, repeat, late) >= same_share]
+    require(fitting, source, first.declared.command.name,
+            "the command of the trace it repeats; another command is no repeat")
+    aligned = _align_repeat(repeat, fitting[0], len(first))
+    require(any(np.nansum(np.abs(aligned.column(name) - first.column(name))) > 0.0 for name in outputs), source, "",
+            "the same command run again; every sample of this one is that of the trace itself")
+    return aligned
 
 
 def _find_first_move(trace: Trace) -> int:

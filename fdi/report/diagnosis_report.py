@@ -665,7 +665,7 @@ def _draw_sizes_of_fault(fault: Fault, fit: Estimate, found: Sequence[tuple[str,
     return [*shades, call("errorbar", fit.value, 0, xerr=interval, color=INK, capsize=3, marker="o", ms=6),
             *(dot(size, row, INK, marker="D", ms=4) for row, (_, size) in enumerate(found, 1)),
             *name_rows(["refined", *(label for label, _ in found)]),
-            axes(xlim=(limits[0], limits[-1]), xlabel=fault.symbol + (f" [{fault.unit}]" if fault.unit != "1" else ""))]
+            axes(xlim=(limits[0], limits[-1]), xlabel=fault.symbol + fault.bracketed_unit)]
 
 
 def _place_size(fault: Fault, departure: float, way: float) -> float:

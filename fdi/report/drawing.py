@@ -214,7 +214,7 @@ def draw_residuals(salt: str, trace: Trace, models: Sequence[tuple[str, str, Flo
         unit, scale = choose_drawn_unit(signal, rms(models[0][2][i]))
         half = scale * max(8.0 * floor[name], 1.2 * float(np.nanmax(np.abs(models[-1][2][i]))))
         panels.append([*(line(trace.t, -misfit[i] * scale, colour, label, 0.9) for label, colour, misfit in models),
-                       *levels(NOISE_BAND_RATIO * floor[name] * scale, GREEN, "two noise floors", 0.8, ":"),
+                       *levels(NOISE_BAND_RATIO * floor[name] * scale, GREEN, "two noise floors", 1.4, ":"),
                        axes(ylabel=f"{signal.symbol} [{unit}]", **{"ylim": (-half, half)} if is_cut else {}),
                        *([legend(3)] if i == 0 else [])])
     return draw_over_time(salt, trace, panels, [0.8] + [1.3] * len(trace.outputs),

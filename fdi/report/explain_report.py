@@ -300,9 +300,11 @@ def _tabulate_candidates(a: Answer, most: int = 8) -> Table:
               Cell(", ".join(describe_parameter(name, v) for name, v in c.parameters.items()), "muted")]
              for c in a.explanations for mood in [WORD_MOODS.get(c.word, "muted")]]
     return Table(columns, rows, (
-        "Signals: repeatable part of the error over its noise floor (1: noise alone). Held-out run: error of the worst "
-        "signal over its noise floor (on the page: that of each signal). Evidence: gain in log likelihood minus a "
-        "penalty for parameters and candidates. p: probability of such a gain where nothing is missing."),
+        "Signals: repeatable part of the error over its noise floor (1: noise alone). "
+        + ("Held-out run: error of the worst signal over its noise floor (on the page: that of each signal). "
+           if has_holdout else "")
+        + "Evidence: gain in log likelihood minus a penalty for parameters and candidates. p: probability of such a "
+          "gain where nothing is missing."),
         terminal_rows=most + 1)
 
 
@@ -451,9 +453,9 @@ def draw_pattern(p: Pattern, t: Floats) -> str:
         amplitude, length, phase = p.wave
         x = np.linspace(0.0, length, 100)
         over += [line(scale * x, amplitude * np.sin(2.0 * np.pi * x / length + phase), AFTER, ls="--"),
-                 axes(xlabel=f"{state} within a period of {scale * length:.4g} {unit}; dashed: a wave")]
+                 axes(xlabel=f"{state} [{unit}], folded on {scale * length:.4g} {unit}; dashed: a wave")]
     n = min(len(t), len(p.trace))
-    along = [line(t[:n], p.trace[:n], ORANGE, width=0.8), axes(xlabel="time [s]")]
+    along = [line(t[:n], p.trace[:n], ORANGE, width=0.8), over[0], axes(xlabel="time [s]")]
     return draw_panels("shape", [[over, along]], 3.0, width_ratios=[1.0, 1.6])
 
 

@@ -336,9 +336,8 @@ def format_requirement(low: float, high: float) -> str:
 
 
 def _tabulate_detections(fault: Fault, points: Sequence[Mapping[str, Any]]) -> Table:
-    unit = f" [{fault.unit}]" if fault.unit != "1" else ""
-    columns = _number_columns(f"{fault.name}{unit}", "detected", "share", "95 % interval", "non-nominal", "ruling",
-                              "by bands")
+    columns = _number_columns(f"{fault.name}{fault.bracketed_unit}", "detected", "share", "95 % interval",
+                              "non-nominal", "ruling", "by bands")
     rows = [[f"{point['size']:g}", *show_share(point["detected"]),
              *(show_share(point[key])[1] for key in ("most", "ruling", "bands"))]
             for point in points if len(points) > 1]
@@ -367,7 +366,7 @@ def _tabulate_errors(errors: Sequence[Mapping[str, Any]], faults: Sequence[Fault
 
 def _tabulate_traces(traces: Sequence[Mapping[str, Any]], faults: Sequence[Fault]) -> list[Item]:
     columns = [Column("trace"), *(Column(fault.name) for fault in faults), Column("ruling"),
-               *(Column(fault.symbol, align="right") for fault in faults)]
+               *(Column(f"{fault.symbol}{fault.bracketed_unit}", align="right") for fault in faults)]
     rows = [[trace["label"], *(trace[f"level_{fault.name}"] or trace["status"] for fault in faults),
              trace["ruling"] or NO_NUMBER,
              *(format_digits(math.nan if trace[fault.key] is None else trace[fault.key]) for fault in faults)]
@@ -414,5 +413,4 @@ def _draw_fault(fault: Fault, points: Sequence[Mapping[str, Any]]) -> list[Mark]
     for size, word in zip(limits, ("MidBand", "MaxBand"), strict=True):
         panel += [instant(size, COMMAND, None, 0.9, "--"),
                   call("text", size, 50, f" {word}", color=INK, fontsize=8, rotation=90, va="center", ha="right")]
-    unit = f" [{fault.unit}]" if fault.unit != "1" else ""
-    return [*panel, axes(xlabel=f"{fault.name}, {fault.symbol}{unit}")]
+    return [*panel, axes(xlabel=f"{fault.name}, {fault.symbol}{fault.bracketed_unit}")]

@@ -12,7 +12,7 @@ from plant.effects import Effect
 from plant.model import find_effect, load_model
 from plant.plants import find_plant, load_plant
 from plant.selftest import Report as SelfTest, check_effect
-from rig.cli.answer import Places, give_answer
+from rig.cli.answer import Places, give_answer, show_progress
 from rig.cli.inputs import load_user_effects
 
 CONVENIENT = {"m": (1e6, "um"), "Pa": (1e-5, "bar")}  # units of a table
@@ -27,7 +27,8 @@ def run_command(args: argparse.Namespace) -> int:
     chosen = [find_effect(args.name, plant)] if args.name else find_plant(plant).list_effects()
     own = {file.absolute() for file in args.effects}
     tested = chosen if args.test or (args.name and chosen[0].file in own) else []
-    tests = {e.name: test_effect(e, plant) for e in tested}
+    with show_progress(args, "testing"):
+        tests = {e.name: test_effect(e, plant) for e in tested}
     report = build_effects_report(chosen, plant, tests, is_detailed=bool(args.name))
     status = int(any(test.faults for test in tests.values()))
     return give_answer(report, args, status, Places(answer=Path(args.out) if args.out else None))

@@ -6,7 +6,7 @@ from pathlib import Path
 from fdi.output import require_new, require_writable
 from fdi.report.report import Report
 from plant.errors import require
-from rig.cli.answer import give_answer
+from rig.cli.answer import give_answer, show_progress
 from rig.cli.inputs import load_chosen_model
 from rig.recorder.convert import export_trace
 
@@ -34,7 +34,8 @@ def write_fmu(args: argparse.Namespace) -> int:
     from rig.fmi.export import export_fmu  # here: it loads numba
 
     model = load_chosen_model(args)
-    platforms = export_fmu(model, out, args.fmi, args.seed)
+    with show_progress(args, "compiling"):
+        platforms = export_fmu(model, out, args.fmi, args.seed)
     sentence = f"{out}: {model.name} as FMI {args.fmi}.0 co-simulation for {', '.join(platforms)}"
     data = {"path": str(out), "count": 1, "fmi": args.fmi, "platforms": platforms}
     return give_answer(Report("export", str(out), sentence=sentence, data=data), args)

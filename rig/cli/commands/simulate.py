@@ -14,7 +14,7 @@ from plant.errors import require
 from plant.plant_check import find_divergence
 from plant.plants import Plant
 from plant.segments import Points, build_profile
-from rig.cli.answer import give_answer
+from rig.cli.answer import give_answer, show_progress
 from rig.cli.inputs import load_chosen_model
 from rig.sequences.sequence import load_nominal_test
 
@@ -36,7 +36,8 @@ def run_command(args: argparse.Namespace) -> int:
     out = Path(args.out or "simulation.csv")
     require(out.name.endswith((".csv", ".csv.gz", ".mcap")), "--out", str(out), "a file .csv, .csv.gz or .mcap")
     require_new(require_writable(out, "--out", source=args.command_file), is_forced=args.force)
-    columns = simulate(model, com, load, args.seed, args.steps)._asdict()
+    with show_progress(args, "simulating"):
+        columns = simulate(model, com, load, args.seed, args.steps)._asdict()
     require(not (diverged := find_divergence(model, columns)), args.model or "--set", "",
             f"a plant that stays finite; {diverged} (rig simulate --steps takes shorter steps)")
     trace = Trace.from_columns(columns, period, {"model": model.name, "seed": str(args.seed), "command": name,
