@@ -211,7 +211,8 @@ def test_a_folder_of_traces_is_judged_and_a_changed_trace_is_another_campaign(tm
     words = ("campaign", tmp_path, "--out", tmp_path / "out", *MATRIX[-2:], "--json", "--jobs", 1)
     said, found = rig(*words), rows(tmp_path / "out")
     assert (said.status, said.json["status"]) == (0, {"ok": 2, "refused": 1})
-    assert "FSS [N]" in rig("campaign", tmp_path / "out", "--summary").out and [row["label"] for row in found] == ["a.csv.gz", "b.csv", "c.csv"]
+    assert ("FSS [N]" in rig("campaign", tmp_path / "out", "--summary").out
+            and [row["label"] for row in found] == ["a.csv.gz", "b.csv", "c.csv"])
     assert found[2]["reason"].startswith(str(tmp_path / "c.csv"))
     Trace.from_columns(columns, 2e-3, {}).write_csv(tmp_path / "b.csv")
     assert "it differs in files" in refuse(*words)
