@@ -33,7 +33,7 @@ from plant.run import sample_noise
 from plant.solve import run_closed_loop
 from rig.benches.bench import Role
 from rig.benches.bench_file import load_bench
-from rig.firmware.build import build_device
+from rig.firmware.build import build_device, build_program
 from rig.interrupts import end_with
 from rig.network.bus import Link, LinkWire, can_open, open_can
 from rig.network.frame import WallClock
@@ -153,26 +153,19 @@ def describe_conditions(figures: Mapping[str, Any]) -> Line:
 Peer = subprocess.Popen[bytes]  # a node opposite the cycle
 
 
-def build_responder(folder: Path) -> Path:
-    """The responder in C, compiled into `folder`."""
-    out = folder / "responder"
-    source = str(files(__package__) / "responder.c")
-    subprocess.run([find_gcc(), "-O2", "-Wall", "-Wextra", "-Werror", "-o", str(out), source], check=True)
-    return out
-
-
 @contextlib.contextmanager
 def run_c_responder(bus: str) -> Iterator[None]:
     """Run the responder in C on a bus while the context lasts, on the CPU and with the priority of the emulator."""
     frames = load_bench().frames
-    with tempfile.TemporaryDirectory() as folder, RawBus(bus, [frames.sync or 0]) as raw:
+    responder = build_program("responder", [Path(__file__).with_name("responder.c")], ("-O2", "-Wall", "-Wextra"))
+    with RawBus(bus, [frames.sync or 0]) as raw:
         receive, send, turn, place = raw.descriptors
         feedback, valve = (_pack(bus, frames.find_role(role).identifier) for role in ("feedback", "valve_state"))
         number = next(each for each in frames.find_role("valve_state").fields if each.name == "cycle")
         cycle_at = valve.index(_PAYLOAD) + number.lowest // 8
         cpu = list_cpus()[-min(2, len(list_cpus()))]
         numbers = (receive, send, turn, place, cpu, LOOP_PRIORITY, cycle_at)
-        words = [str(build_responder(Path(folder))), *map(str, numbers), feedback.hex(), valve.hex()]
+        words = [str(responder), *map(str, numbers), feedback.hex(), valve.hex()]
         with _run_process(words, *(file for file in (receive, send, turn) if file >= 0)) as process:
             assert process.stdout is not None
             process.stdout.readline()

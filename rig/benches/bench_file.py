@@ -18,7 +18,7 @@ from plant.errors import InputError, require
 from plant.model import find_plant_of_model, find_quantity
 from plant.plants import Plant, find_plant, is_known, is_loaded, load_plant
 from plant.quantity import Quantity
-from plant.signals import Signal, Signals
+from plant.signals import Signals
 from plant.tables import Place, build_dataclass, decode_text, list_choices, parse_table, read_file
 from plant.units import parse_quantity
 from rig.benches import canopen_map
@@ -44,6 +44,7 @@ from rig.benches.calibration import read_calibration
 from rig.benches.can_map import map_messages, read_database
 from rig.benches.checksums import CHECKSUMS, load_checksum
 from rig.benches.layout import PHASES, DeviceFrame, Use, build_fields, compute_counts, list_phases
+from rig.templates import fill_template
 
 ReadFile = Callable[[str], bytes]
 Byte = Annotated[int, Quantity("1", low=0, high=255)]
@@ -553,7 +554,6 @@ def _check_identifiers(bench: Bench, place: Place) -> None:
 
 
 _PLANT_BENCH, _PLANT_DBC = "plant_bench.toml", "plant_bench.dbc"
-_FIRST_IDENTIFIER, _DRIVE_IDENTIFIER = 0x101, 0x201
 
 
 def make_plant_bench(plant: Plant, model: str) -> Bench:
@@ -568,35 +568,13 @@ def make_plant_bench(plant: Plant, model: str) -> Bench:
     """
     name, cycle = Path(model).name, f"{1e6 * plant.nominal['controller.period']:.12g} us"
     _read_time(cycle, Place(name).at("controller", "period"), *_CYCLES)
-    return load_bench_from_files({_PLANT_BENCH: _write_plant_bench(plant, name, cycle).encode(),
-                                  _PLANT_DBC: _write_plant_dbc(plant).encode()}, plant.signals)
+    given = {"title": plant.title, "model": name, "cycle": cycle, "dbc": _PLANT_DBC, "drive": plant.signals.drive,
+             "sent": (plant.signals.command, *plant.signals.outputs)}
+    return load_bench_from_files({_PLANT_BENCH: fill_template("benches/plant_bench.jinja", **given).encode(),
+                                  _PLANT_DBC: fill_template("benches/plant_dbc.jinja", **given).encode()},
+                                 plant.signals)
 
 
 def is_plant_bench(bench: Bench) -> bool:
     """Whether the plant's own controller can be the controller of this bench."""
     return next(iter(bench.files), "") == _PLANT_BENCH
-
-
-def _write_plant_bench(plant: Plant, model: str, cycle: str) -> str:
-    sent = [f"{s.word} = {_write_plant_place(s)}" for s in (plant.signals.command, *plant.signals.outputs)]
-    return "\n".join([f'name = "{plant.title}, with its own controller"', f"plant = {model!r}",
-                      f'cycle = "{cycle}"', "",
-                      "[controller]", 'protocol = "can"', f'dbc = "{_PLANT_DBC}"', "", "[controller.inputs]", *sent, "",
-                      "[controller.outputs]",
-                      f"{plant.signals.drive.word} = {_write_plant_place(plant.signals.drive)}", ""])
-
-
-def _write_plant_place(signal: Signal) -> str:
-    count = "" if signal.unit == "1" else f', count = "1 {signal.unit}"'
-    return f'{{ signal = "{signal.word}.{signal.word}"{count} }}'
-
-
-def _write_plant_dbc(plant: Plant) -> str:
-    given = (plant.signals.command, *plant.signals.outputs)
-    frames = [*enumerate(given, _FIRST_IDENTIFIER), (_DRIVE_IDENTIFIER, plant.signals.drive)]
-    lines = ['VERSION ""', "NS_ :", "BS_:", "BU_: Rig Controller", ""]
-    for identifier, signal in frames:
-        sender, receiver = ("Rig", "Controller") if signal in given else ("Controller", "Rig")
-        lines += [f"BO_ {identifier} {signal.word}: 8 {sender}",
-                  f' SG_ {signal.word} : 0|64@1- (1,0) [0|0] "{signal.unit}" {receiver}', ""]
-    return "\n".join([*lines, *(f"SIG_VALTYPE_ {identifier} {signal.word} : 2;" for identifier, signal in frames), ""])

@@ -46,7 +46,7 @@ def run_suite(args: argparse.Namespace) -> int:
     processes = choose_processes(args, base, len(tried.cases))
     name = Path(args.sequence[0]).stem if len(args.sequence) == 1 else "suite"
     folder = Path(args.out) if args.out else make_new_folder(Path("runs"), name)  # not before all has been tried
-    suite = tried.put_into(folder)
+    suite = tried._replace(cases=[case._replace(folder=folder / case.folder) for case in tried.cases])
     for path in (folder, *(case.folder for case in suite.cases)):
         make_folder(path)
     junit = choose_file(args.junit, (".xml",), None, "--junit")

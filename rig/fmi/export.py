@@ -12,11 +12,10 @@ import shutil
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from uuid import UUID
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from plant.model import Model, build_kernel, find_quantity
 from plant.run import report_law_errors, rest_controller
 from rig.firmware.build import compile_c, find_compiler
 from rig.fmi.unit_cycle import INPUTS, advance_unit
+from rig.templates import fill_template
 
 FOLDER = Path(__file__).parent
 _FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-s", "-w")
@@ -92,8 +92,10 @@ def export_fmu(model: Model, out: Path, version: str = "2", seed: int = 0) -> li
     files = {f"binaries/{machine.name if version == '3' else machine.old_name}/{identifier}{machine.suffix}": library
              for machine, library in _build_libraries(model, run, tables, sources).items()}
     platforms = [name.split("/")[1] for name in files]
-    describe = {"2": _describe_fmi2, "3": _describe_fmi3}[version]
-    files |= {"modelDescription.xml": describe(model, variables, identifier, token, seed).encode(),
+    units = {v.unit: find_exponents(v.unit) for v in variables}
+    files |= {"modelDescription.xml": fill_template(f"fmi/fmi{version}.xml", model=model, variables=variables,
+                                                    identifier=identifier, token=token, seed=seed, units=units,
+                                                    largest=_LARGEST).encode(),
               "resources/model.toml": model.to_toml().encode()}
     with write_whole(out) as unfinished, zipfile.ZipFile(unfinished, "w") as archive:
         for name in sorted(files):
@@ -242,78 +244,3 @@ def find_exponents(unit: str) -> dict[str, int] | None:
             for base, exponent in (parts or {}).items():
                 total[base] += sign * exponent * int(word[len(name):] or 1)
     return {base: exponent for base, exponent in total.items() if exponent}
-
-
-def _tag(name: str, attributes: dict[str, object], inner: Iterable[str] = ()) -> str:
-    words = "".join(f" {key}={quoteattr(str(value))}" for key, value in attributes.items())
-    content = list(inner)
-    return f"<{name}{words}>\n{''.join(content)}</{name}>\n" if content else f"<{name}{words}/>\n"
-
-
-def _write_units(variables: Sequence[Variable]) -> str:
-    units = {v.unit: find_exponents(v.unit) for v in variables}
-    return _tag("UnitDefinitions", {}, (
-        _tag("Unit", {"name": name}, [] if base is None else [_tag("BaseUnit", dict(base))])
-        for name, base in units.items()))
-
-
-_OTHERS = (("seed", "seed of the sensors' noise"),
-           ("closed_loop", "true: the controller of the model closes the loop; false: the input drives the plant"))
-_CAUSALITY = {"TIME": ("independent", "continuous"), "INPUT": ("input", "continuous"),
-              "OUTPUT": ("output", "discrete"), "FIXED": ("parameter", "fixed"), "TUNABLE": ("parameter", "tunable")}
-
-
-def _list_attributes(v: Variable) -> tuple[dict[str, object], dict[str, object]]:
-    """What both versions say of a variable: of itself, and of its number."""
-    causality, variability = _CAUSALITY[v.role]
-    itself: dict[str, object] = {"description": v.description, "causality": causality, "variability": variability}
-    limits = (("min", float(v.low), v.low > -_LARGEST), ("max", float(v.high), v.high < _LARGEST),
-              ("start", v.start, v.role in ("INPUT", "FIXED", "TUNABLE")))
-    return itself, {"unit": v.unit, **{name: repr(value) for name, value, is_given in limits if is_given}}
-
-
-def _describe(version: str, model: Model, token: dict[str, object], parts: Iterable[str]) -> str:
-    about = {"fmiVersion": version, "modelName": model.name, **token,
-             "description": f"{model!r}"[1:-1], "generationTool": "eha-rig", "variableNamingConvention": "structured"}
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + _tag("fmiModelDescription", about, parts)
-
-
-def _list_common(model: Model, variables: Sequence[Variable]) -> list[str]:
-    period = model["controller.period"]
-    return [_write_units(variables), _tag("LogCategories", {}, [_tag("Category", {"name": "logStatusError"})]),
-            _tag("DefaultExperiment", {"startTime": 0.0, "stopTime": 1000 * period, "stepSize": period})]
-
-
-def _describe_fmi2(model: Model, variables: Sequence[Variable], identifier: str, token: str, seed: int) -> str:
-    scalars = [
-        *(_tag("ScalarVariable", {"name": v.name, "valueReference": i, **itself}, [_tag("Real", number)])
-          for i, v in enumerate(variables) for itself, number in [_list_attributes(v)]),
-        *(_tag("ScalarVariable", {"name": name, "valueReference": i, "description": text, "causality": "parameter",
-                                  "variability": "fixed"}, [_tag(kind, {"start": start})])
-          for i, ((name, text), kind, start) in enumerate(zip(
-              _OTHERS, ("Integer", "Boolean"), (seed, "false"), strict=True), len(variables)))]
-    unknowns = [_tag("Unknown", {"index": i}) for i, v in enumerate(variables, 1) if v.role == "OUTPUT"]
-    return _describe("2.0", model, {"guid": token}, [
-        _tag("CoSimulation", {"modelIdentifier": identifier, "canHandleVariableCommunicationStepSize": "false",
-                              "canNotUseMemoryManagementFunctions": "true", "canGetAndSetFMUstate": "true",
-                              "canSerializeFMUstate": "true"}),
-        *_list_common(model, variables), _tag("ModelVariables", {}, scalars),
-        _tag("ModelStructure", {}, [_tag("Outputs", {}, unknowns), _tag("InitialUnknowns", {}, unknowns)])])
-
-
-def _describe_fmi3(model: Model, variables: Sequence[Variable], identifier: str, token: str, seed: int) -> str:
-    scalars = [
-        *(_tag("Float64", {"name": v.name, "valueReference": i, **itself, **number})
-          for i, v in enumerate(variables) for itself, number in [_list_attributes(v)]),
-        *(_tag(kind, {"name": name, "valueReference": i, "description": text, "causality": "parameter",
-                      "variability": "fixed", "start": start})
-          for i, ((name, text), kind, start) in enumerate(zip(
-              _OTHERS, ("Int32", "Boolean"), (seed, "false"), strict=True), len(variables)))]
-    outputs = [i for i, v in enumerate(variables) if v.role == "OUTPUT"]
-    return _describe("3.0", model, {"instantiationToken": token}, [
-        _tag("CoSimulation", {"modelIdentifier": identifier, "canHandleVariableCommunicationStepSize": "true",
-                              "fixedInternalStepSize": model["controller.period"], "canGetAndSetFMUState": "true",
-                              "canSerializeFMUState": "true"}),
-        *_list_common(model, variables), _tag("ModelVariables", {}, scalars),
-        _tag("ModelStructure", {}, [_tag(name, {"valueReference": i})
-                                    for name in ("Output", "InitialUnknown") for i in outputs])])

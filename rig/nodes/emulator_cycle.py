@@ -89,7 +89,7 @@ COMMANDED = 256  # + the NMT command
 # What faults act on, late frames in the order of their delivery: drives first, which are for the emulator itself; valve
 # states last, because in lockstep they end the rig's wait. Bus-off is on the whole node.
 _DRIVE, FEEDBACK_FRAME, _VALVE, _SYNC, _BUS_OFF = range(5)
-_FRAMES = ("drive", "feedback", "valve_state", "sync")
+_FRAMES = ("drive", "feedback", "valve_state", "sync", "plant")
 _ADDED, _HOLDS_READING, _HOLDS_VALUE = range(3)  # faults of a sensor
 
 DRIVE_MISSING, DRIVE_LATE, CURRENT_ZEROED = map(int, Flags)
@@ -688,8 +688,7 @@ def make_memory(scenario: Scenario, advance: int = 0, read: int = 0, frames: Seq
             kind = _HOLDS_READING if fault.value is None else _HOLDS_VALUE
             signals.append((number, kind if fault.added is None else _ADDED, fault.first, fault.last, len(values)))
             values += [fault.value or 0.0] if fault.added is None else fault.added
-    off = schedule.list_bus_off_cycles("plant")
-    hits = [*map(schedule.list_frame_hits, _FRAMES), np.column_stack((off, np.ones_like(off), np.zeros_like(off)))]
+    hits = list(map(schedule.list_frame_hits, _FRAMES))
     record = model.build_record()
     state = model.build_flat_state()
     words, places = _join_tables(_TABLES_AT, np.int64, parameters, signals, *hits, find_direct_readings(model))

@@ -396,7 +396,7 @@ class Session:
             heard=(self.stage.begun_ns * 1e-9, self.stage.clock.now() * 1e-9),
             deaf=(self._master.wire.stalled_ns - self._stalled_ns) * 1e-9,
             unsound=self.stage.playing.unsound if not job.sequence.disturbs_bus else 0,
-            deaf_cycles=self.faults.list_bus_off_cycles("rig").tolist(), heartbeat_period=HEARTBEAT * 1e-3,
+            deaf_cycles=self.faults.list_frame_hits("rig")[:, 0].tolist(), heartbeat_period=HEARTBEAT * 1e-3,
             bench=job.bench,
             drive_limit=model.values.get(model.kind.signals.drive.limit, np.nan) if start.gains is None
             else start.gains.current_limit,

@@ -366,8 +366,9 @@ class Schedule:
         # from which cycle on, and the value in each; of several faults in a cycle the first counts
         self.parameters: dict[str, list[tuple[int, Array]]] = {}
         self.signals: dict[str, list[SignalChange]] = {}  # in the order in which they act
-        self._frames: dict[str, list[tuple[int, Table]]] = {}  # from which cycle on, and code and argument in each
-        self._nodes: dict[tuple[str, str], list[range]] = {}  # when a node is silent or bus_off
+        # from which cycle on, and code and argument in each; under the name of a node: of all its frames
+        self._frames: dict[str, list[tuple[int, Table]]] = {}
+        self._silent: dict[str, list[range]] = {"rig": [], "plant": []}
         self._foreign: list[tuple[range, Foreign]] = []
         self.resets: list[tuple[int, str]] = []  # cycles before which the controller is reset: "node", "communication"
         self.edges: tuple[Edge, ...] = ()
@@ -407,11 +408,9 @@ class Schedule:
                 self.resets.append((first, fault.reset))
                 return first + 1
             case BusOff() | Silent():
-                self._nodes.setdefault(("silent", fault.node), []).append(range(first, last))
-                if isinstance(fault, BusOff):
-                    self._nodes.setdefault(("bus_off", fault.node), []).append(range(first, last))
-                    for frame in _FRAMES_OF[fault.node]:
-                        self._put(frame, first, np.tile(np.array((DROP, 0)), (cycles, 1)))
+                self._silent[fault.node].append(range(first, last))
+                for frame in (fault.node, *_FRAMES_OF[fault.node]) if isinstance(fault, BusOff) else ():
+                    self._put(frame, first, np.tile(np.array((DROP, 0)), (cycles, 1)))
         return last
 
     def _compute_growth(self, cycles: int, ramp: Second) -> Array:
@@ -445,7 +444,10 @@ class Schedule:
         return value
 
     def find_action(self, name: str, cycle: int) -> Action:
-        """What happens to the frame `name`, a PDO or `sync`, of this cycle. Of several faults the first acts."""
+        """What happens to the frame `name`, a PDO or `sync`, in this cycle; of a node: DROP while it is bus-off.
+
+        Of several faults the first acts.
+        """
         for first, hits in self._frames.get(name, ()):
             if 0 <= cycle - first < len(hits) and hits[cycle - first, 0]:
                 return Action(*hits[cycle - first].tolist())
@@ -476,15 +478,11 @@ class Schedule:
 
     def is_bus_off(self, node: str, cycle: int) -> bool:
         """Whether the node (rig or plant) is bus-off."""
-        return any(cycle in cycles for cycles in self._nodes.get(("bus_off", node), ()))
+        return self.find_action(node, cycle).code == DROP
 
     def is_heartbeat_alive(self, node: str, cycle: int) -> bool:
         """Whether the node (rig or plant) sends its heartbeat."""
-        return not any(cycle in cycles for cycles in self._nodes.get(("silent", node), ()))
-
-    def list_bus_off_cycles(self, node: str) -> Table:
-        """The cycles in which the node (rig or plant) is bus-off, in order."""
-        return np.array(sorted({k for cycles in self._nodes.get(("bus_off", node), ()) for k in cycles}), np.int64)
+        return not any(cycle in cycles for cycles in self._silent[node])
 
     def find_disturbed(self, cycles: int, reach: int = 1) -> NDArray[np.bool_]:
         """Of the first `cycles` those in which a fault acts on a cyclic frame or SYNC, and the `reach` after each.

@@ -7,7 +7,6 @@ test of a plant is the profile that it declares, or the main phase of preflight.
 """
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -52,6 +51,7 @@ from rig.sequences.faults import Fault, Parameter, Plan, find_contradiction
 from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.python_parts import OWN, PythonPart, PythonSegment, Step, load_function, require_function_name
 from rig.sequences.signals import find_tested, name_signals_of
+from rig.templates import fill_template
 
 InCycle = Annotated[float, Quantity("s", above=0.0, high=0.1)]
 
@@ -306,18 +306,8 @@ def write_preflight(kind: Plant) -> str:
     """
     command = build_profile(kind.profile, rate=round(1.0 / kind.nominal["controller.period"])).command
     span = float(np.ptp(np.append(command, 0.0)))
-    name, last = json.dumps(kind.signals.controlled.name), json.dumps(list_section_names(kind.profile)[-1])
-    rests = [f'  {{ name = "error at the end", kind = "max_error", window = {last}, high = {0.2 * span!r} }},'
-             ] if isinstance(kind.profile[-1], Hold) else []
-    return "\n".join([
-        f"title = {json.dumps('Preflight, ' + (kind.title or kind.name))}",
-        'setup = [{ kind = "hold", time = 0.5 }]',
-        'cleanup = [{ kind = "ramp", to = 0.0, time = 0.5 }, { kind = "hold", time = 0.2 }]', "checks = [",
-        f'  {{ name = "following error", kind = "rms_error", high = {MOST_FOLLOWING_ERROR * span!r} }},',
-        *rests,
-        f'  {{ name = "far out", kind = "never_exceeds", signal = {name}, high = {1.5 * span!r} }},',
-        '  { name = "no emergency", kind = "event_never", event = "EMCY" },', "]",
-        f'guards = [{{ name = "runs away", signal = {name}, low = {-3.0 * span!r}, high = {3.0 * span!r} }}]', ""])
+    rest = list_section_names(kind.profile)[-1] if isinstance(kind.profile[-1], Hold) else ""
+    return fill_template("sequences/preflight.jinja", kind=kind, span=span, rest=rest, most_error=MOST_FOLLOWING_ERROR)
 
 
 def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Sequence:

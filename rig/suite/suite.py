@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
 
 from fdi.progress import ignore_progress
@@ -106,10 +106,6 @@ class Suite(NamedTuple):
     requirements: Mapping[str, str]
     source: str = ""  # the suite file
 
-    def put_into(self, folder: Path) -> Self:
-        """The same suite with the folders of its cases in this one."""
-        return self._replace(cases=[case._replace(folder=folder / case.folder) for case in self.cases])
-
 
 def read_suite_file(path: Path, base: JobChoice, *, is_trusted: bool = False) -> tuple[SuiteFile, list[Case]]:
     """The content of a suite file and its cases; `base` has what the command line chooses for all of them.
@@ -161,7 +157,7 @@ def build_suite(title: str, cases: Sequence[Case], requirements: Mapping[str, st
                 is_trusted: bool = False) -> Suite:
     """The suite of these cases; each is tried first: sequence, model, parameters, effects.
 
-    The folders of its cases are names without a place, see `Suite.put_into`.
+    The folders of its cases are names without a place.
 
     Raises:
         InputError: a case that cannot run, or code that a model brings along and that is not trusted.
@@ -233,15 +229,10 @@ class CaseResult(NamedTuple):
         if self.verdict == "PASS" and self.fdi.get("verdict") == "CANNOT_TELL":
             return "rig fdi cannot tell"
         failed = [check.name for check in self.failed]
-        if self.verdict != "FAIL" or (len(failed) < 2 and not self.has_fault):
+        if self.verdict != "FAIL" or (len(failed) < 2 and not has_fault(self.fdi)):
             return self.why
-        reasons = (list_first(failed, 1), describe_finding(self.fdi) if self.has_fault else "")
+        reasons = (list_first(failed, 1), describe_finding(self.fdi) if has_fault(self.fdi) else "")
         return "; ".join(filter(None, reasons))
-
-    @property
-    def has_fault(self) -> bool:
-        """Whether the diagnosis found a fault of the servovalve beyond acceptable, or another deviation."""
-        return has_fault(self.fdi)
 
 
 _STATUS = {"ERROR": 1, "FAIL": 1, "ABORTED": 1, "NOT_RUN": 1, "INVALID_TIMING": 3, "CANNOT_TELL": 1,
@@ -435,7 +426,7 @@ def _tabulate_faults(results: Sequence[CaseResult], folder: Path) -> list[Table]
 
     def show_verdict(result: CaseResult | None) -> Cell:
         word = result.fdi["verdict"] if result else ""
-        return Cell(word, VERDICT_MOODS.get(word, "bad" if result and result.has_fault else "doubtful"))
+        return Cell(word, VERDICT_MOODS.get(word, "bad" if result and has_fault(result.fdi) else "doubtful"))
 
     return [tabulate(
         rows,
@@ -500,7 +491,7 @@ def _make_run_test(result: CaseResult, classname: str) -> junit.TestCase:
     """The run as a whole: it came to its end and could be judged. Its checks are tests of their own."""
     test = junit.TestCase("run", classname, result.seconds, message=result.why,
                           output=_name_requirements(result.case.requirement))
-    if result.verdict == "ABORTED" or (result.verdict == "FAIL" and not result.failed and not result.has_fault):
+    if result.verdict == "ABORTED" or (result.verdict == "FAIL" and not result.failed and not has_fault(result.fdi)):
         return test._replace(problem="failure", detail=result.verdict)
     if result.verdict in ("INVALID_TIMING", "ERROR"):
         return test._replace(problem="error", detail=result.verdict)
@@ -527,9 +518,9 @@ def _make_diagnosis_test(result: CaseResult, classname: str) -> junit.TestCase:
     word, sentence = result.fdi["verdict"], result.fdi["sentence"]
     faults = describe_faults(result.fdi).replace("; ", "\n")
     test = junit.TestCase("rig fdi", classname, message=sentence, output=f"{word}: {sentence}\n{faults}".strip())
-    if word == "CANNOT_TELL" or (result.has_fault and result.verdict == "INVALID_TIMING"):
+    if word == "CANNOT_TELL" or (has_fault(result.fdi) and result.verdict == "INVALID_TIMING"):
         return test._replace(problem="skipped", message=f"{word}: {sentence}")
-    return test._replace(problem="failure", detail=faults or word) if result.has_fault else test
+    return test._replace(problem="failure", detail=faults or word) if has_fault(result.fdi) else test
 
 
 def _name_requirements(names: Sequence[str]) -> str:

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import signal
 import time
 
 from fdi.output import require_writable
@@ -12,6 +11,7 @@ from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, give_answer
 from rig.cli.inputs import load_chosen_model
+from rig.interrupts import catch_signals
 from rig.network import heartbeat
 from rig.network.bus import Link, can_open, choose_bus, open_can, serve_node
 from rig.network.frame import Node, WallClock
@@ -49,14 +49,13 @@ def run_command(args: argparse.Namespace) -> int:
     places = Places(answer=None if args.out is None else require_writable(args.out, "--out"))
     is_compiled = args.node == "plant" and can_open(bus) and load_chosen_model(args).kind.foreign is None
     clock = WallClock()
-    ended: list[int] = []
     with contextlib.ExitStack() as stack:
         link = Link(open_can(bus, bench.bitrate), clock.now)
         opened_ns = clock.now()
         stack.callback(link.close)
         node = make_node(args, bench, link, stack, is_compiled)
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda got, frame: ended.append(got))
+        is_to_stop = stack.enter_context(catch_signals())
+        is_to_stop()  # from here on a signal ends the node in order
         role = PLANT if args.node == "plant" else CONTROLLER
         require_free_number(bench.find_number(role), args.node, link, bus,
                             LISTENING_TIME - (clock.now() - opened_ns) * 1e-9)
@@ -64,7 +63,7 @@ def run_command(args: argparse.Namespace) -> int:
             kind = "compiled loop" if is_compiled else "Python loop, soft real time"
             print(f"{args.node} on {bus}, {kind}; Ctrl-C ends it", flush=True)
         stack.enter_context(raise_priority(1 if is_compiled else LOOP_PRIORITY))
-        serve_node(node, link, clock, lambda: bool(ended))
+        serve_node(node, link, clock, is_to_stop)
     counts = {"node": args.node, "bus": bus, "lost": link.overflows, "unsent": link.unsent,
               "error_frames": link.error_frames}
     sentence = f"incoming frames lost {link.overflows}, not sent {link.unsent}, error frames {link.error_frames}"
