@@ -35,7 +35,8 @@ SINGLE_MAY_IMPORT = {
     "fdi.analysis": {"fdi.foreign_code", "fdi.trace", "fdi.estimation", "fdi.comparison", "fdi.discovery",
                      "fdi.identification", "fdi.diagnosis", "fdi.prognosis", "fdi.report"},
     "rig.interrupts": set(),
-    "rig.junit": set(),
+    "rig.junit": {"rig.templates"},
+    "rig.templates": set(),
     "rig.doctor": {"rig.benches", "rig.network", "rig.run"},
 }
 
