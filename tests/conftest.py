@@ -13,7 +13,7 @@ from effect_files import restored_catalogue
 from hypothesis import HealthCheck, settings
 from long_tests import LONG_TESTS, LONGEST
 from plugin_bus import require_bus_kind
-from rig_command import rig
+from rig_command import STARTED, rig
 
 pytest_plugins = ["plugin_bus", "pytester"]
 
@@ -44,10 +44,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 @pytest.fixture(autouse=True)
-def forget_effects() -> Iterator[None]:
-    """Effects that a test registers are forgotten after it: a search among others compiles kernels of its own."""
+def leave_nothing() -> Iterator[None]:
+    """A test leaves no effects (a search among others compiles kernels of its own), and where it fails no runs."""
     with restored_catalogue():
         yield
+    while STARTED:
+        STARTED.pop().kill()
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@
 
 #include "wait.h"
 
-static const int64_t LIMIT = 1000000000; /* ns; a turn takes 20 us */
+static const int64_t LIMIT = 10000000000; /* ns; TURN_LIMIT_NS in rig/network/udp.py */
 static const struct timespec PAUSE = {0, 20000};
 
 /* The turn is the lock on one byte of /dev/null; the kernel gives back that of a program that ends. */

@@ -40,7 +40,7 @@ _RAISED = {  # events of the loop: the errors that they raise
     ec.DRIVE_SHORT: (EmcyCode.PDO_TOO_SHORT, ErrorRegister.COMMUNICATION),
     ec.DIVERGED: (EmcyCode.SOFTWARE, ErrorRegister.GENERIC)}
 _CLEARED = {ec.TIMEOUT_CLEARED: EmcyCode.RPDO_TIMEOUT, ec.DRIVE_WHOLE: EmcyCode.PDO_TOO_SHORT}
-_STOP_LIMIT = 5.0  # s: the longest that the loop waits inside a cycle is 1 s, for its turn to send
+_STOP_LIMIT = 15.0  # s: the longest that the loop waits inside a cycle is 10 s, for its turn to send
 
 
 class EmulatorService(PlantNode):

@@ -12,9 +12,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,21 +31,14 @@ from rig.run.runner import Outcome, run_job
 from rig.sequences.sequence import parse_sequence
 
 
-class _Said(NamedTuple):
+@dataclass(frozen=True)
+class Said:
+    """What a command left behind."""
+
     status: int
     out: str
     err: str
-
-
-class Said(_Said):
-    """What a command left behind."""
-
-    words: tuple[str, ...]  # of the command line
-
-    def __new__(cls, status: int, out: str, err: str, words: Iterable[object]) -> Said:
-        said = super().__new__(cls, status, out, err)
-        said.words = tuple(map(str, words))
-        return said
+    words: Sequence[object]  # of the command line
 
     @property
     def json(self) -> dict[str, Any]:
@@ -55,7 +49,7 @@ class Said(_Said):
         value = json.loads(self.out, parse_constant=refuse)
         assert isinstance(value, dict)
         if self.words:
-            check_answer(self.words, value)
+            check_answer(tuple(map(str, self.words)), value)
         return value
 
 
@@ -90,10 +84,14 @@ def write_file(path: Path, text: str) -> Path:
     return path
 
 
+STARTED: list[subprocess.Popen[str]] = []  # of this test
+
+
 def started(*words: object, **options: Any) -> subprocess.Popen[str]:
-    """The command as a process of its own."""
+    """The command as a process of its own, which ends with the test at the latest, and what it has started with it."""
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
-    return subprocess.Popen([sys.executable, "-m", "rig.cli.main", *map(str, words)], **streams)
+    STARTED.append(subprocess.Popen([sys.executable, "-m", "rig.cli.main", *map(str, words)], **streams))
+    return STARTED[-1]
 
 
 def finished(process: subprocess.Popen[str], timeout: float = 300.0) -> Said:
@@ -109,15 +107,15 @@ def interrupted(process: subprocess.Popen[str]) -> Said:
     return finished(process)
 
 
-def grown(path: Path, size: int, timeout: float = 300.0) -> None:
-    """Wait until a file has that many bytes: a run that is well under way."""
+def grown(path: Path, size: int, process: subprocess.Popen[Any], timeout: float = 300.0) -> bool:
+    """Whether a file has that many bytes within `timeout` s, and before the process ends that writes it."""
     end = time.monotonic() + timeout
-    while time.monotonic() < end:
+    while time.monotonic() < end and process.poll() is None:
         with contextlib.suppress(OSError):
             if path.stat().st_size >= size:
-                return
+                return True
         time.sleep(0.02)
-    raise AssertionError(f"{path} has not grown to {size} bytes")
+    return False
 
 
 def nodes_on(where: str) -> list[int]:

@@ -91,7 +91,7 @@ def cluster(gate: Path, tmp_path: Path) -> Iterator[tuple[str, list[subprocess.P
                        "--scheduler-file", note)]
     processes += [start("worker", "--scheduler-file", note, "--nthreads", 1, "--no-nanny", "--no-dashboard", "--host",
                         where) for _ in range(2)]
-    grown(note, 10)
+    assert grown(note, 10, processes[0])
     yield json.loads(note.read_text())["address"], processes
     for process in processes:
         process.kill()

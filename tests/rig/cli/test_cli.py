@@ -100,7 +100,7 @@ def test_a_bug_is_neither_a_verdict_nor_bad_input(short: Path, monkeypatch: pyte
 def test_ctrl_c_runs_clean_up_and_closes_the_log_in_a_folder_that_no_other_run_got(short: Path, tmp_path: Path) -> None:
     process = started("run", write_file(tmp_path / "long.toml", LONG), "--pace", "realtime", "--out", tmp_path / "out",
                       "--json")
-    grown(tmp_path / "out" / "trace.mcap", 60_000)
+    assert grown(tmp_path / "out" / "trace.mcap", 60_000, process)
     assert "no other run" in refuse("run", short, "--out", tmp_path / "out")
     said = interrupted(process)
     assert said.status == 130 and said.json["verdict"] == "ABORTED" and said.err == ""
@@ -112,9 +112,9 @@ def test_a_second_ctrl_c_ends_it_and_the_log_is_closed_all_the_same(tmp_path: Pa
     text = LONG.replace('kind = "ramp", to = 0.0, time = 0.05', 'kind = "hold", time = 60')
     log = tmp_path / "out" / "trace.mcap"
     process = started("run", write_file(tmp_path / "long.toml", text), "--pace", "realtime", "--out", tmp_path / "out")
-    grown(log, 60_000)
+    assert grown(log, 60_000, process)
     process.send_signal(signal.SIGTERM)
-    grown(log, log.stat().st_size + 30_000)  # the run goes on, in its clean-up
+    assert grown(log, log.stat().st_size + 30_000, process)  # the run goes on, in its clean-up
     said = interrupted(process)
     assert said.status == 130 and said.err.splitlines()[-1] == "rig run: interrupted" and "Traceback" not in said.err
     assert Trace.read(tmp_path / "out", all=True).events[-1].text == "end"

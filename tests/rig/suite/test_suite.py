@@ -183,7 +183,7 @@ def test_ctrl_c_writes_what_is_done(tmp_path: Path) -> None:
                       "--jobs", 1)
     while not process.stdout.readline().startswith("PASS"):
         assert process.poll() is None
-    grown(tmp_path / "own.py.hangs", 0)
+    assert grown(tmp_path / "own.py.hangs", 0, process)
     said = interrupted(process)
     assert said.status == 130, said
     told = json.loads((tmp_path / "out" / "suite.json").read_text())

@@ -255,15 +255,19 @@ def test_dead_node_is_announced_before_the_run_ends(tmp_path: Path) -> None:
     """The plant's process is killed; the line comes while the rig is still at work on its clean-up of 4000 cycles."""
     sequence = write_file(tmp_path / "long.toml", LONG + 'cleanup = [{ kind = "hold", time = 4 }]\n')
     group = f"udp_multicast:239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
-    run = started("run", sequence, "--bus", group, "--out", tmp_path / "run")
-    run.stdout.readline()  # the nodes are there
-    grown(tmp_path / "run" / "trace.mcap", 300_000)  # well into main
+    for attempt in range(3):
+        folder = tmp_path / str(attempt)
+        run = started("run", sequence, "--bus", group, "--out", folder)
+        if grown(folder / "trace.mcap", 300_000, run):  # well into main
+            break
+    else:
+        pytest.skip(f"not measured: on this machine each of three runs ended by itself, the last one: {finished(run)}")
     plant = next(number for number in nodes_on(group) if b"plant" in Path(f"/proc/{number}/cmdline").read_bytes())
     os.kill(plant, signal.SIGKILL)
     assert run.stderr.readline() == "rig run: node 3 plant: its process was ended by SIGKILL\n"
     assert run.poll() is None  # its report is still to come
     said = finished(run)
-    cause = json.loads((tmp_path / "run" / "verdict.json").read_text())["cause"]
+    cause = json.loads((folder / "verdict.json").read_text())["cause"]
     assert "ABORTED" in said.out and said.status == 1 and "SIGKILL" in cause["text"]
     assert (cause["source"], cause["kind"]) == ("node 3 plant", "stopped") and gone(group)
 
@@ -317,12 +321,12 @@ def test_the_run_goes_on_when_the_viewer_is_closed(tmp_path: Path) -> None:
         while not is_listening(port):
             assert server.poll() is None
         run = started("run", long, "--live", f"rerun:{port}", "--quiet", "--out", tmp_path / "run")
-        grown(log, 100_000)  # well into main
+        assert grown(log, 100_000, run)  # well into main
     finally:
         os.killpg(server.pid, signal.SIGKILL)
         server.wait()
     assert run.stderr.readline() == "rig run: the viewer was closed; the run goes on\n"
-    grown(log, log.stat().st_size + 100_000)
+    assert grown(log, log.stat().st_size + 100_000, run)
     assert interrupted(run).status == 130 and (tmp_path / "run" / "verdict.json").exists()
 
 
@@ -537,7 +541,7 @@ def test_a_theme_is_served_for_a_browser_until_ctrl_c(folder: Path) -> None:
         assert address.hostname == "127.0.0.1" and parse_qs(address.query)["theme"] == ["light"]
         with urllib.request.urlopen(place) as page:
             assert b"rerun" in page.read().lower()
-        grown(note, 1)
+        assert grown(note, 1, process)
         assert note.read_text() == place
         data = urlsplit(parse_qs(address.query)["url"][0])
         with socket.create_connection(("127.0.0.1", data.port or 0)):
