@@ -56,7 +56,7 @@ from fdi.trace.trace import Floats, Trace
 from plant.signals import Signals
 
 BySignal = Mapping[str, float]  # SI
-FAR_OFF = "only with tolerances that fewer than one healthy unit in 1,000 has"
+FAR_OFF = "only with tolerances that fewer than one healthy unit in 600 has"
 
 MOODS: dict[str, Mood] = {"NOTHING_MISSING": "good", "EXPLAINED": "good", "PARTLY": "doubtful", "AMBIGUOUS": "doubtful",
                           "NOT_RESOLVABLE": "doubtful", "UNEXPLAINED": "bad"}
