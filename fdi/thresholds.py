@@ -165,8 +165,8 @@ WHITE_SQUARE_POOR = 1.02
 # All together, by the chi-squared distribution: a mean square of 2.5 in 16 tolerances, of 4.8 in four. A fit that had
 # ended far off in a valley had 3.4 in 16, left only noise and gave a size half the true one; from a healthy unit it
 # ended at 0.3, and its cost fell by 48. Or the furthest one: 4.1 standard deviations of 16, 3.7 of four. The stiffness
-# of a joint whose flexspline had softened by 45 % was at 4.5, among eight, and nothing else was left to see. Each of the
-# two has this share, so that both together call at most one healthy unit in 640 far.
+# of a joint whose flexspline had softened by 45 % was at 4.5, among eight, and nothing else was left to see. Each
+# of the two has this share, so that both together call at most one healthy unit in 640 far.
 TOLERANCES_FAR_SHARE = 0.00078
 
 # Misfit of the wrong explanation, fitted to the prediction of the other one, from which on a test discriminates.

@@ -17,7 +17,7 @@ the thresholds.
 | more noise | the best leaves more than noise, or its tolerances are those of {TOLERANCES_FAR_SHARE:.2%} of healthy units | searches again from a nominal unit with 30 and 6 times the noise |
 | other valleys | two effects remove {FURTHER_EFFECT_SHARE:g} of the excess cost and still leave more than noise | fits the best two pairs with a population |
 | number of effects | always | keeps the effects that gain more than {GAIN_SEEN:g}, of several only those whose removal costs more than {GAIN_CONVINCES:g} or leaves far tolerances; or that gain {GAIN_DOUBTFUL:g} on the run and alone leave only noise |
-| last fits | always | finishes the base and the best four with finer steps, on the repeats too; begins again those of the best two that leave a mean square above {WHITE_SQUARE_POOR:g} or have far tolerances; with a population these and the base, if they leave only noise and still such a mean square or far tolerances, unless the solver errs |
+| last fits | always | finishes the base and the best four, or two that leave more than {RESIDUAL_IS_NEAR_NOISE:g} floors, with finer steps, on the repeats too; if the best leaves a mean square above {WHITE_SQUARE_POOR:g} or has far tolerances, begins again those of the best two that do; with a population these and the base, if they leave only noise and still such a mean square or far tolerances, unless the solver errs |
 | intervals | the base leaves only noise | drops effects whose 95 % interval holds the off value |
 | small gain | the gain is below {GAIN_DOUBTFUL:g} | fits the base again from there; a single effect that then gains at most {GAIN_SEEN:g} begins again from the base |
 | rivals | the best one leaves only noise | begins the others that do so too, and effects whose signature has a cosine of {LOOKS_ALIKE:g} with its own, from its tolerances |
@@ -301,10 +301,11 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
 
     There are none of the latter where the base does as well when it is taken as far.
     """
-    close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * GAIN_TIE][:4] if depth else []
+    rivals = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * GAIN_TIE] if depth else []
+    close = rivals[:4 if levels[depth][0].is_near_floor else 2]  # where more than noise is left, none decides
     if close and not levels[0][0].is_at_floor:  # one that leaves little of what repeats may only have missed a stop
         clearest = min(levels[depth], key=lambda h: max(h.ratio.values()))
-        close = close if clearest in close else [*close[:3], clearest]
+        close = close if clearest in close else [*close, clearest]
     # where no effect helps, the base is fitted until that is beyond doubt
     rounds = 2 if depth or levels[0][0].is_at_floor else LONG
     search.stage = Stage(progress, "last fits, with finer steps", 0.5, 0.93, rounds + 6 * len(close))
@@ -317,9 +318,10 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
         search.learn_noise(best)
         base, *close = search.map_parallel(partial(search.finish_hypothesis, rounds=2), [base, *close])
         close = sort_by_cost(close)
-    close = sort_by_cost([*search.map_parallel(search.begin_again, close[:2]), *close[2:]])
-    base, *close = [*search.map_parallel(search.leave_valley, [base, *close[:2]]), *close[2:]]
-    close = sort_by_cost(close)
+    # rivals of a fit that is not in doubt begin from its tolerances below
+    doubted = close[:2] if close and (close[0].is_poor or close[0].is_far) else []
+    base, *begun = search.map_parallel(search.leave_valley, [base, *search.map_parallel(search.begin_again, doubted)])
+    close = sort_by_cost([*begun, *close[len(doubted):]])
     if is_cut and close and search.leave_out_undecided(close[0]):
         base, *close = search.map_parallel(partial(search.finish_hypothesis, rounds=2), [base, *close])
     known = [h.effects[0] for h in close]

@@ -28,6 +28,7 @@ from fdi.estimation.fit import (
     find_best_trial,
     follow_population,
     form_normal_equations,
+    invert_hessian,
     limit_dynamic_friction,
     replay_fit,
     scale_noise,
@@ -589,17 +590,6 @@ def linearise_across(slopes: Problem, now: Fit, flat: Floats) -> Fit:
     white = slopes.compute_white_residuals(free, np.vstack([x, x + moves]))
     steep = np.asarray(np.linalg.pinv(moves[:, places]), np.float64) @ (white[1:] - white[0]).reshape(len(places), -1)
     return _weigh_slopes(now, (inverse.T @ steep).reshape(len(x), *now.white.shape))
-
-
-def invert_hessian(hessian: Floats) -> Floats:
-    """The covariance (p, p) of a Hessian (p, p), with every unknown first scaled to a diagonal of one.
-
-    Stick-slip makes some slopes enormous. Beside an eigenvalue of 1e15 a pseudo-inverse takes the 1 of a prior for
-    zero and the direction that only this prior holds for known: sizes along it got intervals forty times too narrow.
-    """
-    diagonal = np.diag(hessian)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    return scale[:, None] * np.linalg.pinv(scale[:, None] * hessian * scale) * scale
 
 
 def start_fit(free: Sequence[Free], x: Floats) -> Fit:
