@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ class Said:
     status: int
     out: str
     err: str
-    words: Sequence[object]  # of the command line
+    words: Sequence[object] = field(compare=False)  # of the command line
 
     @property
     def json(self) -> dict[str, Any]:

@@ -234,7 +234,7 @@ MEMORY = 1 << 30  # bytes of address space: the program itself takes a third of 
 PLAYED = """
 import json, sys
 from rig_command import rig
-print(json.dumps([rig(*words) for words in json.load(sys.stdin)]))
+print(json.dumps([vars(rig(*words)) for words in json.load(sys.stdin)]))
 """
 
 
@@ -245,7 +245,7 @@ def rig_with_little_memory(*commands: tuple[object, ...]) -> list[Said]:
                           input=json.dumps(commands, default=str),
                           env={"OPENBLAS_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "PYTHONPATH": str(SUPPORT)})
     assert done.returncode == 0, (commands, done)
-    return [Said(*said, words) for said, words in zip(json.loads(done.stdout), commands, strict=True)]
+    return [Said(**said) for said in json.loads(done.stdout)]
 
 
 def assert_refused(*commands: tuple[object, ...]) -> None:

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from rig_command import SHORT, answer, finished, grown, interrupted, refuse, rig, started, write_file
+from rig_command import SHORT, Said, answer, finished, grown, interrupted, refuse, rig, started, write_file
 
 from fdi.trace.trace import CLEANUP, Trace
 from plant import Model, load_model
@@ -78,7 +78,7 @@ def test_brackets_in_names_are_brackets(tmp_path: Path) -> None:
 def test_a_run_for_people(short: Path, tmp_path: Path) -> None:
     said = rig("run", short, "--out", tmp_path / "out")
     assert said.status == 0 and "PASS" in said.out and "overshoot" in said.out and "times real time" in said.out
-    assert rig("run", short, "--out", tmp_path / "out", "--quiet") == (0, "", "")
+    assert rig("run", short, "--out", tmp_path / "out", "--quiet") == Said(0, "", "", ())
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["report.html", "trace.mcap", "verdict.json"]
 
 
@@ -131,10 +131,10 @@ def test_ctrl_c_is_not_lost_where_python_ignores_exceptions() -> None:
         repeat_lost_interrupts()
         try:
             Lock()
-            time.sleep(60.0)
+            time.sleep(600.0)
         except KeyboardInterrupt:
             print("heard")"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=50.0, check=False)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300.0, check=False)
     assert (done.stdout, done.stderr) == ("heard\n", "")
 
 
@@ -266,4 +266,4 @@ def test_tools_that_are_not_there_are_missing(monkeypatch: pytest.MonkeyPatch) -
 def test_json_is_one_object_and_nothing_else(tmp_path: Path) -> None:
     told = answer("doctor", "--out", tmp_path / "doctor.json")
     assert told == json.loads((tmp_path / "doctor.json").read_text()) and told["verdict"] == "PASS"
-    assert rig("doctor", "--quiet") == (0, "", "")
+    assert rig("doctor", "--quiet") == Said(0, "", "", ())

@@ -87,7 +87,7 @@ def test_the_right_parameters_bring_it_to_the_floor(folder: Path) -> None:
 
 def test_results_go_where_they_should(folder: Path) -> None:
     words = ("--out", folder / "told.json", "--signals", "xj, xs", "--report")
-    assert rig("compare", folder / "est.csv", "--quiet", *words) == (0, "", "")
+    assert rig("compare", folder / "est.csv", "--quiet", *words) == Said(0, "", "", ())
     assert set(json.loads((folder / "told.json").read_text())["signals"]) == {"xj", "xs"}
     assert "WITHIN_FLOOR" in (folder / "compare.html").read_text()
 

@@ -346,7 +346,7 @@ def test_a_controller_of_python_can_and_canopen_alone_passes_a_run(tmp_path: Pat
                    "--out", tmp_path / "out", "--json")
     finally:
         other.terminate()
-        other.wait(20)
+        other.wait(120)
     assert said.status == 0 and said.json["verdict"] == "PASS", said
 
 

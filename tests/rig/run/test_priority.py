@@ -63,7 +63,7 @@ def run_loop(from_last: int = 2) -> Iterator[tuple[threading.Thread, list[int]]]
     loop = threading.Thread(target=run)
     loop.start()
     try:
-        assert entered.wait(10)
+        assert entered.wait(120)
         yield loop, seen
     finally:
         done.set()
