@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from plant.plants import Plant
 
 MOST_STEP_ERROR = 0.01  # RMS change of an output with half the step, over its range in the nominal test
-MOST_STRAY = 0.5  # of the distance to which a replay at rest is pulled; a spring may hold it back
+PUSHED_ROWS = 200  # cycles; then as many without a drive
+MOST_STRAY = 0.5  # of a distance: a spring has taken the plant back, or a field of its state did not move along
 MOST_FOLLOWING_ERROR = 0.5  # RMS, over the range of the command
 ARGUMENTS = {"step": (4, 5), "measure": (2,), "control": (4,), "coefficients": (2,), "sense": (4,), "moves": (3,)}
 
@@ -84,6 +85,7 @@ def _check_parameters(plant: Plant, where: object) -> None:
         for name, q in quantities.items():
             field = f"{group}.{name}"
             require(isinstance(q, Quantity) and bool(q.unit), where, field, 'Quantity("unit"), "1" for none')
+            require(q.unit == "s" or field != "controller.period", where, field, f"a period in s, not in {q.unit}")
             value = plant.values.get(field, cls._field_defaults.get(name))
             require(isinstance(value, float | int), where, field, f"a nominal value as default, not {value!r}")
             require(not q.refuses(float(value or 0.0)), where, field, f"{q.expected}, not {value:g}")
@@ -162,11 +164,16 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
     if worst := max(errors, key=lambda name: errors[name], default=""):
         yield Finding("step", errors[worst] < MOST_STEP_ERROR, f"half the step changes {worst} by "
                       f"{100 * errors[worst]:.2g} % of its range (limit {100 * MOST_STEP_ERROR:g} %)")
-    there = np.full(min(len(command), 200), 0.1 * np.ptp(once[kind.signals.controlled.name]))
-    pulled = Lanes(quiet, ()).replay(np.empty((1, 0)), 0.0 * there, 0.0 * there, there, 200.0)[0, -1, 0]
-    kept = abs(pulled - there[0]) <= MOST_STRAY * there[0]
-    yield Finding("moves", kept, "a replay is pulled to the recorded signal" if kept else
-                  f"pulled to {there[0]:.3g} {kind.signals.controlled.unit}, a replay is at {pulled:.3g}: "
+    there = np.full(2 * PUSHED_ROWS, 0.1 * np.ptp(once[kind.signals.controlled.name]))
+    push = np.repeat([np.abs(once[kind.signals.drive.name]).max(), 0.0], PUSHED_ROWS)
+    idle = 0.0 * push
+    left, moved, pushed = (Lanes(quiet, ()).replay(np.empty((1, 0)), drive, idle, position)[0, :, 0]
+                           for drive, position in ((idle, None), (idle, there), (push, None)))
+    springs_back = abs(pushed[-1]) < MOST_STRAY * abs(pushed[PUSHED_ROWS])
+    apart = (moved - left)[-1]
+    kept = bool(springs_back or abs(apart - there[0]) <= MOST_STRAY * there[0])
+    yield Finding("moves", kept, "the plant stays where a replay moves it" if kept else
+                  f"moved by {there[0]:.3g} {kind.signals.controlled.unit}, the plant goes to {apart:.3g}: "
                   "every field of the state has to move along, a motor's angle by the gear ratio")
     error = rms(once[kind.signals.command.name] - once[kind.signals.controlled.name]) / max(np.ptp(command), 1e-300)
     yield Finding("control", error < MOST_FOLLOWING_ERROR, f"following error {100 * error:.2g} % of the command's "

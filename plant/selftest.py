@@ -61,7 +61,7 @@ def _find_faults(effect: Effect, starts: tuple[Mapping[str, float], ...], comman
     bare = build_bare_model(plant)
     off, faults = bare.with_effects([effect.name]), []
     if not _are_equal(simulate(bare, command, load), simulate(off, command, load)):
-        faults.append("at its off value it changes the plant")
+        faults.append("at its off value it changes the plant; rounding counts: m + (x - m) is not x")
     if not starts:
         faults.append("no size of it changes anything on this command")
     faults += [f"with {_format_values(start)} the plant has no number any more"

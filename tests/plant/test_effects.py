@@ -289,7 +289,7 @@ def test_the_trial_of_an_unsound_effect(file: Path) -> None:
     text = COGGING.replace("return x +", "return (x + 1.0) * (1.0 + p.cogging.force) ** 400 +")
     load_text(file, text.replace('Quantity("N")', 'Quantity("N", low=0, high=1e3)').replace('"load"', '"position"'))
     off, *infinite = check_effect("cogging", COMMAND).faults
-    assert off == "at its off value it changes the plant"
+    assert off.startswith("at its off value it changes the plant")
     assert infinite and all("has no number any more" in fault for fault in infinite)
 
 

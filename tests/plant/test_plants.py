@@ -150,12 +150,14 @@ def test_the_signal_may_be_in_another_unit_than_the_state_that_moves(tmp_path: P
     assert kind.find_share_moved(kind.move) == pytest.approx(1.0)
 
 
-def test_fields_that_do_not_move_along_fail_the_check(tmp_path: Path) -> None:
-    """A motor's angle and the angle of the wheel behind a stiff shaft, moved by the same angle in spite of the gear."""
+@pytest.mark.parametrize("moves", ['("angle", "motor")', '("angle",)'])
+def test_fields_that_do_not_move_along_fail_the_check(moves: str, tmp_path: Path) -> None:
+    """A motor's angle and the angle of the wheel behind a stiff shaft: moved by the same angle in spite of the gear, or
+    the wheel alone."""
     text = TEXT.replace("    angle: float = 0.0", "    angle: float = 0.0\n    motor: float = 0.0").replace(
         "- load)", "- load - 2e3 * (s.angle - s.motor / ratio))").replace(
         "(s.speed + speed))", "(s.speed + speed), s.motor + h * ratio * speed)").replace(
-        '("angle",)', '("angle", "motor")')
+        '("angle",)', moves)
     model = load_model(write_file(tmp_path / "shaft.py", text))
     moves = next(found for found in check_behaviour(model) if found.check == "moves")
     assert not moves.passed
