@@ -255,7 +255,8 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
     close = leave_out_unneeded(search, _spare_far_tolerances(search, base, close))
     depth = len(close[0].effects) if close else 0
     tried = levels[depth or -1] if max(depth, 1) < len(levels) else []
-    others = [h for h in tried if h.effects not in [c.effects for c in close]]
+    others = search.map_parallel(search.replay_hypothesis,
+                                 (h for h in tried if h.effects not in [c.effects for c in close]))
     parents = [next((p for p in levels[i] if p.effects == close[0].effects[:i]), levels[i][0]) for i in range(1, depth)]
     base, *close = (judge_left_out_rows(search, h, floor) for h in search.judge_on_all([base, *close], FINE))
     ledger = [base, *parents, *close[:1]]

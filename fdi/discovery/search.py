@@ -472,6 +472,10 @@ class Search:
         """A hypothesis refitted with the noise, the steps and the runs as they are now."""
         return self.judge_fit(h.effects, fit_unknowns(self.problem, h.fit.free, h.fit.x, rounds))
 
+    def replay_hypothesis(self, h: Hypothesis) -> Hypothesis:
+        """A hypothesis without a last fit, with what it leaves of the runs and with the steps of those."""
+        return self.judge_fit(h.effects, replay_fit(self.fine or self.problem, h.fit, h.fit.x))
+
     def finish_hypothesis(self, h: Hypothesis, rounds: int = 5) -> Hypothesis:
         """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
         begin = turn_amplitudes_positive(h.fit.free, h.fit.x, self.model.kind.list_effects())
