@@ -166,8 +166,8 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
                       f"{100 * errors[worst]:.2g} % of its range (limit {100 * MOST_STEP_ERROR:g} %)")
     there = np.full(2 * PUSHED_ROWS, 0.1 * np.ptp(once[kind.signals.controlled.name]))
     push = np.repeat([np.abs(once[kind.signals.drive.name]).max(), 0.0], PUSHED_ROWS)
-    idle = 0.0 * push
-    left, moved, pushed = (Lanes(quiet, ()).replay(np.empty((1, 0)), drive, idle, position)[0, :, 0]
+    idle, lanes = 0.0 * push, Lanes(quiet, ())
+    left, moved, pushed = (lanes.replay(np.empty((1, 0)), drive, idle, position)[0, :, 0]
                            for drive, position in ((idle, None), (idle, there), (push, None)))
     springs_back = abs(pushed[-1]) < MOST_STRAY * abs(pushed[PUSHED_ROWS])
     apart = (moved - left)[-1]

@@ -474,13 +474,17 @@ class Search:
 
     def replay_hypothesis(self, h: Hypothesis) -> Hypothesis:
         """A hypothesis without a last fit, with what it leaves of the runs and with the steps of those."""
-        return self.judge_fit(h.effects, replay_fit(self.fine or self.problem, h.fit, h.fit.x))
+        return self._judge_all_runs(h, replay_fit(self.fine or self.problem, h.fit, h.fit.x))
 
     def finish_hypothesis(self, h: Hypothesis, rounds: int = 5) -> Hypothesis:
         """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
         begin = turn_amplitudes_positive(h.fit.free, h.fit.x, self.model.kind.list_effects())
         near = fit_unknowns(self.problem, h.fit.free, begin, 2)
         found = finish_fit(self.fine or self.problem, near, rounds, self.problem, self.stage)
+        return self._judge_all_runs(h, found)
+
+    def _judge_all_runs(self, h: Hypothesis, found: Fit) -> Hypothesis:
+        """What a fit to all runs leaves, of which no repeat is replayed again."""
         ends = np.cumsum([len(run) for run in (self.problem.trace, *self.problem.also)])
         return self.judge_fit(h.effects, found, np.split(found.residuals, ends[:-1], axis=1)[1:])
 
