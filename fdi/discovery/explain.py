@@ -330,13 +330,13 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
     if known and not close:  # an effect may yet do more from where the base is now than by its own fit
         near = fit_unknowns(search.problem, base.fit.free, base.fit.x, 4)
         close = sort_by_cost(search.begin_effects(near, known))
-    return _doubt_small_gain(search, base, _compare_rivals(search, base, close), depth)
+    return _doubt_small_gain(search, base, _compare_rivals(search, close), depth)
 
 
-def _compare_rivals(search: Search, base: Hypothesis, close: list[Hypothesis]) -> list[Hypothesis]:
+def _compare_rivals(search: Search, close: list[Hypothesis]) -> list[Hypothesis]:
     """The hypotheses, best first, after those that leave only noise have begun from the tolerances of the best.
 
-    So do look-alikes of a single effect. Where another one is best then, the others get the same chance from there.
+    So do look-alikes of its effects. Where another one is best then, the others get the same chance from there.
     """
     def begin(h: Hypothesis, best: Hypothesis) -> Hypothesis:
         return search.begin_beside(best, h) if h.is_at_floor and h is not best else h
@@ -344,8 +344,8 @@ def _compare_rivals(search: Search, base: Hypothesis, close: list[Hypothesis]) -
     for _ in range(2):
         if not close or not close[0].is_at_floor:
             break
-        best, known = close[0], {h.effects[0] for h in close if h.is_at_floor}
-        more = search.begin_look_alikes(base, best, known) if len(best.effects) == 1 else []
+        best, known = close[0], {frozenset(h.effects) for h in close if h.is_at_floor}
+        more = search.begin_look_alikes(best, known)
         close = drop_duplicates([*search.map_parallel(partial(begin, best=best), close), *more])
         if close[0] is best:
             break

@@ -1,7 +1,7 @@
 """Which effects are missing: scan, fit, look at what is left, and once more for the next effect."""
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -313,28 +313,31 @@ class Search:
 
     def drop_each_effect(self, h: Hypothesis) -> list[Hypothesis]:
         """The hypothesis with one of its effects taken out, each of them, fitted from where it is; best first."""
-        usual = {f.name: f for f in list_all_unknowns(self.model)}
-
         def fit_without(gone: str) -> Hypothesis:
-            own = set(self.model.find_effect(gone).fitted)
-            free = [usual.get(f.name) if f.name in own else f for f in h.fit.free]
-            kept = [f for f in free if f is not None]
-            x = np.array([[(values[f.name] - f.centre) / f.scale
-                           if f.name not in own or f.low < values[f.name] < f.high else 0.0 for f in kept]
-                          for values in (h.fit.values, *self._list_ways_off(h.fit, gone))])
-            x = np.clip(x, *scaled_bounds(kept))
+            kept, begun = self._place_without(h.fit, gone)
+            x = np.array([begun, *(self._place_without(there, gone)[1] for there in self._list_ways_off(h.fit, gone))])
             best = x[int(np.argmin(self.problem.compute_costs(kept, x)))] if len(x) > 1 else x[0]
             return self.judge_fit(tuple(e for e in h.effects if e != gone), fit_unknowns(self.problem, kept, best))
 
         return sorted(self.map_parallel(fit_without, h.effects), key=lambda each: each.cost)
 
-    def _list_ways_off(self, fit: Fit, effect: str) -> list[dict[str, float]]:
-        """Values at which an effect is off and other parameters have taken its place, along directions no signal shows.
+    def _place_without(self, fit: Fit, effect: str) -> tuple[list[Free], Floats]:
+        """The unknowns of a fit without those of an effect, and where they are, (p,): at 0 its own ones at a bound."""
+        usual = {f.name: f for f in list_all_unknowns(self.model)}
+        own, values = set(self.model.find_effect(effect).fitted), fit.values
+        free = [usual.get(f.name) if f.name in own else f for f in fit.free]
+        kept = [f for f in free if f is not None]
+        x = [(values[f.name] - f.centre) / f.scale if f.name not in own or f.low < values[f.name] < f.high else 0.0
+             for f in kept]
+        return kept, np.clip(x, *scaled_bounds(kept))
+
+    def _list_ways_off(self, fit: Fit, effect: str) -> list[Fit]:
+        """The fit where an effect is off and other parameters have taken its place, along directions no signal shows.
         """
         entry = self.model.find_effect(effect)
         x = [scale_to(fit.free, fit.x, direction.powers, name, entry.off[name])
              for direction in list_directions(self.problem, fit.values) for name in entry.fitted if name in entry.off]
-        return [replace(fit, x=there).values for there in x if there is not None]
+        return [replace(fit, x=there) for there in x if there is not None]
 
     def map_parallel(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
         """In threads whose replays are made together: side by side in the lanes of a kernel."""
@@ -579,24 +582,29 @@ class Search:
         again = self.finish_hypothesis(self.judge_fit(rival.effects, begun))
         return min(rival, again, key=lambda each: each.cost)
 
-    def begin_look_alikes(self, base: Hypothesis, best: Hypothesis, known: Iterable[str]) -> list[Hypothesis]:
-        """The effects that change the signals almost as the best one does, from its tolerances, if noise is left then.
+    def begin_look_alikes(self, best: Hypothesis, known: Container[frozenset[str]]) -> list[Hypothesis]:
+        """The best hypothesis with a look-alike in place of one effect, from its tolerances, if noise is left then.
 
         The search fits what promises most from the tolerances of the base. There a look-alike may miss a stop, and
-        fall far behind or not be fitted at all.
+        fall far behind or not be fitted at all; of two effects the second is sought beside the better look-alike of
+        the first alone.
 
         Args:
-            base: without any effect.
-            best: with one effect.
-            known: effects that need not be tried.
+            best: with one or several effects.
+            known: sets of effects that need not be tried.
         """
-        told = self.compare_signatures(base.fit)
-        own = [effect == best.effects[0] for effect in told.names]
-        alike = {effect for effect, cosines in zip(told.names, np.abs(told.gram), strict=True)
-                 if max(cosines[own], default=0.0) > LOOKS_ALIKE} - {best.effects[0], *known}
-        if not alike:
-            return []
-        return self.begin_effects(linearise(self.problem, base.fit.free, _place_base(base, best)), sorted(alike))
+        found: list[Hypothesis] = []
+        for gone in best.effects:
+            rest = tuple(effect for effect in best.effects if effect != gone)
+            without = linearise(self.problem, *self._place_without(best.fit, gone))
+            told = self.compare_signatures(without)
+            own = [effect == gone for effect in told.names]
+            alike = {effect for effect, cosines in zip(told.names, np.abs(told.gram), strict=True)
+                     if max(cosines[own], default=0.0) > LOOKS_ALIKE and frozenset((*rest, effect)) not in known}
+            alike &= set(self.list_further_effects(rest)) - {gone}
+            if alike:
+                found += self.begin_effects(without, sorted(alike), rest)
+        return found
 
     def compare_signatures(self, fit: Fit) -> Sensitivity:
         """What the effects would change at a fit; repeats of the same command would show the same once more."""
@@ -605,10 +613,16 @@ class Search:
         found = compute_sensitivity(coarse, of_run, self.effects)
         return found._replace(gains=(1 + len(self.problem.also)) * found.gains)
 
-    def begin_effects(self, base: Fit, effects: Sequence[str], rounds: int = 4) -> list[Hypothesis]:
-        """Those of the effects, each alone, that gain over a base and leave only noise, taken to the end."""
+    def begin_effects(self, base: Fit, effects: Sequence[str], present: tuple[str, ...] = ()) -> list[Hypothesis]:
+        """Those of the effects, each on top of a fit, that gain over it and leave only noise, taken to the end.
+
+        Args:
+            base: the fit.
+            effects: to try.
+            present: effects that the fit has already.
+        """
         def begin(p: Prospect) -> Hypothesis:
-            return self.judge_fit((p.effect,), fit_unknowns(self.problem, p.free, p.x, rounds))
+            return self.judge_fit((*present, p.effect), fit_unknowns(self.problem, p.free, p.x, 4))
 
         prospects = scan_effects(self.problem, [base], effects, self.workers)
         found = self.map_parallel(begin, [p for p in prospects if p.cost < base.cost - GAIN_WORTH_A_FIT])
