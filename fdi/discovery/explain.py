@@ -18,9 +18,10 @@ the thresholds.
 | other valleys | two effects remove {FURTHER_EFFECT_SHARE:g} of the excess cost and still leave more than noise | fits the best two pairs with a population |
 | number of effects | always | keeps the effects that gain more than {GAIN_SEEN:g}, of several only those whose removal costs more than {GAIN_CONVINCES:g} or leaves far tolerances; or that gain {GAIN_DOUBTFUL:g} on the run and alone leave only noise |
 | last fits | always | finishes the base and the best four, or two that leave more than {RESIDUAL_IS_NEAR_NOISE:g} floors, with finer steps, on the repeats too; if the best leaves a mean square above {WHITE_SQUARE_POOR:g} or has far tolerances, begins again those of the best two that do; with a population these and the base, if they leave only noise and still such a mean square or far tolerances, unless the solver errs |
+| stops of the last fits | no observer, and the best still leaves such a mean square | leaves out the rows that hang on a stop, and those after them that are not noise; finishes again |
 | intervals | the base leaves only noise | drops effects whose 95 % interval holds the off value |
 | small gain | the gain is below {GAIN_DOUBTFUL:g} | fits the base again from there; a single effect that then gains at most {GAIN_SEEN:g} begins again from the base |
-| rivals | the best one leaves only noise | begins the others that do so too, and effects whose signature has a cosine of {LOOKS_ALIKE:g} with its own, from its tolerances |
+| rivals | the best one leaves only noise | begins the others that do so too, and effects whose signature has a cosine of {LOOKS_ALIKE:g} with one of its, from its tolerances |
 | small gain, again | the same | drops such an effect |
 | solver | half the step changes more than {SOLVER_ERROR_SHARE:g} floors | finishes again with 50 steps a cycle |
 | tolerances | the best leaves only noise, with far tolerances | takes these back in eighths, with each of four effects in their place; keeps those that end near |
@@ -323,7 +324,7 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
     doubted = close[:2] if close and (close[0].is_poor or close[0].is_far) else []
     base, *begun = search.map_parallel(search.leave_valley, [base, *search.map_parallel(search.begin_again, doubted)])
     close = sort_by_cost([*begun, *close[len(doubted):]])
-    if is_cut and close and search.leave_out_undecided(close[0]):
+    if close and ((is_cut and search.leave_out_undecided(close[0])) or search.leave_out_missed_stop(close[0])):
         base, *close = search.map_parallel(partial(search.finish_hypothesis, rounds=2), [base, *close])
     known = [h.effects[0] for h in close]
     base, close = _doubt_small_gain(search, base, close, depth)

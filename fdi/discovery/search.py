@@ -42,7 +42,13 @@ from fdi.estimation.fit import (
 )
 from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, is_long, judge_on_all
 from fdi.estimation.noise import Noise
-from fdi.estimation.replay import find_undecided_rows, leave_out_rest, leave_out_rows, measure_decided_errors
+from fdi.estimation.replay import (
+    find_undecided_rows,
+    find_unpredictable_rows,
+    leave_out_rest,
+    leave_out_rows,
+    measure_decided_errors,
+)
 from fdi.estimation.unidentifiable import (
     finish_fit,
     list_directions,
@@ -526,6 +532,23 @@ class Search:
             return False
         alone = replace(self.fine or self.problem, also=(), _lanes={})
         return self._leave_out(find_undecided_rows(alone, best.fit, self.estimate_floor(best)))
+
+    def leave_out_missed_stop(self, best: Hypothesis) -> bool:
+        """The same where a plant has no observer, if the best fit leaves more than it was made with.
+
+        It has missed a stop in one of the runs, and moved all its parameters by a little to meet it in another: it is
+        off by that in a run that it never saw.
+        """
+        if self.model.kind.correct is not None or not best.is_poor:
+            return False
+        alone = replace(self.fine or self.problem, also=(), _lanes={})
+        rows = find_unpredictable_rows(alone, best.fit, self.estimate_floor(best))
+        is_cut = self._leave_out(rows)
+        if is_cut:
+            left_out = f"{rows.sum() * self.run.period:.1f} s hang on a stop that no fit meets in every run"
+            run = self.problem.trace.with_notes(f"{left_out}: they are not compared in the last fits")
+            self.problem = replace(self.problem, trace=run)
+        return is_cut
 
     def leave_out_bounces(self, base: Hypothesis) -> bool:
         """The same for the rows that would hang on an impact if one of the effects were there at its largest start.

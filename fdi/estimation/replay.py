@@ -208,9 +208,13 @@ def is_friction(name: str) -> bool:
 
 
 def vary_frictions(names: Sequence[str], values: Mapping[str, float]) -> Floats:
-    """Rows (m, p) of the named parameters: as they are, and with each friction level a little higher and lower."""
+    """Rows (1 + 2 m, p) of the named parameters: as they are, each of m friction levels higher, each of them lower.
+
+    Where none is called a friction, as in a plant that calls it Coulomb's force, each of the parameters is varied.
+    """
     base = np.array([values[name] for name in names])
-    shifts = FRICTION_UNCERTAINTY * np.eye(len(names))[list(map(is_friction, names))]
+    frictions = list(map(is_friction, names))
+    shifts = FRICTION_UNCERTAINTY * np.eye(len(names))[frictions if any(frictions) else slice(None)]
     return limit_dynamic_friction(names, np.concatenate([base[None], base * (1 + shifts), base * (1 - shifts)]))
 
 
@@ -223,6 +227,8 @@ def measure_window_power(x: Floats, window: int = WINDOW) -> Floats:
 
 def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) -> Flags:
     """Rows of the problem's run, (n,), in windows that a friction level off by `FRICTION_UNCERTAINTY` changes.
+
+    Where no parameter is called a friction, in windows that any parameter so far off does not change smoothly.
 
     On soft oil a slow ramp is a chain of slips, and the time of each follows from the one before. A replay at the true
     values drifts out of phase within a second, however fine its steps are, and is then wrong by the height of the
@@ -237,16 +243,20 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
     names = list(dict.fromkeys([*(f.name for f in fit.free), *filter(is_friction, values)]))
     tried = vary_frictions(names, values)
     runs = problem.predict_outputs(names, tried)
+    replayed, higher, lower = np.split(runs, [1, 1 + len(tried) // 2])
+    # what another parameter than a friction changes smoothly is nothing undecided, and the same both ways
+    changes = [higher - replayed, lower - replayed] if any(map(is_friction, names)) else [higher + lower - 2 * replayed]
     name = problem.trace.declared.controlled.name
     for sign in (1.0, -1.0):
         noisy = [run.with_columns({name: run.controlled + sign * noise}) for run in (problem.trace, *problem.also)
                  for noise in guess_anchor_noise(run, problem.model, floor)]
         if noisy:
             shifted = replace(problem, trace=noisy[0], also=tuple(noisy[1:]))
-            runs = np.concatenate([runs, shifted.predict_outputs(names, tried[:1])])
-    changes = measure_window_power((runs[1:] - runs[0]).reshape(-1, runs.shape[2])).reshape(-1, *runs.shape[1:])
+            changes.append(shifted.predict_outputs(names, tried[:1]) - replayed)
+    moved = np.concatenate(changes)
+    power = measure_window_power(moved.reshape(-1, moved.shape[2])).reshape(moved.shape)
     least = np.array([[max(floor[s], problem.trace.declared.find(s).slight)] for s in problem.trace.outputs])
-    is_large = changes.max(axis=0, initial=0.0) > least**2
+    is_large = power.max(axis=0, initial=0.0) > least**2
     undecided: Flags = (is_large & ~np.isnan(problem.trace.measurements)).any(axis=0)
     return undecided
 

@@ -17,6 +17,7 @@ from fdi.comparison.compare import compare
 from fdi.discovery.runs import read_runs
 from fdi.discovery.search import Search, scan_effects
 from fdi.discovery.update_model import refit_effects
+from fdi.estimation import replay as replays
 from fdi.estimation.fit import (
     Fit,
     Free,
@@ -37,6 +38,7 @@ from fdi.estimation.replay import (
     find_rest_rows,
     find_undecided_rows,
     hold_inputs,
+    is_friction,
     match_period,
     read_cycles,
     replay_current,
@@ -354,10 +356,14 @@ def _find(changes: dict[str, float], com: np.ndarray) -> np.ndarray:
     model = complete_model(Model()).replace(changes)
     trace = hold_inputs(record_plant(changes, com, seed=1))
     problem = Problem(model, trace, tuple(white_noise(FLOOR[s]) for s in trace.outputs), steps=20)
-    return find_undecided_rows(problem, cast(Fit, cast(Any, SimpleNamespace(free=(), values={}))), FLOOR)
+    fit = SimpleNamespace(free=list_tolerance_unknowns(model), values={})
+    return find_undecided_rows(problem, cast(Fit, cast(Any, fit)), FLOOR)
 
 
-def test_slips_on_soft_oil_are_undecided_and_a_step_is_not() -> None:
+@pytest.mark.parametrize("is_told", [True, False])
+def test_slips_on_soft_oil_are_undecided_and_a_step_is_not(is_told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether or not the plant calls its levels of friction so."""
+    monkeypatch.setattr(replays, "is_friction", lambda name: is_told and is_friction(name))
     ramp = np.concatenate([np.zeros(200), np.linspace(0.0, 1.5e-3, 2500)])  # 0.6 mm/s
     soft = _find({"compressibility.coefficient": 1.0 / 4e8, "jack.static_friction": 1600.0}, ramp)
     assert soft.mean() > 0.2 and not soft[:200].any()
