@@ -140,6 +140,10 @@ def _finish_chain(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesi
         last = min(last, finish_fit(search.problem, again, LAST_FIT_ROUNDS, slopes, search.stage),
                    key=lambda fit: fit.cost)
     done = [search.judge_fit(chain[-1].effects, last)]
+    if search.leave_out_missed_stop(done[0]):
+        slopes = replace(search.problem, steps=coarse, _lanes={})
+        last = finish_fit(search.problem, last, LAST_FIT_ROUNDS, slopes, search.stage)
+        done = [search.judge_fit(chain[-1].effects, last)]
     for h in reversed(chain[:-1]):
         begun = _choose_nearer_start(search, h.fit, done[0].fit)
         fit = finish_fit(search.problem, begun, EARLIER_FIT_ROUNDS, slopes, search.stage)
@@ -347,7 +351,7 @@ def add_effects(effects: Sequence[str], runs: Runs, model: Model, known: Provena
     r = refit_effects(runs.model, every, runs.est, runs.repeats, runs.holdout, progress, model.values, done)
     rows = [Row(s.effect, s.hypothesis.errors, s.holdout) for s in r.steps]
     kept = list(known.ledger) if continues else []
-    notes = (*runs.notes, *([r.excerpt] if r.excerpt else []))
+    notes = (*dict.fromkeys([*runs.notes, *r.search.problem.trace.notes]), *([r.excerpt] if r.excerpt else []))
     if known.ledger and not continues:
         notes = (*notes, "these are other runs than those of the ledger: it begins again")
     return _make_update(r, runs, known, every, [*kept, *rows[bool(kept):]], notes, command, added=tuple(effects))

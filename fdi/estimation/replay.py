@@ -126,6 +126,8 @@ def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str,
                                  ) -> tuple[Columns, Flags, dict[str, float]]:
     """The replay, the rows that hang on a knife's edge, and by how much a guessed current moves it elsewhere, RMS."""
     names = list(filter(is_friction, model.values))
+    if not names and model.kind.foreign is None:
+        names = list(list_tolerance_sizes(model))
     values = vary_frictions(names, model.values)
     lanes = Lanes(silence_sensors(model), names, REPLAY_STEPS)
     position = trace.unlagged if has_known_start(trace) else None
@@ -140,15 +142,16 @@ def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str,
     undecided = np.zeros(len(trace), bool)
     power, count = np.zeros(len(outputs)), 0
     for (first, own), *others in zip(*turns, strict=True):
-        runs = np.concatenate([own, *(other for _, other in others)])
-        rows = slice(first, first + runs.shape[1])
-        found[:, rows] = runs[0].T
+        rows = slice(first, first + own.shape[1])
+        found[:, rows] = own[0].T
+        moved = [other - own[:1] for _, other in others]
+        changes = np.concatenate([compare_neighbours(names, own), *moved])
         for i, signal in enumerate(outputs):
             if signal.name in floor:
-                power_moved = measure_window_power(runs[1:, :, i] - runs[:1, :, i]).max(axis=0, initial=0.0)
+                power_moved = measure_window_power(changes[:, :, i]).max(axis=0, initial=0.0)
                 undecided[rows] |= ((power_moved > max(floor[signal.name], signal.slight) ** 2)
                                     & ~np.isnan(trace.mask_unusable(signal.name)[rows]))
-        guessed = (runs[len(values):len(values) + len(currents)] - runs[:1])[:, ~undecided[rows]]
+        guessed = np.concatenate([own[:0], *moved[:len(currents)]])[:, ~undecided[rows]]
         power, count = power + (guessed**2).sum(axis=(0, 1)), count + guessed.shape[0] * guessed.shape[1]
     blind = {name: math.sqrt(float(power[i]) / count) if count else 0.0 for i, name in enumerate(trace.output_names)}
     return {name: found[i] for i, name in enumerate(trace.output_names)}, undecided, blind
@@ -218,6 +221,18 @@ def vary_frictions(names: Sequence[str], values: Mapping[str, float]) -> Floats:
     return limit_dynamic_friction(names, np.concatenate([base[None], base * (1 + shifts), base * (1 - shifts)]))
 
 
+def compare_neighbours(names: Sequence[str], runs: Floats) -> Floats:
+    """What a level of friction a little off changes, (m, ..), of runs (1 + 2 m, ..) at `vary_frictions`.
+
+    What another parameter changes smoothly is nothing undecided: it is the same both ways, and taken out. A quarter of
+    the rest is left, which no rounding of the readings makes as large as their noise.
+    """
+    replayed, higher, lower = np.split(runs, [1, 1 + len(runs) // 2])
+    if any(map(is_friction, names)):
+        return np.concatenate([higher, lower]) - replayed
+    return 0.25 * (higher + lower - 2.0 * replayed)
+
+
 def measure_window_power(x: Floats, window: int = WINDOW) -> Floats:
     """Mean square of each row's window in signals (m, n): (m, n)."""
     starts = np.arange(0, x.shape[1], window)
@@ -243,16 +258,14 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
     names = list(dict.fromkeys([*(f.name for f in fit.free), *filter(is_friction, values)]))
     tried = vary_frictions(names, values)
     runs = problem.predict_outputs(names, tried)
-    replayed, higher, lower = np.split(runs, [1, 1 + len(tried) // 2])
-    # what another parameter than a friction changes smoothly is nothing undecided, and the same both ways
-    changes = [higher - replayed, lower - replayed] if any(map(is_friction, names)) else [higher + lower - 2 * replayed]
+    changes = [compare_neighbours(names, runs)]
     name = problem.trace.declared.controlled.name
     for sign in (1.0, -1.0):
         noisy = [run.with_columns({name: run.controlled + sign * noise}) for run in (problem.trace, *problem.also)
                  for noise in guess_anchor_noise(run, problem.model, floor)]
         if noisy:
             shifted = replace(problem, trace=noisy[0], also=tuple(noisy[1:]))
-            changes.append(shifted.predict_outputs(names, tried[:1]) - replayed)
+            changes.append(shifted.predict_outputs(names, tried[:1]) - runs[:1])
     moved = np.concatenate(changes)
     power = measure_window_power(moved.reshape(-1, moved.shape[2])).reshape(moved.shape)
     least = np.array([[max(floor[s], problem.trace.declared.find(s).slight)] for s in problem.trace.outputs])

@@ -366,7 +366,7 @@ def test_slips_on_soft_oil_are_undecided_and_a_step_is_not(is_told: bool, monkey
     monkeypatch.setattr(replays, "is_friction", lambda name: is_told and is_friction(name))
     ramp = np.concatenate([np.zeros(200), np.linspace(0.0, 1.5e-3, 2500)])  # 0.6 mm/s
     soft = _find({"compressibility.coefficient": 1.0 / 4e8, "jack.static_friction": 1600.0}, ramp)
-    assert soft.mean() > 0.2 and not soft[:200].any()
+    assert soft.mean() > 0.1 and not soft[:200].any()
     assert not _find({}, np.repeat([0.0, 3e-3], [200, 800])).any()
 
 
