@@ -18,10 +18,6 @@ import numpy as np
 from plant import Model
 from plant.compile import compile_function
 from plant.errors import RigError
-from plant.machine_code import find_function_address
-from plant.model import build_kernel
-from plant.run import find_direct_readings, load_stored_advance, report_law_errors
-from plant.solve import read_flat_sensors
 from rig.benches.bench import Bench
 from rig.benches.canopen_map import RPDO, TPDO
 from rig.benches.packing import VALUES_AT
@@ -31,6 +27,7 @@ from rig.network.node_objects import COUNTERS, CYCLE_RECORD, RING, CycleRecord, 
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator import PlantNode
+from rig.nodes.plant_code import compile_plant
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import Plan
 
@@ -254,24 +251,6 @@ def list_unheard(bench: Bench) -> tuple[int, ...]:
 
 def _encode_cob_id(cob_id: int | None) -> int:
     return -1 if cob_id is None else cob_id
-
-
-def compile_plant(model: Model) -> tuple[int, int]:
-    """Addresses of the compiled plant for `make_memory`; some seconds for what was never compiled before.
-
-    Raises:
-        InputError: a law that cannot be compiled.
-    """
-    with report_law_errors(model):
-        flat, record = model.build_flat_state(), model.build_record()
-        code = load_stored_advance(model.effects, model.plant)
-        code.warm(lambda: (flat.copy(), 5e-3, 100.0, 0.0, 0.0, record, 10))
-        read = 0
-        if not find_direct_readings(model):
-            run = build_kernel(read_flat_sensors, model.effects, plant=model.plant)
-            run(flat, np.zeros(len(model.kind.signals.outputs) + 1), 0.0, record)
-            read = find_function_address(run)
-    return code.find_address(), read
 
 
 @cache

@@ -29,9 +29,9 @@ from rig.network.master import HEARTBEAT_LIMIT, PATIENT, Master
 from rig.network.node_objects import CONTROLLER, Gains, Identity, read_gains
 from rig.nodes.scenario import Scenario
 from rig.run.attribution import find_start_problem
-from rig.run.embedded_loop import EmbeddedLoop, Limits, can_play_many, is_compiled, load_code
+from rig.run.embedded_loop import EmbeddedLoop, Limits, can_play_many, load_code
 from rig.run.job import Job
-from rig.run.loop import AFTER, BEFORE, BEFORE_MAIN, CycleInput, CycleLoop, CycleObserver, History, Loop
+from rig.run.loop import AFTER, BEFORE, BEFORE_MAIN, CycleInput, CycleLoop, CycleObserver, History, Loop, load_parts
 from rig.run.state import Journal, SafeState, Stage
 from rig.run.watch import PATIENCE, describe_silence
 from rig.sequences.faults import Plan, Schedule
@@ -44,7 +44,9 @@ def compile_loop(job: Job) -> None:
         from rig.run.hard_loop import compile_cycle  # here: in lockstep a run needs none of it
 
         compile_cycle()
-    elif job.controller == "builtin" and not job.realtime and is_compiled():
+        return
+    load_parts()
+    if job.controller == "builtin" and not job.realtime:
         load_code()
 
 

@@ -10,7 +10,6 @@ value is what its receiver reads from its frame: rows and payloads are those of 
 """
 
 import ctypes
-import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from math import ceil
@@ -28,7 +27,17 @@ from plant.segments import Array
 from plant.signals import Signals
 from rig.benches.bench import Bench, FrameSpec, Role
 from rig.benches.bench_file import load_bench
-from rig.benches.packing import PAYLOAD, VALUES_AT, Layout, list_frame_places, make_layout, pack_frame
+from rig.benches.packing import (
+    ALL_ROLES,
+    LAST_CYCLE,
+    PAYLOAD,
+    ROLES,
+    VALUES_AT,
+    Layout,
+    list_frame_places,
+    make_layout,
+    pack_frame,
+)
 from rig.network.bus import EmbeddedWire
 from rig.network.master import Master
 from rig.network.node_objects import Gains, read_gains
@@ -37,7 +46,8 @@ from rig.nodes.firmware import Firmware
 from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock
 from rig.recorder.schema import make_row_record
-from rig.run.loop import CycleInput, CycleLoop, CycleObserver, CyclicValues, Seen
+from rig.run import cycle as cy
+from rig.run.loop import CycleInput, CycleLoop, CycleObserver, CyclicValues
 from rig.sequences.faults import Frames, Jitter, Parameter, Plan, Schedule
 
 # Words: cycles to play and played, the number of the first; of the plant its cycle, the address of its code, steps and
@@ -147,9 +157,8 @@ def _note_time(b: Buffers, i: int, column: int) -> None:
 # ---------------------------------------------------------------------------------------- made before the start
 
 
-def make_buffers(bench: Bench, names: Sequence[str], guards: Mapping[str, tuple[float, float]]) -> Buffers:
-    """Buffers for a bench whose values have these names. `guards`: limits by signal, SI."""
-    m = make_layout(bench.frames.list_of(Role.RIG), names, Role.RIG)
+def make_buffers(bench: Bench, m: Layout, names: Sequence[str], guards: Mapping[str, tuple[float, float]]) -> Buffers:
+    """Buffers for a bench with this layout, whose values have these names. `guards`: limits by signal, SI."""
     guarded, sensors = list_guarded(bench.signals), len(bench.signals.outputs)
     first = _READ_AT + sensors
     b = Buffers(np.zeros(SENSORS_AT + 2 * sensors, np.int64), np.zeros(first + 3 * len(guarded)), m,
@@ -193,16 +202,12 @@ def _lend_plant(b: Buffers, actuator: Actuator) -> LentPlant | None:
     return plant
 
 
-def is_compiled() -> bool:
-    """Whether code is compiled in this process: not where a debugger wants plain Python."""
-    return not os.environ.get("NUMBA_DISABLE_JIT")
-
-
 def make_trial() -> tuple[Buffers, Any, Any]:
     """Arguments of some cycles of the shipped bench, without times."""
     bench, actuator = load_bench(), Actuator(Model())
     actuator.warm()
-    b = make_buffers(bench, CyclicValues(bench).names, {})
+    names = CyclicValues(bench).names
+    b = make_buffers(bench, make_layout(bench.frames.list_of(Role.RIG), names, Role.RIG), names, {})
     plant = _lend_plant(b, actuator)
     assert plant is not None
     b.words[ASKED], b.inputs[:, 0], b.noise[:20] = 20, 1e-3, sample_noise(0, 20)
@@ -235,13 +240,14 @@ class EmbeddedLoop(CycleLoop):
         assert isinstance(master.wire, EmbeddedWire)
         self._embedded = master.wire
         self._busy = find_busy_cycles(scenario.plan, faults)
-        self._buffers = make_buffers(bench, self._values.names, guards)
+        self._quiet = make_buffers(bench, self._layout, self._values.names, guards)
         # address of that of the C library
-        self._buffers.words[CLOCK] = ctypes.cast(ctypes.CDLL(None).clock_gettime, ctypes.c_void_p).value or 0
+        self._quiet.words[CLOCK] = ctypes.cast(ctypes.CDLL(None).clock_gettime, ctypes.c_void_p).value or 0
         self._frames, self._sync_id = list_frames(bench), bench.frames.sync or 0
         self._lent: object = None  # the actuator that the compiled code works on
-        self._run: Callable[[], object] | None = None
-        self._roles = {role for answer in self._answers.values() for role in answer.roles}
+        self._run_quiet: Callable[[], object] | None = None
+        # identifiers of the answers and their roles, as words have them
+        self._answered = int(np.bitwise_or.reduce(self._layout.words[self._places + ROLES]))
 
     def play_many(self, phase: int, demands: Array, loads: Array, control: int) -> int:
         """See `Loop`."""
@@ -252,12 +258,11 @@ class EmbeddedLoop(CycleLoop):
         run = self._bind(emulator) if most > 1 else None
         if run is None:
             return 0
-        self._close()
-        b, k = self._buffers, self.k
-        step = CycleInput(phase, 0.0, 0.0, control)
-        self.outputs.update(zip(self._values.given[2:], self._values.list_given(step)[2:], strict=True))
-        at = b.layout.words[VALUES_AT]  # of the cycle before, SI
-        b.layout.doubles[at:at + len(self._values.names)] = [self.outputs[name] for name in self._values.names]
+        self._end()
+        b, k = self._quiet, self.k
+        given = self._values.list_given(CycleInput(phase, 0.0, 0.0, control))
+        at = b.layout.words[VALUES_AT] + 2  # demand and load are those of each cycle
+        b.layout.doubles[at:at + len(given) - 2] = given[2:]
         b.words[ASKED], b.words[FIRST], b.words[PLANT_CYCLE] = most, k, emulator.plant.actuator.cycle
         b.reals[LOOP:GAINS], b.reals[GAINS:PERIOD] = firmware.loop, firmware.gains
         on_plant = emulator.plant.loads[k:k + most]  # none after the last
@@ -275,7 +280,9 @@ class EmbeddedLoop(CycleLoop):
 
     def _count_quiet(self, emulator: Emulator, firmware: Firmware, control: int, most: int) -> int:
         """How many of the cycles to come are quiet, at most `most`; the last may be one in which a timer runs out."""
-        if (self._open is None or self._seen.came != self._roles or self._late or self.problem
+        words = self._words
+        is_answered = words[cy.OPEN] and words[cy.CAME] & ALL_ROLES == self._answered & ALL_ROLES
+        if (not is_answered or words[cy.HELD] or self.problem
                 or not self._embedded.bus.is_empty or not emulator.is_quiet(self.k) or not firmware.is_quiet(control)):
             return 0
         due = min(self._master.find_due(), *(node.device.find_due() for node in (emulator, firmware)))
@@ -286,13 +293,13 @@ class EmbeddedLoop(CycleLoop):
         """The compiled code on the plant of the emulator, which is another one after each reset."""
         actuator = emulator.plant.actuator
         if self._lent is not actuator:
-            self._lent, plant = actuator, _lend_plant(self._buffers, actuator)
-            self._run = None if plant is None else load_code().bind((self._buffers, plant.flat, plant.live))
-        return self._run
+            self._lent, plant = actuator, _lend_plant(self._quiet, actuator)
+            self._run_quiet = None if plant is None else load_code().bind((self._quiet, plant.flat, plant.live))
+        return self._run_quiet
 
     def _take_cycles(self, phase: int, control: int, played: int) -> None:
         """Log the cycles that were played, all but the last, which is the cycle under way now."""
-        b, names, first, signals = self._buffers, self._values.names, self.k, self._bench.signals
+        b, names, first, signals = self._quiet, self._values.names, self.k, self._bench.signals
         begun, sync, plant, drive = b.times[:played].T
         values = dict(zip(names, b.values[:played].T.copy(), strict=True))
         fed, answered = (plant - sync) * 1e-9, (drive - sync) * 1e-9
@@ -309,16 +316,28 @@ class EmbeddedLoop(CycleLoop):
         frames = [(self._frames[0].identifier, command), (self._sync_id, None), *answers]
         block = CycleBlock(self._t_ns + self._period * np.arange(played), frames, columns, make_row_record(signals))
         self._log.cycles(block)
-        self.outputs.update({name: float(column[-1]) for name, column in values.items()})
-        self._step = CycleInput(phase, float(b.inputs[played - 1, 0]), float(b.inputs[played - 1, 1]), control)
-        self._open = int(block.t_ns[-1]), *block.make_row(-1)
-        self._sent[self._frames[0].identifier] += played
-        self._begun += played
-        self._played += played
-        for answer in self._answers.values():
-            answer.last = self._begun - 1
-        self._seen = Seen(set(self._roles))
-        self.k, self._t_ns = first + played - 1, int(block.t_ns[-1])
+        demand, load = b.inputs[played - 1, :2].tolist()
+        self._open_last(CycleInput(phase, demand, load, control), played)
+
+    def _open_last(self, step: CycleInput, played: int) -> None:
+        """The last of the cycles that were played is the cycle under way now, whose answers have come."""
+        words, b, last = self._words, self._quiet, played - 1
+        self._push(step)
+        words[cy.POSITION] = words[cy.HEAD]
+        words[cy.HEAD] = words[cy.TAIL]
+        self.k, self._t_ns = self.k + last, self._t_ns + last * self._period
+        number = words[cy.ROWS] % len(self._buffers.rows)
+        begun, sync, plant, drive = b.times[last]
+        self._buffers.rows[number] = (self.k, words[cy.POSITION], 0, 1, self._t_ns, 0, 0, 0, plant - sync, plant - sync,
+                                      drive - sync, drive - sync, 0)
+        self._buffers.values[number] = b.values[last]
+        words[cy.OPEN], words[cy.ROW_CYCLE], words[cy.WORKED] = 1, self.k, sync - begun
+        words[cy.CAME], words[cy.AWAITED], words[cy.IS_LATE] = self._answered, 0, 0
+        words[cy.HAS_BEGUN] += played
+        words[cy.PLAYED] += played
+        words[cy.CYCLES] += played
+        words[cy.DUE] += played * self._period
+        self._layout.words[self._places + LAST_CYCLE] = words[cy.HAS_BEGUN] - 1
 
     def _run_timers(self, emulator: Emulator, firmware: Firmware) -> None:
         """End the cycle under way: its frames are there, and the timers of nodes and rig run."""
@@ -326,8 +345,7 @@ class EmbeddedLoop(CycleLoop):
             node.device.sync.notice(self._t_ns)
         self._embedded.wait_for_answers(self._t_ns, lambda: True)
         self._master.tick()
-        self.k += 1
-        self._t_ns += self._period
+        self._finish_cycle()
         self._embedded.bus.deliver(self._t_ns)  # the heartbeat of the rig
 
 
@@ -353,4 +371,4 @@ def can_play_many(master: Master, bench: Bench) -> bool:
     """
     nodes = master.wire.nodes if isinstance(master.wire, EmbeddedWire) else []
     is_own = [type(node) for node in nodes] == [Emulator, Firmware]
-    return is_own and bool(list_frames(bench)) and bench.frames.sync is not None and is_compiled()
+    return is_own and bool(list_frames(bench)) and bench.frames.sync is not None

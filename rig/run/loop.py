@@ -1,6 +1,7 @@
-"""The cycle of the bench: command, SYNC, answers, row. This loop is Python, for every bus and both paces.
+"""Loops: what the session needs of the cycle of the bench, and the loop for every bus and both paces.
 
-In real time SocketCAN and the UDP bus have a compiled one (hard_loop.py), which gives the same rows.
+The cycle itself (command, SYNC, answers, row) is compiled code, cycle.py. Here Python waits, sends and receives for it.
+In real time on SocketCAN and the UDP bus the compiled code does that too (hard_loop.py).
 
 Lockstep: the next cycle begins when this one's frames are in. Real time: it begins when it is due; due times are a
 fixed grid, and a cycle that is late by whole periods drops the due times it has missed (and counts them) instead of
@@ -8,47 +9,33 @@ firing a burst. Either way the plant moves one period a SYNC, so a run that was 
 
 from abc import ABC, abstractmethod
 from array import array
-from collections import Counter
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
-from functools import partial
-from math import isnan, nan
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import cache, partial
+from math import nan
 from operator import attrgetter
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from plant import signals as plant_signals
+from plant import Model, signals as plant_signals
+from plant.compile import compile_function, compute_fingerprint, find_cache_folder, interpret_function
+from plant.machine_code import StoredCode
 from plant.segments import Array
-from rig.benches.bench import (
-    RIG_OUTPUTS,
-    Bench,
-    Flags,
-    FrameSpec,
-    Role,
-    check_guards,
-    pack,
-    unpack,
-)
+from rig.benches import packing
+from rig.benches.bench import FD, RIG_OUTPUTS, Bench, Role
+from rig.benches.bench_file import load_bench
 from rig.network.bus import LinkWire
 from rig.network.frame import Frame, WallClock
 from rig.network.master import Master
+from rig.network.raw_bus import GIVEN_TIME, IN_PYTHON, PAYLOAD_IN, Port, make_empty_port
+from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator import Emulator
-from rig.nodes.scenario import FaultyPlant, Scenario
+from rig.nodes.plant_code import PlantProgram, compile_plant
+from rig.nodes.scenario import DIVERGED, Scenario
 from rig.recorder import CycleBlock, Signals, Timing
 from rig.recorder.schema import make_row_record
-from rig.sequences.faults import (
-    CUT,
-    DELAY,
-    DOUBLE,
-    DROP,
-    NORMAL,
-    SENT_NORMALLY,
-    Action,
-    LateFrames,
-    Schedule,
-    apply_action,
-)
+from rig.run import cycle as cy
+from rig.sequences.faults import CUT, DELAY, DOUBLE, DROP, Plan, Schedule
 
 # Numbers of phases: set-up, main, clean-up; then those of the probes, of which the log has the frames only
 BEFORE, AFTER, BEFORE_MAIN = 3, 4, 5
@@ -125,9 +112,6 @@ class CyclicValues:
 def find_phase_value(values: Mapping[str, float], phase: str) -> float:
     """The value of a field in a phase; in the safe state that of clean-up, if the bench file says nothing else."""
     return float(values.get(phase, values.get("cleanup", 0.0)))
-
-
-_RESPONSES = {"feedback": "feedback_response", "valve_state": "valve_response", "drive": "response"}  # of the timing
 
 
 class CycleObserver(Protocol):
@@ -207,57 +191,162 @@ class Loop(ABC):
         """Give back what the loop holds, whatever happened."""
 
 
-class _Answer:
-    """A frame that comes in: what it says, and the last one of it."""
-
-    def __init__(self, spec: FrameSpec) -> None:
-        self.spec, self.roles = spec, set(spec.roles)
-        self.cycle_mask = max(((1 << each.length) - 1 for each in spec.fields if each.name == "cycle"), default=0)
-        self.is_guarded = any(each.guard for each in spec.fields)
-        self.last = -1  # the cycle in which it came
+_AT_REST = Scenario(Model(), Plan(stop=0))  # of a plant that nobody moves
 
 
-@dataclass(slots=True)
-class Seen:
-    """What of the cycle under way has come."""
+class CompiledLoop(Loop):
+    """A loop whose cycle is compiled (cycle.py), and the memory that it shares with it: inputs in, rows and frames out.
+    """
 
-    came: set[str] = field(default_factory=set)  # roles of the frames
-    awaited: set[FrameSpec] = field(default_factory=set)  # frames that are sure to come, and have not
-    plant_left: int = 0  # of the frames that come in a cycle in which a fault doubles some: of the plant
-    drives_left: int = 0  # and of the controller
-    is_late: bool = False  # a drive frame has come that answers an earlier cycle
+    problem = ""
+    _origin = 0  # ns: what the clock of the compiled code says when the run begins
+    _idle_phase = 0
+
+    def __init__(self, master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver,
+                 ahead: int) -> None:
+        """`ahead`: cycles that can be queued."""
+        self._master, self._bench, self._faults, self._log = master, bench, faults, log
+        self._period, self._ahead, self._values = bench.cycle_ns, ahead, CyclicValues(bench)
+        self._layout = packing.make_layout(bench.frames.list_of(Role.RIG), self._values.names, Role.RIG)
+        # where the plant is a node of its own, the cycle does not move this one
+        self._program = None if bench.has_plant_node or scenario.model.kind.foreign is None else PlantProgram(scenario)
+        code = () if bench.has_plant_node else self._program.code if self._program else compile_plant(scenario.model)
+        self._plant = ec.make_memory(_AT_REST if bench.has_plant_node else scenario, *code)
+        self._noise = np.random.default_rng(scenario.seed)
+        self._draw_noise()
+        channels, is_fd = len(self._values.names), any(each.identifier & FD for each in bench.frames.frames)
+        self._buffers = cy.make_buffers(ahead, 8 * ahead, 64 * ahead, 1100, len(self._values.given), channels, is_fd)
+        self._inputs = [CycleInput(0, 0.0, 0.0, 0)] * (9 * ahead)  # of all rows that are not yet logged, and the queue
+        self.outputs = dict.fromkeys(self._values.names, 0.0)
+        words, place, sync = self._buffers.words, self._values.place, bench.frames.sync
+        self._words = words
+        words[cy.PERIOD], words[cy.MAY_IDLE_AT], words[cy.SYNC_ID] = self._period, -1, -1 if sync is None else sync
+        words[cy.MOVES_PLANT], words[cy.MISSED_LIMIT] = not bench.has_plant_node, bench.most_missed
+        words[cy.DRIVEN], words[cy.SENT_CHANNELS] = len(self._values.given), len(self._values.sent)
+        words[cy.SENSED_AT], words[cy.DRIVE_VALUE_AT] = place[self._values.readings[0]], place[self._values.drive]
+        words[cy.FLAGS_AT] = place["flags"]
+
+    @property
+    def overruns(self) -> int:
+        """See `Loop`."""
+        return int(self._words[cy.OVERRUNS])
+
+    @property
+    def underruns(self) -> int:
+        """See `Loop`."""
+        return int(self._words[cy.UNDERRUNS])
+
+    @property
+    def unsound(self) -> int:
+        """See `Loop`."""
+        return sum(int(self._layout.words[at + packing.UNSOUND]) for at in packing.list_frame_places(self._layout))
+
+    def _draw_noise(self) -> None:
+        """Draw the noise of the plant for a minute ahead."""
+        if not self._bench.has_plant_node:
+            ec.fill_noise(self._plant, self._noise)
+
+    def _push(self, step: CycleInput) -> None:
+        """Queue an input."""
+        k, position = self.queued, int(self._words[cy.TAIL])
+        command, sync = self._faults.find_action("command", k), self._faults.find_action("sync", k)
+        self._inputs[position % len(self._inputs)] = step
+        queue = self._buffers.inputs
+        self._buffers.settings[position % len(queue)] = self._values.list_given(step)
+        queue[position % len(queue)] = step.is_counted, *command, *sync, self._faults.is_bus_off("rig", k)
+        self._words[cy.TAIL] = position + 1
+
+    def _read_frames(self, last: int) -> Iterator[tuple[int, int, bytes, bool]]:
+        """Time, identifier and payload of the recorded frames before number `last`, and whether the cycle sent it."""
+        first, self._words[cy.FRAMES_READ] = int(self._words[cy.FRAMES_READ]), last
+        for t_ns, head, *data in _read_ring(self._buffers.frames, first, last):
+            raw = b"".join([(word & 0xFFFFFFFFFFFFFFFF).to_bytes(8, "little") for word in data])
+            yield t_ns - self._origin, head & 0xFFFFFFFF, raw[:head >> 32 & 0xFF], bool(head >> 40)
+
+    def _note_problem(self) -> None:
+        if self._words[cy.DIVERGED]:
+            self.problem = self._program.problem if self._program and self._program.problem else DIVERGED
+
+    def _log_rows(self) -> None:
+        """Log the cycles that are complete."""
+        words, buffers = self._words, self._buffers
+        first, last = int(words[cy.ROWS_READ]), int(words[cy.ROWS])
+        values = _read_ring(buffers.values, first, last)
+        for row, said in zip(_read_ring(buffers.rows, first, last), values, strict=True):
+            words[cy.ROWS_READ] += 1
+            self._take_row(row, dict(zip(self._values.names, said, strict=True)))
+
+    def _take_row(self, row: list[int], said: dict[str, float]) -> None:
+        """Log a cycle."""
+        if not row[cy.IS_COUNTED]:
+            return
+        step = self._inputs[row[cy.INPUT] % len(self._inputs)]
+        phase = self._idle_phase if row[cy.INPUT_HELD] and self._idle_phase else step.phase
+        roles = {role for role, bit in packing.BITS.items() if row[cy.ANSWERS] & bit}
+        signals = self._values.open_row(row[cy.CYCLE], phase, said[self._values.command], step.load,
+                                        int(said["control_word"]))
+        self._values.fill_row(signals, said, roles)
+        timing = Timing(
+            row[cy.CYCLE], bool(row[cy.OVERRUN]), row[cy.LATENESS] * 1e-9,
+            row[cy.DRIVE_AT] * 1e-9 if row[cy.DRIVE_AT] else nan,
+            row[cy.COMPLETE_AT] * 1e-9 if row[cy.COMPLETE_AT] else nan,
+            row[cy.FEEDBACK_AT] * 1e-9 if "feedback" in roles else nan,
+            row[cy.VALVE_AT] * 1e-9 if "valve_state" in roles else nan, row[cy.EXECUTION] * 1e-9)
+        self._log.cycle(row[cy.DUE_AT] - self._origin, signals, timing)
 
 
-class CycleLoop(Loop):
+def _read_ring(ring: np.ndarray, first: int, last: int) -> list[list[Any]]:
+    """Entries `first` to `last` - 1 of a ring."""
+    entries: list[list[Any]] = ring[np.arange(first, last) % len(ring)].tolist()
+    return entries
+
+
+@cache
+def load_parts() -> StoredCode:
+    """The parts of the cycle, for a loop in Python: some seconds on a new machine."""
+    source = compute_fingerprint(interpret_function(cy.play_part, IN_PYTHON))
+    code = StoredCode(find_cache_folder() / source, partial(compile_function, cy.play_part, IN_PYTHON), "parts")
+    code.warm(make_trial)
+    return code
+
+
+def make_trial() -> tuple[Port, cy.Buffers, packing.Layout, ec.Memory]:
+    """Arguments for a part of a cycle of the shipped bench: it sends its command."""
+    bench = load_bench()
+    values = CyclicValues(bench)
+    buffers = cy.make_buffers(1, 2, 8, 1, len(values.given), len(values.names), is_fd=False)
+    buffers.words[cy.PART], buffers.words[cy.PERIOD], buffers.words[cy.DRIVEN] = cy.FIRST, 1, len(values.given)
+    buffers.settings[:] = 0.0
+    layout = packing.make_layout(bench.frames.list_of(Role.RIG), values.names, Role.RIG)
+    return make_empty_port(), buffers, layout, ec.make_memory(_AT_REST)
+
+
+class CycleLoop(CompiledLoop):
     """Runs cycles one by one and passes each to `log` when it is complete. In real time it is soft: Python is in it."""
 
     kind = "soft"
-    k = overruns = underruns = unsound = 0
+    k = 0
 
     def __init__(self, master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver,
                  realtime: bool) -> None:
-        self._master, self._wire = master, master.wire
+        super().__init__(master, bench, scenario, faults, log, ahead=16)
+        self._wire, self._realtime = master.wire, realtime
         self._link = None if realtime or not isinstance(master.wire, LinkWire) else master.wire  # lockstep of programs
-        self._faults, self._log, self._period, self._realtime = faults, log, bench.cycle_ns, realtime
-        self._values, self._bench = CyclicValues(bench), bench
-        self._sent = Counter[int]()  # by identifier: the pages of a multiplexed message have one alive counter
-        self._counters: dict[int, int] = {}  # the last alive counter of each identifier
-        self._answers = {each: _Answer(each) for each in bench.frames.frames if each.sender is not Role.RIG}
-        self._plant = None if bench.has_plant_node else FaultyPlant(scenario)
+        self._port = make_empty_port()
+        self._run = load_parts().bind((self._port, self._buffers, self._layout, self._plant))
+        answers = [each for each in bench.frames.frames if each.sender is not Role.RIG]
+        self._are_sure = all(each.is_answer for each in answers)
+        self._places = np.array([at for at in packing.list_frame_places(self._layout)
+                                 if not self._layout.words[at + packing.IS_MINE]], np.int64)
+        # without a SYNC the controller has its own clock: its frame may slip from one cycle of the rig to the next
+        self._words[cy.SLACK] = bench.frames.sync is None and realtime
         self._emulators = [node for node in getattr(self._wire, "nodes", ()) if isinstance(node, Emulator)]
-        self.outputs = dict.fromkeys(self._values.names, 0.0)
-        self._open: tuple[int, Signals, Timing] | None = None  # the cycle under way
-        self._step = CycleInput(0, 0.0, 0.0, 0)  # its inputs
-        self._seen = Seen()
-        self._begun = 0  # cycles in which answers were expected, those that do not count among them
-        self._played = 0  # cycles
-        self._missed = 0  # drive frames in a row
+        self._plant_left = self._drives_left = 0  # frames to come in a cycle in which a fault doubles some
         self._wall = WallClock()
         # when the cycle under way, or to come, is due
         self._t_ns = max(self._wire.clock.now(), master.played_until) + self._period
-        self._sync = 0
-        self._late = LateFrames()
-        master.hooks.on_cyclic.update({each.identifier: self._receive_answer for each in self._answers})
+        self._words[cy.DUE] = self._t_ns
+        master.hooks.on_cyclic.update({each.identifier: self._receive_answer for each in answers})
 
     def now(self) -> int:
         """See `Loop`."""
@@ -269,157 +358,111 @@ class CycleLoop(Loop):
 
     def hold(self, phase: int) -> float:
         """See `Loop`; the next cycle follows at once."""
-        return self._step.demand
+        last: CycleInput = self._inputs[self._words[cy.POSITION] % len(self._inputs)]
+        return last.demand
 
     def cycle(self, step: CycleInput) -> None:
         """One cycle; the cycle before, which it closes, goes to the log."""
         lateness = self._wait_until_due()
-        self._close()
-        self._step = step
+        self._end()
         master, k = self._master, self.k
         began = self._wall.now()
-        self.outputs.update(zip(self._values.given, self._values.list_given(step), strict=True))
-        if self._plant is not None:
-            self._read_plant(self._plant, k)
-        is_overrun = 2 * lateness > self._period  # it leaves the controller too little of the cycle to answer in
-        timing = Timing(k, is_overrun, lateness * 1e-9, nan, nan)
+        self._push(step)
+        self._draw_noise()
         set_rig_faults(master, self._faults, k)
         reported = master.count_emergencies(Role.PLANT) if self._bench.has_plant_node else 0
-        self._send_frames(is_before_sync=True)
-        delay = self._send_sync()
-        if self._plant is not None:
-            self.outputs["flags"] = self._judge_drive(self._plant)
-        row = self._values.open_row(k, step.phase, self.outputs[self._values.command], step.load, step.control)
-        self._open = self._t_ns, row, timing
-        self._expect_answers(delay is not None)
-        self._send_frames(is_before_sync=False)
-        if self._plant is not None:
-            self._values.fill_row(row, self.outputs, _OF_PLANT)
-            timing.feedback_response = timing.valve_response = 0.0
-            if step.is_counted and not self.problem:
-                if k == 0:  # the plant rests until the run begins: no answer from before drives it
-                    self._plant.drive = 0.0
-                self._plant.move(k)
-        timing.execution = (self._wall.now() - began) * 1e-9
+        self._play(cy.FIRST)
+        fault = self._faults.find_action("sync", k)
+        delay = fault.argument if fault.code == DELAY else 0
+        if delay and self._realtime:
+            self._wire.run_until(self._t_ns + delay)
+        self._plant_left, self._drives_left = self._count_repeated_frames(k) if self._link is not None else (0, 0)
+        self._play(cy.SYNC, lateness)
+        self._words[cy.WORKED] = self._wall.now() - began
         if not self._realtime:
-            self._wait_for_answers(delay)
+            self._wait_for_answers(None if fault.code == DROP and self._words[cy.SYNC_ID] >= 0 else delay)
             self._wait_for_report(reported)
-            self._late.release(self._t_ns + self._period)
+            self._play(cy.LATE, self._t_ns + self._period)
         master.tick()
         for emulator in self._emulators:
             self.problem = self.problem or emulator.plant.problem
-        self.k += step.is_counted
-        self._played += 1
-        self._t_ns += self._period
+        self._finish_cycle()
 
     def finish(self) -> None:
         """Wait for the answers of the last cycle and close it."""
         self._wait_until_due()
-        self._close()
+        self._end()
 
     def _wait_until_due(self) -> int:
         """The next cycle is due; by how much it is late, ns. Lockstep is never late."""
         if not self._realtime:
             return 0
-        while self._late and self._late.due < self._t_ns:
-            due = self._late.due
+        while self._words[cy.HELD] and (due := int(self._buffers.held[0, cy.HELD_DUE])) < self._t_ns:
             self._wire.run_until(due)
-            self._late.release(due + 1)
+            self._play(cy.LATE, due + 1)
         self._wire.run_until(self._t_ns)
         late = self._wire.clock.now() - self._t_ns
-        lost = late // self._period
-        self.overruns += max(lost, 2 * late > self._period)
-        self._t_ns += lost * self._period
+        self._t_ns += late // self._period * self._period
         return late
 
-    # ------------------------------------------------------------------------------------ the rig's own plant
+    def _end(self) -> None:
+        """The cycle under way is over: the next SYNC is due."""
+        self._play(cy.END)
+        self._log_rows()
 
-    def _read_plant(self, plant: FaultyPlant, k: int) -> None:
-        """The readings of the cycle to come."""
-        if self.problem:
+    def _finish_cycle(self) -> None:
+        """What the compiled code has counted is true for all from now on."""
+        self._note_problem()
+        at = int(self._layout.words[packing.VALUES_AT])
+        self.outputs = dict(zip(self._values.names, self._layout.doubles[at:].tolist(), strict=False))
+        self.k, self._t_ns = int(self._words[cy.CYCLES]), int(self._words[cy.DUE])
+
+    # ------------------------------------------------------------------------------------ the compiled code
+
+    def _play(self, part: int, argument: int = 0) -> None:
+        """Play a part of the cycle, and send its frames."""
+        self._call(part, argument)
+        for _, identifier, data, _ in self._read_frames(int(self._words[cy.FRAMES_WRITTEN])):
+            self._master.send(identifier, data)
+
+    def _call(self, part: int, argument: int) -> None:
+        self._words[cy.PART], self._words[cy.ARGUMENT] = part, argument
+        # in lockstep, where the clock is virtual, the wall clock tells how long something took
+        self._port.words[GIVEN_TIME] = (self._wire.clock if self._realtime else self._wall).now()
+        self._run()
+
+    def _receive_answer(self, frame: Frame) -> None:
+        """A frame of the controller, or of the plant, has come."""
+        words = self._words
+        if not words[cy.OPEN]:
             return
-        readings = plant.read(k)
-        if readings is None:
-            self.problem = plant.problem
-            return
-        self.outputs.update(zip(self._values.readings, readings, strict=True))
+        if frame.cob_id == self._bench.frames.drive.identifier:
+            self._drives_left -= 1
+        else:
+            self._plant_left -= 1
+        came = frame.t_ns if self._realtime else self._wall.now()
+        words[cy.CAME_AT] = frame.t_ns if self._realtime else self._t_ns
+        words[cy.CAME_AS], words[cy.CAME_LENGTH] = frame.cob_id, len(frame.data)
+        payload = np.frombuffer(frame.data.ljust(8, b"\0"), np.uint8)
+        self._port.octets[PAYLOAD_IN:PAYLOAD_IN + len(payload)] = payload
+        self._call(cy.ANSWER, came - int(words[cy.SYNC_AT]))
+        words[cy.FRAMES_READ] = words[cy.FRAMES_WRITTEN]  # the master has recorded it
 
-    def _judge_drive(self, plant: FaultyPlant) -> int:
-        """Flags of this cycle, and the current until the next one: see hard_cycle.py."""
-        if not self._begun:
-            return 0
-        if "drive" in self._seen.came:
-            plant.drive, self._missed = self.outputs[self._values.drive], 0
-            return 0
-        self._missed += 1
-        flags = int(Flags.DRIVE_LATE if self._seen.is_late else Flags.DRIVE_MISSING)
-        if self._missed >= self._bench.most_missed:
-            plant.drive = 0.0
-            flags |= int(Flags.CURRENT_ZEROED)
-        return flags
+    # ------------------------------------------------------------------------------------ lockstep
 
-    # ------------------------------------------------------------------------------------ frames out
-
-    def _send_sync(self) -> int | None:
-        """Send SYNC; returns how late a fault makes it, ns, or None where it is lost."""
-        identifier, action = self._bench.frames.sync, self._faults.find_action("sync", self.k)
-        delay = action.argument if action.code == DELAY else 0
-        if delay and self._realtime:
-            self._wire.run_until(self._t_ns + delay)
-        self._sync = self._wire.clock.now() if self._realtime else self._wall.now()
-        if identifier is None:
-            return delay
-        for _ in apply_action(action, b""):
-            self._master.send(identifier, b"")
-        return None if action.code == DROP else delay
-
-    def _send_frames(self, *, is_before_sync: bool) -> None:
-        """Send the frames of this cycle that go before SYNC, or those that follow it."""
-        for spec in self._bench.frames.list_from(Role.RIG):
-            if spec.is_before_sync is is_before_sync and self._played % spec.every == 0:
-                data = pack(spec, {**self.outputs, "cycle": self.k}, self._sent[spec.identifier])
-                self._sent[spec.identifier] += 1
-                self.outputs.update(unpack(spec, data))  # what the receiver will read
-                self._late.pass_on(self._find_fault(spec), data, self._t_ns, partial(self._master.send, spec.sent_as))
-
-    def _find_fault(self, spec: FrameSpec) -> Action:
-        """What a fault does to a frame that the rig sends: to the command, or to the feedback of its own plant."""
-        action = self._faults.find_action("command", self.k) if "command" in spec.roles else NORMAL
-        if action.code == SENT_NORMALLY and self._plant is not None and "feedback" in spec.roles:
-            return self._faults.find_action("feedback", self.k)
-        return action
-
-    # ------------------------------------------------------------------------------------ frames in
-
-    def _expect_answers(self, is_synced: bool) -> None:
-        """Which answers are sure to come in this cycle, and which values of earlier frames still count."""
-        self._seen = Seen()
-        if self._link is not None:
-            self._seen.plant_left, self._seen.drives_left = self._count_repeated_frames(self.k)
-        if self._plant is not None:
-            self._seen.came |= {"feedback", "valve_state"}
-        if not is_synced:
-            return
-        # without a SYNC the controller has its own clock: its frame may slip from one cycle of the rig to the next
-        slack = int(self._bench.frames.sync is None and self._realtime)
-        for spec, answer in self._answers.items():
-            age = self._begun - answer.last
-            if answer.last >= 0 and age < spec.every + (slack if spec.is_answer else self._bench.most_missed):
-                self._seen.came |= answer.roles
-            elif spec.is_answer and age >= spec.every:
-                self._seen.awaited.add(spec)
-        self._begun += 1
+    def _is_answered(self) -> bool:
+        return cy.is_complete(self._words) and self._plant_left <= 0
 
     def _wait_for_answers(self, delay: int | None) -> None:
-        """Lockstep: let the answers come in; what is not sure to come is given the time of a cycle."""
-        seen = self._seen
-        is_unsure = any(answer.last < 0 or not spec.is_answer for spec, answer in self._answers.items())
-        if delay is None or (is_unsure and not seen.awaited):
+        """Let the answers come in; what is not sure to come is given the time of a cycle."""
+        is_sure = self._are_sure and bool((self._layout.words[self._places + packing.LAST_CYCLE] >= 0).all())
+        is_open = not cy.is_complete(self._words)
+        if delay is None or not (is_sure or is_open):
             self._wire.run_until(self._wire.clock.now() + self._period)
-        elif seen.awaited:
-            self._wire.wait_for_answers(self._t_ns + delay, lambda: not seen.awaited and seen.plant_left <= 0)
-            if seen.drives_left > 0 and not seen.awaited:  # not every controller answers twice
-                self._wire.wait(lambda: seen.drives_left <= 0, _SECOND_ANSWER)
+        elif is_open:
+            self._wire.wait_for_answers(self._t_ns + delay, self._is_answered)
+            if self._drives_left > 0 and cy.is_complete(self._words):  # not every controller answers twice
+                self._wire.wait(lambda: self._drives_left <= 0, _SECOND_ANSWER)
 
     def _count_repeated_frames(self, k: int) -> tuple[int, int]:
         """How many frames of the plant and of the controller come in a cycle in which a fault doubles some.
@@ -448,68 +491,6 @@ class CycleLoop(Loop):
         if [self._faults.find_action("drive", k).code == CUT for k in (self.k - 1, self.k)] == [False, True]:
             link.wait(lambda: master.count_emergencies(Role.PLANT) > reported or link.is_node_gone(), link.grace)
 
-    def _receive_answer(self, frame: Frame) -> None:
-        """A frame of the controller, or of the plant, has come."""
-        spec = self._bench.frames.find(frame.cob_id, frame.data)
-        if self._open is None or spec not in self._answers:
-            return
-        answer = self._answers[spec]
-        if "drive" in answer.roles:
-            self._seen.drives_left -= 1
-        else:
-            self._seen.plant_left -= 1
-        if self._plant is None or "drive" not in answer.roles:
-            self._take_answer(answer, frame.data, frame.t_ns)
-            return
-        action = self._faults.find_action("drive", self._open[1].cycle)
-        if self._faults.is_bus_off("plant", self._open[1].cycle):
-            return
-        is_late = action.code == DELAY
-        self._late.pass_on(action, frame.data, frame.t_ns if self._realtime else self._t_ns, lambda data:
-                           self._take_answer(answer, data, self._wire.clock.now() if is_late else frame.t_ns))
-
-    def _is_sound(self, spec: FrameSpec, data: bytes) -> bool:
-        """Whether alive counter and checksum of an answer let it be taken."""
-        last = self._counters.get(spec.identifier, -1)
-        problem, self._counters[spec.identifier] = check_guards(spec, data, last)
-        self.unsound += bool(problem)
-        return problem in ("", "jump")
-
-    def _take_answer(self, answer: _Answer, data: bytes, t_ns: int) -> None:
-        """Take the values of an answer: the first feedback, and of the others the last of this cycle."""
-        if self._open is None or len(data) != answer.spec.length:
-            return
-        _, row, timing = self._open
-        is_first = answer.last != self._begun - 1
-        if not (answer.cycle_mask or is_first or "drive" in answer.roles) or (
-                answer.is_guarded and not self._is_sound(answer.spec, data)):
-            return
-        values = unpack(answer.spec, data)
-        if answer.cycle_mask and values["cycle"] != row.cycle & answer.cycle_mask:
-            self._seen.is_late |= "drive" in answer.roles
-            return
-        self.outputs.update(values)
-        answer.last = self._begun - 1
-        self._seen.came |= answer.roles
-        self._seen.awaited.discard(answer.spec)
-        if is_first:
-            # by its time of reception; in lockstep, where that is virtual, to now
-            since = ((t_ns if self._realtime else self._wall.now()) - self._sync) * 1e-9
-            for role in answer.roles & _RESPONSES.keys():
-                setattr(timing, _RESPONSES[role], since)
-            if not self._seen.awaited and isnan(timing.work):
-                timing.work = since
-
-    def _close(self) -> None:
-        """The cycle under way is over: the next SYNC is due."""
-        if self._open is None:
-            return
-        (t_ns, row, timing), self._open = self._open, None
-        if not self._step.is_counted:
-            return
-        self._values.fill_row(row, self.outputs, self._seen.came - (_OF_PLANT if self._plant is not None else set()))
-        self._log.cycle(t_ns, row, timing)
-
 
 def set_rig_faults(master: Master, faults: Schedule, k: int) -> None:
     """The faults of the rig itself that do not concern the cycle: its heartbeat, and what else it hears."""
@@ -517,7 +498,6 @@ def set_rig_faults(master: Master, faults: Schedule, k: int) -> None:
     master.is_deaf = faults.is_bus_off("rig", k)
 
 
-_OF_PLANT = frozenset({"feedback", "valve_state"})
 _SECOND_ANSWER = 0.08  # s: how long the second drive frame of a cycle is waited for
 _TIMES = ("lateness", "response", "feedback_response", "valve_response", "execution")
 

@@ -1,9 +1,9 @@
 """The rig's cycle as compiled code: due time, frames, SYNC, collecting the answers. No Python object, no allocation.
 
 `play_cycles` runs in a thread of its own without the interpreter lock until the queue is empty and the end is asked
-for. It shares its memory, `Buffers`, with Python (hard_loop.py): Python writes the inputs of the cycles ahead and reads
-rows and frames behind. Which frames there are and what lies where in them is data too: `Layout`
-(rig/benches/packing.py).
+for (hard_loop.py). `play_part` runs a part of a cycle for a loop that waits, sends and receives in Python (loop.py).
+Both share their memory, `Buffers`, with Python, which writes the inputs of the cycles ahead and reads rows and frames
+behind. Which frames there are and what lies where in them is data too: `Layout` (rig/benches/packing.py).
 
 A frame whose values take effect with SYNC goes out before SYNC is due: on a real bus a frame of 8 bytes takes 135 us at
 1 Mbit/s and would delay the SYNC behind it. The others follow the SYNC. Where the plant is no node of its own, this
@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.compile import keep_apart
-from rig.benches.bench import FD
 from rig.benches.packing import (
     ACCEPTED,
     ALL_ROLES,
@@ -52,7 +51,6 @@ from rig.network.raw_bus import (
     Port,
     read_clock,
     receive_frame,
-    send_frame,
     send_payload,
     sleep_until,
 )
@@ -82,7 +80,13 @@ from rig.sequences.faults import DELAY, DOUBLE, DROP, change_frame
  IS_LATE, DRIVES_MISSED, HAS_BEGUN, COUNTED, COMMAND_CODE, COMMAND_ARGUMENT, SYNC_CODE, SYNC_ARGUMENT,
  DEAF) = range(40, 61)
 PLAYED = 61  # cycles so far
-WORDS = 64
+# Words of a loop in Python: the part of a cycle to play, and what it needs; time, identifier and length of a frame
+PART, ARGUMENT, CAME_AT, CAME_AS, CAME_LENGTH = range(62, 67)
+WORDS = 72
+# Parts of a cycle. END: the row of the cycle before is complete. FIRST: an input, and the frames before SYNC. SYNC and
+# what follows it; argument: its lateness, ns. ANSWER: a frame came; time since SYNC, ns. LATE: the frames that faults
+# delay, up to a time.
+END, FIRST, SYNC, ANSWER, LATE = range(5)
 # Columns of an input: whether the cycle counts (before the run the controller is enabled in cycles that do not, and
 # the plant stays where it is); code and argument of the faults of command and SYNC (change_frame); whether the rig
 # receives nothing, by a fault
@@ -94,7 +98,7 @@ COLUMNS = 13
 # Columns of a frame; its head is identifier | length << 32 | sent by the rig << 40. Payload words follow DATA
 TIME, FRAME_HEAD, DATA = range(3)
 # Columns of a frame that waits: when it is due, its place in the layout, its length and 8 words of payload
-_HELD_DUE, _HELD_PLACE, _HELD_LENGTH, _HELD_DATA = range(4)
+HELD_DUE, _HELD_PLACE, _HELD_LENGTH, _HELD_DATA = range(4)
 HELD_COLUMNS = _HELD_DATA + 8
 
 
@@ -143,7 +147,26 @@ def play_cycles(port: Port, buffers: Buffers, m: Layout, plant: Memory) -> None:
         _begin_cycle(port, buffers, m, plant, read_clock(port) - words[DUE])
 
 
-def _is_complete(words: NDArray[np.int64]) -> bool:
+def play_part(port: Port, buffers: Buffers, m: Layout, plant: Memory) -> None:
+    """Play the part of a cycle that Python asks for. An answer stands in the port, with zeros up to 8 bytes."""
+    words = buffers.words
+    part, argument = words[PART], words[ARGUMENT]
+    if part == END:
+        _close_row(port, buffers, m)
+    elif part == FIRST:
+        _take_input(buffers)
+        _send_frames(port, buffers, m, plant, True)
+    elif part == SYNC:
+        _begin_cycle(port, buffers, m, plant, argument)
+    elif part == ANSWER:
+        frame = FRAME, words[CAME_AT], words[CAME_AS], words[CAME_LENGTH], port.words[PAYLOAD_IN // 8]
+        _accept_frame(port, buffers, m, plant, frame, argument)
+    else:
+        while words[HELD] > 0 and buffers.held[0, HELD_DUE] < argument:
+            _release_first_held(port, buffers, m)
+
+
+def is_complete(words: NDArray[np.int64]) -> bool:
     """Whether each answer that is sure to come has come."""
     return bool(words[CAME] & words[AWAITED] == words[AWAITED])
 
@@ -189,8 +212,8 @@ def _wait_until_due(port: Port, buffers: Buffers, m: Layout) -> None:
     """
     words = buffers.words
     _sleep_until(port, buffers, m, words[DUE] - words[SPIN])
-    is_frame_due = words[HELD] > 0 and buffers.held[0, _HELD_DUE] < words[DUE]
-    if is_frame_due or not (words[SPINS_ALWAYS] or _is_complete(words)):
+    is_frame_due = words[HELD] > 0 and buffers.held[0, HELD_DUE] < words[DUE]
+    if is_frame_due or not (words[SPINS_ALWAYS] or is_complete(words)):
         _sleep_until(port, buffers, m, words[DUE])
         return
     _end_work(port, words)
@@ -203,8 +226,8 @@ def _wait_until_due(port: Port, buffers: Buffers, m: Layout) -> None:
 def _sleep_until(port: Port, buffers: Buffers, m: Layout, t_ns: int) -> None:
     """Sleep until `t_ns`, and send the late frames that are due before."""
     words, held = buffers.words, buffers.held
-    while words[HELD] > 0 and held[0, _HELD_DUE] < t_ns:
-        _pause_until(port, words, held[0, _HELD_DUE])
+    while words[HELD] > 0 and held[0, HELD_DUE] < t_ns:
+        _pause_until(port, words, held[0, HELD_DUE])
         _release_first_held(port, buffers, m)
     _pause_until(port, words, t_ns)
 
@@ -264,10 +287,10 @@ def _hold_frame(buffers: Buffers, m: Layout, at: int, due: int, length: int) -> 
     place = words[HELD]
     if place == len(held):
         return
-    while place > 0 and held[place - 1, _HELD_DUE] > due:
+    while place > 0 and held[place - 1, HELD_DUE] > due:
         _move_held(buffers, place - 1, place)
         place -= 1
-    held[place, _HELD_DUE], held[place, _HELD_PLACE], held[place, _HELD_LENGTH] = due, at, length
+    held[place, HELD_DUE], held[place, _HELD_PLACE], held[place, _HELD_LENGTH] = due, at, length
     for i in range(8):
         held[place, _HELD_DATA + i] = m.words[PAYLOAD + i]
     words[HELD] += 1
@@ -301,12 +324,9 @@ def _send(port: Port, buffers: Buffers, m: Layout, identifier: int, length: int,
     for _ in range(count):
         if not words[FAILURE]:
             _record_frame(buffers, m, read_clock(port), identifier | length << 32 | 1 << 40)
-            if identifier & FD:
-                for i in range(64):
-                    port.octets[PAYLOAD_OUT + i] = m.octets[8 * PAYLOAD + i]
-                words[FAILURE] = min(send_payload(port, identifier, length), 0)
-            else:
-                words[FAILURE] = min(send_frame(port, identifier, length, m.words[PAYLOAD]), 0)
+            for i in range(8):
+                port.words[PAYLOAD_OUT // 8 + i] = m.words[PAYLOAD + i]
+            words[FAILURE] = min(send_payload(port, identifier, length), 0)
 
 
 # ---------------------------------------------------------------------------------------- the cycle
@@ -329,8 +349,9 @@ def _begin_cycle(port: Port, buffers: Buffers, m: Layout, plant: Memory, late: i
         _send(port, buffers, m, words[SYNC_ID], 0, 2 if words[SYNC_CODE] == DOUBLE else 1)
     if words[MOVES_PLANT]:
         m.doubles[m.words[VALUES_AT] + words[FLAGS_AT]] = _judge_drive(buffers, m, plant)
-    _send_frames(port, buffers, m, plant, False)
     _open_row(buffers, m, late)
+    _send_frames(port, buffers, m, plant, False)
+    _copy_values(buffers, m, words[DRIVEN], words[SENT_CHANNELS])
     words[OVERRUNS] += max(lost, buffers.rows[words[ROWS] % len(buffers.rows), OVERRUN])
     if words[MOVES_PLANT] and words[COUNTED] and not words[DIVERGED]:
         if words[CYCLES] == 0:  # the plant rests until the run begins: no answer from before drives it
@@ -343,16 +364,21 @@ def _begin_cycle(port: Port, buffers: Buffers, m: Layout, plant: Memory, late: i
 
 def _open_row(buffers: Buffers, m: Layout, late: int) -> None:
     words = buffers.words
-    number = words[ROWS] % len(buffers.rows)
-    row = buffers.rows[number]
+    row = buffers.rows[words[ROWS] % len(buffers.rows)]
     row[CYCLE], row[INPUT], row[INPUT_HELD] = words[CYCLES], words[POSITION], words[IS_HELD]
     row[IS_COUNTED], row[DUE_AT], row[LATENESS] = words[COUNTED], words[DUE], late
     row[OVERRUN] = 1 if 2 * late > words[PERIOD] or words[IS_UNDERRUN] else 0
     row[FEEDBACK_AT], row[VALVE_AT], row[DRIVE_AT], row[COMPLETE_AT] = 0, 0, 0, 0
-    for i in range(words[SENT_CHANNELS]):
-        buffers.values[number, i] = m.doubles[m.words[VALUES_AT] + i]
+    _copy_values(buffers, m, 0, words[DRIVEN])
     words[OPEN], words[ROW_CYCLE] = 1, words[CYCLES]
     _expect_answers(buffers, m)
+
+
+def _copy_values(buffers: Buffers, m: Layout, first: int, last: int) -> None:
+    """Put these values into the row of the cycle under way."""
+    number = buffers.words[ROWS] % len(buffers.rows)
+    for i in range(first, last):
+        buffers.values[number, i] = m.doubles[m.words[VALUES_AT] + i]
 
 
 def _expect_answers(buffers: Buffers, m: Layout) -> None:
@@ -413,13 +439,13 @@ def _receive_waiting(port: Port, buffers: Buffers, m: Layout, plant: Memory) -> 
     now, came = read_clock(port), 0
     while came < now and not buffers.words[FAILURE]:  # the port keeps the reason of the failure
         frame = receive_frame(port, 0)
-        _accept_frame(port, buffers, m, plant, frame)
+        _accept_frame(port, buffers, m, plant, frame, frame[1] - buffers.words[SYNC_AT])
         came = frame[1] if frame[0] == FRAME else now
 
 
 @keep_apart
 def _accept_frame(port: Port, buffers: Buffers, m: Layout, plant: Memory,
-                  frame: tuple[int, int, int, int, int]) -> None:
+                  frame: tuple[int, int, int, int, int], since_sync: int) -> None:
     """Record what `receive_frame` gave, and put the values of an answer into the row of the cycle under way."""
     words = buffers.words
     status, t_ns, identifier, length, data = frame
@@ -443,14 +469,14 @@ def _accept_frame(port: Port, buffers: Buffers, m: Layout, plant: Memory,
         if code in (DELAY, DROP):
             return
         length, m.words[PAYLOAD] = change_frame(code, argument, length, m.words[PAYLOAD])
-    _keep_answer(buffers, m, at, length, t_ns - words[SYNC_AT])
+    _keep_answer(buffers, m, at, length, since_sync)
 
 
 @keep_apart
 def _keep_answer(buffers: Buffers, m: Layout, at: int, length: int, since_sync: int) -> None:
     """Unpack the payload; of frames with the number of their cycle the last counts, of others the first."""
     words = buffers.words
-    roles, came = m.words[at + ROLES], words[CAME]
+    roles = m.words[at + ROLES]
     is_first = m.words[at + LAST_CYCLE] != words[HAS_BEGUN] - 1
     if not (m.words[at + IS_NUMBERED] or is_first or roles & DRIVE):
         return
@@ -465,7 +491,7 @@ def _keep_answer(buffers: Buffers, m: Layout, at: int, length: int, since_sync: 
             row[FEEDBACK_AT + i] = since_sync
     m.words[at + LAST_CYCLE] = words[HAS_BEGUN] - 1
     words[CAME] |= roles
-    if _is_complete(words) and came & words[AWAITED] != words[AWAITED]:
+    if is_first and is_complete(words) and not row[COMPLETE_AT]:
         row[COMPLETE_AT] = since_sync
 
 
@@ -482,11 +508,9 @@ def _record_frame(buffers: Buffers, m: Layout, t_ns: int, head: int) -> None:
 def _close_row(port: Port, buffers: Buffers, m: Layout) -> None:
     """Complete the row of the cycle under way and hand it to Python, with the frames up to now."""
     words = buffers.words
-    number = words[ROWS] % len(buffers.rows)
-    row = buffers.rows[number]
+    row = buffers.rows[words[ROWS] % len(buffers.rows)]
     row[ANSWERS], row[EXECUTION] = words[CAME], words[WORKED]
-    for i in range(words[SENT_CHANNELS], buffers.values.shape[1]):
-        buffers.values[number, i] = m.doubles[m.words[VALUES_AT] + i]
+    _copy_values(buffers, m, words[SENT_CHANNELS], buffers.values.shape[1])
     words[WORKED] = 0
     # The compiler cannot see into a library call: the row is in memory before the counts say that it is there.
     _begin_work(port, words)
