@@ -69,7 +69,6 @@ _IN_KERNEL, _IN_CONTROLLER = 5, 6  # frames lost on the way in
 _LATEST = 7  # time of the last frame: of two frames in a queue the second is not the earlier one
 _OWN, _COUNTS_LOSSES = 8, 9  # UDP: own port, network order; whether the kernel's count is of losses alone
 _STAMPED, _LISTED = 10, 11  # whether kernel times are used; how many COB-IDs beyond the classical ones are received
-GIVEN_TIME = 12  # for `read_given_time`
 # .. then what the kernel reads and writes (asm-generic, 64 bit), as byte offsets
 _MESSAGE, _VECTOR, _POLL, _TIME, _ERRNO, _SENDER, _LOCK = 256, 320, 336, 352, 368, 432, 448
 _CONTROL, _ALLOWED, _FRAME_IN, _FRAME_OUT = 512, 1024, 1280, 1360  # _FRAME: struct can_frame, canfd_frame
@@ -135,6 +134,7 @@ def _read_wall_clock(port: Port) -> int:
 # ---------------------------------------------------------------------------------------- receive
 
 
+@bind_later
 @keep_apart
 def receive_frame(port: Port, deadline_ns: int) -> tuple[int, int, int, int, int]:
     """The next frame; if none is waiting, wait for one until `deadline_ns` (absolute; 0: do not wait).
@@ -337,27 +337,6 @@ def _transmit(port: Port, start: int, size: int) -> int:
         if words[_ERROR] != _EINTR:
             return FAILED
     return SENT
-
-
-# ---------------------------------------------------------------------------------------- where Python sends and waits
-
-
-def read_given_time(port: Port) -> int:
-    """The time that Python has written into the port."""
-    return to_integer(port.words[GIVEN_TIME])
-
-
-def leave_to_python(port: Port, cob_id: int, length: int) -> int:
-    """Python sends the frames that the caller has recorded."""
-    return SENT
-
-
-def go_on(port: Port, t_ns: int) -> None:
-    """Python has waited before it called."""
-
-
-# bound to a loop, they let Python use any bus for it
-IN_PYTHON = {"read_clock": read_given_time, "send_payload": leave_to_python, "sleep_until": go_on}
 
 
 # ---------------------------------------------------------------------------------------- datagrams of python-can
@@ -607,16 +586,11 @@ def _open_socketcan(channel: str, is_fd: bool, stack: contextlib.ExitStack) -> s
     return raw
 
 
-def make_empty_port() -> Port:
-    """A port without a bus, for a loop that is bound to `IN_PYTHON`."""
-    words = np.zeros((_LIST + _LIST_SIZE) // 8, np.int64)
-    return Port(words, words.view(np.int32), words.view(np.uint8))
-
-
 def _make_port() -> Port:
     """The memory, with the addresses that the kernel's structures hold."""
-    port = make_empty_port()
-    words, base = port.words, port.words.ctypes.data
+    words = np.zeros((_LIST + _LIST_SIZE) // 8, np.int64)
+    port = Port(words, words.view(np.int32), words.view(np.uint8))
+    base = words.ctypes.data
     # struct msghdr: name, its length, vectors, their number, control data, its length, flags
     words[_MESSAGE // 8: _MESSAGE // 8 + 7] = base + _SENDER, 0, base + _VECTOR, 1, base + _CONTROL, _CONTROL_SIZE, 0
     words[_VECTOR // 8: _VECTOR // 8 + 2] = base + _IN, _IN_SIZE

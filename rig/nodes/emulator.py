@@ -3,24 +3,40 @@
 At each SYNC it reads its transducers and sends them, then moves the plant one cycle with the current that was latched:
 the answer to cycle k acts from cycle k+1. All faults are loaded before the start (object 0x2210), so a fault takes no
 bus time and begins exactly in the cycle that the sequence gives.
+
+The cycle is compiled (emulator_cycle.py). Here are the CANopen services, which share its memory, and the node whose
+frames Python brings; one that has a bus of its own is in emulator_service.py.
 """
 
-from abc import ABC, abstractmethod
-from functools import partial
-from typing import cast
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
 
-from plant import load_model
+import numpy as np
+
+from plant import Model, load_model
 from plant.errors import InputError, require
-from rig.benches.bench import Bench, CanopenNode, Flags
+from plant.machine_code import StoredCode
+from rig.benches.bench import Bench, CanopenNode
 from rig.benches.bench_file import load_bench
+from rig.benches.canopen_map import RPDO, TPDO
+from rig.benches.packing import VALUES_AT
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
 from rig.network import heartbeat
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import COUNTERS, PLANT, SCENARIO
-from rig.nodes.scenario import FaultyPlant, Scenario
-from rig.sequences.faults import DOUBLE, LateFrames, Plan, Schedule
+from rig.network.raw_bus import Port
+from rig.nodes import emulator_cycle as ec
+from rig.nodes.called_loop import call_loop, load_loop, make_port
+from rig.nodes.plant_code import CompiledPlant, load_plant
+from rig.nodes.scenario import DIVERGED, Scenario
+from rig.sequences.faults import DROP, Plan
 
-_NO_FLAGS = Flags(0)  # made once: an operation on an IntFlag takes a microsecond
+_RAISED = {  # events of the cycle: the errors that they raise
+    ec.TIMEOUT_RAISED: (EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION),
+    ec.DRIVE_SHORT: (EmcyCode.PDO_TOO_SHORT, ErrorRegister.COMMUNICATION),
+    ec.DIVERGED: (EmcyCode.SOFTWARE, ErrorRegister.GENERIC)}
+_CLEARED = {ec.TIMEOUT_CLEARED: EmcyCode.RPDO_TIMEOUT, ec.DRIVE_WHOLE: EmcyCode.PDO_TOO_SHORT}
 
 
 def find_plant_node(bench: Bench) -> CanopenNode:
@@ -41,21 +57,33 @@ def find_plant_node(bench: Bench) -> CanopenNode:
     return node
 
 
-class PlantNode(ABC):
-    """The plant as a CANopen node, whatever runs its cycle. Its interface is `receive` and `tick`."""
+class PlantNode:
+    """The plant as a CANopen node: the services, whatever runs its cycle. Its interface is `receive` and `tick`."""
 
     _scenario: Scenario | None = None
+    _memory: ec.Memory  # what the cycle works on
 
     def __init__(self, send: Send, bench: Bench | None) -> None:
         """`bench`: whose plant it is; default: the shipped one."""
         self._send, self._bench = send, bench or load_bench()
         self._node = node = find_plant_node(self._bench)
-        self._heartbeat = node.find_cob_id(heartbeat.COB_ID)
+        self._heartbeat, self._emcy, self._sdo = map(node.find_cob_id, (heartbeat.COB_ID, 0x080, 0x600))
+        self._unheard = list_unheard(self._bench)
         self.device = Device(node.node, node.eds, self._transmit)
         self.device.on_write, self.device.on_nmt = self._on_write, self._on_nmt
         self._od = self.device.od.values
-        drive = self._bench.frames.drive.identifier
-        self._drive = next(pdo for pdo in self.device.pdo.rpdos.values() if pdo.cob_id == drive)
+        self._frames = [self._bench.frames.find_role(role) for role in ("drive", "feedback", "valve_state")]
+        received, sent = self.device.pdo.rpdos.values(), self.device.pdo.tpdos.values()
+        self._drive = next(pdo for pdo in received if pdo.cob_id == self._frames[0].identifier)
+        self._tpdos = [next(pdo for pdo in sent if pdo.cob_id == spec.identifier) for spec in self._frames[1:]]
+        self._obeying = False  # an NMT command, which the cycle obeys by itself
+        self._booking = False  # an error whose EMCY the cycle has sent
+        self._diverged = ""
+
+    @property
+    def problem(self) -> str:
+        """Why the plant can go on no more; empty if it can."""
+        return self._plant.problem or self._diverged
 
     def load_scenario(self, scenario: Scenario | None) -> None:
         """Load a plant with its faults and loads; it is compiled now, not in the first cycle. None: that of the bench.
@@ -86,176 +114,209 @@ class PlantNode(ABC):
         except InputError as error:
             raise SdoAbort(Abort.VALUE) from error
 
-    def _pass_on(self, cob_id: int, data: bytes, faults: Schedule, k: int, is_running: bool) -> None:
-        """Send a frame of the services unless a fault keeps it back. `k` is the cycle of the SYNC to come.
+    def _begin(self, scenario: Scenario) -> None:
+        """Make new memory for the cycle; the SYNC to come is that of cycle 0. The node stays in its NMT state."""
+        plant = load_plant(scenario)
+        memory = ec.make_memory(scenario, *plant.code, self._frames)
+        words, answered = memory.words, self._node.inputs["cycle"].field
+        words[ec.NODE: ec.MISSED_LIMIT + 1] = (self._node.node, self._drive.n, answered.wrap_number(-1),
+                                               self._bench.most_missed)
+        with self._pause():
+            if self._scenario:
+                words[ec.STATE] = self._memory.words[ec.DEMOTED] or self._memory.words[ec.STATE]
+            words[ec.BEGUN] = words[ec.FIRST] = words[ec.STATE] == ec.OPERATIONAL
+            self._scenario, self._memory, self._schedule = scenario, memory, scenario.make_schedule()
+            self._plant, self._diverged = plant, ""
+            self._noise = np.random.default_rng(scenario.seed)
+            self._seen = self._noticed = 0
+            ec.fill_noise(self._memory, self._noise)
+            self._share_settings()
 
-        `is_running`: there was a SYNC. Before it there is no cycle, and bring-up needs the heartbeat.
-        """
-        is_silent = cob_id == self._heartbeat and is_running and not faults.is_heartbeat_alive("plant", k)
+    @contextmanager
+    def _pause(self) -> Iterator[None]:
+        """Let the cycle rest, and go on with what has been set meanwhile."""
+        yield
+
+    def receive(self, frame: Frame) -> None:
+        """A frame for the services arrived."""
+        is_bus_off = self._schedule.is_bus_off("plant", int(self._memory.words[ec.CYCLE]) - 1)
+        if frame.cob_id in self._unheard or is_bus_off:
+            return
+        self._book_events()
+        if frame.cob_id == self._sdo:
+            self._show_values(frame.data)
+        self.device.receive(frame)
+
+    def _obey(self, command: int) -> None:
+        """Do what the cycle has done at an NMT command, or left to the services."""
+        self._obeying = True
+        try:
+            self.device.receive(Frame(self.device.t_ns, 0, bytes((command, self.device.node_id))))
+        finally:
+            self._obeying = False
+
+    def _transmit(self, cob_id: int, data: bytes) -> None:
+        """Send a frame of the services unless a fault or the cycle has dealt with it."""
+        if cob_id == self._emcy and self._booking:
+            return
+        words, faults, is_beat = self._memory.words, self._schedule, cob_id == self._heartbeat
+        if not is_beat or data == bytes(1):
+            self._share_settings()  # what SDO has written is in force when it is confirmed
+        if is_beat and data == bytes(1) and not words[ec.STATE]:  # the first boot-up
+            words[ec.STATE] = ec.PRE_OPERATIONAL
+        k = int(words[ec.CYCLE])
+        # before the first SYNC there is no cycle, and bring-up needs the heartbeat
+        is_silent = is_beat and words[ec.BEGUN] and not words[ec.FIRST] and not faults.is_heartbeat_alive("plant", k)
         if not is_silent and not faults.is_bus_off("plant", k - 1):
             self._send(cob_id, data)
 
-    @abstractmethod
-    def _begin(self, scenario: Scenario) -> None:
-        """Begin anew with this scenario; the SYNC to come is that of cycle 0."""
-
-    @abstractmethod
-    def _transmit(self, cob_id: int, data: bytes) -> None:
-        """A frame of the device."""
-
-    @abstractmethod
     def _on_nmt(self, old: NmtState, new: NmtState) -> None:
-        """The state has changed."""
+        if new is NmtState.INITIALISING:
+            assert self._scenario is not None
+            self._memory.words[ec.DEMOTED] = ec.PRE_OPERATIONAL
+            self._begin(self._scenario)
+        elif not self._obeying and old is NmtState.OPERATIONAL:  # an error of the services: 0x1029
+            self._memory.words[ec.DEMOTED] = new
+
+    def _share_settings(self) -> None:
+        """What SDO may change, and the error register without the cycle's own error."""
+        shared, od = self._memory.words, self.device.od
+        shared[ec.PERIOD] = od.read_number(0x1006, 0)
+        emcy = od.read_number(0x1014, 0, 1 << 31)
+        shared[ec.EMCY_ID] = -1 if emcy >> 31 else emcy & 0x7FF
+        others = [code for code in self.device.emcy.active if code != EmcyCode.RPDO_TIMEOUT]
+        communication = any(code != EmcyCode.SOFTWARE for code in others)
+        shared[ec.OTHER_REGISTER] = ErrorRegister.GENERIC * bool(others) | ErrorRegister.COMMUNICATION * communication
+        for row, tpdo in enumerate(self._tpdos):
+            at, kind = ec.TPDOS_AT + 4 * row, od.read_number(TPDO + tpdo.n - 1, 2)
+            shared[at + ec.ID] = -1 if tpdo.cob_id is None else tpdo.cob_id
+            if shared[at + ec.TYPE] != kind:
+                shared[at + ec.TYPE] = shared[at + ec.COUNT] = kind
+        shared[ec.DRIVE_TYPE] = od.read_number(RPDO + self._drive.n - 1, 2)
+        shared[ec.SYNC_ID] = od.read_number(0x1005, 0, 0x80) & 0x7FF
+        shared[ec.DRIVE_ID] = -1 if self._drive.cob_id is None else self._drive.cob_id
+
+    def _book_events(self) -> None:
+        """Take over what the cycle noticed or did: errors, whose EMCY it sends itself or leaves to the services."""
+        emcy, t_ns, number = self.device.emcy, self.device.t_ns, bytes((self._drive.n,))
+        while self._seen < self._memory.words[ec.EVENTS]:
+            event = self._memory.words[ec.EVENTS_AT + self._seen % ec.EVENT_RING]
+            self._seen += 1
+            self._booking = event in (ec.TIMEOUT_RAISED, ec.TIMEOUT_CLEARED)
+            if event >= ec.COMMANDED:
+                self._obey(int(event) - ec.COMMANDED)
+            elif event == ec.SYNC_MALFORMED:
+                self.device.sync.receive(Frame(t_ns, self._bench.frames.sync or 0, b"\0"))
+            elif event in _RAISED:
+                emcy.raise_error(*_RAISED[event], b"\x03" if event == ec.DIVERGED else number)
+            else:
+                emcy.clear(_CLEARED[event], number if event == ec.DRIVE_WHOLE else b"")
+            if event == ec.DIVERGED:
+                self._diverged = DIVERGED
+                self._obeying = True  # the cycle has left OPERATIONAL
+                self.device.nmt.communication_error(0)
+                self._obeying = False
+            self._booking = False
+
+    def _show_values(self, request: bytes) -> None:
+        """Put the values of the cycle into the dictionary, which an SDO request is about to read."""
+        shared, frames, signals = self._memory.words, self._memory.frames, ec.list_channels(self._bench.signals)
+        values = dict(zip(signals, frames.doubles[frames.words[VALUES_AT]:], strict=False))
+        for places, cycle in ((self._node.outputs, ec.FRAME_CYCLE), (self._node.inputs, ec.ANSWERED)):
+            for signal, (key, field) in places.items():
+                self._od[key] = (field.wrap_number(int(shared[cycle])) if signal == "cycle" else
+                                 field.compute_counts(values.get(signal, 0.0)))
+        self._od[COUNTERS, 1], self._od[COUNTERS, 2] = int(shared[ec.MISSING]), int(shared[ec.LATE])
 
 
 class Emulator(PlantNode):
-    """The plant node in Python; `scenario` is used until the rig loads another."""
+    """The plant node whose frames Python brings; `scenario` is used until the rig loads another."""
 
     def __init__(self, send: Send, scenario: Scenario | None = None, bench: Bench | None = None) -> None:
         super().__init__(send, bench)
-        node, frames, signals = self._node, self._bench.frames, self._bench.signals
-        self._names = {frames.find_role(name).identifier: name for name in ("feedback", "valve_state")}
-        self._written = [node.outputs[s.word] for s in signals.outputs]
-        self._flags, self._number = (node.outputs[signal] for signal in ("flags", "cycle"))
-        self._driving, self._answered = (node.inputs[word] for word in (signals.drive.word, "cycle"))
-        self._drive_id, self._sync_id = frames.drive.identifier, frames.sync
-        self._most_missed = self._bench.most_missed
-        self.device.on_sync = self._on_sync
+        self._port = make_port()
         self.load_scenario(scenario)
 
     def _begin(self, scenario: Scenario) -> None:
-        self.plant = FaultyPlant(scenario)
-        self._scenario, self._faults = scenario, self.plant.faults
-        self._cycle = 0  # of the SYNC to come
-        self._begun = False  # SYNCs are counted from the first start
-        self._first = True  # of the cycles after a start: no drive can have answered yet
-        self._moved = True
-        self._missed = 0  # drive frames missing in a row
-        self._synced = -1  # the cycle of the last SYNC
-        self._received, self._sent = LateFrames(), LateFrames()
-        for sub in (1, 2):
-            self._od[COUNTERS, sub] = 0
+        super()._begin(scenario)
+        self._run = load_service().bind((self._port, self._memory))
+
+    def _share_settings(self) -> None:
+        super()._share_settings()
+        self._memory.words[ec.PERIOD] = 1  # a frame is late by the clock, also in lockstep
 
     def receive(self, frame: Frame) -> None:
-        """A frame of another node arrived: a fault may delay or drop it."""
-        if frame.cob_id == self._drive_id:
-            action = self._faults.find_action("drive", self._cycle - 1)
-            self._received.pass_on(action, frame.data, frame.t_ns,
-                                   lambda data: self.device.receive(frame._replace(data=data)))
+        """A frame of another node arrived."""
+        words, device, is_sync = self._memory.words, self.device, frame.cob_id == self._memory.words[ec.SYNC_ID]
+        if not is_sync and frame.cob_id not in (0, words[ec.DRIVE_ID]):
+            super().receive(frame)
             return
-        is_sync = frame.cob_id == self._sync_id
-        is_cycle = is_sync and self._begun
-        if self._faults.is_bus_off("plant", self._cycle if is_sync else self._cycle - 1):
-            if is_cycle:  # it receives nothing, but its plant goes on
-                self._pass_cycle()
-            return
-        if is_cycle:
-            for _ in range(self._faults.count_lost_syncs(self._cycle)):  # time went on for the plant
-                self._pass_cycle()
-            is_second = (self._synced == self._cycle - 1
-                         and self._faults.find_action("sync", self._synced).code == DOUBLE)
-            self._synced = -1 if is_second else self._cycle
-            if is_second:
-                self._answer_again()
-                return
-            if self.device.state is not NmtState.OPERATIONAL:
-                self._cycle += 1  # time goes on while the plant pauses
-        self.device.receive(frame)
-        if not self._moved:  # after the answer to a SYNC has gone out
-            self._move()
+        device.t_ns = frame.t_ns
+        is_heard = device.state is NmtState.OPERATIONAL and not self._schedule.is_bus_off("plant", int(words[ec.CYCLE]))
+        if is_sync and is_heard:
+            self._notice_sync(frame)
+        words[ec.PUSHED], words[ec.PUSHED_TIME], words[ec.PUSHED_ID] = 1, frame.t_ns, frame.cob_id
+        words[ec.PUSHED_LENGTH] = len(frame.data)
+        words[ec.PUSHED_DATA] = int.from_bytes(frame.data[:8].ljust(8, b"\0"), "little", signed=True)
+        self._play(frame.t_ns)
 
-    def _pass_cycle(self) -> None:
-        """A cycle of which the node heard no SYNC: the current stays, and is zeroed after three."""
-        if self.device.state is NmtState.OPERATIONAL:
-            self._miss(1)
-            self.plant.pass_unread(self._cycle)
-        self._cycle += 1
-
-    def _answer_again(self) -> None:
-        """Send the PDOs of this SYNC once more; the plant does not move twice."""
-        if self.device.state is NmtState.OPERATIONAL:
-            for tpdo in self.device.pdo.cyclic:
-                tpdo.send()
-
-    def is_quiet(self, k: int) -> bool:
-        """Whether the SYNC to come is that of cycle k, and nothing else is under way: no frame is late or missing."""
-        is_steady = self._moved and not self._first and not self._missed and self._synced == self._cycle - 1
-        return (is_steady and self._cycle == k and self.device.state is NmtState.OPERATIONAL
-                and not self._received and not self._sent and self._drive.is_waiting)
-
-    def pass_quiet(self, cycles: int, drive: bytes) -> None:
-        """So many cycles were simulated elsewhere, on the state of `plant`; the last was answered by `drive`."""
-        self._cycle += cycles
-        self._synced = self._cycle - 1
-        self.plant.pass_quiet(cycles)
-        self._drive.put(drive)
+    def _notice_sync(self, frame: Frame) -> None:
+        """What was missed before this SYNC is reported before what ends with it."""
+        if self._schedule.find_action("sync", int(self._memory.words[ec.CYCLE])).code == DROP:
+            self._memory.words[ec.PUSHED] = ec.LOST_SYNCS
+            self._play(frame.t_ns)
+        if not frame.data:
+            self.device.sync.notice(frame.t_ns)
 
     def tick(self, t_ns: int) -> None:
-        """Deliver the delayed frames that are due at `t_ns`."""
-        self._received.release(t_ns + 1)
-        self._sent.release(t_ns + 1)
+        """Deliver the delayed frames that are due at `t_ns`, and run the timers."""
+        if self._memory.words[ec.HELD]:
+            self.device.t_ns = t_ns
+            self._play(t_ns)
+        ec.fill_noise(self._memory, self._noise)
         self.device.tick(t_ns)
 
-    def _transmit(self, cob_id: int, data: bytes) -> None:
-        """Send a frame unless a fault drops or delays it."""
-        if (name := self._names.get(cob_id)) is not None:
-            self._sent.pass_on(self._faults.find_action(name, self._cycle), data, self.device.t_ns,
-                               partial(self._send, cob_id))
-            return
-        self._pass_on(cob_id, data, self._faults, self._cycle, not self._first)
+    def _play(self, t_ns: int) -> None:
+        for cob_id, data in call_loop(self._port, self._run, t_ns):
+            self._send(cob_id, data)
+        self._book_events()
+        if command := int(self._memory.words[ec.RESET_COMMAND]):
+            self._obey(command)
 
-    def _on_nmt(self, old: NmtState, new: NmtState) -> None:
-        """The first start begins a run; after a pause the plant continues from its last state."""
-        if new is NmtState.OPERATIONAL:
-            self._begun = self._first = True
-        elif new is NmtState.INITIALISING:
-            assert self._scenario is not None
-            self._begin(self._scenario)
+    def share_memory(self, k: int) -> ec.Memory | None:
+        """The plant, for compiled code that moves it from cycle k on.
 
-    def _on_sync(self) -> None:
-        """The drive that came last is latched: judge it, read the transducers, leave the rest until they are sent."""
-        k, od = self._cycle, self._od
-        flags = _NO_FLAGS if self._first else self._judge(k)
-        self._first = False
-        readings = self.plant.read(k)
-        if readings is None:
-            # The simulation diverged (an extreme parameter, a division by zero): stop, send no invented value. Whatever
-            # 0x1029 says, the node becomes PRE-OPERATIONAL: no feedback any more.
-            self.device.emcy.raise_error(EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")
-            self.device.nmt.communication_error(0)
-            return
-        for place, reading in zip(self._written, readings, strict=True):
-            od[place.key] = place.field.compute_counts(reading)
-        od[self._flags.key], od[self._number.key] = int(flags), self._number.field.wrap_number(k)
-        self._moved = False
-
-    def _judge(self, k: int) -> Flags:
-        """Whether the latched drive answers the cycle before this one; the current to use until the next SYNC.
-
-        A missing or late answer leaves the current as it was; after three in a row there is none (EMCY 0x8250) until
-        answers come again.
+        None unless that is the next one and nothing else is under way: no frame is late or missing.
         """
-        fresh = self._drive.fresh
-        if fresh and self._od[self._answered.key] == self._answered.field.wrap_number(k - 1):
-            self.plant.drive = self._driving.field.compute_value(cast(float, self._od[self._driving.key]))
-            if self._missed >= self._most_missed:
-                self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
-            self._missed = 0
-            return _NO_FLAGS
-        return Flags.DRIVE_LATE | self._miss(2) if fresh else Flags.DRIVE_MISSING | self._miss(1)
+        words = self._memory.words
+        is_steady = words[ec.WAITING] and not (words[ec.FIRST] or words[ec.MISSED] or words[ec.HELD])
+        is_next = words[ec.CYCLE] == k and words[ec.SYNCED] == k - 1
+        return self._memory if is_next and is_steady and self.device.state is NmtState.OPERATIONAL else None
 
-    def _miss(self, counter: int) -> Flags:
-        """No answer to the last cycle; the flag if it was one too many: then there is no current."""
-        self._missed += 1
-        self._od[COUNTERS, counter] = cast(int, self._od[COUNTERS, counter]) + 1
-        if self._missed < self._most_missed:
-            return _NO_FLAGS
-        self.plant.drive = 0.0
-        self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, bytes((self._drive.n,)))
-        return Flags.CURRENT_ZEROED
+    def pass_quiet(self, cycles: int, drive: int) -> None:
+        """So many cycles were simulated elsewhere, on the memory of this node; the last was answered by `drive`."""
+        words = self._memory.words
+        words[ec.CYCLE] += cycles
+        words[ec.SYNCED], words[ec.WAITING_DATA] = words[ec.CYCLE] - 1, drive
 
-    def _move(self) -> None:
-        """Advance the plant by one cycle."""
-        self.plant.move(self._cycle)
-        self._moved = True
-        self._cycle += 1
+
+@cache
+def load_service() -> StoredCode:
+    """The cycle of the node, for any plant: some seconds on a new machine."""
+    return load_loop(ec.serve_frame, make_trial)
+
+
+def make_trial() -> tuple[Port, ec.Memory]:
+    """Arguments for one SYNC of the shipped bench."""
+    bench = load_bench()
+    memory = ec.make_memory(Scenario(Model(), Plan(stop=0)), *CompiledPlant(Model()).code,
+                            [bench.frames.find_role(role) for role in ("drive", "feedback", "valve_state")])
+    memory.words[ec.STATE], memory.words[ec.SYNC_ID], memory.words[ec.PUSHED_ID] = ec.OPERATIONAL, 0x080, 0x080
+    memory.words[ec.PUSHED] = memory.words[ec.PERIOD] = 1
+    ec.fill_noise(memory, np.random.default_rng(0))
+    return make_port(), memory
+
+
+def list_unheard(bench: Bench) -> tuple[int, ...]:
+    """What the services need not hear: the frames of the bench, and what the cycle hears."""
+    return 0x000, *bench.frames.identifiers

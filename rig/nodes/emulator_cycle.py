@@ -1,9 +1,8 @@
 """The emulator's cycle as one compiled loop: SYNC in, feedback and valve state out, the plant one cycle further.
 
-`run_emulator` is a plain function; `plant.compile` compiles it with the plant and the bus (raw_bus.py) as one. It does
-what `rig.nodes.emulator.Emulator` does, with the same numbers; only the CANopen services stay in Python
-(emulator_service.py), on another socket. Both work on the same arrays, which are made before the start: nothing is
-allocated in the loop.
+`run_emulator` is a plain function; `plant.compile` compiles it with the bus (raw_bus.py) as one. Only the CANopen
+services stay in Python (emulator.py), on another socket. Both work on the same arrays, which are made before the start:
+nothing is allocated in the loop. `serve_frame` does the same a frame at a time, for a node whose frames Python brings.
 
 Time. In real time a late frame is late by the clock. In lockstep (0x1006 = 0) the cycles have no fixed length, so a
 delay counts in cycles, as on the embedded bus: a frame that is late by m cycles and a part is sent in cycle k + m,
@@ -63,9 +62,9 @@ TPDOS_AT = 9  # rows of feedback and valve state, with the columns
 ID, TYPE, COUNT, DATA = range(4)  # COB-ID, -1: none; transmission type; and of the loop: SYNCs to go, payload
 # .. by the loop:
 (FRAME_CYCLE, ANSWERED, STATE, BEGUN, FIRST, CYCLE, MISSED, WAITING,
- WAITING_DATA, MISSING, LATE, ZEROED, PLANT_CYCLE, HELD, NOW, EVENTS, RECORDED, LAST_SYNC, LONGEST_WAKE,
+ WAITING_DATA, MISSING, LATE, ZEROED, PLANT_CYCLE, HELD, NOW, EVENTS, RECORDED, LONGEST_WAKE,
  LONGEST_RESPONSE, LONGEST_CYCLE, PUSHED, PUSHED_TIME, PUSHED_ID, PUSHED_LENGTH, PUSHED_DATA, SHORT, UNSENT, FAILURE,
- RESET_COMMAND, SYNCED) = range(17, 48)
+ RESET_COMMAND, SYNCED) = range(17, 47)
 # .. by nobody: time of a cycle in ns, and where the tables are that depend on the plant and its faults
 (CYCLE_TIME, PARAMETERS, PARAMETERS_AT, SIGNALS, SIGNALS_AT, FAULT_VALUES_AT, LOAD, LOAD_AT, FLAT, FLAT_AT,
  LIVE_AT, RECORD_SIZE, ADVANCE, READ, STEPS) = range(64, 79)
@@ -85,6 +84,7 @@ IN_FORCE, _PERIOD, _RESULT, _FAILURE, NOISE_AT = 0, 1, 4, 8, 16  # in the real n
 # events for the services
 TIMEOUT_RAISED, TIMEOUT_CLEARED, DRIVE_SHORT, DRIVE_WHOLE, DIVERGED, SYNC_MALFORMED = range(1, 7)
 COMMANDED = 256  # + the NMT command
+LOST_SYNCS = 2  # PUSHED: the SYNCs that were lost before the one that is to be pushed
 
 # What faults act on, late frames in the order of their delivery: drives first, which are for the emulator itself; valve
 # states last, because in lockstep they end the rig's wait. Bus-off is on the whole node.
@@ -127,13 +127,7 @@ class Memory(NamedTuple):
 def run_emulator(port: Port, m: Memory) -> None:
     """Serve the bus until the services stop it, an NMT reset comes (RESET_COMMAND) or the bus fails (FAILURE)."""
     words = m.words
-    while True:
-        if words[STOP]:
-            return
-        if words[DEMOTED]:
-            if words[STATE] == OPERATIONAL:
-                _leave_operational(m, words[DEMOTED])
-            words[DEMOTED] = 0
+    while not words[STOP]:
         if words[PUSHED]:
             words[PUSHED] = 0
             status, t_ns, cob_id = FRAME, words[PUSHED_TIME], words[PUSHED_ID]
@@ -144,33 +138,55 @@ def run_emulator(port: Port, m: Memory) -> None:
         else:
             status, t_ns, cob_id, length, data = await_frame(port)
         if status == FRAME:
-            if cob_id == words[SYNC_ID]:
-                if not words[BEGUN] or _is_next_sync(port, m, t_ns):
-                    _take_sync(port, m, t_ns, length)
-            elif cob_id == words[DRIVE_ID]:
-                _take_drive(m, t_ns, length, data)
-            elif cob_id == 0 and length == 2 and not _is_bus_off(m, words[CYCLE] - 1) and _take_command(m, data):
-                return
+            _take_frame(port, m, t_ns, cob_id, length, data)
         elif status < 0:
             words[FAILURE] = status
         if words[HELD] and words[PERIOD]:
             _release_until(port, m, read_clock(port), True)
-        if words[FAILURE]:
+        if words[FAILURE] or words[RESET_COMMAND]:
             return
+
+
+def serve_frame(port: Port, m: Memory) -> None:
+    """Deal with the frame that Python has pushed, or with LOST_SYNCS, or deliver the late frames that are due."""
+    words = m.words
+    pushed = words[PUSHED]
+    words[PUSHED] = 0
+    if pushed == LOST_SYNCS:
+        _pass_lost_syncs(port, m)
+    elif pushed:
+        _take_frame(port, m, words[PUSHED_TIME], words[PUSHED_ID], words[PUSHED_LENGTH], words[PUSHED_DATA])
+    else:
+        _release_until(port, m, read_clock(port), True)
+
+
+@keep_apart
+def _take_frame(port: Port, m: Memory, t_ns: int, cob_id: int, length: int, data: int) -> None:
+    words = m.words
+    if words[DEMOTED]:
+        if words[STATE] == OPERATIONAL:
+            _leave_operational(m, words[DEMOTED])
+        words[DEMOTED] = 0
+    if cob_id == words[SYNC_ID]:
+        if not words[BEGUN] or _is_next_sync(port, m, t_ns):
+            _take_sync(port, m, t_ns, length)
+    elif cob_id == words[DRIVE_ID]:
+        _take_drive(m, t_ns, length, data)
+    elif cob_id == 0 and length == 2 and not _is_bus_off(m, words[CYCLE] - 1):
+        _take_command(m, data)
 
 
 # ------------------------------------------------------------------------------------ NMT
 
 
-def _take_command(m: Memory, data: int) -> bool:
-    """An NMT command to this node; True for a reset, which the services carry out. They hear of all from here."""
+def _take_command(m: Memory, data: int) -> None:
+    """An NMT command to this node. The services, which hear of all from here, carry out a reset (RESET_COMMAND)."""
     words = m.words
     command, node = data & 0xFF, data >> 8 & 0xFF  # before its boot-up the node hears nothing
     if words[STATE] == INITIALISING or (node != 0 and node != words[NODE]):
-        return False
+        return
     if command == 129 or command == 130:
         words[RESET_COMMAND] = command
-        return True
     if command == 1 or command == 2 or command == 128:
         _post_event(m, COMMANDED + command)
     if command == 1 and words[STATE] != OPERATIONAL:
@@ -180,7 +196,6 @@ def _take_command(m: Memory, data: int) -> bool:
         _leave_operational(m, STOPPED)
     elif command == 128 and words[STATE] != PRE_OPERATIONAL:
         _leave_operational(m, PRE_OPERATIONAL)
-    return False
 
 
 def _leave_operational(m: Memory, state: int) -> None:
@@ -263,7 +278,6 @@ def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
     if length:
         _post_event(m, SYNC_MALFORMED)
         return
-    words[LAST_SYNC] = t_ns
     fresh = words[WAITING]
     if fresh:
         words[WAITING] = 0
@@ -313,13 +327,12 @@ def _wait_for_noise(port: Port, m: Memory) -> bool:
 
 
 def _is_next_sync(port: Port, m: Memory, t_ns: int) -> bool:
-    """Deal with the SYNCs that faults suppress or repeat; whether this one begins a cycle. See `Emulator.receive`."""
+    """Deal with the SYNCs that faults suppress or repeat; whether this one begins a cycle."""
     words = m.words
     if _is_bus_off(m, words[CYCLE]):
         _pass_cycle(port, m)
         return False
-    while find_action(m, _SYNC, words[CYCLE])[0] == DROP:  # time went on for the plant
-        _pass_cycle(port, m)
+    _pass_lost_syncs(port, m)
     if words[SYNCED] == words[CYCLE] - 1 and find_action(m, _SYNC, words[SYNCED])[0] == DOUBLE:
         words[SYNCED] = -1
         if words[STATE] == OPERATIONAL:
@@ -327,6 +340,12 @@ def _is_next_sync(port: Port, m: Memory, t_ns: int) -> bool:
         return False
     words[SYNCED] = words[CYCLE]
     return True
+
+
+def _pass_lost_syncs(port: Port, m: Memory) -> None:
+    """Time went on for the plant while faults suppressed the SYNCs up to this one."""
+    while find_action(m, _SYNC, m.words[CYCLE])[0] == DROP:
+        _pass_cycle(port, m)
 
 
 @keep_apart
@@ -358,7 +377,11 @@ def _read_time(port: Port, m: Memory, t_ns: int) -> int:
 
 
 def _judge_drive(port: Port, m: Memory, k: int, fresh: int) -> int:
-    """Flags of this cycle and the current to use until the next SYNC: see `Emulator._judge`."""
+    """Flags of this cycle and the current to use until the next SYNC: the one that answers the cycle before this one.
+
+    A missing or late answer leaves the current as it was; after three in a row there is none (EMCY 0x8250) until
+    answers come again.
+    """
     words = m.words
     if fresh and words[ANSWERED] == (k - 1) & words[NUMBER_MASK]:
         m.reals[IN_FORCE] = m.frames.doubles[m.frames.words[VALUES_AT] + words[SENSORS] + 1]
@@ -526,12 +549,15 @@ def _find_next_due(m: Memory) -> int:
 
 def _find_next_held(m: Memory, t_ns: int, least: int) -> int:
     """Where the late frame of kind `least` or above stands that is to be delivered next at `t_ns`; -1 for none."""
-    best = -1
+    best, first = -1, (0, 0)
     for i in range(m.words[HELD]):
         at = _HELD_AT + 4 * i
-        what, due = m.words[at], m.words[at + 1]
-        if least <= what and due <= t_ns and (best < 0 or (what, due) < (m.words[best], m.words[best + 1])):
-            best = at
+        what, due = to_integer(m.words[at]), to_integer(m.words[at + 1])
+        order = what, due
+        if m.words[PERIOD]:  # by their times, but drives first
+            order = min(what, FEEDBACK_FRAME), due
+        if least <= what and due <= t_ns and (best < 0 or order < first):
+            best, first = at, order
     return best
 
 
@@ -552,7 +578,8 @@ def _release_until(port: Port, m: Memory, t_ns: int, with_drives: bool) -> bool:
         what, length, data = words[at], words[at + 2], words[at + 3]
         words[HELD] -= 1
         end = _HELD_AT + 4 * words[HELD]
-        words[at:end] = words[at + 4:end + 4]
+        for place in range(at, end):
+            words[place] = words[place + 4]
         if what == _DRIVE:
             _keep_drive(m, length, data)
         elif words[TPDOS_AT + 4 * (what - FEEDBACK_FRAME) + ID] >= 0:  # it may have been switched off meanwhile
@@ -628,7 +655,7 @@ def _set_parameters(m: Memory, k: int) -> None:
 
 
 def _disturb(m: Memory, signal: int, value: float, k: int) -> float:
-    """What a sensor says in place of `value`: see `Schedule.change_signal`."""
+    """What a sensor says in place of `value`; faults act in the order of the plan."""
     words, reals = m.words, m.reals
     for i in range(words[SIGNALS]):
         at = words[SIGNALS_AT] + 5 * i

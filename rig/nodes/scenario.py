@@ -1,4 +1,4 @@
-"""The plant of a run with its faults: the scenario, sent before a run by one SDO download, and what moves by it."""
+"""The plant of a run with its faults: the scenario, sent before a run by one SDO download."""
 
 import json
 import zlib
@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from plant import Actuator, Model, RigError
+from plant import Model
 from plant.errors import InputError, require
 from plant.model import build_bare_model
 from plant.plants import find_key
@@ -103,63 +103,3 @@ def _find_changed_groups(plan: Plan) -> set[str]:
 
 
 DIVERGED = "the plant has diverged: a signal is not a finite number"
-
-
-class FaultyPlant:
-    """What the emulator moves, or the rig itself where the plant is no node of its own."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        """A plant at rest. Raises InputError for an effect that cannot be compiled: it is, now."""
-        self.faults = scenario.make_schedule()
-        self.drive = 0.0  # in force until the next cycle
-        self.loads = scenario.load()  # one a cycle
-        self.actuator = Actuator(scenario.model, scenario.seed)
-        self.actuator.warm()
-        self._names = [s.name for s in scenario.model.kind.signals.outputs]
-        self.problem = ""  # why the plant can go on no more
-        self._changed = -1  # the last cycle whose parameters are in force
-        self._last: tuple[int, tuple[float, ...] | None] = -1, None  # cycle and what the transducers said
-
-    def read(self, k: int) -> tuple[float, ...] | None:
-        """What the transducers say in cycle k, in the order of the plant's outputs; None if the plant failed.
-
-        The first call in a cycle draws the noise and puts the faults of this cycle in force; another one says the same.
-        """
-        if k != self._last[0]:
-            self._last = k, self._draw_readings(k)
-        return self._last[1]
-
-    def _draw_readings(self, k: int) -> tuple[float, ...] | None:
-        self._change_parameters(k)
-        readings = self.actuator.sample()
-        if not self.problem and not isfinite(sum(readings)):
-            self.problem = DIVERGED
-        if self.problem:
-            return None
-        return tuple(self.faults.change_signal(name, reading, k)
-                     for name, reading in zip(self._names, readings, strict=True))
-
-    def move(self, k: int) -> None:
-        """Advance by cycle k under its load and the drive in force."""
-        if not self.problem:
-            try:
-                self.actuator.advance(self.drive, self.loads[k] if k < len(self.loads) else 0.0)
-            except RigError as error:  # another program moves the plant: its run ends, this one ends with a verdict
-                self.problem = str(error)
-
-    def pass_unread(self, k: int) -> None:
-        """A cycle whose readings nobody asks for: the transducers go on as well."""
-        self._change_parameters(k)
-        self.actuator.sample()
-        self.move(k)
-
-    def pass_quiet(self, cycles: int) -> None:
-        """So many cycles were simulated elsewhere, on the state of the actuator; no fault changed in them."""
-        self.actuator.noise.skip(cycles)
-        self.actuator.cycle += cycles
-
-    def _change_parameters(self, k: int) -> None:
-        """Set what faults have made of the plant's parameters since the last cycle."""
-        for name, value in self.faults.parameters_at(k, self._changed).items():
-            self.actuator.set(name, value)
-        self._changed = k

@@ -1,8 +1,7 @@
-"""The cycle loop of the embedded bus in lockstep: quiet cycles run compiled, many at a time, all others in Python.
+"""The cycle loop of the embedded bus in lockstep: quiet cycles run together, many a call, all others one by one.
 
-Both give the same rows and frames. A cycle with a fault that begins, acts or ends, a frame that waits, or a node that
-is not well is played by `CycleLoop` and the nodes themselves. Timers, such as those of heartbeats, run in Python
-between the compiled cycles.
+Both give the same rows and frames. A cycle with a fault on the bus, a frame that waits, or a node that is not well is
+played by `CycleLoop` and the nodes themselves. Timers, such as those of heartbeats, run in Python between the calls.
 
 A cycle is quiet when nothing happens in it but its frames: all nodes are OPERATIONAL, the loop of the controller is
 closed, and no timer runs out. Its frames are packed from the tables of the bench (rig/benches/packing.py), and each
@@ -10,19 +9,17 @@ value is what its receiver reads from its frame: rows and payloads are those of 
 """
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
-from math import ceil
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import ForeignCall, compile_function, compute_fingerprint, find_cache_folder, interpret_function
-from plant.machine_code import ADVANCE_CALL, StoredCode
+from plant.compile import ForeignCall
+from plant.machine_code import StoredCode
 from plant.model import Model
 from plant.pid import Loop, compute_current
-from plant.run import Actuator, LentPlant, sample_noise
 from plant.segments import Array
 from plant.signals import Signals
 from rig.benches.bench import Bench, FrameSpec, Role
@@ -41,30 +38,41 @@ from rig.benches.packing import (
 from rig.network.bus import EmbeddedWire
 from rig.network.master import Master
 from rig.network.node_objects import Gains, read_gains
+from rig.network.raw_bus import Port
+from rig.nodes.called_loop import load_loop, make_port
 from rig.nodes.emulator import Emulator
+from rig.nodes.emulator_cycle import (
+    IN_FORCE,
+    READINGS_AT,
+    SENSORS,
+    Memory,
+    advance_plant,
+    fill_noise,
+    make_memory,
+    read_plant,
+)
 from rig.nodes.firmware import Firmware
+from rig.nodes.plant_code import CompiledPlant
 from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock
 from rig.recorder.schema import make_row_record
 from rig.run import cycle as cy
 from rig.run.loop import CycleInput, CycleLoop, CycleObserver, CyclicValues
-from rig.sequences.faults import Frames, Jitter, Parameter, Plan, Schedule
+from rig.sequences.faults import BusOff, Foreign, Plan, Reset, Schedule, Silent
 
-# Words: cycles to play and played, the number of the first; of the plant its cycle, the address of its code, steps and
-# size of its parameters; address of the C library's clock (0: no times) and its answer; places of the frames
-ASKED, DONE, FIRST, PLANT_CYCLE, ADVANCE, STEPS, RECORD_SIZE, CLOCK, TIME, FRAMES_AT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 10
-SENSORS = 14  # transducers of the plant
-DEMAND, LOAD, READINGS, DRIVE_VALUE = range(15, 19)  # places among the values; the readings stand together
-SENSORS_AT = 20  # for each transducer: place of what it shows in the state, and of its noise among the parameters
+# Words: cycles to play and played, the number of the first; address of the C library's clock (0: no times) and its
+# answer; places of the frames
+ASKED, DONE, FIRST, CLOCK, TIME, FRAMES_AT = 0, 1, 2, 3, 4, 6
+DEMAND, LOAD, READINGS, DRIVE_VALUE = range(10, 14)  # places among the values; the readings stand together
 COMMAND, FEEDBACK, VALVE, DRIVE = range(4)  # frames, columns of the payloads
-# Reals: the controller's loop and gains, period, scratch; then the readings of a cycle, and for each signal with limits
-# (readings, demand, drive, load, error) its value, the lower and the upper limit
-LOOP, GAINS, PERIOD, _SCRATCH, _READ_AT = 0, 3, 8, 9, 12
+# Reals: the controller's loop and gains; then for each signal with limits (readings, demand, drive, load, error) its
+# value, the lower and the upper limit
+LOOP, GAINS, _LIMITS_AT = 0, 3, 8
 _LIMITED = 4  # signals with limits beside the readings
 BEGUN_AT, SYNC_AT, PLANT_AT, DRIVE_AT = range(4)  # columns of the times
 
 MOST = 500  # cycles a call
-_call_advance, _call_clock = ForeignCall(ADVANCE_CALL), ForeignCall("iiq")
+_call_clock = ForeignCall("iiq")
 _MONOTONIC = 1
 
 
@@ -74,39 +82,31 @@ class Buffers(NamedTuple):
     words: NDArray[np.int64]
     reals: NDArray[np.float64]
     layout: Layout
-    inputs: NDArray[np.float64]  # (MOST, 3), SI: demand, load for the rig, load on the plant
-    noise: NDArray[np.float64]  # (MOST, transducers + 1)
+    inputs: NDArray[np.float64]  # (MOST, 2), SI: demand, load for the rig
     values: NDArray[np.float64]  # (MOST, values of the bench), SI
     payloads: NDArray[np.int64]  # (MOST, 4)
     times: NDArray[np.int64]  # (MOST, 4), ns
 
 
-def play_quiet_cycles(b: Buffers, flat: NDArray[np.float64], live: NDArray[np.float64]) -> None:
+def play_quiet_cycles(port: Port, b: Buffers, plant: Memory) -> None:
     """Play the cycles asked for, but none after one whose values are outside a guard, nor one of a plant that diverges.
-
-    `flat`: state of the plant; `live`: its parameters.
     """
     words, reals, m = b.words, b.reals, b.layout
     at = m.words[VALUES_AT]
     loop = Loop(reals[LOOP], reals[LOOP + 1], reals[LOOP + 2])
     gains = Gains(reals[GAINS], reals[GAINS + 1], reals[GAINS + 2], reals[GAINS + 3], reals[GAINS + 4])
-    words[DONE], sensors = 0, words[SENSORS]
+    readings, words[DONE] = at + words[READINGS], 0
     for i in range(words[ASKED]):
         _note_time(b, i, BEGUN_AT)
-        is_finite = True
-        for j in range(sensors):
-            place = SENSORS_AT + 2 * j
-            reals[_READ_AT + j] = flat[words[place]] + live[words[place + 1]] * b.noise[i, j]
-            is_finite &= bool(np.isfinite(reals[_READ_AT + j]))
-        if _is_outside(b) or not is_finite:
+        k = words[FIRST] + i
+        if _is_outside(b, plant.words[SENSORS]) or not read_plant(plant, k):
             break
-        in_force = m.doubles[at + words[DRIVE_VALUE]]  # what the controller answered to the cycle before
+        plant.reals[IN_FORCE] = m.doubles[at + words[DRIVE_VALUE]]  # what the controller answered to the cycle before
         m.doubles[at + words[DEMAND]], m.doubles[at + words[LOAD]] = b.inputs[i, 0], b.inputs[i, 1]
         _pack(b, i, COMMAND)
         _note_time(b, i, SYNC_AT)
-        readings = at + words[READINGS]
-        for j in range(sensors):
-            m.doubles[readings + j] = reals[_READ_AT + j]
+        for j in range(plant.words[SENSORS]):
+            m.doubles[readings + j] = plant.reals[plant.words[READINGS_AT] + j]
         _pack(b, i, FEEDBACK)
         _pack(b, i, VALVE)
         _note_time(b, i, PLANT_AT)
@@ -114,28 +114,24 @@ def play_quiet_cycles(b: Buffers, flat: NDArray[np.float64], live: NDArray[np.fl
             loop, m.doubles[at + words[DEMAND]], m.doubles[readings], gains)
         _pack(b, i, DRIVE)
         _note_time(b, i, DRIVE_AT)
-        _call_advance(words[ADVANCE], reals.ctypes.data + 8 * _SCRATCH, reals.ctypes.data + 8 * (_SCRATCH + 1),
-                      0, 0, len(flat), 8, flat.ctypes.data, len(flat), 8,
-                      in_force, b.inputs[i, 2], b.noise[i, sensors], (words[PLANT_CYCLE] + i) * reals[PERIOD],
-                      0, 0, 1, words[RECORD_SIZE], live.ctypes.data, 1, words[RECORD_SIZE], words[STEPS])
+        advance_plant(plant, k)
         for channel in range(b.values.shape[1]):
             b.values[i, channel] = m.doubles[at + channel]
         words[DONE] += 1
     reals[LOOP], reals[LOOP + 1], reals[LOOP + 2] = loop.integral, loop.error, loop.cycles
 
 
-def _is_outside(b: Buffers) -> bool:
+def _is_outside(b: Buffers, sensors: int) -> bool:
     """Whether a value of the cycle before is outside the limits of the guards."""
     words, reals, at = b.words, b.reals, b.layout.words[VALUES_AT]
-    sensors, first = words[SENSORS], _READ_AT + words[SENSORS]
     for i in range(sensors):
-        reals[first + 3 * i] = b.layout.doubles[at + words[READINGS] + i]
-    rest = first + 3 * sensors
+        reals[_LIMITS_AT + 3 * i] = b.layout.doubles[at + words[READINGS] + i]
+    rest = _LIMITS_AT + 3 * sensors
     reals[rest] = b.layout.doubles[at + words[DEMAND]]
     reals[rest + 3] = b.layout.doubles[at + words[DRIVE_VALUE]]
     reals[rest + 6] = b.layout.doubles[at + words[LOAD]]
-    reals[rest + 9] = reals[rest] - reals[first]
-    for place in range(first, rest + 3 * _LIMITED, 3):
+    reals[rest + 9] = reals[rest] - reals[_LIMITS_AT]
+    for place in range(_LIMITS_AT, rest + 3 * _LIMITED, 3):
         if not reals[place + 1] <= reals[place] <= reals[place + 2]:
             return True
     return False
@@ -159,18 +155,15 @@ def _note_time(b: Buffers, i: int, column: int) -> None:
 
 def make_buffers(bench: Bench, m: Layout, names: Sequence[str], guards: Mapping[str, tuple[float, float]]) -> Buffers:
     """Buffers for a bench with this layout, whose values have these names. `guards`: limits by signal, SI."""
-    guarded, sensors = list_guarded(bench.signals), len(bench.signals.outputs)
-    first = _READ_AT + sensors
-    b = Buffers(np.zeros(SENSORS_AT + 2 * sensors, np.int64), np.zeros(first + 3 * len(guarded)), m,
-                np.zeros((MOST, 3)), np.zeros((MOST, sensors + 1)), np.zeros((MOST, len(names))),
-                np.zeros((MOST, 4), np.int64), np.zeros((MOST, 4), np.int64))
-    b.words[SENSORS] = sensors
+    guarded = list_guarded(bench.signals)
+    b = Buffers(np.zeros(16, np.int64), np.zeros(_LIMITS_AT + 3 * len(guarded)), m, np.zeros((MOST, 2)),
+                np.zeros((MOST, len(names))), np.zeros((MOST, 4), np.int64), np.zeros((MOST, 4), np.int64))
     places = dict(zip((each.identifier for each in bench.frames.list_of(Role.RIG)), list_frame_places(m), strict=True))
     b.words[FRAMES_AT:FRAMES_AT + 4] = [places[each.identifier] for each in list_frames(bench)]
     values = CyclicValues(bench)
     b.words[DEMAND:DRIVE_VALUE + 1] = [names.index(name) for name in (values.command, values.load, values.readings[0],
                                                                       values.drive)]
-    b.reals[first:].reshape(-1, 3)[:, 1:] = [guards.get(signal, (-np.inf, np.inf)) for signal in guarded]
+    b.reals[_LIMITS_AT:].reshape(-1, 3)[:, 1:] = [guards.get(signal, (-np.inf, np.inf)) for signal in guarded]
     return b
 
 
@@ -191,37 +184,22 @@ def list_frames(bench: Bench) -> list[FrameSpec]:
     return found if is_plain and len(bench.frames.frames) == len(set(found)) == len(found) == 4 else []
 
 
-def _lend_plant(b: Buffers, actuator: Actuator) -> LentPlant | None:
-    """A plant for the compiled code, which is told where its code, its parameters and its readings are."""
-    plant = actuator.lend()
-    if plant is None or len(plant.fields) != b.words[SENSORS]:
-        return None
-    b.words[ADVANCE], b.words[STEPS], b.words[RECORD_SIZE] = plant.advance, actuator.steps, 8 * len(plant.live)
-    b.words[SENSORS_AT:].reshape(-1, 2)[:] = np.column_stack((plant.fields, plant.levels))
-    b.reals[PERIOD] = actuator.model["controller.period"]
-    return plant
-
-
-def make_trial() -> tuple[Buffers, Any, Any]:
+def make_trial() -> tuple[Port, Buffers, Memory]:
     """Arguments of some cycles of the shipped bench, without times."""
-    bench, actuator = load_bench(), Actuator(Model())
-    actuator.warm()
+    bench, model = load_bench(), Model()
     names = CyclicValues(bench).names
     b = make_buffers(bench, make_layout(bench.frames.list_of(Role.RIG), names, Role.RIG), names, {})
-    plant = _lend_plant(b, actuator)
-    assert plant is not None
-    b.words[ASKED], b.inputs[:, 0], b.noise[:20] = 20, 1e-3, sample_noise(0, 20)
-    b.reals[GAINS:GAINS + len(Gains._fields)] = read_gains(actuator.model.values)
-    return b, plant.flat, plant.live
+    b.words[ASKED], b.inputs[:, 0] = 20, 1e-3
+    b.reals[GAINS:_LIMITS_AT] = read_gains(model.values)
+    plant = make_memory(Scenario(model, Plan(stop=0)), *CompiledPlant(model).code)
+    fill_noise(plant, np.random.default_rng(0))
+    return make_port(), b, plant
 
 
 @cache
 def load_code() -> StoredCode:
     """The compiled cycles, for any plant: some seconds on a new machine."""
-    source = compute_fingerprint(interpret_function(play_quiet_cycles))
-    code = StoredCode(find_cache_folder() / source, partial(compile_function, play_quiet_cycles), "cycles")
-    code.warm(make_trial)
-    return code
+    return load_loop(play_quiet_cycles, make_trial)
 
 
 FRAMES = ("command", "sync", "feedback", "valve_state", "drive")  # that faults act on
@@ -244,8 +222,7 @@ class EmbeddedLoop(CycleLoop):
         # address of that of the C library
         self._quiet.words[CLOCK] = ctypes.cast(ctypes.CDLL(None).clock_gettime, ctypes.c_void_p).value or 0
         self._frames, self._sync_id = list_frames(bench), bench.frames.sync or 0
-        self._lent: object = None  # the actuator that the compiled code works on
-        self._run_quiet: Callable[[], object] | None = None
+        self._shared: Memory | None = None  # the plant that the compiled code moves
         # identifiers of the answers and their roles, as words have them
         self._answered = int(np.bitwise_or.reduce(self._layout.words[self._places + ROLES]))
 
@@ -254,26 +231,25 @@ class EmbeddedLoop(CycleLoop):
         emulator, firmware = self._embedded.nodes
         assert isinstance(emulator, Emulator)
         assert isinstance(firmware, Firmware)
+        plant = emulator.share_memory(self.k)
         most = self._count_quiet(emulator, firmware, control, min(len(demands), MOST))
-        run = self._bind(emulator) if most > 1 else None
-        if run is None:
+        if plant is None or most < 2:
             return 0
+        if plant is not self._shared:  # another one after each reset
+            self._shared, self._run_quiet = plant, load_code().bind((self._port, self._quiet, plant))
         self._end()
-        b, k = self._quiet, self.k
+        b = self._quiet
         given = self._values.list_given(CycleInput(phase, 0.0, 0.0, control))
         at = b.layout.words[VALUES_AT] + 2  # demand and load are those of each cycle
         b.layout.doubles[at:at + len(given) - 2] = given[2:]
-        b.words[ASKED], b.words[FIRST], b.words[PLANT_CYCLE] = most, k, emulator.plant.actuator.cycle
-        b.reals[LOOP:GAINS], b.reals[GAINS:PERIOD] = firmware.loop, firmware.gains
-        on_plant = emulator.plant.loads[k:k + most]  # none after the last
-        b.inputs[:most, 0], b.inputs[:most, 1], b.inputs[:most, 2] = demands[:most], loads[:most], 0.0
-        b.inputs[:len(on_plant), 2] = on_plant
-        b.noise[:most] = emulator.plant.actuator.noise.look_ahead(most)
-        run()
+        b.words[ASKED], b.words[FIRST] = most, self.k
+        b.reals[LOOP:GAINS], b.reals[GAINS:_LIMITS_AT] = firmware.loop, firmware.gains
+        b.inputs[:most, 0], b.inputs[:most, 1] = demands[:most], loads[:most]
+        self._run_quiet()
         played = int(b.words[DONE])
         if played:
             firmware.loop = Loop(*b.reals[LOOP:GAINS].tolist())
-            emulator.pass_quiet(played, int(b.payloads[played - 1, DRIVE]).to_bytes(8, "little", signed=True))
+            emulator.pass_quiet(played, int(b.payloads[played - 1, DRIVE]))
             self._take_cycles(phase, control, played)
             self._run_timers(emulator, firmware)
         return played
@@ -283,19 +259,11 @@ class EmbeddedLoop(CycleLoop):
         words = self._words
         is_answered = words[cy.OPEN] and words[cy.CAME] & ALL_ROLES == self._answered & ALL_ROLES
         if (not is_answered or words[cy.HELD] or self.problem
-                or not self._embedded.bus.is_empty or not emulator.is_quiet(self.k) or not firmware.is_quiet(control)):
+                or not self._embedded.bus.is_empty or not firmware.is_quiet(control)):
             return 0
         due = min(self._master.find_due(), *(node.device.find_due() for node in (emulator, firmware)))
         busy = self._busy[np.searchsorted(self._busy, self.k):][:1]
         return int(min(most, max(due - self._t_ns, 0) // self._period + 1, *(busy - self.k).tolist()))
-
-    def _bind(self, emulator: Emulator) -> Callable[[], object] | None:
-        """The compiled code on the plant of the emulator, which is another one after each reset."""
-        actuator = emulator.plant.actuator
-        if self._lent is not actuator:
-            self._lent, plant = actuator, _lend_plant(self._quiet, actuator)
-            self._run_quiet = None if plant is None else load_code().bind((self._quiet, plant.flat, plant.live))
-        return self._run_quiet
 
     def _take_cycles(self, phase: int, control: int, played: int) -> None:
         """Log the cycles that were played, all but the last, which is the cycle under way now."""
@@ -350,18 +318,16 @@ class EmbeddedLoop(CycleLoop):
 
 
 def find_busy_cycles(plan: Plan, schedule: Schedule) -> NDArray[np.int64]:
-    """The cycles that Python plays because of faults, in order: where one begins, acts or ends, and their neighbours.
+    """The cycles that are played alone because of faults, in order: where one begins, acts or ends, and neighbours.
 
-    A parameter acts on the plant by itself, but where it changes; a frame that is lost or late concerns the cycles to
-    come as well, until the nodes are well again.
+    Parameters and sensors change in quiet cycles too; a frame that is lost or late concerns the cycles to come as
+    well, until the nodes are well again.
     """
     ranges = [*(range(edge.cycle - 1, edge.cycle + 2) for edge in schedule.edges),
               *(range(k - 1, k + 3) for name in FRAMES for k in schedule.list_frame_hits(name)[:, 0].tolist())]
     for fault in plan.faults:
         first, last = plan.find_cycles(fault)
-        if isinstance(fault, Parameter):
-            ranges.append(range(first, min(first + ceil(fault.ramp * plan.rate) + 2, last)))
-        elif not isinstance(fault, Frames | Jitter):
+        if isinstance(fault, Foreign | BusOff | Reset | Silent):
             ranges.append(range(first, last))
     return np.array(sorted({k for each in ranges for k in each}), np.int64)
 

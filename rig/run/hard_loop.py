@@ -24,7 +24,7 @@ from rig.network.master import Master
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes.scenario import Scenario
 from rig.run import cycle as cy
-from rig.run.loop import CompiledLoop, CycleInput, CycleObserver, make_trial, set_rig_faults
+from rig.run.loop import CycleInput, CycleObserver, Loop, make_trial, read_ring, set_rig_faults
 from rig.run.priority import enter_loop_thread, list_cpus
 from rig.sequences.faults import Schedule
 
@@ -40,7 +40,7 @@ def compile_cycle() -> Any:
     return play
 
 
-class HardLoop(CompiledLoop):
+class HardLoop(Loop):
     """Cycles in compiled code. Call `close` when done.
 
     Raises RigError from `cycle`, `serve` and `finish` when the bus is gone.
@@ -179,8 +179,11 @@ class HardLoop(CompiledLoop):
         """Log the cycles and frames that are complete."""
         self._note_problem()
         until = int(self._words[cy.COMPLETE_UNTIL])  # first: what is added meanwhile waits for the next time
-        for frame in self._read_frames(int(self._words[cy.FRAMES_DONE])):
-            self._take_frame(*frame)
+        first, last = int(self._words[cy.FRAMES_READ]), int(self._words[cy.FRAMES_DONE])
+        for t_ns, head, *data in read_ring(self._buffers.frames, first, last):
+            raw = b"".join([(word & 0xFFFFFFFFFFFFFFFF).to_bytes(8, "little") for word in data])
+            self._take_frame(t_ns - self._origin, head & 0xFFFFFFFF, raw[:head >> 32 & 0xFF], bool(head >> 40))
+        self._words[cy.FRAMES_READ] = last
         self._release_frames(until - self._origin)
         self._log_rows()
 

@@ -9,8 +9,8 @@ firing a burst. Either way the plant moves one period a SYNC, so a run that was 
 
 from abc import ABC, abstractmethod
 from array import array
-from collections.abc import Callable, Collection, Iterator, Mapping
-from functools import cache, partial
+from collections.abc import Callable, Collection, Mapping
+from functools import cache
 from math import nan
 from operator import attrgetter
 from typing import Any, NamedTuple, Protocol
@@ -18,7 +18,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from plant import Model, signals as plant_signals
-from plant.compile import compile_function, compute_fingerprint, find_cache_folder, interpret_function
 from plant.machine_code import StoredCode
 from plant.segments import Array
 from rig.benches import packing
@@ -27,10 +26,11 @@ from rig.benches.bench_file import load_bench
 from rig.network.bus import LinkWire
 from rig.network.frame import Frame, WallClock
 from rig.network.master import Master
-from rig.network.raw_bus import GIVEN_TIME, IN_PYTHON, PAYLOAD_IN, Port, make_empty_port
+from rig.network.raw_bus import PAYLOAD_IN, Port
 from rig.nodes import emulator_cycle as ec
+from rig.nodes.called_loop import call_loop, load_loop, make_port
 from rig.nodes.emulator import Emulator
-from rig.nodes.plant_code import PlantProgram, compile_plant
+from rig.nodes.plant_code import load_plant
 from rig.nodes.scenario import DIVERGED, Scenario
 from rig.recorder import CycleBlock, Signals, Timing
 from rig.recorder.schema import make_row_record
@@ -124,34 +124,51 @@ class CycleObserver(Protocol):
         """Several are over, and the last of the block is under way."""
 
 
+_AT_REST = Scenario(Model(), Plan(stop=0))  # of a plant that nobody moves
+
+
 class Loop(ABC):
-    """What the session needs of a cycle loop. One that queues its inputs runs behind them and overrides more."""
+    """What the session needs of a cycle loop. One that queues its inputs runs behind them and overrides more.
+
+    The cycle is compiled (cycle.py). A loop shares its memory with it: inputs in, rows and frames out.
+    """
 
     kind: str  # "soft" or "hard" real time
     scheduler = ""  # how the kernel schedules the thread of the cycle, if it has one of its own
     problem = ""  # why the plant cannot go on
     plays_many = False  # whether `play_many` is worth a call
-    outputs: dict[str, float]  # the last values of the bench that are known; `CyclicValues` has the names
+    _origin = 0  # ns: what the clock of the compiled code says when the run begins
+    _idle_phase = 0
+
+    def __init__(self, master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver,
+                 ahead: int) -> None:
+        """`ahead`: cycles that can be queued."""
+        self._master, self._bench, self._faults, self._log = master, bench, faults, log
+        self._period, self._ahead, self._values = bench.cycle_ns, ahead, CyclicValues(bench)
+        self._layout = packing.make_layout(bench.frames.list_of(Role.RIG), self._values.names, Role.RIG)
+        # where the plant is a node of its own, the cycle does not move this one
+        self._code = None if bench.has_plant_node else load_plant(scenario)
+        self._plant = ec.make_memory(scenario, *self._code.code) if self._code else ec.make_memory(_AT_REST)
+        self._noise = np.random.default_rng(scenario.seed)
+        self._draw_noise()
+        channels, is_fd = len(self._values.names), any(each.identifier & FD for each in bench.frames.frames)
+        late = 100 + 2_000_000_000 // self._period  # a command and a drive each cycle, for the longest delay
+        self._buffers = cy.make_buffers(ahead, 8 * ahead, 64 * ahead, late, len(self._values.given), channels, is_fd)
+        self._inputs = [CycleInput(0, 0.0, 0.0, 0)] * (9 * ahead)  # of all rows that are not yet logged, and the queue
+        # the last values of the bench that are known; `CyclicValues` has the names
+        self.outputs: dict[str, float] = dict.fromkeys(self._values.names, 0.0)
+        words, place, sync = self._buffers.words, self._values.place, bench.frames.sync
+        self._words = words
+        words[cy.PERIOD], words[cy.MAY_IDLE_AT], words[cy.SYNC_ID] = self._period, -1, -1 if sync is None else sync
+        words[cy.MOVES_PLANT], words[cy.MISSED_LIMIT] = not bench.has_plant_node, bench.most_missed
+        words[cy.DRIVEN], words[cy.SENT_CHANNELS] = len(self._values.given), len(self._values.sent)
+        words[cy.SENSED_AT], words[cy.DRIVE_VALUE_AT] = place[self._values.readings[0]], place[self._values.drive]
+        words[cy.FLAGS_AT] = place["flags"]
 
     @property
     @abstractmethod
     def k(self) -> int:
         """The cycle to come."""
-
-    @property
-    @abstractmethod
-    def overruns(self) -> int:
-        """Due times missed, cycles late by more than half a period, and cycles for which no input was given in time."""
-
-    @property
-    @abstractmethod
-    def underruns(self) -> int:
-        """Cycles for which no input was given in time; they repeat the last one."""
-
-    @property
-    @abstractmethod
-    def unsound(self) -> int:
-        """Frames with a wrong checksum, or an alive counter that is not the next."""
 
     @property
     def queued(self) -> int:
@@ -190,60 +207,24 @@ class Loop(ABC):
     def close(self) -> None:  # noqa: B027 - nothing to give back
         """Give back what the loop holds, whatever happened."""
 
-
-_AT_REST = Scenario(Model(), Plan(stop=0))  # of a plant that nobody moves
-
-
-class CompiledLoop(Loop):
-    """A loop whose cycle is compiled (cycle.py), and the memory that it shares with it: inputs in, rows and frames out.
-    """
-
-    problem = ""
-    _origin = 0  # ns: what the clock of the compiled code says when the run begins
-    _idle_phase = 0
-
-    def __init__(self, master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver,
-                 ahead: int) -> None:
-        """`ahead`: cycles that can be queued."""
-        self._master, self._bench, self._faults, self._log = master, bench, faults, log
-        self._period, self._ahead, self._values = bench.cycle_ns, ahead, CyclicValues(bench)
-        self._layout = packing.make_layout(bench.frames.list_of(Role.RIG), self._values.names, Role.RIG)
-        # where the plant is a node of its own, the cycle does not move this one
-        self._program = None if bench.has_plant_node or scenario.model.kind.foreign is None else PlantProgram(scenario)
-        code = () if bench.has_plant_node else self._program.code if self._program else compile_plant(scenario.model)
-        self._plant = ec.make_memory(_AT_REST if bench.has_plant_node else scenario, *code)
-        self._noise = np.random.default_rng(scenario.seed)
-        self._draw_noise()
-        channels, is_fd = len(self._values.names), any(each.identifier & FD for each in bench.frames.frames)
-        self._buffers = cy.make_buffers(ahead, 8 * ahead, 64 * ahead, 1100, len(self._values.given), channels, is_fd)
-        self._inputs = [CycleInput(0, 0.0, 0.0, 0)] * (9 * ahead)  # of all rows that are not yet logged, and the queue
-        self.outputs = dict.fromkeys(self._values.names, 0.0)
-        words, place, sync = self._buffers.words, self._values.place, bench.frames.sync
-        self._words = words
-        words[cy.PERIOD], words[cy.MAY_IDLE_AT], words[cy.SYNC_ID] = self._period, -1, -1 if sync is None else sync
-        words[cy.MOVES_PLANT], words[cy.MISSED_LIMIT] = not bench.has_plant_node, bench.most_missed
-        words[cy.DRIVEN], words[cy.SENT_CHANNELS] = len(self._values.given), len(self._values.sent)
-        words[cy.SENSED_AT], words[cy.DRIVE_VALUE_AT] = place[self._values.readings[0]], place[self._values.drive]
-        words[cy.FLAGS_AT] = place["flags"]
-
     @property
     def overruns(self) -> int:
-        """See `Loop`."""
+        """Due times missed, cycles late by more than half a period, and cycles for which no input was given in time."""
         return int(self._words[cy.OVERRUNS])
 
     @property
     def underruns(self) -> int:
-        """See `Loop`."""
+        """Cycles for which no input was given in time; they repeat the last one."""
         return int(self._words[cy.UNDERRUNS])
 
     @property
     def unsound(self) -> int:
-        """See `Loop`."""
+        """Frames with a wrong checksum, or an alive counter that is not the next."""
         return sum(int(self._layout.words[at + packing.UNSOUND]) for at in packing.list_frame_places(self._layout))
 
     def _draw_noise(self) -> None:
         """Draw the noise of the plant for a minute ahead."""
-        if not self._bench.has_plant_node:
+        if self._code:
             ec.fill_noise(self._plant, self._noise)
 
     def _push(self, step: CycleInput) -> None:
@@ -256,23 +237,16 @@ class CompiledLoop(Loop):
         queue[position % len(queue)] = step.is_counted, *command, *sync, self._faults.is_bus_off("rig", k)
         self._words[cy.TAIL] = position + 1
 
-    def _read_frames(self, last: int) -> Iterator[tuple[int, int, bytes, bool]]:
-        """Time, identifier and payload of the recorded frames before number `last`, and whether the cycle sent it."""
-        first, self._words[cy.FRAMES_READ] = int(self._words[cy.FRAMES_READ]), last
-        for t_ns, head, *data in _read_ring(self._buffers.frames, first, last):
-            raw = b"".join([(word & 0xFFFFFFFFFFFFFFFF).to_bytes(8, "little") for word in data])
-            yield t_ns - self._origin, head & 0xFFFFFFFF, raw[:head >> 32 & 0xFF], bool(head >> 40)
-
     def _note_problem(self) -> None:
-        if self._words[cy.DIVERGED]:
-            self.problem = self._program.problem if self._program and self._program.problem else DIVERGED
+        if self._code and self._words[cy.DIVERGED]:
+            self.problem = self._code.problem or DIVERGED
 
     def _log_rows(self) -> None:
         """Log the cycles that are complete."""
         words, buffers = self._words, self._buffers
         first, last = int(words[cy.ROWS_READ]), int(words[cy.ROWS])
-        values = _read_ring(buffers.values, first, last)
-        for row, said in zip(_read_ring(buffers.rows, first, last), values, strict=True):
+        values = read_ring(buffers.values, first, last)
+        for row, said in zip(read_ring(buffers.rows, first, last), values, strict=True):
             words[cy.ROWS_READ] += 1
             self._take_row(row, dict(zip(self._values.names, said, strict=True)))
 
@@ -295,7 +269,7 @@ class CompiledLoop(Loop):
         self._log.cycle(row[cy.DUE_AT] - self._origin, signals, timing)
 
 
-def _read_ring(ring: np.ndarray, first: int, last: int) -> list[list[Any]]:
+def read_ring(ring: np.ndarray, first: int, last: int) -> list[list[Any]]:
     """Entries `first` to `last` - 1 of a ring."""
     entries: list[list[Any]] = ring[np.arange(first, last) % len(ring)].tolist()
     return entries
@@ -304,10 +278,7 @@ def _read_ring(ring: np.ndarray, first: int, last: int) -> list[list[Any]]:
 @cache
 def load_parts() -> StoredCode:
     """The parts of the cycle, for a loop in Python: some seconds on a new machine."""
-    source = compute_fingerprint(interpret_function(cy.play_part, IN_PYTHON))
-    code = StoredCode(find_cache_folder() / source, partial(compile_function, cy.play_part, IN_PYTHON), "parts")
-    code.warm(make_trial)
-    return code
+    return load_loop(cy.play_part, make_trial)
 
 
 def make_trial() -> tuple[Port, cy.Buffers, packing.Layout, ec.Memory]:
@@ -318,10 +289,10 @@ def make_trial() -> tuple[Port, cy.Buffers, packing.Layout, ec.Memory]:
     buffers.words[cy.PART], buffers.words[cy.PERIOD], buffers.words[cy.DRIVEN] = cy.FIRST, 1, len(values.given)
     buffers.settings[:] = 0.0
     layout = packing.make_layout(bench.frames.list_of(Role.RIG), values.names, Role.RIG)
-    return make_empty_port(), buffers, layout, ec.make_memory(_AT_REST)
+    return make_port(), buffers, layout, ec.make_memory(_AT_REST)
 
 
-class CycleLoop(CompiledLoop):
+class CycleLoop(Loop):
     """Runs cycles one by one and passes each to `log` when it is complete. In real time it is soft: Python is in it."""
 
     kind = "soft"
@@ -332,7 +303,7 @@ class CycleLoop(CompiledLoop):
         super().__init__(master, bench, scenario, faults, log, ahead=16)
         self._wire, self._realtime = master.wire, realtime
         self._link = None if realtime or not isinstance(master.wire, LinkWire) else master.wire  # lockstep of programs
-        self._port = make_empty_port()
+        self._port = make_port()
         self._run = load_parts().bind((self._port, self._buffers, self._layout, self._plant))
         answers = [each for each in bench.frames.frames if each.sender is not Role.RIG]
         self._are_sure = all(each.is_answer for each in answers)
@@ -384,8 +355,6 @@ class CycleLoop(CompiledLoop):
             self._wait_for_report(reported)
             self._play(cy.LATE, self._t_ns + self._period)
         master.tick()
-        for emulator in self._emulators:
-            self.problem = self.problem or emulator.plant.problem
         self._finish_cycle()
 
     def finish(self) -> None:
@@ -413,6 +382,8 @@ class CycleLoop(CompiledLoop):
     def _finish_cycle(self) -> None:
         """What the compiled code has counted is true for all from now on."""
         self._note_problem()
+        for emulator in self._emulators:
+            self.problem = self.problem or emulator.problem
         at = int(self._layout.words[packing.VALUES_AT])
         self.outputs = dict(zip(self._values.names, self._layout.doubles[at:].tolist(), strict=False))
         self.k, self._t_ns = int(self._words[cy.CYCLES]), int(self._words[cy.DUE])
@@ -421,15 +392,11 @@ class CycleLoop(CompiledLoop):
 
     def _play(self, part: int, argument: int = 0) -> None:
         """Play a part of the cycle, and send its frames."""
-        self._call(part, argument)
-        for _, identifier, data, _ in self._read_frames(int(self._words[cy.FRAMES_WRITTEN])):
-            self._master.send(identifier, data)
-
-    def _call(self, part: int, argument: int) -> None:
         self._words[cy.PART], self._words[cy.ARGUMENT] = part, argument
         # in lockstep, where the clock is virtual, the wall clock tells how long something took
-        self._port.words[GIVEN_TIME] = (self._wire.clock if self._realtime else self._wall).now()
-        self._run()
+        now = (self._wire.clock if self._realtime else self._wall).now()
+        for identifier, data in call_loop(self._port, self._run, now):
+            self._master.send(identifier, data)
 
     def _receive_answer(self, frame: Frame) -> None:
         """A frame of the controller, or of the plant, has come."""
@@ -445,8 +412,7 @@ class CycleLoop(CompiledLoop):
         words[cy.CAME_AS], words[cy.CAME_LENGTH] = frame.cob_id, len(frame.data)
         payload = np.frombuffer(frame.data.ljust(8, b"\0"), np.uint8)
         self._port.octets[PAYLOAD_IN:PAYLOAD_IN + len(payload)] = payload
-        self._call(cy.ANSWER, came - int(words[cy.SYNC_AT]))
-        words[cy.FRAMES_READ] = words[cy.FRAMES_WRITTEN]  # the master has recorded it
+        self._play(cy.ANSWER, came - int(words[cy.SYNC_AT]))
 
     # ------------------------------------------------------------------------------------ lockstep
 

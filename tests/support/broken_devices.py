@@ -1,4 +1,4 @@
-"""Nodes with one defect each: what a conformance test must find. A defect is a patch of our own plant or controller."""
+"""Nodes with one defect each: what a conformance test must find. A defect is a patch of our device or controller."""
 
 import heapq
 from collections.abc import Callable
@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from dbc import EDS
+from rig.benches.bench import Role
+from rig.benches.bench_file import load_bench
 from rig.conformance.run_cases import Outcome, choose_cases, run_cases
 from rig.conformance.target import DataSheet, Options, Target, Verdict
 from rig.device import Device
 from rig.network.bus import EmbeddedWire
 from rig.network.frame import Frame, Send, VirtualClock
-from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 
 MS = 1_000_000  # ns
+CYCLE = load_bench().nodes[Role.PLANT].outputs["cycle"].key
 Break = Callable[[Any], None]  # of a Device; typed loosely, for it replaces methods
 
 
@@ -32,8 +34,10 @@ class Broken:
         self.t_ns = 0
         self.out: Callable[[int, bytes], list[tuple[int, bytes, int]]] = lambda cob_id, data: [(cob_id, data, 0)]
         self.into: Callable[[Frame], Frame | None] = lambda frame: frame
-        self.node: Any = Device(node, eds, self._transmit) if eds else {2: Firmware, 3: Emulator}[node](self._transmit)
-        self.device: Any = self.node if eds else self.node.device
+        self.node: Any = Firmware(self._transmit) if node == 2 else Device(node, eds or EDS[node], self._transmit)
+        self.device: Any = getattr(self.node, "device", self.node)
+        if node == 3:
+            self.device.on_sync = partial(self.device.od.values.update, {CYCLE: 7})
         self.device.broken = self
         patch(self.device)
 

@@ -17,8 +17,8 @@ from rig.network.bus import Link, can_open, choose_bus, open_can, serve_node
 from rig.network.frame import Node, WallClock
 from rig.network.node_objects import CONTROLLER, PLANT, read_gains
 from rig.network.raw_bus import RawBus
-from rig.nodes.emulator import Emulator, find_plant_node
-from rig.nodes.emulator_service import EmulatorService, list_unheard
+from rig.nodes.emulator import Emulator, find_plant_node, list_unheard
+from rig.nodes.emulator_service import EmulatorService
 from rig.nodes.firmware import Firmware
 from rig.nodes.scenario import Scenario
 from rig.run.job import speaks_as_shipped

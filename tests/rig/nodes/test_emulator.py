@@ -1,4 +1,4 @@
-"""The emulator, in Python and compiled, and the reference firmware by scripts of frames: what acts when."""
+"""The emulator and the reference firmware by scripts of frames: what acts when."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import zlib
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from itertools import pairwise
-from typing import Any
 
 import codec
 import numpy as np
@@ -24,11 +23,11 @@ from rig.benches.profiles import CIA408
 from rig.device import Abort, NmtState
 from rig.network.bus import Link, open_can, serve_node
 from rig.network.frame import Frame, WallClock
-from rig.network.node_objects import COUNTERS, GAINS, decode_cycle_record
+from rig.network.node_objects import GAINS, decode_cycle_record
 from rig.network.raw_bus import RawBus
 from rig.nodes import emulator_cycle as ec
-from rig.nodes.emulator import Emulator
-from rig.nodes.emulator_service import EmulatorService, compile_loop, list_unheard
+from rig.nodes.emulator import Emulator, list_unheard
+from rig.nodes.emulator_service import EmulatorService, compile_loop
 from rig.nodes.firmware import LOST_AFTER
 from rig.nodes.scenario import Scenario
 from rig.run.priority import enter_loop_thread
@@ -225,7 +224,7 @@ class TestServices:
         ("SDSSSSSDSDSD", None),  # the EMCY stands before the feedback of its cycle
         ("SDSDSDPSSSSGSDSDSD", None), ("SD" + "PSGS" * 20, None),  # the loop obeys the order of the bus
     ])
-    def test_it_answers_as_the_emulator_in_python(self, bus_kind: str, text: str, fault: Fault | None) -> None:
+    def test_it_answers_as_the_node_in_python(self, bus_kind: str, text: str, fault: Fault | None) -> None:
         """The same frames in, the same frames out, also where it hears no SYNC or nothing at all."""
         scenario = Scenario(QUIET, Plan(faults=() if fault is None else (fault,), stop=20))
         script = write_script(text, Schedule(scenario.plan))
@@ -278,9 +277,14 @@ def scenario(*faults: Fault, model: Model = QUIET, load: tuple[int, ...] = (), s
     return Scenario(model.with_effects(groups), plan, load)
 
 
-def counters(desk: PlantDesk) -> tuple[Any, Any]:
-    values = desk.node.device.od.values
-    return values[COUNTERS, 1], values[COUNTERS, 2]
+def counters(desk: PlantDesk) -> tuple[int, ...]:
+    replies = [desk.send(0x603, b"\x40\x11\x22" + bytes((sub, 0, 0, 0, 0))) for sub in (1, 2)]  # object 0x2211
+    return tuple(int.from_bytes(data[4:], "little") for data, in replies)
+
+
+def read_reals(desk: PlantDesk, place: int, count: int = 1) -> list[float]:
+    """Numbers of the memory that the cycle works on."""
+    return list(desk.node._memory.reals[place:place + count])
 
 
 def test_the_answer_to_cycle_k_acts_from_cycle_k_plus_1() -> None:
@@ -309,7 +313,7 @@ def test_missing_and_late_drives(drives: str, flags: list[int], counted: tuple[i
     desk = PlantDesk(scenario())
     assert [desk.cycle(None if drive == "-" else 2e-3, answers=60_000 if drive == "<" else None)[1].flags
             for drive in drives] == flags
-    assert (counters(desk), desk.emergencies(), desk.node.plant.drive) == (counted, emergencies, current)
+    assert (counters(desk), desk.emergencies(), read_reals(desk, ec.IN_FORCE)) == (counted, emergencies, [current])
 
 
 @pytest.mark.parametrize(("fault", "two", "counted"), [
@@ -349,7 +353,28 @@ def test_sensor_faults_show_in_the_frames_only() -> None:
     assert [x.pressure - y.pressure for (x, _), (y, _) in zip(a[4:6], b[4:6], strict=True)] == pytest.approx([1e6, 1e6])
     assert [x for x, _ in a[6:]] == [y for y, _ in b[6:]]
     assert np.std([x.spool - y.spool for (_, x), (_, y) in zip(a[6:], b[6:], strict=True)]) > 3e-7
-    assert desk.node.plant.actuator.state == sound.node.plant.actuator.state
+    ours, other = (read_reals(each, *each.node._memory.words[[ec.FLAT_AT, ec.FLAT]]) for each in (desk, sound))
+    assert ours == other
+
+
+@pytest.mark.parametrize(("placed", "readings", "said"), [
+    ([Stuck(signal="xj", start=0.003, end=0.006)], range(8), [0, 1, 2, 2, 2, 2, 6, 7]),
+    ([Stuck(signal="xj", value=7.0, start=0.0, end=0.001)], [1, 1], [7, 1]),
+    ([Offset(signal="xj", value=4.0, start=0.0, end=0.006, ramp=0.004)], [1] * 7, [1, 2, 3, 4, 5, 5, 1]),
+    ([Offset(signal="xs", value=4.0, start=0.0)], [1], [1]),
+    ([Offset(signal="xj", value=1.0, start=0.0), Stuck(signal="xj", value=9.0, start=0.0)], [0], [9]),  # in this order
+])
+def test_sensor_faults(placed: list[Fault], readings: list[float], said: list[float]) -> None:
+    memory = ec.make_memory(scenario(*placed))
+    assert [ec._disturb(memory, 0, float(value), k) for k, value in enumerate(readings)] == said
+
+
+def test_noise_has_its_size_and_depends_on_seed_and_cycle_only() -> None:
+    plans = [Plan(faults=(Noise(signal="xj", value=3e-6, start=0.0),), stop=10_000, seed=seed) for seed in (1, 1, 2)]
+    one, same, other = (ec.make_memory(Scenario(QUIET, plan)) for plan in plans)
+    values = [ec._disturb(one, 0, 0.0, k) for k in range(10_000)]
+    assert np.std(values) == pytest.approx(3e-6, rel=0.03) and abs(np.mean(values)) < 1e-7
+    assert values[77] == ec._disturb(same, 0, 0.0, 77) != ec._disturb(other, 0, 0.0, 77)
 
 
 def test_after_a_pause_the_cycle_is_that_of_the_bus_and_no_fault_was_slept_through() -> None:
@@ -367,8 +392,9 @@ def test_after_a_pause_the_cycle_is_that_of_the_bus_and_no_fault_was_slept_throu
     desk.nmt(1)
     said = [desk.cycle(1e-3)[1] for _ in range(3)]
     assert [(s.cycle, s.flags) for s in said] == [(15, 0), (16, 0), (17, 0)] and counters(desk) == (0, 0)
-    plant = desk.node.plant.actuator
-    assert [float(plant._live[plant._index[name]]) for name in ("filter.clogging", "spool.dynamic_friction")] == [0, 1]
+    names, live = QUIET.list_names(), int(desk.node._memory.words[ec.LIVE_AT])
+    assert [read_reals(desk, live + names.index(name)) for name in ("filter.clogging", "spool.dynamic_friction")] == [
+        [0.0], [1.0]]
 
 
 def table(**changes: object) -> bytes:

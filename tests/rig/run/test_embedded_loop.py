@@ -9,8 +9,8 @@ from rig_command import SHORT, job, play
 
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import Trace
-from plant.run import NoiseStream
 from plant.segments import Array
+from rig.nodes import emulator_cycle
 from rig.run import bring_up
 from rig.run.embedded_loop import EmbeddedLoop
 from rig.run.runner import Outcome
@@ -85,14 +85,13 @@ def test_the_log_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pl
 
 def test_a_plant_that_diverges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, played: list[int]) -> None:
     """No exception and no number that is made up, in either loop: EMCY, and clean-up without current."""
-    original = NoiseStream.__init__
+    original = emulator_cycle.fill_noise
 
-    def begin(self: NoiseStream, *given: int) -> None:
-        original(self, *given)
-        self._drawn = self.look_ahead(300)
-        self._drawn[200, 1] = np.nan
+    def fill(m: emulator_cycle.Memory, rng: np.random.Generator) -> None:
+        original(m, rng)
+        m.reals[emulator_cycle.NOISE_AT + 200 * m.words[emulator_cycle.NOISES] + 1] = np.nan
 
-    monkeypatch.setattr(NoiseStream, "__init__", begin)
+    monkeypatch.setattr(emulator_cycle, "fill_noise", fill)
     outcome = play_both(monkeypatch, tmp_path)
     assert (outcome.verdict, outcome.safe) == ("ABORTED", True) and "node 3 plant 0x6000" in outcome.aborted
     trace = Trace.read(tmp_path / "alone", all=True)
