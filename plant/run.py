@@ -67,20 +67,11 @@ class NoiseStream:
 
     def take(self) -> list[float]:
         """The next row."""
-        row: list[float] = self.look_ahead(1)[0].tolist()
+        if self._at == len(self._drawn):
+            self._drawn, self._at = self._rng.standard_normal((self._block, self._drawn.shape[1])), 0
+        row: list[float] = self._drawn[self._at].tolist()
         self._at += 1
         return row
-
-    def look_ahead(self, rows: int) -> Array:
-        """The next rows, (rows, numbers), which stay the next ones; see `skip`."""
-        if self._at + rows > len(self._drawn):
-            more = self._rng.standard_normal((max(rows, self._block), self._drawn.shape[1]))
-            self._drawn, self._at = np.concatenate((self._drawn[self._at:], more)), 0
-        return self._drawn[self._at: self._at + rows]
-
-    def skip(self, rows: int) -> None:
-        """Leave out rows that `look_ahead` has given."""
-        self._at += rows
 
 
 def simulate(model: Model, command: Array, load: Array | None = None, seed: int = 0, steps: int | None = None,
@@ -251,16 +242,6 @@ def find_direct_readings(model: Model) -> list[tuple[int, int]]:
     return list(zip(shown, (index[s.noise] for s in outputs), strict=True))
 
 
-class LentPlant(NamedTuple):
-    """State and parameters of a plant, where its readings and their noise are in these, address of its machine code."""
-
-    flat: Array
-    live: Array
-    fields: list[int]
-    levels: list[int]
-    advance: int
-
-
 class Actuator:
     """One plant that runs cycle by cycle: the core of the emulator. It knows neither clock nor bus."""
 
@@ -326,13 +307,6 @@ class Actuator:
         t = self.cycle * self._period
         self._advance(drive, load, self._noise[-1], t)
         self.cycle += 1
-
-    def lend(self) -> LentPlant | None:
-        """What compiled code needs to run cycles of this plant itself; None where that takes more than `advance`."""
-        if self._code is None or self._read is not None:
-            return None
-        fields, levels = map(list, zip(*self._places, strict=True))
-        return LentPlant(self._flat, self._live, fields, levels, self._code.find_address())
 
     def _bind_advance(self) -> Call:
         if self._code is not None:

@@ -186,25 +186,6 @@ class FrameSpec:
         return any(each.name in names for each in self.fields)
 
 
-def check_guards(spec: FrameSpec, data: bytes, last: int) -> tuple[str, int]:
-    """What is wrong with checksum and alive counter of a frame, and its counter.
-
-    "" for nothing, "checksum", "repeated" for the counter of the frame before, "jump" for one that is not the next.
-    `last`: the counter of the frame before, -1 for the first, and behind a wrong checksum.
-    """
-    from rig.benches.checksums import compute_checksum
-
-    counter = next((each for each in spec.fields if each.guard is Guard.COUNTER), None)
-    number = -1 if counter is None else extract_bits(counter, data)
-    for each in spec.fields:
-        if each.guard is Guard.CHECKSUM and (
-                extract_bits(each, data) != compute_checksum(each, insert_bits(each, data, 0), max(number, 0))):
-            return "checksum", -1
-    if counter is None or last < 0 or number == (last + 1) % counter.modulus:
-        return "", number
-    return "repeated" if number == last else "jump", number
-
-
 def locate_bits(each: Field, length: int) -> tuple[str, int]:
     """Byte order of the integer to which a frame of `length` bytes is taken, and by how much a field is shifted in it.
     """

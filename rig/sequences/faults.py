@@ -6,10 +6,8 @@ the main phase; a fault ends when main ends, so that clean-up runs on a healthy 
 """
 
 from abc import ABC
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from heapq import heappop, heappush
-from itertools import count
 from math import ceil
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
@@ -251,45 +249,6 @@ def change_frame(code: int, argument: int, length: int, data: int) -> tuple[int,
     return length, data
 
 
-def apply_action(action: Action, data: bytes) -> tuple[bytes, ...]:
-    """What arrives of a frame at once; one that `LateFrames` delays arrives unchanged."""
-    if action.code == SENT_NORMALLY:
-        return (data,)
-    length, word = change_frame(*action, len(data), int.from_bytes(data, "little"))
-    frame = (word & (1 << 64) - 1).to_bytes(8, "little")[:length]
-    return {DROP: (), DOUBLE: (frame, frame)}.get(action.code, (frame,))
-
-
-class LateFrames:
-    """The frames that faults delay, each with what passes it on: the one that is due first goes first."""
-
-    def __init__(self) -> None:
-        self._waiting: list[tuple[int, int, Callable[[bytes], None], bytes]] = []
-        self._order = count()  # of frames that are due at the same time
-
-    def __bool__(self) -> bool:
-        return bool(self._waiting)
-
-    @property
-    def due(self) -> int:
-        """When the first of them is due, ns; there must be one."""
-        return self._waiting[0][0]
-
-    def pass_on(self, action: Action, data: bytes, now_ns: int, put: Callable[[bytes], None]) -> None:
-        """Let `put` have what a fault makes of a frame: at once, or when a delay from `now_ns` on is over."""
-        if action.code == DELAY:
-            heappush(self._waiting, (now_ns + action.argument, next(self._order), put, data))
-            return
-        for what in apply_action(action, data):
-            put(what)
-
-    def release(self, before_ns: int) -> None:
-        """Pass on the frames that are due before a time."""
-        while self._waiting and self.due < before_ns:
-            _, _, put, data = heappop(self._waiting)
-            put(data)
-
-
 class Edge(NamedTuple):
     """A fault begins or ends: a line for the log."""
 
@@ -333,7 +292,7 @@ class Plan:
 
 @dataclass
 class SignalChange:
-    """A fault of a sensor in the cycles first <= k < last, called with each cycle and reading in order.
+    """A fault of a sensor in the cycles first <= k < last.
 
     It adds `added`, one value a cycle, or holds `value` or, without one, the last reading.
     """
@@ -342,23 +301,12 @@ class SignalChange:
     last: int
     added: list[float] | None = None
     value: float | None = None
-    last_read: float = 0.0
-
-    def __call__(self, cycle: int, reading: float) -> float:
-        if not self.first <= cycle < self.last:
-            self.last_read = reading
-        elif self.added is not None:
-            reading += self.added[cycle - self.first]
-        else:
-            reading = self.last_read if self.value is None else self.value
-        return reading
 
 
 class Schedule:
     """The faults in cycle k. `base` gives the model's own value of every parameter that a fault changes.
 
-    Cycles are counted from the start of set-up. Only a stuck sensor has a memory (what it last read), so ask for them
-    in the order of the cycles; everything else may be asked in any order. InputError for a parameter without a base.
+    Cycles are counted from the start of set-up. InputError for a parameter without a base.
     """
 
     def __init__(self, plan: Plan, base: Mapping[str, float] | None = None) -> None:
@@ -421,12 +369,6 @@ class Schedule:
     def _put(self, name: str, first: int, hits: Table) -> None:
         self._frames.setdefault(name, []).append((first, hits))
 
-    def parameters_at(self, cycle: int, since: int | None = None) -> dict[str, float]:
-        """The parameters, SI, that differ from what they were in cycle `since` (default: the cycle before)."""
-        before = cycle - 1 if since is None else since
-        return {name: value for name in self.parameters
-                if (value := self._parameter(name, cycle)) != self._parameter(name, before)}
-
     def _parameter(self, name: str, cycle: int) -> float:
         for first, values in self.parameters[name]:
             if 0 <= cycle - first < len(values):
@@ -436,12 +378,6 @@ class Schedule:
     def list_parameters(self, cycle: int) -> dict[str, float]:
         """All parameters of the model, with what faults have made of them in this cycle."""
         return {**self._base, **{name: self._parameter(name, cycle) for name in self.parameters}}
-
-    def change_signal(self, name: str, value: float, cycle: int) -> float:
-        """What the sensor `name` (xj, p12, xs; SI) says in place of `value`; faults act in the order of the plan."""
-        for change in self.signals.get(name, ()):
-            value = change(cycle, value)
-        return value
 
     def find_action(self, name: str, cycle: int) -> Action:
         """What happens to the frame `name`, a PDO or `sync`, in this cycle; of a node: DROP while it is bus-off.
@@ -462,13 +398,6 @@ class Schedule:
             table[first:first + len(hits)][is_hit] = hits[is_hit]
         cycles = np.flatnonzero(table[:, 0])
         return np.column_stack((cycles, table[cycles]))
-
-    def count_lost_syncs(self, cycle: int) -> int:
-        """How many SYNCs in a row are lost from this cycle on."""
-        count = 0
-        while self.find_action("sync", cycle + count).code == DROP:
-            count += 1
-        return count
 
     def foreign_frames(self, cycle: int) -> list[tuple[int, bytes]]:
         """COB-ID and data of the frames of no node of the bench that are sent in this cycle."""
