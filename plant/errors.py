@@ -1,4 +1,4 @@
-"""Errors that the user can correct, each shown as one line; and the hint at a similar name."""
+"""Errors that the user can correct, each shown as one line; and words that messages share."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
@@ -65,6 +65,15 @@ def show_value(value: object) -> str:
         return f"{text[:200]}..." if len(text := repr(value)) > 200 else text
     except (ValueError, RecursionError):  # a whole number of thousands of digits, tables of as many levels
         return "a huge value"
+
+
+def count_nouns(count: int, noun: str, plural: str = "") -> str:
+    """A count and its noun; `plural` where an "s" does not make it.
+
+    >>> count_nouns(1, "repeat"), count_nouns(3, "cycle"), count_nouns(2, "bench", "benches")
+    ('1 repeat', '3 cycles', '2 benches')
+    """
+    return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
 
 
 def suggest_name(word: str, known: Iterable[str], similarity: float = 0.6) -> str:

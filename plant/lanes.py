@@ -26,7 +26,7 @@ from plant.compile import (
     rebind_names,
 )
 from plant.effects import Effect
-from plant.errors import require
+from plant.errors import count_nouns, require
 from plant.foreign import run_foreign
 from plant.kernel_use import KernelUse
 from plant.kernels import (
@@ -442,7 +442,7 @@ def compile_kernels(model: Model, progress: Callable[[str, float], None] = lambd
     """
     rungs = list_kernel_variants(model)
     for done, rung in enumerate(rungs):
-        progress(f"compiling the plant with {len(rung.model.effects)} effects, once", done / len(rungs))
+        progress(f"compiling the plant with {count_nouns(len(rung.model.effects), 'effect')}, once", done / len(rungs))
         rung.prepare()
     progress("", 1.0)
 

@@ -124,6 +124,12 @@ class Model:
         base = self.kind.nominal
         return {name: value for name, value in self.values.items() if base.get(name) != value}
 
+    def describe_value(self, name: str) -> str:
+        """A parameter for people: its SI value with the unit, or the word of a choice."""
+        quantity, value = find_quantity(name, plant=self.plant), self[name]
+        word = next((word for word, number in quantity.words.items() if number == value), "")
+        return word or f"{value:g}" + ("" if quantity.unit == "1" else f" {quantity.unit}")
+
     def to_toml(self, remarks: Mapping[str, str] | None = None) -> str:
         """The text of a model file, which `load_model` reads; `remarks` stand beside parameters, by "group.field"."""
         effects = ", ".join(f'"{e}"' for e in self.effects)

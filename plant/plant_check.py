@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.compile import find_fields_of
-from plant.errors import InputError, require, suggest_name
+from plant.errors import InputError, count_nouns, require, suggest_name
 from plant.faults import Fault
 from plant.quantity import Quantity, list_quantities
 from plant.segments import Segment, build_profile
@@ -105,7 +105,7 @@ def _check_readings(plant: Plant, where: object) -> None:
     with explain_errors(str(plant.file), "step"):
         after = build_kernel(step_cycle, (), False, plant.key)(*plant.build_start(()), 0.0, 0.0, 0.0, 0.0, record, 1)
     require(isinstance(y, tuple) and len(y) == len(names) and all(isinstance(x, float | int) for x in y), where,
-            "measure", f"a tuple of {len(names)} numbers, {', '.join(names)}, not {y!r}")
+            "measure", f"a tuple of {count_nouns(len(names), 'number')}, {', '.join(names)}, not {y!r}")
     require(isinstance(after, tuple) and len(after) == 2 and isinstance(after[0], plant.state), where, "step",
             "the new State and the memories, return State(...), m")
     with explain_errors(str(plant.file), "moves"):

@@ -17,10 +17,11 @@ from fdi.estimation.noise import floor_from_data
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Flags, Floats, Trace, rms
-from plant.errors import require
+from plant.errors import count_nouns, require
 from plant.signals import Signal
 
 SAME_COMMAND = 1.5e-7  # m, times `Trace.scale`; the bus carries steps of 1e-7 m
+MOST_UNCOVERED = 2.0  # rows of the slower run, by which runs of one length may differ
 
 
 class Run(NamedTuple):
@@ -69,7 +70,7 @@ class SignalDifference:
 class RunPair:
     """A run against the reference. `t` and each column of `differences` have shape (n,): rows that both runs have.
 
-    The differences are NaN where a sample is missing or the commands differ.
+    The differences are NaN where a sample is missing or the commands differ. `uncovered` is 0 up to two rows.
     """
 
     run: Run
@@ -77,6 +78,7 @@ class RunPair:
     has_same_command: bool
     common: float  # s, duration over which the commands agree
     overlap: float  # s, duration that both runs cover
+    uncovered: float  # s, duration of the longer run that the other does not cover
     offset: float  # s, time of the reference minus time of this run, for the same cycle
     t: Floats  # s, of the reference
     differences: dict[str, Floats]
@@ -94,9 +96,9 @@ class RunDifferences:
 
     @property
     def verdict(self) -> str:
-        """SAME if noise explains all differences and no check changed its verdict; otherwise DIFFERENT."""
-        is_same = all(pair.has_same_command and pair.signals and all(s.is_within_noise for s in pair.signals)
-                      for pair in self.pairs)
+        """SAME if noise explains all differences of runs of one length and no check changed; otherwise DIFFERENT."""
+        is_same = all(pair.has_same_command and not pair.uncovered and pair.signals
+                      and all(s.is_within_noise for s in pair.signals) for pair in self.pairs)
         return "SAME" if is_same and not any(check.is_changed for check in self.checks) else "DIFFERENT"
 
 
@@ -161,6 +163,8 @@ def _subtract(reference: Run, other: Run) -> RunPair:
     agrees = _find_common_rows(rows)
     period = max(a.period, b.period)
     overlap, common = len(rows.t) * period, float(agrees.sum()) * period
+    uncovered = max(len(a) * a.period, len(b) * b.period) - overlap
+    uncovered = uncovered if uncovered > MOST_UNCOVERED * period else 0.0
     is_same = len(rows.t) > 0 and bool(agrees.mean() > 0.995)  # missing rows and edges of interpolated steps aside
     differences, found, left_out = {}, [], {}
     d = a.declared
@@ -180,8 +184,8 @@ def _subtract(reference: Run, other: Run) -> RunPair:
         differences[name] = difference
         signal = d.find(name)._replace(unit=a.units[name])
         found.append(_measure_difference(signal, rows.t, difference, (first, second)))
-    return RunPair(other, tuple(found), is_same, common, overlap, offset, rows.t, differences, left_out,
-                   tuple(_list_notes(reference, other, offset, rows, agrees, is_same)))
+    return RunPair(other, tuple(found), is_same, common, overlap, uncovered, offset, rows.t, differences, left_out,
+                   tuple(_list_notes(reference, other, offset, agrees, is_same)))
 
 
 def _find_obstacle(name: str, reference: Run, other: Run) -> str:
@@ -258,8 +262,7 @@ def _find_common_rows(rows: _Rows) -> Flags:
     return agrees
 
 
-def _list_notes(reference: Run, other: Run, offset: float, rows: _Rows, agrees: Flags,
-                is_same: bool) -> Iterator[str]:
+def _list_notes(reference: Run, other: Run, offset: float, agrees: Flags, is_same: bool) -> Iterator[str]:
     """What a reader must know before trusting the differences."""
     a, b = reference.trace, other.trace
     where = f"{other.label} against {reference.label}"
@@ -272,10 +275,7 @@ def _list_notes(reference: Run, other: Run, offset: float, rows: _Rows, agrees: 
     if abs(a.period / b.period - 1.0) > 1e-6:
         yield (f"{where}: rows every {1e3 * a.period:g} ms and {1e3 * b.period:g} ms; compared in the rows of the "
                "slower run, with straight lines between the rows of the faster one")
-    uncovered = max(len(a) * a.period, len(b) * b.period) - len(rows.t) * max(a.period, b.period)
-    if uncovered > 2.0 * max(a.period, b.period):
-        yield f"{where}: {uncovered:.3f} s of the longer run have no counterpart"
-    yield from (f"{run.label}: {sum(gap.cycles for gap in run.trace.gaps)} cycles are missing"
+    yield from (f"{run.label}: {count_nouns(sum(gap.cycles for gap in run.trace.gaps), 'cycle')} missing"
                 for run in (reference, other) if run.trace.gaps)
 
 

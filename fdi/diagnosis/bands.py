@@ -45,7 +45,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.sections import Section, describe_section, find_sections
 from fdi.trace.trace import Flags, Floats, Trace
-from plant.errors import InputError, require
+from plant.errors import InputError, count_nouns, require
 from plant.model import Model
 from plant.parameters import parse_toml
 from plant.plants import Plant, find_plant
@@ -216,7 +216,7 @@ def find_difference(bands: Bands, found: Sequence[Section], period: float) -> st
     """
     mine, theirs = ([s for s in parts if s.kind in ("step", "ramp")] for parts in (bands.sections, found))
     if len(mine) != len(theirs):
-        return f"this one has {len(theirs)} sections"
+        return f"this one has {count_nouns(len(theirs), 'section')}"
     same = SAME_COMMAND_POSITION * bands.scale
     for a, b in zip(mine, theirs, strict=True):
         start = (b.start - theirs[0].start) * period

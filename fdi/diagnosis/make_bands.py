@@ -58,7 +58,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Floats, Trace, fill_gaps, measure_scale
-from plant.errors import InputError, require
+from plant.errors import InputError, count_nouns, require
 from plant.lanes import NARROW, Lanes
 from plant.model import Model, load_model
 from plant.threads import count_threads
@@ -329,7 +329,7 @@ def learn_bands(traces: Sequence[Trace], model: Model | None = None, names: Sequ
         InputError: too few traces, another command or period in one, a load, or a position with holes.
     """
     names = names or [f"trace {i + 1}" for i in range(len(traces))]
-    require(len(traces) >= FLEET_FEWEST_TRACES, "--learn-bands", f"{len(traces)} traces",
+    require(len(traces) >= FLEET_FEWEST_TRACES, "--learn-bands", count_nouns(len(traces), "trace"),
             f"at least {FLEET_FEWEST_TRACES} healthy traces of one command")
     com, _, _, period, _ = read_columns(traces[0])
     base = choose_bands(com, np.zeros_like(com), period, model, progress, faults)

@@ -35,7 +35,6 @@ from fdi.report.drawing import (
     shade,
 )
 from fdi.report.numbers import (
-    count_nouns,
     format_amount,
     format_digits,
     format_percent,
@@ -45,6 +44,7 @@ from fdi.report.numbers import (
 )
 from fdi.report.report import Cell, Column, Figure, Line, Medium, Mood, Report, Section, Table, tabulate
 from fdi.thresholds import BLOCK_ERROR_RATIO, CONTROLLER_ERROR_RATIO, DEPENDENCE_SHARE, FLOW_GAIN_FAR, NOISE_BAND_RATIO
+from plant.errors import count_nouns
 from plant.signals import Signal
 
 MOODS: dict[str, Mood] = {"WITHIN_FLOOR": "good", "MODEL_INCOMPLETE": "bad", "CANNOT_TELL": "doubtful"}
@@ -63,7 +63,7 @@ SHAPE_WORDS = {  # how a residual depends on a quantity
 
 def build_comparison_report(c: Comparison, next_command: str = "", files: Sequence[tuple[str, str]] = ()) -> Report:
     """The report of a comparison; `files` are those that were written."""
-    t, changes = c.trace, sorted(c.model.list_changes().items())
+    t, changes = c.trace, sorted(c.model.list_changes())
     facts = [("model", c.model.name), ("trace", f"{len(t) * t.period:.3f} s, {len(t)} cycles of {1e3 * t.period:g} ms"),
              ("repeats", str(c.repeats)), ("signals", ", ".join(s.signal.symbol for s in c.signals.values()))]
     sections = [
@@ -96,7 +96,7 @@ def build_comparison_report(c: Comparison, next_command: str = "", files: Sequen
             "How far each parameter moves when the model is refitted within the tolerances of a healthy unit.")],
             medium=Medium.PAGE),
         Section("Changes of the model", [_list_values(
-            "value, SI", {name: f"{value:g}" for name, value in changes},
+            "value", {name: c.model.describe_value(name) for name in changes},
             "Parameters that differ from the nominal model.")], medium=Medium.PAGE)]
     return Report("compare", c.source, c.verdict, MOODS[c.verdict], describe_verdict(c), facts, c.notes, sections,
                   next_command, files, collect_data(c))
@@ -229,7 +229,7 @@ def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6
     The page and the JSON answer have all places and changes.
     """
     is_wrong = c.verdict != "WITHIN_FLOOR"
-    changes = [f"{name} = {value:g}" for name, value in sorted(c.model.list_changes().items())
+    changes = [f"{name} = {c.model.describe_value(name)}" for name, value in sorted(c.model.list_changes().items())
                if c.model.design.get(name) != value]
     errors = ", ".join(f"{s.signal.symbol} by {format_amount(s.solver_error, s.signal.unit)}"
                        for s in c.signals.values())

@@ -30,7 +30,6 @@ from fdi.report.drawing import (
 )
 from fdi.report.numbers import (
     choose_unit,
-    count_nouns,
     format_digits,
     format_percent,
     format_ratio,
@@ -42,6 +41,7 @@ from fdi.report.run_report import read_verdict
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
+from plant.errors import count_nouns
 
 Facts = dict[str, list[str]]  # the text of each run
 
@@ -76,6 +76,7 @@ def describe_differences(found: RunDifferences) -> str:
         elif all(s.is_equal for s in pair.signals):
             words = "every sample is equal"
         more = "" if pair.has_same_command else ", where the commands agree; elsewhere they differ"
+        more += f"; {pair.uncovered:.3f} s of the longer run are not in the other" if pair.uncovered else ""
         parts.append(f"{pair.run.label} against {found.runs[0].label}: {words}{more}")
     changed = [check.name for check in found.checks if check.is_changed]
     if changed:

@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from pathlib import Path
 
-from fdi.report.numbers import choose_unit, count_nouns, format_digits, list_first
+from fdi.report.numbers import choose_unit, format_digits, list_first
 from fdi.report.report import Cell, Column, Line, Mood, Report, Section, tabulate
 from fdi.trace.importing.conversion import Imported, ImportedSignal
 from fdi.trace.importing.formats import Measurement
@@ -25,7 +25,7 @@ def build_import_report(imported: Imported, measurement: Measurement, out: Path)
         (Column("missing", "rows", "right"), lambda s: str(s.missing or "none")),
         caption="Rate and gaps: in the source. Range and missing: in the trace.")
     lines = [Line(signals.find(s.name).symbol, s.how) for s in imported.signals]
-    sentence = (f"{out}: {count_nouns(len(trace), 'row')} of {1e3 * trace.period:.6g} ms from {measurement.path.name} "
+    sentence = (f"{out}: {len(trace)} rows of {1e3 * trace.period:.6g} ms from {measurement.path.name} "
                 f"({measurement.format})")
     notes = _list_notes(imported, measurement)
     data = {"trace": str(out), "cycles": len(trace), "period": trace.period, "format": measurement.format,

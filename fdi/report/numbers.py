@@ -156,15 +156,6 @@ def list_first(words: Sequence[str], most: int) -> str:
     return ", ".join(words[:most]) + (f" and {rest} more" if rest > 0 else "")
 
 
-def count_nouns(count: int, noun: str) -> str:
-    """A count and its noun, which takes an "s" where it is not one.
-
-    >>> count_nouns(1, "repeat"), count_nouns(3, "cycle")
-    ('1 repeat', '3 cycles')
-    """
-    return f"{count} {noun}" + ("" if count == 1 else "s")
-
-
 def name_parameter(parameter: str) -> str:
     """A parameter "group.field" in words, where the effect is known from the context.
 

@@ -56,6 +56,7 @@ from fdi.report.report import (
 )
 from fdi.trace.check_result import CheckResult, compute_speed, filter_median
 from fdi.trace.trace import Event, Floats, Trace
+from plant.errors import count_nouns
 from plant.signals import EHA, Signals
 from plant.units import UNITS
 
@@ -170,8 +171,10 @@ def _list_notes(trace: Trace, most: int = 5) -> list[str]:
     limits = [text for name, text in sorted(trace.provenance.items()) if name.startswith("limits.")]
     recovered = trace.provenance.get("recovered.reason")
     return [*trace.notes,
-            *(f"{gap.cycles} cycles missing between {gap.t0:.3f} and {gap.t1:.3f} s" for gap in trace.gaps[:most]),
-            *([f"and {sum(gap.cycles for gap in rest)} cycles in {len(rest)} more gaps"] if rest else []),
+            *(f"{count_nouns(gap.cycles, 'cycle')} missing between {gap.t0:.3f} and {gap.t1:.3f} s"
+              for gap in trace.gaps[:most]),
+            *([f"and {count_nouns(sum(gap.cycles for gap in rest), 'cycle')} in {count_nouns(len(rest), 'more gap')}"]
+              if rest else []),
             *([f"missing samples (red on the page): {'; '.join(parts)} (of {len(trace)})"] if parts else []),
             *([f"limits reached: {'; '.join(limits)}"] if limits else []),
             *([] if recovered is None else [f"this log was salvaged after its writer died: {recovered}"])]

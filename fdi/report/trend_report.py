@@ -30,9 +30,10 @@ from fdi.report.drawing import (
     level,
     line,
 )
-from fdi.report.numbers import attach_unit, count_nouns, format_digits, format_interval
+from fdi.report.numbers import attach_unit, format_digits, format_interval
 from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Mood, Report, Section, tabulate
 from fdi.thresholds import TREND_FEWEST_TRACES, TREND_MOST_TRACES
+from plant.errors import count_nouns
 
 MOODS: dict[Level, Mood] = {Level.ACCEPTABLE: "good", Level.MAINTENANCE: "doubtful", Level.NON_NOMINAL: "bad"}
 

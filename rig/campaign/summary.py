@@ -25,6 +25,7 @@ from fdi.report.report import (
     Section,
     Table,
 )
+from plant.errors import count_nouns
 from rig.campaign.batch import BatchProgress, Row
 from rig.campaign.judge import CANNOT_TELL, FAILED, HEALTHY, OK, REFUSED, label_plant, restore_faults
 
@@ -272,7 +273,8 @@ def build_campaign_report(figures: Mapping[str, Any], title: str = "campaign") -
     time = [Line("time a case", f"{took['median']:.2f} s (median), {took['p95']:.2f} s (95th percentile), "
                                 f"{took['most']:.2f} s (longest)")] if took else []
     return Report(
-        command="campaign", title=title, sentence=f"{figures['cases']} cases: {status or 'none finished'}.",
+        command="campaign", title=title,
+        sentence=f"{count_nouns(figures['cases'], 'case')}: {status or 'none finished'}.",
         sections=[Section("Time", time), *(_build_tolerance_section(part, faults) for part in figures["tolerances"]),
                   Section("Traces", _tabulate_traces(figures["traces"], faults)),
                   Section("Cases without a result", _list_reasons(figures["reasons"]))],
@@ -288,7 +290,7 @@ def _build_tolerance_section(part: Mapping[str, Any], faults: Sequence[Fault]) -
               _tabulate_counts("true faults", part["ruling"], "Cases by true faults (row) and ruling fault reported "
                                                               "(column)."),
               _tabulate_errors(part["errors"], faults)]
-    title = f"Plants with {100 * part['tolerance']:g} % scatter: {part['cases']} cases"
+    title = f"Plants with {100 * part['tolerance']:g} % scatter: {count_nouns(part['cases'], 'case')}"
     return Section(title, [table for table in tables if table.rows], title_medium=Medium.BOTH)
 
 
@@ -336,13 +338,19 @@ def format_requirement(low: float, high: float) -> str:
 
 
 def _tabulate_detections(fault: Fault, points: Sequence[Mapping[str, Any]]) -> Table:
-    columns = _number_columns(f"{fault.name}{fault.bracketed_unit}", "detected", "share", "95 % interval",
-                              "non-nominal", "ruling", "by bands")
-    rows = [[f"{point['size']:g}", *show_share(point["detected"]),
-             *(show_share(point[key])[1] for key in ("most", "ruling", "bands"))]
-            for point in points if len(points) > 1]
-    return Table(columns, rows, f"Detected: {fault.name} judged maintenance or worse, by true size; then the shares "
-                                "judged non-nominal, named as ruling fault, and detected by the bands alone.")
+    rates = {"detected": "detected", "non-nominal": "most", "ruling": "ruling", "by bands": "bands"}
+    columns = _number_columns(f"{fault.name}{fault.bracketed_unit}", "cases", *(f"{title} [%]" for title in rates))
+    rows = [[f"{point['size']:g}", str(point["detected"]["of"]),
+             *(_show_interval(point[key]) for key in rates.values())] for point in points if len(points) > 1]
+    return Table(columns, rows, f"Detected: {fault.name} judged maintenance or worse, by true size, with the 95 % "
+                                "interval; then the same for judged non-nominal, named as ruling fault, and detected "
+                                "by the bands alone.")
+
+
+def _show_interval(count: Mapping[str, Any]) -> str:
+    """A share and its 95 % interval in per cent, as in 95.0 (75.1 .. 99.9)."""
+    _, share, interval = show_share(count)
+    return share if share == NO_NUMBER else f"{share.removesuffix(' %')} ({interval})"
 
 
 def _tabulate_counts(title: str, counts: Mapping[str, Mapping[str, int]], caption: str) -> Table:

@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from fdi.report.numbers import count_nouns
+from plant.errors import count_nouns
 from plant.tables import read_file
 from rig.benches.bench import decode_device_text
 from rig.benches.canopen_map import INVALID, MAPPING, PARAMETERS, list_pdos, list_variables, read_dictionary
@@ -271,7 +271,7 @@ class Target:
         if data is None:
             raise CaseFailed(f"no response to {request.hex(' ')} within {self.options.timeout:g} s")
         if len(data) != 8:
-            raise CaseFailed(f"a response of {len(data)} bytes to {request.hex(' ')}: {data.hex(' ')}")
+            raise CaseFailed(f"a response of {count_nouns(len(data), 'byte')} to {request.hex(' ')}: {data.hex(' ')}")
         if data[0] == ABORT:
             raise Refusal(int.from_bytes(data[4:], "little"), int.from_bytes(data[1:3], "little"), data[3])
         return data
@@ -520,7 +520,7 @@ class Variable(NamedTuple):
 
     def decode(self, data: bytes) -> Number:
         """The number in these bytes. Raises Problem for a wrong length."""
-        require(len(data) == self.size, f"{self.label} has {len(data)} bytes, expected {self.size}")
+        require(len(data) == self.size, f"{self.label} has {count_nouns(len(data), 'byte')}, expected {self.size}")
         if self.data_type in FLOATS:
             return float(struct.unpack(FLOATS[self.data_type], data)[0])
         return int.from_bytes(data, "little", signed=self.data_type in datatypes.SIGNED_TYPES)

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from plant.errors import RigError
+from plant.errors import RigError, count_nouns
 from rig.network.bus import Wire
 
 R = TypeVar("R")
@@ -73,7 +73,7 @@ def upload_object(exchange: Exchange, index: int, sub: int, largest: int = LARGE
             most = f"the {size} bytes announced" if is_sized else f"{largest} bytes"
             raise SdoProblem(f"more than {most}", _LENGTH_WRONG)
     if is_sized and len(data) != size:
-        raise SdoProblem(f"{len(data)} bytes, {size} were announced")
+        raise SdoProblem(f"{count_nouns(len(data), 'byte')}, {size} were announced")
     return data, True
 
 
@@ -135,7 +135,7 @@ class CheckedSdoClient(SdoClient):
                 expected = len(variable) // 8
                 data = data if is_sized else data[:expected]
                 if len(data) != expected:
-                    raise SdoProblem(f"{len(data)} bytes, expected {expected}")
+                    raise SdoProblem(f"{count_nouns(len(data), 'byte')}, expected {expected}")
         return data
 
     def download(self, index: int, subindex: int, data: bytes, force_segment: bool = False) -> None:

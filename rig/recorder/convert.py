@@ -22,7 +22,7 @@ from fdi.trace.mcap_log import open_log
 from fdi.trace.sensor_dynamics import write_sensors
 from fdi.trace.trace import Trace, make_table_trace
 from plant import signals as plant_signals
-from plant.errors import InputError, report_system_error, require
+from plant.errors import InputError, count_nouns, report_system_error, require
 from plant.tables import read_file
 from rig.benches.bench import (
     FD,
@@ -206,7 +206,8 @@ class _CycleBuilder:
         elif spec is not None:
             if len(frame.data) < spec.length:
                 return [Event("WARN", "frame",
-                              f"{describe_identifier(cob_id)}: {len(frame.data)} bytes instead of {spec.length}")]
+                              f"{describe_identifier(cob_id)}: {count_nouns(len(frame.data), 'byte')} instead of "
+                              f"{spec.length}")]
             self._take(frame.t_ns, spec, unpack(spec, frame.data[:spec.length]))
         elif (self._is_canopen and 0x700 < cob_id < 0x780 and len(frame.data) == 1
               and self._nmt.get(node) != frame.data[0]):

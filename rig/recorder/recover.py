@@ -15,7 +15,7 @@ from mcap.stream_reader import StreamReader
 
 from fdi.output import require_writable
 from fdi.trace.mcap_log import BoundedFile, read_declarations, scan_messages, unpack_chunk
-from plant.errors import InputError, report_system_error
+from plant.errors import InputError, count_nouns, report_system_error
 from plant.unpacking import UnpackingError, limit_unpacked_size
 from rig.recorder.writer import McapFile
 
@@ -36,7 +36,8 @@ class Salvage:
     reason: str  # why reading stopped; empty for a whole log
 
     def __str__(self) -> str:
-        kept = f"{self.messages} messages, {self.cycles} cycles, {self.duration:.3f} s, {len(self.attachments)} files"
+        kept = (f"{count_nouns(self.messages, 'message')}, {count_nouns(self.cycles, 'cycle')}, {self.duration:.3f} s, "
+                f"{count_nouns(len(self.attachments), 'file')}")
         if self.complete:
             return f"{self.path}: the log was complete: {kept}"
         return (f"{self.path}: kept {kept}; lost {self.lost_bytes} bytes without an intact chunk ({self.reason}) and "

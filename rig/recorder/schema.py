@@ -25,7 +25,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Fd, FileDescr
 
 from fdi.trace.check_result import CheckResult, describe_field
 from plant import signals as plant_signals
-from plant.errors import require
+from plant.errors import count_nouns, require
 
 U32 = Annotated[int, "fixed32"]
 
@@ -269,4 +269,4 @@ def _read_git_state(root: Path) -> dict[str, str]:
         return {}
     commit = next((line.removeprefix("# branch.oid ") for line in lines if line.startswith("# branch.oid ")), "")
     changed = sum(not line.startswith("#") for line in lines)
-    return {"git.commit": commit, "git.state": f"{changed} files changed" if changed else "clean"}
+    return {"git.commit": commit, "git.state": f"{count_nouns(changed, 'file')} changed" if changed else "clean"}

@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi.report.numbers import count_nouns, format_amount
+from fdi.report.numbers import format_amount
 from fdi.report.report import Cell, Column, Line, Medium, Report, Section, Table, tabulate, to_plain
 from fdi.report.run_report import build_run_report
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import MAIN, Event, Trace
 from plant import Model, simulate
+from plant.errors import count_nouns
 from plant.model import find_quantity
 from plant.plants import Plant
 from plant.run import make_columns_type

@@ -16,11 +16,11 @@ from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
 
 from fdi.progress import ignore_progress
-from fdi.report.numbers import count_nouns, list_first
+from fdi.report.numbers import list_first
 from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table, tabulate, to_plain
 from fdi.report.run_report import MOODS as RUN_MOODS, write_run_page
 from fdi.trace.check_result import CheckResult
-from plant.errors import InputError, RigError, require
+from plant.errors import InputError, RigError, count_nouns, require
 from plant.quantity import Quantity
 from plant.tables import build_dataclass, decode_text, parse_table, read_file
 from rig import junit

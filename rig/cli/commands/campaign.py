@@ -15,7 +15,7 @@ from fdi.diagnosis.faults import choose_faults, load_faults
 from fdi.foreign_code import ForeignCode, load_plant_of_model, require_trust
 from fdi.output import write_text
 from plant import load_model
-from plant.errors import InputError, require
+from plant.errors import InputError, count_nouns, require
 from rig.campaign.batch import BatchProgress, Row, Workers
 from rig.campaign.judge import (
     WORKS,
@@ -60,7 +60,7 @@ def give_summary(rows: Sequence[Row], folder: Path, args: argparse.Namespace) ->
         names = sorted(file.name for file in folder.iterdir() if file.suffix in (".parquet", ".json", ".svg"))
         report = replace(report, files=[("results", f"{folder}/ {', '.join(names)}")])
         if left := len(read_matrix_of_folder(folder).cases) - len(rows):
-            report = replace(report, sentence=f"{report.sentence} {left} cases are left.",
+            report = replace(report, sentence=f"{report.sentence} {count_nouns(left, 'case')} left.",
                              next_command=f"rig campaign {shlex.quote(str(folder))}")
     is_missed = any(rate["met"] is False for part in figures["tolerances"] for rate in part["rates"])
     return give_answer(report, args, int(is_missed or bool(figures["status"].get("failed"))))
@@ -108,7 +108,7 @@ def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
     tables = read_matrix(args.what) if args.what else {}
     listed, more = tables.get("case", []), parse_faults(args.fault)
     tables = {**tables, **changed, "case": [*listed, *more] if isinstance(listed, list) else listed}
-    require(tables["case"], "MATRIX.toml|FOLDER", "",
+    require(args.what or tables["case"], "MATRIX.toml|FOLDER", "",
             f"a matrix file, the shipped matrix {' or '.join(list_shipped_matrices())}, a folder of traces, or --fault "
             "EFFECT=SIZE,..")
     return (build_matrix(tables, model, work, args.what or "--fault", faults),

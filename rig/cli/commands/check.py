@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fdi.report.report import Column, Line, Report, Section, Table
-from plant.errors import require
+from plant.errors import count_nouns, require
 from plant.faults import is_fault_file
 from plant.model import load_model
 from plant.plant_check import check_behaviour
@@ -53,8 +53,9 @@ def check_plant(args: argparse.Namespace) -> int:
             progress(found.check, len(findings) / (len(kind.effects) + 6))
     failed = [f.check for f in findings if not f.passed]
     verdict = "UNSOUND" if failed else "SOUND"
-    sentence = f"{kind.title or kind.name}: {len(kind.state._fields)} states, {len(kind.nominal)} parameters, " + (
-        f"{len(kind.effects)} own effects, {len(kind.faults)} faults")
+    counts = {"state": kind.state._fields, "parameter": kind.nominal, "own effect": kind.effects, "fault": kind.faults}
+    counted = ", ".join(count_nouns(len(items), noun) for noun, items in counts.items())
+    sentence = f"{kind.title or kind.name}: {counted}"
     lines = [Line(f.check, f.text, "good" if f.passed else "bad") for f in findings]
     signals = Table([Column("signal"), Column("role"), Column("unit"), Column("content")],
                     [[s.name, s.role, s.unit, s.quantity] for s in kind.signals])

@@ -10,7 +10,7 @@ from fdi.report.report import Report
 from fdi.trace.importing.conversion import ImportMap, import_measurement, read_map
 from fdi.trace.importing.formats import Measurement, open_measurement
 from fdi.trace.importing.guess import guess_map
-from plant.errors import InputError, require
+from plant.errors import InputError, count_nouns, require
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import give_answer
 from rig.cli.inputs import load_declared_model
@@ -60,7 +60,7 @@ def import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
     else:
         raise InputError(source, "", f"--map for other formats than .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}; "
                                      "--guess writes one")
-    return give_answer(Report("import", str(source), sentence=f"{out}: {cycles} cycles",
+    return give_answer(Report("import", str(source), sentence=f"{out}: {count_nouns(cycles, 'cycle')}",
                               data={"trace": str(out), "cycles": cycles}), args)
 
 

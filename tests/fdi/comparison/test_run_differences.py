@@ -10,7 +10,6 @@ from fdi.comparison.run_differences import (
     RunPair,
     SignalDifference,
     compare_runs,
-    find_offset,
     match_checks,
 )
 from fdi.report.diff_report import build_diff_report
@@ -58,10 +57,13 @@ def test_runs_with_other_clocks_are_aligned_by_the_command(start: float) -> None
     assert any("aligned by the command" in note for note in pair.notes)
 
 
-def test_a_run_that_was_recorded_later_is_aligned_by_its_steps() -> None:
-    whole = make_run(1)
-    late = whole.take_rows(slice(700, None), t=whole.t[700:] - whole.t[700])
-    assert find_offset(make_run(0), late) == pytest.approx(0.7) and compare_two(late)[0].verdict == "SAME"
+@pytest.mark.parametrize(("rows", "words"), [
+    (slice(700, None), "; 0.700 s of the longer run are not in the other"), (slice(0, ROWS - 2), ""),
+    (slice(0, 11), "; 3.989 s of the longer run are not in the other")])
+def test_a_part_of_a_run_is_aligned_by_its_steps_and_is_another_run(rows: slice, words: str) -> None:
+    found, pair, _ = compare_two(make_run(1, start=-1e-3 * rows.start).take_rows(rows))
+    assert (found.verdict, pair.offset) == ("DIFFERENT" if words else "SAME", pytest.approx(1e-3 * rows.start))
+    assert words in build_diff_report(found).sentence and all(s.is_within_noise for s in pair.signals)
 
 
 @pytest.mark.parametrize("is_first", [True, False])
