@@ -135,14 +135,19 @@ def effect(port: str, group: Group, *, off: Mapping[str, float] = {}, law: str, 
 
     def register(function: Law) -> Law:
         function = getattr(function, "py_func", function)  # an @njit function is welcome too
-        known = CATALOGUE.list_all().get(name := function.__name__)
-        if name in GROUPS or (known and known.file != Path(function.__code__.co_filename)):
-            raise ValueError(f"{name}: the name is taken")
+        if is_taken(function.__name__, Path(function.__code__.co_filename)):
+            raise ValueError(f"{function.__name__}: the name is taken")
         CATALOGUE.add_effect(build_effect(function, port, group, off=off, law=law, symptoms=symptoms, memory=memory,
                                           disturbance=disturbance, fitted=fitted, starts=starts, **more))
         return function
 
     return register
+
+
+def is_taken(name: str, file: Path) -> bool:
+    """Whether a parameter group or an effect of another file has this name."""
+    known = CATALOGUE.list_all().get(name)
+    return name in GROUPS or (known is not None and known.file != file)
 
 
 def build_effect(function: Law, port: str, group: Group, *, off: Mapping[str, float] = {}, law: str,

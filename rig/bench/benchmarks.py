@@ -125,9 +125,8 @@ def choose_bus(bus: str, seconds: float, blocks: int, least_block: float = 0.5) 
     """The bus of a benchmark in real time: `bus`, or for "auto" a UDP group of this process's own.
 
     Raises:
-        InputError: a time for each block below `least_block` s, or no block.
+        InputError: a time for each block below `least_block` s.
     """
-    require(blocks >= 1, "--blocks", str(blocks), "1 or more")
     require(seconds >= least_block * blocks, "--seconds", f"{seconds:g}", f"{least_block:g} s or more for each block")
     return f"udp_multicast:239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}" if bus == "auto" else bus
 

@@ -137,11 +137,11 @@ COMMANDS = {
          option("--accuracy", action="store_true",
                 help="also the error of the default step size and of others, against 0.2 us (half a minute)"),
          Group("rig bench realtime", (
-             option("--bus", default="auto", metavar="INTERFACE:CHANNEL",
+             option("--bus", metavar="INTERFACE:CHANNEL",
                     help="socketcan:vcan0 or udp_multicast:GROUP (default: a UDP group of its own)"),
-             option("--seconds", type=float, default=60.0, metavar="S",
+             option("--seconds", type=float, metavar="S",
                     help="time of measurement for each row of the table (default: 60)"),
-             option("--blocks", type=int, default=6, metavar="N",
+             option("--blocks", type=parse_count, metavar="N",
                     help="alternating blocks into which this time is divided (default: 6)"))))),
     "campaign": Command(
         "judge a matrix of simulated faults, or a folder of traces, on all cores or a cluster",

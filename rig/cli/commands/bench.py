@@ -1,18 +1,25 @@
 """`rig bench`: the project's own benchmarks."""
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from fdi.progress import Progress
 from fdi.report.report import Report
+from plant.errors import require
 from rig.cli.answer import Places, give_answer, show_progress
+
+REALTIME: Mapping[str, Any] = {"bus": "auto", "seconds": 60.0, "blocks": 6}  # options of rig bench realtime alone
 
 
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 1 if a target of the cycle in real time that could be measured is not met."""
     is_realtime = args.what == "realtime"
+    given = {name: value for name, value in vars(args).items() if name in REALTIME and value is not None}
+    require(is_realtime or not given, f"--{next(iter(given), '')}", "", "rig bench realtime")
     with show_progress(args, is_realtime=is_realtime) as progress:
-        report = measure_cycle(args, progress) if is_realtime else measure_plant(args, progress)
+        report = measure_cycle({**REALTIME, **given}, progress) if is_realtime else measure_plant(args, progress)
     is_missed = any(not each["is_met"] for each in report.data.get("targets", ()) if each["value"] is not None)
     return give_answer(report, args, int(is_missed), Places(answer=Path(args.out) if args.out else None))
 
@@ -30,9 +37,9 @@ def measure_plant(args: argparse.Namespace, progress: Progress) -> Report:
     return build_plant_report(figures)
 
 
-def measure_cycle(args: argparse.Namespace, progress: Progress) -> Report:
+def measure_cycle(options: Mapping[str, Any], progress: Progress) -> Report:
     """The cycle in real time."""
     from rig.bench.benchmarks import build_realtime_report, choose_bus, measure_realtime
 
-    bus = choose_bus(args.bus, args.seconds, args.blocks)
-    return build_realtime_report(measure_realtime(bus, args.seconds, args.blocks, progress))
+    options = {**options, "bus": choose_bus(**options)}
+    return build_realtime_report(measure_realtime(**options, progress=progress))

@@ -2,9 +2,11 @@
 
 import argparse
 import os
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from importlib.resources import files
+from keyword import iskeyword
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +15,7 @@ import numpy as np
 from fdi.diagnosis.faults import load_faults
 from fdi.output import require_new, require_writable, write_text
 from fdi.report.report import Line, Report, Section
-from plant.effects import load_effects
+from plant.effects import is_taken, load_effects
 from plant.errors import InputError, require
 from plant.faults import WORD
 from plant.model import load_model
@@ -32,6 +34,8 @@ def run_command(args: argparse.Namespace) -> int:
     kind = KINDS[args.kind]
     path = Path(args.out or f"{args.name.removesuffix(kind.suffix)}{kind.suffix}")
     require(path.suffix == kind.suffix, "--out", str(path), f"FILE{kind.suffix}")
+    require(kind.name.fullmatch(path.stem) and not iskeyword(path.stem), "NAME", path.stem,
+            f"{'small ' if kind.name is WORD else ''}letters, digits and _, and no keyword of Python")
     require_new(require_writable(path, "--out"), is_forced=args.force)
     check = kind.check.format(path=path) + (f" --model {args.model}" if args.model and args.kind != "bench" else "")
     plant = load_model(args.model or "eha").kind
@@ -51,10 +55,10 @@ def write_example(path: Path, args: argparse.Namespace, plant: Plant, check: str
     kind = args.kind
     require(not (args.eds or args.dbc or args.node or (args.model and kind == "plant")), f"rig new {kind}", "",
             "no device: --eds, --dbc and --node are of a bench, --model is of all but a plant")
-    require(kind not in ("fault", "effect") or WORD.fullmatch(path.stem), "NAME", path.stem,
-            f"small letters, digits and _ : the name is also that of the {kind}")
     if kind == "effect":
         plant.require_equations()
+        require(not is_taken(path.stem, path.absolute()), "NAME", path.stem,
+                "a name that no effect or group of parameters has")
     package, *place = EXAMPLES[kind]
     text = files(package).joinpath(*place).read_text(encoding="utf-8")
     if kind == "plant":
@@ -112,11 +116,13 @@ def build_new_report(path: Path, text: str, problem: str) -> Report:
 
 EXAMPLES = {"plant": ("plant", "models", "new_plant.py"), "effect": ("rig.cli", "new_effect.txt"),
             "sequence": ("rig.cli", "new_sequence.toml"), "fault": ("rig.cli", "new_fault.txt")}
+FILE_NAME = re.compile(r"\w[\w.+-]*")  # needs no quotes in TOML or in a shell
 
 
 class Kind(NamedTuple):
     """A kind of file."""
 
+    name: re.Pattern[str]  # its own, or that of the effect or fault in it
     suffix: str
     write: Callable[[Path, argparse.Namespace, Plant, str], str]  # the last argument is the command that checks it
     read: Callable[[Path, Plant], Any]  # refuses what cannot be used
@@ -124,11 +130,11 @@ class Kind(NamedTuple):
 
 
 KINDS: Mapping[str, Kind] = {
-    "bench": Kind(".toml", write_bench, lambda path, _: load_bench(str(path)), "rig check --bench {path}"),
-    "plant": Kind(".py", write_example, lambda path, _: load_plant(path), "rig check {path}"),
-    "sequence": Kind(".toml", write_example, lambda path, plant: load_sequence(
+    "bench": Kind(FILE_NAME, ".toml", write_bench, lambda path, _: load_bench(str(path)), "rig check --bench {path}"),
+    "plant": Kind(FILE_NAME, ".py", write_example, lambda path, _: load_plant(path), "rig check {path}"),
+    "sequence": Kind(FILE_NAME, ".toml", write_example, lambda path, plant: load_sequence(
         path, round(1.0 / plant.nominal["controller.period"]), plant.key), "rig check {path}"),
-    "effect": Kind(".py", write_example, lambda path, _: load_effects(path),
+    "effect": Kind(WORD, ".py", write_example, lambda path, _: load_effects(path),
                    "rig effects --effects {path} {path.stem}"),
-    "fault": Kind(".toml", write_example, load_faults, "rig check {path}"),
+    "fault": Kind(WORD, ".toml", write_example, load_faults, "rig check {path}"),
 }
