@@ -51,20 +51,27 @@ def draw_residuals(run: str, repeat: str, model: Model) -> str:
         return to_svg(figure, run)
 
 
+def show_progress(stage: str, share: float) -> None:
+    """Replace the line of progress on standard error."""
+    print(f"\r{100 * share:3.0f} % {stage:60.60}", end="", file=sys.stderr, flush=True)
+
+
 def main(folder: str) -> None:
     """Draw residuals and ledger of both examples, and the residual pattern of the second."""
     os.chdir(folder)
     runs = read_runs(Model(), "cog.csv", ["cog2.csv"], "cogheld.csv")
-    found = explain(runs.model, runs.est, runs.repeats, runs.holdout, lambda what, share: None)
+    found = explain(runs.model, runs.est, runs.repeats, runs.holdout, show_progress)
     shape = explain_report.draw_pattern(find_pattern(found.search, found.ledger[-1]), runs.est.t)
     (HERE / "shape.svg").write_text(shorten_svg(shape), encoding="utf-8")
     load_effects(Path("found.py"))
     for example, run, repeat, file in (("first", "run.csv", "run2.csv", "better.toml"),
                                        ("second", "cog.csv", "cog2.csv", "cogged.toml")):
+        show_progress(f"figures of the {example} example", 1.0)
         model, known = load_model_file(Path(file))
         (HERE / f"{example}_left.svg").write_text(shorten_svg(draw_residuals(run, repeat, model)), encoding="utf-8")
         drawn = explain_report.draw_ledger(known.ledger, known.floor or {}, model.kind.signals)
         (HERE / f"{example}_ledger.svg").write_text(shorten_svg(drawn), encoding="utf-8")
+    print(file=sys.stderr)
 
 
 if __name__ == "__main__":

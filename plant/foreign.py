@@ -9,12 +9,20 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from plant.errors import RigError
 from plant.pid import control_by_pid
 from plant.segments import Array
 
 
+class Diverged(RigError):
+    """With its parameters a program gives a number that is not finite, or gives up."""
+
+
 class Program(Protocol):
-    """What moves a plant, a cycle at a time. A plant without load does not look at the load."""
+    """What moves a plant, a cycle at a time. A plant without load does not look at the load.
+
+    Each function raises `Diverged`.
+    """
 
     def begin(self, values: Mapping[str, float]) -> Array:
         """Start anew with these parameters, and the `seed` of the run; the readings at time 0."""
@@ -62,7 +70,7 @@ def run_foreign(model: Any, names: Sequence[str], values: Array, driven: Array, 
     """The runs of `plant.lanes.Lanes` for a plant that another program moves, one after the other.
 
     Its state cannot be pulled to the measured position. So the movement that it shows from row to row is added up, and
-    what has been added up is pulled.
+    what has been added up is pulled. Trials of a fit, which have `names`, are NaN where they diverge.
     """
     if closed:
         from plant.run import simulate
@@ -75,7 +83,12 @@ def run_foreign(model: Any, names: Sequence[str], values: Array, driven: Array, 
     for first, stop in [(part.first, part.stop) for part in parts] or [(0, len(driven))]:
         given = np.column_stack([np.append(0.0, driven[first:stop - 1]), load[first:stop]])
         for i, row in enumerate(values):
-            out[i, first:stop] = program.run({**model.values, **dict(zip(names, row, strict=True))}, given)
+            try:
+                out[i, first:stop] = program.run({**model.values, **dict(zip(names, row, strict=True))}, given)
+            except Diverged:
+                if not names:
+                    raise
+                out[i, first:stop] = np.nan
         if len(position):
             moved = np.diff(out[:, first:stop, 0], append=0.0)
             x = out[:, first, 0].copy() if np.isnan(position[first]) else np.full(len(values), position[first])

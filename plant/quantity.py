@@ -22,13 +22,15 @@ class Quantity(NamedTuple):
     words: Mapping[str, float] = {}  # named values, for a choice
     typical: str = ""  # the range met in practice, for people
     tolerance: float = 0.0  # how far one unit differs from another, as a fraction (prior of a fit)
+    is_whole: bool = False  # such as a number of teeth
 
     def __hash__(self) -> int:
         return hash((*self[:6], *self.words, *self[7:]))  # a dict has none, and annotations must
 
     def refuses(self, value: float) -> bool:
-        """True for a value outside the range, NaN or infinity."""
-        return not (math.isfinite(value) and self.low <= value <= self.high and self.above < value < self.below)
+        """True for a value outside the range, NaN or infinity, and a fraction where only whole numbers are possible."""
+        return not (math.isfinite(value) and self.low <= value <= self.high and self.above < value < self.below
+                    and (value == round(value) or not self.is_whole))
 
     @property
     def expected(self) -> str:
@@ -40,8 +42,9 @@ class Quantity(NamedTuple):
         if self.words:
             return "one of " + ", ".join(self.words)
         bounds = self.bounds
+        if self.is_whole:
+            return f"a whole number {bounds}".rstrip()
         return f"a number {bounds}" if bounds else f"a finite number in {self.unit}"
-
     @property
     def bounds(self) -> str:
         """The range in words, "" for any number.

@@ -181,8 +181,9 @@ def find_compile_error(error: Exception) -> InputError | None:
     if type(error).__module__.partition(".")[0] != "numba":
         return None
     text, own = str(error), str(Path(__file__).parents[1])
-    places = [(file, line) for file, line in re.findall(r"at (/.+?) \((\d+)\)", text)
-              if not file.startswith(own) and "site-packages" not in file]
+    found = [*re.findall(r"at (/.+?) \((\d+)\)", text), *re.findall(r'File "(.+?)", line (\d+)', text)]
+    places = [(path, line) for file, line in found for path in [str(Path(file).resolve())]
+              if not path.startswith(own) and "site-packages" not in path]
     if not places:
         return None
     call = re.search(r">>> (.+)", text)  # of a function that it does not know for such arguments

@@ -14,7 +14,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from plant.errors import count_nouns
 from rig.benches.bench import Bench, describe_identifier
 from rig.benches.bench_report import list_loads
 from rig.network import bus, udp
@@ -142,7 +141,7 @@ def examine_viewer() -> list[Finding]:
               "pip install 'eha-rig[view]'"),
         _find("viewer", "display", os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY") or "",
               "the viewer's window; screenshots need none", "a desktop session"),
-        _find("viewer", "Vulkan", f"{library}, {count_nouns(len(drivers), 'driver')}" if library and drivers else "",
+        _find("viewer", "Vulkan", f"{library}, drivers: {len(drivers)}" if library and drivers else "",
               "draws it, also without a screen", _advise_apt("mesa-vulkan-drivers libvulkan1"))]
 
 

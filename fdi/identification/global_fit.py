@@ -32,7 +32,6 @@ from fdi.estimation.unidentifiable import (
 )
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.trace import Floats
-from plant.errors import count_nouns
 from plant.threads import map_in_threads, map_together
 
 # factor on the noise, fits that go on, rounds of each, solver steps a cycle
@@ -85,7 +84,7 @@ def fit_from_afar(problem: LogProblem, free: Sequence[Free], seed: int, progress
     chosen = [starts[0], *starts[[k for k in np.argsort(costs) if k != 0][:FIT_STAGES[0][1] - 1]]]
     fits = [start_fit(free, x) for x in chosen]
     for number, (factor, count, rounds, steps) in enumerate(FIT_STAGES):
-        progress(f"fitting, {count_nouns(len(fits[:count]), 'start')}", 0.1 + 0.15 * number)
+        progress(f"fitting, {len(fits[:count])} at a time", 0.1 + 0.15 * number)
         stage = replace(problem, workers=1, steps=steps)
 
         def advance(fit: Fit, stage: LogProblem = stage, rounds: int = rounds, factor: float = factor) -> Fit:

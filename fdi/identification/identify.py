@@ -152,7 +152,8 @@ def read_free_parameters(model: Model, source: str | Path | None) -> tuple[Range
     if model.kind.foreign is not None:  # the map of an FMU gives ranges
         known = {name: find_quantity(name, plant=model.plant) for name in model.list_names()}
         widths |= {name: (q.low, q.high) for name, q in known.items()
-                   if math.isfinite(q.high - q.low) and name.partition(".")[0] not in ("controller", "sensors")}
+                   if math.isfinite(q.high - q.low) and not q.is_whole
+                   and name.partition(".")[0] not in ("controller", "sensors")}
     scattering = {name: _parse_range(name, width, model, model.name) for name, width in widths.items()
                   if model[name] > 0.0 or isinstance(width, tuple)}
     require(scattering, source, "identify", "tables [identify.GROUP] that say what is free (docs/identify.md)")
@@ -177,6 +178,8 @@ def parse_free_parameters(tables: object, model: Model, where: object) -> tuple[
 
 def _parse_range(name: str, width: Width, model: Model, where: object) -> Range:
     q, value = find_quantity(name, where, model.plant), model[name]
+    require(not (q.words or q.is_whole), where, f"identify.{name}",
+            f"a parameter that takes values between its steps, not {q.expected}")
     possible_low, possible_high = max(q.low, q.above), min(q.high, q.below)
     if isinstance(width, tuple):
         low, high = width

@@ -235,7 +235,8 @@ def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6
                        for s in c.signals.values())
     return [
         Line("floor", _describe_floor(c)),
-        Line("solver", f"halving the step to {1e6 * c.trace.period / c.replay.steps:g} us changes {errors}"),
+        Line("solver", f"halving the step to {1e6 * c.trace.period / c.replay.steps:g} us changes {errors}"
+             if c.model.kind.foreign is None else "the FMU's own: its steps, and so its error, are not known here"),
         *(Line("where", f"{p.section}, {p.t0:.2f}-{p.t1:.2f} s: {format_percent(p.share)} of the squared error, "
                         f"{format_ratio(p.ratio)} times the floor" + (f"; {p.condition}" if p.condition else ""),
                medium=Medium.TERMINAL) for p in [p for p in c.where if is_wrong and p.share > 0.05][:most_places]),

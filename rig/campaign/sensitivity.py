@@ -18,7 +18,6 @@ from fdi.discovery.sensitivity import (
 )
 from fdi.progress import Progress
 from fdi.sources import hash_sources
-from plant.errors import count_nouns
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
 from rig.network.frame import WallClock
 
@@ -48,7 +47,7 @@ def measure_sensitivity(unit: Unit, answer: Answer, file: Path, workers: Workers
         made, decided = before + finished.done, len(unit.effects) - is_open
         runs_left = finished.total - finished.done + TYPICAL_RUNS * is_open
         minutes = 1e-9 * clock.now() / made * runs_left / 60.0
-        report_progress(f"{decided} of {len(unit.effects)} effects decided, {count_nouns(made, 'run')} explained, "
+        report_progress(f"{decided} of {len(unit.effects)} effects decided, runs explained: {made}, "
                         f"about {minutes:.0f} min left", decided / len(unit.effects))
 
     with RowFile(file) as rows:

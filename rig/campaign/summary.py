@@ -338,10 +338,11 @@ def format_requirement(low: float, high: float) -> str:
 
 
 def _tabulate_detections(fault: Fault, points: Sequence[Mapping[str, Any]]) -> Table:
-    rates = {"detected": "detected", "non-nominal": "most", "ruling": "ruling", "by bands": "bands"}
-    columns = _number_columns(f"{fault.name}{fault.bracketed_unit}", "cases", *(f"{title} [%]" for title in rates))
+    columns = _number_columns(f"{fault.name}{fault.bracketed_unit}", "cases", "detected [%]", "non-nominal [%]",
+                              "ruling [%]", "by bands [%]")
     rows = [[f"{point['size']:g}", str(point["detected"]["of"]),
-             *(_show_interval(point[key]) for key in rates.values())] for point in points if len(points) > 1]
+             *(_show_interval(point[key]) for key in ("detected", "most", "ruling", "bands"))]
+            for point in points if len(points) > 1]
     return Table(columns, rows, f"Detected: {fault.name} judged maintenance or worse, by true size, with the 95 % "
                                 "interval; then the same for judged non-nominal, named as ruling fault, and detected "
                                 "by the bands alone.")
@@ -418,7 +419,8 @@ def _draw_fault(fault: Fault, points: Sequence[Mapping[str, Any]]) -> list[Mark]
         ends = [[100 * abs(point[key]["share"] - point[key][end]) for point in known] for end in ("low", "high")]
         panel.append(call("errorbar", x, y, ends, color=colour, lw=1.4, marker="o", ms=3.5, elinewidth=0.9, capsize=2,
                           label=label))
-    for size, word in zip(limits, ("MidBand", "MaxBand"), strict=True):
+    named = sorted(zip(limits, ("MidBand", "MaxBand"), strict=True))
+    for (size, word), side in zip(named, ("right", "left"), strict=True):  # above the curves, clear of one another
         panel += [instant(size, COMMAND, None, 0.9, "--"),
-                  call("text", size, 50, f" {word}", color=INK, fontsize=8, rotation=90, va="center", ha="right")]
+                  call("text", size, 104, word, color=INK, fontsize=8, va="bottom", ha=side)]
     return [*panel, axes(xlabel=f"{fault.name}, {fault.symbol}{fault.bracketed_unit}")]

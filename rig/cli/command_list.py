@@ -401,7 +401,7 @@ COMMANDS = {
                 help="write recordings to try other commands on: run.csv, its repeat run2.csv, and held.csv of "
                      "another command, into the folder --out (default: here); the recorded unit has two effects that "
                      "the nominal model lacks"),
-         option("--steps", type=parse_whole_number, metavar="N",
+         option("--steps", type=parse_count, metavar="N",
                 help="steps of the plant per cycle (default: one every 10 us)"))),
     "trend": Command(
         "follow the fault sizes of one unit through its dated traces: growth, and time left to the limits",

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from plant.errors import count_nouns
 from rig.conformance.error_cases import LIMIT, beat_as, measure_periods, watch
 from rig.conformance.pdo_cases import identify, list_sent, list_valid, operational, read_mapped, send_short, set_type
 from rig.conformance.sdo_cases import READ_TYPE
@@ -33,7 +32,7 @@ def check_boot(t: Target, specifier: NmtCommand) -> str:
     """What the node sends first after a reset."""
     start = t.now()
     boot = t.reset(specifier)
-    require(boot.data == b"\0", f"{count_nouns(len(boot.data), 'byte')}: {boot.data.hex(' ')}")
+    require(boot.data == b"\0", f"data: {boot.data.hex(' ')}")
     more = [frame for frame in t.listen(QUIET, t.heartbeat_id) if frame.data == b"\0"]
     require(not more, f"{1 + len(more)} boot-up frames")
     return f"0x{boot.cob_id:03X} 00 after {(boot.t_ns - start) * 1e-6:.0f} ms"
@@ -143,7 +142,7 @@ def check_emcy_by_state(t: Target) -> str:
     require(not emergencies, f"{join_labels(emergencies)} in STOPPED")
     beats = len(t.heard(mark, t.heartbeat_id))
     require(beats, "no heartbeat in STOPPED")
-    return f"no EMCY, {count_nouns(beats, 'heartbeat')}"
+    return f"no EMCY, {beats} heartbeats"
 
 
 def check_reset_communication(t: Target) -> str:

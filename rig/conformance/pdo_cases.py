@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
-from plant.errors import count_nouns
 from rig.benches.canopen_map import INVALID, Pdo
 from rig.conformance.target import (
     CANNOT_MAP,
@@ -68,7 +67,7 @@ def check_cyclic(t: Target, pdo: Pdo) -> str:
         accepted.append(str(kind))
         with operational(t):
             frames = answer_syncs(t, identify(t, pdo), 6, expected=6 // kind)
-        require(len(frames) == 6 // kind, f"{pdo.name}, type {kind}: {count_nouns(len(frames), 'frame')} at 6 SYNCs")
+        require(len(frames) == 6 // kind, f"{pdo.name}, type {kind}: frames at 6 SYNCs: {len(frames)}")
         wrong = [len(frame.data) for frame in frames if len(frame.data) != count_bytes(t, pdo)]
         require(not wrong, f"{pdo.name}: {wrong[:1]} bytes, the mapping has {count_bytes(t, pdo)}")
     require_applicable(accepted, "no TPDO accepts a synchronous type")
@@ -80,7 +79,7 @@ def check_acyclic(t: Target, pdo: Pdo) -> str:
     require_type(t, pdo, 0)
     with operational(t):
         before = t.listen(SETTLE, identify(t, pdo))
-        require(not before, f"{pdo.name}: {count_nouns(len(before), 'frame')} without SYNC")
+        require(not before, f"{pdo.name}: frames without SYNC: {len(before)}")
         frames = answer_syncs(t, identify(t, pdo), 4, expected=0)
     require(len(frames) <= 4, f"{pdo.name}: {len(frames)} frames at 4 SYNCs")
     return f"{pdo.name} {len(frames)} at 4 SYNCs"
@@ -93,7 +92,7 @@ def check_event_timer(t: Target, pdo: Pdo) -> str:
     require_applicable(t.try_download(pdo.parameter, 5, 50) == 0, "no TPDO has an event timer")
     with operational(t):
         times = [frame.t_ns for frame in t.listen(1.0, identify(t, pdo))]
-    require(len(times) >= 2, f"{pdo.name}: {count_nouns(len(times), 'frame')} in 1 s")
+    require(len(times) >= 2, f"{pdo.name}: frames in 1 s: {len(times)}")
     period = (times[-1] - times[0]) * 1e-9 / (len(times) - 1)
     text = f"every {1e3 * period:.1f} ms"
     require(abs(period - 0.05) <= 0.005 + t.options.tolerance, f"{pdo.name}: {text}")

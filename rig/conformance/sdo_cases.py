@@ -6,7 +6,6 @@ from functools import partial
 
 from canopen.objectdictionary.datatypes import DOMAIN
 
-from plant.errors import count_nouns
 from rig.conformance.object_cases import read_values
 from rig.conformance.target import (
     COMMAND,
@@ -59,7 +58,7 @@ def check_segmented_upload(t: Target) -> str:
     data = t.upload(*variable.key)
     first, *segments = t.heard(mark, t.response_id)
     require(first.data[0] == 0x41, f"{variable.label}: {first.data.hex(' ')}, expected 0x41: the length is announced")
-    return f"{variable.label}: {count_nouns(len(data), 'byte')} in {count_nouns(len(segments), 'segment')}"
+    return f"{variable.label}: {len(data)} bytes in {len(segments)} segments"
 
 
 def check_segmented_download(t: Target) -> str:
@@ -72,7 +71,7 @@ def check_segmented_download(t: Target) -> str:
     data = t.upload(*variable.key)
     t.download(*variable.key, data, segmented=True)
     t.require_value(variable, data, "holds another value then")
-    return f"{variable.label}: {count_nouns(len(data), 'byte')}"
+    return f"{variable.label}: length {len(data)}"
 
 
 def check_upload_toggle(t: Target) -> str:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.errors import InputError, RigError, require, suggest_name
+from plant.foreign import Diverged
 from plant.tables import Place
 from rig.fmi.host import Settings, Variable
 
@@ -159,14 +160,14 @@ class Unit:
             rows = np.atleast_2d(found)
             k, i = np.argwhere(~np.isfinite(rows))[0]
             t = (self._k if found.ndim == 1 else k) * self._cycle
-            raise RigError(f"{self._path}: the unit gives {rows[k, i]} for {self._outputs[i].name} at {t:.6g} s")
+            raise Diverged(f"{self._path}: the unit gives {rows[k, i]} for {self._outputs[i].name} at {t:.6g} s")
         return found
 
     def _list_settings(self, values: Mapping[str, float]) -> Settings:
         return [(port.variable, values[port.name] / port.worth) for port in self._parameters if port.name in values]
 
     def _ask(self, name: str, *arguments: Any, seconds: float = 0.0) -> Any:
-        """The answer of the process. Raises RigError: the unit refuses, crashes or hangs."""
+        """The answer of the process. Raises Diverged: the unit refuses. Raises RigError: it crashes or hangs."""
         with self._lock:  # analyses run in threads
             return self._ask_alone(name, arguments, LONGEST_CALL + seconds)
 
@@ -182,7 +183,7 @@ class Unit:
                 if word == "done":
                     return result
                 self.close()
-                raise RigError(f"{self._path}: {result}")
+                raise Diverged(f"{self._path}: {result}")
             self.close()
             raise RigError(f"{self._path}: the unit has not answered for {seconds:g} s in {name}; it was stopped")
         status = process.wait()

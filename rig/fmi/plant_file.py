@@ -17,7 +17,7 @@ from collections import namedtuple
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from math import inf
+from math import inf, nan
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, cast
 
@@ -55,16 +55,16 @@ def load_fmu_plant(path: Path) -> Plant:
     if path.suffix == ".fmu":
         return declare_plant(path, {}, Place(str(path)), str(path))
     tables, place = parse_table(decode_text(read_file(path), path), str(path))
-    table, controller = tables.get("plant"), tables.get("controller")
+    table = tables.get("plant")
     if not isinstance(table, dict) or not isinstance(table.get("file"), str):
         raise place.at("plant").refuse('a table [plant] with file = "NAME.fmu"')
-    period = controller.get("period") if isinstance(controller, dict) else None  # its range is checked with the model's
-    return declare_plant(path.parent / table["file"], table, place.at("plant"), str(path),
-                         period if isinstance(period, float) else None)
+    own = {f"{group}.{field}": value for group, fields in tables.items() if isinstance(fields, dict)
+           for field, value in fields.items() if isinstance(value, int | float)}  # checked with the model's
+    return declare_plant(path.parent / table["file"], table, place.at("plant"), str(path), own)
 
 
-def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, period: float | None = None) -> Plant:
-    """The plant of the unit in `file` as `table` maps it; `key` is what models call it, `period` its cycle, s.
+def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, own: Mapping[str, float] = {}) -> Plant:
+    """The plant of the unit in `file` as `table` maps it; `key` is what models call it, `own` the file's parameters.
 
     Raises:
         InputError: see `load_fmu_plant`.
@@ -93,7 +93,11 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, 
     ports = [Port("seed", find_variable(about, table.get("seed", "seed"), ("parameter",), place.at("seed")))
              ] if "seed" in table or (not table and "seed" in about.variables) else []
     for name, (entry, where) in parameters.items():
-        port, quantity, values[name] = _map_parameter(about, name, entry, where)
+        port, quantity, start = _map_parameter(about, name, entry, where)
+        values[name] = own.get(name, start)
+        where.require(name in own or not quantity.refuses(start), f"a start value of {entry.variable} in the unit, or "
+                      f"{name} in this file: {quantity.expected}; the unit has "
+                      f"{about.variables[entry.variable].start or 'none'}")
         group, _, field = name.partition(".")
         groups.setdefault(group, {})[field] = Annotated[float, quantity]
         ports.append(port)
@@ -106,7 +110,7 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, 
     types["controller"] = law if is_usual else convert_group_unit(law, usual.signals.drive.unit, drive.unit, inf)
     values |= {name: value for name, value in usual.nominal.items()
                if name == "controller.period" or (is_usual and name.startswith("controller."))}
-    values["controller.period"] = period or values["controller.period"]
+    values["controller.period"] = own.get("controller.period", values["controller.period"])
     values.setdefault("controller.current_limit", 1e9)  # of a drive in another unit none is known
     state = make_state_type(tuple(signal.name for signal, _ in shown))
     columns = (command, first, drive, *(s for s, _ in shown[1:]), *(s for s, _ in given[1:]))
@@ -138,11 +142,11 @@ def _list_entries(table: object, place: Place, prefix: str = "") -> Iterator[tup
 
 
 def _guess_entries(about: Description, table: str, place: Place) -> Entries:
-    """Variables that have the names of signals of the EHA; as parameters those with one dot in their name."""
+    """Variables with names of signals of the EHA; as parameters those with one dot in their name and a start value."""
     signals = {**{name: name for name in find_plant("eha").signals.names}, **_COLUMNS}
     return {name: (Entry(name), place) for name, v in about.variables.items()
             if v.causality == table.removesuffix("s") and v.type in ("Real", "Float64")
-            and (re.fullmatch(r"(?!controller\b)\w+\.\w+", name) if table == "parameters" else
+            and (v.start is not None and re.fullmatch(r"(?!controller\b)\w+\.\w+", name) if table == "parameters" else
                  signals.get(name) in _COLUMNS.values() and signals.get(name) != "com")}
 
 
@@ -181,14 +185,16 @@ def _find_worth(about: Description, entry: Entry, unit: str, place: Place) -> tu
 
 
 def _map_parameter(about: Description, name: str, entry: Entry, place: Place) -> tuple[Port, Quantity, float]:
-    """A parameter, its meaning and its nominal value."""
+    """A parameter, its meaning and its start value, NaN without one."""
     place.require(re.fullmatch(r"\w+\.\w+", name), "GROUP.NAME = VARIABLE")
     port = Port(name, find_variable(about, entry.variable, ("parameter",), place))
     worth, unit = _find_worth(about, entry, "", place)
     variable = about.variables[entry.variable]
+    ends = {"min": 0.0, "max": 1.0} if variable.type == "Boolean" else {"min": -inf, "max": inf}
     low, high = entry.range or tuple(worth * _read_number(_find_attribute(about, entry.variable, name), far)
-                                     for name, far in (("min", -inf), ("max", inf)))
-    return port._replace(worth=worth), Quantity(unit, low=low, high=high), worth * _read_number(variable.start, 0.0)
+                                     for name, far in ends.items())
+    quantity = Quantity(unit, low=low, high=high, is_whole=port.variable[1] not in ("Real", "Float64", "Float32"))
+    return port._replace(worth=worth), quantity, worth * _read_number(variable.start, nan)
 
 
 def _parse(text: str, unit: str, place: Place) -> float:

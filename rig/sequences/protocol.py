@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.check_result import PROTOCOL, CheckResult
-from plant.errors import count_nouns
 from plant.pid import Loop, compute_current
 from plant.quantity import Quantity
 from plant.segments import Array, Second
@@ -499,7 +498,7 @@ def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterato
         if len(gaps) == 0 and len(beats) > 1:
             continue
         value = 1e3 * float(np.median(gaps)) if len(gaps) else nan
-        detail = "" if len(gaps) else f"{count_nouns(len(beats), 'heartbeat')} in {end - begin:.3g} s"
+        detail = "" if len(gaps) else f"heartbeats in {end - begin:.3g} s: {len(beats)}"
         low, high = (round(1e3 * (period + sign * tolerance), 6) for sign in (-1, 1))
         yield _make_result(f"heartbeat period, {node}", HEARTBEAT, round(value, 6), "ms", low, high, detail)
 

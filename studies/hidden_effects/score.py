@@ -10,6 +10,7 @@ import csv
 import json
 import math
 import random
+import signal as processes
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -316,4 +317,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    processes.signal(processes.SIGPIPE, processes.SIG_DFL)  # whoever reads the output may stop, as `head` does
     raise SystemExit(main())

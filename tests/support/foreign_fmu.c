@@ -1,5 +1,6 @@
 /* A unit of another tool: a slide with a motor, x'' = (k u - load)/m - d x', in steps of whatever length; position
- * in mm. It misbehaves as the macros say: CRASH, HANG, REFUSE, NAN_FROM, END (number of the step) and EVENT_MODE. */
+ * in mm. It misbehaves as the macros say: CRASH, HANG, REFUSE, GIVE_NAN, END (number of the step),
+ * EVENT_MODE and DIVERGE (where k is above 4). */
 #include <math.h>
 #include <stdbool.h>
 #include <stdint.h>
@@ -11,7 +12,7 @@
 #ifndef STEP_THAT
 #define STEP_THAT -1
 #endif
-enum { NOTHING, CRASH, HANG, REFUSE, GIVE_NAN, END, EVENT_MODE };
+enum { NOTHING, CRASH, HANG, REFUSE, GIVE_NAN, END, EVENT_MODE, DIVERGE };
 #ifndef DOES
 #define DOES NOTHING
 #endif
@@ -44,6 +45,7 @@ static int step(Slide *s, double h) {
         if (DOES == REFUSE) return say(s, 3, "the solver did not converge"), 3;
         if (DOES == GIVE_NAN) s->x = NAN;
     }
+    if (DOES == DIVERGE && s->k > 4.0) s->x = NAN;
     s->v += h * ((s->k * s->u - s->load) / mass - s->d * s->v);
     s->x += h * s->v * 1e3;
     return 0;

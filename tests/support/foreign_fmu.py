@@ -21,7 +21,8 @@ def build_fmu(path: Path, version: str = "3", does: str = "NOTHING", at: int = -
     Args:
         path: of the file.
         version: of FMI.
-        does: what it does in step `at`: NOTHING, CRASH, HANG, REFUSE, GIVE_NAN, END; or EVENT_MODE, which it needs.
+        does: what it does in step `at`: NOTHING, CRASH, HANG, REFUSE, GIVE_NAN, END; or EVENT_MODE, which it needs; or
+            DIVERGE, where k is above 4.
         at: number of the step.
         unit: more attributes of the interface.
         platform: folder of its library, where it is not that of this machine.
@@ -39,7 +40,7 @@ def build_fmu(path: Path, version: str = "3", does: str = "NOTHING", at: int = -
     subprocess.run(["cc", "-shared", "-fPIC", "-w", "-o", library, *flags, SOURCE, others], check=True)
     scalars = ""
     for i, (name, causality, variability) in enumerate(_VARIABLES, 1):
-        start = "" if causality == "output" else ' start="0"'
+        start = "" if causality == "output" or name == "d" else ' start="0"'
         itself = f'name="{name}" valueReference="{i}" causality="{causality}" variability="{variability}"'
         scalars += (f"<Float64 {itself}{start}/>" if version == "3" else
                     f"<ScalarVariable {itself}><Real{start}/></ScalarVariable>")

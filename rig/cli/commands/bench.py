@@ -41,5 +41,5 @@ def measure_cycle(options: Mapping[str, Any], progress: Progress) -> Report:
     """The cycle in real time."""
     from rig.bench.benchmarks import build_realtime_report, choose_bus, measure_realtime
 
-    options = {**options, "bus": choose_bus(**options)}
-    return build_realtime_report(measure_realtime(**options, progress=progress))
+    return build_realtime_report(measure_realtime(choose_bus(**options), options["seconds"], options["blocks"],
+                                                  progress))

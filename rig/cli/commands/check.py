@@ -53,9 +53,9 @@ def check_plant(args: argparse.Namespace) -> int:
             progress(found.check, len(findings) / (len(kind.effects) + 6))
     failed = [f.check for f in findings if not f.passed]
     verdict = "UNSOUND" if failed else "SOUND"
-    counts = {"state": kind.state._fields, "parameter": kind.nominal, "own effect": kind.effects, "fault": kind.faults}
-    counted = ", ".join(count_nouns(len(items), noun) for noun, items in counts.items())
-    sentence = f"{kind.title or kind.name}: {counted}"
+    sentence = (f"{kind.title or kind.name}: {count_nouns(len(kind.state._fields), 'state')}, "
+                f"{count_nouns(len(kind.nominal), 'parameter')}, {count_nouns(len(kind.effects), 'own effect')}, "
+                f"{count_nouns(len(kind.faults), 'fault')}")
     lines = [Line(f.check, f.text, "good" if f.passed else "bad") for f in findings]
     signals = Table([Column("signal"), Column("role"), Column("unit"), Column("content")],
                     [[s.name, s.role, s.unit, s.quantity] for s in kind.signals])

@@ -36,8 +36,8 @@ def build_list_report(kind: str, use: str, rows: Rows) -> Report:
     """Report on the names of one kind."""
     keys = [*rows[0]] if rows else ["name"]
     shown = [[Cell(_format(row[key]), is_strong=key == "name") for key in keys] for row in rows]
-    one = "bench" if kind == "benches" else kind.removesuffix("s")
-    sentence = count_nouns(len(rows), one, kind) if rows else f"no {kind} of that name"
+    sentence = (count_nouns(len(rows), "bench" if kind == "benches" else kind.removesuffix("s"), kind) if rows
+                else f"no {kind} of that name")
     return Report("list", kind, sentence=f"{sentence}. {use}", data={"kind": kind, kind: rows},
                   sections=[Section("", [Table([Column(key) for key in keys], shown)] if rows else [])])
 

@@ -32,7 +32,8 @@ def run_command(args: argparse.Namespace) -> int:
     period = model["controller.period"]
     signals = model.kind.signals
     com, load, name = load_command(args.command_file, period, model.kind)
-    require(args.steps != 0, "--steps", "0", "at least 1 step a cycle")
+    require(not args.steps or model.kind.foreign is None, "--steps", str(args.steps),
+            "a plant with equations; an FMU has steps of its own")
     out = Path(args.out or "simulation.csv")
     require(out.name.endswith((".csv", ".csv.gz", ".mcap")), "--out", str(out), "a file .csv, .csv.gz or .mcap")
     require_new(require_writable(out, "--out", source=args.command_file), is_forced=args.force)

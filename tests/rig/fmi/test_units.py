@@ -360,12 +360,14 @@ def test_a_unit_of_another_tool_is_mapped_simulated_and_compared(folder: Path, v
     assert answer("compare", "run.csv", "--model", "slide.toml")["verdict"] == "WITHIN_FLOOR"
     other = answer("compare", "run.csv", "--model", "slide.toml", "--set", "drive.gain=2.2", status=1)
     assert other["verdict"] == "MODEL_INCOMPLETE"
-    assert "a plant with equations" in refuse("explain", "run.csv", "--model", "slide.toml")
-    assert "from 0.5 to 10" in refuse("simulate", "--model", "slide.toml", "--set", "drive.gain=12")
+    for line, *words in (("a plant with equations", "explain", "run.csv"),
+                         ("from 0.5 to 10", "simulate", "--set", "drive.gain=12"),
+                         ("an FMU has steps of its own", "simulate", "--steps", 5, "--command", "command.csv")):
+        assert line in refuse(*words, "--model", "slide.toml")
 
 
-def test_identify_finds_the_parameters_that_the_map_gives_a_range(folder: Path) -> None:
-    build_fmu(Path("slide.fmu"))
+def test_identify_finds_the_parameters_that_the_map_gives_a_range_also_where_trials_diverge(folder: Path) -> None:
+    build_fmu(Path("slide.fmu"), does="DIVERGE")
     answer("simulate", "--model", "slide.toml", "--command", "command.csv", "--set", "drive.gain=2.4", "--out",
            "run.csv")
     found = answer("identify", "run.csv", "--model", "slide.toml", "--out", "found.toml")
@@ -416,6 +418,9 @@ def test_a_unit_that_cannot_run_here_is_refused(folder: Path, kind: dict[str, An
     ("[plant.inputs]", "[plant.input]", "plant.input: expected one of file, seed, inputs, outputs, parameters"),
     ('load_force = {', 'torque = {', "one signal that drives the plant"),
     ('drive.damping = "d"', 'damping = "d"', "GROUP.NAME = VARIABLE"),
+    ("damping = 8.0\n", "", "slide.toml:12: plant.parameters.drive.damping: expected a start value of d in the unit"),
+    ("gain = 2.0\n", "", "or drive.gain in this file: a number from 0.5 to 10; the unit has 0"),
+    ("gain = 2.0", "is_big = 0.5\ngain = 2.0", "drive.is_big: expected a whole number from 0 to 1, not 0.5"),
 ])
 def test_a_wrong_map_is_refused_with_its_line(folder: Path, old: str, new: str, expected: str) -> None:
     build_fmu(Path("slide.fmu"))
