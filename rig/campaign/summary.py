@@ -125,7 +125,7 @@ def _count_off_grid_rates(rows: Sequence[Row]) -> Iterator[Figures]:
 
 def count_share(rows: Iterable[Row], is_good: Callable[[Row], bool]) -> Share:
     """The share of good rows."""
-    judged = [is_good(row) for row in rows]
+    judged = [bool(is_good(row)) for row in rows]  # a row may have numbers of numpy
     return measure_share(sum(judged), len(judged))
 
 

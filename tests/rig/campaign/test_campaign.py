@@ -254,7 +254,7 @@ CLOGGING, FRICTION = "filter_clogging", "spool_friction"
 
 def judged(label: str, kintas: float, fss: float, said: tuple[str, str], n: int, **more: Any) -> list[dict[str, Any]]:
     sizes = {"kintas": kintas, "kintas_low": kintas - 0.02, "kintas_high": kintas + 0.02, "fss": fss * 1.01,
-             "fss_low": fss * 0.95, "fss_high": fss * 1.005}
+             "fss_low": np.float64(fss * 0.95), "fss_high": fss * 1.005}
     levels = dict(zip(("filter_clogging", "spool_friction"), said, strict=True))
     ruling = next((fault for fault, level in levels.items() if level != "acceptable"), "")
     return [{"label": label, "faults": len(label.split()) if label != "healthy" else 0, "tolerance": 0.015, "seed": i,
