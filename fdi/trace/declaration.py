@@ -31,7 +31,7 @@ def read_declaration(where: object, metadata: Mapping[str, str]) -> Signals | No
         for table in json.loads(metadata[DECLARATION]):
             values: dict[str, Any] = {key: table[key] for key in usual if key in table}
             for key, value in values.items():
-                if type(value) is not type(usual[key]):
+                if type(value) is not type(usual[key]) and (type(value), type(usual[key])) != (int, float):
                     raise TypeError(f"{key} is {value!r:.40}")
                 values[key] = escape_control_characters(value) if isinstance(value, str) else value
             found.append(Signal(**values))

@@ -123,7 +123,7 @@ def weak_magnet(x: float, s: Any, u: Any, p: Any) -> float:
 
 PLANT = Plant(
     title="stabiliser trim jack",
-    signals=(Signal("trim_cmd", "tc", "rad", "demanded trim", "command", largest=2.0),
+    signals=(Signal("trim_cmd", "tc", "rad", "demanded trim", "command", largest=2),
              Signal("torque_ref", "Tr", "N m", "commanded torque", "drive", limit="controller.torque_limit"),
              Signal("trim_angle", "ta", "rad", "angle of the stabiliser", noise=2e-5),
              Signal("shaft_rate", "wr", "rad/s", "rate of the rotor", noise=0.05),
