@@ -57,9 +57,8 @@ def write_example(path: Path, args: argparse.Namespace, plant: Plant, check: str
             "no device: --eds, --dbc and --node are of a bench, --model is of all but a plant")
     if kind == "effect":
         plant.require_equations()
-        own = {*plant.parameters, *plant.effects}
-        require(path.stem not in own and not is_taken(path.stem, path.absolute()), "NAME", path.stem,
-                "a name that no effect or group of parameters has")
+        require(path.stem not in {*plant.parameters, *plant.effects} and not is_taken(path.stem, path.absolute()),
+                "NAME", path.stem, "a name that no effect or group of parameters has")
     package, *place = EXAMPLES[kind]
     text = files(package).joinpath(*place).read_text(encoding="utf-8")
     if kind == "plant":
