@@ -21,7 +21,7 @@ from fdi.report.run_report import (
 )
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Event, Trace
-from plant.errors import InputError, require
+from plant.errors import InputError, require, suggest_name
 from plant.plants import find_plant
 from plant.segments import RATE
 from rig.run.job import JobChoice, build_job, load_tested_plant
@@ -83,25 +83,32 @@ class BenchRun:
 
         Returns:
             The SVG file; None for a check that has no window or no signal.
+
+        Raises:
+            InputError: a name that no check has.
         """
         trace = Trace.read(self.folder / "trace.mcap", all=True)
-        check = next(check for check in trace.checks if check.name == name)
-        drawing = draw_failed_check(trace, check)
+        drawing = draw_failed_check(trace, self._find_check(name))
         if not drawing:
             return None
         picture = self.folder / f"check-{re.sub(r'[^a-zA-Z0-9_.=+-]+', '-', name).strip('-')}.svg"
         write_text(picture, drawing)
         return picture
 
+    def _find_check(self, name: str) -> CheckResult:
+        __tracebackhide__ = True
+        require(name in self.checks, "check", name, f"the name of a check of this run{suggest_name(name, self.checks)}")
+        return self.checks[name]
+
     def assert_passed(self, *names: str) -> None:
         """Fail a test unless these checks passed; without names, unless the run passed.
 
         Raises:
             CheckFailedError: it names the checks that failed with limits and measured values, and a picture.
-            KeyError: a name that no check has.
+            InputError: a name that no check has.
         """
         __tracebackhide__ = True
-        chosen = [self.checks[name] for name in names] if names else list(self.outcome.checks)
+        chosen = [*map(self._find_check, names)] if names else list(self.outcome.checks)
         failed = [check for check in chosen if not check.passed]
         if not failed and (names or self.verdict in ("PASS", "NOT_JUDGED")):
             return
@@ -121,7 +128,7 @@ def describe_failure(check: CheckResult) -> str:
 
 
 Table = Mapping[str, Any]
-Command = NDArray[np.float64] | Sequence[Table]
+Command = NDArray[np.float64] | Sequence[float] | Sequence[Table]
 
 
 @dataclass
@@ -208,10 +215,10 @@ def build_sequence(sequence: str | None, command: Command | None, rate: float = 
 
 def _make_table(command: Command, rate: float, column: str) -> tuple[dict[str, Any], dict[str, bytes]]:
     """The table of a sequence that plays a command, and its files."""
-    main: Any = list(command)
+    main: Any = list(np.atleast_1d(command) if isinstance(command, np.ndarray) else command)
     files = {}
-    if isinstance(command, np.ndarray):
-        rows = "\n".join(f"{k / rate!r},{float(value)!r}" for k, value in enumerate(np.atleast_1d(command)))
+    if not any(isinstance(part, Mapping) for part in main):
+        rows = "\n".join(f"{k / rate!r},{float(value)!r}" for k, value in enumerate(main))
         main = [{"name": "command", "kind": "csv", "file": _COMMAND_FILE}]
         files[_COMMAND_FILE] = f"t,{column}\n{rows}\n".encode()
     return {"title": "Command from Python", "main": main}, files
