@@ -84,8 +84,10 @@ def examine_python() -> Iterator[Finding]:
     version = f"{platform.python_implementation()} {platform.python_version()}"
     yield _find("python", "Python", version if sys.version_info >= (3, 11) else "", "runs everything",
                 "Python 3.11 or newer", needed=True)
-    extras = {"": "the bench", "view": "the rerun viewer", "dev": "the tests", "fleet": "rig campaign",
-              "learn": "comparators of rig fdi", "bench": "rivals of rig bench"}
+    extras = {"": "the bench", "shell": "completion of commands", "view": "the rerun viewer", "dev": "the tests",
+              "plots": "plots in Python that can be zoomed", "fleet": "rig campaign", "fmu": "FMUs as plants",
+              "measure": "rig import of MDF and Parquet", "learn": "comparators of rig fdi", "docs": "make docs",
+              "bench": "rivals of rig bench"}
     for extra, names in read_requirements().items():
         found = read_versions(names)
         absent = [name for name, installed in found.items() if not installed]

@@ -19,7 +19,8 @@ GAP = 2  # characters between two columns
 def print_report(report: Report, console: Console) -> None:
     """Print a report: the verdict first, then its sections, notes, files, and what to type next.
 
-    A table that is wider than the console is printed in blocks of columns; a number is never cut.
+    A table that is wider than the console is printed in blocks of columns, each with the rows that say something
+    there; a number is never cut.
     """
     verdict = Text.assemble((report.verdict, style_of(Cell("", report.mood, True))), f"  {report.sentence}")
     headline = verdict if report.verdict else Text(report.sentence, "bold")
@@ -91,8 +92,10 @@ def _print_table(table: Table, console: Console) -> None:
     rows = [[cell for cell in row if isinstance(cell, Cell)] for row in table.rows]  # all are, once columns are chosen
     shown = rows[:table.terminal_rows]
     needed = [_find_least_width(column, [row[i] for row in shown]) for i, column in enumerate(table.columns)]
-    for block in _split_columns(needed, console.width):
-        console.print(_build_table([table.columns[i] for i in block], [[row[i] for i in block] for row in shown],
+    for number, block in enumerate(_split_columns(needed, console.width)):
+        console.print(_build_table([table.columns[i] for i in block],
+                                   [[row[i] for i in block] for row in shown
+                                    if number == 0 or any(row[i].text for i in block[1:])],
                                    [needed[i] for i in block], console.width))
     if len(shown) < len(rows):
         console.print(Text(f"and {len(rows) - len(shown)} more", "dim"))
