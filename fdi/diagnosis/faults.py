@@ -81,7 +81,7 @@ def choose_faults(source: str | Path | None, kind: Plant) -> tuple[Fault, ...]:
     """
     if source is None and kind.faults:
         return place_faults(kind.faults, kind, kind.name)
-    require(source is not None or kind.name == "eha", "--faults", "",
+    require(source is not None or kind == find_plant("eha"), "--faults", "",
             f"a fault file: the plant {kind.name} brings no faults of its own")
     return load_faults(source or "paper", kind)
 

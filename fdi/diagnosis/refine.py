@@ -99,6 +99,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.trace import Floats, Trace
 from plant.effects import CATALOGUE
+from plant.errors import require
 from plant.model import Model, find_quantity, list_searched_effects
 from plant.starts import ensure_starts
 from plant.threads import R, T, map_in_threads
@@ -140,8 +141,14 @@ SUSPECTS = (
 
 
 def get_positive(model: Model, name: str) -> float:
-    """A parameter of the model, bounded below by 0.1 % of its nominal value, as a logarithm needs it."""
-    return max(model[name], 1e-3 * model.nominal.get(name, model[name]))
+    """A parameter of the model, bounded below by 0.1 % of its nominal value, as a logarithm needs it.
+
+    Raises:
+        InputError: it is 0 in this actuator, so a fault of it is of another one.
+    """
+    value = max(model[name], 1e-3 * model.nominal.get(name, model[name]))
+    require(value > 0.0, "--faults", name, f"faults of the model {model.name}, of which this parameter is 0")
+    return value
 
 
 def list_unknowns(model: Model, faults: Sequence[Fault] = FAULTS, fault_spread: float = 150.0) -> tuple[Free, ...]:
