@@ -8,7 +8,7 @@ from pathlib import Path
 from plant.errors import InputError, report_system_error, require
 
 
-def require_writable(out: str | Path, field: str, *, source: str | Path | None = None) -> Path:
+def require_writable(out: str | Path, option: str, *, source: str | Path | None = None) -> Path:
     """`out`, if a file can be written there; what lies there stays as it is until the result comes.
 
     Folders are not made. Raises InputError for a place that cannot be written, and for the `source` itself.
@@ -16,8 +16,8 @@ def require_writable(out: str | Path, field: str, *, source: str | Path | None =
     path = Path(out)
     there = path.exists()
     if there and source is not None and Path(source).exists() and path.samefile(source):
-        raise InputError(path, field, "another file than the one that is read")
-    with report_system_error(path, field, "a place that can be written"):
+        raise InputError(option, str(path), "another file than the one that is read")
+    with report_system_error(option, str(path), "a place that can be written"):
         path.open("ab").close()
     if not there:
         path.unlink()
@@ -77,6 +77,5 @@ def require_new(out: str | Path, *, is_forced: bool) -> Path:
         InputError: there is a file.
     """
     path = Path(out)
-    require(is_forced or not path.is_file(), "--out", str(path),
-            "a file that does not exist yet; --force replaces this one")
+    require(is_forced or not path.is_file(), path, "", "a file that does not exist yet; --force replaces this one")
     return path

@@ -146,7 +146,8 @@ def read_columns(source: Path | bytes, layout: Layout, names: Collection[str], d
                     columns[name].append(parse(fields[i]))
                 except ValueError:
                     kind = "a date and time (ISO 8601)" if name in dates else "a finite number or an empty field"
-                    raise InputError(f"{where}: line {line}", name, f"{kind}, not {fields[i]!r}") from None
+                    hint = " (remove a line of units, or use rig import --guess)" if line == layout.first_line else ""
+                    raise InputError(f"{where}: line {line}", name, f"{kind}, not {fields[i]!r}{hint}") from None
     require(len(next(iter(columns.values()), array("d"))), where, "", "at least one row of numbers")
     return {name: np.frombuffer(column) for name, column in columns.items()}
 

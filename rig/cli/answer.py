@@ -83,26 +83,29 @@ def give_answer(report: Report, args: argparse.Namespace, status: int = 0, place
                 format_junit: Callable[[], str] = str) -> int:
     """Write the files of a report, print it as --json and --quiet ask, and return the exit status.
 
-    --json comes before --quiet. `format_junit` makes the text of --junit.
+    --json comes before --quiet. `format_junit` makes the text of --junit. The answer is printed also if a file
+    cannot be written: it may have taken minutes.
 
     Raises:
         InputError: a file that cannot be written.
     """
     from fdi.report import report as reports  # here: `rig --help` needs no reports
 
-    if places.answer is not None:
-        write_text(places.answer, reports.to_json(report.data) + "\n")
-    if places.junit is not None:
-        write_text(places.junit, format_junit(), "--junit")
-    if places.page is not None:
-        with show_progress(args, "writing"):
-            reports.write_html(report, places.page)
-    if args.json:
-        print(reports.to_json(report.data))
-    elif not args.quiet:
-        from fdi.report.terminal import print_report
+    try:
+        if places.answer is not None:
+            write_text(places.answer, reports.to_json(report.data) + "\n")
+        if places.junit is not None:
+            write_text(places.junit, format_junit(), "--junit")
+        if places.page is not None:
+            with show_progress(args, "writing"):
+                reports.write_html(report, places.page)
+    finally:
+        if args.json:
+            print(reports.to_json(report.data))
+        elif not args.quiet:
+            from fdi.report.terminal import print_report
 
-        print_report(report, open_console())
+            print_report(report, open_console())
     return status
 
 

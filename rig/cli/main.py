@@ -145,8 +145,8 @@ def run_command_line(words: Sequence[str]) -> int:
         return status
     except RigError as error:
         return _report_error(name, str(error), error.status)
-    except KeyboardInterrupt:
-        return _report_error(name, "interrupted", INTERRUPTED)
+    except KeyboardInterrupt as error:
+        return _report_error(name, str(error) or "interrupted", INTERRUPTED)
     except BrokenPipeError:  # whoever read our output has stopped reading: nothing to report, nobody to report it to
         discard_output()
         return status

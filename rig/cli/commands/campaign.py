@@ -44,8 +44,11 @@ def run_command(args: argparse.Namespace) -> int:
         return give_summary(read_campaign_rows(folder), folder, args)
     chosen, folder = choose_matrix(args)
     workers = Workers(args.jobs or len(os.sched_getaffinity(0)), args.scheduler or "")
-    with show_batch_progress(args) as report_progress:
-        rows = run_campaign(chosen, folder, workers, report_progress, args.most, args.again)
+    try:
+        with show_batch_progress(args) as report_progress:
+            rows = run_campaign(chosen, folder, workers, report_progress, args.most, args.again)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted; rig campaign {shlex.quote(str(folder))} resumes it") from None
     return give_summary(rows, folder, args)
 
 
