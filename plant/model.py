@@ -148,7 +148,8 @@ class Model:
                     lines += ["", f"[{heading}{group}]"]
                 quantity = find_quantity(name, plant=self.plant)
                 word = next((f'"{w}"' for w, number in quantity.words.items() if number == value), repr(value))
-                notes = [note for note in (quantity.unit, (remarks or {}).get(name, "")) if note not in ("", "1")]
+                remark = "" if heading and name in own else (remarks or {}).get(name, "")  # a fitted value's, once
+                notes = [note for note in (quantity.unit, remark) if note not in ("", "1")]
                 lines.append(f"{tail} = {word}" + (f"  # {', '.join(notes)}" if notes else ""))
         return "\n".join(lines) + "\n"
 
