@@ -126,7 +126,7 @@ def find_condition(z2: Floats, m: Motion, limit: float) -> str:
 
 def _list_conditions(m: Motion, limit: float) -> Sequence[tuple[str, Flags]]:
     speed, far, hard, by = np.abs(m.v), np.abs(m.x), np.abs(m.a), m.scale
-    unit, ram, symbol = m.signals.controlled.unit, m.signals.controlled.called, m.signals.controlled.symbol
+    unit, ram, symbol = m.signals.controlled.unit, m.signals.controlled.phrase, m.signals.controlled.symbol
     return [
         *((f"{ram} faster than {_format_speed(s * by, unit)}", speed > s * by) for s in SPEEDS),
         *((f"{ram} slower than {_format_speed(s * by, unit)}", speed < s * by) for s in SPEEDS[:4]),
@@ -136,7 +136,7 @@ def _list_conditions(m: Motion, limit: float) -> Sequence[tuple[str, Flags]]:
         *((f"within {1e3 * d:g} ms after a reversal", m.reversed_for < d) for d in DELAYS),
         (f"{ram} extends", m.v > REVERSES * by), (f"{ram} retracts", m.v < -REVERSES * by),
         (f"{symbol} positive", m.x > PLACES[0] * by), (f"{symbol} negative", m.x < -PLACES[0] * by),
-        (f"{m.signals.drive.called} at its limit", np.abs(m.drive) > 0.99 * limit),
+        (f"{m.signals.drive.phrase} at its limit", np.abs(m.drive) > 0.99 * limit),
         *(each for name, x in m.others.items() for each in _list_levels(m.signals.find(name), x))]
 
 
@@ -145,8 +145,8 @@ def _list_levels(signal: Signal, x: Floats) -> Sequence[tuple[str, Flags]]:
     size, levels = np.abs(x), LEVELS.get(signal.unit) or [float(np.abs(x).max()) * share for share in SHARES]
     factor, unit = {"Pa": (1e-5, "bar"), "m": (1e6, "um")}.get(signal.unit, (1.0, signal.unit))
     if signal.unit == "m":
-        return [*((f"{signal.called} within {factor * y:g} {unit} of its null", size < y) for y in levels),
-                *((f"{signal.called} more than {factor * y:g} {unit} from its null", size > y) for y in levels)]
+        return [*((f"{signal.phrase} within {factor * y:g} {unit} of its null", size < y) for y in levels),
+                *((f"{signal.phrase} more than {factor * y:g} {unit} from its null", size > y) for y in levels)]
     return [*((f"|{signal.symbol}| above {factor * y:.3g} {unit}", size > y) for y in levels),
             (f"{signal.symbol} positive", x > levels[0]), (f"{signal.symbol} negative", x < -levels[0])]
 

@@ -564,7 +564,7 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
              if any(s in f for f in floors)}
     if not any(_moves(t) for t in fitted):
         controlled, least = model.kind.signals.controlled, MOVING_RAM * fitted[0].scale
-        reason = (f"no run to fit moves the {controlled.called} by {least * controlled.shown_scale:g} "
+        reason = (f"no run to fit moves the {controlled.phrase} by {least * controlled.shown_scale:g} "
                   f"{controlled.shown_unit}: at rest nothing can be identified")
         return _tell_nothing(model, ranges, runs, sources, len(fitted), floor, reason, notes)
     gains = read_controller(fitted) if model.kind.controller else None

@@ -71,7 +71,7 @@ def build_comparison_report(c: Comparison, next_command: str = "", files: Sequen
         Section("Blocks", [_tabulate_blocks(c)]),
         Section("Findings", describe_findings(c)),
         Section("Measured and replayed", [Figure(
-            f"Each signal as measured and as replayed from the measured {t.declared.drive.called}, and its residual "
+            f"Each signal as measured and as replayed from the measured {t.declared.drive.phrase}, and its residual "
             "(measured minus model) below. Green: two noise floors on either side; noise stays within for 95 % of the "
             "time. Shaded: ramps (blue) and dynamic sections (violet) of the command. Red: not judged.",
             partial(draw_overview, c))]),
@@ -79,7 +79,7 @@ def build_comparison_report(c: Comparison, next_command: str = "", files: Sequen
             "Share of each section in the squared error. The longest bar shows where to look first.",
             partial(draw_error_shares, c))] if c.where else [], medium=Medium.PAGE),
         Section("By speed and amplitude", [Figure(
-            f"Error over noise floor by speed of the {t.declared.controlled.called} (over 20 rows) and by amplitude "
+            f"Error over noise floor by speed of the {t.declared.controlled.phrase} (over 20 rows) and by amplitude "
             "(half its range within 0.25 s before and after). 1 is noise; dark cells show at which motion the model "
             "fails. Empty: fewer than 30 rows.", partial(draw_deviation_map, c))]),
         Section("Is the residual noise", [Figure(
@@ -151,7 +151,7 @@ def _tabulate_signals(c: Comparison) -> Table:
         (Column("solver error", align="right", medium=page),
          lambda s: Cell(format_amount(s.solver_error, s.signal.unit), "muted")),
         caption="Error: RMS of the residual (measured minus model) with the measured "
-                f"{c.trace.declared.drive.called} as input. Noise floor: "
+                f"{c.trace.declared.drive.phrase} as input. Noise floor: "
                 "RMS that noise alone leaves. A perfect model has ratio 1.")
 
 
@@ -365,13 +365,13 @@ def draw_overview(c: Comparison) -> str:
     what = "position" if controlled.unit == "m" else controlled.symbol
     panels: list[Panel] = [[line(t, c.trace.command * command.shown_scale, COMMAND, f"{command.symbol}, command", 2.2),
                             line(t, c.trace.controlled * controlled.shown_scale, BLUE,
-                                 f"{controlled.symbol}, {controlled.called}"),
+                                 f"{controlled.symbol}, {controlled.phrase}"),
                             axes(ylabel=f"{what} [{controlled.shown_unit}]"), legend(2), *left_out]]
     for name, s in c.signals.items():
         scale, (fine, small) = s.signal.shown_scale, choose_drawn_unit(s.signal, s.error)
         floor = NOISE_BAND_RATIO * s.floor.value * small
         panels += [[line(t, c.trace.mask_unusable(name) * scale, choose_colour(d, name), "measured", 1.2),
-                    line(t, c.replay.model[name] * scale, ORANGE, f"model, from the {d.drive.called}", 0.8),
+                    line(t, c.replay.model[name] * scale, ORANGE, f"model, from the {d.drive.phrase}", 0.8),
                     axes(ylabel=label_signal(s.signal)), legend(2), *left_out],
                    [band(-floor, floor, GREEN), line(t, c.replay.residual[name] * small, INK, width=0.7),
                     axes(ylabel=f"residual of\n{s.signal.symbol} [{fine}]"), *left_out]]
@@ -385,7 +385,8 @@ def draw_error_shares(c: Comparison) -> str:
     return draw_panels("shares", [[[
         call("barh", range(len(places)), shares, color=ORANGE, height=0.7),
         *name_rows([f"{p.section}, {p.t0:.2f}–{p.t1:.2f} s" for p in places]),
-        *(call("text", share, row, f" {format_ratio(place.ratio)} times the floor", va="center", fontsize=8)
+        *(call("annotate", f"{format_ratio(place.ratio)} times the floor", (share, row), (3, 0),
+               textcoords="offset points", va="center", fontsize=8)
           for row, (share, place) in enumerate(zip(shares, places, strict=True))),
         axes(xlabel="share of the squared error [%]", xlim=(0, 1.25 * max(shares)))]]], 0.7 + 0.27 * len(places))
 

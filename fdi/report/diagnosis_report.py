@@ -318,7 +318,7 @@ def _tabulate_faults(d: Diagnosis) -> Table:
         (Column("MidBand", align="right", medium=Medium.PAGE), lambda f: format_limits_of_fault(f)[0]),
         (Column("MaxBand", align="right", medium=Medium.PAGE), lambda f: format_limits_of_fault(f)[1]),
         (Column("grid", align="right"), show_grid), (Column("by bands"), show_bands),
-        caption=f"Size: fitted by replay of the measured {d.trace.declared.drive.called}. Grid: minimum of the RMS "
+        caption=f"Size: fitted by replay of the measured {d.trace.declared.drive.phrase}. Grid: minimum of the RMS "
                 f"maps. By bands: level by the response alone. Limits (MidBand and MaxBand): {limits}."
                 + (" * marks the ruling fault." if d.ruling else ""))
 
@@ -452,7 +452,7 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
         return []
 
     def show_deviation(x: float) -> str:
-        return f"{x:+.1f}" if math.isfinite(x) else NO_NUMBER
+        return f"{round(x, 1) + 0.0:+.1f}" if math.isfinite(x) else NO_NUMBER  # + 0.0: not "-0.0"
 
     found, number = d.precursors, partial(Column, unit="", align="right", medium=Medium.PAGE)
 

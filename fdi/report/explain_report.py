@@ -101,15 +101,16 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
         *(_list_law_sections(a.law) if a.law is not None else []),
         Section("Residual", [Figure(
             "Residual (measured minus model) of each signal, without and with the effect. Where the effect explains "
-            "it, the blue line stays between the dotted lines (two noise floors). Shaded: ramps (blue) and dynamic "
-            "sections (violet) of the command.",
+            "it, the blue line is between the dotted lines (two noise floors) for 95 % of the time. Shaded: ramps "
+            "(blue) and dynamic sections (violet) of the command.",
             partial(draw_change, trace, e.base, after, e.floor,
                     "with the missing effect" if e.effects else "with the best candidate"))]),
         Section("Shape of the residual", [] if pattern is None or not pattern.place else [Figure(
             "Left: the missing quantity over the state that it follows best, with two standard errors. Right: over "
             "time.", partial(draw_pattern, pattern, trace.t[find_smooth_rows(trace)]))]),
         Section("Error after each effect", [Figure(
-            "Error over noise floor after each effect. One that lowers the bar of the fitted run alone overfits.",
+            "Error over noise floor after each effect. With a held-out run: an effect that lowers the bar of the "
+            "fitted run alone overfits.",
             partial(draw_ledger, [Row(*row) for row in a.ledger], a.baseline["floor"], trace.declared))]
             if len(a.ledger) > 2 else []),
         _list_suspicious(a.suspicious),
@@ -586,13 +587,14 @@ def build_model_report(update: ModelUpdate, path: Path | None = None, backup: Pa
         sections = [
             Section("Error after each step", [
                 _tabulate_errors(p.ledger, floor, signals), Figure(
-                    "Error over noise floor after each step. One that lowers the bar of the fitted run alone overfits.",
+                    "Error over noise floor after each step. With a held-out run: an effect that lowers the bar of the "
+                    "fitted run alone overfits.",
                     partial(draw_ledger, p.ledger, floor, signals))]),
             *sections,
             Section("Residual", [Figure(
                 "Residual (measured minus model) of each signal, before and after. Where the model is complete, the "
-                "blue line stays between the dotted lines (two noise floors). Shaded: ramps (blue) and dynamic "
-                "sections (violet) of the command.",
+                "blue line is between the dotted lines (two noise floors) for 95 % of the time. Shaded: ramps (blue) "
+                "and dynamic sections (violet) of the command.",
                 partial(draw_change, r.search.problem.trace, first, after, floor))])]
     sections += [_list_suspicious(update.suspicious),
                  Section("Provenance", [Listing("\n".join(p.history))], medium=Medium.PAGE)]

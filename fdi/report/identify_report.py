@@ -56,8 +56,8 @@ def build_identification_report(found: Identification, title: str, command: str 
         Section("Findings", _describe_findings(found)),
         Section("Residual", [Figure(
             f"Residual of each signal of the {'held-out' if shown.is_held_out else 'fitted'} run {shown.source.file}, "
-            "with the data sheet's values and with those found. Where the model is right, the blue line stays between "
-            "the dotted lines (two noise floors).",
+            "with the data sheet's values and with those found. Where the model is right, the blue line is between the "
+            "dotted lines (two noise floors) for 95 % of the time.",
             partial(draw_residuals, "identify", found.runs[place], models, shown.floor, is_cut=True))]),
         Section("Provenance", [Listing(command, medium=Medium.PAGE)] if command else [])]
     facts = [("data sheet", found.before.name),

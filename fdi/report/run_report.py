@@ -297,12 +297,12 @@ def draw_signals(trace: Trace) -> str:
     shown = [(trace.controlled, f"{what} [{d.controlled.shown_unit}]", d.controlled.shown_scale, BLUE),
              (error, f"error [{fine}]", 1.0 / size, ORANGE),
              (error if half else np.full_like(error, math.nan), f"error, close up [{fine}]", 1.0 / size, ORANGE),
-             (trace.drive, f"{d.drive.called} [{d.drive.shown_unit}]", d.drive.shown_scale, VIOLET),
+             (trace.drive, f"{d.drive.phrase} [{d.drive.shown_unit}]", d.drive.shown_scale, VIOLET),
              *((trace.column(s.name), label_signal(s), s.shown_scale, choose_colour(d, s.name)) for s in d.outputs[1:]),
              *([(trace.load, label_signal(d.load), d.load.shown_scale, GREY)]
                if d.load and np.nan_to_num(trace.load).any() else [])]
     faults = list_faults(trace)
-    legends = f"{d.controlled.symbol}, {d.controlled.called}", f"{d.command.symbol}, command"
+    legends = f"{d.controlled.symbol}, {d.controlled.phrase}", f"{d.command.symbol}, command"
     panels = [[line(t, _bridge_short_gaps(values) * scale, colour, None if number else legends[0]),
                _mark_missing(trace, values), *(shade(t0, t1, FAULT, 0.5) for _, t0, t1 in faults),
                axes(ylabel=label, **{"ylim": (-half * scale, half * scale)} if number == 2 else {})]

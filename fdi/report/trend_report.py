@@ -70,7 +70,8 @@ def explain_level(trend: Trend) -> str:
     healthy, middle, most = (attach_unit(f"{x:g}", fault.unit)
                              for x in (fault.healthy, fault.acceptable, fault.maintenance))
     name = fault.title.capitalize()
-    words = f"{name} is {level.word.replace('_', '-')}: {format_interval(*trend.now, fault.unit)} now"
+    words = (f"{name} {'requires' if level == Level.MAINTENANCE else 'is'} {level.word.replace('_', '-')}: "
+             f"{format_interval(*trend.now, fault.unit)} now")
     reasons = (
         (judge_size(fault, trend.now) is None,
          f"; the interval holds both a healthy unit ({healthy}) and MidBand ({middle}), so the value alone decides"),
@@ -95,7 +96,7 @@ def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
                _describe_arrival(remaining, trend, unit), medium=Medium.TERMINAL) for level, remaining in left.items()),
         tabulate(
             left, (Column("reaches"), lambda level: LIMIT_NAMES[level]),
-            (Column("time left", align="right"),
+            (Column("time left (95 % interval)", align="right"),
              lambda level: Cell(_describe_time_left(left[level], trend, unit), is_strong=True)),
             (Column("not before (97.5 %)", align="right"), lambda level: show_date(level, "low")),
             (Column("median", align="right"), lambda level: show_date(level, "value")),

@@ -127,7 +127,7 @@ def draw_screen(run: LiveRun, width: int, height: int, silence: float) -> Text:
     command, controlled = signals.command, signals.controlled
     title = next(title for (origin, title) in list_plots(signals) if origin == "position")
     lines.append(Text.assemble((f"{title}, last 5 s: ", "bold"), ("command", "white"), "  ",
-                               (controlled.called, "bold blue")))
+                               (controlled.phrase, "bold blue")))
     com, xj = (s.shown_scale * run.read_last(s.name, round(5 * run.plan.rate)) for s in (command, controlled))
     lines += draw_plot({"white": com, "bold blue": xj}, width, plot_height, 0.2)
     left, right = _draw_checks(run, lower), [*_draw_timing(run), *_draw_events(run, lower)][:lower]
@@ -150,7 +150,7 @@ def describe_line(run: LiveRun) -> str:
     t = "" if isnan(run.t) else f"{run.t:.1f} of {run.plan.duration:g} s, "
     nodes = ", ".join(f"{node} {run.troubles.get(node) or state}" for node, state in run.states.items() if node != 1)
     signals = run.plan.signals
-    unit, ram = signals.controlled.shown_unit, signals.controlled.called
+    unit, ram = signals.controlled.shown_unit, signals.controlled.phrase
     com, xj = (float(run.read_last(s.name, 1)[0]) * s.shown_scale if run.cycles else nan
                for s in (signals.command, signals.controlled))
     return (f"{t}{run.section}; command {com:.2f} {unit}, {ram} {xj:.2f} {unit}; checks {words.count('PASS')} pass, "

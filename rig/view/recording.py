@@ -499,7 +499,7 @@ def _draw_replay(name: str, models: Sequence[tuple[str, Comparison]]) -> Plot:
     trace = models[-1][1].trace
     signal, scale = trace.declared.find(name), trace.declared.find(name).shown_scale
     colour = MODELS[trace.output_names.index(name) % len(MODELS)]
-    model = f"model, from the {trace.declared.drive.called}"
+    model = f"model, from the {trace.declared.drive.phrase}"
     return Plot(name, label_signal(signal), [
         Curve("1_measured", f"{signal.symbol} measured", COMMAND, trace.t, trace.mask_unusable(name) * scale, 4.0),
         *(Curve(f"{number}_{word}", "before the change" if word == "before" else model,

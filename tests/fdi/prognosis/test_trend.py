@@ -92,7 +92,7 @@ def test_few_points() -> None:
 
 @pytest.mark.parametrize(("now", "words"), [
     (Estimate(10.0, 8.0, 12.0), "Spool friction is acceptable: 10 N (8 .. 12) now, below MidBand (35 N)"),
-    (Estimate(45.0, 42.0, 48.0), "Spool friction is maintenance: 45 N (42 .. 48) now, above MidBand (35 N), not "
+    (Estimate(45.0, 42.0, 48.0), "Spool friction requires maintenance: 45 N (42 .. 48) now, above MidBand (35 N), not "
                                  "surely at MaxBand (70 N)"),
     (Estimate(30.0, 20.0, 40.0), "its interval comes too near MidBand (35 N) to be acceptable"),
     (Estimate(80.0, 70.0, 90.0), "above MidBand (35 N) and up to MaxBand (70 N) or more"),
