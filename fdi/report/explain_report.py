@@ -44,6 +44,7 @@ from fdi.report.numbers import (
     format_amount,
     format_interval,
     format_p_value,
+    format_percent,
     format_ratio,
     join_words,
     list_first,
@@ -186,7 +187,7 @@ def _describe_unexplained(a: Answer) -> str:
                 "difference." if a.explanation.marks.is_firmware_different else
                 "The model fits this run, but not the held-out run; this run does not show what is missing.")
     worst, signals = _find_worst_signal(a), find_signals(a)
-    best = min(a.candidates, key=lambda c: c.ratio, default=None)
+    best = next(iter(a.candidates), None)
     return (f"No effect of the catalogue explains the residual: {signals.find(worst).symbol} error "
             f"{_format(a.baseline['error'], worst, signals)}, noise floor "
             f"{_format(a.baseline['floor'], worst, signals)}"
@@ -259,7 +260,7 @@ def _describe_undecided(a: Answer) -> str:
     if held is None or not held.decided:
         return ""
     worst = max(held.decided[s] / a.explanation.floor[s] for s in held.decided)
-    return (f"{held.undecided:.0%} of it is not judged, because stops there depend on a "
+    return (f"{format_percent(held.undecided)} of it is not judged, because stops there depend on a "
             f"thousandth of a friction level; the rest is at {format_ratio(worst)} times the noise floor")
 
 
@@ -460,16 +461,20 @@ def draw_pattern(p: Pattern, t: Floats) -> str:
     return draw_panels("shape", [[over, along]], 3.0, width_ratios=[1.0, 1.6])
 
 
+def _name_state(state: str) -> str:
+    return "distance since the last reversal" if state == "way" else state.replace("_", " ")
+
+
 def draw_law(c: LawCurve) -> str:
     """What is missing over the law's first state, in bins with two standard errors, and what the law says there."""
     scale, unit = AXES.get(c.state, (1e3, "mm"))
-    name = "distance since the last reversal" if c.state == "way" else c.state.replace("_", " ")
-    folded = f", folded on {scale * c.period:.4g} {unit}" if c.period else ""
     sign = f", times the sign of the {'speed' if c.along == 'direction' else c.along}" if c.along else ""
     return draw_panels("law", [[[
         area(scale * c.at, c.height - 2.0 * c.doubt, c.height + 2.0 * c.doubt, ORANGE, "two standard errors"),
         line(scale * c.at, c.height, ORANGE, "measured", ls="", marker="o", ms=3.5),
-        line(scale * c.at, c.law, AFTER, "law", 1.4), axes(xlabel=f"{name} [{unit}]{folded}"),
+        line(scale * c.at, c.law, AFTER, "law", 1.4),
+        axes(xlabel=f"{_name_state(c.state)} [{unit}]"
+             + (f", folded on {scale * c.period:.4g} {unit}" if c.period else "")),
         call("set_ylabel", f"missing {c.place} [{c.unit}]{sign}", fontsize=8), legend(3)]]], 3.2)
 
 
@@ -484,8 +489,8 @@ def _list_law_sections(found: LawSearch) -> list[Section]:
         Section("Error with the law", [] if law is None else [_tabulate_law_errors(found, law)]),
         Section("What the residual follows", [_tabulate_dependences(found.missing)], medium=Medium.PAGE),
         Section("Law and measurement", [] if law is None or found.curve is None else [Figure(
-            f"Points: the missing {found.curve.place} in bins, with two standard errors. Line: the law in the same "
-            "bins. The law holds where the line passes through the bars.", partial(draw_law, found.curve))])]
+            f"Points: the missing {found.curve.place} in bins; shaded: two standard errors. Line: the law in the same "
+            "bins. The law holds where the line is within the shaded band.", partial(draw_law, found.curve))])]
 
 
 def _describe_law(found: LawSearch) -> str:
@@ -536,8 +541,8 @@ def _tabulate_dependences(missing: Sequence[Missing]) -> Table:
     columns = [Column("missing"), Column("follows"), *(Column(heading, align="right") for heading in (
         "share", "share, held-out run", "p", "size over noise"))]
     return Table(columns, [
-        [PLACES[m.balance.place], " and ".join(d.states), f"{max(d.share, 0.0):.0%}",
-         NO_NUMBER if d.holdout is None else f"{max(d.holdout, 0.0):.0%}", f"{d.p_value:.3f}",
+        [PLACES[m.balance.place], " and ".join(map(_name_state, d.states)), format_percent(max(d.share, 0.0)),
+         NO_NUMBER if d.holdout is None else format_percent(max(d.holdout, 0.0)), f"{d.p_value:.3f}",
          format_ratio(m.balance.ratio)] for m in missing for d in m.dependences],
         "Share of the missing quantity that a curve over the state, or over the pair, predicts: in blocks of the run "
         "that the curve was not made from, and on the held-out run. p: probability that the best of all states and "

@@ -12,7 +12,7 @@ from fdi.trace.importing.formats import Measurement, open_measurement
 from fdi.trace.importing.guess import guess_map
 from plant.errors import InputError, count_nouns, require
 from rig.benches.bench_file import load_bench
-from rig.cli.answer import give_answer
+from rig.cli.answer import give_answer, show_progress
 from rig.cli.inputs import load_declared_model
 from rig.recorder.convert import RAW_SUFFIXES, import_csv, import_frames, import_own_table, open_can_log, write_imported
 
@@ -44,22 +44,23 @@ def import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
     Raises:
         InputError: another format, or other columns.
     """
-    if source.suffix in RAW_SUFFIXES:
-        bench = load_bench(args.bench or "eha", is_trusted=args.trust)
-        cycles = import_frames(source, out, bench)
-    elif source.name.endswith((".csv", ".csv.gz")):
-        try:
-            cycles = import_csv(source, out, load_declared_model(args).kind.signals)
-        except InputError as error:
-            if "in the header" not in error.expected:
-                raise
-            raise InputError(error.where, error.field, f"{error.expected}; for other columns: "
-                                                       f"rig import --guess {source}") from error
-    elif (own := import_own_table(source, out)) is not None:
-        cycles = own
-    else:
-        raise InputError(source, "", f"--map for other formats than .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}; "
-                                     "--guess writes one")
+    with show_progress(args, "reading"):
+        if source.suffix in RAW_SUFFIXES:
+            bench = load_bench(args.bench or "eha", is_trusted=args.trust)
+            cycles = import_frames(source, out, bench)
+        elif source.name.endswith((".csv", ".csv.gz")):
+            try:
+                cycles = import_csv(source, out, load_declared_model(args).kind.signals)
+            except InputError as error:
+                if "in the header" not in error.expected:
+                    raise
+                raise InputError(error.where, error.field, f"{error.expected}; for other columns: "
+                                                           f"rig import --guess {source}") from error
+        elif (own := import_own_table(source, out)) is not None:
+            cycles = own
+        else:
+            raise InputError(source, "", f"--map for other formats than .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}; "
+                                         "--guess writes one")
     return give_answer(Report("import", str(source), sentence=f"{out}: {count_nouns(cycles, 'cycle')}",
                               data={"trace": str(out), "cycles": cycles}), args)
 
@@ -68,16 +69,18 @@ def import_by_map(args: argparse.Namespace, source: Path, out: Path) -> int:
     """Import the columns or frames that --map names."""
     model = load_declared_model(args)
     chosen = read_map(Path(args.map), model.kind.signals)
-    measurement = open_source(args, source, chosen)
-    imported = import_measurement(measurement, chosen, model["controller.period"])
-    write_imported(imported.trace, chosen, out)
+    with show_progress(args, "reading"):
+        measurement = open_source(args, source, chosen)
+        imported = import_measurement(measurement, chosen, model["controller.period"])
+        write_imported(imported.trace, chosen, out)
     return give_answer(build_import_report(imported, measurement, out), args)
 
 
 def write_guess(args: argparse.Namespace, source: Path, out: Path) -> int:
     """Write the map that the names and values of the columns suggest."""
-    measurement = open_source(args, source, None)
-    guessed = guess_map(measurement, load_declared_model(args).kind.signals)
+    with show_progress(args, "reading"):
+        measurement = open_source(args, source, None)
+        guessed = guess_map(measurement, load_declared_model(args).kind.signals)
     write_text(out, guessed.text)
     return give_answer(build_guess_report(guessed, measurement, out, args.model), args)
 

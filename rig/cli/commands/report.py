@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fdi.report.report import Report
 from fdi.report.run_report import write_run_page
-from rig.cli.answer import give_answer
+from rig.cli.answer import give_answer, show_progress
 from rig.cli.inputs import load_declared_model
 
 
@@ -14,5 +14,6 @@ def run_command(args: argparse.Namespace) -> int:
     source = Path(args.trace)
     folder = source if source.is_dir() else source.parent
     out = folder / "report.html" if args.out is None else Path(args.out)
-    write_run_page(source, out, load_declared_model(args).kind.signals)
+    with show_progress(args, "writing"):
+        write_run_page(source, out, load_declared_model(args).kind.signals)
     return give_answer(Report("report", str(source), sentence=str(out), data={"report": str(out)}), args)
