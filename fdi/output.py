@@ -70,12 +70,13 @@ def write_whole(path: str | Path) -> Iterator[Path]:
         raise
 
 
-def require_new(out: str | Path, *, is_forced: bool) -> Path:
-    """`out`, if no file is there or --force allows to replace it.
+def require_new(out: str | Path, option: str = "--out", *, is_forced: bool) -> Path:
+    """`out` of an option, if no file is there or --force allows to replace it.
 
     Raises:
         InputError: there is a file.
     """
     path = Path(out)
-    require(is_forced or not path.is_file(), path, "", "a file that does not exist yet; --force replaces this one")
+    require(is_forced or not path.is_file(), option, str(path),
+            "a file that does not exist yet; --force replaces this one")
     return path

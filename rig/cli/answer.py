@@ -83,14 +83,16 @@ def give_answer(report: Report, args: argparse.Namespace, status: int = 0, place
                 format_junit: Callable[[], str] = str) -> int:
     """Write the files of a report, print it as --json and --quiet ask, and return the exit status.
 
-    --json comes before --quiet. `format_junit` makes the text of --junit. The answer is printed also if a file
-    cannot be written: it may have taken minutes.
+    --json comes before --quiet. `format_junit` makes the text of --junit. The answer is printed also if the disk
+    is full: it may have taken minutes.
 
     Raises:
         InputError: a file that cannot be written.
     """
     from fdi.report import report as reports  # here: `rig --help` needs no reports
 
+    for label, path in places.files:
+        require_writable(path, "--junit" if label == "junit" else "--out")
     try:
         if places.answer is not None:
             write_text(places.answer, reports.to_json(report.data) + "\n")

@@ -30,7 +30,7 @@ def write_fmu(args: argparse.Namespace) -> int:
     require(not (args.trace or args.out or args.all), "--fmu", str(args.fmu),
             "no TRACE, --out and --all beside it: it exports a model")
     require(args.fmu.suffix == ".fmu", "--fmu", str(args.fmu), "a file .fmu")
-    out = require_new(require_writable(args.fmu, "--fmu", source=args.model), is_forced=args.force)
+    out = require_new(require_writable(args.fmu, "--fmu", source=args.model), "--fmu", is_forced=args.force)
     from rig.fmi.export import export_fmu  # here: it loads numba
 
     model = load_chosen_model(args)
