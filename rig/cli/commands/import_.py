@@ -69,26 +69,25 @@ def import_by_map(args: argparse.Namespace, source: Path, out: Path) -> int:
     """Import the columns or frames that --map names."""
     model = load_declared_model(args)
     chosen = read_map(Path(args.map), model.kind.signals)
-    with show_progress(args, "reading"):
-        measurement = open_source(args, source, chosen)
-        imported = import_measurement(measurement, chosen, model["controller.period"])
-        write_imported(imported.trace, chosen, out)
+    measurement = open_source(args, source, chosen)
+    imported = import_measurement(measurement, chosen, model["controller.period"])
+    write_imported(imported.trace, chosen, out)
     return give_answer(build_import_report(imported, measurement, out), args)
 
 
 def write_guess(args: argparse.Namespace, source: Path, out: Path) -> int:
     """Write the map that the names and values of the columns suggest."""
-    with show_progress(args, "reading"):
-        measurement = open_source(args, source, None)
-        guessed = guess_map(measurement, load_declared_model(args).kind.signals)
+    measurement = open_source(args, source, None)
+    guessed = guess_map(measurement, load_declared_model(args).kind.signals)
     write_text(out, guessed.text)
     return give_answer(build_guess_report(guessed, measurement, out, args.model), args)
 
 
 def open_source(args: argparse.Namespace, source: Path, chosen: ImportMap | None) -> Measurement:
     """Open a recording; the map says how a text file is written."""
-    if source.suffix in RAW_SUFFIXES:
-        return open_can_log(source, Path(args.dbc or dbc.DBC))
-    if chosen is None:
-        return open_measurement(source)
-    return open_measurement(source, chosen.file.separator, chosen.file.decimal, chosen.file.header)
+    with show_progress(args, "reading"):
+        if source.suffix in RAW_SUFFIXES:
+            return open_can_log(source, Path(args.dbc or dbc.DBC))
+        if chosen is None:
+            return open_measurement(source)
+        return open_measurement(source, chosen.file.separator, chosen.file.decimal, chosen.file.header)
