@@ -45,6 +45,7 @@ class Quantity(NamedTuple):
         if self.is_whole:
             return f"a whole number {bounds}".rstrip()
         return f"a number {bounds}" if bounds else f"a finite number in {self.unit}"
+
     @property
     def bounds(self) -> str:
         """The range in words, "" for any number.

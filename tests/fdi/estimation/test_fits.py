@@ -17,7 +17,6 @@ from fdi.comparison.compare import compare
 from fdi.discovery.runs import read_runs
 from fdi.discovery.search import Search, scan_effects
 from fdi.discovery.update_model import refit_effects
-from fdi.estimation import replay as replays
 from fdi.estimation.fit import (
     Fit,
     Free,
@@ -363,7 +362,7 @@ def _find(changes: dict[str, float], com: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("is_told", [True, False])
 def test_slips_on_soft_oil_are_undecided_and_a_step_is_not(is_told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether or not the plant calls its levels of friction so."""
-    monkeypatch.setattr(replays, "is_friction", lambda name: is_told and is_friction(name))
+    monkeypatch.setattr("fdi.estimation.replay.is_friction", lambda name: is_told and is_friction(name))
     ramp = np.concatenate([np.zeros(200), np.linspace(0.0, 1.5e-3, 2500)])  # 0.6 mm/s
     soft = _find({"compressibility.coefficient": 1.0 / 4e8, "jack.static_friction": 1600.0}, ramp)
     assert soft.mean() > 0.1 and not soft[:200].any()
