@@ -34,8 +34,11 @@ def compile_all(out: Path) -> int:
     from plant.compile import compile_function
     from rig.firmware.build import build_controller, build_device
     from rig.network import raw_bus
-    from rig.nodes.emulator_service import compile_loop, compile_plant
+    from rig.nodes.emulator import load_service
+    from rig.nodes.emulator_service import compile_loop
+    from rig.nodes.plant_code import CompiledPlant
     from rig.run.hard_loop import compile_cycle
+    from rig.run.loop import load_parts
 
     build_controller()
     build_device(ECU)
@@ -45,7 +48,9 @@ def compile_all(out: Path) -> int:
     compile_function(raw_bus.send_frame)(port, 0x80, 0, 0)
     compile_cycle()
     compile_loop()
-    compile_plant(Model())
+    load_parts()
+    load_service()
+    CompiledPlant(Model())
     Actuator(Model()).warm()
     return 0
 
