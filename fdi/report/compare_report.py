@@ -133,7 +133,8 @@ def _describe_blocks(c: Comparison) -> str:
     less = f", the {' and the '.join(names[1:])} less" if names[1:] else ""
     found = f"the {names[0]} disagree{'' if ' or ' in names[0] else 's'}{less}"
     fits = [name for name, ratio in c.blocks.items() if ratio is not None and name not in c.named]
-    return f"{found}; {join_words(fits)} fit{'s' if len(fits) == 1 else ''}" if fits else found
+    verb = "fits" if len(fits) == 1 else "fit"
+    return f"{found}; {join_words(fits)} {verb}" if fits else found
 
 
 def _tabulate_signals(c: Comparison) -> Table:

@@ -175,10 +175,11 @@ def _describe_rest(d: Diagnosis, worst: Fault) -> str:
     """The levels of the faults that do not rule; of many, those that are not acceptable, and how many are."""
     rest = {fault: d.levels[fault.name] for fault in d.faults if fault != worst}
     many = [fault for fault, level in rest.items() if level == Level.ACCEPTABLE]
-    together = [] if not many or len(rest) == 1 else [
-        f"{len(many)} other faults are acceptable" if len(many) > 1 else f"{many[0].title} is acceptable"]
-    return "; ".join([*(f"{fault.title} {'' if level is None else 'is '}{LEVEL_NAMES[level]}"
-                        for fault, level in rest.items() if len(rest) == 1 or fault not in many), *together])
+    said = [f"{fault.title} {'' if level is None else 'is '}{LEVEL_NAMES[level]}"
+            for fault, level in rest.items() if len(rest) == 1 or fault not in many]
+    if many and len(rest) > 1:
+        said.append(f"{many[0].title} is acceptable" if len(many) == 1 else f"{len(many)} other faults are acceptable")
+    return "; ".join(said)
 
 
 def describe_group(d: Diagnosis, group: Group) -> str:

@@ -375,10 +375,11 @@ def convert_figure(figure: Figure) -> Any:
     figure.draw_without_rendering()  # places the axes
     out = PlotlyFigure()
     shown = [ax for ax in figure.axes if ax.axison]
-    for number, ax in enumerate(shown):
-        end, place, joined = str(number + 1) if number else "", ax.get_position(), ax.get_shared_x_axes().joined
+    ends = ["", *map(str, range(2, len(shown) + 1))]  # of the names that plotly gives axes
+    for number, (end, ax) in enumerate(zip(ends, shown, strict=False)):
+        place, joined = ax.get_position(), ax.get_shared_x_axes().joined
         first = next(k for k, other in enumerate(shown) if other is ax or joined(ax, other))
-        matches = {"matches": f"x{first + 1 if first else ''}"} if first < number else {}
+        matches = {"matches": f"x{ends[first]}"} if first < number else {}
         out.layout[f"xaxis{end}"] = _describe_axis(ax.xaxis, place.intervalx, f"y{end}") | matches
         out.layout[f"yaxis{end}"] = _describe_axis(ax.yaxis, place.intervaly, f"x{end}")
         title = {"text": ax.get_ylabel().replace("\n", " ")}

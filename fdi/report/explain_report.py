@@ -441,7 +441,8 @@ def name_step(row: Row) -> str:
     >>> name_step(Row("null_bias", {}, {}))
     '+ null_bias'
     """
-    return "model as it was" if row.effect is None else f"{'-' if row.removed else '+'} {row.effect}"
+    sign = "-" if row.removed else "+"
+    return "model as it was" if row.effect is None else f"{sign} {row.effect}"
 
 
 def draw_pattern(p: Pattern, t: Floats) -> str:
@@ -468,7 +469,8 @@ def _name_state(state: str) -> str:
 def draw_law(c: LawCurve) -> str:
     """What is missing over the law's first state, in bins with two standard errors, and what the law says there."""
     scale, unit = AXES.get(c.state, (1e3, "mm"))
-    sign = f", times the sign of the {'speed' if c.along == 'direction' else c.along}" if c.along else ""
+    along = c.along.replace("direction", "speed")
+    sign = f", times the sign of the {along}" if along else ""
     return draw_panels("law", [[[
         area(scale * c.at, c.height - 2.0 * c.doubt, c.height + 2.0 * c.doubt, ORANGE, "two standard errors"),
         line(scale * c.at, c.height, ORANGE, "measured", ls="", marker="o", ms=3.5),

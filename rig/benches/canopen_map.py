@@ -113,8 +113,15 @@ def read_number(dictionary: Any, index: int, sub: int) -> int | None:
     """The whole number that the device holds after a reset, or that the DCF writes; None if the file gives none."""
     item = dictionary.get(index)
     found = item if isinstance(item, ODVariable) else getattr(item, "subindices", {}).get(sub)
-    value = None if found is None else found.default if found.value is None else found.value
+    value = _find_value(found)
     return value if type(value) is int else None
+
+
+def _find_value(found: ODVariable | None) -> object:
+    """What an object holds after a reset, or what the DCF writes; None if the file gives neither."""
+    if found is None:
+        return None
+    return found.default if found.value is None else found.value
 
 
 def find_sync(dictionary: Any) -> int:
@@ -232,7 +239,7 @@ def _map_pdo(name: str, dictionary: Any, pdo: Pdo, own: set[str], *, is_answer: 
 
 def read_start(found: ODVariable | None) -> float:
     """The number that an object holds after a reset, 0 if the file gives none."""
-    value = None if found is None else found.default if found.value is None else found.value
+    value = _find_value(found)
     return value if isinstance(value, int | float) and abs(value) < 1 << 64 else 0
 
 

@@ -335,7 +335,8 @@ def _find_faulty(record: ProtocolRecord) -> Mask:
 
 def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
     """Share of the cycles without a drive frame before the next SYNC, and with one of another cycle; unsound frames."""
-    allowed = (0.001 if record.realtime else 0.0) if limits.missing is None else limits.missing
+    usual = 0.001 if record.realtime else 0.0
+    allowed = usual if limits.missing is None else limits.missing
     wrong = missing = cycles = 0
     for rows in record.stretches:
         judged = rows.on_time & ~_find_faulty(record) if rows is record.run else rows.on_time

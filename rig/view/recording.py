@@ -363,7 +363,8 @@ def read_fault_event(text: str) -> tuple[str, str] | None:
     (('leakage', 'active'), ('leakage', ''), None)
     """
     label, _, word = text.rpartition(" ")
-    return (label, "active" if word == "begins" else "") if word in ("begins", "ends") else None
+    states = {"begins": "active", "ends": ""}
+    return (label, states[word]) if word in states else None
 
 
 def _make_check_lane(check: CheckResult, trace: Trace) -> Lane:

@@ -77,8 +77,8 @@ def place_recording(args: argparse.Namespace) -> Path:
     """The recording without --out: beside the last trace."""
     source = Path([args.trace, *args.others[:1]][-1])
     folder = source if source.is_dir() else source.parent
-    name = "compare" if args.compare else "diff" if args.others else source.name.split(".")[0]
-    return folder / f"{name}.rrd"
+    choices = (("compare", args.compare), ("diff", args.others), (source.name.split(".")[0], True))
+    return folder / f"{next(name for name, is_chosen in choices if is_chosen)}.rrd"
 
 
 def draw(args: argparse.Namespace, progress: Progress) -> Drawing:
