@@ -558,18 +558,13 @@ def test_the_report_of_a_model_update_in_all_forms(tmp_path: Any) -> None:
 OFFSETS = {"xj": 0.0, "p12": 3e5, "xs": 8e-6}  # of the sensors; XJ is drawn to the measurement, so it has none
 
 
-def read_lines(drawing: str) -> list[list[np.ndarray]]:
-    """The values of the lines over time of each panel of a figure."""
-    return [[np.asarray(line.get_ydata()) for line in ax.lines if len(line.get_ydata()) > 2]
-            for ax in vars(drawing)["figure"].axes]
-
-
 def test_a_comparison_shows_measured_minus_model() -> None:
     """Of a trace whose sensors of P12 and XS show too much, so that measured minus model is positive."""
     trace = record_plant(com=SHORT, seed=2)
     biased = trace.with_columns({name: trace.column(name) + size for name, size in OFFSETS.items()})
     found = compare(biased, Model())
-    panels = read_lines(compare_report.draw_overview(found))
+    panels = [[np.asarray(line.get_ydata()) for line in ax.lines if len(line.get_ydata()) > 2]  # those over time
+              for ax in vars(compare_report.draw_overview(found))["figure"].axes]
     scales = {"xj": 1e6, "p12": 1e-5, "xs": 1e6}
     for number, (name, scale) in enumerate(scales.items()):
         (measured, model), (residual,) = panels[1 + 2 * number:3 + 2 * number]  # after Com and XJ

@@ -87,13 +87,7 @@ def test_an_export_without_frames_leaves_what_was_there(sources: dict[str, Path]
     assert (tmp_path / "old.blf").read_text() == "precious"
 
 
-SMALLEST = 4096  # bytes that a file may have
-
-
-def run_limited(*words: str) -> subprocess.CompletedProcess[str]:
-    """`rig` in a process in which no file grows beyond SMALLEST bytes, as on a disk that is full then."""
-    return subprocess.run([sys.executable, "-B", "-m", "rig.cli.main", *words], capture_output=True, text=True,
-                          preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (SMALLEST, SMALLEST)))
+SMALLEST = 4096  # bytes that a file may have, as on a disk that is full then
 
 
 @pytest.mark.parametrize("name", ["run.csv", "run.mcap", "frames.asc"])
@@ -107,7 +101,8 @@ def test_a_full_disk_leaves_what_was_there_and_no_part(tmp_path: Path, name: str
     for before in ({}, {name: b"before"}):
         for file, content in before.items():
             (out / file).write_bytes(content)
-        said = run_limited(*words)
+        said = subprocess.run([sys.executable, "-B", "-m", "rig.cli.main", *words], capture_output=True, text=True,
+                              preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (SMALLEST, SMALLEST)))
         assert (said.returncode, said.stderr.count("\n")) == (2, 1), said
         assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
