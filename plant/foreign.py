@@ -15,7 +15,7 @@ from plant.segments import Array
 
 
 class Diverged(RigError):
-    """With its parameters a program gives a number that is not finite, or gives up."""
+    """A program has given up, or has given a number that is not finite: its parameters allow no run."""
 
 
 class Program(Protocol):

@@ -126,9 +126,7 @@ class Model:
 
     def describe_value(self, name: str) -> str:
         """A parameter for people: its SI value with the unit, or the word of a choice."""
-        quantity, value = find_quantity(name, plant=self.plant), self[name]
-        word = next((word for word, number in quantity.words.items() if number == value), "")
-        return word or f"{value:g}" + ("" if quantity.unit == "1" else f" {quantity.unit}")
+        return find_quantity(name, plant=self.plant).describe(self[name])
 
     def to_toml(self, remarks: Mapping[str, str] | None = None) -> str:
         """The text of a model file, which `load_model` reads; `remarks` stand beside parameters, by "group.field"."""

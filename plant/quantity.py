@@ -32,6 +32,11 @@ class Quantity(NamedTuple):
         return not (math.isfinite(value) and self.low <= value <= self.high and self.above < value < self.below
                     and (value == round(value) or not self.is_whole))
 
+    def describe(self, value: float) -> str:
+        """An SI value for people: with its unit, or the word of a choice."""
+        word = next((word for word, number in self.words.items() if number == value), "")
+        return word or f"{value:g}" + ("" if self.unit == "1" else f" {self.unit}")
+
     @property
     def expected(self) -> str:
         """The allowed values in words, for messages and tables.

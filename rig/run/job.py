@@ -370,7 +370,8 @@ class Differences(NamedTuple):
         """All differences in one line; "nothing" if there are none."""
         return "; ".join([
             *([f"model {self.model}"] if self.model else []),
-            *(_describe_parameter(name, value, self.plant) for name, value in self.parameters.items()),
+            *(f"{name} = {find_quantity(name, plant=self.plant).describe(value)}"
+              for name, value in self.parameters.items()),
             *(f"effect {name}" for name in self.effects if not any(key.startswith(f"{name}.")
                                                                    for key in self.parameters)),
             *(f"effects of {name}" for name in self.effect_files), *(f"fault {text}" for text in self.faults),
@@ -390,10 +391,3 @@ def find_differences(job: Job) -> Differences:
     return Differences(model="" if is_usual else model.name, parameters=model.list_changes(),
                        effects=tuple(model.effects), effect_files=tuple(path.name for path in job.effects),
                        faults=faults, plant=model.plant)
-
-
-def _describe_parameter(name: str, value: float, plant: str) -> str:
-    quantity = find_quantity(name, plant=plant)
-    word = next((word for word, number in quantity.words.items() if number == value), None)
-    unit = "" if quantity.unit == "1" else f" {quantity.unit}"
-    return f"{name} = {word}" if word else f"{name} = {value:g}{unit}"
