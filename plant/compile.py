@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import takewhile
 from pathlib import Path
-from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
+from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType, SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -135,13 +135,12 @@ def compile_function(function: Function, ports: Mapping[str, Function] | None = 
     _let_lanes_fill_registers()
     root = _link_calls(function, ports or {}, lambda f: f)
     linked = _link_calls(function, ports or {}, _declare_part, lambda call: call.declare())
-    plain = rebind_names(linked.py_func)
     settings: Any = numba.config
     folder = _find_folder_of_code(root)
     with numba.core.compiler_lock.global_compiler_lock:  # the folder is a setting of the whole process
         before, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)
         try:
-            compiled = numba.njit(plain, cache=True, nogil=True, error_model="numpy")
+            compiled = numba.njit(rebind_names(linked.py_func), cache=True, nogil=True, error_model="numpy")
         finally:
             settings.CACHE_DIR = before
     _compile_in_one_process(compiled, folder)
@@ -192,13 +191,6 @@ def _find_folder_of_code(root: Function) -> Path:
     return find_cache_folder() / compute_fingerprint(root)
 
 
-# no fastmath: one run and many at once, and plain Python, agree to the last bit. No way in from Python for what is only
-# called by compiled code: unpacking nested tuples of a hundred numbers takes longer to compile than the physics.
-INLINE_OPTIONS: Any = {
-    "error_model": "numpy", "forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
-}
-
-
 def keep_apart(function: AnyFunction) -> AnyFunction:
     """Mark a function that compiled code calls instead of including it wherever it is called.
 
@@ -221,10 +213,49 @@ def raise_unbound(*arguments: Any) -> Any:
 
 
 def _declare_part(f: Function) -> Function:
-    """A function below the one to be compiled, as numba gets it."""
+    """A function below the one to be compiled, as numba gets it.
+
+    No fastmath: one run and many at once, and plain Python, agree to the last bit. No way in from Python for what is
+    only called by compiled code: unpacking nested tuples of a hundred numbers takes longer to compile than the physics.
+    """
     import numba
 
-    return numba.njit(f, **INLINE_OPTIONS | {"forceinline": not vars(f).get("is_apart", False)})
+    return numba.njit(  # type: ignore[call-overload]  # its stubs do not know two of the options
+        f, error_model="numpy", forceinline=not vars(f).get("is_apart", False), no_cpython_wrapper=True,
+        no_cfunc_wrapper=True, pipeline_class=_make_part_compiler())
+
+
+@cache
+def _make_part_compiler() -> Any:
+    """numba's compiler without the steps that a function needs to run by itself: it is optimised as part of its caller.
+
+    With them each function would be optimised and made machine code once more: a third of the time to compile.
+    """
+    import numba.core.codegen
+    import numba.core.compiler
+
+    core: Any = numba.core
+
+    class Part(core.codegen.JITCodeLibrary):  # type: ignore[misc]
+        """The code of such a function; nobody asks for its address."""
+
+        codegen = SimpleNamespace(set_env=lambda name, environment: None)
+
+        def _optimize_final_module(self) -> None:
+            pass
+
+        def _finalize_final_module(self) -> None:
+            self._finalized = True
+
+        def get_pointer_to_function(self, name: str) -> int:
+            return 0
+
+    class PartCompiler(core.compiler.Compiler):  # type: ignore[misc]
+        def define_pipelines(self) -> Any:
+            self.state.library = Part(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+            return super().define_pipelines()
+
+    return PartCompiler
 
 
 def _link_calls(function: Function, ports: Mapping[str, Function], make: Callable[[Function], Function],
@@ -314,8 +345,8 @@ def is_costly(function: Function) -> bool:
     """Whether `function`, or one that it calls, divides or calls an elementary function."""
     plain: Any = getattr(function, "py_func", function)
     elementary = {f.__name__ for f in functions.IN_PLACE_OF} | {"sqrt"}
-    calls_elementary = not elementary.isdisjoint(plain.__code__.co_names)
-    return _divides(plain.__code__) or calls_elementary or any(is_costly(f) for f in _find_calls(plain).values())
+    return (_divides(plain.__code__) or not elementary.isdisjoint(plain.__code__.co_names)
+            or any(map(is_costly, _find_calls(plain).values())))
 
 
 def _find_own_version(value: Any) -> Any:

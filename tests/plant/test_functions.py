@@ -10,7 +10,7 @@ import pytest
 from other_cpus import compiles_for
 
 from plant import functions
-from plant.compile import INLINE_OPTIONS, _link_calls, compile_function, interpret_function
+from plant.compile import _declare_part, _link_calls, compile_function, interpret_function
 from plant.parameters import Controller
 from plant.pid import Loop, compute_current
 
@@ -31,7 +31,7 @@ CASES = {
 
 def many(f: Callable[[float], float]) -> Callable[[np.ndarray, np.ndarray], None]:
     """`f` over an array, compiled as laws are: inlined in a loop."""
-    inner = _link_calls(f, {}, lambda g: numba.njit(g, **INLINE_OPTIONS))
+    inner = _link_calls(f, {}, _declare_part)
 
     @numba.njit(error_model="numpy")
     def run(x, y):
