@@ -682,7 +682,8 @@ def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
     """
     maps = (("step sections", grid.step, "A"), ("ramp sections", grid.ramp, "B"), ("both", grid.joint, "C"))
     panels = [[*_draw_map(grid, m, letter),
-               axes(title=f"{name}: {format_amount(m.minimum.rms, grid.unit)} at {letter}"),
+               axes(title=f"{name}: {format_amount(m.minimum.rms, grid.unit)} at {letter}\n"
+                          f"to {format_amount(float(m.rms.max()), grid.unit)} (yellow)"),
                *([dot(*_scale_sizes(grid, truth), "white", "injected", marker="X", ms=9, mec=INK, mew=0.8)]
                  if truth else [])]
               for name, m, letter in maps if m]

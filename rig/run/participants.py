@@ -159,14 +159,14 @@ def is_replaced(master: Master, node: Role, processes: NodeProcesses, seconds: i
         is_present = master.is_present(node, 1.0)
         if node in processes.find_ended():
             if not is_present:
-                break
+                raise BusError(f"our own {NAMES[node]} did not start")
             processes.forget(node)
             return True
         if is_present and processes.is_ready(node):
             return False
         if is_present:  # another one; ours is about to notice
             processes.wait([node])
-    raise BusError(f"our own {NAMES[node]} did not start")
+    raise BusError(f"our own {NAMES[node]} did not answer within {seconds} s")
 
 
 Child = subprocess.Popen[bytes]
