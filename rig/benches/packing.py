@@ -233,9 +233,10 @@ def _decode(m: Layout, field: int, bits: int) -> float:
             bits = (bits & _find_mask(length)) - (1 << length)
         counts = float(bits)
     else:
-        counts = float(bits & _find_mask(length))
-        if counts < 0.0:  # of 64 bits
-            counts += 2.0 * _TWO_63
+        bits &= _find_mask(length)
+        counts = float(bits)
+        if counts < 0.0:  # of 64 bits; the last one stays in the half, for a tie it decides how that is rounded
+            counts = 2.0 * (bits >> 1 & 0x7FFFFFFFFFFFFFFF | bits & 1)
     value: float = counts * doubles[field + _NUMERATOR] / doubles[field + _DENOMINATOR] + doubles[field + _OFFSET]
     return value
 

@@ -362,9 +362,8 @@ def test_a_turn_that_is_held_is_one_line_and_ends_with_its_holder() -> None:
             assert holder.stdout is not None and holder.stdout.readline() == b"taken\n"
             with pytest.raises(can.CanError, match=f"turn to send.*process {holder.pid}"):
                 other.send(message)
-            status = send(bus.port, 1, 0, 0)
-            assert status == NO_TURN
-            error = str(bus.explain_failure(status))
+            assert send(bus.port, 1, 0, 0) == NO_TURN
+            error = str(bus.explain_failure(NO_TURN))
             assert f"process {holder.pid}" in error and "\n" not in error
             holder.kill()
         assert send(bus.port, 1, 0, 0) == SENT
