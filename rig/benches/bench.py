@@ -119,7 +119,8 @@ class Field:
     def compute_value(self, counts: float) -> float:
         """The value that these counts stand for, SI."""
         numerator, denominator, offset = self._worth
-        return counts * numerator / denominator + offset
+        # a whole number of more than 53 bits is rounded first, as in the compiled cycles
+        return float(counts) * numerator / denominator + offset
 
     @cached_property
     def _worth(self) -> tuple[int, int, float]:
@@ -131,11 +132,12 @@ class Field:
 
     def decode(self, bits: int) -> float:
         """The value that these bits stand for, SI."""
+        counts: float = bits
         if self.kind is Kind.FLOAT:
-            return self.compute_value(decode_float(bits, self.length))
-        if self.kind is Kind.SIGNED and bits >> self.length - 1:
-            bits -= 1 << self.length
-        return self.compute_value(float(bits))  # rounded once here, as in the compiled cycles: 53 bits hold no more
+            counts = decode_float(bits, self.length)
+        elif self.kind is Kind.SIGNED and bits >> self.length - 1:
+            counts = bits - (1 << self.length)
+        return self.compute_value(counts)
 
 
 def encode_float(value: float, length: int) -> int:
