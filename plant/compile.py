@@ -229,7 +229,8 @@ def _declare_part(f: Function) -> Function:
 def _make_part_compiler() -> Any:
     """numba's compiler without the steps that a function needs to run by itself: it is optimised as part of its caller.
 
-    With them each function would be optimised and made machine code once more: a third of the time to compile.
+    With them each function would be optimised and made machine code once more: a third of the time that the loops of a
+    run take to compile.
     """
     import numba.core.codegen
     import numba.core.compiler

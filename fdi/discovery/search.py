@@ -243,7 +243,7 @@ class Search:
 
         An effect that does what a tolerance does gains only the square of that, which no forecast from afar sees: the
         valley is narrow and bends. So the tolerances are taken back to a healthy unit in eighths, and the effect and
-        the rest are fitted at each.
+        the rest are fitted at each. Only what that leads to is fitted with the finest steps.
         """
         problem, own = self.problem, {f.name: f for f in start.fit.free}
         far = {f.name: start.fit.values[f.name] for f, x in zip(start.fit.free, start.fit.x, strict=True)
@@ -254,7 +254,8 @@ class Search:
                     if f.name in far and np.isfinite(f.prior) else f for f in free]
 
         free, x = hold(start.fit.free, TAKEN_BACK[0]), np.where([name in far for name in own], 0.0, start.fit.x)
-        begun, limit = linearise(problem, free, x), problem.compute_costs(start.fit.free, start.fit.x[None])[0]
+        begun = linearise(problem, free, x)
+        cost = problem.compute_costs(start.fit.free, start.fit.x[None])[0]  # of `start`, with these steps
         prospects = scan_effects(problem, [begun], self.list_further_effects(start.effects), self.workers)
 
         def linearise_here(now: Fit) -> Fit:
@@ -269,7 +270,7 @@ class Search:
                 before, at = at, take_steps(problem, fit, linearise_here, 2, NO_STAGE, take_curved_step).x
             free = [own.get(f.name, f) if np.isfinite(f.prior) else f for f in p.free]
             there = linearise(problem, free, at)
-            if there.cost < limit + GAIN_DOUBTFUL:
+            if there.cost < cost + GAIN_DOUBTFUL:
                 there = finish_fit(self.fine or problem, there, rounds, problem, take_step=take_curved_step)
             return self.judge_fit((*start.effects, p.effect), there)
 

@@ -639,7 +639,8 @@ def _check_signals(trace: Trace, model: Model, chosen: Sequence[str], source: ob
     declared = trace.declared
     recorded = trace.provenance.get("plant", "")
     if (recorded in MODULES and recorded != model.plant) or declared.names != model.kind.signals.names:
-        own = f"{recorded}, whose rig recorded this" if recorded else f"a plant with {', '.join(declared.names)}"
+        own = (f"{recorded}, whose rig recorded this" if recorded else
+               f"a plant with the signals {', '.join(declared.names)}")
         raise InputError(source, "--model", f"{own}, not {model.plant}")
     if trace.period > 50 * model["controller.period"]:
         raise InputError(source, "t", f"times in s, one row a cycle; the rows are {trace.period:g} s apart")

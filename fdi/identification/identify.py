@@ -400,8 +400,8 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: ScaledProble
     shares = {name: _compute_shares(free, information) for name, information in found.items()}
     for name in unseen:
         share, best = min((shares[experiment][name], experiment) for experiment in shares)
-        is_enough = share <= IDENTIFIABLE_SHARE
-        yield Advice(name, best if is_enough else None, what[best] if is_enough else "", share)
+        chosen, words = (best, what[best]) if share <= IDENTIFIABLE_SHARE else (None, "")
+        yield Advice(name, chosen, words, share)
 
 
 def _simulate(model: Model, com: Floats, load: Floats, outputs: Sequence[str]) -> Trace:

@@ -117,11 +117,12 @@ def _tabulate_errors(errors: Sequence[RunError], signals: Signals) -> Table:
                Column("after", align="right"), Column("noise floor", align="right"),
                Column("over floor", align="right")]
     rows: list[list[Cell | str]] = [
-        [*((e.source.file, Cell("held-out" if e.is_held_out else "fitted", "muted")) if number == 0 else ("", "")),
+        [*(run if number == 0 else ("", "")),
          s.symbol, Cell(format_amount(e.before[s.name], s.unit), "muted"), format_amount(e.after[s.name], s.unit),
          Cell(format_amount(e.floor[s.name], s.unit), "muted"),
          Cell(format_ratio(ratio), "good" if ratio <= RESIDUAL_HELD_OUT else "bad")]
-        for e in errors for number, s in enumerate(map(signals.find, e.after))
+        for e in errors for run in [(e.source.file, Cell("held-out" if e.is_held_out else "fitted", "muted"))]
+        for number, s in enumerate(map(signals.find, e.after))
         for ratio in [e.after[s.name] / e.floor[s.name]]]
     return Table(columns, rows, "RMS error of each signal with the data sheet's values (before) and with those found.")
 

@@ -246,13 +246,13 @@ def write_law(name: str, terms: Sequence[Term], values: Mapping[str, float] | No
     if memory:
         lines += [f"class {group}Way(NamedTuple):", "    way: float = 0.0  # m since the last reversal",
                   "    side: float = 0.0  # direction of the last motion", "", ""]
-    port = PORTS[place]
     is_load = place == "force" and all(term.part == "load" for term in terms)
+    port = "load" if is_load else PORTS[place]
     starts = ""
     if values is not None:
         found = ", ".join(f"{values[f]:.6g}" for term in terms for f in term.fields)
         starts = f",\n        starts=(({found},),)"
-    lines += [f'@effect("{"load" if is_load else port}", {group}{f", memory={group}Way" if memory else ""},',
+    lines += [f'@effect("{port}", {group}{f", memory={group}Way" if memory else ""},',
               f'        law="{format_formula(terms)}"{starts})',
               f"def {name}(x, {'m, ' if memory else ''}s, u, p):", f'    """{words[0].upper()}{words[1:]}."""',
               f"    g = p.{name}"]

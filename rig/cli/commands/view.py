@@ -77,8 +77,12 @@ def place_recording(args: argparse.Namespace) -> Path:
     """The recording without --out: beside the last trace."""
     source = Path([args.trace, *args.others[:1]][-1])
     folder = source if source.is_dir() else source.parent
-    choices = (("compare", args.compare), ("diff", args.others), (source.name.split(".")[0], True))
-    return folder / f"{next(name for name, is_chosen in choices if is_chosen)}.rrd"
+    name = source.name.split(".")[0]
+    if args.compare:
+        name = "compare"
+    elif args.others:
+        name = "diff"
+    return folder / f"{name}.rrd"
 
 
 def draw(args: argparse.Namespace, progress: Progress) -> Drawing:
