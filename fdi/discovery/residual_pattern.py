@@ -61,17 +61,18 @@ class Pattern(NamedTuple):
         """In words."""
         if not self.place:
             return "what is left is too small to be seen as a force, a flow or a current"
-        said = f"{WORDS[self.place]}, {self.size:.3g} {self.unit} RMS"
+        said = f"{WORDS[self.place]}, {self.size:.4g} {self.unit} RMS"
         if self.wave:
             amplitude, length = self.wave[:2]
-            return (f"{said}; {self.share:.0%} of it is periodic in {self.state}: {amplitude:.3g} {self.unit} every "
-                    f"{1e3 * length:.4g} m{STATES[self.state][0]}")
+            return (f"{said}; {100.0 * self.share:.0f} % of it is periodic in {self.state}: "
+                    f"{amplitude:.4g} {self.unit} every {1e3 * length:.4g} m{STATES[self.state][0]}")
         if not self.state:
             return f"{said}; it follows none of position, speed, pressure, spool, current or time alone"
         unit, first, last, height = STATES[self.state][0], self.at[0], self.at[-1], self.height
         middle = float(np.interp(0.5 * (first + last), self.at, height))
-        return (f"{said}; {self.share:.0%} of it follows the {self.state}: {height[0]:.3g} {self.unit} at {first:.3g} "
-                f"{unit}, {middle:.3g} in the middle, {height[-1]:.3g} at {last:.3g} {unit}")
+        return (f"{said}; {100.0 * self.share:.0f} % of it follows the {self.state}: "
+                f"{height[0]:.4g} {self.unit} at {first:.3g} {unit}, {middle:.4g} in the middle, "
+                f"{height[-1]:.4g} at {last:.3g} {unit}")
 
 
 def find_pattern(search: Search, h: Hypothesis) -> Pattern:

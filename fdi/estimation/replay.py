@@ -112,7 +112,7 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
     if is_long(trace):
         checked = cut_excerpt(trace, choose_excerpt(trace, silence_sensors(model), floor))
     steps, error = _choose_steps(checked, model, floor, undecided if checked is trace else ~checked.usable)
-    if checked is trace or steps > 2 * REPLAY_STEPS:  # else the replay that is there will do
+    if steps > (REPLAY_STEPS if checked is trace else 2 * REPLAY_STEPS):  # else the replay that is there will do
         coarse = replay_current(trace, model, steps)
     else:
         steps = REPLAY_STEPS
@@ -159,12 +159,14 @@ def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str,
 
 def _choose_steps(trace: Trace, model: Model, floor: Mapping[str, float], undecided: Flags
                   ) -> tuple[int, dict[str, float]]:
-    """The steps a cycle that the floors ask for, and what half as many change, RMS."""
+    """The steps a cycle that the floors ask for, and what half as many change, RMS; NaN for an FMU, which has its own.
+    """
+    if model.kind.foreign is not None:
+        return REPLAY_STEPS, dict.fromkeys(trace.output_names, math.nan)
     coarse, steps = replay_current(trace, model), REPLAY_STEPS
-    judged = ~undecided
     while True:
         fine, steps = replay_current(trace, model, 2 * steps), 2 * steps
-        error = {name: rms((fine[name] - coarse[name])[judged]) for name in trace.output_names if name in floor}
+        error = {name: rms((fine[name] - coarse[name])[~undecided]) for name in trace.output_names if name in floor}
         if all(error[name] <= SOLVER_ERROR_SHARE * floor[name] for name in error) or steps >= FINEST_REPLAY_STEPS:
             return steps, error
         coarse = fine

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from plant.errors import count_nouns
 from plant.segments import RATE, Array
 from rig.benches.bench import Bench, Flags, Role
 from rig.network.master import StartTime
@@ -387,7 +388,7 @@ def _describe_stop(node: Role, bench: Bench, records: CycleRecords, first: int, 
     frames, name = "drive" if node == CONTROLLER else "feedback", bench.describe_node(node)
     count = int(np.argmin(missing[first:])) if not missing[first:].all() else 0  # 0: until the end
     if not how and (count or first >= records.cycles):
-        text = f"{name} did not answer in time: no {frames} frame for {count} cycles from {first}"
+        text = f"{name} did not answer in time: no {frames} frame for {count_nouns(count, 'cycle')} from {first}"
     else:
         text = f"{name} stopped answering: no {frames} frame since cycle {first}"
         text += f"; {how}" if how else ""

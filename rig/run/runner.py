@@ -21,7 +21,7 @@ from fdi.report.report import to_plain
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Event, Trace
 from plant import Actuator
-from plant.errors import InputError, report_system_error
+from plant.errors import InputError, count_nouns, report_system_error
 from plant.model import Model
 from plant.run import make_columns_type
 from plant.segments import Array
@@ -159,9 +159,10 @@ class Outcome:
         total, most, cycles = int(overruns.sum()), policy.most_in_a_row, self.timing["cycles"]
         if self.job.max_overruns < 1 and total > self.job.max_overruns * cycles:
             # a run that skipped periods has more overruns than cycles
-            found = f"{total} overruns in {cycles} cycles, more than {100 * self.job.max_overruns:g} %:"
+            found = (f"{count_nouns(total, 'overrun')} in {count_nouns(cycles, 'cycle')}, "
+                     f"more than {100 * self.job.max_overruns:g} %:")
         elif most is not None and (in_a_row := count_most_in_a_row(overruns)) > most:
-            found = f"{in_a_row} overruns in a row, {most} are accepted:"
+            found = f"{count_nouns(in_a_row, 'overrun')} in a row, limit {most}:"
         else:
             return ""
         return (f"the bench itself was late: {found} the controller cannot be judged; "

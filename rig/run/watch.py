@@ -6,6 +6,7 @@ from math import isnan
 
 from canopen.emcy import EmcyError
 
+from plant.errors import count_nouns
 from rig.benches.bench import Bench, Flags, Role, describe_identifier
 from rig.device.emcy import EmcyCode
 from rig.interrupts import describe_exit
@@ -200,7 +201,7 @@ def describe_silence(bench: Bench, cycles: int) -> str:
 def describe_missing(bench: Bench, cycles: int) -> str:
     """That no drive frame has come for so many cycles; its name and identifier are those of the bench."""
     frame = bench.frames.drive
-    return f"no frame {frame.name} ({describe_identifier(frame.identifier)}) for {cycles} cycles"
+    return f"no frame {frame.name} ({describe_identifier(frame.identifier)}) for {count_nouns(cycles, 'cycle')}"
 
 
 class OverrunWatch:
@@ -228,8 +229,8 @@ class OverrunWatch:
         is_late = timing.lateness > self._latest_sync or not is_fed
         self._in_a_row = self._in_a_row + max(1, int(timing.lateness / self._period)) if is_late else 0
         if self._in_a_row > self._most:
-            self.problem = (f"the bench was late: {self._in_a_row} overruns in a row up to cycle {timing.cycle}, "
-                            f"{self._most} are accepted")
+            self.problem = (f"the bench was late: {count_nouns(self._in_a_row, 'overrun')} in a row up to cycle "
+                            f"{timing.cycle}, limit {self._most}")
 
 
 class SilenceWatch:

@@ -13,7 +13,7 @@ from fdi.progress import Progress
 from fdi.report.report import Line, Medium, Report, Section, write_html
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Trace
-from plant.errors import report_system_error, require
+from plant.errors import count_nouns, report_system_error, require
 from rig.cli.answer import Places, choose_file, give_answer, open_console, show_progress
 from rig.cli.command_list import LIVE_ON_TERMINAL
 from rig.cli.inputs import is_suite_file, parse_changes
@@ -133,9 +133,10 @@ def add_outcome(report: Report, outcome: Outcome) -> Report:
     """
     timing, judged, fdi = outcome.timing, outcome.attribution.judged, outcome.fdi
     late = timing["lateness_us"]
-    pace = (f"{timing['cycles']} cycles, {timing['overruns']} overruns; lateness p50 {late['p50']:g}, "
+    cycles = count_nouns(timing["cycles"], "cycle")
+    pace = (f"{cycles}, {count_nouns(timing['overruns'], 'overrun')}; lateness p50 {late['p50']:g}, "
             f"p99 {late['p99']:g}, max {late['max']:g} us ({timing['kind']}, {timing['scheduler']})"
-            if outcome.job.realtime else f"{timing['cycles']} cycles in lockstep, {outcome.speed:.1f} times real time")
+            if outcome.job.realtime else f"{cycles} in lockstep, {outcome.speed:.1f} times real time")
     differences = find_differences(outcome.job).describe()
     texts = {
         "timing": pace,

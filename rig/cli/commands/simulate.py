@@ -10,7 +10,7 @@ from fdi.report.report import Report
 from fdi.trace.command_file import read_command
 from fdi.trace.trace import Trace
 from plant import load_model, simulate
-from plant.errors import require
+from plant.errors import count_nouns, require
 from plant.plant_check import find_divergence
 from plant.plants import Plant
 from plant.segments import Points, build_profile
@@ -50,7 +50,7 @@ def run_command(args: argparse.Namespace) -> int:
     else:
         trace.write_csv(out)
     summary: dict[str, Any] = {"trace": str(out), "cycles": len(com), "seconds": len(com) * period}
-    sentence = f"{out}: {summary['cycles']} cycles, {summary['seconds']:g} s"
+    sentence = f"{out}: {count_nouns(len(com), 'cycle')}, {summary['seconds']:g} s"
     unit = signals.controlled.unit
     if signals.command.unit == unit:  # the command of an open loop may be a voltage
         error = columns[signals.command.name] - columns[signals.controlled.name]

@@ -303,7 +303,7 @@ def test_too_many_overruns_in_a_row_end_main(tmp_path: Path) -> None:
     text = SHORT + '[timing]\noverruns = "abort"\ntolerate = 5\nsync = 1e-9\ngrace = 0.0\n'
     outcome = play(job(text, pace="realtime", max_overruns=1.0), tmp_path)
     assert (outcome.verdict, outcome.status) == ("INVALID_TIMING", 3)
-    assert "overruns in a row, 5 are accepted" in outcome.why
+    assert "overruns in a row, limit 5" in outcome.why
     assert phases(tmp_path)[1] == 0 and outcome.to_json()["judged"]["judged"] == 0
 
 
