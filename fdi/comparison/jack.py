@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.estimation.noise import Floor, find_floors, floor_from_data, simulate_reading_noise
-from fdi.estimation.replay import BRIDGED_ROWS, Columns, differentiate, extend_flags
+from fdi.estimation.replay import BRIDGED_ROWS, Columns, differentiate, extend_flags, replay_current
 from fdi.thresholds import BLOCK_EXCESS_LEAST, NOISY_SENSOR_RATIO, SHAPE_TIE_GAIN, SPOOL_FITS_RATIO
 from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, rms
 from plant.forced import compute_flow_balance, compute_force_balance
@@ -23,7 +23,7 @@ SURE = 5.0  # standard deviations of the speed that tell a moving ram
 LOOSE = 2e-3  # m/s; the speed of the sensed position must show the direction too
 PLAYS = (2e-5, 6e-5, 1.5e-4)  # m, hysteresis of any shape as a sum of plays
 FEWEST_FORCE_ROWS = 400  # with known forces; fewer are the ends of steps, where speed is hardest to tell
-OWN = {"way": 5e-7, "force": 8e3}  # m, Pa: what straight lines between the samples leave of a perfect model
+PUSH = 8e3  # Pa, a step of the known load within a sample, over the area, from which on it is left out
 
 
 class Balance(NamedTuple):
@@ -81,13 +81,14 @@ def _compute_force_residual(trace: Trace, model: Model, p12: Floats, xj: Floats,
     size = max(1, round(MEAN / trace.period)) | 1
     kernel = np.ones(size) / size
     mean = np.convolve(speed, kernel, "same")
-    noise = float(np.median(np.abs(np.diff(speed, 2)))) / 0.6745 / math.sqrt(6.0 * size)
+    bend = mean[2 * size:] - 2.0 * mean[size:-size] + mean[:-2 * size]  # of means that share no sample
+    noise = float(np.median(np.abs(bend))) / 0.6745 / math.sqrt(6.0)
     seen = np.convolve(np.gradient(xj, trace.period), kernel, "same")
     direction = np.where(mean > SURE * noise, 1.0, np.where(mean < -SURE * noise, -1.0, 0.0))
     direction[(np.abs(seen) > LOOSE) & (np.sign(seen) != direction)] = 0.0
     turned = extend_flags(np.diff(direction, prepend=direction[0]) != 0.0, size)
     turned |= np.roll(turned, -size) | ~_find_resolved(speed, trace.period)
-    pushed = np.abs(np.diff(trace.load, prepend=trace.load[0])) > OWN["force"] * model["jack.area"]
+    pushed = np.abs(np.diff(trace.load, prepend=trace.load[0])) > PUSH * model["jack.area"]
     turned |= extend_flags(pushed, size)  # a step of the known load: the speed changes within a sample
     out: Floats = p12 - (takes + direction * dynamic) / model["jack.area"]
     return np.where((direction == 0.0) | turned, np.nan, out)
@@ -179,19 +180,18 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     Ratios of flow, force and sensor to their floors, None where one cannot be told, and the gain by which the ram moves
     further than the flow says, as a fraction; nothing where too few rows hang together.
 
-    The floor comes from the repeats, as everywhere; without them the noise `level` of each signal, SI, is put in once
-    more, and what that changes is what noise does.
+    The floor is what the balances leave of the model's own run with the noise `level` of each signal, SI: noise, and what
+    the balances neglect, such as a lag of the sensor. The floor from the repeats counts where it is higher.
     """
     b = compute_balance(trace, model, run)
-    found = {"way": b.way, "force": b.force}
-    if repeats:
-        others = [compute_balance(other, model, theirs) for other, theirs in repeats]
-        pairs = [{"way": other.way, "force": other.force} for other in others]
-        floor = {name: f.value for name, f in find_floors(found, pairs, trace.period).items()}
-    else:
-        again = compute_balance(add_noise(trace, level), model, run)
-        floor = {"way": rms(again.way - b.way), "force": rms(again.force - b.force)}
-    floor = {name: math.hypot(value, OWN[name]) for name, value in floor.items()}
+    free = replay_current(trace, model, anchor=0.0)  # the measured position would pull it off its own balance
+    mine = trace.with_columns({name: free[name] for name in trace.outputs})
+    own = compute_balance(add_noise(mine, level), model, free)
+    others = [compute_balance(other, model, theirs) for other, theirs in repeats]
+    floor = {"way": rms(own.way), "force": rms(own.force)}
+    for name, f in find_floors({"way": b.way, "force": b.force}, [{"way": o.way, "force": o.force} for o in others],
+                               trace.period).items():
+        floor[name] = float(np.fmax(floor[name], f.value))
     known = [trace.column(name) if name in trace.outputs else run[name] for name in (XS, P12)]
     xs, p12 = (bridge_gaps(column, BRIDGED_ROWS)[0] for column in known)
     if (~np.isnan(b.way)).sum() < FEWEST_FORCE_ROWS or not floor.get("way", 0.0) > 0.0:
