@@ -421,6 +421,11 @@ SIGNAL_ERROR_RATIO = 1.1
 # Standard deviations by which a single section may be above the floor; a trace has dozens of sections.
 SECTION_ERROR_SD = 5.0
 
+# Mean square of a window of 0.1 s over that of the floor, from which on a run is off, and up to which another run fits.
+#
+# An error of the model is in both: they differ by less than that even where noise is coloured.
+RUN_IS_OFF, RUN_FITS = 4.0, 2.0
+
 # RMS residual over floor up to which a block of the actuator agrees: the floor of a balance is known less well than a
 # signal's.
 BLOCK_ERROR_RATIO = 1.3

@@ -25,6 +25,7 @@ from fdi.estimation.replay import (
     Scatter,
     answer_readings,
     compute_residuals,
+    extend_until_noise,
     find_controller_gain,
     find_repeat,
     fit_scatter,
@@ -33,6 +34,7 @@ from fdi.estimation.replay import (
     match_period,
     measure_drift,
     measure_misfit,
+    measure_window_power,
     prepare_trace,
     replay_command,
     replay_current,
@@ -47,13 +49,15 @@ from fdi.thresholds import (
     LAG_MISFIT_RATIO,
     LOWER_BOUND_ERROR_RATIO,
     REPEAT_DIFFERENCE_RATIO,
+    RUN_FITS,
+    RUN_IS_OFF,
     SECTION_ERROR_SD,
     SIGNAL_ERROR_RATIO,
     SOLVER_HIDES_RATIO,
     UNDECIDED_SHARE,
 )
 from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
-from fdi.trace.trace import Floats, Trace, hold_last, rms, shift_rows
+from fdi.trace.trace import Flags, Floats, Trace, hold_last, rms, shift_rows
 from plant.model import Model
 from plant.run import compute_needed_drive
 from plant.signals import Signal
@@ -241,6 +245,14 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     # without repeats, the floor holds what a current that was not recorded leaves open
     widened = {name: f._replace(value=math.hypot(f.value, replay.blind[name])) for name, f in noise.items()}
     floor = widened | find_floors(replay.residual, theirs, trace.period)
+    off_alone = find_rows_off_alone(replay.residual, theirs, floor)
+    replay = replay._replace(undecided=replay.undecided | off_alone)
+    floor |= find_floors({name: np.where(off_alone, np.nan, r) for name, r in replay.residual.items()}, theirs,
+                         trace.period)
+    sensed = trace.declared.controlled.name
+    if sensed in floor and any(model.find_effect(name).port == "reading" for name in model.effects):
+        # repeats are rounded alike
+        floor[sensed] = floor[sensed]._replace(value=max(floor[sensed].value, noise[sensed].value))
     left_out = replay.undecided & (replay.undecided.mean() <= UNDECIDED_SHARE)
     judged = {name: np.where(left_out, np.nan, r) for name, r in replay.residual.items()}
     progress("closed loop", 3 / STAGES)
@@ -266,7 +278,27 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     return Comparison(source, model, trace, verdict, reason, table, found, ratios, parts, named, tuple(sections),
                       when, free, speed, measure_drive_error(trace, model), scattered, diagnoses, replay,
                       len(others), (*trace.notes, *([doubtful] if doubtful and verdict != "CANNOT_TELL" else []),
-                                    *_list_notes(floor, replay, trace)))
+                                    *_list_notes(floor, replay, trace, off_alone)))
+
+
+def find_rows_off_alone(residual: Columns, repeats: Sequence[Columns], floor: Mapping[str, Floor]) -> Flags:
+    """Rows, (n,), in which the run is off and a repeat is at the floor: it made a stop, or missed one, by a hair.
+
+    A model that lacks physics is off in every run.
+    """
+    if not repeats:
+        return np.zeros(len(next(iter(residual.values()))), bool)
+
+    def rate(columns: Columns) -> Floats:
+        return np.array([columns[name] / floor[name].value for name in residual])
+
+    rows = min(len(next(iter(columns.values()))) for columns in (residual, *repeats))
+    own = np.nan_to_num(rate(residual))
+    best = np.min([measure_window_power(np.nan_to_num(rate(other)[:, :rows])).max(axis=0) for other in repeats], axis=0)
+    is_off = extend_until_noise(measure_window_power(own).max(axis=0) > RUN_IS_OFF, own)
+    is_off[:rows] &= best <= RUN_FITS
+    is_off[rows:] = False
+    return is_off
 
 
 def _measure_signal(signal: Signal, residual: Floats, floor: Floor, noise: Floor, closed: Floats,
@@ -353,7 +385,7 @@ def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place],
     return ("CANNOT_TELL", doubt) if is_open else ("MODEL_INCOMPLETE", "")
 
 
-def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> Iterator[str]:
+def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace, off_alone: Flags) -> Iterator[str]:
     """What a reader must know about the floor and about rows left out."""
     yield from (f"{name} of the model passes the sensor of the trace: "
                 f"{sensor.describe(trace.period, trace.units[name])}"
@@ -363,9 +395,12 @@ def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> Ite
     if apart := [_describe_apart(trace.declared.find(name), f) for name, f in floor.items() if _is_apart(f)]:
         yield f"the error differs between the repeats, as with stick-slip: {', '.join(apart)} noise floors"
     if replay.undecided.any() and replay.undecided.mean() <= UNDECIDED_SHARE:
-        seconds = float(replay.undecided.sum()) * trace.period
-        yield (f"{seconds:.1f} s are not judged: whether the {trace.declared.controlled.phrase} stops "
-               f"{_describe_cause(replay)}")
+        seconds, alone = (float(rows.sum()) * trace.period for rows in (replay.undecided & ~off_alone, off_alone))
+        if seconds:
+            yield (f"{seconds:.1f} s are not judged: whether the {trace.declared.controlled.phrase} stops "
+                   f"{_describe_cause(replay)}")
+        if alone:
+            yield f"{alone:.1f} s are not judged: this run is off there, and a repeat is at the noise floor"
 
 
 def _is_apart(floor: Floor) -> bool:

@@ -20,6 +20,7 @@ from scipy.linalg import solve_toeplitz
 from scipy.special import gammainc, gammaincinv, ndtri
 
 from fdi.thresholds import (
+    ANCHOR_RATE,
     CALM_BLOCK_RATIO,
     HUM_LINE_RATIO,
     LOWER_BOUND_ERROR_RATIO,
@@ -95,8 +96,11 @@ def floor_from_data(signal: Floats) -> Floor:
 
 
 def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
-    """The floors without repeats: the model's sensor noise, or the data's own where that is more or none is given."""
-    out = {}
+    """The floors without repeats: the model's sensor noise, or the data's own where that is more or none is given.
+
+    What a replay takes over of the controlled signal's noise is in them: see `compute_anchor_noise`.
+    """
+    out, taken_over = {}, compute_anchor_noise(trace, model)
     for name in trace.outputs:
         signal, seen = trace.declared.find(name), floor_from_data(trace.mask_unusable(name))
         given = model.values.get(signal.noise, 0.0)
@@ -106,15 +110,39 @@ def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
             given = trace.sensors[name].measure_noise(given)
             share = trace.sensors[name].count_independent(trace.period)
         found = Floor(given, "model") if given > 0.0 and seen.value < NOISIER_THAN_MODEL * given else seen
-        out[name] = found._replace(value=max(found.value, signal.finest), freedom=share)
+        value = float(np.hypot(max(found.value, signal.finest), taken_over.get(name, 0.0)))
+        out[name] = found._replace(value=value, freedom=share)
     return out
 
 
 def find_sensor_level(trace: Trace, signal: Signal, model: Model) -> float:
-    """RMS of a sensor's white noise: the model's, or that of the data where the plant declares none."""
-    if signal.noise:
-        return model[signal.noise]
-    return max(floor_from_data(trace.mask_unusable(signal.name)).value, signal.finest) or 1.0
+    """RMS of a sensor's white noise: the model's, or that of the data where the plant declares none.
+
+    And what a replay takes over of the controlled signal's noise.
+    """
+    level = model.values.get(signal.noise, 0.0)
+    if not signal.noise:
+        level = max(floor_from_data(trace.mask_unusable(signal.name)).value, signal.finest) or 1.0
+    if signal == trace.declared.controlled:
+        return level
+    return float(np.hypot(level, compute_anchor_noise(trace, model).get(signal.name, 0.0)))
+
+
+def compute_anchor_noise(trace: Trace, model: Model) -> dict[str, float]:
+    """RMS by output that the noise of the controlled signal makes of the others in a replay that is drawn to it.
+
+    It moves whatever moves along, such as the angle of a motor beside the position of its load: white noise through a
+    filter of the first order. A plant with an observer of its own is not looked at.
+    """
+    kind, controlled = model.kind, trace.declared.controlled
+    if kind.foreign is not None or kind.correct is not None:
+        return {}
+    level, pull = find_sensor_level(trace, controlled, model), ANCHOR_RATE * model["controller.period"]
+    start, p = model.build_start()[0], model.build_record()[0]
+    shown, moved = kind.measure(start, p), kind.measure(kind.move(start, level, p), p)
+    passed = np.sqrt(pull / (2.0 - pull))
+    return {signal.name: float(abs(after - before) * passed) for signal, before, after
+            in zip(trace.declared.outputs, shown, moved, strict=True) if signal != controlled}
 
 
 def simulate_reading_noise(model: Model, controlled: Floats) -> float:

@@ -77,9 +77,8 @@ def step(s: State, m: Any, u: Any, p: Any) -> tuple[State, Any]:
 
 
 def measure(s: State, p: Any) -> tuple[float, float, float, float, float]:
-    """Angle, rate, current, torque behind the gear, warmth."""
-    return (s.turned / p.gearing.ratio, s.rate, s.torque / p.rotor.torque_constant, s.torque * p.gearing.ratio,
-            s.warmth)
+    """Angle, rate, current, angle of the rotor, warmth."""
+    return s.turned / p.gearing.ratio, s.rate, s.torque / p.rotor.torque_constant, s.turned, s.warmth
 
 
 class Memory(NamedTuple):
@@ -128,7 +127,7 @@ PLANT = Plant(
              Signal("trim_angle", "ta", "rad", "angle of the stabiliser", noise=2e-5),
              Signal("shaft_rate", "wr", "rad/s", "rate of the rotor", noise=0.05),
              Signal("phase_amps", "ia", "A", "current of the motor", noise=0.05),
-             Signal("gear_torque", "Tg", "N m", "torque behind the gear", noise=0.5),
+             Signal("rotor_angle", "ra", "rad", "angle of the rotor", noise=2e-4),  # a replay shows the other's noise
              Signal("case_rise", "dT", "K", "temperature above the surroundings", noise=0.05),
              Signal("hinge", "Mh", "N m", "hinge moment", "load", largest=1e4)),
     parameters=(Rotor, Gearing, Housing, Controller), state=State, step=step, measure=measure, moves=("turned",),

@@ -83,7 +83,7 @@ def test_from_a_plant_file_to_its_hidden_fault(where: str, here: Path, monkeypat
     assert checked["verdict"] == "WITHIN_LIMITS" and {"trim_cmd", "trim_angle", "torque_ref"} <= carried
     run = play(here / "hidden", "--bench", "trim.toml", "--model", "stiff.toml", "--trust")
     assert run.status == 0, run
-    assert {"shaft_rate", "phase_amps", "gear_torque", "case_rise"} <= {*Trace.read(here / "hidden").signals}
+    assert {"shaft_rate", "phase_amps", "rotor_angle", "case_rise"} <= {*Trace.read(here / "hidden").signals}
     elsewhere = here / "elsewhere"  # the log has the plant with it
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
@@ -132,7 +132,7 @@ def test_a_replay_of_a_run_begins_with_its_set_up(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("old", "new", "line"), [
     ('trim_angle = {', 'ram_position = {', "inputs.ram_position: expected a signal of the bench and its plant: "
-     "'case_rise', 'control_word', 'cycle', 'flags', 'gear_torque', 'hinge', 'mode', 'phase_amps'"),
+     "'case_rise', 'control_word', 'cycle', 'flags', 'hinge', 'mode', 'phase_amps', 'rotor_angle'"),
     ('torque_ref = {', 'current = {', "outputs.current: expected a signal of the bench and its plant: 'cycle', "
      "'mode_display', 'status_word' or 'torque_ref'"),
     ('trim_cmd = { object = "0x607A", count = "1 urad" }', "", "inputs: expected also the signal trim_cmd"),
