@@ -24,7 +24,8 @@ from plant.tables import Place
 from rig.fmi.host import Settings, Variable
 
 Array = NDArray[np.float64]
-LONGEST_CALL = 20.0  # s, of one cycle or of starting: a unit that takes longer hangs
+LONGEST_CALL = 20.0  # s, of starting, or of so many cycles: a unit that takes longer hangs
+CYCLES_A_CALL = 100
 _NUMBERS = {"Real": "Real", "Integer": "Integer", "Enumeration": "Integer", "Boolean": "Boolean"}  # FMI 2
 
 
@@ -125,6 +126,7 @@ class Unit:
         self._lock = RLock()
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Connection | None = None
+        self._hangs = ""  # what is said of a unit that has hung once
 
     def begin(self, values: Mapping[str, float]) -> Array:
         """Start anew with these parameters; the readings at time 0."""
@@ -143,8 +145,12 @@ class Unit:
     def run(self, values: Mapping[str, float], given: Array) -> Array:
         """The readings (n, outputs) before each cycle of a whole run; `given` has drive and load of each, (n, 2)."""
         worth = [port.worth for port in self._inputs]
-        rows = (given[:, :len(worth)] / worth).tolist()
-        return self._scale(self._ask("run", self._list_settings(values), rows, seconds=float(len(rows))))
+        rows = (given[:-1, :len(worth)] / worth).tolist()
+        with self._lock:  # no other run in between
+            found = [self._ask("begin", self._list_settings(values))]
+            for k in range(0, len(rows), CYCLES_A_CALL):
+                found += self._ask("run", rows[k:k + CYCLES_A_CALL])
+        return self._scale(found)
 
     def close(self) -> None:
         """End the process."""
@@ -166,26 +172,29 @@ class Unit:
     def _list_settings(self, values: Mapping[str, float]) -> Settings:
         return [(port.variable, values[port.name] / port.worth) for port in self._parameters if port.name in values]
 
-    def _ask(self, name: str, *arguments: Any, seconds: float = 0.0) -> Any:
+    def _ask(self, name: str, *arguments: Any) -> Any:
         """The answer of the process. Raises Diverged: the unit refuses. Raises RigError: it crashes or hangs."""
         with self._lock:  # analyses run in threads
-            return self._ask_alone(name, arguments, LONGEST_CALL + seconds)
+            return self._ask_alone(name, arguments)
 
-    def _ask_alone(self, name: str, arguments: Sequence[Any], seconds: float) -> Any:
+    def _ask_alone(self, name: str, arguments: Sequence[Any]) -> Any:
+        if self._hangs:
+            raise RigError(self._hangs)
         if self._process is None:
             self._start()
         process, connection = self._process, self._connection
         assert process is not None and connection is not None
         with contextlib.suppress(OSError, EOFError):
             connection.send((name, arguments))
-            if connection.poll(seconds):
+            if connection.poll(LONGEST_CALL):
                 word, result = connection.recv()
                 if word == "done":
                     return result
                 self.close()
                 raise Diverged(f"{self._path}: {result}")
             self.close()
-            raise RigError(f"{self._path}: the unit has not answered for {seconds:g} s in {name}; it was stopped")
+            self._hangs = f"{self._path}: the unit has not answered for {LONGEST_CALL:g} s in {name}; it was stopped"
+            raise RigError(self._hangs)
         status = process.wait()
         self.close()
         cause = signals_of_processes.Signals(-status).name if status < 0 else f"exit status {status}"
@@ -201,8 +210,9 @@ class Unit:
         ours, theirs = socket.socketpair()
         with Path(self._folder.name, "messages.txt").open("wb") as messages, theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "rig.fmi.host", str(theirs.fileno())], pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL, stdout=messages, stderr=messages, start_new_session=True)
+                [sys.executable, "-m", "rig.fmi.host", str(theirs.fileno()), self._folder.name],
+                pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=messages, stderr=messages,
+                start_new_session=True)
         self._connection = Connection(ours.detach())
         weakref.finalize(self, self._process.kill)
         self._ask("load", self._folder.name, str(Path(self._folder.name, self._library)),

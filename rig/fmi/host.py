@@ -1,11 +1,15 @@
-"""Runs a foreign unit in a process of its own: `python -m rig.fmi.host CONNECTION`.
+"""Runs a foreign unit in a process of its own: `python -m rig.fmi.host CONNECTION FOLDER`.
 
 A unit is somebody else's machine code. If it crashes or hangs, only this process does. Requests are a name and its
 arguments, the first one `load`; answers are ("done", result) or ("failed", what went wrong). rig/fmi/foreign.py asks.
 """
 
 import ctypes
+import os
+import shutil
 import sys
+import threading
+import time
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
@@ -82,9 +86,9 @@ class Host:
         self._k += 1
         return self._read()
 
-    def run(self, settings: Settings, rows: Sequence[Sequence[float]]) -> list[list[float]]:
-        """The outputs before each cycle of a whole run, from the inputs of each cycle."""
-        return [self.begin(settings), *(self.step(row) for row in rows[:-1])]
+    def run(self, rows: Sequence[Sequence[float]]) -> list[list[float]]:
+        """The outputs at the end of each of some cycles, from the inputs of each."""
+        return [self.step(row) for row in rows]
 
     def describe_failure(self, error: Exception) -> str:
         """When and how a call failed, with the last message of the unit."""
@@ -144,5 +148,14 @@ def serve(connection: Connection) -> None:
             connection.send(("done", result))
 
 
+def end_with(parent: int, folder: str) -> None:
+    """Remove the unpacked unit and end this process, hung or not, as soon as the rig has ended."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    shutil.rmtree(folder, ignore_errors=True)
+    os._exit(1)
+
+
 if __name__ == "__main__":
+    threading.Thread(target=end_with, args=(os.getppid(), sys.argv[2]), daemon=True).start()
     serve(Connection(int(sys.argv[1])))
