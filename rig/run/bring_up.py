@@ -183,6 +183,7 @@ def find_on_time(history: History, faults: Schedule | None, realtime: bool, peri
 
 
 LIMIT = 5.0  # s: a controller that is not ready by then ends the run
+TIME_TO_SAY = 20  # cycles, beside two of the slowest frame, until a controller has said whether it is ready
 
 
 class Enabling:
@@ -224,12 +225,17 @@ class Enabling:
     def await_ready(self, demand: float, control: int, main_control: int) -> str:
         """Wait, at a `demand` in m, until the controller is ready; why it is not, or "".
 
-        A controller that is not ready at the end of set-up, with `control`, gets the values of main, with
-        `main_control`: it may say that it is ready as soon as it is enabled.
+        A controller that is not ready with the values of set-up and `control`, although it had the time to say so, gets
+        the values of main and `main_control`: it may say that it is ready as soon as it is enabled.
         """
-        self._play(CycleInput(0, demand, 0.0, control, is_counted=False))
-        if self._play_until(lambda: all(self._has(name, value) for name, value in self._bench.ready.items()),
-                            lambda: CycleInput(1, demand, 0.0, main_control, is_counted=False)):
+        def is_ready() -> bool:
+            return all(self._has(name, value) for name, value in self._bench.ready.items())
+
+        at_rest = CycleInput(0, demand, 0.0, control, is_counted=False)
+        self._play(at_rest)
+        slowest = max(frame.every for frame in self._bench.frames.frames)
+        self._play_until(is_ready, lambda: at_rest, 2 * slowest + TIME_TO_SAY)
+        if self._play_until(is_ready, lambda: CycleInput(1, demand, 0.0, main_control, is_counted=False)):
             return ""
         said = ", ".join(f"{name} is {self._loop.outputs.get(name, 0.0):g}, not {value:g}"
                          for name, value in self._bench.ready.items() if not self._has(name, value))
@@ -238,9 +244,12 @@ class Enabling:
     def _describe_silence(self) -> str:
         return describe_silence(self._bench, self._silent) if self._silent else ""
 
-    def _play_until(self, is_done: Callable[[], bool], make_step: Callable[[], CycleInput]) -> bool:
-        """Play cycles until `is_done()`; False if that takes too long, True also when the run is to end."""
-        clock, left = WallClock(), round(LIMIT * 1e9 / self._bench.cycle_ns)
+    def _play_until(self, is_done: Callable[[], bool], make_step: Callable[[], CycleInput], most: int = 0) -> bool:
+        """Play cycles until `is_done()`; False if that takes too long, True also when the run is to end.
+
+        `most`: cycles; default what `LIMIT` allows.
+        """
+        clock, left = WallClock(), most or round(LIMIT * 1e9 / self._bench.cycle_ns)
         while not is_done():
             left -= 1
             is_over = clock.now() > LIMIT * 1e9 if self._realtime else self._silent >= PATIENCE
