@@ -9,7 +9,6 @@ import os
 import shutil
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
@@ -150,8 +149,9 @@ def serve(connection: Connection) -> None:
 
 def end_with(parent: int, folder: str) -> None:
     """Remove the unpacked unit and end this process, hung or not, as soon as the rig has ended."""
+    never = threading.Event()
     while os.getppid() == parent:
-        time.sleep(0.5)
+        never.wait(0.5)
     shutil.rmtree(folder, ignore_errors=True)
     os._exit(1)
 
