@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,6 +36,7 @@ from rig.benches.bench import (
     unpack,
 )
 from rig.benches.can_map import read_database
+from rig.benches.profiles import PROFILES, State
 from rig.network.frame import Frame, find_cob_id, make_message
 from rig.network.node_objects import name_state
 from rig.recorder.schema import Event, NmtState, Record, Signals, collect_provenance, make_row_record
@@ -156,9 +158,11 @@ def _write_log(out: Path, attachments: Mapping[str, tuple[str, bytes]], metadata
 
 
 def import_frames(source: Path, out: Path, bench: Bench) -> int:
-    """Make a log from the raw frames of a bench, cut into cycles at each SYNC or demand; -> cycles.
+    """Make a log from the raw frames of a bench, cut into cycles at each SYNC or demand; -> cycles of its main phase.
 
-    Row k holds the demand of cycle k, what the plant sensed in it and the drive frame that answers it.
+    Row k holds the demand of cycle k, what the plant sensed in it and the drive frame that answers it. Main is the
+    longest piece between two starts of the plant's node, which a run resets after its probes, from where the controller
+    is first told to be active to where it last is.
     Raises InputError for a file that cannot be read, and when there is no cycle in it.
     """
     cycles = _CycleBuilder(bench)
@@ -171,11 +175,18 @@ def import_frames(source: Path, out: Path, bench: Bench) -> int:
     require(starts, source, "", f"at least one {begin}")
     spans = np.sort(np.diff(starts))
     middle = float(spans[len(spans) // 2]) if len(spans) else bench.cycle_ns
+    first, stop = max(pairwise([0, *cycles.plant_starts, len(starts)]), key=lambda piece: piece[1] - piece[0])
+    told = PROFILES[bench.profile].ladder[State.ACTIVE]
+    active = [k for k in range(first, stop) if cycles.rows[k][1].control == told]
+    if active:
+        first, stop = active[0], active[-1] + 1
+    for k, (_, row) in enumerate(cycles.rows):
+        row.phase = int(k >= first) + int(k >= stop)
     period = bench.cycle_ns / 1e9 if 0.9 < middle / bench.cycle_ns < 1.1 else round(middle / 1e9, 4)  # another speed
     items = sorted([*items, *cycles.rows], key=lambda item: item[0])
     _write_log(out, {name: ("text/plain", data) for name, data in bench.files.items()},
                collect_provenance(imported=source.name, period=period, pace="imported"), items, bench.signals)
-    return len(starts)
+    return stop - first
 
 
 _WORDS = {"control_word": "control", "status_word": "status", "flags": "flags"}
@@ -186,6 +197,8 @@ class _CycleBuilder:
 
     def __init__(self, bench: Bench) -> None:
         self.rows: list[tuple[int, Signals]] = []
+        self.plant_starts: list[int] = []  # rows before each boot-up of the plant's node
+        self._plant_node = bench.find_number(Role.PLANT)
         self._frames, self._is_canopen = bench.frames, bool(bench.nodes)
         # without SYNC a cycle begins with the first frame of the rig, of those that it sends most often
         self.begin = min(bench.frames.list_from(Role.RIG), key=lambda each: each.every)
@@ -212,6 +225,8 @@ class _CycleBuilder:
         elif (self._is_canopen and 0x700 < cob_id < 0x780 and len(frame.data) == 1
               and self._nmt.get(node) != frame.data[0]):
             state = self._nmt[node] = frame.data[0]
+            if node == self._plant_node and not state:  # its boot-up
+                self.plant_starts.append(len(self.rows))
             return [NmtState(node, state, name_state(state).lower())]
         elif self._is_canopen and 0x080 < cob_id < 0x100 and len(frame.data) == 8:
             code = int.from_bytes(frame.data[:2], "little")
