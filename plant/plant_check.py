@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.compile import find_fields_of
-from plant.errors import InputError, count_nouns, require, suggest_name
-from plant.faults import Fault
+from plant.errors import InputError, count_nouns, require
+from plant.faults import Fault, place_faults
 from plant.quantity import Quantity, list_quantities
 from plant.segments import Segment, build_profile
 from plant.user_code import explain_errors
@@ -65,13 +65,15 @@ def check_declaration(plant: Plant, where: object) -> None:
         require(not unknown, where, f"effect {e.name}",
                 f"p.{e.name}.FIELD for its own parameters, or a group of the plant ({', '.join(plant.parameters)}), "
                 f"not p.{', p.'.join(unknown)}")
-    known |= {name for e in plant.list_effects() for name in e.parameters}
-    for fault in plant.faults:
-        require(isinstance(fault, Fault), where, "faults", "values Fault(...)")
-        require(fault.parameter in known, where, f"fault {fault.name}, parameter",
-                f"a parameter of the plant or of an effect{suggest_name(fault.parameter, known)}")
+    require(all(isinstance(fault, Fault) for fault in plant.faults), where, "faults", "values Fault(...)")
+    place_faults(plant.faults, plant, where)
     require(all(isinstance(s, Segment) for s in plant.profile), where, "profile",
             "segments such as Step(to=1e-3, time=1.0)")
+    with explain_errors(str(where)):
+        most, command = plant.signals.command.largest, build_profile(plant.profile).command
+    largest = float(np.abs(command).max(initial=0.0))
+    require(largest <= most, where, "profile", f"demands of at most {most:g} {plant.signals.command.unit} either way, "
+            f"the largest of the signal {plant.signals.command.name}, not {largest:g}")
     _check_readings(plant, where)
 
 
