@@ -121,8 +121,7 @@ class Model:
 
     def list_changes(self) -> dict[str, float]:
         """The parameters that are not those of the plant's nominal model, and all parameters of its effects."""
-        base = self.kind.nominal
-        return {name: value for name, value in self.values.items() if base.get(name) != value}
+        return {name: value for name, value in self.values.items() if self.kind.nominal.get(name) != value}
 
     def describe_value(self, name: str) -> str:
         """A parameter for people: its SI value with the unit, or the word of a choice."""

@@ -171,6 +171,11 @@ def report_law_errors(model: Model) -> Iterator[None]:
         if told is not None:
             raise told from error
         where, cause = found or (model.kind.file or "effects", error)
+        # s and c are names of the loops in plant.solve
+        unlike = re.search(r"Cannot unify (.+) and (.+) for '([sc])\b", str(cause).replace("float64", "number"))
+        if unlike:
+            raise InputError(where, "step" if unlike[3] == "s" else "control", "a function that gives back what it "
+                             f"gets, all fields written out: {unlike[1]}, not {unlike[2]}") from error
         said = next((line.strip() for line in reversed(str(cause).splitlines()) if line.strip()), "")
         raise InputError(where, ", ".join(model.effects),
                          f"laws that can be compiled and run ({type(cause).__name__}: {said})") from error

@@ -22,7 +22,7 @@ from typing import Any
 from plant.compile import Function
 from plant.errors import require
 from plant.friction import clip, play, soften
-from plant.parameters import GROUPS
+from plant.parameters import GROUPS, find_field
 from plant.ports import PORTS, chain_laws
 from plant.quantity import Quantity, list_quantities, make_group
 from plant.state import Drag, Held, Lag, Line, Memory
@@ -187,7 +187,7 @@ def register_base(name: str, *fields: str, **more: Any) -> None:
 def build_base_effect(name: str, *fields: str, law: str, symptoms: str = "", starts: Sequence[Start] = (),
                       groups: Mapping[str, type[Any]] = GROUPS, **more: Any) -> Effect:
     """An effect that a plant has already, by the parameters of `groups` that carry it; a fit frees all."""
-    meaning = {field: list_quantities(groups[field.partition(".")[0]])[field.partition(".")[2]] for field in fields}
+    meaning = {field: find_field(f"effect {name}", field, groups) for field in fields}
     return Effect(name, "", law, symptoms, meaning, {}, fitted=fields, starts=_name_starts(fields, starts), **more)
 
 
