@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.compile import find_fields_of
-from plant.errors import InputError, count_nouns, require
+from plant.errors import InputError, count_nouns, require, suggest_name
 from plant.faults import Fault, place_faults
 from plant.quantity import Quantity, list_quantities
 from plant.segments import Segment, build_profile
@@ -65,15 +65,13 @@ def check_declaration(plant: Plant, where: object) -> None:
         require(not unknown, where, f"effect {e.name}",
                 f"p.{e.name}.FIELD for its own parameters, or a group of the plant ({', '.join(plant.parameters)}), "
                 f"not p.{', p.'.join(unknown)}")
-    require(all(isinstance(fault, Fault) for fault in plant.faults), where, "faults", "values Fault(...)")
-    place_faults(plant.faults, plant, where)
+    known |= {name for e in plant.list_effects() for name in e.parameters}
+    for fault in plant.faults:
+        require(isinstance(fault, Fault), where, "faults", "values Fault(...)")
+        require(fault.parameter in known, where, f"fault {fault.name}, parameter",
+                f"a parameter of the plant or of an effect{suggest_name(fault.parameter, known)}")
     require(all(isinstance(s, Segment) for s in plant.profile), where, "profile",
             "segments such as Step(to=1e-3, time=1.0)")
-    with explain_errors(str(where)):
-        most, command = plant.signals.command.largest, build_profile(plant.profile).command
-    largest = float(np.abs(command).max(initial=0.0))
-    require(largest <= most, where, "profile", f"demands of at most {most:g} {plant.signals.command.unit} either way, "
-            f"the largest of the signal {plant.signals.command.name}, not {largest:g}")
     _check_readings(plant, where)
 
 
@@ -137,14 +135,22 @@ def find_divergence(model: Model, columns: Mapping[str, NDArray[np.float64]]) ->
 
 
 def check_behaviour(model: Model) -> Iterator[Finding]:
-    """The checks of a plant over its nominal test, one after the other."""
+    """The checks of a plant over its nominal test, one after the other.
+
+    Raises:
+        InputError: faults that contradict their range or each other, or a demand that is larger than the largest.
+    """
     from plant.lanes import Lanes
     from plant.run import simulate
     from plant.selftest import check_effect
 
     kind = model.kind
+    demanded, where = kind.signals.command, kind.file or kind.name
+    place_faults(kind.faults, kind, where)
     period = model["controller.period"]
     command = build_profile(kind.profile, rate=round(1.0 / period)).command
+    require(np.abs(command).max() <= demanded.largest, where, "profile", f"demands of at most {demanded.largest:g} "
+            f"{demanded.unit} either way, the largest of the signal {demanded.name}, not {np.abs(command).max():g}")
     quiet = model.replace({s.noise: 0.0 for s in kind.signals.outputs if s.noise})
 
     def run(steps: int | None = None, rows: int = len(command), *, fast: bool = True) -> dict[str, Any]:

@@ -200,8 +200,8 @@ def find_compile_error(error: Exception) -> InputError | None:
 
 def _find_law_error(model: Model) -> tuple[str, Exception] | None:
     """The same mistake as Python tells it, with file and line, if it makes it too: numba says neither."""
-    laws = [*model.kind.list_laws(model.effects), model.kind.step]
-    files = {law.__code__.co_filename for law in laws if law is not None}
+    files = {law.__code__.co_filename for law in (*model.kind.list_laws(model.effects), model.kind.step)
+             if law is not None}
     try:
         step = build_kernel(step_cycle, model.effects, False, model.plant)
         step(*model.build_start(), 0.0, 0.0, 0.0, 0.0, model.build_record(), 1)

@@ -124,7 +124,7 @@ def test_its_own_effect_may_have_the_name_of_a_shared_one(tmp_path: Path) -> Non
     ("return s.angle, s.current", "return (s.angle,)", "measure.*2 numbers, angle, current"),
     ("return s.angle, s.current", "return s.angle, s.amps", r"\.py:\d+: measure.*amps"),
     ('@effect("friction"', '@effect("fricton"', "effect dry_friction.*voltage, load, friction"),
-    ('"motor.resistance", (2.0', '"motor.resistence", (2.0', "faults.winding.parameter.*mean resistance"),
+    ('"motor.resistance", (2.0', '"motor.resistence", (2.0', "fault winding.*motor.resistance"),
     ("(2.0, 4.0), 2.3, 3.0", "(2.0, 4.0), 2.3, 30.0", "faults.winding.maintenance.*2 .. 4 ohm, not 30"),
     ("Step(to=0.5, time=0.9)", "Step(to=500.0, time=0.9)", "profile: expected demands of at most 100 rad .*, not 500"),
     ("moves=(\"angle\",)", "moves=(\"angel\",)", "moves.*angle"),
@@ -148,7 +148,7 @@ def test_its_own_effect_may_have_the_name_of_a_shared_one(tmp_path: Path) -> Non
 def test_a_wrong_plant_file_is_refused_in_one_line(old: str, new: str, message: str, tmp_path: Path) -> None:
     assert old in TEXT
     file = write_file(tmp_path / "wrong.py", TEXT.replace(old, new, 1))
-    said = catch_refusal(load_plant, file)
+    said = catch_refusal(lambda path: [*check_behaviour(load_model(path))], file)
     assert re.search(message, said) and str(file) in said
 
 
