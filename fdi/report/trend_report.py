@@ -30,7 +30,7 @@ from fdi.report.drawing import (
     level,
     line,
 )
-from fdi.report.numbers import attach_unit, format_digits, format_interval
+from fdi.report.numbers import format_amount, format_interval, format_limit
 from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Mood, Report, Section, tabulate
 from fdi.thresholds import TREND_FEWEST_TRACES, TREND_MOST_TRACES
 from plant.errors import count_nouns
@@ -67,7 +67,8 @@ def build_trend_report(unit: UnitTrend) -> Report:
 def explain_level(trend: Trend) -> str:
     """Why a fault has its level: its size now, beside the limits that decide."""
     fault, level = trend.fault, trend.level
-    healthy, middle, most = (attach_unit(f"{x:g}", fault.unit)
+    size = max(filter(math.isfinite, map(abs, trend.now)), default=0.0)
+    healthy, middle, most = (format_limit(x, fault.unit, size)
                              for x in (fault.healthy, fault.acceptable, fault.maintenance))
     name = fault.title.capitalize()
     words = (f"{name} {'requires' if level == Level.MAINTENANCE else 'is'} {level.word.replace('_', '-')}: "
@@ -92,7 +93,7 @@ def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
     items: list[Item] = [
         Line("level", explain_level(trend)),
         *(Line("" if i else "size", text) for i, text in enumerate(_describe_trend(trend, unit))),
-        *(Line(f"{LIMIT_NAMES[level]} ({attach_unit(f'{remaining.limit:g}', fault.unit)})",
+        *(Line(f"{LIMIT_NAMES[level]} ({format_limit(remaining.limit, fault.unit)})",
                _describe_arrival(remaining, trend, unit), medium=Medium.TERMINAL) for level, remaining in left.items()),
         tabulate(
             left, (Column("reaches"), lambda level: LIMIT_NAMES[level]),
@@ -145,7 +146,7 @@ def _describe_growth(trend: Trend, unit: UnitTrend) -> str:
 
 def _describe_break(found: Break, point: Point, size_unit: str, unit: UnitTrend) -> str:
     at = f"{point.trace}, {_collect_place(point.t, unit)}"
-    size = attach_unit(format_digits(abs(found.size), 2), size_unit)
+    size = format_amount(abs(found.size), size_unit, 2)
     side = "above" if found.size > 0 else "below"
     words = {"outlier": f"outlier, left out: {at}, {size} {side} the other traces",
              "step": f"step: from {at} on, the size is {size} larger",

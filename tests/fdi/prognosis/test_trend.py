@@ -96,6 +96,7 @@ def test_few_points() -> None:
                                  "surely at MaxBand (70 N)"),
     (Estimate(30.0, 20.0, 40.0), "its interval comes too near MidBand (35 N) to be acceptable"),
     (Estimate(80.0, 70.0, 90.0), "above MidBand (35 N) and up to MaxBand (70 N) or more"),
+    (Estimate(2e4, 1.9e4, 2.1e4), "now, above MidBand (0.035 kN) and up to MaxBand (0.07 kN)"),
     (Estimate(30.0, 0.0, 60.0), "the interval holds both a healthy unit (5 N) and MidBand (35 N), so the value alone"),
 ])
 def test_a_level_names_its_reason(now: Estimate, words: str) -> None:
