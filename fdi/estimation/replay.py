@@ -826,7 +826,7 @@ def _starts_in_motion(trace: Trace, rows: int = 16, fast: float = 2e-3) -> bool:
     return abs(float(parabola[1] @ first)) > max(fast * trace.scale * trace.period, certain)
 
 
-def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_share: float = 0.98) -> Trace:
+def find_repeat(first: Trace, trace: Trace, model: Model, number: int) -> Trace:
     """A repeat of the prepared run `first`, prepared too and on its rows, which are found by the command.
 
     Args:
@@ -834,7 +834,6 @@ def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_shar
         trace: the repeat as it was recorded.
         model: as for `first`.
         number: of the repeat, for error messages.
-        same_share: share of the rows in which both commands must be the same.
 
     Raises:
         InputError: another command, other cycles, no signal in common, or the same samples.
@@ -846,7 +845,7 @@ def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_shar
     require(ways, source, "t", f"rows as in the trace it repeats; they are {1e3 * trace.period:g} ms apart")
     repeat = ways[0]
     fitting = [late for late in (0, _find_first_move(first) - _find_first_move(repeat))
-               if _measure_agreement(first, repeat, late) >= same_share]
+               if has_same_command(first, repeat, late)]
     require(fitting, source, first.declared.command.name,
             "the command of the trace it repeats; another command is no repeat")
     aligned = _align_repeat(repeat, fitting[0], len(first))
@@ -859,17 +858,17 @@ def _find_first_move(trace: Trace) -> int:
     return int(np.argmax(np.abs(trace.command - trace.command[0]) > SAME_COMMAND_POSITION * trace.scale))
 
 
-def _measure_agreement(one: Trace, other: Trace, late: int, overlap: float = 0.5) -> float:
-    """The share of the common rows in which the other's command, `late` rows later, is that of the one.
+def has_same_command(one: Trace, other: Trace, late: int = 0, overlap: float = 0.5, same_share: float = 0.98) -> bool:
+    """Whether the other's command, `late` rows later, is that of the one in nearly all of the common rows.
 
-    0 if these are less than `overlap` of the one.
+    It is not if these are less than `overlap` of the one.
     """
     a, b = one.command, other.command
     first, last = max(0, late), min(len(a), len(b) + late)
     if last - first < overlap * len(a):
-        return 0.0
+        return False
     same = np.abs(a[first:last] - b[first - late:last - late]) <= SAME_COMMAND_POSITION * one.scale
-    return float(np.mean(same))
+    return bool(np.mean(same) >= same_share)
 
 
 def _align_repeat(trace: Trace, late: int, rows: int) -> Trace:
