@@ -665,9 +665,9 @@ def _check_signals(trace: Trace, model: Model, chosen: Sequence[str], source: ob
         require(not moves or highest - lowest >= signal.faint, source, name,
                 f"values in {signal.unit}; the largest is {highest:g}")
     known = ~np.isnan(trace.command + trace.controlled)
-    if moves and not declared.is_open_loop and known.any():
+    if moves and declared.command.unit == declared.controlled.unit and known.sum() > 1:
         (power, shared), (_, answer) = np.cov(trace.command[known], trace.controlled[known])
-        require(shared**2 < ALIKE_SHARE * power * answer or FOLLOWED[0] * power < abs(shared) < FOLLOWED[1] * power,
+        require(shared**2 <= ALIKE_SHARE * power * answer or FOLLOWED[0] * power < abs(shared) < FOLLOWED[1] * power,
                 source, controlled, f"values in {declared.controlled.unit}; it moves {shared / power:.3g} times as far "
                 f"as {declared.command.name}")
 
