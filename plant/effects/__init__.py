@@ -128,7 +128,8 @@ def effect(port: str, group: Group, *, off: Mapping[str, float] = {}, law: str, 
         more: `shift`, `excludes`, `confused_with`, `revealed_by`, `source`, `plant`, `searched_in` of `Effect`.
 
     Raises:
-        ValueError: unknown port or field, a parameter without default, or a name already taken.
+        ValueError: unknown port, or a name already taken.
+        InputError: unknown field, or a parameter without default or unit.
     """
     if port not in PORTS:
         raise ValueError(f"no port {port!r}; there are {', '.join(PORTS)}")
@@ -156,7 +157,7 @@ def build_effect(function: Law, port: str, group: Group, *, off: Mapping[str, fl
     """The effect of a law, with the arguments of `effect`.
 
     Raises:
-        ValueError: an unknown field, or a parameter without default.
+        InputError: an unknown field, or a parameter without default or unit.
     """
     name = function.__name__
     if isinstance(group, Mapping):
@@ -164,10 +165,11 @@ def build_effect(function: Law, port: str, group: Group, *, off: Mapping[str, fl
     free = group._fields if fitted is None else tuple(fitted)
     if disturbance:
         free = ()
-    if not set(free) <= set(group._fields):
-        raise ValueError(f"fitted are fields of {group.__name__} ({', '.join(group._fields)}), not {', '.join(free)}")
-    if set(group._fields) - set(group._field_defaults):
-        raise ValueError(f"{name}: every parameter needs a default, its off value")
+    require(set(free) <= set(group._fields), f"effect {name}", "fitted",
+            f"fields of {group.__name__} ({', '.join(group._fields)}), not {', '.join(free)}")
+    for field, q in list_quantities(group).items():
+        require(field in group._field_defaults, f"effect {name}", field, "a default, its off value")
+        require(q.unit, f"effect {name}", field, 'Quantity("unit"), "1" for none')
     meaning = {f"{name}.{field}": q for field, q in list_quantities(group).items()}
     absent = {f"{name}.{field}": float(x) for field, x in group._field_defaults.items()}
     names = tuple(f"{name}.{field}" for field in free)
