@@ -157,9 +157,8 @@ def place_faults(faults: Any, kind: Any, where: object = "faults") -> tuple[Faul
         if any(other.key == mine.key for other in placed):
             mine = replace(mine, symbol=mine.name) if not fault.symbol else mine
         for what in (*mine.parameters, mine.key):
-            if what in owners:
-                raise InputError(where, f"faults.{mine.name}", f"a parameter and a symbol of its own; {what} is that "
-                                                               f"of {owners[what]}")
+            require(what not in owners, where, f"faults.{mine.name}",
+                    f"a parameter and a symbol of its own; {what} is that of {owners.get(what)}")
             owners[what] = mine.name
         placed.append(mine)
     return tuple(placed)

@@ -106,8 +106,7 @@ def make_runs(batches: Sequence[Batch], workers: int) -> None:
     equal: dict[Hashable, list[Batch]] = {}
     for batch in batches:
         equal.setdefault(batch.key, []).append(batch)
-    work = [task for group in equal.values() for task in _plan_group(group)]
-    map_in_threads(lambda task: task(), work, workers)
+    map_in_threads(lambda task: task(), [task for group in equal.values() for task in _plan_group(group)], workers)
 
 
 def _plan_group(batches: Sequence[Batch]) -> Iterator[Callable[[], None]]:

@@ -100,8 +100,8 @@ def _gives_same_bits(code: bytes, run: Any, make_arguments: Callable[[], Sequenc
 # The interpreter lock is kept: the call is short, and another thread that gets the lock may keep it for longer.
 def _make_entry(engine: Any, arguments: Sequence[Any]) -> Call:
     """The code in the engine as a function of what `_list_places` gives; it returns 0, or not 0 for an exception."""
-    kinds = [kind for kind, _ in _flatten(arguments)]
-    make = ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *kinds)
+    make = ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p,
+                             *(kind for kind, _ in _flatten(arguments)))
     return make(engine.get_function_address(_SYMBOL))
 
 

@@ -43,8 +43,8 @@ def find_quantity(name: str, where: object = "--set", plant: str = "eha") -> Qua
         InputError: there is no such parameter.
     """
     own = {e.name: e.fitted for e in list_offered_effects(plant) if e.base}.get(name.partition(".")[0])
-    if own and name not in own:
-        raise InputError(where, name, f"{' or '.join(own)}: the parameter that this effect is in this plant")
+    require(not own or name in own, where, name,
+            f"{' or '.join(own or ())}: the parameter that this effect is in this plant")
     return find_field(where, name, find_plant(plant).list_groups())
 
 
@@ -121,8 +121,7 @@ class Model:
 
     def list_changes(self) -> dict[str, float]:
         """The parameters that are not those of the plant's nominal model, and all parameters of its effects."""
-        base = self.kind.nominal
-        return {name: value for name, value in self.values.items() if base.get(name) != value}
+        return {name: value for name, value in self.values.items() if self.kind.nominal.get(name) != value}
 
     def describe_value(self, name: str) -> str:
         """A parameter for people: its SI value with the unit, or the word of a choice."""

@@ -96,8 +96,8 @@ def parse_value(where: object, name: str, quantity: Quantity, value: object) -> 
             raise InputError(where, name, f"{quantity.expected}, not {show_value(value)}") from None
     if isinstance(value, bool) or not isinstance(value, (int, float)) or abs(value) > 1e308:
         raise InputError(where, name, f"{quantity.expected}, not {show_value(value)}")
-    if quantity.refuses(float(value)) or (quantity.words and float(value) not in quantity.words.values()):
-        raise InputError(where, name, f"{quantity.expected}, not {value:g}")
+    require(not quantity.refuses(float(value)) and float(value) in (quantity.words.values() or (value,)), where, name,
+            f"{quantity.expected}, not {value:g}")
     return float(value)
 
 
@@ -118,8 +118,7 @@ def find_field(where: object, name: str, groups: Mapping[str, type[Any]]) -> Qua
 
 
 def _suggest_nearest(word: str, known: Mapping[str, Any]) -> str:
-    listed = f" ({', '.join(known)})" if len(known) < 8 else ""
-    return suggest_name(word, known) or listed
+    return suggest_name(word, known) or (f" ({', '.join(known)})" if len(known) < 8 else "")
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from plant.compile import find_fields_of
 from plant.errors import InputError, count_nouns, require, suggest_name
-from plant.faults import Fault
+from plant.faults import Fault, place_faults
 from plant.quantity import Quantity, list_quantities
 from plant.segments import Segment, build_profile
 from plant.user_code import explain_errors
@@ -135,14 +135,22 @@ def find_divergence(model: Model, columns: Mapping[str, NDArray[np.float64]]) ->
 
 
 def check_behaviour(model: Model) -> Iterator[Finding]:
-    """The checks of a plant over its nominal test, one after the other."""
+    """The checks of a plant over its nominal test, one after the other.
+
+    Raises:
+        InputError: faults that contradict their range or each other, or a demand that is larger than the largest.
+    """
     from plant.lanes import Lanes
     from plant.run import simulate
     from plant.selftest import check_effect
 
     kind = model.kind
+    demanded, where = kind.signals.command, kind.file or kind.name
+    place_faults(kind.faults, kind, where)
     period = model["controller.period"]
     command = build_profile(kind.profile, rate=round(1.0 / period)).command
+    require(np.abs(command).max() <= demanded.largest, where, "profile", f"demands of at most {demanded.largest:g} "
+            f"{demanded.unit} either way, the largest of the signal {demanded.name}, not {np.abs(command).max():g}")
     quiet = model.replace({s.noise: 0.0 for s in kind.signals.outputs if s.noise})
 
     def run(steps: int | None = None, rows: int = len(command), *, fast: bool = True) -> dict[str, Any]:
@@ -154,7 +162,7 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
     if diverged:
         return
     silent = [s.name for s in kind.signals.outputs if np.ptp(once[s.name]) == 0.0]
-    yield Finding("signals", not silent, f"{', '.join(silent)} never change" if silent else "every output changes")
+    yield Finding("signals", not silent, f"no change of {', '.join(silent)}" if silent else "every output changes")
     compiled, plain = run(20, 300), run(20, 300, fast=False)
     same = all(np.array_equal(compiled[name], plain[name]) for name in compiled)
     yield Finding("compiled code", same, "the bits of plain Python" if same else "differs from plain Python")
@@ -169,9 +177,9 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
     idle, lanes = 0.0 * push, Lanes(quiet, ())
     left, moved, pushed = (lanes.replay(np.empty((1, 0)), drive, idle, position)[0, :, 0]
                            for drive, position in ((idle, None), (idle, there), (push, None)))
-    springs_back = abs(pushed[-1]) < MOST_STRAY * abs(pushed[PUSHED_ROWS])
     apart = (moved - left)[-1]
-    kept = bool(springs_back or abs(apart - there[0]) <= MOST_STRAY * there[0])
+    kept = bool(abs(apart - there[0]) <= MOST_STRAY * there[0]
+                or abs(pushed[-1]) < MOST_STRAY * abs(pushed[PUSHED_ROWS]))  # it springs back
     yield Finding("moves", kept, "the plant stays where a replay moves it" if kept else
                   f"moved by {there[0]:.3g} {kind.signals.controlled.unit}, the plant goes to {apart:.3g}: "
                   "every field of the state has to move along, a motor's angle by the gear ratio")

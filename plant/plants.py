@@ -178,8 +178,7 @@ class Plant:
         whole = [f for f in (self.step, self.sense, *(v for v, _ in self.variants.values())) if f is not None]
         found = {name[3:]: g.port for f in whole for name, g in find_called_functions(f).items() if hasattr(g, "port")}
         ordered = sorted(found.items(), key=lambda item: item[1].number)
-        unit = self.signals.controlled.unit
-        command, reading = (f.port._replace(unit=unit) for f in (at_command, at_reading))
+        command, reading = (f.port._replace(unit=self.signals.controlled.unit) for f in (at_command, at_reading))
         return {"command": command, **dict(ordered), "reading": reading}
 
     @cached_property
@@ -426,8 +425,7 @@ def load_plant(path: Path, source: bytes | None = None, key: str = "") -> Plant:
     known = _LOADED.get(key)
     if known is not None and (known.file, known.source) == (path, code):
         return known
-    module = run_file(path, code)
-    plant = replace(find_declared_plant(module, path.stem, path, key), source=code)
+    plant = replace(find_declared_plant(run_file(path, code), path.stem, path, key), source=code)
     before, _LOADED[key] = known, plant
     try:
         check_declaration(plant, path)

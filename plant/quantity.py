@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 class Quantity(NamedTuple):
     """Unit, symbol and range of a number. `low` and `high` are allowed; `above` and `below` are not."""
 
-    unit: str
+    unit: str = ""  # "1" for none
     symbol: str = ""  # as in the source paper, where it has one
     low: float = -math.inf
     high: float = math.inf

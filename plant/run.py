@@ -171,6 +171,11 @@ def report_law_errors(model: Model) -> Iterator[None]:
         if told is not None:
             raise told from error
         where, cause = found or (model.kind.file or "effects", error)
+        # s and c are names of the loops in plant.solve
+        unlike = re.search(r"Cannot unify (.+) and (.+) for '([sc])\b", str(cause).replace("float64", "number"))
+        if unlike:
+            raise InputError(where, "step" if unlike[3] == "s" else "control", "a function that gives back what it "
+                             f"gets, all fields written out: {unlike[1]}, not {unlike[2]}") from error
         said = next((line.strip() for line in reversed(str(cause).splitlines()) if line.strip()), "")
         raise InputError(where, ", ".join(model.effects),
                          f"laws that can be compiled and run ({type(cause).__name__}: {said})") from error
@@ -195,8 +200,8 @@ def find_compile_error(error: Exception) -> InputError | None:
 
 def _find_law_error(model: Model) -> tuple[str, Exception] | None:
     """The same mistake as Python tells it, with file and line, if it makes it too: numba says neither."""
-    laws = [*model.kind.list_laws(model.effects), model.kind.step]
-    files = {law.__code__.co_filename for law in laws if law is not None}
+    files = {law.__code__.co_filename for law in (*model.kind.list_laws(model.effects), model.kind.step)
+             if law is not None}
     try:
         step = build_kernel(step_cycle, model.effects, False, model.plant)
         step(*model.build_start(), 0.0, 0.0, 0.0, 0.0, model.build_record(), 1)

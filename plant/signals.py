@@ -4,6 +4,7 @@ from __future__ import annotations
 from math import inf
 from typing import Any, NamedTuple
 
+from plant.errors import require
 from plant.units import UNITS
 
 ROLES = ("time", "command", "drive", "load", "output")
@@ -66,15 +67,17 @@ class Signals(tuple[Signal, ...]):
         """The signals with time in front.
 
         Raises:
-            ValueError: two of one name, an unknown role, or not exactly one command, one drive and at least one output.
+            InputError: two of one name, an unknown role, or not exactly one command, one drive and at least one output.
         """
         made = super().__new__(cls, (Signal("t", "t", "s", "time", "time"), *declared))
+        for s in made:
+            require(s.role in ROLES, f"signal {s.name}", "role", f"one of {', '.join(ROLES[1:])}, not {s.role!r}")
+            require(sum(other.name == s.name for other in made) == 1, f"signal {s.name}", "name",
+                    "a name that no other signal has")
         for role, most in (("time", 1), ("command", 1), ("drive", 1), ("load", 1), ("output", 99)):
             found = [s.name for s in made if s.role == role]
-            if len(found) > most or (not found and role != "load"):
-                raise ValueError(f"expected {'one signal' if most == 1 else 'signals'} of role {role}, not {found}")
-        if len({s.name for s in made}) < len(made) or not {s.role for s in made} <= set(ROLES):
-            raise ValueError(f"expected different names, and roles of {', '.join(ROLES)}: {', '.join(map(repr, made))}")
+            require(len(found) <= most and (found or role == "load"), "signals", "",
+                    f"{'one signal' if most == 1 else 'signals'} of role {role}, not {', '.join(found) or 'none'}")
         return made
 
     def __getnewargs__(self) -> tuple[Signal, ...]:

@@ -46,8 +46,7 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None, plant
     """
     if effect.starts or not effect.fitted:
         return effect.starts
-    nominal = find_plant(plant).nominal
-    usual = {name: effect.off.get(name, nominal.get(name, 0.0)) for name in effect.fitted}
+    usual = {name: effect.off.get(name, find_plant(plant).nominal.get(name, 0.0)) for name in effect.fitted}
     sized = {name: sizes for name, off in usual.items()
              if (sizes := _find_sizes(effect, name, off, command, load, plant))}
     found = [usual | {name: size} for name, sizes in sized.items() for size in sizes]

@@ -80,7 +80,7 @@ def choose_faults(source: str | Path | None, kind: Plant) -> tuple[Fault, ...]:
         InputError: no such list, or faults that the plant cannot have.
     """
     if source is None and kind.faults:
-        return place_faults(kind.faults, kind, kind.name)
+        return place_faults(kind.faults, kind, kind.file or kind.name)
     require(source is not None or kind == find_plant("eha"), "--faults", "",
             f"a fault file: the plant {kind.name} brings no faults of its own")
     return load_faults(source or "paper", kind)

@@ -11,6 +11,7 @@ from fdi.estimation.replay import (
     SAME_PERIOD,
     compute_residuals,
     find_repeat,
+    has_same_command,
     hold_inputs,
     match_period,
     prepare_trace,
@@ -58,7 +59,10 @@ def read_runs(model: Model, trace: str | Trace, repeats: Sequence[str | Trace] =
         first, *left = (compute_residuals(run, replay_current(run, model)) for run in (est, *others))
         doubt = describe_doubtful_repeats(find_floors(first, left, est.period), sensor_floors(est, model),
                                           est.declared)
-    return Runs(model, est, others, unseen, tuple(sources), (*est.notes, *([doubt] if doubt else [])))
+    is_alike = unseen is not None and has_same_command(est, unseen)
+    return Runs(model, est, others, unseen, tuple(sources), (*est.notes, *([doubt] if doubt else []), *(
+        ["the held-out run has the command of the run: it shows overfitting less than another command"] if is_alike
+        else [])))
 
 
 def read_traces(given: Sequence[str | Trace], model: Model) -> tuple[list[Trace], list[Source]]:

@@ -89,8 +89,7 @@ def replay_lanes(lanes: Lanes, values: Floats, trace: Trace, current: Floats | N
 
 def replay_current(trace: Trace, model: Model, steps: int = REPLAY_STEPS, anchor: float = ANCHOR_RATE) -> Columns:
     """The outputs, (n,) each, of the plant driven by the measured current, without noise."""
-    lanes = Lanes(silence_sensors(model), (), steps)
-    out = replay_lanes(lanes, np.empty((1, 0)), trace, anchor=anchor)
+    out = replay_lanes(Lanes(silence_sensors(model), (), steps), np.empty((1, 0)), trace, anchor=anchor)
     return {name: out[0, :, i] for i, name in enumerate(trace.output_names)}
 
 
@@ -522,6 +521,9 @@ SAME_PERIOD = 0.01  # of a period: two periods that differ by less are the same
 BRIDGED_ROWS = 5  # of missing current that are interpolated; longer gaps are left out
 STILL = 5e-5  # m; a ram that moves further than that moves every sensor
 LIMIT_TIMES = {"command": 5.0, "output": 3.0, "drive": 20.0}  # by role: more times its limit is another unit
+LARGEST_TIMES = 2.0  # more times the largest demand or load that the plant declares is another unit
+FOLLOWED = (1 / 300, 30.0)  # of the demand, by a controlled signal in its own unit; a jammed one hardly follows
+ALIKE_SHARE = 0.8  # of the power of the controlled signal, from which on it follows the demand
 
 
 def prepare_trace(trace: Trace, model: Model, outputs: Sequence[str] | None = None, source: object = "trace") -> Trace:
@@ -584,9 +586,8 @@ def match_period(model: Model, trace: Trace, tolerance: float = 0.0) -> Model:
     if own == trace.period or abs(own / trace.period - 1.0) < tolerance:
         return model
     shortest, longest = PERIODS
-    if not shortest <= trace.period <= longest:
-        raise InputError("trace", "t", f"one row a controller cycle, {1e3 * shortest:g} to {1e3 * longest:g} ms apart; "
-                                       f"these rows are {1e3 * trace.period:.4g} ms apart")
+    require(shortest <= trace.period <= longest, "trace", "t", f"one row a controller cycle, {1e3 * shortest:g} to "
+            f"{1e3 * longest:g} ms apart; these rows are {1e3 * trace.period:.4g} ms apart")
     return replace(model, values={**model.values, "controller.period": trace.period})
 
 
@@ -625,9 +626,8 @@ def read_cycles(trace: Trace, model: Model, outputs: Sequence[str] | None = None
 def _choose_outputs(trace: Trace, outputs: Sequence[str] | None, source: object) -> tuple[str, ...]:
     declared = trace.declared
     for name in declared.required:
-        if name not in trace.signals:
-            words = f"{declared.drive.symbol}, {declared.command.symbol} and {declared.controlled.symbol}"
-            raise InputError(source, name, f"a measured column: a replay starts from {words}")
+        require(name in trace.signals, source, name, "a measured column: a replay starts from "
+                f"{declared.drive.symbol}, {declared.command.symbol} and {declared.controlled.symbol}")
     require(len(trace) >= FEWEST_ROWS, source, "t", f"at least {FEWEST_ROWS} rows, not {len(trace)}")
     measured = [name for name in trace.output_names if name in trace.signals]
     for name in outputs or ():
@@ -640,28 +640,36 @@ def _check_signals(trace: Trace, model: Model, chosen: Sequence[str], source: ob
     """Refuse another plant's recordings, other units and dead sensors."""
     declared = trace.declared
     recorded = trace.provenance.get("plant", "")
-    if (recorded in MODULES and recorded != model.plant) or declared.names != model.kind.signals.names:
-        own = (f"{recorded}, whose rig recorded this" if recorded else
-               f"a plant with the signals {', '.join(declared.names)}")
-        raise InputError(source, "--model", f"{own}, not {model.plant}")
-    if trace.period > 50 * model["controller.period"]:
-        raise InputError(source, "t", f"times in s, one row a cycle; the rows are {trace.period:g} s apart")
+    own = (f"{recorded}, whose rig recorded this" if recorded else
+           f"a plant with the signals {', '.join(declared.names)}")
+    require((recorded not in MODULES or recorded == model.plant)
+            and declared.names == model.kind.signals.names, source, "--model", f"{own}, not {model.plant}")
+    require(trace.period <= 50 * model["controller.period"], source, "t",
+            f"times in s, one row a cycle; the rows are {trace.period:g} s apart")
     for signal in declared[1:]:
         largest = float(np.nanmax(np.abs(trace.column(signal.name)))) if signal.name in trace.signals else 0.0
         if largest > LIMIT_TIMES.get(signal.role, math.inf) * model.values.get(signal.limit, math.inf):
-            times = largest / model[signal.limit]
             raise InputError(source, signal.name, f"values in {signal.unit}; the largest, {largest:g}, is "
-                                                  f"{times:.0f} times {signal.limit}")
+                                                  f"{largest / model[signal.limit]:.0f} times {signal.limit}")
+        require(largest <= LARGEST_TIMES * signal.largest, source, signal.name, f"values in {signal.unit}, of which "
+                f"the plant declares {signal.largest:g} as the largest; here it is {largest:g}")
     moves = float(np.nanmax(trace.command) - np.nanmin(trace.command)) > STILL * trace.scale
-    for name in chosen:
-        values, signal, controlled = trace.column(name), declared.find(name), declared.controlled.name
+    drive, controlled = declared.drive.name, declared.controlled.name
+    for name in (drive, *chosen):
+        values, signal = trace.column(name), declared.find(name)
         lowest, highest = float(np.nanmin(values)), float(np.nanmax(values))
         if lowest == highest and (moves or name == controlled):
             without = ",".join(other for other in chosen if other != name) or controlled
-            hint = "" if name == controlled else f" (--signals {without} leaves it out)"
+            hint = "" if name in (drive, controlled) else f" (--signals {without} leaves it out)"
             raise InputError(source, name, f"a signal that changes; it is {lowest:g} throughout{hint}")
-        if moves and highest - lowest < signal.faint:
-            raise InputError(source, name, f"values in {signal.unit}; the largest is {highest:g}")
+        require(not moves or highest - lowest >= signal.faint, source, name,
+                f"values in {signal.unit}; the largest is {highest:g}")
+    known = ~np.isnan(trace.command + trace.controlled)
+    if moves and declared.command.unit == declared.controlled.unit and known.sum() > 1:
+        (power, shared), (_, answer) = np.cov(trace.command[known], trace.controlled[known])
+        require(shared**2 <= ALIKE_SHARE * power * answer or FOLLOWED[0] * power < abs(shared) < FOLLOWED[1] * power,
+                source, controlled, f"values in {declared.controlled.unit}; it moves {shared / power:.3g} times as far "
+                f"as {declared.command.name}")
 
 
 def _take_rows(trace: Trace, chosen: Sequence[str]) -> Trace:
@@ -749,9 +757,8 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
         what = f"{d.drive.phrase} is at work" if works else f"{d.controlled.phrase} already moves"
         notes.append(f"the {what} in the first row: the first {start * rows.period:g} s are not judged")
         usable[:start] = False
-    if usable.sum() < FEWEST_ROWS:
-        raise InputError(source, rows.declared.drive.name,
-                         f"at least {FEWEST_ROWS} rows that can be replayed, not {int(usable.sum())}")
+    require(usable.sum() >= FEWEST_ROWS, source, rows.declared.drive.name,
+            f"at least {FEWEST_ROWS} rows that can be replayed, not {int(usable.sum())}")
     return rows.with_inputs(_fill_demand(rows.command, 2e-4 * rows.scale), drive, hold_last(rows.load),
                             usable=usable, filled=missing, notes=(*rows.notes, *notes), slack=_find_slack(trace))
 
@@ -819,7 +826,7 @@ def _starts_in_motion(trace: Trace, rows: int = 16, fast: float = 2e-3) -> bool:
     return abs(float(parabola[1] @ first)) > max(fast * trace.scale * trace.period, certain)
 
 
-def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_share: float = 0.98) -> Trace:
+def find_repeat(first: Trace, trace: Trace, model: Model, number: int) -> Trace:
     """A repeat of the prepared run `first`, prepared too and on its rows, which are found by the command.
 
     Args:
@@ -827,7 +834,6 @@ def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_shar
         trace: the repeat as it was recorded.
         model: as for `first`.
         number: of the repeat, for error messages.
-        same_share: share of the rows in which both commands must be the same.
 
     Raises:
         InputError: another command, other cycles, no signal in common, or the same samples.
@@ -839,7 +845,7 @@ def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_shar
     require(ways, source, "t", f"rows as in the trace it repeats; they are {1e3 * trace.period:g} ms apart")
     repeat = ways[0]
     fitting = [late for late in (0, _find_first_move(first) - _find_first_move(repeat))
-               if _measure_agreement(first, repeat, late) >= same_share]
+               if has_same_command(first, repeat, late)]
     require(fitting, source, first.declared.command.name,
             "the command of the trace it repeats; another command is no repeat")
     aligned = _align_repeat(repeat, fitting[0], len(first))
@@ -852,17 +858,17 @@ def _find_first_move(trace: Trace) -> int:
     return int(np.argmax(np.abs(trace.command - trace.command[0]) > SAME_COMMAND_POSITION * trace.scale))
 
 
-def _measure_agreement(one: Trace, other: Trace, late: int, overlap: float = 0.5) -> float:
-    """The share of the common rows in which the other's command, `late` rows later, is that of the one.
+def has_same_command(one: Trace, other: Trace, late: int = 0, overlap: float = 0.5, same_share: float = 0.98) -> bool:
+    """Whether the other's command, `late` rows later, is that of the one in nearly all of the common rows.
 
-    0 if these are less than `overlap` of the one.
+    It is not if these are less than `overlap` of the one.
     """
     a, b = one.command, other.command
     first, last = max(0, late), min(len(a), len(b) + late)
     if last - first < overlap * len(a):
-        return 0.0
+        return False
     same = np.abs(a[first:last] - b[first - late:last - late]) <= SAME_COMMAND_POSITION * one.scale
-    return float(np.mean(same))
+    return bool(np.mean(same) >= same_share)
 
 
 def _align_repeat(trace: Trace, late: int, rows: int) -> Trace:

@@ -380,6 +380,15 @@ class Trend:
     remaining: Mapping[str, Remaining]  # by the level that begins there; {} if too few
     past: Curve | None
     future: Curve | None
+    declared: Fault | None = None  # of a fault that falls, which the trend follows by its distance from a healthy unit
+
+    @property
+    def stated(self) -> tuple[Fault, Estimate]:
+        """The fault and its size now, as its file states sizes."""
+        if self.declared is None:
+            return self.fault, self.now
+        value, *ends = map(self.declared.place_size, self.now)
+        return self.declared, Estimate(value, min(ends), max(ends))
 
     @property
     def level(self) -> Level:

@@ -8,7 +8,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,7 +52,8 @@ def follow_unit(gathered: Gathered) -> UnitTrend:
     t = [point.t for point in gathered.points]
     trends = (fit_trend(fault.turn_up(), t, [measure_departures(fault, point.sizes[fault.name])
                                              for point in gathered.points]) for fault in gathered.faults)
-    return UnitTrend(gathered, tuple(trends))
+    return UnitTrend(gathered, tuple(replace(trend, declared=fault if fault.falls else None)
+                                     for trend, fault in zip(trends, gathered.faults, strict=True)))
 
 
 def read_points(path: Path, faults: Sequence[Fault] | None = None) -> Gathered:

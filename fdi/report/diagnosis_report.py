@@ -48,11 +48,10 @@ from fdi.report.drawing import (
 )
 from fdi.report.numbers import (
     NO_NUMBER,
-    attach_unit,
     choose_unit,
     format_amount,
-    format_digits,
     format_interval,
+    format_limit,
     format_ratio,
     join_words,
 )
@@ -236,8 +235,7 @@ def format_limits_of_fault(fault: Fault) -> tuple[str, ...]:
     >>> format_limits_of_fault(FAULTS[1])
     ('35 N', '70 N')
     """
-    return tuple(f"{size / scale:g} {unit}".rstrip() for size in (fault.acceptable, fault.maintenance)
-                 for scale, unit in [choose_unit(fault.unit, abs(size))])
+    return tuple(format_limit(size, fault.unit) for size in (fault.acceptable, fault.maintenance))
 
 
 def describe_residual(d: Diagnosis) -> str:
@@ -262,7 +260,7 @@ def list_overruled(d: Diagnosis, far: float = 2.0) -> Iterator[str]:
         if (grid := _find_grid(d.grids, fault)) is not None:
             found, axis = grid.find_size(fault, grid.merged), grid.axes[grid.faults.index(fault)]
             if max(size.low - found, found - size.high) > far * float(axis[1] - axis[0]):
-                said.append(f"the grid gives {attach_unit(format_digits(found), fault.unit)}")
+                said.append(f"the grid gives {format_amount(found, fault.unit)}")
         if said:
             yield (f"{fault.title}: {' and '.join(said)}; the fit, which alone models the whole plant, finds "
                    f"{fault.symbol} {format_interval(*size, fault.unit)}{beside}. {trust}.")
@@ -483,8 +481,7 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
 
 def _name_limit(fault: Fault) -> str:
     """MidBand of a fault: "FSS 35 N"."""
-    scale, unit = choose_unit(fault.unit, abs(fault.acceptable))
-    return f"{fault.symbol} {fault.acceptable / scale:g} {unit}".rstrip()
+    return f"{fault.symbol} {format_limit(fault.acceptable, fault.unit)}"
 
 
 def collect_data(d: Diagnosis) -> dict[str, Any]:

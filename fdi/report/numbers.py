@@ -112,13 +112,14 @@ def choose_unit(unit: str, size: float) -> tuple[float, str]:
     return next((found for found in reversed(known) if size >= found[0]), known[0])
 
 
-def attach_unit(text: str, unit: str) -> str:
-    """A number with its unit; without one where the unit is 1.
+def format_limit(value: float, unit: str, size: float | None = None) -> str:
+    """An SI value as somebody has declared it, in the unit that people use for a `size` (default: its own).
 
-    >>> attach_unit("35", "N"), attach_unit("0.25", "1")
-    ('35 N', '0.25')
+    >>> format_limit(35.0, "N"), format_limit(5e-5, "m"), format_limit(5e-5, "m", 2e-3), format_limit(0.25, "1")
+    ('35 N', '50 um', '0.05 mm', '0.25')
     """
-    return text if unit == "1" else f"{text} {unit}"
+    scale, name = choose_unit(unit, abs(value if size is None else size))
+    return f"{value / scale:g} {name}".rstrip()
 
 
 def format_duration(seconds: float) -> str:

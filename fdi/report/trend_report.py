@@ -30,7 +30,7 @@ from fdi.report.drawing import (
     level,
     line,
 )
-from fdi.report.numbers import attach_unit, format_digits, format_interval
+from fdi.report.numbers import format_amount, format_interval, format_limit
 from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Mood, Report, Section, tabulate
 from fdi.thresholds import TREND_FEWEST_TRACES, TREND_MOST_TRACES
 from plant.errors import count_nouns
@@ -66,24 +66,26 @@ def build_trend_report(unit: UnitTrend) -> Report:
 
 def explain_level(trend: Trend) -> str:
     """Why a fault has its level: its size now, beside the limits that decide."""
-    fault, level = trend.fault, trend.level
-    healthy, middle, most = (attach_unit(f"{x:g}", fault.unit)
+    (fault, now), level = trend.stated, trend.level
+    size = max(filter(math.isfinite, map(abs, now)), default=0.0)
+    healthy, middle, most = (format_limit(x, fault.unit, size)
                              for x in (fault.healthy, fault.acceptable, fault.maintenance))
-    name = fault.title.capitalize()
-    words = (f"{name} {'requires' if level == Level.MAINTENANCE else 'is'} {level.word.replace('_', '-')}: "
-             f"{format_interval(*trend.now, fault.unit)} now")
+    within, beyond = ("above", "below") if fault.falls else ("below", "above")
+    words = (f"{fault.title.capitalize()} {'requires' if level == Level.MAINTENANCE else 'is'} "
+             f"{level.word.replace('_', '-')}: {format_interval(*now, fault.unit)} now")
     reasons = (
-        (judge_size(fault, trend.now) is None,
+        (judge_size(trend.fault, trend.now) is None,
          f"; the interval holds both a healthy unit ({healthy}) and MidBand ({middle}), so the value alone decides"),
-        (level == Level.ACCEPTABLE, f", below MidBand ({middle})"),
-        (level == Level.NON_NOMINAL, f", above MidBand ({middle}) and up to MaxBand ({most}) or more"),
-        (trend.now.value >= fault.acceptable, f", above MidBand ({middle}), not surely at MaxBand ({most})"),
+        (level == Level.ACCEPTABLE, f", {within} MidBand ({middle})"),
+        (level == Level.NON_NOMINAL, f", {beyond} MidBand ({middle}) and at MaxBand ({most}) or {beyond}"),
+        (trend.now.value >= trend.fault.acceptable,
+         f", {beyond} MidBand ({middle}), not surely at MaxBand ({most})"),
         (True, f"; its interval comes too near MidBand ({middle}) to be acceptable"))
     return words + next(reason for holds, reason in reasons if holds)
 
 
 def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
-    fault = trend.fault
+    fault, _ = trend.stated
     left, span = trend.remaining, float(trend.t[-1] - trend.t[0])
 
     def show_date(level: str, limit: str) -> str:
@@ -92,7 +94,7 @@ def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
     items: list[Item] = [
         Line("level", explain_level(trend)),
         *(Line("" if i else "size", text) for i, text in enumerate(_describe_trend(trend, unit))),
-        *(Line(f"{LIMIT_NAMES[level]} ({attach_unit(f'{remaining.limit:g}', fault.unit)})",
+        *(Line(f"{LIMIT_NAMES[level]} ({format_limit(fault.place_size(remaining.limit), fault.unit)})",
                _describe_arrival(remaining, trend, unit), medium=Medium.TERMINAL) for level, remaining in left.items()),
         tabulate(
             left, (Column("reaches"), lambda level: LIMIT_NAMES[level]),
@@ -125,13 +127,14 @@ def _describe_trend(trend: Trend, unit: UnitTrend) -> list[str]:
     ranked = sorted(trend.laws.items(), key=lambda item: -item[1]) if trend.verdict == "TREND" else []
     laws = ", ".join(f"{law} {100 * p:.0f} %" for law, p in ranked if p >= 0.005)
     return [_describe_growth(trend, unit),
-            *(_describe_break(b, points[b.row], trend.fault.unit, unit) for b in trend.breaks),
+            *(_describe_break(b, points[b.row], trend.stated[0], unit) for b in trend.breaks),
             *([f"only the latest {TREND_MOST_TRACES} traces are used"] if is_cut else []),
             *([f"growth law: {laws}"] if laws else [])]
 
 
 def _describe_growth(trend: Trend, unit: UnitTrend) -> str:
-    state = f"{trend.fault.symbol} {format_interval(*trend.now, trend.fault.unit)} now"
+    fault, now = trend.stated
+    state = f"{fault.symbol} {format_interval(*now, fault.unit)} now"
     if trend.verdict == "TOO_FEW":
         reasons = {1: "one trace shows no growth", 2: "two traces fit every growth law"}
         reason = reasons.get(int(trend.used.sum()), "all traces have the same date")
@@ -139,20 +142,21 @@ def _describe_growth(trend: Trend, unit: UnitTrend) -> str:
     if trend.verdict == "NO_TREND" or trend.rate is None:
         return f"{state}; no trend: the probability that nothing grows is {100 * trend.laws['none']:.0f} %"
     period, length = {"days": ("month", 30.44), "h": ("100 h", 100.0), "flights": ("100 flights", 100.0)}[unit.unit]
-    rate = Estimate(*(length * x for x in trend.rate))
-    return f"{state}; grows by {format_interval(*rate, trend.fault.unit)} per {period}"
+    return (f"{state}; {'falls' if fault.falls else 'grows'} by "
+            f"{format_interval(*Estimate(*(length * x for x in trend.rate)), fault.unit)} per {period}")
 
 
-def _describe_break(found: Break, point: Point, size_unit: str, unit: UnitTrend) -> str:
+def _describe_break(found: Break, point: Point, fault: Fault, unit: UnitTrend) -> str:
     at = f"{point.trace}, {_collect_place(point.t, unit)}"
-    size = attach_unit(format_digits(abs(found.size), 2), size_unit)
-    side = "above" if found.size > 0 else "below"
+    size = format_amount(abs(found.size), fault.unit, 2)
+    side = "above" if (found.size > 0) != fault.falls else "below"
     words = {"outlier": f"outlier, left out: {at}, {size} {side} the other traces",
-             "step": f"step: from {at} on, the size is {size} larger",
-             "repair": f"repair: at {at} the size drops by {size}; the trend starts there"}
-    meaning = {"above": "an outlier, a step or faster growth; each gets a probability of one third",
-               "below": "an outlier or a repair; it is left out"}
-    last = f"the last trace is {size} {side} the others: {meaning[side]}; another trace would decide"
+             "step": f"step: from {at} on, the size is {size} {'smaller' if fault.falls else 'larger'}",
+             "repair": f"repair: at {at} the size {'rises' if fault.falls else 'drops'} by {size}; the trend starts "
+                       "there"}
+    meaning = {True: "an outlier, a step or faster growth; each gets a probability of one third",
+               False: "an outlier or a repair; it is left out"}
+    last = f"the last trace is {size} {side} the others: {meaning[found.size > 0]}; another trace would decide"
     return words.get(found.kind, last)
 
 

@@ -1,6 +1,5 @@
 """Command files: the demand of a test, and the load on the plant, as columns of a CSV text."""
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from fdi.trace.csv_table import (
 )
 from plant.errors import InputError, require
 from plant.segments import LONGEST, RATE, Array, resample_on_cycles
-from plant.signals import EHA, Signals
+from plant.signals import EHA, Signal, Signals
 from plant.tables import read_file
 
 
@@ -49,17 +48,19 @@ def parse_columns(data: bytes, where: object, period: float = 1 / RATE, signals:
         titles = [title.lower() for title in split_line(stream.readline(), ",")]
     require("t" in titles, where, "line 1", "a header with a column t and commas between columns")
     load = signals.load
-    known = [("t", "t", math.inf), ("com", signals.command.name, signals.command.largest), ("value", "value", math.inf),
-             *([("load", load.name, load.largest)] if load else [])]
-    picked = [(key, name.lower(), most) for key, name, most in known if name.lower() in titles]
+    plain = Signal("", "", "", "")
+    known = [("t", "t", plain), ("com", signals.command.name, signals.command), ("value", "value", plain),
+             *([("load", load.name, load)] if load else [])]
+    picked = [(key, name.lower(), signal) for key, name, signal in known if name.lower() in titles]
     columns = read_columns(data, Layout("utf-8-sig", ",", ".", tuple(titles), 1, 2), [name for _, name, _ in picked],
                            where=where)
     t = columns["t"]
     require_growth(t, where, "t")
     _refuse_row(data, where, "t", t, t - t[0] > LONGEST, f"seconds, and at most {LONGEST:g} of them")
-    for key, name, most in picked:
-        _refuse_row(data, where, key, columns[name], ~np.isfinite(columns[name]), "a finite number")
-        _refuse_row(data, where, key, columns[name], np.abs(columns[name]) > most, f"at most {most:g} either way")
+    for _, name, signal in picked:
+        _refuse_row(data, where, name, columns[name], ~np.isfinite(columns[name]), "a finite number")
+        _refuse_row(data, where, name, columns[name], np.abs(columns[name]) > signal.largest,
+                    f"at most {signal.largest:g} {signal.unit} either way")
     return {key: resample_on_cycles(t, columns[name], period) for key, name, _ in picked if key != "t"}
 
 

@@ -48,7 +48,9 @@ def read_csv(path: Path, signals: Signals) -> tuple[dict[str, Floats], tuple[str
     required = ("t", *signals.required)
     possible = (*required, *(name for name in signals.names if name not in required))
     for name in required:
-        require(name in names, f"{path}: line 1", name, f"a column of this name in the header {','.join(possible)}")
+        hint = "" if len(names) > 1 else " (commas separate columns; rig import reads other separators)"
+        require(name in names, f"{path}: line 1", name,
+                f"a column of this name; the header is {','.join(names)[:200]!r}{hint}")
     return *_read_known(path, names, ",", [name for name in possible if name in names]), "", signals
 
 

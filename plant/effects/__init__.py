@@ -22,7 +22,7 @@ from typing import Any
 from plant.compile import Function
 from plant.errors import require
 from plant.friction import clip, play, soften
-from plant.parameters import GROUPS
+from plant.parameters import GROUPS, find_field
 from plant.ports import PORTS, chain_laws
 from plant.quantity import Quantity, list_quantities, make_group
 from plant.state import Drag, Held, Lag, Line, Memory
@@ -128,7 +128,8 @@ def effect(port: str, group: Group, *, off: Mapping[str, float] = {}, law: str, 
         more: `shift`, `excludes`, `confused_with`, `revealed_by`, `source`, `plant`, `searched_in` of `Effect`.
 
     Raises:
-        ValueError: unknown port or field, a parameter without default, or a name already taken.
+        ValueError: unknown port, or a name already taken.
+        InputError: unknown field, or a parameter without default or unit.
     """
     if port not in PORTS:
         raise ValueError(f"no port {port!r}; there are {', '.join(PORTS)}")
@@ -156,7 +157,7 @@ def build_effect(function: Law, port: str, group: Group, *, off: Mapping[str, fl
     """The effect of a law, with the arguments of `effect`.
 
     Raises:
-        ValueError: an unknown field, or a parameter without default.
+        InputError: an unknown field, or a parameter without default or unit.
     """
     name = function.__name__
     if isinstance(group, Mapping):
@@ -164,10 +165,11 @@ def build_effect(function: Law, port: str, group: Group, *, off: Mapping[str, fl
     free = group._fields if fitted is None else tuple(fitted)
     if disturbance:
         free = ()
-    if not set(free) <= set(group._fields):
-        raise ValueError(f"fitted are fields of {group.__name__} ({', '.join(group._fields)}), not {', '.join(free)}")
-    if set(group._fields) - set(group._field_defaults):
-        raise ValueError(f"{name}: every parameter needs a default, its off value")
+    require(set(free) <= set(group._fields), f"effect {name}", "fitted",
+            f"fields of {group.__name__} ({', '.join(group._fields)}), not {', '.join(free)}")
+    for field, q in list_quantities(group).items():
+        require(field in group._field_defaults, f"effect {name}", field, "a default, its off value")
+        require(q.unit, f"effect {name}", field, 'Quantity("unit"), "1" for none')
     meaning = {f"{name}.{field}": q for field, q in list_quantities(group).items()}
     absent = {f"{name}.{field}": float(x) for field, x in group._field_defaults.items()}
     names = tuple(f"{name}.{field}" for field in free)
@@ -187,7 +189,7 @@ def register_base(name: str, *fields: str, **more: Any) -> None:
 def build_base_effect(name: str, *fields: str, law: str, symptoms: str = "", starts: Sequence[Start] = (),
                       groups: Mapping[str, type[Any]] = GROUPS, **more: Any) -> Effect:
     """An effect that a plant has already, by the parameters of `groups` that carry it; a fit frees all."""
-    meaning = {field: list_quantities(groups[field.partition(".")[0]])[field.partition(".")[2]] for field in fields}
+    meaning = {field: find_field(f"effect {name}", field, groups) for field in fields}
     return Effect(name, "", law, symptoms, meaning, {}, fitted=fields, starts=_name_starts(fields, starts), **more)
 
 

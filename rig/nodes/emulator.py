@@ -29,7 +29,7 @@ from rig.network.raw_bus import Port
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.called_loop import call_loop, load_loop, make_port
 from rig.nodes.plant_code import CompiledPlant, load_plant
-from rig.nodes.scenario import DIVERGED, Scenario
+from rig.nodes.scenario import Scenario
 from rig.sequences.faults import DROP, Plan
 
 _RAISED = {  # events of the cycle: the errors that they raise
@@ -212,7 +212,7 @@ class PlantNode:
             else:
                 emcy.clear(_CLEARED[event], number if event == ec.DRIVE_WHOLE else b"")
             if event == ec.DIVERGED:
-                self._diverged = DIVERGED
+                self._diverged = ec.explain_divergence(self._memory, self._bench.signals)
                 self._obeying = True  # the cycle has left OPERATIONAL
                 self.device.nmt.communication_error(0)
                 self._obeying = False

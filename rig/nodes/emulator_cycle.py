@@ -446,6 +446,12 @@ def read_plant(m: Memory, k: int) -> bool:
     return True
 
 
+def explain_divergence(m: Memory, signals: Signals) -> str:
+    """Which of the plant's outputs a divergence has reached first."""
+    return "the plant has diverged: no finite number in " + ", ".join(
+        s.name for s, x in zip(signals.outputs, m.reals[m.words[READINGS_AT]:], strict=False) if not np.isfinite(x))
+
+
 def _fill_frames(m: Memory, k: int, flags: int) -> None:
     """Put the readings of this cycle into the objects and the frames."""
     frames, values = m.frames, m.frames.words[VALUES_AT]

@@ -40,8 +40,8 @@ class Scenario(NamedTuple):
 
     def load(self) -> list[float]:
         """The load, SI, one a cycle; none after the last."""
-        worth = find_load_count(self.model)
-        return [count * worth for count in self.load_counts]
+        loads: list[float] = (find_load_count(self.model) * np.array(self.load_counts)).tolist()
+        return loads
 
     def make_schedule(self) -> Schedule:
         """The faults by cycle."""
@@ -100,6 +100,3 @@ def find_load_count(model: Model) -> float:
 def _find_changed_groups(plan: Plan) -> set[str]:
     """Groups of the parameters that faults change: the plant must have their effects from the start."""
     return {fault.parameter.partition(".")[0] for fault in plan.faults if hasattr(fault, "parameter")}
-
-
-DIVERGED = "the plant has diverged: a signal is not a finite number"

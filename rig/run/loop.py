@@ -31,7 +31,7 @@ from rig.nodes import emulator_cycle as ec
 from rig.nodes.called_loop import call_loop, load_loop, make_port
 from rig.nodes.emulator import Emulator
 from rig.nodes.plant_code import load_plant
-from rig.nodes.scenario import DIVERGED, Scenario
+from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock, Signals, Timing
 from rig.recorder.schema import make_row_record
 from rig.run import cycle as cy
@@ -239,7 +239,7 @@ class Loop(ABC):
 
     def _note_problem(self) -> None:
         if self._code and self._words[cy.DIVERGED]:
-            self.problem = self._code.problem or DIVERGED
+            self.problem = self._code.problem or ec.explain_divergence(self._plant, self._bench.signals)
 
     def _log_rows(self) -> None:
         """Log the cycles that are complete."""

@@ -305,7 +305,7 @@ def write_preflight(kind: Plant) -> str:
     """A preflight for any plant, as TOML: its nominal test, and whether the loop follows at all. The limits are wide.
     """
     command = build_profile(kind.profile, rate=round(1.0 / kind.nominal["controller.period"])).command
-    span = float(np.ptp(np.append(command, 0.0)))
+    span = float(f"{np.ptp(np.append(command, 0.0)):.3g}")
     rest = list_section_names(kind.profile)[-1] if isinstance(kind.profile[-1], Hold) else ""
     return fill_template("sequences/preflight.jinja", kind=kind, span=span, rest=rest, most_error=MOST_FOLLOWING_ERROR)
 

@@ -254,7 +254,8 @@ def list_plots(signals: Signals) -> Plots:
     plots: Plots = {
         ("position", f"{moves} [{unit}]"): (
             RunLine(command.name, scale, "command", f"{command.symbol} command [{unit}]", COMMAND, 4.0),
-            RunLine(controlled.name, scale, controlled.called, f"{symbol} {controlled.called} [{unit}]", MEASURED)),
+            RunLine(controlled.name, scale, controlled.called,
+                    f"{' '.join(dict.fromkeys((symbol, controlled.called)))} [{unit}]", MEASURED)),
         ("error", f"Following error [{fine}]"): (
             RunLine("error", 1.0 / size, "error", f"{command.symbol} - {symbol} [{fine}]", 0xE8A33DFF),)}
     others = [(drive, DRIVE), *((s, OUTPUTS[k % len(OUTPUTS)]) for k, s in enumerate(signals.outputs) if k)]

@@ -212,7 +212,8 @@ def test_the_users_effect_with_memory(file: Path) -> None:
     ("x = 1 / 0", "ZeroDivisionError"),
     ("x = 1", "at least one function marked with @effect"),
     (COGGING.replace('"load"', '"laod"'), "no port 'laod'"),
-    (COGGING.replace('Quantity("N")] = 0.0', 'Quantity("N")]'), "needs a default"),
+    (COGGING.replace('Quantity("N")] = 0.0', 'Quantity("N")]'), "effect cogging, force: expected a default, its off"),
+    (COGGING.replace('Quantity("N")] = 0.0', 'Quantity(low=0)] = 0.0'), "effect cogging, force: expected Quantity(\"u"),
     (COGGING.replace("def cogging", "def null_bias"), "the name is taken"),
     (HEAD + "raise ValueError('two\\nlines')", "ValueError: two"),
 ])

@@ -125,11 +125,19 @@ def test_its_own_effect_may_have_the_name_of_a_shared_one(tmp_path: Path) -> Non
     ("return s.angle, s.current", "return s.angle, s.amps", r"\.py:\d+: measure.*amps"),
     ('@effect("friction"', '@effect("fricton"', "effect dry_friction.*voltage, load, friction"),
     ('"motor.resistance", (2.0', '"motor.resistence", (2.0', "fault winding.*motor.resistance"),
+    ("(2.0, 4.0), 2.3, 3.0", "(2.0, 4.0), 2.3, 30.0", "faults.winding.maintenance.*2 .. 4 ohm, not 30"),
+    ("Step(to=0.5, time=0.9)", "Step(to=500.0, time=0.9)", "profile: expected demands of at most 100 rad .*, not 500"),
     ("moves=(\"angle\",)", "moves=(\"angel\",)", "moves.*angle"),
     ("moves=(\"angle\",)", "moves=lambda s, d, p: State(s.current, s.speed, s.angle - d)",
      "moves.*angle.* rad, not by -1"),
     ("x + p.dry_friction.torque", "x + p.friction.torque", "effect dry_friction.*p.dry_friction.FIELD.*not p.friction"),
-    ('"drive"),', '"output"),', "expected one signal of role drive"),
+    ('"drive"),', '"output"),', "signals: expected one signal of role drive, not none"),
+    ('"drive"),', '"driv"),', r"\.py:\d+: signal voltage, role: expected one of command, .*, not 'driv'"),
+    ('Signal("current"', 'Signal("angle"', r"\.py:\d+: signal angle, name: expected a name that no other signal has"),
+    ('Quantity("ohm", "R", low', "Quantity(low", "motor.resistance.*unit"),
+    ("Step(to=0.5, time=0.9)", "Step(to=0.5, time=-0.9)", r"\.py:\d+: segment, time: expected above 0"),
+    ("class State(", 'import plant.declare as d\nd.base_effect("stiff", Wheel, "stiff", law="")\nclass State(',
+     r"\.py:\d+: effect stiff, wheel.stiff: expected a field of wheel"),
     ("period: Annotated", "cycle: Annotated", "controller.*period|period"),
     ("return State(current, speed", "return Stat(current, speed", r"\.py:\d+.*Stat"),
     ("def control(", "def control(x, ", "control.*4 arguments"),
@@ -140,7 +148,7 @@ def test_its_own_effect_may_have_the_name_of_a_shared_one(tmp_path: Path) -> Non
 def test_a_wrong_plant_file_is_refused_in_one_line(old: str, new: str, message: str, tmp_path: Path) -> None:
     assert old in TEXT
     file = write_file(tmp_path / "wrong.py", TEXT.replace(old, new, 1))
-    said = catch_refusal(load_plant, file)
+    said = catch_refusal(lambda path: [*check_behaviour(load_model(path))], file)
     assert re.search(message, said) and str(file) in said
 
 
@@ -175,13 +183,14 @@ def test_a_stiff_plant_without_tolerances_is_explained(tmp_path: Path) -> None:
 
 
 def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -> None:
-    text = TEXT.replace("current - load", "current - load + 1e5 * s.speed * abs(s.speed)")
-    file = write_file(tmp_path / "unstable.py", text)
+    file = write_file(tmp_path / "unstable.py", TEXT.replace("current - load",
+                                                             "current - load + 1e5 * s.speed * abs(s.speed)"))
     said = rig("simulate", "--model", file, "--out", tmp_path / "s.csv")
     assert said.status == 2 and re.search(r"angle|current|voltage", said.err) and "t = 0.0" in said.err
     assert not (tmp_path / "s.csv").exists()
-    (first,) = (f for f in check_behaviour(load_model(file)))
-    assert not first.passed and "t = 0.1" in first.text
+    first, = check_behaviour(load_model(file))
+    ran = rig("run", "--model", file, "--out", tmp_path / "run")
+    assert not first.passed and "t = 0.1" in first.text and "no finite number in angle" in ran.out
 
 
 CHECK = ("check", "my_new.toml")

@@ -13,7 +13,7 @@ import pytest
 from refusals import catch_refusal
 from rig_command import rig, write_file
 
-from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
+from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Fault
 from fdi.prognosis import unit_trend
 from fdi.prognosis.trend import Trend, fit_trend
 from fdi.prognosis.unit_trend import find_date_in_name, find_row, format_day, parse_date, read_dates_table
@@ -90,16 +90,21 @@ def test_few_points() -> None:
     assert three.verdict == "TREND" and few > 2.0 * enough  # three points know less
 
 
-@pytest.mark.parametrize(("now", "words"), [
-    (Estimate(10.0, 8.0, 12.0), "Spool friction is acceptable: 10 N (8 .. 12) now, below MidBand (35 N)"),
-    (Estimate(45.0, 42.0, 48.0), "Spool friction requires maintenance: 45 N (42 .. 48) now, above MidBand (35 N), not "
-                                 "surely at MaxBand (70 N)"),
-    (Estimate(30.0, 20.0, 40.0), "its interval comes too near MidBand (35 N) to be acceptable"),
-    (Estimate(80.0, 70.0, 90.0), "above MidBand (35 N) and up to MaxBand (70 N) or more"),
-    (Estimate(30.0, 0.0, 60.0), "the interval holds both a healthy unit (5 N) and MidBand (35 N), so the value alone"),
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"now": Estimate(10.0, 8.0, 12.0)}, "Spool friction is acceptable: 10 N (8 .. 12) now, below MidBand (35 N)"),
+    ({"now": Estimate(45.0, 42.0, 48.0)},
+     "Spool friction requires maintenance: 45 N (42 .. 48) now, above MidBand (35 N), not surely at MaxBand (70 N)"),
+    ({"now": Estimate(30.0, 20.0, 40.0)}, "its interval comes too near MidBand (35 N) to be acceptable"),
+    ({"now": Estimate(80.0, 70.0, 90.0)}, "above MidBand (35 N) and at MaxBand (70 N) or above"),
+    ({"now": Estimate(2e4, 1.9e4, 2.1e4)}, "now, above MidBand (0.035 kN) and at MaxBand (0.07 kN)"),
+    ({"now": Estimate(30.0, 0.0, 60.0)},
+     "the interval holds both a healthy unit (5 N) and MidBand (35 N), so the value alone"),
+    ({"declared": (loss := Fault("magnet", "loss of torque", "servomotor.kt", (0.2, 0.32), 0.29, 0.26, unit="N m/A",
+                                 healthy=0.32)), "fault": loss.turn_up(), "now": Estimate(0.04, 0.035, 0.045)},
+     "Loss of torque requires maintenance: 0.280 N m/A (0.275 .. 0.285) now, below MidBand (0.29 N m/A), not surely"),
 ])
-def test_a_level_names_its_reason(now: Estimate, words: str) -> None:
-    assert words in explain_level(replace(friction(np.linspace(10.0, 30.0, 14)), now=now))
+def test_a_level_names_its_reason(changes: dict[str, Any], words: str) -> None:
+    assert words in explain_level(replace(friction(np.linspace(10.0, 30.0, 14)), **changes))
 
 
 LINE = 5.0 + 2.0 * np.arange(12)

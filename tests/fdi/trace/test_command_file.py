@@ -33,9 +33,9 @@ def test_read_command_gives_the_load_only_if_there_is_one(tmp_path: Path) -> Non
     ("t,com\n0,1\n0.001,one\n", "c.csv: line 3: com: expected a finite number or an empty field, not 'one'"),
     ("t,com\n0,1\n0.001\n", "c.csv: line 3: expected 2 fields, not 1"),
     ("t,com\n0,nan\n", "c.csv: line 2, com: expected a finite number, not nan"),
-    ("t,com\n0,1\n0.001,-5\n", "c.csv: line 3, com: expected at most 1 either way, not -5"),
-    ("t,com\n# of the rig\n0,1\n\n0.001,-5\n", "c.csv: line 5, com: expected at most 1 either way, not -5"),
-    ("t,com,load\n0,0,1e7\n", "c.csv: line 2, load: expected at most 1e+06 either way, not 1e+07"),
+    ("t,com\n0,1\n0.001,-5\n", "c.csv: line 3, com: expected at most 1 m either way, not -5"),
+    ("t,com\n# of the rig\n0,1\n\n0.001,-5\n", "c.csv: line 5, com: expected at most 1 m either way, not -5"),
+    ("t,com,load\n0,0,1e7\n", "c.csv: line 2, load: expected at most 1e+06 N either way, not 1e+07"),
     ("t,com\n0,1\n0,2\n", "c.csv: t: expected times that grow; row 2 has 0 s after 0 s"),
     ("t,com\n0,1\n10000,2\n", "c.csv: line 3, t: expected seconds, and at most 3600 of them, not 10000"),
 ])

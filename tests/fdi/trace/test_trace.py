@@ -116,7 +116,9 @@ HEAD = "t,com,xj,cor\n"
 
 
 @pytest.mark.parametrize(("text", "says"), [
-    ("", "line 1: t: expected a column of this name in the header t,com,xj,cor,p12,xs,load"),
+    ("", "line 1: t: expected a column of this name; the header is '' (commas separate"),
+    ("t;com;xj", "line 1: t: expected a column of this name; the header is 't;com;xj' (commas separate columns; rig"),
+    ("t,com,cor", "line 1: xj: expected a column of this name; the header is 't,com,cor'"),
     ("com,xj,cor\n0,0,0\n", "line 1: t: expected a column"),
     ("time;com;xj;cor\n0;0;0;0\n", "line 1: t: expected a column"),
     (HEAD, "expected at least one row of numbers"),
