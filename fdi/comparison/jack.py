@@ -180,8 +180,8 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     Ratios of flow, force and sensor to their floors, None where one cannot be told, and the gain by which the ram moves
     further than the flow says, as a fraction; nothing where too few rows hang together.
 
-    The floor is what the balances leave of the model's own run with the noise `level` of each signal, SI: noise, and what
-    the balances neglect, such as a lag of the sensor. The floor from the repeats counts where it is higher.
+    The floor is what the balances leave of the model's own run with the noise `level` of each signal, SI: noise, and
+    what the balances neglect, such as a lag of the sensor. The floor from the repeats counts where it is higher.
     """
     b = compute_balance(trace, model, run)
     free = replay_current(trace, model, anchor=0.0)  # the measured position would pull it off its own balance

@@ -236,7 +236,7 @@ class Enabling:
         return self._describe_silence() or f"the controller is not ready after {LIMIT:g} s: {said}"
 
     def _describe_silence(self) -> str:
-        return describe_silence(self._bench, self._silent) if self._silent else ""
+        return describe_silence(self._bench, self._silent, self._loop.describe_refusal()) if self._silent else ""
 
     def _play_until(self, is_done: Callable[[], bool], make_step: Callable[[], CycleInput]) -> bool:
         """Play cycles until `is_done()`; False if that takes too long, True also when the run is to end."""

@@ -89,12 +89,14 @@ class NodeWatch:
         if self._missed != (self._patience if is_first else 1):
             return
         # else in the words of a plant that is a node, which says so by EMCY
-        what = describe_silence(self._bench, self._missed) if is_first else (
-            f"plant 0x{EmcyCode.RPDO_TIMEOUT:04X} {describe_missing(self._bench, self._bench.most_missed)}")
+        refusal = self._stage.playing.describe_refusal()
+        what = describe_silence(self._bench, self._missed, refusal) if is_first else (
+            f"plant 0x{EmcyCode.RPDO_TIMEOUT:04X} {describe_missing(self._bench, self._bench.most_missed, refusal)}")
         self._safety.handle("bring_up" if is_first else NO_DRIVE, what, CONTROLLER)
         if CONTROLLER not in self._master.watched or (self._looks and self._safety.aborted):
-            self.gone.setdefault(CONTROLLER, "it sends no frames")
-            self._journal.log("ERROR", SILENCE, f"{self._bench.describe_node(CONTROLLER)} is silent")
+            how = f"sends no valid frames: {refusal}" if refusal else "is silent"
+            self.gone.setdefault(CONTROLLER, f"it {how}")
+            self._journal.log("ERROR", SILENCE, f"{self._bench.describe_node(CONTROLLER)} {how}")
 
     def _note_emergency(self, node: Role, error: EmcyError) -> None:
         if self._stage.is_playing or self._stage.is_probing:
@@ -193,15 +195,19 @@ class NodeWatch:
                 self.gone.setdefault(node, f"no heartbeat within {seconds:g} s at the end of the run")
 
 
-def describe_silence(bench: Bench, cycles: int) -> str:
+def describe_silence(bench: Bench, cycles: int, refusal: str) -> str:
     """That the controller sends no drive frames."""
-    return f"{bench.describe_node(CONTROLLER)}: {describe_missing(bench, cycles)}"
+    return f"{bench.describe_node(CONTROLLER)}: {describe_missing(bench, cycles, refusal)}"
 
 
-def describe_missing(bench: Bench, cycles: int) -> str:
-    """That no drive frame has come for so many cycles; its name and identifier are those of the bench."""
+def describe_missing(bench: Bench, cycles: int, refusal: str) -> str:
+    """That no drive frame has come for so many cycles; its name and identifier are those of the bench.
+
+    `refusal`: why those that come are not taken, if any do.
+    """
     frame = bench.frames.drive
-    return f"no frame {frame.name} ({describe_identifier(frame.identifier)}) for {count_nouns(cycles, 'cycle')}"
+    name = f"{frame.name} ({describe_identifier(frame.identifier)}) for {count_nouns(cycles, 'cycle')}"
+    return f"no valid frame {name}: {refusal}" if refusal else f"no frame {name}"
 
 
 class OverrunWatch:

@@ -123,7 +123,7 @@ CASES: dict[str, tuple[list[tuple[Any, ...]], dict[int, str], tuple[int, str, in
         "by its own record the plant sent feedback 3.0 ms after SYNC"),
     "a dead controller, and not the plant that misses it": (
         [("lose_drive", 600), MISSED], {CONTROLLER: KILLED}, (CONTROLLER, "stopped", 600),
-        f"no drive frame since cycle 600; {KILLED}"),
+        f"no valid drive frame since cycle 600; {KILLED}"),
     "although a SYNC was late just before": (
         [("late", 598, 0.7e-3), ("lose_drive", 600), MISSED], {CONTROLLER: "no heartbeat any more"},
         (CONTROLLER, "stopped", 600), ""),
@@ -138,7 +138,7 @@ CASES: dict[str, tuple[list[tuple[Any, ...]], dict[int, str], tuple[int, str, in
         {PLANT: KILLED}, (PLANT, "stopped", 600), ""),
     "a controller that stalls alone": (
         [("lose_drive", 600, 612), MISSED], {}, (CONTROLLER, "stopped", 600),
-        "did not answer in time: no drive frame for 12 cycles from 600"),
+        "did not answer in time: no valid drive frame for 12 cycles from 600"),
     "missing feedback that came": ([("report", 604.0, CONTROLLER, 0x8250)], {}, (CONTROLLER, "emcy", 604), ""),
     "a plant that leaves OPERATIONAL, known by its next heartbeat": (
         [("lose_feedback", 600, 720), ("report", 603.5, CONTROLLER, 0x8250), ("report", 690.0, PLANT, 127, "nmt")], {},
