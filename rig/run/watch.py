@@ -126,9 +126,12 @@ class NodeWatch:
         self.note_ended_processes()
         limit = "" if node not in self._master.heard_ns else (
             f": last heartbeat {1e-9 * (self._stage.clock.now() - self._master.heard_ns[node]):.2f} s ago")
-        if not self._is_answering(node):
-            self.gone.setdefault(node, f"no heartbeat any more{limit}")
-        self._safety.handle("heartbeat", f"{self._bench.describe_node(node)} is silent", node)
+        what = f"no heartbeat any more{limit}"
+        if self._is_answering(node):
+            what += ", although its other frames come"
+        else:
+            self.gone.setdefault(node, what)
+        self._safety.handle("heartbeat", f"{self._bench.describe_node(node)}: {what}", node)
 
     def _handle_return(self, node: Role) -> None:
         if node not in self._processes.find_ended():
@@ -179,7 +182,7 @@ class NodeWatch:
         for node in found.keys() - self.gone.keys():
             self._silent.add(node)
             self.gone[node] = f"no heartbeat for {found[node]:.1f} s either"
-            what = f"{self._bench.describe_node(node)} is silent"
+            what = f"{self._bench.describe_node(node)}: no heartbeat for {found[node]:.1f} s, and no answer"
             self._safety.handle("heartbeat", what, node)
             if not self._safety.aborted:  # no sequence can mean that in lockstep
                 self._safety.abort("abort", what)

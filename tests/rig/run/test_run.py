@@ -345,7 +345,7 @@ def test_an_external_node_that_dies_is_named_and_the_run_ends(where: str, tmp_pa
     assert (cause["source"], cause["kind"]) == ("node 2 controller", "stopped")
     silence = re.search(r"no heartbeat for (\d+\.?\d*)", cause["text"])
     assert silence and float(silence[1]) >= 2
-    assert "node 2 controller is silent" in said.json["consequences"][0]["text"]
+    assert "node 2 controller: no heartbeat for" in said.json["consequences"][0]["text"]
     assert 1 <= np.isnan(trace.cor[trace.phase != CLEANUP]).sum() <= 2
     assert int((trace.phase == CLEANUP).sum()) == 100
 

@@ -132,7 +132,7 @@ def test_a_meant_end_that_does_not_come_is_a_failure(tmp_path: Path) -> None:
     assert outcome.failures == ["the run did not end in the safe state"]
 
 
-@pytest.mark.parametrize(("node", "says"), [("rig", "0x8130"), ("plant", "node 3 plant is silent")])
+@pytest.mark.parametrize(("node", "says"), [("rig", "0x8130"), ("plant", ", although its other frames come")])
 def test_a_heartbeat_that_stops(tmp_path: Path, node: str, says: str) -> None:
     text = SHORT.replace("time = 0.2 }", "time = 1.2 }")
     outcome = play(job(with_faults(text, f'kind = "heartbeat", node = "{node}", start = 0.1')), tmp_path)
