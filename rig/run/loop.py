@@ -224,14 +224,12 @@ class Loop(ABC):
 
     def describe_refusal(self) -> str:
         """Why the drive frame that came last was not taken; empty where it was, or none came."""
-        words, drive = self._layout.words, self._bench.frames.drive
+        words = self._layout.words
         at = next(at for at in packing.list_frame_places(self._layout) if words[at + packing.ROLES] & packing.DRIVE)
-        why = {packing.OTHER_LENGTH: f"{words[at + packing.CAME_WITH]} bytes, not {drive.length}",
-               packing.WRONG_CHECKSUM: "a wrong checksum",
-               packing.REPEATED: "the alive counter of the one before",
-               packing.OTHER_CYCLE: "the number of another cycle"}
-        status = int(words[at + packing.STATUS])
-        return f"the last that came had {why[status]}" if status in why else ""
+        why = {packing.OTHER_LENGTH: f"{words[at + packing.CAME_WITH]} bytes, not {words[at + packing.LENGTH]}",
+               packing.WRONG_CHECKSUM: "a wrong checksum", packing.REPEATED: "the alive counter of the one before",
+               packing.OTHER_CYCLE: "the number of another cycle"}.get(int(words[at + packing.STATUS]))
+        return f"the last that came had {why}" if why else ""
 
     def _draw_noise(self) -> None:
         """Draw the noise of the plant for a minute ahead."""

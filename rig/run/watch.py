@@ -90,9 +90,9 @@ class NodeWatch:
             return
         # else in the words of a plant that is a node, which says so by EMCY
         refusal = self._stage.playing.describe_refusal()
-        what = describe_silence(self._bench, self._missed, refusal) if is_first else (
-            f"plant 0x{EmcyCode.RPDO_TIMEOUT:04X} {describe_missing(self._bench, self._bench.most_missed, refusal)}")
-        self._safety.handle("bring_up" if is_first else NO_DRIVE, what, CONTROLLER)
+        who = f"{self._bench.describe_node(CONTROLLER)}:" if is_first else f"plant 0x{EmcyCode.RPDO_TIMEOUT:04X}"
+        missing = describe_missing(self._bench, self._missed if is_first else self._bench.most_missed, refusal)
+        self._safety.handle("bring_up" if is_first else NO_DRIVE, f"{who} {missing}", CONTROLLER)
         if CONTROLLER not in self._master.watched or (self._looks and self._safety.aborted):
             how = f"sends no valid frames: {refusal}" if refusal else "is silent"
             self.gone.setdefault(CONTROLLER, f"it {how}")
@@ -196,11 +196,6 @@ class NodeWatch:
             self.note_ended_processes()
             for node in silent:
                 self.gone.setdefault(node, f"no heartbeat within {seconds:g} s at the end of the run")
-
-
-def describe_silence(bench: Bench, cycles: int, refusal: str) -> str:
-    """That the controller sends no drive frames."""
-    return f"{bench.describe_node(CONTROLLER)}: {describe_missing(bench, cycles, refusal)}"
 
 
 def describe_missing(bench: Bench, cycles: int, refusal: str) -> str:
