@@ -97,8 +97,7 @@ class Host:
             tool += f"; the steps that it suggests are of {usual.stepSize} s, controller.period"
         if "Failed to instantiate" in str(error) and not said:
             said = "; the guid, or instantiationToken, in its modelDescription.xml may not be that of its binary"
-        when = f" at {self._k * self._cycle:.6g} s" if self._k >= 0 else ""
-        return f"{str(error).rstrip('.')}{when}{said}{tool}"
+        return f"{str(error).rstrip('.')} at {max(self._k, 0) * self._cycle:.6g} s{said}{tool}"
 
     def _instantiate(self) -> None:
         from fmpy import fmi1  # the base of all versions

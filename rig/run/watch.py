@@ -109,7 +109,7 @@ class NodeWatch:
             self._safety.handle("late", f"the rig sent no heartbeat for {self._master.pause:.2f} s, and "
                                         f"{self._bench.describe_node(node)} reports 0x{error.code:04X}", RIG)
         else:
-            what = f"{self._bench.describe_node(node)} 0x{error.code:04X} {error.get_desc()}".rstrip()
+            what = f"{self._bench.describe_node(node)} 0x{error.code:04X} (EMCY) {error.get_desc()}".rstrip()
             self._safety.handle("emcy", what, node, error.code, round(error.timestamp * 1e9))
 
     def _note_state(self, node: Role, state: int) -> None:
@@ -124,9 +124,8 @@ class NodeWatch:
 
     def _handle_silence(self, node: Role) -> None:
         self.note_ended_processes()
-        limit = "" if node not in self._master.heard_ns else (
-            f": last heartbeat {1e-9 * (self._stage.clock.now() - self._master.heard_ns[node]):.2f} s ago")
-        what = f"no heartbeat any more{limit}"
+        ago = 1e-9 * (self._stage.clock.now() - self._master.heard_ns[node])
+        what = f"no heartbeat any more: last heartbeat {ago:.2f} s ago"
         if self._is_answering(node):
             what += ", although its other frames come"
         else:

@@ -403,7 +403,7 @@ def test_a_unit_that_breaks_ends_the_run_with_a_verdict_and_a_readable_log(
     ({"unit": 'needsExecutionTool="true"', "does": "REFUSE", "at": 1}, "needs the tool that made it"),
     ({"unit": 'fixedInternalStepSize="0.0003"'}, "a step of which the cycle of 1 ms is a multiple, not 0.3 ms"),
     ({"does": "EVENT_MODE"}, "its message: this unit needs event mode"),
-    ({"does": "TOKEN"}, "Failed to instantiate FMU; the guid, or instantiationToken, in its modelDescription.xml may"),
+    ({"does": "TOKEN"}, "at 0 s; the guid, or instantiationToken, in its modelDescription.xml may not"),
     ({"does": "END", "at": 3}, "the unit asks to end the simulation"),
 ])
 def test_a_unit_that_cannot_run_here_is_refused(folder: Path, kind: dict[str, Any], expected: str) -> None:

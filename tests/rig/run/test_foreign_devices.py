@@ -3,7 +3,6 @@
 Each is written with canopen or cantools, and each closes the same position loop, so each must move the ram alike.
 """
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -222,7 +221,7 @@ def test_a_controller_that_sends_no_frames_ends_the_run_with_a_line_that_names_t
     (tmp_path / "bench.toml").write_text(CAN.format(demand="Feedback.Position"))
     _, outcome = play(tmp_path, where, Mute(where, answers, length))
     assert (outcome.verdict, outcome.status) == ("ABORTED", 1)
-    assert said in outcome.why and re.search(r"no (valid )?frame Drive \(0x18F00005\)", outcome.aborted)
+    assert said in outcome.why and "frame Drive (0x18F00005)" in outcome.aborted
     assert outcome.attribution.cause is not None and outcome.attribution.cause.source is Role.CONTROLLER
 
 

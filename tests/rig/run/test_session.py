@@ -168,7 +168,7 @@ def play_with_intruder(folder: Path, frames: list[tuple[int, bytes]]) -> Session
     ([(0x000, b"\x80\x02")], "another node sends 0x000"),
     ([(0x702, b"\0")], "node 2 controller left OPERATIONAL: boot-up"),
     ([(0x703, b"\x7f")], "node 3 plant left OPERATIONAL: pre-operational"),
-    ([(0x082, bytes.fromhex("3023010000000000"))], "node 2 controller 0x2330"),
+    ([(0x082, bytes.fromhex("3023010000000000"))], "node 2 controller 0x2330 (EMCY)"),
 ])
 def test_strangers_and_nodes_that_restart_end_main(tmp_path: Path, frames: list[tuple[int, bytes]], why: str) -> None:
     session = play_with_intruder(tmp_path, frames)

@@ -528,9 +528,8 @@ def test_a_small_current_may_be_allowed_when_idle() -> None:
 def test_a_controller_that_is_switched_off_by_phase_sends_no_current() -> None:
     def largest(currents: list[float], offset: bytes = b"0") -> CheckResult:
         parts = [(word, 0, current, 100) for word, current in zip((2, 3, 2), currents, strict=True)]
-        bench = load_bench_from_files({name: data.replace(b"(0.001,0)", b"(0.001,%s)" % offset)
-                                       for name, data in ECU.files.items()})
-        return judge(make_rows(parts), bench)[0]["no current unless enabled"]
+        files = {name: data.replace(b"(0.001,0)", b"(0.001,%s)" % offset) for name, data in ECU.files.items()}
+        return judge(make_rows(parts), load_bench_from_files(files))[0]["no current unless enabled"]
 
     assert largest([0.0, 1e-3, 0.0]).passed and largest([4e-7, 1e-3, 4e-7], offset=b"0.0004").passed
     assert not largest([1e-3, 1e-3, 0.0]).passed and not largest([0.0, 1e-3, 1e-3]).passed
