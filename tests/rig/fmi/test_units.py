@@ -443,6 +443,8 @@ def test_a_drive_of_its_own_has_no_limit_of_the_shipped_actuator(folder: Path) -
     build_fmu(Path("slide.fmu"))
     Path("own.toml").write_text(SLIDE.replace("current =", "torque =").replace("1 mA", "1 N m"))
     assert load_model("own.toml")["controller.current_limit"] > 1e6
+    assert [load_model(name).kind.signals.drive.limit for name in ("own.toml", "slide.toml")] == [
+        "", "controller.current_limit"]
 
 
 def test_a_run_has_the_period_of_the_model_file(folder: Path) -> None:
