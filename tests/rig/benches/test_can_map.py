@@ -194,8 +194,7 @@ def test_a_page_is_a_frame_and_what_stands_on_all_pages_is_read_from_each() -> N
     assert [each.share for each in list_loads(bench)[1:]] == 2 * [list_loads(load_pages())[1].share / 2]
     assert bench.ready == {"Drive.State": 3}
     frame = bytes([3, 3, 0, 0, 0, 0, 0, 0])
-    found = bench.frames.find(11, frame)
-    assert found is not None and unpack(found, frame)["Drive.State"] == 3
+    assert unpack(bench.frames.find(11, frame), frame)["Drive.State"] == 3
     assert bench.frames.find(11, bytes([9]) + frame[1:]) is None
 
 

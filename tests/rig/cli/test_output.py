@@ -271,8 +271,8 @@ def test_a_log_does_not_choose_the_bus(words: list[str], log: Path, monkeypatch:
     change_log(log, Path("sent.mcap"), settings={"bus": "udp_multicast:239.77.7.7"})
     change_log(log, Path("device.mcap"), settings={"bus": "udp_multicast:239.77.7.7", "controller": "external"})
     monkeypatch.setenv("EHA_RIG_BUS", "udp_multicast:239.77.7.8")
-    assert "--bus udp_multicast:239.77.7.7 to use it again, or --bus embedded:" in refuse("run", "--from", "sent.mcap")
-    assert "--bus udp_multicast:239.77.7.7 to use it again: " in refuse("run", "--from", "device.mcap")
+    for name, offer in (("sent.mcap", ", or --bus embedded: "), ("device.mcap", ": ")):
+        assert f"--bus udp_multicast:239.77.7.7 to use it again{offer}" in refuse("run", "--from", name)
     said = rig("run", "--from", *(word.format(log=log) for word in words), "--json", "--out", "out")
     assert said.status == 0 and said.json["run"]["bus"] == "embedded", said
 

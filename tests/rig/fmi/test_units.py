@@ -15,7 +15,7 @@ import pytest
 from c_device import needs_compiler, skip_without_compiler
 from effect_files import HEAD, restored_catalogue
 from places import ROOT
-from rig_command import answer, refuse, rig
+from rig_command import answer, refuse, rig, write_file
 
 from fdi.trace.trace import Trace
 from plant import Model, RigError, load_model, simulate
@@ -299,6 +299,14 @@ proportional_gain = 4.0
 gain = 2.0
 damping = 8.0
 """
+FAULT = """
+[faults.strong]
+title = "strong drive"
+parameter = "drive.gain"
+range = [2, 8]
+acceptable = 3
+maintenance = 5
+"""
 SHORT = """
 title = "Short"
 setup = [{ kind = "hold", time = 0.02 }]
@@ -362,7 +370,10 @@ def test_a_unit_of_another_tool_is_mapped_simulated_and_compared(folder: Path, v
         ("verdict", "WITHIN_FLOOR"), ("solver_error", None)}
     other = answer("compare", "run.csv", "--model", "slide.toml", "--set", "drive.gain=2.2", status=1)
     assert other["verdict"] == "MODEL_INCOMPLETE"
+    learn = ("fdi", "--faults", write_file(Path("faults.toml"), FAULT), "--out", "bands.toml", "--learn-bands")
     for line, *words in (("a plant with equations", "explain", "run.csv"),
+                         ("units the rig simulates side by side", *learn, "--command", "command.csv"),
+                         ("at least 5 healthy", *learn, "run.csv"),
                          ("from 0.5 to 10", "simulate", "--set", "drive.gain=12"),
                          ("an FMU has steps of its own", "simulate", "--steps", 5, "--command", "command.csv")):
         assert line in refuse(*words, "--model", "slide.toml")
