@@ -169,8 +169,7 @@ def test_the_first_cause(case: str) -> None:
     assert found.cause is not None and (found.cause.source, found.cause.kind, found.cause.cycle) == expected
     assert words in found.cause.text and found.cause.is_gone is (found.cause.source in gone)
     own = sum(trouble.text == found.cause.text for trouble in script.troubles)
-    assert len(found.consequences) == len(script.troubles) - own
-    assert found.by_bench >= found.cause.is_lateness
+    assert len(found.consequences) == len(script.troubles) - own and found.by_bench >= found.cause.is_lateness
     if (found.cause.source, found.cause.kind) == (CONTROLLER, "stopped"):
         assert "SYNC was sent at most 0.02 ms late and feedback came within 0.10 ms" in found.cause.evidence[0]
 
@@ -187,8 +186,7 @@ def test_the_first_cause(case: str) -> None:
 def test_what_lateness_spoils(steps: list[tuple[Any, ...]], unjudged: Collection[int], affected: Collection[int],
                               invalid: dict[str, int], overruns: dict[int, int]) -> None:
     found = Script().spoil(steps).attribute()
-    assert set(np.flatnonzero(~found.judged)) == set(unjudged)
-    assert set(np.flatnonzero(found.affected)) == set(affected)
+    assert [set(np.flatnonzero(rows)) for rows in (~found.judged, found.affected)] == [set(unjudged), set(affected)]
     assert invalid.items() <= found.invalid.items()
     assert {int(k): int(found.overruns[k]) for k in np.flatnonzero(found.overruns)} == overruns
 
