@@ -39,6 +39,7 @@ class NodeWatch:
         self.emergencies: list[Emergency] = []
         self.heartbeats: dict[Role, list[Heartbeat]] = {role: [] for role in master.watched}
         self.last_answers = {CONTROLLER: -1, PLANT: -1}  # last cycle with a cyclic frame of it
+        self._last_row = 0  # the last cycle that is complete
         self._answers = {PLANT: bench.signals.outputs[-1].name, CONTROLLER: bench.signals.drive.name}  # who sends it
         self._operational: set[Role] = set()
         self._patience, self._missed = patience, 0  # cycles in a row for which the rig's own plant had no drive frame
@@ -66,10 +67,9 @@ class NodeWatch:
 
     def add(self, signals: Signals) -> None:
         """Take in a complete cycle: who answered in it."""
-        for role, name in self._answers.items():
-            value = getattr(signals, name)
-            if value == value:  # not NaN
-                self.last_answers[role] = signals.cycle
+        self._last_row = signals.cycle
+        self.last_answers |= {role: signals.cycle for role, name in self._answers.items()
+                              if not isnan(getattr(signals, name))}
         if not self._bench.has_plant_node and not self._master.is_deaf:
             self._watch_drive(bool(signals.flags & Flags.CURRENT_ZEROED))
 
@@ -137,9 +137,9 @@ class NodeWatch:
             self.gone.pop(node, None)
         self._journal.log("INFO", "heartbeat", f"{self._bench.describe_node(node)} is heard")
 
-    def _is_answering(self, node: Role, recent: int = 20) -> bool:
-        """Whether a node sent a cyclic frame in one of the `recent` cycles: its heartbeat alone may be missing."""
-        return self._stage.loop is not None and self.last_answers[node] >= self._stage.loop.k - recent
+    def _is_answering(self, node: Role) -> bool:
+        """Whether a node sent a cyclic frame in one of the last 20 cycles: its heartbeat alone may be missing."""
+        return self._stage.loop is not None and self.last_answers[node] >= self._stage.loop.k - 20
 
     def is_node_gone(self) -> bool:
         """Whether a node will not answer any more; looks every 20 ms."""
@@ -172,7 +172,7 @@ class NodeWatch:
         if self._master.is_deaf:
             return
         heard = self._master.heard_ns  # after a reset a node may have no heartbeat, and answers no SYNC
-        answering = [node for node in self.last_answers if self._is_answering(node, recent=1)]
+        answering = [node for node, cycle in self.last_answers.items() if cycle == self._last_row]
         found = self._silence.find_silent(now, {node: heard[node] for node, state in self._master.states.items()
                                                 if node in heard and state == NmtState.OPERATIONAL}, answering)
         for node in self._silent - found.keys():
