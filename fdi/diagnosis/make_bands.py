@@ -144,7 +144,8 @@ def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: fl
     """
     signals = model.kind.signals
     require(model.kind.control is not None and not signals.is_open_loop, "--learn-bands", model.kind.name,
-            "a plant with a controller of its own: bands are those of a closed loop")
+            "a plant whose healthy and faulty units the rig simulates side by side, in closed loop: no FMU, and none "
+            "without a demand")
     scale = measure_scale(signals.command, com)
     parts = find_sections(com, period, scale)
     require(any(s.kind in ("step", "ramp") for s in parts), "trace", signals.command.name,

@@ -246,13 +246,20 @@ def _show_timing(trace: Trace) -> list[Item]:
 
 
 def _tabulate_events(events: Sequence[Event], most: int = 12, most_on_page: int = 2000) -> list[Item]:
-    """The events on the page, of which a node can send a thousand a second; warnings and errors on the terminal."""
+    """The events on the page; warnings and errors on the terminal.
+
+    A node can send a thousand a second: equal ones are a line, in the place of the first.
+    """
+    equal: dict[tuple[str, ...], list[Event]] = {}
+    for event in events:
+        equal.setdefault(event[1:], []).append(event)
+    events = [each[0] if len(each) == 1 else each[0]._replace(
+        text=f"{each[0].text} ({len(each)} times, the last at {each[-1].t:.3f} s)") for each in equal.values()]
     columns = ((Column("t", "s", "right"), lambda event: f"{event.t:.3f}"),
                (Column("level", medium=Medium.PAGE), lambda event: Cell(event.level, EVENT_MOODS.get(event.level, ""))),
                (Column("kind"), lambda event: event.kind), (Column("event"), lambda event: event.text))
-    is_cut = len(events) > most_on_page
     return [tabulate(events[:most_on_page], *columns, medium=Medium.PAGE,
-                     caption=f"The first {most_on_page} of {len(events)} events." if is_cut else ""),
+                     caption=f"The first {most_on_page} of {len(events)} events." * (len(events) > most_on_page)),
             tabulate([event for event in events if event.level != "INFO"], *columns, terminal_rows=most,
                      medium=Medium.TERMINAL)]
 
@@ -343,10 +350,8 @@ def draw_timing(trace: Trace) -> str:
                            instant(float(np.percentile(known, 99)), INK, width=0.8, style=":"),
                            axes(xscale="log", xlabel=f"{name} [us]",
                                 ylabel="" if panels else "cycles (dotted: p99)")])
-    if not panels:
-        return ""
     return draw_panels("timing", [panels], 2.5, layout=None, gridspec_kw={
-        "left": 0.08, "right": 0.99, "top": 0.96, "bottom": 0.2, "wspace": 0.16})
+        "left": 0.08, "right": 0.99, "top": 0.96, "bottom": 0.2, "wspace": 0.16}) if panels else ""
 
 
 def _bridge_short_gaps(values: Floats) -> Floats:

@@ -415,6 +415,11 @@ class Bench:
         return max((float(abs(each.count)) for spec in self.frames.frames for each in spec.fields
                     if each.name == word and each.kind is not Kind.FLOAT), default=0.0)
 
+    def find_least(self, word: str) -> float:
+        """The size of the value nearest to 0 that a signal can have, SI: of one with an offset up to half a count."""
+        return max((min(abs(each.decode(each.encode(0.0))), 0.5 * float(abs(each.count))) for spec in self.frames.frames
+                    for each in spec.fields if each.name == word), default=0.0)
+
     def replace_signals(self, signals: Signals, noise: float, model: str) -> Self:
         """The bench with the plant of another model: its signals, and the noise of the controlled one's sensor.
 

@@ -1,5 +1,6 @@
 """How much of the bus the frames of a bench take, each at its longest; as a report for terminal, page and JSON."""
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -53,15 +54,20 @@ def compute_time(identifier: int, length: int, bitrate: float, data_bitrate: flo
 
 
 def list_loads(bench: Bench) -> list[FrameLoad]:
-    """The cyclic frames of a bench, then SYNC and the heartbeats."""
+    """The cyclic frames of a bench, then SYNC and the heartbeats.
+
+    The rig sends each page of a multiplexed message in each period, a controller one page after the other.
+    """
     cycle = bench.cycle_ns / 1e9
+    pages = Counter(spec.sent_as for spec in bench.frames.frames if spec.sender is not Role.RIG)
     sync = [] if bench.frames.sync is None else [("SYNC", bench.frames.sync, "rig > all", 0, (), cycle)]
     nodes = {Role.RIG: bench.rig_node, **{role: each.node for role, each in bench.nodes.items()}} if bench.nodes else {}
     found = [*((spec.name, spec.sent_as, _describe_direction(bench, spec), spec.length, list_content(spec),
                 cycle * spec.every) for spec in bench.frames.frames), *sync,
              *((f"heartbeat {node}", 0x700 + node, f"{role.name.lower()} > all", 1, (), HEARTBEAT)
                for role, node in sorted(nodes.items()))]
-    return [FrameLoad(*each, share=compute_time(each[1], each[3], bench.bitrate, bench.data_bitrate) / each[5])
+    return [FrameLoad(*each, share=compute_time(each[1], each[3], bench.bitrate, bench.data_bitrate) / each[5]
+                      / max(pages[each[1]], 1))
             for each in found]
 
 

@@ -206,9 +206,11 @@ def _describe_unmapped(dictionary: Any, pdos: list[Pdo], key: str, use: Use) -> 
     bits = len(found) if found is not None else 0
     if found is not None and not found.pdo_mappable:
         return f"an object that a {kind} maps; {key} cannot be mapped (PDOMapping=0)"
+    lacking = "".join(f"{pdo.name} maps {name_object(*at)}, which the file lacks; " for pdo in own
+                      for *at, _ in pdo.entries if at[0] > 0x1000 and find_variable(dictionary, *at) is None)
     room = [pdo.name for pdo in own if pdo.length + bits <= _LONGEST]
     where = f"{' and '.join(room)} {'has' if len(room) == 1 else 'have'} room" if room else f"no {kind} has room"
-    return f"an object that a {kind} maps; for {key} with {bits} bits {where} (map it in a DCF)"
+    return f"an object that a {kind} maps; {lacking}for {key} with {bits} bits {where} (map it in a DCF)"
 
 
 def _map_pdo(name: str, dictionary: Any, pdo: Pdo, own: set[str], *, is_answer: bool) -> DeviceFrame:

@@ -24,14 +24,17 @@ from rig.benches.canopen_map import (
 UNSURE = "# unsure: "
 # What a name says of a signal: the quantity, and which of several it is.
 _WORDS: dict[str, tuple[set[str], set[str]]] = {
-    "position_demand": ({"position", "pos", "target", "stroke"},
-                        {"demand", "target", "command", "cmd", "setpoint", "set", "reference", "ref", "desired"}),
-    "ram_position": ({"position", "pos", "ram", "stroke"},
-                     {"actual", "act", "feedback", "fb", "measured", "sensor", "ram"}),
-    "load_pressure": ({"pressure", "press", "dp"}, {"load", "differential", "diff", "delta", "dp"}),
-    "spool_position": ({"spool"}, {"position", "pos"}),
-    "load_force": ({"force"}, {"load", "external", "cell", "measured"}),
-    "current": ({"current", "coil", "cur", "torque"}, {"demand", "actual", "coil", "motor", "drive", "output"}),
+    "position_demand": ({"position", "pos", "target", "stroke", "weg", "lage", "hub"},
+                        {"demand", "target", "command", "cmd", "setpoint", "set", "reference", "ref", "desired",
+                         "soll", "sollwert", "vorgabe"}),
+    "ram_position": ({"position", "pos", "ram", "stroke", "weg", "lage", "hub", "kolben"},
+                     {"actual", "act", "feedback", "fb", "measured", "sensor", "ram", "ist", "istwert", "kolben"}),
+    "load_pressure": ({"pressure", "press", "dp", "druck", "differenzdruck"},
+                      {"load", "differential", "diff", "delta", "dp", "last", "differenz", "differenzdruck"}),
+    "spool_position": ({"spool", "schieber"}, {"position", "pos", "weg", "lage", "hub"}),
+    "load_force": ({"force", "kraft"}, {"load", "external", "cell", "measured", "last", "extern"}),
+    "current": ({"current", "coil", "cur", "torque", "strom", "moment"},
+                {"demand", "actual", "coil", "motor", "drive", "output", "ventil", "antrieb", "spule"}),
 }
 for _signal in EHA[1:]:  # its name in a recording says both
     if _signal.role in ("output", "drive"):
@@ -42,7 +45,7 @@ _USUAL = {"m": "1 um", "Pa": "1 kPa", "N": "1 N", "A": "1 uA"}  # counts, where 
 _KNOWN_OBJECTS = {"0x607A": "command", "0x6078": "A", "0x6077": "N m"}  # CiA 402: role, or unit of the drive
 _RATED_CURRENT = 0x6075  # mA; 0x6078 counts thousandths of it
 _ENABLING = {"en", "enable", "enabled", "active", "activate", "engage", "engaged", "request", "run", "on",
-             "operational", "ready"}
+             "operational", "ready", "freigabe", "frei", "ein", "aktiv", "bereit"}
 
 
 @dataclass(frozen=True)
@@ -145,10 +148,12 @@ def guess_can(title: str, file: str, text: str, wanted: Wanted) -> str:
                                            signal.unit or "")
                                  for signal in message.signals if not signal.is_multiplexer] for message in messages}
     every = [each for own in candidates.values() for each in own]
-    drive = wanted.signals.drive.word
-    current = _assign(every, {drive: wanted.tables["outputs"][drive]}, wanted).get(drive)
+    command, drive = wanted.signals.command.word, wanted.signals.drive.word
     senders = {message.name: set(message.senders) for message in messages}
-    device = senders.get(current[0].key.partition(".")[0], set()) if current else set()
+    found = _assign(every, {command: wanted.tables["inputs"][command], drive: wanted.tables["outputs"][drive]}, wanted)
+    by = {word: senders[each.key.partition(".")[0]] for word, (each, _) in found.items()}
+    nodes = set[str]().union(*senders.values())
+    device = by.get(drive) or nodes - by.get(command, nodes)  # the rig sends the demand
     sent = [message for message in messages if device and senders[message.name] & device]
     received = [message for message in messages if message not in sent]
     inputs = [each for message in received for each in candidates[message.name]]
@@ -174,11 +179,11 @@ def _write_states(messages: Sequence[Any], sent: Sequence[Any]) -> list[str]:
         for signal in message.signals:
             words, key = split_words(signal.name), f'"{message.name}.{signal.name}"'
             values = [str(text) for text in (signal.choices or {}).values() if split_words(str(text)) & _ENABLING]
-            if any(word.startswith(("crc", "checksum", "chk")) or word == "cs" for word in words):
+            if any(word.startswith(("crc", "checksum", "chk", "pruef")) or word == "cs" for word in words):
                 tables["protection"].append(f'{key} = "crc8_sae_j1850"  {UNSURE}which checksum it is')
-            elif words & {"counter", "cnt", "alive", "rolling", "sequence"}:
+            elif words & {"counter", "cnt", "alive", "rolling", "sequence", "bz", "zaehler"}:
                 tables["protection"].append(f'{key} = "counter"')
-            elif message in sent and words & {"state", "status", "st", "sts", "mode"}:
+            elif message in sent and words & {"state", "status", "st", "sts", "mode", "zustand", "betrieb"}:
                 if values:
                     tables["ready"].append(f'{key} = "{values[0]}"  {UNSURE}the state in which main begins')
             elif message not in sent and words & (_ENABLING | {"mode"} if values else _ENABLING) and signal.length <= 8:

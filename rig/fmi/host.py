@@ -52,12 +52,12 @@ class Host:
         self._count = len(outputs)
         self._description = fmpy.read_model_description(folder, validate=False)
         self._unit: Any = None
-        self._k = 0
+        self._k = -1  # the step to come; -1 until it is initialised
         self.said = ""  # its last message
 
     def begin(self, settings: Settings) -> list[float]:
         """Start anew with these parameters; the outputs at time 0."""
-        self._k = 0
+        self._k = -1
         if self._unit is not None and self._description.coSimulation.canBeInstantiatedOnlyOncePerProcess:
             self._unit.reset()
         else:
@@ -67,7 +67,9 @@ class Host:
         self.change(settings)
         self._unit.enterInitializationMode()
         self._unit.exitInitializationMode()
-        return self._read()
+        found = self._read()
+        self._k = 0
+        return found
 
     def change(self, settings: Settings) -> None:
         """Set parameters, those of a running unit too."""
@@ -96,7 +98,9 @@ class Host:
         usual = self._description.defaultExperiment
         if self._k == 0 and usual is not None and usual.stepSize:
             tool += f"; the steps that it suggests are of {usual.stepSize} s, controller.period"
-        return f"{str(error).rstrip('.')} at {self._k * self._cycle:.6g} s{said}{tool}"
+        if "Failed to instantiate" in str(error) and not said:
+            said = "; the guid, or instantiationToken, in its modelDescription.xml may not be that of its binary"
+        return f"{str(error).rstrip('.')} at {max(self._k, 0) * self._cycle:.6g} s{said}{tool}"
 
     def _instantiate(self) -> None:
         from fmpy import fmi1  # the base of all versions

@@ -162,8 +162,9 @@ def _map_signal(about: Description, name: str, entry: Entry, place: Place, causa
     if signal is None:
         role = (entry.role or "drive") if causality == "input" else "output"
         signal = Signal(name, name, unit, name.replace("_", " "), role)
-    return signal._replace(noise=noise, limit="", role="output" if causality == "output" else signal.role
-                           ), port._replace(name=signal.name)
+    # the unit has stops of its own; the current's limit is the controller's, which this plant has
+    return signal._replace(noise=noise, limit=signal.limit if signal.role == "drive" else "",
+                           role="output" if causality == "output" else signal.role), port._replace(name=signal.name)
 
 
 def _find_worth(about: Description, entry: Entry, unit: str, place: Place) -> tuple[float, str]:

@@ -385,7 +385,7 @@ def _find_run_start(missing: Mask, cycle: int, near: int = 4) -> int:
 def _describe_stop(node: Role, bench: Bench, records: CycleRecords, first: int, cycle: int, how: str) -> Cause:
     """A node that stopped answering in cycle `first`, with the evidence that the bench did its part."""
     missing = np.isnan(records.response if node == CONTROLLER else records.feedback)
-    frames, name = "drive" if node == CONTROLLER else "feedback", bench.describe_node(node)
+    frames, name = "valid drive" if node == CONTROLLER else "feedback", bench.describe_node(node)
     count = int(np.argmin(missing[first:])) if not missing[first:].all() else 0  # 0: until the end
     if not how and (count or first >= records.cycles):
         text = f"{name} did not answer in time: no {frames} frame for {count_nouns(count, 'cycle')} from {first}"

@@ -33,7 +33,7 @@ from rig.run.embedded_loop import EmbeddedLoop, Limits, can_play_many, load_code
 from rig.run.job import Job
 from rig.run.loop import AFTER, BEFORE, BEFORE_MAIN, CycleInput, CycleLoop, CycleObserver, History, Loop, load_parts
 from rig.run.state import Journal, SafeState, Stage
-from rig.run.watch import PATIENCE, describe_silence
+from rig.run.watch import PATIENCE, describe_missing
 from rig.sequences.faults import Plan, Schedule
 from rig.sequences.protocol import Mask, ProtocolLimits, Rows
 
@@ -242,7 +242,8 @@ class Enabling:
         return self._describe_silence() or f"the controller is not ready after {LIMIT:g} s: {said}"
 
     def _describe_silence(self) -> str:
-        return describe_silence(self._bench, self._silent) if self._silent else ""
+        missing = describe_missing(self._bench, self._silent, self._loop.describe_refusal())
+        return f"{self._bench.describe_node(CONTROLLER)}: {missing}" if self._silent else ""
 
     def _play_until(self, is_done: Callable[[], bool], make_step: Callable[[], CycleInput], most: int = 0) -> bool:
         """Play cycles until `is_done()`; False if that takes too long, True also when the run is to end.

@@ -20,6 +20,7 @@ from plant.compile import keep_apart
 from rig.benches.packing import (
     ACCEPTED,
     ALL_ROLES,
+    CAME_WITH,
     COMMAND,
     DRIVE,
     EVERY,
@@ -37,6 +38,7 @@ from rig.benches.packing import (
     PAYLOAD,
     ROLES,
     SENT_AS,
+    STATUS,
     VALUES_AT,
     VALVE,
     Layout,
@@ -481,6 +483,7 @@ def _keep_answer(buffers: Buffers, m: Layout, at: int, length: int, since_sync: 
     if not (m.words[at + IS_NUMBERED] or is_first or roles & DRIVE):
         return
     status = unpack_frame(m, at, length, words[ROW_CYCLE])
+    m.words[at + STATUS], m.words[at + CAME_WITH] = status, length
     if status == OTHER_CYCLE and roles & DRIVE:
         words[IS_LATE] = 1
     if status != ACCEPTED:

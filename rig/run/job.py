@@ -226,9 +226,8 @@ def _read_bench(attachments: Mapping[str, bytes], name: str, signals: Signals, *
     """
     files = {key.removeprefix(_BENCH_FOLDER): data for key, data in attachments.items()
              if key.startswith(_BENCH_FOLDER)}
-    if not files:
-        return load_bench()
-    return load_bench_from_files({name: files.get(name, b""), **files}, signals, is_trusted=is_trusted)
+    return load_bench_from_files({name: files.get(name, b""), **files}, signals, is_trusted=is_trusted
+                                 ) if files else load_bench()
 
 
 def speaks_as_shipped(bench: Bench) -> bool:

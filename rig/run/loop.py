@@ -222,6 +222,15 @@ class Loop(ABC):
         """Frames with a wrong checksum, or an alive counter that is not the next."""
         return sum(int(self._layout.words[at + packing.UNSOUND]) for at in packing.list_frame_places(self._layout))
 
+    def describe_refusal(self) -> str:
+        """Why the drive frame that came last was not taken; empty where it was, or none came."""
+        words = self._layout.words
+        at = next(at for at in packing.list_frame_places(self._layout) if words[at + packing.ROLES] & packing.DRIVE)
+        why = {packing.OTHER_LENGTH: f"{words[at + packing.CAME_WITH]} bytes, not {words[at + packing.LENGTH]}",
+               packing.WRONG_CHECKSUM: "a wrong checksum", packing.REPEATED: "the alive counter of the one before",
+               packing.OTHER_CYCLE: "the number of another cycle"}.get(int(words[at + packing.STATUS]))
+        return f"the last that came had {why}" if why else ""
+
     def _draw_noise(self) -> None:
         """Draw the noise of the plant for a minute ahead."""
         if self._code:

@@ -39,6 +39,7 @@ class NodeWatch:
         self.emergencies: list[Emergency] = []
         self.heartbeats: dict[Role, list[Heartbeat]] = {role: [] for role in master.watched}
         self.last_answers = {CONTROLLER: -1, PLANT: -1}  # last cycle with a cyclic frame of it
+        self._last_row = 0  # the last cycle that is complete
         self._answers = {PLANT: bench.signals.outputs[-1].name, CONTROLLER: bench.signals.drive.name}  # who sends it
         self._operational: set[Role] = set()
         self._patience, self._missed = patience, 0  # cycles in a row for which the rig's own plant had no drive frame
@@ -66,10 +67,9 @@ class NodeWatch:
 
     def add(self, signals: Signals) -> None:
         """Take in a complete cycle: who answered in it."""
-        for role, name in self._answers.items():
-            value = getattr(signals, name)
-            if value == value:  # not NaN
-                self.last_answers[role] = signals.cycle
+        self._last_row = signals.cycle
+        self.last_answers |= {role: signals.cycle for role, name in self._answers.items()
+                              if not isnan(getattr(signals, name))}
         if not self._bench.has_plant_node and not self._master.is_deaf:
             self._watch_drive(bool(signals.flags & Flags.CURRENT_ZEROED))
 
@@ -89,12 +89,14 @@ class NodeWatch:
         if self._missed != (self._patience if is_first else 1):
             return
         # else in the words of a plant that is a node, which says so by EMCY
-        what = describe_silence(self._bench, self._missed) if is_first else (
-            f"plant 0x{EmcyCode.RPDO_TIMEOUT:04X} {describe_missing(self._bench, self._bench.most_missed)}")
-        self._safety.handle("bring_up" if is_first else NO_DRIVE, what, CONTROLLER)
+        refusal = self._stage.playing.describe_refusal()
+        who = f"{self._bench.describe_node(CONTROLLER)}:" if is_first else f"plant 0x{EmcyCode.RPDO_TIMEOUT:04X}"
+        missing = describe_missing(self._bench, self._missed if is_first else self._bench.most_missed, refusal)
+        self._safety.handle("bring_up" if is_first else NO_DRIVE, f"{who} {missing}", CONTROLLER)
         if CONTROLLER not in self._master.watched or (self._looks and self._safety.aborted):
-            self.gone.setdefault(CONTROLLER, "it sends no frames")
-            self._journal.log("ERROR", SILENCE, f"{self._bench.describe_node(CONTROLLER)} is silent")
+            how = f"sends no valid frames: {refusal}" if refusal else "is silent"
+            self.gone.setdefault(CONTROLLER, f"it {how}")
+            self._journal.log("ERROR", SILENCE, f"{self._bench.describe_node(CONTROLLER)} {how}")
 
     def _note_emergency(self, node: Role, error: EmcyError) -> None:
         if self._stage.is_playing or self._stage.is_probing:
@@ -107,7 +109,7 @@ class NodeWatch:
             self._safety.handle("late", f"the rig sent no heartbeat for {self._master.pause:.2f} s, and "
                                         f"{self._bench.describe_node(node)} reports 0x{error.code:04X}", RIG)
         else:
-            what = f"{self._bench.describe_node(node)} 0x{error.code:04X} {error.get_desc()}".rstrip()
+            what = f"{self._bench.describe_node(node)} 0x{error.code:04X} (EMCY) {error.get_desc()}".rstrip()
             self._safety.handle("emcy", what, node, error.code, round(error.timestamp * 1e9))
 
     def _note_state(self, node: Role, state: int) -> None:
@@ -122,20 +124,22 @@ class NodeWatch:
 
     def _handle_silence(self, node: Role) -> None:
         self.note_ended_processes()
-        limit = "" if node not in self._master.heard_ns else (
-            f": last heartbeat {1e-9 * (self._stage.clock.now() - self._master.heard_ns[node]):.2f} s ago")
-        if not self._is_answering(node):
-            self.gone.setdefault(node, f"no heartbeat any more{limit}")
-        self._safety.handle("heartbeat", f"{self._bench.describe_node(node)} is silent", node)
+        ago = 1e-9 * (self._stage.clock.now() - self._master.heard_ns[node])
+        what = f"no heartbeat any more: last heartbeat {ago:.2f} s ago"
+        if self._is_answering(node):
+            what += ", although its other frames come"
+        else:
+            self.gone.setdefault(node, what)
+        self._safety.handle("heartbeat", f"{self._bench.describe_node(node)}: {what}", node)
 
     def _handle_return(self, node: Role) -> None:
         if node not in self._processes.find_ended():
             self.gone.pop(node, None)
         self._journal.log("INFO", "heartbeat", f"{self._bench.describe_node(node)} is heard")
 
-    def _is_answering(self, node: Role, recent: int = 20) -> bool:
-        """Whether a node sent a cyclic frame in one of the `recent` cycles: its heartbeat alone may be missing."""
-        return self._stage.loop is not None and self.last_answers[node] >= self._stage.loop.k - recent
+    def _is_answering(self, node: Role) -> bool:
+        """Whether a node sent a cyclic frame in one of the last 20 cycles: its heartbeat alone may be missing."""
+        return self._stage.loop is not None and self.last_answers[node] >= self._stage.loop.k - 20
 
     def is_node_gone(self) -> bool:
         """Whether a node will not answer any more; looks every 20 ms."""
@@ -168,7 +172,7 @@ class NodeWatch:
         if self._master.is_deaf:
             return
         heard = self._master.heard_ns  # after a reset a node may have no heartbeat, and answers no SYNC
-        answering = [node for node in self.last_answers if self._is_answering(node, recent=1)]
+        answering = [node for node, cycle in self.last_answers.items() if cycle == self._last_row]
         found = self._silence.find_silent(now, {node: heard[node] for node, state in self._master.states.items()
                                                 if node in heard and state == NmtState.OPERATIONAL}, answering)
         for node in self._silent - found.keys():
@@ -177,7 +181,7 @@ class NodeWatch:
         for node in found.keys() - self.gone.keys():
             self._silent.add(node)
             self.gone[node] = f"no heartbeat for {found[node]:.1f} s either"
-            what = f"{self._bench.describe_node(node)} is silent"
+            what = f"{self._bench.describe_node(node)}: no heartbeat for {found[node]:.1f} s, and no answer"
             self._safety.handle("heartbeat", what, node)
             if not self._safety.aborted:  # no sequence can mean that in lockstep
                 self._safety.abort("abort", what)
@@ -193,15 +197,14 @@ class NodeWatch:
                 self.gone.setdefault(node, f"no heartbeat within {seconds:g} s at the end of the run")
 
 
-def describe_silence(bench: Bench, cycles: int) -> str:
-    """That the controller sends no drive frames."""
-    return f"{bench.describe_node(CONTROLLER)}: {describe_missing(bench, cycles)}"
+def describe_missing(bench: Bench, cycles: int, refusal: str) -> str:
+    """That no drive frame has come for so many cycles; its name and identifier are those of the bench.
 
-
-def describe_missing(bench: Bench, cycles: int) -> str:
-    """That no drive frame has come for so many cycles; its name and identifier are those of the bench."""
+    `refusal`: why those that come are not taken, if any do.
+    """
     frame = bench.frames.drive
-    return f"no frame {frame.name} ({describe_identifier(frame.identifier)}) for {count_nouns(cycles, 'cycle')}"
+    name = f"{frame.name} ({describe_identifier(frame.identifier)}) for {count_nouns(cycles, 'cycle')}"
+    return f"no valid frame {name}: {refusal}" if refusal else f"no frame {name}"
 
 
 class OverrunWatch:

@@ -193,7 +193,8 @@ def _judge_current(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[C
     if record.bench.profile == "none" and not record.bench.enables:
         yield SkippedCheck(name, "the bench has no control word, and no value of its phases enables the controller")
     else:
-        yield _judge_largest(name, drive, idle, limits.idle_current, f"{len(idle)} cycles")
+        largest = limits.idle_current + record.bench.find_least(drive.word)
+        yield _judge_largest(name, drive, idle, largest, f"{len(idle)} cycles")
     if isnan(record.drive_limit):
         yield SkippedCheck(limited, "the plant declares no limit of it")
     else:

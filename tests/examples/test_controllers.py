@@ -270,8 +270,8 @@ STEP = SHORT.replace("to = 1e-3", "to = 5e-3") + SLOW_START  # takes the current
 LATER = SHORT.replace("time = 0.1 }", "time = 1.5 }") + SLOW_START  # some faults begin after a second
 FOUND_BY = {  # fault: by what, and in which sequence; "" for preflight
     "wrong_sign": ("guard 'ram far out'", ""), "wrong_scaling": ("current within its limit", STEP),
-    "ignores_enable": ("no current unless", STEP), "stops_sending": ("no drive frame", LATER),
-    "stuck_status": ("status word follows", STEP), "wrong_counter": ("no drive frame", LATER)}
+    "ignores_enable": ("no current unless", STEP), "stops_sending": ("no valid drive frame", LATER),
+    "stuck_status": ("status word follows", STEP), "wrong_counter": ("the last that came had the alive counter", LATER)}
 
 
 @pytest.mark.parametrize(("folder", "fault"), [

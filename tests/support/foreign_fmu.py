@@ -22,7 +22,7 @@ def build_fmu(path: Path, version: str = "3", does: str = "NOTHING", at: int = -
         path: of the file.
         version: of FMI.
         does: what it does in step `at`: NOTHING, CRASH, HANG, REFUSE, GIVE_NAN, END; or EVENT_MODE, which it needs; or
-            DIVERGE, where k is above 4.
+            TOKEN, which it refuses; or DIVERGE, where k is above 4.
         at: number of the step.
         unit: more attributes of the interface.
         platform: folder of its library, where it is not that of this machine.

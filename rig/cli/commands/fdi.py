@@ -41,7 +41,8 @@ def learn_bands(args: argparse.Namespace) -> int:
             "FILE.toml, where the bands go")
     model = load_chosen_model(args)
     faults = choose_faults(args.faults, model.kind)
-    com, _, name = load_command(args.command_file, model["controller.period"], model.kind)
+    com, _, name = (None, None, "") if args.learn_bands else load_command(
+        args.command_file, model["controller.period"], model.kind)
     with show_progress(args) as progress:
         made = make_bands_file(args.learn_bands, args.out, model, com, name, args.seed, progress, faults)
     return give_answer(build_bands_report(made), args)

@@ -187,9 +187,9 @@ def repeat_job(source: Path, args: argparse.Namespace) -> Job:
     require(not (args.out and (Path(args.out) / "trace.mcap").resolve() == log.resolve()), "--out", args.out,
             "another folder than that of the log to repeat, which would be overwritten")
     job = read_job(source, is_trusted=args.trust)
+    other = "" if "external" in (job.controller, job.plant) else ", or --bus embedded"  # which no other program reaches
     require(args.bus != "auto" or job.bus.partition(":")[0] in EMBEDDED_NAMES, log, f"bus {job.bus}",
-            f"--bus {job.bus} to use it again, or --bus embedded: the bus of a log "
-            "is opened only if the command line names it")
+            f"--bus {job.bus} to use it again{other}: the bus of a log is opened only if the command line names it")
     return replace_settings(job, bus=None if args.bus == "auto" else args.bus, pace=args.pace,
                             controller=args.controller, plant=args.plant, max_overruns=args.max_overruns)
 

@@ -194,13 +194,15 @@ def test_thinned_line_keeps_its_extremes() -> None:
 def test_injected_faults_are_shaded_from_begin_to_end(preflight: Path) -> None:
     trace = Trace.read(preflight)
     events = (Event(1.0, "WARN", "fault", "lost drive begins"), Event(2.5, "INFO", "fault", "lost drive ends"),
-              Event(3.0, "WARN", "fault", "parameter filter.clogging begins"))
+              Event(3.0, "WARN", "fault", "parameter filter.clogging begins"),
+              *(Event(t, "ERROR", "emcy", "node 2 controller 0x2310") for t in (3.1, 3.2, 3.25)))
     faulty = replace(trace, events=events)
     assert run_report.list_faults(faulty) == [
         ("lost drive", 1.0, 2.5), ("parameter filter.clogging", 3.0, trace.t[-1])]
     assert "injected: lost drive from 1 to 2.5 s" in explain_report.describe_injected_faults(faulty)
     assert explain_report.describe_injected_faults(trace) == ""
-    assert "lost drive" in render_run(faulty) and run_report.draw_signals(faulty) != run_report.draw_signals(trace)
+    assert (all(each in render_run(faulty) for each in ("lost drive", "0x2310 (3 times, the last at 3.250 s)"))
+            and run_report.draw_signals(faulty) != run_report.draw_signals(trace))
 
 
 def make_trace() -> Trace:

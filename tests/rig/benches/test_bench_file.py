@@ -193,6 +193,8 @@ SHEETS = [
      "x.eds: 0x1600: expected at most 8 bytes in RPDO1, not 72 bits"),
     ((RPDOS[0]._replace(kind=250), RPDOS[1]), TPDOS, "a transmission type 0 to 240, 254 or 255 for RPDO1, not 250"),
     ((RPDOS[0]._replace(words=(0x2000_0010, 0x6040_0010)), RPDOS[1]), TPDOS, "0x2000 with 32 bits in RPDO1, not 16"),
+    ((RPDOS[0]._replace(words=(0x2999_0310, 0x6040_0010)), RPDOS[1]), TPDOS,
+     "an object that a RPDO maps; RPDO1 maps 0x2999:3, which the file lacks; for 0x2000 with 32 bits RPDO1 and"),
     (RPDOS, (TPDOS[0]._replace(words=(0x2002_0010,)),),
      "controller.profile: expected an object that a TPDO maps; for 0x6041 with 16 bits TPDO1 has room"),
 ]

@@ -16,6 +16,7 @@ from refusals import catch_refusal
 from plant.compile import compile_function
 from rig.benches.bench import EXTENDED, FD, SWITCHED, Field, FrameSpec, Guard, Kind, Role, extract_bits, pack, unpack
 from rig.benches.bench_file import load_bench_from_files
+from rig.benches.bench_report import list_loads
 from rig.benches.checksums import compute_checksum, compute_crc8, load_checksum
 from rig.benches.packing import (
     ACCEPTED,
@@ -190,18 +191,17 @@ def test_a_page_is_a_frame_and_what_stands_on_all_pages_is_read_from_each() -> N
     assert list(list_pages(load_pages())) == [("Drive[2]", True, 2)]
     bench = load_pages('[controller.ready]', '"Drive.State" = "run"')
     assert list(list_pages(bench)) == [("Drive[2]", True, 2), ("Drive[3]", False, 3)]
-    assert bench.ready == {"Drive.State": 3}
+    assert [each.share for each in list_loads(bench)[1:]] == 2 * [list_loads(load_pages())[1].share / 2]
     frame = bytes([3, 3, 0, 0, 0, 0, 0, 0])
-    found = bench.frames.find(11, frame)
-    assert found is not None and unpack(found, frame)["Drive.State"] == 3
+    assert bench.ready == {"Drive.State": 3} and unpack(bench.frames.find(11, frame), frame)["Drive.State"] == 3
     assert bench.frames.find(11, bytes([9]) + frame[1:]) is None
 
 
 def test_a_signal_that_the_bench_file_does_not_use_has_its_start_value() -> None:
     spec = load_pages().frames.list_from(Role.RIG)[0]
     data = pack(spec, {"position_demand": 0.001, "ram_position": -1e-5})
-    assert data == bytes.fromhex("e8030000ffff0700")  # of two that overlap the first is filled
-    assert math.isclose(unpack(spec, data)["ram_position"], -1e-5)
+    # of two that overlap the first is filled
+    assert data == bytes.fromhex("e8030000ffff0700") and math.isclose(unpack(spec, data)["ram_position"], -1e-5)
 
 
 MULTIPLEXED = """VERSION ""

@@ -18,7 +18,7 @@ from plant.signals import EHA
 from rig.benches.bench import Role, list_inputs, list_outputs, pack
 from rig.benches.bench_file import ControllerKeys, NodeKeys, load_bench
 from rig.benches.checksums import CHECKSUMS
-from rig.benches.guess import UNSURE
+from rig.benches.guess import UNSURE, Wanted, guess_can
 from rig.doctor import count_frames, judge_frames
 from rig.network.bus import Link, open_can
 from rig.network.frame import Frame, WallClock
@@ -101,6 +101,31 @@ def test_a_bench_of_an_own_plant_is_guessed_from_its_signals(tmp_path: Path) -> 
     assert {name: float(count) for name, count in counts.items()} == pytest.approx({
         "trim_cmd": 0.01, "trim_angle": 1e-6, "shaft_rate": 0.01 * math.pi / 30.0, "torque_ref": 1e-3})
     assert "expected no device" in refuse("new", "plant", "x", "--model", "ema")
+
+
+BOX_DBC = """VERSION ""
+BU_: HOST BOX
+BO_ 528 Soll: 8 HOST
+ SG_ Soll_Weg : 15|24@0+ (0.00073,-37.5) [0|0] "mm" BOX
+ SG_ Soll_Reserve : 39|8@0+ (1,0) [0|255] "" BOX
+BO_ 529 Ist: 8 HOST
+ SG_ Ist_Weg : 15|28@0- (0.00011,3.3) [0|0] "mm" BOX
+ SG_ Ist_Druck : 35|16@0+ (0.013,-400) [0|0] "bar" BOX
+BO_ 774 Antwort: 4 BOX
+ SG_ Antwort_Takt : 11|4@0+ (1,0) [0|14] "" HOST
+ SG_ Antwort_Strom : 23|12@0+ (0.0041,-8.405) [0|0] "mA" HOST
+"""
+
+
+@pytest.mark.parametrize(("name", "said"), [
+    ("Strom", 'current = "Antwort.Antwort_Strom"'), ("Wert", "nothing looks like it")])
+def test_german_names_are_known_and_what_the_rig_sends_is_no_output(name: str, said: str) -> None:
+    """Also where the current's name says nothing: then the device is who does not send the demand."""
+    text = guess_can("box", "box.dbc", BOX_DBC.replace("Strom", name), Wanted())
+    inputs, outputs = text.split("[controller.outputs]")
+    assert all(f'{word} = "{signal}"' in inputs for word, signal in (
+        ("position_demand", "Soll.Soll_Weg"), ("ram_position", "Ist.Ist_Weg"), ("load_pressure", "Ist.Ist_Druck")))
+    assert said in outputs and "Antwort" not in inputs and "Soll" not in outputs
 
 
 def test_a_sheet_without_the_signals_is_completed_by_the_user(tmp_path: Path) -> None:

@@ -154,8 +154,7 @@ def test_a_ramp_and_a_step_keep_their_seconds(period: float, tmp_path: Path) -> 
     assert (run["com"] == com[row]).all() and (run["load"] == load[row]).all()
     late = run["t"] > 0.1
     speed = np.polyfit(run["t"][late & (run["t"] < 0.3)], run["xj"][late & (run["t"] < 0.3)], 1)[0]
-    assert speed == pytest.approx(5e-3, rel=0.02)
-    assert run["xj"][-1] == pytest.approx(2.5e-3, abs=50e-6)
+    assert (speed, run["xj"][-1]) == (pytest.approx(5e-3, rel=0.02), pytest.approx(2.5e-3, abs=50e-6))
 
 
 CODE = (SPRING + '''
@@ -269,8 +268,10 @@ def test_names_texts_and_settings_of_a_log_are_checked(log: Path, attachments: d
 @pytest.mark.parametrize("words", [["sent.mcap", "--bus", "embedded"], ["{log}"]])  # asked for, and as it was
 def test_a_log_does_not_choose_the_bus(words: list[str], log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     change_log(log, Path("sent.mcap"), settings={"bus": "udp_multicast:239.77.7.7"})
+    change_log(log, Path("device.mcap"), settings={"bus": "udp_multicast:239.77.7.7", "controller": "external"})
     monkeypatch.setenv("EHA_RIG_BUS", "udp_multicast:239.77.7.8")
-    assert "--bus udp_multicast:239.77.7.7" in refuse("run", "--from", "sent.mcap", "--out", "out")
+    for name, offer in (("sent.mcap", ", or --bus embedded: "), ("device.mcap", ": ")):
+        assert f"--bus udp_multicast:239.77.7.7 to use it again{offer}" in refuse("run", "--from", name)
     said = rig("run", "--from", *(word.format(log=log) for word in words), "--json", "--out", "out")
     assert said.status == 0 and said.json["run"]["bus"] == "embedded", said
 

@@ -15,7 +15,7 @@ import pytest
 from c_device import needs_compiler, skip_without_compiler
 from effect_files import HEAD, restored_catalogue
 from places import ROOT
-from rig_command import answer, refuse, rig
+from rig_command import answer, refuse, rig, write_file
 
 from fdi.trace.trace import Trace
 from plant import Model, RigError, load_model, simulate
@@ -180,8 +180,7 @@ def test_states_are_saved_restored_and_serialised(make_instance: Callable[[], In
     data = one.fmu.serializeFMUState(saved)
     other.fmu.setFMUState(other.fmu.deserializeFMUState(data))
     assert other.run(50, 50) == onward
-    assert is_refused(other.fmu.deserializeFMUState, data[:-1])
-    assert is_refused(other.fmu.deserializeFMUState, bytes(len(data)))
+    assert all(is_refused(other.fmu.deserializeFMUState, each) for each in (data[:-1], bytes(len(data))))
     one.fmu.freeFMUState(saved)
     one.fmu.reset()
     one.start()
@@ -299,6 +298,14 @@ proportional_gain = 4.0
 gain = 2.0
 damping = 8.0
 """
+FAULT = """
+[faults.strong]
+title = "strong drive"
+parameter = "drive.gain"
+range = [2, 8]
+acceptable = 3
+maintenance = 5
+"""
 SHORT = """
 title = "Short"
 setup = [{ kind = "hold", time = 0.02 }]
@@ -362,7 +369,10 @@ def test_a_unit_of_another_tool_is_mapped_simulated_and_compared(folder: Path, v
         ("verdict", "WITHIN_FLOOR"), ("solver_error", None)}
     other = answer("compare", "run.csv", "--model", "slide.toml", "--set", "drive.gain=2.2", status=1)
     assert other["verdict"] == "MODEL_INCOMPLETE"
+    learn = ("fdi", "--faults", write_file(Path("faults.toml"), FAULT), "--out", "bands.toml", "--learn-bands")
     for line, *words in (("a plant with equations", "explain", "run.csv"),
+                         ("units the rig simulates side by side", *learn, "--command", "command.csv"),
+                         ("at least 5 healthy", *learn, "run.csv"),
                          ("from 0.5 to 10", "simulate", "--set", "drive.gain=12"),
                          ("an FMU has steps of its own", "simulate", "--steps", 5, "--command", "command.csv")):
         assert line in refuse(*words, "--model", "slide.toml")
@@ -403,6 +413,7 @@ def test_a_unit_that_breaks_ends_the_run_with_a_verdict_and_a_readable_log(
     ({"unit": 'needsExecutionTool="true"', "does": "REFUSE", "at": 1}, "needs the tool that made it"),
     ({"unit": 'fixedInternalStepSize="0.0003"'}, "a step of which the cycle of 1 ms is a multiple, not 0.3 ms"),
     ({"does": "EVENT_MODE"}, "its message: this unit needs event mode"),
+    ({"does": "TOKEN"}, "at 0 s; the guid, or instantiationToken, in its modelDescription.xml may not"),
     ({"does": "END", "at": 3}, "the unit asks to end the simulation"),
 ])
 def test_a_unit_that_cannot_run_here_is_refused(folder: Path, kind: dict[str, Any], expected: str) -> None:
@@ -441,7 +452,9 @@ def test_a_unit_may_lack_functions_that_nobody_calls_and_may_exist_once(folder: 
 def test_a_drive_of_its_own_has_no_limit_of_the_shipped_actuator(folder: Path) -> None:
     build_fmu(Path("slide.fmu"))
     Path("own.toml").write_text(SLIDE.replace("current =", "torque =").replace("1 mA", "1 N m"))
-    assert load_model("own.toml")["controller.current_limit"] > 1e6
+    assert [(each.kind.signals.drive.limit, each["controller.current_limit"] > 1e6)
+            for each in map(load_model, ("own.toml", "slide.toml"))] == [
+                ("", True), ("controller.current_limit", False)]
 
 
 def test_a_run_has_the_period_of_the_model_file(folder: Path) -> None:

@@ -123,7 +123,7 @@ CASES: dict[str, tuple[list[tuple[Any, ...]], dict[int, str], tuple[int, str, in
         "by its own record the plant sent feedback 3.0 ms after SYNC"),
     "a dead controller, and not the plant that misses it": (
         [("lose_drive", 600), MISSED], {CONTROLLER: KILLED}, (CONTROLLER, "stopped", 600),
-        f"no drive frame since cycle 600; {KILLED}"),
+        f"no valid drive frame since cycle 600; {KILLED}"),
     "although a SYNC was late just before": (
         [("late", 598, 0.7e-3), ("lose_drive", 600), MISSED], {CONTROLLER: "no heartbeat any more"},
         (CONTROLLER, "stopped", 600), ""),
@@ -138,7 +138,7 @@ CASES: dict[str, tuple[list[tuple[Any, ...]], dict[int, str], tuple[int, str, in
         {PLANT: KILLED}, (PLANT, "stopped", 600), ""),
     "a controller that stalls alone": (
         [("lose_drive", 600, 612), MISSED], {}, (CONTROLLER, "stopped", 600),
-        "did not answer in time: no drive frame for 12 cycles from 600"),
+        "did not answer in time: no valid drive frame for 12 cycles from 600"),
     "missing feedback that came": ([("report", 604.0, CONTROLLER, 0x8250)], {}, (CONTROLLER, "emcy", 604), ""),
     "a plant that leaves OPERATIONAL, known by its next heartbeat": (
         [("lose_feedback", 600, 720), ("report", 603.5, CONTROLLER, 0x8250), ("report", 690.0, PLANT, 127, "nmt")], {},
@@ -169,8 +169,7 @@ def test_the_first_cause(case: str) -> None:
     assert found.cause is not None and (found.cause.source, found.cause.kind, found.cause.cycle) == expected
     assert words in found.cause.text and found.cause.is_gone is (found.cause.source in gone)
     own = sum(trouble.text == found.cause.text for trouble in script.troubles)
-    assert len(found.consequences) == len(script.troubles) - own
-    assert found.by_bench >= found.cause.is_lateness
+    assert len(found.consequences) == len(script.troubles) - own and found.by_bench >= found.cause.is_lateness
     if (found.cause.source, found.cause.kind) == (CONTROLLER, "stopped"):
         assert "SYNC was sent at most 0.02 ms late and feedback came within 0.10 ms" in found.cause.evidence[0]
 
@@ -187,8 +186,7 @@ def test_the_first_cause(case: str) -> None:
 def test_what_lateness_spoils(steps: list[tuple[Any, ...]], unjudged: Collection[int], affected: Collection[int],
                               invalid: dict[str, int], overruns: dict[int, int]) -> None:
     found = Script().spoil(steps).attribute()
-    assert set(np.flatnonzero(~found.judged)) == set(unjudged)
-    assert set(np.flatnonzero(found.affected)) == set(affected)
+    assert [set(np.flatnonzero(rows)) for rows in (~found.judged, found.affected)] == [set(unjudged), set(affected)]
     assert invalid.items() <= found.invalid.items()
     assert {int(k): int(found.overruns[k]) for k in np.flatnonzero(found.overruns)} == overruns
 

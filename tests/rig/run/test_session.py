@@ -132,7 +132,7 @@ def test_a_meant_end_that_does_not_come_is_a_failure(tmp_path: Path) -> None:
     assert outcome.failures == ["the run did not end in the safe state"]
 
 
-@pytest.mark.parametrize(("node", "says"), [("rig", "0x8130"), ("plant", "node 3 plant is silent")])
+@pytest.mark.parametrize(("node", "says"), [("rig", "0x8130"), ("plant", ", although its other frames come")])
 def test_a_heartbeat_that_stops(tmp_path: Path, node: str, says: str) -> None:
     text = SHORT.replace("time = 0.2 }", "time = 1.2 }")
     outcome = play(job(with_faults(text, f'kind = "heartbeat", node = "{node}", start = 0.1')), tmp_path)
@@ -168,7 +168,7 @@ def play_with_intruder(folder: Path, frames: list[tuple[int, bytes]]) -> Session
     ([(0x000, b"\x80\x02")], "another node sends 0x000"),
     ([(0x702, b"\0")], "node 2 controller left OPERATIONAL: boot-up"),
     ([(0x703, b"\x7f")], "node 3 plant left OPERATIONAL: pre-operational"),
-    ([(0x082, bytes.fromhex("3023010000000000"))], "node 2 controller 0x2330"),
+    ([(0x082, bytes.fromhex("3023010000000000"))], "node 2 controller 0x2330 (EMCY)"),
 ])
 def test_strangers_and_nodes_that_restart_end_main(tmp_path: Path, frames: list[tuple[int, bytes]], why: str) -> None:
     session = play_with_intruder(tmp_path, frames)
@@ -368,8 +368,8 @@ def test_with_faults_loads_a_recorded_command_and_the_users_effect(tmp_path: Pat
     del CATALOGUE["creep"]
     said = rig("run", "--from", tmp_path / "a" / "trace.mcap", "--trust", "--quiet", "--out", tmp_path / "b")
     assert said.status == 0, said
-    assert same(tmp_path / "a", tmp_path / "b")
-    assert abs(Trace.read(tmp_path / "a").cor[-20:].mean()) > 1e-5  # and the effect did something
+    # and the effect did something
+    assert same(tmp_path / "a", tmp_path / "b") and abs(Trace.read(tmp_path / "a").cor[-20:].mean()) > 1e-5
 
 
 def test_two_effect_files_of_one_name_are_refused(tmp_path: Path) -> None:
