@@ -446,8 +446,9 @@ def draw_dependence(c: Comparison) -> str:
     by = {name: {x.on: x for x in d.depends} for name, d in c.diagnoses.items()}
     possible = ("speed", "position", *(s.symbol for s in c.trace.declared.outputs), "acceleration")
     kinds = [kind for kind in possible if any(kind in own for own in by.values())]
-    return draw_panels("dependence", [_draw_means(c, name, kinds, own) for name, own in by.items()],
-                       2.3 * len(by)) if kinds else ""
+    if not kinds:
+        return ""
+    return draw_panels("dependence", [_draw_means(c, name, kinds, own) for name, own in by.items()], 2.3 * len(by))
 
 
 def _draw_means(c: Comparison, name: str, kinds: Sequence[str], by: dict[str, Depends]) -> list[Panel]:

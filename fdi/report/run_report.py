@@ -350,8 +350,10 @@ def draw_timing(trace: Trace) -> str:
                            instant(float(np.percentile(known, 99)), INK, width=0.8, style=":"),
                            axes(xscale="log", xlabel=f"{name} [us]",
                                 ylabel="" if panels else "cycles (dotted: p99)")])
+    if not panels:
+        return ""
     return draw_panels("timing", [panels], 2.5, layout=None, gridspec_kw={
-        "left": 0.08, "right": 0.99, "top": 0.96, "bottom": 0.2, "wspace": 0.16}) if panels else ""
+        "left": 0.08, "right": 0.99, "top": 0.96, "bottom": 0.2, "wspace": 0.16})
 
 
 def _bridge_short_gaps(values: Floats) -> Floats:

@@ -148,7 +148,9 @@ def unpack_frame(m: Layout, at: int, length: int, cycle: int) -> int:
 
 
 def _find_mask(bits: int) -> int:
-    return -1 if bits == 64 else (1 << bits) - 1
+    if bits == 64:
+        return -1
+    return (1 << bits) - 1
 
 
 def _integer(value: Any) -> int:
@@ -222,7 +224,10 @@ def _decode(m: Layout, field: int, bits: int) -> float:
     counts = 0.0
     if words[field + _KIND] == _FLOAT:
         words[_SCRATCH] = bits
-        counts = doubles[_SCRATCH] if length == 64 else float(m.singles[2 * _SCRATCH])
+        if length == 64:
+            counts = doubles[_SCRATCH]
+        else:
+            counts = float(m.singles[2 * _SCRATCH])
     elif words[field + _KIND] == _SIGNED:
         if length < 64 and bits >> length - 1 & 1:
             bits = (bits & _find_mask(length)) - (1 << length)

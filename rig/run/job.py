@@ -226,8 +226,9 @@ def _read_bench(attachments: Mapping[str, bytes], name: str, signals: Signals, *
     """
     files = {key.removeprefix(_BENCH_FOLDER): data for key, data in attachments.items()
              if key.startswith(_BENCH_FOLDER)}
-    return load_bench_from_files({name: files.get(name, b""), **files}, signals, is_trusted=is_trusted
-                                 ) if files else load_bench()
+    if not files:
+        return load_bench()
+    return load_bench_from_files({name: files.get(name, b""), **files}, signals, is_trusted=is_trusted)
 
 
 def speaks_as_shipped(bench: Bench) -> bool:

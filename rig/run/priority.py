@@ -157,7 +157,9 @@ def name_scheduler() -> str:
 def compute_percentiles(seconds: NDArray[np.floating]) -> dict[str, float]:
     """p50, p99, p99.9 and the largest of the times that are not missing, us; nothing if all are."""
     known = seconds[~np.isnan(seconds)] * 1e6
-    return dict(zip(PERCENTILES, np.percentile(known, (50, 99, 99.9, 100)).tolist(), strict=True)) if len(known) else {}
+    if not len(known):
+        return {}
+    return dict(zip(PERCENTILES, np.percentile(known, (50, 99, 99.9, 100)).tolist(), strict=True))
 
 
 def is_fifo_granted() -> bool:
