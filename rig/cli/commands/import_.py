@@ -52,7 +52,7 @@ def import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
             try:
                 cycles = import_csv(source, out, load_declared_model(args).kind.signals)
             except InputError as error:
-                if "in the header" not in error.expected:
+                if "the header is" not in error.expected:
                     raise
                 raise InputError(error.where, error.field, f"{error.expected}; for other columns: "
                                                            f"rig import --guess {source}") from error

@@ -149,8 +149,8 @@ def test_a_mistake_in_a_bench_of_an_own_plant(old: str, new: str, line: str, tmp
 
 
 @pytest.mark.parametrize(("role", "line"), [
-    ('"drive", limit="controller.torque_limit"', "expected one signal of role drive, not []"),
-    ('"command", largest=2', "expected one signal of role command, not []")])
+    ('"drive", limit="controller.torque_limit"', "expected one signal of role drive, not none"),
+    ('"command", largest=2', "expected one signal of role command, not none")])
 def test_a_plant_without_a_role_is_refused(role: str, line: str, tmp_path: Path) -> None:
     """A bench needs what drives the plant and what commands it."""
     said = rig("check", "--bench", write_bench(tmp_path, **{f", {role})": ")"}), "--trust")
