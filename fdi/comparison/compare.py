@@ -247,8 +247,9 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     floor = widened | find_floors(replay.residual, theirs, trace.period)
     off_alone = find_rows_off_alone(replay.residual, theirs, floor)
     replay = replay._replace(undecided=replay.undecided | off_alone)
-    floor |= find_floors({name: np.where(off_alone, np.nan, r) for name, r in replay.residual.items()}, theirs,
-                         trace.period)
+    if off_alone.any():
+        floor |= find_floors({name: np.where(off_alone, np.nan, r) for name, r in replay.residual.items()}, theirs,
+                             trace.period)
     sensed = trace.declared.controlled.name
     if sensed in floor and any(model.find_effect(name).port == "reading" for name in model.effects):
         # repeats are rounded alike

@@ -59,10 +59,9 @@ def read_runs(model: Model, trace: str | Trace, repeats: Sequence[str | Trace] =
         first, *left = (compute_residuals(run, replay_current(run, model)) for run in (est, *others))
         doubt = describe_doubtful_repeats(find_floors(first, left, est.period), sensor_floors(est, model),
                                           est.declared)
-    is_alike = unseen is not None and has_same_command(est, unseen)
-    return Runs(model, est, others, unseen, tuple(sources), (*est.notes, *([doubt] if doubt else []), *(
-        ["the held-out run has the command of the run: it shows overfitting less than another command"] if is_alike
-        else [])))
+    alike = ("the held-out run has the command of the run: it shows overfitting less than another command"
+             if unseen is not None and has_same_command(est, unseen) else "")
+    return Runs(model, est, others, unseen, tuple(sources), (*est.notes, *filter(None, (doubt, alike))))
 
 
 def read_traces(given: Sequence[str | Trace], model: Model) -> tuple[list[Trace], list[Source]]:

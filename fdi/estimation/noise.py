@@ -100,7 +100,8 @@ def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
 
     What a replay takes over of the controlled signal's noise is in them: see `compute_anchor_noise`.
     """
-    out, taken_over = {}, compute_anchor_noise(trace, model)
+    out = {}
+    taken_over = compute_anchor_noise(trace, model)
     for name in trace.outputs:
         signal, seen = trace.declared.find(name), floor_from_data(trace.mask_unusable(name))
         given = model.values.get(signal.noise, 0.0)
@@ -137,7 +138,8 @@ def compute_anchor_noise(trace: Trace, model: Model) -> dict[str, float]:
     kind, controlled = model.kind, trace.declared.controlled
     if kind.foreign is not None or kind.correct is not None:
         return {}
-    level, pull = find_sensor_level(trace, controlled, model), ANCHOR_RATE * model["controller.period"]
+    level = find_sensor_level(trace, controlled, model)
+    pull = ANCHOR_RATE * model["controller.period"]
     start, p = model.build_start()[0], model.build_record()[0]
     shown, moved = kind.measure(start, p), kind.measure(kind.move(start, level, p), p)
     passed = np.sqrt(pull / (2.0 - pull))

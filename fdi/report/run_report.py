@@ -259,7 +259,8 @@ def _tabulate_events(events: Sequence[Event], most: int = 12, most_on_page: int 
                (Column("level", medium=Medium.PAGE), lambda event: Cell(event.level, EVENT_MOODS.get(event.level, ""))),
                (Column("kind"), lambda event: event.kind), (Column("event"), lambda event: event.text))
     return [tabulate(events[:most_on_page], *columns, medium=Medium.PAGE,
-                     caption=f"The first {most_on_page} of {len(events)} events." * (len(events) > most_on_page)),
+                     caption=f"The first {most_on_page} of {len(events)} events."
+                     if len(events) > most_on_page else ""),
             tabulate([event for event in events if event.level != "INFO"], *columns, terminal_rows=most,
                      medium=Medium.TERMINAL)]
 

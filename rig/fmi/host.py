@@ -151,8 +151,11 @@ def serve(connection: Connection) -> None:
             connection.send(("done", result))
 
 
-def end_with(parent: int, folder: str) -> None:
-    """Remove the unpacked unit and end this process, hung or not, as soon as the rig has ended."""
+def end_after_rig(parent: int, folder: str) -> None:
+    """Remove the unpacked unit and end this process, hung or not, as soon as the rig has ended.
+
+    `rig.interrupts.end_with` would end it with the thread that has started it, and analyses start units in threads.
+    """
     never = threading.Event()
     while os.getppid() == parent:
         never.wait(0.5)
@@ -161,5 +164,5 @@ def end_with(parent: int, folder: str) -> None:
 
 
 if __name__ == "__main__":
-    threading.Thread(target=end_with, args=(os.getppid(), sys.argv[2]), daemon=True).start()
+    threading.Thread(target=end_after_rig, args=(os.getppid(), sys.argv[2]), daemon=True).start()
     serve(Connection(int(sys.argv[1])))
