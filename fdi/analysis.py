@@ -17,8 +17,7 @@ from fdi.output import write_text
 from fdi.report.drawing import Drawing, convert_figure, save_drawing
 from fdi.report.report import Figure, Medium, Report, render_html, to_plain
 from fdi.trace.trace import Trace
-from plant.errors import InputError
-from plant.model import Model, load_model
+from plant import InputError, Model, load_model
 
 if TYPE_CHECKING:
     from fdi.comparison.compare import Comparison

@@ -10,12 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from plant import InputError, escape_control_characters, load_plant, read_file, read_model_tables, read_toml, require
 from plant.effects import CATALOGUE, load_effects
-from plant.errors import InputError, escape_control_characters, require
-from plant.parameters import read_toml
-from plant.plant_files import read_model_tables
-from plant.plants import load_plant
-from plant.tables import read_file
 
 Announce = Callable[[str], None]
 

@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from plant.errors import InputError, report_system_error, require
+from plant import InputError, report_system_error, require
 
 
 def require_writable(out: str | Path, option: str, *, source: str | Path | None = None) -> Path:

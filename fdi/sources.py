@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from plant.errors import InputError, require
+from plant import InputError, require
 
 SUFFIXES = (".py", ".toml", ".c", ".json", ".npz")  # what a number can depend on; no pages, no caches
 

@@ -171,7 +171,7 @@ def examine_tools() -> list[Finding]:
 
 def examine_storage() -> list[Finding]:
     """Folders the software writes to."""
-    from plant.compile import find_cache_folder  # here: it loads numba, which takes a second
+    from plant import find_cache_folder  # here: it loads numba, which takes a second
 
     folder = find_cache_folder()
     free = shutil.disk_usage(Path.cwd()).free

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from plant.errors import InputError
+from plant import InputError
 from rig.benches.bench import Role, decode_device_text, pack, unpack
 from rig.benches.bench_file import load_bench, load_bench_from_files
 from rig.benches.bench_report import list_loads

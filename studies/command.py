@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from fdi.report.report import Report
-from plant.errors import RigError
+from plant import RigError
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
 from rig.cli.answer import Places, choose_file, give_answer
 from rig.cli.command_list import parse_whole_number

@@ -22,8 +22,7 @@ from fdi.report.report import Column, Report, Section, tabulate
 from fdi.trace.importing.conversion import import_measurement, read_map
 from fdi.trace.importing.formats import open_measurement
 from fdi.trace.trace import Trace, rms
-from plant.errors import InputError
-from plant.model import Model, load_model
+from plant import InputError, Model, load_model
 from studies.command import run_study_command
 
 MAPS = Path(__file__).parent.parent / "examples" / "servovalve_cylinder"

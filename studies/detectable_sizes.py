@@ -21,8 +21,8 @@ from fdi.discovery.runs import read_runs
 from fdi.discovery.sensitivity import describe_unit
 from fdi.progress import Progress, ignore_progress
 from fdi.sources import hash_sources
+from plant import Model
 from plant.effects import CATALOGUE
-from plant.model import Model
 from rig.campaign.batch import BatchProgress, Row, Workers
 from rig.campaign.sensitivity import measure_sensitivity
 from studies.command import report_progress as report_claims, run_cases

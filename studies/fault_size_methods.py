@@ -29,8 +29,7 @@ from fdi.report.numbers import NO_NUMBER, format_digits
 from fdi.report.report import Column, Report, Section, Table
 from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace, hold_last
-from plant.errors import InputError
-from plant.model import Model, load_model
+from plant import InputError, Model, load_model
 from rig.network.frame import WallClock
 from studies.command import report_progress, run_study_command
 from studies.hidden_effects.cases import measure_rms

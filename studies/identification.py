@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from fdi.estimation.binomial import measure_share
 from fdi.identification.identify import identify_model, read_free_parameters, read_identification_runs
 from fdi.trace.trace import Trace
-from plant.model import load_model
-from plant.segments import RATE
+from plant import RATE, load_model
 from rig.campaign.judge import FLOORS
 from studies.hidden_effects import command
 from studies.hidden_effects.cases import sample_healthy_plant

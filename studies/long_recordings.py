@@ -17,10 +17,7 @@ from fdi.estimation.fit import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
 from fdi.report.report import Column, Report, Section, tabulate
 from fdi.trace.trace import Floats, Trace
-from plant.errors import InputError
-from plant.lanes import Lanes
-from plant.model import Model
-from plant.signals import EHA
+from plant import EHA, InputError, Lanes, Model
 from rig.sequences import load_sequence
 from studies.command import report_progress, run_study_command
 

@@ -24,8 +24,7 @@ from fdi.estimation.replay import compute_residuals, prepare_trace, replay_curre
 from fdi.report.drawing import COMMAND, GREEN, choose_drawn_unit, shorten_svg, start_figure, to_svg
 from fdi.sources import name_software
 from fdi.trace.trace import Trace, rms
-from plant.lanes import Lanes
-from plant.model import Model, load_model
+from plant import Lanes, Model, load_model
 
 Floats = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from typing import Any
 from fdi.diagnosis.faults import Fault, Level, choose_faults, classify_size
 from fdi.estimation.binomial import Share, measure_share
 from fdi.foreign_code import load_plant_of_model
-from plant.model import Model, load_model
+from plant import Model, load_model
 from rig.campaign.batch import Row, Workers
 from rig.campaign.judge import HEALTHY, OK, WORKS, Matrix, build_matrix, run_campaign
 from rig.campaign.summary import describe_progress

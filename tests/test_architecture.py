@@ -222,6 +222,18 @@ def test_public_names() -> None:
     assert found == PUBLIC
 
 
+def test_one_address_for_each_name_of_the_plant() -> None:
+    """What `plant/__init__.pyi` offers is used by fdi or rig, and imported from `plant` alone."""
+    offered = {(f"plant.{node.module}", alias.name) for node in nodes(ROOT / "plant" / "__init__.pyi")
+               if isinstance(node, ast.ImportFrom) for alias in node.names}
+    outside = [path for path in tracked() if path.suffix == ".py" and not name(path).startswith("plant/")]
+    imports = [(node.module, alias.name, name(path)) for path in outside for node in nodes(path)
+               if isinstance(node, ast.ImportFrom) for alias in node.names]
+    assert [found for found in imports if found[:2] in offered] == []
+    used = {word for module, word, path in imports if module == "plant" and path.startswith(("fdi/", "rig/"))}
+    assert {word for _, word in offered} - used == set()
+
+
 def test_no_leftovers_and_no_machine_paths() -> None:
     """No notes to oneself, no folder of one machine, no host of a package registry."""
     notes = "|".join(["TO" + "DO", "FIX" + "ME", "X" * 3, "HA" + "CK"])
@@ -267,7 +279,8 @@ def test_each_dependency_is_explained() -> None:
 def test_each_import_is_declared() -> None:
     """What another package happens to bring along today may be gone tomorrow."""
     distributions = {"can": "python-can", "mcap_protobuf": "mcap-protobuf-support", "google": "protobuf",
-                     "rerun": "rerun-sdk", "llvmlite": "numba", "sklearn": "scikit-learn"}  # numba pins llvmlite itself
+                     "rerun": "rerun-sdk", "llvmlite": "numba", "sklearn": "scikit-learn",
+                     "lazy_loader": "lazy-loader"}  # numba pins llvmlite itself
     named = {re.split("[<>=]", line)[0] for line in requirements()}
     for path in MODULES:
         if name(path).startswith("studies/"):
@@ -279,7 +292,8 @@ def test_each_import_is_declared() -> None:
 
 def test_each_dependency_is_used() -> None:
     """Nothing is installed for nothing."""
-    modules = {"python-can": "can", "mcap-protobuf-support": "mcap_protobuf", "protobuf": "google"}
+    modules = {"python-can": "can", "mcap-protobuf-support": "mcap_protobuf", "protobuf": "google",
+               "lazy-loader": "lazy_loader"}
     used = {module.partition(".")[0] for path in MODULES for module in imported(path)}
     for line in PROJECT["project"]["dependencies"]:
         distribution = re.split("[<>=]", line)[0]

@@ -27,14 +27,11 @@ from reference_pages import write_reference
 from rig_command import rig, write_file
 from short_runs import HIDDEN, write_measured_runs
 
-from plant import Model, load_model, simulate
+from plant import Input, Model, list_offered_effects, list_plants, load_model, simulate
 from plant.effects import effect, load_effects
 from plant.eha import State
-from plant.model import list_offered_effects
 from plant.parameters import GROUPS
-from plant.plants import list_plants
 from plant.quantity import list_quantities
-from plant.state import Input
 from rig.cli import main
 from rig.cli.command_list import COMMANDS
 from rig.conformance.run_cases import CASES

@@ -6,10 +6,8 @@ from typing import Any
 
 from markdown_text import MADE, escape_markup, make_table, name_anchor, quote_code
 
-from plant import Model, load_model
+from plant import Model, list_offered_effects, list_plants, load_model
 from plant.effects import Effect
-from plant.model import list_offered_effects
-from plant.plants import list_plants
 from rig.cli.commands import list as list_command
 
 

@@ -10,8 +10,7 @@ from typing import Any, get_type_hints
 from catalogue_pages import make_plain_table
 from markdown_text import MADE, escape_markup, make_table, quote_code
 
-from plant import Model, tables
-from plant.segments import Segment
+from plant import Model, Segment, tables
 from rig.cli.commands import list as list_command
 from rig.network.node_objects import Identity
 from rig.sequences import faults

@@ -2,8 +2,8 @@
 from math import pi, sin
 from typing import Annotated, NamedTuple
 
+from plant import Quantity
 from plant.effects import effect
-from plant.quantity import Quantity
 
 
 class Cogging(NamedTuple):

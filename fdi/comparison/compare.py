@@ -58,9 +58,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
 from fdi.trace.trace import Flags, Floats, Trace, hold_last, rms, shift_rows
-from plant.model import Model
-from plant.run import compute_needed_drive
-from plant.signals import Signal
+from plant import Model, Signal, compute_needed_drive
 
 CUT_OFF = 0.2  # of half the rate of rows
 DECIMATION = 10

@@ -13,8 +13,7 @@ from fdi.estimation.noise import Floor, find_floors, floor_from_data, simulate_r
 from fdi.estimation.replay import BRIDGED_ROWS, Columns, differentiate, extend_flags, replay_current
 from fdi.thresholds import BLOCK_EXCESS_LEAST, NOISY_SENSOR_RATIO, SHAPE_TIE_GAIN, SPOOL_FITS_RATIO
 from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, rms
-from plant.forced import compute_flow_balance, compute_force_balance
-from plant.model import Model
+from plant import Model, compute_flow_balance, compute_force_balance
 
 XJ, P12, XS = "xj", "p12", "xs"
 SPAN = 0.02  # s; the flow is compared over the ram's way in it: longer adds up noise of XS, shorter shows that of XJ

@@ -20,7 +20,7 @@ from fdi.estimation.replay import Columns, differentiate
 from fdi.thresholds import CONDITION_DENSITY, CONDITION_EXCESS_LEAST, CONDITION_SHARE, RESIDUAL_TEST_CONFIDENCE
 from fdi.trace.sections import describe_section
 from fdi.trace.trace import Flags, Floats, Trace, fill_gaps, hold_last
-from plant.signals import Signal, Signals
+from plant import Signal, Signals
 
 SMOOTH = 0.021  # s of measured position that a speed is taken from
 REVERSES = 5e-4  # m/s in the other direction make a reversal; a ram at rest trembles by less

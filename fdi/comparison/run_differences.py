@@ -17,8 +17,7 @@ from fdi.estimation.noise import floor_from_data
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Flags, Floats, Trace, rms
-from plant.errors import count_nouns, require
-from plant.signals import Signal
+from plant import Signal, count_nouns, require
 
 SAME_COMMAND = 1.5e-7  # m, times `Trace.scale`; the bus carries steps of 1e-7 m
 MOST_UNCOVERED = 2.0  # rows of the slower run, by which runs of one length may differ

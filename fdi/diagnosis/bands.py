@@ -45,11 +45,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.sections import Section, describe_section, find_sections
 from fdi.trace.trace import Flags, Floats, Trace
-from plant.errors import InputError, count_nouns, require
-from plant.model import Model
-from plant.parameters import parse_toml
-from plant.plants import Plant, find_plant
-from plant.tables import decode_text, read_file
+from plant import InputError, Model, Plant, count_nouns, decode_text, find_plant, parse_toml, read_file, require
 
 LEVELS = {"middle": Level.MAINTENANCE, "most": Level.NON_NOMINAL}  # of a signal that has left this band
 

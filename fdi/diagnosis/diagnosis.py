@@ -53,8 +53,7 @@ from fdi.thresholds import (
     UNIT_TOLERANCE,
 )
 from fdi.trace.trace import Trace
-from plant.errors import InputError
-from plant.model import Model, load_model
+from plant import InputError, Model, load_model
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,9 +16,7 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 from fdi.thresholds import ABSENT_FAULT_SHARE, ACCEPTABLE_INTERVAL_FACTOR, INTERVAL_95_SD
-from plant.errors import InputError, require
-from plant.faults import Fault, place_faults, read_faults
-from plant.plants import Plant, find_plant
+from plant import Fault, InputError, Plant, find_plant, place_faults, read_faults, require
 
 __all__ = ["CLOGGING", "FAULTS", "FRICTION", "Estimate", "Fault", "Level", "choose_faults", "classify_size",
            "compute_severity", "find_ruling_fault", "judge_size", "list_fault_files", "load_faults"]

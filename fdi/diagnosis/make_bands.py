@@ -58,10 +58,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Floats, Trace, fill_gaps, measure_scale
-from plant.errors import InputError, count_nouns, require
-from plant.lanes import NARROW, Lanes
-from plant.model import Model, load_model
-from plant.threads import count_threads
+from plant import NARROW, InputError, Lanes, Model, count_nouns, count_threads, load_model, require
 
 FRICTION_AMOUNTS = (2, 5, 10, 14)  # sevenths of MaxBand, beside both limits
 LOW_DYNAMIC_SHARE = 0.3  # of the usual dynamic friction, of units that slip easily

@@ -98,11 +98,9 @@ from fdi.thresholds import (
     WEIGHT_COUNTS,
 )
 from fdi.trace.trace import Floats, Trace
+from plant import Model, ensure_starts, find_quantity, list_searched_effects, map_in_threads, require
 from plant.effects import CATALOGUE
-from plant.errors import require
-from plant.model import Model, find_quantity, list_searched_effects
-from plant.starts import ensure_starts
-from plant.threads import R, T, map_in_threads
+from plant.threads import R, T
 
 SMALLEST_SHARE = 0.01  # of the healthy size, bound of a fit by logarithms
 Sizes = tuple[float, ...]  # one for each fault, SI

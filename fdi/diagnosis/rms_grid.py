@@ -19,10 +19,7 @@ from fdi.estimation.fit import silence_readings
 from fdi.estimation.replay import has_known_start, read_cycles, replay_lanes
 from fdi.thresholds import ANCHOR_RATE
 from fdi.trace.trace import Flags, Floats, Trace
-from plant.errors import require
-from plant.lanes import Lanes
-from plant.model import Model
-from plant.monitor import FAULTS as MONITORED, Monitor
+from plant import FAULTS as MONITORED, Lanes, Model, Monitor, require
 
 CELLS = 21  # along each axis
 SLIDING_RATIOS = (2.0 / 3.0, 1.0, 1.0 / 3.0, 1.0 / 15.0)  # FDS/FSS of the monitor, the nominal plant's first

@@ -25,9 +25,7 @@ from fdi.estimation.replay import simulate_trace
 from fdi.estimation.unidentifiable import VISCOSITY, list_powers, scale_together
 from fdi.thresholds import GAIN_DETECTED, MISFIT_DISCRIMINATES
 from fdi.trace.trace import Floats, Trace
-from plant.lanes import Lanes
-from plant.model import Model
-from plant.threads import map_in_threads
+from plant import Lanes, Model, map_in_threads
 
 FITTED_STEPS, SIMULATED_STEPS = 10, 13  # a cycle: of the fit, and of the run that stands for the measurement
 REFIT_ROUNDS = 4

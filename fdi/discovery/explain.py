@@ -73,7 +73,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
 from fdi.trace.trace import Floats, Trace, hold_last
-from plant.model import Model, list_searched_effects
+from plant import Model, list_searched_effects
 
 NOISE_LEFT = ("NOTHING_MISSING", "NOT_RESOLVABLE", "EXPLAINED", "AMBIGUOUS")
 LONG = 10  # rounds of a last fit on which a verdict hangs alone

@@ -28,12 +28,19 @@ from fdi.thresholds import (
     RESIDUAL_IS_NOISE,
     SUSPICIOUS_TOLERANCES,
 )
+from plant import (
+    InputError,
+    Lanes,
+    Model,
+    compile_kernels,
+    ensure_starts,
+    find_quantity,
+    lacks_starts,
+    list_kernel_variants,
+    list_searched_effects,
+    report_law_errors,
+)
 from plant.effects import CATALOGUE
-from plant.errors import InputError
-from plant.lanes import Lanes, compile_kernels, list_kernel_variants
-from plant.model import Model, find_quantity, list_searched_effects
-from plant.run import report_law_errors
-from plant.starts import ensure_starts, lacks_starts
 
 PATTERN_VERDICTS = ("UNEXPLAINED", "PARTLY")  # after these the shape of the residual is reported
 

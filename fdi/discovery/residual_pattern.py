@@ -13,7 +13,7 @@ from fdi.estimation.fit import Problem
 from fdi.output import write_text
 from fdi.thresholds import PATTERN_EXPLAINED_SHARE, PATTERN_VISIBLE_RATIO
 from fdi.trace.trace import Flags, Floats, Trace
-from plant.model import Model
+from plant import Model
 
 KNOTS = 15  # of a curve
 SPATIAL_TURNS = 3.0  # over the range of the position: a slower wave is a trend, for example a spring

@@ -18,8 +18,7 @@ from fdi.estimation.replay import (
     replay_current,
 )
 from fdi.trace.trace import Trace
-from plant.errors import InputError
-from plant.model import Model
+from plant import InputError, Model
 
 
 class Source(NamedTuple):

@@ -74,9 +74,8 @@ from fdi.thresholds import (
     WHITE_SQUARE_POOR,
 )
 from fdi.trace.trace import Flags, Floats, Trace
-from plant.lanes import Part
-from plant.model import Model
-from plant.threads import R, T, count_threads, map_together
+from plant import Model, Part, count_threads, map_together
+from plant.threads import R, T
 
 FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage

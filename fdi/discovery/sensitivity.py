@@ -28,12 +28,8 @@ from fdi.estimation.fit import limit_friction_values
 from fdi.estimation.noise import Noise
 from fdi.thresholds import GAIN_DETECTED
 from fdi.trace.trace import Floats, Trace
+from plant import InputError, Lanes, Model, load_plant, simulate
 from plant.effects import load_effects
-from plant.errors import InputError
-from plant.lanes import Lanes
-from plant.model import Model
-from plant.plants import load_plant
-from plant.run import simulate
 
 TRIALS, NEEDED = 10, 9
 TRIALS_AT_ONCE = 4  # of a rung, before it is looked at again: most rungs that miss are decided by the first

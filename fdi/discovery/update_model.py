@@ -32,11 +32,18 @@ from fdi.progress import Progress, Stage, ignore_progress
 from fdi.sources import name_software
 from fdi.thresholds import EFFECT_INTERVAL_FACTOR, GAIN_SEEN, INTERVAL_95_SD, WHITE_SQUARE_POOR
 from fdi.trace.trace import Trace
+from plant import (
+    InputError,
+    Model,
+    find_effect,
+    find_plant,
+    find_quantity,
+    list_offered_effects,
+    list_plants,
+    parse_model,
+    read_model_tables,
+)
 from plant.effects import CATALOGUE
-from plant.errors import InputError
-from plant.model import Model, find_effect, find_quantity, list_offered_effects, parse_model
-from plant.plant_files import read_model_tables
-from plant.plants import find_plant, list_plants
 
 FIRST, THEN = 4, 6  # rounds of a first fit, along the parameters and along principal directions
 LAST_FIT_ROUNDS, EARLIER_FIT_ROUNDS = 8, 2  # of the last fit, and of those before it in the ledger

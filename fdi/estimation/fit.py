@@ -26,13 +26,20 @@ from fdi.thresholds import (
     TOLERANCES_FAR_SHARE,
 )
 from fdi.trace.trace import Floats, Trace
+from plant import (
+    Lanes,
+    Model,
+    Part,
+    Plant,
+    build_bare_model,
+    build_profile,
+    find_quantity,
+    list_offered_effects,
+    list_searched_effects,
+    map_in_threads,
+    simulate,
+)
 from plant.effects import Effect
-from plant.lanes import Lanes, Part
-from plant.model import Model, build_bare_model, find_quantity, list_offered_effects, list_searched_effects
-from plant.plants import Plant
-from plant.run import simulate
-from plant.segments import build_profile
-from plant.threads import map_in_threads
 
 HUM_MOST_SD = 8.0  # noise levels, of hum and noise together
 BLOCK = 100  # cycles

@@ -30,8 +30,8 @@ from fdi.estimation.mains import remove_mains
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import ANCHOR_RATE, RESIDUAL_HELD_OUT
 from fdi.trace.trace import Flags, Floats, Trace
-from plant.lanes import TURN, Lanes, Part
-from plant.model import Model
+from plant import Lanes, Model, Part
+from plant.lanes import TURN
 
 LONGEST_WHOLE = 30.0  # s; a shorter recording is fitted whole: the best pieces of it are more than half of it
 PIECE = 3.0  # s

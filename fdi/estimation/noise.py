@@ -30,11 +30,8 @@ from fdi.thresholds import (
     REPEAT_FLOOR_RATIO,
 )
 from fdi.trace.trace import Flags, Floats, Trace, rms
-from plant.compile import Function, compile_function
+from plant import Function, Input, Model, Signal, Signals, compile_function
 from plant.effects import combine_laws
-from plant.model import Model
-from plant.signals import Signal, Signals
-from plant.state import Input
 
 WINDOW = 100  # samples; shorter than stick-slip events are apart, longer than two periods of hum
 QUIET = 0.2  # the part of all windows that the first guess rests on

@@ -45,12 +45,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.sensor_dynamics import find_comb
 from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, fill_gaps, hold_last, hold_next, rms
-from plant.errors import InputError, require
-from plant.lanes import Lanes
-from plant.model import Model
-from plant.plants import MODULES
-from plant.run import compute_answers, rest_controller
-from plant.signals import EHA
+from plant import EHA, MODULES, InputError, Lanes, Model, compute_answers, require, rest_controller
 
 Columns = dict[str, Floats]  # by signal, (n,)
 

@@ -32,7 +32,7 @@ from fdi.estimation.unidentifiable import (
 )
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.trace import Floats
-from plant.threads import map_in_threads, map_together
+from plant import map_in_threads, map_together
 
 # factor on the noise, fits that go on, rounds of each, solver steps a cycle
 FIT_STAGES = ((100.0, 3, 3, 10), (30.0, 2, 4, 10), (6.0, 1, 5, 20), (1.0, 1, 8, 20))

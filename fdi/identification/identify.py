@@ -85,12 +85,18 @@ from fdi.thresholds import (
     STATIC_FRICTION_SYSTEMATIC_SD,
 )
 from fdi.trace.trace import Floats, Trace, rms
-from plant.errors import InputError, require
-from plant.lanes import Lanes
-from plant.model import Model, find_quantity, find_shipped_model
-from plant.parameters import read_toml
-from plant.tables import Place, build_dataclass
-from plant.threads import count_threads
+from plant import (
+    InputError,
+    Lanes,
+    Model,
+    Place,
+    build_dataclass,
+    count_threads,
+    find_quantity,
+    find_shipped_model,
+    read_toml,
+    require,
+)
 
 FRICTIONS = (("jack.static_friction", "jack.dynamic_friction"), ("spool.static_friction", "spool.dynamic_friction"))
 SYSTEMATIC_SD = {"jack.static_friction": STATIC_FRICTION_SYSTEMATIC_SD, "pilot.flow_gain": PILOT_FLOW_SYSTEMATIC_SD}

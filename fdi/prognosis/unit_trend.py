@@ -22,9 +22,7 @@ from fdi.progress import Progress
 from fdi.sources import hash_sources
 from fdi.trace.csv_table import report_unreadable
 from fdi.trace.trace import Trace
-from plant.compile import find_cache_folder
-from plant.errors import InputError, require
-from plant.model import Model
+from plant import InputError, Model, find_cache_folder, require
 
 LIMIT_NAMES = {"maintenance": "MidBand", "non_nominal": "MaxBand"}
 

@@ -41,7 +41,7 @@ from fdi.report.run_report import read_verdict
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
-from plant.errors import count_nouns
+from plant import count_nouns
 
 Facts = dict[str, list[str]]  # the text of each run
 

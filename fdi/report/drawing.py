@@ -23,8 +23,7 @@ from fdi.output import write_text, write_whole
 from fdi.report.numbers import choose_unit
 from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace.trace import Floats, Trace, rms
-from plant.errors import InputError
-from plant.signals import Signal, Signals
+from plant import InputError, Signal, Signals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -54,7 +54,7 @@ from fdi.report.report import Cell, Column, Figure, Line, Listing, Medium, Mood,
 from fdi.report.run_report import list_faults
 from fdi.thresholds import RESIDUAL_FOREIGN
 from fdi.trace.trace import Floats, Trace
-from plant.signals import Signals
+from plant import Signals
 
 BySignal = Mapping[str, float]  # SI
 FAR_OFF = "only with tolerances that fewer than one healthy unit in 600 has"

@@ -27,7 +27,7 @@ from fdi.report.numbers import (
 )
 from fdi.report.report import Cell, Column, Figure, Line, Listing, Medium, Mood, Report, Section, Table, tabulate
 from fdi.thresholds import HELD_OUT_UNDECIDED_SHARE, RESIDUAL_HELD_OUT
-from plant.signals import Signals
+from plant import Signals
 
 MOODS: dict[str, Mood] = {"IDENTIFIED": "good", "PARTLY": "doubtful", "CANNOT_TELL": "doubtful", "UNEXPLAINED": "bad"}
 

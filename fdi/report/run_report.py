@@ -56,9 +56,7 @@ from fdi.report.report import (
 )
 from fdi.trace.check_result import CheckResult, compute_speed, filter_median
 from fdi.trace.trace import Event, Floats, Trace
-from plant.errors import count_nouns
-from plant.signals import EHA, Signals
-from plant.units import UNITS
+from plant import EHA, UNITS, Signals, count_nouns
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",
                           "NOT_JUDGED": "doubtful", "CANNOT_TELL": "doubtful"}

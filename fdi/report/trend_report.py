@@ -33,7 +33,7 @@ from fdi.report.drawing import (
 from fdi.report.numbers import format_amount, format_interval, format_limit
 from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Mood, Report, Section, tabulate
 from fdi.thresholds import TREND_FEWEST_TRACES, TREND_MOST_TRACES
-from plant.errors import count_nouns
+from plant import count_nouns
 
 MOODS: dict[Level, Mood] = {Level.ACCEPTABLE: "good", Level.MAINTENANCE: "doubtful", Level.NON_NOMINAL: "bad"}
 

@@ -14,10 +14,7 @@ from fdi.trace.csv_table import (
     require_growth,
     split_line,
 )
-from plant.errors import InputError, require
-from plant.segments import LONGEST, RATE, Array, resample_on_cycles
-from plant.signals import EHA, Signal, Signals
-from plant.tables import read_file
+from plant import EHA, LONGEST, RATE, Array, InputError, Signal, Signals, read_file, require, resample_on_cycles
 
 
 def read_command(path: str | Path, period: float = 1 / RATE, signals: Signals = EHA) -> tuple[Array, Array | None]:

@@ -17,10 +17,19 @@ import numpy as np
 
 from fdi.output import write_whole
 from fdi.trace.sections import Floats
-from plant.errors import InputError, report_system_error, require
-from plant.plants import Plant, Table, Term, find_plant, list_plants
-from plant.signals import Signals
-from plant.unpacking import LimitedGzip, UnpackingError
+from plant import (
+    InputError,
+    LimitedGzip,
+    Plant,
+    Signals,
+    Table,
+    Term,
+    UnpackingError,
+    find_plant,
+    list_plants,
+    report_system_error,
+    require,
+)
 
 COMMENTS = ("#", "%", "//", "!")
 MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "#n/a", "nil"}

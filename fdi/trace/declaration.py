@@ -4,8 +4,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from plant.errors import InputError, escape_control_characters
-from plant.signals import Signal, Signals
+from plant import InputError, Signal, Signals, escape_control_characters
 
 DECLARATION = "signals"  # metadata record of a log, with one entry of the same name: a list of signals as JSON
 

@@ -28,8 +28,7 @@ from mcap.summary import Summary
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
-from plant.errors import InputError, require
-from plant.unpacking import UnpackingError, limit_unpacked_size
+from plant import InputError, UnpackingError, limit_unpacked_size, require
 
 _KINDS = {  # protobuf's kinds of numbers as numpy's; all others are objects
     FieldDescriptor.CPPTYPE_DOUBLE: "f8", FieldDescriptor.CPPTYPE_FLOAT: "f8", FieldDescriptor.CPPTYPE_BOOL: "?",

@@ -14,8 +14,7 @@ import numpy as np
 
 from fdi.thresholds import ROUNDED_SHARE
 from fdi.trace.sections import Floats
-from plant.quantity import Quantity
-from plant.tables import Place, build_dataclass
+from plant import Place, Quantity, build_dataclass
 
 
 @dataclass(frozen=True)

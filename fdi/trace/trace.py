@@ -18,11 +18,10 @@ from fdi.trace.declaration import DECLARATION, read_declaration
 from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.sensor_dynamics import SensorDynamics, read_sensors
-from plant.errors import InputError, escape_control_characters, require
-from plant.signals import EHA, Signal, Signals
+from plant import EHA, InputError, Signal, Signals, escape_control_characters, require
 
 if TYPE_CHECKING:
-    from plant.lanes import Part  # a bench that reads its own log does not load the compiler
+    from plant import Part  # a bench that reads its own log does not load the compiler
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -26,11 +26,7 @@ from fdi.progress import Progress, ignore_progress
 from fdi.report.numbers import format_digits
 from fdi.report.report import Cell, Column, Item, Line, Report, Section, Table, tabulate
 from fdi.trace.trace import Floats
-from plant import Actuator, Model, simulate
-from plant.errors import RigError, require
-from plant.model import build_kernel
-from plant.run import sample_noise
-from plant.solve import run_closed_loop
+from plant import Actuator, Model, RigError, build_kernel, require, run_closed_loop, sample_noise, simulate
 from rig.benches.bench import Role
 from rig.benches.bench_file import load_bench
 from rig.firmware.build import build_device, build_program

@@ -14,8 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple, Self
 
-from plant.errors import InputError
-from plant.signals import EHA, Signals
+from plant import EHA, InputError, Signals
 from rig.benches.calibration import Decision, SensorCalibration
 
 EXTENDED = 1 << 31  # in an identifier: it has 29 bits, as in Linux's can_id

@@ -14,13 +14,26 @@ from typing import Annotated, Any, Literal
 
 from dbc import EDS
 from fdi.foreign_code import ForeignCode, load_plant_of_model, require_trust
-from plant.errors import InputError, require
-from plant.model import find_plant_of_model, find_quantity
-from plant.plants import Plant, find_plant, is_known, is_loaded, load_plant
-from plant.quantity import Quantity
-from plant.signals import Signals
-from plant.tables import Place, build_dataclass, decode_text, list_choices, parse_table, read_file
-from plant.units import parse_quantity
+from plant import (
+    InputError,
+    Place,
+    Plant,
+    Quantity,
+    Signals,
+    build_dataclass,
+    decode_text,
+    find_plant,
+    find_plant_of_model,
+    find_quantity,
+    is_known,
+    is_loaded,
+    list_choices,
+    load_plant,
+    parse_quantity,
+    parse_table,
+    read_file,
+    require,
+)
 from rig.benches import canopen_map
 from rig.benches.bench import (
     FD,

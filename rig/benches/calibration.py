@@ -11,10 +11,7 @@ from dataclasses import dataclass
 from math import sqrt
 from typing import Annotated, Any, Literal, NamedTuple
 
-from plant.quantity import Quantity
-from plant.signals import Signals
-from plant.tables import Place, build_dataclass, list_choices
-from plant.units import parse_quantity
+from plant import Place, Quantity, Signals, build_dataclass, list_choices, parse_quantity
 
 Decision = Literal["simple", "guarded", "shared"]  # rule by which a value with an uncertainty passes a limit
 DECISIONS = ("simple", "guarded", "shared")

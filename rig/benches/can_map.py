@@ -7,8 +7,7 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
-from plant.errors import InputError, require, suggest_name
-from plant.tables import Place, list_choices
+from plant import InputError, Place, list_choices, require, suggest_name
 from rig.benches.bench import EXTENDED, FD, MOST_FRAMES, Field, FrameSpec, Kind, Role
 from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from canopen.objectdictionary import ODVariable, datatypes
 from canopen.objectdictionary.eds import import_eds
 
-from plant.errors import InputError, require
+from plant import InputError, require
 from rig.benches.bench import EXTENDED, Field, FrameSpec, Kind, Role
 from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
 

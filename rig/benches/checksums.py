@@ -10,8 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from plant.errors import InputError, require
-from plant.user_code import run_file
+from plant import InputError, require, run_file
 from rig.benches.bench import Field, Guard, insert_bits
 
 UserChecksum = Callable[[bytes, int], int]

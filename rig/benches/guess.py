@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, NamedTuple
 
-from plant.signals import EHA, Signals
-from plant.units import find_unit, fit_unit
+from plant import EHA, Signals, find_unit, fit_unit
 from rig.benches.bench import list_inputs, list_outputs
 from rig.benches.can_map import read_database
 from rig.benches.canopen_map import (

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
-from plant.tables import Place, list_choices
-from plant.units import fit_unit
+from plant import Place, fit_unit, list_choices
 from rig.benches.bench import Field, FrameSpec, Guard, Kind, Role, encode_float, list_bits
 
 PHASES = ("setup", "main", "cleanup", "safe")

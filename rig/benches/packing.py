@@ -11,9 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import ForeignCall, compile_function, keep_apart, raise_unbound
-from plant.errors import InputError
-from plant.machine_code import find_function_address
+from plant import ForeignCall, InputError, compile_function, find_function_address, keep_apart, raise_unbound
 from rig.benches.bench import Field, FrameSpec, Guard, Kind, Role
 from rig.benches.checksums import CHECKSUMS, USERS_CHECKSUMS, add_byte
 

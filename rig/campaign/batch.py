@@ -21,7 +21,7 @@ from multiprocessing import connection, get_context
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from plant.errors import InputError, RigError, report_system_error
+from plant import InputError, RigError, report_system_error
 from rig.interrupts import describe_exit, end_with, exit_on_signal, ignore_interrupts
 from rig.network.frame import WallClock
 

@@ -29,15 +29,29 @@ from fdi.prognosis.unit_trend import list_traces
 from fdi.sources import hash_sources, import_function
 from fdi.thresholds import UNIT_TOLERANCE
 from fdi.trace.trace import Floats, Trace
-from plant import simulate
-from plant.errors import InputError, RigError, report_system_error, require
-from plant.model import Model, build_bare_model, find_effect, find_quantity, parse_model
-from plant.parameters import load_nominal_values, parse_toml, parse_value, read_toml
-from plant.plants import Plant, load_plant
-from plant.quantity import Quantity
-from plant.signals import EHA
-from plant.tables import Place, build_dataclass
-from plant.threads import count_threads
+from plant import (
+    EHA,
+    InputError,
+    Model,
+    Place,
+    Plant,
+    Quantity,
+    RigError,
+    build_bare_model,
+    build_dataclass,
+    count_threads,
+    find_effect,
+    find_quantity,
+    load_nominal_values,
+    load_plant,
+    parse_model,
+    parse_toml,
+    parse_value,
+    read_toml,
+    report_system_error,
+    require,
+    simulate,
+)
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, import_extra, read_rows, run_batch
 from rig.network.frame import WallClock
 from rig.sequences.sequence import load_nominal_test

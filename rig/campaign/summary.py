@@ -25,7 +25,7 @@ from fdi.report.report import (
     Section,
     Table,
 )
-from plant.errors import count_nouns
+from plant import count_nouns
 from rig.campaign.batch import BatchProgress, Row
 from rig.campaign.judge import CANNOT_TELL, FAILED, HEALTHY, OK, REFUSED, label_plant, restore_faults
 

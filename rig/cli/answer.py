@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from fdi.output import require_writable, write_text
 from fdi.progress import Progress, ignore_progress
-from plant.errors import report_system_error, require
+from plant import report_system_error, require
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -48,7 +48,7 @@ def offer(list_names: Callable[[], Iterable[str]], *suffixes: str) -> Callable[.
 
 def list_parameters() -> list[str]:
     """Parameters for --set, with the equals sign."""
-    from plant.plants import find_plant
+    from plant import find_plant
 
     groups = find_plant("eha").list_groups()
     return [f"{group}.{field}=" for group, fields in groups.items() for field in fields._fields]
@@ -56,8 +56,7 @@ def list_parameters() -> list[str]:
 
 def list_models() -> list[str]:
     """Shipped models and plants."""
-    from plant.model import SHIPPED_MODELS
-    from plant.plants import list_plants
+    from plant import SHIPPED_MODELS, list_plants
 
     return [*list_plants(), *SHIPPED_MODELS]
 
@@ -71,6 +70,6 @@ def list_sequences() -> list[str]:
 
 def list_effects() -> list[str]:
     """Effects of the catalogue."""
-    from plant.plants import find_plant
+    from plant import find_plant
 
     return [effect.name for effect in find_plant("eha").list_effects()]

@@ -8,9 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fdi.discovery.update_model import Provenance, load_model_file
-from plant.errors import require
-from plant.model import Model, find_effect, load_model
-from plant.plants import find_plant
+from plant import Model, find_effect, find_plant, load_model, require
 from rig.cli.answer import choose_file
 from rig.cli.inputs import change_model, load_chosen_effects
 

@@ -8,10 +8,8 @@ from pathlib import Path
 
 from fdi import foreign_code
 from fdi.trace.mcap_log import open_log
+from plant import InputError, Model, load_model, read_toml, require
 from plant.effects import load_effects
-from plant.errors import InputError, require
-from plant.model import Model, load_model
-from plant.parameters import read_toml
 
 
 def parse_changes(pairs: Sequence[str]) -> dict[str, str]:

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from plant.errors import RigError, escape_control_characters
+from plant import RigError, escape_control_characters
 from rig.cli.answer import discard_output
 from rig.cli.command_list import COMMANDS, OF_EVERY_COMMAND, add_options, find_work
 from rig.interrupts import repeat_lost_interrupts
@@ -94,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _are_fits_at_work() -> bool:
     """Whether threads are left that compute for a command that was interrupted."""
-    from plant.threads import THREAD_NAME
+    from plant import THREAD_NAME
 
     return any(t.name.startswith(THREAD_NAME) for t in threading.enumerate())
 
@@ -156,7 +156,7 @@ def run_command_line(words: Sequence[str]) -> int:
             return _report_error(name, f"no space left for the output or the results ({error.strerror})", 2)
         from traceback import print_exc
 
-        from plant.run import find_compile_error
+        from plant import find_compile_error
 
         told = find_compile_error(error)  # a function of a user's plant file is compiled where it is first needed
         if told is not None:

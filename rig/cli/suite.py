@@ -10,7 +10,7 @@ from rich.text import Text
 
 from fdi.report.report import Cell
 from fdi.report.terminal import style_of
-from plant.errors import count_nouns, require
+from plant import count_nouns, require
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, open_console
 from rig.cli.commands.run import build_choice, choose_bus_of_run, make_new_folder
 from rig.cli.inputs import is_suite_file

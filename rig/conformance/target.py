@@ -11,8 +11,7 @@ from typing import NamedTuple, TypeVar
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from plant.errors import count_nouns
-from plant.tables import read_file
+from plant import count_nouns, read_file
 from rig.benches.bench import decode_device_text
 from rig.benches.canopen_map import INVALID, MAPPING, PARAMETERS, list_pdos, list_variables, read_dictionary
 from rig.network.bus import Wire

@@ -6,8 +6,7 @@ from typing import cast
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from plant.errors import require
-from plant.tables import read_file
+from plant import read_file, require
 from rig.benches.bench import decode_device_text
 from rig.benches.canopen_map import list_variables, read_dictionary
 from rig.device.sdo import Abort, SdoAbort, abort_unless

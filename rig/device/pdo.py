@@ -6,7 +6,7 @@ The mapping is fixed (1600.., 1A00.. are const); COB-ID and transmission type (1
 import struct
 from collections.abc import Callable
 
-from plant.errors import InputError, require
+from plant import InputError, require
 from rig.benches.canopen_map import MAPPING, RPDO, TPDO
 from rig.device.dictionary import INVALID, Dictionary, check_switchable, find_struct
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister

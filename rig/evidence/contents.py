@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 
 from fdi.report.report import to_plain
 from fdi.trace.trace import Trace
-from plant.errors import InputError, require
-from plant.tables import decode_text, read_file
+from plant import InputError, decode_text, read_file, require
 from rig.evidence.package import INDEX
 from rig.evidence.requirements import RUN, JudgedCheck, JudgedRun, Requirement
 

@@ -20,7 +20,7 @@ from typing import IO, NamedTuple
 
 from fdi.output import write_whole
 from fdi.progress import Progress
-from plant.errors import InputError, report_system_error, require, show_value
+from plant import InputError, report_system_error, require, show_value
 
 MANIFEST, INDEX = "MANIFEST.sha256", "evidence.json"
 Files = Mapping[str, Callable[[], IO[bytes]]]  # name -> opens its content

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 from fdi.report.report import Cell, Column, Medium, Mood, Table, tabulate
-from plant.errors import InputError, require, suggest_name
-from plant.tables import decode_text, read_file
+from plant import InputError, decode_text, read_file, require, suggest_name
 
 RUN = "whole run"  # the name of what verifies a requirement of a case
 NO_VERDICT = ("ERROR", "NOT_RUN")  # cases without a run that was judged

@@ -14,8 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fdi.output import write_text, write_whole
-from plant.compile import find_cache_folder
-from plant.errors import InputError, RigError, require
+from plant import InputError, RigError, find_cache_folder, require
 from rig.firmware.object_table import write_object_table
 
 FOLDER = Path(__file__).parent

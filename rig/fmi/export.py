@@ -20,11 +20,18 @@ from uuid import UUID
 import numpy as np
 
 from fdi.output import write_whole
-from plant.compile import read_normal_tables
-from plant.errors import InputError, RigError, require
-from plant.machine_code import emit_object
-from plant.model import Model, build_kernel, find_quantity
-from plant.run import report_law_errors, rest_controller
+from plant import (
+    InputError,
+    Model,
+    RigError,
+    build_kernel,
+    emit_object,
+    find_quantity,
+    read_normal_tables,
+    report_law_errors,
+    require,
+    rest_controller,
+)
 from rig.firmware.build import compile_c, find_compiler
 from rig.fmi.unit_cycle import INPUTS, advance_unit
 from rig.templates import fill_template

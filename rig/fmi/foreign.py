@@ -18,9 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.errors import InputError, RigError, require, suggest_name
-from plant.foreign import Diverged
-from plant.tables import Place
+from plant import Diverged, InputError, Place, RigError, require, suggest_name
 from rig.fmi.host import Settings, Variable
 
 Array = NDArray[np.float64]

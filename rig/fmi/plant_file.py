@@ -21,12 +21,24 @@ from math import inf, nan
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, cast
 
-from plant.parameters import Controller, convert_group_unit
-from plant.plants import Plant, find_plant, keep_plant
-from plant.quantity import Quantity
-from plant.signals import EHA, Signal
-from plant.tables import Place, build_dataclass, decode_text, parse_table, read_file
-from plant.units import find_unit, fit_unit, parse_quantity
+from plant import (
+    EHA,
+    Controller,
+    Place,
+    Plant,
+    Quantity,
+    Signal,
+    build_dataclass,
+    convert_group_unit,
+    decode_text,
+    find_plant,
+    find_unit,
+    fit_unit,
+    keep_plant,
+    parse_quantity,
+    parse_table,
+    read_file,
+)
 from rig.fmi.foreign import Description, Port, Unit, find_variable, read_description
 
 _COLUMNS = EHA.aliases  # these keep their columns and meaning; other names are new signals

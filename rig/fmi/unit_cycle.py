@@ -2,16 +2,19 @@
 
 from typing import Any
 
-from plant.kernels import (
+from plant import (
     control_plant,
     load_control,
     load_readings,
     pack_state,
+    read_sensors,
+    show_start,
+    step_cycle,
     store_control,
     store_readings,
+    take_demand,
     unpack_state,
 )
-from plant.solve import read_sensors, show_start, step_cycle, take_demand
 
 CYCLES, ANSWER, CONTROL = 0, 1, 2  # of `loop`: cycles of the plant, -1: not started; answer, memory of the controller
 INPUTS = 5

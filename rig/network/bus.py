@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from plant.errors import InputError, RigError, require
+from plant import InputError, RigError, require
 from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.network.can_interface import UdpBus
 from rig.network.frame import (

@@ -18,7 +18,7 @@ from typing import Any
 import can
 from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 
-from plant.errors import RigError
+from plant import RigError
 from rig.network.udp import GROUP, PORT, SO_RXQ_OVFL, attach_filter, is_group, open_sockets
 
 _ANCILLARY = socket.CMSG_SPACE(16) + socket.CMSG_SPACE(4)  # the kernel's time, and its count of lost datagrams

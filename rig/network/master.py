@@ -15,7 +15,7 @@ from canopen.emcy import EmcyError
 from canopen.sdo.base import SdoVariable
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from plant.errors import InputError, RigError
+from plant import InputError, RigError
 from rig.benches.bench import Bench, Role
 from rig.benches.canopen_map import (
     INVALID,

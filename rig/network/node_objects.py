@@ -10,8 +10,7 @@ from typing import Annotated, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.errors import InputError
-from plant.quantity import Quantity
+from plant import InputError, Quantity
 from rig.benches.bench import Role
 
 RIG, CONTROLLER, PLANT = Role.RIG, Role.CONTROLLER, Role.PLANT  # of the shipped bench they are the node-IDs as well

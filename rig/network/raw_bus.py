@@ -45,8 +45,7 @@ import numpy as np
 from can.interfaces.udp_multicast.utils import pack_message
 from numpy.typing import NDArray
 
-from plant.compile import ForeignCall, bind_later, keep_apart
-from plant.errors import RigError, require
+from plant import ForeignCall, RigError, bind_later, keep_apart, require
 from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.network import udp
 from rig.network.bus import can_open, parse_spec, require_interface

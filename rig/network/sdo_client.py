@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from plant.errors import RigError, count_nouns
+from plant import RigError, count_nouns
 from rig.network.bus import Wire
 
 R = TypeVar("R")

@@ -20,7 +20,7 @@ import time
 from collections.abc import Collection
 from pathlib import Path
 
-from plant.errors import RigError
+from plant import RigError
 from rig.benches.bench import FD
 
 GROUP, PORT = "239.74.163.2", 43113  # python-can's defaults

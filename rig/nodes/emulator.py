@@ -14,9 +14,7 @@ from functools import cache
 
 import numpy as np
 
-from plant import Model, load_model
-from plant.errors import InputError, require
-from plant.machine_code import StoredCode
+from plant import InputError, Model, StoredCode, load_model, require
 from rig.benches.bench import Bench, CanopenNode
 from rig.benches.bench_file import load_bench
 from rig.benches.canopen_map import RPDO, TPDO

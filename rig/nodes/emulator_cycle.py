@@ -15,10 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import ForeignCall, keep_apart
-from plant.machine_code import ADVANCE_CALL, READ_CALL
-from plant.run import find_direct_readings
-from plant.signals import Signals
+from plant import ADVANCE_CALL, READ_CALL, ForeignCall, Signals, find_direct_readings, keep_apart
 from rig.benches.bench import Flags, FrameSpec, Role
 from rig.benches.packing import (
     FRAME_WORDS,

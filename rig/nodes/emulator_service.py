@@ -15,9 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from plant import Model
-from plant.compile import compile_function
-from plant.errors import RigError
+from plant import Model, RigError, compile_function
 from rig.benches.bench import Bench
 from rig.network.frame import Send
 from rig.network.node_objects import COUNTERS, CYCLE_RECORD, RING, CycleRecord, encode_cycle_record

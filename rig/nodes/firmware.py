@@ -7,10 +7,7 @@ import struct
 from math import isfinite, nan
 from typing import cast
 
-from plant import Model
-from plant.compile import interpret_function
-from plant.pid import Loop, compute_current
-from plant.run import Demand, report_law_errors
+from plant import Demand, Loop, Model, compute_current, interpret_function, report_law_errors
 from rig.benches.bench import Bench, Role, SignalObject, pack, unpack
 from rig.benches.bench_file import load_bench
 from rig.benches.profiles import CIA408, State

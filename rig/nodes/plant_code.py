@@ -6,11 +6,19 @@ from typing import Any
 
 import numpy as np
 
-from plant import Actuator, Model, RigError
-from plant.machine_code import ADVANCE_CALL, READ_CALL, find_function_address
-from plant.model import build_kernel
-from plant.run import find_direct_readings, load_stored_advance, report_law_errors
-from plant.solve import read_flat_sensors
+from plant import (
+    ADVANCE_CALL,
+    READ_CALL,
+    Actuator,
+    Model,
+    RigError,
+    build_kernel,
+    find_direct_readings,
+    find_function_address,
+    load_stored_advance,
+    read_flat_sensors,
+    report_law_errors,
+)
 from rig.nodes.scenario import Scenario
 
 _KINDS: dict[str, Any] = {"i": ctypes.c_int32, "q": ctypes.c_int64, "d": ctypes.c_double}

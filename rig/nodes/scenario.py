@@ -7,11 +7,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from plant import Model
-from plant.errors import InputError, require
-from plant.model import build_bare_model
-from plant.plants import find_key
-from plant.segments import Array
+from plant import Array, InputError, Model, build_bare_model, find_key, require
 from rig.sequences.faults import Plan, Schedule, require_sensible
 
 LARGEST_DOWNLOAD = 1 << 20  # bytes in one SDO download, as the node's server has it

@@ -22,9 +22,7 @@ from fdi.trace.importing.formats import Channel, Measurement, open_measurement
 from fdi.trace.mcap_log import open_log
 from fdi.trace.sensor_dynamics import write_sensors
 from fdi.trace.trace import Trace, make_table_trace
-from plant import signals as plant_signals
-from plant.errors import InputError, count_nouns, report_system_error, require
-from plant.tables import read_file
+from plant import InputError, count_nouns, read_file, report_system_error, require, signals as plant_signals
 from rig.benches.bench import (
     FD,
     SWITCHED,

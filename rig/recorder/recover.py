@@ -15,8 +15,7 @@ from mcap.stream_reader import StreamReader
 
 from fdi.output import require_writable
 from fdi.trace.mcap_log import BoundedFile, read_declarations, scan_messages, unpack_chunk
-from plant.errors import InputError, count_nouns, report_system_error
-from plant.unpacking import UnpackingError, limit_unpacked_size
+from plant import InputError, UnpackingError, count_nouns, limit_unpacked_size, report_system_error
 from rig.recorder.writer import McapFile
 
 _DAMAGE = (McapError, struct.error, ValueError, EOFError)

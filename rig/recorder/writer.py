@@ -44,8 +44,7 @@ from mcap.records import (
 from numpy.typing import NDArray
 
 from fdi.trace.declaration import DECLARATION, write_declaration
-from plant import signals as plant_signals
-from plant.errors import RigError
+from plant import RigError, signals as plant_signals
 from rig.network.frame import Frame
 from rig.recorder.schema import (
     CHANNELS,

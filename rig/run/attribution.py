@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.errors import count_nouns
-from plant.segments import RATE, Array
+from plant import RATE, Array, count_nouns
 from rig.benches.bench import Bench, Flags, Role
 from rig.network.master import StartTime
 from rig.network.node_objects import CONTROLLER, PLANT, RIG

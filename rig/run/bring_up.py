@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plant.errors import require
+from plant import require
 from rig.benches.bench import Bench, Flags, Role
 from rig.benches.profiles import PROFILES, State, choose_control, find_state
 from rig.network.bus import EmbeddedWire, LinkWire, can_open

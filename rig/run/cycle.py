@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import keep_apart
+from plant import keep_apart
 from rig.benches.packing import (
     ACCEPTED,
     ALL_ROLES,

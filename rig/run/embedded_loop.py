@@ -16,12 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import ForeignCall
-from plant.machine_code import StoredCode
-from plant.model import Model
-from plant.pid import Loop, compute_current
-from plant.segments import Array
-from plant.signals import Signals
+from plant import Array, ForeignCall, Loop, Model, Signals, StoredCode, compute_current
 from rig.benches.bench import Bench, FrameSpec, Role
 from rig.benches.bench_file import load_bench
 from rig.benches.packing import (

@@ -15,8 +15,7 @@ from functools import cache
 from operator import itemgetter
 from typing import Any
 
-from plant.compile import compile_function
-from plant.errors import RigError
+from plant import RigError, compile_function
 from rig.benches.bench import Bench, Role
 from rig.network.bus import LinkWire
 from rig.network.frame import Frame

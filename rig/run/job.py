@@ -20,16 +20,27 @@ from fdi.foreign_code import (
 from fdi.output import write_whole
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import Trace
-from plant import InputError, Model, load_model
+from plant import (
+    EHA,
+    Choice,
+    InputError,
+    Model,
+    Place,
+    Quantity,
+    Signals,
+    build_dataclass,
+    find_plant,
+    find_plant_of_model,
+    find_quantity,
+    load_model,
+    load_plant,
+    parse_model,
+    parse_toml,
+    read_named_plant,
+    report_system_error,
+    require,
+)
 from plant.effects import load_effects
-from plant.errors import report_system_error, require
-from plant.model import find_plant_of_model, find_quantity, parse_model
-from plant.parameters import parse_toml
-from plant.plant_files import read_named_plant
-from plant.plants import find_plant, load_plant
-from plant.quantity import Quantity
-from plant.signals import EHA, Signals
-from plant.tables import Choice, Place, build_dataclass
 from rig.benches.bench import Bench
 from rig.benches.bench_file import is_plant_bench, load_bench, load_bench_from_files, make_plant_bench
 from rig.nodes.scenario import Scenario
@@ -256,7 +267,7 @@ def _read_number(text: str) -> object:
 
 def _store_code(codes: list[ForeignCode]) -> Iterator[Path]:
     """Write a user's code to files, which outlive this process: nodes in other processes read them."""
-    from plant.compile import find_cache_folder, make_private_folder
+    from plant import find_cache_folder, make_private_folder
 
     digest = hashlib.sha256(repr([(code.name, code.content) for code in codes]).encode()).hexdigest()
     for code in codes:

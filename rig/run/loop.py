@@ -17,9 +17,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from plant import Model, signals as plant_signals
-from plant.machine_code import StoredCode
-from plant.segments import Array
+from plant import Array, Model, StoredCode, signals as plant_signals
 from rig.benches import packing
 from rig.benches.bench import FD, RIG_OUTPUTS, Bench, Role
 from rig.benches.bench_file import load_bench

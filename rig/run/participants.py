@@ -9,8 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 
-from plant import Model
-from plant.errors import InputError, require
+from plant import InputError, Model, require
 from rig.benches.bench import Role
 from rig.benches.bench_file import is_plant_bench
 from rig.interrupts import end_with

@@ -20,12 +20,7 @@ from fdi.progress import Progress
 from fdi.report.report import to_plain
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Event, Trace
-from plant import Actuator
-from plant.errors import InputError, count_nouns, report_system_error
-from plant.model import Model
-from plant.run import make_columns_type
-from plant.segments import Array
-from plant.signals import Signals
+from plant import Actuator, Array, InputError, Model, Signals, count_nouns, make_columns_type, report_system_error
 from rig.benches.bench import Flags, Role
 from rig.network.frame import WallClock
 from rig.network.node_objects import NAMES, PLANT, CycleRecord, Identity

@@ -15,8 +15,7 @@ from operator import attrgetter
 import numpy as np
 
 from fdi.progress import Progress
-from plant.pid import control_by_pid
-from plant.segments import Array, Hold, Profile, build_profile
+from plant import Array, Hold, Profile, build_profile, control_by_pid
 from rig.benches.bench import unpack
 from rig.benches.profiles import PROFILES, State
 from rig.network.bus import EmbeddedWire, Wire

@@ -6,7 +6,7 @@ from math import isnan
 
 from canopen.emcy import EmcyError
 
-from plant.errors import count_nouns
+from plant import count_nouns
 from rig.benches.bench import Bench, Flags, Role, describe_identifier
 from rig.device.emcy import EmcyCode
 from rig.interrupts import describe_exit

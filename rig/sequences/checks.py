@@ -15,13 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.check_result import CheckResult, compute_speed, filter_median
-from plant import tables
-from plant.errors import require
-from plant.quantity import Quantity
-from plant.run import Columns
-from plant.segments import LONGEST, RATE, Array
-from plant.signals import EHA, Signals
-from plant.units import list_fitting_units, require_unit
+from plant import (
+    EHA,
+    LONGEST,
+    RATE,
+    Array,
+    Columns,
+    Quantity,
+    Signals,
+    list_fitting_units,
+    require,
+    require_unit,
+    tables,
+)
 from rig.benches.bench import Bench
 from rig.benches.profiles import CIA408, ProfileWords, State, find_state
 from rig.sequences.faults import Time

@@ -14,14 +14,21 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from plant import tables
+from plant import (
+    RATE,
+    Array,
+    InputError,
+    Model,
+    Quantity,
+    Second,
+    check_combinations,
+    find_plant,
+    find_quantity,
+    parse_value,
+    require,
+    tables,
+)
 from plant.effects import CATALOGUE
-from plant.errors import InputError, require
-from plant.model import Model, find_quantity
-from plant.parameters import check_combinations, parse_value
-from plant.plants import find_plant
-from plant.quantity import Quantity
-from plant.segments import RATE, Array, Second
 from rig.benches.bench import Bench, Role
 from rig.sequences.signals import Sensed, name_signals_of
 

@@ -13,10 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.check_result import PROTOCOL, CheckResult
-from plant.pid import Loop, compute_current
-from plant.quantity import Quantity
-from plant.segments import Array, Second
-from plant.signals import Signal
+from plant import Array, Loop, Quantity, Second, Signal, compute_current
 from rig.benches.bench import Bench, Flags, Role
 from rig.benches.bench_file import load_bench
 from rig.benches.canopen_map import name_object

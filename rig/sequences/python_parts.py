@@ -11,9 +11,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from plant.errors import InputError, require
-from plant.segments import Array, Timed
-from plant.user_code import explain_errors
+from plant import Array, InputError, Timed, explain_errors, require
 
 Argument = float | str | bool
 OWN = {"key": False}  # a field that the program fills in

@@ -21,28 +21,33 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from fdi.trace.command_file import parse_columns
-from plant import segments, tables
-from plant.errors import InputError, require
-from plant.model import build_bare_model, find_quantity, load_model
-from plant.parameters import parse_value
-from plant.plant_check import MOST_FOLLOWING_ERROR
-from plant.plants import Plant, find_plant
-from plant.quantity import Quantity
-from plant.segments import (
+from plant import (
+    EHA,
     LONGEST,
+    MOST_FOLLOWING_ERROR,
     RATE,
     Array,
     Csv,
     Hold,
+    InputError,
+    Place,
+    Plant,
     Profile,
+    Quantity,
     Segment,
+    build_bare_model,
     build_profile,
+    find_plant,
+    find_quantity,
     list_section_names,
+    load_model,
+    parse_value,
+    require,
     resample_on_cycles,
+    run_file,
+    segments,
+    tables,
 )
-from plant.signals import EHA
-from plant.tables import Place
-from plant.user_code import run_file
 from rig.benches.calibration import Decision
 from rig.network.node_objects import Identity
 from rig.sequences import checks, faults

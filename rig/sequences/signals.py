@@ -8,8 +8,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Annotated
 
-from plant.signals import EHA, Signals
-from plant.tables import Choice
+from plant import EHA, Choice, Signals
 
 _TESTED: ContextVar[Signals] = ContextVar("_TESTED", default=EHA)
 DERIVED = ("error", "speed")  # command less controlled signal, and the speed of the latter, beside the plant's signals

@@ -13,9 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plant.run import Columns
-from plant.segments import Array
-from plant.signals import Signals
+from plant import Array, Columns, Signals
 from rig.benches.bench import Bench, Kind
 from rig.benches.calibration import WIDTHS, Decision, SensorCalibration
 

@@ -12,12 +12,7 @@ from fdi.report.report import Cell, Column, Line, Medium, Report, Section, Table
 from fdi.report.run_report import build_run_report
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import MAIN, Event, Trace
-from plant import Model, simulate
-from plant.errors import count_nouns
-from plant.model import find_quantity
-from plant.plants import Plant
-from plant.run import make_columns_type
-from plant.segments import Array, Profile
+from plant import Array, Model, Plant, Profile, count_nouns, find_quantity, make_columns_type, simulate
 from rig.run.job import Job, find_differences
 from rig.run.runner import LimitReached, find_limits
 from rig.sequences.checks import Guard, GuardWatch, RunData

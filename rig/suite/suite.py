@@ -20,9 +20,17 @@ from fdi.report.numbers import list_first
 from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table, tabulate, to_plain
 from fdi.report.run_report import MOODS as RUN_MOODS, write_run_page
 from fdi.trace.check_result import CheckResult
-from plant.errors import InputError, RigError, count_nouns, require
-from plant.quantity import Quantity
-from plant.tables import build_dataclass, decode_text, parse_table, read_file
+from plant import (
+    InputError,
+    Quantity,
+    RigError,
+    build_dataclass,
+    count_nouns,
+    decode_text,
+    parse_table,
+    read_file,
+    require,
+)
 from rig import junit
 from rig.campaign.batch import UNLIMITED, run_in_processes
 from rig.evidence.requirements import (

@@ -21,9 +21,7 @@ from fdi.report.run_report import (
 )
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Event, Trace
-from plant.errors import InputError, require, suggest_name
-from plant.plants import find_plant
-from plant.segments import RATE
+from plant import RATE, InputError, find_plant, require, suggest_name
 from rig.run.job import JobChoice, build_job, load_tested_plant
 from rig.run.runner import Outcome, run_job
 from rig.sequences.sequence import Sequence as TestSequence, load_sequence, parse_sequence

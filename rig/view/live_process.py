@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fdi.output import require_writable
-from plant.errors import require
+from plant import require
 from rig.interrupts import ignore_interrupts
 from rig.view.live_run import LivePlan
 from rig.view.viewer import is_listening, lacks_display

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Event
-from plant.run import make_columns_type
-from plant.signals import EHA, Signals
+from plant import EHA, Signals, make_columns_type
 from rig import recorder
 from rig.benches.bench import Bench
 from rig.sequences import Sequence

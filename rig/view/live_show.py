@@ -35,7 +35,7 @@ from rich.text import Text
 
 from fdi.trace.check_result import CheckResult
 from fdi.trace.mcap_log import scan_messages, unpack_chunk
-from plant.signals import EHA, Signals
+from plant import EHA, Signals
 from rig.recorder import CanFrame, Event, NmtState, Record
 from rig.recorder.writer import MAGIC, list_channels, list_topics
 from rig.view.live_run import CheckState, LivePlan, LiveRun

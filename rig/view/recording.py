@@ -23,8 +23,7 @@ from fdi.thresholds import NOISE_BAND_RATIO, SIGNAL_ERROR_RATIO
 from fdi.trace.check_result import CheckResult
 from fdi.trace.sections import Section
 from fdi.trace.trace import MAIN, Floats, Trace
-from plant.signals import Signal, Signals
-from plant.units import UNITS
+from plant import UNITS, Signal, Signals
 from rig.network.node_objects import NAMES
 from rig.view.viewer import import_rerun
 

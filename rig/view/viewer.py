@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from plant.errors import RigError
+from plant import RigError
 
 
 class ViewerError(RigError):

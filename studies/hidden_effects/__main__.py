@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fdi.report.report import Listing, Report, Section
-from plant.errors import InputError
+from plant import InputError
 from studies.command import make_row_progress, run_study_command
 from studies.hidden_effects.benchmark import METHODS, answer_benchmark, describe_progress, make_benchmark
 from studies.hidden_effects.score import format_scores, read_answers, read_truths, score_answers

@@ -16,12 +16,20 @@ from numpy.typing import NDArray
 from fdi.estimation.fit import compute_typical_rms, list_relative_tolerances
 from fdi.estimation.replay import find_rest_rows
 from fdi.thresholds import ANCHOR_RATE, HEALTHY_TOLERANCES
-from plant import simulate
+from plant import (
+    Hold,
+    Model,
+    Segment,
+    build_bare_model,
+    build_profile,
+    ensure_starts,
+    find_plant,
+    list_searched_effects,
+    simulate,
+)
 from plant.effects import Effect, load_effects
-from plant.model import Model, build_bare_model, list_searched_effects
-from plant.plants import find_plant
-from plant.segments import Hold, Ramp, Segment, build_profile
-from plant.starts import compute_changes, ensure_starts
+from plant.segments import Ramp
+from plant.starts import compute_changes
 from rig.campaign import judge
 from studies.hidden_effects.cases import KINDS, name_parameter, write_columns, write_truth
 

@@ -16,10 +16,7 @@ from typing import Any
 from fdi.report.numbers import format_duration
 from fdi.sources import hash_sources, import_function
 from fdi.trace.sections import describe_section
-from plant.errors import InputError, RigError
-from plant.model import find_quantity, list_searched_effects
-from plant.plants import Plant, find_plant, load_plant
-from plant.segments import RATE
+from plant import RATE, InputError, Plant, RigError, find_plant, find_quantity, list_searched_effects, load_plant
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch, run_jobs
 from rig.campaign.judge import FLOORS
 from rig.network.frame import WallClock

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.errors import InputError
+from plant import InputError
 from rig.campaign.judge import FLOORS, Unit
 from studies.hidden_effects.hidden import CATALOGUE
 from studies.hidden_effects.truth import SYMBOLS, nominal_symbols, simulate_truth

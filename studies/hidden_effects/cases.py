@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.sections import Section, find_sections
+from plant import RATE, find_plant
 from plant.effects import CATALOGUE, Effect
-from plant.plants import find_plant
-from plant.segments import RATE
 from rig.campaign import judge
 from rig.campaign.judge import FLOORS
 from studies.hidden_effects import command, hidden

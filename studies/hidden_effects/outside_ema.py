@@ -2,9 +2,9 @@
 from math import pi, sin
 from typing import Annotated, Any, NamedTuple
 
+from plant import Quantity
 from plant.effects import effect
 from plant.ema import Friction
-from plant.quantity import Quantity
 
 
 class RoughStroke(NamedTuple):

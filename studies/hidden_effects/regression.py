@@ -14,9 +14,7 @@ import numpy as np
 
 from fdi.estimation.fit import list_relative_tolerances
 from fdi.thresholds import ANCHOR_RATE
-from plant.lanes import Lanes
-from plant.model import build_bare_model, find_quantity, list_searched_effects
-from plant.quantity import Quantity
+from plant import Lanes, Quantity, build_bare_model, find_quantity, list_searched_effects
 from plant.starts import compute_changes
 from rig.campaign.judge import FLOORS
 from studies.hidden_effects.cases import (

@@ -10,9 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from plant.lanes import Lanes
-from plant.model import build_bare_model
-from plant.plants import find_plant
+from plant import Lanes, build_bare_model, find_plant
 from studies.hidden_effects.cases import (
     NO_STOP,
     OUTPUTS,

@@ -23,7 +23,7 @@ import numpy as np
 import pysindy
 from numpy.typing import NDArray
 
-from plant.plants import find_plant
+from plant import find_plant
 from studies.hidden_effects.cases import Array, measure_rms, name_sections, read_columns
 from studies.hidden_effects.truth import nominal_symbols
 

@@ -18,9 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.errors import InputError
-from plant.parameters import load_nominal_values
-from plant.segments import RATE
+from plant import RATE, InputError, load_nominal_values
 
 Array = NDArray[np.float64]
 

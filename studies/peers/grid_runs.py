@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.progress import Progress, ignore_progress
-from plant import Model, simulate
-from plant.lanes import Lanes
-from plant.monitor import FAULTS, Cell, Monitor, compute_cells
+from plant import FAULTS, Lanes, Model, Monitor, simulate
+from plant.monitor import Cell, compute_cells
 from rig.bench.benchmarks import FLAGS, build_library, measure_median_duration
 from studies.peers.rivals import (
     Maker,

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.progress import Progress, ignore_progress
-from plant import Model, simulate
+from plant import Lanes, Model, simulate
 from plant.eha import compute_coefficients
-from plant.lanes import STEPS, Lanes
+from plant.lanes import STEPS
 from rig.bench.benchmarks import FLAGS, SAME_ROUNDING, build_library, measure_median_duration
 from studies.peers.rivals import (
     Maker,

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.trace.trace import Trace
-from plant.errors import RigError
+from plant import RigError
 from rig.benches.bench import Flags
 from rig.firmware.build import build_controller
 from rig.network.bus import Link, open_can

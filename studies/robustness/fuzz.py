@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.progress import Progress, ignore_progress
-from plant.model import load_model
+from plant import load_model
 from rig.benches.profiles import CIA408
 from rig.network.bus import EmbeddedBus, EmbeddedWire
 from rig.network.frame import Frame, Node, Send, VirtualClock

@@ -14,7 +14,7 @@ from fdi.report.run_report import build_run_report
 from fdi.report.terminal import format_report
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import Trace
-from plant.errors import RigError
+from plant import RigError
 from rig.recorder.recover import recover_log
 from rig.recorder.writer import McapFile
 from rig.run.job import read_job

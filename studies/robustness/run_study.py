@@ -13,8 +13,7 @@ from can.interfaces.udp_multicast.utils import pack_message
 
 from fdi.progress import Progress, ignore_progress
 from fdi.report.report import Cell, Column, Item, Line, Paragraph, Report, Section, Table
-from plant.errors import RigError
-from plant.model import load_model
+from plant import RigError, load_model
 from rig.network.frame import WallClock
 from rig.network.master import BusError
 from rig.network.udp import PORT, open_sender

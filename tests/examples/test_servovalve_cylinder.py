@@ -14,9 +14,7 @@ from fdi.estimation.replay import prepare_trace
 from fdi.identification.identify import make_problem, read_identification_runs
 from fdi.trace.importing.conversion import parse_map
 from fdi.trace.trace import Trace
-from plant import simulate
-from plant.model import Model, load_model
-from plant.plants import load_plant
+from plant import Model, load_model, load_plant, simulate
 
 FOLDER = Path(__file__).parent.parent.parent / "examples" / "servovalve_cylinder"
 PLANT = FOLDER / "cylinder.py"

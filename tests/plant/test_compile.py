@@ -11,10 +11,16 @@ import numpy as np
 import pytest
 from effect_files import HEAD
 
-from plant import Actuator, Model, compile, machine_code
-from plant.compile import compute_fingerprint, find_cache_folder
-from plant.machine_code import StoredCode
-from plant.model import build_kernel
+from plant import (
+    Actuator,
+    Model,
+    StoredCode,
+    build_kernel,
+    compile,
+    compute_fingerprint,
+    find_cache_folder,
+    machine_code,
+)
 from plant.solve import advance_flat_state
 
 HOLD = HEAD + '''

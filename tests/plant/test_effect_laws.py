@@ -9,17 +9,14 @@ from effects_cases import EASY, QUIET_SPOOL, WHOLE, H, drive_plant, measure_spee
 from node_bench import FirmwareDesk
 from physics_cases import SMOOTH
 
-from plant import Actuator, Model, simulate
-from plant.compile import interpret_function
+from plant import Actuator, Input, Model, compute_answers, interpret_function, simulate, unpack_state
 from plant.effects import CATALOGUE
 from plant.effects.current import coil_lag, current_noise
 from plant.effects.sensors import Recoil, mount_compliance, sensor_lag
 from plant.effects.supply import Drawn, supply_droop
 from plant.effects.wear import Flux, coil_short, edge_rounding, land_clearance, nozzle_block
 from plant.eha import State, compute_coefficients, compute_metering_line, step_jack as ram
-from plant.kernels import unpack_state
-from plant.run import compute_answers
-from plant.state import Input, Lag, Line
+from plant.state import Lag, Line
 from rig.benches.profiles import CIA408
 
 ADVANCED = np.random.default_rng(1).uniform(-4e-3, 4e-3, 60)  # A, a new one each cycle

@@ -14,14 +14,21 @@ from physics_cases import PREFLIGHT, SILENT
 from refusals import catch_refusal
 from rig_command import answer, refuse, write_file
 
-from plant import Actuator, Model, simulate
+from plant import (
+    Actuator,
+    Model,
+    build_profile,
+    check_effect,
+    ensure_starts,
+    find_plant,
+    find_quantity,
+    list_offered_effects,
+    load_nominal_values,
+    simulate,
+)
 from plant.effects import CATALOGUE, load_effects
-from plant.model import find_quantity, list_offered_effects
-from plant.parameters import load_nominal_values
-from plant.plants import find_plant
-from plant.segments import build_profile
-from plant.selftest import check_effect, list_extremes
-from plant.starts import compute_changes, compute_levels, ensure_starts, find_starts, parse_hint
+from plant.selftest import list_extremes
+from plant.starts import compute_changes, compute_levels, find_starts, parse_hint
 
 CANONICAL = (
     "filter_clogging", "spool_friction", "jack_friction", "viscous_drag", "moving_mass", "internal_leakage",

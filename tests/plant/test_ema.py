@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from plant import ema
-from plant.compile import compile_function
+from plant import compile_function, ema
 from plant.ema import compute_coefficients, step
 
 Array = NDArray[np.float64]

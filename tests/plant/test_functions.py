@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from other_cpus import compiles_for
 
-from plant import functions
-from plant.compile import _declare_part, _link_calls, compile_function, interpret_function
-from plant.parameters import Controller
-from plant.pid import Loop, compute_current
+from plant import Controller, Loop, compile_function, compute_current, functions, interpret_function
+from plant.compile import _declare_part, _link_calls
 
 RNG = np.random.default_rng(1)
 NEAR, TINY = RNG.uniform(-1.0, 1.0, 20000), RNG.normal(size=5000) * 1e-5

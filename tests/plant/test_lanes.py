@@ -10,16 +10,30 @@ from effect_files import MEMORY
 from other_cpus import compiles_for
 from refusals import catch_refusal
 
-from plant import Actuator, Model, kernel_use, lanes as lanes_module, simulate
-from plant.compile import compile_function, interpret_function
+from plant import (
+    FAULTS,
+    Actuator,
+    Lanes,
+    Model,
+    Monitor,
+    Part,
+    compile_function,
+    interpret_function,
+    kernel_use,
+    lanes as lanes_module,
+    list_kernel_variants,
+    list_searched_effects,
+    map_together,
+    read_sensors,
+    show_start,
+    simulate,
+    step_cycle,
+    unpack_state,
+)
 from plant.effects import CATALOGUE, load_effects
 from plant.kernel_use import KernelUse
-from plant.kernels import unpack_state
-from plant.lanes import FEWEST, Lanes, Part, list_kernel_variants, plan_layout
-from plant.model import list_searched_effects
-from plant.monitor import FAULTS, Monitor
-from plant.solve import pull_plant, read_sensors, rest_at_reading, show_start, step_cycle
-from plant.threads import map_together
+from plant.lanes import FEWEST, plan_layout
+from plant.solve import pull_plant, rest_at_reading
 from rig.sequences import load_sequence
 
 QUIET = Model().replace({f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")})

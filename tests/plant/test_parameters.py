@@ -12,22 +12,22 @@ from places import SHARED
 from refusals import catch_refusal
 
 import plant
-from plant import InputError, Model, load_model, simulate
-from plant.model import find_quantity
-from plant.parameters import GROUPS, load_nominal_values
-from plant.segments import (
-    Chirp,
+from plant import (
     Csv,
     Hold,
-    Multisine,
+    InputError,
+    Model,
     Points,
-    Ramp,
     Segment,
-    Sine,
-    Step,
     build_profile,
+    find_quantity,
+    load_model,
+    load_nominal_values,
     resample_on_cycles,
+    simulate,
 )
+from plant.parameters import GROUPS
+from plant.segments import Chirp, Multisine, Ramp, Sine, Step
 
 NAMES = list(load_nominal_values())
 

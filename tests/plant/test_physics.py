@@ -11,12 +11,10 @@ from hypothesis import example, given, settings, strategies as st
 from physics_cases import PREFLIGHT, SILENT, SMOOTH
 from physics_reference import simulate_explicit, simulate_linear
 
-from plant import Actuator, Model, simulate
-from plant.compile import compile_function
+from plant import Actuator, Array, Hold, Input, Model, build_profile, compile_function, simulate
 from plant.eha import State, compute_coefficients, step_actuator
 from plant.friction import clip
-from plant.segments import Array, Chirp, Hold, Ramp, Sine, build_profile
-from plant.state import Input
+from plant.segments import Chirp, Ramp, Sine
 from rig.bench.benchmarks import FRICTIONLESS, QUIET, measure_accuracy
 from rig.cli import main
 

@@ -12,7 +12,22 @@ from places import ROOT
 from refusals import catch_refusal
 from rig_command import refuse, rig, write_file
 
-from plant import Model, load_model, simulate
+from plant import (
+    Input,
+    Lanes,
+    Model,
+    build_profile,
+    check_behaviour,
+    compute_answers,
+    compute_flow_balance,
+    compute_force_balance,
+    list_offered_effects,
+    list_plants,
+    list_searched_effects,
+    load_model,
+    load_plant,
+    simulate,
+)
 from plant.effects import CATALOGUE
 from plant.effects.current import Cascade, flow_delay
 from plant.effects.servovalve import ATMOSPHERE
@@ -24,14 +39,6 @@ from plant.ehs import (
     derive_logger_columns,
     estimate_load_in_motion,
 )
-from plant.forced import compute_flow_balance, compute_force_balance
-from plant.lanes import Lanes
-from plant.model import list_offered_effects, list_searched_effects
-from plant.plant_check import check_behaviour
-from plant.plants import list_plants, load_plant
-from plant.run import compute_answers
-from plant.segments import build_profile
-from plant.state import Input
 
 EXAMPLE = ROOT / "plant" / "models" / "new_plant.py"  # copies with its name share its compiled code
 TEXT = EXAMPLE.read_text()

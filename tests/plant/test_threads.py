@@ -8,7 +8,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from plant.threads import THREAD_NAME, count_threads, do_together, map_in_threads, map_together
+from plant import THREAD_NAME, count_threads, map_in_threads, map_together
+from plant.threads import do_together
 
 
 def test_answers_come_in_the_order_of_the_questions_and_an_error_reaches_who_asked() -> None:

@@ -25,9 +25,8 @@ from fdi.diagnosis.faults import FRICTION, Level
 from fdi.estimation.fit import complete_model
 from fdi.report.report import render_html
 from fdi.trace.trace import Trace
-from plant import Model
+from plant import Lanes, Model
 from plant.effects import CATALOGUE
-from plant.lanes import Lanes
 from rig.bench import benchmarks
 from studies import fault_size_methods as methods, paper_figures as figures
 from studies.bench_mutations import run_trials

@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 
 from fdi.trace.trace import Trace
-from plant import Model
-from plant.errors import InputError
-from plant.threads import count_threads
+from plant import InputError, Model, count_threads
 
 
 def count_rows(trace: Trace, model: Model) -> dict[str, Any]:

@@ -10,10 +10,9 @@ from physics_cases import PREFLIGHT
 from rig_command import job, play
 
 from fdi.trace.mcap_log import open_log
-from plant import Actuator, Model, functions, simulate
+from plant import Actuator, Lanes, Model, Points, build_profile, functions, simulate
 from plant.effects import CATALOGUE
-from plant.lanes import Lanes
-from plant.segments import Chirp, Multisine, Points, Ramp, Sine, build_profile
+from plant.segments import Chirp, Multisine, Ramp, Sine
 
 SHORT = PREFLIGHT[3800:4400]  # a ramp: the ram sticks and slips
 SWING = 3e-3 * functions.sin_of_turns(np.arange(600) / 200.0)

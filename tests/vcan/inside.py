@@ -30,8 +30,7 @@ def compile_all(out: Path) -> int:
     """Compile what the other parts use: cycles, plant, functions of the raw bus, C programs. Always 0."""
     from example_devices import ECU
 
-    from plant import Model
-    from plant.compile import compile_function
+    from plant import Model, compile_function
     from rig.firmware.build import build_controller, build_device
     from rig.network import raw_bus
     from rig.nodes.emulator import load_service

@@ -48,7 +48,7 @@ from fdi.thresholds import (
     WHITE_SQUARE_POOR,
 )
 from fdi.trace.trace import Floats
-from plant.signals import Signals
+from plant import Signals
 
 MOST_TERMS = 3
 PROPOSED = 14  # terms of each balance that a replay looks at

@@ -15,11 +15,24 @@ from fdi.trace.csv_table import require_growth
 from fdi.trace.importing.formats import OTHER_UNITS, Channel, Measurement
 from fdi.trace.sensor_dynamics import SensorDynamics
 from fdi.trace.trace import Floats, Trace
-from plant.errors import InputError, require, suggest_name
-from plant.quantity import Quantity
-from plant.signals import EHA, Signals
-from plant.tables import Place, build_dataclass, decode_text, list_choices, parse_table, read_file
-from plant.units import Unit, fit_unit, list_fitting_units, require_unit
+from plant import (
+    EHA,
+    InputError,
+    Place,
+    Quantity,
+    Signals,
+    Unit,
+    build_dataclass,
+    decode_text,
+    fit_unit,
+    list_choices,
+    list_fitting_units,
+    parse_table,
+    read_file,
+    require,
+    require_unit,
+    suggest_name,
+)
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from fdi.trace.csv_table import (
     split_line,
 )
 from fdi.trace.trace import Floats, Trace
-from plant.errors import InputError, require
-from plant.units import find_unit
+from plant import InputError, find_unit, require
 
 OTHER_UNITS = ("V", "mV", "counts", "%")  # what a logger may write that needs scale and offset
 TEXT_SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".gz")

@@ -16,10 +16,7 @@ from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION, LEAST
 from fdi.trace.importing.formats import OTHER_UNITS, Channel, Measurement, split_unit
 from fdi.trace.sensor_dynamics import find_comb
 from fdi.trace.trace import Floats
-from plant.errors import InputError
-from plant.parameters import load_nominal_values
-from plant.signals import EHA, Signal, Signals
-from plant.units import UNITS, Unit, find_unit, fit_unit
+from plant import EHA, UNITS, InputError, Signal, Signals, Unit, find_unit, fit_unit, load_nominal_values
 
 # Words of a column's name, in English, German, French, Spanish and Italian, and how much each says for a signal: of a
 # role, or of an output with that SI unit. Name and symbol of the signal itself say most.

@@ -7,7 +7,7 @@ from typing import Any
 
 from fdi.progress import Progress
 from fdi.report.report import Report
-from plant.errors import require
+from plant import require
 from rig.cli.answer import Places, give_answer, show_progress
 
 REALTIME: Mapping[str, Any] = {"bus": "auto", "seconds": 60.0, "blocks": 6}  # options of rig bench realtime alone

@@ -14,8 +14,7 @@ from typing import Any
 from fdi.diagnosis.faults import choose_faults, load_faults
 from fdi.foreign_code import ForeignCode, load_plant_of_model, require_trust
 from fdi.output import write_text
-from plant import load_model
-from plant.errors import InputError, count_nouns, require
+from plant import InputError, count_nouns, load_model, require
 from rig.campaign.batch import BatchProgress, Row, Workers
 from rig.campaign.judge import (
     WORKS,

@@ -5,10 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fdi.report.report import Column, Line, Report, Section, Table
-from plant.errors import count_nouns, require
-from plant.faults import is_fault_file
-from plant.model import load_model
-from plant.plant_check import check_behaviour
+from plant import check_behaviour, count_nouns, is_fault_file, load_model, require
 from rig.benches.bench_file import load_bench
 from rig.benches.bench_report import build_bench_report, collect_data, list_loads, tabulate_frames
 from rig.cli.answer import choose_places, give_answer, show_progress

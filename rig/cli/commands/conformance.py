@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from plant.errors import InputError, require
+from plant import InputError, require
 from rig.benches.bench import Role
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, show_progress

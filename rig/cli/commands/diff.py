@@ -7,7 +7,7 @@ from fdi.comparison.run_differences import RunDifferences, compare_runs
 from fdi.progress import Progress
 from fdi.report.diff_report import build_diff_report
 from fdi.trace.trace import Trace
-from plant.signals import Signals
+from plant import Signals
 from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.inputs import load_declared_model
 

@@ -7,7 +7,7 @@ from itertools import groupby
 from pathlib import Path
 
 from fdi.report.report import Cell, Column, Mood, Report, Section, Table
-from plant.errors import require
+from plant import require
 from rig import doctor
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench

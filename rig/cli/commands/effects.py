@@ -8,10 +8,8 @@ from typing import Any
 
 from fdi.report.numbers import format_digits
 from fdi.report.report import Cell, Column, Item, Line, Paragraph, Report, Section, Table
+from plant import Report as SelfTest, check_effect, find_effect, find_plant, load_model, load_plant
 from plant.effects import Effect
-from plant.model import find_effect, load_model
-from plant.plants import find_plant, load_plant
-from plant.selftest import Report as SelfTest, check_effect
 from rig.cli.answer import Places, give_answer, show_progress
 from rig.cli.inputs import load_user_effects
 

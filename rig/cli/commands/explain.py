@@ -11,7 +11,7 @@ from fdi.discovery.runs import Runs, read_runs
 from fdi.discovery.sensitivity import Claim, describe_unit
 from fdi.progress import Progress
 from fdi.report.explain_report import build_explanation_report
-from plant.errors import require
+from plant import require
 from rig.campaign.batch import Workers
 from rig.campaign.sensitivity import measure_sensitivity
 from rig.cli.answer import Places, choose_file, choose_places, give_answer, show_progress

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fdi.output import require_new, require_writable
 from fdi.report.report import Report
-from plant.errors import require
+from plant import require
 from rig.cli.answer import give_answer, show_progress
 from rig.cli.inputs import load_chosen_model
 from rig.recorder.convert import export_trace

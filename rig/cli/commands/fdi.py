@@ -10,7 +10,7 @@ from fdi.diagnosis.faults import choose_faults
 from fdi.diagnosis.make_bands import make_bands_file
 from fdi.report.diagnosis_report import build_bands_report, build_diagnosis_report
 from fdi.trace.trace import Trace
-from plant.errors import require
+from plant import require
 from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.commands.simulate import load_command
 from rig.cli.inputs import format_arguments, load_chosen_model

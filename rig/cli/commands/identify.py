@@ -12,7 +12,7 @@ from fdi.identification.identify import (
     write_identified_model,
 )
 from fdi.report.identify_report import build_identification_report
-from plant.plants import list_plants
+from plant import list_plants
 from rig.cli.answer import Places, choose_file, give_answer, show_progress
 from rig.cli.discovery_inputs import format_command_line, load_known_model
 from rig.cli.inputs import list_signals

@@ -10,7 +10,7 @@ from fdi.report.report import Report
 from fdi.trace.importing.conversion import ImportMap, import_measurement, read_map
 from fdi.trace.importing.formats import Measurement, open_measurement
 from fdi.trace.importing.guess import guess_map
-from plant.errors import InputError, count_nouns, require
+from plant import InputError, count_nouns, require
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import give_answer, show_progress
 from rig.cli.inputs import load_declared_model

@@ -7,15 +7,16 @@ from math import isfinite
 from typing import Any
 
 from fdi.report.report import Cell, Column, Report, Section, Table
-from plant.errors import count_nouns, require
-from plant.model import (
+from plant import (
     SHIPPED_MODELS,
     Model,
+    Quantity,
+    count_nouns,
     find_quantity,
+    list_plants,
     load_model,
+    require,
 )
-from plant.plants import list_plants
-from plant.quantity import Quantity
 from rig.cli.answer import give_answer
 from rig.cli.inputs import load_chosen_model
 

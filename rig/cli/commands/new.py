@@ -15,13 +15,9 @@ import numpy as np
 from fdi.diagnosis.faults import load_faults
 from fdi.output import require_new, require_writable, write_text
 from fdi.report.report import Line, Report, Section
+from plant import InputError, Plant, build_profile, load_model, load_plant, read_file, require
 from plant.effects import is_taken, load_effects
-from plant.errors import InputError, require
 from plant.faults import WORD
-from plant.model import load_model
-from plant.plants import Plant, load_plant
-from plant.segments import build_profile
-from plant.tables import read_file
 from rig.benches.bench import decode_device_text
 from rig.benches.bench_file import load_bench
 from rig.benches.guess import UNSURE, Wanted, guess_can, guess_canopen

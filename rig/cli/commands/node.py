@@ -6,7 +6,7 @@ import time
 
 from fdi.output import require_writable
 from fdi.report.report import Report
-from plant.errors import RigError, require
+from plant import RigError, require
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench
 from rig.cli.answer import Places, give_answer

@@ -13,7 +13,7 @@ from fdi.progress import Progress
 from fdi.report.report import Line, Medium, Report, Section, write_html
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Trace
-from plant.errors import count_nouns, report_system_error, require
+from plant import count_nouns, report_system_error, require
 from rig.cli.answer import Places, choose_file, give_answer, open_console, show_progress
 from rig.cli.command_list import LIVE_ON_TERMINAL
 from rig.cli.inputs import is_suite_file, parse_changes

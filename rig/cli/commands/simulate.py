@@ -9,11 +9,7 @@ from fdi.report.numbers import format_amount
 from fdi.report.report import Report
 from fdi.trace.command_file import read_command
 from fdi.trace.trace import Trace
-from plant import load_model, simulate
-from plant.errors import count_nouns, require
-from plant.plant_check import find_divergence
-from plant.plants import Plant
-from plant.segments import Points, build_profile
+from plant import Plant, Points, build_profile, count_nouns, find_divergence, load_model, require, simulate
 from rig.cli.answer import give_answer, show_progress
 from rig.cli.inputs import load_chosen_model
 from rig.sequences.sequence import load_nominal_test

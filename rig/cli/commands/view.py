@@ -13,8 +13,7 @@ from fdi.progress import Progress
 from fdi.report.numbers import join_words
 from fdi.report.report import Report
 from fdi.trace.trace import Trace
-from plant.errors import require
-from plant.model import Model
+from plant import Model, require
 from rig.cli.answer import choose_file, give_answer, show_progress
 from rig.cli.commands.diff import read_and_compare_runs
 from rig.cli.discovery_inputs import load_known_model

@@ -54,10 +54,9 @@ from fdi.estimation.fit import Free
 from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
-from plant import Model, load_model
-from plant.faults import Fault, place_fault
-from plant.plants import find_plant
-from plant.segments import Hold, Ramp, Step, build_profile as profile
+from plant import Fault, Hold, Model, build_profile as profile, find_plant, load_model
+from plant.faults import place_fault
+from plant.segments import Ramp, Step
 from rig.campaign.judge import build_matrix, simulate_case
 
 GAP = {"title": "play", "parameter": "feedback_gap.gap", "range": [0.0, 5e-4], "acceptable": 4e-5, "maintenance": 9e-5}

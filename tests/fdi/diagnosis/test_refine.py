@@ -39,9 +39,8 @@ from fdi.diagnosis.rms_grid import Grid, Map, Merged, Point, measure_bisector_di
 from fdi.estimation.replay import hold_inputs, read_cycles
 from fdi.report.diagnosis_report import build_diagnosis_report, list_overruled
 from fdi.thresholds import RESIDUAL_WORST
-from plant import Model, load_model
-from plant.monitor import Monitor
-from plant.segments import Chirp, Hold, Ramp, Step, build_profile
+from plant import Hold, Model, Monitor, build_profile, load_model
+from plant.segments import Chirp, Ramp, Step
 
 MODEL = load_model()
 

@@ -79,10 +79,10 @@ from fdi.estimation.fit import Value, fit_unknowns, linearise, list_all_unknowns
 from fdi.estimation.noise import fit_noise, measure_level
 from fdi.estimation.replay import hold_inputs
 from fdi.trace.trace import Trace
-from plant import Model, load_model, simulate
+from plant import Input, Model, load_model, simulate
 from plant.effects import CATALOGUE, combine_laws, load_effects
 from plant.eha import State
-from plant.state import Drag, Input, Line
+from plant.state import Drag, Line
 
 SEEDS = range(20)
 

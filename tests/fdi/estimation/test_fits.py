@@ -54,11 +54,8 @@ from fdi.estimation.unidentifiable import (
     scale_to,
 )
 from fdi.trace.trace import Floats, Trace, rms
-from plant import Model, load_model, simulate
+from plant import Lanes, Model, build_profile, find_quantity, load_model, simulate
 from plant.declare import Chirp, Hold, Ramp, Step
-from plant.lanes import Lanes
-from plant.model import find_quantity
-from plant.segments import build_profile
 from rig.bench.benchmarks import QUIET
 
 MODEL = Model()

@@ -27,10 +27,8 @@ from fdi.identification.identify import (
 )
 from fdi.report.identify_report import describe_identification
 from fdi.trace.trace import Trace
-from plant import simulate
+from plant import Segment, build_profile, load_model, simulate
 from plant.declare import Chirp, Hold, Ramp, Step
-from plant.model import load_model
-from plant.segments import Segment, build_profile
 from studies.hidden_effects.truth import SYMBOLS, has_compiler, simulate_truth
 from studies.identification import sample_actuator
 

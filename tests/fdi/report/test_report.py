@@ -59,8 +59,7 @@ from fdi.report.run_report import build_run_report, read_verdict, write_run_page
 from fdi.report.terminal import format_report, print_report
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Event, Trace
-from plant import Model
-from plant.signals import EHA
+from plant import EHA, Model
 from rig.recorder import Recorder, Signals, Timing
 from rig.recorder.recover import recover_log
 

@@ -13,7 +13,7 @@ from cantools.database.conversion import BaseConversion
 from hypothesis import given, settings, strategies as st
 from refusals import catch_refusal
 
-from plant.compile import compile_function
+from plant import compile_function
 from rig.benches.bench import EXTENDED, FD, SWITCHED, Field, FrameSpec, Guard, Kind, Role, extract_bits, pack, unpack
 from rig.benches.bench_file import load_bench_from_files
 from rig.benches.bench_report import list_loads

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from plant.compile import compile_function
+from plant import compile_function
 from rig.benches.bench import Field, FrameSpec, Guard, Role, pack
 from rig.benches.packing import (
     ACCEPTED,

@@ -14,7 +14,7 @@ from device_files import BENCH, write_bench
 from places import ROOT
 from rig_command import refuse, rig, write_file
 
-from plant.signals import EHA
+from plant import EHA
 from rig.benches.bench import Role, list_inputs, list_outputs, pack
 from rig.benches.bench_file import ControllerKeys, NodeKeys, load_bench
 from rig.benches.checksums import CHECKSUMS

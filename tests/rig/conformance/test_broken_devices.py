@@ -27,7 +27,7 @@ from refusals import catch_refusal
 from rig_command import gone, nodes_on, refuse, rig, write_file
 
 from dbc import EDS
-from plant.errors import RigError
+from plant import RigError
 from rig.conformance.run_cases import CASES, Outcome, Result, choose_cases, run_cases, write_junit
 from rig.conformance.target import CHAPTERS, DataSheet, Options, Target, Verdict
 from rig.device import Abort, NmtState, SdoAbort

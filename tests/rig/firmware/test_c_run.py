@@ -13,7 +13,7 @@ from c_device import SANITIZERS, STRICT, SUPPORT, build_faulty, needs_compiler, 
 from log_rows import describe_first_difference
 from rig_command import SHORT, job, nodes_on, play, rig
 
-from plant.errors import InputError, RigError
+from plant import InputError, RigError
 from rig.firmware.build import FOLDER, build_controller, build_program
 from rig.network.frame import Frame
 from rig.network.node_objects import PLANT

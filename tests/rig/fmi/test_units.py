@@ -18,9 +18,7 @@ from places import ROOT
 from rig_command import answer, refuse, rig, write_file
 
 from fdi.trace.trace import Trace
-from plant import Model, RigError, load_model, simulate
-from plant.lanes import Lanes
-from plant.tables import Place
+from plant import Lanes, Model, Place, RigError, load_model, simulate
 from rig.fmi import foreign
 from rig.fmi.export import export_fmu
 from rig.fmi.foreign import Port, Unit, find_variable, read_description

@@ -29,8 +29,7 @@ from places import ROOT
 from refusals import catch_refusal
 from rig_command import SHORT, SLOW_START, rig, write_file
 
-from plant.compile import compile_function
-from plant.errors import RigError
+from plant import RigError, compile_function
 from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.network import bus as bus_module, raw_bus
 from rig.network.bus import Link, can_open, choose_bus, explain_socketcan_problem, open_can

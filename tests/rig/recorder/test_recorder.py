@@ -25,7 +25,7 @@ from synthetic_run import ATTACHMENTS, METADATA, build_cycles, record_run
 
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import Trace
-from plant.errors import InputError
+from plant import InputError
 from rig.benches.bench import EXTENDED, FD, SWITCHED
 from rig.benches.bench_file import load_bench
 from rig.network.frame import FD_LENGTHS, Frame, make_message

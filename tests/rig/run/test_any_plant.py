@@ -13,7 +13,7 @@ from fdi.discovery.explain import compute_firmware_residual
 from fdi.estimation.fit import silence_sensors
 from fdi.estimation.replay import prepare_trace, replay_current
 from fdi.trace.trace import Trace
-from plant.model import load_model
+from plant import load_model
 
 PLANT = ROOT / "tests" / "support" / "trim_jack.py"
 BENCH = """

@@ -9,7 +9,7 @@ from rig_command import SHORT, job, play
 
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import Trace
-from plant.segments import Array
+from plant import Array
 from rig.nodes import emulator_cycle
 from rig.run import bring_up
 from rig.run.embedded_loop import EmbeddedLoop

@@ -20,8 +20,8 @@ from fdi.report.run_report import build_run_report
 from fdi.report.terminal import format_report
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
-from plant.run import Columns
-from plant.segments import Array, Hold, Ramp, Segment, Step, build_profile
+from plant import Array, Columns, Hold, Segment, build_profile
+from plant.segments import Ramp, Step
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench, load_bench_from_files
 from rig.benches.calibration import SensorCalibration

@@ -11,8 +11,7 @@ from places import ROOT
 from refusals import catch_refusal
 
 from fdi.trace.check_result import CheckResult
-from plant import load_model, simulate, tables
-from plant.errors import InputError
+from plant import InputError, load_model, simulate, tables
 from rig.benches.bench_file import load_bench
 from rig.network.node_objects import Identity
 from rig.nodes.scenario import Scenario

@@ -35,8 +35,7 @@ from fdi.report.numbers import format_ratio
 from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
-from plant import Model
-from plant.plants import find_plant
+from plant import Model, find_plant
 from rig.benches.bench_file import load_bench
 from rig.recorder import Event, NmtState, Record, Signals, Timing
 from rig.recorder.schema import make_row_record
