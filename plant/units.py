@@ -6,6 +6,7 @@ from fractions import Fraction
 from typing import NamedTuple
 
 from plant.errors import InputError, show_value, suggest_name
+from plant.tables import Place
 
 
 class Unit(NamedTuple):
@@ -77,10 +78,10 @@ def require_unit(name: str, own: str, where: object, field: str) -> Unit:
     return unit
 
 
-def parse_quantity(text: str, si: str, where: object, field: str) -> Fraction:
-    """A number with its unit, such as "20 uA", in `si`, exactly; with `si` "" a number alone.
+def parse_quantity(text: str, si: str, place: Place) -> Fraction:
+    """A number with its unit, such as "20 uA", in `si`, exactly; with `si` "" a number alone. `place`: of the text.
 
-    >>> parse_quantity("0.1 um", "m", "", ""), parse_quantity("2", "", "", "")
+    >>> parse_quantity("0.1 um", "m", Place("bench.toml")), parse_quantity("2", "", Place("bench.toml"))
     (Fraction(1, 10000000), Fraction(2, 1))
 
     Raises:
@@ -89,5 +90,6 @@ def parse_quantity(text: str, si: str, where: object, field: str) -> Fraction:
     found = _QUANTITY.fullmatch(text)
     if found is None or bool(found[2]) != bool(si):
         expected = f"a number and a unit, such as '1 {si}'" if si else "a number without a unit"
-        raise InputError(where, field, f"{expected}, not {show_value(text)}")
-    return Fraction(found[1]) * (require_unit(found[2], si, where, field).factor if si else 1)
+        raise place.refuse(f"{expected}, not {show_value(text)}")
+    with place.locate():
+        return Fraction(found[1]) * (require_unit(found[2], si, "", "").factor if si else 1)

@@ -16,7 +16,7 @@ import numpy as np
 
 from fdi.diagnosis.faults import FAULTS, Fault
 from fdi.estimation.fit import silence_readings
-from fdi.estimation.replay import has_known_start, read_cycles, replay_lanes
+from fdi.estimation.replay import read_cycles, replay_lanes
 from fdi.thresholds import ANCHOR_RATE
 from fdi.trace.trace import Flags, Floats, Trace
 from plant import FAULTS as MONITORED, Lanes, Model, Monitor, require
@@ -145,12 +145,10 @@ class _Runs(NamedTuple):
             out = np.concatenate([self.run_plant(values[k:k + MOST_RUNS]) for k in range(0, len(values), MOST_RUNS)])
         else:
             trace, model = self.trace, Monitor(self.model, sliding=sliding, workers=self.workers)
-            position = trace.controlled if has_known_start(trace) else None
             if self.drive == "command":
-                start = float(trace.controlled[0]) if position is not None else 0.0
-                out = model.closed_loop(values, trace.command, start, reduced=self.reduce_runs)
+                out = model.closed_loop(values, trace.command, float(trace.anchor[0]), reduced=self.reduce_runs)
             else:
-                out = model.replay(values, trace.drive, position, ANCHOR_RATE, reduced=self.reduce_runs)
+                out = model.replay(values, trace.drive, trace.anchor, ANCHOR_RATE, reduced=self.reduce_runs)
         return dict(zip(self.rows, out.T, strict=True))
 
     def run_plant(self, values: Floats) -> Floats:

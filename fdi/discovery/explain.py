@@ -592,7 +592,8 @@ def find_marks(model: Model, traces: Sequence[Trace]) -> Marks:
         answer = _measure_rms(model, traces)
         error = float(np.nan_to_num(answer / resolution))
         offered = [e.name for e in model.kind.list_effects()
-                   if e.firmware and e.name not in model.effects and len(e.fitted) == 1]
+                   if e.firmware and e.name not in model.effects and len(e.fitted) == 1
+                   and any(s[e.fitted[0]] != 0.0 for s in e.starts)]
         tried = [_fit_size(model, traces, e, error, resolution) for e in offered if error > FIRMWARE_DIFFERS]
         firmware = sorted((f for f in tried if f.after < 0.7 * error), key=lambda f: f.after)
         unseen = tuple(offered) if np.isnan(answer) else ()
@@ -629,17 +630,25 @@ def _measure_rms(model: Model, traces: Sequence[Trace]) -> float:
 
 
 def _fit_size(model: Model, traces: Sequence[Trace], name: str, before: float, unit: float) -> Fingerprint:
-    """The size of a firmware effect: a logarithmic search over all sizes, then closer and closer."""
+    """The size of a firmware effect, of each sign that it starts with: logarithmic over all sizes, then ever closer."""
     entry = model.find_effect(name)
     parameter = entry.fitted[0]
-    usual = [abs(s[parameter]) for s in entry.starts]
-    low, high = np.log(min(usual) / 10.0), np.log(max(usual) * 10.0)
-    ready = model.with_effects([name])
-    for _ in range(6):  # each time closer around the best size
-        sizes = np.linspace(low, high, SIZES)
-        errors = [_measure_rms(ready.replace({parameter: float(np.exp(s))}), traces) / unit for s in sizes]
-        k = int(np.argmin(errors))
-        low, high = sizes[max(k - 1, 0)], sizes[min(k + 1, SIZES - 1)]
-    value = float(np.exp(sizes[k]))
-    interval = value, float(np.exp(low)), float(np.exp(high))
-    return Fingerprint(name, {parameter: interval}, before, errors[k], entry.firmware)
+    ready, allowed = model.with_effects([name]), entry.parameters[parameter]
+    starts = [s[parameter] for s in entry.starts if s[parameter] != 0.0]
+    span = np.log(min(map(abs, starts)) / 10.0), np.log(max(map(abs, starts)) * 10.0)
+
+    def measure_error(size: float) -> float:
+        return np.inf if allowed.refuses(size) else _measure_rms(ready.replace({parameter: size}), traces) / unit
+
+    found = []
+    for sign in sorted(set(np.sign(starts).tolist())):
+        low, high = span
+        for _ in range(6):  # each time closer around the best size
+            sizes = np.linspace(low, high, SIZES)
+            errors = [measure_error(sign * float(np.exp(s))) for s in sizes]
+            k = int(np.argmin(errors))
+            low, high = sizes[max(k - 1, 0)], sizes[min(k + 1, SIZES - 1)]
+        ends = sorted(sign * float(np.exp(s)) for s in (low, high))
+        interval = sign * float(np.exp(sizes[k])), ends[0], ends[1]
+        found.append(Fingerprint(name, {parameter: interval}, before, errors[k], entry.firmware))
+    return min(found, key=lambda f: f.after)

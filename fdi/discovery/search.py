@@ -385,8 +385,10 @@ class Search:
         return Hypothesis(effects, found, errors, ratio, cost, tuple(others))
 
     def make_problem(self, trace: Trace, steps: int) -> Problem:
-        """One run, with so many steps a cycle, in place of all that the search fits."""
-        return replace(self.problem, trace=trace, steps=steps, also=(), _lanes={})
+        """One run, with so many steps a cycle, in place of all that the search fits; it may lack signals of theirs."""
+        noise = dict(zip(self.problem.trace.outputs, self.problem.noise, strict=True))
+        return replace(self.problem, trace=trace, noise=tuple(noise[s] for s in trace.outputs), steps=steps, also=(),
+                       _lanes={})
 
     def replay_holdout(self, hypotheses: Sequence[Hypothesis]) -> tuple[Problem, list[Floats]]:
         """The held-out run, and what each hypothesis leaves of it, (s, n) SI; none is replayed twice."""

@@ -329,7 +329,7 @@ def list_effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) ->
     for name in effect.fitted:
         q, off = effect.parameters[name], effect.off.get(name, usual.get(name, 0.0))
         sizes = sorted(abs(start[name] - off) for start in effect.starts)
-        scale = sizes[len(sizes) // 2] or 1.0
+        scale = (sizes[len(sizes) // 2] if sizes else abs(model[name] - off)) or 1.0
         step = turning / scale if q.unit == "Hz" else 0.05
         free.append(Free(name, off, scale, np.inf, max(q.low, q.above), min(q.high, q.below), step))
     return tuple(free)

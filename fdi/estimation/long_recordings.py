@@ -117,7 +117,7 @@ def choose_excerpt(trace: Trace, model: Model, floor: Mapping[str, float], chang
     starts = np.arange(0, len(trace) - rows + 1, rows)
     information, misfit, measured = _measure_information(trace, model, floor, list(changes), rows, len(starts),
                                                          progress)
-    full = measured >= 0.5
+    full = measured >= 0.5 * measured.max()  # of rows that come every few cycles, not every one is measured
     leads = np.array([first - _find_lead_in(trace, first) for first in starts.tolist()])
     is_near = leads <= SHORT_LEAD_IN / trace.period
     if (full & is_near).sum() > 2 * PIECES:
@@ -244,7 +244,7 @@ class Judgement:
         """RMS residual over the floor, without the worst blocks: a stop that is made or missed by a hair is luck."""
         found = {}
         for name, squares, n in zip(self.outputs, self.blocks, self.count, strict=True):
-            full = n > 0.5 * BLOCK
+            full = n > 0.5 * n.max()
             means = np.sort(squares[full] / n[full])
             kept = means[:max(1, round(share * len(means)))]
             found[name] = float(np.sqrt(kept.mean())) / floor[name] if len(kept) else 0.0
@@ -256,7 +256,8 @@ class Judgement:
         size = rows // BLOCK
         scale = np.array([floor[name] for name in self.outputs])[:, None] ** 2
         with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = np.where(self.count > 0.5 * BLOCK, self.blocks / self.count / scale, np.nan)
+            is_full = self.count > 0.5 * self.count.max(axis=-1, keepdims=True)
+            ratio = np.where(is_full, self.blocks / self.count / scale, np.nan)
         pieces = ratio[:, :ratio.shape[1] // size * size].reshape(len(self.outputs), -1, size)
         typical = np.nan_to_num(np.median(pieces, axis=-1), nan=0.0).max(axis=0)
         for first, stop in apart:

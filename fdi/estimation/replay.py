@@ -68,17 +68,12 @@ class Replay(NamedTuple):
     blind: Mapping[str, float]  # RMS, elsewhere, by which the drive that was not recorded may move a replay
 
 
-def replay_lanes(lanes: Lanes, values: Floats, trace: Trace, current: Floats | None = None,
-                 anchor: float = ANCHOR_RATE) -> Floats:
-    """The outputs, (m, n, outputs), of the plant driven by a current (default: the measured one), for each of values.
+def replay_lanes(lanes: Lanes, values: Floats, trace: Trace, anchor: float = ANCHOR_RATE) -> Floats:
+    """The outputs, (m, n, outputs), of the plant driven by the measured current, for each of values.
 
-    They are what the sensors of the trace show of the plant.
-
-    The replay starts at the first measured position, or in the middle where that is not known.
+    They are what the sensors of the trace show of the plant. The replay starts at the first measured position.
     """
-    position = trace.unlagged if has_known_start(trace) else None
-    driven = trace.drive if current is None else current
-    out = lanes.replay(values, driven, trace.load, position, anchor, trace.parts, trace.chambers, trace.slack)
+    out = lanes.replay(values, trace.drive, trace.load, trace.anchor, anchor, trace.parts, trace.chambers, trace.slack)
     return trace.pass_sensors(out)
 
 
@@ -92,11 +87,6 @@ def measure_misfit(trace: Trace, model: Model) -> float:
     """How badly a replay fits the outputs of a prepared trace: the mean logarithm of their RMS residuals."""
     left = compute_residuals(trace, replay_current(trace, model, 20))
     return sum(math.log(rms(r)) for r in left.values()) / len(left)
-
-
-def has_known_start(trace: Trace) -> bool:
-    """Whether the first position is known; else the replay starts in the middle."""
-    return not np.isnan(trace.controlled[0])
 
 
 def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, float]) -> Replay:
@@ -124,13 +114,12 @@ def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str,
         names = list(list_tolerance_sizes(model))
     values = vary_frictions(names, model.values)
     lanes = Lanes(silence_sensors(model), names, REPLAY_STEPS)
-    position = trace.unlagged if has_known_start(trace) else None
-    turns = [replay_in_turns(lanes, values, trace, position, ANCHOR_RATE)]
+    turns = [replay_in_turns(lanes, values, trace, trace.anchor, ANCHOR_RATE)]
     currents = guess_current(trace)
-    turns += [replay_in_turns(lanes, values[:1], trace.with_inputs(drive=current), position, ANCHOR_RATE)
+    turns += [replay_in_turns(lanes, values[:1], trace.with_inputs(drive=current), trace.anchor, ANCHOR_RATE)
               for current in currents]
-    turns += [replay_in_turns(lanes, values[:1], trace, position + shift, ANCHOR_RATE)
-              for noise in guess_anchor_noise(trace, model, floor) if position is not None for shift in (noise, -noise)]
+    turns += [replay_in_turns(lanes, values[:1], trace, trace.anchor + shift, ANCHOR_RATE)
+              for noise in guess_anchor_noise(trace, model, floor) for shift in (noise, -noise)]
     outputs = trace.declared.outputs
     found = np.empty((len(outputs), len(trace)))
     undecided = np.zeros(len(trace), bool)
@@ -373,7 +362,7 @@ def measure_drift(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> tupl
     """Of a replay without anchor: RMS of the residual of the controlled signal, SI, and its rate of departure, SI/s."""
     name = trace.declared.controlled.name
     begun, rate = trace, 0.0
-    if not trace.usable[0] and has_known_start(trace):  # in motion: drawn to the measured one until it is judged
+    if not trace.usable[0]:  # in motion: drawn to the measured one until it is judged
         known = np.arange(len(trace)) <= int(np.argmax(trace.usable))
         begun, rate = trace.with_columns({name: np.where(known, trace.unlagged, np.nan)}), ANCHOR_RATE
     free = trace.mask_unusable(name) - replay_current(begun, model, steps, rate)[name]
@@ -544,7 +533,7 @@ def prepare_trace(trace: Trace, model: Model, outputs: Sequence[str] | None = No
 def hold_inputs(trace: Trace, outputs: Sequence[str] | None = None, source: object = "trace") -> Trace:
     """The recording with missing inputs held at their last value, all rows usable, and no check of units or sensors.
 
-    For recordings of other plants, whose ranges are not known, and for simulated ones.
+    For recordings of other plants, whose ranges are not known.
 
     Raises:
         InputError: too few rows, no command, controlled signal or drive, or a chosen signal that was not measured.
@@ -568,7 +557,9 @@ def simulate_trace(lanes: Lanes, values: Floats, command: Floats, load: Floats, 
     out = lanes.closed_loop(values[None], command, load)[0]
     columns = {d.command.name: command, **{s.name: x for s, x in zip(d.columns, out.T, strict=True)},
                **({d.load.name: load} if d.load else {})}
-    return hold_inputs(Trace.from_columns(columns, lanes.model["controller.period"], {}, d), outputs)
+    trace = Trace.from_columns(columns, lanes.model["controller.period"], {}, d)
+    return trace.with_inputs(outputs=tuple(name for name in trace.output_names if name in outputs),
+                             slack=_find_slack(trace))
 
 
 def match_period(model: Model, trace: Trace, tolerance: float = 0.0) -> Model:
@@ -812,7 +803,7 @@ def _starts_in_motion(trace: Trace, rows: int = 16, fast: float = 2e-3) -> bool:
     standard deviation that its residual, the noise, gives it, the plant may as well be at rest.
     """
     first = trace.controlled[:rows]
-    if np.isnan(first).any():
+    if len(first) < rows or np.isnan(first).any():
         return False
     k = np.arange(rows)
     parabola = np.linalg.pinv(np.vander(k.astype(float), 3, increasing=True))
@@ -836,7 +827,8 @@ def find_repeat(first: Trace, trace: Trace, model: Model, number: int) -> Trace:
     source = f"--repeat {trace.provenance.get('source', number)}"
     outputs = [name for name in first.outputs if name in trace.signals]
     require(outputs, source, ", ".join(first.outputs), "a signal that the trace has too")
-    ways = [way for way in read_cycles(trace, model, outputs, source) if way.period == first.period]
+    ways = [way for way in read_cycles(trace, model, outputs, source)
+            if abs(way.period / first.period - 1.0) < SAME_PERIOD]
     require(ways, source, "t", f"rows as in the trace it repeats; they are {1e3 * trace.period:g} ms apart")
     repeat = ways[0]
     fitting = [late for late in (0, _find_first_move(first) - _find_first_move(repeat))

@@ -191,7 +191,7 @@ def profile_unknowns(problem: LogProblem, fit: Fit) -> Fit:
         return replace(best, free=fit.free)
 
     tasks = [(k, way) for k, f in enumerate(fit.free) if is_wide(f) for way in (-1.0, 1.0)]
-    return min(map_together(follow, tasks, problem.workers), key=lambda each: each.cost)
+    return min([fit, *map_together(follow, tasks, problem.workers)], key=lambda each: each.cost)
 
 
 def put_unknown(x: Floats, k: int, value: float) -> Floats:

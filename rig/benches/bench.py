@@ -375,10 +375,6 @@ class CanopenNode:
     inputs: Mapping[str, SignalObject] = field(default_factory=dict)  # signals that it receives
     outputs: Mapping[str, SignalObject] = field(default_factory=dict)  # signals that it sends
 
-    def find_cob_id(self, service: int) -> int:
-        """The COB-ID of a service in the predefined connection set (CiA 301, 7.3.3), such as 0x580."""
-        return service + self.node
-
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:

@@ -192,7 +192,7 @@ class _Reader:
 
     def read_file(self, name: str, place: Place) -> bytes:
         """The content of a file that the key at `place` names."""
-        place.require(name and "\\0" not in name, "the name of a file")
+        place.require(name and "\0" not in name, "the name of a file")
         try:
             self.files[name] = self._read(name)
         except InputError as error:
@@ -268,8 +268,7 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, signals
 
 def _read_time(text: str, place: Place, low: Fraction, high: Fraction) -> int:
     """A time with its unit, in ns."""
-    with place.locate():
-        time = parse_quantity(text, "s", "", "")
+    time = parse_quantity(text, "s", place)
     place.require(low <= time <= high and not time * 1_000_000 % 1,
                   f"whole microseconds from {float(low * 1000):g} to {float(high * 1000):g} ms, not {text!r}")
     return int(time * 1_000_000_000)
@@ -326,8 +325,7 @@ def _list_uses(keys: NodeKeys, place: Place, signals: Signals, *, is_canopen: bo
             numbers = {}
             for key, text in (("count", said.count), ("offset", said.offset)):
                 if text is not None:
-                    with own.at(key).locate():
-                        numbers[key] = parse_quantity(text, known[signal], "", "")
+                    numbers[key] = parse_quantity(text, known[signal], own.at(key))
             own.at("count").require(numbers.get("count") != 0, "a number other than 0")
             use = Use(place=own, is_received=is_received, signal=signal, unit=known[signal], count=numbers.get("count"),
                       offset=numbers.get("offset"), is_needed=signal in needed)

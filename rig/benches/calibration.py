@@ -118,7 +118,6 @@ def _split_distribution(text: str) -> tuple[str, str]:
 
 def _read_size(text: str, unit: str, place: Place) -> float:
     """A size above 0 in an SI unit."""
-    with place.locate():
-        size = float(parse_quantity(text, unit, "", ""))
+    size = float(parse_quantity(text, unit, place))
     place.require(size > 0.0, f"a size above 0, not {text!r}")
     return size

@@ -2,7 +2,6 @@
 
 import io
 import re
-import struct
 from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any, NamedTuple
@@ -247,13 +246,22 @@ def read_start(found: ODVariable | None) -> float:
 
 def encode_value(variable: ODVariable, value: float) -> bytes | None:
     """The bytes of a number in an object, None if it cannot hold it."""
-    whole = variable.data_type not in datatypes.FLOAT_TYPES
-    too_low = variable.min is not None and value < variable.min
-    if (whole and value % 1) or too_low or (variable.max is not None and value > variable.max):
+    kind = _KINDS.get(variable.data_type or 0)
+    if kind is None:  # a text, or a domain
+        return None
+    is_whole = kind is not Kind.FLOAT
+    bits = Field(name="", lowest=0, length=len(variable), kind=kind)
+    lows, highs = [variable.min], [variable.max]
+    if is_whole:  # canopen cuts numbers of 24 bits and the like
+        lows.append(bits.range[0])
+        highs.append(bits.range[1])
+    is_beyond = any(low is not None and value < low for low in lows) or any(
+        high is not None and value > high for high in highs)
+    if is_beyond or (is_whole and value % 1):
         return None
     try:
-        return bytes(variable.encode_raw(int(value) if whole else float(value)))
-    except (TypeError, ValueError, OverflowError, struct.error):
+        return bytes(variable.encode_raw(int(value) if is_whole else float(value)))
+    except OverflowError:
         return None
 
 

@@ -15,6 +15,7 @@ from rig.benches.bench import Field, FrameSpec, Guard, Kind, Role, encode_float,
 PHASES = ("setup", "main", "cleanup", "safe")
 _PLAIN = {"": Fraction(1), "-": Fraction(1), "1": Fraction(1), "%": Fraction(1, 100)}  # units of a plain number
 _SMALLEST, _LARGEST = 1e-30, 1e30  # what a count may be worth: floats can calculate with it
+_MOST_COUNTS = 1e300
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,9 +80,10 @@ def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ..
 
     Raises:
         InputError: a used value that lies outside the frame or overlaps another one, has a length that its type cannot
-            have, or whose counts have no known worth.
+            have, or whose counts have no known worth; a second counter or checksum.
     """
     taken: dict[int, str] = {}
+    guards: dict[Guard, str] = {}
     fields = []
     for slot in sorted(frame.slots, key=lambda slot: slot.name not in uses and not slot.is_selector):
         use, length = uses.get(slot.name), slot.bits.length
@@ -95,6 +97,10 @@ def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ..
             use.place.require(is_inside, f"a signal inside its frame; {slot.name} lies outside the {frame.spec.length} "
                               f"bytes of {frame.spec.name}")
             use.place.require(not other, f"signals that do not overlap; {slot.name} has bits of {other}")
+            use.place.require(use.guard not in guards, f"one {use.guard.name.lower()} in a frame; "
+                              f"{frame.spec.name} has {guards.get(use.guard)}")
+            if use.guard is not Guard.NONE:
+                guards[use.guard] = slot.name
         if is_inside and not other:
             taken |= dict.fromkeys(places, slot.name)
             fields.append(_build_field(slot, use))
@@ -157,6 +163,7 @@ def compute_counts(slot: Slot, value: float | str, place: Place) -> float:
                       f"a number{' or ' if slot.choices else ''}{list_choices(None, slot.choices)}, not {value!r}")
         return slot.choices[value]
     counts = (Fraction(str(value)) - slot.offset) / slot.scale if slot.scale else Fraction(0)
+    place.require(abs(counts) <= _MOST_COUNTS, f"a value of at most {_MOST_COUNTS:g} counts, not {value:g}")
     low, high = slot.bits.range
     if slot.bits.kind is Kind.FLOAT:
         return float(counts)

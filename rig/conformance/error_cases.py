@@ -234,8 +234,7 @@ def check_sync_lost(t: Target) -> str:
             require(not any(list_codes(t, mark)), "an EMCY before the first SYNC")
             t.sync(3, 0.01)
             last = t.now()
-            frames = t.wait_for(t.emcy_id, 10 * t.options.timeout if t.options.timeout < 1 else 3.0,
-                                lambda frame: read_error_code(frame) >> 8 == 0x81)
+            frames = t.wait_for(t.emcy_id, 3.0, lambda frame: read_error_code(frame) >> 8 == 0x81)
     require_applicable(frames, "no EMCY within 3 s: the node does not supervise SYNC")
     return (f"EMCY 0x{read_error_code(frames[0]):04X} {(frames[0].t_ns - last) * 1e-6:.0f} ms after the last SYNC "
             "of 10 ms")

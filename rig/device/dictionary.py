@@ -27,7 +27,8 @@ def read_default(entry: ODVariable) -> Value:
     default: int | float | bytes | str | None = entry.default
     if find_struct(entry) is not None:
         return 0 if default is None else cast(Value, default)
-    return default.encode("ascii") if isinstance(default, str) else cast(bytes, default or b"")
+    # CiA 301: a VISIBLE_STRING is ASCII; some data sheets are not
+    return default.encode("ascii", "replace") if isinstance(default, str) else cast(bytes, default or b"")
 
 
 class Dictionary:
@@ -46,9 +47,6 @@ class Dictionary:
     def restore(self, first: int, last: int) -> None:
         """Set the objects from index `first` to `last` to their defaults."""
         self.values |= {key: read_default(entry) for key, entry in self.entries.items() if first <= key[0] <= last}
-
-    def __contains__(self, key: tuple[int, int]) -> bool:
-        return key in self.entries
 
     def list_subs(self, index: int) -> list[int]:
         """The sub-indices of an object above 0, in order; empty if there is no such object."""

@@ -24,7 +24,7 @@ def read_mapping(od: Dictionary, index: int) -> tuple[list[tuple[int, int]], str
     lets a master change the mapping.
     """
     for sub in (0, *od.list_subs(index)):
-        require((index, sub) not in od or not od.entries[index, sub].writable, od.path,
+        require((index, sub) not in od.entries or not od.entries[index, sub].writable, od.path,
                 f"{index:04X}sub{sub:X}.AccessType", "const: the mapping cannot be changed")
     keys, codes = [], "<"
     for sub in range(1, od.read_number(index, 0) + 1):
@@ -87,15 +87,6 @@ class Rpdo(Pdo):
         else:
             self._od.values.update(zip(self._keys, self._unpack(data), strict=True))
             self._arrived(self.n)
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether a frame waits for the next SYNC."""
-        return self._waiting is not None
-
-    def put(self, data: bytes) -> None:
-        """Let a frame of the right length wait for the next SYNC."""
-        self._waiting = data
 
     def latch(self) -> None:
         """SYNC: what came last becomes valid."""
@@ -163,7 +154,7 @@ class Pdos:
 
     def __init__(self, od: Dictionary, emcy: Emcy, send: Send, arrived: Callable[[int], None]) -> None:
         def numbers(base: int) -> list[int]:
-            return [n for n in range(1, MAPPING + 1) if (base + n - 1, 1) in od]
+            return [n for n in range(1, MAPPING + 1) if (base + n - 1, 1) in od.entries]
 
         self._od = od
         self.rpdos = {n: Rpdo(n, od, emcy, arrived) for n in numbers(RPDO)}

@@ -5,6 +5,7 @@
 does so for the reference firmware. A test compares its two files with the EDS, so they cannot differ from it unnoticed.
 """
 
+import json
 from pathlib import Path
 
 from canopen.objectdictionary import ODVariable
@@ -41,7 +42,8 @@ def _write_entry(index: int, sub: int, entry: ODVariable, default_of_node_2: Val
     words = " | ".join(name for name, is_set in flags.items() if is_set) or "0"
     kind, size, bits, text, length = "KIND_TEXT", 0, "0", "NULL", 0
     if isinstance(default, bytes):
-        text, length = f'"{default.decode("ascii")}"', len(default)
+        text = json.dumps(default.decode("ascii"))  # a literal of C as well
+        length = len(default)
     elif number is not None:
         kind, size = _KINDS.get(number.format.lstrip("<"), "KIND_UNSIGNED"), number.size
         packed = number.pack(default - flags["NODE_RELATIVE"])

@@ -170,7 +170,7 @@ def _map_signal(about: Description, name: str, entry: Entry, place: Place, causa
         signal = None  # a measured current is not that of the servovalve, which drives it
     worth, unit = _find_worth(about, entry, "" if signal is None else signal.unit, place)
     port = Port(name, find_variable(about, entry.variable, (causality,), place), worth)
-    noise = _parse(entry.noise, unit, place.at("noise")) if entry.noise else ""
+    noise = float(parse_quantity(entry.noise, unit, place.at("noise"))) if entry.noise else ""
     if signal is None:
         role = (entry.role or "drive") if causality == "input" else "output"
         signal = Signal(name, name, unit, name.replace("_", " "), role)
@@ -187,7 +187,9 @@ def _find_worth(about: Description, entry: Entry, unit: str, place: Place) -> tu
         known = find_unit(named)
         si = unit or (known.si if known else named or "1")
         count, of = (entry.count, si) if unit or known is not None else (number, "")
-        return _parse(count, of, place.at("count")), si
+        worth = float(parse_quantity(count, of, place.at("count")))
+        place.at("count").require(worth, "a number other than 0")
+        return worth, si
     known = find_unit(stated)
     own = unit or (known.si if known else "")
     if own and (fitting := fit_unit(stated, own)) is not None:
@@ -204,16 +206,10 @@ def _map_parameter(about: Description, name: str, entry: Entry, place: Place) ->
     worth, unit = _find_worth(about, entry, "", place)
     variable = about.variables[entry.variable]
     ends = {"min": 0.0, "max": 1.0} if variable.type == "Boolean" else {"min": -inf, "max": inf}
-    low, high = entry.range or tuple(worth * _read_number(_find_attribute(about, entry.variable, name), far)
-                                     for name, far in ends.items())
+    low, high = entry.range or sorted(worth * _read_number(_find_attribute(about, entry.variable, name), far)
+                                      for name, far in ends.items())
     quantity = Quantity(unit, low=low, high=high, is_whole=port.variable[1] not in ("Real", "Float64", "Float32"))
     return port._replace(worth=worth), quantity, worth * _read_number(variable.start, nan)
-
-
-def _parse(text: str, unit: str, place: Place) -> float:
-    """A number with a unit, in `unit`. Raises InputError with the line of its place."""
-    with place.locate():
-        return float(parse_quantity(text, unit, place.file, place.keys))
 
 
 def _find_attribute(about: Description, name: str, attribute: str) -> Any:

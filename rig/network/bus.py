@@ -292,22 +292,17 @@ class Link:
         self._bus.shutdown()
 
     def _poll_messages(self, timeout: float) -> Iterator[Frame]:
-        for message in self._take_messages(timeout):
+        message = self._bus.recv(timeout)
+        while message is not None:
+            cob_id = find_cob_id(message) & ~SWITCHED
             if message.is_error_frame:
                 self.error_frames += 1
-                continue
-            cob_id = find_cob_id(message) & ~SWITCHED
-            if message.is_remote_frame:
+            elif message.is_remote_frame:
                 self.dropped += 1
             elif not has_valid_length(cob_id, len(message.data)):
                 self.error_frames += 1
             elif cob_id not in self._left_out and not cob_id & self._foreign:
                 yield Frame(self._clock(), cob_id, bytes(message.data))
-
-    def _take_messages(self, timeout: float) -> Iterator[can.Message]:
-        message = self._bus.recv(timeout)
-        while message is not None:
-            yield message
             message = self._bus.recv(0)
 
     def _poll_socket(self, raw: socket.socket, timeout: float) -> list[Frame]:

@@ -263,10 +263,9 @@ class Master:
         """The plant's own record of its cycles (object 0x2212); None if it has none."""
         data = self._upload(Role.PLANT, CYCLE_RECORD, 0) if Role.PLANT in self._nodes else None
         try:
-            record = decode_cycle_record(data or b"")
+            return decode_cycle_record(data) if data else None
         except InputError:  # of a foreign plant
             return None
-        return record if len(record.cycle) else None
 
     def require_identity(self, role: Role) -> None:
         """Refuse a device other than that of the data sheet: device type, vendor and product.
@@ -520,13 +519,9 @@ class Master:
             raise BusError(f"{self._bench.describe_node(role)}, object {name_object(index, sub)}: {error}") from error
 
 
-class ExpectedObject(NamedTuple):
-    """What a device must hold."""
-
-    index: int  # type: ignore[assignment]  # the word of the standard
-    sub: int
-    value: int
-    mask: int = (1 << 64) - 1  # bits that matter
+# what a device must hold: index, sub, value, the bits of it that matter
+ExpectedObject = tuple[int, int, int, int]
+_ALL_BITS = -1
 
 
 def list_identity(dictionary: Any) -> Iterator[ExpectedObject]:
@@ -534,15 +529,15 @@ def list_identity(dictionary: Any) -> Iterator[ExpectedObject]:
     for index, sub in ((DEVICE_TYPE, 0), (0x1018, 1), (0x1018, 2)):
         value = read_number(dictionary, index, sub)
         if value or (value == 0 and not sub):
-            yield ExpectedObject(index, sub, value)
+            yield index, sub, value, _ALL_BITS
 
 
 def list_pdo_objects(dictionary: Any, node: int) -> Iterator[ExpectedObject]:
     """COB-ID, transmission type, inhibit time, event timer and mapping of the PDOs that a data sheet switches on."""
     not_remote = 0xFFFF_FFFF ^ 1 << 30  # whether a PDO may be requested does not matter
     for pdo in (pdo for pdo in list_pdos(dictionary, node) if not pdo.cob_id & INVALID):
-        yield ExpectedObject(pdo.parameter, 1, pdo.cob_id, not_remote)
+        yield pdo.parameter, 1, pdo.cob_id, not_remote
         for index, subs in ((pdo.parameter, (2, 3, 5)), (pdo.parameter + MAPPING, range(len(pdo.entries) + 1))):
             for sub in subs:
                 if (value := read_number(dictionary, index, sub)) is not None:
-                    yield ExpectedObject(index, sub, value)
+                    yield index, sub, value, _ALL_BITS

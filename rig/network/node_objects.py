@@ -171,13 +171,11 @@ def encode_cycle_record(record: CycleRecord) -> bytes:
 
 
 def decode_cycle_record(data: bytes) -> CycleRecord:
-    """What `encode_cycle_record` packed; of an emulator without a record (b"") one without cycles.
+    """What `encode_cycle_record` packed.
 
     Raises:
         InputError: other bytes.
     """
-    if not data:
-        return CycleRecord(*(np.zeros(0, np.int64) for _ in CycleRecord._fields))
     try:
         version, count, first = _HEAD.unpack_from(data)
         if version != _VERSION:

@@ -39,19 +39,6 @@ def is_group(text: str) -> bool:
         return False
 
 
-def open_sender() -> socket.socket:
-    """A socket that sends to groups on this machine only: from 127.0.0.1, with a TTL of 0. Raises OSError."""
-    tx = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        tx.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, _LOOPBACK)
-        tx.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
-        tx.bind(("127.0.0.1", 0))
-    except OSError:
-        tx.close()
-        raise
-    return tx
-
-
 def attach_filter(rx: socket.socket, own_port: int, cob_ids: Collection[int], left_out: bool = False) -> None:
     """A socket filter (classic BPF): no datagram from `own_port`, and only these COB-IDs, in python-can's layout.
 
@@ -84,8 +71,14 @@ def attach_filter(rx: socket.socket, own_port: int, cob_ids: Collection[int], le
 
 
 def open_sockets(group: str, port: int, stack: contextlib.ExitStack) -> tuple[socket.socket, socket.socket, Turn]:
-    """A socket that hears the group, on 127.0.0.1 alone, one that sends to it, and the turn. Raises OSError."""
-    tx = stack.enter_context(open_sender())
+    """A socket that hears the group, on 127.0.0.1 alone, one that sends to it, on this machine only, and the turn.
+
+    Raises OSError.
+    """
+    tx = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    tx.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, _LOOPBACK)
+    tx.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+    tx.bind(("127.0.0.1", 0))
     rx = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     set_receive_options(rx)
     rx.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -65,7 +65,8 @@ class PlantNode:
         """`bench`: whose plant it is; default: the shipped one."""
         self._send, self._bench = send, bench or load_bench()
         self._node = node = find_plant_node(self._bench)
-        self._heartbeat, self._emcy, self._sdo = map(node.find_cob_id, (heartbeat.COB_ID, 0x080, 0x600))
+        # COB-IDs of the predefined connection set (CiA 301, 7.3.3)
+        self._heartbeat, self._emcy, self._sdo = (base + node.node for base in (heartbeat.COB_ID, 0x080, 0x600))
         self._unheard = list_unheard(self._bench)
         self.device = Device(node.node, node.eds, self._transmit)
         self.device.on_write, self.device.on_nmt = self._on_write, self._on_nmt

@@ -4,6 +4,7 @@ import os
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from fdi.report.report import Cell, Column, Item, Line, Paragraph, Report, Secti
 from plant import RigError, load_model
 from rig.network.frame import WallClock
 from rig.network.master import BusError
-from rig.network.udp import PORT, open_sender
+from rig.network.udp import PORT, open_sockets
 from rig.run.job import Job
 from rig.run.runner import run_job
 from rig.sequences.sequence import parse_sequence
@@ -64,7 +65,8 @@ def fuzz_datagrams(count: int, seed: int, group: str, controller: str = "builtin
         try:
             _play(group, Path(place))
             before = read_usage(own)
-            with open_sender() as sender:
+            with ExitStack() as stack:
+                _, sender, _ = open_sockets(group, PORT, stack)
                 for number, frame in enumerate(invent_frames(count, seed)):
                     message = Message(arbitration_id=frame.cob_id, data=frame.data, is_extended_id=False)
                     sender.sendto(_change(rng, pack_message(message)), (group, PORT))
