@@ -599,8 +599,10 @@ def read_cycles(trace: Trace, model: Model, outputs: Sequence[str] | None = None
     if rows_in_cycle > 1 and abs(1 / ratio / rows_in_cycle - 1) < SAME_PERIOD:
         phase = _find_new_current(rows.drive, rows_in_cycle)
         if phase is not None:
+            thinned = _thin_rows(rows, rows_in_cycle, phase)
+            require(len(thinned) >= FEWEST_ROWS, source, "t", f"at least {FEWEST_ROWS} cycles, not {len(thinned)}")
             note = f"rows every {ms:g} ms, current new every {rows_in_cycle}: one row a cycle is used"
-            return [_fill_inputs(_thin_rows(rows, rows_in_cycle, phase).with_notes(note), trace, source)]
+            return [_fill_inputs(thinned.with_notes(note), trace, source)]
     ways = [rows.with_notes(f"the model's cycle of {1e3 * model['controller.period']:g} ms is taken as the trace's, "
                             f"{ms:g} ms")]
     if 1 < cycles_in_row <= 20 and abs(ratio / cycles_in_row - 1) < SAME_PERIOD:

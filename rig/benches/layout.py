@@ -97,13 +97,13 @@ def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ..
             use.place.require(is_inside, f"a signal inside its frame; {slot.name} lies outside the {frame.spec.length} "
                               f"bytes of {frame.spec.name}")
             use.place.require(not other, f"signals that do not overlap; {slot.name} has bits of {other}")
-            use.place.require(use.guard not in guards, f"one {use.guard.name.lower()} in a frame; "
-                              f"{frame.spec.name} has {guards.get(use.guard)}")
-            if use.guard is not Guard.NONE:
-                guards[use.guard] = slot.name
         if is_inside and not other:
             taken |= dict.fromkeys(places, slot.name)
             fields.append(_build_field(slot, use))
+        if use is not None and use.guard is not Guard.NONE:
+            use.place.require(use.guard not in guards, f"one {use.guard.name.lower()} in a frame; "
+                              f"{frame.spec.name} has {guards.get(use.guard)}")
+            guards[use.guard] = slot.name
     counters = [each for each in fields if each.guard is Guard.COUNTER]
     if any(each.checksum == "e2e_profile_1" for each in fields):  # its counter never is 15 (AUTOSAR PRS E2E)
         fields = [replace(each, wrap=min(each.modulus, 15)) if each in counters else each for each in fields]

@@ -134,6 +134,9 @@ def test_the_firmware_leaves_its_mark_without_noise() -> None:
     (found,) = marks.prints
     value, low, high = found.parameters["command_rate_limit.rate"]
     assert low <= 0.12 <= high or value == pytest.approx(0.12, rel=1e-6)
+    slower = hold_inputs(_recorded({"asymmetric_gain.retraction": -0.2}))
+    (found,) = [each for each in find_marks(model, [slower]).prints if each.effect == "asymmetric_gain"]
+    assert found.parameters["asymmetric_gain.retraction"][0] == pytest.approx(-0.2, rel=1e-4)
 
 
 def test_a_converter_with_few_bits_leaves_a_comb() -> None:
@@ -215,6 +218,12 @@ def search() -> Search:
     found = Search(load_model().replace(BIAS), hold_inputs(record_plant(BIAS, COMMAND)), [], [], 1)
     found.problem = replace(found.problem, bare=None)
     return found
+
+
+def test_a_held_out_run_may_lack_signals(search: Search) -> None:
+    """Each that it has keeps its own noise."""
+    unseen = hold_inputs(record_plant(BIAS, COMMAND), ["xs"])
+    assert search.make_problem(unseen, 20).noise == search.problem.noise[-1:]
 
 
 def test_an_effect_counts_only_if_its_interval_leaves_out_the_off_value(search: Search) -> None:

@@ -116,6 +116,8 @@ def test_rows_at_2_khz_are_taken_once_a_cycle() -> None:
     twice = {name: np.repeat(x, 2) for name, x in columns().items() if name != "t"}
     (c,) = read_cycles(Trace.from_columns(twice | {"t": np.arange(27_000) * 5e-4}, 5e-4, {}), MODEL)
     assert c.period == 1e-3 and (c.cor == record_healthy().cor).all() and "one row a cycle" in c.notes[0]
+    few = Trace.from_columns({name: x[:300] for name, x in twice.items()} | {"t": np.arange(300) * 5e-4}, 5e-4, {})
+    assert f"at least {FEWEST_ROWS} cycles, not 150" in catch_refusal(read_cycles, few, MODEL)
 
 
 def test_rows_at_500_hz_can_be_read_in_two_ways() -> None:
@@ -151,10 +153,19 @@ def test_a_trace_that_starts_in_motion() -> None:
     assert not c.usable[:300].any() and c.usable[300] and "already moves" in c.notes[0]
 
 
+def test_a_replay_starts_at_the_first_position_that_was_measured() -> None:
+    """The ram is 5 mm out there."""
+    rows = slice(700, 3000)
+    whole, lacking = (read_cycles(cut(rows, **spoiled), MODEL)[0] for spoiled in ({}, spoil("xj", 700)))
+    assert np.abs(replay_current(whole, MODEL)["xj"] - replay_current(lacking, MODEL)["xj"]).max() < 1e-5
+
+
 def test_a_repeat_is_found_by_its_command() -> None:
     (c,), (spool,) = read_cycles(record_healthy(), MODEL), read_cycles(record_healthy(), MODEL, ["xs"])
     repeat, same = find_repeat(c, cut(slice(100, None)), MODEL, 1), find_repeat(c, record_healthy(1), MODEL, 1)
     assert len(repeat) == len(same) == len(c) and (same.xj == record_healthy(1).xj).all()
+    other = cut(slice(None), 1.000_01e-3, xj=record_healthy(1).xj)  # its clock is 10 ppm off
+    assert len(find_repeat(c, other, MODEL, 1)) == len(c)
     rows = repeat.mask_unusable("xj")
     assert np.isnan(rows[:100]).all() and (rows[100:] == c.xj[100:]).all()
     for first, other, words in (
@@ -244,6 +255,9 @@ def test_a_fit_is_judged_on_all_of_the_recording() -> None:
     assert good.errors["xj"] == pytest.approx(LEVELS["xj"], rel=0.05)
     first, stop = bad.find_worst_piece(LEVELS, rows, ()) or (0, 0)
     assert 30_000 <= first < stop <= 39_000
+    sparse = slipped.with_columns({name: np.where(k % 3, np.nan, slipped.column(name)) for name in LEVELS})
+    assert not judge_on_all(problem, [fit], sparse, 20)[0].holds(LEVELS)
+    assert choose_excerpt(sparse, problem.model, LEVELS).pieces
 
 
 def test_compare_of_a_long_recording() -> None:

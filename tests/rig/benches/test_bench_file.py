@@ -150,6 +150,7 @@ MISTAKES = [
     ('"a drive"', "3", "bench.toml:1: name: expected a text, not 3"),
     ("node = 5", "node = 128", "controller.node: expected a whole number from 1 to 127, not 128"),
     ("node = 5\n", "", "controller: expected also the key 'node', a node-ID from 1 to 127"),
+    ("x.eds", "x\\u0000.eds", "controller.eds: expected the name of a file"),
     ("x.eds", "y.eds", "controller.eds: expected a file that can be read (No such file or directory): "),
     ('eds = "x.eds"\n', "", "controller.eds: expected the name of the device's EDS or DCF"),
     ("x.eds", "bench.toml", "bench.toml: expected an electronic data sheet (CiA 306)"),
@@ -181,6 +182,7 @@ MISTAKES = [
     *(("[controller.outputs]", f'[controller.values]\n"{key}" = {value}\n[controller.outputs]',
        f"controller.values.{key}: expected {said}") for key, value, said in (
         ("0x2003", 300, "a number that Object 2003 can hold, not 300"), ("0x2003", 0.5, "a number that"),
+        ("0x2006", 5, "a number that Object 2006 can hold, not 5"),
         ("0x2002", 1, "an object of the EDS that can be written"))),
     ("[controller.outputs]", 'mode = { object = "0x2003" }\n[controller.outputs]', "for 0x2003 with 8 bits RPDO1"),
     ("cia402", 'none"\ninputs.control_word.object = "0x2003#', "expected TOML; "),
@@ -198,6 +200,7 @@ SHEETS = [
     (RPDOS, (TPDOS[0]._replace(words=(0x2002_0010,)),),
      "controller.profile: expected an object that a TPDO maps; for 0x6041 with 16 bits TPDO1 has room"),
 ]
+ENABLE = '[controller.phases]\n"Demand.Enable" = { main = "on", cleanup = 0 }\n[controller.protection]'
 CAN_MISTAKES = [
     ("Demand.Position", "Demnd.Position", "MESSAGE.SIGNAL of ecu.dbc, not 'Demnd.Position'; did you mean Demand?"),
     ("Demand.Position", "Demand.Posit", "a signal of message Demand: 'Counter', 'Crc', 'Enable' or 'Position', not"),
@@ -211,6 +214,7 @@ CAN_MISTAKES = [
     ('main = "on"', "man = 1", "values by phase: 'cleanup', 'main', 'safe' or 'setup', not 'man'"),
     ('"counter"', '"crc9"', "counter, FILE.py:FUNCTION or a checksum: 'crc8_h2f', 'crc8_sae_j1850', "),
     ('"counter"', '"crc8_h2f"', "a byte for crc8_h2f; Demand.Counter has 4 bits from bit 8 on"),
+    (ENABLE, '[controller.protection]\n"Demand.Enable" = "counter"', "one counter in a frame; Demand has Demand."),
     (", data_id = 0x123", "", "a data_id of 0 to 65535 with e2e_profile_1"),
     ('"ecu.dbc"', '"bench.toml"', "bench.toml: expected a DBC ("),
     ('dbc = "ecu.dbc"', "node = 3", "controller.node: expected protocol = \"canopen\" together with this key"),
