@@ -53,15 +53,8 @@ class Paths(NamedTuple):
     rate: Floats  # now, (paths,), per u
 
 
-class UnitError(NamedTuple):
-    """Standard deviation of a size by the unit's tolerances, common to all its traces: base + share * size."""
-
-    base: float = 0.0
-    share: float = 0.0
-
-
-def sample_paths(posterior: Posterior, own: UnitError, seed: int = 0, paths: int = TREND_PATHS) -> Paths:
-    """Paths of equal probability."""
+def sample_paths(posterior: Posterior, unit_error: Floats, seed: int = 0, paths: int = TREND_PATHS) -> Paths:
+    """Paths of equal probability; `unit_error` as `_fit_unit_error` gives it."""
     rng = np.random.default_rng(seed)
     weights = posterior.weights
     part, shape = np.unravel_index(_sample_stratified_rows(weights.ravel(), paths, rng), weights.shape)
@@ -81,7 +74,7 @@ def sample_paths(posterior: Posterior, own: UnitError, seed: int = 0, paths: int
         sizes[rows] = rise[:, None] * ahead[k] + level[0][:, None] + wander
         rate[rows] = rise * slopes[k] + (level[1] if kind == "integrated" else 0.0)
     common = np.sqrt([NOISES[p.noise][0] for p in posterior.parts])[part] * rng.standard_normal(paths)
-    sizes -= common[:, None] * (own.base + own.share * sizes)
+    sizes -= common[:, None] * np.polyval(unit_error, sizes)
     pace = np.exp(np.clip(PACE_SCALE * rng.standard_t(PACE_FREEDOM, paths), -2.0, 2.0))
     sizes = np.array([np.interp(AHEAD, AHEAD * slower, row) for slower, row in zip(pace, sizes, strict=True)])
     return Paths(sizes, rate / pace)
@@ -146,6 +139,12 @@ class Scaled(NamedTuple):
     loose: tuple[int, ...] = ()  # rows out of line, which carry no information
     bounded: tuple[int, ...] = ()  # rows that only give an upper limit: the estimate stopped at the parameter's bound
 
+    @property
+    def jumps(self) -> Floats:
+        """1 in the rows from each step on, else 0, (steps, n); by row, for two rows may have one time."""
+        rows = np.arange(len(self.u))
+        return np.array([rows >= row for row in self.steps], dtype=float).reshape(-1, len(rows))
+
 
 class Part(NamedTuple):
     """The posterior under one noise and one wander; arrays over shapes, shape (k,)."""
@@ -197,11 +196,9 @@ def compute_covariance(data: Scaled, noise: int, wander: int, loose: float = 10.
     """
     common, factor = NOISES[noise]
     sigma = factor * np.maximum(data.sigma, narrowest)
-    n = len(sigma)
-    jumps = np.array([np.arange(n) >= row for row in data.steps], dtype=float).reshape(-1, n)  # 1 from the step on
-    own = np.where(np.isin(np.arange(n), data.bounded), 1.0, 1.0 - common)
+    own = np.where(np.isin(np.arange(len(sigma)), data.bounded), 1.0, 1.0 - common)
     out: Floats = (np.diag(own * sigma ** 2) + OFFSET_PRIOR_SD ** 2
-                   + STEP_PRIOR_SD ** 2 * jumps.T @ jumps + compute_wander_covariance(wander, data.u, data.u))
+                   + STEP_PRIOR_SD ** 2 * data.jumps.T @ data.jumps + compute_wander_covariance(wander, data.u, data.u))
     out[data.loose, data.loose] += loose ** 2
     return out
 
@@ -229,7 +226,7 @@ def compute_wander_covariance(wander: int, a: Floats, b: Floats) -> Floats:
 def _fit_part(data: Scaled, g: Floats, noise: int, wander: int) -> Part:
     kind, strength = WANDERS[wander]
     factor = np.linalg.cholesky(compute_covariance(data, noise, wander))
-    end = compute_end_covariance(data, data.u, wander)
+    end = _compute_end_covariance(data, wander)
     white = solve_triangular(factor, np.column_stack([data.y, g, end.T]), lower=True, check_finite=False)
     y, g, s = white[:, 0], white[:, 1:-2], white[:, -2:]
     every, _ = list_shapes()
@@ -250,11 +247,11 @@ def compute_rise_evidence(rise: Floats, deviation: Floats, usual: Floats) -> Flo
     return out
 
 
-def compute_end_covariance(data: Scaled, u: Floats, wander: int) -> Floats:
-    """Covariance of the level and of the wander's slope at u = 1 with the levels at times u, (2, m)."""
+def _compute_end_covariance(data: Scaled, wander: int) -> Floats:
+    """Covariance of the level and of the wander's slope at u = 1, after every step, with the rows' levels, (2, n)."""
     kind, strength = WANDERS[wander]
-    counted = np.sum([u >= data.u[row] for row in data.steps], axis=0) if data.steps else 0.0
-    level = OFFSET_PRIOR_SD ** 2 + STEP_PRIOR_SD ** 2 * counted + np.zeros_like(u)
+    u = data.u
+    level = OFFSET_PRIOR_SD ** 2 + STEP_PRIOR_SD ** 2 * data.jumps.sum(axis=0)
     return np.array([level + 3 * strength ** 2 * (u ** 2 / 2 - u ** 3 / 6), 3 * strength ** 2 * u ** 2 / 2]
                     if kind == "integrated" else [level + strength ** 2 * u, np.zeros_like(u)])
 
@@ -267,20 +264,24 @@ def estimate_level(data: Scaled, posterior: Posterior, u: Floats) -> Floats:
     here, there = g[:len(data.u)], g[len(data.u):]
     rise = max(float(part.rise[shape]), 0.0)
     solver = cho_factor(compute_covariance(data, part.noise, part.wander))
-    cross = _compute_cross_covariance(data, part.wander, u, data.u)
+    jumps = np.array([u >= data.u[row] for row in data.steps], dtype=float).reshape(-1, len(u))  # as Scaled.jumps
+    cross = _compute_cross_covariance(part.wander, u, jumps, data.u, data.jumps)
     mean = rise * there + cross @ cho_solve(solver, data.y - rise * here)
     pull = there - cross @ cho_solve(solver, here)
-    own = _compute_cross_covariance(data, part.wander, u, u).diagonal()
+    own = _compute_cross_covariance(part.wander, u, jumps, u, jumps).diagonal()
     left = own - (cross * cho_solve(solver, cross.T).T).sum(axis=1)
     half = INTERVAL_95_SD * np.sqrt(np.maximum(left + (pull * part.deviation[shape]) ** 2, 0.0))
     return np.array([mean - half, mean, mean + half])
 
 
-def _compute_cross_covariance(data: Scaled, wander: int, a: Floats, b: Floats) -> Floats:
-    """Covariance of the level without the rise at times a with that at times b, (len(a), len(b))."""
+def _compute_cross_covariance(wander: int, a: Floats, jumps_a: Floats, b: Floats, jumps_b: Floats) -> Floats:
+    """Covariance of the level without the rise at times a with that at times b, (len(a), len(b)).
+
+    `jumps_a` and `jumps_b` say which of the times are after each step, as `Scaled.jumps`.
+    """
     out = OFFSET_PRIOR_SD ** 2 + compute_wander_covariance(wander, a, b)
-    for row in data.steps:
-        out = out + STEP_PRIOR_SD ** 2 * np.outer(a >= data.u[row], b >= data.u[row])
+    for after_a, after_b in zip(jumps_a, jumps_b, strict=True):
+        out = out + STEP_PRIOR_SD ** 2 * np.outer(after_a, after_b)
     return out
 
 
@@ -433,28 +434,31 @@ def _scale_series(fault: Fault, t: Floats, sizes: Sequence[Estimate]) -> tuple[S
     return Scaled((t - t[0]) / span, (value - fault.healthy) / unit, sigma, bounded=bounded), unit
 
 
-def _fit_unit_error(data: Scaled, used: Flags) -> UnitError:
-    """A line through the intervals' deviations over the sizes; their mean where these hardly differ."""
+def _fit_unit_error(data: Scaled, used: Flags) -> Floats:
+    """Standard deviation of a size by the unit's tolerances, common to all its traces: a polynomial of the size.
+
+    A line through the intervals' deviations over the sizes; the last deviation where the sizes hardly differ.
+    """
     y, sigma = data.y[used], data.sigma[used]
     if np.ptp(y) < INTERVAL_SLOPE_RANGE:
-        return UnitError(float(sigma[-1]))
-    share, base = np.polyfit(y, sigma, 1)
-    return UnitError(float(base), float(share))
+        return sigma[-1:]
+    line: Floats = np.polyfit(y, sigma, 1)
+    return line
 
 
-def _sample_paths(found: Cleaned, posterior: Posterior, own: UnitError) -> Paths:
+def _sample_paths(found: Cleaned, posterior: Posterior, unit_error: Floats) -> Paths:
     """Paths from the last trace on.
 
     A last size that stands out above may be out of line, a step, or the law that turns up: a third of the paths each.
     """
     last = found.breaks[-1] if found.breaks else None
     if last is None or last.kind != "last" or last.size < 0.0:
-        return sample_paths(posterior, own)
+        return sample_paths(posterior, unit_error)
     at = len(found.data.u) - 1
     tight = found.data._replace(loose=tuple(row for row in found.data.loose if row != at))
     third = TREND_PATHS // 3
     posteriors = posterior, fit_growth(tight._replace(steps=(*tight.steps, at))), fit_growth(tight)
-    three = [sample_paths(p, own, i, third) for i, p in enumerate(posteriors)]
+    three = [sample_paths(p, unit_error, i, third) for i, p in enumerate(posteriors)]
     return Paths(np.concatenate([p.sizes for p in three]), np.concatenate([p.rate for p in three]))
 
 

@@ -33,9 +33,9 @@ def estimates(sizes: Sequence[float], sigma: float = SIGMA) -> list[Estimate]:
     return [Estimate(float(x), float(x - 1.96 * sigma), float(x + 1.96 * sigma)) for x in seen]
 
 
-def friction(sizes: Sequence[float]) -> Trend:
+def friction(sizes: Sequence[float], times: np.ndarray = WEEKS) -> Trend:
     """The trend of such sizes, a week apart."""
-    return fit_trend(FRICTION, list(WEEKS[:len(sizes)]), estimates(sizes))
+    return fit_trend(FRICTION, list(times[:len(sizes)]), estimates(sizes))
 
 
 def test_dates_are_found_in_texts_and_names() -> None:
@@ -119,17 +119,20 @@ SHOWS: dict[str, Callable[[Trend, Trend, int], bool]] = {  # of each kind of bre
     "outlier": lambda f, p, row: not f.used[row] and find_median(f) == pytest.approx(find_median(p), rel=0.2),
     "repair": lambda f, p, row: (f.used.sum(), f.verdict) == (4, "NO_TREND"),
     "step": lambda f, p, row: f.now.value == pytest.approx(47.0, abs=2.0),
+    "step within a day": lambda f, p, row: f.now.value == pytest.approx(45.0, abs=2.0),
     "last above": lambda f, p, row: f.remaining["non_nominal"].low < p.remaining["non_nominal"].low,  # the worse case
     "last below": lambda f, p, row: f.verdict == p.verdict,
 }
+TIMES = {"step within a day": np.insert(WEEKS, 6, WEEKS[5])}  # the trace before the step and that after it
 
 
 @pytest.mark.parametrize(("kind", "row", "sizes"), [
     ("outlier", 5, LINE + 25.0 * (np.arange(12) == 5)), ("outlier", 7, LINE - 12.0 * (np.arange(12) == 7)),
-    ("step", 6, LINE + 20.0 * (np.arange(12) >= 6)), ("repair", 8, np.where(np.arange(12) < 8, LINE, 5.0)),
+    ("step", 6, LINE + 20.0 * (np.arange(12) >= 6)),
+    ("step within a day", 6, LINE + 18.0 * (np.arange(12) >= 6)), ("repair", 8, np.where(np.arange(12) < 8, LINE, 5.0)),
     ("last above", 11, LINE + 20.0 * (np.arange(12) == 11)), ("last below", 11, LINE - 20.0 * (np.arange(12) == 11))])
 def test_breaks(kind: str, row: int, sizes: Sequence[float]) -> None:
-    found = friction(sizes)
+    found = friction(sizes, TIMES.get(kind, WEEKS))
     assert [(b.kind, b.row) for b in found.breaks] == [(kind.split()[0], row)]
     assert found.breaks[0].size == pytest.approx(sizes[row] - LINE[row], abs=4.0)
     assert SHOWS[kind](found, friction(LINE), row)
