@@ -137,7 +137,8 @@ def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: fl
         faults: what the bands judge.
 
     Raises:
-        InputError: no controller, a command without steps and ramps, or a period that is not the model's.
+        InputError: no controller, a command without steps and ramps, a period that is not the model's, or a model that
+            has a fault.
     """
     signals = model.kind.signals
     require(model.kind.control is not None and not signals.is_open_loop, "--learn-bands", model.kind.name,
@@ -151,6 +152,10 @@ def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: fl
             f"one row per {1e3 * model['controller.period']:g} ms, the model's cycle, for bands by simulation, not per "
             f"{1e3 * period:g} ms")
     ready = model.with_effects(name.partition(".")[0] for fault in faults for name in fault.parameters)
+    for f in faults:
+        size, limit = ready[f.parameter], f.place_size(f.limits[1])
+        require(f.measure_departure(size) < f.limits[1], "--learn-bands", f.parameter,
+                f"a healthy size in the model, short of MidBand ({f.symbol} {limit:g}), not {size:g}")
 
     def draw(words: str, changes: Mapping[str, float], number: int = faulty) -> Floats:
         return simulate_units(ready, com, load, changes, number, seed, steps, progress, words)
@@ -196,8 +201,8 @@ def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: fl
 
 def _list_amounts(fault: Fault, sound: float) -> list[float]:
     """The amounts of a friction, the healthy one first."""
-    known = {fault.maintenance * part / 7 for part in FRICTION_AMOUNTS} | {fault.acceptable, fault.maintenance}
-    return [sound, *sorted(size for size in known if size > 1.2 * sound)]
+    beside = {fault.maintenance * part / 7 for part in FRICTION_AMOUNTS}
+    return [sound, *sorted({fault.acceptable, fault.maintenance, *(size for size in beside if size > 1.2 * sound)})]
 
 
 def _make_step_band(number: int, s: Section, period: float, sound: Floats, rubbing: Mapping[str, Sequence[Floats]],

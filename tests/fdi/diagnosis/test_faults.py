@@ -368,6 +368,13 @@ def test_any_command() -> None:
         assert {judge_position(SHORT, row, 1e-3, made).ruling for row in x} == {ruling}
 
 
+def test_a_model_may_have_a_friction_near_midband_but_not_at_it() -> None:
+    near, beyond = (partial(make_bands_by_simulation, load_model().replace(make_kind(friction=size)), SHORT,
+                            0.0 * SHORT, 1e-3, 8, 8) for size in (30.0, 35.0))
+    assert near().find(RUBBED).amounts.tolist() == [30.0, 35.0, 50.0, 70.0, 100.0, 140.0]
+    assert "short of MidBand (FSS 35), not 35" in catch_refusal(beyond)
+
+
 def test_faults_of_a_list_of_ones_own() -> None:
     """Where none is a friction, ramps judge the others as well."""
     made = make_bands_by_simulation(load_model(), SHORT, 0.0 * SHORT, 1e-3, 48, 32, seed=1, faults=[CLOGGING])
