@@ -34,6 +34,7 @@ from fdi.diagnosis.precursors import (
     select_ramp_rows,
 )
 from fdi.estimation.replay import is_friction
+from fdi.output import quote_text
 from fdi.thresholds import (
     BAND_FAULT_CLEARANCE_SD,
     BAND_LARGEST_LOAD,
@@ -45,7 +46,18 @@ from fdi.thresholds import (
 )
 from fdi.trace.sections import Section, describe_section, find_sections
 from fdi.trace.trace import Flags, Floats, Trace
-from plant import InputError, Model, Plant, count_nouns, decode_text, find_plant, parse_toml, read_file, require
+from plant import (
+    InputError,
+    Model,
+    Plant,
+    count_nouns,
+    decode_text,
+    escape_control_characters,
+    find_plant,
+    parse_toml,
+    read_file,
+    require,
+)
 
 LEVELS = {"middle": Level.MAINTENANCE, "most": Level.NON_NOMINAL}  # of a signal that has left this band
 
@@ -484,14 +496,15 @@ def format_bands(bands: Bands) -> str:
     head = {"period_ms": bands.period * MS_PER_S, "scale": bands.scale, "count": count}
     lines = [HEADER.format(first=MS_PER_S * STEP_JUDGED_FROM, coarse=KNOT_CYCLES), "[bands]",
              *(f"{key} = {value:g}" for key, value in head.items()), "", "[provenance]",
-             *(f"{key} = {json.dumps(value)}" for key, value in bands.provenance.items()), "",
+             *(f"{key} = {quote_text(escape_control_characters(value))}" for key, value in bands.provenance.items()),
+             "",
              "# kind, rows from and to, demand before and at the end in counts, rate in counts/s", "sections = [",
              *(f"  {json.dumps([*s[:3], *_round_values(np.array(s[3:]) / count, 2)])},"
                for s in bands.sections), "]"]
     for fault in bands.faults:
         lines += ["", f"[faults.{fault.name}]",
-                  *(f"{key} = {json.dumps(getattr(fault, key))}"
-                    for key in ("parameter", "symbol", "unit", "acceptable", "maintenance")),
+                  *(f"{key} = {quote_text(getattr(fault, key))}" for key in ("parameter", "symbol", "unit")),
+                  *(f"{key} = {json.dumps(getattr(fault, key))}" for key in ("acceptable", "maintenance")),
                   *(f"follow.{json.dumps(name)} = {by!r}" for name, by in fault.follow.items()),
                   *(["both_ways = true"] if fault.both_ways else [])]
         if len(fault.amounts):

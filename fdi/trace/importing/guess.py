@@ -1,6 +1,5 @@
 """A first map of a recording, guessed from names, units and data; each choice with its reasons and how sure it is."""
 
-import json
 import math
 import re
 import unicodedata
@@ -12,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fdi.output import quote_text
 from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION, LEAST_SPEED_CORRELATION
 from fdi.trace.importing.formats import OTHER_UNITS, Channel, Measurement, split_unit
 from fdi.trace.sensor_dynamics import find_comb
@@ -171,11 +171,11 @@ def _guess_time(measurement: Measurement, columns: Columns) -> tuple[list[str], 
         date = next((n for n in texts if _has_word(n, TIME_WORDS + "|date|datum")), None)
         if date is not None:
             return ["[time]  # likely: no column of numbers is a time; this one's name says so",
-                    f"source = {_quote(date)}", 'unit = "iso"'], date, "likely"
+                    f"source = {quote_text(date)}", 'unit = "iso"'], date, "likely"
         return ["[time]  # unsure: no column grows from row to row; put in the true rate",
                 "rate = 1000.0  # rows a second"], None, "unsure"
     name = best.source
-    return [f"[time]  # {best.confidence}: {', '.join(best.reasons)}", f"source = {_quote(name)}",
+    return [f"[time]  # {best.confidence}: {', '.join(best.reasons)}", f"source = {quote_text(name)}",
             _guess_time_unit(columns.units[name], columns.data[name])], name, best.confidence
 
 
@@ -416,17 +416,13 @@ def _find_signs(found: Mapping[str, Guess], columns: Columns, signals: Signals) 
             drive.note(0.5, f"it has the sign of {above} - {below} (correlation {r:.2f})")
 
 
-def _quote(text: str) -> str:
-    """As a TOML string."""
-    return json.dumps(text, ensure_ascii=False)
-
-
 def _list_file_lines(measurement: Measurement) -> list[str]:
     layout = measurement.layout
     if layout is None:
         return []
-    return ["[file]  # how the text is written", f"separator = {_quote(layout.separator)}",
-            f"decimal = {_quote(layout.decimal)}", *([f"header = {layout.name_line}"] if layout.name_line else []), ""]
+    return ["[file]  # how the text is written", f"separator = {quote_text(layout.separator)}",
+            f"decimal = {quote_text(layout.decimal)}",
+            *([f"header = {layout.name_line}"] if layout.name_line else []), ""]
 
 
 def _list_signal_lines(signal: Signal, signals: Signals, guess: Guess | None, columns: Columns) -> list[str]:
@@ -438,8 +434,9 @@ def _list_signal_lines(signal: Signal, signals: Signals, guess: Guess | None, co
                 f'# unit = "{signal.unit}"', ""]
     unit = guess.unit.name
     return [f"[signals.{name}]  # {quantity}; {guess.confidence}: {'; '.join(guess.reasons)}",
-            f"source = {_quote(guess.source)}", f'unit = "{unit}"',
-            *([f"minus = {_quote(guess.minus)}"] if guess.minus else []), *(["sign = -1"] if guess.sign < 0 else []),
+            f"source = {quote_text(guess.source)}", f'unit = "{unit}"',
+            *([f"minus = {quote_text(guess.minus)}"] if guess.minus else []),
+            *(["sign = -1"] if guess.sign < 0 else []),
             *([f"scale = {1.0 if guess.scale is None else guess.scale:g}  # {unit} for each "
                f"{columns.units[guess.source]}: put in the true one", f"offset = {guess.offset:g}  # {unit}"]
               if columns.has_raw_unit(guess.source, signal.unit) else []),

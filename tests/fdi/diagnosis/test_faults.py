@@ -399,14 +399,15 @@ def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_file(tmp_path: Path) -> None:
     """What is written is read again, to the digit; it is small, says where it is from, and can be reviewed.
 
-    A step of no whole number of mm is read again, too.
+    A step of no whole number of mm is read again, too, and any character in the name of the command.
     """
     again = load_bands(write_file(tmp_path / "b.toml", format_bands(load_default_bands())))
     assert judged(units(0.3)[0], again) == judged(units(0.3)[0])
     assert {"made", "command", "command_hash", "model", "runs", "seed", "software"} <= again.provenance.keys()
     assert (tmp_path / "b.toml").stat().st_size < 40_000
     some = short_bands()
-    odd = replace(some, precursors={"overshoot_0.341mm": next(iter(some.precursors.values()))})
+    odd = replace(some, precursors={"overshoot_0.341mm": next(iter(some.precursors.values()))},
+                  provenance={**some.provenance, "command": "\U0001d6fc \x7f \udcff.csv"})
     for bands in (load_default_bands(), some, odd):
         text = format_bands(bands)
         assert format_bands(parse_bands(text, "")) == text

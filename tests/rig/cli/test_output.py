@@ -16,7 +16,7 @@ from rig_command import SHORT, answer, job, play, refuse, rig
 from synthetic_run import record_run
 
 import fdi
-from fdi.output import write_text, write_whole
+from fdi.output import replace_text, write_text, write_whole
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from rig.recorder.convert import RAW_SUFFIXES
@@ -128,6 +128,12 @@ def test_a_failure_in_the_middle_leaves_the_file_before(tmp_path: Path) -> None:
     assert place.read_text() == "before" and list(tmp_path.iterdir()) == [place]
     write_text(place, "after")
     assert place.read_text() == "after" and place.stat().st_mode & 0o777 == 0o640
+
+
+def test_a_replaced_file_is_kept_in_whatever_encoding_it_is(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_bytes(b"# M\xfcller")
+    assert replace_text(tmp_path / "a.toml", "new") == tmp_path / "a.toml.bak" and {
+        path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a.toml": b"new", "a.toml.bak": b"# M\xfcller"}
 
 
 def test_links_and_devices_are_written_through(tmp_path: Path) -> None:
