@@ -35,5 +35,5 @@ def read_declaration(where: object, metadata: Mapping[str, str]) -> Signals | No
                 values[key] = escape_control_characters(value) if isinstance(value, str) else value
             found.append(Signal(**values))
         return Signals(*found)
-    except (TypeError, ValueError, InputError) as error:
+    except (TypeError, ValueError, RecursionError, InputError) as error:
         raise InputError(where, f"metadata {DECLARATION}", f"the declaration of signals as JSON ({error})") from error

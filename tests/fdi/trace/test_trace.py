@@ -19,6 +19,7 @@ from refusals import catch_refusal
 from rig_command import Said, write_file
 from synthetic_run import ATTACHMENTS, record_run
 
+from fdi.trace.declaration import read_declaration
 from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import find_sections
 from fdi.trace.trace import Gap, Trace
@@ -284,3 +285,4 @@ def test_brackets_do_not_end_the_program(tmp_path: Path) -> None:
     assert_refused(*(tuple(tmp_path / word if "." in word else word for word in words) for words in (
         ("simulate", "--model", "m.toml"), ("run", "s.toml"), ("run", "keys.toml"), ("trend", "a.json"),
         ("fdi", "t.csv", "--bands", "m.toml"), ("campaign", "m.toml"))))
+    assert "metadata signals" in catch_refusal(read_declaration, "x.mcap", {"signals": deep})
