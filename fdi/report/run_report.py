@@ -55,7 +55,7 @@ from fdi.report.report import (
     write_html,
 )
 from fdi.trace.check_result import CheckResult, compute_speed, filter_median
-from fdi.trace.trace import Event, Floats, Trace
+from fdi.trace.trace import Event, Floats, Trace, fill_gaps
 from plant import EHA, UNITS, Signals, count_nouns
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",
@@ -136,7 +136,8 @@ def _show_cause(trace: Trace) -> list[Item]:
     return [Line("first cause", f"t = {notes.get('cause.t', '?')} s: {notes['cause.text']}", "bad"),
             Line("who", notes.get("cause.source", "")),
             *(Line("evidence", str(text)) for text in _read_list(notes.get("cause.evidence", ""))), tabulate(
-        consequences, (Column("t", "s", "right"), lambda each: f"{float(each.get('t', math.nan)):.3f}"),
+        consequences, (Column("t", "s", "right"),
+                       lambda each: f"{each['t']:.3f}" if isinstance(each.get("t"), float | int) else ""),
         (Column("node"), lambda each: str(each.get("source", ""))),
         (Column("consequence"), lambda each: str(each.get("text", ""))),
         caption="What was reported afterwards and follows from the first cause.")]
@@ -146,7 +147,7 @@ def _read_list(text: str) -> list[Any]:
     """A list in JSON; empty for another text, for a log may come from another program."""
     try:
         found = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return []
     return found if isinstance(found, list) else []
 
@@ -312,7 +313,8 @@ def draw_signals(trace: Trace) -> str:
     panels = [[line(t, _bridge_short_gaps(values) * scale, colour, None if number else legends[0]),
                _mark_missing(trace, values), *(shade(t0, t1, FAULT, 0.5) for _, t0, t1 in faults),
                axes(ylabel=label, **{"ylim": (-half * scale, half * scale)} if number == 2 else {})]
-              for number, (values, label, scale, colour) in enumerate(shown) if not np.isnan(values).all()]
+              for number, (values, label, scale, colour) in enumerate(shown)
+              if number == 0 or not np.isnan(values).all()]  # the first one has the command
     panels[0] = [line(t, trace.command * d.command.shown_scale, COMMAND, legends[1], 2.4), *panels[0], legend(2),
                  *(call("annotate", f" {fault}", (t0, 0.07), xycoords=("data", "axes fraction"), fontsize=7)
                    for fault, t0, _ in faults)]
@@ -358,6 +360,8 @@ def draw_timing(trace: Trace) -> str:
 def _bridge_short_gaps(values: Floats) -> Floats:
     """Straight lines over up to BRIDGED missing samples: single samples between gaps would be invisible."""
     known = np.flatnonzero(~np.isnan(values))
+    if not len(known):
+        return values
     rows = np.arange(len(values))
     after = known[np.minimum(np.searchsorted(known, rows), len(known) - 1)]
     before = known[np.maximum(np.searchsorted(known, rows, side="right") - 1, 0)]
@@ -444,7 +448,7 @@ class _View(NamedTuple):
     def step(self) -> tuple[float, float]:
         """Demand before the window, and what the step adds to it."""
         command = self.trace.command
-        before = float(command[self.rows.start - 1] if self.rows.start else self.trace.controlled[0])
+        before = float(command[self.rows.start - 1] if self.rows.start else fill_gaps(self.trace.controlled)[0])
         return before, float(command[self.rows.stop - 1]) - before
 
     def to_seconds(self, value: float) -> float:
@@ -480,7 +484,8 @@ def draw_failed_check(trace: Trace, check: CheckResult, salt: str = "check") -> 
 def _draw_step(view: _View) -> Panel:
     """What is left of a step, % of it: the overshoot at its peak, or the times of rising and of settling."""
     check, t, (before, size) = view.check, view.shown.t, view.step
-    beyond = 100.0 * ((filter_median(view.shown.controlled, 1.0 / view.trace.period) - before) / size - 1.0)
+    filtered = filter_median(fill_gaps(view.shown.controlled), 1.0 / view.trace.period)  # as the check did
+    beyond = 100.0 * ((filtered - before) / size - 1.0)
     panel = [line(t, beyond, BLUE, f"{view.trace.declared.controlled.symbol} less the target", 1.2),
              axes(ylabel="beyond the\ntarget [%]")]
     if check.kind == "overshoot":
@@ -502,7 +507,7 @@ def _draw_size(view: _View) -> Panel:
     check, is_error, d, t = view.check, view.check.kind != "never_exceeds", view.trace.declared, view.shown.t
     name = "error" if is_error else check.signal
     values = view.read(name) / UNIT_SIZES.get(check.unit, 1.0)
-    filtered = filter_median(values, 1.0 / view.trace.period) if is_error else values
+    filtered = filter_median(fill_gaps(values), 1.0 / view.trace.period) if is_error else values
     middle = 0.5 * float(np.nanpercentile(filtered, (1, 99)).sum()) if check.kind == "break_away" else 0.0
     row = int(np.nanargmax(np.abs(filtered)))
     return [line(t, values, BLUE, f"error, {d.command.symbol} - {d.controlled.symbol}" if is_error else name, 0.9),

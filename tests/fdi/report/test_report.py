@@ -101,11 +101,13 @@ def test_it_says_what_the_trace_says(page: str) -> None:
         "P12 [bar]", "XS [um]", "title = 'synthetic'", "p99.9", "0 of 14000") if words not in text]
 
 
-def test_text_of_the_trace_is_no_html(log: Path) -> None:
+def test_text_of_the_trace_is_no_html_and_may_be_of_another_program(log: Path) -> None:
     trace, nasty = Trace.read(log, all=True), "<script>alert(1)</script>"
     assert "<script>" not in render_run(replace(
         trace, checks=(replace(trace.checks[0], name=nasty, detail=nasty),),
-        provenance={"sequence": nasty, "source": nasty}, attachments={nasty: nasty.encode()}))
+        provenance={"sequence": nasty, "source": nasty, "cause.text": nasty, "cause.evidence": "[" * 100_000,
+                    "cause.consequences": json.dumps([{"t": None, "text": nasty}])},
+        attachments={nasty: nasty.encode()}))
 
 
 @pytest.mark.parametrize(("status", "mood"), [("PASS", "good"), ("INVALID_TIMING", "doubtful"), ("ABORTED", "bad")])
@@ -147,12 +149,14 @@ def test_single_missing_samples_leave_a_line_and_a_mark() -> None:
     values = np.sin(k / 10)
     # every second one: a line through single samples would have no stroke at all
     holes = np.where((k % 2 == 1) | ((k >= 60) & (k < 80)), np.nan, values)
-    sound, broken = (run_report.draw_signals(Trace.from_columns({"com": values, "xj": xj, "cor": values}, 1e-3, {}))
-                     for xj in (values, holes))
+    sound, broken, lost = (
+        run_report.draw_signals(Trace.from_columns({"com": values, "xj": xj, "cor": values}, 1e-3, {}))
+        for xj in (values, holes, np.full(100, np.nan)))
     line = vars(broken)["figure"].axes[0].lines[1].get_ydata()
     assert np.isnan(line).sum() == 22 and np.isnan(line[59:80]).all()  # and the last
     np.testing.assert_allclose(line[:59], 1e3 * values[:59], atol=10.0)
     assert drawing.RED in broken and drawing.RED not in sound
+    assert [ax.get_ylabel() for ax in vars(lost)["figure"].axes] == ["position [mm]", "current [mA]"], "of the command"
 
 
 def test_any_trace_has_a_report(log: Path, tmp_path: Path) -> None:
@@ -204,15 +208,19 @@ def test_injected_faults_are_shaded_from_begin_to_end(preflight: Path) -> None:
             and run_report.draw_signals(faulty) != run_report.draw_signals(trace))
 
 
-def make_trace() -> Trace:
-    """A step of 5 mm at t = 0.5 s with 12 % overshoot, then a ramp with a lag of 20 um and a band of 8 um."""
+def make_trace(every: int = 1) -> Trace:
+    """A step of 5 mm at t = 0.5 s with 12 % overshoot, then a ramp with a lag of 20 um and a band of 8 um.
+
+    The position is known in one of `every` cycles.
+    """
     t = np.arange(3000) / 1000
     since = np.maximum(t - 0.5, 0.0)
     step = np.where(t < 0.5, 0.0, 5e-3 * (1.0 - np.exp(-40 * since) * np.cos(120 * since)))
     ramp = np.where(t > 1.5, 0.5e-3 * (t - 1.5), 0.0)
     com = np.where(t < 0.5, 0.0, 5e-3) + ramp
     xj = step + ramp - np.where(t > 1.5, 20e-6 + 8e-6 * np.sign(np.sin(20 * t)), 0.0)
-    return Trace.from_columns({"com": com, "xj": xj, "cor": 4.0 * (com - xj)}, 1e-3, {})
+    sampled = np.where(np.arange(3000) % every == 0, xj, np.nan)
+    return Trace.from_columns({"com": com, "xj": sampled, "cor": 4.0 * (com - xj)}, 1e-3, {})
 
 
 def make_check(kind: str, value: float, unit: str, high: float, window: tuple[float, float], signal: str = "xj",
@@ -272,10 +280,10 @@ def test_a_reaction_stands_between_its_begin_and_its_limit(kind: str, signal: st
 
 
 @pytest.mark.parametrize("kind", sorted(run_report.DRAWERS))
-def test_every_kind_survives_a_value_that_could_not_be_measured(kind: str) -> None:
+def test_every_kind_survives_a_value_that_could_not_be_measured_and_missing_samples(kind: str) -> None:
     unit = {"overshoot": "%", "amplitude_ratio": "1", "phase_lag": "deg"}.get(kind, "ms" if "time" in kind else "um")
     check = make_check(kind, math.nan, unit, 5.0, (0.5, 1.5))
-    assert run_report.draw_failed_check(make_trace(), check).startswith("<svg")
+    assert all(run_report.draw_failed_check(make_trace(every), check).startswith("<svg") for every in (1, 2))
     for other in (replace(check, t0=math.nan, t1=math.nan), replace(check, kind="event_never"),
                       replace(check, t0=50.0, t1=51.0)):
         assert not run_report.draw_failed_check(make_trace(), other)
