@@ -371,8 +371,8 @@ def test_any_command() -> None:
 def test_a_model_may_have_a_friction_near_midband_but_not_at_it() -> None:
     near, beyond = (partial(make_bands_by_simulation, load_model().replace(make_kind(friction=size)), SHORT,
                             0.0 * SHORT, 1e-3, 8, 8) for size in (30.0, 35.0))
-    assert near().find(RUBBED).amounts.tolist() == [30.0, 35.0, 50.0, 70.0, 100.0, 140.0]
-    assert "short of MidBand (FSS 35), not 35" in catch_refusal(beyond)
+    assert (near().find(RUBBED).amounts.tolist() == [30.0, 35.0, 50.0, 70.0, 100.0, 140.0]
+            and "short of MidBand (FSS 35), not 35" in catch_refusal(beyond))
 
 
 def test_faults_of_a_list_of_ones_own() -> None:

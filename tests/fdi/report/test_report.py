@@ -219,8 +219,8 @@ def make_trace(every: int = 1) -> Trace:
     ramp = np.where(t > 1.5, 0.5e-3 * (t - 1.5), 0.0)
     com = np.where(t < 0.5, 0.0, 5e-3) + ramp
     xj = step + ramp - np.where(t > 1.5, 20e-6 + 8e-6 * np.sign(np.sin(20 * t)), 0.0)
-    sampled = np.where(np.arange(3000) % every == 0, xj, np.nan)
-    return Trace.from_columns({"com": com, "xj": sampled, "cor": 4.0 * (com - xj)}, 1e-3, {})
+    return Trace.from_columns({"com": com, "xj": np.where(np.arange(3000) % every == 0, xj, np.nan),
+                               "cor": 4.0 * (com - xj)}, 1e-3, {})
 
 
 def make_check(kind: str, value: float, unit: str, high: float, window: tuple[float, float], signal: str = "xj",
