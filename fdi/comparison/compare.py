@@ -58,7 +58,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
 from fdi.trace.trace import Flags, Floats, Trace, hold_last, rms, shift_rows
-from plant import Model, Signal, compute_needed_drive
+from plant import Model, Signal, compute_needed_drive, count_nouns
 
 CUT_OFF = 0.2  # of half the rate of rows
 DECIMATION = 10
@@ -150,12 +150,17 @@ def _compare_at_lags(trace: Trace, model: Model, com: int, xj: int) -> Controlle
 
 
 def find_lags(trace: Trace, limit: float, most_rows: int = 60_000) -> tuple[int, int, float]:
-    """Cycles that command and controlled signal are late in drive = g (command - controlled), and the gain g."""
+    """Cycles that command and controlled signal are late in drive = g (command - controlled), and the gain g.
+
+    0, 0 and NaN where the drive does not show them.
+    """
     inside = trace.usable & (np.abs(trace.drive) < 0.98 * min(limit, float(np.abs(trace.drive).max())))
     inside[:max(LAGS)], inside[min(LAGS):] = False, False
     sensed = hold_last(trace.controlled)
     rows = np.flatnonzero(inside)
     rows = rows[::max(1, len(rows) // most_rows)]
+    if not trace.drive[rows].any():  # always at its limit, or 0
+        return 0, 0, math.nan
     columns = [x[rows - lag] for x in (trace.command, sensed) for lag in LAGS]
     whole = np.column_stack([*columns, trace.drive[rows]])
     gram = np.einsum("ki,kj->ij", whole, whole)
@@ -283,17 +288,22 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
 def find_rows_off_alone(residual: Columns, repeats: Sequence[Columns], floor: Mapping[str, Floor]) -> Flags:
     """Rows, (n,), in which the run is off and a repeat is at the floor: it made a stop, or missed one, by a hair.
 
-    A model that lacks physics is off in every run.
+    A model that lacks physics is off in every run. Where a repeat has no data, nothing is known about it.
     """
     if not repeats:
         return np.zeros(len(next(iter(residual.values()))), bool)
 
-    def rate(columns: Columns) -> Floats:
-        return np.array([columns[name] / floor[name].value for name in residual])
-
     rows = min(len(next(iter(columns.values()))) for columns in (residual, *repeats))
-    own = np.nan_to_num(rate(residual))
-    best = np.min([measure_window_power(np.nan_to_num(rate(other)[:, :rows])).max(axis=0) for other in repeats], axis=0)
+
+    def measure_known_power(other: Columns) -> Floats:
+        x = np.array([other.get(name, np.full(rows, np.nan))[:rows] / floor[name].value for name in residual])
+        share = measure_window_power((~np.isnan(x)).astype(float))
+        power = measure_window_power(np.nan_to_num(x)) / np.maximum(share, 1.0 / rows)
+        usual = np.median(share, axis=1, keepdims=True)  # a signal may be sampled in few rows
+        return np.where(share > 0.5 * usual, power, np.inf)
+
+    own = np.nan_to_num(np.array([values / floor[name].value for name, values in residual.items()]))
+    best = np.min([measure_known_power(other).max(axis=0) for other in repeats], axis=0)
     is_off = extend_until_noise(measure_window_power(own).max(axis=0) > RUN_IS_OFF, own)
     is_off[:rows] &= best <= RUN_FITS
     is_off[rows:] = False
@@ -314,7 +324,7 @@ def _align_delays(trace: Trace, model: Model, found: ControllerBlock) -> tuple[T
     drive, sensed = trace.declared.drive.symbol, trace.declared.controlled.symbol
     notes = []
     if xj:
-        moved = trace.with_delays(drive=-xj)
+        moved = trace.with_inputs(drive=shift_rows(trace.drive, -xj))
         if measure_misfit(moved, model) < measure_misfit(trace, model) + math.log(LAG_MISFIT_RATIO):
             trace, com = moved, com - xj
             notes.append(f"{drive} stands {_describe_cycles(xj)} than the other columns: moved into step")
@@ -322,16 +332,14 @@ def _align_delays(trace: Trace, model: Model, found: ControllerBlock) -> tuple[T
             notes.append(f"{drive} fits the {sensed} {_describe_cycles(-xj)}: the firmware answers late, "
                          f"or {sensed} is delayed on its way")
     if com:
-        trace = trace.with_delays(command=com)
+        trace = trace.with_inputs(command=shift_rows(trace.command, com))
         command = trace.declared.command.symbol
         notes.append(f"{command} stands {_describe_cycles(-com)} than the rest of the trace: moved into step")
     return trace.with_notes(*notes), found
 
 
 def _describe_cycles(n: int) -> str:
-    cycles = "cycle" if abs(n) == 1 else "cycles"
-    direction = "later" if n > 0 else "earlier"
-    return f"{abs(n)} {cycles} {direction}"
+    return f"{count_nouns(abs(n), 'cycle')} {'later' if n > 0 else 'earlier'}"
 
 
 def _judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, Columns]],

@@ -297,10 +297,6 @@ class Trace:
         of = f" of {source}" if source else ""
         return f"<Trace{of}: {len(self)} cycles of {1e3 * self.period:g} ms, {len(self) * self.period:g} s, {measured}>"
 
-    def with_delays(self, command: int = 0, drive: int = 0) -> Trace:
-        """The same trace with command and drive delayed by so many cycles (negative: advanced)."""
-        return self.with_inputs(shift_rows(self.command, command), shift_rows(self.drive, drive))
-
     def sections(self) -> list[Section]:
         """Hold, step, ramp and dynamic sections of the command in this trace."""
         return list(self._sections)

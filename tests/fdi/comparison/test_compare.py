@@ -14,7 +14,7 @@ from refusals import catch_refusal
 from rig_command import answer, rig
 from short_runs import STEPS, build_command, simulate_trace
 
-from fdi.comparison.compare import Comparison, compare, compare_controller, find_lags
+from fdi.comparison.compare import Comparison, compare, compare_controller, find_lags, find_rows_off_alone
 from fdi.comparison.residuals import (
     WHITE,
     Motion,
@@ -27,6 +27,7 @@ from fdi.comparison.residuals import (
     map_deviation,
     name_shape,
 )
+from fdi.estimation.noise import Floor
 from fdi.estimation.replay import compute_residuals, prepare_trace, read_cycles, replay_command, replay_current
 from fdi.report.compare_report import describe_findings, describe_verdict
 from fdi.thresholds import CONTROLLER_ERROR_RATIO
@@ -36,6 +37,7 @@ from plant import Model, load_model
 from rig.recorder.convert import write_mcap
 
 MODEL = Model()
+LIMIT = 8e-3  # of the current
 
 
 @cache
@@ -85,6 +87,19 @@ def test_a_repeat_from_another_unit_is_no_measure_of_noise(kind: str) -> None:
                    for unit in (OTHER_UNITS[kind], {}))
     assert (found.verdict, true.verdict) == ("CANNOT_TELL", "WITHIN_FLOOR"), describe_verdict(found)
     assert "repeats of the same unit" in found.reason and "by more than" in found.reason
+
+
+ROWS = np.arange(4000)
+
+
+@pytest.mark.parametrize(("known", "is_left_out"), [
+    ({"xj": ROWS >= 0}, True), ({"xj": ROWS % 5 == 0}, True), ({"xj": (ROWS < 900) | (ROWS >= 1600)}, False),
+    ({"p12": ROWS >= 0}, False)])
+def test_rows_are_left_out_where_a_repeat_is_known_to_be_at_the_floor(known: dict[str, np.ndarray], is_left_out: bool
+                                                                      ) -> None:
+    residual = {"xj": np.where((ROWS >= 1000) & (ROWS < 1500), 10.0, 0.5)}  # floors
+    assert is_left_out == find_rows_off_alone(residual, [
+        {name: np.where(rows, 0.5, np.nan) for name, rows in known.items()}], {"xj": Floor(1.0, "repeats")}).any()
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -201,7 +216,7 @@ def test_columns_that_are_late(c: Trace, com: int, xj: int) -> None:
     """`com` cycles before row k is what Cor_k answers, the file having it earlier than it should."""
     found = compare_controller(c.with_columns({"com": shift_rows(c.com, -com), "xj": shift_rows(c.xj, -xj)}), MODEL)
     assert (found.com_lag, found.xj_lag) == (com, xj) and found.ratio <= 1.0
-    assert find_lags(c, 8e-3)[:2] == (0, 0)
+    assert find_lags(c, LIMIT)[:2] == find_lags(c.with_columns({"cor": c.cor * 0.0 + LIMIT}), LIMIT)[:2] == (0, 0)
 
 
 def test_a_recorder_that_rounds_positions_is_no_error_of_the_controller(c: Trace) -> None:
@@ -209,9 +224,6 @@ def test_a_recorder_that_rounds_positions_is_no_error_of_the_controller(c: Trace
     other = MODEL.replace({"controller.proportional_gain": 1.1 * MODEL["controller.proportional_gain"]})
     assert 0.5 < compare_controller(rounded, MODEL).ratio < CONTROLLER_ERROR_RATIO
     assert compare_controller(rounded, other).ratio > CONTROLLER_ERROR_RATIO
-
-
-LIMIT = 8e-3
 
 
 @pytest.fixture(scope="module")
