@@ -125,9 +125,9 @@ def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | Non
         except InputError as error:
             notes.append(f"{name} left out: {str(error).removeprefix(f'{file}: ')}")
     axis = _choose_axis(folder, rows, axis)  # before the work: a trace without a date is refused at once
-    listed = [find_row(dates, names[file]) for file in rows]
+    found = [find_row(dates, name) for name in names.values()]
     notes += [f"{key} is listed in {place.name}, but there is no such trace" for key, row in dates.items()
-              if row not in listed]
+              if not any(row is own for own in found)]  # two traces may have equal rows
     points = []
     for i, (file, row) in enumerate(rows.items()):
         progress(f"trace {i + 1} of {len(rows)}", i / len(rows))

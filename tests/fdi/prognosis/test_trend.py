@@ -190,7 +190,7 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
     assert re.search(r"table.csv: date: expected .*dates.csv", catch_refusal(gathered))
     (folder / "dates.csv").write_text("file,date,hours\ntable.csv,2026-01-20,30\nown.mcap,,10\n"
-                                      "named.csv,,20\nold.csv,,\n")
+                                      "named.csv,,20\nold.csv,2026-01-20,30\nbroken.csv,2026-01-20,30\n")
     found = gathered()
     assert [p.trace for p in found.points] == ["own.mcap", "table.csv", "2026-02-01/named.csv"]
     assert [format_day(p.t) for p in found.points] == ["2026-01-10", "2026-01-20", "2026-02-01"]
