@@ -112,16 +112,13 @@ def filter_lag(x: Floats, time: float, period: float) -> Floats:
 
 
 def advance_signal(x: Floats, rows: float) -> Floats:
-    """`x`, (n,), so many rows earlier, on straight lines; the last value goes on, and NaN stays beside a NaN.
+    """`x`, (n,), so many rows earlier, on straight lines; the end values go on, and NaN stays beside a NaN.
 
-    >>> advance_signal(np.arange(4.0), 1.5).tolist()
-    [1.5, 2.5, 3.0, 3.0]
+    >>> advance_signal(np.arange(4.0), 1.5).tolist(), advance_signal(np.arange(1.0, 5.0), -0.5).tolist()
+    ([1.5, 2.5, 3.0, 3.0], [1.0, 1.5, 2.5, 3.5])
     """
-    n = len(x)
-    wanted = np.arange(n) + rows
-    left = np.clip(np.floor(wanted).astype(int), 0, n - 1)
-    right, part = np.clip(left + 1, 0, n - 1), wanted - np.floor(wanted)
-    out: Floats = (1.0 - part) * x[left] + part * x[right] if rows % 1.0 else x[left]
+    k = np.arange(len(x))
+    out: Floats = np.interp(k + rows, k, x)
     return out
 
 
