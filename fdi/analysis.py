@@ -337,8 +337,8 @@ def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eh
     source = None if isinstance(model, Model) else model
     ranges = read_free_parameters(own_model, source) if free is None else parse_free_parameters(free, own_model, "free")
     fitted = [runs] if isinstance(runs, Trace | str | Path) else list(runs)
-    own = read_identification_runs(own_model, ranges, [_load_trace(r, own_model) for r in fitted],
-                                      [_load_trace(r, own_model) for r in holdouts], signals)
+    own = read_identification_runs(own_model, ranges, [_pass_run(r) for r in fitted],
+                                   [_pass_run(r) for r in holdouts], signals)
     found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources, seed)
     return IdentificationResult(build_identification_report(found, own_model.name), found)
 
@@ -401,5 +401,10 @@ def _collect_runs(model: Model, trace: TraceOrPath, repeats: Sequence[TraceOrPat
                   signals: Sequence[str] | None) -> Runs:
     from fdi.discovery.runs import read_runs
 
-    unseen = None if holdout is None else _load_trace(holdout, model)
-    return read_runs(model, _load_trace(trace, model), [_load_trace(r, model) for r in repeats], unseen, signals)
+    unseen = None if holdout is None else _pass_run(holdout)
+    return read_runs(model, _pass_run(trace), [_pass_run(r) for r in repeats], unseen, signals)
+
+
+def _pass_run(run: TraceOrPath) -> Trace | str:
+    """A run as analyses of several take it: a file is not read yet, for its hash is to be known by the commands."""
+    return run if isinstance(run, Trace) else str(run)

@@ -72,7 +72,12 @@ def read_traces(given: Sequence[str | Trace], model: Model) -> tuple[list[Trace]
     sources = [Source(each.provenance.get("source", "trace"), _hash_columns(each)) if isinstance(each, Trace)
                else read_source(each) for each in given]
     signals = model.kind.signals
-    return [each if isinstance(each, Trace) else Trace.read(each, signals=signals) for each in given], sources
+    traces = [each if isinstance(each, Trace) else Trace.read(each, signals=signals) for each in given]
+    if any(isinstance(each, Trace) for each in given):  # it may have been read from a file that is given beside it
+        files = {_hash_columns(trace): source.sha256 for each, trace, source in zip(given, traces, sources, strict=True)
+                 if not isinstance(each, Trace)}
+        sources = [source._replace(sha256=files.get(source.sha256, source.sha256)) for source in sources]
+    return traces, sources
 
 
 def _hash_columns(trace: Trace) -> str:

@@ -22,6 +22,7 @@ import fdi
 from fdi.analysis import Plot, Result
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.refine import SUSPECTS
+from fdi.discovery.runs import read_source
 from fdi.trace.trace import Trace
 from plant import Model
 
@@ -55,7 +56,8 @@ def lines(runs: dict[str, Path]) -> Iterator[dict[str, Any]]:
 def test_the_lines_of_the_page_find_the_hidden_effect(lines: dict[str, Any], runs: dict[str, Path]) -> None:
     folder, result = runs["est"].parent, lines["result"]
     assert (lines["explanation"].effects, lines["explanation"].verdict) == (("null_bias",), "EXPLAINED")
-    assert result.helps and result.model.effects == ("null_bias",)
+    assert (result.helps and result.model.effects == ("null_bias",)
+            and result.update.provenance.repeats == (read_source("run2.csv"),))  # by which rig add knows it again
     interval = result.to_dict()["parameters"]["null_bias.current"]
     assert interval["low"] < HIDDEN["null_bias.current"] < interval["high"]
     compared = fdi.compare(folder / "est.csv", folder / "model.toml", repeats=[folder / "repeat.csv"])
@@ -146,13 +148,15 @@ def test_a_model_is_a_value_a_file_or_a_name(runs: dict[str, Path], tmp_path: Pa
 
 
 @pytest.mark.parametrize(("call", "says"), [
-    (lambda est: fdi.compare("nowhere.csv"), "nowhere.csv"), (lambda est: fdi.compare(est, signals=["xq"]), "xq"),
-    (lambda est: fdi.add_effect("nosuch", est), "nosuch: expected an effect of the catalogue"),
-    (lambda est: fdi.compare(est).write_html("none/page.html"), "path"),
-    (lambda est: fdi.explain(est, repeats=[est]), "the same command run again"),
-    (lambda est: fdi.add_effect("null_bias", est, holdout=est), "a run that no fit has seen")])
-def test_bad_input_is_one_line(call: Callable[[Trace], object], says: str, runs: dict[str, Path]) -> None:
-    assert says in catch_refusal(call, fdi.read_trace(runs["est"]))
+    (lambda est, file: fdi.compare("nowhere.csv"), "nowhere.csv"),
+    (lambda est, file: fdi.compare(est, signals=["xq"]), "xq"),
+    (lambda est, file: fdi.add_effect("nosuch", est), "nosuch: expected an effect of the catalogue"),
+    (lambda est, file: fdi.compare(est).write_html("none/page.html"), "path"),
+    (lambda est, file: fdi.explain(est, repeats=[est]), "the same command run again"),
+    (lambda est, file: fdi.add_effect("null_bias", est, holdout=est), "a run that no fit has seen"),
+    (lambda est, file: fdi.add_effect("null_bias", est, holdout=file), "a run that no fit has seen")])
+def test_bad_input_is_one_line(call: Callable[[Trace, Path], object], says: str, runs: dict[str, Path]) -> None:
+    assert says in catch_refusal(call, fdi.read_trace(runs["est"]), runs["est"])
 
 
 def test_importing_fdi_loads_neither_numba_nor_matplotlib() -> None:
