@@ -4,8 +4,6 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +17,6 @@ from fdi.diagnosis.bands import (
     Width,
     describe_other_model,
     find_excursions,
-    format_bands,
     format_design,
     is_friction_fault,
     is_loaded,
@@ -41,7 +38,6 @@ from fdi.diagnosis.precursors import (
     read_columns,
 )
 from fdi.estimation.fit import limit_dynamic_friction, list_tolerance_sizes
-from fdi.output import require_writable, write_text
 from fdi.progress import Progress, ignore_progress
 from fdi.sources import name_software
 from fdi.thresholds import (
@@ -58,37 +54,10 @@ from fdi.thresholds import (
 )
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Floats, Trace, fill_gaps, measure_scale
-from plant import NARROW, InputError, Lanes, Model, count_nouns, count_threads, load_model, require
+from plant import NARROW, Lanes, Model, count_nouns, count_threads, load_model, require
 
 FRICTION_AMOUNTS = (2, 5, 10, 14)  # sevenths of MaxBand, beside both limits
 LOW_DYNAMIC_SHARE = 0.3  # of the usual dynamic friction, of units that slip easily
-
-
-def make_bands_file(sources: Sequence[str | Path], out: str | Path, model: Model | None = None,
-                    com: Floats | None = None, name: str = "", seed: int = 0, progress: Progress = ignore_progress,
-                    faults: Sequence[Fault] = FAULTS) -> dict[str, Any]:
-    """Bands from the traces `sources`, or without any by simulation over the command `com` (n,); written to `out`.
-
-    Returns what was made, for --json.
-
-    Raises:
-        InputError: traces that cannot be learned from, or a place that cannot be written.
-    """
-    place, model = require_writable(out, "--out"), model or load_model()
-    if sources:
-        traces = []
-        for done, source in enumerate(sources):
-            progress("reading", done / len(sources))
-            traces.append(Trace.read(source, signals=model.kind.signals))
-        bands = learn_bands(traces, model, [str(source) for source in sources], progress, faults)
-    elif com is None:
-        raise InputError("--learn-bands", "", "traces, or a command to simulate")
-    else:
-        bands = make_bands_by_simulation(model, com, np.zeros_like(com), model["controller.period"], seed=seed,
-                                         progress=progress, name=name, faults=faults)
-    write_text(place, format_bands(bands))
-    return {"bands": str(out), "judges": [fault.name for fault in bands.faults if bands.shows(fault)],
-            "provenance": dict(bands.provenance)}
 
 
 # ---------------------------------------------------------------------------------------------------------------------

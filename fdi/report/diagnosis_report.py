@@ -117,15 +117,16 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
                   [*list_overruled(d), *d.notes], sections, data=collect_data(d))
 
 
-def build_bands_report(made: Mapping[str, Any]) -> Report:
-    """Report on bands that `rig fdi --learn-bands` wrote."""
-    judged = join_words(name.replace("_", " ") for name in made["judges"])
+def build_bands_report(bands: Bands, place: str) -> Report:
+    """Report on bands that `rig fdi --learn-bands` wrote to this place."""
+    judges = [fault.name for fault in bands.faults if bands.shows(fault)]
+    judged = join_words(name.replace("_", " ") for name in judges)
     return Report(
-        command="fdi", title=str(made["bands"]), files=[("bands", str(made["bands"]))],
+        command="fdi", title=place, files=[("bands", place)],
         sentence=f"The bands judge {judged}." if judged else
         "The bands judge none of the faults: their responses are within the scatter of healthy units.",
-        sections=[Section("Provenance", [Line(label, str(text)) for label, text in made["provenance"].items()])],
-        data=made)
+        sections=[Section("Provenance", [Line(label, str(text)) for label, text in bands.provenance.items()])],
+        data={"bands": place, "judges": judges, "provenance": dict(bands.provenance)})
 
 
 def describe_verdict(d: Diagnosis) -> str:

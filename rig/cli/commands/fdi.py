@@ -4,10 +4,13 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from fdi.diagnosis.bands import load_bands
+import numpy as np
+
+from fdi.diagnosis import make_bands
+from fdi.diagnosis.bands import format_bands, load_bands
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import choose_faults
-from fdi.diagnosis.make_bands import make_bands_file
+from fdi.output import require_writable, write_text
 from fdi.report.diagnosis_report import build_bands_report, build_diagnosis_report
 from fdi.trace.trace import Trace
 from plant import require
@@ -41,11 +44,20 @@ def learn_bands(args: argparse.Namespace) -> int:
             "FILE.toml, where the bands go")
     model = load_chosen_model(args)
     faults = choose_faults(args.faults, model.kind)
-    com, _, name = (None, None, "") if args.learn_bands else load_command(
-        args.command_file, model["controller.period"], model.kind)
+    place = require_writable(args.out, "--out")
     with show_progress(args) as progress:
-        made = make_bands_file(args.learn_bands, args.out, model, com, name, args.seed, progress, faults)
-    return give_answer(build_bands_report(made), args)
+        if args.learn_bands:
+            traces = []
+            for done, source in enumerate(args.learn_bands):
+                progress("reading", done / len(args.learn_bands))
+                traces.append(Trace.read(source, signals=model.kind.signals))
+            bands = make_bands.learn_bands(traces, model, args.learn_bands, progress, faults)
+        else:
+            com, _, name = load_command(args.command_file, model["controller.period"], model.kind)
+            bands = make_bands.make_bands_by_simulation(model, com, np.zeros_like(com), model["controller.period"],
+                                                        seed=args.seed, progress=progress, name=name, faults=faults)
+    write_text(place, format_bands(bands))
+    return give_answer(build_bands_report(bands, args.out), args)
 
 
 def suggest_next_command(args: argparse.Namespace, found: Diagnosis) -> str:
