@@ -1,7 +1,6 @@
 """Where a result is to go: asked before long work is done, and before anything that lies there is lost; or written."""
 
 import contextlib
-import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,15 +36,6 @@ def write_text(path: str | Path, text: str, option: str = "--out") -> None:
 def _write_bytes(path: str | Path, content: bytes, option: str) -> None:
     with report_system_error(option, str(path), "a file that can be written"), write_whole(path) as part:
         part.write_bytes(content)
-
-
-def quote_text(text: str) -> str:
-    r"""A text as TOML writes it.
-
-    >>> print(quote_text("a \"b\" " + chr(0x1d6fc) + chr(127)))
-    "a \"b\" \U0001d6fc\u007f"
-    """
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # a JSON text is TOML but for this
 
 
 def replace_text(path: str | Path, text: str) -> Path | None:

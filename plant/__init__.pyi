@@ -152,6 +152,7 @@ from .tables import (
     decode_text as decode_text,
     list_choices as list_choices,
     parse_table as parse_table,
+    quote_text as quote_text,
     read_file as read_file,
 )
 from .threads import (

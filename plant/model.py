@@ -1,7 +1,6 @@
 """A model is data: a plant, its parameter values and its effects. `build_kernel` turns it into code."""
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -22,6 +21,7 @@ from plant.plant_files import READERS, read_model_tables, read_named_plant
 from plant.plants import Plant, find_loaded_plant, find_plant, is_known, list_plants, load_plant
 from plant.quantity import Quantity
 from plant.solve import show_start
+from plant.tables import quote_text
 
 SHIPPED_MODELS = ("servo", "emps")  # plant/models/NAME.toml, beside the nominal values of the plants
 
@@ -130,8 +130,8 @@ class Model:
     def to_toml(self, remarks: Mapping[str, str] | None = None) -> str:
         """The text of a model file, which `load_model` reads; `remarks` stand beside parameters, by "group.field"."""
         effects = ", ".join(f'"{e}"' for e in self.effects)
-        name = json.dumps(self.name, ensure_ascii=False).replace("\x7f", "\\u007f")  # a JSON text is TOML but for this
-        plant = [] if self.plant == "eha" else [f"plant = {json.dumps(self.plant, ensure_ascii=False)}"]
+        name = quote_text(self.name)
+        plant = [] if self.plant == "eha" else [f"plant = {quote_text(self.plant)}"]
         plant += [f'plant_sha256 = "{self.kind.sha256}"'] if self.kind.sha256 else []
         lines = [f"name = {name}", *plant, f"effects = [{effects}]"]
         usual = self.nominal

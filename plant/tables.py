@@ -7,6 +7,7 @@ is the program's own, not a key; one with the name `kind` gets the kind.
 """
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from bisect import bisect_left
@@ -73,6 +74,15 @@ class Place:
         except InputError as error:
             place = self.at(error.field) if has_field and error.field else self
             raise place.refuse(error.expected) from error
+
+
+def quote_text(text: str) -> str:
+    r"""A text as TOML writes it.
+
+    >>> print(quote_text("a \"b\" " + chr(0x1d6fc) + chr(127)))
+    "a \"b\" \U0001d6fc\u007f"
+    """
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # a JSON text is TOML but for this
 
 
 def read_file(path: Path) -> bytes:

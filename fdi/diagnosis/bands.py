@@ -34,7 +34,6 @@ from fdi.diagnosis.precursors import (
     select_ramp_rows,
 )
 from fdi.estimation.replay import is_friction
-from fdi.output import quote_text
 from fdi.thresholds import (
     BAND_FAULT_CLEARANCE_SD,
     BAND_LARGEST_LOAD,
@@ -55,6 +54,7 @@ from plant import (
     escape_control_characters,
     find_plant,
     parse_toml,
+    quote_text,
     read_file,
     require,
 )

@@ -1,7 +1,6 @@
 """A model file kept up to date: an effect added or removed, everything fitted again, the ledger continued."""
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,6 +40,7 @@ from plant import (
     list_offered_effects,
     list_plants,
     parse_model,
+    quote_text,
     read_model_tables,
 )
 from plant.effects import CATALOGUE
@@ -544,7 +544,7 @@ def _format_provenance(p: Provenance) -> list[str]:
             "repeats": [r.file for r in p.repeats], "repeats_sha256": [r.sha256 for r in p.repeats], "floor": p.floor}
     lines = ["[provenance]", *_format_values(said | {name: value for name, value in more.items() if value})]
     if p.before:
-        lines += ["", "[provenance.before]", *(f"{_quote_text(name)} = {value!r}" for name, value in p.before.items())]
+        lines += ["", "[provenance.before]", *(f"{quote_text(name)} = {value!r}" for name, value in p.before.items())]
     if p.identification:
         lines += ["", "[provenance.identification]", *_format_values(p.identification)]
     for row in p.ledger:
@@ -563,9 +563,5 @@ def _format_value(value: Any) -> str:
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{name} = {float(f'{x:.6g}')!r}" for name, x in value.items()) + " }"
     if isinstance(value, str):
-        return _quote_text(value)
-    return "true" if value is True else "[" + ", ".join(map(_quote_text, value)) + "]"
-
-
-def _quote_text(word: str) -> str:
-    return json.dumps(word, ensure_ascii=False).replace("\x7f", "\\u007f")  # a JSON text is TOML but for this
+        return quote_text(value)
+    return "true" if value is True else "[" + ", ".join(map(quote_text, value)) + "]"

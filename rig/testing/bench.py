@@ -1,6 +1,5 @@
 """The bench for tests in Python: runs in lockstep on the embedded bus, and what they measured."""
 
-import json
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -21,7 +20,7 @@ from fdi.report.run_report import (
 )
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Event, Trace
-from plant import RATE, InputError, find_plant, require, suggest_name
+from plant import RATE, InputError, find_plant, quote_text, require, suggest_name
 from rig.run.job import JobChoice, build_job, load_tested_plant
 from rig.run.runner import Outcome, run_job
 from rig.sequences.sequence import Sequence as TestSequence, load_sequence, parse_sequence
@@ -232,13 +231,15 @@ def write_toml(table: Table) -> str:
 
 
 def _write_key(key: str) -> str:
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key, ensure_ascii=False)
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else quote_text(key)
 
 
 def _write_value(value: object) -> str:
     value = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
-    if isinstance(value, bool | str):
-        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, str):
+        return quote_text(value)
+    if isinstance(value, bool):
+        return str(value).lower()
     if isinstance(value, int | float):
         return repr(value)
     if isinstance(value, Mapping):
