@@ -64,8 +64,7 @@ def write_reader(places: Sequence[tuple[int, int]]) -> Function:
 
 def write_constant(name: str, value: Any) -> Function:
     """A function of that name that returns `value`, a number or a NamedTuple of numbers."""
-    shown = f"Kind({', '.join(map(repr, value))})" if isinstance(value, tuple) else repr(value)
-    return write_function(name, "", [f"return {shown}"], Kind=type(value))
+    return write_function(name, "", ["return value"], value=value)
 
 
 def write_mover(state: type[Any], names: Sequence[str], factor: float = 1.0) -> Function:

@@ -36,6 +36,7 @@ from plant.kernels import (
     keep_sample,
     make_lane_packers,
     measure_plant,
+    start_control,
     step_plant,
 )
 from plant.model import Model, build_bare_model
@@ -545,10 +546,14 @@ def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, slack: 
 
 
 def begin_lane(a: Any, lane: int, position: Any, steps: int, h: float) -> None:
-    """Put one lane at rest where its sensor shows position[0], or as it is, and compute its coefficients."""
+    """Put one lane at rest where its sensor shows position[0], or as it is, and compute its coefficients.
+
+    Its controller begins with what its law remembers at the start.
+    """
     s, m = state_at(a, lane)
     p = parameters_at(a, lane)
     keep_coefficients(compute_plant_coefficients(p, h), a, lane)
+    keep_loop(start_control(), a, lane)
     keep_state(rest_at_reading(s, m, position[0], p, steps) if len(position) else (show_start(s, m, p), m), a, lane)
 
 

@@ -43,10 +43,21 @@ from plant.ehs import (
 EXAMPLE = ROOT / "plant" / "models" / "new_plant.py"  # copies with its name share its compiled code
 TEXT = EXAMPLE.read_text()
 ROWS = 300
+# the controller remembers something from the start: a number, and two that mean "not yet known"
+REMEMBERING = TEXT.replace("class State(", """class Memory(NamedTuple):
+    bias: float = 1.0
+    last: float = float("nan")
+    least: float = float("inf")
 
 
-@pytest.fixture(params=[*list_plants(), str(EXAMPLE)], ids=lambda name: Path(name).stem)
-def model(request: pytest.FixtureRequest) -> Model:
+class State(""").replace("control=control", "control=control, control_memory=Memory").replace(
+    "p.controller.limit), c", "p.controller.limit) + (c.bias if c.last != c.last else 0.5), "
+    "Memory(c.bias, demand, min(c.least, y[0]))")
+
+
+@pytest.fixture(params=[*list_plants(), str(EXAMPLE), "remembering.py"], ids=lambda name: Path(name).stem)
+def model(request: pytest.FixtureRequest, here: Path) -> Model:
+    (here / "remembering.py").write_text(REMEMBERING)
     return load_model(request.param)
 
 
