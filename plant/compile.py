@@ -87,7 +87,7 @@ def read_normal_tables() -> NormalTables:
 def find_cache_folder() -> Path:
     """The folder of compiled code: $EHA_RIG_CACHE, else the user's cache folder, else a temporary one."""
     named = os.environ.get("EHA_RIG_CACHE")
-    home = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eha-rig"
+    home = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eha-rig"
     try:
         home.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=home):
@@ -421,5 +421,20 @@ def find_fields_of(function: Any, argument: str, depth: int = 1) -> frozenset[st
     """
     code = list(dis.get_instructions(getattr(function, "py_func", function)))
     chains = ([step.argval for step in takewhile(lambda step: step.opname == "LOAD_ATTR", code[k + 1:k + 1 + depth])]
-              for k, load in enumerate(code) if load.opname == "LOAD_FAST" and load.argval == argument)
+              for k, load in enumerate(code) if _name_loaded_variable(load) == argument)
     return frozenset(".".join(chain) for chain in chains if chain)
+
+
+def _name_loaded_variable(instruction: Any) -> Any:
+    """The local variable that an instruction puts on top of the stack, None if it loads none.
+
+    From Python 3.13 on one instruction may handle two variables: it loads the second one last.
+
+    >>> _name_loaded_variable(SimpleNamespace(opname="LOAD_FAST_BORROW", argval="s"))
+    's'
+    >>> _name_loaded_variable(SimpleNamespace(opname="STORE_FAST_LOAD_FAST", argval=("x", "s")))
+    's'
+    """
+    if "LOAD_FAST" not in instruction.opname:
+        return None
+    return instruction.argval[-1] if isinstance(instruction.argval, tuple) else instruction.argval

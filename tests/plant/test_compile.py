@@ -91,8 +91,10 @@ def test_fingerprint_sees_what_a_function_depends_on() -> None:
 
 def test_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
-    for own, place in (("a", "a"), ("", "b/eha-rig"), ("file/below", None)):  # the last cannot be made: fall back
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "b"))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for own, common, place in (("a", "b", "a"), ("", "b", "b/eha-rig"), ("", "", ".cache/eha-rig"),
+                               ("file/below", "b", None)):  # the last cannot be made: fall back
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / common) if common else "")
         monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / own) if own else "")
         assert place is None or find_cache_folder() == tmp_path / place
     monkeypatch.setattr(compile.tempfile, "gettempdir", lambda: str(tmp_path))
