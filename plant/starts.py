@@ -22,7 +22,7 @@ ANCHOR = 2.0  # 1/s
 WITHOUT_SIZE = ("1", "s", "Hz", "rad")  # units of parameters that are alike in plants of any size
 PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3, "M": 1e6, "G": 1e9}
 _NUMBER = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
-_RANGE = re.compile(rf"({_NUMBER})\s*-\s*({_NUMBER})\s*([^\s,;:]*)")
+_RANGE = re.compile(rf"({_NUMBER})\s*-\s*({_NUMBER})\s*([^,;:]*)")
 
 
 def find_starts(effect: Effect, command: Array, load: Array | None = None, plant: str = "eha"
@@ -194,11 +194,14 @@ def parse_hint(quantity: Quantity) -> list[float]:
 
     >>> parse_hint(Quantity("N", low=0, typical="1-4 kN"))
     [1000.0, 2000.0, 4000.0]
+    >>> parse_hint(Quantity("N m", low=0, typical="1-4 kN m at rest"))
+    [1000.0, 2000.0, 4000.0]
     """
     said = _RANGE.match(quantity.typical)
     if not said:
         return []
-    low, high, unit = float(said[1]), float(said[2]), said[3]
+    low, high = float(said[1]), float(said[2])
+    unit = " ".join(said[3].split()[:len(quantity.unit.split())])  # more words may follow: 1-5 % of Imax
     if quantity.unit == "1":
         factor = 0.01 if unit == "%" else 1.0
     elif unit.endswith(quantity.unit) and unit.removesuffix(quantity.unit) in PREFIXES:
