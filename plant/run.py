@@ -58,20 +58,11 @@ def sample_noise(seed: int, cycles: int, numbers: int = NOISES) -> Array:
     return np.random.default_rng(seed).standard_normal((cycles, numbers))
 
 
-class NoiseStream:
+def draw_noise(seed: int, numbers: int = NOISES, block: int = 64) -> Iterator[list[float]]:
     """The rows of `sample_noise` without end; drawn in blocks, which costs a tenth of drawing single rows."""
-
-    def __init__(self, seed: int, numbers: int = NOISES, block: int = 64) -> None:
-        self._rng, self._block = np.random.default_rng(seed), block
-        self._drawn, self._at = np.empty((0, numbers)), 0
-
-    def take(self) -> list[float]:
-        """The next row."""
-        if self._at == len(self._drawn):
-            self._drawn, self._at = self._rng.standard_normal((self._block, self._drawn.shape[1])), 0
-        row: list[float] = self._drawn[self._at].tolist()
-        self._at += 1
-        return row
+    generator = np.random.default_rng(seed)
+    while True:
+        yield from generator.standard_normal((block, numbers)).tolist()
 
 
 def simulate(model: Model, command: Array, load: Array | None = None, seed: int = 0, steps: int | None = None,
@@ -261,7 +252,7 @@ class Actuator:
         self._live = self._record.view(np.float64)  # the same numbers, in the order of their names
         self._index = {name: i for i, name in enumerate(model.list_names())}
         outputs = model.kind.signals.outputs
-        self.noise = NoiseStream(seed, len(outputs) + 1)
+        self.noise = draw_noise(seed, len(outputs) + 1)
         self._noise = [0.0] * (len(outputs) + 1)
         foreign = model.kind.foreign
         self._program = None if foreign is None else foreign(model["controller.period"])
@@ -302,7 +293,7 @@ class Actuator:
 
         Call it once per cycle: it draws the cycle's noise.
         """
-        n = self._noise = self.noise.take()
+        n = self._noise = next(self.noise)
         if self._read:
             t = self.cycle * self._period
             return cast("tuple[float, ...]", self._read(self._flat, np.array(n), t, self._record))
