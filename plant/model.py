@@ -42,8 +42,9 @@ def find_quantity(name: str, where: object = "--set", plant: str = "eha") -> Qua
     Raises:
         InputError: there is no such parameter.
     """
-    own = {e.name: e.fitted for e in list_offered_effects(plant) if e.base}.get(name.partition(".")[0])
-    require(not own or name in own, where, name,
+    group = name.partition(".")[0]  # of parameters too, where a plant calls an effect by it
+    own = {e.name: e.fitted for e in list_offered_effects(plant) if e.base}.get(group)
+    require(not own or group in find_plant(plant).parameters, where, name,
             f"{' or '.join(own or ())}: the parameter that this effect is in this plant")
     return find_field(where, name, find_plant(plant).list_groups())
 

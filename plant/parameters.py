@@ -177,8 +177,7 @@ def check_combinations(where: object, values: Mapping[str, float]) -> None:
         InputError: such as a dynamic friction above the static one.
     """
     for body in ("spool", "jack"):
-        if f"{body}.static_friction" not in values:
-            continue
-        static, dynamic = values[f"{body}.static_friction"], values[f"{body}.dynamic_friction"]
+        static = values.get(f"{body}.static_friction", math.inf)  # a plant may lack one of them
+        dynamic = values.get(f"{body}.dynamic_friction", -math.inf)
         require(dynamic <= static or math.isclose(dynamic, static), where, f"{body}.dynamic_friction",
                 f"at most {body}.static_friction ({static:g} N), not {dynamic:g}")

@@ -12,7 +12,7 @@ from plant.compile import find_fields_of
 from plant.errors import InputError, count_nouns, require, suggest_name
 from plant.faults import Fault, place_faults
 from plant.quantity import Quantity, list_quantities
-from plant.segments import Segment, build_profile
+from plant.segments import Segment
 from plant.user_code import explain_errors
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
     demanded, where = kind.signals.command, kind.file or kind.name
     place_faults(kind.faults, kind, where)
     period = model["controller.period"]
-    command = build_profile(kind.profile, rate=round(1.0 / period)).command
+    command = kind.build_nominal_command(period)
     require(np.abs(command).max() <= demanded.largest, where, "profile", f"demands of at most {demanded.largest:g} "
             f"{demanded.unit} either way, the largest of the signal {demanded.name}, not {np.abs(command).max():g}")
     quiet = model.replace({s.noise: 0.0 for s in kind.signals.outputs if s.noise})

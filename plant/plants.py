@@ -42,7 +42,7 @@ from plant.segments import Array, Segment, build_profile
 from plant.signals import Signals
 from plant.state import Sampled
 from plant.tables import read_file
-from plant.user_code import run_file
+from plant.user_code import explain_errors, run_file
 
 __all__ = ["Fault", "MeasuredPressures", "Plant", "Table", "Term", "base_effect", "effect", "find_plant", "list_plants",
            "load_plant", "port"]
@@ -166,6 +166,14 @@ class Plant:
                for group, cls in self.parameters.items() for name in cls._fields}
         return {**own, **self.values}
 
+    def build_nominal_command(self, period: float = 0.0) -> Array:
+        """The demand of its nominal test, (n,), one for each cycle of `period` s, by default its own; else empty.
+
+        Raises:
+            InputError: a segment that is not whole cycles.
+        """
+        return build_profile(self.profile, rate=1.0 / (period or self.nominal["controller.period"])).command
+
     def find_tolerance(self, name: str, q: Quantity) -> float:
         """Scatter of a parameter from unit to unit, as a fraction; 0 where the nominal value is zero."""
         if self.nominal.get(name) == 0.0:
@@ -274,7 +282,7 @@ class Plant:
         from plant.model import build_bare_model
 
         start, p = self.state(), build_bare_model(self.key).build_record()[0]
-        distance = 0.1 * (float(np.abs(build_profile(self.profile).command).max()) if self.profile else 0.0) or 1e-3
+        distance = 0.1 * float(np.abs(self.build_nominal_command()).max(initial=0.0)) or 1e-3
         share = float(self.measure(move(start, distance, p), p)[0] - self.measure(start, p)[0]) / distance
         return 1.0 if share == 0.0 or 0.5 <= share <= 2.0 else share
 
@@ -353,6 +361,8 @@ def find_loaded_plant(name: str, where: object) -> Plant | None:
 
 def find_key(name: str) -> str:
     """What this process calls a user's plant of another one, which may have loaded its file from another folder."""
+    if name in _LOADED:
+        return name
     return next((key for key in _LOADED if Path(key).name == Path(name).name), name)
 
 
@@ -455,5 +465,7 @@ def find_declared_plant(module: ModuleType, name: str, file: Path | None = None,
     title = plant.name or name
     own = {e.name: replace(e, plant=title) for e in vars(module).get(OWN_EFFECTS, {}).values()}
     made = replace(plant, name=title, file=file, effects=own, key=key or name)
-    PORTS.update({name: port for name, port in made.ports.items() if name not in PORTS})
+    with explain_errors(str(file or name), "step"):  # its ports are those of the functions that it calls
+        ports = made.ports
+    PORTS.update({name: port for name, port in ports.items() if name not in PORTS})
     return made

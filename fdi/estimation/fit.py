@@ -32,7 +32,6 @@ from plant import (
     Part,
     Plant,
     build_bare_model,
-    build_profile,
     find_quantity,
     list_offered_effects,
     list_searched_effects,
@@ -103,7 +102,7 @@ def find_fewest_steps(kind: Plant, noise_share: float = 1.0) -> int:
     if not kind.profile or kind.foreign is not None:
         return 10
     model = silence_sensors(build_bare_model(kind.key))
-    run = simulate(model, build_profile(kind.profile, rate=round(1.0 / model["controller.period"])).command)
+    run = simulate(model, kind.build_nominal_command())
     noise = np.array([kind.nominal.get(s.noise, 0.0) for s in kind.signals.outputs])
     drive, read = (getattr(run, s.name) for s in (kind.signals.drive, kind.signals.controlled))
     finest, *others = (Lanes(model, (), n).replay(np.empty((1, 0)), drive, np.zeros(len(drive)), read, ANCHOR_RATE)[0]

@@ -309,7 +309,7 @@ def _find_plant(table: Mapping[str, Any], place: Place) -> str:
 def write_preflight(kind: Plant) -> str:
     """A preflight for any plant, as TOML: its nominal test, and whether the loop follows at all. The limits are wide.
     """
-    command = build_profile(kind.profile, rate=round(1.0 / kind.nominal["controller.period"])).command
+    command = kind.build_nominal_command()
     span = float(f"{np.ptp(np.append(command, 0.0)):.3g}")
     rest = list_section_names(kind.profile)[-1] if isinstance(kind.profile[-1], Hold) else ""
     return fill_template("sequences/preflight.jinja", kind=kind, span=span, rest=rest, most_error=MOST_FOLLOWING_ERROR)
@@ -470,7 +470,7 @@ def load_nominal_test(kind: Plant, period: float) -> tuple[Array, Array | None, 
         InputError: the plant declares no test.
     """
     if kind.profile:
-        return build_profile(kind.profile, rate=1.0 / period).command, None, f"profile of {kind.name}"
+        return kind.build_nominal_command(period), None, f"profile of {kind.name}"
     require(kind.signals.names == EHA.names, "--command", "",
             f"FILE with the columns t and {kind.signals.command.name}: {kind.name} declares no profile")
     try:

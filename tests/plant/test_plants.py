@@ -21,6 +21,7 @@ from plant import (
     compute_answers,
     compute_flow_balance,
     compute_force_balance,
+    find_key,
     list_offered_effects,
     list_plants,
     list_searched_effects,
@@ -102,6 +103,8 @@ def test_a_model_file_of_a_users_plant_is_the_same_model_again(here: Path) -> No
     (here / "unit.toml").write_text(model.to_toml())
     again = load_model(here / "unit.toml")
     assert (again.values, again.effects, again.kind) == (model.values, model.effects, model.kind)
+    other = load_plant(here / "other" / "mine.py", TEXT.encode())  # beside the first, under the same name
+    assert find_key(other.key) == other.key
     (here / "mine.py").write_text(TEXT.replace("= 2.0\n", "= 4.0\n", 1))
     assert load_model("mine.py")["motor.resistance"] == 4.0  # another file under the same name is another plant
 
@@ -160,6 +163,8 @@ def test_its_own_effect_may_have_the_name_of_a_shared_one(tmp_path: Path) -> Non
     ("return State(current, speed", "return Stat(current, speed", r"\.py:\d+.*Stat"),
     ("def control(", "def control(x, ", "control.*4 arguments"),
     ("def step(", "def step((", r"\.py:\d+.*Python"),
+    ("step=step", "step=__import__('functools').partial(step)", "step: expected code .* not AttributeError.*partial"),
+    ("    h, ratio, kt =", "    step(s, m, u, p)\n    h, ratio, kt =", "step: expected code .* not RecursionError"),
     ("PLANT = Plant(", "PLAN = Plant(", "PLANT"),
     ("Step(to=0.5, time=0.9)", "0.5", "profile.*segments"),
 ])
@@ -168,6 +173,25 @@ def test_a_wrong_plant_file_is_refused_in_one_line(old: str, new: str, message: 
     file = write_file(tmp_path / "wrong.py", TEXT.replace(old, new, 1))
     said = catch_refusal(lambda path: [*check_behaviour(load_model(path))], file)
     assert re.search(message, said) and str(file) in said
+
+
+TIMES = "Hold(time=0.1), Step(to=0.5, time=0.9), Sine(amplitude=0.2, frequency=2.0, time=1.0)),"
+
+
+@pytest.mark.parametrize(("old", "new"), [
+    pytest.param(TIMES, 'Hold(time=0.1002),), values={"controller.period": 2e-4},', id="cycles of 0.2 ms"),
+    pytest.param(TIMES, 'Hold(time=0.3),), values={"controller.period": 3e-3},', id="333.3 cycles a second"),
+    pytest.param("Controller),\n", """Controller, NamedTuple("Jack", static_friction=Annotated[float, Quantity("N")])),
+    values={"jack.static_friction": 1.0},""", id="static friction alone"),
+    pytest.param("class DryFriction(", """import plant.declare
+plant.declare.base_effect("wheel", Wheel, "damping", law="B", starts=(0.3,))
+
+
+class DryFriction(""", id="effect named like a group")])
+def test_an_unusual_plant_file_is_taken(old: str, new: str, tmp_path: Path) -> None:
+    assert old in TEXT
+    model = load_model(write_file(tmp_path / "unusual.py", TEXT.replace(old, new))).replace({"wheel.inertia": 0.06})
+    assert np.isfinite(simulate(model, model.kind.build_nominal_command()[:50], steps=4, fast=False)).all()
 
 
 def test_the_signal_may_be_in_another_unit_than_the_state_that_moves(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from fdi.diagnosis.faults import load_faults
 from fdi.output import require_new, require_writable, write_text
 from fdi.report.report import Line, Report, Section
-from plant import InputError, Plant, build_profile, load_model, load_plant, read_file, require
+from plant import InputError, Plant, load_model, load_plant, read_file, require
 from plant.effects import is_taken, load_effects
 from plant.faults import WORD
 from rig.benches.bench import decode_device_text
@@ -68,7 +68,7 @@ def list_plant_words(kind: Plant) -> dict[str, Any]:
     moving = kind.moves if isinstance(kind.moves, tuple) else kind.state._fields
     parameter, healthy = next((name, value) for name, value in kind.nominal.items()
                               if value > 0.0 and name.partition(".")[0] != "controller")
-    largest = float(np.abs(build_profile(kind.profile).command).max(initial=0.0)) or 5e-3
+    largest = float(np.abs(kind.build_nominal_command()).max(initial=0.0)) or 5e-3
     step = float(f"{0.4 * largest:.1g}")
     return {"port": port, "unit": kind.ports[port].unit,
             "ports": "\n".join(f"#   {name} [{p.unit}]: {p.meaning}" for name, p in kind.ports.items()),
@@ -129,7 +129,7 @@ KINDS: Mapping[str, Kind] = {
     "bench": Kind(FILE_NAME, ".toml", write_bench, lambda path, _: load_bench(str(path)), "rig check --bench {path}"),
     "plant": Kind(FILE_NAME, ".py", write_example, lambda path, _: load_plant(path), "rig check {path}"),
     "sequence": Kind(FILE_NAME, ".toml", write_example, lambda path, plant: load_sequence(
-        path, round(1.0 / plant.nominal["controller.period"]), plant.key), "rig check {path}"),
+        path, 1.0 / plant.nominal["controller.period"], plant.key), "rig check {path}"),
     "effect": Kind(WORD, ".py", write_example, lambda path, _: load_effects(path),
                    "rig effects --effects {path} {path.stem}"),
     "fault": Kind(WORD, ".toml", write_example, load_faults, "rig check {path}"),
