@@ -204,7 +204,7 @@ def load_effects(path: Path, source: bytes | None = None) -> list[str]:
     path = path.absolute()  # as the code of its functions will say where it comes from
     require(path.is_file(), path, "", "a Python file with effects; it does not exist")
     run_file(path, read_file(path) if source is None else source)
-    new = [name for name, entry in CATALOGUE.items() if entry.file == path]
+    new = [name for name, entry in CATALOGUE.list_all().items() if entry.file == path]
     require(new, path, "", "at least one function marked with @effect(...) of plant.effects")
     return new
 

@@ -195,6 +195,8 @@ def load_text(file: Path, text: str) -> list[str]:
 
 def test_the_users_effect_is_found_and_acts(file: Path) -> None:
     """A force periodic over a metre is a spring where the ram moves millimetres."""
+    searched = COGGING.replace("law=", 'searched_in=("eha",), law=')
+    assert load_text(file, searched) == ["cogging"] == [CATALOGUE.special.pop("cogging").name]
     assert load_text(file, COGGING) == ["cogging"]
     model = SILENT.replace({"cogging.force": 5e5 / (2.0 * np.pi), "cogging.length": 1.0})
     ours = columns(WHOLE.replace({"aero_stiffness.stiffness": 5e5}))
