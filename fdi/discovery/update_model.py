@@ -492,7 +492,7 @@ def load_model_file(path: Path) -> tuple[Model, Provenance]:
     tables = read_model_tables(path)
     named = tables.get("effects", [])
     plant = tables.get("plant", "eha")
-    own = find_plant(plant).effects if plant in list_plants() else {}
+    own = find_plant(plant).effects if plant in list_plants() else CATALOGUE.of_plants
     gone = [e for e in named if e not in CATALOGUE.list_all() and e not in own] if isinstance(named, list) else []
     if gone and found.effect_files:
         files = " ".join(f"--effects {file}" for file in found.effect_files)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from effect_files import SPRING, restored_catalogue
 from noisy_traces import SHORT, record_healthy, record_plant
+from places import ROOT
 from rig_command import Said, answer, refuse, rig, write_file
 from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 from synthetic_run import record_run
@@ -20,7 +21,7 @@ from fdi.estimation.fit import Value
 from fdi.report.diagnosis_report import describe_verdict
 from fdi.trace.csv_table import write_csv
 from fdi.trace.trace import Trace
-from plant import Model, load_model
+from plant import Model, load_model, load_plant
 
 
 @pytest.fixture(scope="module")
@@ -265,6 +266,10 @@ def test_a_model_with_a_users_effect_finds_its_file_or_asks_for_it(tmp_path: Pat
         interval = {"spring.stiffness": Value(1e5, 9e4, 1.1e5, "N/m")}
         file.write_text(update_model.format_model_file(model, interval, known))
         assert update_model.load_model_file(file) == (model, known)
+        kind = load_plant(ROOT / "plant" / "models" / "new_plant.py")  # brings its own effects along
+        mine = write_file(tmp_path / "mine.toml", f'plant = "{kind.key}"\neffects = ["spring", "dry_friction"]\n'
+                          f'[provenance]\neffect_files = ["{own}"]\n')
+        assert update_model.load_model_file(mine)[0].effects == ("spring", "dry_friction")
     with restored_catalogue():
         said = rig("compare", run, "--model", file, "--trust")
     assert said.status == 0 and str(own) in said.err, said.err
