@@ -82,7 +82,8 @@ class Parameter(_Ramped):
     def __post_init__(self) -> None:
         super().__post_init__()
         group = self.parameter.partition(".")[0]
-        require(group != "controller" and not (group in CATALOGUE and CATALOGUE[group].firmware), "fault", "parameter",
+        effect = {**CATALOGUE.of_plants, **CATALOGUE.list_all()}.get(group)
+        require(group != "controller" and not (effect and effect.firmware), "fault", "parameter",
                 f"a parameter of the plant, not {self.parameter!r}: the controller is the thing under test, no fault "
                 "reaches into it")
 

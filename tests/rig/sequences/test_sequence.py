@@ -173,6 +173,8 @@ BAD = [  # text, then what the user reads
     (HEAD + 'faults = [\n{ kind = "parameter", parameter = "controller.period", value = 0.002, start = 0 }]\n',
      "mine.toml:4: faults[0].parameter: expected a parameter of the plant, not 'controller.period': the controller is "
      "the thing under test, no fault reaches into it"),
+    (HEAD + 'faults = [{ kind = "parameter", parameter = "asymmetric_gain.retraction", value = 0.1, start = 0 }]\n',
+     "mine.toml:3: faults[0].parameter: expected a parameter of the plant, not 'asymmetric_gain.retraction'"),
     (HEAD + 'faults = [{ kind = "parameter", parameter = "filter.law", value = 0.7, start = 0 }]\n',
      "mine.toml:3: faults[0].value: expected one of sqrt, linear, pressure, not 0.7"),
     (HEAD + 'faults = [{ kind = "parameter", parameter = "filter.law", value = "cubic", start = 0 }]\n',
