@@ -74,35 +74,24 @@ def compute_flow_share(left: float, law: float) -> float:
 
 
 def compute_coefficients(p: Any, h: float) -> Coefficients:
-    """Coefficients for parameters `p` and steps of `h` seconds."""
-    f, v, c = p.flapper, p.spool, p.jack
+    """Coefficients at nominal oil for parameters `p` and steps of `h` seconds."""
+    v = p.spool
     left = 1.0 - p.filter.clogging  # 1 - Kintas
     gpf1 = p.pilot.pressure_gain * left
-    slope1 = gpf1 * v.end_area / (p.pilot.flow_gain * compute_flow_share(left, p.filter.law))
-    gq, gp = p.valve.flow_gain, p.valve.pressure_gain
-    loss = gp * c.leakage / gq
-    leak = 1.0 / (1.0 + loss)  # QJ = AJ XJ' + CLK P12, solved for P12
-    slope2 = gp * c.area / gq * leak
-    stiff = 1.0 / (f.inertia + 0.5 * h * f.damping + 0.25 * h * h * f.stiffness)
-    spool, jack = v.mass + h * v.damping, c.mass + h * c.damping
-    return Coefficients(
-        flapper_keep=(f.inertia - 0.5 * h * f.damping - 0.25 * h * h * f.stiffness) * stiff,
-        flapper_push=h * stiff,
+    nominal = Coefficients(
+        flapper_keep=0.0, flapper_push=0.0, spool_coupled=0.0, valve_gain=0.0, valve_slope=0.0, jack_free=0.0,
+        jack_coupled=0.0,  # these seven depend on the oil: scale_coefficients computes them from the others
         pilot_gain=gpf1,
-        pilot_slope=slope1,
+        pilot_slope=gpf1 * v.end_area / (p.pilot.flow_gain * compute_flow_share(left, p.filter.law)),
         pilot_limit=p.supply.pressure * left,
-        spool_free=1.0 / spool,
-        spool_coupled=1.0 / (spool + h * v.end_area * slope1),
+        spool_free=1.0 / (v.mass + h * v.damping),
         spool_push=h * v.end_area,
-        valve_stiffness=gp * c.area / gq,
-        valve_loss=loss,
-        valve_gain=gp * leak,
-        valve_slope=slope2,
+        valve_stiffness=p.valve.pressure_gain * p.jack.area / p.valve.flow_gain,
+        valve_loss=p.valve.pressure_gain * p.jack.leakage / p.valve.flow_gain,
         valve_limit=p.supply.pressure,
-        jack_damping=c.damping,
-        jack_free=1.0 / jack,
-        jack_coupled=1.0 / (jack + h * c.area * slope2),
+        jack_damping=p.jack.damping,
     )
+    return scale_coefficients(nominal, 1.0, 1.0, h, p)
 
 
 @bind_later
@@ -130,7 +119,7 @@ def scale_coefficients(k: Coefficients, ratio: float, thick: float, h: float, p:
     stiff = 1.0 / (f.inertia + 0.5 * h * damping + 0.25 * h * h * f.stiffness)
     slope1 = k.pilot_slope * root  # GPF/GQF
     back = 1.0 / (root * thick)
-    leak = 1.0 / (1.0 + k.valve_loss * back)
+    leak = 1.0 / (1.0 + k.valve_loss * back)  # QJ = AJ XJ' + CLK P12, solved for P12
     slope2 = k.valve_stiffness * (back * thick) * leak
     jack = p.jack.mass + h * drag
     return Coefficients(
