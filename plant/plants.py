@@ -18,12 +18,12 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from plant.compile import Function, find_called_functions, find_fields_of, raise_unbound, rebind_names
+from plant.compile import Function, find_called_functions, find_fields_of, raise_unbound
 from plant.effects import CATALOGUE, Effect, Group, build_base_effect, build_effect, combine_laws
 from plant.errors import InputError, require
 from plant.faults import Fault
 from plant.foreign import Program
-from plant.kernels import make_packers, write_constant, write_mover, write_signal_functions
+from plant.kernels import make_packers, write_constant, write_function, write_mover, write_signal_functions
 from plant.pid import Loop, control_by_pid
 from plant.plant_check import check_declaration
 from plant.ports import (
@@ -291,7 +291,7 @@ class Plant:
         """What does not depend on effects."""
         step = self.step
         if len(inspect.signature(step).parameters) == 4:
-            step = rebind_names(_step_without_coefficients, step=step)
+            step = write_function("step_plant", "s, m, u, p, k", ["return step(s, m, u, p)"], step=step)
         store, load = make_packers(self.build_control_memory(), CONTROL_AT)
         return {"step_plant": step, "store_control": store, "load_control": load,
                 "measure_plant": self.measure, "move_plant": self.move, "correct_plant": self.correct or self.move,
@@ -323,19 +323,12 @@ class Plant:
         return self.state(), self.memory(*(combine_laws(port, effects)[1] for port in self.ports))
 
 
-def _step_without_coefficients(s: Any, m: Any, u: Any, p: Any, k: Any) -> Any:
-    return step(s, m, u, p)
-
-
 def _compute_no_coefficients(p: Any, h: float) -> float:
     return 0.0
 
 
 def _sense_nothing(s: Any, m: Any, u: Any, p: Any) -> Any:
     return s, m
-
-
-step: Function = _step_without_coefficients  # bound for a plant whose step needs no coefficients
 
 
 _LOADED: dict[str, Plant] = {}  # by the name of a shipped plant, or the path that a user's was named by
