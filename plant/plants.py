@@ -315,7 +315,9 @@ class Plant:
         """What the law of the controller remembers at the start."""
         if self.control is None:
             return Loop()
-        return self.control_memory() if self.control_memory else 0.0
+        if self.control_memory is None:
+            return 0.0
+        return self.control_memory(*map(float, self.control_memory()))  # a default may be written as a whole number
 
     def build_start(self, names: tuple[str, ...]) -> tuple[Any, Any]:
         """The plant at rest and the memories of the effects `names` at the start."""

@@ -47,7 +47,7 @@ TEXT = EXAMPLE.read_text()
 ROWS = 300
 # the controller remembers something from the start: a number, and two that mean "not yet known"
 REMEMBERING = TEXT.replace("class State(", """class Memory(NamedTuple):
-    bias: float = 1.0
+    bias: float = 1
     last: float = float("nan")
     least: float = float("inf")
 
