@@ -377,7 +377,7 @@ COMMANDS = {
                 help="largest share of overruns in a real-time run; more make its timing invalid (default: that of "
                      "the sequence, 0.001)"),
          option("--fdi", action="store_true",
-                help="also diagnose the servovalve like rig fdi, against a nominal unit"),
+                help="also judge the faults of the actuator like rig fdi, against a nominal unit"),
          JUNIT, REQUIREMENTS,
          option("--jobs", type=parse_count, metavar="N",
                 help="runs at a time of several sequences or a suite (default: all cores; 1 in real time or on a CAN "

@@ -74,17 +74,18 @@ def find_recorded_plant(args: argparse.Namespace) -> str | None:
 def change_model(model: Model, args: argparse.Namespace) -> Model:
     """The model with the changes of --set, and with the steps in which the frames of a logged run carry the position.
 
-    The steps come from the bench and are no effect that the model lacks; --set gets them for the commands to type next.
+    --set gets these steps for the commands to type next.
 
     Raises:
         InputError: a change that is not possible.
     """
-    log, offered = find_log(args), {effect.name for effect in model.kind.list_effects()}
-    if log is not None and "quantisation" in offered - {*model.effects}:
+    log = find_log(args)
+    if log is not None:
+        from rig.run.job import find_visible_steps  # here: commands without a log need none of it
+
         with suppress(InputError, KeyError, ValueError):  # of an older log it is not known
             step = float(open_log(log / "trace.mcap" if log.is_dir() else log).metadata["run"]["resolution"])
-            if step > 0.5 * model.nominal.get(model.kind.signals.controlled.noise, 0.0):
-                args.set = [f"quantisation.lsb={step:g}", *args.set]
+            args.set = [*(f"{name}={value:g}" for name, value in find_visible_steps(model, step).items()), *args.set]
     return model.replace(parse_changes(args.set))
 
 

@@ -7,7 +7,7 @@ import os
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isnan
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,17 @@ from fdi.progress import Progress
 from fdi.report.report import to_plain
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Event, Trace
-from plant import Actuator, Array, InputError, Model, Signals, count_nouns, make_columns_type, report_system_error
+from plant import (
+    Actuator,
+    Array,
+    InputError,
+    Model,
+    Signals,
+    build_bare_model,
+    count_nouns,
+    make_columns_type,
+    report_system_error,
+)
 from rig.benches.bench import Flags, Role
 from rig.network.frame import WallClock
 from rig.network.node_objects import NAMES, PLANT, CycleRecord, Identity
@@ -28,7 +38,7 @@ from rig.recorder import Observer, Recorder
 from rig.recorder.schema import collect_provenance, read_epoch_ns
 from rig.run.attribution import Attribution, Cause, CycleRecords, Trouble, attribute, count_most_in_a_row, find_injected
 from rig.run.bring_up import compile_loop
-from rig.run.job import Job, find_differences
+from rig.run.job import Job, find_differences, find_visible_steps
 from rig.run.loop import History, Loop
 from rig.run.participants import open_participants
 from rig.run.priority import (
@@ -41,7 +51,7 @@ from rig.run.priority import (
     raise_priority,
     suspend_garbage_collection,
 )
-from rig.run.session import MAIN, Session
+from rig.run.session import MAIN, SETUP, Session
 from rig.sequences.checks import SkippedCheck, evaluate_checks, find_skipped
 from rig.sequences.protocol import HEARTBEAT, Mask, judge_protocol
 from rig.sequences.python_parts import StepRun
@@ -330,28 +340,32 @@ def find_limits(column: Callable[[str], NDArray[np.float64]], model: Model, zero
 FDI_FAILS = ("MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE")  # verdicts of rig fdi that fail a run
 
 
-def diagnose_servovalve(trace: Trace, progress: Progress, workers: int = 2) -> dict[str, Any]:
-    """The answer of `rig fdi --json` on the main phase of a run, against the nominal unit.
+def diagnose_run(trace: Trace, job: Job, progress: Progress, workers: int = 2) -> dict[str, Any]:
+    """The answer of `rig fdi --json` on the main phase of a run, against a nominal unit of its plant.
 
     A phase that cannot be judged, for example a short one, gives CANNOT_TELL with the reason. `workers`: threads.
     """
     from fdi.diagnosis.diagnosis import diagnose  # here: loads the compiler, which other runs do not need
     from fdi.report.diagnosis_report import collect_data
 
+    kind = job.model.kind
+    nominal = build_bare_model(kind.key).with_effects(kind.has)
+    steps = find_visible_steps(nominal, job.bench.find_count(kind.signals.controlled.word))
     try:
-        diagnosis = diagnose(trace, progress=progress, source=trace.provenance["source"], workers=workers)
+        diagnosis = diagnose(trace, nominal.replace(steps), progress=progress, source=trace.provenance["source"],
+                             workers=workers)
     except InputError as error:
         return {"verdict": "CANNOT_TELL", "sentence": f"not judged: {error}"}
     return dict(to_plain(collect_data(diagnosis)))
 
 
 def has_fault(answer: Mapping[str, Any]) -> bool:
-    """Whether a diagnosis found a fault of the servovalve beyond acceptable, or another deviation."""
+    """Whether a diagnosis found a fault beyond acceptable, or another deviation."""
     return answer.get("verdict") in FDI_FAILS
 
 
 def describe_faults(answer: Mapping[str, Any], *levels: str) -> str:
-    """Level and size of both faults with its interval, in words; with `levels` only of faults at one of these.
+    """Level and size of each fault with its interval, in words; with `levels` only of faults at one of these.
 
     "" if there is none, or the trace could not be judged.
     """
@@ -494,10 +508,12 @@ def judge_run(job: Job, session: Session, judged: Mask,
 
 
 def make_main_trace(job: Job, folder: Path, history: History) -> Trace:
-    """The main phase of a run as `Trace.read` gives it from the log."""
-    columns = {name: history.column(name, MAIN) for name in job.model.kind.signals.names}
+    """The main phase of a run as `Trace.read` gives it from the log, with the set-up before it."""
+    signals = job.model.kind.signals
+    columns = {name: history.column(name, MAIN) for name in signals.names}
     settings = {name: str(value) for name, value in job.list_settings().items()}
-    return Trace.from_columns(columns, job.period_ns * 1e-9, {"source": str(folder), **settings})
+    trace = Trace.from_columns(columns, job.period_ns * 1e-9, {"source": str(folder), **settings}, signals)
+    return replace(trace, lead={name: history.column(name, SETUP) for name in signals.names})
 
 
 def attribute_run(job: Job, session: Session) -> Attribution:

@@ -50,7 +50,7 @@ from rig.run.runner import (
     Outcome,
     describe_faults,
     describe_finding,
-    diagnose_servovalve,
+    diagnose_run,
     has_fault,
     run_job,
 )
@@ -232,7 +232,7 @@ class CaseResult(NamedTuple):
     def reason(self) -> str:
         """Why the case did not pass, in a few words: the first check that failed and the number of the others.
 
-        A fault of the servovalve is named beside them. So is a diagnosis that leaves the level of a fault open.
+        A fault that `rig fdi` found is named beside them. So is a diagnosis that leaves the level of a fault open.
         """
         if self.verdict == "PASS" and self.fdi.get("verdict") == "CANNOT_TELL":
             return "rig fdi cannot tell"
@@ -300,7 +300,7 @@ def play_case(case: Case) -> CaseResult:
 
             # the code was announced when it was tried
             job = build_job(case.choice, is_trusted=True, announce=lambda text: None)
-            diagnose = partial(diagnose_servovalve, progress=end_if_asked, workers=1)
+            diagnose = partial(diagnose_run, job=job, progress=end_if_asked, workers=1)
             outcome = run_job(job, case.folder, ignore_progress, is_to_stop,
                               diagnose=diagnose if case.choice.is_diagnosed else None)
             write_run_page(case.folder / "trace.mcap", case.folder / "report.html")
@@ -522,7 +522,7 @@ def _make_check_test(check: CheckResult, result: CaseResult, classname: str) -> 
 
 
 def _make_diagnosis_test(result: CaseResult, classname: str) -> junit.TestCase:
-    """The diagnosis of the servovalve: a failure with a fault, skipped where it leaves the level of one open."""
+    """The diagnosis of `rig fdi`: a failure with a fault, skipped where it leaves the level of one open."""
     word, sentence = result.fdi["verdict"], result.fdi["sentence"]
     faults = describe_faults(result.fdi).replace("; ", "\n")
     test = junit.TestCase("rig fdi", classname, message=sentence, output=f"{word}: {sentence}\n{faults}".strip())

@@ -23,7 +23,7 @@ from rig.network.frame import WallClock
 from rig.recorder import Event, Observer
 from rig.run.job import Job, JobChoice, build_job, find_differences, read_job, replace_settings
 from rig.run.participants import EMBEDDED_NAMES
-from rig.run.runner import Outcome, diagnose_servovalve, run_job
+from rig.run.runner import Outcome, diagnose_run, run_job
 from rig.view.live_process import ViewerPlace, find_viewer_place, show_live
 from rig.view.live_run import find_named_node, make_live_plan
 
@@ -51,7 +51,7 @@ def run_command(args: argparse.Namespace) -> int:
     with catch_signals() as is_to_stop:
         with (announce_run(args, job, why, is_silent=is_silent or is_on_screen) as progress,
               choose_observer(job, folder / "trace.mcap", place, is_live=args.live is not None) as observer):
-            diagnose = partial(diagnose_servovalve, progress=progress) if args.fdi else None
+            diagnose = partial(diagnose_run, job=job, progress=progress) if args.fdi else None
             outcome = run_job(job, folder, progress, is_to_stop, diagnose, observer)
             progress("report", 0.0)
             report = build_run_report(Trace.read(folder / "trace.mcap", all=True))
@@ -146,7 +146,7 @@ def add_outcome(report: Report, outcome: Outcome) -> Report:
         "first cause": outcome.describe_cause() if outcome.attribution.cause is not None else "",
         "missing": _list_counts(outcome.counters),
         "not nominal": differences if differences != "nothing" else "",
-        "servovalve": f"{fdi['verdict']}: {fdi['sentence']}" if fdi else ""}
+        "rig fdi": f"{fdi['verdict']}: {fdi['sentence']}" if fdi else ""}
     reason = (outcome.why or "every check passed") + (
         "; rig fdi cannot tell" if fdi.get("verdict") == "CANNOT_TELL" else "")
     lines = [Line(label, text) for label, text in texts.items() if text]

@@ -130,6 +130,14 @@ def test_a_replay_of_a_run_begins_with_its_set_up(tmp_path: Path) -> None:
         assert np.abs(column - ready.column(name)).max() <= 1e-9 * np.abs(ready.column(name)).max()
 
 
+def test_a_run_with_fdi_is_judged_by_the_faults_of_its_own_plant(tmp_path: Path) -> None:
+    back = ', { kind = "ramp", to = -2e-3, time = 0.5 }, { kind = "step", to = 0.0, time = 0.5 }]\ncleanup'
+    short = write_file(tmp_path / "short.toml", SHORT.replace("]\ncleanup", back))
+    said = rig("run", short, "--model", "ema", "--set", "surface.friction=300", "--fdi", "--json", "--out", tmp_path)
+    assert (said.status, said.json["fdi"]["verdict"]) == (1, "NON_NOMINAL"), said
+    assert said.json["fdi"]["ruling"] == "dry_friction" and len(said.json["fdi"]["level"]) == 4
+
+
 @pytest.mark.parametrize(("old", "new", "line"), [
     ('trim_angle = {', 'ram_position = {', "inputs.ram_position: expected a signal of the bench and its plant: "
      "'case_rise', 'control_word', 'cycle', 'flags', 'hinge', 'mode', 'phase_amps', 'rotor_angle'"),
