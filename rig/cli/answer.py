@@ -68,6 +68,18 @@ def choose_places(args: argparse.Namespace, page_name: str, source: str) -> Plac
     return Places(page, out)
 
 
+def name_after(source: Path, suffix: str) -> str:
+    """The name of a file made from a recording: that of the recording, with another suffix for its format.
+
+    >>> name_after(Path("log.2024-01.csv.gz"), ".mcap"), name_after(Path("/usr/lib/."), ".rrd")
+    ('log.2024-01.mcap', 'lib.rrd')
+    """
+    name = source.resolve().name
+    if not source.is_dir():
+        name = Path(name.removesuffix(".gz")).stem
+    return name + suffix
+
+
 def make_folder(path: Path) -> Path:
     """Make the folder of --out if need be.
 

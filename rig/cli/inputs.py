@@ -52,7 +52,7 @@ def load_chosen_effects(args: argparse.Namespace) -> None:
 
 def find_log(args: argparse.Namespace) -> Path | None:
     """The first log among the arguments."""
-    given = [getattr(args, "trace", None), *(getattr(args, name, None) or [] for name in ("traces", "words"))]
+    given = [getattr(args, "trace", None), *(getattr(args, name, None) or [] for name in ("runs", "words"))]
     names = [name for each in given if each for name in ([each] if isinstance(each, str | Path) else each)]
     return next((path for path in map(Path, names) if path.suffix == ".mcap" or (path / "trace.mcap").is_file()), None)
 

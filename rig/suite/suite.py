@@ -193,7 +193,7 @@ def _find_free(name: str, taken: set[str], pattern: str) -> str:
 
 def _find_beside(folder: Path, name: str) -> str:
     """A file beside the suite file; a name without suffix is that of a shipped sequence or model."""
-    return str(folder / name) if Path(name).suffix == ".toml" else name
+    return str(folder / name) if Path(name).suffix else name
 
 
 def _as_tuple(value: object) -> tuple[Any, ...]:

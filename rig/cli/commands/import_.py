@@ -12,7 +12,7 @@ from fdi.trace.importing.formats import Measurement, open_measurement
 from fdi.trace.importing.guess import guess_map
 from plant import InputError, count_nouns, require
 from rig.benches.bench_file import load_bench
-from rig.cli.answer import give_answer, show_progress
+from rig.cli.answer import give_answer, name_after, show_progress
 from rig.cli.inputs import load_declared_model
 from rig.recorder.convert import RAW_SUFFIXES, import_csv, import_frames, import_own_table, open_can_log, write_imported
 
@@ -30,7 +30,7 @@ def run_command(args: argparse.Namespace) -> int:
     require(not args.dbc or args.map or args.guess, "--dbc", args.dbc,
             "--map or --guess with it; without them the frames are those of --bench")
     suffix = ".map.toml" if args.guess else ".mcap"
-    out = source.with_name(source.name.split(".")[0] + suffix) if args.out is None else Path(args.out)
+    out = source.with_name(name_after(source, suffix)) if args.out is None else Path(args.out)
     if args.guess:
         return write_guess(args, source, require_new(out, is_forced=args.force))
     require(out.suffix == ".mcap", out, "--out", "a name that ends in .mcap")

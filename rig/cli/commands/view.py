@@ -14,7 +14,7 @@ from fdi.report.numbers import join_words
 from fdi.report.report import Report
 from fdi.trace.trace import Trace
 from plant import Model, require
-from rig.cli.answer import choose_file, give_answer, show_progress
+from rig.cli.answer import choose_file, give_answer, name_after, show_progress
 from rig.cli.commands.diff import read_and_compare_runs
 from rig.cli.discovery_inputs import load_known_model
 from rig.cli.inputs import list_signals, load_declared_model
@@ -76,12 +76,12 @@ def place_recording(args: argparse.Namespace) -> Path:
     """The recording without --out: beside the last trace."""
     source = Path([args.trace, *args.others[:1]][-1])
     folder = source if source.is_dir() else source.parent
-    name = source.name.split(".")[0]
+    name = name_after(source, ".rrd")
     if args.compare:
-        name = "compare"
+        name = "compare.rrd"
     elif args.others:
-        name = "diff"
-    return folder / f"{name}.rrd"
+        name = "diff.rrd"
+    return folder / name
 
 
 def draw(args: argparse.Namespace, progress: Progress) -> Drawing:

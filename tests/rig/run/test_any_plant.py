@@ -110,6 +110,7 @@ def test_a_plant_without_a_device_runs_with_its_own_controller(here: Path) -> No
     again = rig("run", "--from", "run", "--trust", "--out", "again")
     assert again.status == 0, again
     assert rig("diff", "run", "again", "--json").json["verdict"] == "SAME"
+    assert "--trust, because it brings code along" in refuse("identify", "run")  # it takes the plant of the log
     assert "expected embedded" in refuse("run", "--model", "motor.py", "--bus", spec("udp_multicast"))
     assert "expected external" in refuse("run", "--model", "motor.py", "--controller", "c")
 

@@ -165,6 +165,7 @@ def test_several_sequences_on_the_command_line_and_junit_of_one(tmp_path: Path) 
     ('"jack.mass" = [90.0, 110]', '"jack.mass" = [90, -1]', r"jack\.mass: expected .*-1"),
     ("timeout = 1.0", "timeout = 0", r"suite\.toml:\d+: case\[3\]\.timeout: expected a number above 0"),
     ("timeout = 1.0", 'model = "none.toml"', r"none\.toml"),
+    ("timeout = 1.0", 'model = "none.py"', r"\d/none\.py: expected"),
     ('title = "All kinds"', "", r"suite\.toml: expected also the key 'title'"),
 ])
 def test_bad_input_is_one_line_before_anything_runs(tmp_path: Path, old: str, new: str, line: str) -> None:
