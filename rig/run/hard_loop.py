@@ -97,7 +97,7 @@ class HardLoop(Loop):
             self._words[cy.DUE] = self._origin + self._wire.clock.now() + 20 * self._period
             self._thread = threading.Thread(target=self._run_thread, name="cycle", daemon=True)
             self._thread.start()
-        while self.waiting >= self._ahead:
+        while self.waiting >= self._ahead - 1:  # the cycle still reads the row of its last input
             self.serve()
 
     def serve(self) -> None:

@@ -286,8 +286,9 @@ def test_an_empty_queue_holds_the_last_demand(bus_kind: str) -> None:
 @only_udp
 def test_waiting_for_the_end_of_the_queue_is_no_underrun(bus_kind: str) -> None:
     """Neither is the hold behind it."""
-    with bench(bus_kind, True) as one:
+    with bench(bus_kind, True, ahead=10) as one:
         one.play(*range(10))
+        assert one.loop.waiting <= 8  # the next input must not be written over the last one, which is held
         one.loop.wait_until_played(lambda: False)
         assert one.loop.waiting == 0
         underruns, k = one.loop.underruns, one.loop.k
