@@ -551,10 +551,11 @@ def lock_folder(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError("--out", str(folder), "a folder that no other run is writing to") from error
         yield
-    except BlockingIOError as error:
-        raise InputError("--out", str(folder), "a folder that no other run is writing to") from error
     finally:
         os.close(handle)
 

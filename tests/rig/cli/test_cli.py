@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from rig_command import SHORT, Said, answer, finished, grown, interrupted, refuse, rig, started, write_file
@@ -90,10 +91,12 @@ def test_timing_that_is_invalid(short: Path, tmp_path: Path, monkeypatch: pytest
     assert told["verdict"] == "INVALID_TIMING" and told["timing"]["overruns"] > 10
 
 
-def test_a_bug_is_neither_a_verdict_nor_bad_input(short: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("rig.run.runner.judge_run", lambda *_: 1 / 0)
+@pytest.mark.parametrize("bug", [ZeroDivisionError, BlockingIOError])  # the latter is no other run in the folder
+def test_a_bug_is_neither_a_verdict_nor_bad_input(bug: type[Exception], short: Path, monkeypatch: pytest.MonkeyPatch,
+                                                  tmp_path: Path) -> None:
+    monkeypatch.setattr("rig.run.runner.judge_run", Mock(side_effect=bug))
     said = rig("run", short, "--out", tmp_path / "out", "--json")
-    assert said.status == 70 and "ZeroDivisionError" in said.err and said.out == ""
+    assert said.status == 70 and bug.__name__ in said.err and said.out == ""
     assert Trace.read(tmp_path / "out").xj.size == 350  # the log is closed
 
 
