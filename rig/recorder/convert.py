@@ -180,7 +180,11 @@ def import_frames(source: Path, out: Path, bench: Bench) -> int:
         first, stop = active[0], active[-1] + 1
     for k, (_, row) in enumerate(cycles.rows):
         row.phase = int(k >= first) + int(k >= stop)
-    period = bench.cycle_ns / 1e9 if 0.9 < middle / bench.cycle_ns < 1.1 else round(middle / 1e9, 4)  # another speed
+    period = bench.cycle_ns / 1e9
+    if not 0.9 < middle / bench.cycle_ns < 1.1:  # another speed; times of receipt are some microseconds off
+        period = round(middle / 1e9, 4)
+        if abs(period - middle / 1e9) > 5e-6:
+            period = round(middle / 1e9, 6)
     items = sorted([*items, *cycles.rows], key=lambda item: item[0])
     _write_log(out, {name: ("text/plain", data) for name, data in bench.files.items()},
                collect_provenance(imported=source.name, period=period, pace="imported"), items, bench.signals)

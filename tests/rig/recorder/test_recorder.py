@@ -372,10 +372,12 @@ CANDUMP = """\
 """
 
 
-def test_lost_and_late_frames_of_a_candump(tmp_path: Path) -> None:
-    assert import_frames(write_file(tmp_path / "x.log", CANDUMP), tmp_path / "x.mcap", load_bench()) == 5
+@pytest.mark.parametrize("faster", [1, 4])
+def test_lost_and_late_frames_of_a_candump(faster: int, tmp_path: Path) -> None:
+    text = re.sub(r"\.(\d+)", lambda found: f".{int(found[1]) // faster:06}", CANDUMP)
+    assert import_frames(write_file(tmp_path / "x.log", text), tmp_path / "x.mcap", load_bench()) == 5
     trace = Trace.read(tmp_path / "x.mcap")
-    assert len(trace) == 7 and [g.cycles for g in trace.gaps] == [2]
+    assert trace.period == 1e-3 / faster and len(trace) == 7 and [g.cycles for g in trace.gaps] == [2]
     np.testing.assert_allclose([trace.cor, trace.com], [[1e-5, 1e-5, 1e-5, np.nan, np.nan, np.nan, 1e-5],
                                                         [1e-3, 1e-3, 1e-3, 1e-3, np.nan, np.nan, 1e-3]])
     assert {(n.node, n.name) for n in trace.nmt} | {(e.kind, e.text[:14]) for e in trace.events} == {
