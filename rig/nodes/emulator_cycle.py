@@ -46,7 +46,7 @@ from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, change_fram
 
 NOISE_RING = 1 << 16  # cycles of noise drawn ahead
 EVENT_RING = 256
-_HELD_FRAMES = 4096  # late frames that can wait: two a cycle for the longest delay, and as many drives
+_HELD_FRAMES = 1 << 15  # late frames that can wait: two a cycle of 0.1 ms for the longest delay, and its drives
 _ANSWER_LIMIT = 80_000_000  # ns: in lockstep the answer to a late feedback frame is waited for this long
 _LONGEST_WAIT = 20_000_000  # ns: then the loop looks whether it is to stop, as after `await_frame`
 
