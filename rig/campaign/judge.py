@@ -421,7 +421,7 @@ def _parse_healthy_model(spec: Mapping[str, Any]) -> Model:
 
 def hash_campaign_sources() -> str:
     """A hash of all code and data that a row depends on."""
-    return hash_sources("plant", "fdi", "rig/campaign")
+    return hash_sources("plant", "fdi", "rig/campaign", "rig/sequences")
 
 
 WORKS: Mapping[str, str] = {"fdi": "rig.campaign.judge:judge_by_fdi"}
