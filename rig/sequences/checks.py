@@ -58,35 +58,40 @@ def bridge_gaps(signal: Array, name: str, allowed: float) -> Array:
     return np.interp(rows, rows[~missing], signal[~missing])
 
 
-def measure_step_size(com: Array, before: float, smallest: float = 20e-6) -> float:
-    """What a step section asks for; NotMeasurable if it has no step at its start or moves on later.
-
-    `smallest`: m; ten times the noise.
-    """
-    size, is_held = float(com[-1] - before), np.abs(com - com[-1]).max() <= 1e-9
-    require_measurable(abs(size) >= smallest and is_held, "the command does not step here and then hold")
-    return size
+SMALLEST_STEP = 20e-6  # m where a plant's command is at most 1 m, else in proportion; ten times the noise of the EHA
 
 
-def measure_overshoot(position: Array, com: Array, before: float, rate: float) -> float:
+class StepResponse(NamedTuple):
+    """What a step section asks for, and the filtered answer to it, SI."""
+
+    position: Array
+    before: float  # the command before the step
+    target: float
+    rate: float  # samples/s
+
+    @property
+    def size(self) -> float:
+        """What the section asks for."""
+        return self.target - self.before
+
+
+def measure_overshoot(step: StepResponse) -> float:
     """How far the highest point is beyond the target, % of the step; 0 if it never gets there."""
-    size = measure_step_size(com, before)
-    return max(0.0, 100 * float(((filter_median(position, rate) - com[-1]) / size).max()))
+    return max(0.0, 100 * float(((step.position - step.target) / step.size).max()))
 
 
-def measure_settling_time(position: Array, com: Array, before: float, rate: float, band: float) -> float:
+def measure_settling_time(step: StepResponse, band: float) -> float:
     """Time until the position stays within +-band % of the step around the target, s."""
-    size = measure_step_size(com, before)
-    outside = np.flatnonzero(np.abs(filter_median(position, rate) - com[-1]) > abs(size) * band / 100)
+    outside = np.flatnonzero(np.abs(step.position - step.target) > abs(step.size) * band / 100)
     if not len(outside):
         return 0.0
-    require_measurable(outside[-1] < len(position) - 1, f"still outside +-{band:g} % at the end of the window")
-    return float(outside[-1] + 1) / rate
+    require_measurable(outside[-1] < len(step.position) - 1, f"still outside +-{band:g} % at the end of the window")
+    return float(outside[-1] + 1) / step.rate
 
 
-def measure_rise_time(position: Array, com: Array, before: float, rate: float) -> float:
+def measure_rise_time(step: StepResponse) -> float:
     """Time from 10 % to 90 % of the step, s, interpolated between samples."""
-    done = (filter_median(position, rate) - before) / measure_step_size(com, before)
+    done = (step.position - step.before) / step.size
 
     def find_time(level: float) -> float:
         beyond = np.flatnonzero(done >= level)
@@ -94,7 +99,7 @@ def measure_rise_time(position: Array, com: Array, before: float, rate: float) -
         k = int(beyond[0])
         return k - (done[k] - level) / (done[k] - done[k - 1]) if k else 0.0
 
-    return float(find_time(0.9) - find_time(0.1)) / rate
+    return float(find_time(0.9) - find_time(0.1)) / step.rate
 
 
 def measure_ramp_error(error: Array, com: Array) -> float:
@@ -222,11 +227,21 @@ class RunData:
         column = getattr(self.trace, name) if name in known else np.zeros(0)  # an event has none
         return int(np.isnan(np.asarray(column, float)[span]).sum())
 
-    def read_step(self, span: slice) -> tuple[Array, Array, float, float]:
-        """Position and demand in a span, the demand before it (at the very start: where the ram is), and the rate."""
-        position, command = self.read_signal(self.signals.controlled.name, span), self.signals.command.name
-        before = float(getattr(self.trace, command)[span.start - 1] if span.start else position[0])
-        return position, self.read_signal(command, span), before, self.rate
+    def read_step(self, span: slice) -> StepResponse:
+        """The step at the start of a span; at the very start of main it begins where the actuator is.
+
+        NotMeasurable if there is none, or if the command moves on later.
+        """
+        from fdi.trace.trace import measure_scale  # here: nodes, which judge nothing, start without recordings
+
+        position, command = self.read_signal(self.signals.controlled.name, span), self.signals.command
+        commands, asked = getattr(self.trace, command.name), self.read_signal(command.name, span)
+        before = float(commands[span.start - 1] if span.start else position[0])
+        target, scale = float(asked[-1]), measure_scale(command, commands)
+        is_held = np.abs(asked - target).max() <= 1e-9 * scale
+        require_measurable(abs(target - before) >= SMALLEST_STEP * scale and is_held,
+                           "the command does not step here and then hold")
+        return StepResponse(filter_median(position, self.rate), before, target, self.rate)
 
     def find_events(self, event: str, t0: float, t1: float = float("inf")) -> list[Any]:
         """Events in t0 <= t < t1 whose kind and text have all words of `event`, whatever their case, by time."""
@@ -553,11 +568,11 @@ class Kind(NamedTuple):
 
 KINDS: dict[str, Kind] = {
     "overshoot": Kind("How far a step goes beyond its target, % of the step.", "%",
-                      lambda check, run, span: measure_overshoot(*run.read_step(span))),
+                      lambda check, run, span: measure_overshoot(run.read_step(span))),
     "settling_time": Kind("Time until a step stays within +-`band` of its target, s.", "s", lambda check, run, span:
-                          measure_settling_time(*run.read_step(span), check.band), Settling, is_rounded=True),
+                          measure_settling_time(run.read_step(span), check.band), Settling, is_rounded=True),
     "rise_time": Kind("Time from 10 % to 90 % of a step, s.", "s",
-                      lambda check, run, span: measure_rise_time(*run.read_step(span))),
+                      lambda check, run, span: measure_rise_time(run.read_step(span))),
     "steady_error": Kind("Size of the mean position error, m.", "m",
                          lambda check, run, span: abs(float(run.read_signal("error", span).mean()))),
     "ramp_error": Kind("Mean lag behind a ramp, m.", "m", lambda check, run, span: measure_ramp_error(

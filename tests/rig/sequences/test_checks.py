@@ -20,7 +20,7 @@ from fdi.report.run_report import build_run_report
 from fdi.report.terminal import format_report
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import Trace
-from plant import Array, Columns, Hold, Segment, build_profile
+from plant import EHA, Array, Columns, Hold, Segment, Signals, build_profile
 from plant.segments import Ramp, Step
 from rig.benches.bench import Bench
 from rig.benches.bench_file import load_bench, load_bench_from_files
@@ -163,6 +163,14 @@ def test_reasons(kind: str, keys: dict[str, Any], reason: str) -> None:
     run, sections = follower(Hold(time=0.1), Step(to=1e-3, time=0.9, name="step"))
     result = judged(run, sections, kind, **keys)
     assert not result.passed and reason in result.detail
+
+
+@pytest.mark.parametrize(("largest", "is_step"), [(1.0, False), (0.1, True), (inf, True)])
+def test_how_small_a_step_may_be_depends_on_the_size_of_the_motion(largest: float, is_step: bool) -> None:
+    small = Signals(*(s._replace(largest=largest) if s.role == "command" else s for s in EHA[1:]))
+    (result,) = evaluate_checks([check("settling_time", window="step", band=90.0)],
+                                *follower(Hold(time=0.1), Step(to=1e-5, time=0.9, name="step")), signals=small)
+    assert isnan(result.value) != is_step
 
 
 @pytest.mark.parametrize(("raised", "said"), [
