@@ -12,7 +12,18 @@ from fdi.report.report import Cell, Column, Line, Medium, Report, Section, Table
 from fdi.report.run_report import build_run_report
 from fdi.trace.check_result import CheckResult
 from fdi.trace.trace import MAIN, Event, Trace
-from plant import Array, Model, Plant, Profile, count_nouns, find_quantity, make_columns_type, simulate
+from plant import (
+    Array,
+    Model,
+    Plant,
+    Profile,
+    count_nouns,
+    find_divergence,
+    find_quantity,
+    make_columns_type,
+    require,
+    simulate,
+)
 from rig.run.job import Job, find_differences
 from rig.run.runner import LimitReached, find_limits
 from rig.sequences.checks import Guard, GuardWatch, RunData
@@ -114,7 +125,7 @@ def make_dry_run(job: Job) -> DryRun:
     """Hold the command and load of a job against the model's limits, and simulate it without bus and faults.
 
     Raises:
-        InputError: a fault that contradicts the model's parameters.
+        InputError: a fault that contradicts the model's parameters, or a plant that diverges.
     """
     faults = plan_faults(job)
     sequence, model = job.sequence, job.model
@@ -127,6 +138,8 @@ def make_dry_run(job: Job) -> DryRun:
     rate = sequence.rate
     t = (np.arange(len(command)) - first) / rate
     predicted = simulate(model, command, load, job.seed)
+    diverged = find_divergence(model, predicted._asdict())
+    require(not diverged, model.name, "", f"a plant that stays finite; {diverged}, counted from the start of set-up")
     signals = model.kind.signals
     columns = make_columns_type(signals)(np.arange(last - first) / rate,
                                          *(column[first:last] for column in predicted[1:]))

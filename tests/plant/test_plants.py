@@ -231,6 +231,7 @@ def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -
     assert said.status == 2 and re.search(r"angle|current|voltage", said.err) and "t = 0.0" in said.err
     assert not (tmp_path / "s.csv").exists()
     first, = check_behaviour(load_model(file))
+    assert "a plant that stays finite; " in refuse("check", "preflight", "--model", file)
     ran = rig("run", "--model", file, "--out", tmp_path / "run")
     assert not first.passed and "t = 0.1" in first.text and "no finite number in angle" in ran.out
 
