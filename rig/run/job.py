@@ -362,7 +362,7 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     require(is_own_plant, sequence.name, "plant", f"a bench or model of {sequence.plant}, not of {model.plant}")
     if choice.model is None and sequence.model.name != "eha":
         own = choice._replace(model=sequence.model.name)
-        _, model, more = load_tested_model(own, is_trusted=is_trusted, announce=announce)
+        bench, model, more = load_tested_model(own, is_trusted=is_trusted, announce=announce)
         brought = (*brought, *more)
     require_different_names((*choice.effects, *brought))
     model = model.replace(sequence.model.overrides, sequence.name).replace(choice.changes)

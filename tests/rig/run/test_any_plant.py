@@ -131,9 +131,14 @@ def test_a_replay_of_a_run_begins_with_its_set_up(tmp_path: Path) -> None:
         assert np.abs(column - ready.column(name)).max() <= 1e-9 * np.abs(ready.column(name)).max()
 
 
+def test_a_sequence_that_names_a_model_runs_on_the_bench_of_its_plant(tmp_path: Path) -> None:
+    assert rig("run", write_file(tmp_path / "named.toml", 'model = { name = "ema" }\n' + SHORT),
+               "--out", tmp_path).status == 0
+
+
 def test_a_run_with_fdi_is_judged_by_the_faults_of_its_own_plant(tmp_path: Path) -> None:
-    back = ', { kind = "ramp", to = -2e-3, time = 0.5 }, { kind = "step", to = 0.0, time = 0.5 }]\ncleanup'
-    short = write_file(tmp_path / "short.toml", SHORT.replace("]\ncleanup", back))
+    short = write_file(tmp_path / "short.toml", SHORT.replace(
+        "]\ncleanup", ', { kind = "ramp", to = -2e-3, time = 0.5 }, { kind = "step", to = 0.0, time = 0.5 }]\ncleanup'))
     said = rig("run", short, "--model", "ema", "--set", "surface.friction=300", "--fdi", "--json", "--out", tmp_path)
     assert (said.status, said.json["fdi"]["verdict"]) == (1, "NON_NOMINAL"), said
     assert said.json["fdi"]["ruling"] == "dry_friction" and len(said.json["fdi"]["level"]) == 4
