@@ -243,12 +243,32 @@ class Action(NamedTuple):
 NORMAL = Action(SENT_NORMALLY)
 
 
+def move_bits(bits: int, size: int) -> int:
+    """As many bits, where there is room, among the lowest `size`: each at its place modulo `size` or the next free one.
+
+    The bits to invert are drawn among 64, whatever the length of the frame that comes.
+
+    >>> hex(move_bits(0x1_0000_0000, 32)), hex(move_bits(0x8000_8000, 16)), move_bits(-1, 8), move_bits(1, 0)
+    ('0x1', '0x8001', 255, 0)
+    """
+    moved = 0
+    for place in range(64):
+        if bits >> place & 1 and moved != (1 << size) - 1:
+            free = place % size
+            while moved >> free & 1:
+                free = (free + 1) % size
+            moved |= 1 << free
+    return moved
+
+
 def change_frame(code: int, argument: int, length: int, data: int) -> tuple[int, int]:
     """Length and payload of a frame after a fault that corrupts or cuts it; after any other code they are unchanged.
 
     `data`: first byte lowest, bytes beyond `length` zero, as in raw_bus.py.
     """
     if code == CORRUPT:
+        if length < 8:
+            argument = move_bits(argument, 8 * length)
         data ^= argument
     elif code == CUT:
         length = min(length, argument)

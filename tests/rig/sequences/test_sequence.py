@@ -454,7 +454,8 @@ DATA = bytes(range(8))
     (NORMAL, DATA, DATA), (Action(DOUBLE), DATA, DATA), (NORMAL, b"", b""), (Action(DELAY, 1000), DATA, DATA),
     (Action(CUT, 3), DATA, DATA[:3]),
     (Action(CORRUPT, 0x01 - (1 << 63)), DATA, bytes((1, 1, 2, 3, 4, 5, 6, 0x87))),  # first byte lowest
-    (Action(CORRUPT, -(1 << 63)), b"\x01\x02", b"\x01\x02")])
+    (Action(CORRUPT, -(1 << 63)), b"\x01\x02", b"\x01\x82"), (Action(CORRUPT, 1), b"", b""),  # within the frame
+    (Action(CORRUPT, 1 << 40 | 1 << 8), b"\x01\x02", b"\x01\x01")])
 def test_what_arrives_of_a_frame(action: Action, data: bytes, arrives: bytes) -> None:
     length, word = change_frame(*action, len(data), int.from_bytes(data, "little"))
     assert (word & (1 << 64) - 1).to_bytes(8, "little")[:length] == arrives
