@@ -112,7 +112,7 @@ class Attribution(NamedTuple):
     invalid: dict[str, int]  # reason: number of cycles that were not judged
     disturbances: tuple[Disturbance, ...]
     cause: Cause | None
-    consequences: tuple[Trouble, ...]  # the other troubles, in order
+    consequences: tuple[tuple[int, Trouble], ...]  # the other troubles in order, each with its cycle
     affected: Mask  # (cycles,) rows in which lateness of the bench changed the signals
     by_bench: int  # troubles that followed from lateness of the bench
     overruns: NDArray[np.int64]  # (cycles,)
@@ -136,7 +136,8 @@ def attribute(records: CycleRecords, troubles: Sequence[Trouble], policy: Timing
     ordered = sorted(troubles, key=lambda trouble: trouble.t_ns)
     causes = [find_cause(trouble, records, disturbances, gone, bench) for trouble in ordered]
     cause = find_first_cause(causes, disturbances)
-    consequences = tuple(trouble for trouble in ordered if cause is None or trouble.text != cause.text)
+    consequences = tuple((records.find_cycle(trouble.t_ns), trouble) for trouble in ordered
+                         if cause is None or trouble.text != cause.text)
     return Attribution(judged, invalid, disturbances, cause, consequences, find_affected(records, disturbances),
                        sum(found.is_lateness for found in causes), count_overruns(records, late))
 

@@ -4,7 +4,6 @@ import contextlib
 import fcntl
 import json
 import os
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,7 +35,7 @@ from rig.network.frame import WallClock
 from rig.network.node_objects import NAMES, PLANT, CycleRecord, Identity
 from rig.recorder import Observer, Recorder
 from rig.recorder.schema import collect_provenance, read_epoch_ns
-from rig.run.attribution import Attribution, Cause, CycleRecords, Trouble, attribute, count_most_in_a_row, find_injected
+from rig.run.attribution import Attribution, Cause, CycleRecords, attribute, count_most_in_a_row, find_injected
 from rig.run.bring_up import compile_loop
 from rig.run.job import Job, find_differences, find_visible_steps
 from rig.run.loop import History, Loop
@@ -94,7 +93,6 @@ class Outcome:
     counters: dict[str, int]
     speed: float  # multiple of real time, of the cycles alone
     attribution: Attribution
-    due_ns: Sequence[int]  # log time of each cycle
     start_times: Mapping[Role, float]  # s from NMT start to OPERATIONAL
     identities: Mapping[Role, Identity]
     skipped: Sequence[SkippedCheck] = ()  # they do not apply to the bench
@@ -205,13 +203,10 @@ class Outcome:
             return ""
         if cause.text == self.aborted and not self.attribution.consequences:
             return self.aborted
-        then = [f"{trouble.text} at {self.find_time(self._find_cycle(trouble)):.3f} s"
-                for trouble in self.attribution.consequences[:4]]
+        then = [f"{trouble.text} at {self.find_time(cycle):.3f} s"
+                for cycle, trouble in self.attribution.consequences[:4]]
         text = f"t = {self.find_time(cause.cycle):.3f} s: {cause.text}"
         return f"{text}; then: {', '.join(then)}" if then else text
-
-    def _find_cycle(self, trouble: Trouble) -> int:
-        return max(bisect_right(self.due_ns, trouble.t_ns) - 1, 0)
 
     @property
     def why(self) -> str:
@@ -253,8 +248,8 @@ class Outcome:
         cause = None if found.cause is None else {
             "source": self._name_source(found.cause), "kind": found.cause.kind, "t": self.find_time(found.cause.cycle),
             "cycle": found.cause.cycle, "text": found.cause.text, "evidence": list(found.cause.evidence)}
-        consequences = [{"t": self.find_time(self._find_cycle(trouble)), "source": self._name_node(trouble.node),
-                         "kind": trouble.kind, "text": trouble.text} for trouble in found.consequences]
+        consequences = [{"t": self.find_time(cycle), "source": self._name_node(trouble.node), "kind": trouble.kind,
+                         "text": trouble.text} for cycle, trouble in found.consequences]
         judged = {"cycles": len(found.judged), "judged": int(found.judged.sum()), "invalid": found.invalid,
                   "overruns": int(found.overruns.sum()),
                   "lateness": [{"t": self.find_time(each.first), "cycle": each.first, "last": each.last,
@@ -461,12 +456,12 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     for check in checks:
         recorder.put(session.stage.now(), check)
     diagnosis = diagnose(make_main_trace(job, folder, history)) if diagnose and not session.safety.interrupted else {}
-    safety, log, starter = session.safety, session.log, session.starter
+    safety, starter = session.safety, session.starter
     outcome = Outcome(
         job=job, folder=folder, checks=checks, skipped=skipped, events=session.journal.events, aborted=safety.aborted,
         safe=safety.is_safe, interrupted=safety.interrupted, fdi=diagnosis, attribution=attribution,
         timing=summarise_timing(history, loop, scheduled, kind, reason), counters=_count_lost_frames(history),
-        speed=len(history) * job.period_ns * 1e-9 / spent, due_ns=tuple(log.due_ns), start_times=starter.start_times,
+        speed=len(history) * job.period_ns * 1e-9 / spent, start_times=starter.start_times,
         identities=starter.identities, metrology=metrology, started_ns=started_ns,
         limits=find_limits(history.column, job.model, job.scenario.plan.start))
     fdi, cause = outcome.fdi, attribution.cause
