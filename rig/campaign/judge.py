@@ -240,13 +240,12 @@ def parse_faults(words: Sequence[str]) -> list[dict[str, Any]]:
     for word in words:
         block = {}
         for part in word.split("/") if word != HEALTHY else []:
-            name, equals, values = part.partition("=")
+            name, _, values = part.partition("=")
             try:
                 block[name.strip()] = [float(value) for value in values.split(",")]
             except ValueError:
                 raise InputError("--fault", word, "healthy, EFFECT=SIZE,SIZE.., or several of these with / between"
                                  ) from None
-            require(equals, "--fault", word, "EFFECT=SIZE")
         blocks.append(block)
     return blocks
 

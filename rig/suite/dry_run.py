@@ -38,10 +38,8 @@ from rig.sequences.faults import (
     Offset,
     Parameter,
     Reset,
-    Schedule,
     Short,
     Stuck,
-    require_sensible,
 )
 
 OF_EVENTS = ("response_within", "shut_off", "recovers", "event_occurs", "event_never")  # without a bus no events
@@ -238,16 +236,11 @@ def plan_faults(job: Job) -> list[PlannedFault]:
     Raises:
         InputError: values that contradict other parameters of the job's model.
     """
-    plan = job.sequence.plan(job.seed)
-    if not plan.faults:
-        return []
-    changed = {fault.parameter.partition(".")[0] for fault in plan.faults if isinstance(fault, Parameter)}
-    model = job.model.with_effects(changed)
-    schedule = Schedule(plan, model.values)
-    require_sensible(plan, model)
+    model, plan = job.scenario.model, job.scenario.plan
+    edges = job.scenario.make_schedule().edges
     return [PlannedFault(fault.label, fault.kind, name_target(fault), (begin.cycle - plan.start) / plan.rate,
                          (end.cycle - plan.start) / plan.rate, describe_size(fault, model.values, model.kind))
-            for fault, begin, end in zip(plan.faults, schedule.edges[::2], schedule.edges[1::2], strict=True)]
+            for fault, begin, end in zip(plan.faults, edges[::2], edges[1::2], strict=True)]
 
 
 def name_target(fault: Fault) -> str:
