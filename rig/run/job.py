@@ -378,38 +378,24 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     return replace_settings(job, pace=choice.pace, max_overruns=choice.max_overruns)
 
 
-class Differences(NamedTuple):
-    """What differs from the nominal unit in a test without faults."""
+def find_differences(job: Job) -> dict[str, Any]:
+    """What of a job differs from the nominal test: the entry `differences` of verdict.json.
 
-    model: str  # its name, if it is not the nominal model; else ""
-    parameters: dict[str, float]  # SI, those that are not nominal, and all of the model's effects
-    effects: tuple[str, ...]  # of the model
-    effect_files: tuple[str, ...]  # the user's own
-    faults: tuple[str, ...]  # of the sequence, with their times
-    plant: str = "eha"  # whose parameters they are
-
-    def describe(self) -> str:
-        """All differences in one line; "nothing" if there are none."""
-        return "; ".join([
-            *([f"model {self.model}"] if self.model else []),
-            *(f"{name} = {find_quantity(name, plant=self.plant).describe(value)}"
-              for name, value in self.parameters.items()),
-            *(f"effect {name}" for name in self.effects if not any(key.startswith(f"{name}.")
-                                                                   for key in self.parameters)),
-            *(f"effects of {name}" for name in self.effect_files), *(f"fault {text}" for text in self.faults),
-        ]) or "nothing"
-
-    def to_json(self) -> dict[str, Any]:
-        """The entry `differences` of verdict.json."""
-        return {**{key: value for key, value in self._asdict().items() if key != "plant"}, "text": self.describe()}
-
-
-def find_differences(job: Job) -> Differences:
-    """What of a job differs from the nominal test."""
+    `parameters`, SI, are those that are not nominal, and all of the model's effects. `text` has all in one line; it is
+    "nothing" if there are none.
+    """
     model = job.model
-    faults = tuple(f"{fault.label!r} from {fault.start:g} s" + ("" if fault.end is None else f" to {fault.end:g} s")
-                   for fault in job.sequence.faults)
     is_usual = model.name == "eha" or Path(model.name).name == Path(job.bench.plant).name
-    return Differences(model="" if is_usual else model.name, parameters=model.list_changes(),
-                       effects=tuple(model.effects), effect_files=tuple(path.name for path in job.effects),
-                       faults=faults, plant=model.plant)
+    name = "" if is_usual else model.name
+    parameters = model.list_changes()
+    files = [path.name for path in job.effects]
+    faults = [f"{fault.label!r} from {fault.start:g} s" + ("" if fault.end is None else f" to {fault.end:g} s")
+              for fault in job.sequence.faults]
+    changed = {parameter.partition(".")[0] for parameter in parameters}
+    words = [*([f"model {name}"] if name else []),
+             *(f"{parameter} = {find_quantity(parameter, plant=model.plant).describe(value)}"
+               for parameter, value in parameters.items()),
+             *(f"effect {effect}" for effect in model.effects if effect not in changed),
+             *(f"effects of {file}" for file in files), *(f"fault {text}" for text in faults)]
+    return {"model": name, "parameters": parameters, "effects": [*model.effects], "effect_files": files,
+            "faults": faults, "text": "; ".join(words) or "nothing"}

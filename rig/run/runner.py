@@ -232,7 +232,7 @@ class Outcome:
                 "checks": [to_plain(check.collect_data()) for check in self.checks],
                 "not_applicable": [check._asdict() for check in self.skipped],
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
-                **self._attribution_to_json(), "differences": find_differences(self.job).to_json(),
+                **self._attribution_to_json(), "differences": find_differences(self.job),
                 "decision": self.metrology.decision, "calibration": {
                     name: each.to_json(self.started_ns) for name, each in self.metrology.calibration.items()},
                 "limits": [limit._asdict() for limit in self.limits],
@@ -467,7 +467,7 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     fdi, cause = outcome.fdi, attribution.cause
     notes: dict[str, dict[str, str]] = {
         "not_applicable": {check.name: check.reason for check in skipped},
-        "differences": {"text": find_differences(job).describe()},
+        "differences": {"text": find_differences(job)["text"]},
         "metrology": {"decision": metrology.decision, **{
             name: each.describe() for name, each in metrology.calibration.items()}} if metrology.is_used else {},
         "limits": {f"{number:02d}": limit.describe(job.model.kind.signals)

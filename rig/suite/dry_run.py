@@ -369,7 +369,7 @@ def collect_data(dry: DryRun) -> dict[str, Any]:
     return {
         "verdict": "BEYOND_LIMITS" if dry.problems else "WITHIN_LIMITS", "problems": dry.problems,
         "sequence": dry.job.sequence.title, "model": dry.job.model.name,
-        "differences": find_differences(dry.job).describe(), "durations": dry.durations,
+        "differences": find_differences(dry.job)["text"], "durations": dry.durations,
         "faults": [{**each._asdict(), "duration": each.duration} for each in dry.faults],
         "demands": [{key: value for key, value in each._asdict().items() if key != "shown"}
                     | {"violated": each.is_violated} for each in dry.demands],

@@ -317,7 +317,7 @@ def play_case(case: Case) -> CaseResult:
 def make_result(case: Case, outcome: Outcome, seconds: float) -> CaseResult:
     """The result of a case from the outcome of its run, which took `seconds`."""
     return CaseResult(case, outcome.verdict, outcome.why, seconds, tuple(outcome.checks),
-                      find_differences(outcome.job).describe(), outcome.fdi, tuple(outcome.skipped))
+                      find_differences(outcome.job)["text"], outcome.fdi, tuple(outcome.skipped))
 
 
 @contextlib.contextmanager

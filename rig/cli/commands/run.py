@@ -137,7 +137,7 @@ def add_outcome(report: Report, outcome: Outcome) -> Report:
     pace = (f"{cycles}, {count_nouns(timing['overruns'], 'overrun')}; lateness p50 {late['p50']:g}, "
             f"p99 {late['p99']:g}, max {late['max']:g} us ({timing['kind']}, {timing['scheduler']})"
             if outcome.job.realtime else f"{cycles} in lockstep, {outcome.speed:.1f} times real time")
-    differences = find_differences(outcome.job).describe()
+    differences = find_differences(outcome.job)["text"]
     texts = {
         "timing": pace,
         "real time": timing["reason"],
