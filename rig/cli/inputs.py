@@ -10,6 +10,7 @@ from fdi import foreign_code
 from fdi.trace.mcap_log import open_log
 from plant import InputError, Model, load_model, read_toml, require
 from plant.effects import load_effects
+from rig.run.frame_steps import find_visible_steps
 
 
 def parse_changes(pairs: Sequence[str]) -> dict[str, str]:
@@ -81,8 +82,6 @@ def change_model(model: Model, args: argparse.Namespace) -> Model:
     """
     log = find_log(args)
     if log is not None:
-        from rig.run.job import find_visible_steps  # here: commands without a log need none of it
-
         with suppress(InputError, KeyError, ValueError):  # of an older log it is not known
             step = float(open_log(log / "trace.mcap" if log.is_dir() else log).metadata["run"]["resolution"])
             args.set = [*(f"{name}={value:g}" for name, value in find_visible_steps(model, step).items()), *args.set]

@@ -216,17 +216,6 @@ def load_plant_of_log(path: Path, *, is_trusted: bool = False, announce: Announc
     return _load_stored_plant(codes, named)
 
 
-def find_visible_steps(model: Model, resolution: float) -> dict[str, float]:
-    """The change that gives a model the steps in which frames carry the position, SI, where its noise shows them.
-
-    They come from the bench and are no effect that the model lacks.
-    """
-    offered = {effect.name for effect in model.kind.list_effects()}
-    noise = model.nominal.get(model.kind.signals.controlled.noise, 0.0)
-    is_visible = "quantisation" in offered - {*model.effects} and resolution > 0.5 * noise
-    return {"quantisation.lsb": resolution} if is_visible else {}
-
-
 def _load_stored_plant(codes: list[ForeignCode], named: str, *, keeps_name: bool = False) -> str:
     """Load the plant that a log calls so, from the files in it; what models call it from now on.
 

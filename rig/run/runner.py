@@ -37,7 +37,8 @@ from rig.recorder import Observer, Recorder
 from rig.recorder.schema import collect_provenance, read_epoch_ns
 from rig.run.attribution import Attribution, Cause, CycleRecords, attribute, count_most_in_a_row, find_injected
 from rig.run.bring_up import compile_loop
-from rig.run.job import Job, find_differences, find_visible_steps
+from rig.run.frame_steps import find_visible_steps
+from rig.run.job import Job, find_differences
 from rig.run.loop import History, Loop
 from rig.run.participants import open_participants
 from rig.run.priority import (
