@@ -15,9 +15,9 @@ from fdi.discovery import explain
 from fdi.discovery.residual_pattern import find_pattern
 from fdi.discovery.runs import read_runs
 from fdi.discovery.update_model import load_model_file
-from fdi.estimation.replay import compute_residuals, prepare_trace, replay_current
-from fdi.report import explain_report
-from fdi.report.drawing import AFTER, BEFORE, GREEN, STYLE, shorten_svg, to_svg
+from fdi.estimation import compute_residuals, prepare_trace, replay_current
+from fdi.report import GREEN, explain_report
+from fdi.report.drawing import AFTER, BEFORE, STYLE, shorten_svg, to_svg
 from plant import Model
 from plant.effects import load_effects
 

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from fdi.foreign_code import load_effects_of_model, load_plant_of_model
 from fdi.output import write_text
-from fdi.report.drawing import Drawing, convert_figure, save_drawing
-from fdi.report.report import Figure, Medium, Report, render_html, to_plain
-from fdi.trace.trace import Trace
+from fdi.report import Drawing, Figure, Medium, Report, convert_figure, render_html, save_drawing, to_plain
+from fdi.trace import Trace
 from plant import InputError, Model, load_model
 
 if TYPE_CHECKING:
@@ -129,7 +128,7 @@ class Result:
 
     def to_text(self, width: int = 100) -> str:
         """The report as the terminal shows it, without colours; `width` in characters."""
-        from fdi.report.terminal import format_report
+        from fdi.report import format_report
 
         return format_report(self.report, width)
 
@@ -243,7 +242,7 @@ def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
         InputError: a trace, a model or a signal that cannot be used.
     """
     from fdi.comparison.compare import compare as compare_trace
-    from fdi.report.compare_report import build_comparison_report
+    from fdi.report import build_comparison_report
 
     own_model = _load_model(model, trust)
     measured = _load_trace(trace, own_model)
@@ -271,7 +270,7 @@ def explain(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
         InputError: a trace, a model or a signal that cannot be used.
     """
     from fdi.discovery.explain_runs import explain_runs
-    from fdi.report.explain_report import build_explanation_report
+    from fdi.report import build_explanation_report
 
     own_model = _load_model(model, trust)
     runs = _collect_runs(own_model, trace, repeats, holdout, signals)
@@ -298,7 +297,7 @@ def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPa
         InputError: an effect that this model cannot take, or runs that cannot be used.
     """
     from fdi.discovery.update_model import add_effects, remove_all_effects
-    from fdi.report.explain_report import build_model_report
+    from fdi.report import build_model_report
 
     effects = [effect] if isinstance(effect, str) else list(effect)
     own_model, known = _load_model_file(model, trust)
@@ -331,7 +330,7 @@ def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eh
         read_free_parameters,
         read_identification_runs,
     )
-    from fdi.report.identify_report import build_identification_report
+    from fdi.report import build_identification_report
 
     own_model = _load_model(model, trust)
     source = None if isinstance(model, Model) else model
@@ -360,7 +359,7 @@ def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Pat
     from fdi.diagnosis.bands import load_bands
     from fdi.diagnosis.diagnosis import diagnose as diagnose_trace
     from fdi.diagnosis.faults import choose_faults
-    from fdi.report.diagnosis_report import build_diagnosis_report
+    from fdi.report import build_diagnosis_report
 
     own_model = _load_model(model, trust)
     known_bands = None if bands is None else load_bands(bands, own_model.kind)

@@ -14,11 +14,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from rig.benches.bench import Bench, describe_identifier
-from rig.benches.bench_report import list_loads
-from rig.network import bus, udp
-from rig.network.bus import Link, LinkWire
-from rig.network.frame import Frame, WallClock
+from rig.benches import Bench, describe_identifier, list_loads
+from rig.network import Frame, Link, LinkWire, WallClock, bus, udp
 from rig.run import priority
 
 Status = Literal["ok", "limited", "missing"]

@@ -24,7 +24,7 @@ from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
-from rig.network.bus import Link, open_can
+from rig.network import Link, open_can
 from studies.robustness.disturb import find_processes
 from studies.shipped_frames import COMMAND, DRIVE, FEEDBACK, SYNC, VALVE_STATE, unpack_frame
 

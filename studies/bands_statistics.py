@@ -6,7 +6,7 @@ from fdi.diagnosis.bands import judge_position, load_default_bands
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Level
 from fdi.diagnosis.make_bands import simulate_units
 from fdi.diagnosis.precursors import format_precursor
-from fdi.trace.sections import find_sections
+from fdi.trace import find_sections
 from plant import load_model
 from rig.sequences import load_sequence
 

@@ -18,11 +18,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 from plant import InputError
-from rig.benches.bench import Role, decode_device_text, pack, unpack
-from rig.benches.bench_file import load_bench, load_bench_from_files
-from rig.benches.bench_report import list_loads
-from rig.benches.guess import Wanted, guess_can, guess_canopen
-from rig.benches.packing import make_layout
+from rig.benches import (
+    Role,
+    Wanted,
+    decode_device_text,
+    guess_can,
+    guess_canopen,
+    list_loads,
+    load_bench,
+    load_bench_from_files,
+    make_layout,
+    pack,
+    unpack,
+)
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 NUMBERS = ("0", "1", "-1", "7", "8", "64", "65", "127", "128", "255", "256", "0xFFFFFFFF", "0x80000000", "0x20000000",

@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi.progress import Progress, ignore_progress
-from fdi.report.report import Cell as TableCell, Column, Medium, Mood, Report, Section, Table
-from fdi.trace.mcap_log import open_log
-from fdi.trace.trace import Trace
+from fdi.report import Cell as TableCell, Column, Medium, Mood, Report, Section, Table
+from fdi.trace import Trace, open_log
 from plant import load_model
 from rig.run.job import Job
 from rig.run.runner import Outcome, run_job

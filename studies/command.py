@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from fdi.report.report import Report
+from fdi.report import Report
 from plant import RigError
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
 from rig.cli.answer import Places, choose_file, give_answer

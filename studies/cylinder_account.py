@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.estimation.replay import measure_drift, prepare_trace, replay_current
+from fdi.estimation import measure_drift, prepare_trace, replay_current
 from fdi.foreign_code import load_plant_of_model
-from fdi.report.report import Column, Report, Section, tabulate
+from fdi.report import Column, Report, Section, tabulate
+from fdi.trace import Trace, rms
 from fdi.trace.importing.conversion import import_measurement, read_map
 from fdi.trace.importing.formats import open_measurement
-from fdi.trace.trace import Trace, rms
 from plant import InputError, Model, load_model
 from studies.command import run_study_command
 

@@ -23,14 +23,12 @@ from fdi.diagnosis.refine import (
     make_start,
     refine_sizes,
 )
-from fdi.estimation.fit import compute_misfit
+from fdi.estimation import compute_misfit
 from fdi.progress import Progress, ignore_progress
-from fdi.report.numbers import NO_NUMBER, format_digits
-from fdi.report.report import Column, Report, Section, Table
-from fdi.trace.sections import find_sections
-from fdi.trace.trace import Trace, hold_last
+from fdi.report import NO_NUMBER, Column, Report, Section, Table, format_digits
+from fdi.trace import Trace, find_sections, hold_last
 from plant import InputError, Model, load_model
-from rig.network.frame import WallClock
+from rig.network import WallClock
 from studies.command import report_progress, run_study_command
 from studies.hidden_effects.cases import measure_rms
 

@@ -19,9 +19,9 @@ import numpy as np
 
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Level, classify_size
-from fdi.estimation.binomial import measure_share
+from fdi.estimation import measure_share
 from fdi.sources import hash_sources
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import count_threads, load_model
 from rig.campaign.batch import BatchProgress, Row
 from studies.command import run_cases

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.binomial import measure_share
+from fdi.estimation import measure_share
 from fdi.identification.identify import identify_model, read_free_parameters, read_identification_runs
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import RATE, load_model
 from rig.campaign.judge import FLOORS
 from studies.hidden_effects import command

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from fdi.diagnosis.make_bands import sample_sensor_noise
-from fdi.estimation.fit import list_tolerance_sizes
+from fdi.estimation import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
-from fdi.report.report import Column, Report, Section, tabulate
-from fdi.trace.trace import Floats, Trace
+from fdi.report import Column, Report, Section, tabulate
+from fdi.trace import Floats, Trace
 from plant import EHA, InputError, Lanes, Model
 from rig.sequences import load_sequence
 from studies.command import report_progress, run_study_command

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from fdi.diagnosis.bands import Bands, Excursion, StepBand, place_sections
-from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, thin_line, to_svg
-from fdi.trace.sections import Section
-from fdi.trace.trace import Trace
+from fdi.report import COMMAND, GREEN, INK, RED
+from fdi.report.drawing import STYLE, thin_line, to_svg
+from fdi.trace import Section, Trace
 
 Floats = NDArray[np.float64]
 COLOURS = ("#2b8a3e", "#d9730d", "#c93c37", "#1f6feb", "#8250df")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Fault
 from fdi.prognosis.trend import fit_trend
 from fdi.progress import Progress
-from fdi.report.report import Column, Line, Report, Section, Table, to_plain
+from fdi.report import Column, Line, Report, Section, Table, to_plain
 from fdi.thresholds import INTERVAL_95_SD, TREND_FEWEST_TRACES
 from plant import RigError
 from rig.campaign.batch import Workers, run_jobs

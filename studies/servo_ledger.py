@@ -19,11 +19,12 @@ from scipy.optimize import least_squares
 
 from fdi.discovery.runs import read_source
 from fdi.discovery.update_model import Provenance, Row, format_model_file
+from fdi.estimation import compute_residuals, prepare_trace, replay_current, replay_lanes
 from fdi.estimation.fit import silence_sensors
-from fdi.estimation.replay import compute_residuals, prepare_trace, replay_current, replay_lanes
-from fdi.report.drawing import COMMAND, GREEN, choose_drawn_unit, shorten_svg, start_figure, to_svg
+from fdi.report import COMMAND, GREEN, choose_drawn_unit
+from fdi.report.drawing import shorten_svg, start_figure, to_svg
 from fdi.sources import name_software
-from fdi.trace.trace import Trace, rms
+from fdi.trace import Trace, rms
 from plant import Lanes, Model, load_model
 
 Floats = NDArray[np.float64]

@@ -2,8 +2,7 @@
 
 from collections.abc import Mapping
 
-from rig.benches.bench import pack, unpack
-from rig.benches.bench_file import load_bench
+from rig.benches import load_bench, pack, unpack
 
 _FRAMES = load_bench().frames
 _SPECS = {spec.identifier: spec for spec in _FRAMES.frames}

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi.diagnosis.faults import Fault, Level, choose_faults, classify_size
-from fdi.estimation.binomial import Share, measure_share
+from fdi.estimation import Share, measure_share
 from fdi.foreign_code import load_plant_of_model
 from plant import Model, load_model
 from rig.campaign.batch import Row, Workers

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from rig_command import rig
 
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant.effects import CATALOGUE
 
 MY_EFFECT = '''

@@ -12,7 +12,7 @@ from markdown_text import MADE, escape_markup, make_table, quote_code
 
 from plant import Model, Segment, tables
 from rig.cli.commands import list as list_command
-from rig.network.node_objects import Identity
+from rig.network import Identity
 from rig.sequences import faults
 from rig.sequences.checks import KEYS, KINDS, Check, Guard
 from rig.sequences.protocol import ProtocolLimits

@@ -17,20 +17,22 @@ from fdi.comparison.residuals import (
     find_condition,
     locate_error,
 )
-from fdi.estimation.fit import list_tolerance_sizes
-from fdi.estimation.noise import Floor, describe_doubtful_repeats, find_floors, sensor_floors
-from fdi.estimation.replay import (
+from fdi.estimation import (
     Columns,
+    Floor,
     Replay,
     Scatter,
     answer_readings,
     compute_residuals,
+    describe_doubtful_repeats,
     extend_until_noise,
     find_controller_gain,
+    find_floors,
     find_repeat,
     fit_scatter,
     has_controller_memory,
     leave_out_rest,
+    list_tolerance_sizes,
     match_period,
     measure_drift,
     measure_misfit,
@@ -39,6 +41,7 @@ from fdi.estimation.replay import (
     replay_command,
     replay_current,
     replay_with_checked_steps,
+    sensor_floors,
 )
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
@@ -56,8 +59,7 @@ from fdi.thresholds import (
     SOLVER_HIDES_RATIO,
     UNDECIDED_SHARE,
 )
-from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
-from fdi.trace.trace import Flags, Floats, Trace, hold_last, rms, shift_rows
+from fdi.trace import Flags, Floats, Trace, find_comb, hold_last, is_rounding_left, measure_resolution, rms, shift_rows
 from plant import Model, Signal, compute_needed_drive, count_nouns
 
 CUT_OFF = 0.2  # of half the rate of rows

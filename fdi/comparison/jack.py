@@ -9,10 +9,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.estimation.noise import Floor, find_floors, floor_from_data, simulate_reading_noise
-from fdi.estimation.replay import BRIDGED_ROWS, Columns, differentiate, extend_flags, replay_current
+from fdi.estimation import (
+    BRIDGED_ROWS,
+    Columns,
+    Floor,
+    differentiate,
+    extend_flags,
+    find_floors,
+    floor_from_data,
+    replay_current,
+    simulate_reading_noise,
+)
 from fdi.thresholds import BLOCK_EXCESS_LEAST, NOISY_SENSOR_RATIO, SHAPE_TIE_GAIN, SPOOL_FITS_RATIO
-from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, rms
+from fdi.trace import Flags, Floats, Trace, bridge_gaps, rms
 from plant import Model, compute_flow_balance, compute_force_balance
 
 XJ, P12, XS = "xj", "p12", "xs"

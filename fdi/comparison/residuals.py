@@ -16,10 +16,9 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.special import kolmogi, ndtri
 
-from fdi.estimation.replay import Columns, differentiate
+from fdi.estimation import Columns, differentiate
 from fdi.thresholds import CONDITION_DENSITY, CONDITION_EXCESS_LEAST, CONDITION_SHARE, RESIDUAL_TEST_CONFIDENCE
-from fdi.trace.sections import describe_section
-from fdi.trace.trace import Flags, Floats, Trace, fill_gaps, hold_last
+from fdi.trace import Flags, Floats, Trace, describe_section, fill_gaps, hold_last
 from plant import Signal, Signals
 
 SMOOTH = 0.021  # s of measured position that a speed is taken from

@@ -13,10 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.estimation.noise import floor_from_data
+from fdi.estimation import floor_from_data
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
-from fdi.trace.check_result import CheckResult
-from fdi.trace.trace import Flags, Floats, Trace, rms
+from fdi.trace import CheckResult, Flags, Floats, Trace, rms
 from plant import Signal, count_nouns, require
 
 SAME_COMMAND = 1.5e-7  # m, times `Trace.scale`; the bus carries steps of 1e-7 m

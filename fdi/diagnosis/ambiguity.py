@@ -19,9 +19,9 @@ from scipy.special import chdtrc, chdtri
 
 from fdi.diagnosis.faults import Estimate, Level, widen_for_many
 from fdi.diagnosis.refine import Refinement, place_value
-from fdi.estimation.fit import scaled_bounds
+from fdi.estimation import scaled_bounds
 from fdi.thresholds import GROUP_CORRELATION, INTERVAL_95_SD, SUSPECT_HEALTHY_TOLERANCES
-from fdi.trace.trace import Floats
+from fdi.trace import Floats
 
 Group = tuple[str, ...]  # names of faults of which at least one has grown, and may have reached MidBand
 

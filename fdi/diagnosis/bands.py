@@ -33,7 +33,7 @@ from fdi.diagnosis.precursors import (
     read_columns,
     select_ramp_rows,
 )
-from fdi.estimation.replay import is_friction
+from fdi.estimation import is_friction
 from fdi.thresholds import (
     BAND_FAULT_CLEARANCE_SD,
     BAND_LARGEST_LOAD,
@@ -43,8 +43,7 @@ from fdi.thresholds import (
     SAME_COMMAND_TIME,
     SECTION_MEASURED_SHARE,
 )
-from fdi.trace.sections import Section, describe_section, find_sections
-from fdi.trace.trace import Flags, Floats, Trace
+from fdi.trace import Flags, Floats, Section, Trace, describe_section, find_sections
 from plant import (
     InputError,
     Model,

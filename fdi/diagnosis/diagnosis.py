@@ -39,10 +39,16 @@ from fdi.diagnosis.refine import (
     refine_sizes,
 )
 from fdi.diagnosis.rms_grid import Grid, search_grid
-from fdi.estimation.fit import list_relative_tolerances
-from fdi.estimation.long_recordings import cut_excerpt, is_long
-from fdi.estimation.noise import sensor_floors
-from fdi.estimation.replay import SAME_PERIOD, leave_out_rest, match_period, prepare_trace
+from fdi.estimation import (
+    SAME_PERIOD,
+    cut_excerpt,
+    is_long,
+    leave_out_rest,
+    list_relative_tolerances,
+    match_period,
+    prepare_trace,
+    sensor_floors,
+)
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     MOVING_RAM,
@@ -52,7 +58,7 @@ from fdi.thresholds import (
     SUSPECT_SMALLEST,
     UNIT_TOLERANCE,
 )
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import InputError, Model, load_model
 
 

@@ -37,7 +37,7 @@ from fdi.diagnosis.precursors import (
     measure_step,
     read_columns,
 )
-from fdi.estimation.fit import limit_dynamic_friction, list_tolerance_sizes
+from fdi.estimation import limit_dynamic_friction, list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
 from fdi.sources import name_software
 from fdi.thresholds import (
@@ -52,8 +52,7 @@ from fdi.thresholds import (
     RAMP_HEALTHY_SHARE,
     STEP_FAULT_LEAVES_SD,
 )
-from fdi.trace.sections import Section, find_sections
-from fdi.trace.trace import Floats, Trace, fill_gaps, measure_scale
+from fdi.trace import Floats, Section, Trace, fill_gaps, find_sections, measure_scale
 from plant import NARROW, Lanes, Model, count_nouns, count_threads, load_model, require
 
 FRICTION_AMOUNTS = (2, 5, 10, 14)  # sevenths of MaxBand, beside both limits

@@ -13,9 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.thresholds import BAND_EVENT_SAMPLES, POSITION_MISSING_SHARE
-from fdi.trace.check_result import compute_speed, filter_median
-from fdi.trace.sections import Section, find_sections
-from fdi.trace.trace import Flags, Floats, Trace, fill_gaps, hold_last
+from fdi.trace import Flags, Floats, Section, Trace, compute_speed, fill_gaps, filter_median, find_sections, hold_last
 
 STEP_JUDGED_FROM = 0.004  # s; the command has to come through a cycle of the bus and the pilot stage
 STEP_JUDGED_UNTIL = 0.1  # s after a step at least; later the EHA only sticks and slips, which ramps show better

@@ -27,52 +27,50 @@ from fdi.diagnosis.faults import CLOGGING, FAULTS, Estimate, Fault, Level, compu
 from fdi.discovery.explain import drop_duplicates, find_marks, sort_by_cost, takes_fair_share
 from fdi.discovery.explain_runs import list_fitted_parameters
 from fdi.discovery.search import Hypothesis, Prospect, list_compatible_effects, scan_effects
-from fdi.estimation import noise as noises
-from fdi.estimation.fit import (
-    UNREPLAYED,
-    Fit,
-    Free,
-    Problem,
-    Value,
-    complete_model,
-    compute_misfit,
-    compute_typical_rms,
-    compute_weights,
-    list_all_unknowns,
-    list_effect_unknowns,
-    replay_fit,
-    scale_noise,
-    scaled_bounds,
-    silence_readings,
-    span_all_rows,
-)
-from fdi.estimation.long_recordings import Excerpt, choose_excerpt, judge_on_all
-from fdi.estimation.replay import (
-    find_undecided_rows,
-    find_unpredictable_rows,
-    guess_anchor_noise,
-    is_friction,
-    leave_out_rows,
-    measure_decided_errors,
-)
-from fdi.estimation.unidentifiable import (
+from fdi.estimation import (
     FLAPPER,
     ORIGINS,
     POWERS,
+    UNREPLAYED,
+    Excerpt,
+    Fit,
+    Free,
     LogFree,
     LogFrictionRatio,
     LogOpenFilter,
     LogProblem,
     PowerFree,
+    Problem,
+    Value,
+    choose_excerpt,
+    complete_model,
+    compute_misfit,
+    compute_typical_rms,
+    compute_weights,
     descend,
     descend_valley,
     estimate_smooth_covariance,
     find_flat_directions,
+    find_undecided_rows,
+    find_unpredictable_rows,
     get_power,
+    guess_anchor_noise,
     guess_covariance,
+    is_friction,
+    judge_on_all,
+    leave_out_rows,
     linearise_across,
+    list_all_unknowns,
     list_directions_of_faults,
+    list_effect_unknowns,
+    measure_decided_errors,
+    noise as noises,
+    replay_fit,
+    scale_noise,
+    scaled_bounds,
     search_widely,
+    silence_readings,
+    span_all_rows,
     start_fit,
     take_logarithm,
 )
@@ -97,7 +95,7 @@ from fdi.thresholds import (
     UNIT_TOLERANCE,
     WEIGHT_COUNTS,
 )
-from fdi.trace.trace import Floats, Trace
+from fdi.trace import Floats, Trace
 from plant import Model, ensure_starts, find_quantity, list_searched_effects, map_in_threads, require
 from plant.effects import CATALOGUE
 from plant.threads import R, T

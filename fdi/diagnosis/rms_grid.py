@@ -15,10 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.diagnosis.faults import FAULTS, Fault
-from fdi.estimation.fit import silence_readings
-from fdi.estimation.replay import read_cycles, replay_lanes
+from fdi.estimation import read_cycles, replay_lanes, silence_readings
 from fdi.thresholds import ANCHOR_RATE
-from fdi.trace.trace import Flags, Floats, Trace
+from fdi.trace import Flags, Floats, Trace
 from plant import FAULTS as MONITORED, Lanes, Model, Monitor, require
 
 CELLS = 21  # along each axis

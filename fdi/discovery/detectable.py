@@ -20,11 +20,21 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from fdi.discovery.search import Hypothesis, Search
-from fdi.estimation.fit import Fit, Problem, compute_misfit, compute_weights, fit_unknowns, scaled_bounds, weigh_priors
-from fdi.estimation.replay import simulate_trace
-from fdi.estimation.unidentifiable import VISCOSITY, list_powers, scale_together
+from fdi.estimation import (
+    VISCOSITY,
+    Fit,
+    Problem,
+    compute_misfit,
+    compute_weights,
+    fit_unknowns,
+    list_powers,
+    scale_together,
+    scaled_bounds,
+    simulate_trace,
+    weigh_priors,
+)
 from fdi.thresholds import GAIN_DETECTED, MISFIT_DISCRIMINATES
-from fdi.trace.trace import Floats, Trace
+from fdi.trace import Floats, Trace
 from plant import Lanes, Model, map_in_threads
 
 FITTED_STEPS, SIMULATED_STEPS = 10, 13  # a cycle: of the fit, and of the run that stands for the measurement

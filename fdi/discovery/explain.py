@@ -46,13 +46,16 @@ import numpy as np
 from fdi.discovery.detectable import Blind, find_hidden_effects
 from fdi.discovery.residual_pattern import is_periodic_in_position
 from fdi.discovery.search import FINE, Hypothesis, Search, Sensitivity
-from fdi.estimation.fit import Problem, compute_typical_rms, fit_unknowns, replay_fit
-from fdi.estimation.replay import (
+from fdi.estimation import (
+    Problem,
     answer_readings,
+    compute_typical_rms,
     find_controller_gain,
     find_undecided_rows,
     find_unpredictable_rows,
+    fit_unknowns,
     has_controller_memory,
+    replay_fit,
 )
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (
@@ -71,8 +74,7 @@ from fdi.thresholds import (
     RESIDUAL_HELD_OUT,
     SOLVER_ERROR_SHARE,
 )
-from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
-from fdi.trace.trace import Floats, Trace, hold_last
+from fdi.trace import Floats, Trace, find_comb, hold_last, is_rounding_left, measure_resolution
 from plant import Model, list_searched_effects
 
 NOISE_LEFT = ("NOTHING_MISSING", "NOT_RESOLVABLE", "EXPLAINED", "AMBIGUOUS")

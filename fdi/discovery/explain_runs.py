@@ -16,8 +16,18 @@ from fdi.discovery.laws.terms import write_law_file
 from fdi.discovery.residual_pattern import UNBALANCED, Pattern, can_balance, find_pattern, write_effect
 from fdi.discovery.runs import Runs
 from fdi.discovery.search import Hypothesis, choose_search_excerpt, compute_p_value
-from fdi.estimation.fit import UNREPLAYED, Fit, Value, complete_model, limit_friction_values, silence_readings
-from fdi.estimation.long_recordings import PIECE, can_be_cut, cut_excerpt, make_excerpt
+from fdi.estimation import (
+    PIECE,
+    UNREPLAYED,
+    Fit,
+    Value,
+    can_be_cut,
+    complete_model,
+    cut_excerpt,
+    limit_friction_values,
+    make_excerpt,
+    silence_readings,
+)
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     EFFECT_INTERVAL_FACTOR,

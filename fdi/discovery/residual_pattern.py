@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.discovery.search import Hypothesis, Search
-from fdi.estimation.fit import Problem
+from fdi.estimation import Problem
 from fdi.output import write_text
 from fdi.thresholds import PATTERN_EXPLAINED_SHARE, PATTERN_VISIBLE_RATIO
-from fdi.trace.trace import Flags, Floats, Trace
+from fdi.trace import Flags, Floats, Trace
 from plant import Model
 
 KNOTS = 15  # of a curve

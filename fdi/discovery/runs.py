@@ -6,18 +6,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from fdi.estimation.noise import describe_doubtful_repeats, find_floors, sensor_floors
-from fdi.estimation.replay import (
+from fdi.estimation import (
     SAME_PERIOD,
     compute_residuals,
+    describe_doubtful_repeats,
+    find_floors,
     find_repeat,
     has_same_command,
     hold_inputs,
     match_period,
     prepare_trace,
     replay_current,
+    sensor_floors,
 )
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import InputError, Model
 
 

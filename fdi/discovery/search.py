@@ -11,53 +11,53 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from fdi.estimation import noise as noises
-from fdi.estimation.fit import (
+from fdi.estimation import (
     BLOCK,
+    Excerpt,
     Fit,
     Free,
+    Judgement,
+    Noise,
     Problem,
+    choose_excerpt,
     complete_model,
     compute_misfit,
     continue_fit,
     cut_blocks,
     cut_runs,
     find_fewest_steps,
+    find_undecided_rows,
+    find_unpredictable_rows,
+    finish_fit,
     fit_unknowns,
     follow_population,
+    is_long,
+    judge_on_all,
+    leave_out_rest,
+    leave_out_rows,
     linearise,
     list_all_unknowns,
+    list_directions,
     list_effect_unknowns,
+    list_powers,
+    measure_decided_errors,
     name_sine,
+    noise as noises,
     place_in_healthy_unit,
     replay_fit,
     scale_noise,
+    scale_to,
+    scale_together,
     scaled_bounds,
     silence_readings,
     span_all_rows,
+    start_fit,
     sum_blocks,
+    take_curved_step,
+    take_steps,
     turn_amplitudes_positive,
     weigh_blocks,
     weigh_priors,
-)
-from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, is_long, judge_on_all
-from fdi.estimation.noise import Noise
-from fdi.estimation.replay import (
-    find_undecided_rows,
-    find_unpredictable_rows,
-    leave_out_rest,
-    leave_out_rows,
-    measure_decided_errors,
-)
-from fdi.estimation.unidentifiable import (
-    finish_fit,
-    list_directions,
-    list_powers,
-    scale_to,
-    scale_together,
-    start_fit,
-    take_curved_step,
-    take_steps,
 )
 from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import (
@@ -73,7 +73,7 @@ from fdi.thresholds import (
     SOLVER_ERROR_SHARE,
     WHITE_SQUARE_POOR,
 )
-from fdi.trace.trace import Flags, Floats, Trace
+from fdi.trace import Flags, Floats, Trace
 from plant import Model, Part, count_threads, map_together
 from plant.threads import R, T
 

@@ -23,11 +23,9 @@ import numpy as np
 from fdi.discovery.detectable import Direction, VirtualTest, list_directions, move_effect
 from fdi.discovery.explain_runs import Answer, explain_recording, prepare_effects
 from fdi.discovery.runs import Runs, read_runs
-from fdi.estimation.binomial import Share, measure_share
-from fdi.estimation.fit import limit_friction_values
-from fdi.estimation.noise import Noise
+from fdi.estimation import Noise, Share, limit_friction_values, measure_share
 from fdi.thresholds import GAIN_DETECTED
-from fdi.trace.trace import Floats, Trace
+from fdi.trace import Floats, Trace
 from plant import InputError, Lanes, Model, load_plant, simulate
 from plant.effects import load_effects
 

@@ -12,11 +12,14 @@ from fdi.discovery.explain import find_marks, measure_gain
 from fdi.discovery.explain_runs import Suspicious, lean_model, list_fitted_parameters, list_suspicious, prepare_effects
 from fdi.discovery.runs import Runs, Source, read_runs, read_source
 from fdi.discovery.search import Hypothesis, Prospect, Search, choose_search_excerpt, scan_effects
-from fdi.estimation.fit import (
+from fdi.estimation import (
     UNREPLAYED,
     Fit,
     Value,
+    can_be_cut,
     continue_fit,
+    cut_excerpt,
+    finish_fit,
     limit_friction_values,
     linearise,
     list_active_effects,
@@ -24,13 +27,11 @@ from fdi.estimation.fit import (
     list_effect_unknowns,
     place_in_healthy_unit,
 )
-from fdi.estimation.long_recordings import can_be_cut, cut_excerpt
-from fdi.estimation.unidentifiable import finish_fit
 from fdi.output import replace_text
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.sources import name_software
 from fdi.thresholds import EFFECT_INTERVAL_FACTOR, GAIN_SEEN, INTERVAL_95_SD, WHITE_SQUARE_POOR
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import (
     InputError,
     Model,

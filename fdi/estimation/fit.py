@@ -25,7 +25,7 @@ from fdi.thresholds import (
     HEALTHY_TOLERANCES,
     TOLERANCES_FAR_SHARE,
 )
-from fdi.trace.trace import Floats, Trace
+from fdi.trace import Floats, Trace
 from plant import (
     Lanes,
     Model,

@@ -29,7 +29,7 @@ from fdi.estimation.fit import (
 from fdi.estimation.mains import remove_mains
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import ANCHOR_RATE, RESIDUAL_HELD_OUT
-from fdi.trace.trace import Flags, Floats, Trace
+from fdi.trace import Flags, Floats, Trace
 from plant import Lanes, Model, Part
 from plant.lanes import TURN
 

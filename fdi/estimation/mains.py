@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from fdi.trace.trace import Floats
+from fdi.trace import Floats
 from plant import Function, compile_function
 
 HUM = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0, 400.0)  # Hz

@@ -29,7 +29,7 @@ from fdi.thresholds import (
     NOISIER_THAN_MODEL,
     REPEAT_FLOOR_RATIO,
 )
-from fdi.trace.trace import Flags, Floats, Trace, rms
+from fdi.trace import Flags, Floats, Trace, rms
 from plant import Function, Input, Model, Signal, Signals, compile_function
 from plant.effects import combine_laws
 

@@ -43,8 +43,7 @@ from fdi.thresholds import (
     SCATTER_TOLERANCES,
     SOLVER_ERROR_SHARE,
 )
-from fdi.trace.sensor_dynamics import find_comb
-from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, fill_gaps, hold_last, hold_next, rms
+from fdi.trace import Flags, Floats, Trace, bridge_gaps, fill_gaps, find_comb, hold_last, hold_next, rms
 from plant import EHA, MODULES, InputError, Lanes, Model, compute_answers, require, rest_controller
 
 Columns = dict[str, Floats]  # by signal, (n,)

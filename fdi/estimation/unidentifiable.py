@@ -38,7 +38,7 @@ from fdi.estimation.fit import (
 )
 from fdi.progress import NO_STAGE, Stage
 from fdi.thresholds import CONVERGED_GAIN, FLAT_DIRECTION_MISFIT, PRIORS_KNOW_MORE_MISFIT
-from fdi.trace.trace import Flags, Floats
+from fdi.trace import Flags, Floats
 
 TRIED = 0.01  # of the logarithms: a way along a direction that is said to be flat
 # A stop of the spool that moves by chance can hide a flat direction in one of these trials, hardly in all four.

@@ -12,26 +12,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdi.estimation.fit import (
+from fdi.estimation import (
     Fit,
     Free,
+    LogFree,
+    LogFrictionRatio,
+    LogProblem,
     compute_misfit,
+    descend,
     evolve_fit,
     fit_unknowns,
     follow_population,
     scale_noise,
     scaled_bounds,
-)
-from fdi.estimation.unidentifiable import (
-    LogFree,
-    LogFrictionRatio,
-    LogProblem,
-    descend,
     search_widely,
     start_fit,
 )
 from fdi.progress import Progress, ignore_progress
-from fdi.trace.trace import Floats
+from fdi.trace import Floats
 from plant import map_in_threads, map_together
 
 # factor on the noise, fits that go on, rounds of each, solver steps a cycle

@@ -18,45 +18,46 @@ import numpy as np
 
 from fdi.discovery.runs import Source, read_traces, require_distinct
 from fdi.discovery.update_model import Provenance, format_model_file
-from fdi.estimation.fit import (
+from fdi.estimation import (
+    BALANCED,
     FIT_ROUNDS,
+    SAME_PERIOD,
     Fit,
     Free,
-    Problem,
-    Value,
-    compute_misfit,
-    compute_typical_rms,
-    limit_friction_values,
-    list_relative_tolerances,
-    list_tolerance_unknowns,
-    scale_noise,
-    scaled_bounds,
-    silence_readings,
-)
-from fdi.estimation.long_recordings import can_be_cut, choose_excerpt, cut_excerpt, is_long
-from fdi.estimation.noise import fit_noise, sensor_floors, white_noise
-from fdi.estimation.replay import (
-    SAME_PERIOD,
-    find_undecided_rows,
-    hold_inputs,
-    leave_out_rest,
-    leave_out_rows,
-    match_period,
-    prepare_trace,
-    simulate_trace,
-)
-from fdi.estimation.unidentifiable import (
-    BALANCED,
     LogFree,
     LogFrictionRatio,
     LogProblem,
+    Problem,
+    Value,
+    can_be_cut,
+    choose_excerpt,
+    compute_misfit,
+    compute_typical_rms,
     compute_values,
+    cut_excerpt,
     descend,
     estimate_smooth_covariance,
     find_flat_directions,
+    find_undecided_rows,
+    fit_noise,
+    hold_inputs,
+    is_long,
+    leave_out_rest,
+    leave_out_rows,
+    limit_friction_values,
+    list_relative_tolerances,
+    list_tolerance_unknowns,
+    match_period,
+    prepare_trace,
     remove_slope,
+    scale_noise,
+    scaled_bounds,
+    sensor_floors,
+    silence_readings,
+    simulate_trace,
     start_fit,
     take_logarithm,
+    white_noise,
 )
 from fdi.identification.global_fit import (
     fit_from_afar,
@@ -84,7 +85,7 @@ from fdi.thresholds import (
     RESIDUAL_WORST,
     STATIC_FRICTION_SYSTEMATIC_SD,
 )
-from fdi.trace.trace import Floats, Trace, rms
+from fdi.trace import Floats, Trace, rms
 from plant import (
     InputError,
     Lanes,

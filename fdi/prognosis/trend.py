@@ -41,7 +41,7 @@ from fdi.thresholds import (
     TREND_MOST_TRACES,
     TREND_PATHS,
 )
-from fdi.trace.trace import Flags, Floats
+from fdi.trace import Flags, Floats
 
 AHEAD = np.concatenate([[0.0], np.logspace(-2.5, np.log10(NEVER_FACTOR), 80)])  # from the last trace, in u
 

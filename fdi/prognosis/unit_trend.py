@@ -20,8 +20,7 @@ from fdi.output import write_text
 from fdi.prognosis.trend import Trend, fit_trend
 from fdi.progress import Progress
 from fdi.sources import hash_sources
-from fdi.trace.csv_table import report_unreadable
-from fdi.trace.trace import Trace
+from fdi.trace import Trace, report_unreadable
 from plant import InputError, Model, find_cache_folder, require
 
 LIMIT_NAMES = {"maintenance": "MidBand", "non_nominal": "MaxBand"}

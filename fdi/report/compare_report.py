@@ -9,7 +9,7 @@ import numpy as np
 
 from fdi.comparison.compare import Comparison, SignalError
 from fdi.comparison.residuals import Depends, ResidualTests, map_deviation
-from fdi.estimation.replay import find_controller_gain
+from fdi.estimation import find_controller_gain
 from fdi.report.drawing import (
     BLUE,
     COMMAND,

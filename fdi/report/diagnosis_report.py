@@ -23,7 +23,7 @@ from fdi.diagnosis.precursors import (
 )
 from fdi.diagnosis.refine import Beside, Explanation
 from fdi.diagnosis.rms_grid import Grid, Map, Merged, Point, find_corners
-from fdi.estimation.fit import Value
+from fdi.estimation import Value
 from fdi.report.drawing import (
     BLUE,
     COMMAND,
@@ -71,8 +71,7 @@ from fdi.report.report import (
 )
 from fdi.sources import name_software
 from fdi.thresholds import BAND_NEAREST_LIMIT_SD
-from fdi.trace.sections import Section as CommandSection, find_sections
-from fdi.trace.trace import Trace
+from fdi.trace import Section as CommandSection, Trace, find_sections
 
 LEVEL_NAMES = {Level.ACCEPTABLE: "acceptable", Level.MAINTENANCE: "maintenance", Level.NON_NOMINAL: "non-nominal",
                None: "cannot be judged"}

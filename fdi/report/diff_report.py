@@ -39,8 +39,7 @@ from fdi.report.numbers import (
 from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Report, Section, Table
 from fdi.report.run_report import read_verdict
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
-from fdi.trace.check_result import CheckResult
-from fdi.trace.trace import Trace
+from fdi.trace import CheckResult, Trace
 from plant import count_nouns
 
 Facts = dict[str, list[str]]  # the text of each run

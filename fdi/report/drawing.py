@@ -22,7 +22,7 @@ import numpy as np
 from fdi.output import write_text, write_whole
 from fdi.report.numbers import choose_unit
 from fdi.thresholds import NOISE_BAND_RATIO
-from fdi.trace.trace import Floats, Trace, rms
+from fdi.trace import Floats, Trace, rms
 from plant import InputError, Signal, Signals
 
 if TYPE_CHECKING:

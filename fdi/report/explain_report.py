@@ -17,7 +17,7 @@ from fdi.discovery.runs import Source
 from fdi.discovery.search import Hypothesis
 from fdi.discovery.sensitivity import NEEDED, RUNGS, TRIALS, Claim
 from fdi.discovery.update_model import ModelUpdate, Row
-from fdi.estimation.fit import Value
+from fdi.estimation import Value
 from fdi.report.compare_report import OTHER_ACTUATOR
 from fdi.report.drawing import (
     AFTER,
@@ -53,7 +53,7 @@ from fdi.report.numbers import (
 from fdi.report.report import Cell, Column, Figure, Line, Listing, Medium, Mood, Report, Section, Table, tabulate
 from fdi.report.run_report import list_faults
 from fdi.thresholds import RESIDUAL_FOREIGN
-from fdi.trace.trace import Floats, Trace
+from fdi.trace import Floats, Trace
 from plant import Signals
 
 BySignal = Mapping[str, float]  # SI

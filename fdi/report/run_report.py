@@ -54,8 +54,7 @@ from fdi.report.report import (
     tabulate,
     write_html,
 )
-from fdi.trace.check_result import CheckResult, compute_speed, filter_median
-from fdi.trace.trace import Event, Floats, Trace, fill_gaps
+from fdi.trace import CheckResult, Event, Floats, Trace, compute_speed, fill_gaps, filter_median
 from plant import EHA, UNITS, Signals, count_nouns
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",

@@ -23,18 +23,13 @@ import numpy as np
 from can.interfaces.udp_multicast.utils import pack_message
 
 from fdi.progress import Progress, ignore_progress
-from fdi.report.numbers import format_digits
-from fdi.report.report import Cell, Column, Item, Line, Report, Section, Table, tabulate
-from fdi.trace.trace import Floats
+from fdi.report import Cell, Column, Item, Line, Report, Section, Table, format_digits, tabulate
+from fdi.trace import Floats
 from plant import Actuator, Model, RigError, build_kernel, require, run_closed_loop, sample_noise, simulate
-from rig.benches.bench import Role
-from rig.benches.bench_file import load_bench
+from rig.benches import Role, load_bench
 from rig.firmware.build import build_device, build_program
 from rig.interrupts import end_with
-from rig.network.bus import Link, LinkWire, can_open, open_can
-from rig.network.frame import WallClock
-from rig.network.master import Master
-from rig.network.raw_bus import RawBus
+from rig.network import Link, LinkWire, Master, RawBus, WallClock, can_open, open_can
 from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.bring_up import open_loop

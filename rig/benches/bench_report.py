@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from fdi.report.report import Cell, Column, Report, Section, Table, tabulate
+from fdi.report import Cell, Column, Report, Section, Table, tabulate
 from rig.benches.bench import EXTENDED, FD, SWITCHED, Bench, FrameSpec, Guard, Role, describe_identifier
 
 HEARTBEAT = 0.1  # s, of each node of the rig

@@ -23,7 +23,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from plant import InputError, RigError, report_system_error
 from rig.interrupts import describe_exit, end_with, exit_on_signal, ignore_interrupts
-from rig.network.frame import WallClock
+from rig.network import WallClock
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

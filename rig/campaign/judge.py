@@ -23,12 +23,12 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from fdi.diagnosis.faults import FAULTS, Fault, Level
-from fdi.estimation.fit import list_relative_tolerances
+from fdi.estimation import list_relative_tolerances
 from fdi.output import write_text, write_whole
 from fdi.prognosis.unit_trend import list_traces
 from fdi.sources import hash_sources, import_function
 from fdi.thresholds import UNIT_TOLERANCE
-from fdi.trace.trace import Floats, Trace
+from fdi.trace import Floats, Trace
 from plant import (
     EHA,
     InputError,
@@ -53,7 +53,7 @@ from plant import (
     simulate,
 )
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, import_extra, read_rows, run_batch
-from rig.network.frame import WallClock
+from rig.network import WallClock
 from rig.sequences.sequence import load_nominal_test
 
 OWN_SIMULATOR = "plant"

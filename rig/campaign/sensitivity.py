@@ -19,7 +19,7 @@ from fdi.discovery.sensitivity import (
 from fdi.progress import Progress
 from fdi.sources import hash_sources
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
-from rig.network.frame import WallClock
+from rig.network import WallClock
 
 TYPICAL_RUNS = 8  # of an effect on one more rung: what is left is estimated with it
 CRASHED = "CRASHED"  # the verdict of a run whose workers died

@@ -10,20 +10,31 @@ from typing import Any
 import numpy as np
 
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Fault, Level, classify_size
-from fdi.estimation.binomial import Share, measure_share
-from fdi.report.drawing import BLUE, COMMAND, GREEN, INK, RED, Mark, axes, call, draw_panels, instant
-from fdi.report.numbers import NO_NUMBER, format_digits, format_duration
-from fdi.report.report import (
+from fdi.estimation import Share, measure_share
+from fdi.report import (
+    BLUE,
+    COMMAND,
+    GREEN,
+    INK,
+    NO_NUMBER,
+    RED,
     Cell,
     Column,
     Item,
     Line,
+    Mark,
     Medium,
     Mood,
     Paragraph,
     Report,
     Section,
     Table,
+    axes,
+    call,
+    draw_panels,
+    format_digits,
+    format_duration,
+    instant,
 )
 from plant import count_nouns
 from rig.campaign.batch import BatchProgress, Row

@@ -17,7 +17,7 @@ from plant import report_system_error, require
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fdi.report.report import Report
+    from fdi.report import Report
 
 
 class Places(NamedTuple):
@@ -117,7 +117,7 @@ def give_answer(report: Report, args: argparse.Namespace, status: int = 0, place
         if args.json:
             print(reports.to_json(report.data))
         elif not args.quiet:
-            from fdi.report.terminal import print_report
+            from fdi.report import print_report
 
             print_report(report, open_console())
     return status

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from fdi import foreign_code
-from fdi.trace.mcap_log import open_log
+from fdi.trace import open_log
 from plant import InputError, Model, load_model, read_toml, require
 from plant.effects import load_effects
 from rig.run.frame_steps import find_visible_steps

@@ -8,15 +8,14 @@ from pathlib import Path
 
 from rich.text import Text
 
-from fdi.report.report import Cell
-from fdi.report.terminal import style_of
+from fdi.report import Cell, style_of
 from plant import count_nouns, require
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, open_console
 from rig.cli.commands.run import build_choice, choose_bus_of_run, make_new_folder
 from rig.cli.inputs import is_suite_file
 from rig.evidence.requirements import read_requirements, require_listed
 from rig.interrupts import catch_signals
-from rig.network.frame import WallClock
+from rig.network import WallClock
 from rig.run.job import JobChoice
 from rig.run.participants import EMBEDDED_NAMES
 from rig.suite.suite import (

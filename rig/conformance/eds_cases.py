@@ -6,7 +6,7 @@ from itertools import combinations
 from canopen.objectdictionary import datatypes
 from canopen.objectdictionary.datatypes import UNSIGNED8, UNSIGNED16, UNSIGNED32, VISIBLE_STRING
 
-from rig.benches.canopen_map import INVALID, PARAMETERS, Pdo
+from rig.benches import INVALID, PARAMETERS, Pdo
 from rig.conformance.pdo_cases import describe_mapping, split_entry
 from rig.conformance.target import (
     HISTORY,

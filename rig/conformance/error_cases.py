@@ -4,7 +4,7 @@ from functools import partial
 from itertools import pairwise
 from statistics import fmean
 
-from rig.benches.canopen_map import Pdo
+from rig.benches import Pdo
 from rig.conformance.pdo_cases import (
     EXTENDED,
     list_received,
@@ -37,8 +37,7 @@ from rig.conformance.target import (
     require_abort,
     require_applicable,
 )
-from rig.network.frame import Frame
-from rig.network.node_objects import NmtState, name_state
+from rig.network import Frame, NmtState, name_state
 
 CONSUMER, CYCLE, BEHAVIOUR = (0x1016, 1), (0x1006, 0), (0x1029, 1)
 HEARTBEAT_LOST, SYNC_LENGTH = 0x8130, 0x8240

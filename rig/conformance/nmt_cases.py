@@ -22,7 +22,7 @@ from rig.conformance.target import (
     require,
     require_applicable,
 )
-from rig.network.node_objects import NmtCommand, NmtState, name_state
+from rig.network import NmtCommand, NmtState, name_state
 
 RESETS = (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
 QUIET = 0.2  # s: the time in which a frame that is not expected would come

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
-from rig.benches.canopen_map import INVALID, Pdo
+from rig.benches import INVALID, Pdo
 from rig.conformance.target import (
     CANNOT_MAP,
     COMMANDS,
@@ -27,7 +27,7 @@ from rig.conformance.target import (
     require_abort,
     require_applicable,
 )
-from rig.network.frame import Frame
+from rig.network import Frame
 
 EXTENDED, PRODUCER = 1 << 29, 1 << 30  # in a COB-ID: 29 bits; in that of SYNC: the node sends it
 LAST_SYNCHRONOUS = 240

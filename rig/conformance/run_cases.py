@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from fdi.progress import Progress, ignore_progress
-from fdi.report.report import Cell, Column, Line, Medium, Mood, Report, Section, Table, tabulate
+from fdi.report import Cell, Column, Line, Medium, Mood, Report, Section, Table, tabulate
 from plant import RigError, count_nouns
 from rig import junit
 from rig.conformance import eds_cases, error_cases, nmt_cases, object_cases, pdo_cases, sdo_cases

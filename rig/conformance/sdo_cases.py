@@ -25,7 +25,7 @@ from rig.conformance.target import (
     require_abort,
     require_applicable,
 )
-from rig.network.sdo_client import ABORT, HEAD, pack_segment
+from rig.network import ABORT, HEAD, pack_segment
 
 Change = tuple[str, Callable[[bytes], bytes]]  # what is done to the data of a download
 READ_TYPE = HEAD.pack(0x40, 0x1000, 0) + bytes(4)

@@ -12,12 +12,19 @@ from typing import NamedTuple, TypeVar
 from canopen.objectdictionary import ODVariable, datatypes
 
 from plant import count_nouns, read_file
-from rig.benches.bench import decode_device_text
-from rig.benches.canopen_map import INVALID, MAPPING, PARAMETERS, list_pdos, list_variables, read_dictionary
-from rig.network.bus import Wire
-from rig.network.frame import Frame
-from rig.network.node_objects import NmtCommand, NmtState, name_state
-from rig.network.sdo_client import ABORT, SdoProblem, download_object, require_confirmation, upload_object
+from rig.benches import INVALID, MAPPING, PARAMETERS, decode_device_text, list_pdos, list_variables, read_dictionary
+from rig.network import (
+    ABORT,
+    Frame,
+    NmtCommand,
+    NmtState,
+    SdoProblem,
+    Wire,
+    download_object,
+    name_state,
+    require_confirmation,
+    upload_object,
+)
 
 Item = TypeVar("Item")
 CHAPTERS = {

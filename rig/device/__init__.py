@@ -3,6 +3,6 @@ from rig.device.device import Device
 from rig.device.dictionary import Dictionary, Value
 from rig.device.emcy import EmcyCode, ErrorRegister
 from rig.device.sdo import Abort, SdoAbort
-from rig.network.node_objects import NmtCommand, NmtState
+from rig.network import NmtCommand, NmtState
 
 __all__ = ["Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value"]

@@ -3,16 +3,14 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from rig.benches.canopen_map import PARAMETERS
+from rig.benches import PARAMETERS
 from rig.device.dictionary import Dictionary, Value, check_consumer_entry, check_switchable, check_sync
 from rig.device.emcy import HISTORY, Emcy, EmcyCode, ErrorRegister
 from rig.device.nmt import Nmt
 from rig.device.pdo import Pdos
 from rig.device.sdo import Abort, SdoAbort, SdoServer, abort_unless
 from rig.device.sync import SyncConsumer
-from rig.network.frame import Frame, Send
-from rig.network.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from rig.network.node_objects import NmtState
+from rig.network import Frame, HeartbeatConsumer, HeartbeatProducer, NmtState, Send
 
 Handler = Callable[[Frame], None]
 _COMMUNICATING = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)  # states in which SDO, SYNC and EMCY exist

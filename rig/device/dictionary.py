@@ -7,8 +7,7 @@ from typing import cast
 from canopen.objectdictionary import ODVariable, datatypes
 
 from plant import read_file, require
-from rig.benches.bench import decode_device_text
-from rig.benches.canopen_map import list_variables, read_dictionary
+from rig.benches import decode_device_text, list_variables, read_dictionary
 from rig.device.sdo import Abort, SdoAbort, abort_unless
 
 Value = int | float | bytes

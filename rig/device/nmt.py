@@ -2,8 +2,7 @@
 
 from collections.abc import Callable
 
-from rig.network.frame import Frame
-from rig.network.node_objects import NmtCommand, NmtState
+from rig.network import Frame, NmtCommand, NmtState
 
 _TARGET = {
     NmtCommand.START: NmtState.OPERATIONAL,

@@ -7,11 +7,11 @@ import struct
 from collections.abc import Callable
 
 from plant import InputError, require
-from rig.benches.canopen_map import MAPPING, RPDO, TPDO
+from rig.benches import MAPPING, RPDO, TPDO
 from rig.device.dictionary import INVALID, Dictionary, check_switchable, find_struct
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
 from rig.device.sdo import Abort, abort_unless
-from rig.network.frame import Frame, Send
+from rig.network import Frame, Send
 
 _LAST_SYNCHRONOUS = 240
 _EVENT_DRIVEN = (254, 255)

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Callable
 from enum import IntEnum
 
-from rig.network.frame import Frame, Send
+from rig.network import Frame, Send
 
 _HEAD = struct.Struct("<BHB")
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(5)  # client command specifiers

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
-from rig.network.frame import Frame
+from rig.network import Frame
 
 # 0x1006 gives the period of SYNC but not when SYNC counts as lost. The bench measures the lateness of a single SYNC
 # itself; a dozen missing in a row mean that the producer is gone. The rig writes 8 ms.

@@ -8,8 +8,8 @@ from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdi.report.report import to_plain
-from fdi.trace.trace import Trace
+from fdi.report import to_plain
+from fdi.trace import Trace
 from plant import InputError, decode_text, read_file, require
 from rig.evidence.package import INDEX
 from rig.evidence.requirements import RUN, JudgedCheck, JudgedRun, Requirement

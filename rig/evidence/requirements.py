@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
-from fdi.report.report import Cell, Column, Medium, Mood, Table, tabulate
+from fdi.report import Cell, Column, Medium, Mood, Table, tabulate
 from plant import InputError, decode_text, read_file, require, suggest_name
 
 RUN = "whole run"  # the name of what verifies a requirement of a case

@@ -21,7 +21,7 @@ import can
 from can.interfaces.socketcan import SocketcanBus
 
 from plant import InputError, RigError, require
-from rig.benches.bench import EXTENDED, FD, SWITCHED
+from rig.benches import EXTENDED, FD, SWITCHED
 from rig.network.can_interface import UdpBus
 from rig.network.frame import (
     IDENTIFIER,

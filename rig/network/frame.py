@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from rig.benches.bench import EXTENDED, FD, SWITCHED
+from rig.benches import EXTENDED, FD, SWITCHED
 
 if TYPE_CHECKING:
     import can

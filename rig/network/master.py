@@ -16,10 +16,11 @@ from canopen.sdo.base import SdoVariable
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from plant import InputError, RigError
-from rig.benches.bench import Bench, Role
-from rig.benches.canopen_map import (
+from rig.benches import (
     INVALID,
     MAPPING,
+    Bench,
+    Role,
     find_variable,
     list_pdos,
     name_object,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import InputError, Quantity
-from rig.benches.bench import Role
+from rig.benches import Role
 
 RIG, CONTROLLER, PLANT = Role.RIG, Role.CONTROLLER, Role.PLANT  # of the shipped bench they are the node-IDs as well
 NAMES: dict[int, str] = {role: role.name.lower() for role in Role}

@@ -46,7 +46,7 @@ from can.interfaces.udp_multicast.utils import pack_message
 from numpy.typing import NDArray
 
 from plant import ForeignCall, RigError, bind_later, keep_apart, require
-from rig.benches.bench import EXTENDED, FD, SWITCHED
+from rig.benches import EXTENDED, FD, SWITCHED
 from rig.network import udp
 from rig.network.bus import can_open, parse_spec, require_interface
 from rig.network.frame import IDENTIFIER, has_valid_length

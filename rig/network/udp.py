@@ -21,7 +21,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from plant import RigError
-from rig.benches.bench import FD
+from rig.benches import FD
 
 GROUP, PORT = "239.74.163.2", 43113  # python-can's defaults
 _LOOPBACK = socket.inet_aton("127.0.0.1")

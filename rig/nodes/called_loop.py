@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from plant import StoredCode, compile_function, compute_fingerprint, find_cache_folder, interpret_function, keep_apart
-from rig.network.raw_bus import PAYLOAD_OUT, QUEUE_FULL, SENT, TIMEOUT, Port, to_integer
+from rig.network import PAYLOAD_OUT, QUEUE_FULL, SENT, TIMEOUT, Port, to_integer
 
 # Words of the port behind the payloads: the time, how many frames are to be sent, and these: identifier, length and 8
 # words of payload each

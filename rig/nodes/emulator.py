@@ -15,15 +15,9 @@ from functools import cache
 import numpy as np
 
 from plant import InputError, Model, StoredCode, load_model, require
-from rig.benches.bench import Bench, CanopenNode
-from rig.benches.bench_file import load_bench
-from rig.benches.canopen_map import RPDO, TPDO
-from rig.benches.packing import VALUES_AT
+from rig.benches import RPDO, TPDO, VALUES_AT, Bench, CanopenNode, load_bench
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
-from rig.network import heartbeat
-from rig.network.frame import Frame, Send
-from rig.network.node_objects import COUNTERS, PLANT, SCENARIO
-from rig.network.raw_bus import Port
+from rig.network import COUNTERS, PLANT, SCENARIO, Frame, Port, Send, heartbeat
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.called_loop import call_loop, load_loop, make_port
 from rig.nodes.plant_code import CompiledPlant, load_plant

@@ -16,22 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import ADVANCE_CALL, READ_CALL, ForeignCall, Signals, find_direct_readings, keep_apart
-from rig.benches.bench import Flags, FrameSpec, Role
-from rig.benches.packing import (
+from rig.benches import (
     FRAME_WORDS,
     FRAMES_AT,
     LENGTH,
     PAYLOAD,
     VALUES_AT,
+    Flags,
+    FrameSpec,
     Layout,
+    Role,
     make_layout,
     pack_frame,
     read_cycle_number,
     unpack_frame,
 )
-from rig.network.node_objects import RING
-from rig.network.raw_bus import (
+from rig.network import (
     FRAME,
+    RING,
     SENT,
     Port,
     await_frame,

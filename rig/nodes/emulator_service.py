@@ -16,10 +16,8 @@ from typing import Any
 import numpy as np
 
 from plant import Model, RigError, compile_function
-from rig.benches.bench import Bench
-from rig.network.frame import Send
-from rig.network.node_objects import COUNTERS, CYCLE_RECORD, RING, CycleRecord, encode_cycle_record
-from rig.network.raw_bus import RawBus, make_closed_port
+from rig.benches import Bench
+from rig.network import COUNTERS, CYCLE_RECORD, RING, CycleRecord, RawBus, Send, encode_cycle_record, make_closed_port
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator import PlantNode
 from rig.nodes.scenario import Scenario

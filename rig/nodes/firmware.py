@@ -8,12 +8,9 @@ from math import isfinite, nan
 from typing import cast
 
 from plant import Demand, Loop, Model, compute_current, interpret_function, report_law_errors
-from rig.benches.bench import Bench, Role, SignalObject, pack, unpack
-from rig.benches.bench_file import load_bench
-from rig.benches.profiles import CIA408, State
+from rig.benches import CIA408, Bench, Role, SignalObject, State, load_bench, pack, unpack
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
-from rig.network.frame import Frame, Send
-from rig.network.node_objects import CONTROLLER, GAINS, Gains
+from rig.network import CONTROLLER, GAINS, Frame, Gains, Send
 
 _RESET, _ACTIVE = CIA408.reset, CIA408.ladder[State.ACTIVE]
 _LOOP_CLOSED, _READY = CIA408.powered, 0x8  # bits of the status word; the second: no fault

@@ -16,27 +16,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fdi.output import require_writable, write_whole
-from fdi.trace.csv_table import combine_columns, find_own_table
+from fdi.trace import Trace, combine_columns, find_own_table, make_table_trace, open_log, write_sensors
 from fdi.trace.importing.conversion import ImportMap
 from fdi.trace.importing.formats import Channel, Measurement, open_measurement
-from fdi.trace.mcap_log import open_log
-from fdi.trace.sensor_dynamics import write_sensors
-from fdi.trace.trace import Trace, make_table_trace
 from plant import InputError, count_nouns, read_file, report_system_error, require, signals as plant_signals
-from rig.benches.bench import (
+from rig.benches import (
     FD,
+    PROFILES,
     SWITCHED,
     Bench,
     FrameSpec,
     Role,
+    State,
     decode_device_text,
     describe_identifier,
+    read_database,
     unpack,
 )
-from rig.benches.can_map import read_database
-from rig.benches.profiles import PROFILES, State
-from rig.network.frame import Frame, find_cob_id, make_message
-from rig.network.node_objects import name_state
+from rig.network import Frame, find_cob_id, make_message, name_state
 from rig.recorder.schema import Event, NmtState, Record, Signals, collect_provenance, make_row_record
 from rig.recorder.writer import Recorder
 

@@ -14,7 +14,7 @@ from mcap.records import Attachment, Chunk, McapRecord, Metadata
 from mcap.stream_reader import StreamReader
 
 from fdi.output import require_writable
-from fdi.trace.mcap_log import BoundedFile, read_declarations, scan_messages, unpack_chunk
+from fdi.trace import BoundedFile, read_declarations, scan_messages, unpack_chunk
 from plant import InputError, UnpackingError, count_nouns, limit_unpacked_size, report_system_error
 from rig.recorder.writer import McapFile
 

@@ -23,7 +23,7 @@ from typing import Annotated, Any, cast, get_type_hints
 
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Fd, FileDescriptorSet
 
-from fdi.trace.check_result import CheckResult, describe_field
+from fdi.trace import CheckResult, describe_field
 from plant import count_nouns, require, signals as plant_signals
 
 U32 = Annotated[int, "fixed32"]

@@ -43,9 +43,9 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-from fdi.trace.declaration import DECLARATION, write_declaration
+from fdi.trace import DECLARATION, write_declaration
 from plant import RigError, signals as plant_signals
-from rig.network.frame import Frame
+from rig.network import Frame
 from rig.recorder.schema import (
     CHANNELS,
     TOPICS,

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import RATE, Array, count_nouns
-from rig.benches.bench import Bench, Flags, Role
-from rig.network.master import StartTime
-from rig.network.node_objects import CONTROLLER, PLANT, RIG
+from rig.benches import Bench, Flags, Role
+from rig.network import CONTROLLER, PLANT, RIG, StartTime
 from rig.sequences.faults import DELAY, BusOff, Offset, Parameter, Plan, Schedule, Silent, Stuck
 from rig.sequences.protocol import Mask
 from rig.sequences.sequence import TimingPolicy

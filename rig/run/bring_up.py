@@ -21,12 +21,20 @@ from typing import NamedTuple
 import numpy as np
 
 from plant import require
-from rig.benches.bench import Bench, Flags, Role
-from rig.benches.profiles import PROFILES, State, choose_control, find_state
-from rig.network.bus import EmbeddedWire, LinkWire, can_open
-from rig.network.frame import WallClock
-from rig.network.master import HEARTBEAT_LIMIT, PATIENT, Master
-from rig.network.node_objects import CONTROLLER, Gains, Identity, read_gains
+from rig.benches import PROFILES, Bench, Flags, Role, State, choose_control, find_state
+from rig.network import (
+    CONTROLLER,
+    HEARTBEAT_LIMIT,
+    PATIENT,
+    EmbeddedWire,
+    Gains,
+    Identity,
+    LinkWire,
+    Master,
+    WallClock,
+    can_open,
+    read_gains,
+)
 from rig.nodes.scenario import Scenario
 from rig.run.attribution import find_start_problem
 from rig.run.embedded_loop import EmbeddedLoop, Limits, can_play_many, load_code
@@ -61,7 +69,7 @@ def open_loop(master: Master, bench: Bench, scenario: Scenario, faults: Schedule
     """
     is_compiled = bench.has_plant_node or scenario.model.kind.foreign is None  # or Python moves the plant
     if realtime and can_open(bus) and isinstance(master.wire, LinkWire) and is_compiled:
-        from rig.network.raw_bus import RawBus  # here: in lockstep a run needs none of it
+        from rig.network import RawBus  # here: in lockstep a run needs none of it
         from rig.run.hard_loop import HardLoop
 
         return HardLoop(master, bench, scenario, faults, log, RawBus(bus, bench.frames.identifiers))

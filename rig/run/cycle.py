@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import keep_apart
-from rig.benches.packing import (
+from rig.benches import (
     ACCEPTED,
     ALL_ROLES,
     CAME_WITH,
@@ -46,7 +46,7 @@ from rig.benches.packing import (
     pack_frame,
     unpack_frame,
 )
-from rig.network.raw_bus import (
+from rig.network import (
     FRAME,
     PAYLOAD_IN,
     PAYLOAD_OUT,

@@ -17,23 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import Array, ForeignCall, Loop, Model, Signals, StoredCode, compute_current
-from rig.benches.bench import Bench, FrameSpec, Role
-from rig.benches.bench_file import load_bench
-from rig.benches.packing import (
+from rig.benches import (
     ALL_ROLES,
     LAST_CYCLE,
     PAYLOAD,
     ROLES,
     VALUES_AT,
+    Bench,
+    FrameSpec,
     Layout,
+    Role,
     list_frame_places,
+    load_bench,
     make_layout,
     pack_frame,
 )
-from rig.network.bus import EmbeddedWire
-from rig.network.master import Master
-from rig.network.node_objects import Gains, read_gains
-from rig.network.raw_bus import Port
+from rig.network import EmbeddedWire, Gains, Master, Port, read_gains
 from rig.nodes.called_loop import load_loop, make_port
 from rig.nodes.emulator import Emulator
 from rig.nodes.emulator_cycle import (

@@ -16,11 +16,8 @@ from operator import itemgetter
 from typing import Any
 
 from plant import RigError, compile_function
-from rig.benches.bench import Bench, Role
-from rig.network.bus import LinkWire
-from rig.network.frame import Frame
-from rig.network.master import Master
-from rig.network.raw_bus import RawBus, make_closed_port
+from rig.benches import Bench, Role
+from rig.network import Frame, LinkWire, Master, RawBus, make_closed_port
 from rig.nodes.scenario import Scenario
 from rig.run import cycle as cy
 from rig.run.loop import CycleInput, CycleObserver, Loop, make_trial, read_ring, set_rig_faults

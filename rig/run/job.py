@@ -18,8 +18,7 @@ from fdi.foreign_code import (
     require_trust,
 )
 from fdi.output import write_whole
-from fdi.trace.mcap_log import open_log
-from fdi.trace.trace import Trace
+from fdi.trace import Trace, open_log
 from plant import (
     EHA,
     Choice,
@@ -41,8 +40,7 @@ from plant import (
     require,
 )
 from plant.effects import load_effects
-from rig.benches.bench import Bench
-from rig.benches.bench_file import is_plant_bench, load_bench, load_bench_from_files, make_plant_bench
+from rig.benches import Bench, is_plant_bench, load_bench, load_bench_from_files, make_plant_bench
 from rig.nodes.scenario import Scenario
 from rig.run.choices import CONTROLLERS, PACES, PLANTS
 from rig.sequences import Sequence, load_sequence

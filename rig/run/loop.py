@@ -18,13 +18,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from plant import Array, Model, StoredCode, signals as plant_signals
-from rig.benches import packing
-from rig.benches.bench import FD, RIG_OUTPUTS, Bench, Role
-from rig.benches.bench_file import load_bench
-from rig.network.bus import LinkWire
-from rig.network.frame import Frame, WallClock
-from rig.network.master import Master
-from rig.network.raw_bus import PAYLOAD_IN, Port
+from rig.benches import FD, RIG_OUTPUTS, Bench, Role, load_bench, packing
+from rig.network import PAYLOAD_IN, Frame, LinkWire, Master, Port, WallClock
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.called_loop import call_loop, load_loop, make_port
 from rig.nodes.emulator import Emulator

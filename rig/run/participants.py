@@ -10,13 +10,25 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 
 from plant import InputError, Model, require
-from rig.benches.bench import Role
-from rig.benches.bench_file import is_plant_bench
+from rig.benches import Role, is_plant_bench
 from rig.interrupts import end_with
-from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, open_can
-from rig.network.frame import Node, Send, VirtualClock, WallClock
-from rig.network.master import BusError, Master
-from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
+from rig.network import (
+    CONTROLLER,
+    NAMES,
+    PLANT,
+    RIG,
+    BusError,
+    EmbeddedWire,
+    Link,
+    LinkWire,
+    Master,
+    Node,
+    Send,
+    VirtualClock,
+    WallClock,
+    Wire,
+    open_can,
+)
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware, StandIn
 from rig.run.job import Job

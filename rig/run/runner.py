@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from fdi.output import write_text
 from fdi.progress import Progress
-from fdi.report.report import to_plain
-from fdi.trace.check_result import CheckResult
-from fdi.trace.trace import Event, Trace
+from fdi.report import to_plain
+from fdi.trace import CheckResult, Event, Trace
 from plant import (
     Actuator,
     Array,
@@ -30,9 +29,8 @@ from plant import (
     make_columns_type,
     report_system_error,
 )
-from rig.benches.bench import Flags, Role
-from rig.network.frame import WallClock
-from rig.network.node_objects import NAMES, PLANT, CycleRecord, Identity
+from rig.benches import Flags, Role
+from rig.network import NAMES, PLANT, CycleRecord, Identity, WallClock
 from rig.recorder import Observer, Recorder
 from rig.recorder.schema import collect_provenance, read_epoch_ns
 from rig.run.attribution import Attribution, Cause, CycleRecords, attribute, count_most_in_a_row, find_injected
@@ -342,7 +340,7 @@ def diagnose_run(trace: Trace, job: Job, progress: Progress, workers: int = 2) -
     A phase that cannot be judged, for example a short one, gives CANNOT_TELL with the reason. `workers`: threads.
     """
     from fdi.diagnosis.diagnosis import diagnose  # here: loads the compiler, which other runs do not need
-    from fdi.report.diagnosis_report import collect_data
+    from fdi.report import collect_data
 
     kind = job.model.kind
     nominal = build_bare_model(kind.key).with_effects(kind.has)
@@ -367,7 +365,7 @@ def describe_faults(answer: Mapping[str, Any], *levels: str) -> str:
     """
     if not answer.get("level"):
         return ""
-    from fdi.report.diagnosis_report import list_found_faults
+    from fdi.report import list_found_faults
 
     return "; ".join(f"{found.name} {found.level}, {found.size}" for found in list_found_faults(answer)
                      if not levels or found.level in levels)

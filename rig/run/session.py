@@ -16,12 +16,8 @@ import numpy as np
 
 from fdi.progress import Progress
 from plant import Array, Hold, Profile, build_profile, control_by_pid
-from rig.benches.bench import unpack
-from rig.benches.profiles import PROFILES, State
-from rig.network.bus import EmbeddedWire, Wire
-from rig.network.frame import Frame
-from rig.network.master import HEARTBEAT, Master
-from rig.network.node_objects import CONTROLLER, NAMES, PLANT, CycleRecord, NmtState
+from rig.benches import PROFILES, State, unpack
+from rig.network import CONTROLLER, HEARTBEAT, NAMES, PLANT, CycleRecord, EmbeddedWire, Frame, Master, NmtState, Wire
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.attribution import find_injected
 from rig.run.bring_up import (

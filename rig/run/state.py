@@ -2,8 +2,8 @@
 
 import bisect
 
-from fdi.trace.trace import Event
-from rig.network.frame import Clock
+from fdi.trace import Event
+from rig.network import Clock
 from rig.recorder import Event as EventRecord, Recorder
 from rig.run.attribution import Trouble
 from rig.run.loop import Loop

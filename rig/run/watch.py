@@ -7,11 +7,10 @@ from math import isnan
 from canopen.emcy import EmcyError
 
 from plant import count_nouns
-from rig.benches.bench import Bench, Flags, Role, describe_identifier
+from rig.benches import Bench, Flags, Role, describe_identifier
 from rig.device.emcy import EmcyCode
 from rig.interrupts import describe_exit
-from rig.network.master import HEARTBEAT_LIMIT, Master
-from rig.network.node_objects import CONTROLLER, PLANT, RIG, NmtState, name_state
+from rig.network import CONTROLLER, HEARTBEAT_LIMIT, PLANT, RIG, Master, NmtState, name_state
 from rig.recorder import NmtState as NmtRecord, Signals, Timing
 from rig.run.attribution import NO_DRIVE
 from rig.run.participants import FRAME_TIMEOUT, NodeProcesses

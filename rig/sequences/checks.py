@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.check_result import CheckResult, compute_speed, filter_median
+from fdi.trace import CheckResult, compute_speed, filter_median
 from plant import (
     EHA,
     LONGEST,
@@ -28,8 +28,7 @@ from plant import (
     require_unit,
     tables,
 )
-from rig.benches.bench import Bench
-from rig.benches.profiles import CIA408, ProfileWords, State, find_state
+from rig.benches import CIA408, Bench, ProfileWords, State, find_state
 from rig.sequences.faults import Time
 from rig.sequences.python_parts import OWN, PythonPart, describe_value, require_function_name
 from rig.sequences.signals import DERIVED, Controlled, Guarded, Measured, find_controlled, find_tested, find_unit
@@ -232,7 +231,7 @@ class RunData:
 
         NotMeasurable if there is none, or if the command moves on later.
         """
-        from fdi.trace.trace import measure_scale  # here: nodes, which judge nothing, start without recordings
+        from fdi.trace import measure_scale  # here: nodes, which judge nothing, start without recordings
 
         position, command = self.read_signal(self.signals.controlled.name, span), self.signals.command
         commands, asked = getattr(self.trace, command.name), self.read_signal(command.name, span)

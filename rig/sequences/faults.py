@@ -29,7 +29,7 @@ from plant import (
     tables,
 )
 from plant.effects import CATALOGUE
-from rig.benches.bench import Bench, Role
+from rig.benches import Bench, Role
 from rig.sequences.signals import Sensed, name_signals_of
 
 Table = NDArray[np.int64]

@@ -12,21 +12,23 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.check_result import PROTOCOL, CheckResult
+from fdi.trace import PROTOCOL, CheckResult
 from plant import Array, Loop, Quantity, Second, Signal, compute_current
-from rig.benches.bench import Bench, Flags, Role
-from rig.benches.bench_file import load_bench
-from rig.benches.canopen_map import name_object
-from rig.benches.profiles import (
+from rig.benches import (
     CIA402,
     CIA408,
     PROFILES,
+    Bench,
+    Flags,
     ProfileWords,
+    Role,
     State,
     find_state,
     find_wanted,
     list_reachable,
     list_transitions,
+    load_bench,
+    name_object,
 )
 from rig.sequences.checks import SkippedCheck, map_words
 

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from fdi.trace.command_file import parse_columns
+from fdi.trace import parse_columns
 from plant import (
     EHA,
     LONGEST,
@@ -48,8 +48,8 @@ from plant import (
     segments,
     tables,
 )
-from rig.benches.calibration import Decision
-from rig.network.node_objects import Identity
+from rig.benches import Decision
+from rig.network import Identity
 from rig.sequences import checks, faults
 from rig.sequences.checks import MAIN, Check, Guard
 from rig.sequences.faults import Fault, Parameter, Plan, find_contradiction

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from plant import Array, Columns, Signals
-from rig.benches.bench import Bench, Kind
-from rig.benches.calibration import WIDTHS, Decision, SensorCalibration
+from rig.benches import WIDTHS, Bench, Decision, Kind, SensorCalibration
 
 COVERAGE = 2.0  # k: U = k u, about 95 %
 DRAWS = 200  # a sensitivity to 1 %, what noise does to 5 %

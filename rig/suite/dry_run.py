@@ -7,11 +7,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi.report.numbers import format_amount
-from fdi.report.report import Cell, Column, Line, Medium, Report, Section, Table, tabulate, to_plain
-from fdi.report.run_report import build_run_report
-from fdi.trace.check_result import CheckResult
-from fdi.trace.trace import MAIN, Event, Trace
+from fdi.report import (
+    Cell,
+    Column,
+    Line,
+    Medium,
+    Report,
+    Section,
+    Table,
+    build_run_report,
+    format_amount,
+    tabulate,
+    to_plain,
+)
+from fdi.trace import MAIN, CheckResult, Event, Trace
 from plant import (
     Array,
     Model,

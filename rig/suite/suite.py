@@ -16,10 +16,21 @@ from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
 
 from fdi.progress import ignore_progress
-from fdi.report.numbers import list_first
-from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table, tabulate, to_plain
-from fdi.report.run_report import MOODS as RUN_MOODS, write_run_page
-from fdi.trace.check_result import CheckResult
+from fdi.report import (
+    MOODS as RUN_MOODS,
+    Cell,
+    Column,
+    Medium,
+    Mood,
+    Report,
+    Section,
+    Table,
+    list_first,
+    tabulate,
+    to_plain,
+    write_run_page,
+)
+from fdi.trace import CheckResult
 from plant import (
     InputError,
     Quantity,
@@ -42,7 +53,7 @@ from rig.evidence.requirements import (
     trace_requirements,
 )
 from rig.interrupts import exit_on_signal, handle_signals
-from rig.network.frame import WallClock
+from rig.network import WallClock
 from rig.run.job import JobChoice, build_job, find_differences, load_tested_sequence
 from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import (
@@ -426,7 +437,7 @@ def _tabulate_failures(results: Sequence[CaseResult], folder: Path) -> list[Tabl
 
 def _tabulate_faults(results: Sequence[CaseResult], folder: Path) -> list[Table]:
     """Level and size of both faults in each case that asked for a diagnosis; what both share stands once."""
-    from fdi.report.diagnosis_report import LEVEL_MOODS, LEVEL_NAMES, VERDICT_MOODS, FoundFault, list_found_faults
+    from fdi.report import LEVEL_MOODS, LEVEL_NAMES, VERDICT_MOODS, FoundFault, list_found_faults
 
     moods = {name: LEVEL_MOODS[level] for level, name in LEVEL_NAMES.items()}
     rows = [(result if number == 0 else None, found) for result in results if result.fdi

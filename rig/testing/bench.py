@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 
 from fdi.output import write_text
 from fdi.progress import ignore_progress
-from fdi.report.run_report import (
+from fdi.report import (
     draw_failed_check,
     draw_signals,
     write_run_page,
 )
-from fdi.trace.check_result import CheckResult
-from fdi.trace.trace import Event, Trace
+from fdi.trace import CheckResult, Event, Trace
 from plant import RATE, InputError, find_plant, quote_text, require, suggest_name
 from rig.run.job import JobChoice, build_job, load_tested_plant
 from rig.run.runner import Outcome, run_job

@@ -10,11 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.check_result import CheckResult
-from fdi.trace.trace import Event
+from fdi.trace import CheckResult, Event
 from plant import EHA, Signals, make_columns_type
 from rig import recorder
-from rig.benches.bench import Bench
+from rig.benches import Bench
 from rig.sequences import Sequence
 from rig.sequences.checks import MAIN, Check, RunData
 

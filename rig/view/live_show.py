@@ -33,8 +33,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from fdi.trace.check_result import CheckResult
-from fdi.trace.mcap_log import scan_messages, unpack_chunk
+from fdi.trace import CheckResult, scan_messages, unpack_chunk
 from plant import EHA, Signals
 from rig.recorder import CanFrame, Event, NmtState, Record
 from rig.recorder.writer import MAGIC, list_channels, list_topics

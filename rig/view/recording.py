@@ -12,19 +12,24 @@ import numpy as np
 from fdi.comparison.compare import Comparison
 from fdi.comparison.run_differences import Run, RunDifferences
 from fdi.output import require_writable
-from fdi.report.compare_report import build_comparison_report
-from fdi.report.diff_report import build_diff_report, choose_difference_units
-from fdi.report.drawing import choose_drawn_unit, label_signal
-from fdi.report.numbers import choose_unit, format_ratio, join_words
-from fdi.report.report import Report
-from fdi.report.run_report import list_faults, read_verdict
-from fdi.report.terminal import format_report
+from fdi.report import (
+    Report,
+    build_comparison_report,
+    build_diff_report,
+    choose_difference_units,
+    choose_drawn_unit,
+    choose_unit,
+    format_ratio,
+    format_report,
+    join_words,
+    label_signal,
+    list_faults,
+    read_verdict,
+)
 from fdi.thresholds import NOISE_BAND_RATIO, SIGNAL_ERROR_RATIO
-from fdi.trace.check_result import CheckResult
-from fdi.trace.sections import Section
-from fdi.trace.trace import MAIN, Floats, Trace
+from fdi.trace import MAIN, CheckResult, Floats, Section, Trace
 from plant import UNITS, Signal, Signals
-from rig.network.node_objects import NAMES
+from rig.network import NAMES
 from rig.view.viewer import import_rerun
 
 TIMELINE = "run"

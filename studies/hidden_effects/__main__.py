@@ -6,7 +6,8 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from fdi.report.report import Listing, Report, Section
+from fdi.report import Report, Section
+from fdi.report.report import Listing
 from plant import InputError
 from studies.command import make_row_progress, run_study_command
 from studies.hidden_effects.benchmark import METHODS, answer_benchmark, describe_progress, make_benchmark

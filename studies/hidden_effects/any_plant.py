@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.fit import compute_typical_rms, list_relative_tolerances
+from fdi.estimation import compute_typical_rms, list_relative_tolerances
 from fdi.estimation.replay import find_rest_rows
 from fdi.thresholds import ANCHOR_RATE, HEALTHY_TOLERANCES
 from plant import (

@@ -13,13 +13,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fdi.report.numbers import format_duration
+from fdi.report import format_duration
 from fdi.sources import hash_sources, import_function
-from fdi.trace.sections import describe_section
+from fdi.trace import describe_section
 from plant import RATE, InputError, Plant, RigError, find_plant, find_quantity, list_searched_effects, load_plant
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch, run_jobs
 from rig.campaign.judge import FLOORS
-from rig.network.frame import WallClock
+from rig.network import WallClock
 from studies.hidden_effects import any_plant, cases, truth
 from studies.hidden_effects.command import preflight_command
 from studies.hidden_effects.hidden import CATALOGUE

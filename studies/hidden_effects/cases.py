@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.sections import Section, find_sections
+from fdi.trace import Section, find_sections
 from plant import RATE, find_plant
 from plant.effects import CATALOGUE, Effect
 from rig.campaign import judge

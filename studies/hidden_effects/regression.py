@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi.estimation.fit import list_relative_tolerances
+from fdi.estimation import list_relative_tolerances
 from fdi.thresholds import ANCHOR_RATE
 from plant import Lanes, Quantity, build_bare_model, find_quantity, list_searched_effects
 from plant.starts import compute_changes

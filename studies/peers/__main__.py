@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from fdi.report.report import Column, Item, Line, Report, Section, Table
+from fdi.report import Column, Item, Line, Report, Section, Table
 from rig.sequences import load_sequence
 from studies.command import report_progress, run_study_command
 from studies.peers.grid_runs import compare_grid_runs

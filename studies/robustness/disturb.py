@@ -26,12 +26,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import RigError
-from rig.benches.bench import Flags
+from rig.benches import Flags
 from rig.firmware.build import build_controller
-from rig.network.bus import Link, open_can
-from rig.network.frame import Frame, WallClock
+from rig.network import Frame, Link, WallClock, open_can
 from rig.network.udp import PORT, Turn
 from rig.recorder.recover import recover_log
 from studies.robustness.fuzz import PAGE

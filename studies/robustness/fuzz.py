@@ -12,10 +12,9 @@ import numpy as np
 
 from fdi.progress import Progress, ignore_progress
 from plant import load_model
-from rig.benches.profiles import CIA408
-from rig.network.bus import EmbeddedBus, EmbeddedWire
-from rig.network.frame import Frame, Node, Send, VirtualClock
-from rig.network.master import BusError
+from rig.benches import CIA408
+from rig.network import BusError, EmbeddedWire, Frame, Node, Send, VirtualClock
+from rig.network.bus import EmbeddedBus
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.run.job import Job

@@ -10,10 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.progress import Progress, ignore_progress
-from fdi.report.run_report import build_run_report
-from fdi.report.terminal import format_report
-from fdi.trace.mcap_log import open_log
-from fdi.trace.trace import Trace
+from fdi.report import build_run_report, format_report
+from fdi.trace import Trace, open_log
 from plant import RigError
 from rig.recorder.recover import recover_log
 from rig.recorder.writer import McapFile

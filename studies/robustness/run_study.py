@@ -13,10 +13,9 @@ from can import Message
 from can.interfaces.udp_multicast.utils import pack_message
 
 from fdi.progress import Progress, ignore_progress
-from fdi.report.report import Cell, Column, Item, Line, Paragraph, Report, Section, Table
+from fdi.report import Cell, Column, Item, Line, Paragraph, Report, Section, Table
 from plant import RigError, load_model
-from rig.network.frame import WallClock
-from rig.network.master import BusError
+from rig.network import BusError, WallClock
 from rig.network.udp import PORT, open_sockets
 from rig.run.job import Job
 from rig.run.runner import run_job

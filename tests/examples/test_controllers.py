@@ -18,8 +18,7 @@ from rig_command import SHORT, SLOW_START, Said, rig, write_file
 from rig.conformance.run_cases import run_cases
 from rig.conformance.target import DataSheet, Options, Target
 from rig.firmware.build import build_device
-from rig.network.bus import EmbeddedWire
-from rig.network.frame import VirtualClock
+from rig.network import EmbeddedWire, VirtualClock
 from rig.run import participants
 
 OFF, SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, RESET = 0x00, 0x06, 0x07, 0x0F, 0x02, 0x80

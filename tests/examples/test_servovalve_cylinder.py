@@ -10,10 +10,10 @@ from rig_command import answer, rig
 from scipy.integrate import solve_ivp
 from scipy.io import savemat
 
-from fdi.estimation.replay import prepare_trace
+from fdi.estimation import prepare_trace
 from fdi.identification.identify import make_problem, read_identification_runs
+from fdi.trace import Trace
 from fdi.trace.importing.conversion import parse_map
-from fdi.trace.trace import Trace
 from plant import Model, load_model, load_plant, simulate
 
 FOLDER = Path(__file__).parent.parent.parent / "examples" / "servovalve_cylinder"

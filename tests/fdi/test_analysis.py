@@ -23,7 +23,7 @@ from fdi.analysis import Plot, Result
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.refine import SUSPECTS
 from fdi.discovery.runs import read_source
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import Model
 
 PAGE = (Path(__file__).parents[2] / "docs" / "python.md").read_text()

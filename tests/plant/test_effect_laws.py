@@ -17,7 +17,7 @@ from plant.effects.supply import Drawn, supply_droop
 from plant.effects.wear import Flux, coil_short, edge_rounding, land_clearance, nozzle_block
 from plant.eha import State, compute_coefficients, compute_metering_line, step_jack as ram
 from plant.state import Lag, Line
-from rig.benches.profiles import CIA408
+from rig.benches import CIA408
 
 ADVANCED = np.random.default_rng(1).uniform(-4e-3, 4e-3, 60)  # A, a new one each cycle
 

@@ -22,9 +22,9 @@ from short_runs import simulate_trace
 
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import FRICTION, Level
-from fdi.estimation.fit import complete_model
-from fdi.report.report import render_html
-from fdi.trace.trace import Trace
+from fdi.estimation import complete_model
+from fdi.report import render_html
+from fdi.trace import Trace
 from plant import Lanes, Model
 from plant.effects import CATALOGUE
 from rig.bench import benchmarks

@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from dbc import EDS
-from rig.benches.bench import Role
-from rig.benches.bench_file import load_bench
+from rig.benches import Role, load_bench
 from rig.conformance.run_cases import Outcome, choose_cases, run_cases
 from rig.conformance.target import DataSheet, Options, Target, Verdict
 from rig.device import Device
-from rig.network.bus import EmbeddedWire
-from rig.network.frame import Frame, Send, VirtualClock
+from rig.network import EmbeddedWire, Frame, Send, VirtualClock
 from rig.nodes.firmware import Firmware
 
 MS = 1_000_000  # ns

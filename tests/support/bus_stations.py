@@ -11,9 +11,8 @@ from typing import Protocol
 import pytest
 from c_device import run_program
 
-from rig.network.bus import EmbeddedBus, Link, open_can
-from rig.network.frame import Frame
-from rig.network.node_objects import NAMES
+from rig.network import NAMES, Frame, Link, open_can
+from rig.network.bus import EmbeddedBus
 
 _SERIAL = count()
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)  # between programs

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rig.firmware.build import FLAGS, FOLDER, build_device, build_program
-from rig.network.frame import Frame, Send
+from rig.network import Frame, Send
 
 SUPPORT = Path(__file__).parent / "firmware"
 STRICT = (*FLAGS, "-Werror")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import InputError, Model, count_threads
 
 

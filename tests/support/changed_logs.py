@@ -11,7 +11,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Chunk, ChunkIndex
 from mcap.stream_reader import StreamReader
 
-from fdi.trace.mcap_log import open_log, scan_messages, unpack_chunk
+from fdi.trace import open_log, scan_messages, unpack_chunk
 from rig.recorder.writer import McapFile, encode_records
 
 

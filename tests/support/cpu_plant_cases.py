@@ -9,7 +9,7 @@ import numpy as np
 from physics_cases import PREFLIGHT
 from rig_command import job, play
 
-from fdi.trace.mcap_log import open_log
+from fdi.trace import open_log
 from plant import Actuator, Lanes, Model, Points, build_profile, functions, simulate
 from plant.effects import CATALOGUE
 from plant.segments import Chirp, Multisine, Ramp, Sine

@@ -13,9 +13,9 @@ from canopen.profiles.p402 import BaseNode402, State402
 from node_bench import MS, Desk
 from places import ROOT
 
-from rig.benches.bench import EXTENDED
+from rig.benches import EXTENDED
 from rig.firmware.build import build_device
-from rig.network.frame import Send
+from rig.network import Send
 
 DRIVE, ECU = ROOT / "examples" / "cia402_drive", ROOT / "examples" / "can_ecu"
 PATIENT = {DRIVE: (), ECU: ("--timeout", "60000")}  # in lockstep the rig may stop for as long as the machine likes

@@ -9,7 +9,7 @@ import codec
 from codec import Command, Drive, Feedback
 
 from plant import Model
-from rig.network.frame import Frame, Send
+from rig.network import Frame, Send
 from rig.nodes.firmware import Firmware
 
 CURRENT_LIMIT = 8e-3  # A

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from short_runs import HIDDEN, STEPS, build_command, simulate_trace
 
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import Model
 
 DBC_TEXT = """VERSION ""

@@ -6,9 +6,8 @@ import codec
 from codec import Drive, Feedback, ValveState
 
 from plant import Model
+from rig.network import SCENARIO, Send
 from rig.network.bus import EmbeddedBus
-from rig.network.frame import Send
-from rig.network.node_objects import SCENARIO
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.nodes.scenario import Scenario

@@ -7,7 +7,7 @@ import numpy as np
 from effects_cases import LAWS
 from physics_cases import PREFLIGHT
 
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import Actuator, Model
 from plant.eha import State
 from rig.bench.benchmarks import QUIET

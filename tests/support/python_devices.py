@@ -10,7 +10,7 @@ import canopen
 import cantools
 
 from plant import Model
-from rig.network.bus import open_can
+from rig.network import open_can
 
 GAIN, LIMIT = (Model()[f"controller.{name}"] for name in ("proportional_gain", "current_limit"))  # A/m, A
 

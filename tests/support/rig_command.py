@@ -22,7 +22,7 @@ import pytest
 from answer_schemas import check_answer
 
 from fdi.progress import ignore_progress
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import load_model
 from rig.cli.main import main
 from rig.network import master

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import Model, simulate
 
 STEPS = 200  # a cycle: 5 us

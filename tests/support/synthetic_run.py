@@ -7,9 +7,9 @@ import codec
 import numpy as np
 from physics_cases import PREFLIGHT
 
-from fdi.trace.check_result import CheckResult
+from fdi.trace import CheckResult
 from plant import load_model, simulate
-from rig.network.frame import Frame
+from rig.network import Frame
 from rig.recorder import Event, NmtState, Recorder, Signals, Timing
 
 ATTACHMENTS = {"sequence.toml": ("application/toml", b"title = 'synthetic'\n"),

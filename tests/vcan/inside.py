@@ -117,7 +117,7 @@ def play_by_three(out: Path) -> int:
     from bus_stations import wait_for_node
 
     from rig.firmware.build import build_controller
-    from rig.network.node_objects import PLANT
+    from rig.network import PLANT
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(background(out, "candump", "candump", "-L", "-r", "16777216", "vcan0"))

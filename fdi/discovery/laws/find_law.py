@@ -20,7 +20,7 @@ from fdi.discovery.explain import Explanation, measure_excess
 from fdi.discovery.laws.terms import LIBRARY, PARTS, TERMS, Term, find_states, name_parameter, registered_library
 from fdi.discovery.residual_pattern import ACCELERATION_WINDOW, CREEP, EDGE, Balance, States, compute_balances
 from fdi.discovery.search import Hypothesis, Search, simulate_starts
-from fdi.estimation.fit import (
+from fdi.estimation import (
     Fit,
     Free,
     Problem,
@@ -47,7 +47,7 @@ from fdi.thresholds import (
     UNIT_TOLERANCE,
     WHITE_SQUARE_POOR,
 )
-from fdi.trace.trace import Floats
+from fdi.trace import Floats
 from plant import Signals
 
 MOST_TERMS = 3

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.estimation.fit import Value
+from fdi.estimation import Value
 from fdi.output import write_text
 from plant.effects import CATALOGUE, Effect, effect
 

@@ -11,10 +11,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
-from fdi.trace.csv_table import require_growth
+from fdi.trace import Floats, SensorDynamics, Trace, require_growth
 from fdi.trace.importing.formats import OTHER_UNITS, Channel, Measurement
-from fdi.trace.sensor_dynamics import SensorDynamics
-from fdi.trace.trace import Floats, Trace
 from plant import (
     EHA,
     InputError,

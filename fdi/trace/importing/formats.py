@@ -17,9 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.csv_table import (
+from fdi.trace import (
     MISSING,
+    Floats,
     Layout,
+    Trace,
     is_comment,
     is_padded,
     make_number_parser,
@@ -28,7 +30,6 @@ from fdi.trace.csv_table import (
     report_unreadable,
     split_line,
 )
-from fdi.trace.trace import Floats, Trace
 from plant import InputError, find_unit, require
 
 OTHER_UNITS = ("V", "mV", "counts", "%")  # what a logger may write that needs scale and offset

@@ -12,9 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION, LEAST_SPEED_CORRELATION
+from fdi.trace import Floats, find_comb
 from fdi.trace.importing.formats import OTHER_UNITS, Channel, Measurement, split_unit
-from fdi.trace.sensor_dynamics import find_comb
-from fdi.trace.trace import Floats
 from plant import EHA, UNITS, InputError, Signal, Signals, Unit, find_unit, fit_unit, load_nominal_values, quote_text
 
 # Words of a column's name, in English, German, French, Spanish and Italian, and how much each says for a signal: of a

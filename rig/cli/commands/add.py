@@ -3,7 +3,7 @@
 import argparse
 
 from fdi.discovery.update_model import add_effects, find_runs, write_model_file
-from fdi.report.explain_report import build_model_report
+from fdi.report import build_model_report
 from rig.cli.answer import Places, choose_file, give_answer, show_progress
 from rig.cli.discovery_inputs import choose_model_file, format_command_line, load_known_model, split_words
 from rig.cli.inputs import list_signals

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi.progress import Progress
-from fdi.report.report import Report
+from fdi.report import Report
 from plant import require
 from rig.cli.answer import Places, give_answer, show_progress
 

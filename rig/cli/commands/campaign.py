@@ -33,7 +33,7 @@ from rig.campaign.judge import (
 from rig.campaign.summary import build_campaign_report, describe_progress, draw_detection_curves, summarise_campaign
 from rig.cli.answer import give_answer, show_progress
 from rig.cli.inputs import parse_changes
-from rig.network.frame import WallClock
+from rig.network import WallClock
 
 
 def run_command(args: argparse.Namespace) -> int:

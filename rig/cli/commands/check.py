@@ -4,10 +4,9 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from fdi.report.report import Column, Line, Report, Section, Table
+from fdi.report import Column, Line, Report, Section, Table
 from plant import check_behaviour, count_nouns, is_fault_file, load_model, require
-from rig.benches.bench_file import load_bench
-from rig.benches.bench_report import build_bench_report, collect_data, list_loads, tabulate_frames
+from rig.benches import build_bench_report, collect_data, list_loads, load_bench, tabulate_frames
 from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.commands.list import build_list_report, list_faults
 from rig.cli.inputs import load_chosen_model, parse_changes

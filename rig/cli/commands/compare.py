@@ -3,8 +3,8 @@
 import argparse
 
 from fdi.comparison.compare import Comparison, compare
-from fdi.report.compare_report import build_comparison_report
-from fdi.trace.trace import Trace
+from fdi.report import build_comparison_report
+from fdi.trace import Trace
 from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.inputs import format_arguments, list_signals, load_chosen_model
 

@@ -7,14 +7,11 @@ from functools import partial
 from pathlib import Path
 
 from plant import InputError, require
-from rig.benches.bench import Role
-from rig.benches.bench_file import load_bench
+from rig.benches import Role, load_bench
 from rig.cli.answer import Places, choose_file, give_answer, make_folder, show_progress
 from rig.conformance.run_cases import build_conformance_report, choose_cases, run_cases, write_junit
 from rig.conformance.target import DataSheet, Options, Target
-from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, choose_bus, open_can
-from rig.network.frame import VirtualClock, WallClock
-from rig.network.master import Master
+from rig.network import EmbeddedWire, Link, LinkWire, Master, VirtualClock, WallClock, Wire, choose_bus, open_can
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.run.participants import (

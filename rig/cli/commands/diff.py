@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 from fdi.comparison.run_differences import RunDifferences, compare_runs
 from fdi.progress import Progress
-from fdi.report.diff_report import build_diff_report
-from fdi.trace.trace import Trace
+from fdi.report import build_diff_report
+from fdi.trace import Trace
 from plant import Signals
 from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.inputs import load_declared_model

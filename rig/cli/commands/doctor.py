@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 
-from fdi.report.report import Cell, Column, Mood, Report, Section, Table
+from fdi.report import Cell, Column, Mood, Report, Section, Table
 from plant import require
 from rig import doctor
-from rig.benches.bench import Bench
-from rig.benches.bench_file import load_bench
+from rig.benches import Bench, load_bench
 from rig.cli.answer import Places, give_answer
-from rig.network.bus import choose_bus
+from rig.network import choose_bus
 
 MOODS: dict[doctor.Status, Mood] = {"ok": "good", "limited": "doubtful", "missing": "bad"}
 

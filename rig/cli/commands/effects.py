@@ -6,8 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fdi.report.numbers import format_digits
-from fdi.report.report import Cell, Column, Item, Line, Paragraph, Report, Section, Table
+from fdi.report import Cell, Column, Item, Line, Paragraph, Report, Section, Table, format_digits
 from plant import Report as SelfTest, check_effect, find_effect, find_plant, load_model, load_plant
 from plant.effects import Effect
 from rig.cli.answer import Places, give_answer, show_progress

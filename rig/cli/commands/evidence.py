@@ -5,8 +5,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from fdi.output import require_new
-from fdi.report.report import Cell, Column, Line, Report, Section, tabulate
-from fdi.report.run_report import MOODS
+from fdi.report import MOODS, Cell, Column, Line, Report, Section, tabulate
 from plant import count_nouns, escape_control_characters, require
 from rig.cli.answer import give_answer, show_progress
 from rig.evidence.contents import BILL, add_index, collect_runs

@@ -10,7 +10,7 @@ from fdi.discovery.residual_pattern import can_balance
 from fdi.discovery.runs import Runs, read_runs
 from fdi.discovery.sensitivity import Claim, describe_unit
 from fdi.progress import Progress
-from fdi.report.explain_report import build_explanation_report
+from fdi.report import build_explanation_report
 from plant import require
 from rig.campaign.batch import Workers
 from rig.campaign.sensitivity import measure_sensitivity

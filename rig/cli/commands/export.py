@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from fdi.output import require_new, require_writable
-from fdi.report.report import Report
+from fdi.report import Report
 from plant import require
 from rig.cli.answer import give_answer, show_progress
 from rig.cli.inputs import load_chosen_model

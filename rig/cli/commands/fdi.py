@@ -11,8 +11,8 @@ from fdi.diagnosis.bands import format_bands, load_bands
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import choose_faults
 from fdi.output import require_writable, write_text
-from fdi.report.diagnosis_report import build_bands_report, build_diagnosis_report
-from fdi.trace.trace import Trace
+from fdi.report import build_bands_report, build_diagnosis_report
+from fdi.trace import Trace
 from plant import require
 from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.commands.simulate import load_command

@@ -11,7 +11,7 @@ from fdi.identification.identify import (
     read_identification_runs,
     write_identified_model,
 )
-from fdi.report.identify_report import build_identification_report
+from fdi.report import build_identification_report
 from plant import list_plants
 from rig.cli.answer import Places, choose_file, give_answer, show_progress
 from rig.cli.discovery_inputs import format_command_line, load_known_model

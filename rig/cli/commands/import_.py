@@ -5,13 +5,12 @@ from pathlib import Path
 
 import dbc
 from fdi.output import require_new, require_writable, write_text
-from fdi.report.import_report import build_guess_report, build_import_report
-from fdi.report.report import Report
+from fdi.report import Report, build_guess_report, build_import_report
 from fdi.trace.importing.conversion import ImportMap, import_measurement, read_map
 from fdi.trace.importing.formats import Measurement, open_measurement
 from fdi.trace.importing.guess import guess_map
 from plant import InputError, count_nouns, require
-from rig.benches.bench_file import load_bench
+from rig.benches import load_bench
 from rig.cli.answer import give_answer, name_after, show_progress
 from rig.cli.inputs import load_declared_model
 from rig.recorder.convert import RAW_SUFFIXES, import_csv, import_frames, import_own_table, open_can_log, write_imported

@@ -6,7 +6,7 @@ from dataclasses import MISSING, fields
 from math import isfinite
 from typing import Any
 
-from fdi.report.report import Cell, Column, Report, Section, Table
+from fdi.report import Cell, Column, Report, Section, Table
 from plant import (
     SHIPPED_MODELS,
     Model,

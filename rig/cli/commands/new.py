@@ -14,13 +14,11 @@ import numpy as np
 
 from fdi.diagnosis.faults import load_faults
 from fdi.output import require_new, require_writable, write_text
-from fdi.report.report import Line, Report, Section
+from fdi.report import Line, Report, Section
 from plant import InputError, Plant, load_model, load_plant, read_file, require
 from plant.effects import is_taken, load_effects
 from plant.faults import WORD
-from rig.benches.bench import decode_device_text
-from rig.benches.bench_file import load_bench
-from rig.benches.guess import UNSURE, Wanted, guess_can, guess_canopen
+from rig.benches import UNSURE, Wanted, decode_device_text, guess_can, guess_canopen, load_bench
 from rig.cli.answer import give_answer
 from rig.sequences import load_sequence
 

@@ -5,18 +5,26 @@ import contextlib
 import time
 
 from fdi.output import require_writable
-from fdi.report.report import Report
+from fdi.report import Report
 from plant import RigError, require
-from rig.benches.bench import Bench
-from rig.benches.bench_file import load_bench
+from rig.benches import Bench, load_bench
 from rig.cli.answer import Places, give_answer
 from rig.cli.inputs import load_chosen_model
 from rig.interrupts import catch_signals
-from rig.network import heartbeat
-from rig.network.bus import Link, can_open, choose_bus, open_can, serve_node
-from rig.network.frame import Node, WallClock
-from rig.network.node_objects import CONTROLLER, PLANT, read_gains
-from rig.network.raw_bus import RawBus
+from rig.network import (
+    CONTROLLER,
+    PLANT,
+    Link,
+    Node,
+    RawBus,
+    WallClock,
+    can_open,
+    choose_bus,
+    heartbeat,
+    open_can,
+    read_gains,
+    serve_node,
+)
 from rig.nodes.emulator import Emulator, find_plant_node, list_unheard
 from rig.nodes.emulator_service import EmulatorService
 from rig.nodes.firmware import Firmware

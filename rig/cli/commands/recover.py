@@ -4,7 +4,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from fdi.report.report import Report
+from fdi.report import Report
 from rig.cli.answer import give_answer
 from rig.recorder.recover import recover_log
 

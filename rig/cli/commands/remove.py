@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from fdi.discovery.update_model import find_runs, remove_effect_and_refit, write_model_file
-from fdi.report.explain_report import build_model_report
+from fdi.report import build_model_report
 from plant import require
 from rig.cli.answer import Places, choose_file, give_answer, show_progress
 from rig.cli.discovery_inputs import choose_model_file, format_command_line, load_known_model, split_words

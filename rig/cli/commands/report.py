@@ -3,8 +3,7 @@
 import argparse
 from pathlib import Path
 
-from fdi.report.report import Report
-from fdi.report.run_report import write_run_page
+from fdi.report import Report, write_run_page
 from rig.cli.answer import give_answer, show_progress
 from rig.cli.inputs import load_declared_model
 

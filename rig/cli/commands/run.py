@@ -10,16 +10,14 @@ from itertools import count
 from pathlib import Path
 
 from fdi.progress import Progress
-from fdi.report.report import Line, Medium, Report, Section, write_html
-from fdi.report.run_report import build_run_report
-from fdi.trace.trace import Trace
+from fdi.report import Line, Medium, Report, Section, build_run_report, write_html
+from fdi.trace import Trace
 from plant import count_nouns, report_system_error, require
 from rig.cli.answer import Places, choose_file, give_answer, open_console, show_progress
 from rig.cli.command_list import LIVE_ON_TERMINAL
 from rig.cli.inputs import is_suite_file, parse_changes
 from rig.interrupts import catch_signals
-from rig.network.bus import choose_bus
-from rig.network.frame import WallClock
+from rig.network import WallClock, choose_bus
 from rig.recorder import Event, Observer
 from rig.run.job import Job, JobChoice, build_job, find_differences, read_job, replace_settings
 from rig.run.participants import EMBEDDED_NAMES

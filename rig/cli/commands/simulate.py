@@ -5,10 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from fdi.output import require_new, require_writable
-from fdi.report.numbers import format_amount
-from fdi.report.report import Report
-from fdi.trace.command_file import read_command
-from fdi.trace.trace import Trace
+from fdi.report import Report, format_amount
+from fdi.trace import Trace, read_command
 from plant import Plant, Points, build_profile, count_nouns, find_divergence, load_model, require, simulate
 from rig.cli.answer import give_answer, show_progress
 from rig.cli.inputs import load_chosen_model

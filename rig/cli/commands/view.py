@@ -10,9 +10,8 @@ from pathlib import Path
 from fdi.comparison.compare import Comparison, compare
 from fdi.discovery.update_model import remove_all_effects
 from fdi.progress import Progress
-from fdi.report.numbers import join_words
-from fdi.report.report import Report
-from fdi.trace.trace import Trace
+from fdi.report import Report, join_words
+from fdi.trace import Trace
 from plant import Model, require
 from rig.cli.answer import choose_file, give_answer, name_after, show_progress
 from rig.cli.commands.diff import read_and_compare_runs

@@ -27,12 +27,11 @@ from fdi.comparison.residuals import (
     map_deviation,
     name_shape,
 )
-from fdi.estimation.noise import Floor
-from fdi.estimation.replay import compute_residuals, prepare_trace, read_cycles, replay_command, replay_current
+from fdi.estimation import Floor, compute_residuals, prepare_trace, read_cycles, replay_command, replay_current
 from fdi.report.compare_report import describe_findings, describe_verdict
 from fdi.thresholds import CONTROLLER_ERROR_RATIO
-from fdi.trace.sensor_dynamics import SensorDynamics, measure_resolution, read_sensors, write_sensors
-from fdi.trace.trace import Trace, rms, shift_rows
+from fdi.trace import SensorDynamics, Trace, measure_resolution, rms, shift_rows, write_sensors
+from fdi.trace.sensor_dynamics import read_sensors
 from plant import Model, load_model
 from rig.recorder.convert import write_mcap
 

@@ -12,11 +12,8 @@ from fdi.comparison.run_differences import (
     compare_runs,
     match_checks,
 )
-from fdi.report.diff_report import build_diff_report
-from fdi.report.report import render_html
-from fdi.report.terminal import format_report
-from fdi.trace.check_result import CheckResult
-from fdi.trace.trace import Trace
+from fdi.report import build_diff_report, format_report, render_html
+from fdi.trace import CheckResult, Trace
 
 ROWS = 4000
 NOISE = 2e-6  # m rms

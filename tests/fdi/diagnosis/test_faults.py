@@ -50,10 +50,9 @@ from fdi.diagnosis.faults import (
 from fdi.diagnosis.make_bands import choose_bands, learn_bands, make_bands_by_simulation, simulate_units
 from fdi.diagnosis.precursors import compute_features, format_precursor, measure_precursors
 from fdi.diagnosis.refine import list_unknowns
-from fdi.estimation.fit import Free
+from fdi.estimation import Free
 from fdi.thresholds import BAND_EVENT_SAMPLES
-from fdi.trace.sections import Section, find_sections
-from fdi.trace.trace import Trace
+from fdi.trace import Section, Trace, find_sections
 from plant import Fault, Hold, Model, build_profile as profile, find_plant, load_model
 from plant.faults import place_fault
 from plant.segments import Ramp, Step

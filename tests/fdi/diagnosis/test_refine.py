@@ -36,8 +36,9 @@ from fdi.diagnosis.refine import (
     refine_sizes,
 )
 from fdi.diagnosis.rms_grid import Grid, Map, Merged, Point, measure_bisector_distance, merge_minima, search_grid
-from fdi.estimation.replay import hold_inputs, read_cycles
-from fdi.report.diagnosis_report import build_diagnosis_report, list_overruled
+from fdi.estimation import hold_inputs, read_cycles
+from fdi.report import build_diagnosis_report
+from fdi.report.diagnosis_report import list_overruled
 from fdi.thresholds import RESIDUAL_WORST
 from plant import Hold, Model, Monitor, build_profile, load_model
 from plant.segments import Chirp, Ramp, Step

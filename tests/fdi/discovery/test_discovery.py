@@ -75,10 +75,10 @@ from fdi.discovery.sensitivity import (
     measure_size,
     summarise_injections,
 )
-from fdi.estimation.fit import Value, fit_unknowns, linearise, list_all_unknowns, silence_sensors
-from fdi.estimation.noise import fit_noise, measure_level
-from fdi.estimation.replay import hold_inputs
-from fdi.trace.trace import Trace
+from fdi.estimation import Value, fit_noise, fit_unknowns, hold_inputs, linearise, list_all_unknowns
+from fdi.estimation.fit import silence_sensors
+from fdi.estimation.noise import measure_level
+from fdi.trace import Trace
 from plant import Input, Model, load_model, simulate
 from plant.effects import CATALOGUE, combine_laws, load_effects
 from plant.eha import State

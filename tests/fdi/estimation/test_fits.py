@@ -17,43 +17,44 @@ from fdi.comparison.compare import compare
 from fdi.discovery.runs import read_runs
 from fdi.discovery.search import Search, scan_effects
 from fdi.discovery.update_model import refit_effects
-from fdi.estimation.fit import (
+from fdi.estimation import (
+    FLAPPER,
+    PIECE,
+    VISCOSITY,
     Fit,
     Free,
     Problem,
+    answer_readings,
+    choose_excerpt,
     complete_model,
+    compute_residuals,
+    cut_excerpt,
+    find_repeat,
+    find_undecided_rows,
+    finish_fit,
+    hold_inputs,
+    is_friction,
+    is_long,
+    judge_on_all,
     linearise,
     list_all_unknowns,
     list_tolerance_unknowns,
-)
-from fdi.estimation.long_recordings import PIECE, choose_excerpt, cut_excerpt, is_long, judge_on_all, make_excerpt
-from fdi.estimation.noise import white_noise
-from fdi.estimation.replay import (
-    FEWEST_ROWS,
-    PERIODS,
-    answer_readings,
-    compute_residuals,
-    find_repeat,
-    find_rest_rows,
-    find_undecided_rows,
-    hold_inputs,
-    is_friction,
+    make_excerpt,
     match_period,
     read_cycles,
     replay_current,
+    scale_to,
+    white_noise,
 )
+from fdi.estimation.replay import FEWEST_ROWS, PERIODS, find_rest_rows
 from fdi.estimation.unidentifiable import (
-    FLAPPER,
     JACK_PRESSURE,
     POSITION_SCALE,
     POSITION_SCALE_AT_FORCES,
     SPOOL_WAY,
-    VISCOSITY,
     find_tangents,
-    finish_fit,
-    scale_to,
 )
-from fdi.trace.trace import Floats, Trace, rms
+from fdi.trace import Floats, Trace, rms
 from plant import Lanes, Model, build_profile, find_quantity, load_model, simulate
 from plant.declare import Chirp, Hold, Ramp, Step
 from rig.bench.benchmarks import QUIET

@@ -7,8 +7,9 @@ import pytest
 from noisy_traces import LEVELS, sample_noise
 from scipy.stats import binomtest
 
-from fdi.estimation.binomial import clopper_pearson_interval, measure_share
-from fdi.estimation.noise import find_hum_lines, floor_from_data, floor_from_repeats
+from fdi.estimation import floor_from_data, measure_share
+from fdi.estimation.binomial import clopper_pearson_interval
+from fdi.estimation.noise import find_hum_lines, floor_from_repeats
 
 ROWS = 13_500
 

@@ -9,9 +9,7 @@ from refusals import catch_refusal
 from rig_command import answer, refuse, rig, write_file
 
 from fdi.discovery.update_model import read_provenance
-from fdi.estimation import long_recordings
-from fdi.estimation.noise import sensor_floors
-from fdi.estimation.unidentifiable import start_fit
+from fdi.estimation import long_recordings, sensor_floors, start_fit
 from fdi.identification import global_fit
 from fdi.identification.global_fit import scale_values
 from fdi.identification.identify import (
@@ -26,7 +24,7 @@ from fdi.identification.identify import (
     write_identified_model,
 )
 from fdi.report.identify_report import describe_identification
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import Segment, build_profile, load_model, simulate
 from plant.declare import Chirp, Hold, Ramp, Step
 from studies.hidden_effects.truth import SYMBOLS, has_compiler, simulate_truth

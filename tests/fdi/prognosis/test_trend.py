@@ -19,7 +19,7 @@ from fdi.prognosis.trend import Trend, fit_trend
 from fdi.prognosis.unit_trend import find_date_in_name, find_row, format_day, parse_date, read_dates_table
 from fdi.progress import ignore_progress
 from fdi.report.trend_report import explain_level
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import InputError, load_model, simulate
 
 WEEKS = 7.0 * np.arange(14)

@@ -28,37 +28,37 @@ from fdi.discovery.explain import Marks
 from fdi.discovery.explain_runs import Answer, Candidate
 from fdi.discovery.runs import Source
 from fdi.discovery.update_model import ModelUpdate, Provenance, Row
-from fdi.estimation.fit import Value
-from fdi.report import compare_report, drawing, explain_report, run_report
-from fdi.report.compare_report import build_comparison_report
-from fdi.report.explain_report import (
-    MOODS,
-    build_explanation_report,
-    build_model_report,
-    describe_findings,
-    describe_verdict,
-)
-from fdi.report.report import (
+from fdi.estimation import Value
+from fdi.report import (
     Cell,
     Column,
     Figure,
     Item,
     Line,
-    Listing,
     Medium,
     Paragraph,
     Report,
     Section,
     Table,
+    build_comparison_report,
+    build_explanation_report,
+    build_model_report,
+    build_run_report,
+    compare_report,
+    drawing,
+    explain_report,
+    format_report,
+    print_report,
+    read_verdict,
     render_html,
-    to_json,
+    run_report,
     to_plain,
     write_html,
+    write_run_page,
 )
-from fdi.report.run_report import build_run_report, read_verdict, write_run_page
-from fdi.report.terminal import format_report, print_report
-from fdi.trace.check_result import CheckResult
-from fdi.trace.trace import Event, Trace
+from fdi.report.explain_report import MOODS, describe_findings, describe_verdict
+from fdi.report.report import Listing, to_json
+from fdi.trace import CheckResult, Event, Trace
 from plant import EHA, Model
 from rig.recorder import Recorder, Signals, Timing
 from rig.recorder.recover import recover_log

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from refusals import catch_refusal
 
-from fdi.trace.command_file import parse_columns, read_command
+from fdi.trace import parse_columns, read_command
 
 
 def test_csv_files_are_read_resampled_and_shifted_to_their_first_row() -> None:

@@ -19,10 +19,10 @@ from refusals import catch_refusal
 from rig_command import Said, write_file
 from synthetic_run import ATTACHMENTS, record_run
 
+from fdi.trace import Trace, find_sections, open_log
 from fdi.trace.declaration import read_declaration
-from fdi.trace.mcap_log import Log, open_log
-from fdi.trace.sections import find_sections
-from fdi.trace.trace import Gap, Trace
+from fdi.trace.mcap_log import Log
+from fdi.trace.trace import Gap
 from rig.recorder import U32, Event, NmtState, Recorder, Signals, Timing, schema
 
 KINDS = ["hold", "step", "step", "step", "step", "ramp", "hold", "ramp", "hold", "dynamic", "hold"]  # of preflight

@@ -23,7 +23,7 @@ from rig.bench.benchmarks import (
     run_c_responder,
     summarise_contenders,
 )
-from rig.network.bus import Link, open_can
+from rig.network import Link, open_can
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {benchmarks.GET_GCC}")
 

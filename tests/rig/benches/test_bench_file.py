@@ -10,8 +10,9 @@ from places import ROOT
 from refusals import catch_refusal
 
 from dbc import EDS
-from rig.benches.bench import Guard, Kind, Role, pack
-from rig.benches.bench_file import list_benches, load_bench, load_bench_from_files
+from rig.benches import Kind, Role, load_bench, load_bench_from_files, pack
+from rig.benches.bench import Guard
+from rig.benches.bench_file import list_benches
 
 EXAMPLES = sorted(ROOT.glob("examples/*/bench.toml"))
 

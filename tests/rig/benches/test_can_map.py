@@ -14,21 +14,29 @@ from hypothesis import given, settings, strategies as st
 from refusals import catch_refusal
 
 from plant import compile_function
-from rig.benches.bench import EXTENDED, FD, SWITCHED, Field, FrameSpec, Guard, Kind, Role, extract_bits, pack, unpack
-from rig.benches.bench_file import load_bench_from_files
-from rig.benches.bench_report import list_loads
-from rig.benches.checksums import compute_checksum, compute_crc8, load_checksum
-from rig.benches.packing import (
+from rig.benches import (
     ACCEPTED,
+    EXTENDED,
+    FD,
     FRAMES_AT,
     PAYLOAD,
+    SWITCHED,
     VALUES_AT,
+    FrameSpec,
+    Kind,
+    Role,
     find_frame,
     list_frame_places,
+    list_loads,
+    load_bench_from_files,
     make_layout,
+    pack,
     pack_frame,
+    unpack,
     unpack_frame,
 )
+from rig.benches.bench import Field, Guard, extract_bits
+from rig.benches.checksums import compute_checksum, compute_crc8, load_checksum
 
 INPUTS = {"position_demand": ("mm", 1e-3), "ram_position": ("m", 1.0), "load_pressure": ("bar", 1e5),
           "load_force": ("kN", 1e3), "spool_position": ("um", 1e-6), "flags": ("%", 1e-2)}

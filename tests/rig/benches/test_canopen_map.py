@@ -10,9 +10,9 @@ from canopen.objectdictionary.eds import import_eds
 from device_files import BENCH as DRIVE, NODE, OBJECTS, RPDOS, TPDOS, Entry, Mapped, format_eds
 from hypothesis import given, strategies as st
 
-from rig.benches.bench import EXTENDED, Kind, Role, extract_bits, pack, unpack
-from rig.benches.bench_file import load_bench_from_files
-from rig.benches.canopen_map import list_values, read_dictionary
+from rig.benches import EXTENDED, Kind, Role, load_bench_from_files, pack, read_dictionary, unpack
+from rig.benches.bench import extract_bits
+from rig.benches.canopen_map import list_values
 
 # data type of CiA 301: bits
 TYPES = {0x01: 1, 0x02: 8, 0x03: 16, 0x04: 32, 0x10: 24, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64, 0x05: 8, 0x06: 16,

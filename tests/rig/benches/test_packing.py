@@ -5,22 +5,24 @@ import numpy as np
 import pytest
 
 from plant import compile_function
-from rig.benches.bench import Field, FrameSpec, Guard, Role, pack
-from rig.benches.packing import (
+from rig.benches import (
     ACCEPTED,
     FRAMES_AT,
     OTHER_CYCLE,
     PAYLOAD,
-    REPEATED,
     VALUES_AT,
-    WRONG_CHECKSUM,
+    FrameSpec,
     Layout,
+    Role,
     find_frame,
     list_frame_places,
     make_layout,
+    pack,
     pack_frame,
     unpack_frame,
 )
+from rig.benches.bench import Field, Guard
+from rig.benches.packing import REPEATED, WRONG_CHECKSUM
 
 
 @pytest.fixture(scope="module")

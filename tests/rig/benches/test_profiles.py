@@ -3,17 +3,8 @@
 import pytest
 from canopen.profiles.p402 import State402
 
-from rig.benches.profiles import (
-    CIA402,
-    CIA408,
-    PROFILES,
-    TRANSITIONS,
-    ProfileWords,
-    State,
-    choose_control,
-    find_state,
-    find_wanted,
-)
+from rig.benches import CIA402, CIA408, PROFILES, ProfileWords, State, choose_control, find_state, find_wanted
+from rig.benches.profiles import TRANSITIONS
 
 NAMES = {"NOT READY TO SWITCH ON": State.NOT_READY, "SWITCH ON DISABLED": State.OFF,
          "READY TO SWITCH ON": State.READY, "SWITCHED ON": State.ON, "OPERATION ENABLED": State.ACTIVE,

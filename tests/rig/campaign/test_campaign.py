@@ -20,9 +20,9 @@ from places import SUPPORT
 from refusals import catch_refusal
 from rig_command import answer, finished, grown, is_running, refuse, rig, started
 
-from fdi.estimation.binomial import measure_share
-from fdi.report.terminal import format_report
-from fdi.trace.trace import Trace
+from fdi.estimation import measure_share
+from fdi.report import format_report
+from fdi.trace import Trace
 from plant import Model, RigError
 from plant.effects import CATALOGUE
 from rig.campaign import batch, judge, summary as campaign_summary

@@ -15,13 +15,12 @@ from places import ROOT
 from rig_command import refuse, rig, write_file
 
 from plant import EHA
-from rig.benches.bench import Role, list_inputs, list_outputs, pack
-from rig.benches.bench_file import ControllerKeys, NodeKeys, load_bench
+from rig.benches import UNSURE, Role, Wanted, guess_can, load_bench, pack
+from rig.benches.bench import list_inputs, list_outputs
+from rig.benches.bench_file import ControllerKeys, NodeKeys
 from rig.benches.checksums import CHECKSUMS
-from rig.benches.guess import UNSURE, Wanted, guess_can
 from rig.doctor import count_frames, judge_frames
-from rig.network.bus import Link, open_can
-from rig.network.frame import Frame, WallClock
+from rig.network import Frame, Link, WallClock, open_can
 
 PLANT = ROOT / "tests" / "support" / "trim_jack.py"
 PAGE = (ROOT / "docs" / "bench.md").read_text()

@@ -15,7 +15,8 @@ from unittest.mock import Mock
 import pytest
 from rig_command import SHORT, Said, answer, finished, grown, interrupted, refuse, rig, started, write_file
 
-from fdi.trace.trace import CLEANUP, Trace
+from fdi.trace import Trace
+from fdi.trace.trace import CLEANUP
 from plant import Model, load_model
 from plant.effects import CATALOGUE
 from rig import doctor
@@ -23,7 +24,7 @@ from rig.cli import commands
 from rig.cli.command_list import COMMANDS, find_work
 from rig.cli.commands.list import KINDS
 from rig.cli.main import FIRST_STEPS
-from rig.network.master import Master
+from rig.network import Master
 from rig.sequences import checks, load_sequence
 
 LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 60')

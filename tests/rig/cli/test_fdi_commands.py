@@ -17,10 +17,10 @@ from synthetic_run import record_run
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Level
 from fdi.discovery import update_model
-from fdi.estimation.fit import Value
+from fdi.estimation import Value
 from fdi.report.diagnosis_report import describe_verdict
+from fdi.trace import Trace
 from fdi.trace.csv_table import write_csv
-from fdi.trace.trace import Trace
 from plant import Model, load_model, load_plant
 
 

@@ -17,7 +17,7 @@ from synthetic_run import record_run
 
 import fdi
 from fdi.output import replace_text, write_text, write_whole
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant.effects import CATALOGUE
 from rig.recorder.convert import RAW_SUFFIXES
 

@@ -32,9 +32,8 @@ from rig.conformance.run_cases import CASES, Outcome, Result, choose_cases, run_
 from rig.conformance.target import CHAPTERS, DataSheet, Options, Target, Verdict
 from rig.device import Abort, NmtState, SdoAbort
 from rig.device.dictionary import INVALID
-from rig.network.bus import Done, EmbeddedWire
-from rig.network.frame import Send, VirtualClock
-from rig.network.node_objects import CONTROLLER
+from rig.network import CONTROLLER, EmbeddedWire, Send, VirtualClock
+from rig.network.bus import Done
 from rig.nodes.firmware import Firmware
 
 

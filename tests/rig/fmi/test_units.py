@@ -17,7 +17,7 @@ from effect_files import HEAD, restored_catalogue
 from places import ROOT
 from rig_command import answer, refuse, rig, write_file
 
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import Lanes, Model, Place, RigError, load_model, simulate
 from rig.fmi import foreign
 from rig.fmi.export import export_fmu

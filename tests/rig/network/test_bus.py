@@ -30,23 +30,31 @@ from refusals import catch_refusal
 from rig_command import SHORT, SLOW_START, rig, write_file
 
 from plant import RigError, compile_function
-from rig.benches.bench import EXTENDED, FD, SWITCHED
-from rig.network import bus as bus_module, raw_bus
-from rig.network.bus import Link, can_open, choose_bus, explain_socketcan_problem, open_can
-from rig.network.can_interface import UdpBus
-from rig.network.frame import FD_LENGTHS, IDENTIFIER, Frame, find_cob_id, has_valid_length, make_message
-from rig.network.raw_bus import (
+from rig.benches import EXTENDED, FD, SWITCHED
+from rig.network import (
     FRAME,
-    NO_TURN,
     PAYLOAD_IN,
     PAYLOAD_OUT,
     QUEUE_FULL,
     SENT,
     TIMEOUT,
+    Frame,
+    Link,
     Port,
     RawBus,
+    bus as bus_module,
+    can_open,
+    choose_bus,
+    find_cob_id,
+    make_message,
+    open_can,
+    raw_bus,
     send_frame,
 )
+from rig.network.bus import explain_socketcan_problem
+from rig.network.can_interface import UdpBus
+from rig.network.frame import FD_LENGTHS, IDENTIFIER, has_valid_length
+from rig.network.raw_bus import NO_TURN
 from rig.network.udp import PORT
 
 only_socketcan = pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)

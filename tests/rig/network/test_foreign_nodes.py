@@ -12,12 +12,8 @@ import pytest
 from device_files import BENCH, OBJECTS, RPDOS, TPDOS, Entry, Mapped, format_eds, write_bench
 from refusals import catch_refusal
 
-from rig.benches.bench import Role
-from rig.benches.bench_file import load_bench
-from rig.network.bus import EmbeddedWire
-from rig.network.frame import Frame, Send, VirtualClock
-from rig.network.master import BusError, Master
-from rig.network.node_objects import NmtState
+from rig.benches import Role, load_bench
+from rig.network import BusError, EmbeddedWire, Frame, Master, NmtState, Send, VirtualClock
 
 IDENTITY = {"1000": Entry(7, "ro", "0x20192"), "1018sub0": Entry(5, "const", "2"), "1018sub1": Entry(7, "ro", "0x77"),
             "1018sub2": Entry(7, "ro", "0x5")}

@@ -11,11 +11,23 @@ from bus_stations import spec
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from plant import Model
-from rig.benches.bench_file import load_bench
-from rig.network.bus import EmbeddedWire, Link, LinkWire, Wire, open_can, serve_node
-from rig.network.frame import Frame, Send, VirtualClock, WallClock
-from rig.network.master import BusError, Master
-from rig.network.node_objects import CONTROLLER, PLANT
+from rig.benches import load_bench
+from rig.network import (
+    CONTROLLER,
+    PLANT,
+    BusError,
+    EmbeddedWire,
+    Frame,
+    Link,
+    LinkWire,
+    Master,
+    Send,
+    VirtualClock,
+    WallClock,
+    Wire,
+    open_can,
+    serve_node,
+)
 from rig.network.sdo_client import CheckedSdoClient, ConfirmationError, repeat_transfer
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware

@@ -18,13 +18,10 @@ from bus_stations import only_udp, raw_kinds, spec
 from node_bench import MS, FirmwareDesk, PlantDesk
 
 from plant import Actuator, Model
-from rig.benches.bench_file import load_bench
-from rig.benches.profiles import CIA408
+from rig.benches import CIA408, load_bench
 from rig.device import Abort, NmtState
-from rig.network.bus import Link, open_can, serve_node
-from rig.network.frame import Frame, WallClock
-from rig.network.node_objects import GAINS, decode_cycle_record
-from rig.network.raw_bus import RawBus
+from rig.network import GAINS, Frame, Link, RawBus, WallClock, open_can, serve_node
+from rig.network.node_objects import decode_cycle_record
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator import Emulator, list_unheard
 from rig.nodes.emulator_service import EmulatorService, compile_loop

@@ -23,12 +23,11 @@ from refusals import catch_refusal
 from rig_command import refuse, rig, write_file
 from synthetic_run import ATTACHMENTS, METADATA, build_cycles, record_run
 
-from fdi.trace.mcap_log import open_log
-from fdi.trace.trace import Trace
+from fdi.trace import Trace, open_log
 from plant import InputError
-from rig.benches.bench import EXTENDED, FD, SWITCHED
-from rig.benches.bench_file import load_bench
-from rig.network.frame import FD_LENGTHS, Frame, make_message
+from rig.benches import EXTENDED, FD, SWITCHED, load_bench
+from rig.network import Frame, make_message
+from rig.network.frame import FD_LENGTHS
 from rig.recorder import U32, CanFrame, Event, NmtState, Recorder, RecorderError
 from rig.recorder.convert import (
     RAW_SUFFIXES,

@@ -10,9 +10,9 @@ from places import ROOT
 from rig_command import Said, refuse, rig, write_file
 
 from fdi.discovery.explain import compute_firmware_residual
+from fdi.estimation import prepare_trace, replay_current
 from fdi.estimation.fit import silence_sensors
-from fdi.estimation.replay import prepare_trace, replay_current
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import load_model
 
 PLANT = ROOT / "tests" / "support" / "trim_jack.py"

@@ -7,10 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.benches.bench import Flags, Role
-from rig.benches.bench_file import load_bench
-from rig.network.master import StartTime
-from rig.network.node_objects import CONTROLLER, PLANT, RIG, CycleRecord
+from rig.benches import Flags, Role, load_bench
+from rig.network import CONTROLLER, PLANT, RIG, CycleRecord, StartTime
 from rig.run.attribution import (
     Attribution,
     CycleRecords,

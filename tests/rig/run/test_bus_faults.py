@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from rig_command import SHORT, job, play, read_signals
 
-from fdi.trace.mcap_log import open_log
-from fdi.trace.trace import CLEANUP, MAIN, Trace
+from fdi.trace import MAIN, Trace, open_log
+from fdi.trace.trace import CLEANUP
 from rig.run.runner import Outcome
 
 SAFE = SHORT + 'ends = "safe_state"\n'

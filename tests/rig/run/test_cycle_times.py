@@ -10,9 +10,9 @@ import pytest
 from rig_command import SHORT, job, play, refuse, rig, write_file
 
 import dbc
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import Model, simulate
-from rig.benches.bench_file import load_bench
+from rig.benches import load_bench
 from rig.run.job import JobChoice, build_job
 from rig.sequences import load_sequence
 from rig.sequences.sequence import parse_sequence

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from rig_command import SHORT, job, play
 
-from fdi.trace.mcap_log import open_log
-from fdi.trace.trace import Trace
+from fdi.trace import Trace, open_log
 from plant import Array
 from rig.nodes import emulator_cycle
 from rig.run import bring_up

@@ -14,9 +14,9 @@ from device_files import Entry, Mapped, format_eds
 from python_devices import CanDevice, CanopenDevice, PythonDevice
 
 from fdi.progress import ignore_progress
-from fdi.trace.trace import Trace
+from fdi.trace import Trace
 from plant import simulate
-from rig.benches.bench import Bench, Role
+from rig.benches import Bench, Role
 from rig.recorder.convert import export_trace, import_frames
 from rig.run import bring_up, participants
 from rig.run.job import Job, JobChoice, build_job

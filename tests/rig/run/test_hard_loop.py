@@ -21,11 +21,8 @@ from log_rows import CycleBook
 from numba.core.event import install_recorder
 
 from plant import Model
-from rig.benches.bench_file import load_bench
-from rig.network.bus import Link, LinkWire, open_can
-from rig.network.frame import Frame, WallClock
-from rig.network.master import Master
-from rig.network.raw_bus import RawBus
+from rig.benches import load_bench
+from rig.network import Frame, Link, LinkWire, Master, RawBus, WallClock, open_can
 from rig.network.udp import PORT, Turn
 from rig.nodes.scenario import Scenario
 from rig.recorder import Signals

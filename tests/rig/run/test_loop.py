@@ -7,9 +7,8 @@ import pytest
 from log_rows import CycleBook
 
 from plant import Model
-from rig.benches.bench_file import load_bench
-from rig.network.frame import Frame, VirtualClock
-from rig.network.master import Master
+from rig.benches import load_bench
+from rig.network import Frame, Master, VirtualClock
 from rig.nodes.scenario import Scenario
 from rig.run.loop import CycleInput, CycleLoop
 from rig.sequences.faults import Plan, Schedule

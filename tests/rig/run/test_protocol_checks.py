@@ -12,9 +12,9 @@ import pytest
 from firmware_variants import Variant
 from rig_command import job, play
 
-from fdi.report.run_report import build_run_report
-from fdi.trace.trace import Trace
-from rig.network.frame import Frame
+from fdi.report import build_run_report
+from fdi.trace import Trace
+from rig.network import Frame
 from rig.recorder import Signals, Timing
 from rig.run import participants
 from rig.run.bring_up import find_gap

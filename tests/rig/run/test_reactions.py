@@ -8,8 +8,7 @@ import pytest
 from firmware_variants import Variant
 from rig_command import job, play
 
-from rig.network.frame import Frame
-from rig.network.node_objects import GAINS
+from rig.network import GAINS, Frame
 from rig.nodes import firmware
 from rig.run import participants
 from rig.run.runner import Outcome
@@ -45,7 +44,7 @@ def test_the_reference_firmware_reacts_and_recovers(tmp_path: Path, name: str) -
 
 def test_a_node_that_was_reset_is_watched_as_before(tmp_path: Path) -> None:
     """Supervision of SYNC and heartbeat, its own heartbeat, and the gains, which the run has set."""
-    from fdi.trace.mcap_log import open_log
+    from fdi.trace import open_log
 
     outcome = play_sequence("reset_in_mid_run", tmp_path, set_={"controller.current_limit": 7e-3})
     log = open_log(tmp_path / "trace.mcap")

@@ -35,15 +35,12 @@ from rig_command import (
 )
 from vcan_host import kernel_has_vcan0
 
-from fdi.report.run_report import build_run_report
-from fdi.trace.mcap_log import open_log
-from fdi.trace.trace import CLEANUP, Trace
+from fdi.report import build_run_report
+from fdi.trace import Trace, open_log
+from fdi.trace.trace import CLEANUP
 from plant import simulate
-from rig.benches.bench_file import load_bench
-from rig.network.bus import Link, LinkWire, open_can
-from rig.network.frame import Frame, WallClock
-from rig.network.master import BusError, Master
-from rig.network.node_objects import CONTROLLER, PLANT
+from rig.benches import load_bench
+from rig.network import CONTROLLER, PLANT, BusError, Frame, Link, LinkWire, Master, WallClock, open_can
 from rig.run import participants, runner
 from rig.run.participants import NodeProcesses
 from rig.run.session import Session

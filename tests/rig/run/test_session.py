@@ -16,14 +16,12 @@ from refusals import catch_refusal
 from rig_command import SHORT, act_at, job, kinds, play, read_signals, rig, stop_after
 
 from fdi.progress import ignore_progress
-from fdi.report.report import Line, Table
-from fdi.report.run_report import build_run_report, write_run_page
-from fdi.trace.mcap_log import open_log
-from fdi.trace.trace import CLEANUP, MAIN, SETUP, Trace
+from fdi.report import Line, Table, build_run_report, write_run_page
+from fdi.trace import MAIN, Trace, open_log
+from fdi.trace.trace import CLEANUP, SETUP
 from plant import RigError
 from plant.effects import CATALOGUE
-from rig.network.bus import EmbeddedWire
-from rig.network.frame import Frame, Send, VirtualClock
+from rig.network import EmbeddedWire, Frame, Send, VirtualClock
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.recorder import Recorder, RecorderError, Signals, Timing

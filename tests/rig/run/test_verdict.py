@@ -8,9 +8,8 @@ import pytest
 from rig_command import SHORT, job, play, rig, write_file
 
 from fdi.diagnosis.diagnosis import diagnose
-from fdi.report.run_report import build_run_report
-from fdi.report.terminal import format_report
-from fdi.trace.trace import Trace
+from fdi.report import build_run_report, format_report
+from fdi.trace import Trace
 from plant import load_model
 from rig.run.runner import Outcome, find_limits, run_job
 

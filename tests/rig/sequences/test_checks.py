@@ -16,15 +16,11 @@ from places import ROOT
 from refusals import catch_refusal
 from rig_command import SHORT, job, play, rig, write_file
 
-from fdi.report.run_report import build_run_report
-from fdi.report.terminal import format_report
-from fdi.trace.check_result import CheckResult
-from fdi.trace.trace import Trace
+from fdi.report import build_run_report, format_report
+from fdi.trace import CheckResult, Trace
 from plant import EHA, Array, Columns, Hold, Segment, Signals, build_profile
 from plant.segments import Ramp, Step
-from rig.benches.bench import Bench
-from rig.benches.bench_file import load_bench, load_bench_from_files
-from rig.benches.calibration import SensorCalibration
+from rig.benches import Bench, SensorCalibration, load_bench, load_bench_from_files
 from rig.sequences import checks, uncertainty
 from rig.sequences.checks import NO_DRIVES, DriveFrames, Guard, GuardWatch, RunData, evaluate_checks
 from rig.sequences.protocol import (

@@ -10,10 +10,10 @@ import pytest
 from places import ROOT
 from refusals import catch_refusal
 
-from fdi.trace.check_result import CheckResult
+from fdi.trace import CheckResult
 from plant import InputError, load_model, simulate, tables
-from rig.benches.bench_file import load_bench
-from rig.network.node_objects import Identity
+from rig.benches import load_bench
+from rig.network import Identity
 from rig.nodes.scenario import Scenario
 from rig.sequences import faults
 from rig.sequences.checks import evaluate_checks

@@ -10,7 +10,7 @@ from junit_schema import read_valid_junit
 from places import ROOT
 from rig_command import SHORT, Said, answer, finished, grown, interrupted, job, refuse, rig, started, write_file
 
-from fdi.trace.check_result import CheckResult
+from fdi.trace import CheckResult
 from rig.cli.inputs import is_suite_file
 from rig.evidence.requirements import Evidence, JudgedCheck, trace_requirements
 from rig.run.job import JobChoice

@@ -31,12 +31,11 @@ from synthetic_run import build_cycles, record_run
 
 from fdi.comparison.compare import compare
 from fdi.comparison.run_differences import compare_runs
-from fdi.report.numbers import format_ratio
+from fdi.report import format_ratio
 from fdi.thresholds import NOISE_BAND_RATIO
-from fdi.trace.check_result import CheckResult
-from fdi.trace.trace import Trace
+from fdi.trace import CheckResult, Trace
 from plant import Model, find_plant
-from rig.benches.bench_file import load_bench
+from rig.benches import load_bench
 from rig.recorder import Event, NmtState, Record, Signals, Timing
 from rig.recorder.schema import make_row_record
 from rig.sequences import load_sequence

@@ -14,10 +14,10 @@ from refusals import catch_refusal
 from rig_command import refuse, rig, write_file
 from scipy.io import savemat
 
+from fdi.trace import Trace
 from fdi.trace.importing.conversion import Imported, Samples, import_measurement, parse_map, place_samples
 from fdi.trace.importing.formats import Channel, Measurement, open_measurement, open_text_table, read_singly
 from fdi.trace.importing.guess import GuessedMap, guess_map
-from fdi.trace.trace import Trace
 
 MAP = """
 [signals.com]

@@ -1,0 +1,92 @@
+"""The names that other folders use, each imported at its first use."""
+
+from .bench import (
+    EXTENDED as EXTENDED,
+    FD as FD,
+    RIG_OUTPUTS as RIG_OUTPUTS,
+    SWITCHED as SWITCHED,
+    Bench as Bench,
+    CanopenNode as CanopenNode,
+    Flags as Flags,
+    FrameSpec as FrameSpec,
+    Kind as Kind,
+    Role as Role,
+    SignalObject as SignalObject,
+    decode_device_text as decode_device_text,
+    describe_identifier as describe_identifier,
+    pack as pack,
+    unpack as unpack,
+)
+from .bench_file import (
+    is_plant_bench as is_plant_bench,
+    load_bench as load_bench,
+    load_bench_from_files as load_bench_from_files,
+    make_plant_bench as make_plant_bench,
+)
+from .bench_report import (
+    build_bench_report as build_bench_report,
+    collect_data as collect_data,
+    list_loads as list_loads,
+    tabulate_frames as tabulate_frames,
+)
+from .calibration import WIDTHS as WIDTHS, Decision as Decision, SensorCalibration as SensorCalibration
+from .can_map import read_database as read_database
+from .canopen_map import (
+    INVALID as INVALID,
+    MAPPING as MAPPING,
+    PARAMETERS as PARAMETERS,
+    RPDO as RPDO,
+    TPDO as TPDO,
+    Pdo as Pdo,
+    find_variable as find_variable,
+    list_pdos as list_pdos,
+    list_variables as list_variables,
+    name_object as name_object,
+    read_dictionary as read_dictionary,
+    read_number as read_number,
+)
+from .guess import UNSURE as UNSURE, Wanted as Wanted, guess_can as guess_can, guess_canopen as guess_canopen
+from .packing import (
+    ACCEPTED as ACCEPTED,
+    ALL_ROLES as ALL_ROLES,
+    CAME_WITH as CAME_WITH,
+    COMMAND as COMMAND,
+    DRIVE as DRIVE,
+    EVERY as EVERY,
+    FEEDBACK as FEEDBACK,
+    FRAME_WORDS as FRAME_WORDS,
+    FRAMES as FRAMES,
+    FRAMES_AT as FRAMES_AT,
+    IS_ANSWER as IS_ANSWER,
+    IS_BEFORE_SYNC as IS_BEFORE_SYNC,
+    IS_MINE as IS_MINE,
+    IS_NUMBERED as IS_NUMBERED,
+    LAST_CYCLE as LAST_CYCLE,
+    LENGTH as LENGTH,
+    OTHER_CYCLE as OTHER_CYCLE,
+    PAYLOAD as PAYLOAD,
+    ROLES as ROLES,
+    SENT_AS as SENT_AS,
+    STATUS as STATUS,
+    VALUES_AT as VALUES_AT,
+    VALVE as VALVE,
+    Layout as Layout,
+    find_frame as find_frame,
+    list_frame_places as list_frame_places,
+    make_layout as make_layout,
+    pack_frame as pack_frame,
+    read_cycle_number as read_cycle_number,
+    unpack_frame as unpack_frame,
+)
+from .profiles import (
+    CIA402 as CIA402,
+    CIA408 as CIA408,
+    PROFILES as PROFILES,
+    ProfileWords as ProfileWords,
+    State as State,
+    choose_control as choose_control,
+    find_state as find_state,
+    find_wanted as find_wanted,
+    list_reachable as list_reachable,
+    list_transitions as list_transitions,
+)
