@@ -8,7 +8,7 @@ from .diagnosis_report import (
     FoundFault as FoundFault,
     build_bands_report as build_bands_report,
     build_diagnosis_report as build_diagnosis_report,
-    collect_data as collect_data,
+    collect_diagnosis_data as collect_diagnosis_data,
     list_found_faults as list_found_faults,
 )
 from .diff_report import build_diff_report as build_diff_report, choose_difference_units as choose_difference_units

@@ -113,7 +113,7 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
             sorted(provenance.items()), (Column(""), lambda row: Cell(row[0], "muted")),
             (Column(""), lambda row: row[1]), is_list=True)], medium=page)]
     return Report("fdi", d.source, d.verdict, VERDICT_MOODS.get(d.verdict, "doubtful"), describe_verdict(d), facts,
-                  [*list_overruled(d), *d.notes], sections, data=collect_data(d))
+                  [*list_overruled(d), *d.notes], sections, data=collect_diagnosis_data(d))
 
 
 def build_bands_report(bands: Bands, place: str) -> Report:
@@ -484,7 +484,7 @@ def _name_limit(fault: Fault) -> str:
     return f"{fault.symbol} {format_limit(fault.acceptable, fault.unit)}"
 
 
-def collect_data(d: Diagnosis) -> dict[str, Any]:
+def collect_diagnosis_data(d: Diagnosis) -> dict[str, Any]:
     """The answer of `rig fdi --json`; SI units."""
     r = d.refinement
     return {

@@ -25,7 +25,7 @@ from .bench_file import (
 )
 from .bench_report import (
     build_bench_report as build_bench_report,
-    collect_data as collect_data,
+    collect_bench_data as collect_bench_data,
     list_loads as list_loads,
     tabulate_frames as tabulate_frames,
 )

@@ -112,7 +112,7 @@ def build_bench_report(bench: Bench, files: Sequence[tuple[str, str]] = ()) -> R
     verdict = "WITHIN_LIMITS" if is_possible else "BEYOND_LIMITS"
     return Report(command="check", title=f"Bench: {bench.name}", verdict=verdict, mood="good" if is_possible else "bad",
                   sentence=sentence, facts=facts, notes=notes, sections=[Section("Frames", [tabulate_frames(loads)])],
-                  files=files, data={"verdict": verdict, "bench": collect_data(bench, loads)})
+                  files=files, data={"verdict": verdict, "bench": collect_bench_data(bench, loads)})
 
 
 def tabulate_frames(loads: Sequence[FrameLoad]) -> Table:
@@ -132,7 +132,7 @@ def tabulate_frames(loads: Sequence[FrameLoad]) -> Table:
         caption="Share of the time, each frame at its longest (all stuff bits).")
 
 
-def collect_data(bench: Bench, loads: Sequence[FrameLoad]) -> dict[str, Any]:
+def collect_bench_data(bench: Bench, loads: Sequence[FrameLoad]) -> dict[str, Any]:
     """The bench as the JSON answer has it."""
     frames = [{"name": each.name, "identifier": each.identifier & _IDENTIFIER,
                "extended": bool(each.identifier & EXTENDED), "fd": bool(each.identifier & FD),

@@ -340,7 +340,7 @@ def diagnose_run(trace: Trace, job: Job, progress: Progress, workers: int = 2) -
     A phase that cannot be judged, for example a short one, gives CANNOT_TELL with the reason. `workers`: threads.
     """
     from fdi.diagnosis.diagnosis import diagnose  # here: loads the compiler, which other runs do not need
-    from fdi.report import collect_data
+    from fdi.report import collect_diagnosis_data
 
     kind = job.model.kind
     nominal = build_bare_model(kind.key).with_effects(kind.has)
@@ -350,7 +350,7 @@ def diagnose_run(trace: Trace, job: Job, progress: Progress, workers: int = 2) -
                              workers=workers)
     except InputError as error:
         return {"verdict": "CANNOT_TELL", "sentence": f"not judged: {error}"}
-    return dict(to_plain(collect_data(diagnosis)))
+    return dict(to_plain(collect_diagnosis_data(diagnosis)))
 
 
 def has_fault(answer: Mapping[str, Any]) -> bool:

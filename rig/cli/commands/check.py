@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fdi.report import Column, Line, Report, Section, Table
 from plant import check_behaviour, count_nouns, is_fault_file, load_model, require
-from rig.benches import build_bench_report, collect_data, list_loads, load_bench, tabulate_frames
+from rig.benches import build_bench_report, collect_bench_data, list_loads, load_bench, tabulate_frames
 from rig.cli.answer import choose_places, give_answer, show_progress
 from rig.cli.commands.list import build_list_report, list_faults
 from rig.cli.inputs import load_chosen_model, parse_changes
@@ -33,7 +33,7 @@ def run_command(args: argparse.Namespace) -> int:
         bench = load_bench(args.bench, is_trusted=args.trust)
         loads = list_loads(bench)
         report = replace(report, sections=[*report.sections, Section("Frames", [tabulate_frames(loads)])],
-                         data={**report.data, "bench": collect_data(bench, loads)})
+                         data={**report.data, "bench": collect_bench_data(bench, loads)})
     return give_answer(report, args, int(bool(dry.problems)), places)
 
 
