@@ -432,7 +432,7 @@ def test_the_answers_of_small_commands(preflight: Path, here: Path) -> None:
     traces = [Path(name) for name in ("run.csv", "run2.csv", "held.csv")]
     assert samples["traces"] == [*map(str, traces)] and all(trace.exists() for trace in traces)
     assert_all_seen("simulate", simulated, samples)
-    kinds = ("parameters", "signals", "sequences", "effects", "checks", "models", "benches", "faults")
+    kinds = ("parameters", "signals", "sequences", "effects", "checks", "models", "benches", "plants", "faults")
     assert_all_seen("list", *(rig("list", kind, "--json").json for kind in kinds))
     assert_all_seen("report", rig("report", preflight, "--out", "page.html", "--json").json)
     assert_all_seen("export", rig("export", preflight, "--out", "run.csv", "--force", "--json").json,

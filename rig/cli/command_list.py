@@ -307,11 +307,13 @@ COMMANDS = {
          BENCH, option("--model", metavar="FILE|NAME",
                        help="whose signals were recorded: model file, plant file or model name (default eha)"), TRUST)),
     "list": Command(
-        "list names that other commands take: parameters, signals, sequences, effects, checks, models, benches, faults",
+        "list names that other commands take: parameters, signals, sequences, effects, checks, models, benches, "
+        "plants, faults",
         "Names come with unit, range and default.",
         (option("kind", metavar="KIND",
-                choices=("parameters", "signals", "sequences", "effects", "checks", "models", "benches", "faults"),
-                help="one of: parameters, signals, sequences, effects, checks, models, benches, faults"),
+                choices=("parameters", "signals", "sequences", "effects", "checks", "models", "benches", "plants",
+                         "faults"),
+                help="one of: parameters, signals, sequences, effects, checks, models, benches, plants, faults"),
          option("word", nargs="?", default="", metavar="WORD", help="only names that contain this word"), *MODEL,
          FAULTS)),
     "new": Command(

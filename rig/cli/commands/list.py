@@ -12,6 +12,7 @@ from plant import (
     Model,
     Quantity,
     count_nouns,
+    find_plant,
     find_quantity,
     list_plants,
     load_model,
@@ -132,6 +133,13 @@ def list_benches(model: Model) -> Rows:
              "cycle, s": b.cycle_ns / 1e9, "frames": len(b.frames.frames)} for name, b in found]
 
 
+def list_shipped_plants(model: Model) -> Rows:
+    """The shipped plants: what `plant` in a model or bench file names beside a file."""
+    return [{"name": plant.name, "title": plant.title, "controlled": plant.signals.controlled.name,
+             "cycle, s": plant.nominal["controller.period"], "effects": len(plant.list_effects()),
+             "own faults": len(plant.faults)} for plant in map(find_plant, list_plants())]
+
+
 def list_faults(model: Model, source: str | None = None) -> Rows:
     """The faults of a file, of the plant, or of all shipped lists that the plant can have."""
     from fdi.diagnosis.faults import choose_faults, list_fault_files, load_faults  # here: only this list needs them
@@ -154,5 +162,6 @@ KINDS: Mapping[str, tuple[Callable[[Model], Iterable[dict[str, Any]]], str]] = {
                             "skip and requirement."),
     "models": (list_models, "Choose one with --model NAME, or a file."),
     "benches": (list_benches, "Choose one with --bench NAME, or a file."),
+    "plants": (list_shipped_plants, "Name one with plant = in a model or bench file, or a file (rig new plant)."),
     "faults": (list_faults, "Measure those of a list with rig fdi TRACE --faults LIST, or a file; SI units."),
 }
