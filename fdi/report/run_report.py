@@ -86,7 +86,7 @@ def build_run_report(trace: Trace) -> Report:
         Section("First cause and consequences", _show_cause(trace), medium=page),
         Section("Checks", [_tabulate_checks(trace.sequence_checks, "check", Medium.BOTH)]),
         Section("Failed checks", _show_failed_checks(trace), medium=page),
-        Section("Servovalve", _show_diagnosis(trace), medium=page),
+        Section("Faults found by rig fdi", _show_diagnosis(trace), medium=page),
         Section("Protocol", [_tabulate_checks(trace.protocol_checks, "protocol check", page),
                              _tabulate_skipped(trace)]),
         Section("Signals", [Figure(

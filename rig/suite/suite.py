@@ -381,7 +381,7 @@ def build_suite_report(suite: Suite, results: Sequence[CaseResult], seconds: flo
         facts=facts, notes=[f"no check verifies {', '.join(missing)}"] if missing else [],
         sections=[Section("Cases", _tabulate_cases(results, folder)),
                   Section("Checks that did not pass", _tabulate_failures(results, folder), title_medium=Medium.BOTH),
-                  Section("Servovalve", _tabulate_faults(results, folder), title_medium=Medium.BOTH),
+                  Section("Faults found by rig fdi", _tabulate_faults(results, folder), title_medium=Medium.BOTH),
                   Section("Requirements", tabulate_requirements(requirements), title_medium=Medium.BOTH)],
         files=files, conclusion="" if verdict == "PASS" else f"{verdict}: {_describe(results)}",
         data=collect_data(suite, results, requirements, seconds, processes))

@@ -81,7 +81,7 @@ def test_a_fault_that_rig_fdi_finds_fails_the_run(found: str, verdict: str, stat
     assert (outcome.verdict, outcome.status) == (verdict, status) and said(outcome)["verdict"] == verdict
     report = build_run_report(Trace.read(tmp_path, all=True))  # the log alone says so too
     assert report.verdict == verdict
-    section = next(section for section in report.sections if section.title == "Servovalve")
+    section = next(section for section in report.sections if section.title == "Faults found by rig fdi")
     assert section.items[0].text == f"The sentence of {found}."  # type: ignore[union-attr]
     assert (f"The sentence of {found}" in report.sentence) == (verdict == "FAIL")
 

@@ -289,7 +289,7 @@ def test_a_fault_fails_its_case_and_no_other(units: tuple[Path, Said]) -> None:
 
 def test_report_and_page_show_level_and_size(units: tuple[Path, Said]) -> None:
     folder, said = units
-    table = said.out.split("Servovalve\n")[1].split("A fault beyond acceptable")[0]
+    table = said.out.split("Faults found by rig fdi\n")[1].split("A fault beyond acceptable")[0]
     assert table.count("Kintas 0") == table.count("FSS ") == 2 and table.count("non-nominal") == 1
     assert "rig fdi: filter clogging non-nominal, Kintas 0." in " ".join(said.out.split())
     page = (folder / "suite.html").read_text()
