@@ -250,14 +250,13 @@ def encode_value(variable: ODVariable, value: float) -> bytes | None:
     if kind is None:  # a text, or a domain
         return None
     is_whole = kind is not Kind.FLOAT
-    bits = Field(name="", lowest=0, length=len(variable), kind=kind)
-    lows, highs = [variable.min], [variable.max]
+    ranges = [(variable.min, variable.max)]
     if is_whole:  # canopen cuts numbers of 24 bits and the like
-        lows.append(bits.range[0])
-        highs.append(bits.range[1])
-    is_beyond = any(low is not None and value < low for low in lows) or any(
-        high is not None and value > high for high in highs)
-    if is_beyond or (is_whole and value % 1):
+        ranges.append(Field(name="", lowest=0, length=len(variable), kind=kind).range)
+    for low, high in ranges:
+        if (low is not None and value < low) or (high is not None and value > high):
+            return None
+    if is_whole and value % 1:
         return None
     try:
         return bytes(variable.encode_raw(int(value) if is_whole else float(value)))
