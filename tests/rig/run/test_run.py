@@ -81,7 +81,9 @@ def test_real_time_gives_the_same_signals(tmp_path: Path, reference: np.ndarray)
 def test_processes_on_a_bus_give_the_same_signals(where: str, tmp_path: Path, reference: np.ndarray) -> None:
     """Plant and controller as processes of their own: same signals, and nobody is left behind."""
     outcome = play(job(seed=1, bus=where), tmp_path / "b")
-    assert (outcome.verdict, outcome.aborted, set(outcome.counters.values())) == ("PASS", "", {0})
+    # a machine that stood still holds back the plant's heartbeat, which has no lockstep
+    assert outcome.verdict == "PASS" or outcome.timing_problem.endswith("own heartbeat was not on time")
+    assert (outcome.aborted, set(outcome.counters.values())) == ("", {0})
     assert np.array_equal(read_signals(tmp_path / "b"), reference), outcome.counters
     assert nodes_on(where) == []
 
@@ -278,7 +280,7 @@ def test_a_killed_run_loses_half_a_second_at_most(tmp_path: Path) -> None:
         where, folder = spec("udp_multicast"), tmp_path / str(attempt)
         last = killed(where, folder, 1000)
         assert gone(where)
-        if last < 1000:
+        if last < 1000 or (folder / "verdict.json").exists():  # it had ended by itself, if only just before
             continue
         said = rig("report", folder / "trace.mcap")
         assert said.status == 2 and "rig recover" in said.err
