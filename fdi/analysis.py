@@ -12,6 +12,7 @@ from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
+import fdi.report  # a report's function, and what it needs, is loaded at its first use
 from fdi.foreign_code import load_effects_of_model, load_plant_of_model
 from fdi.output import write_text
 from fdi.report import Drawing, Figure, Medium, Report, convert_figure, render_html, save_drawing, to_plain
@@ -128,9 +129,7 @@ class Result:
 
     def to_text(self, width: int = 100) -> str:
         """The report as the terminal shows it, without colours; `width` in characters."""
-        from fdi.report import format_report
-
-        return format_report(self.report, width)
+        return fdi.report.format_report(self.report, width)
 
     def __str__(self) -> str:
         return self.to_text()
@@ -139,8 +138,7 @@ class Result:
         return f"<{type(self).__name__} {self.verdict}: {shorten(self.sentence, 90, placeholder=' ..')}>"
 
     def _repr_html_(self) -> str:
-        page = html.escape(self.to_html(), quote=True)
-        return f'<iframe srcdoc="{page}" style="width: 100%; height: 720px; border: 0"></iframe>'
+        return f'<iframe srcdoc="{html.escape(self.to_html())}" style="width: 100%; height: 720px; border: 0"></iframe>'
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -242,13 +240,12 @@ def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
         InputError: a trace, a model or a signal that cannot be used.
     """
     from fdi.comparison.compare import compare as compare_trace
-    from fdi.report import build_comparison_report
 
     own_model = _load_model(model, trust)
     measured = _load_trace(trace, own_model)
     comparison = compare_trace(measured, own_model, [_load_trace(r, own_model) for r in repeats], signals,
                                source=measured.provenance.get("source", "trace"))
-    return ComparisonResult(build_comparison_report(comparison), comparison)
+    return ComparisonResult(fdi.report.build_comparison_report(comparison), comparison)
 
 
 def explain(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence[TraceOrPath] = (),
@@ -270,13 +267,12 @@ def explain(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
         InputError: a trace, a model or a signal that cannot be used.
     """
     from fdi.discovery.explain_runs import explain_runs
-    from fdi.report import build_explanation_report
 
     own_model = _load_model(model, trust)
     runs = _collect_runs(own_model, trace, repeats, holdout, signals)
     answer, pattern = explain_runs(runs, seed, effect_file)
-    return ExplanationResult(build_explanation_report(answer, runs.sources[0].file, own_model.name, runs.sources,
-                                                      pattern=pattern, notes=runs.notes), answer)
+    return ExplanationResult(fdi.report.build_explanation_report(
+        answer, runs.sources[0].file, own_model.name, runs.sources, pattern=pattern, notes=runs.notes), answer)
 
 
 def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPath = "eha", *,
@@ -297,13 +293,12 @@ def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPa
         InputError: an effect that this model cannot take, or runs that cannot be used.
     """
     from fdi.discovery.update_model import add_effects, remove_all_effects
-    from fdi.report import build_model_report
 
     effects = [effect] if isinstance(effect, str) else list(effect)
     own_model, known = _load_model_file(model, trust)
     runs = _collect_runs(remove_all_effects(own_model, known), trace, repeats, holdout, signals)
     update = add_effects(effects, runs, own_model, known, f"fdi.add_effect({', '.join(map(repr, effects))})")
-    return ModelResult(build_model_report(update), update)
+    return ModelResult(fdi.report.build_model_report(update), update)
 
 
 def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eha", *,
@@ -330,16 +325,15 @@ def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eh
         read_free_parameters,
         read_identification_runs,
     )
-    from fdi.report import build_identification_report
 
     own_model = _load_model(model, trust)
     source = None if isinstance(model, Model) else model
     ranges = read_free_parameters(own_model, source) if free is None else parse_free_parameters(free, own_model, "free")
-    fitted = [runs] if isinstance(runs, Trace | str | Path) else list(runs)
+    fitted = [runs] if isinstance(runs, Trace | str | Path) else runs
     own = read_identification_runs(own_model, ranges, [_pass_run(r) for r in fitted],
                                    [_pass_run(r) for r in holdouts], signals)
     found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources, seed)
-    return IdentificationResult(build_identification_report(found, own_model.name), found)
+    return IdentificationResult(fdi.report.build_identification_report(found, own_model.name), found)
 
 
 def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Path | None = None,
@@ -359,14 +353,13 @@ def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Pat
     from fdi.diagnosis.bands import load_bands
     from fdi.diagnosis.diagnosis import diagnose as diagnose_trace
     from fdi.diagnosis.faults import choose_faults
-    from fdi.report import build_diagnosis_report
 
     own_model = _load_model(model, trust)
     known_bands = None if bands is None else load_bands(bands, own_model.kind)
-    measured, own_faults = _load_trace(trace, own_model), choose_faults(faults, own_model.kind)
+    measured = _load_trace(trace, own_model)
     diagnosis = diagnose_trace(measured, own_model, known_bands, source=measured.provenance.get("source", "trace"),
-                               faults=own_faults)
-    return DiagnosisResult(build_diagnosis_report(diagnosis), diagnosis)
+                               faults=choose_faults(faults, own_model.kind))
+    return DiagnosisResult(fdi.report.build_diagnosis_report(diagnosis), diagnosis)
 
 
 def _load_trace(trace: TraceOrPath, model: Model) -> Trace:

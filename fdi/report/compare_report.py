@@ -31,6 +31,7 @@ from fdi.report.drawing import (
     label_signal,
     legend,
     line,
+    name_controlled,
     name_rows,
     shade,
 )
@@ -275,8 +276,7 @@ def _describe_drift(c: Comparison, notable: float = 1e-6) -> str:
     controlled = c.trace.declared.controlled
     if controlled.name not in c.signals or abs(c.drift) <= notable * c.trace.scale or c.trace.filled.any():
         return ""
-    what = "position" if controlled.unit == "m" else controlled.symbol
-    return (f"a replay that is not corrected towards the measured {what} drifts by "
+    return (f"a replay that is not corrected towards the measured {name_controlled(c.trace.declared)} drifts by "
             f"{format_amount(c.drift, f'{controlled.unit}/s')}; its error is "
             f"{format_amount(c.free_error, controlled.unit)} RMS")
 
@@ -362,11 +362,10 @@ def draw_overview(c: Comparison) -> str:
     left_out = [shade(float(t[a]), float(t[b - 1]), RED, 0.12) for a, b in ends.reshape(-1, 2)]
     d = c.trace.declared
     command, controlled = d.command, d.controlled
-    what = "position" if controlled.unit == "m" else controlled.symbol
     panels: list[Panel] = [[line(t, c.trace.command * command.shown_scale, COMMAND, f"{command.symbol}, command", 2.2),
                             line(t, c.trace.controlled * controlled.shown_scale, BLUE,
                                  f"{controlled.symbol}, {controlled.phrase}"),
-                            axes(ylabel=f"{what} [{controlled.shown_unit}]"), legend(2), *left_out]]
+                            axes(ylabel=f"{name_controlled(d)} [{controlled.shown_unit}]"), legend(2), *left_out]]
     for name, s in c.signals.items():
         scale, (fine, small) = s.signal.shown_scale, choose_drawn_unit(s.signal, s.error)
         floor = NOISE_BAND_RATIO * s.floor.value * small

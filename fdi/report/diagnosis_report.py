@@ -131,9 +131,8 @@ def build_bands_report(bands: Bands, place: str) -> Report:
 def describe_verdict(d: Diagnosis) -> str:
     """The verdict in a sentence or two."""
     whole, each = ("neither fault", "the two faults") if len(d.faults) == 2 else ("no fault", "the faults")
-    titles = {fault.name: fault.title for fault in d.faults}
     grouped = {name for group in d.groups for name in group}
-    names = join_words(titles[name] for name, level in d.levels.items() if level is None and name not in grouped)
+    names = join_words(f.title for f in d.faults if d.levels[f.name] is None and f.name not in grouped)
     is_disputed = d.beside is not None and d.beside.disputed
     groups = " ".join(describe_group(d, group) for group in d.groups)
     match d.verdict:
@@ -459,7 +458,7 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
         return number(title), lambda name: format_precursor(find_value(found[name]), name, found[name].unit)
 
     def show_fault(fault: BandFault) -> list[tuple[Column, Callable[[str], Cell | str]]]:
-        title = f"{_name_limit(fault)} adds"
+        title = f"{fault.symbol} {format_limit(fault.acceptable, fault.unit)} adds"  # MidBand
 
         def ratio(name: str) -> Cell | str:
             return show_deviation(found[name].compute_ratio(fault.name))
@@ -477,11 +476,6 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
            *(column for fault in d.bands.faults for column in show_fault(fault))) if d.bands else ()),
         caption="Deviation: measured minus healthy mean, in standard deviations of healthy units; red beyond 4."
         if d.bands else "As measured; without bands there are no healthy units to compare with.")]
-
-
-def _name_limit(fault: Fault) -> str:
-    """MidBand of a fault: "FSS 35 N"."""
-    return f"{fault.symbol} {format_limit(fault.acceptable, fault.unit)}"
 
 
 def collect_diagnosis_data(d: Diagnosis) -> dict[str, Any]:

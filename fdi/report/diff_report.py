@@ -37,7 +37,7 @@ from fdi.report.numbers import (
     list_first,
 )
 from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Report, Section, Table
-from fdi.report.run_report import read_verdict
+from fdi.report.run_report import TIMES, read_verdict
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
 from fdi.trace import CheckResult, Trace
 from plant import count_nouns
@@ -260,10 +260,9 @@ def _collect_facts(traces: Sequence[Trace]) -> dict[str, Facts]:
                               for trace in traces]
                        for name, start in (("sequence file", "sequence/"), ("effect files", "effects/"),
                                            ("model file", "model.toml"))}
-    measured = {"SYNC lateness": "lateness", "controller's response": "response", "bench's own work": "work"}
     facts["timing"] |= {
         **{f"{words}, p50 / p99 / max": [_format_percentiles(getattr(trace.timing, field)) for trace in traces]
-           for words, field in measured.items()},
+           for words, field in TIMES.items()},
         "overruns": [f"{int(trace.timing.overrun.sum())} of {len(trace.timing.t)}" if len(trace.timing.t) else ""
                      for trace in traces]}
     return facts

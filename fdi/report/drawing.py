@@ -69,6 +69,11 @@ def label_signal(signal: Signal) -> str:
     return f"{signal.symbol} [{signal.shown_unit}]"
 
 
+def name_controlled(signals: Signals) -> str:
+    """What a page calls the controlled signal: the position of a ram, any other by its symbol."""
+    return "position" if signals.controlled.unit == "m" else signals.controlled.symbol
+
+
 call = methodcaller  # of matplotlib's `Axes`
 
 

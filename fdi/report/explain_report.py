@@ -469,8 +469,7 @@ def _name_state(state: str) -> str:
 def draw_law(c: LawCurve) -> str:
     """What is missing over the law's first state, in bins with two standard errors, and what the law says there."""
     scale, unit = AXES.get(c.state, (1e3, "mm"))
-    along = c.along.replace("direction", "speed")
-    sign = f", times the sign of the {along}" if along else ""
+    sign = f", times the sign of the {c.along.replace('direction', 'speed')}" if c.along else ""
     return draw_panels("law", [[[
         area(scale * c.at, c.height - 2.0 * c.doubt, c.height + 2.0 * c.doubt, ORANGE, "two standard errors"),
         line(scale * c.at, c.height, ORANGE, "measured", ls="", marker="o", ms=3.5),

@@ -34,8 +34,7 @@ def format_interval(value: float, low: float, high: float, unit: str, most_digit
     >>> format_interval(45.01, 44.6, 45.4, "N"), format_interval(2.2e-5, 2.18e-5, 2.22e-5, "m")
     ('45.0 N (44.6 .. 45.4)', '22.0 um (21.8 .. 22.2)')
     """
-    limits = [x for x in (value, low, high) if math.isfinite(x)]
-    largest = max(map(abs, limits), default=0.0)
+    largest = max((abs(x) for x in (value, low, high) if math.isfinite(x)), default=0.0)
     scale, name = choose_unit(unit, largest)
     digits = _digits_of_interval(0.5 * abs(high - low), largest, most_digits)
     shown = [format_digits(x / scale, digits, largest / scale) for x in (value, low, high)]

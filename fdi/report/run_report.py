@@ -35,6 +35,7 @@ from fdi.report.drawing import (
     level,
     levels,
     line,
+    name_controlled,
     shade,
     spans,
 )
@@ -64,6 +65,7 @@ DECISIONS = {"simple": "simple acceptance: by the value alone, U is not used",
              "shared": "shared risk: by the value alone, if U is small against the limits"}
 _SKIPPED = "not_applicable."  # before the names of checks that do not apply to the bench, in the provenance
 EVENT_MOODS: dict[str, Mood] = {"ERROR": "bad", "WARN": "doubtful"}
+TIMES = {"SYNC lateness": "lateness", "controller's response": "response", "bench's own work": "work"}  # of `Timing`
 KINDS_OF_TIMING = {"hard real time": "the rig's cycle ran as compiled code",
                    "soft real time": "the rig's cycle ran in Python, on a bus that compiled code cannot use"}
 
@@ -220,7 +222,7 @@ def _name_measure(check: CheckResult) -> str:
     if check.kind in ("event_occurs", "event_never"):
         return f"number of {check.signal} events" if check.signal else "number of events"
     quantity = {"never_exceeds": "largest size", "response_within": "response time"}.get(check.kind)
-    return " of ".join(word for word in (quantity or check.kind.replace("_", " "), check.signal) if word)
+    return " of ".join(filter(None, (quantity or check.kind.replace("_", " "), check.signal)))
 
 
 def _format_window(check: CheckResult) -> str:
@@ -230,8 +232,7 @@ def _format_window(check: CheckResult) -> str:
 
 
 def _show_timing(trace: Trace) -> list[Item]:
-    timed = (("SYNC lateness", trace.timing.lateness), ("controller's response", trace.timing.response),
-             ("bench's own work", trace.timing.work))
+    timed = ((name, getattr(trace.timing, field)) for name, field in TIMES.items())
     known = [(name, values[~np.isnan(values)] * 1e6) for name, values in timed if not np.isnan(values).all()]
     if not known:
         return []
@@ -298,9 +299,8 @@ def draw_signals(trace: Trace) -> str:
     """Command and controlled signal, error, drive, other outputs and load over one time axis, with sections and checks.
     """
     d, t, error, half = trace.declared, trace.t, trace.command - trace.controlled, _choose_close_up(trace)
-    what = "position" if d.controlled.unit == "m" else d.controlled.symbol
     size, fine = choose_unit(d.controlled.unit, 0.0)
-    shown = [(trace.controlled, f"{what} [{d.controlled.shown_unit}]", d.controlled.shown_scale, BLUE),
+    shown = [(trace.controlled, f"{name_controlled(d)} [{d.controlled.shown_unit}]", d.controlled.shown_scale, BLUE),
              (error, f"error [{fine}]", 1.0 / size, ORANGE),
              (error if half else np.full_like(error, math.nan), f"error, close up [{fine}]", 1.0 / size, ORANGE),
              (trace.drive, f"{d.drive.phrase} [{d.drive.shown_unit}]", d.drive.shown_scale, VIOLET),
@@ -338,11 +338,10 @@ def list_faults(trace: Trace) -> list[tuple[str, float, float]]:
 
 def draw_timing(trace: Trace) -> str:
     """Histograms of lateness, response and work; "" for a trace without timing."""
-    columns = (("SYNC lateness", trace.timing.lateness, BLUE), ("controller's response", trace.timing.response, ORANGE),
-               ("bench's own work", trace.timing.work, GREY))
     shortest_time = 0.1  # us, the left end of a histogram: the resolution of the clock
     panels: list[Panel] = []
-    for name, values, colour in columns:
+    for (name, field), colour in zip(TIMES.items(), (BLUE, ORANGE, GREY), strict=True):
+        values = getattr(trace.timing, field)
         if (values > 0).any():
             known = np.maximum(values[~np.isnan(values)] * 1e6, shortest_time)
             bins = np.logspace(math.log10(known.min()), math.log10(max(float(known.max()), 1.0)) + 0.02, 60)
@@ -527,8 +526,7 @@ def _draw_response(view: _View) -> Panel:
 
     return [line(shown.t, com, COMMAND, d.command.symbol, 1.6),
             line(shown.t, scale * shown.controlled, BLUE, d.controlled.symbol), *_draw_lines(view.check, place),
-            axes(ylabel=f"{'position' if d.controlled.unit == 'm' else d.controlled.symbol} "
-                        f"[{d.controlled.shown_unit}]")]
+            axes(ylabel=f"{name_controlled(d)} [{d.controlled.shown_unit}]")]
 
 
 def _draw_reaction(view: _View) -> Panel:

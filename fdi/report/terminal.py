@@ -31,7 +31,7 @@ def print_report(report: Report, console: Console) -> None:
         if section.title_medium.includes(Medium.TERMINAL) or section.badge is not None:
             _flush_lines(labels, console)
             console.print()
-            badge = Text(f"  {section.badge.text}", style_of(section.badge)) if section.badge else Text()
+            badge = Text(f"  {section.badge.text}", style_of(section.badge)) if section.badge else ""
             console.print(Text.assemble((section.title, "bold"), badge), soft_wrap=True)
         for item in items:
             if isinstance(item, Line):

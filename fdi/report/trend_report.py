@@ -150,14 +150,14 @@ def _describe_break(found: Break, point: Point, fault: Fault, unit: UnitTrend) -
     at = f"{point.trace}, {_collect_place(point.t, unit)}"
     size = format_amount(abs(found.size), fault.unit, 2)
     side = "above" if (found.size > 0) != fault.falls else "below"
+    meaning = ("an outlier, a step or faster growth; each gets a probability of one third" if found.size > 0 else
+               "an outlier or a repair; it is left out")
     words = {"outlier": f"outlier, left out: {at}, {size} {side} the other traces",
              "step": f"step: from {at} on, the size is {size} {'smaller' if fault.falls else 'larger'}",
              "repair": f"repair: at {at} the size {'rises' if fault.falls else 'drops'} by {size}; the trend starts "
-                       "there"}
-    meaning = {True: "an outlier, a step or faster growth; each gets a probability of one third",
-               False: "an outlier or a repair; it is left out"}
-    last = f"the last trace is {size} {side} the others: {meaning[found.size > 0]}; another trace would decide"
-    return words.get(found.kind, last)
+                       "there",
+             "last": f"the last trace is {size} {side} the others: {meaning}; another trace would decide"}
+    return words[found.kind]
 
 
 def _describe_time_left(remaining: Remaining, trend: Trend, unit: UnitTrend) -> str:
@@ -237,9 +237,8 @@ def draw_trends(unit: UnitTrend) -> Drawing:
 def _draw_fault(trend: Trend, unit: UnitTrend) -> Panel:
     t = _convert_times(trend.t, unit)
     value, low, high = np.array(trend.sizes).T
-    unit_shown = "" if trend.fault.unit == "1" else f" [{trend.fault.unit}]"
     panel = [axes(ylim=(min(0.0, float(low.min())), 1.25 * max(trend.fault.maintenance, float(value.max()))),
-                  ylabel=f"{trend.fault.title}, {trend.fault.symbol}{unit_shown}")]
+                  ylabel=f"{trend.fault.title}, {trend.fault.symbol}{trend.fault.bracketed_unit}")]
     if trend.past is not None and trend.future is not None:
         for curve, colour, name, style in ((trend.past, BLUE, "fitted course", "-"),
                                            (trend.future, ORANGE, "forecast, 95 %", "--")):

@@ -30,7 +30,12 @@ from .mcap_log import (
     scan_messages as scan_messages,
     unpack_chunk as unpack_chunk,
 )
-from .sections import Section as Section, describe_section as describe_section, find_sections as find_sections
+from .sections import (
+    Floats as Floats,
+    Section as Section,
+    describe_section as describe_section,
+    find_sections as find_sections,
+)
 from .sensor_dynamics import (
     SensorDynamics as SensorDynamics,
     find_comb as find_comb,
@@ -42,7 +47,6 @@ from .trace import (
     MAIN as MAIN,
     Event as Event,
     Flags as Flags,
-    Floats as Floats,
     Trace as Trace,
     bridge_gaps as bridge_gaps,
     fill_gaps as fill_gaps,

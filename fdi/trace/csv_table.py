@@ -102,10 +102,9 @@ def report_unreadable(where: object, encodings: str) -> Iterator[None]:
 
 def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
     """Write columns, shape (rows,) each; values survive a round trip exactly; `.gz` compresses, with no time inside."""
-    names = list(columns)
     rows = (",".join("" if math.isnan(v) else repr(v) for v in row)
-            for row in zip(*(columns[name].tolist() for name in names), strict=True))
-    raw = ("\n".join([",".join(names), *rows]) + "\n").encode()
+            for row in zip(*(column.tolist() for column in columns.values()), strict=True))
+    raw = ("\n".join([",".join(columns), *rows]) + "\n").encode()
     with report_system_error(path, "", "a place that can be written"), write_whole(path) as part:
         part.write_bytes(gzip.compress(raw, mtime=0) if path.suffix == ".gz" else raw)
 

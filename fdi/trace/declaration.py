@@ -7,12 +7,12 @@ from typing import Any
 from plant import InputError, Signal, Signals, escape_control_characters
 
 DECLARATION = "signals"  # metadata record of a log, with one entry of the same name: a list of signals as JSON
+USUAL = Signal("", "", "", "")._asdict()  # every field of a signal, as it usually is
 
 
 def write_declaration(signals: Signals) -> dict[str, str]:
     """The signals as metadata of a log; fields that are as usual are left out."""
-    usual = Signal("", "", "", "")
-    return {DECLARATION: json.dumps([{key: value for key, value in s._asdict().items() if value != getattr(usual, key)}
+    return {DECLARATION: json.dumps([{key: value for key, value in s._asdict().items() if value != USUAL[key]}
                                      for s in signals[1:]])}
 
 
@@ -24,13 +24,12 @@ def read_declaration(where: object, metadata: Mapping[str, str]) -> Signals | No
     """
     if DECLARATION not in metadata:
         return None
-    usual = Signal("", "", "", "")._asdict()
     try:
         found = []
         for table in json.loads(metadata[DECLARATION]):
-            values: dict[str, Any] = {key: table[key] for key in usual if key in table}
+            values: dict[str, Any] = {key: table[key] for key in USUAL if key in table}
             for key, value in values.items():
-                if type(value) is not type(usual[key]) and (type(value), type(usual[key])) != (int, float):
+                if type(value) is not type(USUAL[key]) and (type(value), type(USUAL[key])) != (int, float):
                     raise TypeError(f"{key} is {value!r:.40}")
                 values[key] = escape_control_characters(value) if isinstance(value, str) else value
             found.append(Signal(**values))

@@ -84,11 +84,10 @@ class Log:
             first = next(messages, None)
             if first is None:
                 return {"time_ns": np.empty(0, np.int64)}
-            fields = first[1].DESCRIPTOR.fields
-            kinds = [(f.name, _KINDS.get(f.cpp_type, "O")) for f in fields]
-            read = attrgetter(*(f.name for f in fields))
+            kinds = {f.name: _KINDS.get(f.cpp_type, "O") for f in first[1].DESCRIPTOR.fields}
+            read = attrgetter(*kinds)
             rows = ((time_ns, *read(message)) for time_ns, message in chain([first], messages))
-            table = np.fromiter(rows, np.dtype([("time_ns", "i8"), *kinds]))
+            table = np.fromiter(rows, np.dtype([("time_ns", "i8"), *kinds.items()]))
             table = table[np.argsort(table["time_ns"], kind="stable")]
             return {name: table[name].copy() for name in table.dtype.names or ()}
 

@@ -28,13 +28,12 @@ def describe_section(section: Section, furthest: float = 0.0, unit: str = "m") -
     'step to 5 mm'
     """
     factor, shown = (1e3, "mm") if unit == "m" else (1.0, unit)
-    level = f"{factor * section.last:.4g} {shown}"
     match section.kind:
         case "ramp":
             return f"ramp at {factor * section.rate:.3g} {shown}/s"
         case "dynamic":
             return f"motion within {factor * furthest:.4g} {shown}"
-    return f"{section.kind} {'to' if section.kind == 'step' else 'at'} {level}"
+    return f"{section.kind} {'to' if section.kind == 'step' else 'at'} {factor * section.last:.4g} {shown}"
 
 
 def find_sections(command: Floats, period: float = 1e-3, scale: float = 1.0) -> list[Section]:
@@ -85,11 +84,7 @@ def _is_tangent(com: Floats, start: int, stop: int, slope: float, longest: int) 
     """True for a short line that only touches a slow curve: its slope bends on beyond one of its ends."""
     if stop - start > longest or abs(slope) * (stop - start) <= 2 * RESOLUTION:
         return False
-    beyond = []
-    if start >= 20:
-        beyond.append(com[start] - com[start - 20])
-    if stop + 20 <= len(com):
-        beyond.append(com[stop + 19] - com[stop - 1])
+    beyond = [com[b] - com[a] for a, b in ((start - 20, start), (stop - 1, stop + 19)) if a >= 0 and b < len(com)]
     return any(0 < abs(rise / (20 * slope) - 1) < 0.2 and abs(rise - 20 * slope) > RESOLUTION / 10 for rise in beyond)
 
 
@@ -99,7 +94,7 @@ def _is_jump(com: Floats, row: int) -> bool:
         return False
     before = np.abs(np.diff(com[max(0, row - 4):row]))
     least_step = 2e-6  # m; least step
-    return bool(abs(com[row] - com[row - 1]) > least_step + 3 * (before.max() if len(before) else 0.0))
+    return bool(abs(com[row] - com[row - 1]) > least_step + 3 * before.max(initial=0.0))
 
 
 def _merge_short_parts(parts: list[Section], shortest: int) -> list[Section]:

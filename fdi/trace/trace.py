@@ -16,14 +16,13 @@ from fdi.trace.check_result import CheckResult
 from fdi.trace.csv_table import read_csv, require_growth, write_csv
 from fdi.trace.declaration import DECLARATION, read_declaration
 from fdi.trace.mcap_log import Log, open_log
-from fdi.trace.sections import Section, find_sections
+from fdi.trace.sections import Floats, Section, find_sections
 from fdi.trace.sensor_dynamics import SensorDynamics, read_sensors
 from plant import EHA, InputError, Signal, Signals, escape_control_characters, require
 
 if TYPE_CHECKING:
     from plant import Part  # a bench that reads its own log does not load the compiler
 
-Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Messages = list[tuple[int, Any]]  # (time ns, protobuf message)
 
@@ -274,11 +273,9 @@ class Trace:
     @cached_property
     def anchor(self) -> Floats:
         """What a replay is drawn to: the controlled signal as measured, and known in the first row, where it starts."""
-        anchor = self.unlagged
-        if not np.isnan(anchor[0]):
-            return anchor
-        anchor = anchor.copy()
-        anchor[0] = anchor[~np.isnan(anchor)][0]
+        anchor = self.unlagged.copy()
+        if np.isnan(anchor[0]):
+            anchor[0] = anchor[~np.isnan(anchor)][0]
         return anchor
 
     @cached_property

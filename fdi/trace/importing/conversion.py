@@ -212,13 +212,12 @@ def _parse_signal(name: str, table: Any, place: Place, declared: Signals) -> Sig
 def convert_to_si(values: Floats, unit: Unit) -> Floats:
     """Values in SI units.
 
-    A factor below 1 is a division by a whole number: 12.3456 mm becomes the float nearest to 0.0123456 m.
+    A factor 1/n is a division by a whole number: 12.3456 mm becomes the float nearest to 0.0123456 m.
 
     >>> convert_to_si(np.array([12.3456]), require_unit("mm", "m", "", "")).tolist()
     [0.0123456]
     """
-    is_part = unit.factor < 1 and unit.factor.numerator == 1
-    return values / float(unit.factor.denominator) if is_part else values * float(unit.factor)
+    return values / float(unit.factor.denominator) if unit.factor.numerator == 1 else values * float(unit.factor)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -367,8 +366,7 @@ def _scale(measurement: Measurement, chosen: ImportMap, name: str, channels: Map
     signal, si = chosen.signals[name], chosen.declared.find(name).unit
     channel = channels[signal.source]
     x = _convert(channel.values, signal, si)
-    t = _find_times(measurement, chosen, signal, channel, channels)
-    t = t - signal.delay if signal.delay else t
+    t = _find_times(measurement, chosen, signal, channel, channels) - signal.delay
     if signal.minus:
         other = channels[signal.minus.source]
         if len(other.values) != len(x) or (other.t is not None and channel.t is not None

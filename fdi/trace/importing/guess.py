@@ -182,13 +182,14 @@ def _rate_time(name: str, x: Floats, columns: Columns) -> Guess:
     guess, steps = Guess(name, UNITS["s"]), np.diff(x)
     if not (steps > 0).all():
         return guess
-    guess.note(2.0, "it grows in every row")
-    if float(np.median(np.abs(steps - np.median(steps)))) <= 0.01 * float(np.median(steps)):
-        guess.note(1.0, "evenly")
-    if _has_word(name, TIME_WORDS):
-        guess.note(2.0, "its name says time")
-    if columns.measures(name, "s"):
-        guess.note(2.0, f"its unit is {columns.units[name]}")
+    findings = (
+        (True, 2.0, "it grows in every row"),
+        (np.median(np.abs(steps - np.median(steps))) <= 0.01 * np.median(steps), 1.0, "evenly"),
+        (_has_word(name, TIME_WORDS), 2.0, "its name says time"),
+        (columns.measures(name, "s"), 2.0, f"its unit is {columns.units[name]}"))
+    for holds, points, reason in findings:
+        if holds:
+            guess.note(points, reason)
     return guess
 
 
