@@ -9,7 +9,6 @@ from .bench import (
     CanopenNode as CanopenNode,
     Flags as Flags,
     FrameSpec as FrameSpec,
-    Kind as Kind,
     Role as Role,
     SignalObject as SignalObject,
     decode_device_text as decode_device_text,

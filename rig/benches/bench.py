@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple, Self
 
-from plant import EHA, InputError, Signals
+from plant import EHA, Signals, require
 from rig.benches.calibration import Decision, SensorCalibration
 
 EXTENDED = 1 << 31  # in an identifier: it has 29 bits, as in Linux's can_id
@@ -105,11 +105,7 @@ class Field:
         if self.kind is Kind.FLOAT:
             return counts
         low, high = self.range
-        if counts >= high:
-            return high
-        if counts <= low:
-            return low
-        return round(counts)  # of NaN: ValueError
+        return round(min(max(counts, low), high))  # of NaN: ValueError
 
     def wrap_number(self, number: int) -> int:
         """The number of a cycle as the field holds it."""
@@ -424,14 +420,13 @@ class Bench:
         if signals == self.signals:
             return replace(self, noise=noise)
         used = {each.name for spec in self.frames.frames for each in spec.fields}
-        own = {s.word: s for s in signals[1:]}
+        own = {s.word: (s.unit, s.role) for s in signals[1:]}
+        has = ", ".join(f"{word} ({unit})" for word, (unit, _) in own.items())
         for s in self.signals[1:]:
             if s.word in used or s.role in ("command", "drive"):
-                found = own.get(s.word)
-                if found is None or (found.unit, found.role) != (s.unit, s.role):
-                    has = ", ".join(f"{each.word} ({each.unit})" for each in own.values())
-                    raise InputError(self.name, s.word, f"a plant that has this signal, as {s.role} in {s.unit}; "
-                                                        f"{model} has {has}; another bench by --bench FILE")
+                require(own.get(s.word) == (s.unit, s.role), self.name, s.word,
+                        f"a plant that has this signal, as {s.role} in {s.unit}; {model} has {has}; another bench by "
+                        "--bench FILE")
         return replace(self, signals=signals, noise=noise)
 
     @property
@@ -489,8 +484,8 @@ class Bench:
 
     def list_participants(self) -> dict[int, str]:
         """Who takes part in a run: number, and name with it."""
-        roles = [role for role in Role if role is not Role.PLANT or self.has_plant_node]
-        return {self.find_number(role): self.describe_node(role) for role in roles}
+        return {self.find_number(role): self.describe_node(role) for role in Role
+                if role is not Role.PLANT or self.has_plant_node}
 
     def read_data_sheet(self, role: Role) -> tuple[str, str]:
         """Name and text of a node's EDS or DCF."""

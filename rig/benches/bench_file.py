@@ -34,7 +34,7 @@ from plant import (
     read_file,
     require,
 )
-from rig.benches import canopen_map
+from rig.benches import can_map, canopen_map
 from rig.benches.bench import (
     FD,
     MOST_FRAMES,
@@ -54,7 +54,6 @@ from rig.benches.bench import (
     list_outputs,
 )
 from rig.benches.calibration import read_calibration
-from rig.benches.can_map import map_messages, read_database
 from rig.benches.checksums import CHECKSUMS, load_checksum
 from rig.benches.layout import PHASES, DeviceFrame, Use, build_fields, compute_counts, list_phases
 from rig.templates import fill_template
@@ -235,21 +234,20 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, signals
         keys.controller.timeout, place.at("timeout"), Fraction(cycle_ns, 10**9), Fraction(10))
     is_canopen = keys.controller.protocol == "canopen"
     uses = _list_uses(keys.controller, place, signals, is_canopen=is_canopen)
-    uses = _add_states(reader, uses, keys.controller, place, is_canopen=is_canopen)
-    command, controlled, drive = signals.command.word, signals.controlled.word, signals.drive.word
-    _check_signals(uses, (command, controlled), (drive,), place)
+    _add_states(reader, uses, keys.controller, place, is_canopen=is_canopen)
+    _check_signals(uses, (signals.command.word, signals.controlled.word), (signals.drive.word,), place)
     for use in uses.values():
         use.place.require(not (use.signal in ("control_word", "mode") and keys.controller.profile == "none"),
                           "a profile that gives it a meaning, or values in [controller.phases]")
     nodes: dict[Role, CanopenNode] = {}
     sync = None
     if is_canopen:
-        uses, frames, sync, nodes[Role.CONTROLLER] = _map_node(reader, keys.controller, place, uses, folder)
+        frames, sync, nodes[Role.CONTROLLER] = _map_node(reader, keys.controller, place, uses, folder)
     else:
         _refuse_canopen_keys(keys, reader.place)
         text = reader.read_text(keys.controller.dbc, place.at("dbc"), "DBC")
         dbc = keys.controller.dbc or ""
-        frames = map_messages(dbc, read_database(dbc, text), uses, cycle_ns)
+        frames = can_map.map_messages(dbc, can_map.read_database(dbc, text), uses, cycle_ns)
     specs = [_build_spec(frame, uses, signals) for frame in frames]
     if keys.plant_node is not None:
         specs, nodes[Role.PLANT] = _join_plant_node(reader, specs, sync, nodes, folder, signals)
@@ -257,11 +255,10 @@ def _parse_bench(name: str, source: bytes, read: ReadFile, folder: Path, signals
     phases, ready = _list_states(frames, uses)
     decision, calibration = read_calibration(_group_keys(keys.calibration, 0), reader.place.at("calibration"), signals)
     nominal = find_plant(reader.kind).nominal if is_known(reader.kind) else {}
-    noise = nominal.get(signals.controlled.noise, 0.0)
     bench = Bench(name=keys.name, frames=FrameMap(frames=tuple(specs), sync=sync), nodes=nodes, plant=reader.plant,
-                  kind=reader.kind, signals=signals, noise=noise, cycle_ns=cycle_ns, bitrate=keys.bitrate,
-                  data_bitrate=keys.data_bitrate, timeout_ns=timeout_ns, phases=phases, ready=ready, files=reader.files,
-                  decision=decision, calibration=calibration)
+                  kind=reader.kind, signals=signals, noise=nominal.get(signals.controlled.noise, 0.0),
+                  cycle_ns=cycle_ns, bitrate=keys.bitrate, data_bitrate=keys.data_bitrate, timeout_ns=timeout_ns,
+                  phases=phases, ready=ready, files=reader.files, decision=decision, calibration=calibration)
     _check_identifiers(bench, reader.place)
     return bench
 
@@ -315,20 +312,17 @@ def _list_uses(keys: NodeKeys, place: Place, signals: Signals, *, is_canopen: bo
                                       ("outputs", inputs if is_plant else outputs, False)):
         for named, entry in _group_keys(getattr(keys, table), 0).items():
             own, signal = place.at(table, named), find_word(signals, named)
-            if signal not in known:
-                raise own.refuse(f"a signal of the bench and its plant: {list_choices(named, known)}")
+            own.require(signal in known, f"a signal of the bench and its plant: {list_choices(named, known)}")
             word = "object" if is_canopen else "signal"
             said = build_dataclass(SignalKeys, {word if key == "" else key: text for key, text in entry.items()}, own)
             name = said.object if is_canopen else said.signal
             if name is None or (said.signal if is_canopen else said.object) is not None:
                 raise own.refuse(f"a table with {word} = " + ('"0x607A"' if is_canopen else '"MESSAGE.SIGNAL"'))
-            numbers = {}
-            for key, text in (("count", said.count), ("offset", said.offset)):
-                if text is not None:
-                    numbers[key] = parse_quantity(text, known[signal], own.at(key))
-            own.at("count").require(numbers.get("count") != 0, "a number other than 0")
-            use = Use(place=own, is_received=is_received, signal=signal, unit=known[signal], count=numbers.get("count"),
-                      offset=numbers.get("offset"), is_needed=signal in needed)
+            count, offset = (None if text is None else parse_quantity(text, known[signal], own.at(key))
+                             for key, text in (("count", said.count), ("offset", said.offset)))
+            own.at("count").require(count != 0, "a number other than 0")
+            use = Use(place=own, is_received=is_received, signal=signal, unit=known[signal], count=count, offset=offset,
+                      is_needed=signal in needed)
             _add_use(uses, name, use, is_canopen=is_canopen)
     return uses
 
@@ -359,9 +353,8 @@ def _add_use(uses: dict[str, Use], name: str, use: Use, *, is_canopen: bool) -> 
     uses[key] = use
 
 
-def _add_states(reader: _Reader, uses: dict[str, Use], keys: ControllerKeys, place: Place, *,
-                is_canopen: bool) -> dict[str, Use]:
-    """`uses` with the values of [phases], [ready] and [protection]."""
+def _add_states(reader: _Reader, uses: dict[str, Use], keys: ControllerKeys, place: Place, *, is_canopen: bool) -> None:
+    """Add the values of [phases], [ready] and [protection]."""
     dots = 0 if is_canopen else 1
     for name, values in _group_keys(keys.phases, dots).items():
         own = place.at("phases", name)
@@ -375,14 +368,12 @@ def _add_states(reader: _Reader, uses: dict[str, Use], keys: ControllerKeys, pla
         own = place.at("protection", name)
         said = build_dataclass(ProtectionKeys, {key or "kind": list(value) if isinstance(value, tuple) else value
                                                 for key, value in entry.items()}, own)
+        own.at("data_id").require(said.kind != "counter" or said.data_id is None, "a checksum with it")
         use = Use(place=own, is_received=None, guard=Guard.COUNTER)
         if said.kind != "counter":
-            use = replace(use, guard=Guard.CHECKSUM, checksum=reader.find_checksum(said.kind, own))
-            use = _set_data_id(use, said.data_id)
-        elif said.data_id is not None:
-            raise own.at("data_id").refuse("a checksum with it")
+            checksum = reader.find_checksum(said.kind, own)
+            use = _set_data_id(replace(use, guard=Guard.CHECKSUM, checksum=checksum), said.data_id)
         _add_use(uses, name, use, is_canopen=is_canopen)
-    return uses
 
 
 def _set_data_id(use: Use, data_id: int | tuple[int, ...] | None) -> Use:
@@ -424,8 +415,8 @@ def _list_states(frames: list[DeviceFrame], uses: Mapping[str, Use],
 # ---------------------------------------------------------------------------------------------------------------------
 
 def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use], folder: Path,
-              ) -> tuple[dict[str, Use], list[DeviceFrame], int, CanopenNode]:
-    """The uses with the objects of the profile, the PDOs, the identifier of SYNC, and the node."""
+              ) -> tuple[list[DeviceFrame], int, CanopenNode]:
+    """The PDOs, the identifier of SYNC, and the node; the objects of its profile are added to the uses."""
     if keys.node is None:
         raise place.refuse("also the key 'node', a node-ID from 1 to 127")
     eds = keys.eds or ""
@@ -433,7 +424,7 @@ def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use
     node = CanopenNode(node=keys.node, eds=folder / eds, values=canopen_map.list_values(dictionary),
                        emcy=keys.emcy)
     if isinstance(keys, ControllerKeys):
-        uses = _add_profile(uses, dictionary, keys, place)
+        _add_profile(uses, dictionary, keys, place)
         place.at("mode").require(keys.profile == "cia402" or keys.mode is None, 'profile = "cia402" with it')
         mode = CYCLE_POSITION if keys.profile == "cia402" and keys.mode is None else keys.mode
         node = replace(node, profile=keys.profile, mode=mode, settings=tuple(_list_settings(
@@ -442,7 +433,7 @@ def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use
     frames = list(canopen_map.map_pdos(eds, dictionary, keys.node, uses))
     node = replace(node, inputs=_list_objects(frames, uses, is_received=True),
                    outputs=_list_objects(frames, uses, is_received=False))
-    return uses, frames, canopen_map.find_sync(dictionary), node
+    return frames, canopen_map.find_sync(dictionary), node
 
 
 def _list_objects(frames: list[DeviceFrame], uses: Mapping[str, Use], *, is_received: bool) -> dict[str, SignalObject]:
@@ -457,15 +448,13 @@ def _list_objects(frames: list[DeviceFrame], uses: Mapping[str, Use], *, is_rece
     return found
 
 
-def _add_profile(uses: dict[str, Use], dictionary: Any, keys: ControllerKeys, place: Place) -> dict[str, Use]:
-    """`uses` with the objects that the profile gives a meaning; its modes only where a PDO maps them."""
-    named = {(use.signal, use.is_received): use for use in uses.values()}
-    added = dict(uses)
+def _add_profile(uses: dict[str, Use], dictionary: Any, keys: ControllerKeys, place: Place) -> None:
+    """Add the objects that the profile gives a meaning; its modes only where a PDO maps them."""
+    named = {(use.signal, use.is_received) for use in uses.values()}
     for signal, (key, is_received) in _PROFILE_OBJECTS[keys.profile].items():
         is_optional = signal.startswith("mode") and not canopen_map.is_mapped(dictionary, key, is_received=is_received)
         if key not in uses and (signal, is_received) not in named and not is_optional:
-            added[key] = Use(place=place.at("profile"), is_received=is_received, signal=signal)
-    return added
+            uses[key] = Use(place=place.at("profile"), is_received=is_received, signal=signal)
 
 
 def _find_writable(dictionary: Any, key: str, place: Place) -> Any:
@@ -515,7 +504,7 @@ def _join_plant_node(reader: _Reader, specs: list[FrameSpec], sync: int | None, 
     assert keys is not None
     uses = _list_uses(keys, place, signals, is_canopen=True, is_plant=True)
     _check_signals(uses, (signals.drive.word,), (signals.controlled.word,), place)
-    uses, frames, own_sync, node = _map_node(reader, keys, place, uses, folder)
+    frames, own_sync, node = _map_node(reader, keys, place, uses, folder)
     place.at("node").require(node.node != nodes[Role.CONTROLLER].node,
                              f"a node-ID other than {node.node}, which the controller has")
     place.at("eds").require(own_sync == sync, "the controller's identifier of SYNC in 0x1005")
@@ -538,19 +527,17 @@ def _join_frame(other: FrameSpec, own: FrameSpec, frame: DeviceFrame, place: Pla
     place.at("outputs").require(frame.is_received or other.sender is not Role.CONTROLLER,
                                 f"COB-IDs that the controller does not send; {frame.spec.name} has "
                                 f"{describe_identifier(own.identifier)} too")
-    places = [[(each.lowest, each.length) for each in spec.fields] for spec in (other, own)]
-    fields = []
-    for theirs, ours in zip(other.fields, own.fields, strict=False):
-        if theirs.name and ours.name and theirs != ours:
-            places.append([])
-        fields.append(theirs if theirs.name else ours)
-    place.at("eds").require(places[0] == places[-1] and other.length == own.length,
+    pairs = list(zip(other.fields, own.fields, strict=False))
+    is_alike = len(other.fields) == len(own.fields) and all(
+        (theirs.lowest, theirs.length) == (ours.lowest, ours.length)
+        and (theirs == ours or not theirs.name or not ours.name) for theirs, ours in pairs)
+    place.at("eds").require(is_alike and other.length == own.length,
                             f"the layout and counts of the controller's {other.name} in {frame.spec.name}, "
                             f"{describe_identifier(own.identifier)}")
+    joined = replace(other, fields=tuple(theirs if theirs.name else ours for theirs, ours in pairs))
     if frame.is_received:
-        return replace(other, fields=tuple(fields))
-    return replace(other, fields=tuple(fields), sender=Role.PLANT, every=own.every, is_answer=own.is_answer,
-                   is_before_sync=False)
+        return joined
+    return replace(joined, sender=Role.PLANT, every=own.every, is_answer=own.is_answer, is_before_sync=False)
 
 
 def _check_identifiers(bench: Bench, place: Place) -> None:

@@ -74,9 +74,8 @@ def list_loads(bench: Bench) -> list[FrameLoad]:
 def _describe_direction(bench: Bench, spec: FrameSpec) -> str:
     if spec.sender is Role.RIG:
         return "rig > controller"
-    to_plant = ", plant" if bench.has_plant_node else ""
     if spec.sender is Role.CONTROLLER:
-        return f"controller > rig{to_plant}"
+        return "controller > rig, plant" if bench.has_plant_node else "controller > rig"
     return "plant > rig" if spec.roles == ("valve_state",) else "plant > rig, controller"
 
 

@@ -58,9 +58,10 @@ class SensorCalibration(NamedTuple):
 
     def describe(self) -> str:
         """All of it in a line."""
-        more = f" ({self.distribution})" + (f", span {100 * self.gain:g} %" if self.gain else "")
-        more += f", noise {self.noise:g} {self.unit}" if self.noise else ""
-        return f"{self.identifier}, {self.date} to {self.expiry}, u = {self.u:g} {self.unit}{more}"
+        span = f", span {100 * self.gain:g} %" if self.gain else ""
+        noise = f", noise {self.noise:g} {self.unit}" if self.noise else ""
+        return (f"{self.identifier}, {self.date} to {self.expiry}, u = {self.u:g} {self.unit} ({self.distribution})"
+                f"{span}{noise}")
 
 
 def read_calibration(tables: Mapping[str, Mapping[str, Any]], place: Place,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from plant import InputError, Place, list_choices, require, suggest_name
 from rig.benches.bench import EXTENDED, FD, MOST_FRAMES, Field, FrameSpec, Kind, Role
-from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
+from rig.benches.layout import DeviceFrame, Slot, Use, use_reader
 
 if TYPE_CHECKING:
     from cantools.database.can import Message, Signal
@@ -29,12 +29,8 @@ def read_database(name: str, text: str) -> Any:
         raise InputError(name, "", f"a DBC with lengths of CAN frames, not {huge[0].strip()[:100]!r}")
     import cantools  # here: a CANopen bench has no DBC, and to load it takes 20 ms
 
-    try:
-        with silence_log("cantools"):  # what it warns of are messages that the bench does not use
-            return cantools.database.load_string(text, "dbc", strict=False)
-    except Exception as error:  # whatever cantools stumbles over in a file that is no DBC
-        said = " ".join(str(error).split())[:200]
-        raise InputError(name, "", f"a DBC ({said or type(error).__name__})") from error
+    with use_reader("cantools", name, "a DBC ({})"):  # it warns of messages that the bench does not use
+        return cantools.database.load_string(text, "dbc", strict=False)
 
 
 def map_messages(name: str, database: Any, uses: Mapping[str, Use], cycle_ns: int) -> list[DeviceFrame]:
@@ -52,8 +48,7 @@ def map_messages(name: str, database: Any, uses: Mapping[str, Use], cycle_ns: in
         use.place.require(sum(each.name == message for each in database.messages) == 1,
                           f"one message {message}; {name} has several")
         known = {each.name for each in messages[message].signals}
-        if signal not in known:
-            raise use.place.refuse(f"a signal of message {message}: {list_choices(signal, known)}")
+        use.place.require(signal in known, f"a signal of message {message}: {list_choices(signal, known)}")
         grouped.setdefault(message, {})[full] = use
     switched = _find_switched(database)
     return [frame for message, own in grouped.items()

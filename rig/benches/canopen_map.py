@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 from canopen.objectdictionary import ODVariable, datatypes
 from canopen.objectdictionary.eds import import_eds
 
-from plant import InputError, require
+from plant import require
 from rig.benches.bench import EXTENDED, Field, FrameSpec, Kind, Role
-from rig.benches.layout import DeviceFrame, Slot, Use, silence_log
+from rig.benches.layout import DeviceFrame, Slot, Use, use_reader
 
 INVALID = 1 << 31  # in a COB-ID: the PDO is switched off
 LONG = 1 << 29  # in a COB-ID: the identifier has 29 bits
@@ -76,12 +76,8 @@ def read_dictionary(name: str, text: str, node: int) -> Any:
     Raises:
         InputError: not an EDS, or a DCF of another node.
     """
-    try:
-        with silence_log("canopen"):  # what it warns of is no object of a bench
-            dictionary: Any = import_eds(io.StringIO(text), node)  # type: ignore[no-untyped-call]
-    except Exception as error:  # whatever canopen stumbles over in a file that is no EDS
-        said = " ".join(str(error).split())[:200]
-        raise InputError(name, "", f"an electronic data sheet (CiA 306): {said or type(error).__name__}") from error
+    with use_reader("canopen", name, "an electronic data sheet (CiA 306): {}"):  # it warns of what no bench uses
+        dictionary: Any = import_eds(io.StringIO(text), node)  # type: ignore[no-untyped-call]
     require(any(index >= 0x1000 for index in dictionary), name, "", "an electronic data sheet (CiA 306) with objects")
     own = read_node(text)
     require(own in (None, node), name, "NodeID", f"{node}, the node of the bench file, not {own}")
@@ -216,7 +212,7 @@ def _map_pdo(name: str, dictionary: Any, pdo: Pdo, own: set[str], *, is_answer: 
     """The frame of a PDO; only `own` objects keep their names."""
     where = f"0x{pdo.mapping:04X}"
     require(0 < pdo.length <= _LONGEST, name, where, f"at most 8 bytes in {pdo.name}, not {pdo.length} bits")
-    require(0 <= pdo.kind <= 240 or pdo.kind in (254, 255), name, f"0x{pdo.parameter:04X}:2",
+    require(0 <= pdo.kind <= 240 or pdo.kind in _EVENT, name, f"0x{pdo.parameter:04X}:2",
             f"a transmission type 0 to 240, 254 or 255 for {pdo.name}, not {pdo.kind}")
     slots, lowest = [], 0
     for index, sub, length in pdo.entries:
@@ -253,10 +249,8 @@ def encode_value(variable: ODVariable, value: float) -> bytes | None:
     ranges = [(variable.min, variable.max)]
     if is_whole:  # canopen cuts numbers of 24 bits and the like
         ranges.append(Field(name="", lowest=0, length=len(variable), kind=kind).range)
-    for low, high in ranges:
-        if (low is not None and value < low) or (high is not None and value > high):
-            return None
-    if is_whole and value % 1:
+    is_outside = any((low is not None and value < low) or (high is not None and value > high) for low, high in ranges)
+    if is_outside or (is_whole and value % 1):
         return None
     try:
         return bytes(variable.encode_raw(int(value) if is_whole else float(value)))

@@ -13,8 +13,6 @@ from typing import NamedTuple
 from plant import InputError, require, run_file
 from rig.benches.bench import Field, Guard, insert_bits
 
-UserChecksum = Callable[[bytes, int], int]
-
 
 @cache
 def _list_remainders(polynomial: int) -> tuple[int, ...]:
@@ -64,7 +62,7 @@ CHECKSUMS = {
     "e2e_profile_1": Crc(0x1D, 0, 0, has_data_id=True),  # AUTOSAR PRS E2E, profile 1A
     "e2e_profile_2": Crc(0x2F),  # AUTOSAR PRS E2E, profile 2, with a data ID for each counter
 }
-USERS_CHECKSUMS: dict[str, UserChecksum] = {}  # by `Field.checksum`
+USERS_CHECKSUMS: dict[str, Callable[[bytes, int], int]] = {}  # by `Field.checksum`
 
 
 def compute_checksum(each: Field, data: bytes, counter: int) -> int:

@@ -209,8 +209,8 @@ def _assign(candidates: Iterable[Candidate], known: Mapping[str, str], wanted: W
         for signal, unit in known.items():
             quantity, which = wanted.list_words(signal)
             fits = bool(unit) and fit_unit(each.unit, unit) is not None
-            score = 3 * bool(words & quantity) + 2 * bool(words & which) + fits
-            score += 9 * wanted.is_known_object(each.key, signal)
+            score = (3 * bool(words & quantity) + 2 * bool(words & which) + fits
+                     + 9 * wanted.is_known_object(each.key, signal))
             if score >= 3 and (find_unit(each.unit) is None or fits):
                 scored.append((score, signal, each))
     found: dict[str, tuple[Candidate, bool]] = {}

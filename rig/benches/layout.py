@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
-from plant import Place, fit_unit, list_choices
+from plant import InputError, Place, fit_unit, list_choices
 from rig.benches.bench import Field, FrameSpec, Guard, Kind, Role, encode_float, list_bits
 
 PHASES = ("setup", "main", "cleanup", "safe")
@@ -64,13 +64,19 @@ class DeviceFrame:
 
 
 @contextmanager
-def silence_log(name: str) -> Iterator[None]:
-    """Keep a library, and its parts, from logging for a while."""
-    log = logging.getLogger(name)
+def use_reader(library: str, name: str, expected: str) -> Iterator[None]:
+    """Within, a library reads the file `name` without logging; what it stumbles over there becomes an InputError.
+
+    `expected`: what the file should have been, with {} for what the library says.
+    """
+    log = logging.getLogger(library)
     level = log.level
     log.setLevel(logging.CRITICAL + 1)
     try:
         yield
+    except Exception as error:  # of any kind
+        said = " ".join(str(error).split())[:200]
+        raise InputError(name, "", expected.format(said or type(error).__name__)) from error
     finally:
         log.setLevel(level)
 
@@ -104,9 +110,8 @@ def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ..
             use.place.require(use.guard not in guards, f"one {use.guard.name.lower()} in a frame; "
                               f"{frame.spec.name} has {guards.get(use.guard)}")
             guards[use.guard] = slot.name
-    counters = [each for each in fields if each.guard is Guard.COUNTER]
     if any(each.checksum == "e2e_profile_1" for each in fields):  # its counter never is 15 (AUTOSAR PRS E2E)
-        fields = [replace(each, wrap=min(each.modulus, 15)) if each in counters else each for each in fields]
+        fields = [replace(each, wrap=min(each.modulus, 15)) if each.guard is Guard.COUNTER else each for each in fields]
     return tuple(sorted(fields, key=lambda each: min(list_bits(each))))
 
 

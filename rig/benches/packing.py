@@ -122,9 +122,7 @@ def unpack_frame(m: Layout, at: int, length: int, cycle: int) -> int:
             counter = field
         elif rule == _CHECKSUM:
             checksum = field
-    number = 0
-    if counter >= 0:
-        number = _read_bits(m, counter)
+    number = _read_bits(m, counter) if counter >= 0 else 0
     last = words[at + _COUNT_OF] + COUNT
     if checksum >= 0:
         said = _read_bits(m, checksum)
@@ -146,9 +144,7 @@ def unpack_frame(m: Layout, at: int, length: int, cycle: int) -> int:
 
 
 def _find_mask(bits: int) -> int:
-    if bits == 64:
-        return -1
-    return (1 << bits) - 1
+    return -1 if bits == 64 else (1 << bits) - 1
 
 
 def _integer(value: Any) -> int:
@@ -190,9 +186,7 @@ def _read_bits(m: Layout, field: int) -> int:
 
 def _find_next_byte(m: Layout, field: int, place: int) -> int:
     """Where a field goes on above the byte of `place`: Intel in the byte after it, Motorola in the one before."""
-    if m.words[field + _IS_BIG]:
-        return (place // 8 - 1) * 8
-    return (place // 8 + 1) * 8
+    return (place // 8 - 1) * 8 if m.words[field + _IS_BIG] else (place // 8 + 1) * 8
 
 
 @keep_apart
@@ -210,9 +204,7 @@ def _encode(m: Layout, field: int, value: float) -> int:
     if counts >= doubles[field + _HIGH]:
         return _find_mask(words[field + _BITS] - (words[field + _KIND] == _SIGNED))
     counts = np.rint(max(counts, doubles[field + _LOW]))
-    if counts < _TWO_63:
-        return int(counts)
-    return int(counts - _TWO_63) - 0x7FFFFFFFFFFFFFFF - 1
+    return int(counts) if counts < _TWO_63 else int(counts - _TWO_63) - 0x7FFFFFFFFFFFFFFF - 1
 
 
 @keep_apart
@@ -222,10 +214,7 @@ def _decode(m: Layout, field: int, bits: int) -> float:
     counts = 0.0
     if words[field + _KIND] == _FLOAT:
         words[_SCRATCH] = bits
-        if length == 64:
-            counts = doubles[_SCRATCH]
-        else:
-            counts = float(m.singles[2 * _SCRATCH])
+        counts = doubles[_SCRATCH] if length == 64 else float(m.singles[2 * _SCRATCH])
     elif words[field + _KIND] == _SIGNED:
         if length < 64 and bits >> length - 1 & 1:
             bits = (bits & _find_mask(length)) - (1 << length)

@@ -3,8 +3,7 @@
 import re
 from itertools import combinations
 
-from canopen.objectdictionary import datatypes
-from canopen.objectdictionary.datatypes import UNSIGNED8, UNSIGNED16, UNSIGNED32, VISIBLE_STRING
+from canopen.objectdictionary.datatypes import DATA_TYPES, UNSIGNED8, UNSIGNED16, UNSIGNED32, VISIBLE_STRING
 
 from rig.benches import INVALID, PARAMETERS, Pdo
 from rig.conformance.pdo_cases import describe_mapping, split_entry
@@ -26,7 +25,7 @@ SECTIONS = {"FileInfo": (), "MandatoryObjects": (),
                            "Granularity", "NrOfRXPDO", "NrOfTXPDO")}
 LISTS = {"MandatoryObjects": range(0x1000, 0x1019), "OptionalObjects": range(0x1000, 0x10000),
          "ManufacturerObjects": range(0x2000, 0x6000)}  # list -> objects that may be in it
-TYPES = (*SIZES, *datatypes.DATA_TYPES)
+TYPES = (*SIZES, *DATA_TYPES)
 # Data type and access of objects of the communication profile, CiA 301, 7.5.2.
 STANDARD = {
     (0x1000, 0): (UNSIGNED32, "ro const"), (0x1001, 0): (UNSIGNED8, "ro"), (0x1002, 0): (UNSIGNED32, "ro"),

@@ -31,6 +31,7 @@ from rig.conformance.target import (
     VALUE,
     Case,
     Target,
+    find_abort,
     for_each,
     read_error_code,
     require,
@@ -103,7 +104,7 @@ def check_history(t: Target) -> str:
     """0x1003, where the node has it."""
     t.variable(HISTORY)
     require(t.read(HISTORY) == 0, f"{t.read(HISTORY)} errors in it after a reset")
-    require_abort(t.try_upload(HISTORY, 1), (0, NO_DATA, NO_SUB), "an empty entry")
+    require_abort(find_abort(t.upload, HISTORY, 1), (0, NO_DATA, NO_SUB), "an empty entry")
     frame = provoke(t)
     count = t.read(HISTORY)
     require(count >= 1, "an EMCY was sent, and sub 0 is 0")

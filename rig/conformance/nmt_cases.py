@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import product
 
 from rig.conformance.error_cases import LIMIT, beat_as, measure_periods, watch
 from rig.conformance.pdo_cases import identify, list_sent, list_valid, operational, read_mapped, send_short, set_type
@@ -50,11 +51,10 @@ def check_state_after_boot(t: Target) -> str:
 def check_transitions(t: Target) -> str:
     """All nine, addressed to the node."""
     t.beat()
-    for old in COMMANDS:
-        for new in COMMANDS:
-            t.enter(old)
-            t.command(COMMANDS[new])
-            t.require_state(new, f"{name_state(old)} to {name_state(new)}")
+    for old, new in product(COMMANDS, repeat=2):
+        t.enter(old)
+        t.command(COMMANDS[new])
+        t.require_state(new, f"{name_state(old)} to {name_state(new)}")
     return "9 transitions"
 
 
@@ -154,8 +154,7 @@ def check_reset_communication(t: Target) -> str:
 def check_reset_node(t: Target) -> str:
     """Only with --write."""
     require_applicable(0x1010 not in t.sheet.objects, "the node can store parameters (0x1010)")
-    if not t.options.may_write:
-        raise CaseSkipped("values are changed only with --write")
+    require(t.options.may_write, "values are changed only with --write", CaseSkipped)
     check_restored(t, NmtCommand.RESET_NODE, t.require_writable(0x1017))
     for variable in t.sheet.variables:
         is_suitable = not variable.is_communication and variable.access == "rw" and variable.size
@@ -274,8 +273,7 @@ CASES = (
          "a changed object of the manufacturer or the profile has its default again", check_reset_node),
     Case("6.13", "reset from each state", "7.3.2.4",
          "boot-up from PRE-OPERATIONAL, OPERATIONAL and STOPPED, by both resets",
-         for_each(lambda t: [(state, reset) for state in COMMANDS for reset in RESETS], check_reset_from_state,
-                  "reset")),
+         for_each(lambda t: product(COMMANDS, RESETS), check_reset_from_state, "reset")),
     Case("7.1", "SDO response time", "7.2.4.3", "99 of 100 uploads of 0x1000 are answered within 50 ms",
          partial(check_times, act=lambda t: t.demand(READ_TYPE), count=100, share=0.99, limit=50.0), is_timed=True),
     Case("7.2", "boot time", "7.3.2.2.1", "boot-up within 2 s of a reset node",

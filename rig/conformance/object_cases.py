@@ -23,6 +23,7 @@ from rig.conformance.target import (
     Refusal,
     Target,
     Variable,
+    find_abort,
     for_each,
     format_abort,
     require,
@@ -45,7 +46,7 @@ class Offer(NamedTuple):
 
 def check_refused(t: Target, offer: Offer) -> str:
     """The node refuses an offer with the right code."""
-    code = t.try_upload(*offer.key) if offer.data is None else t.try_download(*offer.key, offer.data)
+    code = find_abort(t.upload, *offer.key) if offer.data is None else t.try_download(*offer.key, offer.data)
     if not code and offer.before is not None:
         t.try_download(*offer.key, offer.before)
     require_abort(code, offer.codes, offer.what)
@@ -70,7 +71,7 @@ def read_values(t: Target, is_wanted: Callable[[Variable], object],
 
 def check_readable(t: Target, variable: Variable) -> None:
     """An empty field of the error history, and a string without a value, may say so."""
-    code = t.try_upload(*variable.key)
+    code = find_abort(t.upload, *variable.key)
     is_empty = code in (NO_DATA, NO_SUB) and (variable.index == HISTORY or not variable.size)
     require(not code or is_empty, f"{variable.label}: {format_abort(code)}")
 

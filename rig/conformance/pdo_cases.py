@@ -45,8 +45,7 @@ def check_parameters(t: Target, pdo: Pdo) -> str:
 
 def describe_mapping(t: Target, pdo: Pdo, words: Sequence[int]) -> str:
     """The length of a mapping. Raises Problem for objects that the EDS does not have, or with another length."""
-    for word in words:
-        index, sub, bits = split_entry(word)
+    for index, sub, bits in map(split_entry, words):
         if 0 < index < 0x20:  # a dummy entry
             continue
         name, mapped = f"{pdo.name} maps 0x{index:04X}:{sub:X}", t.sheet.find(index, sub)
@@ -182,8 +181,7 @@ def check_long_rpdo(t: Target, pdo: Pdo) -> str:
 
 def check_rpdo_values(t: Target, pdo: Pdo) -> str:
     """Each number changes by the smallest step, and is set back. Only with --write."""
-    if not t.options.may_write:
-        raise CaseSkipped("values are changed only with --write")
+    require(t.options.may_write, "values are changed only with --write", CaseSkipped)
     mapped = [t.sheet.find(*split_entry(word)[:2]) for word in read_mapping(t, pdo)]
     readable = [variable for variable in mapped if variable is not None and variable.is_readable]
     require_applicable(len(readable) == len(mapped), "no valid RPDO maps readable objects alone")
@@ -282,8 +280,7 @@ def write_mapping(t: Target, pdo: Pdo, words: Sequence[int]) -> list[int]:
 
 def read_mapped(t: Target, pdo: Pdo) -> list[bytes]:
     """What the mapped objects hold; zeros for what cannot be read. Raises Refusal, Problem."""
-    entries = [split_entry(word) for word in read_mapping(t, pdo)]
-    mapped = [(t.sheet.find(index, sub), bits) for index, sub, bits in entries]
+    mapped = [(t.sheet.find(index, sub), bits) for index, sub, bits in map(split_entry, read_mapping(t, pdo))]
     return [t.upload(*variable.key) if variable is not None and variable.is_readable else bytes(bits // 8)
             for variable, bits in mapped]
 

@@ -55,17 +55,14 @@ def run_cases(target: Target, cases: Sequence[Case] = CASES, progress: Progress 
     if is_live:
         _require_present(target)
     snapshot = _read_all(target) if is_live else {}
-    outcome = Outcome([], [], False)
+    judged = []
     for position, each in enumerate(cases):
         progress(CHAPTERS[each.chapter], position / len(cases))
-        result, is_disturbed = _run_case(target, each)
-        outcome.results.append(result)
-        outcome = outcome._replace(is_disturbed=outcome.is_disturbed or is_disturbed)
-    if is_live:
-        outcome.notes.extend(_restore(target, snapshot))
+        judged.append(_run_case(target, each))
+    notes = [*_restore(target, snapshot)] if is_live else []
     if target.others:
-        outcome.notes.append(f"Other nodes on the bus: {', '.join(map(str, sorted(target.others)))}.")
-    return outcome
+        notes.append(f"Other nodes on the bus: {', '.join(map(str, sorted(target.others)))}.")
+    return Outcome([result for result, _ in judged], notes, any(is_disturbed for _, is_disturbed in judged))
 
 
 def _run_case(target: Target, each: Case, attempts: int = 3) -> tuple[Result, bool]:

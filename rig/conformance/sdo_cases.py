@@ -18,6 +18,7 @@ from rig.conformance.target import (
     CaseNotApplicable,
     Target,
     Variable,
+    find_abort,
     for_each,
     format_abort,
     join_labels,
@@ -79,8 +80,8 @@ def check_upload_toggle(t: Target) -> str:
     _, data = begin_upload(t)
     if len(data) > 7:
         t.demand(b"\x60")
-    said = require_abort(t.try_demand(b"\x60" if len(data) > 7 else b"\x70"), (TOGGLE,))
-    require(t.try_demand(b"\x70"), "the transfer goes on after the abort")
+    said = require_abort(find_abort(t.demand, b"\x60" if len(data) > 7 else b"\x70"), (TOGGLE,))
+    require(find_abort(t.demand, b"\x70"), "the transfer goes on after the abort")
     return said
 
 
@@ -92,7 +93,7 @@ def check_segment(t: Target, change: Change, codes: Sequence[int], toggle: int =
         code = begin_download(t, variable, len(offered) if is_announced else variable.size)
         if not (is_announced and code):
             require_abort(code, (0,), "the transfer was refused")
-            code = t.try_demand(pack_segment(offered, True, toggle))
+            code = find_abort(t.demand, pack_segment(offered, True, toggle))
         said = require_abort(code, codes, what)
         t.require_value(variable, before, "was changed")
     return f"{what}: {said}"
@@ -100,13 +101,13 @@ def check_segment(t: Target, change: Change, codes: Sequence[int], toggle: int =
 
 def check_refused_frame(t: Target, frame: bytes) -> str:
     """A frame that the server does not know, or does not expect."""
-    return require_abort(t.try_demand(frame), (COMMAND,))
+    return require_abort(find_abort(t.demand, frame), (COMMAND,))
 
 
 def check_block_transfer(t: Target, request: tuple[str, bytes]) -> str:
     """Block transfer is optional. Where it is offered it is not tested further."""
     what, frame = request
-    code = t.try_demand(frame)
+    code = find_abort(t.demand, frame)
     if not code:
         t.send(t.request_id, HEAD.pack(ABORT, *HEAD.unpack_from(frame)[1:]) + bytes(4))
         t.wait(0.01)
@@ -120,13 +121,14 @@ def check_client_abort(t: Target) -> str:
     variable, _ = begin_upload(t)
     answer = t.ask(HEAD.pack(ABORT, *variable.key) + (0x08000000).to_bytes(4, "little"), 0.1)
     require(answer is None, f"an abort was answered with {(answer or b'').hex(' ')}")
-    return "no answer; the next segment: " + require_abort(t.try_demand(b"\x60"), (COMMAND,), "the next segment")
+    said = require_abort(find_abort(t.demand, b"\x60"), (COMMAND,), "the next segment")
+    return f"no answer; the next segment: {said}"
 
 
 def check_unfinished_transfer(t: Target) -> str:
     """The client loses interest in a segmented transfer and asks for something else."""
     begin_upload(t)
-    code = t.try_demand(READ_TYPE)
+    code = find_abort(t.demand, READ_TYPE)
     t.demand(READ_TYPE)  # a server may abort the old transfer first
     return f"answered after {format_abort(code)}" if code else "answered"
 
@@ -168,7 +170,7 @@ def check_foreign_requests(t: Target) -> str:
 def check_abort_object(t: Target, key: tuple[int, int]) -> str:
     """So that a client can tell which of its requests failed."""
     label = f"0x{key[0]:04X}:{key[1]:X}"
-    require(t.try_upload(*key), f"{label} was not refused")
+    require(find_abort(t.upload, *key), f"{label} was not refused")
     answer = t.heard(0, t.response_id)[-1].data
     require(answer[:4] == HEAD.pack(ABORT, *key), f"asked {label}: {answer.hex(' ')}")
     return label
@@ -217,7 +219,7 @@ def begin_upload(t: Target) -> tuple[Variable, bytes]:
 
 def begin_download(t: Target, variable: Variable, size: int) -> int:
     """Begin a segmented one; its abort code. Raises CaseNotApplicable for a server without segments."""
-    code = t.try_demand(HEAD.pack(0x21, *variable.key) + size.to_bytes(4, "little"))
+    code = find_abort(t.demand, HEAD.pack(0x21, *variable.key) + size.to_bytes(4, "little"))
     require_applicable(code != COMMAND or find_long_writable(t) is not None,
                        "no object needs segments, and the server refuses them")
     return code

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from configparser import RawConfigParser
 from contextlib import contextmanager
 from enum import Enum
+from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, ParamSpec, TypeVar
 
 from canopen.objectdictionary import ODVariable, datatypes
 
@@ -27,6 +28,7 @@ from rig.network import (
 )
 
 Item = TypeVar("Item")
+Request = ParamSpec("Request")
 CHAPTERS = {
     1: "Electronic data sheet",
     2: "Object dictionary",
@@ -119,16 +121,15 @@ def for_each(select: Callable[[Target], Iterable[Item]], probe: Callable[[Target
     return check
 
 
-def require(condition: object, measured: str) -> None:
-    """Raises Problem unless the condition holds."""
+def require(condition: object, measured: str, end: type[CaseEnd] = Problem) -> None:
+    """Ends the case, as a rule with Problem, unless the condition holds."""
     if not condition:
-        raise Problem(measured)
+        raise end(measured)
 
 
 def require_applicable(condition: object, reason: str = "") -> None:
     """Raises CaseNotApplicable unless the condition holds."""
-    if not condition:
-        raise CaseNotApplicable(reason)
+    require(condition, reason, CaseNotApplicable)
 
 
 def join_labels(labels: Sequence[str], most: int = 4) -> str:
@@ -305,18 +306,10 @@ class Target:
         """Write a number into an object of the EDS. Raises Refusal, Problem."""
         self.download(index, sub, self.variable(index, sub).encode(value))
 
-    def try_upload(self, index: int, sub: int) -> int:
-        """Read an object; the abort code, 0 if it was sent."""
-        return find_abort(lambda: self.upload(index, sub))
-
     def try_download(self, index: int, sub: int, value: bytes | int) -> int:
         """Write bytes, or a number into an object of the EDS; the abort code, 0 if it was accepted."""
         data = value if isinstance(value, bytes) else self.variable(index, sub).encode(value)
-        return find_abort(lambda: self.download(index, sub, data))
-
-    def try_demand(self, request: bytes) -> int:
-        """Send an SDO frame; the abort code of the response, 0 if it is none."""
-        return find_abort(lambda: self.demand(request))
+        return find_abort(self.download, index, sub, data)
 
     def require_value(self, variable: Variable, data: bytes, problem: str) -> None:
         """Raises Problem unless the object holds these bytes."""
@@ -360,8 +353,7 @@ class Target:
         """Reset the node, or all; its boot-up. Raises CaseFailed if none comes."""
         self.command(specifier, node)
         boot = self.wait_for(self.heartbeat_id, self.options.boot_timeout, lambda frame: frame.data[:1] == b"\0")
-        if not boot:
-            raise CaseFailed(f"no boot-up within {self.options.boot_timeout:g} s of an NMT reset")
+        require(boot, f"no boot-up within {self.options.boot_timeout:g} s of an NMT reset", CaseFailed)
         return boot[0]
 
     @property
@@ -384,8 +376,7 @@ class Target:
         require_applicable(self.fixed_heartbeat != 0.0, "the node sends no heartbeat")
         seconds = self.options.timeout + 1.0 + 3 * (self.fixed_heartbeat or 0.0)
         frames = self.wait_for(self.heartbeat_id, seconds, lambda frame: frame.data != b"\0", 2)
-        if not frames:
-            raise CaseFailed("no heartbeat came")
+        require(frames, "no heartbeat came", CaseFailed)
         found = frames[1].data[0] & 0x7F if len(frames[1].data) == 1 else -1
         require(found == state, f"{after}: {name_state(found)}, expected {name_state(state)}")
 
@@ -421,10 +412,10 @@ class Target:
         return next(each for each in range(0x57E, 0x480, -1) if each not in used)
 
 
-def find_abort(action: Callable[[], object]) -> int:
-    """The abort code with which the node refuses, 0 if it does not. Raises CaseFailed without a response."""
+def find_abort(action: Callable[Request, object], *request: Request.args, **named: Request.kwargs) -> int:
+    """The abort code with which the node refuses a request, 0 if it does not. Raises CaseFailed without a response."""
     try:
-        action()
+        action(*request, **named)
     except Refusal as refusal:
         return refusal.code
     return 0
@@ -585,12 +576,10 @@ class DataSheet:
         self.text = RawConfigParser(inline_comment_prefixes=(";",))
         self.text.optionxform = str  # type: ignore[assignment, method-assign]
         self.text.read_string(text)
-        self.objects: dict[int, list[Variable]] = {}
         self.variables = [Variable(each.index, each.subindex, each.data_type or 0, (each.access_type or "").lower(),
                                    each.default, each.min, each.max, bool(each.pdo_mappable))
                           for each in list_variables(od) if each.index >= 0x1000]
-        for variable in self.variables:
-            self.objects.setdefault(variable.index, []).append(variable)
+        self.objects = {index: list(own) for index, own in groupby(self.variables, lambda each: each.index)}
         self._by_key = {variable.key: variable for variable in self.variables}
         self.pdos = list(list_pdos(od, node))
 

@@ -16,12 +16,10 @@ from threading import RLock
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from plant import Diverged, InputError, Place, RigError, require, suggest_name
+from plant import Array, Diverged, InputError, Place, RigError, require, suggest_name
 from rig.fmi.host import Settings, Variable
 
-Array = NDArray[np.float64]
 LONGEST_CALL = 20.0  # s, of starting, or of so many cycles: a unit that takes longer hangs
 CYCLES_A_CALL = 100
 _NUMBERS = {"Real": "Real", "Integer": "Integer", "Enumeration": "Integer", "Boolean": "Boolean"}  # FMI 2
@@ -70,9 +68,8 @@ def read_description(path: Path) -> Description:
         raise InputError(path, "modelDescription.xml", f"that of an FMU 2.0 or 3.0 ({said})") from error
     require(version[:2] in ("2.", "3."), path, "fmiVersion", f"2.0 or 3.0, not {version}")
     unit = found.coSimulation
-    if unit is None:
-        kind = "model exchange" if found.modelExchange is not None else "scheduled execution"
-        raise InputError(path, "", f"an FMU for co-simulation; this one is for {kind} only")
+    kind = "model exchange" if found.modelExchange is not None else "scheduled execution"
+    require(unit is not None, path, "", f"an FMU for co-simulation; this one is for {kind} only")
     folders = [fmpy.platform_tuple, *([fmpy.platform] if version[0] == "2" else [])]
     libraries = [f"binaries/{folder}/{unit.modelIdentifier}{fmpy.sharedLibraryExtension}" for folder in folders]
     library = next((name for name in libraries if name in names), None)

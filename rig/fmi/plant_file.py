@@ -97,8 +97,7 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, 
                                'one signal that drives the plant, and at most one of role = "load"')
     given.sort(key=lambda item: item[0].role)
     first, drive = shown[0][0], given[0][0]
-    usual = find_plant("eha")
-    command = usual.signals.command if first.name == usual.signals.controlled.name else Signal(
+    command = EHA.command if first.name == EHA.controlled.name else Signal(
         "demand", f"{first.symbol}_c", first.unit, f"demand of {first.quantity}", "command")
     groups: dict[str, dict[str, Any]] = {}
     values: dict[str, float] = {}
@@ -116,11 +115,11 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, 
     types: dict[str, Any] = {
         group: NamedTuple(group.title().replace("_", ""), list(fields.items()))
         for group, fields in groups.items()}
-    is_usual = drive.name == usual.signals.drive.name
-    same = usual.signals.controlled
+    is_usual = drive.name == EHA.drive.name
+    same = EHA.controlled
     law = Controller if first.unit == same.unit else convert_group_unit(Controller, same.unit, first.unit, inf)
-    types["controller"] = law if is_usual else convert_group_unit(law, usual.signals.drive.unit, drive.unit, inf)
-    values |= {name: value for name, value in usual.nominal.items()
+    types["controller"] = law if is_usual else convert_group_unit(law, EHA.drive.unit, drive.unit, inf)
+    values |= {name: value for name, value in find_plant("eha").nominal.items()
                if name == "controller.period" or (is_usual and name.startswith("controller."))}
     values["controller.period"] = own.get("controller.period", values["controller.period"])
     values.setdefault("controller.current_limit", 1e9)  # of a drive in another unit none is known
@@ -155,25 +154,23 @@ def _list_entries(table: object, place: Place, prefix: str = "") -> Iterator[tup
 
 def _guess_entries(about: Description, table: str, place: Place) -> Entries:
     """Variables with names of signals of the EHA; as parameters those with one dot in their name and a start value."""
-    signals = {**{name: name for name in find_plant("eha").signals.names}, **_COLUMNS}
+    known = {*_COLUMNS.values()} - {"com"}
     return {name: (Entry(name), place) for name, v in about.variables.items()
             if v.causality == table.removesuffix("s") and v.type in ("Real", "Float64")
             and (v.start is not None and re.fullmatch(r"(?!controller\b)\w+\.\w+", name) if table == "parameters" else
-                 signals.get(name) in _COLUMNS.values() and signals.get(name) != "com")}
+                 _COLUMNS.get(name, name) in known)}
 
 
 def _map_signal(about: Description, name: str, entry: Entry, place: Place, causality: str) -> tuple[Signal, Port]:
     """A signal and its variable."""
-    eha = {s.name: s for s in find_plant("eha").signals}
-    signal = eha.get(_COLUMNS.get(name, name))
+    signal = {s.name: s for s in EHA}.get(_COLUMNS.get(name, name))
     if signal is not None and (signal.role == "output") != (causality == "output"):
         signal = None  # a measured current is not that of the servovalve, which drives it
     worth, unit = _find_worth(about, entry, "" if signal is None else signal.unit, place)
     port = Port(name, find_variable(about, entry.variable, (causality,), place), worth)
     noise = float(parse_quantity(entry.noise, unit, place.at("noise"))) if entry.noise else ""
     if signal is None:
-        role = (entry.role or "drive") if causality == "input" else "output"
-        signal = Signal(name, name, unit, name.replace("_", " "), role)
+        signal = Signal(name, name, unit, name.replace("_", " "), entry.role or "drive")
     # the unit has stops of its own; the current's limit is the controller's, which this plant has
     return signal._replace(noise=noise, limit=signal.limit if signal.role == "drive" else "",
                            role="output" if causality == "output" else signal.role), port._replace(name=signal.name)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant import ADVANCE_CALL, READ_CALL, ForeignCall, Signals, find_direct_readings, keep_apart
+from plant import ADVANCE_CALL, READ_CALL, Array, ForeignCall, Signals, find_direct_readings, keep_apart
 from rig.benches import (
     FRAME_WORDS,
     FRAMES_AT,
@@ -97,9 +97,6 @@ _TIMEOUT_CODE, _TIMEOUT_REGISTER = 0x8250, 0x11
 
 _call_advance, _call_read = ForeignCall(ADVANCE_CALL), ForeignCall(READ_CALL)
 
-Words = NDArray[np.int64]
-Reals = NDArray[np.float64]
-
 
 class Memory(NamedTuple):
     """All that loop and services share. Two arrays: with one for each table the loop takes a minute to compile.
@@ -118,15 +115,15 @@ class Memory(NamedTuple):
     frames: drive, feedback and valve state as the bench has them, with their values.
     """
 
-    words: Words
-    reals: Reals
+    words: NDArray[np.int64]
+    reals: Array
     frames: Layout
 
 
 def run_emulator(port: Port, m: Memory) -> None:
     """Serve the bus until the services stop it, an NMT reset comes (RESET_COMMAND) or the bus fails (FAILURE)."""
     words = m.words
-    while not words[STOP]:
+    while not (words[STOP] or words[FAILURE] or words[RESET_COMMAND]):
         if words[PUSHED]:
             words[PUSHED] = 0
             status, t_ns, cob_id = FRAME, words[PUSHED_TIME], words[PUSHED_ID]
@@ -142,8 +139,6 @@ def run_emulator(port: Port, m: Memory) -> None:
             words[FAILURE] = status
         if words[HELD] and words[PERIOD]:
             _release_until(port, m, read_clock(port), True)
-        if words[FAILURE] or words[RESET_COMMAND]:
-            return
 
 
 def serve_frame(port: Port, m: Memory) -> None:
@@ -216,11 +211,9 @@ def _post_event(m: Memory, event: int) -> None:
 
 def _take_drive(m: Memory, t_ns: int, length: int, data: int) -> None:
     """A drive frame came; a fault may drop, delay or change it. One that comes twice counts once."""
-    words = m.words
-    code, argument = find_action(m, _DRIVE, words[CYCLE] - 1)
+    code, argument = find_action(m, _DRIVE, m.words[CYCLE] - 1)
     if code == DELAY:
-        now = t_ns if words[PERIOD] else words[NOW]
-        _hold_frame(m, _DRIVE, now + argument, length, data)
+        _hold_frame(m, _DRIVE, t_ns, argument, length, data)
     elif code != DROP:
         length, data = change_frame(code, argument, length, data)
         _keep_drive(m, length, data)
@@ -282,9 +275,7 @@ def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
         words[WAITING] = 0
         _read_drive(m, words[WAITING_DATA])
     k = words[CYCLE]
-    flags = 0
-    if not words[FIRST]:
-        flags = _judge_drive(port, m, k, fresh)
+    flags = 0 if words[FIRST] else _judge_drive(port, m, k, fresh)
     words[FIRST] = 0
     if not read_plant(m, k):
         _post_event(m, DIVERGED)
@@ -370,9 +361,7 @@ def _answer_again(port: Port, m: Memory, t_ns: int) -> None:
 
 def _read_time(port: Port, m: Memory, t_ns: int) -> int:
     """The time for the record, ns; in lockstep, where nobody reads it, that of the SYNC."""
-    if m.words[PERIOD]:
-        return read_clock(port)
-    return t_ns
+    return read_clock(port) if m.words[PERIOD] else t_ns
 
 
 def _judge_drive(port: Port, m: Memory, k: int, fresh: int) -> int:
@@ -387,9 +376,7 @@ def _judge_drive(port: Port, m: Memory, k: int, fresh: int) -> int:
         words[MISSED] = 0
         _announce_timeout(port, m, 0)
         return 0
-    if fresh:
-        return DRIVE_LATE | _miss(port, m, LATE)
-    return DRIVE_MISSING | _miss(port, m, MISSING)
+    return DRIVE_LATE | _miss(port, m, LATE) if fresh else DRIVE_MISSING | _miss(port, m, MISSING)
 
 
 def _miss(port: Port, m: Memory, counter: int) -> int:
@@ -468,9 +455,7 @@ def _fill_frames(m: Memory, k: int, flags: int) -> None:
 def advance_plant(m: Memory, k: int) -> None:
     """One cycle under the drive in force and the load of this cycle."""
     words, reals = m.words, m.reals
-    load = 0.0
-    if k < words[LOAD]:
-        load = reals[words[LOAD_AT] + k]
+    load = reals[words[LOAD_AT] + k] if k < words[LOAD] else 0.0
     noise = reals[NOISE_AT + words[NOISES] * (words[PLANT_CYCLE] % NOISE_RING) + words[NOISES] - 1]
     base = reals.ctypes.data
     _call_advance(words[ADVANCE], base + 8 * _RESULT, base + 8 * _FAILURE,
@@ -519,8 +504,7 @@ def _send_pdo(port: Port, m: Memory, what: int, k: int, t_ns: int) -> bool:
         return False
     code, argument = find_action(m, what, k)
     if code == DELAY:
-        now = t_ns if words[PERIOD] else words[NOW]
-        _hold_frame(m, what, now + argument, m.frames.words[_find_place(what) + LENGTH], words[at + DATA])
+        _hold_frame(m, what, t_ns, argument, m.frames.words[_find_place(what) + LENGTH], words[at + DATA])
     if code in (DELAY, DROP):
         return False
     length, data = change_frame(code, argument, m.frames.words[_find_place(what) + LENGTH], words[at + DATA])
@@ -533,14 +517,15 @@ def _send_pdo(port: Port, m: Memory, what: int, k: int, t_ns: int) -> bool:
 # ------------------------------------------------------------------------------------ late frames
 
 
-def _hold_frame(m: Memory, what: int, due: int, length: int, data: int) -> None:
-    """Keep a frame until it is due; one too many is lost and counted."""
+def _hold_frame(m: Memory, what: int, t_ns: int, delay: int, length: int, data: int) -> None:
+    """Keep a frame that comes at `t_ns` until its delay is over; one too many is lost and counted."""
     words = m.words
     if words[HELD] >= _HELD_FRAMES:
         words[UNSENT] += 1
         return
     at = _HELD_AT + 4 * words[HELD]
-    words[at], words[at + 1], words[at + 2], words[at + 3] = what, due, length, data
+    now = t_ns if words[PERIOD] else words[NOW]
+    words[at], words[at + 1], words[at + 2], words[at + 3] = what, now + delay, length, data
     words[HELD] += 1
 
 
@@ -558,9 +543,8 @@ def _find_next_held(m: Memory, t_ns: int, least: int) -> int:
     for i in range(m.words[HELD]):
         at = _HELD_AT + 4 * i
         what, due = to_integer(m.words[at]), to_integer(m.words[at + 1])
-        order = what, due
-        if m.words[PERIOD]:  # by their times, but drives first
-            order = min(what, FEEDBACK_FRAME), due
+        # in real time by their times, but drives first
+        order = (min(what, FEEDBACK_FRAME) if m.words[PERIOD] else what), due
         if least <= what and due <= t_ns and (best < 0 or order < first):
             best, first = at, order
     return best
@@ -703,7 +687,6 @@ def make_memory(scenario: Scenario, advance: int = 0, read: int = 0, frames: Seq
     that is a node of its own.
     """
     model, load, schedule = scenario.model, scenario.load(), scenario.make_schedule()
-    names = {name: i for i, name in enumerate(model.list_names())}
     parameters: list[tuple[int, ...]] = []
     signals: list[tuple[int, ...]] = []
     values: list[float] = []
@@ -713,7 +696,7 @@ def make_memory(scenario: Scenario, advance: int = 0, read: int = 0, frames: Seq
         course = np.full(last - first + 1, model[name])
         for begin, changed in reversed(changes):  # of several in a cycle the first counts
             course[begin - first: begin - first + len(changed)] = changed
-        parameters.append((names[name], first, len(course), len(values)))
+        parameters.append((model.list_names().index(name), first, len(course), len(values)))
         values += course.tolist()
     for number, output in enumerate(model.kind.signals.outputs):
         for fault in schedule.signals.get(output.name, ()):

@@ -72,8 +72,8 @@ class EmulatorService(PlantNode):
 
     def _serve(self) -> None:
         with self._enter_thread() as scheduler:
-            self._kind = _COMPILED | _FIFO * (scheduler == "SCHED_FIFO") | _LOCKED * self._is_locked
-            self._kind |= _PINNED * (len(os.sched_getaffinity(0)) == 1)
+            self._kind = (_COMPILED | _FIFO * (scheduler == "SCHED_FIFO") | _LOCKED * self._is_locked
+                          | _PINNED * (len(os.sched_getaffinity(0)) == 1))
             self._run(self._bus.port, self._memory)
 
     def close(self) -> None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from plant import Array, InputError, Model, build_bare_model, find_key, require
-from rig.sequences.faults import Plan, Schedule, require_sensible
+from rig.sequences.faults import Parameter, Plan, Schedule, require_sensible
 
 LARGEST_DOWNLOAD = 1 << 20  # bytes in one SDO download, as the node's server has it
 LONGEST_PLAN = 20_000_000  # cycles; noise is drawn for all of them beforehand
@@ -32,7 +32,9 @@ class Scenario(NamedTuple):
         """
         require_sensible(plan, model)
         counts = [0] * plan.start + np.rint(load / find_load_count(model)).astype(int).tolist()
-        return cls(model.with_effects(_find_changed_groups(plan)), plan, tuple(counts), seed)
+        # the plant must have the effects whose parameters faults change from the start
+        changed = {fault.parameter.partition(".")[0] for fault in plan.faults if isinstance(fault, Parameter)}
+        return cls(model.with_effects(changed), plan, tuple(counts), seed)
 
     def load(self) -> list[float]:
         """The load, SI, one a cycle; none after the last."""
@@ -91,8 +93,3 @@ def find_load_count(model: Model) -> float:
     """
     load = model.kind.signals.load
     return load.largest * 1e-9 if load is not None and isfinite(load.largest) else 1e-6
-
-
-def _find_changed_groups(plan: Plan) -> set[str]:
-    """Groups of the parameters that faults change: the plant must have their effects from the start."""
-    return {fault.parameter.partition(".")[0] for fault in plan.faults if hasattr(fault, "parameter")}

@@ -5,7 +5,6 @@ it is created; the same seed gives the same faults in the same cycles. Times in 
 the main phase; a fault ends when main ends, so that clean-up runs on a healthy plant.
 """
 
-from abc import ABC
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from math import ceil
@@ -45,7 +44,7 @@ Count = Annotated[int, Quantity("1", low=1, high=1_000_000_000)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fault(ABC):
+class Fault:
     """A fault that acts from `start` until before `end` (default: the end of main). Checks refer to it by `name`."""
 
     kind: ClassVar[str]
@@ -129,7 +128,7 @@ class Frames(Fault):
     """Affects every `every`-th frame, each with a probability, until `count` frames were affected."""
 
     code: ClassVar[int]  # what happens to them
-    frame: FrameName | PdoName
+    frame: FrameName
     every: Count = 1
     count: Count | None = None
     probability: Annotated[float, Quantity("1", above=0.0, high=1.0)] = 1.0
@@ -140,7 +139,6 @@ class Lost(Frames):
     """Frames that never arrive."""
 
     kind, code = "lost", DROP
-    frame: FrameName
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +155,6 @@ class Duplicated(Frames):
     """Frames that arrive twice, one right after the other."""
 
     kind, code = "duplicated", DOUBLE
-    frame: FrameName
 
 
 @dataclass(frozen=True, kw_only=True)

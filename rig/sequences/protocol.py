@@ -217,14 +217,19 @@ def find_states(rows: Rows, words: ProfileWords) -> Whole:
     return map_words(rows.status, lambda word: find_state(words, word))
 
 
+def _find_active(rows: Rows, words: ProfileWords) -> Mask:
+    """The cycles whose control word asks for ACTIVE."""
+    active: Mask = map_words(rows.control, lambda word: find_wanted(words, word)) == State.ACTIVE
+    return active
+
+
 def find_idle(rows: Rows, words: ProfileWords, limits: ProtocolLimits, rate: float) -> Mask:
     """Cycles in which there must be no current; none is before the first.
 
     By the control word: it does not ask for ACTIVE, nor did it in the time `status` before. By the status word of
     CiA 402: it has said that there is none, for 2 ms and two cycles.
     """
-    wanted = map_words(rows.control, lambda word: find_wanted(words, word))
-    idle = _find_over(wanted == State.ACTIVE, round(limits.find_delay(words, rate) * rate))
+    idle = _find_over(_find_active(rows, words), round(limits.find_delay(words, rate) * rate))
     if words is CIA402:
         powered = np.isnan(rows.drive) | (rows.status.astype(int) & words.powered != 0)
         idle |= _find_over(powered, round(ProtocolLimits().find_delay(CIA408, rate) * rate))
@@ -348,13 +353,13 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
         cycles += int(judged.sum())
     own = record.bench.frames.list_from(Role.CONTROLLER)
     is_numbered = any(spec.has("cycle") for spec in own)
-    numbered = "drive frames of another cycle"
-    for name, count in ((numbered, wrong), ("drive frames missing or late", missing)):
-        value = 100 * count / cycles if cycles else 0.0
-        if name == numbered and not is_numbered:
+    for name, count, can_be_told in (("drive frames of another cycle", wrong, is_numbered),
+                                     ("drive frames missing or late", missing, True)):
+        if can_be_told:
+            value = 100 * count / cycles if cycles else 0.0
+            yield _make_result(name, "drive", value, "%", high=100 * allowed, detail=f"{count} of {cycles}")
+        else:
             yield SkippedCheck(name, "the controller's frames do not carry the number of the cycle")
-            continue
-        yield _make_result(name, "drive", value, "%", high=100 * allowed, detail=f"{count} of {cycles}")
     if any(each.guard for spec in own for each in spec.fields):
         yield _make_result("wrong checksums and alive counters", "drive", record.unsound, "1", high=allowed * cycles)
 
@@ -379,8 +384,7 @@ def measure_frozen(rows: Rows, limit: float | None, words: ProfileWords = CIA408
     """
     largest = np.nanmax(np.abs(rows.drive), initial=0.0) if limit is None else limit
     is_limited = np.abs(rows.drive) >= 0.98 * largest
-    wanted = map_words(rows.control, lambda word: find_wanted(words, word))
-    closed = (wanted == State.ACTIVE) & (find_states(rows, words) == State.ACTIVE) & ~is_limited
+    closed = _find_active(rows, words) & (find_states(rows, words) == State.ACTIVE) & ~is_limited
     error = rows.demand - rows.position
     stays = closed[1:] & closed[:-1] & (rows.drive[1:] == rows.drive[:-1]) & ~np.isnan(error[1:] + error[:-1])
     edges = np.flatnonzero(np.diff(np.concatenate(([0], stays.astype(int), [0]))))
@@ -415,16 +419,12 @@ def _judge_probes(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
                            detail=detail)
 
 
-def _find_active(rows: Rows, words: ProfileWords) -> Whole:
-    return np.flatnonzero(map_words(rows.control, lambda word: find_wanted(words, word)) == State.ACTIVE)
-
-
 def measure_step_delay(probe: Rows, rate: float, words: ProfileWords = CIA408) -> tuple[float, str]:
     """Time from the demand step to the first answer that follows it in the same direction, ms, and a remark.
 
     An answer follows when the current has changed by a fifth of the largest change since the step.
     """
-    active = _find_active(probe, words)
+    active = np.flatnonzero(_find_active(probe, words))
     steps = active[1:][np.diff(probe.demand[active]) != 0]
     if not len(steps):
         return nan, "the probe ended before its step"

@@ -104,8 +104,6 @@ class TimingPolicy:
 PHASES = ("setup", "main", "cleanup", "load")
 PREFLIGHT = "preflight.toml"
 
-
-
 ReadFile = Callable[[str], bytes]
 
 SEGMENT_KINDS: dict[str, type[Segment]] = {**segments.KINDS, PythonSegment.kind: PythonSegment}
@@ -333,8 +331,8 @@ def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Seq
                            rate=sequence.rate)
         if isinstance(part, PythonPart):
             file, name = require_function_name(part.python)
-            source = read(file, here.at("python"), "a Python file beside the sequence")
             if file not in modules:
+                source = read(file, here.at("python"), "a Python file beside the sequence")
                 modules[file] = run_file(Path(place.file).parent / file, source)
             return replace(part, function=load_function(modules[file], name, part.given, part.arguments))
         return part

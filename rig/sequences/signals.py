@@ -36,8 +36,8 @@ def find_controlled() -> str:
 
 def find_unit(signals: Signals, name: str) -> str:
     """The SI unit of a signal, of the error or of the speed."""
-    known = {s.name: s.unit for s in signals}
-    return known.get(name) or {"error": signals.controlled.unit, "speed": f"{signals.controlled.unit}/s"}[name]
+    derived = {"error": signals.controlled.unit, "speed": f"{signals.controlled.unit}/s"}
+    return {**derived, **{s.name: s.unit for s in signals}}[name]
 
 
 def _list_aliases() -> Mapping[str, str]:

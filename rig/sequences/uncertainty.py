@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from plant import Array, Columns, Signals
-from rig.benches import WIDTHS, Bench, Decision, Kind, SensorCalibration
+from rig.benches import WIDTHS, Bench, Decision, SensorCalibration
 
 COVERAGE = 2.0  # k: U = k u, about 95 %
 DRAWS = 200  # a sensitivity to 1 %, what noise does to 5 %
@@ -48,9 +48,7 @@ def collect_metrology(bench: Bench, signals: Signals, decision: Decision | None,
 
     `decision`: the rule of the sequence, which comes before that of the bench.
     """
-    fields = [each for spec in bench.frames.frames for each in spec.fields if each.kind is not Kind.FLOAT]
-    counts = {s.name: max((abs(float(each.count)) for each in fields if each.name in (s.alias, s.name)), default=0.0)
-              for s in signals[1:]}
+    counts = {s.name: bench.find_count(s.word) for s in signals[1:]}
     problems = {name: problem for name, each in bench.calibration.items() if (problem := each.find_problem(t_ns))}
     return Metrology(decision or bench.decision, bench.calibration, counts, problems)
 

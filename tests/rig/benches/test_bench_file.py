@@ -10,8 +10,8 @@ from places import ROOT
 from refusals import catch_refusal
 
 from dbc import EDS
-from rig.benches import Kind, Role, load_bench, load_bench_from_files, pack
-from rig.benches.bench import Guard
+from rig.benches import Role, load_bench, load_bench_from_files, pack
+from rig.benches.bench import Guard, Kind
 from rig.benches.bench_file import list_benches
 
 EXAMPLES = sorted(ROOT.glob("examples/*/bench.toml"))

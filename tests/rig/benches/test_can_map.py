@@ -23,7 +23,6 @@ from rig.benches import (
     SWITCHED,
     VALUES_AT,
     FrameSpec,
-    Kind,
     Role,
     find_frame,
     list_frame_places,
@@ -35,7 +34,7 @@ from rig.benches import (
     unpack,
     unpack_frame,
 )
-from rig.benches.bench import Field, Guard, extract_bits
+from rig.benches.bench import Field, Guard, Kind, extract_bits
 from rig.benches.checksums import compute_checksum, compute_crc8, load_checksum
 
 INPUTS = {"position_demand": ("mm", 1e-3), "ram_position": ("m", 1.0), "load_pressure": ("bar", 1e5),

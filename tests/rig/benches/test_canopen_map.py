@@ -10,8 +10,8 @@ from canopen.objectdictionary.eds import import_eds
 from device_files import BENCH as DRIVE, NODE, OBJECTS, RPDOS, TPDOS, Entry, Mapped, format_eds
 from hypothesis import given, strategies as st
 
-from rig.benches import EXTENDED, Kind, Role, load_bench_from_files, pack, read_dictionary, unpack
-from rig.benches.bench import extract_bits
+from rig.benches import EXTENDED, Role, load_bench_from_files, pack, read_dictionary, unpack
+from rig.benches.bench import Kind, extract_bits
 from rig.benches.canopen_map import list_values
 
 # data type of CiA 301: bits
