@@ -51,10 +51,6 @@ def _grade(area: str, name: str, is_enough: bool, value: str, purpose: str, reme
     return Finding(area, name, "ok" if is_enough else "limited", value, purpose, "" if is_enough else remedy)
 
 
-def _advise_apt(packages: str) -> str:
-    return f"apt-get install {packages}"
-
-
 def read_requirements() -> dict[str, list[str]]:
     """The project's declared dependencies by extra ('' for the plain ones): names only."""
     named: dict[str, list[str]] = {"": []}
@@ -119,7 +115,7 @@ def examine_buses() -> list[Finding]:
         _find("bus", "CAN interface", ", ".join(bus.list_can_interfaces()),
               "rig run --bus socketcan:vcan0, or hardware", bus.explain_socketcan_problem("vcan0")),
         _find("bus", "CAN guest", "" if absent else "User-Mode Linux with a vcan0",
-              "the socketcan tests on a kernel without CAN", _advise_apt(" ".join(absent)))]
+              "the socketcan tests on a kernel without CAN", f"apt-get install {' '.join(absent)}")]
 
 
 _SEARCH_PATH = os.environ.get("PATH", "") + ":/usr/local/sbin:/usr/sbin:/sbin"  # users seldom have the last three
@@ -141,7 +137,7 @@ def examine_viewer() -> list[Finding]:
         _find("viewer", "display", os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY") or "",
               "the viewer's window; screenshots need none", "a desktop session"),
         _find("viewer", "Vulkan", f"{library}, drivers: {len(drivers)}" if library and drivers else "",
-              "draws it, also without a screen", _advise_apt("mesa-vulkan-drivers libvulkan1"))]
+              "draws it, also without a screen", "apt-get install mesa-vulkan-drivers libvulkan1")]
 
 
 def _read_version_line(*command: str) -> str:
@@ -158,12 +154,12 @@ def examine_tools() -> list[Finding]:
     """Programs of the system that some commands and tests use."""
     compiler = next((text for name in ("cc", "gcc", "clang") if (text := _read_version_line(name, "--version"))), "")
     return [
-        _find("tools", "C compiler", compiler, "rig bench compares with C", _advise_apt("gcc libc6-dev")),
+        _find("tools", "C compiler", compiler, "rig bench compares with C", "apt-get install gcc libc6-dev"),
         _find("tools", "candump", _find_tool("candump"), "an independent log of a CAN interface",
-              _advise_apt("can-utils")),
-        _find("tools", "tshark", _find_tool("tshark"), "an independent CANopen decoding", _advise_apt("tshark")),
+              "apt-get install can-utils"),
+        _find("tools", "tshark", _find_tool("tshark"), "an independent CANopen decoding", "apt-get install tshark"),
         _find("tools", "git", _read_version_line("git", "--version"), "the project's state in each log",
-              _advise_apt("git"))]
+              "apt-get install git")]
 
 
 def examine_storage() -> list[Finding]:

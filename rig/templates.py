@@ -15,5 +15,4 @@ def _load_environment() -> Any:
 
 def fill_template(path: str, /, **values: object) -> str:
     """The text of the template at `path` in this package; in XML the values are escaped."""
-    text: str = _load_environment().get_template(path).render(values)
-    return text
+    return str(_load_environment().get_template(path).render(values))

@@ -9,8 +9,7 @@ from typing import Any, TypeVar
 from fdi.report import Report
 from plant import RigError
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
-from rig.cli.answer import Places, choose_file, give_answer
-from rig.cli.command_list import parse_whole_number
+from rig.cli import Places, choose_file, give_answer, parse_whole_number
 
 Job = TypeVar("Job")
 

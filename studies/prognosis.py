@@ -15,7 +15,7 @@ from fdi.report import Column, Line, Report, Section, Table, to_plain
 from fdi.thresholds import INTERVAL_95_SD, TREND_FEWEST_TRACES
 from plant import RigError
 from rig.campaign.batch import Workers, run_jobs
-from rig.cli.command_list import parse_count
+from rig.cli import parse_count
 from studies.command import report_progress, run_study_command
 
 Floats = NDArray[np.float64]

@@ -6,12 +6,12 @@ Rivals take turns in short rounds or blocks, so that a disturbance of the machin
 import contextlib
 import ctypes
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from importlib.resources import files
@@ -34,6 +34,7 @@ from rig.nodes.scenario import Scenario
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.bring_up import open_loop
 from rig.run.hard_loop import compile_cycle
+from rig.run.job import Job
 from rig.run.loop import CycleInput, History
 from rig.run.priority import (
     LOOP_PRIORITY,
@@ -44,7 +45,7 @@ from rig.run.priority import (
     raise_priority,
     suspend_garbage_collection,
 )
-from rig.run.runner import INTERRUPTED
+from rig.run.runner import INTERRUPTED, run_job
 from rig.sequences import load_sequence
 from rig.sequences.faults import Plan, Schedule
 
@@ -206,12 +207,12 @@ def list_contenders(bus: str) -> dict[str, Callable[[float], Times]]:
     def measure_cyclictest(seconds: float) -> Times:
         return {"lateness": run_cyclictest(seconds, choose_priority(), list_cpus()[-1])}
 
-    def measure_cycle(seconds: float, run_peer: Callable[[], AbstractContextManager[Peer | None]],
+    def measure_cycle(seconds: float, run_peer: Callable[[], contextlib.AbstractContextManager[Peer | None]],
                       bench: Path | None = None) -> Times:
         with run_peer() as peer:
             return play_block(bus, seconds, peer, bench)
 
-    def run_example(folder: Path) -> AbstractContextManager[Peer]:
+    def run_example(folder: Path) -> contextlib.AbstractContextManager[Peer]:
         return _run_process([str(build_device(folder)), bus])
 
     emulator = [sys.executable, "-m", "rig.cli.main", "node", "plant", "--quiet", "--bus", bus]
@@ -313,9 +314,6 @@ def list_targets(tables: Mapping[str, Mapping[str, Mapping[str, float]]]) -> lis
              "is_met": value is not None and value <= limit} for name, value, limit, unit in found]
 
 
-GET_CYCLICTEST = "apt-get install rt-tests"
-
-
 def find_cyclictest() -> str:
     """The path of cyclictest; "" without it."""
     return shutil.which("cyclictest", path="/usr/bin:/usr/local/bin:/bin:/usr/sbin") or ""
@@ -340,16 +338,10 @@ def run_cyclictest(seconds: float, priority: int, cpu: int, period_us: int = 100
 
 def parse_histogram(text: str) -> Floats:
     """The latencies, s, in the histogram that cyclictest prints; those beyond its end count as its maximum."""
-    bins, most, overflows = [], 0, 0
-    for line in text.splitlines():
-        words = line.split()
-        if line.startswith("# Max Latencies:"):
-            most = int(words[-1])
-        elif line.startswith("# Histogram Overflows:"):
-            overflows = int(words[-1])
-        elif len(words) == 2 and words[0].isdigit():
-            bins.append((int(words[0]), int(words[1])))
-    latencies, counts = np.array([*bins, (most, overflows)]).T
+    ends = dict(re.findall(r"^# (Max Latencies|Histogram Overflows):.*?(\d+)\s*$", text, re.MULTILINE))
+    bins = [*re.findall(r"^(\d+)[ \t]+(\d+)\s*$", text, re.MULTILINE),
+            (ends.get("Max Latencies", 0), ends.get("Histogram Overflows", 0))]
+    latencies, counts = np.array(bins, int).T
     return np.repeat(latencies, counts) * 1e-6
 
 
@@ -373,7 +365,7 @@ _TITLES = {
 def build_realtime_report(figures: Mapping[str, Any]) -> Report:
     """Report on the figures of `rig.bench.benchmarks.measure_realtime`, which are its `data`."""
     met = sum(target["is_met"] for target in figures["targets"])
-    get = {"cyclictest": GET_CYCLICTEST, "gcc": GET_GCC}
+    get = {"cyclictest": "apt-get install rt-tests", "gcc": GET_GCC}
     return Report(
         command="bench", title="realtime",
         sentence=f"{met} of {len(figures['targets'])} targets are met on {figures['bus']}.",
@@ -496,9 +488,6 @@ def measure_simulation_speed(command: Floats, rounds: int = 9) -> float:
 
 def measure_bus_run_speed(runs: int = 3) -> float:
     """The speed of a preflight run on the embedded bus, with its log, as a multiple of real time; best of `runs`."""
-    from rig.run.job import Job
-    from rig.run.runner import run_job
-
     job = Job(sequence=load_sequence("preflight"), model=Model())
     speeds = []
     for _ in range(runs):

@@ -105,8 +105,8 @@ class Matrix(NamedTuple):
 
 def list_shipped_matrices() -> list[str]:
     """The names of the matrices that come with this software."""
-    names = [file.name for file in files("rig.campaign").iterdir()]
-    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+    return sorted(file.name.removesuffix(".toml") for file in files("rig.campaign").iterdir()
+                  if file.name.endswith(".toml"))
 
 
 def read_matrix(source: str) -> dict[str, Any]:
@@ -189,18 +189,16 @@ def _expand_cases(spec: Mapping[str, Any]) -> tuple[Case, ...]:
 
     Each block's seeds are spread evenly over the campaign, so that the first cases are of every kind.
     """
-    cases: dict[tuple[str, float, int], Case] = {}
-    places: dict[tuple[str, float, int], float] = {}  # from 0 to 1
+    found: dict[tuple[str, float, int], tuple[float, Case]] = {}  # places from 0 to 1, and cases
     for block in spec["case"]:
         for values in itertools.product(*block["sizes"].values()):
             sizes = dict(sorted(zip(block["sizes"], values, strict=True)))
             for tolerance, k in itertools.product(block["tolerance"], range(block["seeds"])):
                 seed = spec["first"] + k
-                key = label_plant(sizes), tolerance, seed
-                cases.setdefault(key, Case(0, label_plant(sizes), sizes, tolerance, seed))
-                places.setdefault(key, (k + 0.5) / block["seeds"])
-    ordered = sorted(cases, key=lambda key: places[key])  # stable: equal places keep the order of the file
-    return tuple(cases[key]._replace(number=number) for number, key in enumerate(ordered))
+                case = Case(0, label_plant(sizes), sizes, tolerance, seed)
+                found.setdefault((case.label, tolerance, seed), ((k + 0.5) / block["seeds"], case))
+    ordered = sorted(found.values(), key=lambda pair: pair[0])  # stable: equal places keep the order of the file
+    return tuple(case._replace(number=number) for number, (_, case) in enumerate(ordered))
 
 
 def label_plant(sizes: Mapping[str, float]) -> str:
@@ -215,8 +213,8 @@ def build_trace_matrix(folder: str | Path, model: Model, work: str, faults: Sequ
         InputError: no such folder, or no trace in it.
     """
     root = Path(folder).absolute()
-    names = {path.relative_to(root).as_posix(): path for path in list_traces(root)}
-    digests = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in names.items()}
+    digests = {path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+               for path in list_traces(root)}
     return restore_matrix({"traces": str(root), "files": digests, **list_shared(model, work, faults)})
 
 

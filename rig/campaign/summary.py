@@ -1,6 +1,5 @@
 """The statistics of a campaign (false alarms, detection by size, confusion, errors, coverage), and their report."""
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -235,14 +234,9 @@ def measure_errors(rows: Sequence[Row], faults: Sequence[Fault] = FAULTS) -> Ite
         group = [row for row in rows
                  if row["label"] == label and row["status"] == OK and not has_other_fault(row, faults)]
         for fault in faults:
-            if estimated := [row for row in group if math.isfinite(_measure_width(row, fault))]:
+            low, high = f"{fault.key}_low", f"{fault.key}_high"
+            if estimated := [row for row in group if row.get(low) is not None and np.isfinite(row[high] - row[low])]:
                 yield _measure_error(label, estimated, fault)
-
-
-def _measure_width(row: Row, fault: Fault) -> float:
-    """Width of the interval of an estimate; NaN without one."""
-    low = row.get(f"{fault.key}_low")
-    return math.nan if low is None else float(row[f"{fault.key}_high"] - low)
 
 
 def _measure_error(label: str, rows: Sequence[Row], fault: Fault) -> Figures:
@@ -389,7 +383,7 @@ def _tabulate_traces(traces: Sequence[Mapping[str, Any]], faults: Sequence[Fault
                *(Column(f"{fault.symbol}{fault.bracketed_unit}", align="right") for fault in faults)]
     rows = [[trace["label"], *(trace[f"level_{fault.name}"] or trace["status"] for fault in faults),
              trace["ruling"] or NO_NUMBER,
-             *(format_digits(math.nan if trace[fault.key] is None else trace[fault.key]) for fault in faults)]
+             *(format_digits(np.nan if trace[fault.key] is None else trace[fault.key]) for fault in faults)]
             for trace in traces]
     return [Table(columns, rows, "Levels, ruling fault and fault sizes of each recorded trace.")]
 

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import plant
 from rig.cli.main import build_parser
 
 
@@ -48,17 +49,13 @@ def offer(list_names: Callable[[], Iterable[str]], *suffixes: str) -> Callable[.
 
 def list_parameters() -> list[str]:
     """Parameters for --set, with the equals sign."""
-    from plant import find_plant
-
-    groups = find_plant("eha").list_groups()
+    groups = plant.find_plant("eha").list_groups()
     return [f"{group}.{field}=" for group, fields in groups.items() for field in fields._fields]
 
 
 def list_models() -> list[str]:
     """Shipped models and plants."""
-    from plant import SHIPPED_MODELS, list_plants
-
-    return [*list_plants(), *SHIPPED_MODELS]
+    return [*plant.list_plants(), *plant.SHIPPED_MODELS]
 
 
 def list_sequences() -> list[str]:
@@ -70,6 +67,4 @@ def list_sequences() -> list[str]:
 
 def list_effects() -> list[str]:
     """Effects of the catalogue."""
-    from plant import find_plant
-
-    return [effect.name for effect in find_plant("eha").list_effects()]
+    return [effect.name for effect in plant.find_plant("eha").list_effects()]

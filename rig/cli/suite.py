@@ -10,9 +10,8 @@ from rich.text import Text
 
 from fdi.report import Cell, style_of
 from plant import count_nouns, require
-from rig.cli.answer import Places, choose_file, give_answer, make_folder, open_console
+from rig.cli import Places, choose_file, give_answer, is_suite_file, make_folder, open_console
 from rig.cli.commands.run import build_choice, choose_bus_of_run, make_new_folder
-from rig.cli.inputs import is_suite_file
 from rig.evidence.requirements import read_requirements, require_listed
 from rig.interrupts import catch_signals
 from rig.network import WallClock

@@ -9,7 +9,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -162,7 +161,8 @@ def import_frames(source: Path, out: Path, bench: Bench) -> int:
     """
     cycles = _CycleBuilder(bench)
     items: list[Frame | tuple[int, Record]] = []
-    for frame in _read_frames(source):
+    for t, message in list_can_messages(source):
+        frame = Frame(max(0, round(t * 1e9)), find_cob_id(message), bytes(message.data))
         items += [frame, *((frame.t_ns, record) for record in cycles.feed(frame))]
     starts = [t_ns for t_ns, _ in cycles.rows]
     sync = bench.frames.sync
@@ -237,7 +237,7 @@ class _CycleBuilder:
         sent = expected if self._sent is None else self._sent
         skipped = (sent - expected) & 0xFFFF if self.rows else 0
         cycle += skipped if skipped < 1000 else 0  # the counter of a bench started anew is no gap
-        row = self._record(cycle, 1, *(nan for _ in range(len(self._columns) - len(_WORDS))), 0, 0, 0)
+        row = self._record(cycle, 1, *(np.nan for _ in range(len(self._columns) - len(_WORDS))), 0, 0, 0)
         self._fill(row, self._waiting)
         self.rows.append((t_ns, row))
         self._recent.append((sent & 0xFFFF, row))
@@ -266,11 +266,6 @@ class _CycleBuilder:
                 setattr(row, column, round(value) if name in _WORDS else value)
 
 
-def _read_frames(source: Path) -> Iterator[Frame]:
-    for t, message in list_can_messages(source):
-        yield Frame(max(0, round(t * 1e9)), find_cob_id(message), bytes(message.data))
-
-
 def list_can_messages(source: Path) -> Iterator[tuple[float, can.Message]]:
     """The data frames of a CAN log (.log of candump, .blf, .asc, .trc) and their times since the first of them, s.
 
@@ -292,16 +287,6 @@ def list_can_messages(source: Path) -> Iterator[tuple[float, can.Message]]:
         raise InputError(source, "", f"a readable file ({error.strerror})") from error
     except (ValueError, IndexError, struct.error, can.CanError, BLFParseError) as error:
         raise InputError(source, "", f"CAN frames as {source.suffix} ({error})") from error
-
-
-def _load_messages(dbc: Path) -> dict[tuple[int, bool], Any]:
-    """The messages of a DBC by identifier and whether it is extended.
-
-    Raises:
-        InputError: it cannot be read.
-    """
-    return {(m.frame_id, m.is_extended_frame): m
-            for m in read_database(str(dbc), decode_device_text(read_file(dbc))).messages}
 
 
 def _read_signals(path: Path, messages: Mapping[tuple[int, bool], Any], names: Collection[str],
@@ -335,7 +320,9 @@ def open_can_log(path: Path, dbc: Path) -> Measurement:
     Raises:
         InputError: a DBC that cannot be read or has no signals.
     """
-    messages = _load_messages(dbc)
+    messages: dict[tuple[int, bool], Any] = {
+        (m.frame_id, m.is_extended_frame): m
+        for m in read_database(str(dbc), decode_device_text(read_file(dbc))).messages}
     units = {f"{m.name}.{s.name}": s.unit or "" for m in messages.values() for s in m.signals}
     require(units, dbc, "--dbc", "a DBC file with at least one signal")
     return Measurement(path, f"CAN log, {dbc.name}", units, partial(_read_signals, path, messages), has_times=True)

@@ -348,7 +348,6 @@ class McapFile:
     """Appends attachments, metadata and chunks; `finish` writes indexes and statistics. OSError is the disk's own."""
 
     def __init__(self, path: Path, library: str, declarations: Iterable[McapRecord]) -> None:
-        self.path = path
         self._file: BinaryIO = path.open("wb", buffering=0)
         self._offset = 0
         self.schemas: dict[int, Schema] = {}

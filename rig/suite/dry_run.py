@@ -1,6 +1,5 @@
 """A sequence before its run: command, load, and the run that a healthy actuator is predicted to make, as a report."""
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -80,13 +79,6 @@ class Demand(NamedTuple):
         return self.limit is not None and self.value > self.limit * (1.0 + 1e-9)
 
 
-class GuardTrip(NamedTuple):
-    """A guard that the predicted run violates, at `t` s of main."""
-
-    name: str
-    t: float
-
-
 class PlannedFault(NamedTuple):
     """A fault as the run will inject it; times in s of main."""
 
@@ -114,7 +106,7 @@ class DryRun(NamedTuple):
     limits: tuple[LimitReached, ...]  # that the predicted run reaches
     checks: list[CheckResult]  # on the predicted run, those that need no events
     not_predicted: list[str]  # the other checks
-    trips: list[GuardTrip]
+    trips: list[tuple[str, float]]  # guards that the predicted run violates, and when, s of main
 
     @property
     def problems(self) -> list[str]:
@@ -124,7 +116,7 @@ class DryRun(NamedTuple):
                   f"{each.section!r}, t = {each.t:.3f} s"
                   for each in self.demands if each.limit is not None and each.is_violated),
                 *(each.describe(signals) for each in self.limits if each.signal == signals.controlled.name),
-                *(f"guard {trip.name!r} violated at t = {trip.t:.3f} s" for trip in self.trips),
+                *(f"guard {name!r} violated at t = {t:.3f} s" for name, t in self.trips),
                 *(f"check {check.name!r}: {check.detail}" for check in self.checks if check.value != check.value)]
 
 
@@ -230,13 +222,13 @@ def find_capabilities(model: Model) -> dict[str, float]:
     return found
 
 
-def find_trips(guards: Sequence[Guard], run: RunData) -> Iterator[GuardTrip]:
-    """The guards that the predicted main phase violates."""
+def find_trips(guards: Sequence[Guard], run: RunData) -> Iterator[tuple[str, float]]:
+    """The guards that the predicted main phase violates, and when, s."""
     for guard in guards:
         watch, values = GuardWatch([guard]), run.read_signal(guard.signal, slice(0, len(run.trace.t))).tolist()
         passed = [watch.find_passed({guard.signal: value}) is not None for value in values]
         if any(passed):
-            yield GuardTrip(guard.name, float(run.trace.t[passed.index(True)]))
+            yield guard.name, float(run.trace.t[passed.index(True)])
 
 
 def plan_faults(job: Job) -> list[PlannedFault]:
@@ -316,7 +308,7 @@ def build_dry_run_report(dry: DryRun, files: Sequence[tuple[str, str]] = ()) -> 
         mood="bad" if problems else "good", sentence=sentence, facts=facts, notes=_list_notes(dry),
         sections=[Section("Command and load", [Line("duration", duration), *_tabulate_demands(dry.demands)]),
                   Section("Faults", _tabulate_faults(dry.faults)),
-                  Section("Predicted run", [Line(name, text) for name, text in describe_prediction(dry)]),
+                  Section("Predicted run", describe_prediction(dry)),
                   *(shown[title] for title in ("Checks", "Failed checks", "Signals"))],
         files=files, data=data)
 
@@ -357,19 +349,19 @@ def _tabulate_faults(faults: Sequence[PlannedFault]) -> list[Table]:
         caption="Times count from the start of main; all faults end with it.")]
 
 
-def describe_prediction(dry: DryRun) -> list[tuple[str, str]]:
+def describe_prediction(dry: DryRun) -> list[Line]:
     """The figures of the predicted run: drive, following error, limits that it reaches."""
     run, signals = dry.predicted, dry.job.model.kind.signals
     error, drive = (run.command - run.controlled)[run.phase == MAIN], signals.drive
     limit = dry.job.model.values.get(drive.limit)
     scale, unit = drive.shown_scale, drive.shown_unit
     most = f" of {scale * limit:.3g} {unit}" if limit else ""
-    text = f"largest {scale * np.abs(run.drive).max():.3g} {unit}{most}"
+    drive_line = Line(drive.phrase, f"largest {scale * np.abs(run.drive).max():.3g} {unit}{most}")
     scale, unit = signals.controlled.shown_scale, signals.controlled.shown_unit
-    return [(drive.phrase, text),
-            ("error", f"largest {scale * np.abs(error).max():.4g} {unit}, RMS "
-                      f"{scale * math.sqrt(float(np.mean(error ** 2))):.4g} {unit} in main"),
-            *([("reaches", "; ".join(each.describe(signals) for each in dry.limits))] if dry.limits else [])]
+    return [drive_line,
+            Line("error", f"largest {scale * np.abs(error).max():.4g} {unit}, RMS "
+                          f"{scale * np.sqrt(np.mean(error ** 2)):.4g} {unit} in main"),
+            *([Line("reaches", "; ".join(each.describe(signals) for each in dry.limits))] if dry.limits else [])]
 
 
 def collect_data(dry: DryRun) -> dict[str, Any]:
@@ -385,5 +377,5 @@ def collect_data(dry: DryRun) -> dict[str, Any]:
         "predicted": {"current": float(np.abs(run.drive).max()),
                       "error": float(np.abs(run.command - run.controlled).max()),
                       "limits": [each._asdict() for each in dry.limits],
-                      "guards": [trip._asdict() for trip in dry.trips]},
+                      "guards": [{"name": name, "t": t} for name, t in dry.trips]},
         "checks": [to_plain(check.collect_data()) for check in dry.checks], "not_predicted": dry.not_predicted}

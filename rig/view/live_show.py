@@ -111,10 +111,9 @@ def _list_chunks(data: bytes) -> Iterator[tuple[bytes, int]]:
             yield unpack_chunk(Chunk.read(ReadDataStream(BytesIO(data[at - length:at])))), at
 
 
-_STYLES = {"PASS": "green", "FAIL": "bold red", "CANNOT_TELL": "bold yellow", "measures": "bold cyan", "waits": "dim",
-           "after the run": "dim"}
+_STYLES = {"FAIL": "bold red", "CANNOT_TELL": "bold yellow", "measures": "bold cyan", "PASS": "green", "waits": "dim",
+           "after the run": "dim"}  # in the order in which checks are shown
 _NODE_STYLES = {"operational": "green", "pre-operational": "yellow", "stopped": "red"}
-_ORDER = ("FAIL", "CANNOT_TELL", "measures", "PASS", "waits", "after the run")
 
 
 def draw_screen(run: LiveRun, width: int, height: int, silence: float) -> Text:
@@ -130,10 +129,9 @@ def draw_screen(run: LiveRun, width: int, height: int, silence: float) -> Text:
     com, xj = (s.shown_scale * run.read_last(s.name, round(5 * run.plan.rate)) for s in (command, controlled))
     lines += draw_plot({"white": com, "bold blue": xj}, width, plot_height, 0.2)
     left, right = _draw_checks(run, lower), [*_draw_timing(run), *_draw_events(run, lower)][:lower]
-    half = width // 2
     for number in range(lower):
         line = left[number] if number < len(left) else Text("")
-        line.truncate(half - 1, overflow="ellipsis", pad=True)
+        line.truncate(width // 2 - 1, overflow="ellipsis", pad=True)
         line.append(" ")
         line.append_text(right[number] if number < len(right) else Text(""))
         lines.append(line)
@@ -181,7 +179,7 @@ def _draw_checks(run: LiveRun, count: int) -> list[Text]:
     passed, failed = words.count("PASS"), words.count("FAIL")
     title = Text.assemble((f"Checks: {passed} pass", "bold"), (f", {failed} fail", "bold red" if failed else "bold"),
                           (f" of {len(states)}", "bold"))
-    shown = [state for word in _ORDER for state in states if state.word == word]
+    shown = [state for word in _STYLES for state in states if state.word == word]
     done = [state for state in states if state.word == "PASS"]
     room = count - 1 - sum(word in ("FAIL", "CANNOT_TELL", "measures") for word in words)
     if len(shown) > count - 1:  # the newest of those that passed
@@ -233,10 +231,8 @@ def draw_plot(lines: dict[str, NDArray[np.float64]], width: int, height: int, sm
         smallest_range: of the axis, so that noise does not fill the screen.
     """
     columns = max(width - 8, 1)
-    known = [values[~np.isnan(values)] for values in lines.values()]
-    known = [values for values in known if len(values)]
-    low = min((float(values.min()) for values in known), default=0.0)
-    high = max((float(values.max()) for values in known), default=0.0)
+    known = np.concatenate([values[~np.isnan(values)] for values in lines.values()])
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     margin = max(smallest_range - (high - low), 0.1 * (high - low)) / 2
     low, high = low - margin, high + margin
     bits = np.zeros((height, columns), int)

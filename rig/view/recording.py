@@ -232,20 +232,9 @@ LANES = "Faults, nodes, run"  # title of a view that is no plot
 LIMITS_OF = {"never_exceeds", "max_error"}  # kinds of check whose limits are limits of the plotted line
 
 
-class RunLine(NamedTuple):
-    """A line of a plot of a run: the signal, its scale from SI, and how it is shown."""
-
-    signal: str
-    scale: float
-    path: str
-    name: str
-    colour: int
-    width: float = 1.5
-
-
 DRIVE, LOAD = 0xB57EDCFF, 0xD9A441FF
 OUTPUTS = (MEASURED, 0x45B8ACFF, 0xD96BA0FF, 0x9ACD5BFF, 0x6FA8DCFF)  # the controlled one first
-Plots = dict[tuple[str, str], tuple[RunLine, ...]]  # origin, title -> lines
+Plots = dict[tuple[str, str], tuple[tuple[str, float, Curve], ...]]  # origin, title -> signals, scales from SI, lines
 
 
 @cache
@@ -257,21 +246,21 @@ def list_plots(signals: Signals) -> Plots:
     symbol, unit, scale = controlled.symbol, controlled.shown_unit, controlled.shown_scale
     plots: Plots = {
         ("position", f"{moves} [{unit}]"): (
-            RunLine(command.name, scale, "command", f"{command.symbol} command [{unit}]", COMMAND, 4.0),
-            RunLine(controlled.name, scale, controlled.called,
-                    f"{' '.join(dict.fromkeys((symbol, controlled.called)))} [{unit}]", MEASURED)),
+            (command.name, scale, Curve("command", f"{command.symbol} command [{unit}]", COMMAND, width=4.0)),
+            (controlled.name, scale, Curve(
+                controlled.called, f"{' '.join(dict.fromkeys((symbol, controlled.called)))} [{unit}]", MEASURED))),
         ("error", f"Following error [{fine}]"): (
-            RunLine("error", 1.0 / size, "error", f"{command.symbol} - {symbol} [{fine}]", 0xE8A33DFF),)}
+            ("error", 1.0 / size, Curve("error", f"{command.symbol} - {symbol} [{fine}]", 0xE8A33DFF)),)}
     others = [(drive, DRIVE), *((s, OUTPUTS[k % len(OUTPUTS)]) for k, s in enumerate(signals.outputs) if k)]
     for signal, colour in [*others, *([(signals.load, LOAD)] if signals.load else [])]:
         title = f"{signal.quantity[:1].upper()}{signal.quantity[1:]} [{signal.shown_unit}]"
         name = " ".join(dict.fromkeys((signal.symbol, signal.called)))
-        plots[signal.called, title] = (RunLine(signal.name, signal.shown_scale, signal.called,
-                                               f"{name} [{signal.shown_unit}]", colour),)
+        plots[signal.called, title] = ((signal.name, signal.shown_scale, Curve(
+            signal.called, f"{name} [{signal.shown_unit}]", colour)),)
     return plots | {("timing", "Cycle timing [us]"): (
-        RunLine("lateness", 1e6, "lateness", "SYNC lateness [us]", 0xF2C94CFF, 1.0),
-        RunLine("response", 1e6, "response", "controller's response [us]", 0x7FD46BFF, 1.0),
-        RunLine("work", 1e6, "work", "bench's own work [us]", 0x8C7AE6FF, 1.0))}
+        ("lateness", 1e6, Curve("lateness", "SYNC lateness [us]", 0xF2C94CFF, width=1.0)),
+        ("response", 1e6, Curve("response", "controller's response [us]", 0x7FD46BFF, width=1.0)),
+        ("work", 1e6, Curve("work", "bench's own work [us]", 0x8C7AE6FF, width=1.0)))}
 
 
 def draw_run(trace: Trace) -> Drawing:
@@ -300,14 +289,14 @@ def list_columns(trace: Trace) -> dict[str, tuple[Floats, Floats]]:
 def draw_signals(columns: Mapping[str, tuple[Floats, Floats]], layout: Plots) -> list[Plot]:
     """The plots of the signals that there are."""
     plots = [Plot(origin, title, [
-        Curve(line.path, line.name, line.colour, columns[line.signal][0], columns[line.signal][1] * line.scale,
-              line.width) for line in lines if line.signal in columns]) for (origin, title), lines in layout.items()]
+        curve._replace(t=columns[signal][0], values=columns[signal][1] * scale)
+        for signal, scale, curve in lines if signal in columns]) for (origin, title), lines in layout.items()]
     return [plot for plot in plots if plot.curves]
 
 
 def _list_limits(origin: str, checks: tuple[CheckResult, ...], layout: Plots) -> Iterator[Curve]:
     """Limits of a plotted signal as red lines over the check's window."""
-    scales = {line.signal: line.scale for (own, _), lines in layout.items() for line in lines if own == origin}
+    scales = {signal: scale for (own, _), lines in layout.items() for signal, scale, _ in lines if own == origin}
     for number, check in enumerate(checks):
         signal = "error" if check.kind == "max_error" else check.signal
         if check.kind in LIMITS_OF and signal in scales and not math.isnan(check.t0 + check.high):

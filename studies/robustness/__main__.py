@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 
 from fdi.report import Report
-from rig.cli.command_list import parse_whole_number
+from rig.cli import parse_whole_number
 from studies.command import report_progress, run_study_command
 from studies.robustness.run_study import build_robustness_report, run_study
 

@@ -1,1 +1,1 @@
-"""One module per subcommand: add_arguments(parser) and run_command(args) -> exit status, which holds heavy imports."""
+"""One module per subcommand, which does its work: `run_command(args)` returns the exit status."""

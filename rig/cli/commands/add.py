@@ -4,9 +4,17 @@ import argparse
 
 from fdi.discovery.update_model import add_effects, find_runs, write_model_file
 from fdi.report import build_model_report
-from rig.cli.answer import Places, choose_file, give_answer, show_progress
-from rig.cli.discovery_inputs import choose_model_file, format_command_line, load_known_model, split_words
-from rig.cli.inputs import list_signals
+from rig.cli import (
+    Places,
+    choose_file,
+    choose_model_file,
+    format_command_line,
+    give_answer,
+    list_signals,
+    load_known_model,
+    show_progress,
+    split_words,
+)
 
 
 def run_command(args: argparse.Namespace) -> int:

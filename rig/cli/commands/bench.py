@@ -8,7 +8,16 @@ from typing import Any
 from fdi.progress import Progress
 from fdi.report import Report
 from plant import require
-from rig.cli.answer import Places, give_answer, show_progress
+from rig.bench.benchmarks import (
+    build_plant_report,
+    build_realtime_report,
+    choose_bus,
+    measure_accuracy,
+    measure_realtime,
+    run_benchmarks,
+)
+from rig.cli import Places, give_answer, show_progress
+from rig.sequences import load_sequence
 
 REALTIME: Mapping[str, Any] = {"bus": "auto", "seconds": 60.0, "blocks": 6}  # options of rig bench realtime alone
 
@@ -26,9 +35,6 @@ def run_command(args: argparse.Namespace) -> int:
 
 def measure_plant(args: argparse.Namespace, progress: Progress) -> Report:
     """The speed of the plant; with --accuracy also the error of its step."""
-    from rig.bench.benchmarks import build_plant_report, measure_accuracy, run_benchmarks
-    from rig.sequences import load_sequence
-
     command = load_sequence("preflight").main_profile().command
     figures = run_benchmarks(command, progress)
     if args.accuracy:
@@ -39,7 +45,5 @@ def measure_plant(args: argparse.Namespace, progress: Progress) -> Report:
 
 def measure_cycle(options: Mapping[str, Any], progress: Progress) -> Report:
     """The cycle in real time."""
-    from rig.bench.benchmarks import build_realtime_report, choose_bus, measure_realtime
-
     return build_realtime_report(measure_realtime(choose_bus(**options), options["seconds"], options["blocks"],
                                                   progress))

@@ -31,8 +31,7 @@ from rig.campaign.judge import (
     run_campaign,
 )
 from rig.campaign.summary import build_campaign_report, describe_progress, draw_detection_curves, summarise_campaign
-from rig.cli.answer import give_answer, show_progress
-from rig.cli.inputs import parse_changes
+from rig.cli import give_answer, parse_changes, show_progress
 from rig.network import WallClock
 
 

@@ -5,8 +5,7 @@ import argparse
 from fdi.comparison.compare import Comparison, compare
 from fdi.report import build_comparison_report
 from fdi.trace import Trace
-from rig.cli.answer import choose_places, give_answer, show_progress
-from rig.cli.inputs import format_arguments, list_signals, load_chosen_model
+from rig.cli import choose_places, format_arguments, give_answer, list_signals, load_chosen_model, show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from plant import InputError, require
 from rig.benches import Role, load_bench
-from rig.cli.answer import Places, choose_file, give_answer, make_folder, show_progress
+from rig.cli import Places, choose_file, give_answer, make_folder, show_progress
 from rig.conformance.run_cases import build_conformance_report, choose_cases, run_cases, write_junit
 from rig.conformance.target import DataSheet, Options, Target
 from rig.network import EmbeddedWire, Link, LinkWire, Master, VirtualClock, WallClock, Wire, choose_bus, open_can

@@ -8,8 +8,7 @@ from fdi.progress import Progress
 from fdi.report import build_diff_report
 from fdi.trace import Trace
 from plant import Signals
-from rig.cli.answer import choose_places, give_answer, show_progress
-from rig.cli.inputs import load_declared_model
+from rig.cli import choose_places, give_answer, load_declared_model, show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:

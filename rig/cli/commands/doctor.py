@@ -10,7 +10,7 @@ from fdi.report import Cell, Column, Mood, Report, Section, Table
 from plant import require
 from rig import doctor
 from rig.benches import Bench, load_bench
-from rig.cli.answer import Places, give_answer
+from rig.cli import Places, give_answer
 from rig.network import choose_bus
 
 MOODS: dict[doctor.Status, Mood] = {"ok": "good", "limited": "doubtful", "missing": "bad"}

@@ -9,8 +9,7 @@ from typing import Any
 from fdi.report import Cell, Column, Item, Line, Paragraph, Report, Section, Table, format_digits
 from plant import Report as SelfTest, check_effect, find_effect, find_plant, load_model, load_plant
 from plant.effects import Effect
-from rig.cli.answer import Places, give_answer, show_progress
-from rig.cli.inputs import load_user_effects
+from rig.cli import Places, give_answer, load_user_effects, show_progress
 
 CONVENIENT = {"m": (1e6, "um"), "Pa": (1e-5, "bar")}  # units of a table
 
@@ -22,10 +21,9 @@ def run_command(args: argparse.Namespace) -> int:
     load_user_effects(args.effects)
     plant = load_model(args.model).plant
     chosen = [find_effect(args.name, plant)] if args.name else find_plant(plant).list_effects()
-    own = {file.absolute() for file in args.effects}
-    tested = chosen if args.test or (args.name and chosen[0].file in own) else []
+    is_own = args.name and chosen[0].file in {file.absolute() for file in args.effects}
     with show_progress(args, "testing"):
-        tests = {e.name: test_effect(e, plant) for e in tested}
+        tests = {e.name: test_effect(e, plant) for e in chosen if args.test or is_own}
     report = build_effects_report(chosen, plant, tests, is_detailed=bool(args.name))
     status = int(any(test.faults for test in tests.values()))
     return give_answer(report, args, status, Places(answer=Path(args.out) if args.out else None))

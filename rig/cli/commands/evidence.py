@@ -7,7 +7,7 @@ from pathlib import Path
 from fdi.output import require_new
 from fdi.report import MOODS, Cell, Column, Line, Report, Section, tabulate
 from plant import count_nouns, escape_control_characters, require
-from rig.cli.answer import give_answer, show_progress
+from rig.cli import give_answer, show_progress
 from rig.evidence.contents import BILL, add_index, collect_runs
 from rig.evidence.package import verify_package, write_package
 from rig.evidence.requirements import read_requirements, require_listed, tabulate_requirements, trace_requirements

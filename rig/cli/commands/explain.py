@@ -14,9 +14,18 @@ from fdi.report import build_explanation_report
 from plant import require
 from rig.campaign.batch import Workers
 from rig.campaign.sensitivity import measure_sensitivity
-from rig.cli.answer import Places, choose_file, choose_places, give_answer, show_progress
-from rig.cli.discovery_inputs import format_command_line, load_known_model, split_words
-from rig.cli.inputs import format_arguments, list_signals
+from rig.cli import (
+    Places,
+    choose_file,
+    choose_places,
+    format_arguments,
+    format_command_line,
+    give_answer,
+    list_signals,
+    load_known_model,
+    show_progress,
+    split_words,
+)
 
 
 def run_command(args: argparse.Namespace) -> int:

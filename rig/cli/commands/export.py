@@ -6,8 +6,7 @@ from pathlib import Path
 from fdi.output import require_new, require_writable
 from fdi.report import Report
 from plant import require
-from rig.cli.answer import give_answer, show_progress
-from rig.cli.inputs import load_chosen_model
+from rig.cli import give_answer, load_chosen_model, show_progress
 from rig.recorder.convert import export_trace
 
 

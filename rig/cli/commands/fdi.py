@@ -14,9 +14,8 @@ from fdi.output import require_writable, write_text
 from fdi.report import build_bands_report, build_diagnosis_report
 from fdi.trace import Trace
 from plant import require
-from rig.cli.answer import choose_places, give_answer, show_progress
+from rig.cli import choose_places, format_arguments, give_answer, load_chosen_model, show_progress
 from rig.cli.commands.simulate import load_command
-from rig.cli.inputs import format_arguments, load_chosen_model
 
 
 def run_command(args: argparse.Namespace) -> int:

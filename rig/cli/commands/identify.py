@@ -13,9 +13,7 @@ from fdi.identification.identify import (
 )
 from fdi.report import build_identification_report
 from plant import list_plants
-from rig.cli.answer import Places, choose_file, give_answer, show_progress
-from rig.cli.discovery_inputs import format_command_line, load_known_model
-from rig.cli.inputs import list_signals
+from rig.cli import Places, choose_file, format_command_line, give_answer, list_signals, load_known_model, show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:

@@ -11,8 +11,7 @@ from fdi.trace.importing.formats import Measurement, open_measurement
 from fdi.trace.importing.guess import guess_map
 from plant import InputError, count_nouns, require
 from rig.benches import load_bench
-from rig.cli.answer import give_answer, name_after, show_progress
-from rig.cli.inputs import load_declared_model
+from rig.cli import give_answer, load_declared_model, name_after, show_progress
 from rig.recorder.convert import RAW_SUFFIXES, import_csv, import_frames, import_own_table, open_can_log, write_imported
 
 
@@ -45,8 +44,7 @@ def import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
     """
     with show_progress(args, "reading"):
         if source.suffix in RAW_SUFFIXES:
-            bench = load_bench(args.bench or "eha", is_trusted=args.trust)
-            cycles = import_frames(source, out, bench)
+            cycles = import_frames(source, out, load_bench(args.bench or "eha", is_trusted=args.trust))
         elif source.name.endswith((".csv", ".csv.gz")):
             try:
                 cycles = import_csv(source, out, load_declared_model(args).kind.signals)

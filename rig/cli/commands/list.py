@@ -18,8 +18,7 @@ from plant import (
     load_model,
     require,
 )
-from rig.cli.answer import give_answer
-from rig.cli.inputs import load_chosen_model
+from rig.cli import give_answer, load_chosen_model
 
 Rows = list[dict[str, Any]]
 
@@ -73,9 +72,8 @@ def _describe_range(q: Quantity) -> str:
 def list_signals(model: Model) -> Rows:
     """The columns of a trace."""
     signals = model.kind.signals
-    required = ("t", *signals.required)
     return [{"name": s.name, "symbol": s.symbol, "unit": s.unit, "content": s.quantity,
-             "in a trace": "required" if s.name in required else "optional",
+             "in a trace": "required" if s.name in ("t", *signals.required) else "optional",
              "noise of the model": model.values.get(s.noise) if s.role == "output" else None}
             for s in signals]
 

@@ -19,7 +19,7 @@ from plant import InputError, Plant, load_model, load_plant, read_file, require
 from plant.effects import is_taken, load_effects
 from plant.faults import WORD
 from rig.benches import UNSURE, Wanted, decode_device_text, guess_can, guess_canopen, load_bench
-from rig.cli.answer import give_answer
+from rig.cli import give_answer
 from rig.sequences import load_sequence
 
 

@@ -8,8 +8,7 @@ from fdi.output import require_writable
 from fdi.report import Report
 from plant import RigError, require
 from rig.benches import Bench, load_bench
-from rig.cli.answer import Places, give_answer
-from rig.cli.inputs import load_chosen_model
+from rig.cli import Places, give_answer, load_chosen_model
 from rig.interrupts import catch_signals
 from rig.network import (
     CONTROLLER,
@@ -103,18 +102,13 @@ def make_node(args: argparse.Namespace, bench: Bench, link: Link, stack: context
     Raises:
         InputError: a model that the bench cannot drive.
     """
+    scenario = Scenario(load_chosen_model(args), Plan(stop=0), (), args.seed)
     if is_compiled:
         is_locked = stack.enter_context(lock_memory())
         raw = stack.enter_context(RawBus(choose_bus(args.bus)[0]))
         link.leave_out(list_unheard(bench))
-        service = EmulatorService(link.send, raw, enter_loop_thread, choose_scenario(args), is_locked, bench)
+        service = EmulatorService(link.send, raw, enter_loop_thread, scenario, is_locked, bench)
         stack.callback(service.close)
         return service
-    scenario = choose_scenario(args)
     return (Emulator(link.send, scenario, bench) if args.node == "plant" else
             Firmware(link.send, read_gains(scenario.model.values), scenario.model))
-
-
-def choose_scenario(args: argparse.Namespace) -> Scenario:
-    """The plant that the options describe, without faults. Raises InputError."""
-    return Scenario(load_chosen_model(args), Plan(stop=0), (), args.seed)

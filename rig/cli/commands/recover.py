@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from fdi.report import Report
-from rig.cli.answer import give_answer
+from rig.cli import give_answer
 from rig.recorder.recover import recover_log
 
 

@@ -6,9 +6,17 @@ from pathlib import Path
 from fdi.discovery.update_model import find_runs, remove_effect_and_refit, write_model_file
 from fdi.report import build_model_report
 from plant import require
-from rig.cli.answer import Places, choose_file, give_answer, show_progress
-from rig.cli.discovery_inputs import choose_model_file, format_command_line, load_known_model, split_words
-from rig.cli.inputs import list_signals
+from rig.cli import (
+    Places,
+    choose_file,
+    choose_model_file,
+    format_command_line,
+    give_answer,
+    list_signals,
+    load_known_model,
+    show_progress,
+    split_words,
+)
 
 
 def run_command(args: argparse.Namespace) -> int:

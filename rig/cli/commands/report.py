@@ -4,8 +4,7 @@ import argparse
 from pathlib import Path
 
 from fdi.report import Report, write_run_page
-from rig.cli.answer import give_answer, show_progress
-from rig.cli.inputs import load_declared_model
+from rig.cli import give_answer, load_declared_model, show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:

@@ -13,9 +13,16 @@ from fdi.progress import Progress
 from fdi.report import Line, Medium, Report, Section, build_run_report, write_html
 from fdi.trace import Trace
 from plant import count_nouns, report_system_error, require
-from rig.cli.answer import Places, choose_file, give_answer, open_console, show_progress
-from rig.cli.command_list import LIVE_ON_TERMINAL
-from rig.cli.inputs import is_suite_file, parse_changes
+from rig.cli import (
+    LIVE_ON_TERMINAL,
+    Places,
+    choose_file,
+    give_answer,
+    is_suite_file,
+    open_console,
+    parse_changes,
+    show_progress,
+)
 from rig.interrupts import catch_signals
 from rig.network import WallClock, choose_bus
 from rig.recorder import Event, Observer

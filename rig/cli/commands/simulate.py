@@ -8,8 +8,7 @@ from fdi.output import require_new, require_writable
 from fdi.report import Report, format_amount
 from fdi.trace import Trace, read_command
 from plant import Plant, Points, build_profile, count_nouns, find_divergence, load_model, require, simulate
-from rig.cli.answer import give_answer, show_progress
-from rig.cli.inputs import load_chosen_model
+from rig.cli import give_answer, load_chosen_model, show_progress
 from rig.sequences.sequence import load_nominal_test
 
 SAMPLE_UNIT = {"jack.static_friction": 900.0, "jack.dynamic_friction": 600.0, "null_bias.current": 5e-5}

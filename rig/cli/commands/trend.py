@@ -8,8 +8,7 @@ from fdi.diagnosis.faults import choose_faults, load_faults
 from fdi.prognosis.unit_trend import UnitTrend, follow_unit, gather_sizes, read_points
 from fdi.report import build_trend_report, draw_trends, save_drawing
 from plant import require
-from rig.cli.answer import Places, choose_file, give_answer, show_progress
-from rig.cli.inputs import load_chosen_model
+from rig.cli import Places, choose_file, give_answer, load_chosen_model, show_progress
 
 
 def run_command(args: argparse.Namespace) -> int:

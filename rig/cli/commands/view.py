@@ -13,10 +13,16 @@ from fdi.progress import Progress
 from fdi.report import Report, join_words
 from fdi.trace import Trace
 from plant import Model, require
-from rig.cli.answer import choose_file, give_answer, name_after, show_progress
+from rig.cli import (
+    choose_file,
+    give_answer,
+    list_signals,
+    load_declared_model,
+    load_known_model,
+    name_after,
+    show_progress,
+)
 from rig.cli.commands.diff import read_and_compare_runs
-from rig.cli.discovery_inputs import load_known_model
-from rig.cli.inputs import list_signals, load_declared_model
 from rig.interrupts import catch_signals
 from rig.view import viewer
 from rig.view.recording import Drawing, draw_comparison, draw_run, draw_runs, write_recording
@@ -67,8 +73,7 @@ def require_options_that_fit(args: argparse.Namespace) -> None:
     require(not (args.compare and args.others), "--compare", "".join(args.others[:1]),
             "one trace; rig view A B holds traces against each other")
     for option in ("set", "effects", "seed", "repeat", "signals"):
-        given = getattr(args, option)
-        require(args.compare or given in (None, []), f"--{option}", "", "--compare with it")
+        require(args.compare or getattr(args, option) in (None, []), f"--{option}", "", "--compare with it")
 
 
 def place_recording(args: argparse.Namespace) -> Path:

@@ -164,9 +164,11 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere"])
-def test_a_scheduler_that_does_not_answer_is_one_line(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_does_not_answer_is_one_line(
+        address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch, "connect_to_cluster", partial(batch.connect_to_cluster, timeout=0.5))
-    assert f"--scheduler: {address}: expected the addr" in refuse("campaign", *MATRIX, "--scheduler", address)
+    assert f"--scheduler: {address}: expected the addr" in refuse(
+        "campaign", *MATRIX, "--scheduler", address, "--out", tmp_path)
 
 
 def test_a_matrix_file_says_the_same_as_options_and_any_beginning_is_a_fair_sample(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from places import ROOT
 from rig_command import SHORT, Said, answer, finished, grown, interrupted, job, refuse, rig, started, write_file
 
 from fdi.trace import CheckResult
-from rig.cli.inputs import is_suite_file
+from rig.cli import is_suite_file
 from rig.evidence.requirements import Evidence, JudgedCheck, trace_requirements
 from rig.run.job import JobChoice
 from rig.suite.dry_run import make_dry_run
