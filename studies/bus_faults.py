@@ -18,9 +18,8 @@ from fdi.progress import Progress, ignore_progress
 from fdi.report import Cell as TableCell, Column, Medium, Mood, Report, Section, Table
 from fdi.trace import Trace, open_log
 from plant import load_model
-from rig.run.job import Job
-from rig.run.runner import Outcome, run_job
-from rig.sequences.sequence import parse_sequence
+from rig.run import Job, Outcome, run_job
+from rig.sequences import parse_sequence
 from studies.command import report_progress, run_study_command
 
 MS = 1e3  # per s

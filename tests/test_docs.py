@@ -35,10 +35,8 @@ from plant.quantity import list_quantities
 from rig.cli import main
 from rig.cli.command_list import COMMANDS
 from rig.conformance.run_cases import CASES
-from rig.sequences import faults
-from rig.sequences.checks import KEYS, KINDS, Guard
-from rig.sequences.python_parts import Step
-from rig.sequences.sequence import SEGMENT_KINDS, Sequence, parse_sequence
+from rig.sequences import SEGMENT_KINDS, Guard, Sequence, Step, faults, parse_sequence
+from rig.sequences.checks import KEYS, KINDS
 
 README = (ROOT / "README.md").read_text()
 PAGES = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -13,11 +13,8 @@ from markdown_text import MADE, escape_markup, make_table, quote_code
 from plant import Model, Segment, tables
 from rig.cli.commands import list as list_command
 from rig.network import Identity
-from rig.sequences import faults
-from rig.sequences.checks import KEYS, KINDS, Check, Guard
-from rig.sequences.protocol import ProtocolLimits
-from rig.sequences.python_parts import Step
-from rig.sequences.sequence import SEGMENT_KINDS, Sequence, TimingPolicy
+from rig.sequences import SEGMENT_KINDS, Check, Guard, ProtocolLimits, Sequence, Step, TimingPolicy, faults
+from rig.sequences.checks import KEYS, KINDS
 
 
 def write_sequence_page() -> list[str]:

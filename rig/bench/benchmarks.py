@@ -30,24 +30,23 @@ from rig.benches import Role, load_bench
 from rig.firmware.build import build_device, build_program
 from rig.interrupts import end_with
 from rig.network import Link, LinkWire, Master, RawBus, WallClock, can_open, open_can
-from rig.nodes.scenario import Scenario
+from rig.nodes import Scenario
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
-from rig.run.bring_up import open_loop
-from rig.run.hard_loop import compile_cycle
-from rig.run.job import Job
-from rig.run.loop import CycleInput, History
-from rig.run.priority import (
+from rig.run import (
+    INTERRUPTED,
     LOOP_PRIORITY,
+    CycleInput,
+    History,
+    Job,
+    compile_cycle,
     compute_percentiles,
+    enter_real_time,
     list_cpus,
-    lock_memory,
-    prevent_deep_sleep,
+    open_loop,
     raise_priority,
-    suspend_garbage_collection,
+    run_job,
 )
-from rig.run.runner import INTERRUPTED, run_job
-from rig.sequences import load_sequence
-from rig.sequences.faults import Plan, Schedule
+from rig.sequences import Plan, Schedule, load_sequence
 
 Work = Callable[[], object]
 
@@ -259,9 +258,7 @@ def play_block(bus: str, seconds: float, peer: Peer | None = None, bench: Path |
         scenario, faults = Scenario(Model(), plan), Schedule(plan)
         loop = open_loop(master, chosen, scenario, faults, log, bus, True)
         stack.callback(loop.close)
-        for right in (raise_priority(1), lock_memory(), prevent_deep_sleep(),
-                      suspend_garbage_collection()):  # as a run in real time takes them
-            stack.enter_context(right)
+        stack.enter_context(enter_real_time(1))
         for _ in range(round(seconds * 1000)):
             loop.cycle(CycleInput(1, 0.0, 0.0, 0))
         loop.finish()

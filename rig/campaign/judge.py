@@ -54,7 +54,7 @@ from plant import (
 )
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, import_extra, read_rows, run_batch
 from rig.network import WallClock
-from rig.sequences.sequence import load_nominal_test
+from rig.sequences import load_nominal_test
 
 OWN_SIMULATOR = "plant"
 HEALTHY = "healthy"

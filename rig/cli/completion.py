@@ -60,7 +60,7 @@ def list_models() -> list[str]:
 
 def list_sequences() -> list[str]:
     """Shipped sequences."""
-    from rig.sequences.sequence import list_shipped
+    from rig.sequences import list_shipped
 
     return [*list_shipped()]
 

@@ -10,7 +10,7 @@ from fdi import foreign_code
 from fdi.trace import open_log
 from plant import InputError, Model, load_model, read_toml, require
 from plant.effects import load_effects
-from rig.run.frame_steps import find_visible_steps
+from rig.run import find_visible_steps
 
 
 def parse_changes(pairs: Sequence[str]) -> dict[str, str]:
@@ -67,7 +67,7 @@ def find_recorded_plant(args: argparse.Namespace) -> str | None:
     log = find_log(args)
     if log is None:
         return None
-    from rig.run.job import load_plant_of_log  # here: commands without a log need none of it
+    from rig.run import load_plant_of_log  # here: commands without a log need none of it
 
     return load_plant_of_log(log, is_trusted=args.trust) or None
 

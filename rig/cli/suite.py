@@ -15,8 +15,7 @@ from rig.cli.commands.run import build_choice, choose_bus_of_run, make_new_folde
 from rig.evidence.requirements import read_requirements, require_listed
 from rig.interrupts import catch_signals
 from rig.network import WallClock
-from rig.run.job import JobChoice
-from rig.run.participants import EMBEDDED_NAMES
+from rig.run import EMBEDDED_NAMES, JobChoice
 from rig.suite.suite import (
     MOODS,
     Case,

@@ -5,13 +5,11 @@ Rejected alternative: canopen's SdoServer, which notices a read-only or absent o
 a download, accepts any number of bytes against the size announced, and answers a stray first request with an exception.
 """
 
-import struct
 from collections.abc import Callable
 from enum import IntEnum
 
-from rig.network import Frame, Send
+from rig.network import HEAD, Frame, Send
 
-_HEAD = struct.Struct("<BHB")
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(5)  # client command specifiers
 _LARGEST = 1 << 20  # bytes in one download: a scenario is a few kB
 
@@ -108,11 +106,11 @@ class SdoServer:
 
     def _abort(self, code: int) -> None:
         self.reset()
-        self._send(self._tx, _HEAD.pack(0x80, *self._object) + code.to_bytes(4, "little"))
+        self._send(self._tx, HEAD.pack(0x80, *self._object) + code.to_bytes(4, "little"))
 
     def _answer(self, data: bytes) -> bytes:
         """The reply to one request, empty for none; raises SdoAbort."""
-        command, index, sub = _HEAD.unpack_from(data)
+        command, index, sub = HEAD.unpack_from(data)
         specifier = command >> 5
         if specifier == _ABORT:
             self.reset()
@@ -123,7 +121,7 @@ class SdoServer:
         self._object = index, sub
         if specifier == _DOWNLOAD:
             self._begin_download(command, data)
-            return _HEAD.pack(0x60, index, sub)
+            return HEAD.pack(0x60, index, sub)
         if specifier == _UPLOAD:
             return self._begin_upload()
         raise SdoAbort(Abort.COMMAND)  # block transfer, or nothing the standard knows
@@ -146,10 +144,10 @@ class SdoServer:
     def _begin_upload(self) -> bytes:
         value = self._upload(*self._object)
         if 0 < len(value) <= 4:
-            return _HEAD.pack(0x43 | (4 - len(value)) << 2, *self._object) + value
+            return HEAD.pack(0x43 | (4 - len(value)) << 2, *self._object) + value
         self._buffer += value
         self._open = _UPLOAD_SEGMENT
-        return _HEAD.pack(0x41, *self._object) + len(value).to_bytes(4, "little")
+        return HEAD.pack(0x41, *self._object) + len(value).to_bytes(4, "little")
 
     def _segment(self, command: int, data: bytes) -> bytes:
         abort_unless(self._open == command >> 5, Abort.COMMAND)

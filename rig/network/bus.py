@@ -22,7 +22,6 @@ from can.interfaces.socketcan import SocketcanBus
 
 from plant import InputError, RigError, require
 from rig.benches import EXTENDED, FD, SWITCHED
-from rig.network.can_interface import UdpBus
 from rig.network.frame import (
     IDENTIFIER,
     Clock,
@@ -34,7 +33,7 @@ from rig.network.frame import (
     has_valid_length,
     make_message,
 )
-from rig.network.udp import GROUP, SO_RXQ_OVFL, SO_TIMESTAMPNS, is_group, set_receive_options
+from rig.network.udp import GROUP, SO_RXQ_OVFL, SO_TIMESTAMPNS, UdpBus, is_group, set_receive_options
 
 BUS_VARIABLE = "EHA_RIG_BUS"  # environment: what `auto` takes
 BITRATE, _DATA_BITRATE = 1_000_000, 4_000_000  # bit/s; the second of CAN FD, in advice
@@ -140,8 +139,8 @@ def can_open(spec: str) -> bool:
 
 def list_can_interfaces() -> list[str]:
     """The kernel's CAN interfaces that are up, real and virtual."""
-    names = (path.parent.name for path in _NETWORK.glob("*/type") if path.read_text().strip() == _ARPHRD_CAN)
-    return sorted(name for name in names if not explain_socketcan_problem(name))
+    return sorted(path.parent.name for path in _NETWORK.glob("*/type")
+                  if not explain_socketcan_problem(path.parent.name))
 
 
 def has_socketcan() -> bool:
@@ -197,11 +196,9 @@ def parse_spec(spec: str, where: str) -> tuple[str, str]:
 _CAN_FRAME, _CANFD_FRAME = struct.Struct("=IBxxx8s"), struct.Struct("=IBBxx64s")  # linux/can.h
 _SWITCHED = 1  # CANFD_BRS
 _TIMESPEC = struct.Struct("@qq")
-_REMOTE, _ERROR = 0x40000000, 0x20000000  # in the kernel's can_id
 _CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
 _ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(4)
 _FILTER = struct.Struct("=II")  # struct can_filter: identifier, mask
-_SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_JOIN_FILTERS = 101, 1, 6  # linux/can/raw.h
 _INVERTED = 0x20000000
 _QUEUE_FULL = (errno.ENOBUFS, errno.EAGAIN)
 
@@ -281,11 +278,11 @@ class Link:
         if isinstance(self._bus, UdpBus):
             self._bus.leave_out(sorted(self._left_out))
         elif self._socket is not None:
-            exact = IDENTIFIER | EXTENDED | _REMOTE
+            exact = IDENTIFIER | EXTENDED | socket.CAN_RTR_FLAG
             filters = [*(_FILTER.pack(cob_id & ~FD | _INVERTED, exact) for cob_id in sorted(self._left_out)),
                        *([_FILTER.pack(0, self._foreign)] if self._foreign else [])]
-            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, int(bool(filters)))
-            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"".join(filters) or _FILTER.pack(0, 0))
+            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_JOIN_FILTERS, int(bool(filters)))
+            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"".join(filters) or _FILTER.pack(0, 0))
 
     def close(self) -> None:
         """Give the bus back."""
@@ -324,10 +321,10 @@ class Link:
                     self._in_kernel = int.from_bytes(value, "little")
             self._latest = t_ns
             identifier, length, payload = int.from_bytes(data[:4], sys.byteorder), data[4], data[8:]
-            if identifier & _ERROR:
+            if identifier & socket.CAN_ERR_FLAG:
                 self.error_frames += 1
                 self._in_controller += bool(identifier & _CONTROLLER and payload[1] & _RX_OVERFLOW)
-            elif identifier & _REMOTE:
+            elif identifier & socket.CAN_RTR_FLAG:
                 self.dropped += 1
             else:
                 kind = FD if len(data) == _CANFD_FRAME.size else 0

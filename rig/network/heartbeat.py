@@ -53,9 +53,8 @@ class HeartbeatConsumer:
         """`entries` of 0x1016: bits 16..23 node, bits 0..15 consumer time in ms; a zero in either disables."""
         pairs = [(entry >> 16 & 0xFF, entry & 0xFFFF) for entry in entries]
         limits = {node: time * _MS for node, time in pairs if node and time}
-        changed = {node for node in self._limits | limits if self._limits.get(node) != limits.get(node)}
-        for node in changed:
-            self._deadlines.pop(node, None)
+        self._deadlines = {node: deadline for node, deadline in self._deadlines.items()
+                           if self._limits[node] == limits.get(node)}
         self._limits = limits
 
     @property

@@ -7,7 +7,7 @@ thread does all and the embedded bus needs no other.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import canopen
@@ -233,24 +233,21 @@ class Master:
         Raises:
             BusError: a node did not boot.
         """
-        self._empty_receive_buffer()
-        self._booted.clear()
-        for role in self._nodes:
-            self._command_node(role, NmtCommand.RESET_COMMUNICATION)
-        self.wire.wait(lambda: self._booted >= self._nodes.keys(), BOOT_TIMEOUT)
+        self._reset(self._nodes, BOOT_TIMEOUT)
         if silent := [self._bench.describe_node(role) for role in sorted(self._nodes) if role not in self._booted]:
             raise BusError(f"no boot-up from {' and '.join(silent)} within {BOOT_TIMEOUT:g} s of an NMT reset")
 
-    def _empty_receive_buffer(self) -> None:
-        """Take in the frames that wait: a full buffer would have no room for the answers to come."""
-        self.wire.run_until(self.wire.clock.now())
+    def _reset(self, roles: Collection[Role], seconds: float) -> bool:
+        """Reset communication of these nodes; whether all have booted within `seconds`."""
+        self.wire.run_until(self.wire.clock.now())  # a full buffer would have no room for the answers to come
+        self._booted.difference_update(roles)
+        for role in roles:
+            self._command_node(role, NmtCommand.RESET_COMMUNICATION)
+        return self.wire.wait(lambda: self._booted.issuperset(roles), seconds)
 
     def is_present(self, role: Role, seconds: float) -> bool:
         """Whether a node answers an NMT reset of its communication."""
-        self._empty_receive_buffer()
-        self._booted.discard(role)
-        self._command_node(role, NmtCommand.RESET_COMMUNICATION)
-        return self.wire.wait(lambda: role in self._booted, seconds)
+        return self._reset([role], seconds)
 
     def hears_rival(self, seconds: float) -> bool:
         """Whether another rig is active on the bus; only listens, at most `seconds`."""
@@ -461,8 +458,7 @@ class Master:
 
     def reset_controller(self, reset: str) -> None:
         """Send the controller an NMT reset, "node" or "communication", and do not wait."""
-        commands = {"node": NmtCommand.RESET_NODE, "communication": NmtCommand.RESET_COMMUNICATION}
-        self._command_node(Role.CONTROLLER, commands[reset])
+        self._command_node(Role.CONTROLLER, NmtCommand[f"RESET_{reset.upper()}"])
 
     def read_parameters(self) -> dict[str, float]:
         """The parameters of the model that objects of the controller hold; those that it does not have are missing."""
@@ -481,12 +477,10 @@ class Master:
 
     def _upload(self, role: Role, index: int, sub: int) -> bytes | None:
         """An object's bytes; None if the node does not have it or does not answer."""
-        sdo = self._nodes[role].sdo
         try:
-            data: bytes = repeat_transfer(lambda: sdo.upload(index, sub))
+            return bytes(repeat_transfer(lambda: self._nodes[role].sdo.upload(index, sub)))
         except (SdoAbortedError, SdoCommunicationError):
             return None
-        return data
 
     def _set(self, role: Role, index: int, sub: int, value: Any) -> None:
         """Write an object and remember the value for `configure_again`."""

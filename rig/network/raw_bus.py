@@ -47,10 +47,20 @@ from numpy.typing import NDArray
 
 from plant import ForeignCall, RigError, bind_later, keep_apart, require
 from rig.benches import EXTENDED, FD, SWITCHED
-from rig.network import udp
 from rig.network.bus import can_open, parse_spec, require_interface
 from rig.network.frame import IDENTIFIER, has_valid_length
-from rig.network.udp import FLOCK, SO_RXQ_OVFL, SO_TIMESTAMPNS, TURN_LIMIT_NS, TURN_PAUSE_NS, Turn, set_receive_options
+from rig.network.udp import (
+    FLOCK,
+    PORT,
+    SO_RXQ_OVFL,
+    SO_TIMESTAMPNS,
+    TURN_LIMIT_NS,
+    TURN_PAUSE_NS,
+    Turn,
+    attach_filter,
+    open_sockets,
+    set_receive_options,
+)
 
 # status of receive_frame
 TIMEOUT, FRAME = 0, 1
@@ -79,7 +89,6 @@ PAYLOAD_IN, PAYLOAD_OUT = _FRAME_IN + 8, _FRAME_OUT + 8  # 64 bytes each
 _SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_ERR_FILTER, _CAN_RAW_FD_FRAMES = 101, 1, 2, 5
 _RTR, _ERR, _CANFD_BRS = 0x40000000, 0x20000000, 1  # linux/can.h: remote and error frames; bit of canfd_frame.flags
 _DONTWAIT, _POLLIN = 0x40, 1
-_EAGAIN, _EINTR, _ENOBUFS = errno.EAGAIN, errno.EINTR, errno.ENOBUFS
 _CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
 _REALTIME, _MONOTONIC, _ABSOLUTE = 0, 1, 1
 
@@ -121,7 +130,7 @@ def sleep_until(port: Port, t_ns: int) -> None:
     """Sleep until CLOCK_MONOTONIC says `t_ns`; a signal does not end it."""
     port.words[_TIME // 8] = t_ns // 1_000_000_000
     port.words[_TIME // 8 + 1] = t_ns % 1_000_000_000
-    while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, port.octets.ctypes.data + _TIME, 0) == _EINTR:
+    while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, port.octets.ctypes.data + _TIME, 0) == errno.EINTR:
         pass
 
 
@@ -167,9 +176,9 @@ def _take_frame(port: Port, flags: int) -> tuple[int, int, int, int, int]:
             cob_id, length, data = _decode(port, size)
             if cob_id >= 0 and _is_allowed(port, cob_id):
                 return FRAME, _find_time(port), cob_id, length, data
-        elif words[_ERROR] == _EAGAIN:
+        elif words[_ERROR] == errno.EAGAIN:
             return TIMEOUT, 0, 0, 0, 0
-        elif words[_ERROR] != _EINTR:
+        elif words[_ERROR] != errno.EINTR:
             return FAILED, 0, 0, 0, 0
 
 
@@ -211,7 +220,7 @@ def _wait_for_input(port: Port, deadline_ns: int) -> int:
     count = _ppoll(base + _POLL, 1, base + _TIME, 0)
     if count < 0:
         _note_errno(port)
-        return FRAME if port.words[_ERROR] == _EINTR else FAILED
+        return FRAME if port.words[_ERROR] == errno.EINTR else FAILED
     return FRAME if count else TIMEOUT
 
 
@@ -331,9 +340,9 @@ def _transmit(port: Port, start: int, size: int) -> int:
     words = port.words
     while _send(words[_TX], port.octets.ctypes.data + start, size, _DONTWAIT) < 0:
         _note_errno(port)
-        if words[_ERROR] == _EAGAIN or words[_ERROR] == _ENOBUFS:
+        if words[_ERROR] == errno.EAGAIN or words[_ERROR] == errno.ENOBUFS:
             return QUEUE_FULL
-        if words[_ERROR] != _EINTR:
+        if words[_ERROR] != errno.EINTR:
             return FAILED
     return SENT
 
@@ -529,9 +538,9 @@ class RawBus(contextlib.AbstractContextManager["RawBus"]):
 
     def _open_udp(self, group: str, stack: contextlib.ExitStack) -> tuple[socket.socket, socket.socket]:
         """Sockets that receive and send."""
-        rx, tx, self._turn = udp.open_sockets(group, udp.PORT, stack)
+        rx, tx, self._turn = open_sockets(group, PORT, stack)
         self.port.words[_OWN] = socket.htons(tx.getsockname()[1])
-        tx.connect((group, udp.PORT))
+        tx.connect((group, PORT))
         self.port.words[_TURN] = self._turn.descriptor
         self.port.octets[_LOCK: _LOCK + FLOCK.size] = np.frombuffer(
             FLOCK.pack(fcntl.F_UNLCK, os.SEEK_SET, self._turn.place, 1, 0), np.uint8)
@@ -553,7 +562,7 @@ class RawBus(contextlib.AbstractContextManager["RawBus"]):
                            for cob_id in cob_ids]
                 self._rx.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"".join(filters))
             else:
-                udp.attach_filter(self._rx, socket.ntohs(int(self.port.words[_OWN])), cob_ids)
+                attach_filter(self._rx, socket.ntohs(int(self.port.words[_OWN])), cob_ids)
         except OSError as error:
             raise RigError(f"{self.spec}: {error.strerror}") from error
         self.port.words[_COUNTS_LOSSES] = is_socketcan

@@ -12,7 +12,6 @@ from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from plant import RigError, count_nouns
-from rig.network.bus import Wire
 
 R = TypeVar("R")
 Exchange = Callable[[bytes], bytes]
@@ -117,8 +116,7 @@ class CheckedSdoClient(SdoClient):
             self.responses.get_nowait()
         self.send_request(sdo_request)
         network: Any = self.network
-        wire: Wire = network.wire
-        if not wire.wait(lambda: not self.responses.empty(), self.RESPONSE_TIMEOUT):
+        if not network.wire.wait(lambda: not self.responses.empty(), self.RESPONSE_TIMEOUT):
             raise SdoCommunicationError("No SDO response received")
         response: bytes = self.responses.get_nowait()
         require_confirmation(sdo_request, response)

@@ -22,7 +22,7 @@ from rig.nodes import emulator_cycle as ec
 from rig.nodes.called_loop import call_loop, load_loop, make_port
 from rig.nodes.plant_code import CompiledPlant, load_plant
 from rig.nodes.scenario import Scenario
-from rig.sequences.faults import DROP, Plan
+from rig.sequences import DROP, Plan
 
 _RAISED = {  # events of the cycle: the errors that they raise
     ec.TIMEOUT_RAISED: (EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION),

@@ -44,7 +44,7 @@ from rig.network import (
     to_integer,
 )
 from rig.nodes.scenario import Scenario
-from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, change_frame
+from rig.sequences import DELAY, DOUBLE, DROP, SENT_NORMALLY, change_frame
 
 NOISE_RING = 1 << 16  # cycles of noise drawn ahead
 EVENT_RING = 256

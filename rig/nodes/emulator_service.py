@@ -21,7 +21,7 @@ from rig.network import COUNTERS, CYCLE_RECORD, RING, CycleRecord, RawBus, Send,
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator import PlantNode
 from rig.nodes.scenario import Scenario
-from rig.sequences.faults import Plan
+from rig.sequences import Plan
 
 _COMPILED, _FIFO, _LOCKED, _PINNED = 1, 2, 4, 8  # 0x2211 sub 9
 _STOP_LIMIT = 15.0  # s: the longest that the loop waits inside a cycle is 10 s, for its turn to send

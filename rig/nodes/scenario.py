@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from plant import Array, InputError, Model, build_bare_model, find_key, require
-from rig.sequences.faults import Parameter, Plan, Schedule, require_sensible
+from rig.sequences import Parameter, Plan, Schedule, require_sensible
 
 LARGEST_DOWNLOAD = 1 << 20  # bytes in one SDO download, as the node's server has it
 LONGEST_PLAN = 20_000_000  # cycles; noise is drawn for all of them beforehand

@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 from plant import RATE, Array, count_nouns
 from rig.benches import Bench, Flags, Role
 from rig.network import CONTROLLER, PLANT, RIG, StartTime
-from rig.sequences.faults import DELAY, BusOff, Offset, Parameter, Plan, Schedule, Silent, Stuck
-from rig.sequences.protocol import Mask
-from rig.sequences.sequence import TimingPolicy
+from rig.sequences import DELAY, BusOff, Mask, Offset, Parameter, Plan, Schedule, Silent, Stuck, TimingPolicy
 
 NO_DRIVE = "drive"  # kind of a trouble: the rig, which moves the plant, gets no drive frames
 _NO_DRIVE = int(Flags.DRIVE_MISSING | Flags.DRIVE_LATE)
@@ -118,7 +116,7 @@ class Attribution(NamedTuple):
 
 
 def attribute(records: CycleRecords, troubles: Sequence[Trouble], policy: TimingPolicy, bench: Bench,
-              gone: Mapping[Role, str] | None = None) -> Attribution:
+              gone: Mapping[Role, str]) -> Attribution:
     """Find the cycles that may be judged, and the first cause of the troubles of a run.
 
     Args:
@@ -128,7 +126,6 @@ def attribute(records: CycleRecords, troubles: Sequence[Trouble], policy: Timing
         bench: names the participants.
         gone: nodes that did not answer any more at the end of the run, and how that is known.
     """
-    gone = gone or {}
     late = find_late_cycles(records, policy, find_plant_stops(records, troubles, gone))
     disturbances = find_disturbances(records, late)
     judged, invalid = select_judged(records, late, disturbances)
@@ -251,8 +248,7 @@ def _describe_disturbance(records: CycleRecords, late: LateCycles, first: int, l
 
 def _describe_plant(records: CycleRecords, late: LateCycles, span: slice) -> str:
     if late.stalled[span].any():
-        delay = float(records.plant_delay[span].max())
-        return f"by its own record the plant sent feedback {1e3 * delay:.1f} ms after SYNC"
+        return f"by its own record the plant sent feedback {1e3 * records.plant_delay[span].max():.1f} ms after SYNC"
     if missing := int(np.isnan(records.feedback[span]).sum() or np.isnan(records.valve[span]).sum()):
         return f"the plant sent no feedback for {missing} {'cycle' if missing == 1 else 'cycles'}"
     return f"the plant's feedback came {1e3 * float(np.nanmax(records.feedback[span], initial=0.0)):.1f} ms after SYNC"
@@ -280,13 +276,11 @@ def count_most_in_a_row(overruns: NDArray[np.int64]) -> int:
 def select_judged(records: CycleRecords, late: LateCycles,
                   disturbances: Iterable[Disturbance]) -> tuple[Mask, dict[str, int]]:
     """Select the cycles on which the controller may be judged; with the number of the others by reason."""
-    n = records.cycles
-    shortened = np.zeros(n, dtype=bool)
-    shortened[:-1] = late.sync[1:]  # the whole machine may have stood still between the two SYNCs
-    following = np.zeros(n, dtype=bool)
+    shortened = np.append(late.sync[1:], False)  # the whole machine may have stood still between the two SYNCs
+    following = np.zeros(records.cycles, dtype=bool)
     for disturbance in disturbances:
         following[disturbance.last + 1:disturbance.reach - 1] = True
-    taken = np.zeros(n, dtype=bool)
+    taken = np.zeros(records.cycles, dtype=bool)
     counts = {}
     for reason, mask in (("sync_late", late.sync), ("feedback_late", late.feedback), ("plant_stalled", late.stalled),
                          ("next_sync_late", shortened), ("following", following)):
@@ -303,10 +297,9 @@ def find_affected(records: CycleRecords, disturbances: Iterable[Disturbance]) ->
     affected = np.zeros(records.cycles, dtype=bool)
     lost = np.isnan(records.feedback) | np.isnan(records.response) | (records.flags & _NO_DRIVE != 0)
     for disturbance in disturbances:
-        cycles = np.flatnonzero(lost[disturbance.first:disturbance.reach + 1])
+        cycles = disturbance.first + np.flatnonzero(lost[disturbance.first:disturbance.reach + 1])
         if len(cycles):
-            first = disturbance.first + int(cycles[0])
-            affected[first:disturbance.first + int(cycles[-1]) + _SETTLING] = True
+            affected[cycles[0]:cycles[-1] + _SETTLING] = True
     return affected
 
 

@@ -35,15 +35,14 @@ from rig.network import (
     can_open,
     read_gains,
 )
-from rig.nodes.scenario import Scenario
+from rig.nodes import Scenario
 from rig.run.attribution import find_start_problem
 from rig.run.embedded_loop import EmbeddedLoop, Limits, can_play_many, load_code
 from rig.run.job import Job
 from rig.run.loop import AFTER, BEFORE, BEFORE_MAIN, CycleInput, CycleLoop, CycleObserver, History, Loop, load_parts
 from rig.run.state import Journal, SafeState, Stage
 from rig.run.watch import PATIENCE, describe_missing
-from rig.sequences.faults import Plan, Schedule
-from rig.sequences.protocol import Mask, ProtocolLimits, Rows
+from rig.sequences import Mask, Plan, ProtocolLimits, Rows, Schedule
 
 
 def compile_loop(job: Job) -> None:
@@ -69,10 +68,9 @@ def open_loop(master: Master, bench: Bench, scenario: Scenario, faults: Schedule
     """
     is_compiled = bench.has_plant_node or scenario.model.kind.foreign is None  # or Python moves the plant
     if realtime and can_open(bus) and isinstance(master.wire, LinkWire) and is_compiled:
-        from rig.network import RawBus  # here: in lockstep a run needs none of it
-        from rig.run.hard_loop import HardLoop
+        from rig.run.hard_loop import HardLoop  # here: in lockstep a run needs none of it
 
-        return HardLoop(master, bench, scenario, faults, log, RawBus(bus, bench.frames.identifiers))
+        return HardLoop(master, bench, scenario, faults, log, bus)
     if guards is not None and not realtime and can_play_many(master, bench):
         return EmbeddedLoop(master, bench, scenario, faults, log, guards)
     return CycleLoop(master, bench, scenario, faults, log, realtime)
@@ -142,11 +140,6 @@ def _count_release(bench: Bench) -> int:
     return round(PROFILES["none"].delay * bench.rate) if bench.profile == "none" else 0
 
 
-def count_cycles(steps: tuple[Step, ...]) -> int:
-    """The length of a probe in cycles."""
-    return sum(step.cycles for step in steps)
-
-
 def list_inputs(step: Step, demand: float = 0.0) -> list[CycleInput]:
     """The cycles of a step at the position `demand`, SI."""
     return [CycleInput(step.phase, demand + step.demand, 0.0, step.control)] * step.cycles
@@ -175,19 +168,6 @@ def read_rows(history: History, on_time: Mask) -> Rows:
     own = {"demand": signals.command.name, "position": signals.controlled.name, "drive": signals.drive.name}
     return Rows(on_time=on_time, **{name: history.column(own.get(name, name)) for name in Rows._fields
                                     if name != "on_time"})
-
-
-def find_on_time(history: History, faults: Schedule | None, realtime: bool, period: float, reach: int = 1) -> Mask:
-    """Cycles that the bench delivered: neither this SYNC nor the next was late, feedback came within half a cycle, and
-    no injected fault touched a frame of this cycle or of the `reach` before it."""
-    on_time: Mask = ~np.isnan(history.column(history.signals.controlled.name))
-    if realtime:
-        on_time &= history.column("feedback_response") <= 0.5 * period
-        late = history.column("lateness") > 0.1 * period
-        on_time &= ~late & ~np.append(late[1:], False)
-    if faults is not None:
-        on_time &= ~faults.find_disturbed(len(on_time), reach)
-    return on_time
 
 
 LIMIT = 5.0  # s: a controller that is not ready by then ends the run
@@ -335,7 +315,7 @@ class BringUp:
         """
         bench = self._job.bench
         steps = list_first_steps(self._job.sequence.protocol, bench)
-        cycles = count_cycles(steps)
+        cycles = sum(step.cycles for step in steps)
         steps = (*list_warm_up(bench), *steps) if self._job.realtime else steps
         self._stage.is_probing = True
         for _ in range(PROBES if bench.nodes else 1):
@@ -356,8 +336,8 @@ class BringUp:
     def _play_probe(self, steps: tuple[Step, ...]) -> History:
         """Play one probe after a reset of the nodes. Raises BusError."""
         # The plant of the run in its initial state, without faults and loads.
-        bench = self._job.bench
-        scenario, probe = Scenario(self._job.scenario.model, Plan(stop=0), (), self._job.seed), History(bench.signals)
+        scenario = Scenario(self._job.scenario.model, Plan(stop=0), (), self._job.seed)
+        probe = History(self._job.bench.signals)
         self.start_nodes(scenario)
         if self._safety.aborted:  # a node did not become OPERATIONAL
             return probe
@@ -434,8 +414,18 @@ class BringUp:
             self._safety.handle(*problem)
 
     def find_on_time_of(self, history: History, faults: Schedule | None = None) -> Mask:
-        """The cycles of a play in which the bench was on time."""
-        # a frame that comes every n-th cycle is missing until the next but one
-        slowest = max(frame.every for frame in self._job.bench.frames.frames)
-        reach = 1 if slowest == 1 else 2 * slowest
-        return find_on_time(history, faults, self._job.realtime, self._job.period_ns * 1e-9, reach)
+        """The cycles of a play that the bench delivered: neither this SYNC nor the next was late, feedback came within
+        half a cycle, and no injected fault touched a frame of this cycle or of those before it that count.
+        """
+        on_time: Mask = ~np.isnan(history.column(history.signals.controlled.name))
+        if self._job.realtime:
+            period = self._job.period_ns * 1e-9
+            on_time &= history.column("feedback_response") <= 0.5 * period
+            late = history.column("lateness") > 0.1 * period
+            on_time &= ~late & ~np.append(late[1:], False)
+        if faults is not None:
+            # a frame that comes every n-th cycle is missing until the next but one
+            slowest = max(frame.every for frame in self._job.bench.frames.frames)
+            reach = 1 if slowest == 1 else 2 * slowest
+            on_time &= ~faults.find_disturbed(len(on_time), reach)
+        return on_time

@@ -56,7 +56,7 @@ from rig.network import (
     send_payload,
     sleep_until,
 )
-from rig.nodes.emulator_cycle import (
+from rig.nodes import (
     CURRENT_ZEROED,
     DRIVE_LATE,
     DRIVE_MISSING,
@@ -70,7 +70,7 @@ from rig.nodes.emulator_cycle import (
     find_drive_action,
     read_plant,
 )
-from rig.sequences.faults import DELAY, DOUBLE, DROP, change_frame
+from rig.sequences import DELAY, DOUBLE, DROP, change_frame
 
 # Words that Python writes; the cycle sets CANCEL back
 (PERIOD, LEAD, SPIN, SPINS_ALWAYS, TAIL, CANCEL, OVERRIDE_LIMIT, FINISH, FRAMES_READ, ROWS_READ, MAY_IDLE_AT,
@@ -183,7 +183,7 @@ def _take_input(buffers: Buffers) -> bool:
     words[IS_HELD] = head == words[TAIL]
     words[IS_UNDERRUN] = words[IS_HELD] and head != words[MAY_IDLE_AT]
     if not words[IS_HELD]:
-        for i in range(INPUT_COLUMNS):
+        for i in range(INPUT_COLUMNS):  # by `_copy` it took 80 ns more
             words[COUNTED + i] = buffers.inputs[head % len(buffers.inputs), i]
         words[POSITION] = head
         words[HEAD] = head + 1
@@ -290,17 +290,17 @@ def _hold_frame(buffers: Buffers, m: Layout, at: int, due: int, length: int) -> 
     if place == len(held):
         return
     while place > 0 and held[place - 1, HELD_DUE] > due:
-        _move_held(buffers, place - 1, place)
+        _copy(held[place - 1], 0, held[place], 0, HELD_COLUMNS)
         place -= 1
     held[place, HELD_DUE], held[place, _HELD_PLACE], held[place, _HELD_LENGTH] = due, at, length
-    for i in range(8):
-        held[place, _HELD_DATA + i] = m.words[PAYLOAD + i]
+    _copy(m.words, PAYLOAD, held[place], _HELD_DATA, 8)
     words[HELD] += 1
 
 
-def _move_held(buffers: Buffers, place: int, to: int) -> None:
-    for i in range(HELD_COLUMNS):
-        buffers.held[to, i] = buffers.held[place, i]
+def _copy(source: NDArray[np.int64], first: int, target: NDArray[np.int64], place: int, count: int) -> None:
+    """Copy so many words; one by one, because the assignment of a slice may allocate."""
+    for i in range(count):
+        target[place + i] = source[first + i]
 
 
 @keep_apart
@@ -308,11 +308,10 @@ def _release_first_held(port: Port, buffers: Buffers, m: Layout) -> None:
     """Send the frame that has waited; one of the controller is received now."""
     words, held = buffers.words, buffers.held
     at, length = held[0, _HELD_PLACE], held[0, _HELD_LENGTH]
-    for i in range(8):
-        m.words[PAYLOAD + i] = held[0, _HELD_DATA + i]
+    _copy(held[0], _HELD_DATA, m.words, PAYLOAD, 8)
     words[HELD] -= 1
     for place in range(words[HELD]):
-        _move_held(buffers, place + 1, place)
+        _copy(held[place + 1], 0, held[place], 0, HELD_COLUMNS)
     if m.words[at + IS_MINE]:
         _send(port, buffers, m, m.words[at + SENT_AS], length, 1)
     else:
@@ -326,8 +325,7 @@ def _send(port: Port, buffers: Buffers, m: Layout, identifier: int, length: int,
     for _ in range(count):
         if not words[FAILURE]:
             _record_frame(buffers, m, read_clock(port), identifier | length << 32 | 1 << 40)
-            for i in range(8):
-                port.words[PAYLOAD_OUT // 8 + i] = m.words[PAYLOAD + i]
+            _copy(m.words, PAYLOAD, port.words, PAYLOAD_OUT // 8, 8)
             words[FAILURE] = min(send_payload(port, identifier, length), 0)
 
 
@@ -502,9 +500,8 @@ def _record_frame(buffers: Buffers, m: Layout, t_ns: int, head: int) -> None:
     words, frames = buffers.words, buffers.frames
     if words[FRAMES_WRITTEN] - words[FRAMES_READ] < len(frames):
         frame = frames[words[FRAMES_WRITTEN] % len(frames)]
-        frame[TIME], frame[FRAME_HEAD], frame[DATA] = t_ns, head, m.words[PAYLOAD]
-        for i in range(DATA + 1, frames.shape[1]):
-            frame[i] = m.words[PAYLOAD + i - DATA]
+        frame[TIME], frame[FRAME_HEAD] = t_ns, head
+        _copy(m.words, PAYLOAD, frame, DATA, frames.shape[1] - DATA)
         words[FRAMES_WRITTEN] += 1
 
 

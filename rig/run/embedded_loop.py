@@ -33,26 +33,26 @@ from rig.benches import (
     pack_frame,
 )
 from rig.network import EmbeddedWire, Gains, Master, Port, read_gains
-from rig.nodes.called_loop import load_loop, make_port
-from rig.nodes.emulator import Emulator
-from rig.nodes.emulator_cycle import (
+from rig.nodes import (
     IN_FORCE,
     READINGS_AT,
     SENSORS,
+    CompiledPlant,
+    Emulator,
+    Firmware,
     Memory,
+    Scenario,
     advance_plant,
     fill_noise,
+    load_loop,
     make_memory,
+    make_port,
     read_plant,
 )
-from rig.nodes.firmware import Firmware
-from rig.nodes.plant_code import CompiledPlant
-from rig.nodes.scenario import Scenario
-from rig.recorder import CycleBlock
-from rig.recorder.schema import make_row_record
+from rig.recorder import CycleBlock, make_row_record
 from rig.run import cycle as cy
 from rig.run.loop import CycleInput, CycleLoop, CycleObserver, CyclicValues
-from rig.sequences.faults import BusOff, Foreign, Plan, Reset, Schedule, Silent
+from rig.sequences import BusOff, Foreign, Plan, Reset, Schedule, Silent
 
 # Words: cycles to play and played, the number of the first; address of the C library's clock (0: no times) and its
 # answer; places of the frames
@@ -272,10 +272,9 @@ class EmbeddedLoop(CycleLoop):
             "status": values["status_word"].astype(np.int64), "flags": values["flags"].astype(np.int64),
             "overrun": False, "lateness": 0.0, "response": answered, "work": answered, "feedback_response": fed,
             "valve_response": fed, "execution": (sync - begun) * 1e-9}
-        payloads = iter(b.payloads[:played].T.copy())
-        command = next(payloads)
-        answers = ((frame.identifier, payload) for frame, payload in zip(self._frames[1:], payloads, strict=True))
-        frames = [(self._frames[0].identifier, command), (self._sync_id, None), *answers]
+        identifiers = [frame.identifier for frame in self._frames]
+        command, *answers = zip(identifiers, b.payloads[:played].T.copy(), strict=True)
+        frames = [command, (self._sync_id, None), *answers]
         block = CycleBlock(self._t_ns + self._period * np.arange(played), frames, columns, make_row_record(signals))
         self._log.cycles(block)
         demand, load = b.inputs[played - 1, :2].tolist()

@@ -18,11 +18,11 @@ from typing import Any
 from plant import RigError, compile_function
 from rig.benches import Bench, Role
 from rig.network import Frame, LinkWire, Master, RawBus, make_closed_port
-from rig.nodes.scenario import Scenario
+from rig.nodes import Scenario
 from rig.run import cycle as cy
 from rig.run.loop import CycleInput, CycleObserver, Loop, make_trial, read_ring, set_rig_faults
 from rig.run.priority import enter_loop_thread, list_cpus
-from rig.sequences.faults import Schedule
+from rig.sequences import Schedule
 
 _US = 1000  # ns
 
@@ -45,12 +45,15 @@ class HardLoop(Loop):
     kind = "hard"
 
     def __init__(self, master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver,
-                 bus: RawBus, ahead: int = 1000) -> None:
-        """`ahead`: cycles that Python queues; a stall of Python up to that length does no harm."""
+                 bus: str, ahead: int = 1000) -> None:
+        """`ahead`: cycles that Python queues; a stall of Python up to that length does no harm.
+
+        Raises RigError if the bus cannot be opened.
+        """
         super().__init__(master, bench, scenario, faults, log, ahead)
         wire = master.wire
         assert isinstance(wire, LinkWire)
-        self._wire, self._bus, self._play = wire, bus, compile_cycle()
+        self._wire, self._bus, self._play = wire, RawBus(bus, bench.frames.identifiers), compile_cycle()
         self._origin = wire.clock.origin_ns
         words, period = self._words, self._period
         words[cy.LEAD], words[cy.SPIN] = min(200 * _US, period // 4), min(80 * _US, period // 8)
@@ -178,17 +181,14 @@ class HardLoop(Loop):
         first, last = int(self._words[cy.FRAMES_READ]), int(self._words[cy.FRAMES_DONE])
         for t_ns, head, *data in read_ring(self._buffers.frames, first, last):
             raw = b"".join([(word & 0xFFFFFFFFFFFFFFFF).to_bytes(8, "little") for word in data])
-            self._take_frame(t_ns - self._origin, head & 0xFFFFFFFF, raw[:head >> 32 & 0xFF], bool(head >> 40))
+            frame = Frame(t_ns - self._origin, head & 0xFFFFFFFF, raw[:head >> 32 & 0xFF])
+            if frame.cob_id in self._ours and not head >> 40:  # not sent by this rig
+                self._receive_service(frame)  # the master reports a second rig
+            else:
+                self._frames.append((frame.t_ns, frame))
         self._words[cy.FRAMES_READ] = last
         self._release_frames(until - self._origin)
         self._log_rows()
-
-    def _take_frame(self, t_ns: int, cob_id: int, data: bytes, is_sent: bool) -> None:
-        frame = Frame(t_ns, cob_id, data)
-        if cob_id in self._ours and not is_sent:
-            self._receive_service(frame)  # the master reports a second rig
-        else:
-            self._frames.append((t_ns, frame))
 
     def _receive_service(self, frame: Frame) -> None:
         self._came_at = frame.t_ns

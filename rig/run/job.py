@@ -41,10 +41,9 @@ from plant import (
 )
 from plant.effects import load_effects
 from rig.benches import Bench, is_plant_bench, load_bench, load_bench_from_files, make_plant_bench
-from rig.nodes.scenario import Scenario
+from rig.nodes import Scenario
 from rig.run.choices import CONTROLLERS, PACES, PLANTS
-from rig.sequences import Sequence, load_sequence
-from rig.sequences.faults import require_possible
+from rig.sequences import Sequence, load_sequence, require_possible
 
 # folders of the attachments
 _EFFECT_FOLDER, _SEQUENCE_FOLDER, _BENCH_FOLDER, _PLANT_FOLDER = "effects/", "sequence/", "bench/", "plant/"
@@ -128,10 +127,9 @@ class Job(RunSettings):
                 "sequence": self.sequence.title, "period": self.period_ns / 1e9}
 
 
-def replace_settings(job: Job, **given: object) -> Job:
+def replace_settings(job: Job, **given: Any) -> Job:
     """The job with the settings that are not None."""
-    settings: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
-    return replace(job, **settings)
+    return replace(job, **{key: value for key, value in given.items() if value is not None})
 
 
 def require_bench_cycle(model: Model, bench: Bench, where: object) -> None:

@@ -20,15 +20,10 @@ import numpy as np
 from plant import Array, Model, StoredCode, signals as plant_signals
 from rig.benches import FD, RIG_OUTPUTS, Bench, Role, load_bench, packing
 from rig.network import PAYLOAD_IN, Frame, LinkWire, Master, Port, WallClock
-from rig.nodes import emulator_cycle as ec
-from rig.nodes.called_loop import call_loop, load_loop, make_port
-from rig.nodes.emulator import Emulator
-from rig.nodes.plant_code import load_plant
-from rig.nodes.scenario import Scenario
-from rig.recorder import CycleBlock, Signals, Timing
-from rig.recorder.schema import make_row_record
+from rig.nodes import Emulator, Scenario, call_loop, emulator_cycle as ec, load_loop, load_plant, make_port
+from rig.recorder import CycleBlock, Signals, Timing, make_row_record
 from rig.run import cycle as cy
-from rig.sequences.faults import CUT, DELAY, DOUBLE, DROP, Plan, Schedule
+from rig.sequences import CUT, DELAY, DOUBLE, DROP, Plan, Schedule
 
 # Numbers of phases: set-up, main, clean-up; then those of the probes, of which the log has the frames only
 BEFORE, AFTER, BEFORE_MAIN = 3, 4, 5

@@ -29,10 +29,9 @@ from rig.network import (
     Wire,
     open_can,
 )
-from rig.nodes.emulator import Emulator
-from rig.nodes.firmware import Firmware, StandIn
+from rig.nodes import Emulator, Firmware, StandIn
 from rig.run.job import Job
-from rig.sequences.faults import is_noticed_by_time
+from rig.sequences import is_noticed_by_time
 
 EMBEDDED_NAMES = ("embedded", "virtual")
 FRAME_TIMEOUT = 2.0  # s: in lockstep a frame may be this late, for the machine may be busy
@@ -53,7 +52,6 @@ def open_participants(job: Job) -> Iterator[tuple[Wire, NodeProcesses]]:
     in_firmware = find_firmware_parameters(job.model)
     require(job.controller == "builtin" or not in_firmware, "--controller", job.controller,
             f"a model without effects in the firmware, which only the builtin one has: not {', '.join(in_firmware)}")
-    _require_time(job)
     if job.bus.partition(":")[0] in EMBEDDED_NAMES:
         require(job.controller == "builtin" and job.plant != "external", "--bus", job.bus,
                 "a bus that an external node can be on, such as socketcan:can0")
@@ -63,6 +61,7 @@ def open_participants(job: Job) -> Iterator[tuple[Wire, NodeProcesses]]:
         wire = EmbeddedWire(WallClock() if job.realtime else VirtualClock(), makers, job.period_ns)
         yield wire, NodeProcesses()
         return
+    _require_time(job)
     require(not (job.controller == "builtin" and is_plant_bench(job.bench)), "--bus", job.bus,
             "embedded: the controller that the plant declares runs inside the rig")
     if job.controller == "c":
@@ -87,9 +86,8 @@ def open_participants(job: Job) -> Iterator[tuple[Wire, NodeProcesses]]:
 
 def _require_time(job: Job) -> None:
     """Refuse faults that nodes notice by the time, where there is none: in lockstep between processes."""
-    is_embedded = job.bus.partition(":")[0] in EMBEDDED_NAMES
     timed = [fault.label for fault in job.sequence.faults if is_noticed_by_time(fault)]
-    if timed and not job.realtime and not is_embedded:
+    if timed and not job.realtime:
         raise InputError("--pace", "lockstep", f"realtime, or the embedded bus, for the fault {timed[0]!r}: in "
                                                "lockstep between processes nodes watch neither SYNC nor heartbeats")
 
@@ -135,8 +133,8 @@ def require_firmware_bus(bus: str) -> None:
 
 def find_firmware_parameters(model: Model) -> dict[str, float]:
     """The parameters of the effects at work in a model's firmware."""
-    acting = [e for e in map(model.find_effect, model.effects) if e.firmware]
-    return {name: model[name] for effect in acting if effect.is_active(model.values) for name in effect.parameters}
+    return {name: model[name] for effect in map(model.find_effect, model.effects)
+            if effect.firmware and effect.is_active(model.values) for name in effect.parameters}
 
 
 def make_node_command(node: Role, bus: str, *words: str, is_in_c: bool = False) -> list[str]:
@@ -180,16 +178,13 @@ def is_replaced(master: Master, node: Role, processes: NodeProcesses, seconds: i
     raise BusError(f"our own {NAMES[node]} did not answer within {seconds} s")
 
 
-Child = subprocess.Popen[bytes]
-
-
 class NodeProcesses:
     """Processes of this run, by role; they end with it, also when it is killed. Each has its own session, so that
     Ctrl-C reaches the rig alone: clean-up needs its plant.
     """
 
     def __init__(self) -> None:
-        self._children: dict[Role, Child] = {}
+        self._children: dict[Role, subprocess.Popen[bytes]] = {}
 
     def start(self, node: Role, command: Sequence[str]) -> None:
         """Start a node as a new process, which writes a line as soon as it is on the bus."""
@@ -208,8 +203,7 @@ class NodeProcesses:
 
     def find_ended(self) -> dict[Role, int]:
         """Nodes whose process has ended, with its exit status; negative: the signal that ended it."""
-        found = {node: child.poll() for node, child in self._children.items()}
-        return {node: status for node, status in found.items() if status is not None}
+        return {node: status for node, child in self._children.items() if (status := child.poll()) is not None}
 
     def wait(self, nodes: Iterable[Role], seconds: float = 1.0) -> None:
         """Wait until the processes of these nodes end, for so long each; other nodes are left out.

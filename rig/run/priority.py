@@ -21,6 +21,13 @@ PERCENTILES = ("p50", "p99", "p99_9", "max")
 
 
 @contextlib.contextmanager
+def enter_real_time(priority: int) -> Iterator[None]:
+    """What a run in real time takes of the machine: priority, memory, awake CPUs, no garbage collection."""
+    with raise_priority(priority), lock_memory(), prevent_deep_sleep(), suspend_garbage_collection():
+        yield
+
+
+@contextlib.contextmanager
 def raise_priority(priority: int = LOOP_PRIORITY) -> Iterator[None]:
     """Run the calling thread under SCHED_FIFO where that is allowed; restore its priority afterwards.
 
@@ -83,17 +90,12 @@ def lock_memory() -> Iterator[bool]:
 @contextlib.contextmanager
 def prevent_deep_sleep() -> Iterator[None]:
     """Keep idle CPUs in states that they leave at once, where the machine allows it (root); as cyclictest does."""
-    try:
-        request = os.open("/dev/cpu_dma_latency", os.O_WRONLY)  # holds as long as it is open
-    except OSError:
-        yield
-        return
-    try:
+    with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):
+            request = os.open("/dev/cpu_dma_latency", os.O_WRONLY)  # holds as long as it is open
+            stack.callback(os.close, request)
             os.write(request, struct.pack("=i", 0))  # us
         yield
-    finally:
-        os.close(request)
 
 
 def list_cpus() -> list[int]:

@@ -7,12 +7,10 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import isnan
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.output import write_text
 from fdi.progress import Progress
@@ -31,8 +29,7 @@ from plant import (
 )
 from rig.benches import Flags, Role
 from rig.network import NAMES, PLANT, CycleRecord, Identity, WallClock
-from rig.recorder import Observer, Recorder
-from rig.recorder.schema import collect_provenance, read_epoch_ns
+from rig.recorder import Observer, Recorder, collect_provenance, read_epoch_ns
 from rig.run.attribution import Attribution, Cause, CycleRecords, attribute, count_most_in_a_row, find_injected
 from rig.run.bring_up import compile_loop
 from rig.run.frame_steps import find_visible_steps
@@ -43,17 +40,22 @@ from rig.run.priority import (
     LOOP_PRIORITY,
     PERCENTILES,
     compute_percentiles,
-    lock_memory,
+    enter_real_time,
     name_scheduler,
-    prevent_deep_sleep,
-    raise_priority,
-    suspend_garbage_collection,
 )
 from rig.run.session import MAIN, SETUP, Session
-from rig.sequences.checks import SkippedCheck, evaluate_checks, find_skipped
-from rig.sequences.protocol import HEARTBEAT, Mask, judge_protocol
-from rig.sequences.python_parts import StepRun
-from rig.sequences.uncertainty import NO_METROLOGY, Metrology, collect_metrology
+from rig.sequences import (
+    HEARTBEAT,
+    NO_METROLOGY,
+    Mask,
+    Metrology,
+    SkippedCheck,
+    StepRun,
+    collect_metrology,
+    evaluate_checks,
+    find_skipped,
+    judge_protocol,
+)
 
 STATUS_OF_VERDICT = {"PASS": 0, "NOT_JUDGED": 0, "FAIL": 1, "CANNOT_TELL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
 INTERRUPTED = 130
@@ -174,7 +176,7 @@ class Outcome:
         """Whether a check saw rows that lateness of the bench changed, or the heartbeats of a bench that was late."""
         if check.signal == HEARTBEAT:
             return self._is_plant_off
-        first, last = (0.0 if isnan(t) else t for t in (check.t0, check.t1))
+        first, last = (0.0 if np.isnan(t) else t for t in (check.t0, check.t1))
         start, rate = self.job.scenario.plan.start, self.job.bench.rate
         rows = slice(start + round(first * rate), start + round(last * rate) if last > first else None)
         return bool(self.attribution.affected[rows].any())
@@ -270,10 +272,9 @@ class Outcome:
     def describe_attribution(self) -> dict[str, str]:
         """First cause and consequences as they stand in the log; evidence and consequences are JSON."""
         found = self._attribution_to_json()
-        cause = found["cause"] or {}
-        return {"t": f"{cause.get('t', 0.0):.3f}", "source": str(cause.get("source", "")),
-                "text": str(cause.get("text", "")), "evidence": json.dumps(cause.get("evidence", [])),
-                "consequences": json.dumps(found["consequences"])}
+        cause = found["cause"]
+        return {"t": f"{cause['t']:.3f}", "source": cause["source"], "text": cause["text"],
+                "evidence": json.dumps(cause["evidence"]), "consequences": json.dumps(found["consequences"])}
 
     def save(self) -> None:
         """Write verdict.json."""
@@ -307,7 +308,7 @@ def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str, re
 NEAR_A_STOP = 5.0  # standard deviations of the sensor's noise from a stop within which a reading is at it
 
 
-def find_limits(column: Callable[[str], NDArray[np.float64]], model: Model, zero: int) -> tuple[LimitReached, ...]:
+def find_limits(column: Callable[[str], Array], model: Model, zero: int) -> tuple[LimitReached, ...]:
     """The limits that the signals of a run reached.
 
     Args:
@@ -431,13 +432,9 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     session.bring_up()
     loop = session.stage.playing
     stopwatch = WallClock()
-    with contextlib.ExitStack() as rights:
-        if job.realtime:
-            is_hard = loop.kind == "hard"  # then Python only has to keep up; the cycle's thread is above it
-            rights.enter_context(raise_priority(1 if is_hard else LOOP_PRIORITY))
-            rights.enter_context(lock_memory())
-            rights.enter_context(prevent_deep_sleep())
-            rights.enter_context(suspend_garbage_collection())
+    # where the loop is hard, Python only has to keep up: the cycle's thread is above it
+    priority = 1 if loop.kind == "hard" else LOOP_PRIORITY
+    with enter_real_time(priority) if job.realtime else contextlib.nullcontext():
         session.run_phases()
         scheduled = loop.scheduler or name_scheduler()
     spent = stopwatch.now() * 1e-9
@@ -562,9 +559,9 @@ def open_recorder(job: Job, folder: Path, epoch_ns: int = 0, observer: Observer 
     """
     for name in ("verdict.json", "report.html"):  # of the run before
         (folder / name).unlink(missing_ok=True)
-    recorder = Recorder(folder / "trace.mcap", job.build_attachments(),
-                        collect_provenance(**job.list_settings(), resolution=job.bench.find_count(
-                            job.model.kind.signals.controlled.word)), epoch_ns, observer, job.model.kind.signals)
+    signals = job.model.kind.signals
+    provenance = collect_provenance(**job.list_settings(), resolution=job.bench.find_count(signals.controlled.word))
+    recorder = Recorder(folder / "trace.mcap", job.build_attachments(), provenance, epoch_ns, observer, signals)
     with contextlib.closing(recorder):
         yield recorder
 

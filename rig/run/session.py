@@ -16,14 +16,13 @@ import numpy as np
 
 from fdi.progress import Progress
 from plant import Array, Hold, Profile, build_profile, control_by_pid
-from rig.benches import PROFILES, State, unpack
+from rig.benches import PROFILES, Role, State, unpack
 from rig.network import CONTROLLER, HEARTBEAT, NAMES, PLANT, CycleRecord, EmbeddedWire, Frame, Master, NmtState, Wire
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.attribution import find_injected
 from rig.run.bring_up import (
     BringUp,
     Enabling,
-    count_cycles,
     list_first_steps,
     list_inputs,
     list_last_steps,
@@ -36,8 +35,7 @@ from rig.run.loop import AFTER, CycleInput, History
 from rig.run.participants import NodeProcesses, find_firmware_parameters
 from rig.run.state import Journal, SafeState, Stage
 from rig.run.watch import PATIENCE, NodeWatch, OverrunWatch
-from rig.sequences.checks import DriveFrames, Guard, GuardWatch
-from rig.sequences.protocol import Mask, ProtocolRecord, Rows
+from rig.sequences import DriveFrames, Guard, GuardWatch, Mask, ProtocolRecord, Rows
 
 SETUP, MAIN, CLEANUP = 0, 1, 2
 PHASES = ("setup", "main", "cleanup")
@@ -217,7 +215,7 @@ class Session:
     def _enable(self) -> bool:
         """Enable a controller that confirms each step; False when the run is to end."""
         demand = float(self._setup.command[0]) if len(self._setup.command) else 0.0
-        return self._go_on(self._enablings[0][1].enable(demand))
+        return self._go_on("ready", self._enablings[0][1].enable(demand), CONTROLLER)
 
     def _enable_again(self) -> None:
         """After the safe state: a controller that confirms each step climbs once more, and its fault is reset."""
@@ -234,13 +232,13 @@ class Session:
         if not self.job.bench.ready:
             return True
         words = [self._choose_control_word(phase, 0) for phase in (SETUP, MAIN)]
-        return self._go_on(self._enablings[0][1].await_ready(self._demand, *words))
+        return self._go_on("ready", self._enablings[0][1].await_ready(self._demand, *words), CONTROLLER)
 
-    def _go_on(self, problem: str) -> bool:
-        """End the run because of a problem; whether it goes on."""
+    def _go_on(self, kind: str, problem: str, node: Role) -> bool:
+        """End the run because of a problem of a node; whether it goes on."""
         if problem and not self.safety.aborted:
-            self.safety.note("ready", problem, CONTROLLER)
-            self.safety.abort("ready", problem)
+            self.safety.note(kind, problem, node)
+            self.safety.abort(kind, problem)
         return not self.safety.aborted
 
     def _run(self, phase: int, profile: Profile) -> bool:
@@ -282,9 +280,7 @@ class Session:
         """Before each cycle of set-up and main: whether something ends main."""
         self._inject_faults()
         self.nodes.is_node_gone()
-        if self.stage.playing.problem and not self.safety.aborted:
-            self.safety.note("plant", self.stage.playing.problem, PLANT)
-            self.safety.abort("plant", self.stage.playing.problem)
+        self._go_on("plant", self.stage.playing.problem, PLANT)
         if self._overruns.problem and not self.safety.aborted:
             self.safety.abort("overrun", self._overruns.problem)
         if self._stop() and not self.safety.aborted:
@@ -373,7 +369,7 @@ class Session:
     def read_protocol_record(self, judged: Mask) -> ProtocolRecord:
         """All that the protocol checks of this run are judged by; `judged`: cycles in which the bench was on time."""
         job, model, start = self.job, self.job.model, self.starter
-        cycles = count_cycles(list_first_steps(job.sequence.protocol, job.bench))
+        cycles = sum(step.cycles for step in list_first_steps(job.sequence.protocol, job.bench))
 
         def read(history: History) -> Rows:
             rows = read_rows(history, start.find_on_time_of(history))

@@ -1,7 +1,6 @@
 """The watch of the nodes of a run: emergencies, heartbeats, states, processes that end, and silence."""
 
 from collections.abc import Collection, Container, Mapping
-from itertools import filterfalse
 from math import isnan
 
 from canopen.emcy import EmcyError
@@ -15,8 +14,7 @@ from rig.recorder import NmtState as NmtRecord, Signals, Timing
 from rig.run.attribution import NO_DRIVE
 from rig.run.participants import FRAME_TIMEOUT, NodeProcesses
 from rig.run.state import Journal, SafeState, Stage
-from rig.sequences.protocol import Emergency, Heartbeat
-from rig.sequences.sequence import TimingPolicy
+from rig.sequences import Emergency, Heartbeat, TimingPolicy
 
 PATIENCE = 5  # cycles in lockstep, of which each may wait long, until the first drive frame must have come
 
@@ -189,7 +187,7 @@ class NodeWatch:
         """After trouble: find out which nodes still answer, for the first cause depends on it."""
         if self._safety.aborted and not self._safety.interrupted:
             seconds = HEARTBEAT_LIMIT * 1e-3
-            silent = list(filterfalse(self._is_answering, self._master.find_silent(seconds)))
+            silent = [node for node in self._master.find_silent(seconds) if not self._is_answering(node)]
             self._processes.wait(silent)
             self.note_ended_processes()
             for node in silent:

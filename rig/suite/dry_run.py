@@ -32,20 +32,21 @@ from plant import (
     require,
     simulate,
 )
-from rig.run.job import Job, find_differences
-from rig.run.runner import LimitReached, find_limits
-from rig.sequences.checks import Guard, GuardWatch, RunData
-from rig.sequences.faults import (
+from rig.run import Job, LimitReached, find_differences, find_limits
+from rig.sequences import (
     Corrupted,
     Fault,
     Foreign,
     Frames,
+    Guard,
+    GuardWatch,
     Jitter,
     Late,
     Noise,
     Offset,
     Parameter,
     Reset,
+    RunData,
     Short,
     Stuck,
 )

@@ -54,18 +54,21 @@ from rig.evidence.requirements import (
 )
 from rig.interrupts import exit_on_signal, handle_signals
 from rig.network import WallClock
-from rig.run.job import JobChoice, build_job, find_differences, load_tested_sequence
-from rig.run.participants import EMBEDDED_NAMES
-from rig.run.runner import (
+from rig.run import (
+    EMBEDDED_NAMES,
     INTERRUPTED,
+    JobChoice,
     Outcome,
+    build_job,
     describe_faults,
     describe_finding,
     diagnose_run,
+    find_differences,
     has_fault,
+    load_tested_sequence,
     run_job,
 )
-from rig.sequences.checks import SkippedCheck
+from rig.sequences import SkippedCheck
 
 Value = float | str
 Seed = Annotated[int, Quantity("1", low=0)]

@@ -20,9 +20,8 @@ from fdi.report import (
 )
 from fdi.trace import CheckResult, Event, Trace
 from plant import RATE, InputError, find_plant, quote_text, require, suggest_name
-from rig.run.job import JobChoice, build_job, load_tested_plant
-from rig.run.runner import Outcome, run_job
-from rig.sequences.sequence import Sequence as TestSequence, load_sequence, parse_sequence
+from rig.run import JobChoice, Outcome, build_job, load_tested_plant, run_job
+from rig.sequences import Sequence as TestSequence, load_sequence, parse_sequence
 
 
 class CheckFailedError(AssertionError):

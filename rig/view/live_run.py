@@ -14,8 +14,8 @@ from fdi.trace import CheckResult, Event
 from plant import EHA, Signals, make_columns_type
 from rig import recorder
 from rig.benches import Bench
-from rig.sequences import Sequence
-from rig.sequences.checks import MAIN, Check, RunData
+from rig.sequences import Check, RunData, Sequence
+from rig.sequences.checks import MAIN
 
 PHASES = ("set-up", "main", "clean-up")
 _AFTER_RUN = ("shut_off", "recovers")  # kinds that need all drive frames

@@ -15,13 +15,9 @@ from plant import load_model
 from rig.benches import CIA408
 from rig.network import BusError, EmbeddedWire, Frame, Node, Send, VirtualClock
 from rig.network.bus import EmbeddedBus
-from rig.nodes.emulator import Emulator
-from rig.nodes.firmware import Firmware
-from rig.run.job import Job
-from rig.run.participants import NodeProcesses
-from rig.run.runner import attribute_run, judge_run, open_recorder
-from rig.run.session import Session
-from rig.sequences.sequence import parse_sequence
+from rig.nodes import Emulator, Firmware
+from rig.run import Job, NodeProcesses, Session, attribute_run, judge_run, open_recorder
+from rig.sequences import parse_sequence
 from studies.shipped_frames import COMMAND, DRIVE, FEEDBACK, SYNC, VALVE_STATE, pack_frame, unpack_frame
 
 NODES = (1, 2, 3)

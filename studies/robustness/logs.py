@@ -15,7 +15,7 @@ from fdi.trace import Trace, open_log
 from plant import RigError
 from rig.recorder.recover import recover_log
 from rig.recorder.writer import McapFile
-from rig.run.job import read_job
+from rig.run import read_job
 
 _SIZES = (0, 1, 2**31, 2**32 - 1, 2**32, 2**40, 2**63, 2**64 - 1, 6 * 10**9)
 _TEXTS = ("", "nan", "zz", "-1", "1e999", "\x1b[2J", "$\\frac$", "9" * 5000, "\0")

@@ -17,9 +17,8 @@ from fdi.report import Cell, Column, Item, Line, Paragraph, Report, Section, Tab
 from plant import RigError, load_model
 from rig.network import BusError, WallClock
 from rig.network.udp import PORT, open_sockets
-from rig.run.job import Job
-from rig.run.runner import run_job
-from rig.sequences.sequence import parse_sequence
+from rig.run import Job, run_job
+from rig.sequences import parse_sequence
 from studies.robustness.disturb import (
     ACTIONS,
     PROCESSES,

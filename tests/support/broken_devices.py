@@ -13,7 +13,7 @@ from rig.conformance.run_cases import Outcome, choose_cases, run_cases
 from rig.conformance.target import DataSheet, Options, Target, Verdict
 from rig.device import Device
 from rig.network import EmbeddedWire, Frame, Send, VirtualClock
-from rig.nodes.firmware import Firmware
+from rig.nodes import Firmware
 
 MS = 1_000_000  # ns
 CYCLE = load_bench().nodes[Role.PLANT].outputs["cycle"].key

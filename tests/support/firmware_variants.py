@@ -10,7 +10,7 @@ from codec import Command, Drive, Feedback
 
 from plant import Model
 from rig.network import Frame, Send
-from rig.nodes.firmware import Firmware
+from rig.nodes import Firmware
 
 CURRENT_LIMIT = 8e-3  # A
 _HEARTBEAT = 0x702

@@ -8,9 +8,7 @@ from codec import Drive, Feedback, ValveState
 from plant import Model
 from rig.network import SCENARIO, Send
 from rig.network.bus import EmbeddedBus
-from rig.nodes.emulator import Emulator
-from rig.nodes.firmware import Firmware
-from rig.nodes.scenario import Scenario
+from rig.nodes import Emulator, Firmware, Scenario
 
 MS = 1_000_000  # ns
 

@@ -2,7 +2,7 @@
 
 from plant import Model
 from rig.bench.benchmarks import FRICTIONLESS, QUIET
-from rig.sequences.sequence import load_sequence
+from rig.sequences import load_sequence
 
 PREFLIGHT = load_sequence("preflight").main_profile().command
 SILENT = Model().replace(QUIET)

@@ -26,9 +26,8 @@ from fdi.trace import Trace
 from plant import load_model
 from rig.cli.main import main
 from rig.network import master
-from rig.run.job import Job
-from rig.run.runner import Outcome, run_job
-from rig.sequences.sequence import parse_sequence
+from rig.run import Job, Outcome, run_job
+from rig.sequences import parse_sequence
 
 
 @dataclass(frozen=True)

@@ -33,10 +33,10 @@ def compile_all(out: Path) -> int:
     from plant import Model, compile_function
     from rig.firmware.build import build_controller, build_device
     from rig.network import raw_bus
+    from rig.nodes import CompiledPlant
     from rig.nodes.emulator import load_service
     from rig.nodes.emulator_service import compile_loop
-    from rig.nodes.plant_code import CompiledPlant
-    from rig.run.hard_loop import compile_cycle
+    from rig.run import compile_cycle
     from rig.run.loop import load_parts
 
     build_controller()

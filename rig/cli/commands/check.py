@@ -9,7 +9,7 @@ from plant import check_behaviour, count_nouns, is_fault_file, load_model, requi
 from rig.benches import build_bench_report, collect_bench_data, list_loads, load_bench, tabulate_frames
 from rig.cli import choose_places, give_answer, load_chosen_model, parse_changes, show_progress
 from rig.cli.commands.list import build_list_report, list_faults
-from rig.run.job import JobChoice, build_job
+from rig.run import JobChoice, build_job
 from rig.suite.dry_run import build_dry_run_report, make_dry_run
 
 

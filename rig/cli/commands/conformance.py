@@ -12,15 +12,8 @@ from rig.cli import Places, choose_file, give_answer, make_folder, show_progress
 from rig.conformance.run_cases import build_conformance_report, choose_cases, run_cases, write_junit
 from rig.conformance.target import DataSheet, Options, Target
 from rig.network import EmbeddedWire, Link, LinkWire, Master, VirtualClock, WallClock, Wire, choose_bus, open_can
-from rig.nodes.emulator import Emulator
-from rig.nodes.firmware import Firmware
-from rig.run.participants import (
-    EMBEDDED_NAMES,
-    NodeProcesses,
-    is_replaced,
-    make_node_command,
-    require_firmware_bus,
-)
+from rig.nodes import Emulator, Firmware
+from rig.run import EMBEDDED_NAMES, NodeProcesses, is_replaced, make_node_command, require_firmware_bus
 
 OWN_NODES = {"controller": Role.CONTROLLER, "plant": Role.PLANT, "c": Role.CONTROLLER}  # c: in C
 

@@ -31,7 +31,7 @@ def run_command(args: argparse.Namespace) -> int:
 
 def test_effect(e: Effect, plant: str = "eha") -> SelfTest:
     """Test an effect on the nominal test of its plant, of the EHA the preflight."""
-    from rig.sequences.sequence import load_nominal_test  # here: it takes half a second
+    from rig.sequences import load_nominal_test  # here: it takes half a second
 
     kind = find_plant(plant)
     return check_effect(e.name, load_nominal_test(kind, kind.nominal["controller.period"])[0], plant=plant)

@@ -11,7 +11,7 @@ from rig.cli import give_answer, show_progress
 from rig.evidence.contents import BILL, add_index, collect_runs
 from rig.evidence.package import verify_package, write_package
 from rig.evidence.requirements import read_requirements, require_listed, tabulate_requirements, trace_requirements
-from rig.recorder.schema import read_epoch_ns
+from rig.recorder import read_epoch_ns
 
 
 def run_command(args: argparse.Namespace) -> int:

@@ -24,14 +24,9 @@ from rig.network import (
     read_gains,
     serve_node,
 )
-from rig.nodes.emulator import Emulator, find_plant_node, list_unheard
-from rig.nodes.emulator_service import EmulatorService
-from rig.nodes.firmware import Firmware
-from rig.nodes.scenario import Scenario
-from rig.run.job import speaks_as_shipped
-from rig.run.participants import EMBEDDED_NAMES
-from rig.run.priority import LOOP_PRIORITY, enter_loop_thread, lock_memory, raise_priority
-from rig.sequences.faults import Plan
+from rig.nodes import Emulator, EmulatorService, Firmware, Scenario, find_plant_node, list_unheard
+from rig.run import EMBEDDED_NAMES, LOOP_PRIORITY, enter_loop_thread, lock_memory, raise_priority, speaks_as_shipped
+from rig.sequences import Plan
 
 LISTENING_TIME = 0.25  # s; two heartbeats of a node of ours
 

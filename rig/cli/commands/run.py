@@ -26,9 +26,18 @@ from rig.cli import (
 from rig.interrupts import catch_signals
 from rig.network import WallClock, choose_bus
 from rig.recorder import Event, Observer
-from rig.run.job import Job, JobChoice, build_job, find_differences, read_job, replace_settings
-from rig.run.participants import EMBEDDED_NAMES
-from rig.run.runner import Outcome, diagnose_run, run_job
+from rig.run import (
+    EMBEDDED_NAMES,
+    Job,
+    JobChoice,
+    Outcome,
+    build_job,
+    diagnose_run,
+    find_differences,
+    read_job,
+    replace_settings,
+    run_job,
+)
 from rig.view.live_process import ViewerPlace, find_viewer_place, show_live
 from rig.view.live_run import find_named_node, make_live_plan
 

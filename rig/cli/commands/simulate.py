@@ -9,7 +9,7 @@ from fdi.report import Report, format_amount
 from fdi.trace import Trace, read_command
 from plant import Plant, Points, build_profile, count_nouns, find_divergence, load_model, require, simulate
 from rig.cli import give_answer, load_chosen_model, show_progress
-from rig.sequences.sequence import load_nominal_test
+from rig.sequences import load_nominal_test
 
 SAMPLE_UNIT = {"jack.static_friction": 900.0, "jack.dynamic_friction": 600.0, "null_bias.current": 5e-5}
 SAMPLE_POINTS = ((0.0, 0.0), (0.5, 0.0), (0.501, 2e-3), (1.5, 2e-3), (3.0, -3e-3), (4.0, -3e-3), (4.001, -1e-3),

@@ -34,7 +34,7 @@ from rig.device import Abort, NmtState, SdoAbort
 from rig.device.dictionary import INVALID
 from rig.network import CONTROLLER, EmbeddedWire, Send, VirtualClock
 from rig.network.bus import Done
-from rig.nodes.firmware import Firmware
+from rig.nodes import Firmware
 
 
 class StallingWire(EmbeddedWire):

@@ -16,9 +16,8 @@ from rig_command import SHORT, job, nodes_on, play, rig
 from plant import InputError, RigError
 from rig.firmware.build import FOLDER, build_controller, build_program
 from rig.network import PLANT, Frame
-from rig.nodes.firmware import Firmware
-from rig.run import participants
-from rig.run.runner import Outcome
+from rig.nodes import Firmware
+from rig.run import Outcome, participants
 
 
 @only_udp

@@ -52,10 +52,9 @@ from rig.network import (
     send_frame,
 )
 from rig.network.bus import explain_socketcan_problem
-from rig.network.can_interface import UdpBus
 from rig.network.frame import FD_LENGTHS, IDENTIFIER, has_valid_length
 from rig.network.raw_bus import NO_TURN
-from rig.network.udp import PORT
+from rig.network.udp import PORT, UdpBus
 
 only_socketcan = pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
 links = pytest.mark.parametrize("bus_kind", ["virtual", "udp_multicast", "socketcan"], indirect=True)

@@ -29,10 +29,8 @@ from rig.network import (
     serve_node,
 )
 from rig.network.sdo_client import CheckedSdoClient, ConfirmationError, repeat_transfer
-from rig.nodes.emulator import Emulator
-from rig.nodes.firmware import Firmware
-from rig.nodes.scenario import Scenario
-from rig.sequences.faults import Plan
+from rig.nodes import Emulator, Firmware, Scenario
+from rig.sequences import Plan
 
 SCENARIO = Scenario(Model(), Plan(stop=10)).to_bytes()
 

@@ -22,21 +22,17 @@ from rig.benches import CIA408, load_bench
 from rig.device import Abort, NmtState
 from rig.network import GAINS, Frame, Link, RawBus, WallClock, open_can, serve_node
 from rig.network.node_objects import decode_cycle_record
-from rig.nodes import emulator_cycle as ec
-from rig.nodes.emulator import Emulator, list_unheard
-from rig.nodes.emulator_service import EmulatorService, compile_loop
+from rig.nodes import Emulator, EmulatorService, Scenario, emulator_cycle as ec, list_unheard
+from rig.nodes.emulator_service import compile_loop
 from rig.nodes.firmware import LOST_AFTER
-from rig.nodes.scenario import Scenario
-from rig.run.priority import enter_loop_thread
-from rig.sequences.faults import (
+from rig.run import enter_loop_thread
+from rig.sequences import (
     DOUBLE,
     DROP,
     BusOff,
     Corrupted,
-    Duplicated,
     Fault,
     Late,
-    Lost,
     Noise,
     Offset,
     Parameter,
@@ -45,6 +41,7 @@ from rig.sequences.faults import (
     Short,
     Stuck,
 )
+from rig.sequences.faults import Duplicated, Lost
 
 
 class BusDesk:

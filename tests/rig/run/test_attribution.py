@@ -19,8 +19,8 @@ from rig.run.attribution import (
     find_start_problem,
 )
 from rig.run.runner import select_plant_delays
-from rig.sequences.faults import Fault, Late, Lost, Offset, Plan, Schedule, Silent
-from rig.sequences.sequence import TimingPolicy
+from rig.sequences import Fault, Late, Offset, Plan, Schedule, Silent, TimingPolicy
+from rig.sequences.faults import Lost
 
 MS = 1_000_000  # ns
 N = 1000
@@ -72,7 +72,7 @@ class Script:
         due = np.arange(N, dtype=np.int64) * MS
         records = CycleRecords(due, self.lateness, self.feedback, self.valve, self.response, self.flags,
                                Injected(*self.injected), self.delay)
-        return attribute(records, self.troubles, policy, load_bench(), gone)
+        return attribute(records, self.troubles, policy, load_bench(), gone or {})
 
 
 @pytest.mark.parametrize(("controller", "plant", "blamed"), [

@@ -9,7 +9,7 @@ from rig_command import SHORT, job, play, read_signals
 
 from fdi.trace import MAIN, Trace, open_log
 from fdi.trace.trace import CLEANUP
-from rig.run.runner import Outcome
+from rig.run import Outcome
 
 SAFE = SHORT + 'ends = "safe_state"\n'
 

@@ -13,9 +13,8 @@ import dbc
 from fdi.trace import Trace
 from plant import Model, simulate
 from rig.benches import load_bench
-from rig.run.job import JobChoice, build_job
-from rig.sequences import load_sequence
-from rig.sequences.sequence import parse_sequence
+from rig.run import JobChoice, build_job
+from rig.sequences import load_sequence, parse_sequence
 from rig.suite.dry_run import make_dry_run
 from rig.testing.bench import Bench
 

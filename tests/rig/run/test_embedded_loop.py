@@ -10,9 +10,8 @@ from rig_command import SHORT, job, play
 from fdi.trace import Trace, open_log
 from plant import Array
 from rig.nodes import emulator_cycle
-from rig.run import bring_up
+from rig.run import Outcome, bring_up
 from rig.run.embedded_loop import EmbeddedLoop
-from rig.run.runner import Outcome
 
 LOADED = SHORT.replace("main = [", 'load = [{ kind = "ramp", to = 1500, time = 0.3 }]\nmain = [')
 GUARDED = SHORT + 'guards = [{ name = "g", signal = "error", low = -0.5, high = 0.1, unit = "mm", cycles = %d }]'

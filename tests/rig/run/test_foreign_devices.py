@@ -18,9 +18,7 @@ from fdi.trace import Trace
 from plant import simulate
 from rig.benches import Bench, Role
 from rig.recorder.convert import export_trace, import_frames
-from rig.run import bring_up, participants
-from rig.run.job import Job, JobChoice, build_job
-from rig.run.runner import Outcome, run_job
+from rig.run import Job, JobChoice, Outcome, bring_up, build_job, participants, run_job
 
 SEQUENCE = """
 title = "Two steps"

@@ -22,24 +22,15 @@ from numba.core.event import install_recorder
 
 from plant import Model
 from rig.benches import load_bench
-from rig.network import Frame, Link, LinkWire, Master, RawBus, WallClock, open_can
+from rig.network import Frame, Link, LinkWire, Master, WallClock, open_can
 from rig.network.udp import PORT, Turn
-from rig.nodes.scenario import Scenario
+from rig.nodes import Scenario
 from rig.recorder import Signals
-from rig.run.hard_loop import HardLoop, compile_cycle
-from rig.run.loop import CycleInput, CycleLoop
-from rig.sequences.faults import (
-    BusOff,
-    Corrupted,
-    Duplicated,
-    Fault,
-    Jitter,
-    Late,
-    Lost,
-    Plan,
-    Schedule,
-    Short,
-)
+from rig.run import CycleInput, compile_cycle
+from rig.run.hard_loop import HardLoop
+from rig.run.loop import CycleLoop
+from rig.sequences import BusOff, Corrupted, Fault, Jitter, Late, Plan, Schedule, Short
+from rig.sequences.faults import Duplicated, Lost
 
 PERIOD = 10_000_000  # ns: ten times the bench's, because the nodes of this test are Python on a busy machine
 
@@ -109,7 +100,7 @@ class Bench(CycleBook):
         schedule = Schedule(Plan(faults=faults, stop=1000))
         bench = replace(load_bench(), cycle_ns=PERIOD)
         parts = self.master, bench, Scenario(Model(), Plan(stop=0)), schedule, self
-        self.loop: Any = HardLoop(*parts, RawBus(where, bench.frames.identifiers), ahead) if realtime else CycleLoop(
+        self.loop: Any = HardLoop(*parts, where, ahead) if realtime else CycleLoop(
             *parts, realtime=False)
         self._markers = 0
 

@@ -9,9 +9,10 @@ from log_rows import CycleBook
 from plant import Model
 from rig.benches import load_bench
 from rig.network import Frame, Master, VirtualClock
-from rig.nodes.scenario import Scenario
-from rig.run.loop import CycleInput, CycleLoop
-from rig.sequences.faults import Plan, Schedule
+from rig.nodes import Scenario
+from rig.run import CycleInput
+from rig.run.loop import CycleLoop
+from rig.sequences import Plan, Schedule
 
 MS = 1_000_000  # ns
 

@@ -11,16 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from rig.run.priority import (
-    LOOP_PRIORITY,
-    SWITCH_INTERVAL,
-    enter_loop_thread,
-    list_cpus,
-    lock_memory,
-    name_scheduler,
-    raise_priority,
-    suspend_garbage_collection,
-)
+from rig.run import LOOP_PRIORITY, enter_loop_thread, list_cpus, lock_memory, raise_priority
+from rig.run.priority import SWITCH_INTERVAL, name_scheduler, suspend_garbage_collection
 
 
 def allowed() -> bool:

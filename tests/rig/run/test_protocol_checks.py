@@ -16,10 +16,8 @@ from fdi.report import build_run_report
 from fdi.trace import Trace
 from rig.network import Frame
 from rig.recorder import Signals, Timing
-from rig.run import participants
+from rig.run import History, Outcome, participants
 from rig.run.bring_up import find_gap
-from rig.run.loop import History
-from rig.run.runner import Outcome
 
 HOLD = 'title = "Holds"\nmain = [{ kind = "hold", time = 0.4 }]\n'
 MOVE = """

@@ -10,8 +10,7 @@ from rig_command import job, play
 
 from rig.network import GAINS, Frame
 from rig.nodes import firmware
-from rig.run import participants
-from rig.run.runner import Outcome
+from rig.run import Outcome, participants
 from rig.sequences import load_sequence
 
 LOSSES = ("lost_command", "lost_feedback", "lost_sync", "lost_heartbeat")

@@ -41,9 +41,7 @@ from fdi.trace.trace import CLEANUP
 from plant import simulate
 from rig.benches import load_bench
 from rig.network import CONTROLLER, PLANT, BusError, Frame, Link, LinkWire, Master, WallClock, open_can
-from rig.run import participants, runner
-from rig.run.participants import NodeProcesses
-from rig.run.session import Session
+from rig.run import NodeProcesses, Session, participants, runner
 
 LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 60')
 LONG += 'ends = "safe_state"\n' + SLOW_START

@@ -22,14 +22,10 @@ from fdi.trace.trace import CLEANUP, SETUP
 from plant import RigError
 from plant.effects import CATALOGUE
 from rig.network import EmbeddedWire, Frame, Send, VirtualClock
-from rig.nodes.emulator import Emulator
-from rig.nodes.firmware import Firmware
+from rig.nodes import Emulator, Firmware
 from rig.recorder import Recorder, RecorderError, Signals, Timing
-from rig.run import participants, runner
-from rig.run.job import read_job
-from rig.run.participants import NodeProcesses
-from rig.run.session import Session
-from rig.sequences.sequence import parse_sequence
+from rig.run import NodeProcesses, Session, participants, read_job, runner
+from rig.sequences import parse_sequence
 
 SAFE = SHORT + 'ends = "safe_state"\n'
 

@@ -11,7 +11,7 @@ from fdi.diagnosis.diagnosis import diagnose
 from fdi.report import build_run_report, format_report
 from fdi.trace import Trace
 from plant import load_model
-from rig.run.runner import Outcome, find_limits, run_job
+from rig.run import Outcome, find_limits, run_job
 
 UNCHECKED = SHORT.partition("checks = [")[0]
 TO_THE_STOP = """

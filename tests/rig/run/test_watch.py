@@ -8,7 +8,7 @@ import pytest
 
 from rig.recorder import Timing
 from rig.run.watch import OverrunWatch, SilenceWatch
-from rig.sequences.sequence import TimingPolicy
+from rig.sequences import TimingPolicy
 
 MS = 1_000_000  # ns
 

@@ -21,17 +21,24 @@ from fdi.trace import CheckResult, Trace
 from plant import EHA, Array, Columns, Hold, Segment, Signals, build_profile
 from plant.segments import Ramp, Step
 from rig.benches import Bench, SensorCalibration, load_bench, load_bench_from_files
-from rig.sequences import checks, uncertainty
-from rig.sequences.checks import NO_DRIVES, DriveFrames, Guard, GuardWatch, RunData, evaluate_checks
-from rig.sequences.protocol import (
+from rig.sequences import (
+    DriveFrames,
+    Guard,
+    GuardWatch,
     Heartbeat,
+    Metrology,
     ProtocolLimits,
     ProtocolRecord,
     Rows,
+    RunData,
+    checks,
+    evaluate_checks,
     judge_protocol,
-    measure_frozen,
+    uncertainty,
 )
-from rig.sequences.uncertainty import WIDTHS, Decision, Metrology, decide
+from rig.sequences.checks import NO_DRIVES
+from rig.sequences.protocol import measure_frozen
+from rig.sequences.uncertainty import WIDTHS, Decision, decide
 
 NOISE = 2e-6  # m rms, as the position transducer has it
 LAG = 0.01  # s, of the first-order follower

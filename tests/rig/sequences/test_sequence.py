@@ -14,38 +14,36 @@ from fdi.trace import CheckResult
 from plant import InputError, load_model, simulate, tables
 from rig.benches import load_bench
 from rig.network import Identity
-from rig.nodes.scenario import Scenario
-from rig.sequences import faults
-from rig.sequences.checks import evaluate_checks
-from rig.sequences.faults import (
-    CORRUPT,
+from rig.nodes import Scenario
+from rig.sequences import (
     CUT,
     DELAY,
     DOUBLE,
     DROP,
-    NORMAL,
-    Action,
     BusOff,
     Corrupted,
-    Duplicated,
     Fault,
     Foreign,
     Jitter,
     Late,
-    Lost,
     Noise,
     Offset,
     Parameter,
     Plan,
     Reset,
     Schedule,
+    Sequence,
     Short,
     Silent,
     Stuck,
     change_frame,
+    evaluate_checks,
+    faults,
+    load_sequence,
+    parse_sequence,
     require_possible,
 )
-from rig.sequences.sequence import Sequence, load_sequence, parse_sequence
+from rig.sequences.faults import CORRUPT, NORMAL, Action, Duplicated, Lost
 
 FULL = """\
 title = "All of it"

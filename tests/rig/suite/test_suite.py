@@ -13,7 +13,7 @@ from rig_command import SHORT, Said, answer, finished, grown, interrupted, job, 
 from fdi.trace import CheckResult
 from rig.cli import is_suite_file
 from rig.evidence.requirements import Evidence, JudgedCheck, trace_requirements
-from rig.run.job import JobChoice
+from rig.run import JobChoice
 from rig.suite.dry_run import make_dry_run
 from rig.suite.suite import (
     Case,

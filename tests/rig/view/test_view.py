@@ -36,8 +36,7 @@ from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace import CheckResult, Trace
 from plant import Model, find_plant
 from rig.benches import load_bench
-from rig.recorder import Event, NmtState, Record, Signals, Timing
-from rig.recorder.schema import make_row_record
+from rig.recorder import Event, NmtState, Record, Signals, Timing, make_row_record
 from rig.sequences import load_sequence
 from rig.view import viewer
 from rig.view.live_process import find_viewer_place
