@@ -8,8 +8,6 @@ cores. Both change the last bits. A fit over stick-slip amplifies them: measured
 import os
 from pathlib import Path
 
-CPU_INFO = Path("/proc/cpuinfo")
-
 
 def fix_blas_kernels() -> None:
     """Select one thread, and the kernels for AVX2 and FMA where the CPU has both; what the user has set stays."""
@@ -18,7 +16,7 @@ def fix_blas_kernels() -> None:
         os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 
 
-def read_cpu_flags(file: Path = CPU_INFO) -> set[str]:
+def read_cpu_flags(file: Path = Path("/proc/cpuinfo")) -> set[str]:
     """Names of the instruction sets of the first CPU; empty where the kernel does not list them."""
     try:
         with file.open(encoding="ascii", errors="replace") as lines:

@@ -50,7 +50,6 @@ class ForeignCall:
     def declare(self) -> Any:
         """What numba compiles into the call."""
         import llvmlite.ir
-        import numba
         import numba.extending
 
         kinds: dict[str, Any] = {"i": numba.types.int32, "q": numba.types.int64, "d": numba.types.float64}
@@ -129,8 +128,7 @@ def interpret_function(function: Function, ports: Mapping[str, Function] | None 
 
 def compile_function(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
     """`function` and all functions that it calls, with `ports` bound, as machine code that is cached on disk."""
-    import numba  # here and below: who only reads a trace need not load it, which takes 0.3 s
-    import numba.core.compiler_lock
+    import numba.core.compiler_lock  # here and below: who only reads a trace need not load it, which takes 0.3 s
 
     _let_lanes_fill_registers()
     root = _link_calls(function, ports or {}, lambda f: f)
@@ -288,7 +286,6 @@ def make_record_reader(kind: np.dtype[Any], first: int, apart: int) -> Function:
     two hundred numbers passed to each law doubles the time to compile; with the address in the array itself the
     compiler turns a choice of two numbers into a choice of two addresses, and then makes no vector code.
     """
-    import numba
     import numba.core.cgutils
     import numba.extending
 

@@ -5,18 +5,17 @@ and data: github.com/ivliev123/Electro-Hydraulic-Actuator; "raw" is the unit of 
 """
 from collections import namedtuple
 from collections.abc import Mapping
-from typing import Any, NamedTuple
 
 import numpy as np
 
+from plant.declare import Any, NamedTuple, Plant, Quantity, base_effect, clip, port
 from plant.effects.sensors import QUANTISATION
 from plant.effects.servovalve import COMPRESSIBILITY
 from plant.eha import step_jack, update_compliance
-from plant.friction import clip
 from plant.parameters import GROUPS, convert_group_unit, read_shipped_model
-from plant.plants import MeasuredPressures, Plant, Table, Term, base_effect
-from plant.ports import at_position, at_valve, port
-from plant.quantity import Quantity, make_group
+from plant.plants import MeasuredPressures, Table, Term
+from plant.ports import at_position, at_valve
+from plant.quantity import make_group
 from plant.segments import Array
 from plant.signals import EHA, Signals
 from plant.state import Input, Line, Memory
@@ -156,8 +155,7 @@ def derive_logger_columns(sources: Mapping[str, Array]) -> dict[str, Array]:
 
 def compute_centred_mean(x: Array, rows: int) -> Array:
     """The mean of so many rows (odd) around each row of `x`, (n,); the ends are repeated."""
-    mean: Array = np.convolve(np.pad(x, rows // 2, "edge"), np.full(rows, 1.0 / rows), "valid")
-    return mean
+    return np.convolve(np.pad(x, rows // 2, "edge"), np.full(rows, 1.0 / rows), "valid")
 
 
 base_effect("check_valve", Pump, "least_speed", starts=(10.0, 40.0),

@@ -290,7 +290,6 @@ def control(c: Loops, demand: float, y: Any, p: Any) -> tuple[float, Loops]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 _FAULTS = "Dalla Vedova, Germana, Berri and Maggiore, Aerospace 6(9), 94, 2019"
-_FRICTION = "Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30, 1994"
 
 base_effect("backlash", Screw, "backlash", law="F = 0 while |z - x| < b/2", starts=(2e-5, 6e-5, 2e-4),
             symptoms="at each reversal the motor turns and the surface waits",
@@ -327,7 +326,7 @@ def friction_asymmetry(x: Friction, s: Any, u: Any, p: Any) -> Friction:
     "speed": Quantity("m/s", above=0, high=10, typical="1-50 mm/s"),
 }, off={"speed": 0.01}, law="FD + rise FS exp(-(x'/speed)^2); at rest no less than that",
     symptoms="more current at creep speed; stick-slip", starts=((0.3, 0.01), (1.0, 0.003), (1.0, 0.03)),
-    source="Stribeck 1902; " + _FRICTION)
+    source="Stribeck 1902; Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30, 1994")
 def stribeck(x: Friction, s: Any, u: Any, p: Any) -> Friction:
     """Boundary lubrication: the film in screw and seals carries more the faster they move."""
     g, v = p.stribeck, s.speed / p.stribeck.speed

@@ -1,8 +1,8 @@
 """Errors that the user can correct, each shown as one line; and words that messages share."""
-from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Self
 
 
 class RigError(Exception):
@@ -22,7 +22,7 @@ class InputError(RigError):
         self.where, self.field, self.expected = str(where), field, expected
         super().__init__(f"{where}: {field}: expected {expected}" if field else f"{where}: expected {expected}")
 
-    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+    def __reduce__(self) -> tuple[type[Self], tuple[str, str, str]]:
         """As a worker process hands it on."""
         return type(self), (self.where, self.field, self.expected)
 

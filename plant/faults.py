@@ -13,14 +13,13 @@ value.
     follow = ["spool.dynamic_friction"]     # grows in proportion
     source = "Table 2 of the paper"
 """
-from __future__ import annotations
 
 import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from plant.errors import InputError, require
 from plant.parameters import find_field, read_toml
@@ -90,7 +89,7 @@ class Fault:
             return self.healthy + departure
         return self.healthy - departure if self.falls else departure
 
-    def turn_up(self) -> Fault:
+    def turn_up(self) -> Self:
         """The fault by its departure, which rises from a healthy unit on; itself where its size does."""
         if not (self.falls or self.both_ways):
             return self
@@ -104,8 +103,8 @@ class Fault:
         """Departures of a healthy unit, of MidBand and of MaxBand, rising."""
         if self.both_ways:
             return 0.0, self.acceptable, self.maintenance
-        healthy, middle, most = (self.measure_departure(x) for x in (self.healthy, self.acceptable, self.maintenance))
-        return healthy, middle, most
+        return (self.measure_departure(self.healthy), self.measure_departure(self.acceptable),
+                self.measure_departure(self.maintenance))
 
 
 SCATTER = 5.0  # tolerances, by which a healthy unit may be off its nominal size: a fit must be able to say so

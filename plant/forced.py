@@ -82,9 +82,8 @@ def run_flow_balance(flat: Any, measured: Any, position: float, record: Any, ste
     constant = compute_coefficients(p, h)
     s, m = unpack_state(flat)
     s, m = rest_at_reading(s, m, position, p, steps)
-    last = len(measured) - 1
     for k in range(len(measured)):
-        ahead = k + 1 if k < last else k
+        ahead = min(k + 1, len(measured) - 1)
         for i in range(steps):
             part = (i + 0.5) / steps
             xs = measured[k, 0] + part * (measured[ahead, 0] - measured[k, 0])

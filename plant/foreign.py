@@ -3,7 +3,7 @@
 `Plant.foreign` gives the program for cycles of so many seconds.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Protocol
 
@@ -38,10 +38,9 @@ class Program(Protocol):
 
 
 @lru_cache(2)
-def _find_program(foreign: Any, period: float) -> Program:
+def _find_program(foreign: Callable[[float], Program], period: float) -> Program:
     """The program for replays: one serves them all, because each begins anew."""
-    program: Program = foreign(period)
-    return program
+    return foreign(period)
 
 
 def run_foreign_loop(actuator: Any, com: Array, load: Array, out: Array) -> None:

@@ -105,20 +105,22 @@ def _cosine(r: Number) -> Number:
     return w + (((1.0 - w) - half) + z * z * y)
 
 
-def sin(x: float) -> float:
-    """The sine of an angle in radian."""
+def _sine_ahead(x: float, turned: float) -> float:
+    """The sine of an angle that is `turned` quarters further than `x`."""
     n, r = _quarters(x)
-    quarter = _bits(n + ROUND)
+    quarter = _bits(n + (ROUND + turned))
     y = _sine(r) if quarter & 1 == 0 else _cosine(r)
     return y if quarter & 2 == 0 else -y
+
+
+def sin(x: float) -> float:
+    """The sine of an angle in radian."""
+    return _sine_ahead(x, 0.0)
 
 
 def cos(x: float) -> float:
     """The cosine of an angle in radian."""
-    n, r = _quarters(x)
-    quarter = _bits(n + (ROUND + 1.0))
-    y = _sine(r) if quarter & 1 == 0 else _cosine(r)
-    return y if quarter & 2 == 0 else -y
+    return _sine_ahead(x, 1.0)
 
 
 def tan(x: float) -> float:

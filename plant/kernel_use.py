@@ -17,8 +17,7 @@ class KernelUse:
     """Counts the steps that kernels could have made, and prepares those for which it is time, one at a time."""
 
     def __init__(self) -> None:
-        self._steps: dict[Hashable, float] = {}
-        self._worth: dict[Hashable, float] = {}
+        self._left: dict[Hashable, float] = {}  # steps until it is worth its while
         self._ready: set[Hashable] = set()
         self._counting, self._preparing = threading.Lock(), threading.Lock()
 
@@ -34,11 +33,12 @@ class KernelUse:
         """
         if kernel in self._ready:
             return True
-        if kernel not in self._worth:
-            self._worth[kernel] = WORTH_LOADING if is_stored() else WORTH_COMPILING
+        if kernel not in self._left:
+            # another thread may have begun to count meanwhile
+            self._left.setdefault(kernel, WORTH_LOADING if is_stored() else WORTH_COMPILING)
         with self._counting:
-            self._steps[kernel] = self._steps.get(kernel, 0.0) + steps
-            is_due = self._steps[kernel] >= self._worth[kernel]
+            self._left[kernel] -= steps
+            is_due = self._left[kernel] <= 0.0
         if not is_due or not self._preparing.acquire(blocking=False):
             return False
         try:

@@ -13,11 +13,10 @@ from plant.compile import Function, raise_unbound
 from plant.signals import Signals
 from plant.state import Memory
 
-step_plant = measure_plant = sense_plant = move_plant = correct_plant = control_plant = raise_unbound
-shift_memories = raise_unbound
-compute_plant_coefficients = start_control = add_noise = replace_first = get_readings = raise_unbound
+step_plant = measure_plant = sense_plant = move_plant = correct_plant = invert_plant = shift_memories = raise_unbound
+compute_plant_coefficients = start_control = control_plant = load_control = store_control = raise_unbound
+add_noise = replace_first = get_readings = load_readings = store_readings = raise_unbound
 keep_row = keep_sample = keep_answer = raise_unbound
-invert_plant = load_readings = store_readings = load_control = store_control = raise_unbound
 
 
 def write_signal_functions(signals: Signals) -> dict[str, Function]:

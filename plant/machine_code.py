@@ -116,10 +116,9 @@ def _flatten(arguments: Sequence[Any]) -> list[tuple[Any, Any]]:
     words: list[tuple[Any, Any]] = []
     for one in arguments:
         if isinstance(one, np.ndarray):
-            sizes = (one.size, one.dtype.itemsize), (*one.shape, *one.strides)
-            words += [(ctypes.c_void_p, None)] * 2
-            words += [*((ctypes.c_int64, n) for n in sizes[0]), (ctypes.c_void_p, one.ctypes.data),
-                      *((ctypes.c_int64, n) for n in sizes[1])]
+            words += [(ctypes.c_void_p, None), (ctypes.c_void_p, None), (ctypes.c_int64, one.size),
+                      (ctypes.c_int64, one.dtype.itemsize), (ctypes.c_void_p, one.ctypes.data),
+                      *((ctypes.c_int64, n) for n in (*one.shape, *one.strides))]
         elif isinstance(one, tuple):
             words += _flatten(one)
         else:

@@ -1,13 +1,13 @@
 """A model is data: a plant, its parameter values and its effects. `build_kernel` turns it into code."""
-from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
+from itertools import groupby
 from pathlib import Path
 from textwrap import shorten
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +94,7 @@ class Model:
         """The effect of that name, as the plant has it. Raises KeyError."""
         return self.kind.find_effect(name)
 
-    def replace(self, changes: Mapping[str, object], where: object = "--set") -> Model:
+    def replace(self, changes: Mapping[str, object], where: object = "--set") -> Self:
         """The model with some parameters changed; naming an effect's parameter gives the model that effect.
 
         Raises:
@@ -108,7 +108,7 @@ class Model:
         check_exclusions(where, model, merged)
         return replace(model, values=merged)
 
-    def with_effects(self, groups: Iterable[str]) -> Model:
+    def with_effects(self, groups: Iterable[str]) -> Self:
         """The model with the effects among `groups` added at their off values."""
         wanted = set(groups) | set(self.effects)
         found = [e for e in self.kind.list_effects() if e.name in wanted and not e.base]
@@ -131,24 +131,21 @@ class Model:
     def to_toml(self, remarks: Mapping[str, str] | None = None) -> str:
         """The text of a model file, which `load_model` reads; `remarks` stand beside parameters, by "group.field"."""
         effects = ", ".join(f'"{e}"' for e in self.effects)
-        name = quote_text(self.name)
         plant = [] if self.plant == "eha" else [f"plant = {quote_text(self.plant)}"]
         plant += [f'plant_sha256 = "{self.kind.sha256}"'] if self.kind.sha256 else []
-        lines = [f"name = {name}", *plant, f"effects = [{effects}]"]
+        lines = [f"name = {quote_text(self.name)}", *plant, f"effects = [{effects}]"]
         usual = self.nominal
         own = {name: value for name, value in self.values.items() if usual.get(name) != value}
         for heading, values in (("design.", self.design), ("", own)):
-            group = ""
-            for name, value in values.items():
-                head, _, tail = name.partition(".")
-                if head != group:
-                    group = head
-                    lines += ["", f"[{heading}{group}]"]
-                quantity = find_quantity(name, plant=self.plant)
-                word = next((f'"{w}"' for w, number in quantity.words.items() if number == value), repr(value))
-                remark = "" if heading and name in own else (remarks or {}).get(name, "")  # a fitted value's, once
-                notes = [note for note in (quantity.unit, remark) if note not in ("", "1")]
-                lines.append(f"{tail} = {word}" + (f"  # {', '.join(notes)}" if notes else ""))
+            for group, fields in groupby(values.items(), lambda item: item[0].partition(".")[0]):
+                lines += ["", f"[{heading}{group}]"]
+                for name, value in fields:
+                    tail = name.partition(".")[2]
+                    quantity = find_quantity(name, plant=self.plant)
+                    word = next((f'"{w}"' for w, number in quantity.words.items() if number == value), repr(value))
+                    remark = "" if heading and name in own else (remarks or {}).get(name, "")  # a fitted value's, once
+                    notes = [note for note in (quantity.unit, remark) if note not in ("", "1")]
+                    lines.append(f"{tail} = {word}" + (f"  # {', '.join(notes)}" if notes else ""))
         return "\n".join(lines) + "\n"
 
     def list_names(self) -> list[str]:
@@ -241,12 +238,10 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     Raises:
         InputError: an unknown plant, effect or parameter, or a value that the parameter cannot have.
     """
-    tables = dict(tables)
+    tables = {key: x for key, x in tables.items() if key not in ("provenance", "identify", "plant_sha256")}
     name, effects = tables.pop("name", name), tables.pop("effects", [])
     named = tables.pop("plant", "eha")
     design = tables.pop("design", {})
-    for key in ("provenance", "identify", "plant_sha256"):
-        tables.pop(key, None)
     require(isinstance(name, str) and name, where, "name", f"a text, not {name!r}")
     plant = _find_plant(named, where)
     known = [e.name for e in list_offered_effects(plant)]  # a list, as what stands in a file need not be hashable

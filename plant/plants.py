@@ -9,7 +9,7 @@ import importlib
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -39,7 +39,7 @@ from plant.ports import (
 )
 from plant.quantity import Quantity, make_group
 from plant.segments import Array, Segment, build_profile
-from plant.signals import Signals
+from plant.signals import Signal, Signals
 from plant.state import Sampled
 from plant.tables import read_file
 from plant.user_code import explain_errors, run_file
@@ -140,13 +140,12 @@ class Plant:
         parameters = self.parameters
         if not isinstance(parameters, Mapping):
             parameters = {name_group(cls): cls for cls in parameters}
-        levels = {s.name: s.noise for s in self.signals if isinstance(s.noise, float | int)}
-        if levels:
-            units = {s.name: s.unit for s in self.signals}
-            parameters = {**parameters, "sensors": make_noise_group(levels, units)}
-        named = (s._replace(noise=f"sensors.{s.name}_noise") if s.name in levels else s
-                 for s in self.signals if s.role != "time")
-        for key, value in (("parameters", parameters), ("signals", Signals(*named))):
+        noisy = [s for s in self.signals if isinstance(s.noise, float | int)]
+        signals = Signals(*(s._replace(noise=f"sensors.{s.name}_noise") if s in noisy else s
+                            for s in self.signals if s.role != "time"))
+        if noisy:
+            parameters = {**parameters, "sensors": make_noise_group(noisy)}
+        for key, value in (("parameters", parameters), ("signals", signals)):
             object.__setattr__(self, key, value)
 
     @property
@@ -381,12 +380,11 @@ def name_group(cls: type[Any]) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
 
 
-def make_noise_group(levels: Mapping[str, float], units: Mapping[str, str]) -> type[Any]:
-    """The group `sensors` of a plant whose signals give the noise of their sensors as numbers."""
-    fields = {f"{name}_noise": Quantity(f"{units[name]} rms", low=0, high=max(1.0, 1e4 * level))
-              for name, level in levels.items()}
+def make_noise_group(signals: Sequence[Signal]) -> type[Any]:
+    """The group `sensors` of a plant whose `signals` give the noise of their sensors as numbers."""
+    fields = {f"{s.name}_noise": Quantity(f"{s.unit} rms", low=0, high=max(1.0, 1e4 * s.noise)) for s in signals}
     return make_group("Sensors", "White noise of the sensors, one sample a cycle.", fields, __name__,
-                      map(float, levels.values()))
+                      [float(s.noise) for s in signals])
 
 
 def effect(port: str, group: Group, **more: Any) -> Callable[[Function], Function]:

@@ -8,7 +8,7 @@ here pass the signal unchanged; a model's kernels are compiled with its effects 
 from collections import namedtuple
 from collections.abc import Iterable, Sequence
 from itertools import count
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from plant.compile import Function, bind_later, raise_unbound, rebind_names
 from plant.kernels import write_function
@@ -66,8 +66,7 @@ PORTS: dict[str, Port] = {name[3:]: value.port for name, value in list(globals()
 
 def make_memory_type(names: Sequence[str]) -> type[Any]:
     """The memories of all effects of a plant with these ports: a NamedTuple with a field for each port."""
-    make: Any = namedtuple
-    made: type[Any] = make("Memory", names)
+    made = cast("type[Any]", namedtuple("Memory", names))
     made.holds_memories = True
     return made
 

@@ -7,7 +7,7 @@ A parameter group is a NamedTuple whose fields are `Annotated[float, Quantity(..
 import math
 from collections import namedtuple
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
+from typing import Annotated, Any, NamedTuple, cast, get_args, get_type_hints
 
 
 class Quantity(NamedTuple):
@@ -79,8 +79,7 @@ _KNOWN_GROUPS: dict[type[Any], Mapping[str, Quantity]] = {}
 def make_group(name: str, meaning: str, fields: Mapping[str, Quantity], module: str, values: Iterable[float] = ()
                ) -> type[Any]:
     """A parameter group from a table of its fields; `module` has it as `name`, `values` are the nominal ones."""
-    make: Any = namedtuple
-    made: type[Any] = make(name, fields, defaults=values, module=module)
+    made = cast("type[Any]", namedtuple(name, fields, defaults=values, module=module))
     made.__annotations__ = {field: Annotated[float, q] for field, q in fields.items()}
     made.__doc__ = meaning
     return made

@@ -210,8 +210,7 @@ class Csv(Segment):
         return len(self.values) / self.rate
 
     def demand(self, t: Array, last: float) -> Array:
-        values: Array = np.array((*self.values, self.values[-1]))[np.rint(t * self.rate).astype(int)]
-        return values
+        return np.take((*self.values, self.values[-1]), np.rint(t * self.rate).astype(int))
 
 
 KINDS: dict[str, type[Segment]] = {

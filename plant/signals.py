@@ -1,8 +1,7 @@
 """The signals of a plant, as it declares them: what commands it, what drives it, what of it is measured."""
-from __future__ import annotations
 
 from math import inf
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from plant.errors import require
 from plant.units import UNITS
@@ -63,7 +62,7 @@ class Signal(NamedTuple):
 class Signals(tuple[Signal, ...]):
     """The signals of one plant in the order of its columns, `t` first."""
 
-    def __new__(cls, *declared: Signal) -> Signals:
+    def __new__(cls, *declared: Signal) -> Self:
         """The signals with time in front.
 
         Raises:
@@ -101,8 +100,7 @@ class Signals(tuple[Signal, ...]):
     @property
     def required(self) -> tuple[str, ...]:
         """Names of those without which nothing can be replayed: command, controlled signal, drive; in their order."""
-        needed = {self.command.name, self.controlled.name, self.drive.name}
-        return tuple(name for name in self.names if name in needed)
+        return tuple(s.name for s in self if s in (self.command, self.controlled, self.drive))
 
     @property
     def command(self) -> Signal:

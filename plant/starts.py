@@ -134,19 +134,19 @@ def compute_changes(effect: Effect, values: Sequence[Mapping[str, float]], comma
         return out[1:] - out[:1]
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def compute_rms(change: Array) -> Array:
     """RMS of each column of a `change` (m, n, outputs), SI, (m, outputs); infinite where the simulation diverged."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        square: Array = (change**2).mean(axis=1)
+    square: Array = (change**2).mean(axis=1)
     return np.sqrt(np.nan_to_num(square, nan=np.inf, posinf=np.inf))
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def compute_levels(change: Array, plant: str = "eha") -> Array:
     """RMS of a `change` (m, n, outputs) over the noise of each column's sensor, (m, outputs)."""
     kind = find_plant(plant)
     noise = np.array([kind.nominal.get(s.noise, 0.0) for s in kind.signals.outputs])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        levels: Array = compute_rms(change) / noise
+    levels: Array = compute_rms(change) / noise
     return np.nan_to_num(levels, nan=0.0, posinf=np.inf)
 
 

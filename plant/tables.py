@@ -5,7 +5,6 @@ The dataclass is the schema: its fields are the keys, its annotations the types 
 kinds are told apart by the key `kind` is read by the table of kinds given for it. A field with metadata {"key": False}
 is the program's own, not a key; one with the name `kind` gets the kind.
 """
-from __future__ import annotations
 
 import json
 import re
@@ -17,7 +16,7 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from plant.errors import InputError, report_system_error, show_value
 from plant.quantity import Quantity
@@ -51,7 +50,7 @@ class Place:
     text: str = field(default="", repr=False)
     keys: str = ""
 
-    def at(self, *keys: str | int) -> Place:
+    def at(self, *keys: str | int) -> Self:
         """The place below this one."""
         path = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
         return replace(self, keys=(self.keys + path).lstrip("."))

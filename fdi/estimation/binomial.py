@@ -1,5 +1,4 @@
 """Shares: counted successes with the exact interval of their probability."""
-from __future__ import annotations
 
 import math
 from typing import NamedTuple

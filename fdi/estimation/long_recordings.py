@@ -10,7 +10,6 @@ the other, each time the one with which the determinant of the information matri
 Fedorov, "Theory of Optimal Experiments", 1972). One more piece is taken where the model fits worst: what is missing may
 act there alone.
 """
-from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -175,10 +174,8 @@ def _choose_pieces(information: Floats, full: Flags) -> list[int]:
     alike = 20.0  # neighbouring samples that say the same thing
     total, chosen = np.eye(information.shape[1]), list[int]()
     for _ in range(min(PIECES, int(full.sum()))):
-        gains = np.full(len(information), -np.inf)
-        for k in np.flatnonzero(full):
-            if k not in chosen:
-                gains[k] = np.linalg.slogdet(total + information[k] / alike)[1]
+        gains = np.where(full, np.linalg.slogdet(total + information / alike)[1], -np.inf)
+        gains[chosen] = -np.inf
         chosen.append(int(np.argmax(gains)))
         total = total + information[chosen[-1]] / alike
     return chosen
@@ -273,14 +270,13 @@ def judge_on_all(problem: Problem, fits: Sequence[Fit], trace: Trace, steps: int
              for fit in fits]
     values = np.array([[own.get(name, problem.model[name]) for name in names] for own in found])
     lanes = Lanes(problem.model, names, steps)
-    period, outputs = trace.period, trace.output_columns
     squares, counts = [], []
     turns = replay_in_turns(lanes, limit_dynamic_friction(names, values), trace, trace.anchor, problem.anchor)
     for first, out in turns:
         seen = trace.measurements[:, first:first + out.shape[1]]
-        left = np.ascontiguousarray(out.transpose(0, 2, 1)[:, outputs] - seen)
+        left = np.ascontiguousarray(out.transpose(0, 2, 1)[:, trace.output_columns] - seen)
         if seen.shape[1] > BLOCK:
-            remove_mains(left, 0, seen.shape[1], period, np.full(len(seen), np.inf))
+            remove_mains(left, 0, seen.shape[1], trace.period, np.full(len(seen), np.inf))
         squares.append(sum_blocks(np.nan_to_num(left)))
         counts.append(sum_blocks((~np.isnan(seen)).astype(float)))
     blocks, count = np.concatenate(squares, axis=-1), np.concatenate(counts, axis=-1)

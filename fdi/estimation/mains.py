@@ -4,7 +4,6 @@ every run, so no repeat tells it from physics.
 All residuals of a fit pass this. What is done once a value is compiled: it takes an eighth of the time of array
 expressions, and holds no other thread.
 """
-from __future__ import annotations
 
 import math
 from functools import cache

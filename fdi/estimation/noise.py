@@ -7,7 +7,6 @@ difference, the quietest first, and on upward as long as they are as large as th
 the same phase in every run (the mains start the test, or the test waits for them) is in the difference no more;
 its lines are measured in the quiet windows of each run and added.
 """
-from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -59,12 +58,8 @@ def find_floors(residual: Mapping[str, Floats], repeats: Sequence[Mapping[str, F
 
     Rows correspond; NaN is a missing sample. Signals that no repeat has are left out. Lengths may differ at the end.
     """
-    out = {}
-    for name, r in residual.items():
-        others = [other[name] for other in repeats if name in other]
-        if others:
-            out[name] = floor_from_repeats(r, others, period)
-    return out
+    others = {name: [repeat[name] for repeat in repeats if name in repeat] for name in residual}
+    return {name: floor_from_repeats(residual[name], own, period) for name, own in others.items() if own}
 
 
 def floor_from_repeats(residual: Floats, repeats: Sequence[Floats], period: float = 1e-3) -> Floor:
@@ -101,8 +96,8 @@ def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
     taken_over = compute_anchor_noise(trace, model)
     for name in trace.outputs:
         signal, seen = trace.declared.find(name), floor_from_data(trace.mask_unusable(name))
-        given = model.values.get(signal.noise, 0.0)
-        given = simulate_reading_noise(model, trace.controlled) if signal == trace.declared.controlled else given
+        given = (simulate_reading_noise(model, trace.controlled) if signal == trace.declared.controlled else
+                 model.values.get(signal.noise, 0.0))
         share = 1.0
         if name in trace.sensors:
             given = trace.sensors[name].measure_noise(given)
@@ -164,11 +159,11 @@ def simulate_reading_noise(model: Model, controlled: Floats) -> float:
 
 def describe_doubtful_repeats(floor: Mapping[str, Floor], noise: Mapping[str, Floor], signals: Signals) -> str:
     """What makes a noise floor from repeats larger than the sensors' own noise explains; empty if nothing does."""
-    def limit(name: str) -> float:  # the data's own noise is a lower bound: coloured noise has less of it
-        return REPEAT_FLOOR_RATIO * (LOWER_BOUND_ERROR_RATIO if noise[name].lower_bound else 1.0)
-
+    # the data's own noise is a lower bound: coloured noise has less of it
+    limits = {name: REPEAT_FLOOR_RATIO * (LOWER_BOUND_ERROR_RATIO if own.lower_bound else 1.0) * own.value
+              for name, own in noise.items()}
     above = [f"{signals.find(name).symbol} by {f.value / noise[name].value:.2g}" for name, f in floor.items()
-             if f.source == "repeats" and f.value > limit(name) * noise[name].value]
+             if f.source == "repeats" and f.value > limits[name]]
     if not above:
         return ""
     return (f"the repeats differ by more than the noise of the sensors: {', '.join(above)} times. Use repeats of the "
@@ -209,13 +204,11 @@ def measure_quiet_level(noise: Sequence[Floats], window: int = WINDOW) -> tuple[
 
 def _mean_square(part: float, freedom: float) -> float:
     """The mean square that this part of all windows stays below: chi-squared over its degrees of freedom."""
-    half: float = gammaincinv(freedom / 2, part)
-    return 2.0 * float(half) / freedom
+    return 2.0 * float(gammaincinv(freedom / 2, part)) / freedom
 
 
 def _cut_windows(x: Floats, window: int) -> Floats:
-    n = len(x) // window * window
-    return x[:n].reshape(-1, window)
+    return x[:len(x) // window * window].reshape(-1, window)
 
 
 def measure_freedom(x: Floats) -> float:
@@ -287,15 +280,11 @@ class Noise(NamedTuple):
     filter: Floats  # (p + 1,) coefficients, first 1: e_k = sum_i filter_i r_{k-i} is white
     innovation: float  # standard deviation of e
 
-    def whiten(self, residual: Floats) -> Floats:
-        """Residuals, (.., n), time last, as white noise of variance 1; NaN (nothing measured) gives 0."""
-        rows = np.ascontiguousarray(residual, float).reshape(-1, 1, residual.shape[-1])
-        white = np.empty_like(rows)
-        self.whiten_signal(rows, 0, white)
-        return white.reshape(residual.shape)
-
     def whiten_signal(self, residuals: Floats, signal: int, white: Floats) -> None:
-        """Fill one signal of `white` (m, s, n) with that of the residuals (m, s, n), as `whiten` does."""
+        """Fill one signal of `white` (m, s, n) with that of the residuals (m, s, n), as white noise of variance 1.
+
+        NaN (nothing measured) gives 0.
+        """
         _compile_filter()(residuals, signal, self.filter / self.innovation, white)
 
 

@@ -10,7 +10,6 @@ Could the residual be nothing but scatter from one unit to the next? `fit_scatte
 model, each parameter tied to its value by its own tolerance, and judges by a replay and not by the linear forecast.
 `rig explain` does the same with every effect beside it.
 """
-from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
@@ -161,8 +160,7 @@ def guess_current(trace: Trace) -> list[Floats]:
     """
     if not trace.filled.any():
         return []
-    there = np.flatnonzero(~trace.filled)
-    odd = there[1::2]
+    odd = np.flatnonzero(~trace.filled)[1::2]
     thinned = trace.drive.copy()
     thinned[trace.filled], thinned[odd] = np.nan, np.nan
     again, lost = bridge_gaps(thinned, len(trace))
@@ -374,8 +372,7 @@ def replay_command(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> Col
     """Residuals, measured less model, of the chosen signals and the drive in a run from the command alone, no noise."""
     rest_time = 1.0  # s at the first demand, before a closed-loop replay begins
     before = round(rest_time / trace.period)
-    command = np.concatenate([np.full(before, trace.command[0]), trace.command])
-    load = np.concatenate([np.full(before, trace.load[0]), trace.load])
+    command, load = (np.pad(x, (before, 0), "edge") for x in (trace.command, trace.load))
     lanes = Lanes(silence_sensors(model), (), steps)
     out = lanes.closed_loop(np.empty((1, 0)), command, load)[0]
     drive = trace.declared.drive.name
@@ -661,17 +658,16 @@ def _check_signals(trace: Trace, model: Model, chosen: Sequence[str], source: ob
 
 def _take_rows(trace: Trace, chosen: Sequence[str]) -> Trace:
     """The recording row by row, nothing filled yet; of the outputs only those chosen, and the controlled one."""
-    notes = []
     grid = trace.t[0] + trace.period * np.arange(len(trace))
     jitter = float(np.abs(trace.t - grid).max())
     if jitter > 0.1 * trace.period:
-        notes.append(f"times are up to {1e3 * jitter:.2g} ms off an even grid; each row is taken as one cycle")
+        trace = trace.with_notes(
+            f"times are up to {1e3 * jitter:.2g} ms off an even grid; each row is taken as one cycle")
     nothing = np.full(len(trace), np.nan)
     # the controller's block and the anchor of a replay need the controlled signal, chosen or not
     left_out = {name: nothing for name in trace.output_names[1:] if name not in chosen}
     return trace.with_columns(left_out, filled=np.zeros(len(trace), bool), incomplete=_find_incomplete(trace),
-                              outputs=tuple(chosen),
-                              notes=(*trace.notes, *notes))
+                              outputs=tuple(chosen))
 
 
 def _find_incomplete(trace: Trace) -> Flags:
@@ -806,9 +802,9 @@ def _starts_in_motion(trace: Trace, rows: int = 16, fast: float = 2e-3) -> bool:
     first = trace.controlled[:rows]
     if len(first) < rows or np.isnan(first).any():
         return False
-    k = np.arange(rows)
-    parabola = np.linalg.pinv(np.vander(k.astype(float), 3, increasing=True))
-    noise = float(np.linalg.norm(first - np.vander(k.astype(float), 3, increasing=True) @ (parabola @ first)))
+    powers = np.vander(np.arange(float(rows)), 3, increasing=True)
+    parabola = np.linalg.pinv(powers)
+    noise = float(np.linalg.norm(first - powers @ (parabola @ first)))
     certain = 5.0 * noise / math.sqrt(rows - 3) * float(np.linalg.norm(parabola[1]))
     return abs(float(parabola[1] @ first)) > max(fast * trace.scale * trace.period, certain)
 
