@@ -1,7 +1,7 @@
 """Model against measurement: how large the error is beside what noise explains, where, when, and in which block."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -115,19 +115,18 @@ def compare_controller(trace: Trace, model: Model) -> ControllerBlock:
     limit = model.values.get(model.kind.signals.drive.limit, math.inf)
     if not model.kind.controller:
         return ControllerBlock(math.nan, math.nan, limit=limit)
-    found = _compare_at_lags(trace, model, 0, 0)
+    found = _compare_at_lags(trace, model, limit, 0, 0)
     if not found.ratio > CONTROLLER_ERROR_RATIO:  # or it cannot be told
         return found
     com, xj, gain = find_lags(trace, limit)
     found = found._replace(gain=gain)
     if (com, xj) == (0, 0):
         return found
-    late = _compare_at_lags(trace, model, com, xj)
+    late = _compare_at_lags(trace, model, limit, com, xj)
     return late._replace(gain=gain) if late.error < CONTROLLER_LAG_RATIO * found.error else found
 
 
-def _compare_at_lags(trace: Trace, model: Model, com: int, xj: int) -> ControllerBlock:
-    limit = model.values.get(model.kind.signals.drive.limit, math.inf)
+def _compare_at_lags(trace: Trace, model: Model, limit: float, com: int, xj: int) -> ControllerBlock:
     sensed = shift_rows(trace.controlled, xj)
     residual = trace.drive - answer_readings(model, trace, shift_rows(trace.command, com), hold_last(sensed))
     unknown = np.isnan(sensed) | np.isnan(residual) | ~trace.usable
@@ -377,10 +376,10 @@ def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place],
     local = [p for p in sections if p.ratio > SIGNAL_ERROR_RATIO + SECTION_ERROR_SD / math.sqrt(
         max(1.0, 2 * least * (p.t1 - p.t0) / period))]
     if not (above or local or _list_blocks_above(ratios, table)):
-        apart = [_describe_apart(s.signal, s.floor) for s in table.values() if _is_apart(s.floor)]
+        apart = _list_apart((s.signal, s.floor) for s in table.values())
         if apart and not doubtful:
             doubtful = (f"the model fits this trace but not its repeat: they differ by more than noise "
-                        f"({', '.join(apart)} noise floors). Use repeats of the same unit")
+                        f"({apart} noise floors). Use repeats of the same unit")
         return ("CANNOT_TELL", doubtful) if doubtful else ("WITHIN_FLOOR", "")
     edgy = float(replay.undecided.mean())
     doubt = ""
@@ -401,8 +400,8 @@ def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace, off_al
                 for name, sensor in trace.sensors.items() if name in trace.outputs)
     if trace.filtered:
         yield f"flow and force are not balanced: {', '.join(trace.filtered)} is filtered by its sensor"
-    if apart := [_describe_apart(trace.declared.find(name), f) for name, f in floor.items() if _is_apart(f)]:
-        yield f"the error differs between the repeats, as with stick-slip: {', '.join(apart)} noise floors"
+    if apart := _list_apart((trace.declared.find(name), f) for name, f in floor.items()):
+        yield f"the error differs between the repeats, as with stick-slip: {apart} noise floors"
     if replay.undecided.any() and replay.undecided.mean() <= UNDECIDED_SHARE:
         seconds, alone = (float(rows.sum()) * trace.period for rows in (replay.undecided & ~off_alone, off_alone))
         if seconds:
@@ -412,13 +411,10 @@ def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace, off_al
             yield f"{alone:.1f} s are not judged: this run is off there, and a repeat is at the noise floor"
 
 
-def _is_apart(floor: Floor) -> bool:
-    """Whether the repeats differ by more than the floor."""
-    return floor.source == "repeats" and floor.difference > REPEAT_DIFFERENCE_RATIO * floor.value
-
-
-def _describe_apart(signal: Signal, floor: Floor) -> str:
-    return f"{signal.symbol} by {floor.difference / floor.value:.2g}"
+def _list_apart(floors: Iterable[tuple[Signal, Floor]]) -> str:
+    """The signals in which the repeats differ by more than the floor, and by how much; "" for none."""
+    return ", ".join(f"{signal.symbol} by {floor.difference / floor.value:.2g}" for signal, floor in floors
+                     if floor.source == "repeats" and floor.difference > REPEAT_DIFFERENCE_RATIO * floor.value)
 
 
 def _describe_cause(replay: Replay) -> str:

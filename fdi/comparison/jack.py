@@ -98,8 +98,7 @@ def _compute_force_residual(trace: Trace, model: Model, p12: Floats, xj: Floats,
     turned |= np.roll(turned, -size) | ~_find_resolved(speed, trace.period)
     pushed = np.abs(np.diff(trace.load, prepend=trace.load[0])) > PUSH * model["jack.area"]
     turned |= extend_flags(pushed, size)  # a step of the known load: the speed changes within a sample
-    out: Floats = p12 - (takes + direction * dynamic) / model["jack.area"]
-    return np.where((direction == 0.0) | turned, np.nan, out)
+    return np.where((direction == 0.0) | turned, np.nan, p12 - (takes + direction * dynamic) / model["jack.area"])
 
 
 def _find_resolved(speed: Floats, period: float) -> Flags:
@@ -160,8 +159,8 @@ def _measure_remainders(y: Floats, columns: list[Floats], first: int
         part = gram[pick, -1]
         return float(size[-1]) * math.sqrt(max(0.0, 1.0 - float(part @ inverse @ part)))
 
-    parts = slice(0, first), slice(first, -1), slice(first, first + 1), slice(0, -1)
-    return float(size[-1]), tuple(measure_remainder(part) for part in parts)  # type: ignore[return-value]
+    return float(size[-1]), (measure_remainder(slice(0, first)), measure_remainder(slice(first, -1)),
+                             measure_remainder(slice(first, first + 1)), measure_remainder(slice(0, -1)))
 
 
 def _list_rate_shapes(xs: Floats, p12: Floats) -> list[Floats]:
@@ -202,7 +201,7 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
         floor[name] = float(np.fmax(floor[name], f.value))
     known = [trace.column(name) if name in trace.outputs else run[name] for name in (XS, P12)]
     xs, p12 = (bridge_gaps(column, BRIDGED_ROWS)[0] for column in known)
-    if (~np.isnan(b.way)).sum() < FEWEST_FORCE_ROWS or not floor.get("way", 0.0) > 0.0:
+    if (~np.isnan(b.way)).sum() < FEWEST_FORCE_ROWS or not floor["way"] > 0.0:
         return {}
     is_noisy = (XJ in level
                 and floor_from_data(trace.mask_unusable(XJ)).value > NOISY_SENSOR_RATIO * level[XJ])
@@ -210,7 +209,7 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     flow = flow if XS in trace.outputs else max(flow, sensor)
     most_missing = 0.2  # of the rows; where more are missing, accelerations are guesses
     is_enough = (~np.isnan(b.force)).sum() >= FEWEST_FORCE_ROWS and trace.filled.mean() < most_missing
-    is_told = is_enough and floor.get("force", 0.0) > 0.0
+    is_told = is_enough and floor["force"] > 0.0
     return {"flow": flow, "force": rms(b.force) / floor["force"] if is_told else None, "sensor": sensor,
             "gain": b.gain}
 

@@ -81,8 +81,7 @@ def combine_residuals(residual: Columns, floor: Mapping[str, float]) -> Floats:
     """Squared error over squared floor, mean of the signals, (n,); 1 on average where only noise is left."""
     stack = np.array([(residual[name] / floor[name]) ** 2 for name in residual if floor.get(name, 0.0) > 0.0])
     there = ~np.isnan(stack)
-    total = np.where(there, stack, 0.0).sum(axis=0)
-    return np.where(there.any(axis=0), total / np.maximum(there.sum(axis=0), 1), np.nan)
+    return np.where(there.any(axis=0), np.nansum(stack, axis=0) / np.maximum(there.sum(axis=0), 1), np.nan)
 
 
 def locate_error(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Place]:

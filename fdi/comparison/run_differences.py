@@ -256,8 +256,7 @@ def _find_common_rows(rows: _Rows) -> Flags:
     """The rows in which both commands are known and equal."""
     first, second = rows.sample(rows.reference.declared.command.name)
     with np.errstate(invalid="ignore"):
-        agrees: Flags = np.abs(first - second) <= SAME_COMMAND * rows.reference.scale
-    return agrees
+        return np.asarray(np.abs(first - second) <= SAME_COMMAND * rows.reference.scale)
 
 
 def _list_notes(reference: Run, other: Run, offset: float, agrees: Flags, is_same: bool) -> Iterator[str]:
@@ -316,9 +315,6 @@ def match_checks(checks_of_runs: Sequence[Sequence[CheckResult]]) -> list[Matche
 
 
 def _number_checks(checks: Sequence[CheckResult]) -> dict[tuple[str, int], CheckResult]:
-    out: dict[tuple[str, int], CheckResult] = {}
-    count: dict[str, int] = {}
-    for check in checks:
-        out[check.name, count.setdefault(check.name, 0)] = check
-        count[check.name] += 1
-    return out
+    """The checks by their name and how many of that name come before them."""
+    names = [check.name for check in checks]
+    return {(check.name, names[:i].count(check.name)): check for i, check in enumerate(checks)}

@@ -59,7 +59,7 @@ from fdi.thresholds import (
     UNIT_TOLERANCE,
 )
 from fdi.trace import Trace
-from plant import InputError, Model, load_model
+from plant import InputError, Model, load_model, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,10 +177,9 @@ def _choose_pairs(faults: Sequence[Fault], sizes: Mapping[str, Estimate], levels
 
 def _require_bands_of(bands: Bands, model: Model, faults: Sequence[Fault]) -> Bands:
     """Bands of another unit, or of none of these faults, are refused."""
-    if not any(own.is_of(fault) for own in bands.faults for fault in faults):
-        names = ", ".join(own.name for own in bands.faults)
-        raise InputError("--bands", f"of {names}", "bands of one of these faults with the same limits; rig fdi "
-                                                   "--learn-bands --faults FILE makes them")
+    require(any(own.is_of(fault) for own in bands.faults for fault in faults), "--bands",
+            f"of {', '.join(own.name for own in bands.faults)}",
+            "bands of one of these faults with the same limits; rig fdi --learn-bands --faults FILE makes them")
     if other := describe_other_model(bands, model):
         design = ", ".join(f"{name} = {value:g}" for name, value in list_design(model, bands.faults).items())
         raise InputError("--bands", f"made for {other}", f"bands of the model of this diagnosis, {model.name}"

@@ -16,7 +16,7 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 from fdi.thresholds import ABSENT_FAULT_SHARE, ACCEPTABLE_INTERVAL_FACTOR, INTERVAL_95_SD
-from plant import Fault, InputError, Plant, find_plant, place_faults, read_faults, require
+from plant import Fault, Plant, find_plant, place_faults, read_faults, require
 
 __all__ = ["CLOGGING", "FAULTS", "FRICTION", "Estimate", "Fault", "Level", "choose_faults", "classify_size",
            "compute_severity", "find_ruling_fault", "judge_size", "list_fault_files", "load_faults"]
@@ -61,8 +61,7 @@ def load_faults(source: str | Path = "paper", kind: Plant | None = None) -> tupl
     kind = kind or find_plant("eha")
     if str(source) in list_fault_files():
         return _load_shipped_faults(str(source), kind)
-    if not Path(source).is_file():
-        raise InputError("--faults", str(source), f"a fault file, or one of {', '.join(list_fault_files())}")
+    require(Path(source).is_file(), "--faults", str(source), f"a fault file, or one of {', '.join(list_fault_files())}")
     return read_faults(Path(source), kind)
 
 

@@ -179,15 +179,14 @@ def _make_step_band(number: int, s: Section, period: float, sound: Floats, rubbi
 
     Shifts and spreads are taken at knots that are KNOT_CYCLES apart, with straight lines between them.
     """
-    settling = dict(measure_step(sound[:, s.start:s.stop], s, period))["settling_time"]
+    settling = measure_step(sound[:, s.start:s.stop], s, period)["settling_time"]
     until = max(STEP_JUDGED_UNTIL, 2.0 * float(np.nan_to_num(np.nanmedian(settling))))
     first, stop = round(STEP_JUDGED_FROM / period), min(round(until / period) + 1, s.stop - s.start)
     fine = np.arange(first, stop)
     knots = np.unique(np.r_[fine[::KNOT_CYCLES], fine[-1:]])
 
     def interpolate(values: Floats) -> Floats:
-        line: Floats = np.interp(fine, knots, values[knots - first])
-        return line
+        return np.asarray(np.interp(fine, knots, values[knots - first]))
 
     def cut(runs: Floats) -> Floats:
         return runs[:, s.start + first:s.start + stop]

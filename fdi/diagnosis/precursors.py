@@ -7,7 +7,7 @@ between percentiles, and a reversal counts when it passes a quarter of the usual
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -176,10 +176,10 @@ def compute_features(com: Floats, x: Floats, period: float, parts: Sequence[Sect
         if s.kind == "step" and abs(s.last - s.first) >= least_step * scale:
             of_size, factor = _choose_size_unit(unit)
             size = f"{factor * abs(s.last - s.first):.3g}{of_size}"
-            for word, values in measure_step(x[:, rows], s, period):
+            for word, values in measure_step(x[:, rows], s, period).items():
                 out.setdefault(word if word == "rest_error" else f"{word}_{size}", []).append(values)
         elif is_slow_ramp(s, period, scale):
-            for word, values in _measure_ramp_response(com, x, period, s):
+            for word, values in _measure_ramp_response(com, x, period, s).items():
                 out.setdefault(word, []).append(values)
         elif s.kind == "dynamic":
             out.setdefault("tracking_error", []).append(np.sqrt(np.nanmean((com[rows] - x[:, rows])**2, axis=1)))
@@ -191,14 +191,13 @@ def is_slow_ramp(s: Section, period: float, scale: float = 1.0, fastest: float =
     """Whether a section is a ramp that shows friction: below `fastest` m/s by the `scale` of `Trace.scale`, and several
     slips (`lasting` s) long.
     """
-    if s.kind != "ramp" or abs(s.rate) >= fastest * scale:
-        return False
-    return bool(s.stop - select_ramp_rows(s, period).start > lasting / period)
+    return (s.kind == "ramp" and abs(s.rate) < fastest * scale
+            and bool(s.stop - select_ramp_rows(s, period).start > lasting / period))
 
 
 def measure_step(x: Floats, s: Section, period: float, settling_band: float = 0.05, settled_for: float = 0.05,
-                 at_rest_after: float = 0.25) -> Iterator[tuple[str, Floats]]:
-    """Response of (m, rows) to one step.
+                 at_rest_after: float = 0.25) -> dict[str, Floats]:
+    """Response of (m, rows) to one step, by precursor.
 
     A run has settled once it stays within `settling_band` of the step for `settled_for` s, as an oscillation passes
     through the band now and then. `at_rest_after` s after the step it should be at rest.
@@ -208,29 +207,28 @@ def measure_step(x: Floats, s: Section, period: float, settling_band: float = 0.
     if np.median(y[:, :horizon].max(axis=1)) < 0.9:  # a slow plant
         horizon = rows
     peak = np.argmax(y[:, :horizon], axis=1)
-    yield "overshoot", 100 * (y[np.arange(len(y)), peak] - 1)
     lowest = np.where(np.arange(horizon) > peak[:, None], y[:, :horizon], np.inf).min(axis=1)
-    yield "undershoot", np.where(np.isfinite(lowest), 100 * (1 - lowest), np.nan)
     outside = np.abs(y - 1) > settling_band
     last = rows - 1 - np.argmax(outside[:, ::-1], axis=1)
     needed = settled_for / period if rows > 2 * settled_for / period else 1
     is_settled = rows - 1 - last >= needed
-    yield "settling_time", np.where(is_settled, (last + 1) * period, np.nan)
+    found = {"overshoot": 100 * (y[np.arange(len(y)), peak] - 1),
+             "undershoot": np.where(np.isfinite(lowest), 100 * (1 - lowest), np.nan),
+             "settling_time": np.where(is_settled, (last + 1) * period, np.nan)}
     if (resting := round(at_rest_after / period)) < rows:
-        yield "rest_error", np.sqrt(np.nanmean((x[:, resting:] - s.last)**2, axis=1))
+        found["rest_error"] = np.sqrt(np.nanmean((x[:, resting:] - s.last)**2, axis=1))
+    return found
 
 
-def _measure_ramp_response(com: Floats, x: Floats, period: float, s: Section) -> Iterator[tuple[str, Floats]]:
-    """Response of (m, n) to a slow ramp, on which the plant sticks and slips."""
+def _measure_ramp_response(com: Floats, x: Floats, period: float, s: Section) -> dict[str, Floats]:
+    """Response of (m, n) to a slow ramp, on which the plant sticks and slips, by precursor."""
     rows = select_ramp_rows(s, period)
     error = np.sign(s.rate) * (com[rows] - x[:, rows])
-    yield "mean_ramp_error", np.nanmean(error, axis=1)
     half = compute_half_range(error)
-    yield "break_away", half
     amplitude, frequency = _measure_oscillation(filter_median(error, 1.0 / period), half, period)
-    yield "stick_slip_amplitude", amplitude
-    yield "stick_slip_frequency", frequency
-    yield "speed_ripple", np.nanstd(compute_speed(x, 1.0 / period)[:, rows], axis=1)
+    return {"mean_ramp_error": np.nanmean(error, axis=1), "break_away": half, "stick_slip_amplitude": amplitude,
+            "stick_slip_frequency": frequency,
+            "speed_ripple": np.nanstd(compute_speed(x, 1.0 / period)[:, rows], axis=1)}
 
 
 def _measure_oscillation(error: Floats, half: Floats, period: float) -> tuple[Floats, Floats]:

@@ -400,9 +400,8 @@ def refine_sizes(model: Model, trace: Trace, starts: Sequence[Sizes] | None = No
     free = list_unknowns(problem.model, faults)
     if problem.model.kind.correct is not None:
         problem = _allow_observer_noise(problem, free)
-    first = _fit_coarsely(problem, free, starts or list_coarse_starts(faults))
-    problem = learn_left_noise(problem, first)
-    last = first
+    last = _fit_coarsely(problem, free, starts or list_coarse_starts(faults))
+    problem = learn_left_noise(problem, last)
     for _ in range(2 if problem.model.kind.correct is not None else 0):  # an observer's stops hang on the noise
         problem = _leave_out_stops(problem, last)
         last = _fit_finely(problem, last)
@@ -442,8 +441,8 @@ def _allow_observer_noise(problem: CountedProblem, free: Sequence[Free]) -> Coun
     The observer takes that noise for a speed, and the replayed speed has it, too.
     """
     trace, floor, controlled = problem.trace, list_floors(problem), problem.trace.declared.controlled.name
-    x = make_healthy_start(problem, free)[None]
-    names, values = [f.name for f in free], problem.convert_unknowns(free, x)
+    names = [f.name for f in free]
+    values = problem.convert_unknowns(free, make_healthy_start(problem, free)[None])
     for noise in guess_anchor_noise(trace, problem.model, floor):
         shaken = replace(problem, trace=trace.with_columns({controlled: trace.controlled + noise}), _lanes={})
         moved = compute_typical_rms((shaken.predict_outputs(names, values) - problem.predict_outputs(names, values))[0])
@@ -476,10 +475,9 @@ def _fit_finely(problem: CountedProblem, first: Fit) -> Fit:
         last = descend_valley(fine, last, rounds, problem.find_flat(first.free, last.x), problem.stage)
         if is_noise_left(problem, last):
             return last
-    signals = problem.trace.outputs
     for parts in ((1.0, 0.5), (0.75, -0.25), (0.25, 1.25)):
-        ratios = dict(zip(signals, measure_ratios(problem, last), strict=True))
-        if is_noise_left(problem, last) or any(x > find_hopeless_ratio(problem.trace, s) for s, x in ratios.items()):
+        ratios = zip(problem.trace.outputs, measure_ratios(problem, last), strict=True)
+        if is_noise_left(problem, last) or any(x > find_hopeless_ratio(problem.trace, s) for s, x in ratios):
             break
         last = _restart_fit(problem, last, parts)
     return last

@@ -73,7 +73,7 @@ class Grid:
 
 
 def search_grid(trace: Trace, model: Model | None = None, faults: Sequence[Fault] = FAULTS, drive: str = "current",
-                sliding: Sequence[float] = SLIDING_RATIOS, workers: int | None = None) -> Grid:
+                sliding: Sequence[float] = SLIDING_RATIOS) -> Grid:
     """The RMS maps of a trace over all pairs of sizes of two faults.
 
     Args:
@@ -82,7 +82,6 @@ def search_grid(trace: Trace, model: Model | None = None, faults: Sequence[Fault
         faults: two of them; `Fault.axis` has the ends of their axes.
         drive: what drives the plant, the measured "current", or the "command" in closed loop.
         sliding: FDS/FSS of the spool for the monitor to try; the grid is that of the best one.
-        workers: threads.
 
     Raises:
         InputError: a trace that cannot be replayed, a command with neither steps nor ramps, or an unknown drive.
@@ -100,7 +99,7 @@ def search_grid(trace: Trace, model: Model | None = None, faults: Sequence[Fault
     axes = np.linspace(*first.axis, CELLS), np.linspace(*second.axis, CELLS)
     values = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     has_monitor = model.kind.name == "eha" and (first.parameter, second.parameter) == MONITORED
-    runs = _Runs(trace, model, (first, second), drive, rows, workers, has_monitor)
+    runs = _Runs(trace, model, (first, second), drive, rows, has_monitor)
     tried = {ratio: runs.compute_maps(values, ratio) for ratio in (sliding if has_monitor else (1.0,))}
     joint = {ratio: runs.join_maps(maps) for ratio, maps in tried.items()}
     ratio = min(joint, key=lambda ratio: float(joint[ratio].min()))
@@ -135,7 +134,6 @@ class _Runs(NamedTuple):
     faults: tuple[Fault, Fault]
     drive: str
     rows: dict[str, Flags]  # by kind of section
-    workers: int | None
     has_monitor: bool
 
     def compute_maps(self, values: Floats, sliding: float) -> dict[str, Floats]:
@@ -143,7 +141,7 @@ class _Runs(NamedTuple):
         if not self.has_monitor:
             out = np.concatenate([self.run_plant(values[k:k + MOST_RUNS]) for k in range(0, len(values), MOST_RUNS)])
         else:
-            trace, model = self.trace, Monitor(self.model, sliding=sliding, workers=self.workers)
+            trace, model = self.trace, Monitor(self.model, sliding=sliding)
             if self.drive == "command":
                 out = model.closed_loop(values, trace.command, float(trace.anchor[0]), reduced=self.reduce_runs)
             else:
@@ -157,7 +155,7 @@ class _Runs(NamedTuple):
         names = [name for fault in self.faults for name in fault.parameters]
         rows = [[x for fault, size in zip(self.faults, pair, strict=True) for x in fault.list_changes(size).values()]
                 for pair in values.tolist()]
-        lanes = Lanes(model, names, workers=self.workers)
+        lanes = Lanes(model, names)
         out = (lanes.closed_loop(np.array(rows), self.trace.command, self.trace.load) if self.drive == "command" else
                replay_lanes(lanes, np.array(rows), self.trace))
         return self.reduce_runs(out.transpose(0, 2, 1))

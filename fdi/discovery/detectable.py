@@ -7,7 +7,6 @@ run. Without this a size of which the tolerances make up for all but the stops l
 
 Where two explanations fit equally well: which sensor or which command would tell them apart, found by simulation too.
 """
-from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -147,9 +146,8 @@ class VirtualTest:
         begun = np.array([self._list_beginnings(dict(zip(names, row, strict=True))) for row in rows])
         costs, left = self._measure_costs(begun, run)
         best = np.argmin(costs, axis=1)
-        every = np.arange(len(ways))
-        x, white, cost = begun[every, best], left[every, best], costs[every, best]
         still = np.arange(len(ways))
+        x, white, cost = begun[still, best], left[still, best], costs[still, best]
         for _ in range(6):
             still = still[cost[still] - known[still] - with_effect[still] > GAIN_DETECTED]
             if not len(still):
@@ -183,9 +181,8 @@ class VirtualTest:
         In some runs a stop that moves with the solver's step changes all that follows. A fit mends that with small
         changes of the base parameters. So it would with the effect, which counts with its true values otherwise.
         """
-        names = self.names
         row = self.problem.convert_unknowns(self.fit.free, self.fit.x[None])
-        run = self._predict_values(self.simulated, names, row)[0]
+        run = self._predict_values(self.simulated, self.names, row)[0]
         healthy = SimulatedRun(**vars(self.problem), run=run)
         return fit_unknowns(healthy, self.fit.free, self.fit.x, REFIT_ROUNDS).cost - float(self.prior @ self.fit.x**2)
 
@@ -214,8 +211,7 @@ class VirtualTest:
             ratio = (1.0 - values[first]) / (1.0 - held[first]) if first == "filter.clogging" else \
                 values[first] / held[first]
             x = scale_together(self.fit.free, x, way, -float(np.log(max(ratio, 0.01))))
-        both: Floats = np.clip([self.fit.x, x], *self.bounds)
-        return both
+        return np.asarray(np.clip([self.fit.x, x], *self.bounds))
 
     def _list_steps(self, white: Floats, x: Floats) -> Floats:
         """Gauss-Newton steps of the tolerances, (k, p), from whitened residuals (s, n): whole, damped and short."""
@@ -230,11 +226,8 @@ class VirtualTest:
         model = self.problem.model
         names = list(dict.fromkeys([*self.names, *(name for way in ways for name in way.start)]))
         values = {**model.values, **self.fit.values}
-        rows = []
-        for way, size in zip(ways, sizes, strict=True):
-            at = move_effect(model, values, way, size)
-            rows.append([at.get(name, values[name]) for name in names])
-        return names, np.array(rows)
+        moved = [move_effect(model, values, way, size) for way, size in zip(ways, sizes, strict=True)]
+        return names, np.array([[at.get(name, values[name]) for name in names] for at in moved])
 
     def _predict_values(self, problem: Problem, names: Sequence[str], rows: Floats, together: int = 64) -> Floats:
         parts = np.array_split(rows, -(-len(rows) // together))
@@ -247,6 +240,8 @@ class VirtualTest:
 
 
 SECONDS = 3.0
+# A command in words, as segments of a sequence, and as a function of time giving demand and load.
+Command = tuple[str, dict[str, Any], Callable[[Floats], tuple[Floats, Floats]]]
 
 
 class Separation(NamedTuple):
@@ -282,45 +277,31 @@ def find_separation(search: Search, equal: Sequence[Hypothesis]) -> Separation |
     return best
 
 
-def list_commands(trace: Trace) -> list[tuple[str, dict[str, Any], Callable[[Floats], tuple[Floats, Floats]]]]:
-    """Commands to try, in words, as segments of a sequence, and as functions of time giving demand and load.
-
-    They are those of a ram, in m and N, as large as the trace's plant has its motions and loads.
-    """
+def list_commands(trace: Trace) -> list[Command]:
+    """Commands to try: those of a ram, in m and N, as large as the trace's plant has its motions and loads."""
     signal, load_signal = trace.declared.command, trace.declared.load
     push = 5e-3 * (load_signal.largest if load_signal and math.isfinite(load_signal.largest) else 0.0)
 
     def name(amplitude: float) -> str:
         return f"{1e3 * amplitude:g} mm" if signal.unit == "m" else f"{amplitude:.3g} {signal.unit}"
 
-    def sine(amplitude: float, hertz: float, load: float = 0.0) -> Callable[[Floats], tuple[Floats, Floats]]:
-        return lambda t: (amplitude * np.sin(2.0 * np.pi * hertz * t), np.full_like(t, load))
+    def sine(amplitude: float, hertz: float, load: float = 0.0, against: str = "") -> Command:
+        segments = {"main": [{"kind": "sine", "amplitude": amplitude, "frequency": hertz, "time": SECONDS}],
+                    "load": [{"kind": "hold", "time": SECONDS, "value": load}] if load else []}
+        return (f"a sine of {name(amplitude)} at {hertz:g} Hz{against}", segments,
+                lambda t: (amplitude * np.sin(2.0 * np.pi * hertz * t), np.full_like(t, load)))
 
-    def step(to: float, load: float = 0.0) -> Callable[[Floats], tuple[Floats, Floats]]:
-        return lambda t: (np.where((t > 0.3) & (t < 1.8), to, 0.0), np.full_like(t, load))
-
-    def segments(*parts: dict[str, Any], load: float = 0.0) -> dict[str, Any]:
-        return {"main": list(parts), "load": [{"kind": "hold", "time": SECONDS, "value": load}] if load else []}
-
-    def sines(amplitude: float, hertz: float, load: float = 0.0) -> dict[str, Any]:
-        return segments({"kind": "sine", "amplitude": amplitude, "frequency": hertz, "time": SECONDS}, load=load)
-
-    def steps(to: float) -> dict[str, Any]:
-        return segments({"kind": "hold", "time": 0.3}, {"kind": "step", "to": to, "time": 1.5},
-                        {"kind": "step", "to": 0.0, "time": 1.2})
+    def step(words: str, to: float) -> Command:
+        segments = {"main": [{"kind": "hold", "time": 0.3}, {"kind": "step", "to": to, "time": 1.5},
+                             {"kind": "step", "to": 0.0, "time": 1.2}], "load": []}
+        return (f"a step {words} and back", segments,
+                lambda t: (np.where((t > 0.3) & (t < 1.8), to, 0.0), np.zeros_like(t)))
 
     small, middle, wide, far, beyond = (size * trace.scale for size in (2e-4, 2e-3, 3e-3, 20e-3, 45e-3))
-    pushed = f"a sine of {name(wide)} at 1 Hz against a load of "
-    pushed += f"{1e-3 * push:g} kN" if load_signal and load_signal.unit == "N" else f"{push:g}"
-    found = [(f"a sine of {name(middle)} at 10 Hz", sines(middle, 10.0), sine(middle, 10.0)),
-             (f"a sine of {name(small)} at 20 Hz", sines(small, 20.0), sine(small, 20.0)),
-             (f"a sine of {name(far)} at 1 Hz", sines(far, 1.0), sine(far, 1.0)),
-             (f"a step of {name(far)} and back", steps(far), step(far))]
-    if push:
-        found.insert(0, (pushed, sines(wide, 1.0, push), sine(wide, 1.0, push)))
-    if signal.limit:
-        found.append((f"a step into the end stop, {name(beyond)}, and back", steps(beyond), step(beyond)))
-    return found
+    pushed = f"{1e-3 * push:g} kN" if load_signal and load_signal.unit == "N" else f"{push:g}"
+    return [*([sine(wide, 1.0, push, f" against a load of {pushed}")] if push else []),
+            sine(middle, 10.0), sine(small, 20.0), sine(far, 1.0), step(f"of {name(far)}", far),
+            *([step(f"into the end stop, {name(beyond)},", beyond)] if signal.limit else [])]
 
 
 def _same_command(search: Search, h: Hypothesis, signals: tuple[str, ...]) -> Trace:
@@ -336,8 +317,7 @@ def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tu
                       signals: tuple[str, ...]) -> Trace:
     """Another command as a hypothesis predicts it, with the model's own controller."""
     problem = search.problem
-    period = problem.model.values["controller.period"]
-    com, load = play(np.arange(0.0, SECONDS, period))
+    com, load = play(np.arange(0.0, SECONDS, problem.model["controller.period"]))
     names = [f.name for f in h.fit.free]
     return simulate_trace(Lanes(problem.model, names, problem.steps, 1), np.array([h.fit.values[n] for n in names]),
                           com, load, signals)

@@ -39,7 +39,6 @@ from fdi.thresholds import (
     SUSPICIOUS_TOLERANCES,
 )
 from plant import (
-    InputError,
     Lanes,
     Model,
     compile_kernels,
@@ -49,6 +48,7 @@ from plant import (
     list_kernel_variants,
     list_searched_effects,
     report_law_errors,
+    require,
 )
 from plant.effects import CATALOGUE
 
@@ -73,8 +73,8 @@ def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = Non
     Raises:
         InputError: a user's effect that cannot be compiled and run, or a file that cannot be written.
     """
-    if effect_file and not can_balance(runs.model):
-        raise InputError("--write-effect", str(effect_file), f"a plant with known balances; {UNBALANCED}")
+    require(not effect_file or can_balance(runs.model), "--write-effect", str(effect_file),
+            f"a plant with known balances; {UNBALANCED}")
     prepare_effects(runs, progress=progress)
     e = explain_recording(runs, progress)
     is_left, law = e.verdict in PATTERN_VERDICTS, None

@@ -1,5 +1,4 @@
 """The shape of what is missing: a curve over the state it follows, in words, and as an effect file to go on from."""
-from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
@@ -286,8 +285,7 @@ def find_followed_rows(x: Floats, noise: float, share: float = 0.03) -> Flags:
     window = ACCELERATION_WINDOW
     swing = maximum_filter1d(x, 3 * window) - minimum_filter1d(x, 3 * window)
     off = np.abs(x - _smooth(x, window)) > 6.0 * noise + share * swing
-    followed: Flags = ~(maximum_filter1d(off.astype(np.int8), window).astype(bool))
-    return followed
+    return np.asarray(maximum_filter1d(off.astype(np.int8), window) == 0)
 
 
 def measure_way(position: Floats, speed: Floats, least: float = 3e-4) -> Floats:
@@ -297,8 +295,7 @@ def measure_way(position: Floats, speed: Floats, least: float = 3e-4) -> Floats:
     side = moving[last]
     begin = np.maximum.accumulate(np.where(np.diff(side, prepend=side[:1]) != 0.0, np.arange(len(speed)), 0))
     path = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(position)))])
-    way: Floats = path - path[begin]
-    return way
+    return np.asarray(path - path[begin])
 
 
 def find_smooth_rows(trace: Trace) -> Flags:
@@ -326,8 +323,7 @@ def _smooth(x: Floats, window: int, **derivative: float) -> Floats:
     """Cubics through the samples of a window, or their derivative (Savitzky and Golay)."""
     from scipy.signal import savgol_filter  # here, as it takes a second to import
 
-    smooth: Floats = savgol_filter(x, window, 3, **derivative)
-    return smooth
+    return np.asarray(savgol_filter(x, window, 3, **derivative))
 
 
 def _compute_terms(signals: Floats, current: Floats, load: Floats, p: Mapping[str, float], period: float

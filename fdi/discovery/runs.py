@@ -1,5 +1,4 @@
 """Measured runs made ready for a search: one to explain, repeats of its command, and one that no fit sees."""
-from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from fdi.estimation import (
     sensor_floors,
 )
 from fdi.trace import Trace
-from plant import InputError, Model
+from plant import InputError, Model, require
 
 
 class Source(NamedTuple):
@@ -73,8 +72,7 @@ def read_traces(given: Sequence[str | Trace], model: Model) -> tuple[list[Trace]
     """
     sources = [Source(each.provenance.get("source", "trace"), _hash_columns(each)) if isinstance(each, Trace)
                else read_source(each) for each in given]
-    signals = model.kind.signals
-    traces = [each if isinstance(each, Trace) else Trace.read(each, signals=signals) for each in given]
+    traces = [each if isinstance(each, Trace) else Trace.read(each, signals=model.kind.signals) for each in given]
     if any(isinstance(each, Trace) for each in given):  # it may have been read from a file that is given beside it
         files = {_hash_columns(trace): source.sha256 for each, trace, source in zip(given, traces, sources, strict=True)
                  if not isinstance(each, Trace)}
@@ -130,9 +128,8 @@ def _prepare_run(trace: Trace, model: Model, outputs: Sequence[str] | None, sour
 
 def _prepare_repeat(est: Trace, trace: Trace, model: Model, source: str, number: int) -> Trace:
     """A repeat on the rows of the run, with its outputs."""
-    missing = [s for s in est.outputs if s not in trace.signals]
-    if missing:
-        raise InputError(source, missing[0], f"the signals of the run it repeats ({', '.join(est.outputs)})")
+    for name in est.outputs:
+        require(name in trace.signals, source, name, f"the signals of the run it repeats ({', '.join(est.outputs)})")
     if not model.kind.controller:
         return hold_inputs(trace, est.outputs, source)
     return find_repeat(est, trace, model, number)
@@ -143,6 +140,6 @@ def _prepare_holdout(est: Trace, trace: Trace, model: Model, fitted: str, source
     outputs = [s for s in est.outputs if s in trace.signals]
     unseen = _prepare_run(trace, model, outputs or est.outputs, source)
     period = model["controller.period"]
-    if match_period(model, unseen, SAME_PERIOD)["controller.period"] != period:
-        raise InputError(source, "t", f"rows {period:g} s apart, as in {fitted}")
+    require(match_period(model, unseen, SAME_PERIOD)["controller.period"] == period, source, "t",
+            f"rows {period:g} s apart, as in {fitted}")
     return unseen

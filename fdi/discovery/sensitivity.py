@@ -8,7 +8,6 @@ Sizes are the largest usual one and halves of it, quarters and so on (the rungs 
 where a simulated gain says that it just shows (detectable.py), then at larger or smaller sizes, until one rung is named
 and the next smaller one is not. A rung on which that can no longer be reached is left at once.
 """
-from __future__ import annotations
 
 import math
 from collections import Counter
@@ -26,7 +25,7 @@ from fdi.discovery.runs import Runs, read_runs
 from fdi.estimation import Noise, Share, limit_friction_values, measure_share
 from fdi.thresholds import GAIN_DETECTED
 from fdi.trace import Floats, Trace
-from plant import InputError, Lanes, Model, load_plant, simulate
+from plant import Lanes, Model, load_plant, require, simulate
 from plant.effects import load_effects
 
 TRIALS, NEEDED = 10, 9
@@ -93,23 +92,19 @@ def describe_unit(runs: Runs, answer: Answer, effects: Sequence[str] = (), effec
         InputError: more than noise is left, sensors that filter or delay, or an effect that cannot be hidden.
     """
     e, best = answer.explanation, answer.best
-    if runs.est.sensors:
-        raise InputError("--sensitivity", ", ".join(runs.est.sensors), "sensors that neither filter nor delay")
-    if not best.is_at_floor:
-        raise InputError("--sensitivity", answer.verdict, "runs that the model explains; here more than noise is left, "
-                         "so no simulated run stands for a measured one (rig add first)")
+    require(not runs.est.sensors, "--sensitivity", ", ".join(runs.est.sensors), "sensors that neither filter nor delay")
+    require(best.is_at_floor, "--sensitivity", answer.verdict, "runs that the model explains; here more than noise is "
+            "left, so no simulated run stands for a measured one (rig add first)")
     offered = [name for name in e.search.effects if name not in best.effects]
     for name in effects:
-        if name not in offered:
-            raise InputError("--hide", name, f"one of {', '.join(offered)}")
+        require(name in offered, "--hide", name, f"one of {', '.join(offered)}")
     fitted = limit_friction_values(best.fit.values)
     found = {p for name in best.effects for p in runs.model.find_effect(name).fitted if p in fitted}
     problem = e.search.problem
-    kind = runs.model.kind
     return Unit(runs.model.replace({name: fitted[name] for name in sorted(found)}, "fit"), fitted,
                 dict(zip(problem.trace.outputs, problem.noise, strict=True)), _read_play(runs.est), len(runs.repeats),
                 None if runs.holdout is None else _read_play(runs.holdout), tuple(effects or offered),
-                tuple(effect_files), str(kind.file or ""))
+                tuple(effect_files), str(runs.model.kind.file or ""))
 
 
 def _read_play(trace: Trace) -> Play:
@@ -122,8 +117,8 @@ def find_first_rungs(answer: Answer, effects: Sequence[str]) -> dict[str, int]:
     It is one above the smallest that gains `GAIN_DETECTED`: a search wants more than a gain in a known place.
     """
     search = answer.explanation.search
-    ways = {name: list_directions(name, search.model)[:1] for name in effects}
-    tried = [(way, rung) for each in ways.values() for way in each for rung in range(RUNGS)]
+    tried = [(way, rung) for name in effects for way in list_directions(name, search.model)[:1]
+             for rung in range(RUNGS)]
     gains = VirtualTest(search.problem, answer.best.fit).measure_gains(
         [way for way, _ in tried], [way.most * 0.5**rung for way, rung in tried]) if tried else []
     shown: dict[str, int] = dict.fromkeys(effects, 0)

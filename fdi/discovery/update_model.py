@@ -43,6 +43,7 @@ from plant import (
     parse_model,
     quote_text,
     read_model_tables,
+    require,
 )
 from plant.effects import CATALOGUE
 
@@ -166,7 +167,7 @@ def _choose_nearer_start(search: Search, fit: Fit, other: Fit) -> Fit:
     """
     there = dict(zip([f.name for f in other.free], other.x, strict=True))
     own = zip(fit.free, fit.x, strict=True)
-    moved = np.array([there.get(f.name, x) if np.isfinite(f.prior) else x for f, x in own])
+    moved = [there.get(f.name, x) if np.isfinite(f.prior) else x for f, x in own]
     trials = np.array([fit.x, moved])
     return replace(fit, x=trials[int(np.argmin(search.problem.compute_costs(fit.free, trials)))])
 
@@ -188,16 +189,15 @@ def check_addable(model: Model, effects: Sequence[str]) -> None:
     """
     present = list(list_active_effects(model))
     for name in effects:
-        if name not in [e.name for e in list_offered_effects(model.plant)]:
-            raise InputError("effect", name, f"an effect that the plant {model.plant} can have")
+        require(name in [e.name for e in list_offered_effects(model.plant)], "effect", name,
+                f"an effect that the plant {model.plant} can have")
         entry = model.find_effect(name)
-        if name in present:
-            raise InputError("effect", name, f"one that is not in the model already (rig remove {name} takes it out)")
-        if not entry.fitted:
-            raise InputError("effect", name, "an effect with parameters to fit; this is noise of the bench")
+        require(name not in present, "effect", name,
+                f"one that is not in the model already (rig remove {name} takes it out)")
+        require(entry.fitted, "effect", name, "an effect with parameters to fit; this is noise of the bench")
         for other in present:
-            if name in model.find_effect(other).excludes or other in entry.excludes:
-                raise InputError("effect", name, f"{name} or {other} in a model, not both")
+            require(name not in model.find_effect(other).excludes and other not in entry.excludes, "effect", name,
+                    f"{name} or {other} in a model, not both")
         present.append(name)
 
 
@@ -503,8 +503,7 @@ def load_model_file(path: Path) -> tuple[Model, Provenance]:
 
 def remove_all_effects(model: Model, p: Provenance) -> Model:
     """The model as it was before any effect was added, tolerances included."""
-    added = [model.find_effect(name) for name in p.effects]
-    theirs = {name for e in added if not e.base for name in e.off}
+    theirs = {name for e in map(model.find_effect, p.effects) if not e.base for name in e.off}
     values = {name: value for name, value in {**model.values, **(p.before or {})}.items() if name not in theirs}
     return replace(model, values=values, effects=tuple(e for e in model.effects if e not in p.effects))
 
@@ -523,8 +522,8 @@ def remove_effect(model: Model, p: Provenance, name: str) -> tuple[Model, Proven
         usual = {n: (p.before or {}).get(n, model.nominal[n]) for n in entry.fitted}
         found = replace(model, values=limit_friction_values({**model.values, **usual}))
     else:
-        has = [*dict.fromkeys([*p.effects, *model.effects])]
-        raise InputError("effect", name, f"one that the model has ({', '.join(has) or 'it has none'})")
+        has = ", ".join(dict.fromkeys([*p.effects, *model.effects])) or "it has none"
+        raise InputError("effect", name, f"one that the model has ({has})")
     return found, replace(p, effects=tuple(e for e in p.effects if e != name))
 
 

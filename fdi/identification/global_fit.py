@@ -50,12 +50,11 @@ def scale_values(free: Sequence[Free], values: Mapping[str, float]) -> Floats:
     """Scaled unknowns, (p,), of parameters by name, SI, within the bounds; the centre for what is not named."""
     x = np.zeros(len(free))
     for k, f in enumerate(free):
-        if f.name not in values:
-            continue
-        known = values[f.name]
-        value = max(known / values[f.leader], 1.0) if isinstance(f, LogFrictionRatio) else known
-        place = math.log(value) if isinstance(f, LogFree) else value
-        x[k] = (min(max(place, f.low), f.high) - f.centre) / f.scale
+        if f.name in values:
+            known = values[f.name]
+            value = max(known / values[f.leader], 1.0) if isinstance(f, LogFrictionRatio) else known
+            place = math.log(value) if isinstance(f, LogFree) else value
+            x[k] = (min(max(place, f.low), f.high) - f.centre) / f.scale
     return x
 
 
@@ -152,14 +151,10 @@ def scan_unknowns(problem: LogProblem, fit: Fit, rounds: int = 2) -> Fit:
     free, x = fit.free, fit.x
     low, high = scaled_bounds(free)
     prior = np.array([f.prior**-2 for f in free])
+    steps = [(k, way / f.scale if isinstance(f, LogFree) else way) for k, f in enumerate(free) if is_wide(f)
+             for way in GRID]
     for _ in range(rounds):
-        trials = [x]
-        for k, f in enumerate(free):
-            if is_wide(f):
-                for way in GRID:
-                    step = way / f.scale if isinstance(f, LogFree) else way
-                    trials.append(np.clip(put_unknown(x, k, x[k] + step), low, high))
-        tried = np.array(trials)
+        tried = np.array([x, *(np.clip(put_unknown(x, k, x[k] + step), low, high) for k, step in steps)])
         costs = compute_misfit(problem.compute_white_residuals(free, tried)) + tried**2 @ prior
         best = int(np.argmin(costs))
         if best == 0 or costs[best] > costs[0] - 1.0:

@@ -210,8 +210,7 @@ def compute_shape_log_priors(noise: int, wander: int) -> Floats:
     chance = WANDER_PRIOR[wander] * np.ones(len(every))
     chance[constant] = WANDERS[wander][0] == "still"
     with np.errstate(divide="ignore"):
-        out: Floats = np.log(chance * prior * NOISE_PRIOR[noise])
-    return out
+        return np.asarray(np.log(chance * prior * NOISE_PRIOR[noise]))
 
 
 def compute_wander_covariance(wander: int, a: Floats, b: Floats) -> Floats:
@@ -430,7 +429,7 @@ def _scale_series(fault: Fault, t: Floats, sizes: Sequence[Estimate]) -> tuple[S
     value, low, high = np.array(sizes).T
     sigma = np.maximum(high - value, value - low) / INTERVAL_95_SD / unit  # one side may end at the parameter's bound
     span = float(t[-1] - t[0]) or 1.0
-    bounded = tuple(int(row) for row in np.flatnonzero(value <= low))
+    bounded = tuple(np.flatnonzero(value <= low).tolist())
     return Scaled((t - t[0]) / span, (value - fault.healthy) / unit, sigma, bounded=bounded), unit
 
 
@@ -442,8 +441,7 @@ def _fit_unit_error(data: Scaled, used: Flags) -> Floats:
     y, sigma = data.y[used], data.sigma[used]
     if np.ptp(y) < INTERVAL_SLOPE_RANGE:
         return sigma[-1:]
-    line: Floats = np.polyfit(y, sigma, 1)
-    return line
+    return np.polyfit(y, sigma, 1)
 
 
 def _sample_paths(found: Cleaned, posterior: Posterior, unit_error: Floats) -> Paths:

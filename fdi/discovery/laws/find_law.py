@@ -143,9 +143,8 @@ def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, flo
     balances, states = compute_balances(search.problem, base, floor)
     there = compute_balances(unseen, base, floor) if unseen is not None else None
     missing = tuple(describe_balance(b, states, there) for b in balances)
-    outputs = search.problem.trace.outputs
     hidden = {place: why for place, (signal, why) in HIDDEN.items()
-              if signal not in outputs and any(b.place == place for b in balances)}
+              if signal not in search.problem.trace.outputs and any(b.place == place for b in balances)}
     places = [m.balance.place for m in missing if m.balance.place not in hidden]
     with registered_library():
         worker = _Worker(search, base, places, floor)
@@ -173,14 +172,13 @@ def find_law_beside(e: Explanation, progress: Progress = ignore_progress) -> Law
     beside = find_law(e.search, e.ledger[-1], best, e.floor, progress)
     if beside.law is None or not beside.law.holds:
         return found
-    if found.law is None or not found.law.holds or _measure_left(beside, e.floor) < _measure_left(found, e.floor):
-        return beside
-    return found
+    is_better = (found.law is None or not found.law.holds
+                 or _measure_left(beside.law, e.floor) < _measure_left(found.law, e.floor))
+    return beside if is_better else found
 
 
-def _measure_left(found: LawSearch, floor: Mapping[str, float]) -> float:
-    assert found.law is not None
-    return measure_excess(found.law.holdout or found.law.hypothesis.errors, floor)
+def _measure_left(law: Law, floor: Mapping[str, float]) -> float:
+    return measure_excess(law.holdout or law.hypothesis.errors, floor)
 
 
 def describe_balance(b: Balance, states: States, there: tuple[list[Balance], States] | None) -> Missing:
@@ -288,8 +286,10 @@ class _Worker:
         balances, states = compute_balances(problem, Hypothesis(self.base.effects, fit, {}), self.floor)
         ranked: list[_Ranked] = []
         for b in balances:
+            if b.place not in self.places:
+                continue
             rows = select_rows(b, states, {**problem.model.values, **fit.values})
-            proposals = propose_terms(b.place, rows, terms)[:PROPOSED] if b.place in self.places else []
+            proposals = propose_terms(b.place, rows, terms)[:PROPOSED]
             tried = [(p, factor) for p in proposals for factor in TRIED_SIZES]
             starts = [(p.term.name, {name_parameter(p.term, f): v * (factor if f == p.term.name else 1.0)
                                      for f, v in p.values.items()}, False) for p, factor in tried]
@@ -478,8 +478,7 @@ def find_dependences(y: Floats, states: Mapping[str, Floats], holdout: tuple[Flo
     """
     names = [name for name, x in states.items() if np.ptp(x) > 0.0]
     n = len(y)
-    rng = np.random.default_rng(seed)
-    shifts = rng.integers(n // 20, n - n // 20, SHIFTS)
+    shifts = np.random.default_rng(seed).integers(n // 20, n - n // 20, SHIFTS)
     moved = np.column_stack([y, *(np.roll(y, int(k)) for k in shifts)])
     fold = np.minimum(np.arange(n) * FOLDS // n, FOLDS - 1)
     edges = {name: {bins: np.unique(np.quantile(states[name], np.linspace(0.0, 1.0, bins + 1)[1:-1]))
@@ -591,7 +590,7 @@ def propose_terms(place: str, rows: Rows, present: Sequence[Term] = ()) -> list[
     remove = _make_remover(rows)
     y = remove(rows.missing[:, None])[:, 0]
     found = (_fit_term(t, rows, remove, y) for t in TERMS if t.place == place and t not in present)
-    return sorted((p for p in found if p is not None), key=lambda p: -p.share)
+    return sorted(filter(None, found), key=lambda p: -p.share)
 
 
 def _make_remover(rows: Rows) -> Callable[[Floats], Floats]:
@@ -624,11 +623,10 @@ def _fit_term(term: Term, rows: Rows, remove: Callable[[Floats], Floats], y: Flo
 
 def _predict_blocks(columns: Floats, y: Floats) -> tuple[float, Floats]:
     """Share of `y` (n,) that the columns (n, k) predict in blocks left out of their fit, and the fit to all, (k,)."""
-    n = len(y)
     blocks = list(zip(np.array_split(columns, FOLDS), np.array_split(y, FOLDS), strict=True))
     grams = np.array([block.T @ block for block, _ in blocks])
     sides = np.array([block.T @ part for block, part in blocks])
-    gram, side, small = grams.sum(axis=0), sides.sum(axis=0), 1e-6 * n * np.eye(columns.shape[1])
+    gram, side, small = grams.sum(axis=0), sides.sum(axis=0), 1e-6 * len(y) * np.eye(columns.shape[1])
     error = float(y @ y)
     for g, s in zip(grams, sides, strict=True):
         c = np.linalg.solve(gram - g + small, side - s)

@@ -3,7 +3,6 @@
 A formula stands here once, as text. The regression evaluates it on measured states, the replay compiles it, and the
 effect file of a law contains it.
 """
-from __future__ import annotations
 
 import math
 import re
@@ -310,11 +309,11 @@ def _strip_brackets(part: str) -> str:
 def _format_field(name: str, unit: str, term: Term, values: Mapping[str, float] | None) -> str:
     """A parameter with unit and range: a coefficient may lie between zero and ten times what was found."""
     if name == term.name:
-        limits, off = "", "0.0"
+        limits = ""
         if values is not None:
             far = 10.0 ** (math.ceil(math.log10(abs(values[name]) or 1.0)) + 1)
             limits = f", low=0, high={far:g}" if values[name] > 0.0 else f", low={-far:g}, high=0"
-        return f'    {name}: Annotated[float, Quantity("{unit}"{limits})] = {off}  # {term.words}'
+        return f'    {name}: Annotated[float, Quantity("{unit}"{limits})] = 0.0  # {term.words}'
     usual = 1.0 if values is None else float(f"{values[name]:.6g}")
     if unit == "rad":
         return f'    {name}: Annotated[float, Quantity("rad", low=-100, high=100)] = {usual if values else 0.0!r}'
