@@ -5,7 +5,6 @@ the logarithm of its mean square. So no single stop of the ram, made or missed, 
 is missing is not made up for by parameters that no healthy unit has. The search is that of Levenberg and Marquardt with
 priors; its trials are replayed side by side in lanes.
 """
-from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -6,7 +6,6 @@ the spool or the pressure of the jack is not measured, its scale is not seen eit
 this, as each parameter shifts a hundred small stops of the spool; so along these directions slopes are set to zero,
 where a trial replay confirms it.
 """
-from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
