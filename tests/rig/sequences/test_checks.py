@@ -307,6 +307,13 @@ def calibrate(u: float = 5e-6, distribution: str = "normal", gain: float = 2e-3,
     return Metrology("guarded", {"xj": known}, {"xj": 1e-6})
 
 
+def test_a_count_is_that_of_the_signals_own_field() -> None:
+    """Unused bits of a frame have no name, as most signals have no alias; they count 1."""
+    bench = load_bench(str(ROOT / "examples/cia402_drive/ema.toml"))
+    counts = uncertainty.collect_metrology(bench, bench.signals, None, 0).counts
+    assert (counts["position"], counts["motor_speed"]) == (1e-3, 0.0)
+
+
 def first(beyond: Any) -> float:
     return float(np.argmax(beyond)) / FINE / 1e3
 
