@@ -311,7 +311,7 @@ def test_a_count_is_that_of_the_signals_own_field() -> None:
     """Unused bits of a frame have no name, as most signals have no alias; they count 1."""
     bench = load_bench(str(ROOT / "examples/cia402_drive/ema.toml"))
     counts = uncertainty.collect_metrology(bench, bench.signals, None, 0).counts
-    assert (counts["position"], counts["motor_speed"]) == (1e-3, 0.0)
+    assert (counts["current_demand"], counts["position"], counts["motor_speed"]) == (0.02, 0.0, 0.0)
 
 
 def first(beyond: Any) -> float:
