@@ -387,9 +387,11 @@ class KernelVariant:
         self._names, self._laws = self.model.list_names(), model.kind.list_laws(effects)
         self._state: Array | None = None
         self._parameters = self.model.build_record().view(np.float64)[:, None]
-        # lanes of its blocks: a costly effect keeps the processor busy with one register, else a step is half waiting
-        is_costly = not all(_is_cheap(model.find_effect(name)) for name in effects)
-        self.widths = (FEWEST,) if is_costly else (FEWEST, NARROW)
+        # lanes of its blocks: a costly effect keeps the processor busy with one register, else a step is half waiting;
+        # a model of few effects makes too few runs to be worth the seconds in which a second layout is compiled
+        is_waiting = all(_is_cheap(model.find_effect(name)) for name in effects)
+        makes_many = not effects or len(model.effects) > FEW
+        self.widths = (FEWEST, NARROW) if is_waiting and makes_many else (FEWEST,)
 
     def is_ready(self, steps: float) -> bool:
         """Whether the kernel can make so many steps of all lanes now: see `KernelUse.is_ready`."""

@@ -7,7 +7,7 @@ ACTIVE again (recovery), and how far the position was from that of the sound run
 
 import argparse
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -152,12 +152,12 @@ def find_first_difference(sound: Path, faulty: Path) -> float | None:
     return None
 
 
-def _list_frames(folder: Path) -> list[tuple[float, int, bytes]]:
+def _list_frames(folder: Path) -> Iterator[tuple[float, int, bytes]]:
     """Time, s of main, COB-ID and data of the frames from the first cycle of main on."""
     log = open_log(folder / "trace.mcap")
     begin = next(t_ns for _, t_ns, row in log.read_messages("/signals") if row.phase == 1)
-    return [((t_ns - begin) * 1e-9, frame.cob_id, frame.data) for _, t_ns, frame in log.read_messages("/can")
-            if t_ns >= begin]
+    return (((t_ns - begin) * 1e-9, frame.cob_id, frame.data) for _, t_ns, frame in log.read_messages("/can")
+            if t_ns >= begin)
 
 
 def collect_figures(cells: list[Cell], seed: int) -> dict[str, Any]:
