@@ -55,10 +55,11 @@ def served(where: str, *makers: type[Emulator] | type[Firmware]) -> Iterator[Non
 
 
 @pytest.fixture
-def wire(bus_kind: str) -> Iterator[Wire]:
+def wire(bus_kind: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
     if bus_kind == "embedded":
         yield EmbeddedWire(VirtualClock(), [Emulator, Firmware])
         return
+    monkeypatch.setattr("rig.network.master.BOOT_TIMEOUT", 20.0)  # beside four busy processes 2 s were too short
     where, clock = spec(bus_kind), WallClock()
     with served(where, Emulator, Firmware), closing(LinkWire(Link(open_can(where), clock.now), clock)) as link:
         yield link
