@@ -166,15 +166,18 @@ class Device:
 
     def _configure(self, index: int) -> None:
         """Pass a changed communication object to the service that uses it."""
-        if index == 0x1006:
+        if index == 0x1005:
+            self._gate()
+        elif index == 0x1006:
             self.sync.configure(self.od.read_number(0x1006, 0))
         elif index == 0x1016:
             self.consumer.configure([self.od.read_number(0x1016, sub) for sub in self.od.list_subs(0x1016)])
+            self._gate()
         elif index == 0x1017:
             self.heartbeat.configure(self.od.read_number(0x1017, 0), self.t_ns)
         elif index in PARAMETERS:
             self.pdo.configure()
-        self._gate()
+            self._gate()
 
     def _heartbeat_lost(self, node: int) -> None:
         self.emcy.raise_error(EmcyCode.HEARTBEAT_LOST, ErrorRegister.COMMUNICATION, bytes((node,)))

@@ -687,6 +687,7 @@ def make_memory(scenario: Scenario, advance: int = 0, read: int = 0, frames: Seq
     that is a node of its own.
     """
     model, load, schedule = scenario.model, scenario.load(), scenario.make_schedule()
+    names = model.list_names()
     parameters: list[tuple[int, ...]] = []
     signals: list[tuple[int, ...]] = []
     values: list[float] = []
@@ -696,7 +697,7 @@ def make_memory(scenario: Scenario, advance: int = 0, read: int = 0, frames: Seq
         course = np.full(last - first + 1, model[name])
         for begin, changed in reversed(changes):  # of several in a cycle the first counts
             course[begin - first: begin - first + len(changed)] = changed
-        parameters.append((model.list_names().index(name), first, len(course), len(values)))
+        parameters.append((names.index(name), first, len(course), len(values)))
         values += course.tolist()
     for number, output in enumerate(model.kind.signals.outputs):
         for fault in schedule.signals.get(output.name, ()):
