@@ -597,6 +597,9 @@ def read_cycles(trace: Trace, model: Model, outputs: Sequence[str] | None = None
         if phase is not None:
             thinned = _thin_rows(rows, rows_in_cycle, phase)
             require(len(thinned) >= FEWEST_ROWS, source, "t", f"at least {FEWEST_ROWS} cycles, not {len(thinned)}")
+            for name in (trace.declared.controlled.name, *chosen):
+                require(not np.isnan(thinned.column(name)).all(), source, name, "readings in the rows in which "
+                        f"{trace.declared.drive.symbol} is new, every {rows_in_cycle}; there are none")
             note = f"rows every {ms:g} ms, current new every {rows_in_cycle}: one row a cycle is used"
             return [_fill_inputs(thinned.with_notes(note), trace, source)]
     ways = [rows.with_notes(f"the model's cycle of {1e3 * model['controller.period']:g} ms is taken as the trace's, "

@@ -242,9 +242,13 @@ TRIAL = ("effects", "--effects", "my_new.py", "my_new")  # on a shipped plant it
 
 @pytest.mark.parametrize(("kind", "check", "plant"), [
     ("sequence", CHECK, "eha"), ("fault", CHECK, "eha"), pytest.param("effect", TRIAL, "eha", marks=pytest.mark.slow),
+    ("sequence", CHECK, "slow_plant.py"),
     *((kind, check, "new_plant.py") for kind, check in (("sequence", CHECK), ("fault", CHECK), ("effect", TRIAL)))])
 def test_a_new_file_passes_its_own_check(kind: str, check: tuple[str, ...], plant: str, here: Path) -> None:
     (here / "new_plant.py").write_text(TEXT)
+    slow = TEXT.replace("period: Annotated[float, Quantity(\"s\", low=1e-4, high=0.1)] = 1e-3",
+                        "period: Annotated[float, Quantity(\"s\", low=1e-4, high=0.1)] = 3e-3")
+    (here / "slow_plant.py").write_text(slow.replace("time=0.1)", "time=0.3)").replace("time=1.0)", "time=0.9)"))
     assert rig("new", kind, "my_new", "--model", plant, "--json").json["verdict"] == "COMPLETE"
     said = rig(*check, "--model", plant, "--json")
     assert said.status == 0 and "are of a bench" in rig("new", kind, "other", "--node", "3").err

@@ -68,12 +68,15 @@ def list_plant_words(kind: Plant) -> dict[str, Any]:
                               if value > 0.0 and name.partition(".")[0] != "controller")
     largest = float(np.abs(kind.build_nominal_command()).max(initial=0.0)) or 5e-3
     step = float(f"{0.4 * largest:.1g}")
+    period = kind.nominal["controller.period"]
+    times = {"brief": 0.2, "hold": 0.3, "out": 0.6, "long": 1.0}  # s, of segments: whole cycles
     return {"port": port, "unit": kind.ports[port].unit,
             "ports": "\n".join(f"#   {name} [{p.unit}]: {p.meaning}" for name, p in kind.ports.items()),
             "field": next(iter(moving), ""), "fields": ", ".join(kind.state._fields),
             "parameter": parameter, "healthy": healthy, "acceptable": 1.2 * healthy, "maintenance": 1.4 * healthy,
             "range": 2.0 * healthy, "controlled": kind.signals.controlled.unit,
-            "signal": kind.signals.controlled.name, "step": step, "sine": 0.5 * step, "limit": 0.25 * step}
+            "signal": kind.signals.controlled.name, "step": step, "sine": 0.5 * step, "limit": 0.25 * step,
+            **{name: round(time / period) * period for name, time in times.items()}}
 
 
 def write_bench(path: Path, args: argparse.Namespace, plant: Plant, check: str) -> str:

@@ -119,6 +119,9 @@ def test_rows_at_2_khz_are_taken_once_a_cycle() -> None:
     assert c.period == 1e-3 and (c.cor == record_healthy().cor).all() and "one row a cycle" in c.notes[0]
     few = Trace.from_columns({name: x[:300] for name, x in twice.items()} | {"t": np.arange(300) * 5e-4}, 5e-4, {})
     assert f"at least {FEWEST_ROWS} cycles, not 150" in catch_refusal(read_cycles, few, MODEL)
+    twice["xj"][::2] = np.nan  # read between two currents
+    late = Trace.from_columns(twice | {"t": np.arange(27_000) * 5e-4}, 5e-4, {})
+    assert "xj: expected readings in the rows in which Cor is new" in catch_refusal(read_cycles, late, MODEL)
 
 
 def test_rows_at_500_hz_can_be_read_in_two_ways() -> None:
