@@ -88,10 +88,10 @@ def test_the_effects_in_the_manual_work(tmp_path: Path) -> None:
     assert all(len(block.splitlines()) <= 25 for block in code)
     file = write_file(tmp_path / "my_effects.py", "\n".join(code))
     assert load_effects(file) == ["seal_drag", "rod_play"]
-    said = rig("effects", "--effects", file, "seal_drag")
-    assert said.status == 0 and "seal_drag: exact at its off value" in said.out
+    result = rig("effects", "--effects", file, "seal_drag")
+    assert result.status == 0 and "seal_drag: exact at its off value" in result.out
     for row in re.findall(r"^    (level = .*)", text, re.MULTILINE):
-        assert " ".join(row.split()) in " ".join(said.out.split())
+        assert " ".join(row.split()) in " ".join(result.out.split())
     command = np.full(100, 1e-3)
     plain, loose = (simulate(model, command).xj for model in (Model(), Model().replace({"rod_play.width": 1e-4})))
     assert np.abs(plain - loose).max() > 1e-5
@@ -192,14 +192,14 @@ def test_the_page_lists_every_program() -> None:
 
 
 def test_an_effect_of_ones_own() -> None:
-    said = rig("effects", "--effects", EXAMPLES / "cogging.py", "cogging")
-    assert said.status == 0 and "F sin(2 pi XJ / pitch)" in said.out
+    result = rig("effects", "--effects", EXAMPLES / "cogging.py", "cogging")
+    assert result.status == 0 and "F sin(2 pi XJ / pitch)" in result.out
 
 
 def test_a_sequence_with_own_profile_and_measure(tmp_path: Path) -> None:
-    said = rig("run", EXAMPLES / "growing_sine.toml", "--out", tmp_path / "run", "--json")
-    assert said.status == 0 and said.json["verdict"] == "PASS"
-    checks = {check["name"]: check for check in said.json["checks"]}
+    result = rig("run", EXAMPLES / "growing_sine.toml", "--out", tmp_path / "run", "--json")
+    assert result.status == 0 and result.json["verdict"] == "PASS"
+    checks = {check["name"]: check for check in result.json["checks"]}
     assert 0.0 < checks["RMS error"]["value"] < 500.0 and checks["no emergency"]["passed"]
 
 
@@ -226,8 +226,8 @@ def test_missing_physics_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(subprocess, "run", write_samples)
     with restored_catalogue("null_bias", "constant_load", "spool_friction", "jack_friction"):
         runpy.run_path(program, run_name="__main__")
-    said = capsys.readouterr().out
-    assert "null_bias" in said and said.rstrip().endswith("WITHIN_FLOOR")
+    message = capsys.readouterr().out
+    assert "null_bias" in message and message.rstrip().endswith("WITHIN_FLOOR")
     assert "<svg" in (tmp_path / "residual.svg").read_text() and (tmp_path / "better.toml").exists()
 
 
@@ -317,12 +317,12 @@ def test_what_is_wrong_with_a_site_is_found(tmp_path: Path) -> None:
 
 
 def test_the_notebook_finds_the_effect_and_the_error_falls(cells: list[RunCell]) -> None:
-    said = "".join(cell.printed for cell in cells)
-    assert "EXPLAINED null_bias explains the residual" in said
-    ratios = [float(value) for value in re.findall(r"([\d.]+) times the noise floor", said)]
+    message = "".join(cell.printed for cell in cells)
+    assert "EXPLAINED null_bias explains the residual" in message
+    ratios = [float(value) for value in re.findall(r"([\d.]+) times the noise floor", message)]
     assert len(ratios) == 2 and ratios[0] > 20.0 and 0.8 < ratios[1] < 1.2
     ((value, low, high),) = (map(float, found) for found in
-                             re.findall(r"null bias ([\d.]+) uA \(([\d.]+) \.\. ([\d.]+)\)", said))
+                             re.findall(r"null bias ([\d.]+) uA \(([\d.]+) \.\. ([\d.]+)\)", message))
     assert low < 50.0 < high and abs(value - 50.0) < 1.0
     assert sum(str(cell.value).startswith("<svg") for cell in cells) == 2
 

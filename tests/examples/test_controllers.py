@@ -13,7 +13,7 @@ from bus_stations import spec
 from c_device import needs_compiler
 from example_devices import DRIVE, ECU, PATIENT, DriveDesk, EcuDesk, make_drive, run_device
 from node_bench import MS
-from rig_command import SHORT, SLOW_START, Said, rig, write_file
+from rig_command import SHORT, SLOW_START, CommandResult, rig, write_file
 
 from rig.conformance.run_cases import run_cases
 from rig.conformance.target import DataSheet, Options, Target
@@ -166,14 +166,14 @@ def test_current_of_the_ecu_follows_the_error_up_to_its_limit(ecu: EcuDesk, targ
                                                               current: float) -> None:
     """3.6 A/m; the derivative part is 0 in the first cycle with a current and while nothing changes."""
     ecu.cycle(target, position, enable=0)
-    said = [read(ecu.cycle(target, position)) for _ in range(2)]
-    assert said == [pytest.approx((OPERATIONAL, current))] * 2
+    answers = [read(ecu.cycle(target, position)) for _ in range(2)]
+    assert answers == [pytest.approx((OPERATIONAL, current))] * 2
 
 
 @pytest.mark.parametrize(("name", "kind"), list(product(("Demand", "Feedback"), ("checksum", "counter"))))
 def test_wrong_frames_are_not_used_and_three_are_a_fault(ecu: EcuDesk, name: str, kind: str) -> None:
     ecu.cycle(1.0, 0.5)
-    said = []
+    answers = []
     for _ in range(3):
         frames = {"Demand": {"Position": 1.0, "Enable": 1}, "Feedback": {"Position": 0.5, "Pressure": 0}}
         frames[name]["Position"] = -3.0
@@ -183,8 +183,8 @@ def test_wrong_frames_are_not_used_and_three_are_a_fault(ecu: EcuDesk, name: str
             data = ecu.encode(each, **values)
             is_spoilt = (each, kind) == (name, "checksum")
             drives = ecu.transmit(each, bytes((data[0] ^ is_spoilt, *data[1:])))
-        said += map(read, drives)
-    assert said == [(OPERATIONAL, 1.8), (OPERATIONAL, 1.8), (ECU_FAULT, 0.0)]
+        answers += map(read, drives)
+    assert answers == [(OPERATIONAL, 1.8), (OPERATIONAL, 1.8), (ECU_FAULT, 0.0)]
     assert [ecu.cycle(enable=0)["State"] for _ in range(10)][-1] == OPERATIONAL  # its counters begin anew
 
 
@@ -209,21 +209,21 @@ TRIES = 3  # in real time, on a machine that may be busy
 examples = pytest.mark.parametrize("folder", [DRIVE, ECU], ids=lambda folder: folder.name)
 
 
-def run_bench(folder: Path, where: str, out: Path, *words: object, options: tuple[str, ...] = ()) -> Said:
+def run_bench(folder: Path, where: str, out: Path, *words: object, options: tuple[str, ...] = ()) -> CommandResult:
     """Run a sequence, preflight unless `words` begin with another one, against an example on a bus."""
     with run_device(folder, where, *options):
         return rig("run", *words, "--bench", folder / "bench.toml", "--bus", where, "--json", "--out", out)
 
 
-def list_failed(said: Said) -> list[str]:
+def list_failed(result: CommandResult) -> list[str]:
     """Names of the checks that failed."""
-    return [check["name"] for check in said.json["checks"] if not check["passed"]]
+    return [check["name"] for check in result.json["checks"] if not check["passed"]]
 
 
 @examples
 def test_preflight_passes_in_lockstep(tmp_path: Path, folder: Path) -> None:
-    said = run_bench(folder, spec("udp_multicast"), tmp_path, options=PATIENT[folder])
-    assert (said.status, said.json["verdict"], list_failed(said)) == (0, "PASS", [])
+    result = run_bench(folder, spec("udp_multicast"), tmp_path, options=PATIENT[folder])
+    assert (result.status, result.json["verdict"], list_failed(result)) == (0, "PASS", [])
 
 
 OWN_CHECKSUM = '''
@@ -245,24 +245,24 @@ def test_a_checksum_of_the_users_own_protects_a_whole_run(tmp_path: Path) -> Non
     (tmp_path / "ecu.dbc").write_bytes((ECU / "ecu.dbc").read_bytes())
     (tmp_path / "short.toml").write_text(SHORT + SLOW_START)
     (tmp_path / "own.py").write_text(OWN_CHECKSUM.replace("INVERSION", "255"))
-    said = rig("run", tmp_path / "short.toml", *words, "--bus", where)
-    assert said.status == 2 and said.err.count("own.py") == 1 and said.err.count("\n") == 1
+    result = rig("run", tmp_path / "short.toml", *words, "--bus", where)
+    assert result.status == 2 and result.err.count("own.py") == 1 and result.err.count("\n") == 1
     for inversion, verdict in ((255, "PASS"), (254, "ABORTED")):
         (tmp_path / "own.py").write_text(OWN_CHECKSUM.replace("INVERSION", str(inversion)))
         with run_device(ECU, where, *PATIENT[ECU]):
-            said = rig("run", tmp_path / "short.toml", *words, "--bus", where, "--trust")
-        assert said.json["verdict"] == verdict and said.err.count("own.py") == 1, said.err
+            result = rig("run", tmp_path / "short.toml", *words, "--bus", where, "--trust")
+        assert result.json["verdict"] == verdict and result.err.count("own.py") == 1, result.err
 
 
 @examples
 def test_a_short_run_passes_in_real_time(tmp_path: Path, folder: Path) -> None:
     words = (write_file(tmp_path / "short.toml", SHORT + SLOW_START + IN_TIME), "--pace", "realtime")
     for k in range(TRIES):
-        said = run_bench(folder, spec("udp_multicast"), tmp_path / str(k), *words)
-        if said.json["verdict"] not in ("ABORTED", "INVALID_TIMING"):
-            assert (said.status, said.json["verdict"], list_failed(said)) == (0, "PASS", [])
+        result = run_bench(folder, spec("udp_multicast"), tmp_path / str(k), *words)
+        if result.json["verdict"] not in ("ABORTED", "INVALID_TIMING"):
+            assert (result.status, result.json["verdict"], list_failed(result)) == (0, "PASS", [])
             return
-    pytest.skip(f"the machine was too busy for {TRIES} runs in real time: {said.json['verdict']}")
+    pytest.skip(f"the machine was too busy for {TRIES} runs in real time: {result.json['verdict']}")
 
 
 STEP = SHORT.replace("to = 1e-3", "to = 5e-3") + SLOW_START  # takes the current to its limit
@@ -281,10 +281,10 @@ def test_a_faulty_controller_does_not_pass(tmp_path: Path, folder: Path, fault: 
     monkeypatch.setattr(participants, "FRAME_TIMEOUT", 0.2)  # s: it is spent in each cycle without an answer
     found_by, text = FOUND_BY[fault]
     words = (write_file(tmp_path / "step.toml", text),) if text else ()
-    said = run_bench(folder, spec("udp_multicast"), tmp_path, *words, options=("--fault", fault, *PATIENT[folder]))
-    cause = (said.json.get("cause") or {}).get("text", "")
-    assert said.status == 1 and said.json["verdict"] in ("FAIL", "ABORTED")
-    assert any(re.search(found_by, text) for text in [*list_failed(said), cause]), (list_failed(said), cause)
+    result = run_bench(folder, spec("udp_multicast"), tmp_path, *words, options=("--fault", fault, *PATIENT[folder]))
+    cause = (result.json.get("cause") or {}).get("text", "")
+    assert result.status == 1 and result.json["verdict"] in ("FAIL", "ABORTED")
+    assert any(re.search(found_by, text) for text in [*list_failed(result), cause]), (list_failed(result), cause)
 
 
 @needs_compiler

@@ -135,9 +135,9 @@ def test_every_result_prints_shows_plots_and_converts(name: str, lines: dict[str
 
 
 def test_the_dictionary_is_the_answer_of_the_command(lines: dict[str, Any], runs: dict[str, Path]) -> None:
-    said = rig("compare", runs["est"], "--repeat", runs["repeat"], "--json").json
-    assert fdi.compare(runs["est"], repeats=[runs["repeat"]]).to_dict() == said
-    assert {**lines["comparison"].to_dict(), "trace": said["trace"]} == said  # from memory
+    answer = rig("compare", runs["est"], "--repeat", runs["repeat"], "--json").json
+    assert fdi.compare(runs["est"], repeats=[runs["repeat"]]).to_dict() == answer
+    assert {**lines["comparison"].to_dict(), "trace": answer["trace"]} == answer  # from memory
 
 
 def test_a_model_is_a_value_a_file_or_a_name(runs: dict[str, Path], tmp_path: Path) -> None:
@@ -161,8 +161,8 @@ def test_bad_input_is_one_line(call: Callable[[Trace, Path], object], says: str,
 
 def test_importing_fdi_loads_neither_numba_nor_matplotlib() -> None:
     code = "import sys, fdi; print([m for m in ('numba', 'matplotlib', 'numpy', 'rich', 'jinja2') if m in sys.modules])"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert said.stdout.strip() == "[]"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
 
 
 def test_the_bar_of_a_diagnosis_moves_within_its_long_stage() -> None:

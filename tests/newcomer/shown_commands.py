@@ -84,8 +84,8 @@ def play_page(page: str, folder: Path, environment: Mapping[str, str], not_playe
             is_played = False
             yield Played(step.text, None, 0.0, ())
         else:
-            played, folder, said = play_line(step.text, folder, environment)
-            printed |= {*VERDICT.findall(said)}
+            played, folder, output = play_line(step.text, folder, environment)
+            printed |= {*VERDICT.findall(output)}
             is_played = True
             yield played
 

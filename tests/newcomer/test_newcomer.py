@@ -26,9 +26,9 @@ def test_bad_input_gets_one_line_that_names_it(here: Path) -> None:
     before = {path: path.read_bytes() for path in here.rglob("*") if path.is_file()}
     found = {}
     for case in BAD_INPUTS:
-        said = rig(*case.words.split())
+        result = rig(*case.words.split())
         CATALOGUE.pop("slip", None)  # of one of them
-        found[case.words] = find_faults(case, said.status, said.out, said.err)
+        found[case.words] = find_faults(case, result.status, result.out, result.err)
     assert {words: faults for words, faults in found.items() if faults} == {}
     assert {path: path.read_bytes() for path in here.rglob("*") if path.is_file()} == before
 
@@ -42,8 +42,8 @@ def test_ctrl_c_ends_a_search_and_leaves_nothing(tmp_path: Path) -> None:
     process = started("explain", tmp_path / "run.csv", "--out", tmp_path / "page.html")
     time.sleep(3.0)  # it may still load its libraries, and then it ends as well
     process.send_signal(signal.SIGINT)
-    said = finished(process)
-    assert (said.status, said.err.count("\n")) == (130, 1), said
+    result = finished(process)
+    assert (result.status, result.err.count("\n")) == (130, 1), result
     assert [path.name for path in tmp_path.iterdir()] == ["run.csv"]
 
 

@@ -215,7 +215,7 @@ def test_the_users_effect_with_memory(file: Path) -> None:
     assert plant.memory.load.travelled == pytest.approx(way, rel=0.01) and way > 1e-3
 
 
-@pytest.mark.parametrize(("text", "said"), [
+@pytest.mark.parametrize(("text", "message"), [
     ("effect(", ":1: expected Python ("),
     ("import no_such_module", ":1: expected code that runs without an exception, not ModuleNotFoundError"),
     ("x = 1 / 0", "ZeroDivisionError"),
@@ -226,10 +226,10 @@ def test_the_users_effect_with_memory(file: Path) -> None:
     (COGGING.replace("def cogging", "def null_bias"), "the name is taken"),
     (HEAD + "raise ValueError('two\\nlines')", "ValueError: two"),
 ])
-def test_a_bad_file_is_refused_in_one_line(file: Path, text: str, said: str) -> None:
+def test_a_bad_file_is_refused_in_one_line(file: Path, text: str, message: str) -> None:
     assert "a Python file with effects" in catch_refusal(load_effects, file)  # there is none yet
     line = catch_refusal(load_text, file, text)
-    assert said in line and str(file) in line
+    assert message in line and str(file) in line
 
 
 @pytest.mark.parametrize(("body", "port", "use"), [

@@ -32,7 +32,7 @@ from plant.segments import Chirp, Multisine, Ramp, Sine, Step
 NAMES = list(load_nominal_values())
 
 
-@pytest.mark.parametrize(("name", "value", "said"), [
+@pytest.mark.parametrize(("name", "value", "message"), [
     ("spool.static_friction", -1, "from 0 to 1e+06 N, not -1"),
     ("jack.mass", 0, "from 0.01 to"),
     ("supply.pressure", 1e-300, "from 100000 to 1e+08 Pa, not 1e-300"),
@@ -61,9 +61,9 @@ NAMES = list(load_nominal_values())
     ("", 3, "a known group"),
     ("sensor_lag.time", 1.0, "to 0.1 s"),
 ])
-def test_refused_by_name(name: str, value: object, said: str) -> None:
+def test_refused_by_name(name: str, value: object, message: str) -> None:
     text = catch_refusal(Model().replace, {name: value})
-    assert said in text and text.startswith(f"--set: {name}: expected" if name else "--set: expected")
+    assert message in text and text.startswith(f"--set: {name}: expected" if name else "--set: expected")
 
 
 @pytest.mark.parametrize("body", ["spool", "jack"])
@@ -145,7 +145,7 @@ def test_model_file_round_trip(tmp_path_factory: pytest.TempPathFactory, changes
     assert (back.name, back.effects, dict(back.values)) == (name, changed.effects, dict(changed.values))
 
 
-@pytest.mark.parametrize(("text", "said"), [
+@pytest.mark.parametrize(("text", "message"), [
     ("[spool\n", "TOML"),
     pytest.param(f"[spool]\nmass = {'9' * 5000}", "at most 4300 digits", id="5000 digits"),
     ("[spool]\nstatic_friction = nan", "spool.static_friction"),
@@ -159,11 +159,11 @@ def test_model_file_round_trip(tmp_path_factory: pytest.TempPathFactory, changes
     ("name = 3", "name"),
     ("[jack]\nstatic_friction = 1.0", "jack.dynamic_friction"),
 ])
-def test_a_bad_model_file_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_a_bad_model_file_is_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(text)
     line = catch_refusal(load_model, path)
-    assert said in line and str(path) in line
+    assert message in line and str(path) in line
 
 
 @pytest.mark.parametrize(("command", "load"), [([], None), ([[0.0]], None), ([0.0, 0.0], [1.0])])

@@ -122,8 +122,8 @@ def test_a_model_file_runs_its_plant_only_with_trust(tmp_path: Path) -> None:
 def test_the_written_example_passes_its_checks(tmp_path: Path) -> None:
     file = tmp_path / "new_plant.py"
     assert rig("new", "plant", "new_plant", "--out", file).status == 0
-    said = rig("check", file, "--json")
-    assert said.status == 0 and said.json["verdict"] == "SOUND" and len(said.json["checks"]) == 7
+    result = rig("check", file, "--json")
+    assert result.status == 0 and result.json["verdict"] == "SOUND" and len(result.json["checks"]) == 7
     assert rig("new", "plant", "new_plant", "--out", file).status == 2  # it replaces nothing
 
 
@@ -171,8 +171,8 @@ def test_its_own_effect_may_have_the_name_of_a_shared_one(tmp_path: Path) -> Non
 def test_a_wrong_plant_file_is_refused_in_one_line(old: str, new: str, message: str, tmp_path: Path) -> None:
     assert old in TEXT
     file = write_file(tmp_path / "wrong.py", TEXT.replace(old, new, 1))
-    said = catch_refusal(lambda path: [*check_behaviour(load_model(path))], file)
-    assert re.search(message, said) and str(file) in said
+    line = catch_refusal(lambda path: [*check_behaviour(load_model(path))], file)
+    assert re.search(message, line) and str(file) in line
 
 
 TIMES = "Hold(time=0.1), Step(to=0.5, time=0.9), Sine(amplitude=0.2, frequency=2.0, time=1.0)),"
@@ -227,8 +227,8 @@ def test_a_stiff_plant_without_tolerances_is_explained(tmp_path: Path) -> None:
 def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -> None:
     file = write_file(tmp_path / "unstable.py", TEXT.replace("current - load",
                                                              "current - load + 1e5 * s.speed * abs(s.speed)"))
-    said = rig("simulate", "--model", file, "--out", tmp_path / "s.csv")
-    assert said.status == 2 and re.search(r"angle|current|voltage", said.err) and "t = 0.0" in said.err
+    result = rig("simulate", "--model", file, "--out", tmp_path / "s.csv")
+    assert result.status == 2 and re.search(r"angle|current|voltage", result.err) and "t = 0.0" in result.err
     assert not (tmp_path / "s.csv").exists()
     first, = check_behaviour(load_model(file))
     assert "a plant that stays finite; " in refuse("check", "preflight", "--model", file)
@@ -250,10 +250,10 @@ def test_a_new_file_passes_its_own_check(kind: str, check: tuple[str, ...], plan
                         "period: Annotated[float, Quantity(\"s\", low=1e-4, high=0.1)] = 3e-3")
     (here / "slow_plant.py").write_text(slow.replace("time=0.1)", "time=0.3)").replace("time=1.0)", "time=0.9)"))
     assert rig("new", kind, "my_new", "--model", plant, "--json").json["verdict"] == "COMPLETE"
-    said = rig(*check, "--model", plant, "--json")
-    assert said.status == 0 and "are of a bench" in rig("new", kind, "other", "--node", "3").err
+    result = rig(*check, "--model", plant, "--json")
+    assert result.status == 0 and "are of a bench" in rig("new", kind, "other", "--node", "3").err
     if kind == "effect":
-        trial = said.json["effects"][0]["self_test"]
+        trial = result.json["effects"][0]["self_test"]
         assert trial["faults"] == [] and trial["visible"]
         assert {"start", "level", *(s.name for s in load_model(plant).kind.signals.outputs)} == set(trial["shown"][0])
 

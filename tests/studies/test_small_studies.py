@@ -180,7 +180,7 @@ def test_a_killed_process() -> None:
 GONE = "ABORTED node 3 plant stopped answering: no feedback frame since cycle 9; "
 
 
-@pytest.mark.parametrize(("action", "victim", "pause", "status", "said", "is_sound"), [
+@pytest.mark.parametrize(("action", "victim", "pause", "status", "message", "is_sound"), [
     ("kill", "plant", 0.0, 1, f"{GONE}its process was ended by SIGKILL", True),
     ("kill", "plant", 0.0, 1, f"{GONE}no heartbeat any more: last heartbeat 0.30 s ago", False),
     ("kill", "controller", 0.0, 1, f"{GONE}its process was ended by SIGKILL", False),  # the wrong node
@@ -192,9 +192,9 @@ GONE = "ABORTED node 3 plant stopped answering: no feedback frame since cycle 9;
     ("stop", "rig", 3.1, 0, "PASS", True),
     ("stop", "rig", 0.9, 2, "rig run: the turn to send was held for more than 10 s by process 7", False),
 ])
-def test_what_the_verdict_of_a_disturbed_run_must_be(action: str, victim: str, pause: float, status: int, said: str,
+def test_what_the_verdict_of_a_disturbed_run_must_be(action: str, victim: str, pause: float, status: int, message: str,
                                                      is_sound: bool) -> None:
-    assert (judge_verdict(action, victim, pause, status, said) == []) == is_sound
+    assert (judge_verdict(action, victim, pause, status, message) == []) == is_sound
 
 
 def test_a_log_that_cannot_be_written() -> None:

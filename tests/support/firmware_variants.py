@@ -48,10 +48,10 @@ class Variant:
         if cob_id == codec.DRIVE:
             self.answers += 1
             drive = codec.unpack_drive(data)
-            said = self.answer(drive)
+            payload = self.answer(drive)
             self.last = drive
-            if said is not None:
-                self.bus(cob_id, codec.pack_drive(*said))
+            if payload is not None:
+                self.bus(cob_id, codec.pack_drive(*payload))
         elif not self.swallows(cob_id, data):
             self.bus(cob_id, data)
 

@@ -78,12 +78,12 @@ class PlantDesk(Desk):
     def cycle(self, current: float | None = 0.0, answers: int | None = None) -> tuple[Feedback, ValveState]:
         """SYNC, what the plant says, and the drive that answers it (None: none; `answers`: another cycle's)."""
         self.send(codec.SYNC)
-        said = self.last()
+        signals = self.last()
         if current is not None:
             self.drive(current, self.k if answers is None else answers)
         self.k += 1
         self.wait(MS)
-        return said
+        return signals
 
     def drive(self, current: float, cycle: int) -> None:
         self.send(codec.DRIVE, codec.pack_drive(current, 15, cycle))

@@ -112,9 +112,9 @@ class CanDevice(PythonDevice):
             known = self._database.get_message_by_frame_id(message.arbitration_id)
         except KeyError:
             return []
-        said = known.decode(message.data)
-        self._values |= said
-        if known.name != self._on or "Measured" not in said:  # once a cycle, not for each page
+        values = known.decode(message.data)
+        self._values |= values
+        if known.name != self._on or "Measured" not in values:  # once a cycle, not for each page
             return []
         amperes = compute_current(*(self._values[name] * self._position for name in ("Position", "Measured")))
         answer = self._database.get_message_by_name("Drive")

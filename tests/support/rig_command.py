@@ -31,7 +31,7 @@ from rig.sequences import parse_sequence
 
 
 @dataclass(frozen=True)
-class Said:
+class CommandResult:
     """What a command left behind."""
 
     status: int
@@ -52,7 +52,7 @@ class Said:
         return value
 
 
-def rig(*words: object) -> Said:
+def rig(*words: object) -> CommandResult:
     """The command in this process."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -60,21 +60,21 @@ def rig(*words: object) -> Said:
             status = main([str(word) for word in words])
         except SystemExit as end:
             status = int(end.code or 0)
-    return Said(status, out.getvalue(), err.getvalue(), words)
+    return CommandResult(status, out.getvalue(), err.getvalue(), words)
 
 
 def refuse(*words: object) -> str:
     """What the command says about words that it must refuse: one line, exit status 2, nothing on standard output."""
-    said = rig(*words)
-    assert (said.status, said.out, said.err.count("\n")) == (2, "", 1), (words, said)
-    return said.err
+    result = rig(*words)
+    assert (result.status, result.out, result.err.count("\n")) == (2, "", 1), (words, result)
+    return result.err
 
 
 def answer(*words: object, status: int = 0) -> dict[str, Any]:
     """The JSON answer of a command that must end with this status, with nothing on standard error."""
-    said = rig(*words, "--json")
-    assert (said.status, said.err) == (status, ""), (words, said)
-    return said.json
+    result = rig(*words, "--json")
+    assert (result.status, result.err) == (status, ""), (words, result)
+    return result.json
 
 
 def write_file(path: Path, text: str) -> Path:
@@ -93,14 +93,14 @@ def started(*words: object, **options: Any) -> subprocess.Popen[str]:
     return STARTED[-1]
 
 
-def finished(process: subprocess.Popen[str], timeout: float = 300.0) -> Said:
+def finished(process: subprocess.Popen[str], timeout: float = 300.0) -> CommandResult:
     """Wait for it."""
     out, err = process.communicate(timeout=timeout)
     typed = process.args[3:] if isinstance(process.args, list) else ()  # after python -m rig.cli.main
-    return Said(process.returncode, out or "", err or "", typed)
+    return CommandResult(process.returncode, out or "", err or "", typed)
 
 
-def interrupted(process: subprocess.Popen[str]) -> Said:
+def interrupted(process: subprocess.Popen[str]) -> CommandResult:
     """Press Ctrl-C, and wait for the end."""
     process.send_signal(signal.SIGINT)
     return finished(process)

@@ -84,10 +84,10 @@ def play(out: Path, name: str, *words: str | Path) -> int:
 
     (out / "short.toml").write_text(SHORT + SLOW_START)
     shutil.rmtree(out / name, ignore_errors=True)
-    said = rig("run", out / "short.toml", "--bus", BUS, "--json", "--out", out / name, *words)
-    (out / f"{name}.json").write_text(said.out)
-    (out / f"{name}.log").write_text(said.err)
-    return said.status
+    result = rig("run", out / "short.toml", "--bus", BUS, "--json", "--out", out / name, *words)
+    (out / f"{name}.json").write_text(result.out)
+    (out / f"{name}.log").write_text(result.err)
+    return result.status
 
 
 def three(out: Path) -> int:

@@ -245,8 +245,8 @@ def squares(seed: int, rows: int, extra: np.ndarray) -> np.ndarray:
 def test_the_condition_is_named(c: Trace, m: Motion, chosen: object, words: str) -> None:
     rows = chosen(c, m)  # type: ignore[operator]
     z2 = squares(1, len(c), np.where(rows, 30.0, 0.0))
-    said = find_condition(z2, m, LIMIT)
-    assert said.startswith(("100 %", "99 %")) and re.search(words, said), said
+    message = find_condition(z2, m, LIMIT)
+    assert message.startswith(("100 %", "99 %")) and re.search(words, message), message
 
 
 def test_noise_and_what_is_everywhere_have_no_condition(c: Trace, m: Motion) -> None:

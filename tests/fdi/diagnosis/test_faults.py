@@ -233,8 +233,8 @@ maintenance = 0.04
     assert (found["ruling"], found["bands"]["ruling"]) == ("bearing", "bearing")
     assert found["events"] and {event["section"] for event in found["events"]} == {"step to 0.5 rad"}
     assert [set(grid["faults"]) for grid in found["grids"]] and "bearing" in found["grids"][0]["faults"]
-    said = re.sub("<[^>]*>", " ", Path("page.html").read_text())
-    assert not re.search(r"\b(ram|jack|spool|valve|servo|XJ|XS|Kintas|FSS)\b", said)
+    text = re.sub("<[^>]*>", " ", Path("page.html").read_text())
+    assert not re.search(r"\b(ram|jack|spool|valve|servo|XJ|XS|Kintas|FSS)\b", text)
     assert "--bands: of bearing" in refuse("fdi", run, *own[:3], "--bands", "bands.toml")
     trend = rig("trend", "unit", *own, "--json").json
     assert [fault["name"] for fault in trend["faults"]] == ["bearing", "winding", "magnet"]

@@ -625,8 +625,8 @@ def test_the_command_tells_claims_and_resumes(files: dict[str, Path], monkeypatc
     monkeypatch.setattr(rounds, "judge_injection", judge)
     arguments = ("explain", *list_trace_arguments(files), "--sensitivity", "--hide", "coil_lag,constant_load",
                  "--workers", "1", "--out", tmp_path / "page.html")
-    said = rig(*arguments, "--json")
-    claims = {claim["effect"]: claim for claim in said.json["sensitivity"]}
+    result = rig(*arguments, "--json")
+    claims = {claim["effect"]: claim for claim in result.json["sensitivity"]}
     assert set(claims) == {"coil_lag", "constant_load"} and made
     lag = claims["coil_lag"]
     assert lag["parameter"] == "coil_lag.time" and lag["unit"] == "s" and lag["named"]["good"] == TRIALS

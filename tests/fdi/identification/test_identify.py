@@ -108,9 +108,9 @@ def test_range_that_is_too_narrow_gives_no_model_file(runs: tuple[Trace, Trace, 
     assert [told["parameters"][name]["at_bound"] for name in ("jack.area", "jack.travel", "supply.pressure")] == [
         True, False, False]
     assert not Path("identified.toml").exists() and Path("identified.html").exists()
-    said = rig("identify", "stops.csv", "--model", "sheet.toml", "--out", "mine.toml")
-    shown = " ".join(said.out.split())
-    assert said.status == 1 and "jack.area: the interval reaches the end of the data sheet's range" in shown
+    result = rig("identify", "stops.csv", "--model", "sheet.toml", "--out", "mine.toml")
+    shown = " ".join(result.out.split())
+    assert result.status == 1 and "jack.area: the interval reaches the end of the data sheet's range" in shown
     assert "mine.toml was written because of --out; its parameters do not explain the runs" in shown
 
 

@@ -154,12 +154,12 @@ def points(path: Path, sizes: Sequence[float]) -> Path:
 
 def test_the_command_on_an_earlier_answer(tmp_path: Path) -> None:
     source = points(tmp_path / "a.json", LINE)
-    said = rig("trend", source, "--json", "--out", tmp_path / "b.json")
-    fss = said.json["trends"]["spool_friction"]
+    result = rig("trend", source, "--json", "--out", tmp_path / "b.json")
+    fss = result.json["trends"]["spool_friction"]
     days = fss["remaining"]["maintenance"]
-    assert said.status == 0 and fss["verdict"] == "TREND" and said.json["last"] == "2026-03-23"
+    assert result.status == 0 and fss["verdict"] == "TREND" and result.json["last"] == "2026-03-23"
     assert days["low"] <= days["value"] <= days["high"] and days["value_at"] > "2026-03-23"
-    assert rig("trend", tmp_path / "b.json", "--json").json["trends"] == said.json["trends"]
+    assert rig("trend", tmp_path / "b.json", "--json").json["trends"] == result.json["trends"]
     shown = rig("trend", source, "--out", tmp_path / "x.html").out
     assert all(word in shown for word in ("spool friction", "TREND", "MaxBand", "per month", "x.html"))
     bad = points(tmp_path / "c.json", LINE + 25.0)

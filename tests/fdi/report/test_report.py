@@ -112,8 +112,8 @@ def test_text_of_the_trace_is_no_html_and_may_be_of_another_program(log: Path) -
 
 @pytest.mark.parametrize(("status", "mood"), [("PASS", "good"), ("INVALID_TIMING", "doubtful"), ("ABORTED", "bad")])
 def test_verdict_of_the_run_comes_first(log: Path, status: str, mood: str) -> None:
-    said = {"verdict.verdict": status, "verdict.why": "because", "verdict.timing": "because"}
-    page = render_run(replace(Trace.read(log), provenance=said))
+    provenance = {"verdict.verdict": status, "verdict.why": "because", "verdict.timing": "because"}
+    page = render_run(replace(Trace.read(log), provenance=provenance))
     assert f'<div class="verdict {mood}">{status}</div>' in page and "because" in page
 
 
@@ -652,11 +652,12 @@ def test_a_wide_table_fits_into_a_window_of_800_pixels(tmp_path: Path) -> None:
 def test_a_figure_is_zoomed_and_read(run_page: Path) -> None:
     notes = measure_page(run_page, 1200, ZOOM)
     assert notes.errors == []
-    said = notes.notes
-    assert "XJ less the target=" in said["whole"] and "time=0.7500 s" in said["whole"].replace("0.750 s", "0.7500 s")
-    assert said["zoomed"] != said["before"] == said["after"]
-    assert {"0.540", "0.560"} <= set(said["zoomed"].split("|")) and "0.540" not in said["before"].split("|")
-    shown = dict(part.split("=") for part in said["read"].split("|"))
+    readouts = notes.notes
+    assert "XJ less the target=" in readouts["whole"]
+    assert "time=0.7500 s" in readouts["whole"].replace("0.750 s", "0.7500 s")
+    assert readouts["zoomed"] != readouts["before"] == readouts["after"]
+    assert {"0.540", "0.560"} <= set(readouts["zoomed"].split("|")) and "0.540" not in readouts["before"].split("|")
+    shown = dict(part.split("=") for part in readouts["read"].split("|"))
     assert float(shown["time"].removesuffix(" s")) == pytest.approx(0.55, abs=0.001)
     percent = float(shown["XJ less the target"].split()[0].replace("\u2212", "-"))
     assert percent == pytest.approx(-100 * np.exp(-40 * 0.05), abs=1.0)  # beyond the target, % of the step

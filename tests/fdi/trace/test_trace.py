@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from physics_cases import PREFLIGHT
 from places import SUPPORT
 from refusals import catch_refusal
-from rig_command import Said, write_file
+from rig_command import CommandResult, write_file
 from synthetic_run import ATTACHMENTS, record_run
 
 from fdi.trace import Trace, find_sections, open_log
@@ -241,21 +241,21 @@ print(json.dumps([vars(rig(*words)) for words in json.load(sys.stdin)]))
 """
 
 
-def rig_with_little_memory(*commands: tuple[object, ...]) -> list[Said]:
+def rig_with_little_memory(*commands: tuple[object, ...]) -> list[CommandResult]:
     """Commands, one after the other, in a process that may not have more than MEMORY."""
     done = subprocess.run([sys.executable, "-c", PLAYED], text=True, capture_output=True, timeout=120,
                           preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY)),
                           input=json.dumps(commands, default=str),
                           env={"OPENBLAS_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "PYTHONPATH": str(SUPPORT)})
     assert done.returncode == 0, (commands, done)
-    return [Said(**said) for said in json.loads(done.stdout)]
+    return [CommandResult(**result) for result in json.loads(done.stdout)]
 
 
 def assert_refused(*commands: tuple[object, ...]) -> None:
     """Each of the commands reports bad input in one line."""
-    for said in rig_with_little_memory(*commands):
-        assert (said.status, said.err.count("\n"), said.out) == (2, 1, ""), said.words
-        assert "Memory" not in said.err
+    for result in rig_with_little_memory(*commands):
+        assert (result.status, result.err.count("\n"), result.out) == (2, 1, ""), result.words
+        assert "Memory" not in result.err
 
 
 def test_a_small_log_does_not_take_gigabytes(tmp_path: Path) -> None:
@@ -263,8 +263,8 @@ def test_a_small_log_does_not_take_gigabytes(tmp_path: Path) -> None:
     logs = [write_bomb(tmp_path / f"{kind}.mcap", kind) for kind in kinds]
     assert_refused(*(("report", log) for log in logs))  # messages by topic, and one by one
     assert_refused(*(("export", log, "--out", tmp_path / "x.log") for log in logs))
-    for said in rig_with_little_memory(*(("recover", log) for log in logs)):  # keeps what is sound, if there is any
-        assert said.status in (0, 2), said
+    for result in rig_with_little_memory(*(("recover", log) for log in logs)):  # keeps what is sound, if there is any
+        assert result.status in (0, 2), result
 
 
 def test_a_packed_table_does_not_take_gigabytes(tmp_path: Path) -> None:

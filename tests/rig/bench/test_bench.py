@@ -105,9 +105,9 @@ def test_percentiles_ratios_and_targets() -> None:
 @pytest.mark.parametrize("bus_kind", ["udp_multicast"] + ["socketcan"] * ("EHA_RIG_GUEST" not in os.environ
                                                                           and kernel_has_vcan0()), indirect=True)
 def test_the_command_measures_everybody(where: str) -> None:
-    said = rig("bench", "realtime", "--bus", where, "--seconds", 0.5, "--blocks", 1, "--json")
-    assert said.status in (0, 1) and said.err == ""
-    figures = said.json
+    result = rig("bench", "realtime", "--bus", where, "--seconds", 0.5, "--blocks", 1, "--json")
+    assert result.status in (0, 1) and result.err == ""
+    figures = result.json
     there = {COMPILED} | ({IN_C} if shutil.which("gcc") else set())
     assert figures["times_us"]["feedback_response"].keys() == there
     for name in there:

@@ -181,7 +181,7 @@ MISTAKES = [
     ("[controller.outputs]", '[controller.parameters]\n"0x2003" = "controller.gain"\n[controller.outputs]',
      "controller.parameters.0x2003: expected a field of controller"),
     *(("[controller.outputs]", f'[controller.values]\n"{key}" = {value}\n[controller.outputs]',
-       f"controller.values.{key}: expected {said}") for key, value, said in (
+       f"controller.values.{key}: expected {message}") for key, value, message in (
         ("0x2003", 300, "a number that Object 2003 can hold, not 300"), ("0x2003", 0.5, "a number that"),
         ("0x2006", 5, "a number that Object 2006 can hold, not 5"),
         ("0x2002", 1, "an object of the EDS that can be written"))),

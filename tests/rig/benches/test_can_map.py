@@ -265,8 +265,8 @@ def test_nested_multiplexers_are_refused() -> None:
     part = "SG_ Part m3M : 40|8@1+ (1,0) [0|0] \"\" Rig"
     nested = MULTIPLEXED.replace("SG_ State m3 :", f"{part}\n SG_ State m3 :").replace(
         "SG_MUL_VAL_ 11 State Kind 3-3;", "SG_MUL_VAL_ 11 Part Kind 3-3;\nSG_MUL_VAL_ 11 State Part 3-3;")
-    said = catch_refusal(load_multiplexed, nested, "State")
-    assert "signals of one multiplexer; Drive has Kind and Part, a nested one" in said
+    message = catch_refusal(load_multiplexed, nested, "State")
+    assert "signals of one multiplexer; Drive has Kind and Part, a nested one" in message
 
 
 def test_a_selector_has_no_other_use() -> None:

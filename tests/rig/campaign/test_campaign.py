@@ -128,8 +128,8 @@ def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(
     assert len(done) == 3
     with (there / judge.ROWS).open("a") as out:
         out.write('{"case": 5, "label": "hea')  # as a kill in the middle of a write leaves it
-    said = rig("campaign", there, *few, *MATRIX[-2:], "--json")
-    assert (said.status, said.json["cases"]) == (0, 6)
+    result = rig("campaign", there, *few, *MATRIX[-2:], "--json")
+    assert (result.status, result.json["cases"]) == (0, 6)
     assert rows(there) == rows(local)[:6] and rows(there / judge.RESULTS) == rows(there)
     again = Counter(source for _, source in calls(environment))
     assert len(again) == 6 and sum(again.values()) <= 7  # the one that the kill interrupted may have begun twice
@@ -211,8 +211,8 @@ def test_a_folder_of_traces_is_judged_and_a_changed_trace_is_another_campaign(tm
         Trace.from_columns(columns, 1e-3, {}).write_csv(tmp_path / name)
     (tmp_path / "c.csv").write_text("nothing\n1\n")
     words = ("campaign", tmp_path, "--out", tmp_path / "out", *MATRIX[-2:], "--json", "--jobs", 1)
-    said, found = rig(*words), rows(tmp_path / "out")
-    assert (said.status, said.json["status"]) == (0, {"ok": 2, "refused": 1})
+    result, found = rig(*words), rows(tmp_path / "out")
+    assert (result.status, result.json["status"]) == (0, {"ok": 2, "refused": 1})
     assert ("FSS [N]" in rig("campaign", tmp_path / "out", "--summary").out
             and [row["label"] for row in found] == ["a.csv.gz", "b.csv", "c.csv"])
     assert found[2]["reason"].startswith(str(tmp_path / "c.csv"))
@@ -221,17 +221,17 @@ def test_a_folder_of_traces_is_judged_and_a_changed_trace_is_another_campaign(tm
 
 
 def test_rig_fdi_in_a_campaign_finds_both_faults_and_the_statistics_are_written(tmp_path: Path) -> None:
-    said = rig("campaign", "--fault", "filter_clogging=0.17/spool_friction=45", "--seeds", 1, "--tolerance", 0,
+    result = rig("campaign", "--fault", "filter_clogging=0.17/spool_friction=45", "--seeds", 1, "--tolerance", 0,
                "--out", tmp_path, "--json", "--jobs", 1)
     row, = judge.read_campaign_rows(tmp_path)
-    assert row["status"] == "ok" and said.json["cases"] == 1, row["reason"]
+    assert row["status"] == "ok" and result.json["cases"] == 1, row["reason"]
     assert row["kintas"] == pytest.approx(0.17, rel=0.1) and row["fss"] == pytest.approx(45.0, rel=0.05)
     assert row["kintas_low"] < 0.17 < row["kintas_high"] and row["fss_low"] < 45.0 < row["fss_high"]
     assert (row["level_spool_friction"], row["ruling"]) == ("maintenance", "spool_friction")
     shown = rig("campaign", tmp_path / judge.RESULTS, "--summary").out
     assert "off-grid FSS within 2 %" in shown and "1/1" in shown
-    assert answer("campaign", tmp_path, "--summary") == said.json
-    assert json.loads((tmp_path / "summary.json").read_text()) == said.json
+    assert answer("campaign", tmp_path, "--summary") == result.json
+    assert json.loads((tmp_path / "summary.json").read_text()) == result.json
 
 
 def test_a_plant_file_is_judged_by_worker_processes_and_resumed_only_with_trust(environment: Path, here: Path) -> None:
@@ -247,22 +247,23 @@ def test_a_plant_file_is_judged_by_worker_processes_and_resumed_only_with_trust(
     assert "expected --trust" in refuse("campaign", "two", *work)
     with Path("my_motor.py").open("a") as file:
         file.write("# changed\n")
-    said = rig("campaign", "two", *work, "--trust")
-    assert said.status == 2 and "is not the plant file with which the campaign was started" in said.err
+    result = rig("campaign", "two", *work, "--trust")
+    assert result.status == 2 and "is not the plant file with which the campaign was started" in result.err
 
 
 CLOGGING, FRICTION = "filter_clogging", "spool_friction"
 
 
-def judged(label: str, kintas: float, fss: float, said: tuple[str, str], n: int, **more: Any) -> list[dict[str, Any]]:
+def judged(label: str, kintas: float, fss: float, reported: tuple[str, str], n: int, **more: Any
+           ) -> list[dict[str, Any]]:
     sizes = {"kintas": kintas, "kintas_low": kintas - 0.02, "kintas_high": kintas + 0.02, "fss": fss * 1.01,
              "fss_low": np.float64(fss * 0.95), "fss_high": fss * 1.005}
-    levels = dict(zip(("filter_clogging", "spool_friction"), said, strict=True))
+    levels = dict(zip(("filter_clogging", "spool_friction"), reported, strict=True))
     ruling = next((fault for fault, level in levels.items() if level != "acceptable"), "")
     return [{"label": label, "faults": len(label.split()) if label != "healthy" else 0, "tolerance": 0.015, "seed": i,
-             "status": "ok", "reason": "", "true_kintas": kintas, "true_fss": fss, "level_filter_clogging": said[0],
-             "level_spool_friction": said[1], "ruling": ruling,
-             "band_spool_friction": said[1] if said[1] == "non_nominal" else "acceptable",
+             "status": "ok", "reason": "", "true_kintas": kintas, "true_fss": fss, "level_filter_clogging": reported[0],
+             "level_spool_friction": reported[1], "ruling": ruling,
+             "band_spool_friction": reported[1] if reported[1] == "non_nominal" else "acceptable",
              "seconds": 2.0, **sizes, **more} for i in range(n)]
 
 

@@ -35,14 +35,14 @@ def test_the_frames_of_the_shipped_bench_load_the_bus_as_the_page_of_the_bus_say
     assert sum(each["share"] for each in cyclic) == pytest.approx((4 * 135 + 55) / 1000)  # docs/bus.md, Load
     assert answer["nodes"] == {"controller": 2, "plant": 3}
     assert answer["frames"][0]["signals"] == ["position_demand", "control_word", "cycle"]
-    said = rig("check", "--bench", "eha")
-    assert said.status == 0 and "RPDO1" in said.out and "0x202" in said.out and "WITHIN_LIMITS" in said.out
+    result = rig("check", "--bench", "eha")
+    assert result.status == 0 and "RPDO1" in result.out and "0x202" in result.out and "WITHIN_LIMITS" in result.out
 
 
 def test_a_bus_that_is_too_slow_is_reported(tmp_path: Path) -> None:
     slow = write_bench(tmp_path, BENCH.replace("[controller]", "bitrate = 125_000\n[controller]", 1))
-    said = rig("check", "--bench", slow)
-    assert said.status == 1 and "BEYOND_LIMITS" in said.out and "The frames need" in said.out
+    result = rig("check", "--bench", slow)
+    assert result.status == 1 and "BEYOND_LIMITS" in result.out and "The frames need" in result.out
 
 
 def test_a_sequence_is_checked_together_with_a_bench(tmp_path: Path) -> None:
@@ -116,21 +116,21 @@ BO_ 774 Antwort: 4 BOX
 """
 
 
-@pytest.mark.parametrize(("name", "said"), [
+@pytest.mark.parametrize(("name", "message"), [
     ("Strom", 'current = "Antwort.Antwort_Strom"'), ("Wert", "nothing looks like it")])
-def test_german_names_are_known_and_what_the_rig_sends_is_no_output(name: str, said: str) -> None:
+def test_german_names_are_known_and_what_the_rig_sends_is_no_output(name: str, message: str) -> None:
     """Also where the current's name says nothing: then the device is who does not send the demand."""
     text = guess_can("box", "box.dbc", BOX_DBC.replace("Strom", name), Wanted())
     inputs, outputs = text.split("[controller.outputs]")
     assert all(f'{word} = "{signal}"' in inputs for word, signal in (
         ("position_demand", "Soll.Soll_Weg"), ("ram_position", "Ist.Ist_Weg"), ("load_pressure", "Ist.Ist_Druck")))
-    assert said in outputs and "Antwort" not in inputs and "Soll" not in outputs
+    assert message in outputs and "Antwort" not in inputs and "Soll" not in outputs
 
 
 def test_a_sheet_without_the_signals_is_completed_by_the_user(tmp_path: Path) -> None:
     write_bench(tmp_path)
-    said = rig("new", "bench", "x", "--eds", tmp_path / "x.eds", "--out", tmp_path / "new.toml")
-    assert said.status == 0 and "is to be completed" in said.out and "nothing looks like it" in said.out
+    result = rig("new", "bench", "x", "--eds", tmp_path / "x.eds", "--out", tmp_path / "new.toml")
+    assert result.status == 0 and "is to be completed" in result.out and "nothing looks like it" in result.out
     for words in ((), ("--eds", "a.eds", "--dbc", "b.dbc")):
         assert "expected --eds FILE" in refuse("new", "bench", "y", *words)
     assert "expected 1 to 127" in refuse("new", "bench", "y", "--eds", tmp_path / "x.eds", "--node", "128")
@@ -159,11 +159,11 @@ def test_the_doctor_listens_for_a_bench() -> None:
     with closing(Link(open_can(spec), WallClock().now)) as link, ThreadPoolExecutor() as pool:
         sender = pool.submit(send, link)
         try:
-            said = rig("doctor", "--bench", ECU / "bench.toml", "--bus", spec, "--seconds", "1", "--json")
+            result = rig("doctor", "--bench", ECU / "bench.toml", "--bus", spec, "--seconds", "1", "--json")
         finally:
             stop.set()
             sender.result()  # raises what went wrong in it
-    found = {each["name"].split()[0]: each for each in said.json["findings"]}
+    found = {each["name"].split()[0]: each for each in result.json["findings"]}
     assert found["Drive"]["status"] == "limited"
     assert f"some of 2 bytes, not {drive.length}" in found["Drive"]["found"]
     assert "another rig" in found["Demand"]["remedy"] and found["Feedback"]["found"] == "none; the rig sends it"

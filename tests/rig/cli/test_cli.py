@@ -13,7 +13,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
-from rig_command import SHORT, Said, answer, finished, grown, interrupted, refuse, rig, started, write_file
+from rig_command import SHORT, CommandResult, answer, finished, grown, interrupted, refuse, rig, started, write_file
 
 from fdi.trace import Trace
 from fdi.trace.trace import CLEANUP
@@ -73,14 +73,15 @@ def test_results_stay_where_no_run_comes_about(short: Path, tmp_path: Path) -> N
 def test_brackets_in_names_are_brackets(tmp_path: Path) -> None:
     """rich would take them for mark-up, and end a run that passed with a traceback."""
     text = SHORT.replace("A short one", "[red]A[/] short one").replace('"overshoot",', '"[/b] overshoot",', 1)
-    said = rig("run", write_file(tmp_path / "odd.toml", text.replace('"rest"', '"[rest"')), "--out", tmp_path / "[out]")
-    assert said.status == 0 and "[red]A[/] short one" in said.out and "[/b] overshoot" in said.out, said
+    sequence = write_file(tmp_path / "odd.toml", text.replace('"rest"', '"[rest"'))
+    result = rig("run", sequence, "--out", tmp_path / "[out]")
+    assert result.status == 0 and "[red]A[/] short one" in result.out and "[/b] overshoot" in result.out, result
 
 
 def test_a_run_for_people(short: Path, tmp_path: Path) -> None:
-    said = rig("run", short, "--out", tmp_path / "out")
-    assert said.status == 0 and "PASS" in said.out and "overshoot" in said.out and "times real time" in said.out
-    assert rig("run", short, "--out", tmp_path / "out", "--quiet") == Said(0, "", "", ())
+    result = rig("run", short, "--out", tmp_path / "out")
+    assert result.status == 0 and "PASS" in result.out and "overshoot" in result.out and "times real time" in result.out
+    assert rig("run", short, "--out", tmp_path / "out", "--quiet") == CommandResult(0, "", "", ())
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["report.html", "trace.mcap", "verdict.json"]
 
 
@@ -96,8 +97,8 @@ def test_timing_that_is_invalid(short: Path, tmp_path: Path, monkeypatch: pytest
 def test_a_bug_is_neither_a_verdict_nor_bad_input(bug: type[Exception], short: Path, monkeypatch: pytest.MonkeyPatch,
                                                   tmp_path: Path) -> None:
     monkeypatch.setattr("rig.run.runner.judge_run", Mock(side_effect=bug))
-    said = rig("run", short, "--out", tmp_path / "out", "--json")
-    assert said.status == 70 and bug.__name__ in said.err and said.out == ""
+    result = rig("run", short, "--out", tmp_path / "out", "--json")
+    assert result.status == 70 and bug.__name__ in result.err and result.out == ""
     assert Trace.read(tmp_path / "out").xj.size == 350  # the log is closed
 
 
@@ -106,8 +107,8 @@ def test_ctrl_c_runs_clean_up_and_closes_the_log_in_a_folder_that_no_other_run_g
                       "--json")
     assert grown(tmp_path / "out" / "trace.mcap", 60_000, process)
     assert "no other run" in refuse("run", short, "--out", tmp_path / "out")
-    said = interrupted(process)
-    assert said.status == 130 and said.json["verdict"] == "ABORTED" and said.err == ""
+    result = interrupted(process)
+    assert result.status == 130 and result.json["verdict"] == "ABORTED" and result.err == ""
     trace = Trace.read(tmp_path / "out", all=True)
     assert (trace.phase == CLEANUP).sum() == 50 and trace.events[-1].text == "end"
 
@@ -119,8 +120,9 @@ def test_a_second_ctrl_c_ends_it_and_the_log_is_closed_all_the_same(tmp_path: Pa
     assert grown(log, 60_000, process)
     process.send_signal(signal.SIGTERM)
     assert grown(log, log.stat().st_size + 30_000, process)  # the run goes on, in its clean-up
-    said = interrupted(process)
-    assert said.status == 130 and said.err.splitlines()[-1] == "rig run: interrupted" and "Traceback" not in said.err
+    result = interrupted(process)
+    assert result.status == 130 and result.err.splitlines()[-1] == "rig run: interrupted"
+    assert "Traceback" not in result.err
     assert Trace.read(tmp_path / "out", all=True).events[-1].text == "end"
 
 
@@ -156,8 +158,8 @@ def test_output_that_nobody_reads_changes_no_verdict(how: str, short: Path, tmp_
         process = started(*words)
         process.stdout.close()
         process.stdout = None
-    said = finished(process)
-    assert (said.status, said.err) == (0, "") and (tmp_path / "out" / "verdict.json").exists()
+    result = finished(process)
+    assert (result.status, result.err) == (0, "") and (tmp_path / "out" / "verdict.json").exists()
 
 
 def test_the_installed_command_is_this_one() -> None:
@@ -178,9 +180,9 @@ def test_only_import_loads_the_reader_of_mf4_files(words: list[str], is_loaded: 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_is_a_table_without_cut_words(kind: str) -> None:
     rows = rig("list", kind, "--json").json[kind]
-    said = rig("list", kind)
-    assert said.status == 0 and "…" not in said.out
-    words = set(said.out.split())
+    result = rig("list", kind)
+    assert result.status == 0 and "…" not in result.out
+    words = set(result.out.split())
     assert rows and all(row["name"] in words for row in rows)
 
 
@@ -255,9 +257,9 @@ def test_each_finding_is_there_once_and_says_what_it_is_for_and_how_to_get_it(fi
 def test_a_missing_package_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(doctor, "read_requirements", lambda: {"": ["numpy", "no-such-distribution"]})
-    said = rig("doctor")
-    assert said.status == 1 and "missing: no-such-distribution" in said.out
-    assert said.out.splitlines()[0] == "FAIL  The bench cannot run without: packages."
+    result = rig("doctor")
+    assert result.status == 1 and "missing: no-such-distribution" in result.out
+    assert result.out.splitlines()[0] == "FAIL  The bench cannot run without: packages."
 
 
 def test_tools_that_are_not_there_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -270,4 +272,4 @@ def test_tools_that_are_not_there_are_missing(monkeypatch: pytest.MonkeyPatch) -
 def test_json_is_one_object_and_nothing_else(tmp_path: Path) -> None:
     told = answer("doctor", "--out", tmp_path / "doctor.json")
     assert told == json.loads((tmp_path / "doctor.json").read_text()) and told["verdict"] == "PASS"
-    assert rig("doctor", "--quiet") == Said(0, "", "", ())
+    assert rig("doctor", "--quiet") == CommandResult(0, "", "", ())

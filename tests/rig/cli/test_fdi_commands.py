@@ -10,7 +10,7 @@ import pytest
 from effect_files import SPRING, restored_catalogue
 from noisy_traces import SHORT, record_healthy, record_plant
 from places import ROOT
-from rig_command import Said, answer, refuse, rig, write_file
+from rig_command import CommandResult, answer, refuse, rig, write_file
 from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 from synthetic_run import record_run
 
@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def fault(folder: Path) -> Said:
+def fault(folder: Path) -> CommandResult:
     return rig("compare", folder / "fault.csv", "--out", folder / "fault.html")
 
 
@@ -55,7 +55,7 @@ def test_json_of_a_model_that_fits(folder: Path) -> None:
     assert sum(place["share"] for place in told["where"]) == pytest.approx(1.0, abs=0.01)
 
 
-def test_words_of_a_model_that_does_not(fault: Said, folder: Path) -> None:
+def test_words_of_a_model_that_does_not(fault: CommandResult, folder: Path) -> None:
     assert (fault.status, fault.err) == (1, "")
     assert re.match(r"MODEL_INCOMPLETE  The model does not explain this trace: XJ error [\d.]+ um, noise floor "
                     r"[\d.]+ um; the servovalve disagrees; controller, jack and sensor fit.\n", fault.out)
@@ -66,7 +66,7 @@ def test_words_of_a_model_that_does_not(fault: Said, folder: Path) -> None:
     assert "nan" not in fault.out and not re.search(r"\d[eE][-+]\d", fault.out)
 
 
-def test_a_page_that_needs_no_network(fault: Said, folder: Path) -> None:
+def test_a_page_that_needs_no_network(fault: CommandResult, folder: Path) -> None:
     page = (folder / "fault.html").read_text()
     assert "MODEL_INCOMPLETE" in page and page.count("<svg") == 5 and "</html>" in page
     assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//|@import|<script[^>]*src""", page)
@@ -81,14 +81,14 @@ def test_the_right_parameters_bring_it_to_the_floor(folder: Path) -> None:
     friction = ["--set", "spool.static_friction=30", "--set", "spool.dynamic_friction=20"]
     assert answer("compare", folder / "fault.csv", *friction)["verdict"] == "WITHIN_FLOOR"
     text = 'name = "stiff"\n[spool]\nstatic_friction = 30.0\ndynamic_friction = 20.0\n'
-    said = rig("compare", folder / "fault.csv", "--model", write_file(folder / "model.toml", text))
-    assert said.status == 0 and said.out.startswith("WITHIN_FLOOR  The model explains this trace")
-    assert "next" not in said.out
+    result = rig("compare", folder / "fault.csv", "--model", write_file(folder / "model.toml", text))
+    assert result.status == 0 and result.out.startswith("WITHIN_FLOOR  The model explains this trace")
+    assert "next" not in result.out
 
 
 def test_results_go_where_they_should(folder: Path) -> None:
     words = ("--out", folder / "told.json", "--signals", "xj, xs", "--report")
-    assert rig("compare", folder / "est.csv", "--quiet", *words) == Said(0, "", "", ())
+    assert rig("compare", folder / "est.csv", "--quiet", *words) == CommandResult(0, "", "", ())
     assert set(json.loads((folder / "told.json").read_text())["signals"]) == {"xj", "xs"}
     assert "WITHIN_FLOOR" in (folder / "compare.html").read_text()
 
@@ -102,8 +102,8 @@ def test_a_run_of_the_bench(preflight: Path) -> None:
 def test_few_rows_still_have_a_page(tmp_path: Path) -> None:
     short = {name: getattr(record_healthy(2), name)[:300] for name in ("com", "xj", "cor", "p12", "xs")}
     Trace.from_columns(short, 1e-3, {}).write_csv(tmp_path / "short.csv")
-    said = rig("compare", tmp_path / "short.csv", "--out", tmp_path / "short.html")
-    assert said.status in (0, 1) and (tmp_path / "short.html").exists(), said.err
+    result = rig("compare", tmp_path / "short.csv", "--out", tmp_path / "short.html")
+    assert result.status in (0, 1) and (tmp_path / "short.html").exists(), result.err
 
 
 def test_a_run_is_the_same_as_itself_in_any_format_and_another_differs(tmp_path: Path) -> None:
@@ -114,9 +114,9 @@ def test_a_run_is_the_same_as_itself_in_any_format_and_another_differs(tmp_path:
     assert not any(check["changed"] for check in same["checks"])
     trace = Trace.read(csv)
     write_csv(other, {"t": trace.t, "com": trace.com, "xj": trace.xj + 1e-4 * (trace.t > 1.0), "cor": trace.cor})
-    said = rig("diff", csv, other, "--report")
+    result = rig("diff", csv, other, "--report")
     page = (tmp_path / "diff.html").read_text(encoding="utf-8")
-    assert said.status == 1 and said.out.startswith("DIFFERENT") and "P12 of B: only A has it" in said.out
+    assert result.status == 1 and result.out.startswith("DIFFERENT") and "P12 of B: only A has it" in result.out
     assert "B - A" in page and page.count("<svg") == 1
 
 
@@ -129,23 +129,23 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def found(runs: dict[str, Path]) -> Said:
+def found(runs: dict[str, Path]) -> CommandResult:
     """One search; its page is page.html beside the run."""
     return rig("explain", *list_trace_arguments(runs), "--json", "--out", runs["est"].with_name("page.html"))
 
 
-def test_the_effect_is_named_with_its_evidence(found: Said) -> None:
-    said, hidden = found.json, HIDDEN["null_bias.current"]
-    best, *others = said["candidates"]
-    assert (found.status, said["verdict"], said["effects"]) == (1, "EXPLAINED", ["null_bias"])
+def test_the_effect_is_named_with_its_evidence(found: CommandResult) -> None:
+    answer, hidden = found.json, HIDDEN["null_bias.current"]
+    best, *others = answer["candidates"]
+    assert (found.status, answer["verdict"], answer["effects"]) == (1, "EXPLAINED", ["null_bias"])
     assert (best["effect"], best["word"]) == ("null_bias", "explains")
     assert best["ratio"] < 1.1 and best["evidence"] > 1000.0 and best["p_value"] < 1e-6
     current = best["parameters"]["null_bias.current"]
     assert current["unit"] == "A" and current["low"] < hidden < current["high"] < current["low"] + 0.1 * hidden
-    assert all(other["ratio"] > best["ratio"] for other in others) and said["blind_to"] and said["notes"] == []
+    assert all(other["ratio"] > best["ratio"] for other in others) and answer["blind_to"] and answer["notes"] == []
 
 
-def test_baseline_and_floor(found: Said) -> None:
+def test_baseline_and_floor(found: CommandResult) -> None:
     base, best = found.json["baseline"], found.json["candidates"][0]
     for told in (base, best):
         assert set(told["error"]) == set(told["holdout"]) == set(base["floor"]) == SIGNALS
@@ -154,7 +154,7 @@ def test_baseline_and_floor(found: Said) -> None:
                for signal, floor in base["floor"].items())
 
 
-def test_effects_that_hide_in_the_tolerances_are_listed_with_what_would_reveal_them(found: Said) -> None:
+def test_effects_that_hide_in_the_tolerances_are_listed_with_what_would_reveal_them(found: CommandResult) -> None:
     blind = {b["effect"]: b for b in found.json["blind_to"]}
     offset = blind["sensor_offset"]  # no size of it shows in a closed loop
     assert (offset["smallest_visible"], offset["usual"], offset["unit"]) == (None, 2e-4, "m")
@@ -167,39 +167,40 @@ def test_effects_that_hide_in_the_tolerances_are_listed_with_what_would_reveal_t
 def test_both_effects_of_the_readme_are_named(here: Path) -> None:
     """A repeat on which the right second effect misses another stop is no evidence against it."""
     assert rig("simulate", "--samples", "--quiet").status == 0
-    said = rig("explain", "run.csv", "--repeat", "run2.csv", "--holdout", "held.csv", "--json").json
-    assert (said["verdict"], {*said["effects"]}) == ("EXPLAINED", {"null_bias", "jack_friction"})
+    answer = rig("explain", "run.csv", "--repeat", "run2.csv", "--holdout", "held.csv", "--json").json
+    assert (answer["verdict"], {*answer["effects"]}) == ("EXPLAINED", {"null_bias", "jack_friction"})
 
 
 @pytest.fixture(scope="module")
-def added(runs: dict[str, Path]) -> tuple[Said, Path]:
+def added(runs: dict[str, Path]) -> tuple[CommandResult, Path]:
     """The right effect in a new model file; not to be written to."""
     model = runs["est"].with_name("biased.toml")
     return rig("add", "null_bias", *list_trace_arguments(runs), "--json", "--out", model), model
 
 
 @pytest.fixture
-def model(added: tuple[Said, Path], tmp_path: Path) -> Path:
+def model(added: tuple[CommandResult, Path], tmp_path: Path) -> Path:
     """A copy of that file."""
     return Path(shutil.copy(added[1], tmp_path / "biased.toml"))
 
 
-def test_the_error_falls_to_the_floor(added: tuple[Said, Path]) -> None:
-    said, path = added
-    floor, (before, after) = said.json["floor"], said.json["ledger"]
-    assert (said.status, said.json["model"], said.json["helps"]) == (0, str(path), True)
+def test_the_error_falls_to_the_floor(added: tuple[CommandResult, Path]) -> None:
+    result, path = added
+    floor, (before, after) = result.json["floor"], result.json["ledger"]
+    assert (result.status, result.json["model"], result.json["helps"]) == (0, str(path), True)
     assert (before["effect"], after["effect"]) == (None, "null_bias")
-    assert "null_bias added" in Path(said.json["report"]).read_text()
+    assert "null_bias added" in Path(result.json["report"]).read_text()
     assert min(before["error"]["xj"], before["holdout"]["xj"]) > 20.0 * floor["xj"]
     assert all(after["error"][signal] < 1.1 * level and after["holdout"][signal] < 1.15 * level
                for signal, level in floor.items())
 
 
-def test_the_file_is_a_model_with_intervals_and_provenance(added: tuple[Said, Path], runs: dict[str, Path]) -> None:
-    said, path = added
+def test_the_file_is_a_model_with_intervals_and_provenance(added: tuple[CommandResult, Path], runs: dict[str, Path]
+                                                           ) -> None:
+    result, path = added
     model, known = update_model.load_model_file(path)
     assert model.effects == ("null_bias",) and load_model(path) == model
-    value = said.json["parameters"]["null_bias.current"]
+    value = result.json["parameters"]["null_bias.current"]
     assert model["null_bias.current"] == pytest.approx(value["value"], rel=1e-5)
     assert value["low"] < HIDDEN["null_bias.current"] < value["high"]
     assert re.search(r"^current = .*# A, .*\(95 %\)$", path.read_text(), re.MULTILINE)
@@ -214,21 +215,21 @@ def test_a_run_at_rest_shows_next_to_nothing(tmp_path: Path) -> None:
     command = write_file(tmp_path / "rest.csv", "t,com\n0,0\n2,0\n")
     run = tmp_path / "run.csv"
     assert rig("simulate", "--command", command, "--set=null_bias.current=5e-5", "--out", run).status == 0
-    said = rig("explain", run, "--json", "--out", tmp_path / "page.html").json
-    assert (said["verdict"], said["effects"]) == ("NOT_RESOLVABLE", [])
-    blind = {b["effect"]: b["revealed_by"] for b in said["blind_to"]}
+    answer = rig("explain", run, "--json", "--out", tmp_path / "page.html").json
+    assert (answer["verdict"], answer["effects"]) == ("NOT_RESOLVABLE", [])
+    blind = {b["effect"]: b["revealed_by"] for b in answer["blind_to"]}
     assert "motion" in blind["moving_mass"] and "gauge" in blind["filter_clogging"]
 
 
 def test_such_a_model_simulates_and_lacks_nothing(model: Path, runs: dict[str, Path], tmp_path: Path) -> None:
     assert rig("simulate", "--model", model, "--out", tmp_path / "s.csv", "--quiet").status == 0
-    said = rig("explain", *list_trace_arguments(runs), "--model", model, "--out", tmp_path / "found.json")
-    assert said.status == 0 and said.out.startswith("NOTHING_MISSING")
-    assert "the residual is noise" in said.out and "not detectable" in said.out and "next" not in said.out
+    result = rig("explain", *list_trace_arguments(runs), "--model", model, "--out", tmp_path / "found.json")
+    assert result.status == 0 and result.out.startswith("NOTHING_MISSING")
+    assert "the residual is noise" in result.out and "not detectable" in result.out and "next" not in result.out
     assert json.loads((tmp_path / "found.json").read_text())["verdict"] == "NOTHING_MISSING"
 
 
-def test_the_ledger_goes_on_and_a_useless_effect_is_said_so(model: Path, added: tuple[Said, Path]) -> None:
+def test_the_ledger_goes_on_and_a_useless_effect_is_said_so(model: Path, added: tuple[CommandResult, Path]) -> None:
     told = answer("add", "spool_overlap", "--model", model, status=1)  # the runs are those of the file
     assert not told["helps"] and [row["effect"] for row in told["ledger"]] == [None, "null_bias", "spool_overlap"]
     assert told["ledger"][0]["error"]["xj"] == pytest.approx(added[0].json["ledger"][0]["error"]["xj"], rel=1e-5)
@@ -246,8 +247,8 @@ def test_without_it_the_error_rises_again(model: Path, runs: dict[str, Path]) ->
 
 def test_taken_out_without_a_run_all_else_stays(model: Path) -> None:
     mass = load_model(model)["jack.mass"]
-    said = rig("remove", "null_bias", "--model", model)
-    assert said.status == 0 and "give a TRACE" in said.out
+    result = rig("remove", "null_bias", "--model", model)
+    assert result.status == 0 and "give a TRACE" in result.out
     assert (load_model(model).effects, load_model(model)["jack.mass"]) == ((), mass)
 
 
@@ -271,8 +272,8 @@ def test_a_model_with_a_users_effect_finds_its_file_or_asks_for_it(tmp_path: Pat
                           f'[provenance]\neffect_files = ["{own}"]\n')
         assert update_model.load_model_file(mine)[0].effects == ("spring", "dry_friction")
     with restored_catalogue():
-        said = rig("compare", run, "--model", file, "--trust")
-    assert said.status == 0 and str(own) in said.err, said.err
+        result = rig("compare", run, "--model", file, "--trust")
+    assert result.status == 0 and str(own) in result.err, result.err
     own.rename(tmp_path / "elsewhere.py")
     for words in (["add", "null_bias", run], ["explain", run]):
         assert f"--effects {own} with it, where spring is defined" in refuse(*words, "--model", file)
@@ -283,7 +284,7 @@ STUCK = {"spool.static_friction": 45.0, "spool.dynamic_friction": 30.0}
 
 
 @pytest.fixture(scope="module")
-def clogged(folder: Path) -> Said:
+def clogged(folder: Path) -> CommandResult:
     return rig("fdi", folder / "clogged.csv", "--out", folder / "clogged.json")
 
 
@@ -299,7 +300,7 @@ def test_json_of_a_healthy_unit(folder: Path) -> None:
     assert {"step", "ramp"} <= set(told["grid"]) and not any(other["unhealthy"] for other in told["others"].values())
 
 
-def test_words_and_json_of_a_clogged_filter(clogged: Said, folder: Path) -> None:
+def test_words_and_json_of_a_clogged_filter(clogged: CommandResult, folder: Path) -> None:
     told = json.loads((folder / "clogged.json").read_text())
     printed = re.match(r"MAINTENANCE  Filter clogging requires maintenance: Kintas ([\d.]+)\b", clogged.out)
     kintas, text = told["refined"]["kintas"], " ".join(clogged.out.split())
@@ -322,10 +323,10 @@ def test_another_command_is_judged_without_bands(folder: Path) -> None:
 def test_a_fault_that_only_the_bands_blame_is_explained(folder: Path, tmp_path: Path) -> None:
     """A null bias moves the response out of the bands of clogging; the fit knows better, and that is said."""
     record_plant({"null_bias.current": 2.4e-4}).write_csv(tmp_path / "biased.csv")
-    said = rig("fdi", tmp_path / "biased.csv", "--out", tmp_path / "biased.html")
+    result = rig("fdi", tmp_path / "biased.csv", "--out", tmp_path / "biased.html")
     page = (tmp_path / "biased.html").read_text()
-    assert said.status == 0 and said.out.startswith("ACCEPTABLE")
-    for text in (" ".join(said.out.split()), page):
+    assert result.status == 0 and result.out.startswith("ACCEPTABLE")
+    for text in (" ".join(result.out.split()), page):
         bias = re.search(r"filter clogging: the bands call it non-nominal.* beside null bias ([\d.]+) mA", text)
         assert bias and float(bias[1]) == pytest.approx(0.24, rel=0.05)
     assert len(re.findall(r"<td[^>]*>step to 0 mm</td>", page)) > 1  # two steps, two lines

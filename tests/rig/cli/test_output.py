@@ -101,9 +101,9 @@ def test_a_full_disk_leaves_what_was_there_and_no_part(tmp_path: Path, name: str
     for before in ({}, {name: b"before"}):
         for file, content in before.items():
             (out / file).write_bytes(content)
-        said = subprocess.run([sys.executable, "-B", "-m", "rig.cli.main", *words], capture_output=True, text=True,
+        result = subprocess.run([sys.executable, "-B", "-m", "rig.cli.main", *words], capture_output=True, text=True,
                               preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (SMALLEST, SMALLEST)))
-        assert (said.returncode, said.stderr.count("\n")) == (2, 1), said
+        assert (result.returncode, result.stderr.count("\n")) == (2, 1), result
         assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
@@ -199,16 +199,17 @@ def test_code_in_a_log_runs_only_with_trust(log: Path) -> None:
     change_log(log, Path("sent.mcap"), {"effects/spring.py": CODE})
     line = refuse("run", "--from", "sent.mcap", "--json", "--out", "out")
     assert all(word in line for word in ("--trust", "effects/spring.py", "sent.mcap", DIGEST)) and not RAN.exists()
-    said = rig("run", "--from", "sent.mcap", "--trust", "--json", "--out", "out")
-    assert (said.status, RAN.read_text(), said.json["verdict"]) == (0, "ran ", "PASS")  # one object, without the list
-    assert said.err.count("\n") == 1 and DIGEST in said.err and "sent.mcap" in said.err
+    result = rig("run", "--from", "sent.mcap", "--trust", "--json", "--out", "out")
+    # one object, without the list
+    assert (result.status, RAN.read_text(), result.json["verdict"]) == (0, "ran ", "PASS")
+    assert result.err.count("\n") == 1 and DIGEST in result.err and "sent.mcap" in result.err
 
 
 def test_the_list_comes_before_the_code_runs(log: Path) -> None:
     change_log(log, Path("sent.mcap"), {"effects/bad.py": b"raise SystemError('it ran')"})
-    said = rig("run", "--from", "sent.mcap", "--trust", "--out", "out")
-    first, second = said.err.splitlines()
-    assert said.status == 2 and "trusted code: effects/bad.py, 27 bytes" in first and "it ran" in second
+    result = rig("run", "--from", "sent.mcap", "--trust", "--out", "out")
+    first, second = result.err.splitlines()
+    assert result.status == 2 and "trusted code: effects/bad.py, 27 bytes" in first and "it ran" in second
 
 
 def test_code_of_a_model_file_runs_only_with_trust(model: Path, trace: Path) -> None:
@@ -217,8 +218,8 @@ def test_code_of_a_model_file_runs_only_with_trust(model: Path, trace: Path) -> 
                   ["fdi", "--learn-bands", "--out", "b.toml"], ["node", "plant", "--bus", "udp_multicast"]):
         line = refuse(*words, "--model", model)
         assert "--trust" in line and "spring.py" in line and DIGEST in line and not RAN.exists(), words
-    said = rig("simulate", "--out", "x.csv", "--model", model, "--trust", "--json")
-    assert said.status == 0 and said.json["cycles"] and RAN.read_text() == "ran " and DIGEST in said.err
+    result = rig("simulate", "--out", "x.csv", "--model", model, "--trust", "--json")
+    assert result.status == 0 and result.json["cycles"] and RAN.read_text() == "ran " and DIGEST in result.err
 
 
 @pytest.mark.parametrize("words", [["named.toml"], ["short.toml", "--model", "m.toml"]], ids=["sequence", "command"])
@@ -235,13 +236,13 @@ def test_a_run_on_a_model_with_code_can_be_repeated(words: list[str], model: Pat
 
 def test_a_file_that_the_user_names_is_trusted(model: Path) -> None:
     """--effects replaces the file of the same name that the model names."""
-    said = rig("simulate", "--model", model, "--effects", "spring.py", "--out", "x.csv")
-    assert (said.status, said.err, RAN.read_text()) == (0, "", "ran ")
+    result = rig("simulate", "--model", model, "--effects", "spring.py", "--out", "x.csv")
+    assert (result.status, result.err, RAN.read_text()) == (0, "", "ran ")
 
 
 def test_the_next_command_keeps_the_trust(model: Path, trace: Path) -> None:
-    said = rig("compare", trace, "--model", model, "--trust")
-    assert said.status == 1 and "rig explain" in said.out and "--trust" in said.out, said
+    result = rig("compare", trace, "--model", model, "--trust")
+    assert result.status == 1 and "rig explain" in result.out and "--trust" in result.out, result
 
 
 def test_the_python_interface_asks_for_trust_too(model: Path, trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -278,8 +279,8 @@ def test_a_log_does_not_choose_the_bus(words: list[str], log: Path, monkeypatch:
     monkeypatch.setenv("EHA_RIG_BUS", "udp_multicast:239.77.7.8")
     for name, offer in (("sent.mcap", ", or --bus embedded: "), ("device.mcap", ": ")):
         assert f"--bus udp_multicast:239.77.7.7 to use it again{offer}" in refuse("run", "--from", name)
-    said = rig("run", "--from", *(word.format(log=log) for word in words), "--json", "--out", "out")
-    assert said.status == 0 and said.json["run"]["bus"] == "embedded", said
+    result = rig("run", "--from", *(word.format(log=log) for word in words), "--json", "--out", "out")
+    assert result.status == 0 and result.json["run"]["bus"] == "embedded", result
 
 
 def test_texts_of_a_log_do_not_command_the_terminal(log: Path) -> None:

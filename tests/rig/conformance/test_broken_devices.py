@@ -124,7 +124,7 @@ def test_other_nodes_are_not_commanded() -> None:
     assert (outcome.verdict, skipped, outcome.notes) == ("PASS", ["6.5"], ["Other nodes on the bus: 126."])
 
 
-@pytest.mark.parametrize(("section", "old", "new", "found_by", "said"), [
+@pytest.mark.parametrize(("section", "old", "new", "found_by", "message"), [
     ("DeviceInfo", "VendorName=eha-rig\n", "", "1.1", "DeviceInfo has no VendorName"),
     ("DeviceInfo", "BaudRate_1000=1", "BaudRate_1000=0", "1.1", "no bit rate"),
     ("DeviceInfo", "NrOfRXPDO=1", "NrOfRXPDO=2", "1.7", "NrOfRXPDO is 2, 1 are described"),
@@ -146,11 +146,11 @@ def test_other_nodes_are_not_commanded() -> None:
     ("1801sub1", "$NODEID+0x280", "$NODEID+0x180", "1.10", "TPDO2 and TPDO1 send 0x183"),
 ])  # fmt: skip
 def test_defect_of_the_data_sheet_is_found(
-    tmp_path: Path, section: str, old: str, new: str, found_by: str, said: str
+    tmp_path: Path, section: str, old: str, new: str, found_by: str, message: str
 ) -> None:
     outcome = examine(nothing, chapters=("1",), sheet=change_sheet(tmp_path, (section, old, new)))
     assert list_cases(outcome) == found_by.split()
-    assert any(said in result.measured for result in outcome.results)
+    assert any(message in result.measured for result in outcome.results)
 
 
 def test_missing_mandatory_object(tmp_path: Path) -> None:
@@ -250,16 +250,16 @@ def map_freely(*rules: str) -> Break:
     return all_of(change_entries(lambda entry: entry.index in parameters, access_type="rw"), wrap("_check", check))
 
 
-@pytest.mark.parametrize(("rules", "said"), [
+@pytest.mark.parametrize(("rules", "message"), [
     (("off", "object", "mappable", "length"), "RPDO1, TPDO1, TPDO2"),
     (("object", "mappable", "length"), "was changed while the PDO is valid"),
     (("off", "mappable", "length"), "RPDO1, an unknown object: accepted"),
     (("off", "object", "length"), "RPDO1, the vendor-ID: accepted"),
     (("off", "object", "mappable"), "more than 64 bits: accepted"),
 ])
-def test_mapping_rules(tmp_path: Path, rules: tuple[str, ...], said: str) -> None:
+def test_mapping_rules(tmp_path: Path, rules: tuple[str, ...], message: str) -> None:
     outcome = examine(map_freely(*rules), chapters=("4.17",), sheet=open_mappings(tmp_path))
-    assert said in measured(outcome, "4.17")[1]
+    assert message in measured(outcome, "4.17")[1]
     assert (outcome.verdict, outcome.notes) == ("PASS" if len(rules) == 4 else "FAIL", [])
 
 
@@ -505,23 +505,23 @@ def test_cases_are_numbered_without_a_gap() -> None:
 
 @own_nodes
 def test_our_nodes_pass_on_the_embedded_bus(node: str) -> None:
-    said = rig("conformance", node, "--json")
-    assert (said.status, said.json["verdict"], said.json["notes"]) == (0, "PASS", [])
-    by_verdict = {verdict.value: {test["number"] for test in said.json["tests"] if test["verdict"] == verdict.value}
+    result = rig("conformance", node, "--json")
+    assert (result.status, result.json["verdict"], result.json["notes"]) == (0, "PASS", [])
+    by_verdict = {verdict.value: {test["number"] for test in result.json["tests"] if test["verdict"] == verdict.value}
                   for verdict in Verdict}
     assert by_verdict["fail"] == by_verdict["skipped"] == set()
     assert by_verdict["not applicable"] == NOT_FOR_OUR_NODES[node]
-    assert len(by_verdict["pass"]) == len(CASES) - len(NOT_FOR_OUR_NODES[node]) == said.json["counts"]["pass"]
+    assert len(by_verdict["pass"]) == len(CASES) - len(NOT_FOR_OUR_NODES[node]) == result.json["counts"]["pass"]
 
 
 @only_udp
 @needs_compiler
 def test_the_firmware_passes_on_udp(where: str) -> None:
     """Wide limits, for the machine may be busy. Nothing is left behind."""
-    said = rig("conformance", "c", "--bus", where, "--json", "--timeout", 20, "--tolerance", 2000)
-    failed = [(test["number"], test["measured"]) for test in said.json["tests"] if test["verdict"] == "fail"]
-    assert (failed, said.err) == ([], "")
-    assert {test["number"] for test in said.json["tests"] if test["verdict"] == "not applicable"} == (
+    result = rig("conformance", "c", "--bus", where, "--json", "--timeout", 20, "--tolerance", 2000)
+    failed = [(test["number"], test["measured"]) for test in result.json["tests"] if test["verdict"] == "fail"]
+    assert (failed, result.err) == ([], "")
+    assert {test["number"] for test in result.json["tests"] if test["verdict"] == "not applicable"} == (
         NOT_FOR_OUR_NODES["controller"])
     assert gone(where)
 
@@ -529,9 +529,9 @@ def test_the_firmware_passes_on_udp(where: str) -> None:
 def test_files(tmp_path: Path) -> None:
     out = tmp_path / "new" / "folder"
     junit = out / "junit.xml"  # in a folder that the command makes, as docs/conformance.md shows it
-    said = rig("conformance", "plant", "--chapter", 1, "--chapter", "3.6", "--out", out, "--junit", junit)
-    assert said.status == 0 and said.out.startswith("PASS  Every applicable test passed (11 of 11).")
-    assert "3.6" in said.out and "0x05030000" in said.out
+    result = rig("conformance", "plant", "--chapter", 1, "--chapter", "3.6", "--out", out, "--junit", junit)
+    assert result.status == 0 and result.out.startswith("PASS  Every applicable test passed (11 of 11).")
+    assert "3.6" in result.out and "0x05030000" in result.out
     told, page = json.loads((out / "conformance.json").read_text()), (out / "conformance.html").read_text()
     assert (told["node"], told["product"], told["bus"]) == (3, "EHA plant emulator", "embedded")
     assert [test["number"] for test in told["tests"]][-2:] == ["1.10", "3.6"]
@@ -544,8 +544,8 @@ def test_files(tmp_path: Path) -> None:
 def test_a_failure_is_shown_everywhere(tmp_path: Path) -> None:
     junit = tmp_path / "junit.xml"
     sheet = write_file(tmp_path / "other.eds", EDS[3].read_text().replace("EHA plant emulator", "EHA <other>"))
-    said = rig("conformance", "plant", "--eds", sheet, "--chapter", 2, "--junit", junit, "--out", tmp_path)
-    assert said.status == 1 and said.out.startswith("FAIL  1 test failed: 2.3.") and "2.3 fail" in said.out
+    result = rig("conformance", "plant", "--eds", sheet, "--chapter", 2, "--junit", junit, "--out", tmp_path)
+    assert result.status == 1 and result.out.startswith("FAIL  1 test failed: 2.3.") and "2.3 fail" in result.out
     (failed,) = ElementTree.parse(junit).getroot().findall(".//testcase[failure]")
     assert failed.get("name") == "2.3 constants" and "EHA <other>" in str(failed[0].get("message"))
     assert "EHA &lt;other&gt;" in (tmp_path / "conformance.html").read_text()
@@ -574,10 +574,10 @@ def test_a_node_by_its_number_and_data_sheet(where: str) -> None:
     words = ("conformance", 2, "--eds", EDS[2], "--bus", where, "--json", "--timeout", 20, "--tolerance", 2000,
              "--chapter", "2", "--chapter", "4.15", "--chapter", "6.12")
     with stand_nodes(where, CONTROLLER):
-        said, more = rig(*words), rig(*words, "--write")
-        assert (said.status, more.status, len(nodes_on(where))) == (0, 0, 1)
-    assert [test["number"] for test in said.json["tests"] if test["verdict"] == "skipped"] == ["4.15", "6.12"]
-    assert (said.json["write"], more.json["write"], more.json["counts"]["skipped"]) == (False, True, 0)
+        result, more = rig(*words), rig(*words, "--write")
+        assert (result.status, more.status, len(nodes_on(where))) == (0, 0, 1)
+    assert [test["number"] for test in result.json["tests"] if test["verdict"] == "skipped"] == ["4.15", "6.12"]
+    assert (result.json["write"], more.json["write"], more.json["counts"]["skipped"]) == (False, True, 0)
 
 
 @needs_compiler
@@ -590,7 +590,7 @@ def test_the_firmware_passes_on_a_can_interface(bus_kind: str) -> None:
     """
     numbers = [each.number for each in CASES if each.number[0] == "3" and each.number != "3.15"]
     words = [word for number in numbers for word in ("--chapter", number)]
-    said = rig("conformance", "c", "--bus", spec(bus_kind), "--json", "--timeout", 20, "--tolerance", 2000, *words)
-    assert [test["number"] for test in said.json["tests"]] == numbers
-    failed = [(test["number"], test["measured"]) for test in said.json["tests"] if test["verdict"] == "fail"]
-    assert (failed, said.status) == ([], 0)
+    result = rig("conformance", "c", "--bus", spec(bus_kind), "--json", "--timeout", 20, "--tolerance", 2000, *words)
+    assert [test["number"] for test in result.json["tests"]] == numbers
+    failed = [(test["number"], test["measured"]) for test in result.json["tests"] if test["verdict"] == "fail"]
+    assert (failed, result.status) == ([], 0)

@@ -286,5 +286,5 @@ def test_impossible_dictionary_is_refused_in_one_line(tmp_path: Path, old: str, 
     node = 2 if "Data" in old else 3
     path = tmp_path / "bad.eds"
     path.write_text(EDS[node].read_text().replace(old, new))
-    said = catch_refusal(Device, node, path, lambda cob_id, data: None)
-    assert complaint in said and str(path) in said
+    message = catch_refusal(Device, node, path, lambda cob_id, data: None)
+    assert complaint in message and str(path) in message

@@ -115,9 +115,9 @@ def spoil(package: Path, what: str) -> None:
                                                                 "added     inputs/run/bench"])])
 def test_a_spoiled_folder_is_told_by_file(what: str, lines: list[str], package: Path) -> None:
     spoil(package, what)
-    said = rig("evidence", "--verify", package)
-    assert said.status == 1 and "CHANGED" in said.out
-    assert [line for line in lines if line not in said.out] == [], said.out
+    result = rig("evidence", "--verify", package)
+    assert result.status == 1 and "CHANGED" in result.out
+    assert [line for line in lines if line not in result.out] == [], result.out
     assert set(answer("evidence", "--verify", package, status=1)) > {"changed", "missing", "added"}
 
 
@@ -173,13 +173,13 @@ def test_bad_input_of_packing_is_refused(runs: Path, tmp_path: Path) -> None:
             ((runs / "run", "--requirements", tmp_path / "other.csv", *out), "an id of"),
             ((runs / "run", "--verify", runs / "pack"), "it only reads")):
         assert line in refuse("evidence", *words)
-    said = refuse("run", runs / "short.toml", "--requirements", tmp_path / "other.csv", *out)
-    assert "requirement of 'no emergency': expected an id of" in said and "not 'REQ-2'" in said
+    message = refuse("run", runs / "short.toml", "--requirements", tmp_path / "other.csv", *out)
+    assert "requirement of 'no emergency': expected an id of" in message and "not 'REQ-2'" in message
 
 
 def test_a_run_with_requirements_shows_their_coverage(runs: Path, tmp_path: Path) -> None:
-    said = rig("run", runs / "short.toml", "--requirements", runs / "req.csv", "--out", tmp_path)
-    assert said.status == 0 and "REQ-3        NOT_COVERED     0/0     0" in said.out
+    result = rig("run", runs / "short.toml", "--requirements", runs / "req.csv", "--out", tmp_path)
+    assert result.status == 0 and "REQ-3        NOT_COVERED     0/0     0" in result.out
     assert "REQ-1" in (tmp_path / "suite.html").read_text()
 
 

@@ -25,9 +25,9 @@ from rig.run import Outcome, participants
 def test_preflight_rows_are_byte_for_byte_those_of_the_builtin_controller(where: str, tmp_path: Path,
                                                                           preflight: Path) -> None:
     """On a CAN interface the same is asked in tests/vcan."""
-    said = rig("run", "--controller", "c", "--bus", where, "--json", "--out", tmp_path)
-    assert said.status == 0, said.err
-    assert said.json["verdict"] == "PASS"
+    result = rig("run", "--controller", "c", "--bus", where, "--json", "--out", tmp_path)
+    assert result.status == 0, result.err
+    assert result.json["verdict"] == "PASS"
     assert describe_first_difference(tmp_path, preflight) == "none in 14500 rows"
     assert nodes_on(where) == []
 
@@ -43,16 +43,16 @@ def test_gains_of_the_model_reach_the_firmware(tmp_path: Path) -> None:
     assert describe_first_difference(tmp_path / "c", tmp_path / "builtin").startswith("none in")
 
 
-@pytest.mark.parametrize(("words", "path", "said"), [
+@pytest.mark.parametrize(("words", "path", "message"), [
     (["--set", "command_rate_limit.rate=0.05"], None, "builtin"),  # effects in the firmware
     *((["--bus", bus], None, "--bus") for bus in ("virtual", "embedded", "slcan:x")),  # no port for it
     (["--bus", "udp_multicast"], "/nowhere", "apt-get install gcc"),
 ])
 def test_what_the_firmware_cannot_do_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str],
-                                                 path: str | None, said: str) -> None:
+                                                 path: str | None, message: str) -> None:
     monkeypatch.setenv("PATH", path or os.environ["PATH"])
     answer = rig("run", "--controller", "c", *words, "--out", tmp_path)
-    assert answer.status == 2 and said in answer.err and answer.err.count("\n") == 1
+    assert answer.status == 2 and message in answer.err and answer.err.count("\n") == 1
 
 
 @needs_compiler

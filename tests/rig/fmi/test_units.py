@@ -99,9 +99,9 @@ def test_a_unit_needs_no_interpreter_and_two_exports_are_one_file(
     source = Path(__file__).parents[2] / "support" / "drive_fmu.c"
     subprocess.run(["cc", str(source), "-o", str(driver), "-ldl"], check=True)
     words = [driver, tmp_path / "binaries" / platforms[0] / "eha.so", guid, 7, 1e-3, first, len(found) - 1, seed_at]
-    said = subprocess.run([str(word) for word in words], input="\n".join(x.hex() for x in COMMAND.tolist()),
+    result = subprocess.run([str(word) for word in words], input="\n".join(x.hex() for x in COMMAND.tolist()),
                           capture_output=True, text=True, check=True)
-    rows = np.array([[float.fromhex(word) for word in line.split()] for line in said.stdout.splitlines()])
+    rows = np.array([[float.fromhex(word) for word in line.split()] for line in result.stdout.splitlines()])
     expected = simulate(choose_model("nominal"), COMMAND, seed=7)
     assert rows.tobytes() == np.column_stack([expected.xj, expected.p12, expected.xs]).tobytes()
 
@@ -219,14 +219,14 @@ def test_messages_reach_the_logger(unit: Callable[[str, str], Path], tmp_path: P
     from fmpy.fmi3 import FMU3Slave, fmi3LogMessageCallback
 
     path = unit("nominal", "3")
-    said: list[str] = []
+    messages: list[str] = []
     described = fmpy.read_model_description(str(path))
     slave = FMU3Slave(guid=described.guid, unzipDirectory=fmpy.extract(str(path), str(tmp_path)),
                       modelIdentifier=described.coSimulation.modelIdentifier, instanceName="unit")
-    slave.instantiate(logMessage=fmi3LogMessageCallback(lambda _e, _s, _c, text: said.append(text.decode())))
+    slave.instantiate(logMessage=fmi3LogMessageCallback(lambda _e, _s, _c, text: messages.append(text.decode())))
     with pytest.raises(Exception, match="fmi3DoStep"):
         slave.doStep(0.0, 1e-3)
-    assert said == ["fmi3DoStep: not allowed in this state of the unit"]
+    assert messages == ["fmi3DoStep: not allowed in this state of the unit"]
     slave.freeInstance()
 
 
@@ -398,8 +398,8 @@ def test_a_unit_that_breaks_ends_the_run_with_a_verdict_and_a_readable_log(
     build_fmu(Path("slide.fmu"), **fault)
     monkeypatch.setattr(foreign, "LONGEST_CALL", 4.0)  # loading takes a second on a busy machine
     assert expected in refuse("simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
-    said = rig("run", "short.toml", "--model", "slide.toml", "--out", "run", "--quiet")
-    assert said.status == 1, said
+    result = rig("run", "short.toml", "--model", "slide.toml", "--out", "run", "--quiet")
+    assert result.status == 1, result
     verdict = json.loads(Path("run", "verdict.json").read_text())
     assert verdict["verdict"] == "ABORTED" and expected in json.dumps(verdict)
     assert len(Trace.read("run", all=True)) > 50

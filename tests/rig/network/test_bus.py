@@ -274,7 +274,7 @@ DOWN, UP = {"type": "280", "flags": "0x80"}, {"type": "280", "flags": "0xc1"}  #
 CLASSICAL = "is set to classical CAN, not to CAN FD; sudo ip link set"
 
 
-@pytest.mark.parametrize(("name", "files", "fd", "said"), [
+@pytest.mark.parametrize(("name", "files", "fd", "message"), [
     ("vcan1", {}, False, "ip link add vcan1 type vcan && sudo ip link set vcan1 up"),
     ("can1", {}, False, "ip link set can1 up type can bitrate 1000000"),
     ("eth0", {"type": "1", "flags": "0x1003"}, False, "eth0 is not a CAN interface"),
@@ -283,7 +283,7 @@ CLASSICAL = "is set to classical CAN, not to CAN FD; sudo ip link set"
     ("can0", UP | {"mtu": "16"}, True, f"can0 {CLASSICAL} can0 down && sudo ip link set can0 up type can bitrate "
                                        "1000000 dbitrate 4000000 fd on"),
     ("vcan0", UP | {"mtu": "16"}, True, f"vcan0 {CLASSICAL} vcan0 down && sudo ip link set vcan0 mtu 72 up")])
-def test_what_is_wrong_with_an_interface(name: str, files: dict[str, str], fd: bool, said: str,
+def test_what_is_wrong_with_an_interface(name: str, files: dict[str, str], fd: bool, message: str,
                                          monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Absent, not CAN, down, classical, fine."""
     for word in ("AF_CAN", "CAN_RAW"):
@@ -294,7 +294,7 @@ def test_what_is_wrong_with_an_interface(name: str, files: dict[str, str], fd: b
         (tmp_path / name).mkdir(exist_ok=True)
         (tmp_path / name / file).write_text(f"{text}\n")
     problem = explain_socketcan_problem(name, fd)
-    assert said in problem and bool(said) == bool(problem)
+    assert message in problem and bool(message) == bool(problem)
     assert bus_module.list_can_interfaces() == [name] * (files.get("flags") == "0xc1")
 
 
@@ -348,12 +348,12 @@ def test_a_controller_of_python_can_and_canopen_alone_passes_a_run(tmp_path: Pat
         with can.Bus(interface="eha_rig_udp", channel=group) as bus:
             boot = bus.recv(60.0)
             assert boot is not None and (boot.arbitration_id, bytes(boot.data)) == (0x702, b"\0")
-        said = rig("run", short, "--bus", f"udp_multicast:{group}", "--controller", "external",
+        result = rig("run", short, "--bus", f"udp_multicast:{group}", "--controller", "external",
                    "--out", tmp_path / "out", "--json")
     finally:
         other.terminate()
         other.wait(120)
-    assert said.status == 0 and said.json["verdict"] == "PASS", said
+    assert result.status == 0 and result.json["verdict"] == "PASS", result
 
 
 TAKE = "import sys; from rig.network.udp import Turn; turn = Turn(sys.argv[1], int(sys.argv[2])); turn.take(); "
@@ -484,14 +484,14 @@ class TestFrames:
         receive, send = function("receive_frame"), function("send_frame")
         with RawBus(where) as bus, RawBus(where, ()) as sender:
             make_buffer_small(bus.descriptors[0])
-            said = [send(sender.port, 0x100, 0, 0) for _ in range(3_000)]
-            sent = said.count(SENT)
+            outcomes = [send(sender.port, 0x100, 0, 0) for _ in range(3_000)]
+            sent = outcomes.count(SENT)
             kept = len(receive_all(bus.port))
             send(sender.port, 0x100, 0, 0)  # the count rides on the next frame
             assert receive(bus.port, soon())[0] == FRAME
             assert kept + bus.overflows == sent
             assert bus.overflows > 0
-            assert sent + said.count(QUEUE_FULL) == 3_000
+            assert sent + outcomes.count(QUEUE_FULL) == 3_000
 
 def read_by_python_can(data: bytes) -> tuple[Any, ...]:
     """What `Link` on a `UdpBus` makes of a datagram: COB-ID, length, payload; (-1,) for what is no data frame."""

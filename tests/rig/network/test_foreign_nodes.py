@@ -80,23 +80,23 @@ class Place:
         self.master.reset()
 
 
-@pytest.mark.parametrize(("held", "said"), [
+@pytest.mark.parametrize(("held", "message"), [
     ({(0x1000, 0): 0x198}, "x.eds: 0x1000: expected 0x20192, but node 5 controller has 0x198"),
     ({(0x1018, 1): 0x78}, "x.eds: 0x1018:1: expected 0x77, but node 5 controller has 0x78"),
     ({(0x1018, 2): 0x6}, "x.eds: 0x1018:2: expected 0x5, but node 5 controller has 0x6"),
 ])
-def test_another_device_is_refused(tmp_path: Path, held: dict[tuple[int, int], int], said: str) -> None:
-    assert catch_refusal(Place(tmp_path, held=held).master.require_identity, Role.CONTROLLER) == said
+def test_another_device_is_refused(tmp_path: Path, held: dict[tuple[int, int], int], message: str) -> None:
+    assert catch_refusal(Place(tmp_path, held=held).master.require_identity, Role.CONTROLLER) == message
 
 
-@pytest.mark.parametrize(("held", "said"), [
+@pytest.mark.parametrize(("held", "message"), [
     ({(0x1800, 1): 0x8000_0185}, "0x1800:1: expected 0x185, but node 5 controller has 0x80000185"),
     ({(0x1401, 2): 1}, "0x1401:2: expected 0xFF, but node 5 controller has 0x1"),
     ({(0x1600, 0): 1}, "0x1600: expected 0x2, but node 5 controller has 0x1"),
     ({(0x1A00, 1): 0x2003_0008}, "0x1A00:1: expected 0x20020010, but node 5 controller has 0x20030008"),
 ])
-def test_other_pdos_are_refused(tmp_path: Path, held: dict[tuple[int, int], int], said: str) -> None:
-    assert catch_refusal(Place(tmp_path, held=held).master.require_pdos, Role.CONTROLLER) == f"x.eds: {said}"
+def test_other_pdos_are_refused(tmp_path: Path, held: dict[tuple[int, int], int], message: str) -> None:
+    assert catch_refusal(Place(tmp_path, held=held).master.require_pdos, Role.CONTROLLER) == f"x.eds: {message}"
 
 
 def test_a_pdo_that_differs_only_in_whether_it_may_be_requested_is_taken(tmp_path: Path) -> None:

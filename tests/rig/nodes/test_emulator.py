@@ -351,16 +351,16 @@ def test_sensor_faults_show_in_the_frames_only() -> None:
     assert ours == other
 
 
-@pytest.mark.parametrize(("placed", "readings", "said"), [
+@pytest.mark.parametrize(("placed", "readings", "expected"), [
     ([Stuck(signal="xj", start=0.003, end=0.006)], range(8), [0, 1, 2, 2, 2, 2, 6, 7]),
     ([Stuck(signal="xj", value=7.0, start=0.0, end=0.001)], [1, 1], [7, 1]),
     ([Offset(signal="xj", value=4.0, start=0.0, end=0.006, ramp=0.004)], [1] * 7, [1, 2, 3, 4, 5, 5, 1]),
     ([Offset(signal="xs", value=4.0, start=0.0)], [1], [1]),
     ([Offset(signal="xj", value=1.0, start=0.0), Stuck(signal="xj", value=9.0, start=0.0)], [0], [9]),  # in this order
 ])
-def test_sensor_faults(placed: list[Fault], readings: list[float], said: list[float]) -> None:
+def test_sensor_faults(placed: list[Fault], readings: list[float], expected: list[float]) -> None:
     memory = ec.make_memory(scenario(*placed))
-    assert [ec._disturb(memory, 0, float(value), k) for k, value in enumerate(readings)] == said
+    assert [ec._disturb(memory, 0, float(value), k) for k, value in enumerate(readings)] == expected
 
 
 def test_noise_has_its_size_and_depends_on_seed_and_cycle_only() -> None:
@@ -384,8 +384,8 @@ def test_after_a_pause_the_cycle_is_that_of_the_bus_and_no_fault_was_slept_throu
         desk.k += 1
         desk.wait(MS)
     desk.nmt(1)
-    said = [desk.cycle(1e-3)[1] for _ in range(3)]
-    assert [(s.cycle, s.flags) for s in said] == [(15, 0), (16, 0), (17, 0)] and counters(desk) == (0, 0)
+    signals = [desk.cycle(1e-3)[1] for _ in range(3)]
+    assert [(s.cycle, s.flags) for s in signals] == [(15, 0), (16, 0), (17, 0)] and counters(desk) == (0, 0)
     names, live = QUIET.list_names(), int(desk.node._memory.words[ec.LIVE_AT])
     assert [read_reals(desk, live + names.index(name)) for name in ("filter.clogging", "spool.dynamic_friction")] == [
         [0.0], [1.0]]

@@ -208,10 +208,10 @@ def test_a_whole_log_stays_the_same(log: Path, tmp_path: Path) -> None:
     assert (before.xj == after.xj).all() and before.events == after.events and before.attachments == after.attachments
 
 
-@pytest.mark.parametrize(("name", "said"), [("text.mcap", "MCAP log"), ("none.mcap", "a file that can be read")])
-def test_refusals(name: str, said: str, log: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "message"), [("text.mcap", "MCAP log"), ("none.mcap", "a file that can be read")])
+def test_refusals(name: str, message: str, log: Path, tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("t,com,xj,cor\n")
-    assert said in catch_refusal(recover_log, tmp_path / name, tmp_path / "out.mcap")
+    assert message in catch_refusal(recover_log, tmp_path / name, tmp_path / "out.mcap")
     assert "another file" in catch_refusal(recover_log, log, log)
 
 

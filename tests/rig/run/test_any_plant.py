@@ -7,7 +7,7 @@ import pytest
 from bus_stations import only_udp, spec
 from example_devices import DRIVE, PATIENT, run_device
 from places import ROOT
-from rig_command import Said, refuse, rig, write_file
+from rig_command import CommandResult, refuse, rig, write_file
 
 from fdi.discovery.explain import compute_firmware_residual
 from fdi.estimation import prepare_trace, replay_current
@@ -46,7 +46,7 @@ checks = [
 """
 
 
-def play(folder: Path, *words: object) -> Said:
+def play(folder: Path, *words: object) -> CommandResult:
     """`rig run` on the drive of the example, in lockstep on UDP."""
     where = spec("udp_multicast")
     with run_device(DRIVE, where, *PATIENT[DRIVE]):
@@ -66,8 +66,8 @@ def write_bench(folder: Path, **changes: str) -> Path:
 
 def test_an_ema_with_a_cia402_drive(tmp_path: Path) -> None:
     """It passes the preflight of the EMA; faulty drives are found on the bench of the EHA (test_controllers.py)."""
-    said = play(tmp_path / "run", "preflight", "--bench", DRIVE / "ema.toml")
-    assert said.status == 0, said
+    result = play(tmp_path / "run", "preflight", "--bench", DRIVE / "ema.toml")
+    assert result.status == 0, result
     trace = Trace.read(tmp_path / "run")
     assert trace.signals == ("demand", "position", "current_demand", "motor_speed", "current", "load")
     assert abs(trace.position[-1]) < 2e-5 and abs(trace.column("motor_speed")).max() > 100.0
@@ -102,10 +102,10 @@ def test_a_plant_without_a_device_runs_with_its_own_controller(here: Path) -> No
     assert rig("new", "plant", "motor").status == 0
     slower = Path("motor.py").read_text().replace('high=0.1)] = 1e-3', 'high=0.1)] = 2e-3')
     Path("motor.py").write_text(slower)
-    said = rig("run", "--model", "motor.py", "--set", "dry_friction.torque=0.3", "--json", "--out", "run")
-    assert (said.status, said.json["verdict"]) == (0, "PASS"), said
+    result = rig("run", "--model", "motor.py", "--set", "dry_friction.torque=0.3", "--json", "--out", "run")
+    assert (result.status, result.json["verdict"]) == (0, "PASS"), result
     assert Trace.read("run").period == 2e-3
-    skipped = {each["name"] for each in said.json["not_applicable"]}
+    skipped = {each["name"] for each in result.json["not_applicable"]}
     assert "same answers after a reset" in skipped  # and so not counted as passed
     again = rig("run", "--from", "run", "--trust", "--out", "again")
     assert again.status == 0, again
@@ -139,9 +139,9 @@ def test_a_sequence_that_names_a_model_runs_on_the_bench_of_its_plant(tmp_path: 
 def test_a_run_with_fdi_is_judged_by_the_faults_of_its_own_plant(tmp_path: Path) -> None:
     short = write_file(tmp_path / "short.toml", SHORT.replace(
         "]\ncleanup", ', { kind = "ramp", to = -2e-3, time = 0.5 }, { kind = "step", to = 0.0, time = 0.5 }]\ncleanup'))
-    said = rig("run", short, "--model", "ema", "--set", "surface.friction=300", "--fdi", "--json", "--out", tmp_path)
-    assert (said.status, said.json["fdi"]["verdict"]) == (1, "NON_NOMINAL"), said
-    assert said.json["fdi"]["ruling"] == "dry_friction" and len(said.json["fdi"]["level"]) == 4
+    result = rig("run", short, "--model", "ema", "--set", "surface.friction=300", "--fdi", "--json", "--out", tmp_path)
+    assert (result.status, result.json["fdi"]["verdict"]) == (1, "NON_NOMINAL"), result
+    assert result.json["fdi"]["ruling"] == "dry_friction" and len(result.json["fdi"]["level"]) == 4
 
 
 @pytest.mark.parametrize(("old", "new", "line"), [
@@ -167,12 +167,12 @@ def test_a_mistake_in_a_bench_of_an_own_plant(old: str, new: str, line: str, tmp
     ('"command", largest=2', "expected one signal of role command, not none")])
 def test_a_plant_without_a_role_is_refused(role: str, line: str, tmp_path: Path) -> None:
     """A bench needs what drives the plant and what commands it."""
-    said = rig("check", "--bench", write_bench(tmp_path, **{f", {role})": ")"}), "--trust")
-    assert said.status == 2 and line in said.err
+    result = rig("check", "--bench", write_bench(tmp_path, **{f", {role})": ")"}), "--trust")
+    assert result.status == 2 and line in result.err
 
 
 @pytest.mark.parametrize("command", ["check", "run", "doctor"])
 def test_a_plant_file_is_code(command: str, tmp_path: Path) -> None:
     """A bench file is data that people send to each other: the plant in it runs with --trust only."""
-    said = refuse(command, "--bench", write_bench(tmp_path, **{"stabiliser trim jack": "another jack"}))
-    assert "expected --trust, because it brings code along that would run here: trim_jack.py" in said
+    message = refuse(command, "--bench", write_bench(tmp_path, **{"stabiliser trim jack": "another jack"}))
+    assert "expected --trust, because it brings code along that would run here: trim_jack.py" in message

@@ -56,8 +56,8 @@ def test_a_run_is_that_of_the_simulation_at_any_cycle(cycle: str, tmp_path: Path
     bench = write_bench(tmp_path, cycle)
     short = write_file(tmp_path / "short.toml", SHORT)
     gain = f"controller.proportional_gain={GAIN!r}"
-    said = rig("run", short, "--bench", bench, "--set", gain, "--json", "--out", tmp_path / "a")
-    assert said.json["verdict"] == "PASS" and said.json["run"]["period"] == float(cycle) / 1e3
+    result = rig("run", short, "--bench", bench, "--set", gain, "--json", "--out", tmp_path / "a")
+    assert result.json["verdict"] == "PASS" and result.json["run"]["period"] == float(cycle) / 1e3
     trace, period = Trace.read(tmp_path / "a"), float(cycle) / 1e3
     assert trace.period == period and len(trace) == round(0.35 / period)
     sequence = parse_sequence(SHORT, "short.toml", lambda name: b"", 1 / period)
@@ -65,8 +65,8 @@ def test_a_run_is_that_of_the_simulation_at_any_cycle(cycle: str, tmp_path: Path
     model = Model().replace({"controller.period": period, "controller.proportional_gain": GAIN})
     twin = simulate(model, command).xj[round(0.05 / period):]
     assert float(np.abs(trace.xj - twin).max()) < 20e-6
-    said = rig("run", "--from", tmp_path / "a" / "trace.mcap", "--quiet", "--out", tmp_path / "b")
-    assert said.status == 0, said
+    result = rig("run", "--from", tmp_path / "a" / "trace.mcap", "--quiet", "--out", tmp_path / "b")
+    assert result.status == 0, result
     again = Trace.read(tmp_path / "b")
     assert (again.xj == trace.xj).all() and again.period == period
 
@@ -90,7 +90,7 @@ def test_a_bench_in_a_test_has_its_own_cycle(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["run", "check"])
-@pytest.mark.parametrize(("old", "new", "said"), [
+@pytest.mark.parametrize(("old", "new", "message"), [
     ('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 0.051',
      "odd.toml:5: main[0].time: expected whole cycles of 0.002 s, not 0.051"),
     ('kind = "hold", time = 0.05 },\n  { name = "step"',
@@ -102,9 +102,10 @@ def test_a_bench_in_a_test_has_its_own_cycle(tmp_path: Path) -> None:
      "faults[0].size: expected a time below a cycle, 0.002 s, not 0.002"),
     ("checks = [", 'timing = { sync = 3e-3 }\nchecks = [',
      "timing.sync: expected at most a cycle, 0.002 s, not 0.003")])
-def test_what_such_cycles_cannot_show_is_refused(command: str, old: str, new: str, said: str, tmp_path: Path) -> None:
+def test_what_such_cycles_cannot_show_is_refused(command: str, old: str, new: str, message: str, tmp_path: Path
+                                                 ) -> None:
     sequence = write_file(tmp_path / "odd.toml", SHORT.replace(old, new, 1))
-    assert said in refuse(command, sequence, "--bench", write_bench(tmp_path, "2"))
+    assert message in refuse(command, sequence, "--bench", write_bench(tmp_path, "2"))
 
 
 def test_the_period_of_the_model_is_the_cycle_of_the_bench(tmp_path: Path) -> None:

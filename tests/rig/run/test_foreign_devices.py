@@ -206,20 +206,20 @@ class Mute(CanDevice):
 
 
 @only_udp
-@pytest.mark.parametrize(("answers", "length", "said"), [
+@pytest.mark.parametrize(("answers", "length", "message"), [
     (0, 0, "controller: no frame Drive (0x18F00005) for 5 cycles"), (1080, 0, "controller stopped answering"),
     (0, 2, "no valid frame Drive (0x18F00005) for 5 cycles: the last that came had 2 bytes, not 3"),
     (1080, 2, "it sends no valid frames: the last that came had 2 bytes, not 3"),
 ])
 def test_a_controller_that_sends_no_frames_ends_the_run_with_a_line_that_names_them(
-    answers: int, length: int, said: str, where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    answers: int, length: int, message: str, where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(participants, "FRAME_TIMEOUT", 0.2)  # s: it is spent in each cycle without an answer
     (tmp_path / "device.dbc").write_text(PAGES_DBC)
     (tmp_path / "bench.toml").write_text(CAN.format(demand="Feedback.Position"))
     _, outcome = play(tmp_path, where, Mute(where, answers, length))
     assert (outcome.verdict, outcome.status) == ("ABORTED", 1)
-    assert said in outcome.why and "frame Drive (0x18F00005)" in outcome.aborted
+    assert message in outcome.why and "frame Drive (0x18F00005)" in outcome.aborted
     assert outcome.attribution.cause is not None and outcome.attribution.cause.source is Role.CONTROLLER
 
 

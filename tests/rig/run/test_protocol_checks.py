@@ -112,9 +112,9 @@ class ReportsLostSync(Variant):
 def test_a_report_before_or_after_the_cycles_of_the_run_ends_nothing(tmp_path: Path,
                                                                      monkeypatch: pytest.MonkeyPatch) -> None:
     outcome = play_with(ReportsLostSync, tmp_path, monkeypatch)
-    said = [event.text for event in outcome.events if event.kind == "emcy"]
+    texts = [event.text for event in outcome.events if event.kind == "emcy"]
     assert (outcome.verdict, outcome.safe) == ("NOT_JUDGED", False)
-    assert said[0].endswith("0x8100 (EMCY) Monitoring (before the run)") and said[-1].endswith("(after the run)")
+    assert texts[0].endswith("0x8100 (EMCY) Monitoring (before the run)") and texts[-1].endswith("(after the run)")
 
 
 def test_a_gap_where_the_bench_was_late_is_not_the_controllers() -> None:

@@ -221,11 +221,11 @@ def test_a_rig_does_not_disturb_another(tmp_path: Path) -> None:
                 other.send(codec.SYNC, b"")
                 sent.append(time.monotonic())
                 time.sleep(0.01)
-            said = finished(process)
+            result = finished(process)
             heard = {frame.cob_id for frame in listener.poll(0.0)}
-        if said.status == 2 or max(later - earlier for earlier, later in pairwise(sent)) < 0.1:
+        if result.status == 2 or max(later - earlier for earlier, later in pairwise(sent)) < 0.1:
             break
-    assert said.status == 2 and "another rig is active" in said.err and heard == {codec.SYNC}
+    assert result.status == 2 and "another rig is active" in result.err and heard == {codec.SYNC}
 
 
 def wait_for_cycle(link: Link, process: subprocess.Popen[str], cycle: int, limit: float = 300.0) -> int:
@@ -280,8 +280,8 @@ def test_a_killed_run_loses_half_a_second_at_most(tmp_path: Path) -> None:
         assert gone(where)
         if last < 1000 or (folder / "verdict.json").exists():  # it had ended by itself, if only just before
             continue
-        said = rig("report", folder / "trace.mcap")
-        assert said.status == 2 and "rig recover" in said.err
+        result = rig("report", folder / "trace.mcap")
+        assert result.status == 2 and "rig recover" in result.err
         assert rig("recover", folder / "trace.mcap", "--out", folder / "saved.mcap", "--quiet").status == 0
         assert {"model.toml", "sequence/long.toml"} <= Trace.read(folder / "saved.mcap", all=True).attachments.keys()
         lost.append(last - int(open_log(folder / "saved.mcap").read_columns("/signals")["cycle"][-1]))
@@ -336,13 +336,13 @@ def test_an_external_node_that_dies_is_named_and_the_run_ends(where: str, tmp_pa
         wait_for_node(where, node)
     process = started_until_main(where, tmp_path, "--controller", "external", "--plant", "external", "--json")
     nodes[1].kill()
-    said = finished(process)
-    cause, trace = said.json["cause"], Trace.read(tmp_path, all=True)
-    assert (said.status, said.json["verdict"]) == (1, "ABORTED") and said.json["timing"]["cycles"] < 60_000
+    result = finished(process)
+    cause, trace = result.json["cause"], Trace.read(tmp_path, all=True)
+    assert (result.status, result.json["verdict"]) == (1, "ABORTED") and result.json["timing"]["cycles"] < 60_000
     assert (cause["source"], cause["kind"]) == ("node 2 controller", "stopped")
     silence = re.search(r"no heartbeat for (\d+\.?\d*)", cause["text"])
     assert silence and float(silence[1]) >= 2
-    assert "node 2 controller: no heartbeat for" in said.json["consequences"][0]["text"]
+    assert "node 2 controller: no heartbeat for" in result.json["consequences"][0]["text"]
     assert 1 <= np.isnan(trace.cor[trace.phase != CLEANUP]).sum() <= 2
     assert int((trace.phase == CLEANUP).sum()) == 100
 
@@ -368,10 +368,10 @@ def test_nodes_that_were_there_before_are_taken_and_left_alone(where: str, tmp_p
     assert all(node.poll() is None for node in nodes)
     for node in nodes:
         node.send_signal(signal.SIGTERM)
-    said = [finished(node) for node in nodes]
-    assert outcome.verdict == "PASS" and [one.status for one in said] == [0, 0]
-    assert "incoming frames lost 0" in said[0].out
-    assert said[1].json == {"node": "controller", "bus": where, "lost": 0, "unsent": 0, "error_frames": 0}
+    results = [finished(node) for node in nodes]
+    assert outcome.verdict == "PASS" and [one.status for one in results] == [0, 0]
+    assert "incoming frames lost 0" in results[0].out
+    assert results[1].json == {"node": "controller", "bus": where, "lost": 0, "unsent": 0, "error_frames": 0}
     assert np.array_equal(read_signals(tmp_path / "b"), reference), outcome.counters
 
 
@@ -405,9 +405,9 @@ def open_master(where: str) -> Iterator[Master]:
 
 
 def test_a_second_node_of_a_number_does_not_start(bus_with_nodes: str) -> None:
-    said = rig("node", "plant", "--bus", bus_with_nodes)
-    assert (said.status, said.err.count("\n")) == (2, 1)
-    assert f"{bus_with_nodes}: a node 3 (plant) is on this bus already; stop it before you start another" in said.err
+    result = rig("node", "plant", "--bus", bus_with_nodes)
+    assert (result.status, result.err.count("\n")) == (2, 1)
+    assert f"{bus_with_nodes}: a node 3 (plant) is on this bus already; stop it before you start another" in result.err
 
 
 def test_a_plant_that_came_first_is_used_in_place_of_ours(bus_with_nodes: str) -> None:
@@ -425,9 +425,9 @@ def test_a_plant_that_came_first_is_used_in_place_of_ours(bus_with_nodes: str) -
 
 
 def test_a_run_that_asks_for_its_own_plant_refuses_another_one(bus_with_nodes: str, tmp_path: Path) -> None:
-    said = rig("run", "--bus", bus_with_nodes, "--plant", "builtin", "--out", tmp_path)
-    assert said.status == 2
-    assert f"a node 3 plant is on {bus_with_nodes} already: stop it, or say --plant external" in said.err
+    result = rig("run", "--bus", bus_with_nodes, "--plant", "builtin", "--out", tmp_path)
+    assert result.status == 2
+    assert f"a node 3 plant is on {bus_with_nodes} already: stop it, or say --plant external" in result.err
 
 
 def test_a_node_of_ours_that_ends_is_no_node() -> None:

@@ -288,8 +288,8 @@ def test_who_the_nodes_are(tmp_path: Path) -> None:
 
 
 def test_another_firmware_than_the_sequence_asks_for_is_refused(tmp_path: Path) -> None:
-    said = catch_refusal(play, job(SHORT + "[firmware]\nproduct = 7\n"), tmp_path)
-    assert "firmware.product: expected 0x00000007, but the controller has 0x00000002" in said
+    message = catch_refusal(play, job(SHORT + "[firmware]\nproduct = 7\n"), tmp_path)
+    assert "firmware.product: expected 0x00000007, but the controller has 0x00000002" in message
 
 
 def test_too_many_overruns_in_a_row_end_main(tmp_path: Path) -> None:
@@ -354,14 +354,14 @@ def test_with_faults_loads_a_recorded_command_and_the_users_effect(tmp_path: Pat
     text = FAULTY.replace('  { name = "back"', '  { name = "recorded", kind = "csv", file = "recorded.csv" },\n'
                                                '  { name = "back"')
     (origin / "faulty.toml").write_text(text)
-    said = rig("run", origin / "faulty.toml", "--effects", origin / "creep.py", "--seed", 3, "--quiet", "--out",
+    result = rig("run", origin / "faulty.toml", "--effects", origin / "creep.py", "--seed", 3, "--quiet", "--out",
                tmp_path / "a", "--set", "creep.rate=1e-4")
-    assert said.status == 0, said
+    assert result.status == 0, result
     for path in origin.iterdir():
         path.unlink()
     del CATALOGUE["creep"]
-    said = rig("run", "--from", tmp_path / "a" / "trace.mcap", "--trust", "--quiet", "--out", tmp_path / "b")
-    assert said.status == 0, said
+    result = rig("run", "--from", tmp_path / "a" / "trace.mcap", "--trust", "--quiet", "--out", tmp_path / "b")
+    assert result.status == 0, result
     # and the effect did something
     assert same(tmp_path / "a", tmp_path / "b") and abs(Trace.read(tmp_path / "a").cor[-20:].mean()) > 1e-5
 
@@ -371,9 +371,9 @@ def test_two_effect_files_of_one_name_are_refused(tmp_path: Path) -> None:
     for folder, name in (("a", "creep"), ("b", "crawl")):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "mine.py").write_text(EFFECT.replace("creep", name))
-    said = rig("run", "--effects", tmp_path / "a" / "mine.py", "--effects", tmp_path / "b" / "mine.py", "--out",
+    result = rig("run", "--effects", tmp_path / "a" / "mine.py", "--effects", tmp_path / "b" / "mine.py", "--out",
                tmp_path / "out")
-    assert said.status == 2 and "mine.py" in said.err and len(said.err.splitlines()) == 1
+    assert result.status == 2 and "mine.py" in result.err and len(result.err.splitlines()) == 1
 
 
 @pytest.mark.parametrize("missing", ["seed", "model.toml"])
@@ -386,7 +386,7 @@ def test_a_log_without_what_decides_is_refused(tmp_path: Path, missing: str) -> 
 
 def test_bus_and_pace_may_be_asked_for_anew(tmp_path: Path) -> None:
     play(job(seed=4), tmp_path / "a")
-    said = rig("run", "--from", tmp_path / "a" / "trace.mcap", "--pace", "realtime", "--max-overruns", 1, "--json",
+    result = rig("run", "--from", tmp_path / "a" / "trace.mcap", "--pace", "realtime", "--max-overruns", 1, "--json",
                "--out", tmp_path / "b")
-    assert said.json["run"]["pace"] == "realtime" and said.json["run"]["seed"] == 4
+    assert result.json["run"]["pace"] == "realtime" and result.json["run"]["seed"] == 4
     assert same(tmp_path / "a", tmp_path / "b")

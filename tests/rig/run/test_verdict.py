@@ -20,7 +20,7 @@ main = [{ kind = "ramp", to = 0.05, time = 1.5 }, { kind = "hold", time = 0.1 }]
 """
 
 
-def said(outcome: Outcome) -> dict[str, object]:
+def build_answer(outcome: Outcome) -> dict[str, object]:
     return json.loads((outcome.folder / "verdict.json").read_text())
 
 
@@ -28,7 +28,7 @@ def test_without_checks_nothing_passed(tmp_path: Path) -> None:
     outcome = play(job(UNCHECKED), tmp_path)
     assert (outcome.verdict, outcome.status, outcome.failures) == ("NOT_JUDGED", 0, [])
     assert outcome.why.startswith("the sequence has no checks; ")
-    assert said(outcome)["verdict"] == "NOT_JUDGED"
+    assert build_answer(outcome)["verdict"] == "NOT_JUDGED"
     report = build_run_report(Trace.read(tmp_path, all=True))
     assert (report.verdict, report.mood) == ("NOT_JUDGED", "doubtful") and "every check" not in report.sentence.lower()
     assert play(job(SHORT), tmp_path).verdict == "PASS"
@@ -44,7 +44,7 @@ def test_the_ram_at_its_stop_and_the_current_at_its_limit_are_reported(tmp_path:
     assert found["cor"].limit == 8e-3 and found["cor"].seconds > 0.1
     text = format_report(build_run_report(Trace.read(tmp_path, all=True)))
     assert "limits reached: ram at its stop (40 mm)" in text and "current at its limit (8 mA)" in text
-    assert [each["parameter"] for each in said(outcome)["limits"]] == [  # type: ignore[attr-defined]
+    assert [each["parameter"] for each in build_answer(outcome)["limits"]] == [  # type: ignore[attr-defined]
         "jack.travel", "spool.travel", "controller.current_limit"]
 
 
@@ -78,7 +78,7 @@ def diagnosis(verdict: str) -> dict[str, object]:
 def test_a_fault_that_rig_fdi_finds_fails_the_run(found: str, verdict: str, status: int, tmp_path: Path) -> None:
     outcome = run_job(job(SHORT), tmp_path, lambda stage, share: None, lambda: False,
                       diagnose=lambda trace: diagnosis(found))
-    assert (outcome.verdict, outcome.status) == (verdict, status) and said(outcome)["verdict"] == verdict
+    assert (outcome.verdict, outcome.status) == (verdict, status) and build_answer(outcome)["verdict"] == verdict
     report = build_run_report(Trace.read(tmp_path, all=True))  # the log alone says so too
     assert report.verdict == verdict
     section = next(section for section in report.sections if section.title == "Faults found by rig fdi")

@@ -75,8 +75,8 @@ def watch(timings: Iterable[Timing], injected: Collection[int] = (), **policy: A
     ({"response": nan}, False),  # that is the controller's
 ])
 def test_late_and_missing_frames_of_the_plant_count_as_late_syncs_do(changes: dict[str, float], is_late: bool) -> None:
-    said = watch(make_timing(cycle, **changes) for cycle in range(200, 203))
-    assert said == is_late * "the bench was late: 3 overruns in a row up to cycle 202, limit 2"
+    result = watch(make_timing(cycle, **changes) for cycle in range(200, 203))
+    assert result == is_late * "the bench was late: 3 overruns in a row up to cycle 202, limit 2"
 
 
 def test_a_cycle_on_time_ends_the_row_and_one_that_a_fault_disturbs_does_not() -> None:

@@ -176,13 +176,13 @@ def test_how_small_a_step_may_be_depends_on_the_size_of_the_motion(largest: floa
     assert isnan(result.value) != is_step
 
 
-@pytest.mark.parametrize(("raised", "said"), [
+@pytest.mark.parametrize(("raised", "message"), [
     (ZeroDivisionError("float division by zero"), "the measure failed (ZeroDivisionError: float division by zero)"),
     (np.linalg.LinAlgError("SVD did not converge"), "the measure failed (LinAlgError: SVD did not converge)"),
     (OverflowError("too large"), "the measure failed (OverflowError: too large)"),
     (None, "the measure came to inf"),
 ])
-def test_a_measure_that_raises_or_has_no_end_has_failed(raised: Exception | None, said: str,
+def test_a_measure_that_raises_or_has_no_end_has_failed(raised: Exception | None, message: str,
                                                         monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> float:
         if raised is not None:
@@ -193,7 +193,7 @@ def test_a_measure_that_raises_or_has_no_end_has_failed(raised: Exception | None
     monkeypatch.setattr(checks, "measure_overshoot", broken)
     both = [check("overshoot", window="step", low=0.0, high=None), check("rise_time", window="step")]
     spoilt, sound = evaluate_checks(both, run, sections)
-    assert (spoilt.passed, isnan(spoilt.value), spoilt.detail, sound.passed) == (False, True, said, True)
+    assert (spoilt.passed, isnan(spoilt.value), spoilt.detail, sound.passed) == (False, True, message, True)
 
 
 ON, OFF = 2e-3, 0.0  # A

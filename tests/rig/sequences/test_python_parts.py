@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from refusals import catch_refusal
-from rig_command import Said, refuse, rig, write_file
+from rig_command import CommandResult, refuse, rig, write_file
 
 from rig.sequences import load_sequence
 
@@ -55,12 +55,12 @@ def write(folder: Path, sequence: str = SEQUENCE, code: str = CODE) -> Path:
 
 
 def test_profile_check_and_steps_run_from_a_log_too(tmp_path: Path) -> None:
-    said = rig("run", write(tmp_path), "--out", tmp_path / "a", "--json")
-    check = said.json["checks"][0]
-    assert said.status == 0 and check["passed"] and 1.0 < check["value"] < 200.0
+    result = rig("run", write(tmp_path), "--out", tmp_path / "a", "--json")
+    check = result.json["checks"][0]
+    assert result.status == 0 and check["passed"] and 1.0 < check["value"] < 200.0
     assert (check["unit"], check["requirement"], check["kind"]) == ("um", ["R-1"], "python")
     assert (tmp_path / "a" / "notes.txt").read_text() == "begin ''\nend 'PASS'\n"
-    assert said.err == "begin\nend\n"  # what the code prints does not spoil the JSON answer
+    assert result.err == "begin\nend\n"  # what the code prints does not spoil the JSON answer
     profile = load_sequence(tmp_path / "own.toml").main_profile()
     assert profile.command[150] == pytest.approx(1e-3 * 0.25) and profile.sections[1].name == "own"
 
@@ -68,7 +68,7 @@ def test_profile_check_and_steps_run_from_a_log_too(tmp_path: Path) -> None:
     line = refuse("run", "--from", tmp_path / "a", "--out", tmp_path / "b")
     assert "expected --trust" in line and "sequence/own.py" in line and not (tmp_path / "b").exists()
     again = rig("run", "--from", tmp_path / "a", "--out", tmp_path / "b", "--trust", "--json")
-    assert again.status == 0 and again.json["checks"] == said.json["checks"]
+    assert again.status == 0 and again.json["checks"] == result.json["checks"]
     assert "trusted code: sequence/own.py" in again.err
 
 
@@ -76,12 +76,12 @@ def test_the_example_of_the_page_works(tmp_path: Path) -> None:
     block = DOCS.read_text().split("The files `settle.toml` and `settle.py`:\n")[1].split("\nAn exception")[0]
     toml, code = re.sub(r"^    ", "", block, flags=re.MULTILINE).split("import numpy as np", 1)
     write_file(tmp_path / "settle.py", "import numpy as np" + code)
-    said = rig("run", write_file(tmp_path / "settle.toml", toml), "--out", tmp_path / "out", "--json")
-    assert (said.status, said.json["checks"][0]["name"]) == (0, "energy of the error")
+    result = rig("run", write_file(tmp_path / "settle.toml", toml), "--out", tmp_path / "out", "--json")
+    assert (result.status, result.json["checks"][0]["name"]) == (0, "energy of the error")
     assert (tmp_path / "out" / "note.txt").read_text() == "Own profile, own measure, seed 0"
 
 
-def run_with(folder: Path, old: str, new: str, *, in_code: bool = True) -> Said:
+def run_with(folder: Path, old: str, new: str, *, in_code: bool = True) -> CommandResult:
     source = CODE if in_code else SEQUENCE
     assert old in source
     changed = source.replace(old, new)
@@ -103,9 +103,9 @@ def run_with(folder: Path, old: str, new: str, *, in_code: bool = True) -> Said:
 ])
 @pytest.mark.filterwarnings("ignore:.*encountered in")
 def test_an_error_in_the_code_is_one_line(tmp_path: Path, old: str, new: str, line: str) -> None:
-    said = run_with(tmp_path, old, new)
-    (told,) = [text for text in said.err.splitlines() if text.startswith("rig run:")]
-    assert said.status == 2 and re.search(line, told), said.err
+    result = run_with(tmp_path, old, new)
+    (told,) = [text for text in result.err.splitlines() if text.startswith("rig run:")]
+    assert result.status == 2 and re.search(line, told), result.err
 
 
 @pytest.mark.parametrize(("old", "new", "line"), [
@@ -117,16 +117,16 @@ def test_an_error_in_the_code_is_one_line(tmp_path: Path, old: str, new: str, li
     ('requirement = "R-1"', 'requirement = ""', r"own\.toml:19: checks\[0\]\.requirement: expected the id"),
 ])
 def test_a_wrong_entry_is_one_line(tmp_path: Path, old: str, new: str, line: str) -> None:
-    said = run_with(tmp_path, old, new, in_code=False)
-    assert said.status == 2 and len(said.err.splitlines()) == 1 and re.search(line, said.err), said.err
+    result = run_with(tmp_path, old, new, in_code=False)
+    assert result.status == 2 and len(result.err.splitlines()) == 1 and re.search(line, result.err), result.err
 
 
 @pytest.mark.parametrize(("returned", "why"), [("None", "no value"), ("float('nan')", "returned nan"),
                                                ("'x'", "not a number")])
 def test_a_value_that_cannot_be_measured_fails_the_check(returned: str, why: str, tmp_path: Path) -> None:
-    said = run_with(tmp_path, "return 1e6 * np.abs(window.error).max()", f"return {returned}")
+    result = run_with(tmp_path, "return 1e6 * np.abs(window.error).max()", f"return {returned}")
     detail = json.loads((tmp_path / "out" / "verdict.json").read_text())["checks"][0]["detail"]
-    assert said.status == 1 and why in detail
+    assert result.status == 1 and why in detail
 
 
 def test_the_step_after_runs_even_if_the_run_cannot(tmp_path: Path) -> None:

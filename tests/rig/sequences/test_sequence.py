@@ -269,8 +269,9 @@ CHECKS = [  # keys of a check, the key that cannot be used, and what was expecte
 ]
 BAD += [(HEAD + f'checks = [{{ name = "c", {keys} }}]\n', f"mine.toml:3: checks[0]{key}: expected {expected}")
         for keys, key, expected in CHECKS]
-BAD += [(HEAD + f'guards = [{{ name = "g", signal = "xj"{keys} }}]\n', f"mine.toml:3: guards[0]{key}: expected {said}")
-        for keys, key, said in (("", "", "a low, a high, or both"),
+BAD += [(HEAD + f'guards = [{{ name = "g", signal = "xj"{keys} }}]\n',
+         f"mine.toml:3: guards[0]{key}: expected {expected}")
+        for keys, key, expected in (("", "", "a low, a high, or both"),
                                 (", low = 1, high = 1", "", "a low, a high, or both"),
                                 (", high = 1, cycles = 0", ".cycles", "a whole number from 1, not 0"),
                                 (', high = 1, unit = "bar"', ".unit", "'cm', 'inch', 'm'"))]
@@ -497,7 +498,7 @@ def test_a_node_that_is_bus_off_sends_and_receives_nothing() -> None:
     assert s.list_frame_hits("rig")[:, 0].tolist() == [*range(300, 400)]
 
 
-@pytest.mark.parametrize(("bench", "fault", "said"), [
+@pytest.mark.parametrize(("bench", "fault", "message"), [
     ("", Foreign(start=0.0, cob_id=0x183), "cob_id: expected an identifier from 1 to 0x7FF that 'EHA controller' does "
                                            "not use; 0x183 is RPDO2"),
     ("", Foreign(start=0.0, cob_id=0x702), "cob_id: expected an identifier from 1 to 0x7FF that 'EHA controller' does "
@@ -515,10 +516,10 @@ def test_a_node_that_is_bus_off_sends_and_receives_nothing() -> None:
     ("can_ecu", Silent(start=0.0, node="rig"), "node: expected a node of 'Actuator with an ECU on plain CAN' with a"),
     ("can_ecu", Lost(start=0.0, frame="drive"), ""),
 ])
-def test_a_fault_is_refused_on_a_bench_that_cannot_have_it(bench: str, fault: Fault, said: str) -> None:
+def test_a_fault_is_refused_on_a_bench_that_cannot_have_it(bench: str, fault: Fault, message: str) -> None:
     at = load_bench(str(ROOT / "examples" / bench / "bench.toml")) if bench else load_bench()
-    if not said:
+    if not message:
         require_possible([fault], at, "x.toml")
         return
     refusal = catch_refusal(require_possible, [fault], at, "x.toml")
-    assert refusal.startswith("x.toml: faults[0].") and said in refusal
+    assert refusal.startswith("x.toml: faults[0].") and message in refusal

@@ -8,7 +8,19 @@ import numpy as np
 import pytest
 from junit_schema import read_valid_junit
 from places import ROOT
-from rig_command import SHORT, Said, answer, finished, grown, interrupted, job, refuse, rig, started, write_file
+from rig_command import (
+    SHORT,
+    CommandResult,
+    answer,
+    finished,
+    grown,
+    interrupted,
+    job,
+    refuse,
+    rig,
+    started,
+    write_file,
+)
 
 from fdi.trace import CheckResult
 from rig.cli import is_suite_file
@@ -72,7 +84,7 @@ def write_sequences(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Said]:
+def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CommandResult]:
     """The folder of a suite that ran as a user's command, and what the command said."""
     folder = tmp_path_factory.mktemp("suite")
     write_sequences(folder)
@@ -82,15 +94,15 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Said]:
     return folder / "out", finished(process)
 
 
-def test_each_case_has_its_verdict_and_the_worst_is_that_of_the_suite(suite: tuple[Path, Said]) -> None:
-    folder, said = suite
+def test_each_case_has_its_verdict_and_the_worst_is_that_of_the_suite(suite: tuple[Path, CommandResult]) -> None:
+    folder, result = suite
     told = json.loads((folder / "suite.json").read_text())
     cases = {case["name"]: case for case in told["cases"]}
     assert list(cases) == ["short, seed 1", "short, seed 2", "weak, jack.mass=90", "weak, jack.mass=110", "crash",
                            "fail", "hang"]
     assert [(case["verdict"], case["seed"]) for case in cases.values()] == [
-        ("PASS", 1), ("PASS", 2), ("FAIL", 0), ("FAIL", 0), ("ERROR", 0), ("ERROR", 0), ("ERROR", 0)], said
-    assert (said.status, told["verdict"], told["jobs"]) == (1, "ERROR", 2)
+        ("PASS", 1), ("PASS", 2), ("FAIL", 0), ("FAIL", 0), ("ERROR", 0), ("ERROR", 0), ("ERROR", 0)], result
+    assert (result.status, told["verdict"], told["jobs"]) == (1, "ERROR", 2)
     for name, why in (("crash", r"its process was ended by SIGKILL"), ("hang", "it took longer than 1 s"),
                       ("fail", r".*own\.py:13: fail: expected .*AttributeError.*")):
         assert re.fullmatch(why, cases[name]["why"])
@@ -98,7 +110,7 @@ def test_each_case_has_its_verdict_and_the_worst_is_that_of_the_suite(suite: tup
     assert "jack.mass = 110 kg" in cases["weak, jack.mass=110"]["differences"]
 
 
-def test_a_line_for_each_case_and_a_table(suite: tuple[Path, Said]) -> None:
+def test_a_line_for_each_case_and_a_table(suite: tuple[Path, CommandResult]) -> None:
     lines = suite[1].out.splitlines()
     assert lines[0] == "All kinds: 7 cases, 2 at a time"
     assert sorted(line.split()[0] for line in lines[1:8]) == ["ERROR"] * 3 + ["FAIL"] * 2 + ["PASS"] * 2
@@ -108,7 +120,7 @@ def test_a_line_for_each_case_and_a_table(suite: tuple[Path, Said]) -> None:
     assert "Traceback" not in suite[1].err
 
 
-def test_folders_and_page(suite: tuple[Path, Said]) -> None:
+def test_folders_and_page(suite: tuple[Path, CommandResult]) -> None:
     folder, _ = suite
     page = (folder / "suite.html").read_text()
     links = re.findall(r'<a href="([^"]+)"', page)
@@ -120,8 +132,8 @@ def test_folders_and_page(suite: tuple[Path, Said]) -> None:
     assert "script" not in page and page.count("http") == 0
 
 
-def test_requirements_are_traced(suite: tuple[Path, Said]) -> None:
-    folder, said = suite
+def test_requirements_are_traced(suite: tuple[Path, CommandResult]) -> None:
+    folder, result = suite
     told = json.loads((folder / "suite.json").read_text())
     traced = {each["id"]: each for each in told["requirements"]}
     assert list(traced) == ["R-1", "R-2", "R-9", "R-3"]
@@ -129,10 +141,10 @@ def test_requirements_are_traced(suite: tuple[Path, Said]) -> None:
     assert [each["check"] for each in traced["R-2"]["checks"]] == ["whole run"] * 2
     assert {(each["case"], each["verdict"]) for each in traced["R-3"]["checks"]} == {
         ("crash", "OPEN"), ("fail", "OPEN"), ("hang", "OPEN")}
-    assert "note      no check verifies R-9" in said.out
+    assert "note      no check verifies R-9" in result.out
 
 
-def test_junit_is_valid_and_complete(suite: tuple[Path, Said]) -> None:
+def test_junit_is_valid_and_complete(suite: tuple[Path, CommandResult]) -> None:
     folder, _ = suite
     root = read_valid_junit(folder / "junit.xml")
     assert [each.get("errors") for each in root] == ["0"] * 4 + ["1"] * 3
@@ -185,12 +197,12 @@ def test_ctrl_c_writes_what_is_done(tmp_path: Path) -> None:
     while not process.stdout.readline().startswith("PASS"):
         assert process.poll() is None
     assert grown(tmp_path / "own.py.hangs", 0, process)
-    said = interrupted(process)
-    assert said.status == 130, said
+    result = interrupted(process)
+    assert result.status == 130, result
     told = json.loads((tmp_path / "out" / "suite.json").read_text())
     assert [case["verdict"] for case in told["cases"]] == ["PASS", "NOT_RUN", "NOT_RUN"]
     assert len(read_valid_junit(tmp_path / "j.xml").findall("testsuite/testcase[skipped]")) == 2
-    assert "Traceback" not in said.err and "3 at" not in said.out
+    assert "Traceback" not in result.err and "3 at" not in result.out
     assert rig("report", tmp_path / "out" / "hang-seed-1", "--quiet").status == 0  # its log was closed
 
 
@@ -265,7 +277,7 @@ requirement = "R-1"
 
 
 @pytest.fixture(scope="module")
-def units(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Said]:
+def units(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CommandResult]:
     """The folder of a suite with a healthy and a clogged unit and a run without diagnosis; what the command said."""
     folder = tmp_path_factory.mktemp("suite")
     (folder / "steps.toml").write_text(STEPS)
@@ -275,11 +287,11 @@ def units(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Said]:
                                "--junit", folder / "out" / "junit.xml")
 
 
-def test_a_fault_fails_its_case_and_no_other(units: tuple[Path, Said]) -> None:
-    folder, said = units
+def test_a_fault_fails_its_case_and_no_other(units: tuple[Path, CommandResult]) -> None:
+    folder, result = units
     told = json.loads((folder / "suite.json").read_text())
     healthy, clogged, plain = told["cases"]
-    assert [case["verdict"] for case in told["cases"]] == ["PASS", "FAIL", "PASS"] and said.status == 1, said
+    assert [case["verdict"] for case in told["cases"]] == ["PASS", "FAIL", "PASS"] and result.status == 1, result
     assert (healthy["fdi"]["verdict"], clogged["fdi"]["verdict"], plain["fdi"]) == ("ACCEPTABLE", "NON_NOMINAL", {})
     assert clogged["fdi"]["level"]["filter_clogging"] == "non_nominal"
     size = clogged["fdi"]["refined"]["kintas"]
@@ -287,17 +299,17 @@ def test_a_fault_fails_its_case_and_no_other(units: tuple[Path, Said]) -> None:
     assert all(check["passed"] for check in clogged["checks"])  # the fault alone fails it
 
 
-def test_report_and_page_show_level_and_size(units: tuple[Path, Said]) -> None:
-    folder, said = units
-    table = said.out.split("Faults found by rig fdi\n")[1].split("A fault beyond acceptable")[0]
+def test_report_and_page_show_level_and_size(units: tuple[Path, CommandResult]) -> None:
+    folder, result = units
+    table = result.out.split("Faults found by rig fdi\n")[1].split("A fault beyond acceptable")[0]
     assert table.count("Kintas 0") == table.count("FSS ") == 2 and table.count("non-nominal") == 1
-    assert "rig fdi: filter clogging non-nominal, Kintas 0." in " ".join(said.out.split())
+    assert "rig fdi: filter clogging non-nominal, Kintas 0." in " ".join(result.out.split())
     page = (folder / "suite.html").read_text()
     assert "Filter clogging is non-nominal" in page and "size (95 % interval)" in page
     assert "Kintas 0." in (folder / "unit-filter.clogging=0.6" / "report.html").read_text()
 
 
-def test_junit_has_the_diagnosis_as_a_test_of_its_own(units: tuple[Path, Said]) -> None:
+def test_junit_has_the_diagnosis_as_a_test_of_its_own(units: tuple[Path, CommandResult]) -> None:
     folder, _ = units
     healthy, clogged, plain = read_valid_junit(folder / "junit.xml")
     assert [each.get("failures") for each in (healthy, clogged, plain)] == ["0", "1", "0"]
@@ -358,9 +370,9 @@ def test_the_prediction_is_that_of_the_run(preflight: Path) -> None:
 
 
 def test_what_is_beyond_the_limits(tmp_path: Path) -> None:
-    said = rig("check", write_file(tmp_path / "far.toml", FAR), "--out", tmp_path / "far.html")
-    text, page = " ".join(said.out.split()), (tmp_path / "far.html").read_text()
-    assert said.status == 1 and [words for words in (
+    result = rig("check", write_file(tmp_path / "far.toml", FAR), "--out", tmp_path / "far.html")
+    text, page = " ".join(result.out.split()), (tmp_path / "far.html").read_text()
+    assert result.status == 1 and [words for words in (
         "BEYOND_LIMITS position 50 mm beyond 40 mm (jack.travel) in 'end', t = 0.150 s",
         "speed 333.3 mm/s beyond 250 mm/s (no-load speed) in 'out'", "load 40 kN beyond 30.15 kN (stall force)",
         "guard 'far out' violated at t = 0.0", "check 'steps': the command does not step here")
@@ -383,16 +395,16 @@ faults = [
 
 def test_the_faults_of_a_sequence_are_listed_and_drawn(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text(SHORT + FAULTS)
-    said = rig("check", tmp_path / "s.toml", "--json")
-    listed = {each["name"]: each for each in said.json["faults"]}
+    result = rig("check", tmp_path / "s.toml", "--json")
+    listed = {each["name"]: each for each in result.json["faults"]}
     assert {name: (each["kind"], each["target"], each["t0"], each["t1"]) for name, each in listed.items()} == {
         "parameter filter.clogging": ("parameter", "filter.clogging", 0.05, 0.25),
         "some": ("lost", "frame drive", 0.1, 0.106), "biased": ("offset", "sensor xj", 0.3, 0.35),
         "mute": ("heartbeat", "node plant", 0.2, 0.25), "reset node": ("reset", "node controller", 0.125, 0.126)}
     assert listed["biased"]["duration"] == pytest.approx(0.05)
     assert listed["parameter filter.clogging"]["size"] == "0 to 0.900 within 100 ms"
-    said = rig("check", tmp_path / "s.toml", "--out", tmp_path / "s.html")
-    text = " ".join(said.out.split())
+    result = rig("check", tmp_path / "s.toml", "--out", tmp_path / "s.html")
+    text = " ".join(result.out.split())
     assert "biased sensor xj 0.300 0.350 100 um" in text and "ends with main at 0.35 s, not at 9 s" in text
     page = (tmp_path / "s.html").read_text()
     assert page.count("#ffd8a8") > 5 and all(f">{name}" in page.replace("> ", ">") for name in listed)

@@ -82,8 +82,8 @@ def test_a_project_with_the_fixture(project: pytest.Pytester) -> None:
 def test_a_log_can_be_repeated(tmp_path: Path) -> None:
     run = Bench(tmp_path).run(command=list(np.linspace(0.0, 1e-3, 120)), seed=2, checks=[
         {"name": "error", "kind": "max_error", "high": 1.0, "unit": "mm"}])
-    said = rig("run", "--from", run.folder, "--out", tmp_path / "again", "--json")
-    assert said.json["checks"][0]["value"] == run.checks["error"].value and said.json["run"]["seed"] == 2
+    result = rig("run", "--from", run.folder, "--out", tmp_path / "again", "--json")
+    assert result.json["checks"][0]["value"] == run.checks["error"].value and result.json["run"]["seed"] == 2
 
 
 def test_faults_and_checks_are_added_to_a_sequence(tmp_path: Path) -> None:
@@ -126,5 +126,5 @@ def test_loading_the_plugin_costs_next_to_nothing() -> None:
     assert project["tool"]["setuptools"]["py-modules"] == ["rig_pytest"]
     program = ("import os, pytest, sys; before, settings = set(sys.modules), dict(os.environ); import rig_pytest; "
                "assert dict(os.environ) == settings; print(*sorted(set(sys.modules) - before))")
-    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert said.stdout.split() == ["rig_pytest"]
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert result.stdout.split() == ["rig_pytest"]

@@ -241,9 +241,9 @@ def test_screen_follows_the_run_and_ctrl_c_restores_the_terminal(tmp_path: Path)
 
 def test_lines_without_a_terminal(tmp_path: Path) -> None:
     sequence = write_file(tmp_path / "events.toml", EVENTS)
-    said = finished(started("run", sequence, "--live", "--json", "--out", tmp_path / "run"))
-    lines = said.err.splitlines()
-    assert said.status == 1 and said.out.startswith("{") and "live" not in said.out
+    result = finished(started("run", sequence, "--live", "--json", "--out", tmp_path / "run"))
+    lines = result.err.splitlines()
+    assert result.status == 1 and result.out.startswith("{") and "live" not in result.out
     assert lines[0] == "live: standard error is no terminal: a line every 2 s instead of the screen"
     assert re.search(r"checks \d+ pass, [1-9] fail of \d+; lockstep: no cycle is late; nodes: 2 operational", lines[-1])
 
@@ -263,9 +263,9 @@ def test_dead_node_is_announced_before_the_run_ends(tmp_path: Path) -> None:
     os.kill(plant, signal.SIGKILL)
     assert run.stderr.readline() == "rig run: node 3 plant: its process was ended by SIGKILL\n"
     assert run.poll() is None  # its report is still to come
-    said = finished(run)
+    result = finished(run)
     cause = json.loads((folder / "verdict.json").read_text())["cause"]
-    assert "ABORTED" in said.out and said.status == 1 and "SIGKILL" in cause["text"]
+    assert "ABORTED" in result.out and result.status == 1 and "SIGKILL" in cause["text"]
     assert (cause["source"], cause["kind"]) == ("node 3 plant", "stopped") and gone(group)
 
 
@@ -292,8 +292,8 @@ checks = [{ name = "position", kind = "never_exceeds", signal = "xj", high = 6, 
 @needs_viewer
 def test_what_arrives_is_what_the_log_holds(tmp_path: Path) -> None:
     short = write_file(tmp_path / "short.toml", SHORT)
-    said = rig("run", short, "--live", f"rerun:{tmp_path}/live.rrd", "--out", tmp_path / "run")
-    assert said.status == 1 and said.err == "" and "too small" in said.out
+    result = rig("run", short, "--live", f"rerun:{tmp_path}/live.rrd", "--out", tmp_path / "run")
+    assert result.status == 1 and result.err == "" and "too small" in result.out
     rows, trace = read_recording(tmp_path / "live.rrd"), Trace.read(tmp_path / "run", all=True)
     for entity, values in (("/position/ram", trace.xj * 1e3), ("/spool/spool", trace.xs * 1e6),
                            ("/load/load", 1e-3 * trace.load)):
@@ -333,8 +333,8 @@ def test_without_the_viewer_one_line_says_how_to_get_it(status: int, words: list
                                                         monkeypatch: pytest.MonkeyPatch) -> None:
     record_run(here / "trace.mcap", stop=400)
     monkeypatch.setitem(sys.modules, "rerun", None)
-    said = rig(*words)
-    assert (said.status, said.err.count("\n")) == (status, 1) and "pip install 'eha-rig[view]'" in said.err
+    result = rig(*words)
+    assert (result.status, result.err.count("\n")) == (status, 1) and "pip install 'eha-rig[view]'" in result.err
     assert [path.name for path in here.iterdir()] == ["trace.mcap"]
 
 
@@ -544,5 +544,5 @@ def test_a_theme_is_served_for_a_browser_until_ctrl_c(folder: Path) -> None:
         with socket.create_connection(("127.0.0.1", data.port or 0)):
             pass
     finally:
-        said = interrupted(process)
-    assert said.status == 0 and said.err == ""
+        result = interrupted(process)
+    assert result.status == 0 and result.err == ""

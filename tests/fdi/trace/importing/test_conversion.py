@@ -262,8 +262,8 @@ def require_same_answer(path: Path, expected: dict, tolerance: float) -> None:
 
 def test_guess_then_import_of_a_german_csv(folder: Path, original: dict) -> None:
     """The guessed map needs no change: names, units, sign and rate are found, the samples are those of the run."""
-    said = rig("import", "--guess", folder / "german.csv", "--json").json
-    assert {name: entry["source"] for name, entry in said["signals"].items()} == {
+    guess = rig("import", "--guess", folder / "german.csv", "--json").json
+    assert {name: entry["source"] for name, entry in guess["signals"].items()} == {
         "time": "Zeit [ms]", "com": "Sollweg [mm]", "xj": "Kolbenweg [mm]", "cor": "Ventilstrom",
         "p12": "Differenzdruck (bar)", "xs": "Schieber"}
     text = (folder / "german.map.toml").read_text()
@@ -289,8 +289,9 @@ def test_guess_keeps_a_map_that_exists(folder: Path) -> None:
 def test_mf4_with_times_of_its_own_and_two_chamber_pressures(folder: Path, original: dict) -> None:
     pytest.importorskip("asammdf", reason="no asammdf: pip install 'eha-rig[measure]'")
     write_mf4(Trace.read(folder / "original.csv"), folder / "run.mf4")
-    said = rig("import", folder / "run.mf4", "--map", folder / "mdf.toml", "--out", folder / "mdf.mcap", "--json").json
-    assert said["format"].startswith("MDF 4") and said["signals"]["p12"]["source"] == "pressure_a - pressure_b"
+    answer = rig("import", folder / "run.mf4", "--map", folder / "mdf.toml", "--out", folder / "mdf.mcap",
+                 "--json").json
+    assert answer["format"].startswith("MDF 4") and answer["signals"]["p12"]["source"] == "pressure_a - pressure_b"
     trace, want = Trace.read(folder / "mdf.mcap"), Trace.read(folder / "original.csv")
     for name in SIGNALS:
         np.testing.assert_allclose(trace.column(name), want.column(name), rtol=1e-14,
@@ -299,9 +300,9 @@ def test_mf4_with_times_of_its_own_and_two_chamber_pressures(folder: Path, origi
 
 
 def test_blf_with_the_users_dbc(folder: Path, original: dict) -> None:
-    said = rig("import", folder / "log.blf", "--map", folder / "can.toml", "--dbc", folder / "user.dbc",
+    answer = rig("import", folder / "log.blf", "--map", folder / "can.toml", "--dbc", folder / "user.dbc",
                "--out", folder / "can.mcap", "--json").json
-    assert said["cycles"] == 1500 and said["format"] == "CAN log, user.dbc"
+    assert answer["cycles"] == 1500 and answer["format"] == "CAN log, user.dbc"
     trace, want = Trace.read(folder / "can.mcap"), Trace.read(folder / "original.csv")
     for name, lsb in zip(SIGNALS, (1e-8, 1e-8, 1e-8, 10.0, 1e-9), strict=True):
         assert np.abs(trace.column(name) - want.column(name)).max() <= 0.5001 * lsb
@@ -309,9 +310,9 @@ def test_blf_with_the_users_dbc(folder: Path, original: dict) -> None:
 
 
 def test_guess_of_a_can_log(folder: Path) -> None:
-    said = rig("import", "--guess", folder / "log.blf", "--dbc", folder / "user.dbc", "--out", folder / "blf.toml",
+    answer = rig("import", "--guess", folder / "log.blf", "--dbc", folder / "user.dbc", "--out", folder / "blf.toml",
                "--json").json
-    found = {name: entry["source"] for name, entry in said["signals"].items()}
+    found = {name: entry["source"] for name, entry in answer["signals"].items()}
     assert found == {"time": "its own times", "com": "Demand.Target", "xj": "Ram.Stroke", "cor": "Valve.Current",
                      "p12": "Ram.DeltaP", "xs": "Valve.Spool"}
 
