@@ -141,11 +141,11 @@ def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, flo
     progress("which states the residual follows", 0.85)
     unseen = None if search.holdout is None else search.make_problem(search.holdout, search.problem.steps)
     balances, states = compute_balances(search.problem, base, floor)
-    there = compute_balances(unseen, base, floor) if unseen is not None else None
-    missing = tuple(describe_balance(b, states, there) for b in balances)
-    hidden = {place: why for place, (signal, why) in HIDDEN.items()
-              if signal not in search.problem.trace.outputs and any(b.place == place for b in balances)}
-    places = [m.balance.place for m in missing if m.balance.place not in hidden]
+    holdout = compute_balances(unseen, base, floor) if unseen is not None else None
+    missing = tuple(describe_balance(b, states, holdout) for b in balances)
+    hidden_places = {place: why for place, (signal, why) in HIDDEN.items()
+                     if signal not in search.problem.trace.outputs and any(b.place == place for b in balances)}
+    places = [m.balance.place for m in missing if m.balance.place not in hidden_places]
     with registered_library():
         worker = _Worker(search, base, places, floor)
         trial, equals = worker.choose_terms(progress)
@@ -153,11 +153,12 @@ def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, flo
         if trial is not None:
             progress("last fit of the law", 0.93)
             law = worker.judge_law(trial, equals, catalogue)
-    known = [("base", base), ("catalogue", catalogue)] if unseen is not None else []
-    errors = {name: _measure_holdout(search, h) for name, h in known if h}
+    hypotheses = [("base", base), ("catalogue", catalogue)] if unseen is not None else []
+    errors = {name: _measure_holdout(search, h) for name, h in hypotheses if h}
     curve = None if law is None else compute_law_curve(law, search, base.effects)
-    said = law.floor if law is not None and law.holds else floor
-    return LawSearch(missing, hidden, law, base, catalogue, errors, said, search.problem.trace.declared, curve)
+    last_floor = law.floor if law is not None and law.holds else floor
+    return LawSearch(missing, hidden_places, law, base, catalogue, errors, last_floor,
+                     search.problem.trace.declared, curve)
 
 
 def find_law_beside(e: Explanation, progress: Progress = ignore_progress) -> LawSearch:
@@ -166,31 +167,31 @@ def find_law_beside(e: Explanation, progress: Progress = ignore_progress) -> Law
     Of a part that the catalogue explains, the law is tried alone first, then beside the named effects.
     """
     best = e.ranked[0] if e.ranked else None
-    found = find_law(e.search, e.base, best, e.floor, progress)
-    if e.verdict != "PARTLY" or len(e.ledger) < 2 or (found.law is not None and found.law.hypothesis.is_at_floor):
-        return found
-    beside = find_law(e.search, e.ledger[-1], best, e.floor, progress)
-    if beside.law is None or not beside.law.holds:
-        return found
-    is_better = (found.law is None or not found.law.holds
-                 or _measure_left(beside.law, e.floor) < _measure_left(found.law, e.floor))
-    return beside if is_better else found
+    first = find_law(e.search, e.base, best, e.floor, progress)
+    if e.verdict != "PARTLY" or len(e.ledger) < 2 or (first.law is not None and first.law.hypothesis.is_at_floor):
+        return first
+    second = find_law(e.search, e.ledger[-1], best, e.floor, progress)
+    if second.law is None or not second.law.holds:
+        return first
+    is_better = (first.law is None or not first.law.holds
+                 or _measure_left(second.law, e.floor) < _measure_left(first.law, e.floor))
+    return second if is_better else first
 
 
 def _measure_left(law: Law, floor: Mapping[str, float]) -> float:
     return measure_excess(law.holdout or law.hypothesis.errors, floor)
 
 
-def describe_balance(b: Balance, states: States, there: tuple[list[Balance], States] | None) -> Missing:
-    """What is missing in a balance, and on which states it depends, `there` on the held-out run too."""
+def describe_balance(b: Balance, states: States, holdout: tuple[list[Balance], States] | None) -> Missing:
+    """What is missing in a balance, and on which states it depends; `holdout`: the same on the held-out run."""
     if b.ratio < PATTERN_VISIBLE_RATIO:
         return Missing(b, False)
     unseen = None
-    if there is not None:
-        same = next(other for other in there[0] if other.place == b.place)
-        unseen = _screen_rows(same, there[1])
-    own = _screen_rows(b, states)
-    return Missing(b, True, () if own is None else tuple(find_dependences(*own, unseen)))
+    if holdout is not None:
+        same = next(other for other in holdout[0] if other.place == b.place)
+        unseen = _screen_rows(same, holdout[1])
+    rows = _screen_rows(b, states)
+    return Missing(b, True, () if rows is None else tuple(find_dependences(*rows, unseen)))
 
 
 def _screen_rows(b: Balance, states: States) -> tuple[Floats, dict[str, Floats]] | None:
@@ -207,8 +208,8 @@ def _measure_holdout(search: Search, h: Hypothesis) -> dict[str, float]:
     """RMS residual of the typical block of the held-out run, SI; {} without one."""
     if search.holdout is None:
         return {}
-    left = search.make_problem(search.holdout, search.problem.steps).compute_residuals(h.fit.free, h.fit.x[None])[0]
-    return dict(zip(search.holdout.outputs, compute_typical_rms(left).tolist(), strict=True))
+    residual = search.make_problem(search.holdout, search.problem.steps).compute_residuals(h.fit.free, h.fit.x[None])[0]
+    return dict(zip(search.holdout.outputs, compute_typical_rms(residual).tolist(), strict=True))
 
 
 class _Ranked(NamedTuple):
@@ -243,83 +244,83 @@ class _Worker:
         if self.base.is_at_floor:
             return None, ()  # what a healthy unit's tolerances have not quite reached is not a law
         start = continue_fit(self.problem(()), linearise(self.problem(()), self.base.fit.free, self.base.fit.x), 2)
-        (now,) = self.measure_unseen([Trial((), start)])
+        (trial,) = self.measure_unseen([Trial((), start)])
         equals: tuple[str, ...] = ()
         samples = float(np.isfinite(self.search.problem.trace.measurements).sum())
         for count in range(MOST_TERMS):
-            if now.fit.misfit < WHITE_SQUARE_POOR * samples:
+            if trial.fit.misfit < WHITE_SQUARE_POOR * samples:
                 break  # only noise is left
             progress(f"looking for term {count + 1} of a law", 0.86 + 0.02 * count)
-            tried = self.add_each_term(now)
-            if not tried or tried[0].fit.cost > now.fit.cost - GAIN_CONVINCES:
+            extensions = self.add_each_term(trial)
+            if not extensions or extensions[0].fit.cost > trial.fit.cost - GAIN_CONVINCES:
                 break
-            limit = tried[0].fit.cost + 0.1 * (now.fit.cost - tried[0].fit.cost)
-            judged = self.measure_unseen([t for t in tried if t.fit.cost < limit][:3])
-            best = min(judged, key=lambda t: t.unseen + GAIN_TIE * sum(len(term.fields) for term in t.terms))
-            if now.unseen - best.unseen < max(GAIN_CONVINCES, FURTHER_EFFECT_SHARE * (now.unseen - samples)):
+            limit = extensions[0].fit.cost + 0.1 * (trial.fit.cost - extensions[0].fit.cost)
+            close_trials = self.measure_unseen([t for t in extensions if t.fit.cost < limit][:3])
+            best = min(close_trials, key=lambda t: t.unseen + GAIN_TIE * sum(len(term.fields) for term in t.terms))
+            if trial.unseen - best.unseen < max(GAIN_CONVINCES, FURTHER_EFFECT_SHARE * (trial.unseen - samples)):
                 break
             if count == 0:
-                equals = tuple(t.terms[-1].name for t in judged if t is not best
+                equals = tuple(t.terms[-1].name for t in close_trials if t is not best
                                and t.unseen < best.unseen + GAIN_TIE)
-            now = best
-        now = self.drop_terms(now)
-        return (now, equals) if now.terms else (None, ())
+            trial = best
+        trial = self.drop_terms(trial)
+        return (trial, equals) if trial.terms else (None, ())
 
-    def add_each_term(self, now: Trial) -> list[Trial]:
+    def add_each_term(self, trial: Trial) -> list[Trial]:
         """The law with one more term, the promising ones fitted, best first.
 
         Tolerances that have moved to make up for what is missing hide it: proposals come from the healthy unit too.
         """
-        x = place_in_healthy_unit(now.fit.free, now.fit.x)
-        healthy = linearise(self.problem(now.terms), now.fit.free, x)
-        ranked = [each for fit in (now.fit, healthy) for each in self.rank_terms(now.terms, fit)]
+        x = place_in_healthy_unit(trial.fit.free, trial.fit.x)
+        healthy = linearise(self.problem(trial.terms), trial.fit.free, x)
+        ranking = [each for fit in (trial.fit, healthy) for each in self.rank_terms(trial.terms, fit)]
         best: dict[str, _Ranked] = {}
-        for each in sorted(ranked, key=lambda r: r.cost):
+        for each in sorted(ranking, key=lambda r: r.cost):
             best.setdefault(each.proposal.term.name, each)
-        worth = [each for each in best.values() if each.cost < now.fit.cost - GAIN_CONVINCES][:MOST_FITTED]
-        fits = self.search.map_parallel(lambda each: self.fit_term(now.terms, each), worth)
+        best_proposals = [each for each in best.values() if each.cost < trial.fit.cost - GAIN_CONVINCES][:MOST_FITTED]
+        fits = self.search.map_parallel(lambda each: self.fit_term(trial.terms, each), best_proposals)
         return sorted(fits, key=lambda t: t.fit.cost)
 
     def rank_terms(self, terms: tuple[Term, ...], fit: Fit) -> list[_Ranked]:
         """Every proposal at each of `TRIED_SIZES` on top of a fit, with what a replay says that it would leave."""
         problem = replace(self.problem(terms), workers=self.search.workers)
         balances, states = compute_balances(problem, Hypothesis(self.base.effects, fit, {}), self.floor)
-        ranked: list[_Ranked] = []
+        ranking: list[_Ranked] = []
         for b in balances:
             if b.place not in self.places:
                 continue
             rows = select_rows(b, states, {**problem.model.values, **fit.values})
             proposals = propose_terms(b.place, rows, terms)[:PROPOSED]
-            tried = [(p, factor) for p in proposals for factor in TRIED_SIZES]
+            pairs = [(p, factor) for p in proposals for factor in TRIED_SIZES]
             starts = [(p.term.name, {name_parameter(p.term, f): v * (factor if f == p.term.name else 1.0)
-                                     for f, v in p.values.items()}, False) for p, factor in tried]
+                                     for f, v in p.values.items()}, False) for p, factor in pairs]
             trials = simulate_starts(self.problem(terms, b.place), fit, starts, self.search.workers)
-            ranked += [_Ranked(t.cost, *each, fit, t.x) for each, t in zip(tried, trials, strict=True)]
-        return [each for each in ranked if np.isfinite(each.cost)]
+            ranking += [_Ranked(t.cost, *each, fit, t.x) for each, t in zip(pairs, trials, strict=True)]
+        return [each for each in ranking if np.isfinite(each.cost)]
 
     def fit_term(self, terms: tuple[Term, ...], r: _Ranked) -> Trial:
         """The law with one more term, fitted with all tolerances from where the ranking has left them, or before it."""
         terms = (*terms, r.proposal.term)
         problem = self.problem(terms)
         free = (*r.fit.free, *_make_unknowns(r.proposal, r.factor))
-        added = np.zeros(len(free) - len(r.fit.free))
-        begun = [linearise(problem, free, np.concatenate([x, added])) for x in (r.x, r.fit.x)]
-        fits = [continue_fit(problem, fit, 2) for fit in begun]
+        new_x = np.zeros(len(free) - len(r.fit.free))
+        start_fits = [linearise(problem, free, np.concatenate([x, new_x])) for x in (r.x, r.fit.x)]
+        fits = [continue_fit(problem, fit, 2) for fit in start_fits]
         return Trial(terms, continue_fit(problem, min(fits, key=lambda fit: fit.cost), 4))
 
-    def drop_terms(self, now: Trial) -> Trial:
+    def drop_terms(self, trial: Trial) -> Trial:
         """The law without the terms that left-out pieces of the run do not want."""
-        while len(now.terms) > 1:
-            shorter = self.measure_unseen(self.search.map_parallel(partial(self.fit_without, now), now.terms))
+        while len(trial.terms) > 1:
+            shorter = self.measure_unseen(self.search.map_parallel(partial(self.fit_without, trial), trial.terms))
             best = min(shorter, key=lambda t: t.unseen)
-            if best.unseen > now.unseen + GAIN_CONVINCES:
+            if best.unseen > trial.unseen + GAIN_CONVINCES:
                 break
-            now = best
-        return now
+            trial = best
+        return trial
 
-    def fit_without(self, now: Trial, gone: Term) -> Trial:
+    def fit_without(self, trial: Trial, term: Term) -> Trial:
         """The law without a term."""
-        terms, (free, x) = tuple(t for t in now.terms if t is not gone), leave_out_terms(now.fit, [gone])
+        terms, (free, x) = tuple(t for t in trial.terms if t is not term), leave_out_terms(trial.fit, [term])
         return Trial(terms, continue_fit(self.problem(terms), linearise(self.problem(terms), free, x), 5))
 
     def measure_unseen(self, trials: Sequence[Trial]) -> list[Trial]:
@@ -333,11 +334,11 @@ class _Worker:
             total = 0.0
             for half in (0, 1):
                 mask = (piece % 2 == half).astype(float)
-                fitted = replace(t.fit, white=white * mask, jacobian=t.fit.jacobian * mask)
-                gradient, hessian = form_normal_equations(fitted)
-                x = step_within_bounds(fitted, hessian, gradient, (1e-3,))
-                there = problem.compute_white_residuals(t.fit.free, x) * (1.0 - mask)
-                total += float(compute_misfit(there)[0])
+                half_fit = replace(t.fit, white=white * mask, jacobian=t.fit.jacobian * mask)
+                gradient, hessian = form_normal_equations(half_fit)
+                x = step_within_bounds(half_fit, hessian, gradient, (1e-3,))
+                residuals = problem.compute_white_residuals(t.fit.free, x) * (1.0 - mask)
+                total += float(compute_misfit(residuals)[0])
             return replace(t, unseen=total)
 
         return self.search.map_parallel(measure, trials)
@@ -353,19 +354,19 @@ class _Worker:
         h = last.judge_on_all([h], last.problem.steps)[0]
         values = {f: _read_value(h.fit, name_parameter(term, f), unit)
                   for term in t.terms for f, unit in zip(term.fields, term.units, strict=True)}
-        left = _measure_holdout(last, h)
-        holds, reason = self.decide(h, left, catalogue)
-        return Law(t.terms, values, holds, reason, h, left, last.estimate_floor(h), equals)
+        holdout = _measure_holdout(last, h)
+        holds, reason = self.decide(h, holdout, catalogue)
+        return Law(t.terms, values, holds, reason, h, holdout, last.estimate_floor(h), equals)
 
-    def decide(self, h: Hypothesis, left: Mapping[str, float], catalogue: Hypothesis | None) -> tuple[bool, str]:
-        """Whether the law holds, and why; `left` is its error on the held-out run."""
+    def decide(self, h: Hypothesis, holdout: Mapping[str, float], catalogue: Hypothesis | None) -> tuple[bool, str]:
+        """Whether the law holds, and why; `holdout` has its errors on the held-out run."""
         floor = self.floor
         before, after = (measure_excess(each.errors, floor) for each in (self.base, h))
         if after > ERROR_PARTLY_EXPLAINED**2 * before:
             return False, "the law lowers the error of its own run too little"
-        if not left:
+        if not holdout:
             return True, "no held-out run: judged on pieces of the run that its fit did not see"
-        unseen = measure_excess(left, floor)
+        unseen = measure_excess(holdout, floor)
         bare = measure_excess(_measure_holdout(self.search, self.base), floor)
         if unseen > ERROR_PARTLY_EXPLAINED**2 * bare:
             return False, "the law does not lower the error of the held-out run"
@@ -397,9 +398,9 @@ def _read_value(fit: Fit, name: str, unit: str) -> Value:
 
 def leave_out_terms(fit: Fit, terms: Iterable[Term]) -> tuple[tuple[Free, ...], Floats]:
     """The unknowns of a fit, and their values (p,), without those of some terms."""
-    own = {name_parameter(term, f) for term in terms for f in term.fields}
-    kept = [k for k, f in enumerate(fit.free) if f.name not in own]
-    return tuple(fit.free[k] for k in kept), fit.x[kept]
+    names = {name_parameter(term, f) for term in terms for f in term.fields}
+    indices = [k for k, f in enumerate(fit.free) if f.name not in names]
+    return tuple(fit.free[k] for k in indices), fit.x[indices]
 
 
 def compute_law_curve(law: Law, search: Search, effects: tuple[str, ...]) -> LawCurve:
@@ -420,19 +421,19 @@ def compute_law_curve(law: Law, search: Search, effects: tuple[str, ...]) -> Law
     state = "speed" if state == "direction" else state
     is_odd = bool(along) and state != along and not (along == "direction" and state == "speed")
     side = np.sign(rows.states[along]) if is_odd else 1.0
-    found = {f: v.value for f, v in law.values.items()}
-    said = np.sum([found[t.name] * evaluate_columns(t, {f: found[f] for f in t.fields}, rows.states)[:, 0]
-                   for t in law.terms if t.place == term.place], axis=0)
+    values = {f: v.value for f, v in law.values.items()}
+    prediction = np.sum([values[t.name] * evaluate_columns(t, {f: values[f] for f in t.fields}, rows.states)[:, 0]
+                         for t in law.terms if t.place == term.place], axis=0)
     over, period = rows.states[state], 0.0
     if term.is_wave and term.shape is not None:
-        shape = found[f"{term.name}_{term.shape.name}"]
+        shape = values[f"{term.name}_{term.shape.name}"]
         period = shape if term.shape.kind == "period" else 1.0 / shape
         over = np.mod(over, period)
     bins = 24
     edges = np.unique(np.quantile(over, np.linspace(0.0, 1.0, bins + 1)))
     place = np.clip(np.searchsorted(edges, over, side="right") - 1, 0, len(edges) - 2)
     (at, _), (height, doubt), (law_height, _) = (average_bins(place, len(edges) - 1, column)
-                                                 for column in (over, side * rows.missing, side * said))
+                                                 for column in (over, side * rows.missing, side * prediction))
     return LawCurve(term.place, balance.unit, state, along if is_odd else "", period, at, height, doubt, law_height)
 
 
@@ -479,19 +480,20 @@ def find_dependences(y: Floats, states: Mapping[str, Floats], holdout: tuple[Flo
     names = [name for name, x in states.items() if np.ptp(x) > 0.0]
     n = len(y)
     shifts = np.random.default_rng(seed).integers(n // 20, n - n // 20, SHIFTS)
-    moved = np.column_stack([y, *(np.roll(y, int(k)) for k in shifts)])
+    columns = np.column_stack([y, *(np.roll(y, int(k)) for k in shifts)])
     fold = np.minimum(np.arange(n) * FOLDS // n, FOLDS - 1)
     edges = {name: {bins: np.unique(np.quantile(states[name], np.linspace(0.0, 1.0, bins + 1)[1:-1]))
                     for bins in (SINGLE_BINS, PAIR_BINS, *OWN_BINS.values())} for name in names}
     choices = [(name,) for name in names] + list(combinations(names, 2))
-    shares = np.array([_predict_folds(_find_bins(c, states, edges), fold, moved) for c in choices])
+    shares = np.array([_predict_folds(_find_bins(c, states, edges), fold, columns) for c in choices])
     best_by_chance = shares[:, 1:].max(axis=0)
-    own = dict(zip(choices, shares[:, 0].tolist(), strict=True))
+    share_of = dict(zip(choices, shares[:, 0].tolist(), strict=True))
     least_gain = 0.03  # share that a pair must add to the better one of its states
-    found = [c for c in choices if len(c) == 1 or own[c] > max(own[c[:1]], own[c[1:]]) + least_gain]
-    ranked = sorted(found, key=lambda c: -own[c])[:most]
-    return [Dependence(c, own[c], _predict_holdout(c, y, states, holdout, edges),
-                       float((1 + np.sum(best_by_chance >= own[c])) / (1 + SHIFTS))) for c in ranked]
+    useful_choices = [c for c in choices
+                      if len(c) == 1 or share_of[c] > max(share_of[c[:1]], share_of[c[1:]]) + least_gain]
+    best_choices = sorted(useful_choices, key=lambda c: -share_of[c])[:most]
+    return [Dependence(c, share_of[c], _predict_holdout(c, y, states, holdout, edges),
+                       float((1 + np.sum(best_by_chance >= share_of[c])) / (1 + SHIFTS))) for c in best_choices]
 
 
 def _find_bins(choice: Sequence[str], states: Mapping[str, Floats], edges: Mapping[str, Mapping[int, Floats]]
@@ -510,10 +512,10 @@ def _predict_folds(place: Places, fold: Places, y: Floats) -> Floats:
     bins = int(place.max()) + 1
     group = place * FOLDS + fold
     pick = csr_array((np.ones(len(place)), (group, np.arange(len(place)))), shape=(bins * FOLDS, len(place)))
-    own = (pick @ y).reshape(bins, FOLDS, -1)
+    sums = (pick @ y).reshape(bins, FOLDS, -1)
     count = np.bincount(group, minlength=bins * FOLDS).reshape(bins, FOLDS, 1)
-    mean = (own.sum(axis=1, keepdims=True) - own) / (count.sum(axis=1, keepdims=True) - count + 5.0)  # shrunk to zero
-    error = (y**2).sum(axis=0) - (2.0 * mean * own - mean**2 * count).sum(axis=(0, 1))
+    mean = (sums.sum(axis=1, keepdims=True) - sums) / (count.sum(axis=1, keepdims=True) - count + 5.0)  # shrunk to zero
+    error = (y**2).sum(axis=0) - (2.0 * mean * sums - mean**2 * count).sum(axis=(0, 1))
     share: Floats = 1.0 - error / np.maximum((y**2).sum(axis=0), 1e-300)
     return share
 
@@ -524,10 +526,10 @@ def _predict_holdout(choice: Sequence[str], y: Floats, states: Mapping[str, Floa
     if holdout is None:
         return None
     unseen, at = holdout
-    place, there = _find_bins(choice, states, edges), _find_bins(choice, at, edges)
-    bins = max(int(place.max()), int(there.max())) + 1
+    place, unseen_place = _find_bins(choice, states, edges), _find_bins(choice, at, edges)
+    bins = max(int(place.max()), int(unseen_place.max())) + 1
     mean = np.bincount(place, y, bins) / (np.bincount(place, minlength=bins) + 5.0)
-    return 1.0 - float(np.sum((unseen - mean[there]) ** 2)) / max(float(np.sum(unseen**2)), 1e-300)
+    return 1.0 - float(np.sum((unseen - mean[unseen_place]) ** 2)) / max(float(np.sum(unseen**2)), 1e-300)
 
 
 THINNED = 3  # every so many rows: smoothing has made neighbours alike
@@ -589,8 +591,8 @@ def propose_terms(place: str, rows: Rows, present: Sequence[Term] = ()) -> list[
         return []
     remove = _make_remover(rows)
     y = remove(rows.missing[:, None])[:, 0]
-    found = (_fit_term(t, rows, remove, y) for t in TERMS if t.place == place and t not in present)
-    return sorted(filter(None, found), key=lambda p: -p.share)
+    proposals = (_fit_term(t, rows, remove, y) for t in TERMS if t.place == place and t not in present)
+    return sorted(filter(None, proposals), key=lambda p: -p.share)
 
 
 def _make_remover(rows: Rows) -> Callable[[Floats], Floats]:
@@ -661,13 +663,13 @@ def find_lines(y: Floats, t: Floats, span: float, highest: float = 120.0, most: 
     places = np.rint((t - t[0]) / step).astype(int)
     regular = np.zeros(2 * (int(places.max()) + 1))  # twice as long: two frequencies a line
     np.add.at(regular, places, y - y.mean())
-    hertz, power, found = np.fft.rfftfreq(len(regular), step), np.abs(np.fft.rfft(regular)) ** 2, []
+    hertz, power, lines = np.fft.rfftfreq(len(regular), step), np.abs(np.fft.rfft(regular)) ** 2, []
     power[(hertz < 1.0 / span) | (hertz > highest)] = 0.0
     for _ in range(most):
         line = hertz[int(np.argmax(power))]
-        found.append(float(line))
+        lines.append(float(line))
         power[np.abs(hertz - line) < 2.0 / span] = 0.0
-    return found
+    return lines
 
 
 def evaluate_columns(term: Term, values: Mapping[str, float], states: Mapping[str, Floats]) -> Floats:
@@ -679,8 +681,8 @@ def evaluate_columns(term: Term, values: Mapping[str, float], states: Mapping[st
     times = {"1": 1.0, "speed": states["speed"], "pressure": states["pressure"], "direction": states["direction"]}
     columns = []
     for phase in phases:
-        named = dict(values) if phase is None else {**values, f"{term.name}_phase": phase}
-        text = term.format_factor({field: repr(value) for field, value in named.items()})
+        all_values = dict(values) if phase is None else {**values, f"{term.name}_phase": phase}
+        text = term.format_factor({field: repr(value) for field, value in all_values.items()})
         factor = eval(text, dict(FUNCTIONS), dict(states))  # a formula of `terms.TERMS`
         columns.append(np.broadcast_to(factor * times[PARTS[term.part][1]], states["time"].shape))
     return np.column_stack(columns)

@@ -182,28 +182,28 @@ def find_states(term: Term) -> list[str]:
 PORTS = {"force": "jack_drag", "flow": "valve", "current": "current"}
 
 
-def write_law_file(path: str | Path, terms: Sequence[Term], found: Mapping[str, Value], reason: str) -> dict[str, str]:
+def write_law_file(path: str | Path, terms: Sequence[Term], values: Mapping[str, Value], reason: str) -> dict[str, str]:
     """Write a law as an effect file; the names of its effects, by balance.
 
     Args:
         path: the file.
         terms: of the law.
-        found: its parameters, by field.
+        values: its parameters, by field.
         reason: why it holds.
 
     Raises:
         InputError: a place that cannot be written.
     """
-    known = CATALOGUE.list_all()
+    catalogue = CATALOGUE.list_all()
     names = {place: next(name for number in count(1)  # that no other effect has
-                         if (name := f"missing_{place}" + (f"_{number}" if number > 1 else "")) not in known)
+                         if (name := f"missing_{place}" + (f"_{number}" if number > 1 else "")) not in catalogue)
              for place in dict.fromkeys(term.place for term in terms)}
     sizes = [f"{t.name}: {t.words}, {v.value:.4g} {v.unit} (95 %: {v.low:.4g} to {v.high:.4g})."
-             for t, v in ((t, found[t.name]) for t in terms)]
+             for t, v in ((t, values[t.name]) for t in terms)]
     text = "\n".join([f"Found by rig explain: {describe_formula(terms)}.", "", *sizes, "",
                       f"{reason[0].upper()}{reason[1:]}."]) + "\n"
-    values = {name: v.value for name, v in found.items()}
-    write_text(path, write_effects(names, terms, values, text), "--write-effect")
+    numbers = {name: v.value for name, v in values.items()}
+    write_text(path, write_effects(names, terms, numbers, text), "--write-effect")
     return names
 
 
@@ -219,9 +219,9 @@ def write_effects(names: Mapping[str, str], terms: Sequence[Term], values: Mappi
     """
     source = "\n\n".join(write_law(name, [t for t in terms if t.place == place], values)
                          for place, name in names.items())
-    used = set(re.findall(r"[A-Za-z]+", re.sub(r'"[^"]*"', "", source)))
-    functions = [f for f in ("exp", "pi", "sin", "sqrt", "tanh") if f in used]
-    records = [r for r in ("Drag", "Line") if r in used]
+    words = set(re.findall(r"[A-Za-z]+", re.sub(r'"[^"]*"', "", source)))
+    functions = [f for f in ("exp", "pi", "sin", "sqrt", "tanh") if f in words]
+    records = [r for r in ("Drag", "Line") if r in words]
     head = [f"from math import {', '.join(functions)}"] if functions else []
     head += ["from typing import Annotated, NamedTuple", "", "from plant.effects import effect",
              "from plant.quantity import Quantity"]
@@ -249,8 +249,8 @@ def write_law(name: str, terms: Sequence[Term], values: Mapping[str, float] | No
     port = "load" if is_load else PORTS[place]
     starts = ""
     if values is not None:
-        found = ", ".join(f"{values[f]:.6g}" for term in terms for f in term.fields)
-        starts = f",\n        starts=(({found},),)"
+        numbers = ", ".join(f"{values[f]:.6g}" for term in terms for f in term.fields)
+        starts = f",\n        starts=(({numbers},),)"
     lines += [f'@effect("{port}", {group}{f", memory={group}Way" if memory else ""},',
               f'        law="{format_formula(terms)}"{starts})',
               f"def {name}(x, {'m, ' if memory else ''}s, u, p):", f'    """{words[0].upper()}{words[1:]}."""',
@@ -263,10 +263,10 @@ def write_law(name: str, terms: Sequence[Term], values: Mapping[str, float] | No
               if state != "way" and any(state in find_states(term) for term in terms)]
     parts = list(dict.fromkeys(term.part for term in terms))
     for part in parts:
-        own = [f"g.{t.name} * ({t.format_factor({f: f'g.{f}' for f in t.fields})})" for t in terms if t.part == part]
-        own = [line.replace(" * (1.0)", "") for line in own]
+        texts = [f"g.{t.name} * ({t.format_factor({f: f'g.{f}' for f in t.fields})})" for t in terms if t.part == part]
+        texts = [line.replace(" * (1.0)", "") for line in texts]
         name = "lost" if part == "current" else part  # `current` is a state
-        lines.append(f"    {name} = " + (own[0] if len(own) == 1 else "(" + "\n        + ".join(own) + ")"))
+        lines.append(f"    {name} = " + (texts[0] if len(texts) == 1 else "(" + "\n        + ".join(texts) + ")"))
     result = {"force": _return_force, "flow": _return_flow, "current": _return_current}[place](parts, is_load)
     if memory:
         result[-1] = f"    return {result[-1].removeprefix('    return ')}, {group}Way(way, side)"
